@@ -33,12 +33,15 @@ from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
+from flight_design.gains.gain_design import selected_observer
+from flight_design.gains.observer_search import SelectedObserver
 from flight_design.identification.likelihood import Innovations
 from flight_design.identification.model_identification import Part
 from flight_design.identification.model_quality import Prediction, advantage, another_airframe
 from flight_design.learning import learner as design_learner
 from flight_design.learning import part_checks
 from flight_design.learning.change_test import Change
+from flight_design.learning.designs import Goal, goal
 from flight_design.learning.learner import Known, Learner
 from flight_design.learning.scenario_learner import learn_again, learner, with_last_model
 from flight_log.stored_messages import parameter_changes
@@ -417,7 +420,7 @@ def test_model_with_coupling_is_not_replaced_by_one_of_a_part(
     parts = [(whole,), apart, worse_than_file]
     identified = Mock(side_effect=[SimpleNamespace(parts=each) for each in parts])
     monkeypatch.setattr(design_learner, "identify", identified)
-    monkeypatch.setattr(made, "_design", lambda *_: start)
+    monkeypatch.setattr(made, "_design", lambda *_: SelectedObserver(start, 0.03, 0.6, ONES, 0.0))
     record_rest(made)
     assert made.propose(0).sentence == "B[q, elevator] +10 +- 1 %, with coupling"
     assert made.model is not None
@@ -552,9 +555,9 @@ def lateral(*, whiteness: float = 1.0, latest: float = 0.0) -> Part:
     return Part(inputs, ("p", "r"), LATERAL, before, after, "", (latest, latest), gusts=False)
 
 
-def learner_that_finds(part: Part, monkeypatch: pytest.MonkeyPatch) -> Learner:
+def learner_that_finds(part: Part, monkeypatch: pytest.MonkeyPatch, **learn: Any) -> Learner:
     """A learner with a record of 10 s, whose search finds a part."""
-    made = made_learner(scenario(learn={"updates": [10.0]}))
+    made = made_learner(scenario(learn={"updates": [10.0]} | learn))
     monkeypatch.setattr(design_learner, "identify", lambda *_, **__: SimpleNamespace(parts=(part,)))
     record_rest(made)
     return made
@@ -578,35 +581,71 @@ def test_guidance_gets_effects_less_two_deviations_of_what_was_learned(
 
 
 @pytest.mark.parametrize(
-    "latest, margin",
+    "latest, asked, margin",
     [
-        (0.008, 0.03),  # 8 and 10 ms are within the 30 ms of the start
-        (0.024, 0.034),  # 10 ms are left
-        (0.0424, 0.0524),
+        (0.008, None, 0.03),  # 8 and 10 ms are within the 30 ms of the start
+        (0.024, None, 0.034),  # 10 ms are left
+        (0.0424, None, 0.0524),
+        (0.008, 0.04, 0.04),  # `learn.margin`
+        (0.0424, 0.04, 0.0524),
     ],
 )
 def test_delay_margin_counts_the_delay_that_was_found(
-    latest: float, margin: float, monkeypatch: pytest.MonkeyPatch
+    latest: float, asked: float | None, margin: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked = list[float]()
+    goals = list[Goal]()
 
-    def design(start: RiseDiConfig, model: Airframe) -> RiseDiConfig:
-        assert start.observer is not None
-        asked.append(start.observer.margin)
+    def design(start: RiseDiConfig, model: Airframe, goal: Goal) -> SelectedObserver:
+        goals.append(goal)
         raise ParameterError("none has it")
 
-    made = learner_that_finds(lateral(latest=latest), monkeypatch)
+    made = learner_that_finds(lateral(latest=latest), monkeypatch, margin=asked)
     monkeypatch.setattr(made, "_design", design)
     sentence = made.propose(0).sentence
-    assert asked == [approx(margin)]
+    (goal,) = goals
+    assert goal.margin[1:3] == approx(margin)
     late = f"u is up to {1e3 * latest:.0f} ms late: " if margin > 0.03 else ""
     assert sentence == f"{late}none has it"
     assert made.model is None  # what flies stays
 
 
-@pytest.mark.parametrize("latest, margin", [((0.004, 0.05), 0.03), ((0.03, 0.004), 0.04)])
+def test_learned_part_keeps_the_margin_of_the_file_and_the_other_part_its_gains() -> None:
+    """An elevator with 1.4 of its effect: the loop of the file is faster around it, and keeps less
+    than the 30 ms that it was designed for.
+    """
+    start = scenario().rise_di()
+    plain = start.model_copy(update={"learn": None})
+    flight = scenario()
+    file = selected_observer(plain, flight, OSPREY, 0.03)
+    B = OSPREY.matrix_b().copy()
+    B[:, 0] *= 1.4
+    model = OSPREY.with_matrices(OSPREY.matrix_a(), B, OSPREY.matrix_gusts())
+    aim = goal(start, file, model, [("q", "V")], {})
+    q, p, r, V = aim.margin
+    assert 0.02 <= q == V < 0.029
+    assert p == r == approx(0.03, abs=1e-3)
+    assert aim.is_free == [True, False, False, True]
+    design = selected_observer(
+        plain,
+        flight,
+        model,
+        aim.margin,
+        aim.needed,
+        uncertain=False,
+        beside=file,
+        is_free=aim.is_free,
+    )
+    assert (design.relaxation[1:3] == file.relaxation[1:3]).all()
+    law = linear_law(design.controller.tuned_law(), 4, 0.01)
+    loop = Loop(np.array(plain.lag), 0.0, 0.01)
+    assert is_stable(plant_of(model, design.controller), law, loop, aim.margin)
+    slow = selected_observer(plain, flight, model, 0.03, uncertain=False, beside=file)
+    assert design.cost < slow.cost
+
+
+@pytest.mark.parametrize("latest", [(0.004, 0.05), (0.03, 0.004)])
 def test_late_thrust_costs_the_elevator_no_margin(
-    latest: tuple[float, float], margin: float, monkeypatch: pytest.MonkeyPatch
+    latest: tuple[float, float], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The loop of V is slow: thrust may be 60 ms late where all inputs may be 30 ms late."""
     entry = Entry("B", "q", "elevator", 56.15, 0.1, 0.01, 56.15)
@@ -617,7 +656,7 @@ def test_late_thrust_costs_the_elevator_no_margin(
     flown = made.propose(0).controller
     assert flown is not None
     assert flown.observer is not None
-    assert flown.observer.margin == margin
+    assert flown.observer.margin == 0.03  # of all inputs at once
     assert made.model is not None
     behind = dict(zip(part.inputs, np.add(latest, 0.01), strict=True))
     late = np.array([max(behind.get(name, 0.0), 0.03) for name in flown.inputs])
@@ -649,6 +688,8 @@ def test_model_of_a_late_u_has_margin_behind_its_delay_and_errs_less_than_the_la
     assert np.sum(error(tape, SWITCH, 26.0) / units) < np.sum(error(alone, SWITCH, 26.0) / units)
 
 
+ONES = np.ones(4)
+OSPREY = load_airframe("osprey")
 RECORDED = 2000  # ticks of 10 ms; the last 1000 are tested
 
 
@@ -686,7 +727,7 @@ def test_flight_without_learner_is_refused() -> None:
 
 
 def test_law_with_wrong_model_falls_back_and_replay_is_equal() -> None:
-    """A model without the delay of the aircraft, and a feedback eight times too strong: the model
+    """A model without the delay of the aircraft, and a feedback five times too strong: the model
     alone is certified.
     """
     margin = {"observer": scenario().rise_di().model_dump()["observer"] | {"margin": 0.0}}
@@ -697,7 +738,7 @@ def test_law_with_wrong_model_falls_back_and_replay_is_equal() -> None:
     shipped = find_scenario("osprey_observer").rise_di().observer
     assert shipped is not None
     given = {f"observer.{key}": getattr(shipped, key) for key in ("Phi", "Gamma", "L")}
-    strong = tuple(8.0 * value for value in shipped.F)
+    strong = tuple(5.0 * value for value in shipped.F)
     wrong = vary(start, given | {"observer.F": strong, "observer.part": 1.0})
     assert isinstance(wrong, RiseDiConfig)
     tape = simulate(late, learn=lambda _: Fixed(None, wrong))

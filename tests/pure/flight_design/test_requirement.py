@@ -33,6 +33,7 @@ from flight_design.gains.ideal_control import Manoeuvre
 from flight_design.gains.linear_error import linear_error
 from flight_design.gains.relaxation import lacking
 from flight_design.gains.requirement import (
+    MOVES,
     NAMES,
     Requirement,
     above_zeros,
@@ -186,7 +187,8 @@ def test_descend_goes_round_a_corner_of_two_goals() -> None:
         return [Trial(*row, None) for row in zip(places, shortages, costs, strict=True)]
 
     (start,) = assess([(0, 0)])
-    assert descend(assess, start, np.array([[80], [80]])).place == (30, 10)
+    lowest = np.zeros((2, 1), dtype=np.int64)
+    assert descend(assess, start, MOVES, lowest, lowest + 80).place == (30, 10)
 
 
 def test_a_larger_margin_costs_integral_gain() -> None:

@@ -162,12 +162,12 @@ def scaled(name: str, factor: float) -> dict[str, Any]:
         ),
         (scaled("observer.F", -1.0), r"^refused: controller\.observer\.F: found a spectral radius"),
         (scaled("observer.L", -1.0), r"^refused: controller\.observer\.L: found a spectral"),
-        (scaled("observer.F", 8.0), r"late, expected a delay margin of at"),
+        (scaled("observer.F", 4.0), r"late, expected a delay margin of at"),
         (scaled("observer.Phi", math.nan), r"^refused: controller\.observer\.Phi.*found nan"),
         (scaled("observer.Phi", 1e7), r"^refused: controller\.observer\.L: found a spectral"),
         (
             CHANGE | {"observer.margin": 0.0},
-            r"^refused: controller\.observer\.margin: found 0 s, expected at least 0\.03 s",
+            r"^refused: controller\.observer\.margin: found 0 s, expected at least 0\.02 s",
         ),
         (
             CHANGE | {"D": [-1, 1, 1, 1]},

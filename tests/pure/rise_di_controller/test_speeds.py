@@ -13,17 +13,20 @@ from pytest import approx
 from tests.conftest import refusing
 
 import rise_di
-from aircraft_sim.airframe import load_airframe
+from aircraft_sim.airframe import Airframe, load_airframe
 from aircraft_sim.airspeed import at_speed
 from aircraft_sim.uncertainty import as_yaml
 from flight_analysis.closed_loop.loop_margins import law_order
 from flight_analysis.closed_loop.replay import replay
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
+from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
 from flight_core.vectors import StampedVector
 from flight_design.gains.gain_design import observed
+from flight_design.gains.observer_search import SelectedObserver
 from flight_design.identification.model_quality import best_known
+from flight_design.learning.designs import Goal
 from flight_design.learning.learner import Learner
 from rise_di_controller.control_law import Measurements
 from rise_di_controller.controller import Controller
@@ -114,7 +117,7 @@ def test_observer_of_the_speed_flies_where_the_fixed_one_is_lost(
         truth = simulate(fast.vary(controller=controller))["truth"]
         largest.append(float(np.abs(truth["x.q"]).max()))
     assert largest[1] < 0.15  # rad/s: the command is 0.1
-    assert largest[0] > 1.0
+    assert largest[0] > 0.5
 
 
 def test_law_at_a_steady_speed_is_that_of_its_models(scheduled: RiseDiConfig) -> None:
@@ -288,6 +291,10 @@ def test_lie_about_another_speed_is_refused(
     assert flight.controller.parameters == LEARNS
 
 
+def no_design(start: RiseDiConfig, model: Airframe, goal: Goal) -> SelectedObserver:
+    raise ParameterError("no design")
+
+
 def test_effects_at_another_speed_are_reduced_to_the_trim_speed() -> None:
     """A record at 1.24 of the trim speed, where effects of surfaces are 54 % larger."""
     faster = {"start": [0.0, 2.0], "stop": [100.0, 100.0], "value": [3.0, 3.0]}
@@ -313,7 +320,7 @@ def test_effects_at_another_speed_are_reduced_to_the_trim_speed() -> None:
         },
     )
     ticks = simulate(scenario.vary(controller={"learn": None}))["internals"]
-    made = Learner(scenario.rise_di(), OSPREY, lambda start, model: start)
+    made = Learner(scenario.rise_di(), OSPREY, no_design)
     for stamp_ns, y, u in zip(
         ticks.stamp_ns.tolist(), ticks.group("y").values, ticks.group("u").values, strict=True
     ):

@@ -30,14 +30,10 @@ from flight_campaign.statistics import score_units
 from flight_core.vectors import Array, FloatArray
 from flight_design.gains.extended_state import integrator_model
 from flight_design.gains.gain_selection import with_feedforward
-from flight_design.gains.nominal import nominal_model
+from flight_design.gains.nominal import ACTIVITY_UNIT, nominal_model
 from flight_design.gains.requirement import REQUIREMENT, Requirement, least_fractions
 from flight_design.gains.tuned_gains import TuningResult
 from rise_di_controller.linear_loop import Loop
-
-ACTIVITY_UNIT = {"deg": np.deg2rad(60.0), "rad": np.deg2rad(60.0), "%": 6.0, "1": 6.0}
-"""rad/s and 1/s by the unit of an input: mean abs(u_dot) that costs as much as one unit of error.
-60 deg/s and 600 %/s."""
 
 GUST = "gust"
 TURBULENCE = "turbulence"

@@ -281,20 +281,18 @@ def delay_margin(
     plant: LinearPlant,
     law: LinearLaw,
     loop: Loop,
-    channel: int | None = None,
+    share: FloatArray | float = 1.0,
     longest: float = MAX_DELAY_MARGIN,
     near: float | None = None,
-    above: float | None = None,
 ) -> float:
-    """Delay margin: pure delay beyond loop.delay, s, at the limit of stability of the loop, in all
-    channels or in `channel`.
+    """Delay margin: pure delay beyond loop.delay, s, at the limit of stability of the loop.
 
-    0 if the loop is unstable without extra delay, infinite if the loop tolerates `longest`, s. The
-    search takes steps of half a period, then bisects down to 0.1 ms. With the margin of a loop
-    `near` this one, s, the search begins there, in a third of the time. 0 too where the margin is
-    not `above` a value, s.
+    Input i is late by `share`_i, (m,), of the delay: all inputs by the same delay, or a part of
+    them. 0 if the loop is unstable without extra delay, infinite if the loop tolerates `longest`,
+    s. The search takes steps of half a period, then bisects down to 0.1 ms. With the margin of a
+    loop `near` this one, s, the search begins there, in a third of the time.
     """
-    delayed = np.ones(len(loop.lag)) if channel is None else np.eye(len(loop.lag))[channel]
+    delayed = np.broadcast_to(share, loop.lag.shape)
     stride = 1  # in parts of 0.1 ms or less
     while loop.period / 2.0 / stride > 1e-4:
         stride *= 2
@@ -305,13 +303,7 @@ def delay_margin(
 
     lower = 0
     growth = 1
-    if above is not None and above < longest:
-        lower = round(above / part) + 1
-        stride = NEAR
-        growth = 2
-        if not stable(lower):
-            return 0.0
-    elif near is not None and 0.0 < near < longest:
+    if near is not None and 0.0 < near < longest:
         lower = round(near / part)
         stride = NEAR
         growth = 2

@@ -431,12 +431,14 @@ def _certificate(
         f"that of the start: {speeds or 'none'}",
     )
     least = start.observer.margin
+    if start.learn is not None:
+        least = start.learn.least_margin(least)
     margin = proposed.observer.margin
     require(
         margin >= least,
         "controller.observer.margin",
         f"{margin:g} s",
-        f"at least {least:g} s, that of the start",
+        f"at least {least:g} s",
     )
     if bare_outputs := outputs_without(flown):
         others = f"one of other outputs than {', '.join(bare_outputs)}, by learn.without"

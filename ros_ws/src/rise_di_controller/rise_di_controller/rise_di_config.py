@@ -93,6 +93,9 @@ class PriorConfig(Config):
     )
 
 
+LEAST_MARGIN = 0.02  # s, delay margin of a learned model, two periods of a law at 100 Hz
+
+
 class LearnConfig(Config):
     """Learning in the air, an extension of the paper: A and B are identified in flight, and the
     observer is designed again.
@@ -109,6 +112,10 @@ class LearnConfig(Config):
         default=10.0, description="then: period of the test for a changed aircraft, s"
     )
     prior: PriorConfig | None = Field(default=None, description="the rough model")
+    margin: Annotated[float, Field(ge=0, le=0.5)] | None = Field(
+        default=None,
+        description="delay margin of a learned model, s; else what the file's loop keeps around it",
+    )
     without: tuple[str, ...] | None = Field(
         default=None,
         description="outputs without a learned model",
@@ -117,6 +124,12 @@ class LearnConfig(Config):
         default=4.0,
         description="in lockstep: from the end of a window to its model, s",
     )
+
+    def least_margin(self, margin: float) -> float:
+        """The least delay margin of a learned model, s, beside that of the start: `margin`, or at
+        most LEAST_MARGIN, since the loop of the file may keep less around the aircraft.
+        """
+        return min(margin, LEAST_MARGIN) if self.margin is None else self.margin
 
     def spacing(self) -> float:
         """The shortest time between two identifications or tests, s."""

@@ -120,8 +120,8 @@ def loop_assessment(linear: LinearLoop) -> LoopMargins:
     uncertain = Margins._make(value[1:] for value in together)
     delay = delay_margin(linear.nominal, linear.law, linear.loop)
     each = tuple(
-        delay_margin(linear.nominal, linear.law, linear.loop, channel)
-        for channel in range(len(linear.inputs))
+        delay_margin(linear.nominal, linear.law, linear.loop, share)
+        for share in np.eye(len(linear.inputs))
     )
     result = LoopMargins(
         linear.inputs, nominal, slow_modes(linear.nominal, linear.law, linear.loop), delay, each
@@ -301,8 +301,8 @@ def delay_margins(scenario: Scenario, controller: ControllerConfig) -> dict[str,
         return {}
     loop = scenario_loop(scenario, controller)
     each = {
-        name: delay_margin(loop.nominal, loop.law, loop.loop, channel)
-        for channel, name in enumerate(controller.outputs)
+        name: delay_margin(loop.nominal, loop.law, loop.loop, share)
+        for name, share in zip(controller.outputs, np.eye(len(controller.outputs)), strict=True)
     }
     return {
         "delay_margin": delay_margin(loop.nominal, loop.law, loop.loop),

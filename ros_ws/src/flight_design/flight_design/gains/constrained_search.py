@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A search for factors on gains: the least cost of a loop that lacks nothing of a requirement.
 
-A place is a tuple of whole exponents of STEP, two factors a channel, so that a search is
+A place is a tuple of whole exponents of STEP, k factors of m channels, so that a search is
 deterministic. The search is a pattern search: R. Hooke, T. A. Jeeves, Journal of the ACM 8(2),
 1961.
 """
@@ -21,10 +21,15 @@ IntArray = NDArray[np.int64]
 STEP = 1.05  # factor of an exponent of 1
 GAIN = 0.01  # least fall of cost or shortage that counts: a hundredth, or a hundredth of a goal
 REACH = 16  # exponents, the longest move from a place with a shortage: a factor of 2.2
-CHEAPER = ((-1, 0), (0, -1), (1, -1), (2, -1), (-3, 1))
-MOVES = (*CHEAPER, (-1, 1), (1, 0), (0, 1))
-"""Of the two exponents of a channel, a of the integral and b of the bandwidth. The error after a
-slow disturbance grows with slower lower^2: only moves with a + 2 b <= 0 can lower the cost."""
+
+
+class Moves(NamedTuple):
+    """The moves of a search, each the changes of the k exponents of a channel."""
+
+    mending: Sequence[tuple[int, ...]]  # of those that may reduce a shortage
+    cheaper: Sequence[tuple[int, ...]]  # of those that may lower the cost
+    begin: int = 1  # exponents, the first reach
+    is_joint: bool = False  # whether all channels may move at once while something is short
 
 
 class Trial(NamedTuple, Generic[Content]):
@@ -50,21 +55,30 @@ def exponent(factor: float) -> int:
     return math.floor(math.log(factor) / math.log(STEP))
 
 
-def descend(assess: Assess[Content], start: Trial[Content], highest: IntArray) -> Trial[Content]:
+def descend(
+    assess: Assess[Content],
+    start: Trial[Content],
+    moves: Moves,
+    lowest: IntArray,
+    highest: IntArray,
+) -> Trial[Content]:
     """The trial that no move of one channel betters, from a start.
 
-    `highest` (2, m) are the largest exponents of both factors, by channel; the least is 0. With a
-    shortage the best move of all channels counts, and the reach doubles where none helps. Without a
-    shortage each channel moves in turn, from the last reach on, and the reach is halved where none
-    helps.
+    `lowest` and `highest`, (k, m), are the bounds of the exponents. With a shortage the best move
+    of all channels counts, and the reach doubles where none helps. Without a shortage each channel
+    moves in turn, from the last reach on, and the reach is halved where none helps.
     """
     best = start
-    reach = 1
+    reach = moves.begin
     channels = range(highest.shape[1])
+    bounds = lowest, highest
     while best.shortage:
         if reach > REACH:
             return best
-        places = [place for i in channels for place in _moved(best.place, i, reach, MOVES, highest)]
+        moved = [*channels, *([list(channels)] if moves.is_joint else [])]
+        places = [
+            place for i in moved for place in _moved(best.place, i, reach, moves.mending, bounds)
+        ]
         trials = assess(places)
         nearest = min(trials, key=lambda trial: (trial.shortage, trial.cost), default=best)
         if nearest.is_better(best):
@@ -74,7 +88,7 @@ def descend(assess: Assess[Content], start: Trial[Content], highest: IntArray) -
     while reach:
         before = best
         for i in channels:
-            for trial in assess(_moved(best.place, i, reach, CHEAPER, highest)):
+            for trial in assess(_moved(best.place, i, reach, moves.cheaper, bounds)):
                 best = trial if trial.is_better(best) else best
         if best is before:
             reach //= 2
@@ -82,10 +96,15 @@ def descend(assess: Assess[Content], start: Trial[Content], highest: IntArray) -
 
 
 def _moved(
-    place: Place, channel: int, reach: int, moves: Sequence[tuple[int, int]], highest: IntArray
+    place: Place,
+    channels: int | list[int],
+    reach: int,
+    moves: Sequence[tuple[int, ...]],
+    bounds: tuple[IntArray, IntArray],
 ) -> list[Place]:
-    """The places that moves of a channel lead to, other than the place itself."""
-    moved = np.repeat(np.reshape(place, (1, 2, -1)), len(moves), axis=0)
-    moved[:, :, channel] += reach * np.array(moves)
-    rows = np.clip(moved, 0, highest).reshape(len(moves), -1).tolist()
+    """The places that moves of a channel, or of some, lead to, other than the place itself."""
+    moved = np.repeat(np.reshape(place, (1, *bounds[0].shape)), len(moves), axis=0)
+    for channel in np.atleast_1d(channels):
+        moved[:, :, channel] += reach * np.array(moves)
+    rows = np.clip(moved, *bounds).reshape(len(moves), -1).tolist()
     return [row for row in dict.fromkeys(map(tuple, rows)) if row != place]

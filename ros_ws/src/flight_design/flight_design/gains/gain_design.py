@@ -17,6 +17,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.arguments import FilePath, as_count, as_names, as_number, as_numbers
 from flight_core.parameters import require
+from flight_core.vectors import FloatArray
 from flight_design.gains import gain_selection, ideal_control, tuned_gains
 from flight_design.gains.effectors import LAW_INPUT, Effectors, design_allocation
 from flight_design.gains.gain_selection import GainAssessment, LoopSetting, Selection
@@ -29,6 +30,7 @@ from flight_design.gains.observer_gains import (
     gains_of_search,
     read_gains,
 )
+from flight_design.gains.observer_search import SelectedObserver
 from flight_design.gains.observer_selection import model_for, with_aircraft_observer
 from flight_design.gains.requirement import (
     OBSERVER_REQUIREMENT,
@@ -425,39 +427,63 @@ def observed(
     needed: Requirement = OBSERVER_REQUIREMENT,
     *,
     uncertain: bool = True,
-    sketched: bool = False,
     speeds: tuple[float, float] | None = None,
-    quick: bool = False,
     weights: FilePath | None = None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> tuple[RiseDiConfig, str]:
-    """A controller with feedforward and observer of a model, and a sentence on its gains.
+    """A controller with feedforward and observer of a model, and a sentence on its gains: of
+    `selected_observer`.
+    """
+    selected = selected_observer(
+        controller,
+        scenario,
+        model,
+        margin,
+        needed,
+        uncertain=uncertain,
+        speeds=speeds,
+        weights=weights,
+        progress=progress,
+    )
+    return selected.controller, selected.origin
+
+
+def selected_observer(
+    controller: RiseDiConfig,
+    scenario: Scenario,
+    model: Airframe,
+    margin: float | FloatArray,
+    needed: Requirement = OBSERVER_REQUIREMENT,
+    *,
+    uncertain: bool = True,
+    sketched: bool = False,
+    speeds: tuple[float, float] | None = None,
+    weights: FilePath | None = None,
+    beside: SelectedObserver | None = None,
+    is_free: Sequence[bool] | None = None,
+    progress: Callable[[str], None] = lambda _: None,
+) -> SelectedObserver:
+    """A controller with feedforward and observer of a model, and what it comes from.
 
     The gains are those of the file `weights`. Without a file they are those that `rise-di compare
     --tune` found in the scenario, or in one that ships with its airframe and lags, where the model
     has the same states and no channel has SLOWER times the total lag; else they follow from the
-    lags by a rule. Of several gain sets it is the one that the margins change least, then the one
-    of the least cost. `uncertain` counts the phase margin of uncertain aircraft too, `sketched`
-    takes the gains for a model from a sketch, and `speeds` are two ratios to the trim speed, with
-    models there. `quick` and `progress` as for `with_aircraft_observer`.
+    lags by a rule. From there the search for the least error begins, of several gain sets with
+    each; gains of a file and those beside a sketch are only relaxed, where the margins need it.
+    `uncertain` counts the phase margin of uncertain aircraft too, `sketched` takes the gains for a
+    model from a sketch, and `speeds` are two ratios to the trim speed, with models there. `margin`,
+    `is_free` and `progress` as for `with_aircraft_observer`; the search begins at the gains and the
+    relaxation of the design `beside`.
     """
-    channels = scenario.aircraft.channels().outputs
-    by_name = dict(
-        zip(channels, scenario.aircraft.sensors.noise or (0.0,) * len(channels), strict=True)
-    )
-    measured = [name for name in scenario.aircraft.vanes.channels if name in model.states]
-    vanes: dict[str, float] = {name: by_name[name] or PERFECT_VANE for name in measured}
-    # noise in place of none, of a perfect sensor
-    perfect = sizes(model.units_of_outputs()[name] for name in controller.outputs) / 100.0
-    noise = np.array(
-        [by_name[name] or least for name, least in zip(controller.outputs, perfect, strict=True)]
-    )
+    noise, vanes = _noise(controller, scenario, model)
     nominal = model_for(model, controller, noise)
     if weights is None:
         candidates = _gain_sets(controller, scenario, model, nominal, sketched=sketched)
     else:
         read = read_gains(Path(weights), nominal.total_lag, len(model.gusts), len(model.states))
         candidates = [(read, f"gains of {Path(weights).name}")]
+    if beside is not None:
+        candidates = [candidates[beside.place]]
     sets, origins = zip(*candidates, strict=True)
     selected = with_aircraft_observer(
         controller,
@@ -469,20 +495,39 @@ def observed(
         vanes,
         uncertain=uncertain,
         speeds=speeds,
-        quick=quick,
+        keeps_gains=sketched or weights is not None,
+        begin=None if beside is None else beside.relaxation,
+        is_free=is_free,
         progress=progress,
     )
     origin = origins[selected.place]
     factors = zip(selected.controller.outputs, selected.relaxation.tolist(), strict=True)
-    relaxed = ", ".join(f"{output} {factor:.2f}" for output, factor in factors if factor > 1.0)
-    lowered = f"; for the margin K and integral /, effort x {relaxed}" if relaxed else ""
+    changed = ", ".join(f"{output} {factor:.2f}" for output, factor in factors if factor != 1.0)
+    changes = f"; K and integral /, effort x {changed}" if changed else ""
     margins = (
         f"delay margin {1e3 * selected.delay_margin:.0f} ms, phase margin "
         f"{np.degrees(selected.phase_margin):.0f} deg"
     )
     vane_text = f" with vanes for {' and '.join(vanes)}" if vanes else ""
-    sentence = f"{origin}{lowered}; {margins}{selected.not_counted()}"
-    return selected.controller, f"observer of {model.name}{vane_text}: {sentence}"
+    sentence = f"{origin}{changes}; {margins}{selected.not_counted()}"
+    return selected._replace(origin=f"observer of {model.name}{vane_text}: {sentence}")
+
+
+def _noise(
+    controller: RiseDiConfig, scenario: Scenario, model: Airframe
+) -> tuple[FloatArray, dict[str, float]]:
+    """Rms per sample of the outputs, (m,), and of the vanes in use, by channel; some for none of a
+    perfect sensor.
+    """
+    channels = scenario.aircraft.channels().outputs
+    measured = scenario.aircraft.sensors.noise or (0.0,) * len(channels)
+    by_name = dict(zip(channels, measured, strict=True))
+    perfect = sizes(model.units_of_outputs()[name] for name in controller.outputs) / 100.0
+    noise = np.array(
+        [by_name[name] or least for name, least in zip(controller.outputs, perfect, strict=True)]
+    )
+    vanes = [name for name in scenario.aircraft.vanes.channels if name in model.states]
+    return noise, {name: by_name[name] or PERFECT_VANE for name in vanes}
 
 
 def _gain_sets(

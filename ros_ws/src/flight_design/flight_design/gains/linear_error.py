@@ -1,13 +1,138 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The error of a linear loop along a manoeuvre."""
+"""The error of a linear loop: along a manoeuvre, and in wind with noise."""
+
+import math
+from typing import NamedTuple
 
 import numpy as np
 
 from flight_analysis.closed_loop.loop_margins import LinearLoop
 from flight_core.vectors import FloatArray
 from flight_design.gains.ideal_control import STEP
-from rise_di_controller.linear_loop import closed_loop, zero_order_hold
+from rise_di_controller.linear_loop import (
+    LinearLaw,
+    LinearPlant,
+    Loop,
+    closed_loop,
+    sampled_plant,
+    zero_order_hold,
+)
+
+HORIZON = 20.0  # s, of turbulence and noise: longer than the slowest mode that counts
+GUST_HORIZON = 8.0  # s, of the response to a gust
+FLIGHT = 60.0  # s, over which the errors of the gusts are averaged: one of each axis
+TURBULENT = 0.5  # weight of turbulence, where errors are about twice those in the gusts
+MEAN = math.sqrt(2.0 / math.pi)  # of the magnitude of a normal value, in standard deviations
+
+GUST_TIME = 0.6  # s, from the entry of a gust to its peak
+GUST_LENGTHS = (9.1, 106.7)  # m, from the entry to the peak, CS 25.341 (a)(3): 30 to 350 ft
+GUST_SPEED = 17.07  # m/s, at 106.7 m and sea level, CS 25.341 (a)(5): 56 ft/s
+
+
+class Air(NamedTuple):
+    """The wind that a loop has to bear, and the noise that it measures.
+
+    The turbulence of each of G axes is a first-order process with a time constant and a standard
+    deviation. A 1-cosine gust of each axis has a duration and a peak, 0 for none.
+    """
+
+    wind: FloatArray  # (n, G) effect of 1 m/s on x_dot
+    reading: FloatArray  # (m + k, G) effect of 1 m/s on a measurement: of a vane
+    time: FloatArray  # (G,) s
+    sigma: FloatArray  # (G,) m/s
+    noise: FloatArray  # (m + k,) rms per sample of the measurements, SI
+    gust: FloatArray  # (G,) peaks, m/s
+    gust_duration: float  # s
+
+
+def discrete_gust(speed: float) -> tuple[float, float]:
+    """Peak, m/s, and duration, s, of a 1-cosine gust at a speed, m/s:
+
+        U = GUST_SPEED (H / 106.7 m)^(1/6),  H = GUST_TIME speed within GUST_LENGTHS
+
+    Source: CS 25.341 (a), without the alleviation factor.
+    """  # noqa: D400, D415 - what follows is an equation
+    length = min(max(GUST_TIME * speed, GUST_LENGTHS[0]), GUST_LENGTHS[1])
+    peak = GUST_SPEED * (length / GUST_LENGTHS[1]) ** (1.0 / 6.0)
+    return peak, 2.0 * length / speed
+
+
+class AirResponse(NamedTuple):
+    """What a loop does in wind and noise."""
+
+    error: FloatArray  # (m,) SI: rms of the outputs in gusts, and TURBULENT times in turbulence
+    activity: FloatArray  # (m,) mean abs(u_dot) in turbulence, SI
+
+
+def air_response(plant: LinearPlant, law: LinearLaw, loop: Loop, air: Air) -> AirResponse:
+    """What a stable loop does in the gusts, and in turbulence with noise for HORIZON from rest.
+
+        z+ = A z + N n,  P+ = A P A' + N N',  n white with unit variance
+
+    The covariance P after 2^j periods comes from that after 2^(j-1). The noise counts in turbulence
+    alone.
+    """
+    none = np.zeros(len(loop.lag))
+    matrix = closed_loop(plant, law, loop, none)
+    _, B, C_sampled = sampled_plant(plant, loop, none)
+    _, drive = zero_order_hold(plant.A, air.wind, loop.period)
+    n = len(plant.A)
+    size = len(matrix)
+    C = plant.C[: len(loop.lag)]
+    measured = np.vstack([B @ law.D, law.B])
+    blown = measured @ air.reading
+    blown[:n] += drive
+    noise = measured * air.noise
+    covariance, transition = _turbulent(matrix, blown, noise, loop.period, air)
+    variance = np.einsum("ij,jk,ik->i", C, covariance[:n, :n], C)
+    # of u = K z + D v, and of its value a tick later
+    K = np.hstack([law.D @ C_sampled, law.C, law.D @ air.reading])
+    direct = law.D * air.noise
+    after = transition @ covariance @ K.T
+    after[:size] += noise @ direct.T
+    step = (K @ covariance * K).sum(axis=1) + (direct**2).sum(axis=1) - (K * after.T).sum(axis=1)
+    activity = MEAN * np.sqrt(2.0 * np.maximum(step, 0.0)) / loop.period
+    gusts = np.sqrt(_gust_energy(matrix, blown * air.gust, C, loop.period, air) / FLIGHT)
+    return AirResponse(gusts + TURBULENT * np.sqrt(np.maximum(variance, 0.0)), activity)
+
+
+def _gust_energy(
+    matrix: FloatArray, driven: FloatArray, C: FloatArray, period: float, air: Air
+) -> FloatArray:
+    """Integral of the squares of the outputs in a gust of each axis, (m,)."""
+    state = np.zeros(driven.shape)
+    energy = np.zeros(len(C))
+    for k in range(round(GUST_HORIZON / period)):
+        turn = 2.0 * np.pi * (k + 0.5) * period / air.gust_duration
+        state = matrix @ state
+        if turn < 2.0 * np.pi:
+            state += driven * (0.5 * (1.0 - math.cos(turn)))
+        energy += ((C @ state[: C.shape[1]]) ** 2).sum(axis=1)
+    return energy * period
+
+
+def _turbulent(
+    matrix: FloatArray, blown: FloatArray, noise: FloatArray, period: float, air: Air
+) -> tuple[FloatArray, FloatArray]:
+    """The covariance of the state of a loop in turbulence and noise, the wind below, and the
+    transition of this state.
+    """
+    size, G = blown.shape
+    kept = np.exp(-period / air.time)
+    transition = np.zeros((size + G, size + G))
+    transition[:size, :size] = matrix
+    transition[:size, size:] = blown
+    transition[size:, size:] = np.diag(kept)
+    drive = np.zeros((size + G, noise.shape[1] + G))
+    drive[:size, : noise.shape[1]] = noise
+    drive[size:, noise.shape[1] :] = np.diag(air.sigma * np.sqrt(1.0 - kept**2))
+    covariance = drive @ drive.T
+    power = transition
+    for _ in range(round(math.log2(HORIZON / period))):
+        covariance = covariance + power @ covariance @ power.T
+        power = power @ power
+    return covariance, transition
 
 
 def linear_error(loop: LinearLoop, u_dot: FloatArray) -> FloatArray:

@@ -15,6 +15,11 @@ from rise_di_controller.linear_loop import Loop
 
 SIZES = {SPEED: 1.0, LENGTH: 1.0}  # m/s, m: the units of states in weights, "sizes"
 ANGLE_SIZE = 0.1  # rad (/s), and of states without a dimension
+ERROR_SHARE = 0.1  # of a size: the unit of an error in a score, 0.1 m/s or 0.01 rad/s
+
+ACTIVITY_UNIT = {"deg": np.deg2rad(60.0), "rad": np.deg2rad(60.0), "%": 6.0, "1": 6.0}
+"""rad/s and 1/s by the unit of an input: mean abs(u_dot) that costs as much as one unit of error.
+60 deg/s and 600 %/s."""
 
 
 def sizes(units: Iterable[str]) -> FloatArray:

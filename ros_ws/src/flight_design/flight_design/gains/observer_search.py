@@ -1,12 +1,14 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The search for the relaxation of an observer's gains at which the loop has its margins.
+"""The search for the relaxation of an observer's gains with the least error within the margins.
 
-Until then `effort` is raised, and K and the integral are lowered, in the channel in which that
-gains most, and the disturbances of the extended-state observer are taken as slower.
+The relaxation of a channel divides K and the integral, and multiplies `effort`. Above 1 the loop is
+slower than the gains say, below 1 faster: the inputs of an aircraft may act less or more than those
+for which the gains were found.
 """
 
-from collections.abc import Callable, Generator, Sequence
+import math
+from collections.abc import Callable, Sequence
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -17,12 +19,23 @@ from control_laws.observer_design import ObserverDesign
 from flight_analysis.closed_loop.loop_margins import loop_of
 from flight_core.parameters import ParameterError, require
 from flight_core.vectors import FloatArray
+from flight_design.gains.constrained_search import (
+    GAIN,
+    STEP,
+    Moves,
+    Place,
+    Trial,
+    descend,
+    exponent,
+)
 from flight_design.gains.gain_conditions import MIN_K, Condition, failing
+from flight_design.gains.linear_error import Air, air_response
+from flight_design.gains.nominal import ERROR_SHARE
 from flight_design.gains.observer_gains import ObserverGains
 from flight_design.gains.requirement import (
     Requirement,
     above_zeros,
-    least_fraction,
+    fractions,
     nominal_conditions,
 )
 from rise_di_controller.control_law import TunedLaw
@@ -32,6 +45,7 @@ from rise_di_controller.linear_loop import (
     LinearPlant,
     Loop,
     delay_margin,
+    is_stable,
     linear_law,
     spectral_radius,
 )
@@ -40,23 +54,18 @@ from rise_di_controller.model_sections import FeedforwardConfig, ObserverConfig,
 from rise_di_controller.observer import without_frozen
 from rise_di_controller.rise_di_config import RiseDiConfig, SpeedConfig
 
-RELAXATION = 1.05
-"""Factor by which `effort` rises, and K and the integral fall, in a step of the search for the
-margins."""
-
-LATE = 1e-3  # of its fraction: what a delay margin that is too small counts in a quick search
+MOVES = Moves(mending=((1,),), cheaper=((-1,), (1,)), begin=4, is_joint=True)
+SLOWER = Moves(mending=((1,),), cheaper=((-1,),), is_joint=True)
+"""Moves of the relaxation of a channel: both ways, or only where the margins need it."""
 
 RESOLUTION = 3e-4  # s: of the delay margin, and of what its digits in a file change
 
-MAX_RELAXATION = 18.0  # of a channel: beyond it the search ends
-# the search ends after so many steps in which the margins do not grow by this factor
-PATIENCE = 20
-PROGRESS = 1.01
+MAX_RELAXATION = 18.0  # of a channel
+MAX_QUICKENING = 4.0  # of a channel: inputs that act four times as much
 MEND = (
     "give the loop less delay or lag, ask for a smaller delay margin, or fly the law without "
     "an observer"
 )
-DELAYS = 4.0  # of the delay margin that is asked for: how far the search looks for it
 WORST_OF = 50  # uncertain aircraft whose least phase margin counts
 
 
@@ -66,10 +75,11 @@ class SelectedObserver(NamedTuple):
     controller: RiseDiConfig
     delay_margin: float  # s, of the nominal linear loop, the declared delay included
     phase_margin: float  # rad, the least of the nominal linear loop
-    fraction: float  # the least of what is found over what is needed
-    # (m,) factors by which the search raised `effort` and lowered K and the integral; 1: not at all
+    # (m,) factors on `effort`, and of which K and the integral are lower; 1: as the gains say
     relaxation: FloatArray
+    cost: float  # a logarithm, in wind and noise
     place: int = 0  # of its gain set
+    origin: str = ""  # of its gains, a sentence
     left_out: int = 0  # uncertain aircraft that no gains hold
 
     def not_counted(self) -> str:
@@ -107,19 +117,31 @@ class AtSpeed(NamedTuple):
         return controller.model_copy(update=changed)
 
 
-class MarginSearch(NamedTuple):
-    """The search for the relaxation of a gain set at which the loop has its margins."""
+class _Loops(NamedTuple):
+    """A controller of the search, and its loops around the nominal aircraft at each speed."""
+
+    controller: RiseDiConfig
+    relaxation: FloatArray
+    around: list[tuple[LinearPlant, LinearLaw]]  # at the trim speed first, all vanes in use first
+
+
+class ObserverSearch(NamedTuple):
+    """The search for the relaxation of a gain set with the least error within the margins."""
 
     base: RiseDiConfig  # the controller without an observer
     model: NominalModel
     plant: LinearPlant  # the nominal aircraft, then uncertain aircraft, if any
     gains: ObserverGains
     design: Callable[[FloatArray], ObserverDesign]  # the observer of a relaxation, (m,)
-    margin: float  # s, least delay margin
+    margin: FloatArray  # (m,) s, least delay margin of each input
     needed: Requirement
     vanes: VanesConfig | None = None
     others: Sequence[AtSpeed] = ()  # speeds whose margins count too
-    quick: bool = False  # the delay margin alone counts until it is enough
+    # None: the gains stay, but where the margins need slower ones
+    air: Air | None = None
+    activity_unit: FloatArray | float = math.inf  # (m,) of mean abs(u_dot) in the cost, SI
+    begin: FloatArray | None = None  # (m,) relaxation at which the search begins; None: 1
+    is_free: Sequence[bool] | None = None  # (m,) whether it may change; None: in every channel
 
     @property
     def nominal(self) -> LinearPlant:
@@ -131,142 +153,130 @@ class MarginSearch(NamedTuple):
         """The loop without its delay: the delay margin counts the declared delay too."""
         return Loop(self.model.lag, 0.0, self.model.period)
 
-    def steps(self) -> Generator[SelectedObserver, None, SelectedObserver]:
-        """The first relaxation with the margins: steps in the channel that gains most, or in all
-        where none gains.
+    def best(self, progress: Callable[[str], None] = lambda _: None) -> Trial[_Loops]:
+        """The trial with the least error that has the margins, or that lacks least of them.
 
-        Yields the state of the search before a step, and at the end. The channel with the least
-        phase margin of uncertain aircraft is next once the nominal aircraft has its margins. The
-        damping asked for is at most that of the zeros of the aircraft: no feedback moves a zero.
-        Raises ParameterError for margins out of reach.
+        The damping asked for is at most that of the zeros of the aircraft: no feedback moves a
+        zero. Without `air` the least relaxed trial counts. `progress` gets a sentence a loop.
         """
-        search = self._replace(needed=above_zeros(self.needed, self.nominal))
-        steps = RELAXATION ** np.eye(len(self.model.lag))
-        selected = search._best(np.ones((1, len(steps))))
-        fractions = [selected.fraction]
-        short = list[int]()
-        while True:
-            yield selected
-            stalled = (
-                len(fractions) > PATIENCE
-                and selected.fraction < PROGRESS * fractions[-1 - PATIENCE]
-            )
-            if selected.relaxation.max() > MAX_RELAXATION or stalled:
-                raise search._refusal(selected)
-            if selected.fraction < 1.0:
-                near = selected.delay_margin
-                stepped = search._best(selected.relaxation * steps, near)
-                selected = (
-                    stepped
-                    if stepped.fraction > selected.fraction
-                    else search._best(selected.relaxation[None] * RELAXATION, near)
-                )
-                fractions.append(selected.fraction)
-                continue
-            weak, short = search._weak_channel(selected.controller, short if self.quick else ())
-            if weak is None:
-                return search._checked(selected)
-            selected = search._best(selected.relaxation * steps[[weak]])
-            fractions = []
+        m = len(self.model.lag)
+        free = np.ones((1, m)) if self.is_free is None else np.array([self.is_free])
+        moves = SLOWER if self.air is None else MOVES
+        lowest = 0 if self.air is None else -exponent(MAX_QUICKENING)
+        lowest_of = (free * lowest).astype(np.int64)
+        highest_of = (free * exponent(MAX_RELAXATION)).astype(np.int64)
+        needed = above_zeros(self.needed, self.nominal)
+        trials: dict[Place, Trial[_Loops]] = {}
+        least = math.inf  # cost of a trial with the margins
 
-    def _best(self, relaxations: FloatArray, near: float | None = None) -> SelectedObserver:
-        """The first with the largest fraction; loop margins only where the delay margin leaves a
-        chance. `near` is the delay margin of the step before.
+        def assess(places: Sequence[Place]) -> list[Trial[_Loops]]:
+            nonlocal least
+            for place in places:
+                if place not in trials:
+                    progress(f"observer: {len(trials) + 1} loops")
+                    trials[place] = self._trial(place, needed, least)
+                    least = min(least, trials[place].cost)
+            return [trials[place] for place in places]
+
+        (start,) = assess([(0,) * m])
+        return descend(assess, start, moves, lowest_of, highest_of)
+
+    def _trial(self, place: Place, needed: Requirement, least: float) -> Trial[_Loops]:
+        """The trial at a place. Beside one with the margins and the cost `least`, the margins of a
+        trial that is late or costs more are not computed.
         """
-        controllers = [
-            _parameters(
-                self.base, self.model, self.gains, self.design(relaxation), relaxation, self.vanes
-            )
-            for relaxation in relaxations
-        ]
-        delayed = [self._delayed(controllers[0], self.nominal, near)]
-        for controller in controllers[1:]:
-            most = max(delay for _, delay in delayed)
-            above = most if self.quick and self._delay_fraction(most) < 1.0 else None
-            delayed.append(self._delayed(controller, self.nominal, near, above))
-        fractions = [self._delay_fraction(delay) for _, delay in delayed]
-        candidates: dict[int, SelectedObserver] = {}
-        for k in sorted(range(len(delayed)), key=lambda k: -fractions[k]):
-            best = max((each.fraction for each in candidates.values()), default=0.0)
-            if candidates and fractions[k] < best:
-                break
-            laws, delay = delayed[k]
-            if self.quick and fractions[k] < 1.0:
-                late = LATE * fractions[k]
-                return SelectedObserver(controllers[k], delay, np.nan, late, relaxations[k])
-            phase, fraction = self._margin_fraction(controllers[k], laws, self.nominal)
-            elsewhere = (
-                self._fraction_at(speed, controllers[k], relaxations[k]) for speed in self.others
-            )
-            fraction = min([fractions[k], fraction, *elsewhere])
-            candidates[k] = SelectedObserver(controllers[k], delay, phase, fraction, relaxations[k])
-        return max(
-            (candidates[k] for k in sorted(candidates)), key=lambda candidate: candidate.fraction
+        loops = self._loops(place)
+        if least < math.inf:
+            if not self._is_tolerant(loops):
+                return Trial(place, math.inf, math.inf, loops)
+            cost = self._cost(loops)
+            if not cost < least - GAIN:
+                return Trial(place, 0.0, math.inf, loops)
+        shortage = self._shortage(loops, needed)
+        if not shortage:
+            shortage = max(needed.uncertain_phase - self._worst_phase(loops), 0.0)  # rad
+        cost = math.inf if shortage else self._cost(loops)
+        return Trial(place, shortage, cost, loops)
+
+    def selected(self, best: Trial[_Loops]) -> SelectedObserver:
+        """The controller of a trial, with the delay margin that it states.
+
+        Raises ParameterError for a trial without the margins.
+        """
+        if best.shortage:
+            raise self._refusal(best.content)
+        values = best.content.controller.model_dump()
+        values["observer"]["margin"] = float(self.margin.min())
+        final = RiseDiConfig.validate_mapping(values, "controller")
+        laws = _laws(final)
+        loop = loop_of(final)
+        return SelectedObserver(
+            controller=final,
+            delay_margin=min(delay_margin(self.nominal, law, self.loop) for law in laws),
+            phase_margin=min(float(phase_margins(self.nominal, law, loop).min()) for law in laws),
+            relaxation=best.content.relaxation,
+            cost=best.cost,
         )
 
-    def _delayed(
-        self,
-        controller: RiseDiConfig,
-        plant: LinearPlant,
-        near: float | None = None,
-        above: float | None = None,
-    ) -> tuple[list[LinearLaw], float]:
-        """The laws, for every set of vanes in use, and the least delay margin, s."""
-        laws = _laws(controller)
-        longest = DELAYS * self.margin
-        return laws, min(
-            delay_margin(plant, law, self.loop, longest=longest, near=near, above=above)
-            for law in laws
+    def _loops(self, place: Place) -> _Loops:
+        """The loops of a place."""
+        begin = np.ones(len(place)) if self.begin is None else self.begin
+        relaxation = begin * STEP ** np.array(place, dtype=np.float64)
+        controller = _parameters(
+            self.base, self.model, self.gains, self.design(relaxation), relaxation, self.vanes
         )
+        around = [(self.nominal, law) for law in _laws(controller)]
+        for speed in self.others:
+            at_speed = speed.flown(controller, relaxation)
+            around += [(speed.plant, law) for law in _laws(at_speed)]
+        return _Loops(controller, relaxation, around)
 
-    def _delay_fraction(self, delay: float) -> float:
-        return delay / (self.margin + RESOLUTION) if self.margin > 0.0 else 1.0
+    def _is_tolerant(self, loops: _Loops) -> bool:
+        """Whether each loop is stable with the inputs late by their margins."""
+        late = self.margin + RESOLUTION
+        return all(is_stable(plant, law, self.loop, late) for plant, law in loops.around)
 
-    def _margin_fraction(
-        self, controller: RiseDiConfig, laws: Sequence[LinearLaw], plant: LinearPlant
-    ) -> tuple[float, float]:
-        """The least phase margin, and the least of what is found over what is needed beside the
-        delay margin.
+    def _delay_fraction(self, plant: LinearPlant, law: LinearLaw) -> float:
+        """The delay margin over what is needed with each input late by its share; 1 for enough."""
+        longest = float(self.margin.max())
+        if longest == 0.0 or is_stable(plant, law, self.loop, self.margin + RESOLUTION):
+            return 1.0
+        found = delay_margin(plant, law, self.loop, self.margin / longest)
+        return min(found / (longest + RESOLUTION), 1.0)
+
+    def _shortage(self, loops: _Loops, needed: Requirement) -> float:
+        """The sum over the goals of 1 - found / needed, where this is above 0."""
+        loop = loop_of(loops.controller)
+        goals = [np.array([self._delay_fraction(plant, law) for plant, law in loops.around])]
+        for plant, law in loops.around:
+            margins = loop_margins(plant, law, loop, together=False)
+            phase, gain_fraction, damping = fractions(margins, needed)
+            each = np.append(np.minimum(phase, gain_fraction), damping)
+            goals.append(np.where(margins.stable, each, 0.0))
+        return float(np.maximum(1.0 - np.concatenate(goals), 0.0).sum())
+
+    def _cost(self, loops: _Loops) -> float:
+        """The logarithms of error and activity in wind and noise, in units of a score, summed over
+        the channels; without `air` those of the relaxation.
         """
-        each = [loop_margins(plant, law, loop_of(controller), together=False) for law in laws]
-        return min(float(margins.phase.min()) for margins in each), min(
-            least_fraction(margins, self.needed) for margins in each
-        )
+        if self.air is None:
+            return float(np.log(loops.relaxation).sum())
+        response = air_response(*loops.around[0], loop_of(loops.controller), self.air)
+        unit = ERROR_SHARE * (self.model.C @ self.model.size)
+        return float(np.log(response.error / unit + response.activity / self.activity_unit).sum())
 
-    def _fraction_at(
-        self, speed: AtSpeed, controller: RiseDiConfig, relaxation: FloatArray
-    ) -> float:
-        """The least of what is found over what is needed at another speed."""
-        flown = speed.flown(controller, relaxation)
-        laws, delay = self._delayed(flown, speed.plant)
-        fraction = self._margin_fraction(flown, laws, speed.plant)[1]
-        return min(self._delay_fraction(delay), fraction)
+    def _worst_phase(self, loops: _Loops) -> float:
+        """The least phase margin of uncertain aircraft, rad; infinite without any."""
+        uncertain = self.plant._replace(A=self.plant.A[1:], B=self.plant.B[1:])
+        if not len(uncertain.A):
+            return math.inf
+        loop = loop_of(loops.controller)
+        laws = _laws(loops.controller)
+        return min(float(phase_margins(uncertain, law, loop).min()) for law in laws)
 
-    def _weak_channel(
-        self, controller: RiseDiConfig, short: Sequence[int] = ()
-    ) -> tuple[int | None, list[int]]:
-        """The channel with the least phase margin of uncertain aircraft, None if enough, and the
-        places in `plant` of the aircraft with too little.
-
-        Aircraft `short` in the step before come first, the rest once no margin is too small.
-        """
-        needed = self.needed.uncertain_phase
-        for places in (list(short), list(range(1, len(self.plant.A)))):
-            if not places:
-                continue
-            uncertain = self.plant._replace(A=self.plant.A[places], B=self.plant.B[places])
-            loop = loop_of(controller)
-            each = [phase_margins(uncertain, law, loop) for law in _laws(controller)]
-            margins = np.min(each, axis=0)
-            if margins.min() < needed:
-                lacking = np.flatnonzero(margins.min(axis=1) < needed)
-                channel = int(np.argmin(margins.min(axis=0)))
-                return channel, [places[k] for k in lacking]
-        return None, []
-
-    def _refusal(self, selected: SelectedObserver) -> ParameterError:
-        """What is missing at the last step of the search."""
-        lacking = self._lacking(selected.controller)
+    def _refusal(self, loops: _Loops) -> ParameterError:
+        """What is missing at the end of the search."""
+        lacking = self._lacking(loops)
         if self.others and not lacking:
             return ParameterError(
                 "speeds: found less than the margins at another speed, expected speeds nearer to "
@@ -278,60 +288,32 @@ class MarginSearch(NamedTuple):
         )
         return ParameterError(f"--margin: {lacking or uncertain}; {MEND}")
 
-    def _lacking(self, controller: RiseDiConfig) -> str:
+    def _lacking(self, loops: _Loops) -> str:
         """The margins missing around the nominal aircraft, in sentences."""
+        needed = above_zeros(self.needed, self.nominal)
+        longest = float(self.margin.max())
         lacking = []
-        for law in _laws(controller):
-            margins = loop_margins(self.nominal, law, loop_of(controller), together=False)
-            delay = 1e3 * delay_margin(self.nominal, law, self.loop)
-            late = Condition("delay margin (ms)", None, delay, 1e3 * self.margin)
-            failed = failing((late, *nominal_conditions(margins, self.needed)))
-            lacking += [condition.sentence(controller.outputs) for condition in failed]
+        for law in _laws(loops.controller):
+            margins = loop_margins(self.nominal, law, loop_of(loops.controller), together=False)
+            share = self.margin / longest if longest else 1.0
+            delay = 1e3 * delay_margin(self.nominal, law, self.loop, share)
+            late = Condition("delay margin (ms)", None, delay, 1e3 * (longest + RESOLUTION))
+            failed = failing((late, *nominal_conditions(margins, needed)))
+            lacking += [condition.sentence(loops.controller.outputs) for condition in failed]
         return "; ".join(dict.fromkeys(lacking))
 
-    def _checked(self, selected: SelectedObserver) -> SelectedObserver:
-        """The result with the delay margin that its controller states."""
-        values = selected.controller.model_dump()
-        values["observer"]["margin"] = self.margin
-        final = RiseDiConfig.validate_mapping(values, "controller")
-        near = selected.delay_margin
-        delay = min(delay_margin(self.nominal, law, self.loop, near=near) for law in _laws(final))
-        return selected._replace(controller=final, delay_margin=delay)
 
-
-def least_relaxed(
-    searches: Sequence[Generator[SelectedObserver, None, SelectedObserver]],
-    progress: Callable[[str], None] = lambda _: None,
+def least_error(
+    searches: Sequence[ObserverSearch], progress: Callable[[str], None] = lambda _: None
 ) -> SelectedObserver:
-    """The result of the search with the least relaxation: the least relaxed search takes the next
-    step.
-
-    Raises the ParameterError of the last search where none has a result.
+    """The best of the searches of several gain sets. Raises ParameterError where none has the
+    margins.
     """
-    reached = dict.fromkeys(range(len(searches)), 1.0)
-    refusal = ParameterError("found no gains, expected a set")
-    while reached:
-        place = min(reached, key=reached.__getitem__)
-        try:
-            now = next(searches[place])
-        except StopIteration as end:
-            selected: SelectedObserver = end.value
-            return selected._replace(place=place)
-        except ParameterError as error:  # another gain set may have the margins
-            refusal = error
-            del reached[place]
-        else:
-            reached[place] = float(np.prod(now.relaxation))
-            reached_text = (
-                f"least margin {now.fraction:.0%} of the needed"
-                if now.fraction < 1.0
-                else "margins met, uncertain aircraft"
-            )
-            progress(
-                f"observer: {reached_text}, K and integral / "
-                f"{', '.join(f'{factor:.2f}' for factor in now.relaxation)}"
-            )
-    raise refusal
+    trials = [search.best(progress) for search in searches]
+    place = 0
+    for k, trial in enumerate(trials):
+        place = k if trial.is_better(trials[place]) else place
+    return searches[place].selected(trials[place])._replace(place=place)
 
 
 def _laws(controller: RiseDiConfig) -> list[LinearLaw]:

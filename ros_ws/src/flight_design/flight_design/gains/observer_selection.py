@@ -16,7 +16,8 @@ import numpy as np
 
 from aircraft_sim.airframe import Airframe
 from aircraft_sim.airspeed import at_speed
-from aircraft_sim.disturbance import AIR_STATE
+from aircraft_sim.disturbance import AIR_STATE, AXES
+from aircraft_sim.turbulence import MODERATE, dryden, roll_gust
 from aircraft_sim.uncertainty import nominal_and_sampled
 from control_laws.nominal_model import NominalModel
 from control_laws.observer_design import (
@@ -36,14 +37,15 @@ from flight_core.vectors import FloatArray
 from flight_design.gains.airframe_properties import fastest_zero
 from flight_design.gains.extended_state import extended_state_weights, integrator_model
 from flight_design.gains.gain_selection import with_feedforward
-from flight_design.gains.nominal import nominal_model
+from flight_design.gains.linear_error import Air, discrete_gust
+from flight_design.gains.nominal import ACTIVITY_UNIT, nominal_model
 from flight_design.gains.observer_gains import ObserverGains
 from flight_design.gains.observer_search import (
     WORST_OF,
     AtSpeed,
-    MarginSearch,
+    ObserverSearch,
     SelectedObserver,
-    least_relaxed,
+    least_error,
 )
 from flight_design.gains.requirement import OBSERVER_REQUIREMENT, Requirement
 from rise_di_controller.linear_loop import LinearPlant
@@ -59,6 +61,7 @@ WORST_SEED = 1
 
 # factor on the noise of the wind of a filter that has a vane: with 10 u moves three times as much
 GUST_WITH_VANE = 2.0
+SPAN_TIME = 0.12  # s, wing span over the trim speed of an airframe without a span: the osprey's
 STILL = 1.4  # of the noise of a vane: a motion of less counts as none
 
 
@@ -85,52 +88,63 @@ def with_aircraft_observer(
     airframe: Airframe,
     sets: Sequence[ObserverGains],
     noise: FloatArray,
-    margin: float,
+    margin: float | FloatArray,
     needed: Requirement = OBSERVER_REQUIREMENT,
     vanes: Mapping[str, float] = MappingProxyType({}),
     *,
     uncertain: bool = True,
     speeds: tuple[float, float] | None = None,
-    quick: bool = False,
+    keeps_gains: bool = False,
+    begin: FloatArray | None = None,
+    is_free: Sequence[bool] | None = None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> SelectedObserver:
     """The controller with the feedforward and the observer of an airframe, and the gains of the law
     beside it.
 
-    Of several gain sets the margins choose: the least product of the factors of `relaxation`, then
-    the first. `vanes` has the noise of each vane, rms per sample in rad, by its channel, alpha or
-    beta. The phase margin is also that of WORST_OF uncertain aircraft where the airframe is
-    `uncertain`. `speeds` are two ratios to the trim speed: the controller has a schedule then, and
-    the margins at these speeds too. Uncertain aircraft with a zero on the right do not count: no
-    gains hold all outputs there. In a `quick` search the delay margin
-    alone counts until it is enough. `progress` gets a sentence before a step. Raises ParameterError
-    for an airframe with another D or without a wind, one that a feedforward refuses, and for
-    margins that no relaxation reaches.
+    The gains are relaxed, or made faster, channel by channel: the error of the linear loop in
+    moderate turbulence with the noise of the sensors is the least with which the loop has its
+    margins. Of several gain sets the one with the least error is taken. `margin` is the least delay
+    margin, s, of all inputs or of each, (m,). `vanes` has the noise of each vane, rms per sample in
+    rad, by its channel, alpha or beta. The phase margin is also that of WORST_OF uncertain aircraft
+    where the airframe is `uncertain`; those with a zero on the right do not count: no gains hold
+    all outputs there. `speeds` are two ratios to the trim speed: the controller has a schedule
+    then, and the margins at these speeds too. With `keeps_gains` the gains are only relaxed, where
+    the margins need it. The search begins at the relaxation `begin`, (m,), and changes it in the
+    channels that are free. `progress` gets a sentence a loop. Raises ParameterError for an airframe
+    with another D or without a wind, one that a feedforward refuses, and for margins that no
+    relaxation reaches.
     """
     designs = _AircraftDesigns.around(controller, airframe, noise)
     if speeds is not None:
         _require_no_vanes(vanes, controller.outputs)
     model = designs.model
     plant = designs.plant(WORST_OF * uncertain, vanes)
+    activity_unit = np.array(
+        [ACTIVITY_UNIT[airframe.inputs[name].unit] for name in controller.inputs]
+    )
     searches = []
     for gains in sets:
         section = None
         if vanes:
             section = _vanes(airframe, model, designs.names, gains.weights, vanes)
-        search = MarginSearch(
-            designs.base,
-            model,
-            plant,
-            gains,
-            designs.observer(model, gains),
-            margin,
-            needed,
-            section,
-            [designs.at_speed(ratio, gains) for ratio in speeds or ()],
-            quick,
+        search = ObserverSearch(
+            base=designs.base,
+            model=model,
+            plant=plant,
+            gains=gains,
+            design=designs.observer(model, gains),
+            margin=np.broadcast_to(margin, model.lag.shape),
+            needed=needed,
+            vanes=section,
+            others=[designs.at_speed(ratio, gains) for ratio in speeds or ()],
+            air=None if keeps_gains else _air(airframe, model, vanes),
+            activity_unit=activity_unit,
+            begin=begin,
+            is_free=is_free,
         )
         searches.append(search)
-    selected = least_relaxed([search.steps() for search in searches], progress)
+    selected = least_error(searches, progress)
     selected = selected._replace(left_out=1 + WORST_OF * uncertain - len(plant.A))
     if speeds is None:
         return selected
@@ -143,6 +157,44 @@ def with_aircraft_observer(
         selected.controller.model_dump() | {"schedule": schedule}, "controller"
     )
     return selected._replace(controller=scheduled)
+
+
+def _air(airframe: Airframe, model: NominalModel, vanes: Mapping[str, float]) -> Air:
+    """Moderate turbulence, a gust from below and one from the side, and the noise of outputs and
+    vanes. The air rolls, too: without that nothing but noise would move a symmetrical aircraft in
+    roll.
+    """
+    speed = airframe.speed
+    spectrum = dryden(**MODERATE, sigma=0.0)
+    axes = [AXES.index(axis) for axis in airframe.gusts]
+    peak, duration = discrete_gust(speed)
+    wind = model.wind
+    time = spectrum.length[axes] / speed
+    sigma = spectrum.sigma[axes]
+    gust = np.array([0.0 if axis == "longitudinal" else peak for axis in airframe.gusts])
+    if "p" in airframe.states:
+        turning, lag = roll_gust(spectrum, speed, airframe.span or SPAN_TIME * speed)
+        column = -model.A[:, list(airframe.states).index("p")] * (1.0 - model.kinematic)
+        wind = np.column_stack([wind, column])
+        time = np.append(time, lag)
+        sigma = np.append(sigma, turning)
+        gust = np.append(gust, 0.0)
+    m = len(model.noise)
+    reading = np.zeros((m + len(vanes), len(time)))
+    for k, name in enumerate(vanes):
+        for column_of, axis in enumerate(airframe.gusts):
+            if AIR_STATE[axis] == name:
+                reading[m + k, column_of] = -1.0 / speed
+    noise = np.append(model.noise, list(vanes.values()))
+    return Air(
+        wind=wind,
+        reading=reading,
+        time=time,
+        sigma=sigma,
+        noise=noise,
+        gust=gust,
+        gust_duration=duration,
+    )
 
 
 class _AircraftDesigns(NamedTuple):
@@ -286,7 +338,16 @@ def with_extended_state_observer(
         return extended_state_observer(model, names, changed)
 
     plant = LinearPlant(np.zeros((1, m, m)), Omega[None], np.eye(m))
-    return least_relaxed([MarginSearch(base, model, plant, gains, design, margin, needed).steps()])
+    search = ObserverSearch(
+        base=base,
+        model=model,
+        plant=plant,
+        gains=gains,
+        design=design,
+        margin=np.full(m, margin),
+        needed=needed,
+    )
+    return least_error([search])
 
 
 def _integrators(

@@ -21,7 +21,15 @@ from flight_core.arguments import as_number
 from flight_core.parameters import require
 from flight_core.vectors import FloatArray
 from flight_design.gains.airframe_properties import invariant_zeros
-from flight_design.gains.constrained_search import STEP, Assess, Place, Trial, descend, exponent
+from flight_design.gains.constrained_search import (
+    STEP,
+    Assess,
+    Moves,
+    Place,
+    Trial,
+    descend,
+    exponent,
+)
 from flight_design.gains.gain_conditions import Condition, failing
 from flight_design.gains.linear_error import linear_error
 from rise_di_controller.linear_loop import LinearLaw, LinearPlant
@@ -44,6 +52,11 @@ FURTHER_STARTS = (
     (exponent(2.0), exponent(2.0)),
     (exponent(8.0), exponent(8.0)),
 )  # exponents of `slower` and `lower` of all channels
+CHEAPER = ((-1, 0), (0, -1), (1, -1), (2, -1), (-3, 1))
+MOVES = Moves(mending=(*CHEAPER, (-1, 1), (1, 0), (0, 1)), cheaper=CHEAPER)
+"""Of the two exponents of a channel, a of the integral and b of the bandwidth. The error after a
+slow disturbance grows with slower lower^2: only moves with a + 2 b <= 0 can lower the cost."""
+
 NO_ERROR = 1e-12  # SI: an error below it costs nothing
 # by which the nominal phase margin rises while the worst aircraft has too little
 WORST_STEP = math.radians(2.5)
@@ -233,13 +246,14 @@ class _Loops(Generic[Controller]):
     def search(self, needed: Requirement) -> Trial[_Measured[Controller]]:
         """The trial with the least cost that meets a requirement, or the least shortage."""
         assess = partial(self.assess, needed)
-        best = descend(assess, self._fastest_integrals(assess), self.highest)
+        lowest = np.zeros_like(self.highest)
+        best = descend(assess, self._fastest_integrals(assess), MOVES, lowest, self.highest)
         for slower, lower in FURTHER_STARTS:
             if best.shortage == 0.0:
                 break
             place = np.minimum([[slower], [lower]], self.highest)
             (start,) = assess([tuple(place.ravel().tolist())])
-            reached = descend(assess, start, self.highest)
+            reached = descend(assess, start, MOVES, lowest, self.highest)
             best = reached if reached.is_better(best) else best
         return best
 

@@ -151,7 +151,7 @@ def with_sketch(
     model = model_for(rough, start, noise)
     gains = gains_beside_sketch(model, start.outputs, tuple(rough.gusts), speed)
     designed = with_aircraft_observer(
-        start, rough, [gains], noise, margin, uncertain=False
+        start, rough, [gains], noise, margin, uncertain=False, keeps_gains=True
     ).controller
     assert designed.observer is not None  # noqa: S101 - it was designed
     observer = designed.observer.model_copy(update={"part": 0.0})

@@ -1,21 +1,38 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What a design takes from the learner: delay margin, deviations, an input without effect."""
+"""What a design takes from the learner: margins, deviations, an input without effect."""
 
-from collections.abc import Mapping
+import math
+from collections.abc import Collection, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
 
 from aircraft_sim.airframe import Airframe
 from flight_analysis.closed_loop.learning_loop import Entry
 from flight_analysis.closed_loop.loop_margins import linear_loop
 from flight_core.vectors import FloatArray
+from flight_design.gains.observer_search import RESOLUTION, SelectedObserver
+from flight_design.gains.requirement import OBSERVER_REQUIREMENT, Requirement
 from flight_design.identification.likelihood import PRIOR
 from flight_design.identification.model_identification import with_entries
-from rise_di_controller.linear_loop import is_stable
-from rise_di_controller.rise_di_config import RiseDiConfig
+from rise_di_controller.linear_loop import delay_margin
+from rise_di_controller.margins import loop_margins
+from rise_di_controller.rise_di_config import LEAST_MARGIN, RiseDiConfig
 
 # s, delay margin beyond the latest delay: a loop of 30 ms flew well with u 20 ms late
 DELAY_LEFT = 0.01
+ROUNDED = 1.001  # of the margins of a loop: the loop itself has them in spite of rounding
 FAINT = 1e-3  # 1, of an effect: none, with its sign, which the search keeps
+
+
+class Goal(NamedTuple):
+    """What the design of a learned model has to keep."""
+
+    margin: FloatArray  # (m,) delay margin of each input, s
+    needed: Requirement
+    beside: SelectedObserver | None = None  # the design of the airframe file; None without one
+    is_free: Sequence[bool] | None = None  # (m,) the channels that leave it; None: all
 
 
 def margin_of(controller: RiseDiConfig) -> float:
@@ -24,28 +41,56 @@ def margin_of(controller: RiseDiConfig) -> float:
     return controller.observer.margin
 
 
-def with_margin(controller: RiseDiConfig, margin: float) -> RiseDiConfig:
-    """A controller that loads with another delay margin, s."""
-    assert controller.observer is not None  # noqa: S101 - a controller that learns has one
-    return controller.model_copy(
-        update={"observer": controller.observer.model_copy(update={"margin": margin})}
-    )
+def goal(
+    start: RiseDiConfig,
+    file: SelectedObserver | None,
+    model: Airframe,
+    parts: Collection[tuple[str, ...]],
+    latest: Mapping[str, float],
+) -> Goal:
+    """The goal of a design for a model of which some parts are learned.
 
-
-def margin_behind(delay: float, start: RiseDiConfig) -> float:
-    """The delay margin of an input that is late by a delay, s: that of the start, or more.
-
-    Beyond the delay at least DELAY_LEFT is left, or what the start leaves beyond its own delay.
+    A part keeps the delay margin that the loop of the file keeps around the model, at least
+    LEAST_MARGIN and at most that of the start; without a file that of the start; or the margin
+    that is asked for, `learn.margin`. Each input keeps at least DELAY_LEFT beyond its latest
+    delay, s, by name. With a file the sensitivity is at most 2, or that of the loop of the file;
+    phase and gain follow from it (Astrom, Murray, "Feedback Systems", 10.5).
     """
-    reserve = min(max(margin_of(start) - start.delay, 0.0), DELAY_LEFT)
+    outputs = start.outputs
+    margin = np.full(len(outputs), margin_of(start))
+    needed = OBSERVER_REQUIREMENT
+    is_free = None
+    if file is not None:
+        linear = linear_loop(file.controller, model, model.matrix_a()[None], model.matrix_b()[None])
+        undelayed = linear.loop._replace(delay=0.0)
+        learned = {output for part in parts for output in part}
+        is_free = [output in learned for output in outputs]
+        for part in (*parts, tuple(output for output in outputs if output not in learned)):
+            share = np.array([float(output in part) for output in outputs])
+            if not part:
+                continue
+            kept = delay_margin(linear.nominal, linear.law, undelayed, share)
+            kept = min(kept, margin_of(start)) - RESOLUTION
+            if part in parts:
+                kept = max(kept, min(LEAST_MARGIN, margin_of(start)))
+            else:
+                kept -= RESOLUTION  # its gains stay: it has what it has
+            margin = np.where(share > 0.0, max(kept, 0.0), margin)
+        margins = loop_margins(linear.nominal, linear.law, linear.loop, together=False)
+        if margins.stable:
+            most = max(needed.sensitivity, ROUNDED * float(margins.sensitivity.max()))
+            needed = needed._replace(
+                sensitivity=most,
+                phase=min(needed.phase, 2.0 * math.asin(0.5 / most)),
+                gain=min(needed.gain, most / (most - 1.0)),
+                damping=min(needed.damping, float(margins.damping) / ROUNDED),
+            )
+    settings = start.learn
+    if settings is not None and settings.margin is not None:
+        margin = np.full(len(outputs), settings.margin)
     # 0.1 ms, as few digits as the file of a scenario
-    return max(margin_of(start), round(delay + reserve, 4))
-
-
-def tolerates(controller: RiseDiConfig, model: Airframe, late: FloatArray) -> bool:
-    """Whether the linear loop of a controller around a model is stable with u late, s, (m,)."""
-    linear = linear_loop(controller, model, model.matrix_a()[None], model.matrix_b()[None])
-    return is_stable(linear.nominal, linear.law, linear.loop._replace(delay=0.0), late)
+    late = [round(latest[name] + DELAY_LEFT, 4) if name in latest else 0.0 for name in start.inputs]
+    return Goal(np.maximum(margin, late), needed, file, is_free)
 
 
 def with_deviations(designed: RiseDiConfig, deviation: Mapping[str, float]) -> RiseDiConfig:

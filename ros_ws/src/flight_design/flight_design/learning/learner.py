@@ -23,6 +23,7 @@ from flight_core.parameters import ParameterError, require
 from flight_core.rates import nanoseconds, seconds
 from flight_core.vectors import FloatArray
 from flight_design.gains.ideal_control import ChannelPairing
+from flight_design.gains.observer_search import SelectedObserver
 from flight_design.identification.innovation_filters import DRIFT, TRANSIENT, Actuation, Recording
 from flight_design.identification.likelihood import HELD_OUT, KNOWN, Unknown
 from flight_design.identification.model_identification import (
@@ -33,11 +34,10 @@ from flight_design.identification.model_identification import (
 from flight_design.identification.model_quality import another_airframe
 from flight_design.learning.change_test import ANGLE, MAX_GAIN, RECORD, Change, change_test
 from flight_design.learning.designs import (
-    margin_behind,
+    Goal,
+    goal,
     margin_of,
-    tolerates,
     with_deviations,
-    with_margin,
     without_effect,
 )
 from flight_design.learning.flight_record import SPREAD, FlightRecord, Sample, about, steady_end
@@ -67,9 +67,11 @@ AT_BOUND = 1
 # s, of a record: two held-out seconds of the six that `identify` needs at least
 SHORTEST = 20.0 * TRANSIENT
 
-Design = Callable[[RiseDiConfig, Airframe], RiseDiConfig]
-"""A controller with the feedforward and the observer of a model, and its delay margin. Raises
-ParameterError."""
+Design = Callable[[RiseDiConfig, Airframe, Goal], SelectedObserver]
+"""A controller with the feedforward and the observer of a model. Raises ParameterError."""
+
+DesignOfFile = Callable[[RiseDiConfig], SelectedObserver]
+"""The design of the rough model as one that errs. Raises ParameterError."""
 
 
 class Known(NamedTuple):
@@ -106,7 +108,7 @@ class Learner:
         design: Design,
         delay: float = 0.0,
         rough: Unknown = KNOWN,
-        design_of_rough: Design | None = None,
+        design_of_rough: DesignOfFile | None = None,
         *,
         quick: bool = False,
     ) -> None:
@@ -354,7 +356,7 @@ class Learner:
         """The rough airframe by a design for one that errs. Raises ParameterError."""
         name = self._rough.name
         try:
-            proposed = self._designed_with(margin_of(self._controller), self._rough, {}, self._dead)
+            proposed = self._designed(self._rough, {}, self._dead)
         except ParameterError as error:
             self._design_of_rough = None
             raise ParameterError(f"the airframe {name} as it is: {error}") from None
@@ -516,55 +518,39 @@ class Learner:
     ) -> RiseDiConfig:
         """The controller of a model, with the law of the start in the parts without one.
 
-        The loop around the model is stable with each input late by the margin behind its own
-        latest delay. The delay margin of all inputs at once is the least of these with which it
-        is so: an input whose delay is known worst, as thrust, costs the others no bandwidth.
-        Raises ParameterError.
+        While the rough model flies, a part without a learned model flies by it. Raises
+        ParameterError.
         """
         start = self._controller
-        latest = dict(chain.from_iterable(value.latest.items() for value in known.values()))
-        behind = {name: margin_behind(delay, start) for name, delay in latest.items()}
-        late = np.array([behind.get(name, margin_of(start)) for name in start.inputs])
-        *smaller, largest = sorted(set(behind.values()) or {margin_of(start)})
-        try:
-            # beside models at other speeds the check of the trim speed does not suffice
-            for margin in () if self._has_speeds else smaller:
-                proposed = self._designed_with(margin, model, known, dead)
-                if tolerates(proposed, model, late):
-                    return proposed
-            return self._designed_with(largest, model, known, dead)
-        except ParameterError as error:
-            if largest > margin_of(start):
-                worst = 1e3 * max(latest.values())
-                raise ParameterError(f"u is up to {worst:.0f} ms late: {error}") from None
-            raise
-
-    def _designed_with(
-        self,
-        margin: float,
-        model: Airframe,
-        known: Mapping[tuple[str, ...], Known],
-        dead: Mapping[tuple[str, ...], str],
-    ) -> RiseDiConfig:
-        """`_designed`, with a delay margin, s. While the rough model flies, parts without another
-        fly by it. Raises ParameterError.
-        """
-        start = self._controller
+        without_learning = start.model_copy(update={"learn": None})
         flying = {output for part in known for output in part}
-        design = self._design
         held = {output for part in dead for output in part}
-        if self._design_of_rough is not None and not is_within(start.outputs, flying | held):
-            design = self._design_of_rough
+        file = None
+        if self._design_of_rough is not None:
+            file = self._design_of_rough(without_learning)
             flying = set(start.outputs) - held
-        bare = [output not in flying for output in start.outputs]
-        designed = start.model_copy(update={"learn": None})
+        designed = without_learning
+        if file is not None and not known:
+            designed = file.controller
+        elif flying:
+            latest = dict(chain.from_iterable(value.latest.items() for value in known.values()))
+            aim = goal(start, file, model, list(known), latest)
+            try:
+                designed = self._design(without_learning, model, aim).controller
+            except ParameterError as error:
+                if aim.margin.max() > margin_of(start):
+                    worst = 1e3 * max(latest.values())
+                    raise ParameterError(f"u is up to {worst:.0f} ms late: {error}") from None
+                raise
         if flying:
-            designed = design(with_margin(designed, margin), model)
             designed = with_deviations(
                 designed, {k: v for part in known.values() for k, v in part.deviation.items()}
             )
         proposed = with_channels_of(
-            start, designed, bare, [name in dead.values() for name in start.inputs]
+            start,
+            designed,
+            [output not in flying for output in start.outputs],
+            [name in dead.values() for name in start.inputs],
         )
         return RiseDiConfig.validate_mapping(
             proposed.model_dump() | {"learn": self._start.model_dump()["learn"]}, "proposal"

@@ -24,10 +24,12 @@ from flight_core.parameters import require
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
-from flight_design.gains.gain_design import observed
+from flight_design.gains.gain_design import selected_observer
+from flight_design.gains.observer_search import SelectedObserver
 from flight_design.identification.likelihood import KNOWN
 from flight_design.identification.sketch import ROUGH, sketched, with_sketch
 from flight_design.identification.step_identification import NOISE, STEP_MARGIN
+from flight_design.learning.designs import Goal, margin_of
 from flight_design.learning.learner import Learner
 from flight_log.tape_reader import RecordedRun
 from rise_di_controller.internals import GIVEN_UP
@@ -47,7 +49,7 @@ def learner(scenario: Scenario, *, real_time: bool = False, quick: bool = False)
         scenario: The flight.
         real_time: Whether the learner works beside a controller in real time.
         quick: Whether an identification begins its search once where the air is the same in every
-            second, and the search of a design begins with the delay margin, as in a campaign.
+            second, as in a campaign.
 
     Returns:
         A function from the parameters of the controller to a learner, or None.
@@ -80,28 +82,27 @@ def learner(scenario: Scenario, *, real_time: bool = False, quick: bool = False)
 
     speeds = _speeds(controller, airframe)
 
-    def design(start: RiseDiConfig, model: Airframe, *, errs: bool = False) -> RiseDiConfig:
-        assert start.observer is not None  # noqa: S101 - a controller that learns has one
-        margin = start.observer.margin
-        return observed(
+    def design(start: RiseDiConfig, model: Airframe, goal: Goal) -> SelectedObserver:
+        return selected_observer(
             start,
             scenario,
             model,
-            margin,
-            uncertain=errs,
+            goal.margin,
+            goal.needed,
+            uncertain=False,
             sketched=sketch,
             speeds=speeds,
-            quick=quick,
-        )[0]
+            beside=goal.beside,
+            is_free=goal.is_free,
+        )
 
-    of_rough: dict[RiseDiConfig, RiseDiConfig] = {}
+    of_rough: dict[RiseDiConfig, SelectedObserver] = {}
 
-    def design_of_rough(start: RiseDiConfig, model: Airframe) -> RiseDiConfig:
-        """As `design` for a model that errs; once for the learners of many aircraft."""
-        if model is not airframe:
-            return design(start, model, errs=True)
+    def design_of_rough(start: RiseDiConfig) -> SelectedObserver:
+        """The airframe as one that errs; once for the learners of many aircraft."""
         if start not in of_rough:
-            of_rough[start] = design(start, model, errs=True)
+            margin = margin_of(start)
+            of_rough[start] = selected_observer(start, scenario, airframe, margin, speeds=speeds)
         return of_rough[start]
 
     return lambda parameters: Learner(
