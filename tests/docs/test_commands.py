@@ -87,7 +87,7 @@ def python(words: list[str]) -> None:
 
 
 # a second or two each on a short run, and without ROS
-QUICK = {"airframes", "layouts", "replay", "report"}
+QUICK = {"airframes", "replay", "report"}
 CHECKS = {"rise-di": rise_di, "make": make, "ros2": ros2, "python": python, "python3": python}
 
 

@@ -139,7 +139,7 @@ def test_an_invalid_value_is_rejected(command: str, garbage: Path) -> None:
         )
 
 
-COMMANDS = ["fly", "report", "replay", "play", "gains", "check", "airframes", "layouts", "identify"]
+COMMANDS = ["fly", "report", "replay", "play", "gains", "check", "airframes", "identify"]
 OTHERS = [
     "--json",
     "--set",

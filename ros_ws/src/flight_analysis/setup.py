@@ -20,10 +20,9 @@ setup(
     package_data={
         "flight_analysis": [
             "py.typed",
+            "layouts/*",
             "scenarios/*.yaml",
             "report/*.jinja",
-            "report/*.json",
-            "report/*.urdf",
             "report/*.js",
             "report/scene/*",
             "report/vendor/*",
@@ -32,6 +31,7 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/flight_analysis"]),
         ("share/flight_analysis", ["package.xml"]),
+        ("share/flight_analysis/layouts", sorted(glob("flight_analysis/layouts/*"))),
         ("share/flight_analysis/scenarios", sorted(glob("flight_analysis/scenarios/*.yaml"))),
     ],
 )

@@ -1,7 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The layouts of `rise-di layouts` for Foxglove and PlotJuggler: format, arrangement, and channels
-of a run.
+"""The layouts of Foxglove and PlotJuggler that ship: every curve is a channel of a flight.
 
 The formats follow the sources of the two programs. Neither program runs here.
 """
@@ -10,46 +9,49 @@ import json
 import re
 from collections import Counter
 from collections.abc import Iterator
-from pathlib import Path
+from importlib.resources import files
 from typing import Any
 from xml.etree import ElementTree
 
 import pytest
-import yaml
-from tests.conftest import invoke
 
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.report.layouts import MAP_TOPICS, channels_of, foxglove, plotjuggler
 from flight_core.tape import Tape
+from flight_core.topics import LOG, TOPICS
 
-CHANNELS = channels_of(find_scenario("osprey_gust"))
-JSON = foxglove({"": CHANNELS})
-XML = plotjuggler({"": CHANNELS})
-OUTPUTS = ("q", "V", "p", "r")
-INPUTS = ("elevator", "aileron", "rudder", "thrust")
-CURVES = {
-    *(f"{topic} {name}" for topic in ("y", "y_m") for name in OUTPUTS),
-    *(f"internals {group}.{name}" for group in ("e", "integral_e", "Pi") for name in OUTPUTS),
-    *(f"internals {group}.{name}" for group in ("u", "u_free", "limited") for name in INPUTS),
-    *(f"internals {name}" for name in ("mode", "late", "age", "dt")),
-    *(f"truth gust.{axis}" for axis in ("longitudinal", "lateral", "vertical")),
-}
-# title: number of plots
-TABS = {"tracking": 4, "error": 4, "input": 4, "integrals": 8, "controller": 4, "wind": 3}
-"""The fixed part of a Plot panel of Foxglove."""
+FOLDER = files("flight_analysis") / "layouts"
+FOXGLOVE = json.loads((FOLDER / "osprey.foxglove.json").read_text())
+PLOTJUGGLER = ElementTree.fromstring((FOLDER / "osprey.plotjuggler.xml").read_text())
+# A tab of the map stands in Foxglove alone.
+TABS = ["guidance", "tracking", "error", "input", "integrals", "controller", "wind"]
 
 
-@pytest.fixture(scope="module", params=["osprey_gust", "osprey_servo"])
+@pytest.fixture(scope="module", params=["osprey_route", "osprey_servo", "osprey_vanes"])
 def tape(request: pytest.FixtureRequest) -> Tape:
-    """A run; the layout of osprey_gust fits both scenarios."""
+    """A flight with guidance, one without, and one whose observer has more channels."""
     return simulate(find_scenario(request.param, 0.1))
 
 
-def leaves(tree: Any) -> Iterator[str]:
-    """Panels of a tree of splits (react-mosaic): a name, or a direction with a first and a second
-    part.
-    """
+def foxglove_curves() -> Iterator[tuple[str, int, str]]:
+    """Topic, index in `position`, and label of each curve of Foxglove."""
+    for panel in FOXGLOVE["configById"].values():
+        for path in panel.get("paths", ()):
+            parts = re.fullmatch(r"/(\w+)\.position\[(\d+)\]", path["value"])
+            assert parts is not None, path
+            yield parts[1], int(parts[2]), path["label"]
+
+
+def plotjuggler_curves() -> Iterator[tuple[str, str]]:
+    """Topic and channel of each curve of PlotJuggler."""
+    for curve in PLOTJUGGLER.iter("curve"):
+        root, topic, channel, field = curve.attrib["name"].split("/")
+        assert (root, field) == ("", "position")
+        yield topic, channel
+
+
+def panels_of(tree: Any) -> Iterator[str]:
+    """Panels of a tree of splits (react-mosaic): a name, or a direction with two parts."""
     if isinstance(tree, str):
         yield tree
         return
@@ -57,102 +59,50 @@ def leaves(tree: Any) -> Iterator[str]:
     assert tree["direction"] in {"row", "column"}
     assert 0 < tree["splitPercentage"] < 100
     for part in ("first", "second"):
-        yield from leaves(tree[part])
+        yield from panels_of(tree[part])
 
 
-def test_the_command_writes_both_layouts(tmp_path: Path) -> None:
-    result = invoke("layouts", "osprey_gust", "--folder", str(tmp_path / "new"))
-    assert result.exit_code == 0, result.output
-    files = {path.name: path.read_text() for path in (tmp_path / "new").iterdir()}
-    assert files == {"osprey_gust.foxglove.json": JSON, "osprey_gust.plotjuggler.xml": XML}
-    assert result.output.split() == [str(tmp_path / "new" / name) for name in sorted(files)]
+def test_every_curve_of_foxglove_is_the_channel_that_its_label_names(tape: Tape) -> None:
+    for topic, index, label in foxglove_curves():
+        if topic != "guidance" or topic in tape:
+            assert label == f"{topic}: {tape[topic].names[index]}"
 
 
-def test_every_path_of_foxglove_leads_to_channel_that_label_names(tape: Tape) -> None:
-    curves = []
-    for panel in json.loads(JSON)["configById"].values():
-        for path in panel.get("paths", ()):
-            parts = re.fullmatch(r"/(\w+)\.position\[(\d+)\]", path["value"])
-            assert parts is not None, path
-            curve = f"{parts[1]}: {tape[parts[1]].names[int(parts[2])]}"
-            assert path["label"] == curve
-            curves.append(curve.replace(": ", " "))
-    assert Counter(curves) == Counter(CURVES)
+def test_every_curve_of_plotjuggler_is_a_channel(tape: Tape) -> None:
+    for topic, channel in plotjuggler_curves():
+        if topic != "guidance" or topic in tape:
+            assert channel in tape[topic].names
+
+
+def test_both_programs_show_the_same_curves() -> None:
+    labels = [label for *_, label in foxglove_curves()]
+    assert Counter(labels) == Counter(f"{topic}: {name}" for topic, name in plotjuggler_curves())
+    assert {topic for topic, _ in plotjuggler_curves()} == {
+        "guidance",
+        "internals",
+        "truth",
+        "y",
+        "y_m",
+    }
 
 
 def test_every_panel_of_foxglove_stands_in_one_tab() -> None:
-    layout = json.loads(JSON)
-    assert layout.keys() == {
-        "configById",
-        "globalVariables",
-        "userNodes",
-        "playbackConfig",
-        "layout",
+    assert FOXGLOVE["layout"] == "Tab!rise_di"
+    panels = dict(FOXGLOVE["configById"])
+    tabs = {
+        tab["title"]: list(panels_of(tab["layout"])) for tab in panels.pop("Tab!rise_di")["tabs"]
     }
-    assert (layout["globalVariables"], layout["userNodes"], layout["playbackConfig"]) == (
-        {},
-        {},
-        {"speed": 1},
-    )
-    assert layout["layout"] == "Tab!rise_di"
-    tab_panel = layout["configById"]["Tab!rise_di"]
-    assert tab_panel.keys() == {"activeTabIdx", "tabs"}
-    assert tab_panel["activeTabIdx"] == 0
-    placed = {tab["title"]: list(leaves(tab["layout"])) for tab in tab_panel["tabs"]}
-    assert {title: len(names) for title, names in placed.items()} == TABS
-    assert list(placed) == list(TABS)
-    count = Counter(name for names in placed.values() for name in names)
-    assert set(count.values()) == {1}
-    assert set(count) == set(layout["configById"]) - {"Tab!rise_di"}
-    assert {name.split("!")[0] for name in count} == {"Plot"}
+    assert list(tabs) == ["map", *TABS]
+    assert Counter(name for names in tabs.values() for name in names) == Counter(panels.keys())
 
 
-def test_every_curve_of_plotjuggler_is_channel_of_run(tape: Tape) -> None:
-    curves = []
-    for curve in ElementTree.fromstring(XML).iter("curve"):
-        root, topic, channel, position = curve.attrib["name"].split("/")
-        assert channel in tape[topic].names
-        assert (root, position) == ("", "position")
-        curves.append(f"{topic} {channel}")
-    assert Counter(curves) == Counter(CURVES)
+def test_map_of_foxglove_shows_recorded_topics() -> None:
+    """The frame `map` is that of REP 105."""
+    panel = FOXGLOVE["configById"]["3D!map"]
+    assert panel["followTf"] == "map"
+    recorded = {f"/{topic.name}" for topic in TOPICS if LOG in topic.subscribers}
+    assert set(panel["topics"]) <= recorded
 
 
-def test_fleet_has_common_map_and_tabs_by_aircraft(tmp_path: Path) -> None:
-    """RViz shows each aircraft at the frame that guidance publishes, after REP 105."""
-    fleet = tmp_path / "fleet.yaml"
-    fleet.write_text("aircraft: {uav1: {}, uav2: {scenario: osprey_gust}, uav3: {}}")
-    result = invoke("layouts", str(fleet), "--folder", str(tmp_path))
-    assert result.exit_code == 0, result.output
-    panels = json.loads((tmp_path / "fleet.foxglove.json").read_text())["configById"]
-    assert [tab["title"] for tab in panels["Tab!rise_di"]["tabs"]] == [
-        "map",
-        "uav1",
-        "uav2",
-        "uav3",
-    ]
-    assert set(panels["3D!map"]["topics"]) == {
-        f"/{name}/{topic}" for name in ("uav1", "uav3") for topic in MAP_TOPICS
-    }
-    (tracking,) = (tab for tab in panels["Tab!uav2"]["tabs"] if tab["title"] == "tracking")
-    first = panels[next(leaves(tracking["layout"]))]["paths"][0]
-    assert (first["value"], first["label"]) == (
-        f"/uav2/y.position[{CHANNELS['y'].index('q')}]",
-        "y: q",
-    )
-    tabs = [
-        tab.attrib["tab_name"]
-        for tab in ElementTree.parse(tmp_path / "fleet.plotjuggler.xml").iter("Tab")
-    ]
-    assert tabs[len(TABS) + 1 :][: len(TABS)] == [f"uav2 {title}" for title in TABS]
-    shown = yaml.safe_load((tmp_path / "fleet.rviz").read_text())["Visualization Manager"]
-    models = [display for display in shown["Displays"] if display["Class"].endswith("/RobotModel")]
-    assert [(model["TF Prefix"], Path(model["Description File"])) for model in models] == [
-        (name, tmp_path / "aircraft.urdf") for name in ("uav1", "uav3")
-    ]
-    assert (shown["Global Options"]["Fixed Frame"], shown["Views"]["Current"]["Target Frame"]) == (
-        "map",
-        "uav1/base_link",
-    )
-    (link,) = ElementTree.parse(tmp_path / "aircraft.urdf").iter("link")
-    widths = [float(box.attrib["size"].split()[1]) for box in link.iter("box")]
-    assert (link.attrib["name"], max(widths)) == ("base_link", 3.0)  # m, the span
+def test_tabs_of_plotjuggler_are_those_of_foxglove() -> None:
+    assert [tab.attrib["tab_name"] for tab in PLOTJUGGLER.iter("Tab")] == TABS

@@ -51,8 +51,6 @@ GROUPS = MappingProxyType(
             "replay": "Compute every tick of a recorded flight again and compare it with the "
             "log bit by bit.",
             "play": "Publish the topics of a recorded flight again with their timing.",
-            "layouts": "Write layouts for Foxglove and PlotJuggler that open the runs of a "
-            "scenario.",
         },
         "Design": {
             "airframes": "Show airframes and what the theorem asks of each, or make one of your "
