@@ -145,7 +145,10 @@ def write_mcap(
 
 
 def write_rosbags(
-    folder: Path, messages: Sequence[Recorded], storage: StoragePlugin, mode: CompressionMode | None
+    folder: Path,
+    messages: Sequence[Recorded],
+    mode: CompressionMode | None,
+    storage: StoragePlugin = StoragePlugin.MCAP,
 ) -> None:
     """Write the messages by the library rosbags."""
     writer = RosbagWriter(folder, version=9, storage_plugin=storage)
@@ -225,16 +228,17 @@ def whole_bags() -> dict[str, Callable[[Path, list[Recorded]], object]]:
     }
     nothing |= {"repeat_channels": False, "repeat_schemas": False, "use_summary_offsets": False}
     rosbags = {
-        f"rosbags_{storage.name}_{'plain' if mode is None else mode.name}".lower(): partial(
-            write_rosbags, storage=storage, mode=mode
+        f"rosbags_{'plain' if mode is None else mode.name}".lower(): partial(
+            write_rosbags, mode=mode
         )
-        for storage in StoragePlugin
-        for mode in (None, CompressionMode.FILE, CompressionMode.MESSAGE)
+        for mode in (
+            None,
+            CompressionMode.FILE,
+            CompressionMode.MESSAGE,
+            CompressionMode.STORAGE,
+        )
     }
     return rosbags | {
-        "rosbags_mcap_storage": lambda f, m: write_rosbags(
-            f, m, StoragePlugin.MCAP, CompressionMode.STORAGE
-        ),
         "chunks_zstd": lambda f, m: write_mcap(f, m, compression=CompressionType.ZSTD),
         "chunks_lz4": lambda f, m: write_mcap(f, m, compression=CompressionType.LZ4),
         "chunks_plain": lambda f, m: write_mcap(f, m, compression=CompressionType.NONE),

@@ -251,13 +251,12 @@ def test_definitions_need_no_ros_package(
 def record(
     folder: Path,
     topics: dict[str, list[bytes]],
-    storage: StoragePlugin,
     compression: CompressionMode = CompressionMode.NONE,
 ) -> None:
     """Write a bag with rosbags: the messages of each topic 1 ms apart, and a topic of another
     type.
     """
-    writer = Writer(folder, version=9, storage_plugin=storage)
+    writer = Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP)
     if compression is not CompressionMode.NONE:
         writer.set_compression(compression, CompressionFormat.ZSTD)
     with writer:
@@ -281,21 +280,18 @@ def test_flight_that_rosbag2_recorded_read_with_scenario_beside_it(
     """As the launch files leave it: a log without messages, and the bag in a folder of its own."""
     with BagWriter(tmp_path / "run") as bag:
         bag.add_attachments(LogAttachments(osprey_gust.path), 1)
-    record(tmp_path / "run" / ROSBAG2, {"/y": SAMPLES}, StoragePlugin.MCAP)
+    record(tmp_path / "run" / ROSBAG2, {"/y": SAMPLES})
     back = read_run(tmp_path / "run")
     assert back.scenario == ("osprey_gust.yaml", osprey_gust.path.read_bytes())
     assert back.tape["y"]["q"].tolist() == [0.1 * k for k in range(50)]
     assert back.tape.notes == ()
 
 
-@pytest.mark.parametrize("storage", StoragePlugin)
 @pytest.mark.parametrize(
     "compression", [CompressionMode.NONE, CompressionMode.FILE, CompressionMode.MESSAGE]
 )
-def test_bags_of_other_recorders_are_read(
-    storage: StoragePlugin, compression: CompressionMode, tmp_path: Path
-) -> None:
-    record(tmp_path / "bag", {"/y": SAMPLES}, storage, compression)
+def test_bags_of_other_recorders_are_read(compression: CompressionMode, tmp_path: Path) -> None:
+    record(tmp_path / "bag", {"/y": SAMPLES}, compression)
     back = read_run(tmp_path / "bag").tape
     assert list(back.signals) == ["y"]
     assert back.notes == ()
@@ -303,12 +299,9 @@ def test_bags_of_other_recorders_are_read(
     assert back["y"]["q"].tolist() == [0.1 * k for k in range(50)]
 
 
-@pytest.mark.parametrize("storage", StoragePlugin)
 @pytest.mark.parametrize("compression", [CompressionMode.FILE, CompressionMode.MESSAGE])
-def test_bags_of_other_recorders_are_played(
-    storage: StoragePlugin, compression: CompressionMode, tmp_path: Path
-) -> None:
-    record(tmp_path / "bag", {"/y": SAMPLES}, storage, compression)
+def test_bags_of_other_recorders_are_played(compression: CompressionMode, tmp_path: Path) -> None:
+    record(tmp_path / "bag", {"/y": SAMPLES}, compression)
     playback = read_playback(tmp_path / "bag", ["y"])
     assert [message.data for message in playback.messages] == SAMPLES
     assert all(message.stamped for message in playback.messages)
@@ -317,9 +310,7 @@ def test_bags_of_other_recorders_are_played(
 def test_bag_in_several_files_is_one_flight(tmp_path: Path) -> None:
     # more than ten, so that the order of numbers is not that of names
     for part in range(12):
-        record(
-            tmp_path / f"part{part}", {"/y": SAMPLES[4 * part : 4 * part + 4]}, StoragePlugin.MCAP
-        )
+        record(tmp_path / f"part{part}", {"/y": SAMPLES[4 * part : 4 * part + 4]})
         (tmp_path / "bag").mkdir(exist_ok=True)
         (tmp_path / f"part{part}" / f"part{part}.mcap").rename(
             tmp_path / "bag" / f"bag_{part}.mcap"
@@ -340,7 +331,7 @@ def test_two_aircraft_in_one_bag_selected_by_namespace(tmp_path: Path) -> None:
         "/fleet/two/gps/speed": SAMPLES[:3],
         "/one/u": SAMPLES[1:6],
     }
-    record(tmp_path / "bag", topics, StoragePlugin.MCAP)
+    record(tmp_path / "bag", topics)
     found = "bag: found aircraft in the namespaces /fleet/two, /one, expected"
     with refusing(f"{found} that one of them"):
         read_run(tmp_path / "bag")

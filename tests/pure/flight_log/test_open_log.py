@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 import zstandard
-from rosbags.rosbag2 import Reader
+from rosbags.rosbag2 import CompressionMode, Reader, StoragePlugin
 from tests.bags import (
     FOREIGN_FILES,
     Recorded,
@@ -20,6 +20,7 @@ from tests.bags import (
     split,
     whole_bags,
     write_mcap,
+    write_rosbags,
 )
 from tests.conftest import invoke, refusing
 from tests.joint_states import JOINT_STATE, STORE, vector
@@ -31,6 +32,7 @@ from flight_analysis.report.run_folder import read_flight
 from flight_core.outcome import STATUS_ENDED_EARLY
 from flight_core.parameters import ParameterError
 from flight_log.disk import try_lock
+from flight_log.open_log import ROSBAG2
 from flight_log.playback import read_playback
 from flight_log.repair import repair
 from flight_log.tape_reader import read_run
@@ -140,6 +142,30 @@ def test_path_without_log_names_its_content(command: str, recorded: Path, tmp_pa
     assert "found no .mcap file, but the folders of runs run" in refusal(
         command, str(recorded.parent)
     )
+
+
+@pytest.mark.parametrize("mode", [None, CompressionMode.MESSAGE])
+@pytest.mark.parametrize("command", COMMANDS)
+def test_bag_of_sqlite_names_the_converter(
+    command: str, mode: CompressionMode | None, messages: list[Recorded], tmp_path: Path
+) -> None:
+    write_rosbags(tmp_path / "bag", messages, mode, StoragePlugin.SQLITE3)
+    words = "a database of SQLite, of which `ros2 bag convert` or `rosbags-convert` makes"
+    for path in (tmp_path / "bag", tmp_path / "bag" / "bag.db3"):
+        sentence = refusal(command, str(path))
+        assert sentence.startswith(str(path))  # `--repair` names the file in a folder
+        assert words in sentence
+
+
+@pytest.mark.parametrize("command", ["report", "replay", "watch", "play"])
+def test_bag_of_sqlite_is_refused_packed_and_beside_mcap(
+    command: str, messages: list[Recorded], tmp_path: Path
+) -> None:
+    write_rosbags(tmp_path / "packed", messages, CompressionMode.FILE, StoragePlugin.SQLITE3)
+    write_mcap(tmp_path / "run", messages)
+    write_rosbags(tmp_path / "run" / ROSBAG2, messages, None, StoragePlugin.SQLITE3)
+    for name in ("packed", "run"):
+        assert "`rosbags-convert`" in refusal(command, str(tmp_path / name))
 
 
 @pytest.mark.parametrize("command", sorted(COMMANDS.keys() - {"play", "repair"}))

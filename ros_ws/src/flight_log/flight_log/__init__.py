@@ -10,7 +10,7 @@
 | `message_definitions` | finds the definition of a message type |
 | `provenance` | collects versions, revision, host and command |
 | `file_kinds` | names the kind of a file by the first bytes |
-| `open_log` | opens the files of a log for every reader: MCAP, SQLite, packed files, compressed messages |
+| `open_log` | opens the files of a log for every reader: MCAP, packed files, compressed messages |
 | `scan` | reads the records of an intact, truncated or damaged MCAP file |
 | `follow` | reads a growing log |
 | `repair` | rebuilds a truncated or damaged bag |
@@ -20,4 +20,4 @@
 | `playback` | schedules the messages of a bag for sending |
 | `age_of_u` | reads the age of u at the aircraft |
 | `latency` | computes the time from y to u |
-"""  # noqa: E501 - a text as it is written
+"""

@@ -14,16 +14,15 @@ from mcap.writer import MCAP0_MAGIC
 from flight_core.files import open_nonblocking
 
 MCAP = "an MCAP file"
-SQLITE = "a database of SQLite"
+SQLITE = "a database of SQLite, of which `ros2 bag convert` or `rosbags-convert` makes an MCAP file"
 ZSTD = "a zstd file"
 LZ4 = "an lz4 file"
 EMPTY = "an empty file"
 BEGUN = "the first bytes of an MCAP file"
 UNREADABLE = "a file that cannot be read"
 
-LOGS = (MCAP, SQLITE)
 PACKED = (ZSTD, LZ4)
-"""Kinds that may be a log, and kinds that may hold a log."""
+"""Kinds that may hold a log."""
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"  # RFC 8878, section 3.1.1
 LZ4_MAGIC = b"\x04\x22\x4d\x18"  # LZ4 frame format, Magic Number

@@ -3,7 +3,7 @@
 """Reads a growing log by `Scan`: a call continues at the end of the last call. A finished log is
 read in the same way.
 
-A log of another storage, or a packed log, is finished: `open_log` reads it. A record is read once
+A packed log is finished: `open_log` reads it. A record is read once
 the record is whole: a chunk in progress is never read.
 """
 
@@ -18,12 +18,11 @@ from mcap.records import Attachment, Channel, Metadata, Schema
 
 from flight_core.rates import NANOSECONDS
 from flight_log.bag import stack_topic
-from flight_log.file_kinds import BEGUN, EMPTY, MCAP, PACKED, SQLITE, file_kind
+from flight_log.file_kinds import BEGUN, EMPTY, MCAP, PACKED, file_kind
 from flight_log.named_vectors import STAMP, full_name, stamps_of
 from flight_log.open_log import ROSBAG2, open_scan, plain_batches
 from flight_log.rosbag2_metadata import bag_files
 from flight_log.scan import MessageBatch, Scan
-from flight_log.sqlite_scan import SqliteScan
 
 
 class Messages(NamedTuple):
@@ -85,12 +84,12 @@ class Follower:
 
     def _begin_file(self) -> None:
         self._path: Path | None = None
-        self._scan: Scan | SqliteScan | None = None
+        self._scan: Scan | None = None
         self._size = 0  # bytes, at the last look
         self._identity = (0, 0)  # device and inode of the file, once something of it has been read
         self._schemas: dict[int, str] = {}
         self._channels: dict[int, _Channel] = {}
-        # records of a file of another storage, or of a packed file
+        # records of a packed file
         self._finished: Iterator[object] | None = None
 
     @property
@@ -135,7 +134,7 @@ class Follower:
                 return
             identity = (status.st_dev, status.st_ino)
             if not isinstance(self._scan, Scan) or self._scan.position == 0:
-                if (kind := file_kind(path)) in {*PACKED, SQLITE}:
+                if (kind := file_kind(path)) in PACKED:
                     yield from self._read_finished(path)
                     continue
                 if kind not in {MCAP, EMPTY, BEGUN}:
@@ -164,7 +163,7 @@ class Follower:
         self._begin_file()
 
     def _read_finished(self, path: Path) -> Iterator[Messages | Attachment | Metadata]:
-        """The records of a file of another storage, or of a packed file."""
+        """The records of a packed file."""
         if self._finished is None:
             self._finished = self._records_of(path)
         for record in self._finished:

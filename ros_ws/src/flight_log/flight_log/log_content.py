@@ -381,12 +381,9 @@ def _add_metadata(folder: Path, log: LogContent) -> None:
         log.known_end_ns = max(log.known_end_ns, end_ns)
     except ParameterError:
         fault = "cannot be read" if is_file(folder / METADATA) else "is missing"
-        mend = {".mcap": "rise-di report --repair", ".db3": "ros2 bag reindex"}.get(
-            bag_files(folder)[0].suffix
-        )
-        log.notes.append(
-            f"{METADATA} {fault}{f': {mend} {shlex.quote(str(folder))}' if mend else ''}"
-        )
+        is_plain = bag_files(folder)[0].suffix == ".mcap"
+        mend = f": rise-di report --repair {shlex.quote(str(folder))}" if is_plain else ""
+        log.notes.append(f"{METADATA} {fault}{mend}")
     if missing := missing_parts(bag_files(folder), information):
         known = f"named in {METADATA}" if information else "a number before the last"
         log.notes.append(

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Opens the files of a log for every reader: MCAP and SQLite, packed files, compressed messages,
-several files of a bag.
+"""Opens the files of a log for every reader: packed files, compressed messages, several files of a
+bag.
 
 A path that is no log is refused in one sentence with what is there.
 """
@@ -24,7 +24,6 @@ from flight_log.bag import stack_topic
 from flight_log.file_kinds import (
     BEGUN,
     EMPTY,
-    LOGS,
     LZ4,
     MCAP,
     PACKED,
@@ -32,6 +31,7 @@ from flight_log.file_kinds import (
     ZSTD_MAGIC,
     file_kind,
 )
+from flight_log.named_vectors import tables
 from flight_log.rosbag2_metadata import (
     METADATA,
     PACKED_SUFFIXES,
@@ -40,7 +40,6 @@ from flight_log.rosbag2_metadata import (
     plain_name,
 )
 from flight_log.scan import MAX_CHUNK_BYTES, MessageBatch, Scan
-from flight_log.sqlite_scan import SqliteScan, message_tables
 
 A_RUN = "the folder of a run or an MCAP file"
 ROSBAG2 = "rosbag2"
@@ -59,9 +58,9 @@ def log_files(run: Path) -> list[Path]:
     """
     files = [*bag_files(run), *(bag_files(run / ROSBAG2) if is_folder(run / ROSBAG2) else ())]
     kinds = [file_kind(file) for file in files]
-    if not any(kind in (*LOGS, *PACKED) for kind in kinds) and not (
-        is_folder(run) and {EMPTY, BEGUN} & {*kinds}
-    ):
+    is_log = any(kind in (MCAP, *PACKED) for kind in kinds)
+    is_begun = is_folder(run) and bool({EMPTY, BEGUN} & {*kinds})
+    if SQLITE in kinds or not (is_log or is_begun):
         raise ParameterError(f"{run}: found {_what_is_there(run, files, kinds)}, expected {A_RUN}")
     return files
 
@@ -130,7 +129,7 @@ def missing_parts(files: Sequence[Path], information: Mapping[str, Any]) -> list
 
 
 @contextmanager
-def open_scan(file: Path) -> Iterator["Scan | SqliteScan"]:
+def open_scan(file: Path) -> Iterator[Scan]:
     """The reader of a file of a log, by the first bytes; a packed file is unpacked into a temporary
     folder.
 
@@ -138,24 +137,17 @@ def open_scan(file: Path) -> Iterator["Scan | SqliteScan"]:
     """
     kind = file_kind(file)
     if kind not in PACKED:
-        yield SqliteScan(file) if kind == SQLITE else Scan(file)
+        yield Scan(file)
         return
     with TemporaryDirectory(prefix="rise-di-") as folder:
         plain = Path(folder) / plain_name(file.name)
-        is_complete = _unpack(file, plain, kind)
-        scan = SqliteScan(plain, file) if file_kind(plain) == SQLITE else Scan(plain)
-        require(
-            is_complete or isinstance(scan, Scan),
-            str(file),
-            "a packed file that is truncated",
-            "a whole file",
-        )
-        yield scan
+        _unpack(file, plain, kind)
+        require(file_kind(plain) != SQLITE, str(file), SQLITE, A_RUN)
+        yield Scan(plain)
 
 
-def _unpack(file: Path, plain: Path, kind: str) -> bool:
-    """Write the content of a packed file; of a truncated file the beginning. Returns whether the
-    file is whole.
+def _unpack(file: Path, plain: Path, kind: str) -> None:
+    """Write the content of a packed file; of a truncated file the beginning.
 
     Raises ParameterError.
     """
@@ -175,12 +167,11 @@ def _unpack(file: Path, plain: Path, kind: str) -> bool:
                 )
                 target.write(block)
     except (EOFError, RuntimeError, zstandard.ZstdError):
-        return False
+        return
     except OSError as error:
         raise ParameterError(
             f"{file}: cannot be unpacked ({error.strerror or error}), expected {A_RUN}"
         ) from None
-    return True
 
 
 def log_topics(run: Path, remaps: Mapping[str, str] = {}) -> dict[str, str]:
@@ -230,10 +221,12 @@ def plain_batches(batch: MessageBatch) -> Iterator[MessageBatch]:
     if not len(batch.data) or batch.data[0, :4].tobytes() != ZSTD_MAGIC:
         yield batch
         return
-    rows = [plain_message(row.tobytes()) for row in batch.data]
-    yield from message_tables(
-        batch.channel_id, rows, batch.log_ns, batch.publish_ns, batch.sequence
-    )
+    columns = (batch.log_ns, batch.publish_ns, batch.sequence)
+    begin = 0
+    for table in tables(plain_message(row.tobytes()) for row in batch.data):
+        end = begin + len(table)
+        yield MessageBatch(batch.channel_id, table, *(column[begin:end] for column in columns))
+        begin = end
 
 
 def require_mcap(file: Path) -> None:
@@ -241,6 +234,4 @@ def require_mcap(file: Path) -> None:
     kind = file_kind(file)
     if kind in PACKED and file.name.endswith(PACKED_SUFFIXES):
         kind += f", which {UNPACK[file.suffix]} unpacks"
-    elif kind == SQLITE:
-        kind += ", which ros2 bag reindex repairs"
     require(kind in {MCAP, EMPTY, BEGUN}, str(file), kind, "an MCAP file")

@@ -144,8 +144,8 @@ def read_accounted(
     """Read the folder or a file of a run: named vectors by topic name (without the namespace),
     samples by stamp.
 
-    The bag comes from this stack or from `ros2 bag record`: MCAP or SQLite, in one or several
-    files, compressed or not. A truncated MCAP file is read up to the last complete chunk.
+    The bag comes from this stack or from `ros2 bag record`: MCAP, in one or several files,
+    compressed or not. A truncated MCAP file is read up to the last complete chunk.
     `run.tape.account` has the share of each topic, and `run.tape.notes` say what the log lacks; a
     log without a scenario has no account.
 
