@@ -195,9 +195,5 @@ def test_fault_that_cannot_be_is_refused_with_the_mend(fault: str, sentence: str
     assert refusal("osprey", fault).startswith(f"faults[0]: {sentence}")
 
 
-def test_keys_of_earlier_versions_and_second_faults_of_a_kind_are_refused() -> None:
-    assert refusal("osprey", lost_at=[0.0] * 4) == (
-        "lost_at: found a key of earlier versions, expected aircraft.actuators.faults, a list of "
-        "INPUT KIND AT, as aileron lost 60"
-    )
+def test_second_fault_of_a_kind_is_refused() -> None:
     assert refusal("osprey", "rudder slow 1", "rudder slow 2").endswith("expected one of each kind")

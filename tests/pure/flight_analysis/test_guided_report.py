@@ -4,6 +4,7 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 from pytest import approx
+from tests.conftest import refusing
 from tests.plots import drawn
 from tests.recordings import EPOCH, signal
 
@@ -19,13 +21,16 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report import guided_figures
 from flight_analysis.report.guided import guidance_summary, segments
 from flight_analysis.report.html import write_page
+from flight_analysis.report.run_folder import read_flight
 from flight_analysis.report.summary import RecordedFlight, summarise
-from flight_core.tape import Tape
+from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 from flight_guidance.fence import Fence, Zone
 from flight_guidance.guidance import names
 from flight_guidance.guidance_state import Lateral, Mode, Vertical
 from flight_guidance.path import Arc, Line
+from flight_log.bag import LogAttachments
+from flight_log.tape_writer import write_run
 
 pytestmark = pytest.mark.slow
 
@@ -141,6 +146,20 @@ def flight() -> RecordedFlight:
     scenario = find_scenario("osprey_route").vary(flight={"duration": 4.0})
     tape = simulate(scenario)
     return RecordedFlight("osprey_route", scenario, tape, summarise(tape, scenario))
+
+
+def test_log_without_a_channel_of_guidance_is_refused(
+    flight: RecordedFlight, tmp_path: Path
+) -> None:
+    guidance = flight.tape["guidance"]
+    kept = [name for name in guidance.names if name not in {"missed", "age.link"}]
+    fewer = Signal(
+        guidance.stamp_ns, tuple(kept), np.column_stack([guidance[name] for name in kept])
+    )
+    tape = replace(flight.tape, signals={**flight.tape.signals, "guidance": fewer})
+    write_run(tape, tmp_path / "run", LogAttachments(find_scenario("osprey_route").path))
+    with refusing("guidance: found a log without missed, age.link, expected all of its channels"):
+        read_flight(tmp_path / "run")
 
 
 def test_figures_of_flight_are_those_of_scenario(flight: RecordedFlight) -> None:

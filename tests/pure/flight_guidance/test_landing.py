@@ -24,7 +24,9 @@ from flight_core.tape import Tape
 from flight_guidance.guidance_state import Lateral
 from flight_guidance.landing import flare_climb, time_to_touch
 from flight_guidance.modes import holding
+from flight_guidance.notices import LEARNED
 from flight_guidance.params import GuidanceConfig
+from flight_guidance.reach import Authority
 
 GROUND = -40.0  # m; the osprey starts at 0
 ROUTE = {
@@ -119,7 +121,8 @@ def test_box_ahead_is_flown_to_and_a_missed_box_goes_around(across: Scenario) ->
     lander, state, pose, route = low(section_with(across, touchdown=beside), 4.0)
     assert lander.commands(state, pose, route)["leg"] == 1.0
     notices = section_with(across, touchdown=beside).notices()
-    around = dict.fromkeys(notices.CHANNELS, 0.0) | {"leg": 1.0}
+    unlearned = dict(zip(LEARNED, Authority(), strict=True))
+    around = dict.fromkeys(notices.CHANNELS, 0.0) | unlearned | {"leg": 1.0}
     text = "goes around: no touch at the end of leg 0 in guidance.touchdown"
     assert [notice.text for notice in notices.take(1.0, around)] == [text]
 

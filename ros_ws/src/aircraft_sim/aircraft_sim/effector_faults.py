@@ -46,9 +46,6 @@ s, and a half-width of 0.57 deg, or 1 % of thrust."""
 STOPPED = frozenset({"stuck", "lost", "failed", HARD_OVER})
 """The kinds after which an input no longer follows u."""
 
-OLD_KEYS = frozenset(key for kind in KINDS.values() for key in (kind.begin, kind.strength) if key)
-"""Keys of earlier versions, lists with a value per input, and of the arrays."""
-
 FORM = "INPUT KIND AT, as aileron lost 60"
 
 

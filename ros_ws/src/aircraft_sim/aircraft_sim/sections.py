@@ -5,14 +5,14 @@
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal
 
 import numpy as np
 
 from aircraft_sim import effector_faults, wind_field
 from aircraft_sim.turbulence import HIGH, LOW, LOWEST
 from aircraft_sim.uncertainty import AIR_RELATIVE, Distribution, Spread, WindEffect
-from flight_core.fields import Field, Problems
+from flight_core.fields import Field
 from flight_core.parameters import (
     Config,
     NonNegative,
@@ -288,18 +288,6 @@ class ActuatorConfig(Config):
         le=10,
         description="delay of u, s; whole periods of the aircraft",
     )
-
-    @classmethod
-    def read(
-        cls, values: Mapping[Any, Any], key: str, problems: Problems, *, check: bool = True
-    ) -> Self | None:
-        """See `Config.read`; a key of earlier versions is refused with the new key."""
-        old = sorted(effector_faults.OLD_KEYS.intersection(values))
-        if not old:
-            return super().read(values, key, problems, check=check)
-        form = f"{key}.faults, a list of {effector_faults.FORM}"
-        problems.unknown.append(f"{key}.{old[0]}: found a key of earlier versions, expected {form}")
-        return None
 
     def _check(self) -> None:
         self.read_faults()

@@ -7,13 +7,14 @@ The node and the simulation in one process use the same class `Guidance`.
 
 import zlib
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from flight_core.channels import POSE, UNKNOWN
 from flight_core.failures import Failures, sentence
+from flight_core.parameters import require
 from flight_core.rates import nanoseconds, seconds
 from flight_core.vectors import (
     ChannelError,
@@ -50,10 +51,6 @@ LIMITED = ("bank", "theta", "climb", "V", "slew")
 STATE = ("phi", "theta", "alpha", "alpha_trim", "slip", "psi")
 WIND = ("north", "east")
 FENCE = ("action", "clearance", "predicted")
-HEADING = "state.psi"
-ADDED = (LINK_AGE, HEADING, FAILED, *LEARNED)
-"""Channels that logs of earlier versions lack, or flights without a learner: no step takes LINK_AGE
-and FAILED, HEADING is taken by `Lateral.HEADING` alone, and LEARNED is then UNKNOWN."""
 
 
 class GuidanceOutput(NamedTuple):
@@ -81,6 +78,12 @@ def names(outputs: Sequence[str]) -> tuple[str, ...]:
         *(f"y.{name}" for name in outputs),
         *(f"u_m.{name}" for name in outputs),
     )
+
+
+def require_channels(logged: Collection[str]) -> None:
+    """Raise ParameterError for a log of guidance without one of the channels of `names`."""
+    missing = [name for name in names(()) if name not in logged]
+    require(not missing, "guidance", f"a log without {', '.join(missing)}", "all of its channels")
 
 
 def u_m(state: GuidanceState) -> FloatArray:
@@ -141,12 +144,7 @@ def row(
 def restored(
     t_ns: int, logged: Mapping[str, float], outputs: Sequence[str]
 ) -> tuple[Inputs, GuidanceState]:
-    """The inputs of a step and the state after the step, from a sample of the log. Without HEADING
-    it is that of the pose.
-    """
-    logged = (
-        {HEADING: logged["pose.psi"]} | dict(zip(LEARNED, Authority(), strict=True)) | dict(logged)
-    )
+    """The inputs of a step and the state after the step, from a sample of the log."""
 
     def group(prefix: str, keys: Sequence[str]) -> tuple[float, ...]:
         return tuple(logged[f"{prefix}.{key}"] for key in keys)

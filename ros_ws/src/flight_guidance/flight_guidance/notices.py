@@ -8,12 +8,11 @@ log.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
 
-from flight_core.channels import UNKNOWN
 from flight_core.failures import Failures
 from flight_core.vectors import Array, Scalar, array_namespace
 from flight_guidance.fence import RIGHT
@@ -28,13 +27,12 @@ LEARNED = tuple(f"authority.{name}" for name in Authority._fields)
 """Channels of `guidance`: what the inputs can do, as learned in flight."""
 
 FAILED = "failed"
-"""Channel of `guidance`: number of failed steps. Earlier versions had none."""
+"""Channel of `guidance`: number of failed steps."""
 
 LAST_GOES_ON = "a step of guidance failed, the last u_m goes on"
 
 LINK_AGE = "age.link"
-"""Channel of `guidance`: time since the last message of an operator, s, 0 without a limit. Earlier
-versions had none."""
+"""Channel of `guidance`: time since the last message of an operator, s, 0 without a limit."""
 
 TILTED = math.radians(8.0)
 """A multicopter beyond its largest tilt by as much does not follow: a step of the command to the
@@ -115,6 +113,8 @@ class Notices:
         "age.pose",
         "pose.phi",
         "pose.theta",
+        LINK_AGE,
+        *LEARNED,
     )
 
     def __init__(
@@ -167,14 +167,14 @@ class Notices:
         texts += self._outside(t, log["fence.clearance"])
         wind = math.hypot(log["wind.north"], log["wind.east"])
         largest = self._largest_wind(log["V_c"])
-        authority = Authority(*(log.get(name, UNKNOWN) for name in LEARNED))
+        authority = Authority(*(log[name] for name in LEARNED))
         if authority != self._authority:
             earlier = self._reached
             self._authority = authority
             self._reached = self._reach(authority)
             if self._reached != earlier:
                 texts.append(f"from now on {self._reached or 'own limits again'}")
-        if self._link.due(t, holds=log.get(LINK_AGE, 0.0) > self._link_timeout):
+        if self._link.due(t, holds=log[LINK_AGE] > self._link_timeout):
             texts.append(f"no message of an operator for {self._link_timeout:g} s: home")
         if self._stale.due(t, holds=log["age.pose"] > self._max_age):
             texts.append(
@@ -221,23 +221,12 @@ class Notices:
         return []
 
     def read_log(self, t: Array, log: Mapping[str, Array]) -> list[Notice]:
-        """The notices of a whole log, with arrays as channels; none where the log is of a version
-        without these channels.
-        """
-        if not has_channels([*log]):
-            return []
-        names = [*self.CHANNELS, *(name for name in (LINK_AGE, *LEARNED) if name in log)]
-        columns = [log[name].tolist() for name in names]
+        """The notices of a whole log, with arrays as channels."""
+        columns = [log[name].tolist() for name in self.CHANNELS]
         notices: list[Notice] = []
         for instant, *row in zip(t.tolist(), *columns, strict=True):
-            notices += self.take(instant, dict(zip(names, row, strict=True)))
-        if FAILED in log:
-            failures = Failures()
-            rises = t[np.diff(log[FAILED], prepend=0.0) > 0.0]
-            notices += [Notice(at, LAST_GOES_ON) for at in rises.tolist() if failures.add(at)]
+            notices += self.take(instant, dict(zip(self.CHANNELS, row, strict=True)))
+        failures = Failures()
+        rises = t[np.diff(log[FAILED], prepend=0.0) > 0.0]
+        notices += [Notice(at, LAST_GOES_ON) for at in rises.tolist() if failures.add(at)]
         return sorted(notices, key=lambda notice: notice.t)
-
-
-def has_channels(names: Sequence[str]) -> bool:
-    """Whether a log of guidance has the channels of the notices."""
-    return set(Notices.CHANNELS) <= set(names)

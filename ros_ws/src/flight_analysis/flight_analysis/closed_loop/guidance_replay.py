@@ -16,7 +16,7 @@ from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
 from flight_guidance import guidance
-from flight_guidance.guidance_state import Begin, Commands, GuidanceState, Inputs, Lateral
+from flight_guidance.guidance_state import Begin, Commands, GuidanceState, Inputs
 from flight_guidance.notices import FAILED, LINK_AGE
 from flight_guidance.params import GuidanceConfig
 from flight_guidance.path import Route
@@ -62,16 +62,14 @@ def replay_guidance(tape: Tape, parameters: GuidanceConfig | None) -> GuidanceRe
     """Compute every step of the topic `guidance` again, and the published u_m of the instant.
 
     After a failed step the state before stays and the last u_m goes on, which is checked.
-    Steps on a route outside the log are not checked, nor steps with the channels of a different
-    version; a log may lack `guidance.ADDED`; without `guidance.HEADING` the steps that hold a
-    heading are not checked. Raises ParameterError for a log without the scenario's section of
-    guidance.
+    Steps on a route outside the log are not checked, nor steps of a log with other channels.
+    Raises ParameterError for a log without the scenario's section of guidance.
     """
     if parameters is None:
         raise ParameterError("the log: found guidance, expected its section in the scenario too")
     steps = len(tape.time("guidance"))
-    if not _has_known_channels(tape["guidance"].names, parameters.outputs):
-        why = "a different version recorded their channels"
+    if tape["guidance"].names != guidance.names(parameters.outputs):
+        why = "the log has other channels of guidance"
         return GuidanceReplay(steps, 0, 0, None, (f"{steps} steps of guidance not checked: {why}",))
     comparison = _Comparison(tape, parameters)
     differences = [*comparison.differences()]
@@ -82,13 +80,6 @@ def replay_guidance(tape: Tape, parameters: GuidanceConfig | None) -> GuidanceRe
         notes.append(f"{comparison.failed} steps of guidance failed: the last u_m went on")
     first = next(iter(differences), None)
     return GuidanceReplay(steps, comparison.checked, len(differences), first, tuple(notes))
-
-
-def _has_known_channels(names: tuple[str, ...], outputs: tuple[str, ...]) -> bool:
-    """Whether a log has the channels of guidance; `guidance.ADDED` may lack."""
-    expected = guidance.names(outputs)
-    known = [name for name in expected if name in names or name not in guidance.ADDED]
-    return tuple(known) == names
 
 
 class _Comparison:
@@ -116,16 +107,13 @@ class _Comparison:
         for k, (stamp_ns, row) in enumerate(rows):
             channels = dict(zip(self._names, row.tolist(), strict=True))
             inputs, recorded = guidance.restored(stamp_ns, channels, self._outputs)
-            without_heading = (
-                recorded.lateral is Lateral.HEADING and guidance.HEADING not in channels
-            )
             begins = previous is not None or inputs.begin is Begin.HOLD
             # After a failed step without a sample in the log the filters begin again.
-            failed = channels.get(FAILED, 0.0)
+            failed = channels[FAILED]
             goes_on = failed > failed_before and inputs.begin is Begin.NO
             failed_before = failed
             self.failed += goes_on
-            if int(channels["route"]) in self._legs and not without_heading and begins:
+            if int(channels["route"]) in self._legs and begins:
                 self.checked += 1
                 computed = self._computed(previous, inputs, channels, goes_on=goes_on)
                 u_m = self._published.get(stamp_ns, guidance.u_m(recorded))
@@ -147,10 +135,9 @@ class _Comparison:
             state, commands = previous, Commands()
         else:
             state, commands = guidance.step(previous, inputs, self._legs[flown], self._params)
-        copied = channels.get(LINK_AGE, 0.0), int(channels.get(FAILED, 0.0))
+        copied = channels[LINK_AGE], int(channels[FAILED])
         row = guidance.row(inputs, state, commands, flown, *copied)
-        logged = [name in self._names for name in guidance.names(self._outputs)]
-        return np.append(row[logged], guidance.u_m(state))
+        return np.append(row, guidance.u_m(state))
 
     def _difference(self, k: int, recorded: FloatArray, computed: FloatArray) -> Difference | None:
         """The first channel of step k with a different bit."""

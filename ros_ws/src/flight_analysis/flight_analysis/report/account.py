@@ -293,20 +293,19 @@ def _lack(name: str, topic: TopicAccount, end: float, late: float, *, late_u: bo
 
 
 def account_of_json(summary: Mapping[str, Any]) -> Account | None:
-    """The account in a summary; None for a summary of an earlier version."""
+    """The account in a summary; None for a summary without one."""
     content = summary.get("account")
     if content is None:
         return None
     values: dict[str, Any] = content | {
         "topics": {
-            name: TopicAccount(**{key: topic[key] for key in TopicAccount._fields if key in topic})
+            name: TopicAccount(**{key: topic[key] for key in TopicAccount._fields})
             for name, topic in content["topics"].items()
         },
         "processes": {
-            name: ProcessAccount(**process)
-            for name, process in content.get("processes", {}).items()
+            name: ProcessAccount(**process) for name, process in content["processes"].items()
         },
-        "commands": content.get("commands") and Commands(**content["commands"]),
+        "commands": content["commands"] and Commands(**content["commands"]),
     }
     lists = {name: tuple(value) for name, value in values.items() if isinstance(value, list)}
     return Account(**(values | lists))

@@ -25,7 +25,7 @@ from flight_guidance.guidance_state import (
     Vertical,
     bits,
 )
-from flight_guidance.notices import FAILED, LINK_AGE, Notice, has_channels
+from flight_guidance.notices import FAILED, LINK_AGE, Notice
 from flight_guidance.params import GuidanceConfig
 from flight_guidance.path import Route, is_orbit, leg_places, lengths_after, route_outline
 from flight_guidance.zones import clearance
@@ -94,14 +94,8 @@ def segments(tape: Tape) -> list[Segment]:
     errors = control_errors(tape)
     times = sample_times(tape["guidance"].stamp_ns)
     log = tape["guidance"]
-    targets = [f"target.{name}" for name in TARGETS if f"target.{name}" in log.names]
-    named = [
-        "mode.lateral",
-        "mode.vertical",
-        "leg",
-        *targets,
-        *(name for name in ("joining",) if name in log.names),
-    ]
+    targets = [f"target.{name}" for name in TARGETS]
+    named = ["mode.lateral", "mode.vertical", "leg", *targets, "joining"]
     columns = np.column_stack([log[name] for name in named])
     follows = [k for k, name in enumerate(named) if name in {"target.altitude", "target.climb"}]
     # they change along the leg
@@ -132,14 +126,9 @@ def segments(tape: Tape) -> list[Segment]:
 
 
 def flown_legs(tape: Tape) -> list[FlownLeg]:
-    """The legs of a guided flight in order, from `guidance`: flown, missed, or not ended.
-
-    Empty for a log of a version without the channels.
-    """
+    """The legs of a guided flight in order, from `guidance`: flown, missed, or not ended."""
     t = tape.time("guidance")
     log = tape["guidance"]
-    if "missed" not in log.names:
-        return []
     legs = np.where(log["mode.lateral"] == Lateral.ROUTE, log["leg"], -1.0)
     chosen = log["given"].astype(np.int64) & bits(("leg",))  # a leg chosen again begins again
     edges = np.flatnonzero((np.diff(legs) != 0.0) | (chosen[1:] != 0)) + 1
@@ -179,9 +168,7 @@ def unflown_legs(tape: Tape, section: GuidanceConfig) -> range:
         return range(0)
     last = int(on_route[-1])
     limit = section.home.link_timeout or math.inf
-    lost = (
-        LINK_AGE in log.names and last + 1 < len(log.stamp_ns) and log[LINK_AGE][last + 1] > limit
-    )
+    lost = last + 1 < len(log.stamp_ns) and log[LINK_AGE][last + 1] > limit
     replaced = (
         last + 1 < len(log.stamp_ns) and int(log["given"][last + 1]) & bits(LATERAL) and not lost
     )
@@ -408,8 +395,6 @@ def guidance_notices(tape: Tape, section: GuidanceConfig | None) -> list[str]:
         return []
     log = tape["guidance"]
     t = tape.time("guidance")
-    if not has_channels(log.names):
-        return []
     flown = known_routes(tape, section)
     notes = []
     for number, k in zip(*np.unique(log["route"], return_index=True), strict=True):
@@ -448,21 +433,15 @@ def guidance_summary(tape: Tape, section: GuidanceConfig | None = None) -> dict[
         "wind": _mean_wind(tape),
         "bank": _largest(log["pose.phi"]),
         "age_pose": _largest(log["age.pose"]),
-        "failed": int(log[FAILED][-1]) if FAILED in log.names else 0,
+        "failed": int(log[FAILED][-1]),
         "limited": {name: float(np.mean(limited[name] != 0.0)) for name in limited.names},
     }
 
 
-def _mean_wind(tape: Tape) -> dict[str, float] | None:
-    """Mean of the estimated wind to the north and to the east, m/s; None for a log of a version
-    without the channels.
-    """
+def _mean_wind(tape: Tape) -> dict[str, float]:
+    """Mean of the estimated wind to the north and to the east, m/s."""
     log = tape["guidance"]
-    return (
-        {name: float(np.mean(log[f"wind.{name}"])) for name in WIND}
-        if "wind.north" in log.names
-        else None
-    )
+    return {name: float(np.mean(log[f"wind.{name}"])) for name in WIND}
 
 
 def _largest(values: NDArray[np.float64]) -> float:

@@ -242,8 +242,7 @@ def cross_track_figure(context: PlotContext) -> Figure | None:
     log = context.tape["guidance"]
     lateral = log["mode.lateral"]
     on_path = np.isin(lateral, [Lateral.ORBIT, Lateral.ROUTE])
-    if "joining" in log.names:  # the way to a leg has no line to be beside
-        on_path &= log["joining"] == 0.0
+    on_path &= log["joining"] == 0.0  # the way to a leg has no line to be beside
     if not on_path.any():
         return None
     error = Curve(_signal(context, {"xtrack": np.where(on_path, log["xtrack"], np.nan)}), ERROR)

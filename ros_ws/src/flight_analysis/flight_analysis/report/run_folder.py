@@ -40,6 +40,7 @@ from flight_core.rates import NANOSECONDS
 from flight_core.scenario_file import A_SCENARIO
 from flight_core.tape import Tape
 from flight_core.text import printable
+from flight_guidance.guidance import require_channels
 from flight_log.bag import CHANNEL_UNITS, IMPORTED, OUTCOME_FILE, LogAttachments
 from flight_log.engagements import Engagement
 from flight_log.provenance import FLIGHT, provenance
@@ -216,6 +217,8 @@ def _flight(recorded: RecordedRun, run: Path, outcome: Outcome | None) -> Record
     outcome = outcome or _previous_outcome(recorded, folder, scenario)
     if outcome == COMPLETED and not {"u", "internals"} & set(log.signals) and engagements is None:
         outcome = NEVER_ENGAGED
+    if "guidance" in log:
+        require_channels(log["guidance"].names)
     tape = flown(log)
     flight_account = account(log, scenario, outcome, simulated=engagements is None)
     engaged = _engaged(tape, engagements or [])

@@ -144,7 +144,7 @@ def _guided(tape: Tape, section: GuidanceConfig, *, has_landed: bool) -> list[Sh
 
 def _failed_steps(tape: Tape) -> list[Shortfall]:
     """The steps of guidance without commands: the commands of the step before went on."""
-    count = int(tape["guidance"]["failed"].max()) if "failed" in tape["guidance"].names else 0
+    count = int(tape["guidance"]["failed"].max())
     if not count:
         return []
     sentence = f"{count} steps of guidance failed"

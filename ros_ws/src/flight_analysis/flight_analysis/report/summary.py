@@ -293,8 +293,7 @@ def _commands(tape: Tape, events: Sequence[Transient], end: float) -> Commands:
     targets = sum(
         tape.recording[topic].found for topic in ("target", "route") if topic in tape.recording
     )
-    guided = "guidance" in tape and "given" in tape["guidance"].names
-    steps_taken = int(np.count_nonzero(tape["guidance"]["given"])) if guided else 0
+    steps_taken = int(np.count_nonzero(tape["guidance"]["given"])) if "guidance" in tape else 0
     return Commands(len(commands), sum(start <= end for start in commands), targets, steps_taken)
 
 

@@ -283,7 +283,7 @@ def _tick_table(summary: Mapping[str, Any]) -> Table:
         ]
         if latency is not None:
             rows.append(("y sent to u sent median / p99 / max (ms)", ms(*latency.values())))
-        if (age := summary.get("age_of_u")) is not None:  # none in a summary of an earlier version
+        if (age := summary["age_of_u"]) is not None:
             rows.append(("age of u at the aircraft mean / max (ms)", ms(*age.values())))
     return Table(f"Ticks of the controller{taken_over(summary, 'ticks')}", [Column("", "")], rows)
 

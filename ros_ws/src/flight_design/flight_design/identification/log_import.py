@@ -27,7 +27,7 @@ from flight_design.identification.parameter_agreement import (
     servo_of,
     stick_of,
 )
-from flight_log.bag import COMPARED, IMPORTED
+from flight_log.bag import IMPORTED
 from flight_log.tape_reader import RecordedRun
 from flight_log.vehicle_log import COPTER, PLANE, ULOG_TORQUES, Source, VehicleLog
 
@@ -406,20 +406,12 @@ def _pose(channel_map: ChannelMap, log: VehicleLog, first: int, last: int) -> Si
 
 
 def require_map_of_import(channel_map: ChannelMap, recorded: RecordedRun) -> None:
-    """Raise ParameterError for an imported log whose u is not by the map, but by rows of another
-    map or an earlier version.
-    """
+    """Raise ParameterError for an imported log whose u is by rows of another map."""
     source = recorded.metadata.get(IMPORTED)
     if source is None:
         return
     key = str(recorded.path or "the log")
     again = f"that of the map {channel_map.name}: import the log again, with --map"
-    require(
-        COMPARED in source,
-        key,
-        "a log of an earlier version, which did not compare its parameters with the map",
-        again,
-    )
     maps = [stored.content for stored in recorded.attachments if stored.name != PARAMETERS]
     require(len(maps) == 1, key, f"{len(maps)} maps in the log", "the one of the import")
     content = parse_yaml(maps[0], key, "a channel map")
