@@ -155,7 +155,7 @@ def test_names_of_python_control_are_taken() -> None:
         inputs=["elevator"],
         outputs=["u", "w", "q", "theta"],
     )
-    with refusing(r"feet and metres"):  # the labels have no unit, and A is in ft
+    with refusing(r"expected -g = -9.81"):  # the labels have no unit, and A is in ft
         import_airframe(system, thrust=True, speed="176 ft/s")
     frame, _ = import_airframe(system, thrust=True, speed="176 ft/s", states=NAMES["states"])
     assert list(frame.inputs) == ["elevator", "thrust"]
@@ -338,7 +338,7 @@ REFUSED: dict[str, tuple[Any, dict[str, Any], str]] = {
     "wrong units": (
         SYSTEM,
         {"states": "u: m/s, w: m/s, q: rad/s, theta: rad"},
-        "feet and metres are mixed up",
+        "u_dot = -32.2 theta in SI, expected -g = -9.81",
     ),
 }
 

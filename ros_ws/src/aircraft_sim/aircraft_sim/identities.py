@@ -11,13 +11,12 @@ sec. 3.7; B. Etkin, L. D. Reid, Dynamics of Flight, 3rd ed. (1996), eq. (4.9,18)
 """
 
 from collections.abc import Iterator, Mapping
-from itertools import chain, combinations
 from typing import NamedTuple
 
 import numpy as np
 
 from flight_core.parameters import ParameterError
-from flight_core.units import ANGLE, ANGULAR_RATE, FOOT, GRAVITY, LENGTH, SPEED, quantity
+from flight_core.units import ANGLE, ANGULAR_RATE, GRAVITY, LENGTH, SPEED, quantity
 from flight_core.vectors import FloatArray
 
 KINDS = {
@@ -87,17 +86,6 @@ Published aircraft have 0.27 to 3.3, 0.04 to 0.93 and 0.04 to 1.1. A column per 
 57 times off.
 """
 
-FACTORS = {
-    "degrees and radians": 180.0 / np.pi,
-    "feet and metres": 1.0 / FOOT,
-    "knots and m/s": 3600.0 / 1852.0,
-    "knots and ft/s": FOOT * 3600.0 / 1852.0,
-    "km/h and m/s": 3.6,
-    "crad and rad": 100.0,
-    "crad and deg": np.pi / 1.8,
-}
-"""Ratios of units that are taken for each other."""
-
 
 class Model(NamedTuple):
     """The linear model of an airframe in the units of the file."""
@@ -130,30 +118,22 @@ class Model(NamedTuple):
 
 
 class Finding(NamedTuple):
-    """A contradiction: what the file has, what is expected, and a mend where the numbers tell."""
+    """A contradiction: what the file has, and what is expected."""
 
     key: str
     actual: str
     expected: str
-    mend: str = ""
-    mended: Model | None = None  # the model with the mend
 
 
 def check(model: Model) -> None:
-    """Raise ParameterError for the first contradiction, with the first mend of every contradiction:
-    the finding's own, else a rearrangement of A or B.
-    """
-    findings = list(contradictions(model))
-    if not findings:
+    """Raise ParameterError for the first contradiction."""
+    finding = next(contradictions(model), None)
+    if finding is None:
         return
-    key, actual, expected, mend, mended = findings[0]
-    simplest = [] if mended is None else [(mend, mended)]
-    mends = chain(simplest, rearranged(model))
-    mend = next((text for text, changed in mends if not any(contradictions(changed))), mend)
-    way_out = f": {mend}" if mend else ""
     skip = "(identities: false in the file skips this check)"
     raise ParameterError(
-        f"airframe {model.name}: {key}: found {actual}, expected {expected}{way_out} {skip}"
+        f"airframe {model.name}: {finding.key}: found {finding.actual}, "
+        f"expected {finding.expected} {skip}"
     )
 
 
@@ -167,46 +147,6 @@ def contradictions(model: Model) -> Iterator[Finding]:
     yield from _strengths(model)
 
 
-def rearranged(model: Model) -> Iterator[tuple[str, Model]]:
-    """The model with the arrangement of A or B changed, and the sentence that says so."""
-    A = model.file_A
-    B = model.file_B
-    names = list(model.states)
-    inputs = list(model.effects)
-    units = list(model.states.items())
-    yield (
-        "A is transposed: write a row a state derivative, a column a state",
-        model._replace(file_A=A.T),
-    )
-    for order in _orders(len(inputs)):
-        listed = ", ".join(inputs[k] for k in order)
-        yield (
-            f"the columns of B have the order {listed}",
-            model._replace(file_B=B[:, np.argsort(order)]),
-        )
-    one_order = "A and B need one order of the states"
-    for order in _orders(len(A)):
-        listed = ", ".join(names[k] for k in order)
-        place = np.argsort(order)
-        renamed = model._replace(
-            states=dict(units[k] for k in order), gravity=model.gravity[np.ix_(order, order)]
-        )
-        yield f"the matrices have the states in the order {listed}: name the states so", renamed
-        yield f"the rows of A have the order {listed}", model._replace(file_A=A[place])
-        yield f"the columns of A have the order {listed}", model._replace(file_A=A[:, place])
-        yield f"the rows of B have the order {listed}: {one_order}", model._replace(file_B=B[place])
-        both = model._replace(file_A=A[np.ix_(place, place)])
-        yield f"A has the states in the order {listed}, unlike B: {one_order}", both
-
-
-def _orders(count: int) -> Iterator[list[int]]:
-    """Orders in which two of the items are exchanged."""
-    for i, j in combinations(range(count), 2):
-        order = list(range(count))
-        order[i], order[j] = j, i
-        yield order
-
-
 def _dimensions(model: Model) -> Iterator[Finding]:
     for name, unit in model.states.items():
         known = "V" if name.lower() == "vt" else name.lower()  # as books have it
@@ -214,13 +154,7 @@ def _dimensions(model: Model) -> Iterator[Finding]:
             yield Finding(f"states.{name}", name, f"{known}: the name by which a state is checked")
         dimension, words = KINDS.get(name, (None, ""))
         if dimension is not None and quantity(unit).dimension != dimension:
-            near = {"w": "alpha", "v": "beta", "alpha": "w", "beta": "v"}.get(name)
-            yield Finding(
-                f"states.{name}",
-                unit,
-                words,
-                f"a state in {unit} is {near} perhaps" if near else "",
-            )
+            yield Finding(f"states.{name}", unit, words)
 
 
 def _entries(model: Model) -> Iterator[Finding]:
@@ -237,7 +171,6 @@ def _entries(model: Model) -> Iterator[Finding]:
             "2 g/V0": 2.0 * GRAVITY / V0,
             "2 g/V0^2": 2.0 * GRAVITY / V0**2,
         }
-    right = dict.fromkeys(values, True)
     for (row, column), (sign, symbol, (least, most)) in EXPECTED.items():
         row = "altitude" if row == "h" and "altitude" in names else row  # noqa: PLW2901 - the two names of a height
         if row not in names or column not in names or (V0 == 0.0 and "V0" in symbol):
@@ -249,33 +182,9 @@ def _entries(model: Model) -> Iterator[Finding]:
         )  # a multirotor hovers
         if least <= entry / expected <= most or left_out:
             continue
-        right[symbol] = False
-        key = "A"
-        mend = _mend(entry / expected)
-        if "V0" in symbol and right["g"] and entry * sign > 0.0:
-            fits = f", and A fits {abs(entry):.4g} m/s" if symbol == "V0" else ""
-            key = "speed"
-            mend = f"speed is in m/s{fits}; {row} and {column} need the units of A"
         about = f"{'-' if sign < 0.0 else ''}{symbol} = {expected:.4g}" if symbol else f"{sign:.0f}"
-        yield Finding(key, f"{row}_dot = {entry:.4g} {column} in SI", about, mend)
-
-
-def _mend(ratio: float) -> str:
-    """What a ratio of the found to the expected value tells."""
-    if ratio == 0.0:
-        return "the entry is missing"
-    sign = "the sign is reversed" if ratio < 0.0 else ""
-    size = abs(ratio)
-    away = {
-        words: min(abs(size / factor - 1.0), abs(size * factor - 1.0))
-        for words, factor in FACTORS.items()
-    }
-    nearest = min(away, key=lambda words: away[words])
-    if away[nearest] < 0.06:
-        return f"{nearest} are mixed up, give each state the unit that A has" + (
-            ", and " + sign if sign else ""
-        )
-    return sign
+        at_speed = f" at the speed {V0:.4g} m/s" if "V0" in symbol else ""
+        yield Finding("A", f"{row}_dot = {entry:.4g} {column} in SI", about + at_speed)
 
 
 def _kinematic_rows(model: Model) -> Iterator[Finding]:
@@ -322,19 +231,10 @@ def _effects(model: Model) -> Iterator[Finding]:
         row = next((row for row in rows.split() if row in names), None)
         value = 0.0 if row is None else float(model.matrix_b()[names.index(row), k])
         if row is not None and value * sign <= 0.0:
-            mend = (
-                f"correct `positive`, or the sign of the column {name} of B"
-                if value
-                else "the entry is missing"
-            )
-            reversed_column = np.where(np.arange(len(model.inputs)) == k, -1.0, 1.0)
-            mended = model._replace(file_B=model.file_B * reversed_column)
             yield Finding(
                 f"inputs.{name}",
                 f"{row}_dot = {value:.4g} {name} beside {phrase!r}",
                 f"{'more' if sign > 0 else 'less'} than 0",
-                mend,
-                mended if _moves_most(model, row, k) else None,
             )
 
 
@@ -356,27 +256,9 @@ def _strengths(model: Model) -> Iterator[Finding]:
         )
         ratio = abs(float(model.matrix_b()[i, k])) / scale if scale > 0.0 else least
         if not least <= ratio <= most:
-            mend = ""
-            mended = None
-            units = model.inputs
-            for unit in (*model.states.values(), "deg", "rad"):
-                factor = quantity(units[k]).si / quantity(unit).si
-                if quantity(unit).dimension == ANGLE and least <= ratio * factor <= most:
-                    mend = f"B is per {unit}, and the unit {units[k]}?"
-                    mended = model._replace(inputs=(*units[:k], unit, *units[k + 1 :]))
-                    break
             known = f"{least * scale:.2g} to {most * scale:.2g} for an aircraft with this A"
             yield Finding(
                 f"inputs.{name}.unit",
                 f"{rate}_dot = {model.matrix_b()[i, k]:.3g} {name} in SI",
                 known,
-                mend,
-                mended,
             )
-
-
-def _moves_most(model: Model, row: str, k: int) -> bool:
-    """Whether no control surface moves a state at once by more than input k."""
-    effects = np.abs(model.matrix_b()[list(model.states).index(row)])
-    surfaces = [name in model.angular for name in model.effects]
-    return bool(effects[k] >= np.max(effects[surfaces], initial=0.0))
