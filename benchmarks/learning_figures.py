@@ -41,10 +41,10 @@ LABELS = {
     "learner": "learner",
     "true": "true model",
 }
-RIVALS = ("rise", "pi", "l1", "indi", "mrac", "self_tuner", "lqg", "rise_observer")
+RIVALS = ("rise", "pi", "l1", "indi", "lqg", "rise_observer")
 OBJECTIVE = "gust_turbulence"
 """Laws of the catalogue with the gains that ship, of a search with this cost on the airframe file
-in the loop of osprey_servo. MRAC measures the full state, and INDI the actuators too."""
+in the loop of osprey_servo. INDI measures the actuators too."""
 
 
 def figures(rows: Sequence[Row]) -> Iterator[evidence.Row]:

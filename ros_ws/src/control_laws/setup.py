@@ -20,6 +20,7 @@ setup(
             "lqg = control_laws.lqg:LqgConfig",
             "indi = control_laws.indi:IndiConfig",
             "lqi = control_laws.lqi:LqiConfig",
+            "mackunis = control_laws.mackunis:MacKunisConfig",
             "excitation = control_laws.excitation:ExcitationConfig",
         ]
     },

@@ -31,7 +31,10 @@ def scenario_file(path: Path, controller: dict[str, Any]) -> Path:
     [
         (
             "pid",
-            "found 'pid', expected a registered law: excitation, indi, l1, lqg, lqi, pi, rise_di",
+            (
+                "found 'pid', expected a registered law: excitation, indi, l1, lqg, lqi, "
+                "mackunis, pi, rise_di"
+            ),
         ),
         (
             "lqi",

@@ -21,6 +21,7 @@ from tests.pure.flight_analysis.test_replay import BUSY, equal
 
 from aircraft_sim.airframe import load_airframe
 from control_laws import lqg
+from control_laws.catalogue import LAWS
 from flight_analysis.closed_loop.replay import replay
 from flight_analysis.closed_loop.simulate import simulate
 from flight_core.modes import Mode
@@ -546,7 +547,7 @@ def test_page_names_every_registered_law_and_parameters() -> None:
     for name in laws.names():
         own = (
             []
-            if name in {"lqi", "indi"}
+            if name in {"lqi", "indi", "mackunis"}
             else set(laws.schema(name).model_fields) - set(ControllerConfig.model_fields)
         )
         for word in (name, *own):
@@ -555,7 +556,7 @@ def test_page_names_every_registered_law_and_parameters() -> None:
 
 def test_unregistered_law_refused() -> None:
     """The sentence lists the registered laws."""
-    registered = "excitation, indi, l1, lqg, lqi, pi, pid, rise_di"
+    registered = "excitation, indi, l1, lqg, lqi, mackunis, pi, pid, rise_di"
     refused(
         f"controller.law: found 'adrc', expected a registered law: {registered}",
         COMMON | {"law": "adrc"},
@@ -573,6 +574,15 @@ def test_law_of_more_than_y_refused() -> None:
         f"controller.law: found 'indi', which needs the positions of the actuators, {topics}",
         COMMON | {"law": "indi"},
     )
+    refused(
+        f"controller.law: found 'mackunis', which needs the derivative of y, {topics}",
+        COMMON | {"law": "mackunis"},
+    )
+
+
+def test_compared_laws_are_those_that_a_scenario_names() -> None:
+    """The excitation controls nothing, and `pid` is a package of an example."""
+    assert {law.law for law in LAWS.values()} == {*laws.names()} - {"excitation", "pid"}
 
 
 def test_entry_point_that_is_no_law_refused(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,14 +9,11 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from pytest import approx
-from scipy.linalg import block_diag, solve_discrete_are
-from scipy.signal import lfilter
+from scipy.linalg import solve_discrete_are
 
-from control_laws import l1, lqi, observed, observer_design, riccati, self_tuner
+from control_laws import l1, lqi, observed, observer_design, riccati
 from control_laws.catalogue import LAWS, initial_gains
 from control_laws.nominal_model import NominalModel, conditional_integration
 from flight_analysis.closed_loop.scenario_library import find_scenario
@@ -111,51 +108,6 @@ def law_of(name: str, model: NominalModel, **values: Any) -> tuple[ControlLaw, A
     """A law of the catalogue and its parameters; the initial ones of a search without gains."""
     law = LAWS[name]
     return law.control_law(model), law.params(gains(**values) or initial_gains(law, model), model)
-
-
-@settings(max_examples=30, deadline=None)
-@given(
-    st.lists(st.floats(-0.3, 0.3), min_size=8, max_size=8),
-    st.lists(st.floats(-1.0, 1.0), min_size=4, max_size=4),
-)
-def test_inversion_cancels_model_and_leaves_error_own_dynamics(
-    osprey: NominalModel, x_of: list[float], y_m_dot_of: list[float]
-) -> None:
-    x = np.array(x_of)[:, None]
-    y_m_dot = np.array(y_m_dot_of)[:, None]
-    K = np.array([[9.0], [8.0], [4.0], [2.0]])
-    control_law, params = law_of("di", osprey, K=K)
-    y = osprey.C @ x
-    measured = Measurements(y, y - 0.1, y_m_dot, 0.0 * y, 0.0 * y, 0.0 * y, x, x, 0.0 * y)
-    _, u = control_law.step(control_law.engage(measured, params), measured, np.array(DT), params)
-    y_dot = osprey.C @ (osprey.A @ x + osprey.gravity @ np.sin(x) + osprey.B @ u)
-    # e = 0.1, so e_dot = -0.1 K exactly; what is left is rounding of terms of size 10
-    assert_allclose(y_dot - y_m_dot, -0.1 * K, atol=1e-12)
-
-
-def test_inversion_with_vanes_uses_state_relative_to_air(osprey: NominalModel) -> None:
-    x = np.zeros((8, 1))
-    air = np.zeros((8, 1))
-    air[1] = 0.05
-    y = osprey.C @ x
-    measured = Measurements(y, y, 0.0 * y, 0.0 * y, 0.0 * y, 0.0 * y, x, air, 0.0 * y)
-    u = {}
-    for name in ("di", "di_vanes"):
-        control_law, params = law_of(name, osprey, K=np.ones((4, 1)))
-        u[name] = control_law.step(
-            control_law.engage(measured, params), measured, np.array(DT), params
-        )[1]
-    assert not u["di"].any()
-    assert_allclose(osprey.Omega @ u["di_vanes"], -osprey.C @ osprey.A @ air, atol=1e-12)
-
-
-def test_integral_of_inversion_rejects_constant_disturbance() -> None:
-    model = integrator()
-    without = fly(*law_of("di", model, K=8.0), 2000, 0.0, 1.0, model)
-    with_integral = fly(*law_of("di_pi", model, K=8.0, Lambda=2.0), 2000, 0.0, 1.0, model)
-    # without the integral K e = d at rest; sampling changes nothing, since y_dot is then 0
-    assert without.y[-1] == approx(1.0 / 8.0, rel=1e-9)
-    assert abs(with_integral.y[-1]) < 1e-9
 
 
 def test_doubling_solves_the_riccati_equation(osprey: NominalModel) -> None:
@@ -271,122 +223,6 @@ def test_l1_with_feedforward_does_not_cancel_disturbance_twice() -> None:
     assert abs(y - y_m_dot * 500 * DT) < 0.01 * 0.7 / 3.0
 
 
-def test_weights_of_mrac_converge_to_model_error() -> None:
-    model = integrator()
-    flight = fly(
-        *law_of("mrac", model, K=2.0, adaptation=20.0, bias=20.0, leak=0.0), 4000, 0.3, 0.7, model
-    )
-    assert abs(flight.y[-1]) < 1e-6
-    assert flight.state.W[0, 1, 0] == approx(0.7, rel=1e-4)  # the weight of 1 is the disturbance
-
-
-def test_lyapunov_function_of_mrac_decreases_as_in_theory() -> None:
-    model = integrator(period=1e-4)
-    K, gamma, d = 2.0, 20.0, 0.7
-    control_law, params = law_of("mrac", model, K=K, adaptation=gamma, bias=gamma, leak=0.0)
-    W = control_law.engage(at(0.3), params)
-    y = 0.3
-    u = np.zeros(COLUMN)
-    values = []
-    decay = 0.0
-    for _ in range(10_000):
-        # the weights to be learned: 0 of x, d of the constant
-        values.append(
-            y**2 / 2.0 + (W.W[0, 0, 0] ** 2 + (W.W[0, 1, 0] - d) ** 2) / (2.0 * gamma) + decay
-        )
-        decay += K * y**2 * model.period
-        W, u = control_law.step(W, at(y, u_before=u), np.array(model.period), params)
-        y += model.period * (2.0 * u.item() + d)
-    # V + integral of K e^2 is constant in continuous time; Euler steps of 0.1 ms keep it within 1
-    # in 1000
-    assert_allclose(values, values[0], rtol=1e-3)
-
-
-def self_tuner_gains(**changes: float) -> dict[str, float]:
-    return {
-        "K": 3.0,
-        "Lambda": 0.1,
-        "filter": 10.0,
-        "memory": 1e9,
-        "prior_A": 1e4,
-        "prior_Omega": 1e4,
-        "prior_bias": 1e4,
-    } | changes
-
-
-def test_self_tuner_converges_to_aircraft_under_commands_in_calm_air() -> None:
-    model = integrator(Omega=2.0)
-    A = -1.5
-    Omega = 3.0
-    y = 0.0  # the nominal model has an A of 0
-    control_law, params = law_of("self_tuner", model, **self_tuner_gains())
-    state = control_law.engage(at(y), params)
-    u = np.zeros(COLUMN)
-    for k in range(600):
-        state, u = control_law.step(
-            state, at(y, 0.1 * (-1.0) ** (k // 100), u_before=u), np.array(DT), params
-        )
-        y += DT * (A * y + Omega * u.item())
-    # input scale 1 / 2; the prior is 1e8 times weaker than the signals
-    assert_allclose(state.theta[0, :, 0], [A, Omega / 2.0, 0.0], atol=1e-4)
-
-
-def test_self_tuner_estimates_as_least_squares_over_all_ticks() -> None:
-    model = integrator()
-    a = 1.0 - np.exp(-10.0 * DT)
-    ticks = 40
-    memory = 0.5
-    deviation = np.array([2.0, 3.0, 5.0])
-    own = self_tuner_gains(memory=memory, prior_A=2.0, prior_Omega=3.0, prior_bias=5.0)
-    control_law, params = law_of("self_tuner", model, **own)
-    y, u = np.random.default_rng(1).normal(0.0, [[1.0], [3.0]], (2, ticks))
-    y[0] = u[0] = 0.0
-    state = control_law.engage(at(0.0), params)
-    for k in range(ticks):
-        state, _ = control_law.step(
-            state, at(y[k], u_before=np.full(COLUMN, u[k])), np.array(DT), params
-        )
-    y_f, u_f = (lfilter([a], [1.0, a - 1.0], signal) for signal in (y, u))
-    before = np.concatenate([[0.0], y_f[:-1]])
-    phi = np.stack([before, 2.0 * u_f, np.ones(ticks)], axis=1)
-    nominal = np.array([0.0, 1.0, 0.0])
-    # 3 unknowns a tick: theta is a Markov process around the nominal with this deviation, seen with
-    # noise of variance 1 / dt
-    kept = np.exp(-DT / memory)
-    step = np.eye(3 * ticks) - kept * np.eye(3 * ticks, k=-3)
-    of_step = np.tile(1.0 / (deviation * np.sqrt(1.0 - kept**2)), ticks)
-    of_step[:3] = 1.0 / deviation
-    seen = np.sqrt(DT) * block_diag(*phi[:, None, :])
-    residual = np.sqrt(DT) * ((y_f - before) / DT - phi @ nominal)
-    found, *_ = np.linalg.lstsq(
-        np.vstack([seen, of_step[:, None] * step]), np.append(residual, np.zeros(3 * ticks))
-    )
-    assert_allclose(state.theta[0, :, 0], nominal + found[-3:], rtol=1e-8)
-
-
-def test_self_tuner_without_excitation_returns_to_nominal_model(osprey: NominalModel) -> None:
-    control_law, params = law_of("self_tuner", osprey)
-    state = control_law.engage(at(np.zeros(4)), params)
-    calm = at(np.zeros(4))
-    before = state._replace(theta=state.theta + 1.0, P=0.5 * state.P)
-    for _ in range(5):
-        before, _ = control_law.step(before, calm, 5.0 * params.memory[0, 0], params)
-    # exp(-25) of theta and exp(-50) of P are left; the bias alone is seen in calm
-    assert_allclose(before.theta[:, :-1], self_tuner.nominal_theta(osprey)[:, :-1, None], atol=1e-9)
-    assert_allclose(before.P[:-1, :-1], state.P[:-1, :-1], atol=1e-12)
-
-
-def test_self_tuner_keeps_signs_and_least_size_of_effects(osprey: NominalModel) -> None:
-    nu = np.array([[1.0], [2.0], [-1.0], [0.5]])
-    Omega = self_tuner.nominal_theta(osprey)[:, 4:8, None]
-    expected = np.linalg.solve(Omega[..., 0], nu)
-    assert_allclose(self_tuner.solve(Omega, nu, osprey.D), expected, rtol=1e-12)
-    for share in (-1.0, 0.0, 0.1):  # an estimate of the wrong sign, or too small
-        wrong = share * np.eye(4)[..., None]
-        assert_allclose(self_tuner.solve(wrong, nu, osprey.D), nu / self_tuner.LEAST_EFFECT)
-    assert_allclose(self_tuner.solve(wrong, nu, -osprey.D), -nu / self_tuner.LEAST_EFFECT)
-
-
 def test_indi_needs_no_model_except_input_gain() -> None:
     model = integrator()
     for Omega in (2.0, 1.4, 2.6):
@@ -401,36 +237,6 @@ def test_indi_needs_no_model_except_input_gain() -> None:
         # exp(-2 15) of the start and the disturbance, were it first order
         assert abs(flight.y[-1]) < 1e-6, Omega
         assert flight.u[-1] == approx(-0.7 / Omega, rel=1e-5)
-
-
-def reaching(e_0: float) -> float:
-    """Reaching time, s: from then on abs(e) stays below 1e-4 of its initial value."""
-    model = integrator(period=2e-4)
-    flight = fly(*law_of("twisting", model, root=3.0, beta=2.0), 15_000, e_0, 0.0, model)
-    return float((np.flatnonzero(np.abs(flight.y) > 1e-4 * e_0)[-1] + 1) * model.period)
-
-
-def test_super_twisting_reaching_time() -> None:
-    """The reaching time is proportional to the root of the initial error."""
-    # e(t) = c E(t / sqrt(c)) solves it for any c where E does: an exponential would take as long
-    # from anywhere. 1 %: with steps of 0.2 ms the sliding is within 1e-7, the arrival within some
-    # ten steps of 1 s
-    assert reaching(4.0) == approx(2.0 * reaching(1.0), rel=0.01)
-
-
-def test_super_twisting_rejects_a_ramp_disturbance() -> None:
-    model = integrator(period=2e-4)
-    # d_dot = 2 < 3
-    flight = fly(
-        *law_of("twisting", model, root=4.0, beta=3.0), 20_000, 0.5, lambda k: 2.0 * k * 2e-4, model
-    )
-    # the sliding of an explicit scheme: of the order of beta dt^2 = 1.2e-7
-    assert np.abs(flight.y[15_000:]).max() < 3e-6
-    linear = fly(
-        *law_of("di_pi", model, K=8.0, Lambda=2.0), 20_000, 0.5, lambda k: 2.0 * k * 2e-4, model
-    )
-    # d_dot / (K Lambda) = 0.125: an integral alone follows late
-    assert np.abs(linear.y[15_000:]).min() > 0.1
 
 
 def test_pi_is_the_law_without_its_sign(osprey: NominalModel) -> None:

@@ -10,20 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from control_laws import (
-    indi,
-    inversion,
-    l1,
-    lqg,
-    lqi,
-    mackunis,
-    mrac,
-    observed,
-    pi,
-    rise_di_law,
-    self_tuner,
-    super_twisting,
-)
+from control_laws import indi, l1, lqg, lqi, mackunis, observed, pi, rise_di_law
 from control_laws.nominal_model import NominalModel
 from flight_core.vectors import FloatArray
 from rise_di_controller import law as rise
@@ -39,12 +26,9 @@ crossover."""
 
 INITIAL_CHANNEL_GAINS = {
     "beta": 5.0,
-    "root": 1.0,
     "bandwidth": 15.0,
     "share": 0.7,
     "drift": 0.1,
-    "adaptation": 10.0,
-    "bias": 10.0,
     "integral": 2.0,
     "effort": 0.05,
     "rate_drift": 0.5,
@@ -57,13 +41,8 @@ INITIAL_COMMON_GAINS = {
     "softening": 3.0,
     "omega": 1.5,
     "filter": 12.6,
-    "leak": 0.05,
     "fade": 4.0,
     "loose": 0.01,
-    "memory": 30.0,
-    "prior_A": 1.0,
-    "prior_Omega": 0.1,
-    "prior_bias": 1.0,
 }
 """Initial gains common to all channels."""
 
@@ -83,6 +62,7 @@ class Law(NamedTuple):
     """A law."""
 
     title: str
+    law: str  # that a scenario names as controller.law
     measurements: str  # of the aircraft, besides y_m
     model_data: str  # of the nominal aircraft, besides D
     control_law: Callable[[NominalModel], ControlLaw]
@@ -106,19 +86,6 @@ def initial_gains(law: Law, model: NominalModel) -> Gains:
         name: np.full((model.wind.shape[1], 1), value) for name, value in INITIAL_WIND_GAINS.items()
     }
     return {name: gains[name] for name in law.tuned}
-
-
-def _full_state_laws() -> dict[str, Law]:
-    """Each law of FULL_STATE with the measured state, and with the state relative to the air, from
-    vanes.
-    """
-    entries: dict[str, Law] = {}
-    for name, (title, control_law, params, tuned) in FULL_STATE.items():
-        measured = partial(control_law, vanes=False)
-        relative = partial(control_law, vanes=True)
-        entries[name] = Law(title, "full state", _model, measured, params, tuned)
-        entries[f"{name}_vanes"] = Law(title, "full state, vanes", _model, relative, params, tuned)
-    return entries
 
 
 def _over(
@@ -148,32 +115,23 @@ _observer_gains = ("effort", "gust", "wind_time", "drift", "loose")
 _soft, _implicit = (_fixed(rise.CONTROL_LAWS[sign]) for sign in (Sign.SOFT, Sign.IMPLICIT))
 _filtered, _ideal = (partial(mackunis.control_law, ideal=ideal) for ideal in (False, True))
 _l1, _l1_ff = (_fixed(l1.CONTROL_LAWS[feedforward]) for feedforward in (False, True))
+_lqi, _lqi_vanes = (partial(lqi.control_law, vanes=vanes) for vanes in (False, True))
 _model = "A, B, f"
 _wind = "A, B, f, wind, lags, noise"
 
-FULL_STATE: dict[
-    str,
-    tuple[str, Callable[..., ControlLaw], Callable[[Gains, NominalModel], Any], tuple[str, ...]],
-] = {
-    "di": ("dynamic inversion", inversion.control_law, inversion.inversion_params, ("K",)),
-    "di_pi": (
-        "dynamic inversion + PI",
-        inversion.control_law,
-        inversion.inversion_params,
-        ("K", "Lambda"),
-    ),
-    "mrac": ("MRAC", mrac.control_law, mrac.mrac_params, ("K", "adaptation", "bias", "leak")),
-    "lqi": ("LQI", lqi.control_law, lqi.lqi_params, ("integral", "effort", "fade")),
-}
-"""Title, law, parameters and tuned gains of the laws of the full state; these laws also fly with
-vanes, relative to the air."""
-
 LAWS: dict[str, Law] = {
     "rise": Law(
-        "RISE-DI, softened sign", "y", "Omega_ii", _soft, rise_di_law.params_of, _rise_gains
+        "RISE-DI, softened sign",
+        "rise_di",
+        "y",
+        "Omega_ii",
+        _soft,
+        rise_di_law.params_of,
+        _rise_gains,
     ),
     "rise_implicit": Law(
         "RISE-DI, implicit sign",
+        "rise_di",
         "y",
         "Omega_ii",
         _implicit,
@@ -182,10 +140,18 @@ LAWS: dict[str, Law] = {
         linear=False,
     ),
     "rise_ff": Law(
-        "RISE-DI + feedforward", "y", _model, _soft, rise_di_law.params_of, _rise_gains, AIRCRAFT
+        "RISE-DI + feedforward",
+        "rise_di",
+        "y",
+        _model,
+        _soft,
+        rise_di_law.params_of,
+        _rise_gains,
+        AIRCRAFT,
     ),
     "rise_observer": Law(
         "RISE-DI + feedforward + observer",
+        "rise_di",
         "y",
         _wind,
         _fixed(with_observer(rise.CONTROL_LAWS[Sign.SOFT])),
@@ -195,6 +161,7 @@ LAWS: dict[str, Law] = {
     ),
     "pi_observer": Law(
         "PI + feedforward + observer",
+        "pi",
         "y",
         _wind,
         _fixed(with_observer(pi.CONTROL_LAW)),
@@ -204,6 +171,7 @@ LAWS: dict[str, Law] = {
     ),
     "lqg": Law(
         "LQG + feedforward",
+        "lqg",
         "y",
         _wind,
         _fixed(with_observer(lqg.CONTROL_LAW)),
@@ -213,6 +181,7 @@ LAWS: dict[str, Law] = {
     ),
     "eso": Law(
         "PI + feedforward + extended-state observer",
+        "pi",
         "y",
         "Omega, lags, noise",
         _fixed(with_observer(pi.CONTROL_LAW)),
@@ -220,9 +189,10 @@ LAWS: dict[str, Law] = {
         ("K", "Lambda", "effort", "drift", "rate_drift", "decay"),
         INTEGRATORS,
     ),
-    "pi": Law("PI", "y", "Omega_ii", _fixed(pi.CONTROL_LAW), pi.params_of, ("K", "Lambda")),
+    "pi": Law("PI", "pi", "y", "Omega_ii", _fixed(pi.CONTROL_LAW), pi.params_of, ("K", "Lambda")),
     "pi_ff": Law(
         "PI + feedforward",
+        "pi",
         "y",
         _model,
         _fixed(pi.CONTROL_LAW),
@@ -230,21 +200,13 @@ LAWS: dict[str, Law] = {
         ("K", "Lambda"),
         AIRCRAFT,
     ),
-    "l1": Law("L1", "y", "Omega", _l1, l1.params_of, ("K", "bandwidth")),
+    "l1": Law("L1", "l1", "y", "Omega", _l1, l1.params_of, ("K", "bandwidth")),
     "l1_ff": Law(
-        "L1 + feedforward", "y", _model, _l1_ff, l1.params_of, ("K", "bandwidth"), AIRCRAFT
-    ),
-    "twisting": Law(
-        "super-twisting",
-        "y",
-        "Omega",
-        super_twisting.control_law,
-        super_twisting.twisting_params,
-        ("root", "beta"),
-        linear=False,
+        "L1 + feedforward", "l1", "y", _model, _l1_ff, l1.params_of, ("K", "bandwidth"), AIRCRAFT
     ),
     "mackunis": Law(
         "MacKunis RISE, filtered difference",
+        "mackunis",
         "y",
         "Omega",
         _filtered,
@@ -253,27 +215,38 @@ LAWS: dict[str, Law] = {
     ),
     "mackunis_ideal": Law(
         "MacKunis RISE, perfect y_dot",
+        "mackunis",
         "y, y_dot",
         "Omega",
         _ideal,
         mackunis.mackunis_params,
         _rise_gains,
     ),
-    "self_tuner": Law(
-        "indirect self-tuner",
-        "y",
-        "A, B, lags",
-        self_tuner.control_law,
-        self_tuner.self_tuner_params,
-        ("K", "Lambda", "filter", "memory", "prior_A", "prior_Omega", "prior_bias"),
-        linear=False,
-    ),
     "indi": Law(
         "INDI",
+        "indi",
         "y, actuators",
         "Omega",
         indi.control_law,
         indi.indi_params,
         ("K", "bandwidth", "share"),
     ),
-} | _full_state_laws()
+    "lqi": Law(
+        "LQI",
+        "lqi",
+        "full state",
+        _model,
+        _lqi,
+        lqi.lqi_params,
+        ("integral", "effort", "fade"),
+    ),
+    "lqi_vanes": Law(
+        "LQI",
+        "lqi",
+        "full state, vanes",
+        _model,
+        _lqi_vanes,
+        lqi.lqi_params,
+        ("integral", "effort", "fade"),
+    ),
+}

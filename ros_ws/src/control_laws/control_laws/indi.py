@@ -10,10 +10,9 @@ from control_laws.nominal_model import (
     NominalModel,
     campaign_law,
     filter_gain,
-    params_of_gains,
     saturate,
 )
-from flight_core.vectors import Array, array_namespace
+from flight_core.vectors import Array, FloatArray, array_namespace
 from rise_di_controller.control_law import ControlLaw, Measurements
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.saturation import Limits
@@ -67,7 +66,9 @@ def control_law(model: NominalModel) -> ControlLaw:
     return campaign_law(IndiState, engage, limited)
 
 
-indi_params = params_of_gains(IndiParams)
+def indi_params(gains: dict[str, FloatArray], _: NominalModel) -> IndiParams:
+    """Parameters from the gains, shapes (m, N)."""
+    return IndiParams(**gains)
 
 
 class IndiConfig(ControllerConfig):

@@ -15,6 +15,7 @@ from control_laws.nominal_model import (
 )
 from flight_core.vectors import Array, FloatArray, array_namespace
 from rise_di_controller.control_law import ControlLaw, Measurements
+from rise_di_controller.params import ControllerConfig
 from rise_di_controller.saturation import Limits
 
 
@@ -84,6 +85,12 @@ def control_law(model: NominalModel, *, ideal: bool) -> ControlLaw:
         return MacKunisState(state.e_0, e, e_dot, integral_e, Pi), u_free, u
 
     return campaign_law(MacKunisState, engage, limited)
+
+
+class MacKunisConfig(ControllerConfig):
+    """The acceleration-based RISE inversion, flown by campaigns only."""
+
+    needs = "the derivative of y"
 
 
 def mackunis_params(gains: dict[str, FloatArray], model: NominalModel) -> MacKunisParams:

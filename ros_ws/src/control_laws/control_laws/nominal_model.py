@@ -58,13 +58,6 @@ class NominalModel(NamedTuple):
         )
 
 
-def params_of_gains(
-    kind: Callable[..., Any],
-) -> Callable[[dict[str, FloatArray], NominalModel], Any]:
-    """Parameters of a law with the gains as fields, shapes (m, N) or (1, N)."""
-    return lambda gains, model: kind(**gains)
-
-
 def campaign_law(
     state: type[Any],
     engage: Callable[[Measurements, Any], Any],

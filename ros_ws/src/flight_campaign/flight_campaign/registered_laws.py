@@ -61,6 +61,7 @@ def registered_law(controller: ControllerConfig, name: str) -> Law:
 
     return Law(
         f"law {controller.law}, gains of the scenario",
+        controller.law,
         "y",
         "own parameters",
         lambda model: controller.tuned_law().control_law,

@@ -23,19 +23,8 @@ from rise_di_controller.laws import AnyLaw
 from rise_di_controller.model_sections import FeedforwardConfig, ObserverConfig
 from rise_di_controller.params import ControllerConfig
 
-REGISTERED = {
-    "rise": "rise_di",
-    "rise_implicit": "rise_di",
-    "rise_ff": "rise_di",
-    "rise_observer": "rise_di",
-    "pi": "pi",
-    "pi_ff": "pi",
-    "pi_observer": "pi",
-    "eso": "pi",
-    "l1": "l1",
-    "l1_ff": "l1",
-    "lqg": "lqg",
-}
+FROM_Y = ("rise_di", "pi", "l1", "lqg")
+REGISTERED = {name: law.law for name, law in LAWS.items() if law.law in FROM_Y}
 """The registered law of a law of the catalogue: of those that measure y alone and that a scenario
 can fly."""
 
