@@ -21,7 +21,8 @@ from rich.console import Console
 from flight_analysis.closed_loop.learning_loop import Learn, LearnerResult
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
-from flight_campaign.campaign import Definition, define
+from flight_campaign.campaign import define
+from flight_campaign.definition import Definition
 from flight_campaign.learning_flights import side_by_side
 from flight_campaign.statistics import score, score_units
 from flight_core.parameters import ParameterError

@@ -71,7 +71,7 @@ def test_limits_follow_from_the_size(tmp_path: Path, monkeypatch: pytest.MonkeyP
     with path.open("ab") as stream:
         stream.truncate(10_000_000)
     read_foreign_log(path)
-    assert given == {"timeout": 5.0 + 60.0, "memory": (1 << 30) + 1_000_000_000}
+    assert (given["timeout"], given["memory"]) == (5.0 + 60.0, (1 << 30) + 1_000_000_000)
 
 
 def test_log_from_the_isolated_process_is_that_of_this_one(tmp_path: Path) -> None:

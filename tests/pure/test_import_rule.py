@@ -116,6 +116,15 @@ def test_no_unit_imports_itself_over_others() -> None:
     assert len(list(TopologicalSorter(IMPORTS).static_order())) == len(IMPORTS)  # raises CycleError
 
 
+def test_no_file_imports_itself_over_others() -> None:
+    """Imports inside functions and under TYPE_CHECKING count: they only hide a circle."""
+    files = {module_of(path).removesuffix(".__init__"): path for path in FILES}
+    graph = {
+        module: (imported_modules(path) & files.keys()) - {module} for module, path in files.items()
+    }
+    assert len(list(TopologicalSorter(graph).static_order())) == len(files)  # raises CycleError
+
+
 def test_architecture_page_shows_table_in_layers() -> None:
     page = (REPOSITORY / "docs" / "architecture.md").read_text()
     lines = re.findall(r"^```text\n(.*?)```$", page, re.MULTILINE | re.DOTALL)[0].splitlines()

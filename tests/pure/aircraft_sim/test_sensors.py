@@ -22,7 +22,8 @@ from aircraft_sim.sensors import (
     transmit,
     walk,
 )
-from aircraft_sim.simulator import Simulator, StateSpaceModel
+from aircraft_sim.simulator import Simulator
+from aircraft_sim.state_space_model import StateSpaceModel
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_core.vectors import FloatArray

@@ -25,7 +25,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_cli.export import Export
 from flight_design.identification.module_log import STATUS, module_flight
-from flight_log.vehicle_log import Table, VehicleLog
+from flight_log.vehicle_tables import Table, VehicleLog
 from rise_di_controller.internals import Saturation
 from rise_di_controller.params import ControllerConfig
 

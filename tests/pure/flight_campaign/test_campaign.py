@@ -42,16 +42,9 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.guided import control_errors
 from flight_analysis.report.run_folder import REPORT, SUMMARY
 from flight_campaign import campaign, device, engines, equipment, learning_flights
-from flight_campaign.campaign import (
-    CHUNKS,
-    Campaign,
-    Definition,
-    Sweep,
-    define,
-    fly_chunk,
-    fly_chunk_figures,
-)
+from flight_campaign.campaign import CHUNKS, Campaign, define, fly_chunk, fly_chunk_figures
 from flight_campaign.campaign_report import figure_rows, overview
+from flight_campaign.definition import Definition, Sweep
 from flight_campaign.influence import rank_correlations
 from flight_campaign.rows import Chunk, encode, entry_names, tally_of
 from flight_campaign.statistics import WORST_KEPT, Figure, Tally, score, score_units

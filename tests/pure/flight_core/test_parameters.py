@@ -21,7 +21,7 @@ from aircraft_sim.airframe import LIBRARY, Airframe, load_airframe
 from flight_analysis.closed_loop.scenario import Scenario, load_scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_campaign.campaign import Definition
+from flight_campaign.definition import Definition
 from flight_core.files import read_yaml, writing
 from flight_core.outcome import COMPLETED
 from flight_core.parameters import Config, ParameterError, flatten, nest

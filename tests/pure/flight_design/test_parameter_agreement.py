@@ -23,7 +23,7 @@ from flight_design.identification.parameter_agreement import (
     servo_of,
     stick_of,
 )
-from flight_log.vehicle_log import ParameterRecord
+from flight_log.vehicle_tables import ParameterRecord
 
 MAPS = ("ardupilot", "ardupilot_mavlink")
 AXES = {"elevator": "PITCH", "thrust": "THROTTLE", "aileron": "ROLL", "rudder": "YAW"}

@@ -10,7 +10,7 @@ import numpy as np
 
 from aircraft_sim.dynamics import Forcing
 from aircraft_sim.params import AircraftConfig
-from aircraft_sim.simulator import POSE_STATES, StateSpaceModel
+from aircraft_sim.state_space_model import POSE_STATES, StateSpaceModel
 from flight_core.channels import VERTICAL, vertical
 from flight_core.kinematics import euler_rates, thrust_axis
 from flight_core.units import GRAVITY

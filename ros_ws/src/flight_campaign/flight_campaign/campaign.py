@@ -11,15 +11,11 @@ import logging
 import math
 from collections.abc import Iterator, Mapping
 from functools import lru_cache, partial
-from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
-
-import numpy as np
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from aircraft_sim.airframe import load_airframe
 from aircraft_sim.uncertainty import (
-    Distribution,
     Spread,
     WindEffect,
     drawn_entries,
@@ -28,20 +24,18 @@ from aircraft_sim.uncertainty import (
 from flight_analysis.closed_loop.guarantee import Guarantee
 from flight_analysis.closed_loop.kept_guarantee import kept
 from flight_analysis.closed_loop.loop_margins import LoopMargins, margins, scenario_loop
-from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario, scenario_of
+from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario
 from flight_campaign import equipment, learning_flights
 from flight_campaign.campaign_course import Course, build_course
+from flight_campaign.definition import Definition, Sweep
 from flight_campaign.engines import Engine, Job
 from flight_campaign.influence import RANKED, influence
 from flight_campaign.learning_flights import MakeLearner
 from flight_campaign.rows import Chunk, encode, joined, tally_of
-from flight_campaign.statistics import Tally, score, score_units
-from flight_core.fields import Field
+from flight_campaign.statistics import Tally, score_units
 from flight_core.files import replacing, write_file, writing
-from flight_core.parameters import Config, ParameterError, Positive, Positives, require
-from flight_core.vectors import FloatArray
+from flight_core.parameters import ParameterError, require
 from rise_di_controller.control_law import TunedLaw
-from rise_di_controller.params import ControllerConfig
 
 if TYPE_CHECKING:
     import polars as pl
@@ -57,167 +51,6 @@ _FITTING: dict[str, int] = {}  # aircraft at once by definition, where a chunk d
 # aircraft at once that learn: the flight takes 3 % of the time, and few leave no core idle
 LEARNING_CHUNK = 10
 MARGIN_AIRCRAFT = 200  # aircraft of a case, the first ones, whose stability is counted
-
-
-class Sweep(Config):
-    """Factors of one parameter of the controller, or of its value in a channel; every aircraft
-    flies with each of them.
-    """
-
-    parameter: str = Field(description="its name, as beta, or with a channel of y or u, as beta[V]")
-    factors: Positives
-
-    @property
-    def name(self) -> str:
-        """Name of the parameter, without the channel."""
-        return self.parameter.partition("[")[0]
-
-    def scaled(self, controller: ControllerConfig, factor: float) -> float | tuple[float, ...]:
-        """The parameter times a factor, in the channel alone where one is named.
-
-        A channel of u means the channel of y that it is paired with. Raises ParameterError for
-        another parameter or channel.
-        """
-        swept = swept_parameters(controller)
-        require(
-            self.name in swept,
-            "sweep",
-            self.parameter,
-            f"a parameter of the controller: {', '.join(swept)}",
-        )
-        value = getattr(controller, self.name)
-        if self.name == self.parameter:
-            return (
-                tuple(factor * number for number in value)
-                if isinstance(value, tuple)
-                else factor * float(value)
-            )
-        m = len(controller.outputs)
-        # k_d of (22) has none for the last
-        by_channel = isinstance(value, tuple) and len(value) in (m - 1, m)
-        require(
-            by_channel, "sweep", self.parameter, f"{self.name}: it does not have a value a channel"
-        )
-        named = [
-            *enumerate(controller.outputs[: len(value)]),
-            *enumerate(controller.inputs[: len(value)]),
-        ]
-        places = [k for k, name in named if f"{self.name}[{name}]" == self.parameter]
-        names = ", ".join(name for _, name in named)
-        require(
-            bool(places), "sweep", self.parameter, f"{self.name}[CHANNEL], CHANNEL one of {names}"
-        )
-        return tuple(
-            factor * number if k == places[0] else number for k, number in enumerate(value)
-        )
-
-
-class Definition(Config):
-    """All inputs of a campaign's figures, except the version of the stack and the arithmetic of the
-    CPU.
-    """
-
-    name: str  # of the scenario
-    sections: dict[str, dict[str, object]]  # of the scenario, every parameter
-    aircraft: int = Field(ge=1, le=2**32, description="how many aircraft fly")
-    uncertainty: float = Field(
-        ge=0, lt=1, description="the largest part by which an entry of A and of B differs"
-    )
-    wind: WindEffect = Field(
-        description="the effect of wind: by each aircraft's own A, or that of the airframe"
-    )
-    seed: int = Field(ge=0, lt=2**63, description="the seed of the aircraft")
-    chunk: int = Field(ge=1, le=1_000_000, description="how many of them fly at once")
-    sweep: Sweep | None = None
-    entries: dict[str, Annotated[float, Field(ge=0, lt=1)]] = Field(
-        default={}, description="the largest part of entries with one of their own, by name"
-    )
-    distribution: Distribution = Field(
-        default="uniform", description="of the parts, within the largest"
-    )
-    score_units: dict[str, Positive] = Field(
-        default={}, description="unit of an rms error in the score by output, SI, if its own"
-    )
-
-    @property
-    def spread(self) -> Spread:
-        """How the entries of A and B are drawn."""
-        return Spread(equipment.matrix_entries(self.entries), self.distribution)
-
-    def drawn_equipment(self, scenario: Scenario, first: int, count: int) -> dict[str, FloatArray]:
-        """Lags, noise and delays of aircraft of a case, as `equipment.drawn`."""
-        return equipment.drawn(
-            scenario, Spread(self.entries, self.distribution), self.seed, first, count
-        )
-
-    def scenario(self, case: int = 0) -> Scenario:
-        """The scenario of a case of the sweep, the airframe as published."""
-        scenario = scenario_of(self.name, Path(self.name), self.sections)
-        if self.sweep is None:
-            return scenario
-        scaled = self.sweep.scaled(scenario.controller, self.factor(case))
-        return scenario.vary(controller={self.sweep.name: scaled})
-
-    def aircraft_scenario(self, number: int, case: int = 0) -> Scenario:
-        """The scenario of one aircraft of the campaign, as `rise-di fly` flies it."""
-        uncertainty: dict[str, Any] = {
-            "A": self.uncertainty,
-            "B": self.uncertainty,
-            "wind": self.wind,
-            "seed": self.seed,
-            "number": number,
-        }
-        entries = self.spread.entries
-        scenario = self.scenario(case)
-        uncertainty |= {
-            "entries": [*entries],
-            "parts": [*entries.values()],
-            "distribution": self.distribution,
-        }
-        drawn = self.drawn_equipment(scenario, number, 1)
-        equipped = equipment.with_equipment(
-            scenario, {name: float(value[0]) for name, value in drawn.items()}
-        )
-        return equipped.vary(aircraft={"uncertainty": uncertainty})
-
-    def score(self, rms: FloatArray) -> FloatArray:
-        """The scores of N aircraft, (N,), of their rms errors, (m, N)."""
-        scenario = self.scenario()
-        units = scenario.aircraft.channels().outputs
-        return score(rms, score_units(scenario.controller.outputs, units, self.score_units))
-
-    @property
-    def cases(self) -> int:
-        """Number of flights of each aircraft."""
-        return 1 if self.sweep is None else len(self.sweep.factors)
-
-    def factor(self, case: int) -> float:
-        """Factor of the swept parameter in a case."""
-        return 1.0 if self.sweep is None else self.sweep.factors[case]
-
-    def label(self, case: int) -> str:
-        """The name of a case in tables."""
-        return (
-            self.name if self.sweep is None else f"{self.sweep.parameter} x {self.factor(case):g}"
-        )
-
-    def size(self, job: Job) -> int:
-        """Number of aircraft of a chunk."""
-        return min(self.chunk, self.aircraft - job[1] * self.chunk)
-
-    def jobs(self) -> Iterator[Job]:
-        """The chunks, each (case, chunk)."""
-        chunks = -(-self.aircraft // self.chunk)
-        return product(range(self.cases), range(chunks))
-
-
-def swept_parameters(controller: ControllerConfig) -> list[str]:
-    """Parameters that a sweep may multiply: the numbers of the law itself, and input_scale."""
-    names = [
-        name for name in type(controller).model_fields if name not in ControllerConfig.model_fields
-    ]
-    values = ((name, np.atleast_1d(getattr(controller, name))) for name in names)
-    return [*(name for name, value in values if value.dtype == np.float64), "input_scale"]
 
 
 def _permitted_units(scenario: Scenario, units: Mapping[str, float]) -> dict[str, float]:

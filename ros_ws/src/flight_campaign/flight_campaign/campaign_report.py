@@ -38,7 +38,8 @@ from flight_analysis.report.summary import finite_or_null
 from flight_analysis.report.summary_rows import Column
 from flight_analysis.report.tables import Table
 from flight_campaign import equipment
-from flight_campaign.campaign import Campaign, Definition
+from flight_campaign.campaign import Campaign
+from flight_campaign.definition import Definition
 from flight_campaign.statistics import (
     EDGES,
     FIRST_MODEL,

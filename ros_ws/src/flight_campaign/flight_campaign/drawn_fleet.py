@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The drawn aircraft of a campaign: on the host, then as arrays of the device."""
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,10 +12,8 @@ from flight_campaign import batch, batch_matrices, equipment
 from flight_campaign.batch_loop import Vehicle
 from flight_campaign.batch_matrices import Fleet
 from flight_campaign.campaign_course import Course
+from flight_campaign.definition import Definition
 from flight_core.vectors import FloatArray
-
-if TYPE_CHECKING:
-    from flight_campaign.campaign import Definition
 
 
 class DrawnFleet(NamedTuple):
@@ -46,7 +44,7 @@ class DrawnFleet(NamedTuple):
         return drawn_entries(airframe, self.A, self.B) | self.equipment
 
 
-def drawn_fleet(definition: "Definition", scenario: Scenario, first: int, count: int) -> DrawnFleet:
+def drawn_fleet(definition: Definition, scenario: Scenario, first: int, count: int) -> DrawnFleet:
     """The `count` aircraft of a campaign from number `first`."""
     part = definition.uncertainty
     airframe = scenario.aircraft.nominal_airframe()

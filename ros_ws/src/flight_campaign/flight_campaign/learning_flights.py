@@ -15,6 +15,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import error_metrics, inputs_by_part, true_error
 from flight_campaign.campaign_course import build_course
+from flight_campaign.definition import Definition
 from flight_campaign.engines import Job
 from flight_campaign.rows import Chunk
 from flight_core.outcome import COMPLETED
@@ -25,7 +26,6 @@ from flight_core.vectors import FloatArray
 from rise_di_controller.proposals import UNVERIFIED, Event, EventKind
 
 if TYPE_CHECKING:
-    from flight_campaign.campaign import Definition
     from flight_campaign.learning_fleet import LearningFleet
 
 MakeLearner = Callable[[Scenario], Learn | None]
@@ -133,7 +133,7 @@ def _kept(make: Callable[..., Any], scenario: Scenario, **options: bool) -> Any:
 
 
 def side_by_side(
-    definition: "Definition",
+    definition: Definition,
     case: int,
     first: int,
     learn: Sequence[Learn],
@@ -158,7 +158,7 @@ def side_by_side(
 
 
 def _fly_side_by_side(
-    definition: "Definition", case: int, first: int, count: int, learner: MakeLearner
+    definition: Definition, case: int, first: int, count: int, learner: MakeLearner
 ) -> list[Flight]:
     """The flights of the `count` aircraft from number `first`.
 
@@ -185,7 +185,7 @@ def _fly_side_by_side(
     return flights
 
 
-def fly_chunk(definition: "Definition", job: Job, learner: MakeLearner) -> Chunk:
+def fly_chunk(definition: Definition, job: Job, learner: MakeLearner) -> Chunk:
     """Fly a chunk of a campaign with learners."""
     from flight_campaign.drawn_fleet import drawn_fleet  # noqa: PLC0415 - JAX, as above
 

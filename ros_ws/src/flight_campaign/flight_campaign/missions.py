@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from aircraft_sim import pose as pose_model
 from aircraft_sim.effector_faults import STOPPED
 from aircraft_sim.sections import StartConfig
-from aircraft_sim.simulator import POSE_STATES
+from aircraft_sim.state_space_model import POSE_STATES
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.metrics import CAPTURE_TIME
 from flight_campaign.campaign_course import ENGAGE, HOLD, STEP, Course, Segments

@@ -24,7 +24,7 @@ from flight_analysis.report.run_folder import REPORT, new_run
 from flight_analysis.report.tables import Table
 from flight_campaign import engines
 from flight_campaign.campaign import Campaign as MonteCarlo
-from flight_campaign.campaign import Definition, Sweep, define
+from flight_campaign.campaign import define
 from flight_campaign.campaign_report import (
     FIGURE_HEADINGS,
     WIND_EFFECTS,
@@ -32,6 +32,7 @@ from flight_campaign.campaign_report import (
     influence_table,
     write_results,
 )
+from flight_campaign.definition import Definition, Sweep
 from flight_campaign.statistics import LOSS_OF_TRACK_SCORE, Tally
 from flight_cli.output import (
     COUNT_COLUMNS,

@@ -28,7 +28,8 @@ from flight_design.identification.parameter_agreement import Agreement
 from flight_log.bag import CHANNEL_UNITS, COMPARED, IMPORTED, LogAttachments
 from flight_log.provenance import provenance
 from flight_log.tape_writer import TapeWriter, write_run
-from flight_log.vehicle_log import Choice, read_foreign_log
+from flight_log.vehicle_log import read_foreign_log
+from flight_log.vehicle_tables import Choice
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,7 +16,7 @@ import tempfile
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
-from types import MappingProxyType
+from types import MappingProxyType, ModuleType
 from typing import Any
 
 from flight_core import confinement
@@ -50,12 +50,13 @@ def call(
     timeout: float,
     memory: int = DATA_LIMIT,
     foreign: bool = True,
+    records: ModuleType | None = None,
 ) -> Any:
     """Return value of function(*arguments) in a fresh process, confined to an empty working folder.
 
     The subprocess finds the function by module and name. Arguments must fit JSON; the return value
-    consists of plain values, arrays, and named tuples of the function's module. FlightEnded and
-    ParameterError of the function are raised here too.
+    consists of plain values, arrays, and named tuples of the module `records`, by default that of
+    the function. FlightEnded and ParameterError of the function are raised here too.
 
     The subprocess has `memory` bytes of data, FILE_LIMIT, and `timeout` seconds of processor time,
     or WAIT times as many of wall time: an endless computation is found on a busy machine too, and a
@@ -89,7 +90,9 @@ def call(
             last = (process.stderr.strip() or "no result").splitlines()[-1]
             raise IsolatedCallError(f"exited with status {process.returncode} ({last})")
         with file.open("rb") as stream:
-            kind, value, open_ways = _Reader(stream, function.__module__).load()
+            kind, value, open_ways = _Reader(
+                stream, records.__name__ if records else function.__module__
+            ).load()
     for way in open_ways if foreign else ():
         note(way)
     if kind in ERRORS:

@@ -13,7 +13,7 @@ import numpy as np
 
 from flight_core.parameters import ParameterError, require
 from flight_log.log_samples import Instances
-from flight_log.vehicle_log import PLANE, Choice, Parameters, Table
+from flight_log.vehicle_tables import PLANE, Choice, Parameters, Table
 
 STILL = 0.1  # of the largest motion: an instance with less does not fly
 UNLIKE = 0.4  # of the deviation of a quantity: two sensors of one quantity differ by less

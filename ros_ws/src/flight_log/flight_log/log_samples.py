@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from flight_core.rates import NANOSECONDS
 from flight_core.vectors import FloatArray
-from flight_log.vehicle_log import PARAMETER, ParameterRecord, Parameters, Table
+from flight_log.vehicle_tables import PARAMETER, ParameterRecord, Parameters, Table
 
 LARGEST = 2**62  # ns, of a damaged stamp
 # an autopilot that goes back by a step has started again; a link may be lost

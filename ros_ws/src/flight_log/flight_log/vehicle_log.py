@@ -6,185 +6,18 @@ Sources: ArduPilot, libraries/AP_Logger/LogStructure.h and ArduPlane/Log.cpp; MA
 PX4 guide, ULog file format, and PX4's msg/*.msg. pymavlink and pyulog decode the files.
 """
 
-import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from io import StringIO
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any, NamedTuple
-
-import numpy as np
-import yaml
-from numpy.typing import NDArray
 
 from flight_core import isolated
 from flight_core.parameters import ParameterError, require
-from flight_core.vectors import FloatArray
+from flight_log import vehicle_tables
 from flight_log.file_kinds import file_kind
-
-DEGREE = math.pi / 180.0
-# channels that are read
-STICKS = 16
-SERVOS = 16
-
-
-class Table(NamedTuple):
-    """The samples of a message: stamps, ns, shape (N,), ascending, and the fields by name, each of
-    shape (N,).
-    """
-
-    stamp_ns: NDArray[np.int64]
-    fields: Mapping[str, FloatArray]
-
-    def at(self, field: str, stamp_ns: NDArray[np.int64]) -> FloatArray:
-        """The newest value of a field at each of some instants, shape (n,); NaN before the
-        first.
-        """
-        places = np.searchsorted(self.stamp_ns, stamp_ns, side="right") - 1
-        return np.where(places < 0, np.nan, self.fields[field][places])
-
-
-class ParameterRecord(NamedTuple):
-    """A value of a parameter of the autopilot, and the instant of the record, ns."""
-
-    stamp_ns: int
-    value: float
-
-
-Parameters = Mapping[str, tuple[ParameterRecord, ...]]
-"""The records of the parameters by name, in the order of the log."""
-
-# a message of DataFlash; the samples of each format have their parameters by this name
-PARAMETER = "PARM"
-
-
-class Source(NamedTuple):
-    """Where a log has a quantity: value = scale field."""
-
-    message: str
-    field: str
-    scale: float = 1.0
-
-
-Sources = Mapping[str, tuple[Source, ...]]
-"""By quantity the places that may have it, the first one first."""
-
-
-class Format(NamedTuple):
-    """A format of logs: what has y and pose in SI (body FRD; north, east, up), the transmitter's
-    channels, the servos.
-    """
-
-    sources: Sources
-    sticks: Source  # its field has the number of the channel in place of {}
-    servos: Source
-    mode: tuple[Source, ...]
-    # of a multicopter's rate controllers, normalised, by what responds to them
-    torques: Sources = MappingProxyType({})
-
-
-def _source(place: str) -> Source:
-    message, field, *factors = place.split()
-    return Source(message, field, *(DEGREE if text == "deg" else float(text) for text in factors))
-
-
-def _sources(places: Mapping[str, Sequence[str]]) -> Sources:
-    return {name: tuple(map(_source, listed)) for name, listed in places.items()}
-
-
-def _format(rows: Mapping[str, Any]) -> Format:
-    return Format(
-        sources=_sources(rows["sources"]),
-        sticks=_source(rows["sticks"]),
-        servos=_source(rows["servos"]),
-        mode=tuple(map(_source, rows["mode"])),
-        torques=_sources(rows.get("torques", {})),
-    )
-
-
-_PLACES = yaml.safe_load(Path(__file__).with_name("vehicle_logs.yaml").read_text(encoding="utf-8"))
-DATAFLASH = _format(_PLACES["dataflash"])
-TLOG = _format(_PLACES["tlog"])
-ULOG_SOURCES = _sources(_PLACES["ulog"]["sources"])
-
-ULOG_TORQUES: Mapping[tuple[str, str], Source] = MappingProxyType(
-    {
-        ("vehicle_torque_setpoint", f"xyz[{axis}]"): Source(
-            "actuator_controls_0", f"control[{axis}]"
-        )
-        for axis in range(3)
-    }
-    | {("vehicle_thrust_setpoint", "xyz[0]"): Source("actuator_controls_0", "control[3]")}
-    | {("vehicle_thrust_setpoint", "xyz[2]"): Source("actuator_controls_0", "control[3]", -1.0)}
-)
-"""Where PX4 before 1.14 has the setpoints of torque and thrust (actuator_controls.msg: roll, pitch,
-yaw, thrust)."""
-
-PLANE = "plane"
-COPTER = "multicopter"
-
-
-class Choice(NamedTuple):
-    """What a user takes of a log, and the kind of vehicle of the map."""
-
-    system: int | None = None  # of a tlog; None: the system that flew
-    # by message; else the sensor or the part that flew
-    instances: Mapping[str, int] = MappingProxyType({})
-    vehicle: str = PLANE
-
-
-ANY = Choice()
-
-
-class VehicleLog(NamedTuple):
-    """A log of an autopilot. `format` is None for a ULog, whose messages have the names of PX4's
-    topics.
-    """
-
-    kind: str
-    tables: Mapping[str, Table]
-    parameters: Parameters
-    format: Format | None
-    vehicle: str = PLANE  # "": the log does not say
-    # the number of the mode in which the sticks of a plane are the commands: 0 of ArduPlane
-    # (mode.h)
-    manual: int = 0
-    # of several systems, sensors or instances: what is taken, and why
-    taken: tuple[tuple[str, str], ...] = ()
-
-    def source(self, quantity: str) -> Source | None:
-        """The place in this log that has a quantity of y or of the pose; None where it has none."""
-        sources = ULOG_SOURCES if self.format is None else self.format.sources
-        return next((source for source in sources.get(quantity, ()) if self.has(source)), None)
-
-    def start_ns(self, quantity: str) -> int:
-        """The first stamp of a quantity that the log has."""
-        source = self.source(quantity)
-        return 0 if source is None else int(self.tables[source.message].stamp_ns[0])
-
-    def parameters_at(self, stamp_ns: int) -> dict[str, float]:
-        """The values of the parameters at an instant, without parameters whose first record comes
-        later.
-        """
-        values: dict[str, float] = {}
-        for name, records in self.parameters.items():
-            known = [record.value for record in records if record.stamp_ns <= stamp_ns]
-            if known:
-                values[name] = known[-1]
-        return values
-
-    def has(self, source: Source) -> bool:
-        """Whether the log has samples of a field."""
-        return source.message in self.tables and source.field in self.tables[source.message].fields
-
-    def at(self, source: Source, stamp_ns: NDArray[np.int64]) -> FloatArray:
-        """The newest value of a place at each of some instants, shape (n,); NaN before the
-        first.
-        """
-        return source.scale * self.tables[source.message].at(source.field, stamp_ns)
-
+from flight_log.vehicle_readers import READERS
+from flight_log.vehicle_tables import ANY, Choice, VehicleLog
 
 EXPECTED = "a DataFlash log (.bin, .log), a tlog or a ULog"
 
@@ -195,8 +28,6 @@ def read_vehicle_log(path: Path, choice: Choice = ANY) -> VehicleLog:
     Raises ParameterError for another file, where no message can be decoded, and where two systems
     or sensors may have flown.
     """
-    from flight_log.vehicle_readers import READERS  # noqa: PLC0415 - the readers need the types of this module
-
     require(path.is_file(), str(path), "no such file", EXPECTED)
     kind = file_kind(path)
     read = next((reader for word, reader in READERS.items() if f" {word} " in f"{kind} "), None)
@@ -262,7 +93,12 @@ def read_foreign_log(path: Path, choice: Choice = ANY) -> VehicleLog:
     plain = choice._replace(instances=dict(choice.instances))
     try:
         return isolated.call(
-            _read_absolute, str(path.absolute()), plain, timeout=timeout, memory=memory
+            _read_absolute,
+            str(path.absolute()),
+            plain,
+            timeout=timeout,
+            memory=memory,
+            records=vehicle_tables,
         )
     except isolated.IsolatedCallError as error:
         raise ParameterError(

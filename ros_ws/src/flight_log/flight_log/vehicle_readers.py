@@ -33,7 +33,7 @@ from flight_log.log_samples import (
     table_of,
     tables_of,
 )
-from flight_log.vehicle_log import (
+from flight_log.vehicle_tables import (
     COPTER,
     DATAFLASH,
     PARAMETER,

@@ -14,8 +14,9 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.report.run_folder import REPORT, new_run
 from flight_campaign import engines
-from flight_campaign.campaign import Campaign, Definition, Sweep, define
+from flight_campaign.campaign import Campaign, define
 from flight_campaign.campaign_report import write_results
+from flight_campaign.definition import Definition, Sweep
 from flight_core.arguments import FilePath, as_count, as_number, as_path
 from flight_core.parameters import ParameterError, require
 from flight_design.learning.scenario_learner import quick_learner

@@ -29,7 +29,7 @@ from flight_design.identification.parameter_agreement import (
 )
 from flight_log.bag import IMPORTED
 from flight_log.tape_reader import RecordedRun
-from flight_log.vehicle_log import COPTER, PLANE, ULOG_TORQUES, Source, VehicleLog
+from flight_log.vehicle_tables import COPTER, PLANE, ULOG_TORQUES, Source, VehicleLog
 
 COMMANDS = "commands"  # the topic with trim + u, by input
 # of the typical airspeed, of a multicopter the typical thrust: below, the aircraft is on the ground
@@ -211,7 +211,7 @@ def _measured(log: VehicleLog, quantity: str, key: str) -> Source:
 
 def _messages(log: VehicleLog, quantity: str) -> str:
     """The messages of a log's format that have a quantity, as a sentence."""
-    from flight_log.vehicle_log import ULOG_SOURCES  # noqa: PLC0415 - of this sentence alone
+    from flight_log.vehicle_tables import ULOG_SOURCES  # noqa: PLC0415 - of this sentence alone
 
     sources = ULOG_SOURCES if log.format is None else log.format.sources
     return (

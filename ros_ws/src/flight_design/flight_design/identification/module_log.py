@@ -14,7 +14,7 @@ from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS, seconds
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray, StampedVector
-from flight_log.vehicle_log import Table, VehicleLog
+from flight_log.vehicle_tables import Table, VehicleLog
 from rise_di_controller import guard, internals
 from rise_di_controller.params import ControllerConfig
 

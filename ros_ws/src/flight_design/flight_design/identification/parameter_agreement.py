@@ -20,7 +20,7 @@ from autopilot_bridge.params import ChannelMap
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import seconds
 from flight_core.vectors import FloatArray
-from flight_log.vehicle_log import SERVOS, Parameters
+from flight_log.vehicle_tables import SERVOS, Parameters
 
 # of a transmitter: Rc.msg from 0, MAVLink from 1
 CHANNEL = re.compile(r"channels\[(\d+)\]|chan(\d+)_raw")

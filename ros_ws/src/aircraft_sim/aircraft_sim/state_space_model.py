@@ -1,0 +1,199 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The linear model of an airframe as a flight dynamics model: equation (1), wind and pose."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from aircraft_sim import plant, pose, truth, turbulence, vanes, wind_field
+from aircraft_sim.disturbance import AXES
+from aircraft_sim.dynamics import Forcing
+from aircraft_sim.params import AircraftConfig
+from flight_core.kinematics import heading_rate
+from flight_core.rates import divide, seconds
+from flight_core.vectors import FloatArray
+
+BLOCK = 100  # steps
+POSE_STATES = ("V", "alpha", "beta", "phi", "theta", "q", "r")
+"""States of an airframe from which its pose follows."""
+
+
+class StateSpaceModel:
+    """Equation (1) with the matrices of an airframe, behind actuators.
+
+    The forcing is computed for BLOCK steps together, which takes a tenth of the time. Heading,
+    position and altitude, no states of an airframe, are integrated by the trapezoidal rule over
+    `advance`, from 0. States missing in the airframe are 0, as in trim.
+    """
+
+    def __init__(self, parameters: AircraftConfig) -> None:
+        self._plant = parameters.plant()
+        self._state = plant.initial_state(self._plant)
+        self._block_ns = 0
+        self._block = plant.forcing(0, BLOCK, self._plant)
+        airframe = parameters.sampled_airframe()
+        self.truth_names = truth.names(airframe)
+        states = list(airframe.states)
+        self._places = [states.index(name) if name in states else None for name in POSE_STATES]
+        self._axes = list(airframe.gusts)
+        self._angles = [
+            (POSE_STATES.index(name), self._axes.index(axis) if axis in self._axes else None)
+            for name, axis in zip(vanes.ANGLES, ("vertical", "lateral"), strict=True)
+        ]
+        self._speed = airframe.speed
+        self._euler = parameters.kinematics != "linear"
+        # north, east, altitude
+        self._psi = 0.0
+        self._position = [0.0, 0.0, 0.0]
+        self._over_place = parameters.relative_wind()
+        self._wind_here = self._wind_at(0)
+        self._wind_dot = np.zeros(3)
+        self._into = np.zeros((len(states), 3))  # of a change of the wind forward, right, down
+        for k, name in enumerate(("V", "beta", "alpha")):
+            if name in states:
+                self._into[states.index(name), k] = -1.0 if name == "V" else -1.0 / self._speed
+        self._psi_dot, self._velocity = (
+            self._heading_rate(self._states()),
+            self._air_velocity(self._states()),
+        )
+
+    def advance(self, t_ns: int, u: FloatArray, duration_ns: int) -> None:
+        """See FlightDynamicsModel."""
+        steps = divide(duration_ns, self._plant.step_ns, "step", "the duration")
+        begin = (t_ns - self._block_ns) // self._plant.step_ns
+        if not 0 <= begin <= begin + steps <= BLOCK or self._drifts(t_ns):
+            self._block_ns = t_ns
+            begin = 0
+            self._block = plant.forcing(t_ns, max(steps, BLOCK), self._plant, self._state.x)
+        forced = Forcing(*(part[2 * begin : 2 * (begin + steps) + 1] for part in self._block))
+        if self._over_place is not None:
+            forced = forced._replace(rate=forced.rate + self._rate_by_wind())
+        self._state = plant.advance(
+            t_ns, self._state, u, duration_ns, self._plant, self._tilted(forced)
+        )
+        half = seconds(duration_ns) / 2.0
+        self._fly_on(2.0 * half)
+        psi_dot = self._psi_dot
+        velocity = self._velocity
+        states = self._states()
+        self._psi_dot = self._heading_rate(states)
+        self._psi += half * (psi_dot + self._psi_dot)
+        self._velocity = self._air_velocity(states)
+        self._position = [
+            x + half * (v + w)
+            for x, v, w in zip(self._position, velocity, self._velocity, strict=True)
+        ]
+        if self._over_place is not None:
+            before = self._wind_here
+            self._position = [
+                x + 2.0 * half * w
+                for x, w in zip(self._position, (*before[:2], -before[2]), strict=True)
+            ]
+            self._wind_here = self._wind_at(t_ns + duration_ns)
+            self._wind_dot = (self._wind_here - before) / (2.0 * half)
+
+    def _tilted(self, forced: Forcing) -> Forcing:
+        """The forcing of a step, with what a tilt takes from the lift: nothing of an airplane."""
+        return forced
+
+    def _fly_on(self, dt: float) -> None:
+        """Integrate over a step what no state of the airframe holds, beside heading and place."""
+
+    def _wind_at(self, t_ns: int) -> FloatArray:
+        """The wind against that of the start, to the north, to the east and down, m/s."""
+        if self._over_place is None:
+            return np.zeros(3)
+        return self._over_place.at(seconds(t_ns), *self._position)
+
+    def _rate_by_wind(self) -> FloatArray:
+        """x_dot by the change of the wind along the flight, shape (n,): the states V, beta and
+        alpha are relative to the air.
+
+        V_dot -= W_dot forward, beta_dot -= W_dot right / V0, alpha_dot -= W_dot down / V0. W_dot is
+        that over the period before. Source: B. Etkin, Dynamics of Atmospheric Flight (1972), 5.5.
+        """
+        _, _, _, phi, theta, *_ = self._states()
+        return self._into @ (wind_field.body_axes(phi, theta, self._psi) @ self._wind_dot)
+
+    def _drifts(self, t_ns: int) -> bool:
+        """Whether the aircraft at t differs from that of the block."""
+        drift = self._plant.drift
+        if drift is None:
+            return False
+        now, before = plant.share(
+            np.array([seconds(t_ns), seconds(self._block_ns)]), drift.start, drift.duration
+        )
+        return bool(now != before)
+
+    def pose(self) -> FloatArray:
+        """See FlightDynamicsModel."""
+        _, _, beta, phi, theta, *_ = self._states()
+        attitude = (pose.wrapped(phi), theta, pose.wrapped(self._psi))
+        velocity = np.array(self._velocity)
+        if self._over_place is not None:
+            velocity += self._wind_here * [1.0, 1.0, -1.0]
+        return np.array([*attitude, *self._position, *velocity, beta])
+
+    def _states(self) -> list[float]:
+        """The POSE_STATES, deviations from trim."""
+        x = self._state.x.tolist()
+        return [0.0 if place is None else x[place] for place in self._places]
+
+    def _heading_rate(self, states: Sequence[float]) -> float:
+        """psi_dot in rad/s from the POSE_STATES; r with the linear kinematics."""
+        *_, phi, theta, q, r = states
+        return heading_rate(phi, theta, q, r) if self._euler else r
+
+    def _air_velocity(self, states: Sequence[float]) -> tuple[float, float, float]:
+        """Velocity relative to the air mass: north, east, up, m/s."""
+        V, alpha, beta, phi, theta, *_ = states
+        return pose.velocity(self._speed + V, alpha, beta, phi, theta, self._psi)
+
+    def y(self) -> FloatArray:
+        """See FlightDynamicsModel."""
+        y: FloatArray = plant.output(self._state, self._plant)
+        return y
+
+    def air_angles(self, t_ns: int) -> FloatArray:
+        """See FlightDynamicsModel: x less the wind along the axis of the angle over V0,
+        `disturbance.AIR_STATE`.
+        """
+        x = self._states()
+        wind = self._block.wind[2 * ((t_ns - self._block_ns) // self._plant.step_ns)]
+        if self._plant.turbulence is not None:
+            wind = wind + turbulence.wind(self._state.turbulence, self._plant.turbulence)
+        return np.array(
+            [
+                x[place] - (0.0 if axis is None else wind[axis] / self._speed)
+                for place, axis in self._angles
+            ]
+        )
+
+    def truth(self, t_ns: int) -> FloatArray:
+        """See FlightDynamicsModel."""
+        index = 2 * ((t_ns - self._block_ns) // self._plant.step_ns)
+        flown = self._plant._replace(aircraft=plant.aircraft_at(t_ns, self._plant, self._state.x))
+        rate = self._block.rate[index]
+        wind = self._block.wind[index]
+        if self._over_place is not None:
+            rate = rate + self._rate_by_wind()
+            along = wind_field.body_axes(0.0, 0.0, self._psi) @ self._wind_here
+            blown = [place for place, axis in enumerate(self._axes) if axis in AXES]
+            wind = wind.copy()
+            wind[blown] += along[[AXES.index(self._axes[place]) for place in blown]]
+        return truth.values(self._state, wind, rate, flown)
+
+    def diverged(self) -> bool:
+        """See FlightDynamicsModel."""
+        return plant.diverged(self._state)
+
+    def retune(self, t_ns: int, parameters: AircraftConfig) -> None:
+        """See FlightDynamicsModel."""
+        aircraft = self._plant.aircraft._replace(gusts=parameters.gust_arrays(self._axes))
+        self._plant = self._plant._replace(
+            aircraft=aircraft,
+            actuators=parameters.actuator_model(),
+            drift=parameters.drift_factors(),
+        )
+        self._block_ns, self._block = t_ns, plant.forcing(t_ns, BLOCK, self._plant, self._state.x)
