@@ -19,24 +19,24 @@ import yaml
 
 from aircraft_sim.airframe import Airframe, load_airframe
 from aircraft_sim.uncertainty import Spread, as_yaml, drawn_places, with_entries
-from flight_analysis.closed_loop.guarantee import Unstable, guarantee
-from flight_analysis.closed_loop.loop_margins import (
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
+from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.linear_loop.guarantee import Unstable, guarantee
+from flight_analysis.linear_loop.loop_margins import (
     LinearLoop,
     box_of,
     linear_loop,
     scenario_loop,
 )
-from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.closed_loop.scenario_library import find_scenario
-from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.linear_loop.uncertain_loop import aircraft_at
+from flight_analysis.linear_loop.worst_case import worst_in_box
 from flight_analysis.report.account import account
 from flight_analysis.report.shortfalls import judged
 from flight_design.gains.gain_design import select_gains
 from flight_design.identification.likelihood import PRIOR
 from flight_design.learning.scenario_learner import learner
 from rise_di_controller.linear_loop import SPECTRAL_RADIUS_TOLERANCE, closed_loop
-from rise_di_controller.uncertain_loop import aircraft_at
-from rise_di_controller.worst_case import worst_in_box
 
 UNCERTAINTY = 0.3
 LATE = 0.01  # s

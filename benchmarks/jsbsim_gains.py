@@ -20,13 +20,13 @@ from pathlib import Path
 import numpy as np
 import yaml
 
+from flight_analysis.linear_loop.input_margins import input_margins
 from flight_core.outcome import FlightEnded
 from flight_core.parameters import ParameterError
 from flight_design.gains.gain_selection import SOFTENING, Selection, gain_candidates, select_gains
 from flight_design.gains.relaxation import binding
 from flight_design.gains.requirement import least_fraction
 from flight_design.identification.step_identification import identify
-from rise_di_controller.margins import loop_margins
 
 CONDITIONS = yaml.safe_load(Path(__file__).with_suffix(".yaml").read_text(encoding="utf-8"))
 FIVE = 5
@@ -69,7 +69,7 @@ def searched(selection: Selection) -> str:
         fresh = best < 0.0 or generator.random() < FRESH
         tried = generator.random((2, m)) * WIDEST if fresh else np.clip(place + step, 0.0, WIDEST)
         loop = build(*np.exp(tried)).loop
-        margins = loop_margins(loop.nominal, loop.law, loop.loop, together=False)
+        margins = input_margins(loop.nominal, loop.law, loop.loop, together=False)
         if np.isfinite(margins.phase).all():
             fraction = least_fraction(margins, selection.setting.requirement)
             if fraction > best:

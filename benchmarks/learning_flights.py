@@ -19,12 +19,12 @@ from aircraft_sim.airframe import Airframe, load_airframe
 from aircraft_sim.turbulence import MODERATE
 from aircraft_sim.uncertainty import AIR_RELATIVE, as_yaml, wind_factors
 from flight_analysis.closed_loop.learning_loop import Learn, Learner, LearnerResult
-from flight_analysis.closed_loop.loop_margins import law_order, linear_loop, loop_assessment
 from flight_analysis.closed_loop.replay import replay
 from flight_analysis.closed_loop.replay_ticks import vary
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.linear_loop.loop_margins import law_order, linear_loop, loop_margins
 from flight_campaign.learning_flights import learned
 from flight_campaign.statistics import LOSS_OF_TRACK_SCORE, score_units
 from flight_core.outcome import COMPLETED
@@ -278,7 +278,7 @@ def margin_left(controller: RiseDiConfig, chosen: Scenario) -> float:
     plant = linear.plant._replace(A=linear.plant.A[0], B=linear.plant.B[0])
     if not is_stable(plant, linear.law, Loop(lag, 0.0, period), np.full(len(lag), late)):
         return -1.0
-    return loop_assessment(linear._replace(loop=Loop(lag, 0.0, period))).delay - late
+    return loop_margins(linear._replace(loop=Loop(lag, 0.0, period))).delay - late
 
 
 class Learned(NamedTuple):

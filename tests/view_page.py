@@ -11,9 +11,9 @@ from pathlib import Path
 from tests.browser import Browser
 from tests.view_link import NodesInMemory, in_the_air
 
-from flight_analysis.closed_loop.loop_margins import delay_margins
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.linear_loop.loop_margins import delay_margins
 from flight_analysis.report.run_folder import attachments_for
 from flight_log.tape_writer import write_run
 from flight_view.control import Control

@@ -15,6 +15,7 @@ setup(
     packages=[
         "flight_analysis",
         "flight_analysis.closed_loop",
+        "flight_analysis.linear_loop",
         "flight_analysis.report",
     ],
     package_data={

@@ -11,8 +11,8 @@ import pytest
 from tests.joint_states import STORE
 from tests.recordings import signal
 
-from flight_analysis.closed_loop.loop_margins import margins
 from flight_analysis.closed_loop.scenario_library import find_scenario
+from flight_analysis.linear_loop.loop_margins import margins
 from flight_analysis.report.summary import summarise
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Tape

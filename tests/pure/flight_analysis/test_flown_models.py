@@ -11,10 +11,10 @@ import pytest
 from tests.plots import drawn
 
 from aircraft_sim.uncertainty import as_yaml
-from flight_analysis.closed_loop.loop_margins import loop_assessment, scenario_loop
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.linear_loop.loop_margins import loop_margins, scenario_loop
 from flight_analysis.report import figures
 from flight_analysis.report.flown_models import (
     FILE,
@@ -87,8 +87,8 @@ def test_margins_are_of_each_model_around_file_and_true_aircraft(
     true = learns.vary(aircraft={"airframe": str(path), "uncertainty": {"A": 0.0, "B": 0.0}})
     phases = []
     for each, controller in zip(loops[1::2], controllers, strict=True):
-        expected = loop_assessment(scenario_loop(true, controller.controller)).nominal.phase
-        phase = loop_assessment(each.loop).nominal.phase
+        expected = loop_margins(scenario_loop(true, controller.controller)).nominal.phase
+        phase = loop_margins(each.loop).nominal.phase
         assert phase == pytest.approx(expected)
         phases.append(phase)
     assert not np.allclose(phases[0], phases[1], rtol=0.05)  # the file flies less phase margin

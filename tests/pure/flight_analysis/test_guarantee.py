@@ -14,25 +14,30 @@ from pytest import approx
 from tests.conftest import invoke, refusing
 
 from aircraft_sim.airframe import load_airframe
-from flight_analysis.closed_loop import guarantee as guarantee_module
-from flight_analysis.closed_loop.guarantee import guarantee
-from flight_analysis.closed_loop.kept_guarantee import keep, kept
-from flight_analysis.closed_loop.loop_margins import LinearLoop, box_of, margins, scenario_loop
 from flight_analysis.closed_loop.scenario_library import find_scenario
-from flight_analysis.report.html import write_loop_page
-from flight_analysis.report.margin_figures import guarantee_text
-from flight_core.vectors import FloatArray
-from rise_di_controller import branch_and_bound
-from rise_di_controller.linear_loop import LinearLaw, LinearPlant, Loop, closed_loop
-from rise_di_controller.margins import loop_margins
-from rise_di_controller.structured_value import (
+from flight_analysis.linear_loop import branch_and_bound
+from flight_analysis.linear_loop import guarantee as guarantee_module
+from flight_analysis.linear_loop.guarantee import guarantee
+from flight_analysis.linear_loop.input_margins import input_margins
+from flight_analysis.linear_loop.kept_guarantee import keep, kept
+from flight_analysis.linear_loop.loop_margins import LinearLoop, box_of, margins, scenario_loop
+from flight_analysis.linear_loop.structured_value import (
     Scaling,
     balanced,
     bound_at,
     tightened,
 )
-from rise_di_controller.uncertain_loop import Box, aircraft_at, every_channel, uncertain_loop
-from rise_di_controller.worst_case import worst_in_box
+from flight_analysis.linear_loop.uncertain_loop import (
+    Box,
+    aircraft_at,
+    every_channel,
+    uncertain_loop,
+)
+from flight_analysis.linear_loop.worst_case import worst_in_box
+from flight_analysis.report.html import write_loop_page
+from flight_analysis.report.margin_figures import guarantee_text
+from flight_core.vectors import FloatArray
+from rise_di_controller.linear_loop import LinearLaw, LinearPlant, Loop, closed_loop
 
 LIMIT = 1.0 + 1e-6  # abs(z) of the limit of stability
 PERIOD = 0.01
@@ -217,7 +222,7 @@ def test_no_corner_is_unstable_or_has_less_than_guaranteed() -> None:
     assert promise.stable < promise.unstable.deviation < 1.02 * promise.stable
     corners = np.sign(np.random.default_rng(3).standard_normal((2000, len(linear.box.names))))
     assert (radii(linear, corners * promise.stable / 0.3) <= LIMIT).all()
-    found = loop_margins(
+    found = input_margins(
         aircraft_at(linear.nominal, linear.box, corners[:40]), linear.law, linear.loop
     )
     assert (found.disk >= promise.disk).all()
@@ -230,7 +235,7 @@ def test_search_is_at_or_below_corners() -> None:
     assert linear.box is not None
     search = worst_in_box(linear.nominal, linear.law, linear.loop, linear.box)
     corners = np.sign(np.random.default_rng(8).standard_normal((150, len(linear.box.names))))
-    drawn = loop_margins(
+    drawn = input_margins(
         aircraft_at(linear.nominal, linear.box, corners), linear.law, linear.loop
     ).worst()
     for name in ("phase", "gain", "disk", "disk_all", "damping"):
@@ -252,7 +257,7 @@ def test_search_over_two_entries_is_brute_force() -> None:
     plant = LinearPlant(np.array([[-2.0]]), np.ones((1, 1)), np.eye(1))
     search = worst_in_box(plant, linear.law, linear.loop, box)
     grid = np.array(list(itertools.product(np.linspace(-1.0, 1.0, 9), repeat=2)))
-    brute = loop_margins(aircraft_at(plant, box, grid), linear.law, linear.loop).worst()
+    brute = input_margins(aircraft_at(plant, box, grid), linear.law, linear.loop).worst()
     assert search.worst.phase == approx(brute.phase, rel=1e-6)
     assert search.worst.disk == approx(brute.disk, rel=1e-3)
 

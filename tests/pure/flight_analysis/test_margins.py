@@ -15,28 +15,29 @@ from tests.conftest import refusing
 
 from aircraft_sim.airframe import load_airframe
 from aircraft_sim.uncertainty import nominal_and_sampled
-from flight_analysis.closed_loop.loop_margins import (
-    LinearLoop,
-    law_order,
-    loop_assessment,
-    loop_of,
-    margins,
-)
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
-from flight_core.vectors import FloatArray
-from rise_di_controller import linear_loop
-from rise_di_controller.linear_loop import LinearLaw, LinearPlant, Loop, delay_margin, linear_law
-from rise_di_controller.margins import (
+from flight_analysis.linear_loop.delay_margin import delay_margin
+from flight_analysis.linear_loop.input_margins import (
     Margins,
     disk_gain,
     disk_phase,
-    loop_margins,
+    input_margins,
     loop_transfer,
     phase_margins,
     scaled_norm,
     slow_modes,
 )
+from flight_analysis.linear_loop.loop_margins import (
+    LinearLoop,
+    law_order,
+    loop_margins,
+    loop_of,
+    margins,
+)
+from flight_core.vectors import FloatArray
+from rise_di_controller import linear_loop
+from rise_di_controller.linear_loop import LinearLaw, LinearPlant, Loop, linear_law
 
 NO_LAG = Loop(np.zeros(1), 0.0, 0.01)
 INTEGRATOR = LinearPlant(np.zeros((1, 1)), np.eye(1), np.eye(1))
@@ -59,7 +60,7 @@ def plant_of(scenario: Scenario) -> LinearPlant:
 def margins_of(scenario: Scenario) -> Margins:
     controller = scenario.controller
     loop = loop_of(controller)
-    return loop_margins(
+    return input_margins(
         plant_of(scenario), linear_law(controller.tuned_law(), len(loop.lag), loop.period), loop
     )
 
@@ -69,7 +70,7 @@ def test_integrator_has_its_closed_forms(k: float) -> None:
     # L = kT / (z - 1): abs(L) = 1 at 2 sin(wT/2) = kT, angle -(pi/2 + wT/2); L(-1) = -kT/2; S(-1) =
     # 1 / (1 - kT/2); S - 1/2 = (z - 1 - kT) / (2 (z - 1 + kT)), largest at z = -1
     kT = k * NO_LAG.period
-    found = loop_margins(INTEGRATOR, proportional(np.array([[k]])), NO_LAG)
+    found = input_margins(INTEGRATOR, proportional(np.array([[k]])), NO_LAG)
     assert found.stable
     assert found.phase[0] == approx(math.pi / 2.0 - math.asin(kT / 2.0), rel=1e-8)
     assert found.crossover[0] == approx(2.0 * math.asin(kT / 2.0) / NO_LAG.period, rel=1e-8)
@@ -111,7 +112,7 @@ def test_unstable_plant_has_a_gain_decrease() -> None:
     # y_dot = y + u under u = -k y is stable for k > 1 and, sampled, up to (e^T + 1) / (e^T - 1)
     plant = LinearPlant(np.eye(1), np.eye(1), np.eye(1))
     k = 4.0
-    found = loop_margins(plant, proportional(np.array([[k]])), NO_LAG)
+    found = input_margins(plant, proportional(np.array([[k]])), NO_LAG)
     # at w = 0, seen at the lowest frequency
     assert found.gain_decrease[0] == approx(1.0 / k, rel=1e-3)
     growth = math.exp(NO_LAG.period)
@@ -120,14 +121,14 @@ def test_unstable_plant_has_a_gain_decrease() -> None:
 
 
 def test_unstable_loop_has_no_margin() -> None:
-    found = loop_margins(INTEGRATOR, proportional(np.array([[-1.0]])), NO_LAG)
+    found = input_margins(INTEGRATOR, proportional(np.array([[-1.0]])), NO_LAG)
     assert not found.stable
     assert [*found.phase, *found.gain, *found.disk, found.disk_all] == [0.0, 1.0, 0.0, 0.0]
     assert [*found.sensitivity, found.sensitivity_all] == [math.inf, math.inf]
 
 
 def test_no_feedback_has_infinite_margins() -> None:
-    found = loop_margins(INTEGRATOR, proportional(np.zeros((1, 1))), NO_LAG)
+    found = input_margins(INTEGRATOR, proportional(np.zeros((1, 1))), NO_LAG)
     assert [*found.phase, *found.crossover, *found.gain] == [math.inf, 0.0, math.inf]
     assert [*found.sensitivity, *found.disk, found.disk_all] == approx([1.0, 2.0, 2.0])
 
@@ -135,7 +136,7 @@ def test_no_feedback_has_infinite_margins() -> None:
 def test_least_delay_margin_beside_a_nominal_loop_that_tolerates_every_delay() -> None:
     gains = np.array([[[2.0]], [[4.0]]])  # an integrator of gain k has the delay margin pi / 2 k
     plant = LinearPlant(np.zeros((2, 1, 1)), gains, np.eye(1))
-    found = loop_assessment(LinearLoop("two", ("u",), plant, proportional(np.eye(1)), NO_LAG))
+    found = loop_margins(LinearLoop("two", ("u",), plant, proportional(np.eye(1)), NO_LAG))
     assert found.delay == math.inf  # beyond MAX_DELAY_MARGIN
     assert found.worst_delay == approx(math.pi / 8.0, rel=0.02)
 
@@ -149,7 +150,7 @@ def test_second_order_loop_has_its_damping() -> None:
     natural = math.sqrt(k / tau)
     assert modes.frequency == approx([natural], rel=1e-2)
     assert modes.damping == approx([1.0 / (2.0 * tau * natural)], rel=1e-2)
-    assert loop_margins(INTEGRATOR, proportional(np.array([[k]])), loop).damping == approx(
+    assert input_margins(INTEGRATOR, proportional(np.array([[k]])), loop).damping == approx(
         modes.damping[0]
     )
 
@@ -161,7 +162,7 @@ def test_disk_margin_of_the_spinning_satellite() -> None:
     a = 10.0
     A = np.array([[0.0, a], [-a, 0.0]])
     C = np.array([[1.0, a], [-a, 1.0]])
-    found = loop_margins(
+    found = input_margins(
         LinearPlant(A, np.eye(2), C), proportional(np.eye(2)), Loop(np.zeros(2), 0.0, 1e-3)
     )
     expected = 1.0 / math.sqrt(np.linalg.eigvalsh([[0.25, a / 2.0], [a / 2.0, a**2 + 0.25]])[-1])
@@ -304,11 +305,11 @@ def test_uncertain_aircraft_have_the_margins_of_each() -> None:
     A, B = nominal_and_sampled(airframe, 0.3, 20, seed=3)
     _, columns = law_order(airframe, scenario.controller)
     plants = LinearPlant(A + airframe.matrix_gravity(), B[:, :, columns], nominal.C)
-    together = loop_margins(plants, law, loop)
+    together = input_margins(plants, law, loop)
     # a sum over modes beside back substitution: the vectors of the modes have a condition up to 1e6
     assert_allclose(phase_margins(plants, law, loop), together.phase, rtol=1e-8)
     for k in (0, 7, 20):
-        alone = loop_margins(LinearPlant(plants.A[k], plants.B[k], plants.C), law, loop)
+        alone = input_margins(LinearPlant(plants.A[k], plants.B[k], plants.C), law, loop)
         for name, value in alone._asdict().items():
             assert_allclose(getattr(together, name)[k], value, rtol=1e-6, err_msg=name)
     worst = together.worst()

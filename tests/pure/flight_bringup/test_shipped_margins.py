@@ -12,9 +12,9 @@ import pytest
 from tests.conftest import REPOSITORY
 from tests.other_laws import example_installed
 
-from flight_analysis.closed_loop.loop_margins import margins
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import LIBRARY, find_scenario
+from flight_analysis.linear_loop.loop_margins import margins
 from rise_di_controller.law import Sign
 from rise_di_controller.rise_di_config import RiseDiConfig
 

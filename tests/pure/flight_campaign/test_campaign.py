@@ -35,10 +35,11 @@ from tests.conftest import invoke, refusing
 from aircraft_sim.airframe import load_airframe
 from aircraft_sim.uncertainty import Spread
 from flight_analysis.closed_loop.learning_loop import Learn, LearnerResult
-from flight_analysis.closed_loop.loop_margins import linear_loop
 from flight_analysis.closed_loop.scenario import Scenario, load_scenario, scenario_yaml
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.linear_loop.input_margins import input_margins
+from flight_analysis.linear_loop.loop_margins import linear_loop
 from flight_analysis.report.guided import control_errors
 from flight_analysis.report.run_folder import REPORT, SUMMARY
 from flight_campaign import campaign, device, engines, equipment, learning_flights
@@ -54,7 +55,6 @@ from flight_design.identification.model_identification import identify
 from flight_design.learning import scenario_learner
 from rise_di import CampaignResult
 from rise_di_controller import divergence
-from rise_di_controller.margins import loop_margins
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 pytestmark = pytest.mark.slow
@@ -545,7 +545,7 @@ def test_results_have_margins_beside_score(tmp_path: Path) -> None:
         linear_loop(flown[0].controller, frame, frame.matrix_a()[None], frame.matrix_b()[None])
         for frame in airframes
     ]
-    phases = [loop_margins(loop.nominal, loop.law, loop.loop).phase.min() for loop in loops]
+    phases = [input_margins(loop.nominal, loop.law, loop.loop).phase.min() for loop in loops]
     assert found[1] is not None
     assert found[1].worst is not None
     # a search over the box is at or below each aircraft that flies

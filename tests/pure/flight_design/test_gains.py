@@ -24,6 +24,7 @@ from typer.testing import Result
 from aircraft_sim.airframe import LIBRARY, load_airframe
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
+from flight_analysis.linear_loop.delay_margin import delay_margin
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 from flight_design.gains import gain_conditions, ideal_control
@@ -36,7 +37,7 @@ from flight_design.gains.ideal_control import ChannelPairing, Study
 from rise_di_controller.decomposition import decompose
 from rise_di_controller.law import LawParams, Sign, engage, step, tuned
 from rise_di_controller.laws import AnyLaw
-from rise_di_controller.linear_loop import LinearLaw, LinearPlant, Loop, delay_margin, linear_law
+from rise_di_controller.linear_loop import LinearLaw, LinearPlant, Loop, linear_law
 
 pytestmark = pytest.mark.slow
 

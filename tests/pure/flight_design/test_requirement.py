@@ -19,9 +19,10 @@ from tests.conftest import invoke, refusing
 from typer.testing import Result
 
 from aircraft_sim.airframe import Airframe
-from flight_analysis.closed_loop.loop_margins import LinearLoop, law_order, linear_loop, margins
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.linear_loop.input_margins import input_margins
+from flight_analysis.linear_loop.loop_margins import LinearLoop, law_order, linear_loop, margins
 from flight_analysis.metrics import best_error, error_metrics
 from flight_core.vectors import FloatArray
 from flight_design.gains import gain_selection, ideal_control
@@ -44,7 +45,6 @@ from flight_design.gains.requirement import (
 from flight_design.gains.trade import trade
 from reference_model.params import ReferenceModelConfig
 from rise_di_controller.linear_loop import LinearLaw, LinearPlant, Loop
-from rise_di_controller.margins import loop_margins
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 pytestmark = pytest.mark.slow
@@ -154,7 +154,7 @@ def test_no_gains_of_a_random_search_meet_the_margins_with_a_lower_error() -> No
 
     def log_error(controller: RiseDiConfig) -> float:
         loop = linear_loop(controller, study.airframe, study.A, study.B)
-        loop_figures = loop_margins(loop.nominal, loop.law, loop.loop, together=False)
+        loop_figures = input_margins(loop.nominal, loop.law, loop.loop, together=False)
         met = least_fraction(loop_figures, Requirement()) >= 1.0
         error = linear_error(loop, study.u_dot[:, 0][:, columns])
         return float(np.log(error).sum()) if met else math.inf

@@ -16,10 +16,11 @@ import rise_di
 from aircraft_sim.airframe import Airframe, load_airframe
 from aircraft_sim.airspeed import at_speed
 from aircraft_sim.uncertainty import as_yaml
-from flight_analysis.closed_loop.loop_margins import law_order
 from flight_analysis.closed_loop.replay import replay
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.linear_loop.delay_margin import delay_margin
+from flight_analysis.linear_loop.loop_margins import law_order
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
 from flight_core.vectors import StampedVector
@@ -30,7 +31,7 @@ from flight_design.learning.designs import Goal
 from flight_design.learning.learner import Learner
 from rise_di_controller.control_law import Measurements
 from rise_di_controller.controller import Controller
-from rise_di_controller.linear_loop import LinearPlant, Loop, delay_margin, linear_law
+from rise_di_controller.linear_loop import LinearPlant, Loop, linear_law
 from rise_di_controller.proposals import Event, Learning, Proposal, designed
 from rise_di_controller.rise_di_config import RiseDiConfig
 

@@ -73,6 +73,13 @@ class Law(NamedTuple):
     initial: Gains | None = None
     linear: bool = True  # near e = 0
 
+    @property
+    def has_margins(self) -> bool:
+        """Whether it has a linear loop from y to u: not with further measurements or the implicit
+        sign.
+        """
+        return self.linear and self.measurements == "y"
+
 
 def initial_gains(law: Law, model: NominalModel) -> Gains:
     """Initial gains of the search, shapes (m, 1) and (1, 1)."""

@@ -21,10 +21,10 @@ from aircraft_sim.uncertainty import (
     drawn_entries,
     sampled_matrices,
 )
-from flight_analysis.closed_loop.guarantee import Guarantee
-from flight_analysis.closed_loop.kept_guarantee import kept
-from flight_analysis.closed_loop.loop_margins import LoopMargins, margins, scenario_loop
 from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario
+from flight_analysis.linear_loop.guarantee import Guarantee
+from flight_analysis.linear_loop.kept_guarantee import kept
+from flight_analysis.linear_loop.loop_margins import LoopMargins, margins, scenario_loop
 from flight_campaign import equipment, learning_flights
 from flight_campaign.campaign_course import Course, build_course
 from flight_campaign.definition import Definition, Sweep

@@ -14,15 +14,22 @@ from numpy.typing import NDArray
 
 from aircraft_sim.uncertainty import nominal_and_sampled
 from control_laws.catalogue import LAWS, Law
+from flight_analysis.linear_loop.input_margins import Margins
 from flight_campaign import batch
 from flight_campaign.batch_matrices import Fleet
-from flight_campaign.law_margins import has_margins, nominal_margins
 from flight_campaign.statistics import LOSS_OF_TRACK_SCORE
-from flight_campaign.tuning import GUST, TURBULENCE, Benchmark, as_gains, benchmark_fleet, score
+from flight_campaign.tuning import (
+    GUST,
+    TURBULENCE,
+    Benchmark,
+    as_gains,
+    benchmark_fleet,
+    nominal_margins,
+    score,
+)
 from flight_core.vectors import FloatArray
 from flight_design.gains.tuned_gains import TuningResult
 from rise_di_controller.control_law import ControlLaw
-from rise_di_controller.margins import Margins
 
 DELAY_TICKS = (1, 2, 3, 4, 6)  # delays of u: 10 to 60 ms at 100 Hz
 TURBULENCE_SEED = 3  # of a comparison, unlike that of the tuning
@@ -171,7 +178,7 @@ def score_cells(result: LawResult) -> list[str]:
 
 
 def _margins(law: Law, gains: TuningResult, benchmark: Benchmark) -> Margins | None:
-    if not has_margins(law):
+    if not law.has_margins:
         return None
     return Margins(
         *(values[0] for values in nominal_margins(law, as_gains(gains), benchmark.model))

@@ -19,13 +19,13 @@ from aircraft_sim.turbulence import MODERATE
 from aircraft_sim.uncertainty import gust_directions, nominal_and_sampled
 from control_laws.catalogue import AIRCRAFT, INTEGRATORS, NONE, Gains, Law, initial_gains
 from control_laws.nominal_model import NominalModel
-from flight_analysis.closed_loop.loop_margins import law_order
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.linear_loop.input_margins import Margins, input_margins
+from flight_analysis.linear_loop.loop_margins import law_order
 from flight_campaign import batch, batch_matrices, statistics
 from flight_campaign.batch_loop import FleetResult, Vehicle
 from flight_campaign.batch_matrices import Fleet
 from flight_campaign.campaign_course import Course, build_course, require_flyable
-from flight_campaign.law_margins import has_margins, nominal_margins
 from flight_campaign.statistics import score_units
 from flight_core.vectors import Array, FloatArray
 from flight_design.gains.extended_state import integrator_model
@@ -33,7 +33,8 @@ from flight_design.gains.gain_selection import with_feedforward
 from flight_design.gains.nominal import ACTIVITY_UNIT, nominal_model
 from flight_design.gains.requirement import REQUIREMENT, Requirement, least_fractions
 from flight_design.gains.tuned_gains import TuningResult
-from rise_di_controller.linear_loop import Loop
+from rise_di_controller.control_law import TunedLaw
+from rise_di_controller.linear_loop import LinearPlant, Loop, linear_law
 
 GUST = "gust"
 TURBULENCE = "turbulence"
@@ -367,9 +368,23 @@ def tune(
     return TuningResult(gains, lowest[winner], seeds[winner], lowest, generations * POPULATION)
 
 
+def nominal_margins(law: Law, gains: Gains, model: NominalModel) -> Margins:
+    """Margins of a law around the nominal aircraft for N sets of gains, (m, N) or (1, N), shapes
+    (N, m) and (N,), without those of all inputs at once.
+
+    u has no delay, as in a benchmark.
+    """
+    tuned = TunedLaw(law.control_law(model), law.params(gains, model))
+    count = max((gain.shape[-1] for gain in gains.values()), default=1)
+    plant = LinearPlant(model.A + model.gravity, model.B, model.C)
+    candidates = linear_law(tuned, len(model.lag), model.period, count)
+    loop = Loop(model.lag, 0.0, model.period)
+    return input_margins(plant, candidates, loop, together=False)
+
+
 def _lacking(law: Law, objective: Objective, benchmark: Benchmark, gains: Gains) -> FloatArray:
     """Costs of the missing margins of N candidates, (N,)."""
-    if objective.requirement is None or not has_margins(law):
+    if objective.requirement is None or not law.has_margins:
         return np.zeros(next(iter(gains.values())).shape[-1])
     margins = nominal_margins(law, gains, benchmark.model)
     fractions = least_fractions(margins, objective.requirement)

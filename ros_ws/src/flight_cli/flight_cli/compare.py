@@ -18,16 +18,16 @@ from rich.table import Table
 
 from aircraft_sim.uncertainty import WindEffect
 from control_laws.catalogue import LAWS, Law
-from flight_analysis.closed_loop.loop_margins import loop_assessment, scenario_loop
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
+from flight_analysis.linear_loop.input_margins import Margins
+from flight_analysis.linear_loop.loop_margins import loop_margins, scenario_loop
 from flight_analysis.report.display_units import display_units
 from flight_analysis.report.summary import finite_or_null
 from flight_campaign import engines, law_comparison, registered_laws, tuned_controller
 from flight_campaign import tuning as gain_tuning
 from flight_campaign.campaign_report import WIND_EFFECTS
 from flight_campaign.law_comparison import LawResult
-from flight_campaign.law_margins import has_margins
 from flight_campaign.tuning import Benchmark
 from flight_cli.output import (
     COUNT_COLUMNS,
@@ -45,7 +45,6 @@ from flight_core.parameters import require
 from flight_design.gains import tuned_gains
 from flight_design.gains.gain_yaml import section_yaml
 from flight_design.gains.tuned_gains import TuningResult
-from rise_di_controller.margins import Margins
 from rise_di_controller.params import ControllerConfig
 
 SEEDS = (1, 2, 3)
@@ -300,8 +299,8 @@ def _write(path: Path, name: str, aim: str, result: TuningResult, benchmark: Ben
     airframe, _ = benchmark.scenario.aircraft.load()
     origin = f"by rise-di compare: law {name}, tuned on {aim} in {benchmark.scenario.name}"
     margins = (
-        loop_assessment(scenario_loop(benchmark.scenario, controller, 1))
-        if has_margins(LAWS[name])
+        loop_margins(scenario_loop(benchmark.scenario, controller, 1))
+        if LAWS[name].has_margins
         else None
     )
     comments = {"delay": "s, beyond sampling: topics have none in the benchmark"}

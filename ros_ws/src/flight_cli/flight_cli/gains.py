@@ -16,8 +16,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from flight_analysis.closed_loop.guarantee import Guarantee, guarantee
-from flight_analysis.closed_loop.kept_guarantee import keep
+from flight_analysis.linear_loop.guarantee import Guarantee, guarantee
+from flight_analysis.linear_loop.kept_guarantee import keep
 from flight_analysis.report.display_units import display_unit
 from flight_analysis.report.html import write_loop_page
 from flight_analysis.report.margin_figures import (

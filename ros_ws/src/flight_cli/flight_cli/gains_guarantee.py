@@ -9,17 +9,17 @@ from rich.console import Console
 
 from aircraft_sim.airframe import load_airframe
 from aircraft_sim.uncertainty import as_yaml, with_entries
-from flight_analysis.closed_loop.guarantee import Guarantee
-from flight_analysis.closed_loop.loop_margins import LoopMargins
 from flight_analysis.closed_loop.scenario import scenario_yaml
 from flight_analysis.closed_loop.scenario_library import find_scenario
+from flight_analysis.linear_loop.delay_margin import MAX_DELAY_MARGIN
+from flight_analysis.linear_loop.guarantee import Guarantee
+from flight_analysis.linear_loop.input_margins import disk_gain, disk_phase
+from flight_analysis.linear_loop.loop_margins import LoopMargins
 from flight_analysis.report.margin_figures import decibels, guarantee_rows, guarantee_text
 from flight_cli.output import LICENCE, new_table, print_table, say, write_text
 from flight_core.arguments import as_number
 from flight_core.files import writing
 from flight_core.parameters import require
-from rise_di_controller.linear_loop import MAX_DELAY_MARGIN
-from rise_di_controller.margins import disk_gain, disk_phase
 
 FORMS = (".3f", ".1f", ".1f", ".3f")  # of the columns of a guarantee
 

@@ -171,7 +171,7 @@ def _serve_foxglove(run: Path, port: int | None) -> None:
 def _serve_with_control(
     flights: Sequence[Flight], ports: Sequence[int], namespace: str, *, real: bool
 ) -> None:
-    from flight_analysis.closed_loop.loop_margins import delay_margins  # noqa: PLC0415 - loads scipy, which a page without control lacks
+    from flight_analysis.linear_loop.loop_margins import delay_margins  # noqa: PLC0415 - loads scipy, which a page without control lacks
     from flight_view.control import Control, new_key  # noqa: PLC0415 - as above
 
     require_ros_environment()

@@ -4,10 +4,10 @@
 # loads them from here.
 
 from aircraft_sim.airframe import Airframe, airframes, load_airframe
-from flight_analysis.closed_loop.loop_margins import LoopMargins, margins
 from flight_analysis.closed_loop.replay import ReplayResult, recorded_scenario, replay
 from flight_analysis.closed_loop.scenario import Scenario, scenario_yaml
 from flight_analysis.closed_loop.scenario_library import find_scenario, scenarios
+from flight_analysis.linear_loop.loop_margins import LoopMargins, margins
 from flight_analysis.metrics import error_metrics
 from flight_analysis.report.account import best_error_over as best_error
 from flight_analysis.report.data_frame import data_frame

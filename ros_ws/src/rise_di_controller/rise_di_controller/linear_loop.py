@@ -1,10 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The sampled linear loop of a control law around a model, with actuators and delay: stability and
-delay margin.
+"""The sampled linear loop of a control law around a model, with actuators and delay: its
+stability.
 """
 
-import math
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -19,12 +18,6 @@ from rise_di_controller.observer import ObserverParams
 SPECTRAL_RADIUS_TOLERANCE = 1e-6
 """A spectral radius above 1 by more than this is unstable. Angles that integrate the outputs give a
 double eigenvalue 1, which rounding splits by the root of the rounding error, 1e-8."""
-
-MAX_DELAY_MARGIN = 0.5
-"""s, upper end of the search for a delay margin. A loop that tolerates more is slower than any loop
-of this stack."""
-
-NEAR = 4  # of the resolution, first step of the search about the delay margin of a loop nearby
 
 ROOT = np.sqrt(3.0)  # of the second Legendre polynomial, normalised: ROOT (2 s - 1)
 
@@ -275,50 +268,3 @@ def spectral_radius(matrix: FloatArray) -> float:
 def is_stable(plant: LinearPlant, law: LinearLaw, loop: Loop, extra: FloatArray) -> bool:
     """Whether no eigenvalue of `closed_loop` lies outside the unit circle, up to rounding."""
     return spectral_radius(closed_loop(plant, law, loop, extra)) <= 1.0 + SPECTRAL_RADIUS_TOLERANCE
-
-
-def delay_margin(
-    plant: LinearPlant,
-    law: LinearLaw,
-    loop: Loop,
-    share: FloatArray | float = 1.0,
-    longest: float = MAX_DELAY_MARGIN,
-    near: float | None = None,
-) -> float:
-    """Delay margin: pure delay beyond loop.delay, s, at the limit of stability of the loop.
-
-    Input i is late by `share`_i, (m,), of the delay: all inputs by the same delay, or a part of
-    them. 0 if the loop is unstable without extra delay, infinite if the loop tolerates `longest`,
-    s. The search takes steps of half a period, then bisects down to 0.1 ms. With the margin of a
-    loop `near` this one, s, the search begins there, in a third of the time.
-    """
-    delayed = np.broadcast_to(share, loop.lag.shape)
-    stride = 1  # in parts of 0.1 ms or less
-    while loop.period / 2.0 / stride > 1e-4:
-        stride *= 2
-    part = loop.period / 2.0 / stride
-
-    def stable(place: int) -> bool:
-        return is_stable(plant, law, loop, place * part * delayed)
-
-    lower = 0
-    growth = 1
-    if near is not None and 0.0 < near < longest:
-        lower = round(near / part)
-        stride = NEAR
-        growth = 2
-        while lower > 0 and not stable(lower):
-            lower = max(lower - stride, 0)
-            stride *= growth
-        stride = max(stride // growth, NEAR)
-    if lower == 0 and not stable(0):
-        return 0.0
-    while stable(lower + stride):
-        lower += stride
-        stride *= growth
-        if lower * part > longest:
-            return math.inf
-    while stride > 1:
-        stride //= 2
-        lower += stride * stable(lower + stride)
-    return lower * part

@@ -11,15 +11,15 @@ from typing import NamedTuple
 import numpy as np
 
 from aircraft_sim.airframe import Airframe, load_airframe
-from flight_analysis.closed_loop.loop_margins import (
+from flight_analysis.closed_loop.replay_ticks import Change, vary
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.linear_loop.loop_margins import (
     LinearLoop,
     distribution,
     linear_loop,
     scenario_loop,
     through_allocation,
 )
-from flight_analysis.closed_loop.replay_ticks import Change, vary
-from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.report.model_spans import flown_parameters
 from flight_analysis.report.sample_counts import is_simulated
 from flight_core.parameters import ParameterError

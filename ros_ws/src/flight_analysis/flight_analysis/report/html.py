@@ -15,9 +15,9 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from flight_analysis.closed_loop.kept_guarantee import kept
-from flight_analysis.closed_loop.loop_margins import LinearLoop, loop_assessment
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.linear_loop.kept_guarantee import kept
+from flight_analysis.linear_loop.loop_margins import LinearLoop, loop_margins
 from flight_analysis.report import (
     comparison,
     figures,
@@ -110,7 +110,7 @@ def _write(path: Path, page: Page) -> None:
 
 def write_loop_page(path: Path, title: str, loop: LinearLoop) -> None:
     """Write a page of a linear loop that need not have flown: margins, Bode and Nyquist plot."""
-    table = margin_figures.margin_table(loop_assessment(loop), kept(loop))
+    table = margin_figures.margin_table(loop_margins(loop), kept(loop))
     sections = _loop_sections({"": loop})
     _write(path, Page(title, [], [TableGroup([table])], sections, SampleStore()))
 
@@ -325,7 +325,7 @@ def _margin_tables(loops: Sequence[FlownLoop]) -> list[tables.Table]:
     if len(loops) > 1:
         return [margin_figures.flown_margin_table(loops)]
     loop = loops[0].loop
-    return [margin_figures.margin_table(loop_assessment(loop), kept(loop))]
+    return [margin_figures.margin_table(loop_margins(loop), kept(loop))]
 
 
 def _drawn_loops(loops: Sequence[FlownLoop]) -> dict[str, LinearLoop]:

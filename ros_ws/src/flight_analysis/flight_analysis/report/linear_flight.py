@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from aircraft_sim import dynamics
 from aircraft_sim.airframe import Airframe
 from aircraft_sim.params import AircraftConfig
-from flight_analysis.closed_loop.loop_margins import (
+from flight_analysis.linear_loop.loop_margins import (
     distribution,
     is_literal,
     linear_loop,

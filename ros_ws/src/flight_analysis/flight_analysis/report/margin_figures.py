@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from flight_analysis.closed_loop.guarantee import Guarantee
-from flight_analysis.closed_loop.loop_margins import LinearLoop, LoopMargins, loop_assessment
+from flight_analysis.linear_loop.guarantee import Guarantee
+from flight_analysis.linear_loop.input_margins import Margins, disk_gain, disk_phase, loop_transfer
+from flight_analysis.linear_loop.loop_margins import LinearLoop, LoopMargins, loop_margins
 from flight_analysis.report import comparison
 from flight_analysis.report.display_units import NO_VALUE
 from flight_analysis.report.flown_models import FlownLoop
@@ -19,7 +20,6 @@ from flight_analysis.report.plotting import Figure, add_line, axis, first_in_leg
 from flight_analysis.report.summary_rows import Column
 from flight_analysis.report.tables import Table
 from flight_core.vectors import FloatArray
-from rise_di_controller.margins import Margins, disk_gain, disk_phase, loop_transfer
 
 MARGIN_COLUMNS = (
     Column("phase", "deg"),
@@ -183,7 +183,7 @@ def flown_margin_table(loops: Sequence[FlownLoop]) -> Table:
         Column("delay", "ms"),
     ]
     rows = [
-        [loop.name or "law", loop.times, loop.aircraft, *least_margins(loop_assessment(loop.loop))]
+        [loop.name or "law", loop.times, loop.aircraft, *least_margins(loop_margins(loop.loop))]
         for loop in loops
     ]
     legend = (

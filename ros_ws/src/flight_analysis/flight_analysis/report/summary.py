@@ -12,6 +12,7 @@ import numpy as np
 
 from flight_analysis import metrics
 from flight_analysis.closed_loop.scenario import Scenario, as_scenario
+from flight_analysis.linear_loop.delay_margin import delay_margin
 from flight_analysis.metrics import (
     CALM,
     TRUE_ERROR,
@@ -63,7 +64,6 @@ from flight_core.rates import period_ns
 from flight_core.tape import Tape, as_tape, refusal_note
 from flight_log.bag import COMPARED
 from flight_log.clock import SINCE_EPOCH_NS
-from rise_di_controller.linear_loop import delay_margin
 
 
 def pulse_edges(scenario: Scenario) -> list[Transient]:
@@ -267,7 +267,7 @@ def late_u(scenario: Scenario, age: AgeMetrics | None) -> list[str]:
     controller = scenario.controller
     if age is None or age.mean - controller.delay < 1.0 / controller.rate:
         return []
-    from flight_analysis.closed_loop.loop_margins import scenario_loop  # noqa: PLC0415 - loads SciPy, which few flights need
+    from flight_analysis.linear_loop.loop_margins import scenario_loop  # noqa: PLC0415 - loads SciPy, which few flights need
 
     try:
         linear = scenario_loop(scenario, controller)

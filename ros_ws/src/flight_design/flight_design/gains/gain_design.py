@@ -12,9 +12,10 @@ from numpy.typing import ArrayLike
 
 from aircraft_sim.airframe import Airframe, load_airframe
 from control_laws.nominal_model import NominalModel
-from flight_analysis.closed_loop.loop_margins import distribution, loop_of, through_allocation
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
+from flight_analysis.linear_loop.delay_margin import MAX_DELAY_MARGIN
+from flight_analysis.linear_loop.loop_margins import distribution, loop_of, through_allocation
 from flight_core.arguments import FilePath, as_count, as_names, as_number, as_numbers
 from flight_core.parameters import require
 from flight_core.vectors import FloatArray
@@ -38,7 +39,6 @@ from flight_design.gains.requirement import (
     Requirement,
     requirement,
 )
-from rise_di_controller.linear_loop import MAX_DELAY_MARGIN
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di_config import RiseDiConfig
 

@@ -19,17 +19,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aircraft_sim.airframe import Airframe
-from flight_analysis.closed_loop.loop_margins import (
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.linear_loop.loop_margins import (
     LinearLoop,
     LoopMargins,
     box_of,
     is_literal,
     law_order,
     linear_loop,
-    loop_assessment,
+    loop_margins,
     loop_of,
 )
-from flight_analysis.closed_loop.scenario import Scenario
 from flight_core.parameters import LARGEST, require
 from flight_core.vectors import FloatArray
 from flight_design.gains import gain_conditions
@@ -437,7 +437,7 @@ def assess_gains(
     if is_literal(controller):
         return GainAssessment(controller, theorem, loop_conditions, bounds, None, study)
     loop = loop_with_box(study, controller)
-    margins = loop_assessment(loop)
+    margins = loop_margins(loop)
     stable = (margins.stable + float(margins.nominal.stable)) / len(study.A)
     loop_conditions += (Condition("linear stability", None, stable, 1.0),)
     if not (isinstance(controller, RiseDiConfig) and controller.sampled_sign()[0] is Sign.IMPLICIT):

@@ -11,7 +11,7 @@ import numpy as np
 from jinja2 import Environment, StrictUndefined, Template
 
 from aircraft_sim.airframe import Airframe
-from flight_analysis.closed_loop.loop_margins import LoopMargins, law_order
+from flight_analysis.linear_loop.loop_margins import LoopMargins, law_order
 from flight_core.arguments import as_instance
 from flight_core.files import parse_yaml
 from flight_core.text import printable

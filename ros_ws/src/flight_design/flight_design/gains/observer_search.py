@@ -16,7 +16,9 @@ import numpy as np
 
 from control_laws.nominal_model import NominalModel
 from control_laws.observer_design import ObserverDesign
-from flight_analysis.closed_loop.loop_margins import loop_of
+from flight_analysis.linear_loop.delay_margin import delay_margin
+from flight_analysis.linear_loop.input_margins import input_margins, phase_margins
+from flight_analysis.linear_loop.loop_margins import loop_of
 from flight_core.parameters import ParameterError, require
 from flight_core.vectors import FloatArray
 from flight_design.gains.constrained_search import (
@@ -44,12 +46,10 @@ from rise_di_controller.linear_loop import (
     LinearLaw,
     LinearPlant,
     Loop,
-    delay_margin,
     is_stable,
     linear_law,
     spectral_radius,
 )
-from rise_di_controller.margins import loop_margins, phase_margins
 from rise_di_controller.model_sections import FeedforwardConfig, ObserverConfig, VanesConfig
 from rise_di_controller.observer import without_frozen
 from rise_di_controller.rise_di_config import RiseDiConfig, SpeedConfig
@@ -249,7 +249,7 @@ class ObserverSearch(NamedTuple):
         loop = loop_of(loops.controller)
         goals = [np.array([self._delay_fraction(plant, law) for plant, law in loops.around])]
         for plant, law in loops.around:
-            margins = loop_margins(plant, law, loop, together=False)
+            margins = input_margins(plant, law, loop, together=False)
             phase, gain_fraction, damping = fractions(margins, needed)
             each = np.append(np.minimum(phase, gain_fraction), damping)
             goals.append(np.where(margins.stable, each, 0.0))
@@ -294,7 +294,7 @@ class ObserverSearch(NamedTuple):
         longest = float(self.margin.max())
         lacking = []
         for law in _laws(loops.controller):
-            margins = loop_margins(self.nominal, law, loop_of(loops.controller), together=False)
+            margins = input_margins(self.nominal, law, loop_of(loops.controller), together=False)
             share = self.margin / longest if longest else 1.0
             delay = 1e3 * delay_margin(self.nominal, law, self.loop, share)
             late = Condition("delay margin (ms)", None, delay, 1e3 * (longest + RESOLUTION))

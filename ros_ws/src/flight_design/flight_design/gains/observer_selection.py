@@ -31,7 +31,7 @@ from control_laws.observer_design import (
     feedback_gain,
     vane_correction,
 )
-from flight_analysis.closed_loop.loop_margins import law_order, loop_of
+from flight_analysis.linear_loop.loop_margins import law_order, loop_of
 from flight_core.parameters import require
 from flight_core.vectors import FloatArray
 from flight_design.gains.airframe_properties import fastest_zero

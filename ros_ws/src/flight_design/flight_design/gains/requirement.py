@@ -4,9 +4,9 @@
 margins meet the requirement.
 
 The margins are those of the sampled loop with actuators, delay and hold
-(`rise_di_controller.margins`). 45 degrees and 6 dB are those of MIL-F-9490D, 3.1.3.6.1, for an
-aerodynamic surface, a sensitivity of at most 2 that of K. J. Astrom, R. M. Murray, "Feedback
-Systems", 12.3.
+(`flight_analysis.linear_loop.input_margins`). 45 degrees and 6 dB are those of MIL-F-9490D,
+3.1.3.6.1, for an aerodynamic surface, a sensitivity of at most 2 that of K. J. Astrom, R. M.
+Murray, "Feedback Systems", 12.3.
 """
 
 import math
@@ -16,7 +16,8 @@ from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
-from flight_analysis.closed_loop.loop_margins import LinearLoop, LoopMargins
+from flight_analysis.linear_loop.input_margins import Margins, input_margins
+from flight_analysis.linear_loop.loop_margins import LinearLoop, LoopMargins
 from flight_core.arguments import as_number
 from flight_core.parameters import require
 from flight_core.vectors import FloatArray
@@ -33,7 +34,6 @@ from flight_design.gains.constrained_search import (
 from flight_design.gains.gain_conditions import Condition, failing
 from flight_design.gains.linear_error import linear_error
 from rise_di_controller.linear_loop import LinearLaw, LinearPlant
-from rise_di_controller.margins import Margins, loop_margins
 from rise_di_controller.params import ControllerConfig
 
 Controller = TypeVar("Controller", bound=ControllerConfig)
@@ -285,7 +285,7 @@ class _Loops(Generic[Controller]):
         candidates = [self._build(slower, lower) for slower, lower in factors]
         if candidates:
             loop = _stacked(candidates)
-            margins = loop_margins(loop.nominal, loop.law, loop.loop, together=False)
+            margins = input_margins(loop.nominal, loop.law, loop.loop, together=False)
             for k, (place, candidate) in enumerate(zip(places, candidates, strict=True)):
                 self._measured[place] = candidate, Margins(*(values[k] for values in margins))
 
@@ -342,4 +342,4 @@ def _worst_phase(loop: LinearLoop) -> float:
     if len(loop.plant.A) == 1:
         return math.inf
     uncertain = loop.plant._replace(A=loop.plant.A[1:], B=loop.plant.B[1:])
-    return float(loop_margins(uncertain, loop.law, loop.loop, together=False).phase.min())
+    return float(input_margins(uncertain, loop.law, loop.loop, together=False).phase.min())

@@ -8,7 +8,7 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from flight_analysis.closed_loop.loop_margins import law_order, linear_loop
+from flight_analysis.linear_loop.loop_margins import law_order, linear_loop
 from flight_core.vectors import FloatArray
 from flight_design.gains.gain_selection import Selection, select_gains
 from flight_design.gains.ideal_control import Study

@@ -12,11 +12,11 @@ from aircraft_sim.airframe import Airframe
 from aircraft_sim.uncertainty import nominal_and_sampled
 from autopilot_bridge.map_rows import UNITS
 from autopilot_bridge.params import ChannelMap
-from flight_analysis.closed_loop.loop_margins import (
+from flight_analysis.linear_loop.loop_margins import (
     LoopMargins,
     law_order,
     linear_loop,
-    loop_assessment,
+    loop_margins,
 )
 from flight_core.vectors import FloatArray
 from flight_design.gains import gain_selection, gain_yaml, ideal_control
@@ -233,7 +233,7 @@ def _within_margins(
         return Candidate(chosen, linear_loop(chosen, airframe, A, B))
 
     chosen = within_requirement(build, needed, study.u_dot[:, 0][:, columns])
-    return chosen.controller, loop_assessment(chosen.loop)
+    return chosen.controller, loop_margins(chosen.loop)
 
 
 def _without_sideslip(channels: Channels, pairing: ChannelPairing) -> Channels:

@@ -10,14 +10,14 @@ import numpy as np
 
 from aircraft_sim.airframe import Airframe
 from flight_analysis.closed_loop.learning_loop import Entry
-from flight_analysis.closed_loop.loop_margins import linear_loop
+from flight_analysis.linear_loop.delay_margin import delay_margin
+from flight_analysis.linear_loop.input_margins import input_margins
+from flight_analysis.linear_loop.loop_margins import linear_loop
 from flight_core.vectors import FloatArray
 from flight_design.gains.observer_search import RESOLUTION, SelectedObserver
 from flight_design.gains.requirement import OBSERVER_REQUIREMENT, Requirement
 from flight_design.identification.likelihood import PRIOR
 from flight_design.identification.model_identification import with_entries
-from rise_di_controller.linear_loop import delay_margin
-from rise_di_controller.margins import loop_margins
 from rise_di_controller.rise_di_config import LEAST_MARGIN, RiseDiConfig
 
 # s, delay margin beyond the latest delay: a loop of 30 ms flew well with u 20 ms late
@@ -76,7 +76,7 @@ def goal(
             else:
                 kept -= RESOLUTION  # its gains stay: it has what it has
             margin = np.where(share > 0.0, max(kept, 0.0), margin)
-        margins = loop_margins(linear.nominal, linear.law, linear.loop, together=False)
+        margins = input_margins(linear.nominal, linear.law, linear.loop, together=False)
         if margins.stable:
             most = max(needed.sensitivity, ROUNDED * float(margins.sensitivity.max()))
             needed = needed._replace(

@@ -14,10 +14,10 @@ from aircraft_sim.airframe import Airframe, load_airframe
 from aircraft_sim.jsbsim_aircraft import PREFIX
 from aircraft_sim.uncertainty import as_yaml
 from flight_analysis.closed_loop.learning_loop import Entry, Learn
-from flight_analysis.closed_loop.loop_margins import distribution
 from flight_analysis.closed_loop.replay import recorded_changes, recorded_parameters
 from flight_analysis.closed_loop.replay_ticks import vary
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.linear_loop.loop_margins import distribution
 from flight_core.files import comment
 from flight_core.modes import Mode
 from flight_core.parameters import require

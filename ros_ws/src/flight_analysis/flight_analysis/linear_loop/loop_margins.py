@@ -11,26 +11,25 @@ import numpy as np
 from aircraft_sim.airframe import Airframe, load_airframe
 from aircraft_sim.uncertainty import UNIFORM, Spread, drawn_places, nominal_and_sampled
 from flight_analysis.closed_loop.scenario import Scenario, as_scenario
+from flight_analysis.linear_loop.delay_margin import MAX_DELAY_MARGIN, delay_margin
+from flight_analysis.linear_loop.input_margins import Margins, SlowModes, input_margins, slow_modes
+from flight_analysis.linear_loop.uncertain_loop import Box, aircraft_at
+from flight_analysis.linear_loop.worst_case import worst_in_box
 from flight_core.arguments import as_count, as_number
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 from rise_di_controller.law import Sign
 from rise_di_controller.linear_loop import (
-    MAX_DELAY_MARGIN,
     SPECTRAL_RADIUS_TOLERANCE,
     LinearLaw,
     LinearPlant,
     Loop,
     closed_loop,
-    delay_margin,
     is_stable,
     linear_law,
 )
-from rise_di_controller.margins import Margins, SlowModes, loop_margins, slow_modes
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di_config import RiseDiConfig
-from rise_di_controller.uncertain_loop import Box, aircraft_at
-from rise_di_controller.worst_case import worst_in_box
 
 BARE = (
     "; each output integrates its inputs, without drag and phugoid: the margins cover Omega alone"
@@ -106,16 +105,14 @@ def margins(
     count = as_count(aircraft, "aircraft", 0)
     numbered = as_count(seed, "seed", 0)
     deviation = as_number(uncertainty, "uncertainty", 0.0, 1.0)
-    return loop_assessment(
-        scenario_loop(flown, flown.controller, count, deviation, numbered, spread)
-    )
+    return loop_margins(scenario_loop(flown, flown.controller, count, deviation, numbered, spread))
 
 
-def loop_assessment(linear: LinearLoop) -> LoopMargins:
+def loop_margins(linear: LinearLoop) -> LoopMargins:
     """The margins of a loop: of the nominal aircraft, and the worst of the uncertain aircraft."""
     if linear.box is not None and len(linear.plant.A) > 1:
         return _assessed_by_search(linear, linear.box)
-    together = loop_margins(linear.plant, linear.law, linear.loop)
+    together = input_margins(linear.plant, linear.law, linear.loop)
     nominal = Margins._make(value[0] for value in together)
     uncertain = Margins._make(value[1:] for value in together)
     delay = delay_margin(linear.nominal, linear.law, linear.loop)
@@ -140,7 +137,7 @@ def loop_assessment(linear: LinearLoop) -> LoopMargins:
 
 def _assessed_by_search(linear: LinearLoop, box: Box) -> LoopMargins:
     """The margins with the worst of the box by search; the samples count for stability alone."""
-    nominal = loop_assessment(linear._replace(plant=_some(linear.plant, slice(1)), box=None))
+    nominal = loop_margins(linear._replace(plant=_some(linear.plant, slice(1)), box=None))
     samples = closed_loop(
         _some(linear.plant, slice(1, None)), linear.law, linear.loop, np.zeros(len(linear.inputs))
     )

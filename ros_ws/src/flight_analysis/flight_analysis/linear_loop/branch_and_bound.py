@@ -10,8 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flight_core.vectors import FloatArray
-from rise_di_controller.structured_value import (
+from flight_analysis.linear_loop.structured_value import (
     NARROWEST,
     RADIUS,
     STALLED,
@@ -22,7 +21,8 @@ from rise_di_controller.structured_value import (
     interval_at,
     tightened_at,
 )
-from rise_di_controller.uncertain_loop import Channels, ComplexArray
+from flight_analysis.linear_loop.uncertain_loop import Channels, ComplexArray
+from flight_core.vectors import FloatArray
 
 SLOW = 1e-3  # part of pi / T of a slow motion
 

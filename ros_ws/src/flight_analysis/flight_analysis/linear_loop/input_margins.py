@@ -138,7 +138,7 @@ def loop_transfer(plant: LinearPlant, law: LinearLaw, loop: Loop, w: FloatArray)
     return np.asarray(1.0 / np.einsum("...ii->...i", S) - 1.0)
 
 
-def loop_margins(
+def input_margins(
     plant: LinearPlant, law: LinearLaw, loop: Loop, *, together: bool = True
 ) -> Margins:
     """Margins of an aircraft, or of N: A (N, n, n) and B (N, n, m) of the plant, and one law or a
@@ -168,7 +168,7 @@ def loop_margins(
 
 
 def phase_margins(plant: LinearPlant, law: LinearLaw, loop: Loop) -> FloatArray:
-    """The `phase` of `loop_margins` alone, (..., m), without the search for gain margins and
+    """The `phase` of `input_margins` alone, (..., m), without the search for gain margins and
     peaks, to 1e-8: a loop with independent modes is a sum over them.
     """
     parts = []

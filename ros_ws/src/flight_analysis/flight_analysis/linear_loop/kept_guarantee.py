@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from flight_analysis.closed_loop.guarantee import Guarantee, Unstable
-from flight_analysis.closed_loop.loop_margins import LinearLoop
+from flight_analysis.linear_loop.guarantee import Guarantee, Unstable
+from flight_analysis.linear_loop.loop_margins import LinearLoop
 from flight_core.files import write_file
 
 DIGITS = 10  # of the entries in the digest: two ways to the same loop differ by rounding

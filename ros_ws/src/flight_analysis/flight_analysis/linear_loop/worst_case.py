@@ -11,25 +11,18 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flight_core.vectors import FloatArray
-from rise_di_controller.linear_loop import (
-    SPECTRAL_RADIUS_TOLERANCE,
-    LinearLaw,
-    LinearPlant,
-    Loop,
-)
-from rise_di_controller.margins import (
+from flight_analysis.linear_loop.input_margins import (
     NO_MODE,
     VANISHED,
     Margins,
-    loop_margins,
+    input_margins,
     norm_bound,
     on_grid,
     schur_form,
 )
-from rise_di_controller.margins import SLOW as SLOW_TURN
-from rise_di_controller.structured_value import balanced
-from rise_di_controller.uncertain_loop import (
+from flight_analysis.linear_loop.input_margins import SLOW as SLOW_TURN
+from flight_analysis.linear_loop.structured_value import balanced
+from flight_analysis.linear_loop.uncertain_loop import (
     Box,
     Channels,
     ComplexArray,
@@ -38,6 +31,13 @@ from rise_di_controller.uncertain_loop import (
     every_channel,
     sensitivity_slopes,
     uncertain_loop,
+)
+from flight_core.vectors import FloatArray
+from rise_di_controller.linear_loop import (
+    SPECTRAL_RADIUS_TOLERANCE,
+    LinearLaw,
+    LinearPlant,
+    Loop,
 )
 
 SEED = 1  # of the corners at which a search starts
@@ -208,7 +208,7 @@ def worst_in_box(plant: LinearPlant, law: LinearLaw, loop: Loop, box: Box) -> Wo
     """The least margins over the corners of a box around a plant, A (n, n), by search.
 
     Each figure goes from the corner at which it is least to the corner to which its slope points,
-    until no figure moves. The values are those of `loop_margins`.
+    until no figure moves. The values are those of `input_margins`.
     """
     rng = np.random.default_rng(SEED)
     k = len(box.names)
@@ -216,7 +216,7 @@ def worst_in_box(plant: LinearPlant, law: LinearLaw, loop: Loop, box: Box) -> Wo
     drawn = np.where(rng.random((BEGUN, k)) < 0.5, -1.0, 1.0)
     slopes = _slopes(plant, law, loop, box, uncertain, np.zeros(k))
     corners = np.unique(np.concatenate([_corners(slopes), drawn]), axis=0)
-    margins = loop_margins(aircraft_at(plant, box, corners), law, loop)
+    margins = input_margins(aircraft_at(plant, box, corners), law, loop)
     walked: set[tuple[int, int]] = set()
     for _ in range(WALKED):
         least = np.argsort(_figures(margins), axis=0)[:FOLLOWED]
@@ -232,7 +232,7 @@ def worst_in_box(plant: LinearPlant, law: LinearLaw, loop: Loop, box: Box) -> Wo
         if not fresh:
             break
         fresh_corners = np.unique(fresh, axis=0)
-        further = loop_margins(aircraft_at(plant, box, fresh_corners), law, loop)
+        further = input_margins(aircraft_at(plant, box, fresh_corners), law, loop)
         corners = np.concatenate([corners, fresh_corners])
         margins = Margins(*(np.concatenate(pair) for pair in zip(margins, further, strict=True)))
     smallest = int(np.argmin(margins.phase.min(axis=1)))

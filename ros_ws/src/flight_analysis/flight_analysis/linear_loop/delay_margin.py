@@ -1,0 +1,63 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The delay of u at the limit of stability of a linear loop."""
+
+import math
+
+import numpy as np
+
+from flight_core.vectors import FloatArray
+from rise_di_controller.linear_loop import LinearLaw, LinearPlant, Loop, is_stable
+
+MAX_DELAY_MARGIN = 0.5
+"""s, upper end of the search for a delay margin. A loop that tolerates more is slower than any loop
+of this stack."""
+
+NEAR = 4  # of the resolution, first step of the search about the delay margin of a loop nearby
+
+
+def delay_margin(
+    plant: LinearPlant,
+    law: LinearLaw,
+    loop: Loop,
+    share: FloatArray | float = 1.0,
+    longest: float = MAX_DELAY_MARGIN,
+    near: float | None = None,
+) -> float:
+    """Delay margin: pure delay beyond loop.delay, s, at the limit of stability of the loop.
+
+    Input i is late by `share`_i, (m,), of the delay: all inputs by the same delay, or a part of
+    them. 0 if the loop is unstable without extra delay, infinite if the loop tolerates `longest`,
+    s. The search takes steps of half a period, then bisects down to 0.1 ms. With the margin of a
+    loop `near` this one, s, the search begins there, in a third of the time.
+    """
+    delayed = np.broadcast_to(share, loop.lag.shape)
+    stride = 1  # in parts of 0.1 ms or less
+    while loop.period / 2.0 / stride > 1e-4:
+        stride *= 2
+    part = loop.period / 2.0 / stride
+
+    def stable(place: int) -> bool:
+        return is_stable(plant, law, loop, place * part * delayed)
+
+    lower = 0
+    growth = 1
+    if near is not None and 0.0 < near < longest:
+        lower = round(near / part)
+        stride = NEAR
+        growth = 2
+        while lower > 0 and not stable(lower):
+            lower = max(lower - stride, 0)
+            stride *= growth
+        stride = max(stride // growth, NEAR)
+    if lower == 0 and not stable(0):
+        return 0.0
+    while stable(lower + stride):
+        lower += stride
+        stride *= growth
+        if lower * part > longest:
+            return math.inf
+    while stride > 1:
+        stride //= 2
+        lower += stride * stable(lower + stride)
+    return lower * part
