@@ -7,11 +7,13 @@ in python-control.
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from flight_analysis.closed_loop import stations
 from flight_analysis.report.account import account
 from flight_analysis.report.shortfalls import judged
 from flight_core.arguments import as_number
@@ -19,11 +21,10 @@ from flight_core.installation import require_package
 from flight_core.modes import Mode
 from flight_core.outcome import COMPLETED, FlightEnded
 from flight_core.parameters import require, require_channels
-from flight_core.rates import nanoseconds, seconds
+from flight_core.rates import nanoseconds, period_ns, seconds
 from flight_core.tape import Signal, Tape
-from flight_core.vectors import FloatArray, StampedVector, as_array, select
+from flight_core.vectors import FloatArray, StampedVector, as_array
 from reference_model.params import ReferenceModelConfig
-from reference_model.reference import Reference
 from rise_di_controller.control_law import Measurements, fields, restored
 from rise_di_controller.controller import Controller, ControlOutput
 from rise_di_controller.guard import law_within_limits
@@ -201,37 +202,74 @@ def fly_plant(
     """
     loop = Loop(controller)
     config = _reference_model(reference_model, loop)
-    reference = Reference(config)
-    period_ns = nanoseconds(loop.period)
-    samples, rest = divmod(period_ns, reference.period_ns)
+    topics = stations.Topics()
+    plant_station = _PlantStation(plant, loop, topics)
+    reference = stations.ReferenceStation(config, topics, plant_station.period_ns)
+    rest = plant_station.period_ns % period_ns(config.rate, "reference_model.rate")
     multiple = f"a whole multiple of controller.rate ({loop.config.rate:g} Hz)"
     require(rest == 0, "reference_model.rate", f"{config.rate:g} Hz", multiple)
     length_ns = nanoseconds(as_number(duration, "duration", loop.period, unit="s"))
-    channels = {"y": loop.measured, "y_m": loop.outputs, "u": loop.inputs, "internals": loop.names}
-    rows: dict[str, list[tuple[int, FloatArray]]] = {topic: [] for topic in channels}
-    u = np.zeros(len(loop.inputs))
     outcome = COMPLETED
-    for k in range(int(length_ns // period_ns) + 1):
-        t_ns = k * period_ns
-        dt = loop.period if k else 0.0
-        try:
-            y = loop.vector(
-                plant(seconds(t_ns) - dt, u.copy(), dt), "y of the plant", loop.measured
-            )
-        except FlightEnded as error:
-            outcome = error.outcome
-            break
-        y_m = select(loop.outputs, config.outputs, reference.sample(k * samples))
-        u = loop.step(seconds(t_ns), y, y_m)
-        sample = {"y": y, "y_m": y_m} | (
-            {} if loop.output is None else {"u": u, "internals": loop.output.internals}
-        )
-        for topic, value in sample.items():
-            rows[topic].append((t_ns, value))
-    signals = {topic: _signal(names, rows[topic]) for topic, names in channels.items()}
+    try:
+        stations.Loop([plant_station, reference, _LoopStation(loop, topics)]).run(length_ns)
+    except FlightEnded as error:
+        outcome = error.outcome
+    signals = topics.pop_signals()
+    y_m = signals["y_m"]
+    values = np.column_stack([y_m[name] for name in loop.outputs])
+    signals["y_m"] = Signal(y_m.stamp_ns, loop.outputs, values)
     tape = Tape(signals, outcome=outcome)
     held = account(tape, None, outcome)
     return replace(tape, outcome=judged(outcome, tape, None, held, loop.config))
+
+
+class _PlantStation:
+    """A plant of the user's own: y with the last u held."""
+
+    def __init__(self, plant: Plant, loop: Loop, topics: stations.Topics) -> None:
+        self._plant = plant
+        self._loop = loop
+        self._topics = topics
+        self._u = np.zeros(len(loop.inputs))
+        self.period_ns = nanoseconds(loop.period)
+        topics.advertise("y", loop.measured)
+        topics.subscribe("u", self._take_u)
+
+    def _take_u(self, sample: StampedVector, _t_ns: int) -> None:
+        self._u = sample.value
+
+    def step(self, t_ns: int) -> None:
+        """See Station."""
+        dt = self._loop.period if t_ns else 0.0
+        y = self._plant(seconds(t_ns) - dt, self._u.copy(), dt)
+        value = self._loop.vector(y, "y of the plant", self._loop.measured)
+        self._topics.publish("y", StampedVector(t_ns, value), t_ns)
+
+
+class _LoopStation:
+    """A `Loop` that steps with the y and y_m of its instant: u and internals."""
+
+    def __init__(self, loop: Loop, topics: stations.Topics) -> None:
+        self._loop = loop
+        self._topics = topics
+        self._samples: dict[str, FloatArray] = {}
+        self.period_ns = nanoseconds(loop.period)
+        for topic in ("y", "y_m"):
+            names = loop.measured if topic == "y" else loop.outputs
+            topics.subscribe(topic, partial(self._take, topic), names)
+        topics.advertise("u", loop.inputs)
+        topics.advertise("internals", loop.names)
+
+    def _take(self, topic: str, sample: StampedVector, _t_ns: int) -> None:
+        self._samples[topic] = sample.value
+
+    def step(self, t_ns: int) -> None:
+        """See Station."""
+        u = self._loop.step(seconds(t_ns), self._samples["y"], self._samples["y_m"])
+        if self._loop.output is not None:
+            self._topics.publish("u", StampedVector(t_ns, u), t_ns)
+            internals = StampedVector(t_ns, self._loop.output.internals)
+            self._topics.publish("internals", internals, t_ns)
 
 
 def _reference_model(
@@ -243,12 +281,6 @@ def _reference_model(
     expected = "the outputs of the controller"
     require_channels("reference_model.outputs", config.outputs, loop.outputs, expected)
     return config
-
-
-def _signal(names: tuple[str, ...], rows: Sequence[tuple[int, FloatArray]]) -> Signal:
-    """The samples of a topic, a row each: stamp, ns, and values."""
-    stamp_ns = np.array([stamp for stamp, _ in rows], dtype=np.int64)
-    return Signal(stamp_ns, names, np.array([row for _, row in rows]).reshape(-1, len(names)))
 
 
 def as_control(
