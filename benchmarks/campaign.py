@@ -5,7 +5,6 @@ the simulation in one process, integration error, memory.
 
 python -m benchmarks.campaign  # 10,000 aircraft of osprey_servo, a minute on two cores
     # 1,000,000 on a GPU, and 10,000 on the CPU of its host
-python -m benchmarks.campaign --scenario osprey_route --aircraft 2000 --exact 1        # missions
 
 The rows of the device are written to docs/evidence/tables/campaign-devices.csv.
 """
@@ -83,7 +82,7 @@ def floor(scenario: Scenario, aircraft: int) -> float:
     tick = sum(matrix.nbytes for matrix in fleet.tick)
     size = sum(
         run.length * (tick + bool(run.pattern[0].forced) * fleet.forced.nbytes)
-        for run in without_branches(course, None)
+        for run in without_branches(course)
     )
     copy = jax.jit(lambda numbers: numbers + 1.0)
     numbers = jnp.zeros(COPIED)
@@ -164,7 +163,7 @@ def integration_error(scenario: Scenario, count: int) -> tuple[float, FloatArray
 
 def main(
     scenario: Annotated[
-        str, typer.Option(help="Name of a scenario; one with guidance flies missions.")
+        str, typer.Option(help="Name of a scenario without guidance and learner.")
     ] = "osprey_servo",
     aircraft: Annotated[
         int | None,

@@ -25,7 +25,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.linear_loop.loop_margins import law_order, linear_loop, loop_margins
-from flight_campaign.learning_flights import learned
+from flight_campaign.single_flights import learned
 from flight_campaign.statistics import LOSS_OF_TRACK_SCORE, score_units
 from flight_core.outcome import COMPLETED
 from flight_core.parameters import ParameterError

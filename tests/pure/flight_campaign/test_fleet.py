@@ -20,7 +20,7 @@ from control_laws.nominal_model import campaign_law
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_campaign import batch, batch_allocation, batch_matrices, batch_schedule, missions
+from flight_campaign import batch, batch_allocation, batch_matrices, batch_schedule
 from flight_campaign.batch_loop import FleetResult
 from flight_campaign.campaign_course import build_course
 from flight_core.vectors import Array, FloatArray
@@ -267,7 +267,7 @@ def test_runs_of_a_course_cover_each_tick_once_with_its_phase_and_forcing() -> N
     segments = course.segments
     k = 0
     kinds = set()
-    for run in batch_schedule.without_branches(course, None):
+    for run in batch_schedule.without_branches(course):
         kinds.add(run)
         for tick in range(k, k + run.length):
             kind = run.pattern[(tick - k) % len(run.pattern)]
@@ -277,15 +277,6 @@ def test_runs_of_a_course_cover_each_tick_once_with_its_phase_and_forcing() -> N
     assert k == len(segments.t)
     assert any(run.pattern[0].phase is None for run in kinds)  # a run with a dropout asks
     assert len(kinds) <= 8  # each is compiled, a few seconds
-
-
-def test_actions_of_guidance_are_known_in_runs_of_a_route() -> None:
-    route = find_scenario("osprey_route", 20.0)
-    course = build_course(route)
-    action = np.asarray(missions.build(route, course).action)
-    runs = list(batch_schedule.without_branches(course, action))
-    known = [kind.action for run in runs for kind in run.pattern * (run.length // len(run.pattern))]
-    assert known == action.tolist()
 
 
 def test_matrices_compiled_for_a_device_are_those_of_numpy(

@@ -16,7 +16,7 @@ from c_export.constants import exportable
 from flight_analysis.closed_loop.scenario import load_scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_bringup.graph import second_stage
-from flight_campaign import learning_flights, tuning
+from flight_campaign import single_flights, tuning
 from flight_design.learning import scenario_learner
 
 PAGE = REPOSITORY / "docs" / "learning.md"
@@ -42,12 +42,8 @@ REFUSALS: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: find_scenario("osprey_vanes").vary(controller={"learn": learning()}),
         r"learn: found observer\.vanes beside it, expected none: a learner designs",
     ),
-    "a campaign with guidance": (
-        lambda: learning_flights.require_flyable(find_scenario("osprey_learn_route")),
-        r"guidance: found a section beside controller\.learn, expected none",
-    ),
     "a campaign of JSBSim": (
-        lambda: learning_flights.require_flyable(find_scenario("jsbsim_c172p_learn")),
+        lambda: single_flights.require_flyable(find_scenario("jsbsim_c172p_learn")),
         r"airframe: found jsbsim:c172p, expected an airframe with matrices",
     ),
     "a flight behind a bridge": (

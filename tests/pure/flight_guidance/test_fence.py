@@ -1,11 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The fence: distances and predicted turns against closed forms, flights that would leave, a fleet,
-refusals.
-"""
+"""The fence: distances and predicted turns against closed forms, flights out of it, refusals."""
 
 import math
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,15 +12,11 @@ from pytest import approx
 from tests.closed_loop import calm_osprey as calm
 from tests.conftest import refusing
 
-from aircraft_sim.airframe import load_airframe
-from aircraft_sim.uncertainty import sampled_matrices
 from flight_analysis.closed_loop.guidance_replay import replay_guidance
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.guided import guidance_notices, unflown_legs
-from flight_campaign import batch, batch_matrices, missions
-from flight_campaign.campaign_course import build_course
 from flight_core.channels import POSE
 from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
@@ -441,47 +434,6 @@ def test_flight_towards_fence_stays_inside(
     (notice,) = guidance_notices(tape, scenario.guidance)
     assert "turns to the" in notice
     assert replay_guidance(tape, scenario.guidance).differing == 0
-
-
-class Fenced(Guidance):
-    """Guidance with a fence that the route of the scenario leaves."""
-
-    def __init__(self, parameters: GuidanceConfig) -> None:
-        super().__init__(parameters)
-        self._params = self._params._replace(fence=FLEET_FENCE)
-
-
-FLEET_FENCE = Fence(
-    (Zone((-400.0, 250.0, 250.0, -400.0), (-500.0, -500.0, 500.0, 500.0)),), (0.0, 0.0)
-)
-
-
-def test_fleet_keeps_fence_as_one_process_does() -> None:
-    route = {"north": [0.0, 2000.0], "east": [0.0, 0.0], "altitude": [0.0, 0.0]}
-    scenario = find_scenario("osprey_route").vary(
-        flight={"duration": 12.0},
-        aircraft={"rate": 100.0, "step": 0.005},
-        reference_model={"rate": 100.0},
-        guidance={"route": route},
-    )
-    course = build_course(scenario)
-    uncertain = {"A": 0.3, "B": 0.3, "seed": 5, "number": 1}
-    A, B = sampled_matrices(load_airframe("osprey"), 0.3, 0.3, 5, 0, 2)
-    mission = missions.build(scenario, course)
-    mission = replace(mission, guidance=mission.guidance._replace(fence=FLEET_FENCE))
-    control_law, params = scenario.controller.tuned_law()
-    assembled = batch_matrices.assemble(A, B, scenario.aircraft.plant(), course)
-    result = batch.fly(
-        assembled, batch.vehicle(scenario), course, control_law, batch.shared(params), mission
-    )
-    assert result.mission is not None
-    tape = simulate(scenario.vary(aircraft={"uncertainty": uncertain}), guide=Fenced)
-    assert tape["guidance"]["fence.action"][-1] != 0.0
-    bank = float(np.abs(tape["guidance"]["pose.phi"]).max())
-    # the turn may begin a step apart
-    assert float(result.mission["max.phi"][1]) == approx(bank, abs=1e-3)
-    assert tape["guidance"]["fence.clearance"].min() > 0.0
-    assert np.asarray(result.mission["max.breach"]).tolist() == [0.0, 0.0]
 
 
 @pytest.mark.parametrize(

@@ -28,13 +28,11 @@ from flight_campaign.batch_loop import (
     Timing,
     Vehicle,
     figures,
-    window_of,
 )
 from flight_campaign.batch_matrices import Fleet, remainder_rows
 from flight_campaign.batch_schedule import Schedule
 from flight_campaign.campaign_course import Course, Segments
 from flight_campaign.device import schedule_of_device
-from flight_campaign.missions import Mission
 from flight_core.parameters import require
 from flight_core.rates import seconds
 from flight_core.vectors import Array, FloatArray
@@ -146,34 +144,30 @@ def fly(
     course: Course,
     control_law: ControlLaw,
     params: Any,
-    mission: Mission | None = None,
-    windows: tuple[int, ...] = (),
     schedule: Schedule | None = None,
 ) -> FleetResult:
-    """Fly N aircraft through the course under one law, from trim at rest; on a mission guidance
-    commands the reference.
+    """Fly N aircraft through the course under one law, from trim at rest.
 
     At each tick: sensors, step of the law (or engagement, or a missed sample, by the course's
     phase), actuators over the K steps to the next tick, aircraft. The remainder s at the middle of
     a tick is extrapolated from this tick and the previous. Arguments: `params` of the law, (m, 1)
-    or (m, N); of one aircraft, (m,), where all fly the same, as `shared` makes them. `windows` has
-    the ticks at which a window of the figures ends and the next begins. `schedule` divides the
-    ticks into compiled loops; None: as is fastest on the device. The figures stay the same.
+    or (m, N); of one aircraft, (m,), where all fly the same, as `shared` makes them. `schedule`
+    divides the ticks into compiled loops; None: as is fastest on the device. The figures stay the
+    same.
     """
-    timing = _timing(fleet, course, windows)
-    constants = batch_loop.Constants(fleet._replace(blocks=()), vehicle, params, mission)
+    timing = _timing(fleet, course)
+    constants = batch_loop.Constants(fleet._replace(blocks=()), vehicle, params)
     segments = jax.tree.map(jnp.asarray, course.segments)
     compiled: dict[str, Any] = {"control_law": control_law, "timing": timing}
     first = jax.tree.map(lambda values: values[0], segments)
     state = batch_loop.begin(constants, first, **compiled)
-    action = None if mission is None else np.asarray(mission.action)
     k = 0
-    for run in (schedule or schedule_of_device())(course, action):
+    for run in (schedule or schedule_of_device())(course):
         # The branches of an allocation stay; unrolled they would compile for minutes.
         looped = run if vehicle.allocation is None else run._replace(unroll=1)
         state = batch_loop.fly_run(state, constants, segments, k, run=looped, **compiled)
         k += run.length
-    return figures(state, k, course.period, mission, timing)
+    return figures(state, k, course.period)
 
 
 def on_host(result: FleetResult) -> FleetResult:
@@ -181,9 +175,9 @@ def on_host(result: FleetResult) -> FleetResult:
     return jax.tree.map(np.asarray, result)
 
 
-def _timing(fleet: Fleet, course: Course, windows: tuple[int, ...]) -> Timing:
+def _timing(fleet: Fleet, course: Course) -> Timing:
     late = int(np.max(np.asarray(fleet.late)))
-    return Timing(fleet.blocks, course.steps, course.late, late, windows)
+    return Timing(fleet.blocks, course.steps, course.late, late)
 
 
 class Stepper:
@@ -191,24 +185,15 @@ class Stepper:
     tick of the course.
     """
 
-    def __init__(
-        self,
-        fleet: Fleet,
-        vehicle: Vehicle,
-        course: Course,
-        mission: Mission | None = None,
-        windows: tuple[int, ...] = (),
-    ) -> None:
+    def __init__(self, fleet: Fleet, vehicle: Vehicle, course: Course) -> None:
         self.ticks = len(course.segments.t)
         self._course = course
-        self._mission = mission
         self._k = 0
-        self._timing = _timing(fleet, course, windows)
+        self._timing = _timing(fleet, course)
         self._fleet, self._vehicle, self._segments = jax.device_put(
             (fleet._replace(blocks=()), vehicle, course.segments)
         )
-        self._windows = window_of(np.arange(self.ticks), windows)
-        self._state = self._begin = batch_loop.in_trim(fleet, vehicle, mission, self._timing)
+        self._state = self._begin = batch_loop.in_trim(fleet, vehicle, self._timing)
 
     @property
     def t(self) -> float:
@@ -222,16 +207,7 @@ class Stepper:
 
     def sense(self) -> tuple[FloatArray, FloatArray]:
         """The y and y_m of the present tick, each (m, N), in the law's order."""
-        action = None if self._mission is None else np.asarray(self._mission.action)[self._k]
-        self._state, sample = _sense_once(
-            self._state,
-            self._segments,
-            self._k,
-            action,
-            self._windows[self._k],
-            self._vehicle,
-            self._mission,
-        )
+        self._state, sample = _sense_once(self._state, self._segments, self._k, self._vehicle)
         y = np.asarray(sample.y)
         return y, np.broadcast_to(np.asarray(sample.y_m), y.shape)
 
@@ -246,7 +222,6 @@ class Stepper:
             self._k,
             self._fleet,
             self._vehicle,
-            self._mission,
             self._timing,
         )
         self._k += 1
@@ -257,14 +232,14 @@ class Stepper:
 
     def result(self) -> FleetResult:
         """The figures after the last tick."""
-        return figures(self._state, self.ticks, self._course.period, self._mission, self._timing)
+        return figures(self._state, self.ticks, self._course.period)
 
 
 @jax.jit
 def _sense_once(
-    now: LoopState, segments: Segments, k: int, *others: Any
+    now: LoopState, segments: Segments, k: int, vehicle: Vehicle
 ) -> tuple[LoopState, Sample]:
-    return batch_loop.sense(now, jax.tree.map(lambda values: values[k], segments), *others)
+    return batch_loop.sense(now, jax.tree.map(lambda values: values[k], segments), vehicle)
 
 
 @partial(jax.jit, static_argnames=("timing",))
@@ -275,7 +250,6 @@ def _advance_once(
     k: int,
     fleet: Fleet,
     vehicle: Vehicle,
-    mission: Mission | None,
     timing: Timing,
 ) -> LoopState:
     return batch_loop.advance(
@@ -284,6 +258,5 @@ def _advance_once(
         jax.tree.map(lambda values: values[k], segments),
         fleet,
         vehicle,
-        mission,
         timing,
     )

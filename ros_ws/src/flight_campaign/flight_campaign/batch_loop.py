@@ -21,12 +21,10 @@ from aircraft_sim import actuators, dynamics, sensors
 from aircraft_sim.actuators import Actuators
 from aircraft_sim.dynamics import Aircraft
 from aircraft_sim.plant import DIVERGENCE_LIMIT
-from flight_campaign import missions
 from flight_campaign.batch_allocation import allocate
 from flight_campaign.batch_matrices import Fleet, StateBlock, at
 from flight_campaign.batch_schedule import ASKED, Kind, Run
 from flight_campaign.campaign_course import Segments
-from flight_campaign.missions import Mission
 from flight_core.arithmetic import product
 from flight_core.vectors import Array
 from rise_di_controller.allocation import Allocation, reached
@@ -68,8 +66,6 @@ class FleetResult(NamedTuple):
     max: Array  # (m, N)
     slew: Array  # (p, N) mean abs(u_dot) by effector, units of u / s
     diverged: Array  # (N,) bool: the state exceeded DIVERGENCE_LIMIT, the other figures are invalid
-    mission: dict[str, Array] | None = None  # of `missions.figures`; None without guidance
-    windows: Array | None = None  # (W, m, N) rms by window
 
 
 def rows_of(array: Array, places: Sequence[int] | NDArray[np.int64]) -> Array:
@@ -93,7 +89,6 @@ class Timing(NamedTuple):
     steps: int  # of the integration in a tick
     y_late: int  # ticks
     u_late: int  # ticks, the largest
-    windows: tuple[int, ...]  # ticks at which a window of the figures ends and the next begins
 
 
 class Sample(NamedTuple):
@@ -115,11 +110,10 @@ class LoopState(NamedTuple):
     command: Array  # (p, N) the effectors; u without an allocation
     y_before: Array  # (y_late, m, N) newest first
     command_before: Array  # (u_late, p, N)
-    squares: Array  # (W, m, N) sums over the ticks of a window
+    squares: Array  # (m, N) sums over the ticks
     max: Array
     travel: Array  # (p, N) sum of abs(command - previous command)
     bounded: Array  # (N,) whether the state stayed below DIVERGENCE_LIMIT
-    mission: Any  # MissionState; None without guidance
 
 
 class Constants(NamedTuple):
@@ -128,7 +122,6 @@ class Constants(NamedTuple):
     fleet: Fleet  # without its blocks
     vehicle: Vehicle
     params: Any  # of the law
-    mission: Mission | None
 
 
 @partial(jax.jit, static_argnames=("control_law", "timing"))
@@ -136,8 +129,8 @@ def begin(
     constants: Constants, first: Segments, *, control_law: ControlLaw, timing: Timing
 ) -> LoopState:
     """The state before the first tick, in trim, the law not yet engaged."""
-    fleet, vehicle, params, mission = constants
-    start = in_trim(fleet, vehicle, mission, timing)
+    fleet, vehicle, params = constants
+    start = in_trim(fleet, vehicle, timing)
     none = 0.0 * start.u
 
     def stepped() -> Any:
@@ -162,9 +155,6 @@ def fly_run(
 ) -> LoopState:
     """The state after the ticks of a run, the first of number `first`."""
     size = len(run.pattern)
-    mission = constants.mission
-    window = window_of(np.arange(len(segments.t)), timing.windows)
-    in_time = (segments, None if mission is None else mission.action, window)
 
     def patterns(values: Array) -> Array:
         chosen = jax.lax.dynamic_slice_in_dim(jnp.asarray(values), first, run.length)
@@ -173,10 +163,10 @@ def fly_run(
     def pattern(now: LoopState, ticks: Any) -> tuple[LoopState, None]:
         for k, kind in enumerate(run.pattern):
             at_tick = jax.tree.map(lambda values, k=k: values[k], ticks)
-            now, _ = tick(now, at_tick, kind, constants, control_law, timing)
+            now = tick(now, at_tick, kind, constants, control_law, timing)
         return now, None
 
-    return jax.lax.scan(pattern, state, jax.tree.map(patterns, in_time), unroll=run.unroll)[0]
+    return jax.lax.scan(pattern, state, jax.tree.map(patterns, segments), unroll=run.unroll)[0]
 
 
 def _chosen(
@@ -190,15 +180,14 @@ def _chosen(
 
 def tick(
     now: LoopState,
-    at_tick: tuple[Segments, Array | None, Array],
+    segment: Segments,
     kind: Kind,
     constants: Constants,
     control_law: ControlLaw,
     timing: Timing,
-) -> tuple[LoopState, Sample]:
-    """The state at the next tick, and what the law took at this one."""
-    segment, action, window = at_tick
-    fleet, vehicle, params, mission = constants
+) -> LoopState:
+    """The state at the next tick."""
+    fleet, vehicle, params = constants
     measure = partial(_measured, fleet=fleet, vehicle=vehicle)
 
     # Each branch calls `measure`: the compiler then removes the measurements that its law does not
@@ -233,12 +222,10 @@ def tick(
     def hold(now: LoopState, *measured: Any) -> tuple[Any, Array, Array]:
         return control_law.missed(now.law, measure(now, *measured), params), now.u, now.command
 
-    if not timing.windows and kind is not ASKED:
-        window = np.int64(0)
-    sensed, sample = sense(now, segment, action, window, vehicle, mission, kind)
+    sensed, sample = sense(now, segment, vehicle)
     law, u, command = _chosen(kind.phase, segment.phase, (hold, engage, step), now, segment, sample)
-    flown = sensed._replace(law=law, u=u)
-    return advance(flown, command, segment, fleet, vehicle, mission, timing, kind), sample
+    commanded = sensed._replace(law=law, u=u)
+    return advance(commanded, command, segment, fleet, vehicle, timing, kind)
 
 
 def _measured(
@@ -253,8 +240,7 @@ def _measured(
         matrices.rate, [*now.x, *actuators.effect(segment.t, now.position, vehicle.actuators)]
     )
     moving = acting + fleet.wind * _product(matrices.forced_rate, segment.forcing_now)
-    u_ff = segment.u_ff if segment.u_ff.ndim == y.ndim else segment.u_ff[:, None]
-    u_trim = u_ff + 0.0 * y
+    u_trim = segment.u_ff[:, None] + 0.0 * y
     x_air = x - fleet.wind * segment.air[:, None]
     vane = vane_m = None
     if vehicle.vanes:
@@ -266,31 +252,10 @@ def _measured(
     return Measurements(y, y_m, y_m_dot, u_trim, now.u, position, x, x_air, moving, vane, vane_m)
 
 
-def window_of(ticks: Array, windows: tuple[int, ...]) -> Array:
-    """Number of the window of each tick, from 0."""
-    return np.searchsorted(np.array(windows, dtype=np.int64), ticks, side="right")
-
-
-def sense(
-    now: LoopState,
-    segment: Segments,
-    action: Array | None,
-    window: Array,
-    vehicle: Vehicle,
-    mission: Mission | None,
-    kind: Kind = ASKED,
-) -> tuple[LoopState, Sample]:
-    """The sample of a tick for the law; guidance steps, and the figures take the true error."""
+def sense(now: LoopState, segment: Segments, vehicle: Vehicle) -> tuple[LoopState, Sample]:
+    """The sample of a tick for the law; the figures take the true error."""
     true = rows_of(now.x, vehicle.outputs)
-    flown = now.mission
-    if mission is None:
-        y_m, *reference = (
-            values[:, None]
-            for values in (segment.y_m, segment.sampled_y_m, segment.sampled_y_m_dot)
-        )
-    else:
-        flown, y_m, *reference = missions.reference(flown, mission)
-    e = true - y_m
+    e = true - segment.y_m[:, None]
     y = true + segment.error[:, None]
     if vehicle.noisier is not None:
         y = y + vehicle.noisier * segment.noise[:, None]
@@ -299,20 +264,14 @@ def sense(
     arriving = jnp.concatenate([y[None], now.y_before])
     y = arriving[-1]
     y_before = arriving[:-1]
-    if mission is not None:
-        assert action is not None  # noqa: S101 - for the type checker: a mission has the actions of its guidance
-        flown = missions.guide(
-            flown, now.x, y, segment, action if kind.action is None else kind.action, mission
-        )
     sensed = now._replace(
         y_before=y_before,
-        squares=now.squares.at[window].add(e * e),
+        squares=now.squares + e * e,
         max=jnp.maximum(now.max, jnp.abs(e)),
         bounded=now.bounded
         & (jnp.max(jnp.abs(now.x), axis=0) < DIVERGENCE_LIMIT),  # False for NaN too
-        mission=flown,
     )
-    return sensed, Sample(y, *reference)
+    return sensed, Sample(y, segment.sampled_y_m[:, None], segment.sampled_y_m_dot[:, None])
 
 
 def advance(
@@ -321,14 +280,12 @@ def advance(
     segment: Segments,
     fleet: Fleet,
     vehicle: Vehicle,
-    mission: Mission | None,
     timing: Timing,
     kind: Kind = ASKED,
 ) -> LoopState:
     """The state at the next tick, with the command of this one."""
     blocks = timing.blocks
     u_late = timing.u_late
-    flown = now.mission
     # of the states in the order of the blocks
     places = np.argsort([*chain.from_iterable(block.rows for block in blocks)])
     history = jnp.concatenate([command[None], now.command_before])
@@ -354,8 +311,6 @@ def advance(
         (lambda x: x, lambda x: x + fleet.wind * _product(matrices.forced, segment.forcing)),
         x,
     )
-    if mission is not None:
-        flown = missions.advance(flown, x, mission)
     return now._replace(
         x=x,
         position=position,
@@ -363,7 +318,6 @@ def advance(
         command=command,
         command_before=history[:u_late],
         travel=now.travel + jnp.abs(command - now.command),
-        mission=flown,
     )
 
 
@@ -381,24 +335,18 @@ def _actuated(
     return jax.lax.scan(move, position, times, unroll=unroll)
 
 
-@partial(jax.jit, static_argnames=("ticks", "timing"))
-def figures(
-    end: LoopState, ticks: int, period: Array, mission: Mission | None, timing: Timing
-) -> FleetResult:
+@partial(jax.jit, static_argnames=("ticks",))
+def figures(end: LoopState, ticks: int, period: Array) -> FleetResult:
     """The figures of flights at their end."""
-    mission_figures = None if mission is None else missions.figures(end.mission, mission)
-    lengths = np.diff([0, *timing.windows, ticks])[:, None, None]
     return FleetResult(
-        jnp.sqrt(jnp.sum(end.squares, axis=0) / ticks),
+        jnp.sqrt(end.squares / ticks),
         end.max,
         end.travel / ((ticks - 1) * period),
         ~end.bounded,
-        mission_figures,
-        jnp.sqrt(end.squares / lengths),
     )
 
 
-def in_trim(fleet: Fleet, vehicle: Vehicle, mission: Mission | None, timing: Timing) -> LoopState:
+def in_trim(fleet: Fleet, vehicle: Vehicle, timing: Timing) -> LoopState:
     """The state of the closed loop before the first tick, without that of the law."""
     n = len(fleet.forced)
     count = len(fleet.wind)
@@ -415,11 +363,10 @@ def in_trim(fleet: Fleet, vehicle: Vehicle, mission: Mission | None, timing: Tim
         command,
         jnp.zeros((timing.y_late, m, count)),
         jnp.zeros((timing.u_late, p, count)),
-        jnp.zeros((len(timing.windows) + 1, m, count)),
+        none,
         none,
         command,
         jnp.ones(count, dtype=bool),
-        None if mission is None else missions.initial_state(count, timing.y_late, mission),
     )
 
 

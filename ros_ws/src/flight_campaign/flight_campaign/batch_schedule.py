@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """How the loop over the ticks of a course is compiled: with branches, or in runs of known ticks.
 
-A GPU waits for the host at each branch. Phase, forcing and action of guidance are known before the
-flight, so each run of ticks has a loop without a branch. A CPU is faster with one loop.
+A GPU waits for the host at each branch. Phase and forcing are known before the flight, so each run
+of ticks has a loop without a branch. A CPU is faster with one loop.
 """
 
 from collections.abc import Callable, Iterator
@@ -11,12 +11,11 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flight_campaign.campaign_course import ENGAGE, HOLD, Course
+from flight_campaign.campaign_course import ENGAGE, Course
 
 RUN = 120
-"""Ticks of a run, a multiple of most periods of guidance. A run is forced if a tick of it is."""
+"""Ticks of a run. A run is forced if a tick of it is."""
 
 UNROLL = 4
 """Ticks of a step of the loop. On one H200, 250,000 aircraft of 60 s took 3.3 s with 1, 1.8 s with
@@ -29,11 +28,10 @@ class Kind(NamedTuple):
     """What is known of a tick when the loop is compiled; None: a branch asks at the tick."""
 
     phase: int | None
-    action: int | None  # of guidance
     forced: bool | None  # whether biases, gusts or turbulence act
 
 
-ASKED = Kind(None, None, None)
+ASKED = Kind(None, None)
 
 
 class Run(NamedTuple):
@@ -44,35 +42,31 @@ class Run(NamedTuple):
     unroll: int  # patterns a step of the loop
 
 
-Schedule = Callable[[Course, NDArray[np.int32] | None], Iterator[Run]]
-"""The runs of a course, with the actions of guidance or None."""
+Schedule = Callable[[Course], Iterator[Run]]
+"""The runs of a course."""
 
 
-def with_branches(course: Course, action: NDArray[np.int32] | None) -> Iterator[Run]:
+def with_branches(course: Course) -> Iterator[Run]:
     """One loop, whose branches ask at each tick."""
     yield Run(len(course.segments.t), (ASKED,), 1)
 
 
-def without_branches(course: Course, action: NDArray[np.int32] | None) -> Iterator[Run]:
+def without_branches(course: Course) -> Iterator[Run]:
     """Runs of at most RUN ticks, so that few loops are compiled, each used many times.
 
     A run without a short pattern of phases, as one with dropouts, keeps the branch of the phase.
     """
     phase = course.segments.phase
     ticks = len(phase)
-    actions = np.full(ticks, HOLD) if action is None else np.asarray(action)
     blows = (course.segments.forcing != 0.0).any(axis=1)
-    engaging = np.flatnonzero((phase == ENGAGE) | (actions == ENGAGE))
+    engaging = np.flatnonzero(phase == ENGAGE)
     cuts = np.unique([0, *engaging, *(engaging + 1), ticks])
     for begin, end in pairwise(cuts.tolist()):
         for first in range(begin, end, RUN):
             run = slice(first, min(first + RUN, end))
             forced = bool(blows[run].any())
-            kinds = [
-                Kind(int(of_law), int(of_guidance), forced)
-                for of_law, of_guidance in zip(phase[run], actions[run], strict=True)
-            ]
-            pattern = _pattern(kinds) or (Kind(None, None, forced),)
+            kinds = [Kind(int(of_law), forced) for of_law in phase[run]]
+            pattern = _pattern(kinds) or (Kind(None, forced),)
             yield Run(len(kinds), pattern, max(UNROLL // len(pattern), 1))
 
 

@@ -25,13 +25,13 @@ from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario
 from flight_analysis.linear_loop.guarantee import Guarantee
 from flight_analysis.linear_loop.kept_guarantee import kept
 from flight_analysis.linear_loop.loop_margins import LoopMargins, margins, scenario_loop
-from flight_campaign import equipment, learning_flights
+from flight_campaign import equipment, single_flights
 from flight_campaign.campaign_course import Course, build_course
 from flight_campaign.definition import Definition, Sweep
 from flight_campaign.engines import Engine, Job
 from flight_campaign.influence import RANKED, influence
-from flight_campaign.learning_flights import MakeLearner
 from flight_campaign.rows import Chunk, encode, joined, tally_of
+from flight_campaign.single_flights import MakeLearner
 from flight_campaign.statistics import Tally, score_units
 from flight_core.files import replacing, write_file, writing
 from flight_core.parameters import ParameterError, require
@@ -41,15 +41,12 @@ if TYPE_CHECKING:
     import polars as pl
 
     from flight_campaign.batch_loop import Vehicle
-    from flight_campaign.missions import Mission
 
 DEFINITION = "campaign.json"
 CHUNKS = "chunks"
 OUT_OF_MEMORY = "RESOURCE_EXHAUSTED"  # in an error of JAX
 LOGGER = logging.getLogger(__name__)
 _FITTING: dict[str, int] = {}  # aircraft at once by definition, where a chunk did not fit
-# aircraft at once that learn: the flight takes 3 % of the time, and few leave no core idle
-LEARNING_CHUNK = 10
 MARGIN_AIRCRAFT = 200  # aircraft of a case, the first ones, whose stability is counted
 
 
@@ -95,20 +92,16 @@ def define(
     """The definition of a campaign over a scenario.
 
     `wind` and `spread` None: those of the scenario's `aircraft.uncertainty`. `units` replaces units
-    of the score by output, SI. `chunk` None: what is fast on the device, or LEARNING_CHUNK.
+    of the score by output, SI. `chunk` None: what is fast on the device, or that of single flights.
 
     Raises ParameterError if a campaign cannot fly it.
     """
     if sweep is not None:
         sweep.scaled(scenario.controller, 1.0)
-    if scenario.learns():
-        learning_flights.require_flyable(scenario)
+    if single_flights.flies_alone(scenario):
+        single_flights.require_flyable(scenario)
     else:
-        course = build_course(scenario)
-        if scenario.guidance is not None:
-            from flight_campaign import missions  # noqa: PLC0415 - JAX, which the command needs only for flights
-
-            missions.build(scenario, course)
+        build_course(scenario)
     # each aircraft of the campaign has its own
     published = scenario.vary(aircraft={"uncertainty": {}})
     spread = scenario.aircraft.uncertainty.spread() if spread is None else spread
@@ -151,9 +144,9 @@ def _default_chunk(scenario: Scenario, aircraft: int) -> int:
     """How many aircraft fly at once."""
     if aircraft < 1:
         return 1
-    if scenario.learns():
-        return LEARNING_CHUNK
-    from flight_campaign.device import chunk_of_device  # noqa: PLC0415 - JAX, as above
+    if single_flights.flies_alone(scenario):
+        return single_flights.CHUNK
+    from flight_campaign.device import chunk_of_device  # noqa: PLC0415 - JAX, which the command needs only for flights
 
     return chunk_of_device(aircraft)
 
@@ -166,8 +159,8 @@ def fly_chunk(text: str, job: Job, learner: MakeLearner | None = None) -> bytes:
     fit into memory.
     """
     definition = Definition.model_validate_json(text)
-    if learner is not None and definition.scenario().learns():
-        figures = learning_flights.fly_chunk(definition, job, learner)
+    if single_flights.flies_alone(definition.scenario()):
+        figures = single_flights.fly_chunk(definition, job, learner)
     else:
         figures = fly_chunk_figures(text, job)
     return encode(figures, definition.seed, definition.factor(job[0]))
@@ -204,27 +197,22 @@ def fly_chunk_figures(text: str, job: Job) -> Chunk:
 
 
 def _fly_at_once(text: str, case: int, first: int, count: int, size: int) -> Chunk:
-    """The first `count` of the `size` aircraft from number `first`, which fly at once. Those of a
-    guided scenario fly missions.
-    """
+    """The first `count` of the `size` aircraft from number `first`, which fly at once."""
     from flight_campaign import batch  # noqa: PLC0415 - JAX, which the command needs only for flights
     from flight_campaign.device import turn  # noqa: PLC0415 - as above
     from flight_campaign.drawn_fleet import drawn_fleet  # noqa: PLC0415 - as above
 
     definition = Definition.model_validate_json(text)
-    scenario, course, vehicle, law, mission = _prepare(text, case)
+    scenario, course, vehicle, law = _prepare(text, case)
     drawn = drawn_fleet(definition, scenario, first, size)  # while the chunk before flies
     with turn():
         fleet, equipped = drawn.on_device(course, vehicle)
-        flown = batch.fly(fleet, equipped, course, law.control_law, law.params, mission)
+        flown = batch.fly(fleet, equipped, course, law.control_law, law.params)
         result = batch.on_host(flown)
     rms, largest, slew = (part[:, :count] for part in (result.rms, result.max, result.slew))
     outputs = scenario.controller.outputs
     inputs = scenario.controller.effectors
-    if result.mission is None:
-        figures = {"score": definition.score(rms)}
-    else:
-        figures = {name: values[:count] for name, values in result.mission.items()}
+    figures = {"score": definition.score(rms)}
     for kind, names, values in (
         ("rms", outputs, rms),
         ("max", outputs, largest),
@@ -242,24 +230,21 @@ class _Shared(NamedTuple):
     course: Course
     vehicle: "Vehicle"
     law: TunedLaw
-    mission: "Mission | None"
 
 
 @lru_cache(maxsize=8)
 def _prepare(text: str, case: int) -> _Shared:
     """Data that all chunks of a case share."""
-    from flight_campaign import batch, missions  # noqa: PLC0415 - as above
+    from flight_campaign import batch  # noqa: PLC0415 - as above
 
     scenario = Definition.model_validate_json(text).scenario(case)
     law = scenario.controller.tuned_law()
     course = build_course(scenario)
-    mission = None if scenario.guidance is None else missions.build(scenario, course)
     return _Shared(
         scenario,
         course,
         batch.vehicle(scenario),
         law._replace(params=batch.shared(law.params)),
-        mission,
     )
 
 

@@ -71,7 +71,7 @@ class Course(NamedTuple):
     steps: int  # of the integration from tick to tick
 
 
-def require_flyable(scenario: Scenario, *, learns: bool) -> None:
+def require_flyable(scenario: Scenario) -> None:
     """Raise ParameterError for an aircraft or a controller beyond a campaign."""
     aircraft = scenario.aircraft
     controller = scenario.controller
@@ -81,7 +81,7 @@ def require_flyable(scenario: Scenario, *, learns: bool) -> None:
         aircraft.airframe,
         "an airframe with matrices: JSBSim flies one at a time",
     )
-    fixed = learns or getattr(controller, "learn", None) is None
+    fixed = getattr(controller, "learn", None) is None
     require(
         fixed, "controller.learn", "a section", "none: only rise-di fly and rise-di campaign learn"
     )
@@ -118,17 +118,16 @@ def _references(scenario: Scenario, ticks: int, tick_ns: int) -> tuple[FloatArra
     return y_m, y_m_dot
 
 
-def build_course(scenario: Scenario, *, learns: bool = False) -> Course:
+def build_course(scenario: Scenario) -> Course:
     """The course of a scenario, with the feedforward of the controller.
 
-    `learns`: whether the controller may take models in flight; the feedforward is that before.
     Raises ParameterError for a scenario beyond a campaign: an aircraft of JSBSim, a delay of y or u
     by a part of a tick, dropouts of a y with a different rate than the ticks, or dropouts longer
     than the age limit; for vanes with faults.
     """
     aircraft = scenario.aircraft
     controller = scenario.controller
-    require_flyable(scenario, learns=learns)
+    require_flyable(scenario)
     airframe = aircraft.load()[0]
     plant = aircraft.plant()
     tick_ns = period_ns(controller.rate, "controller.rate")

@@ -95,7 +95,8 @@ def dask(
     again.
 
     A scheduler gets the lost chunks again when the scheduler is back within RECONNECT. On a host
-    with GPUs each process has a GPU of its own, unless `on_devices` is False: learners need cores.
+    with GPUs each process has a GPU of its own, unless `on_devices` is False: single flights need
+    cores.
     """
 
     def fly(work: Work, jobs: Iterable[Job]) -> Iterator[tuple[Job, Any]]:

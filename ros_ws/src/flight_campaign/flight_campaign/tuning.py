@@ -123,7 +123,7 @@ def build_benchmark(scenario: Scenario, turbulence_seed: int = TUNING_TURBULENCE
     Raises ParameterError for a scenario that a campaign cannot fly, and for outputs whose unit has
     no score.
     """
-    require_flyable(scenario, learns=False)
+    require_flyable(scenario)
     scenario = scenario.vary(
         aircraft={
             "rate": scenario.controller.rate,

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Monte Carlo campaigns, as `rise-di campaign` flies them with the threads of this process."""
+"""Monte Carlo campaigns, as `rise-di campaign` flies them on the cores of this machine."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -17,6 +17,7 @@ from flight_campaign import engines
 from flight_campaign.campaign import Campaign, define
 from flight_campaign.campaign_report import write_results
 from flight_campaign.definition import Definition, Sweep
+from flight_campaign.single_flights import flies_alone
 from flight_core.arguments import FilePath, as_count, as_number, as_path
 from flight_core.parameters import ParameterError, require
 from flight_design.learning.scenario_learner import quick_learner
@@ -89,9 +90,9 @@ def fly_campaign(
             {"beta[V]": [0.5, 1.0, 2.0]}.
         duration: Seconds to fly; None: those of the scenario.
         chunk: Aircraft computed at once; None: 1000, on a GPU what its memory holds, with a
-            learner 10.
-        workers: Threads, with a learner processes; None: one a core. A script with a learner calls
-            the function under `if __name__ == "__main__":`.
+            learner or a route 4.
+        workers: Threads, with a learner or a route processes; None: one a core. A script with
+            processes calls the function under `if __name__ == "__main__":`.
         runs: Folder that the folder of the campaign is made in.
         progress: Called with the flights so far and all flights, after each chunk.
 
@@ -131,7 +132,7 @@ def resume_campaign(
 
     Args:
         folder: The folder of the campaign.
-        workers: Threads, with a learner processes; None: as many as cores.
+        workers: Threads, with a learner or a route processes; None: as many as cores.
         progress: Called with the flights so far and all flights, after each chunk.
 
     Returns:
@@ -152,10 +153,10 @@ def resume_campaign(
 
 
 def _engine(definition: Definition, workers: int | None) -> engines.Engine:
-    """Threads of this process; with a learner, processes of this machine."""
+    """Threads of this process; with a learner or a route, processes of this machine."""
     count = None if workers is None else as_count(workers, "workers", 1)
-    learns = definition.scenario().learns()
-    return engines.dask(count, on_devices=False) if learns else engines.threads(count)
+    alone = flies_alone(definition.scenario())
+    return engines.dask(count, on_devices=False) if alone else engines.threads(count)
 
 
 def _progress(progress: Progress | None) -> Progress:

@@ -1,0 +1,176 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Flights of a campaign one by one, as those of `rise-di fly --in-process`: of aircraft that learn,
+and of aircraft on a route.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from flight_analysis.closed_loop.learning_loop import Learn
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.metrics import CAPTURE_TIME, error_metrics, inputs_by_part, true_error
+from flight_analysis.report.guided import control_errors, time_outside
+from flight_campaign.definition import Definition
+from flight_campaign.engines import Job
+from flight_campaign.rows import Chunk
+from flight_core.outcome import End
+from flight_core.parameters import require
+from flight_core.rates import period_ns
+from flight_core.tape import Tape
+from flight_core.vectors import FloatArray
+from flight_guidance.guidance_state import Lateral
+from flight_guidance.params import GuidanceConfig
+from rise_di_controller.proposals import UNVERIFIED, Event, EventKind
+
+MakeLearner = Callable[[Scenario], Learn | None]
+"""Makes the learner of a scenario, as `flight_design.learning.scenario_learner.learner`. Raises
+ParameterError."""
+
+CHUNK = 4
+"""Aircraft of a chunk: the progress moves every minute, and few leave no core idle at the end."""
+
+
+class LearningOutcome(NamedTuple):
+    """Outcomes of the identifications of a flight."""
+
+    first_model: float  # s, when the first model flew; NaN without one
+    models: int  # proposals that flew, without the rough model
+    refused: int  # identifications refused by the learner, and proposals refused by the controller
+    fallbacks: int  # to the law of the start, in all channels or in some
+
+
+def learned(tape: Tape, events: Sequence[Event]) -> LearningOutcome:
+    """Outcomes of the identifications of a flight, from its tape and its events."""
+    proposed = tape["learned"]["proposed"] if "learned" in tape else np.ones(0)
+    models = [
+        event.stamp_ns
+        for event in events
+        if event.kind is EventKind.FLIES and UNVERIFIED not in event.sentence
+    ]
+    fallbacks = sum(event.kind in {EventKind.FALLBACK, EventKind.RESTART} for event in events)
+    refused = sum(event.kind is EventKind.REFUSED for event in events)
+    refused += int(np.sum(proposed == 0.0))
+    return LearningOutcome(models[0] / 1e9 if models else math.nan, len(models), refused, fallbacks)
+
+
+def flies_alone(scenario: Scenario) -> bool:
+    """Whether the aircraft of a scenario fly one by one: beside a learner, or under guidance."""
+    return scenario.learns() or scenario.guidance is not None
+
+
+def require_flyable(scenario: Scenario) -> None:
+    """Raise ParameterError for a scenario of single flights beyond a campaign."""
+    aircraft = scenario.aircraft
+    require(
+        not aircraft.is_jsbsim,
+        "airframe",
+        aircraft.airframe,
+        "an airframe with matrices: a campaign draws their entries",
+    )
+    require(
+        scenario.guidance is None or scenario.guidance.route is not None,
+        "guidance.route",
+        "none",
+        "a route, whose cross-track error is the score of a campaign of missions",
+    )
+
+
+class Flight(NamedTuple):
+    """A flight of a campaign."""
+
+    diverged: bool
+    figures: dict[str, float]  # SI, by name
+
+
+def fly(scenario: Scenario, learner: MakeLearner | None = None) -> Flight:
+    """Fly a scenario; the errors are the true ones at the ticks of the controller.
+
+    Raises ParameterError.
+    """
+    events: list[Event] = []
+    learn = None if learner is None else learner(scenario)
+    tape = simulate(scenario, learn=learn, announce=events.append)
+    diverged = tape.outcome.end not in {End.COMPLETED, End.LANDED}
+    figures: dict[str, float] = {}
+    if scenario.guidance is not None:
+        figures |= mission_figures(tape, scenario.guidance)
+    figures |= _tracking_figures(tape, scenario)
+    if scenario.learns():
+        outcome = learned(tape, events)
+        figures |= {name: float(value) for name, value in outcome._asdict().items()}
+    return Flight(diverged, figures)
+
+
+def _tracking_figures(tape: Tape, scenario: Scenario) -> dict[str, float]:
+    """True errors by output, and the mean abs(u_dot) by effector."""
+    true = true_error(tape)
+    assert true is not None  # noqa: S101 - simulated flights have the truth
+    is_tick = true.stamp_ns % period_ns(scenario.controller.rate, "controller.rate") == 0
+    errors = {name: error_metrics(true[name][is_tick]) for name in scenario.controller.outputs}
+    slew = {name: parts["whole"].rate for name, parts in inputs_by_part(tape, ()).items()}
+    return {
+        **{f"rms.{name}": metrics.rms for name, metrics in errors.items()},
+        **{f"max.{name}": metrics.max for name, metrics in errors.items()},
+        **{f"slew.{name}": value for name, value in slew.items()},
+    }
+
+
+def mission_figures(tape: Tape, guidance: GuidanceConfig) -> dict[str, float]:
+    """Score, cross-track error and altitude error on the route, largest bank, legs missed; with a
+    fence the distance flown beyond it and the last distance from home. SI.
+
+    The score is the largest cross-track error in half seconds of flight at V0. The orbit round the
+    last waypoint, which begins at the centre, and the ways onto a leg are left out. NaN where no
+    leg was flown.
+    """
+    log = tape["guidance"]
+    last_leg = len(guidance.plan(guidance.waypoints()).legs) - 1
+    on_route = (log["mode.lateral"] == Lateral.ROUTE) & (log["joining"] == 0.0)
+    on_route &= (log["leg"] < last_leg) & (log["fence.action"] == 0.0)
+    errors = control_errors(tape)
+    xtrack = errors["xtrack"][on_route]
+    altitude = errors["altitude"][on_route]
+    largest = float(np.max(np.abs(xtrack))) if len(xtrack) else math.nan
+    figures = {
+        "score": largest / (CAPTURE_TIME * guidance.speed),
+        "max.xtrack": largest,
+        "rms.xtrack": _rms(xtrack),
+        "rms.altitude": _rms(altitude),
+        "max.phi": float(np.max(np.abs(log["pose.phi"]))),
+        "missed": float(np.count_nonzero(log["missed"])),
+    }
+    outside = time_outside(tape, guidance)
+    if outside is not None:
+        figures["max.breach"] = outside.farthest_m
+        figures["home"] = math.hypot(
+            log["pose.north"][-1] - guidance.home.north, log["pose.east"][-1] - guidance.home.east
+        )
+    return figures
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2))) if len(values) else math.nan
+
+
+def fly_chunk(definition: Definition, job: Job, learner: MakeLearner | None = None) -> Chunk:
+    """Fly a chunk of a campaign one by one."""
+    from flight_campaign.drawn_fleet import drawn_fleet  # noqa: PLC0415 - JAX, as the loop of many
+
+    case, chunk = job
+    first = chunk * definition.chunk
+    count = definition.size(job)
+    scenario = definition.scenario(case)
+    entries = drawn_fleet(definition, scenario, first, count).entries()
+    flights = [fly(definition.aircraft_scenario(first + k, case), learner) for k in range(count)]
+    figures = {
+        name: np.array([flight.figures[name] for flight in flights]) for name in flights[0].figures
+    }
+    if "score" not in figures:
+        rms = np.array([figures[f"rms.{name}"] for name in scenario.controller.outputs])
+        figures = {"score": definition.score(rms)} | figures
+    return Chunk(first, np.array([flight.diverged for flight in flights]), figures, entries)
