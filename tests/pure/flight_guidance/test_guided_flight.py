@@ -154,10 +154,8 @@ def test_each_step_follows_from_log_to_last_bit() -> None:
             stamp_ns, dict(zip(signal.names, values.tolist(), strict=True)), params.outputs
         )
         state, commands = modes.step(state, inputs, None, params)
-        assert (
-            guidance.row(inputs, state, commands, guidance.digest(None), 0.0, 0).tobytes()
-            == values.tobytes()
-        )
+        sample = guidance.Sample(inputs, state, commands, guidance.digest(None), 0.0, 0)
+        assert guidance.row(sample, params.outputs).tobytes() == values.tobytes()
         assert state == logged
         state = logged
 

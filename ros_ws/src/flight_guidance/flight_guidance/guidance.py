@@ -7,8 +7,10 @@ The node and the simulation in one process use the same class `Guidance`.
 
 import zlib
 from collections import deque
-from collections.abc import Collection, Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Collection, Mapping, Sequence
+from itertools import chain
+from operator import attrgetter
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -50,7 +52,6 @@ from flight_guidance.reach import Authority, RollTest, authority_of
 LIMITED = ("bank", "theta", "climb", "V", "slew")
 STATE = ("phi", "theta", "alpha", "alpha_trim", "slip", "psi")
 WIND = ("north", "east")
-FENCE = ("action", "clearance", "predicted")
 
 
 class GuidanceOutput(NamedTuple):
@@ -61,23 +62,88 @@ class GuidanceOutput(NamedTuple):
     notices: tuple[str, ...] = ()
 
 
-def names(outputs: Sequence[str]) -> tuple[str, ...]:
-    """Channels of the log."""
+class Sample(NamedTuple):
+    """What a step leaves for the log: inputs, state after the step, commands."""
+
+    inputs: Inputs
+    state: GuidanceState
+    commands: Commands
+    route: int  # a `digest`
+    link_age: float  # s since the last message of an operator, 0 without a limit
+    failed: int  # number of failed steps
+
+    @property
+    def pose_age(self) -> float:
+        """Age of the pose, s."""
+        return seconds(self.inputs.pose_age_ns)
+
+    @property
+    def given(self) -> int:
+        """The new commands, as `bits`."""
+        return guidance_state.bits(self.inputs.commands)
+
+
+def _tuple(*values: float) -> tuple[float, ...]:
+    return values
+
+
+class Channels(NamedTuple):
+    """Channels of the log, and the attribute of a `Sample` that they hold."""
+
+    names: Sequence[str]
+    attribute: str
+    kind: Callable[..., Any] = float  # makes the attribute of the logged numbers
+
+    def logged(self, sample: Sample) -> Sequence[float]:
+        """The numbers of the channels."""
+        value = attrgetter(self.attribute)(sample)
+        return value if isinstance(value, tuple) else (value,)
+
+    def restored(self, logged: Mapping[str, float]) -> Any:
+        """The attribute."""
+        return self.kind(*(logged[name] for name in self.names))
+
+
+def channels(outputs: Sequence[str]) -> tuple[Channels, ...]:
+    """The channels of the log, in its order."""
     return (
-        *("mode", "mode.lateral", "mode.vertical", "leg", "route", "xtrack", "to_go"),
-        *("joining", "track", "missed"),
-        *(f"fence.{name}" for name in FENCE),
-        *("phi_c", "theta_c", "climb_c", "V_c"),
-        *(f"limited.{name}" for name in LIMITED),
-        *("age.pose", LINK_AGE, FAILED, "begin", "given", *LEARNED),
-        *(f"target.{name}" for name in TARGETS),
-        *(f"state.{name}" for name in STATE),
-        *(f"wind.{name}" for name in WIND),
-        "loitered",
-        *(f"pose.{name}" for name in POSE),
-        *(f"y.{name}" for name in outputs),
-        *(f"u_m.{name}" for name in outputs),
+        Channels(["mode"], "state.mode", Mode),
+        Channels(["mode.lateral"], "state.lateral", Lateral),
+        Channels(["mode.vertical"], "state.vertical", Vertical),
+        Channels(["leg"], "state.leg", int),
+        Channels(["route"], "route"),
+        Channels(["xtrack"], "commands.xtrack"),
+        Channels(["to_go"], "commands.to_go"),
+        Channels(["joining"], "state.joining"),
+        Channels(["track"], "commands.track"),
+        Channels(["missed"], "commands.missed"),
+        Channels(["fence.action"], "state.fence"),
+        Channels(["fence.clearance"], "commands.clearance"),
+        Channels(["fence.predicted"], "commands.predicted"),
+        Channels(["phi_c"], "commands.phi_c"),
+        Channels(["theta_c"], "commands.theta_c"),
+        Channels(["climb_c"], "state.climb_c"),
+        Channels(["V_c"], "state.V_c"),
+        *(Channels([f"limited.{name}"], f"commands.{name}_limited") for name in LIMITED),
+        Channels(["age.pose"], "pose_age"),
+        Channels([LINK_AGE], "link_age"),
+        Channels([FAILED], "failed"),
+        Channels(["begin"], "inputs.begin", Begin),
+        Channels(["given"], "given", int),
+        Channels(LEARNED, "inputs.authority", Authority),
+        Channels([f"target.{name}" for name in TARGETS], "state.target", Target),
+        *(Channels([f"state.{name}"], f"state.{name}") for name in STATE),
+        Channels([f"wind.{name}" for name in WIND], "state.wind", _tuple),
+        Channels(["loitered"], "state.loitered"),
+        Channels([f"pose.{name}" for name in POSE], "inputs.pose", _tuple),
+        Channels([f"y.{name}" for name in outputs], "inputs.y", _tuple),
+        Channels([f"u_m.{name}" for name in outputs], "state.u_m", _tuple),
     )
+
+
+def names(outputs: Sequence[str]) -> tuple[str, ...]:
+    """Names of the channels of the log."""
+    return tuple(chain.from_iterable(each.names for each in channels(outputs)))
 
 
 def require_channels(logged: Collection[str]) -> None:
@@ -93,98 +159,40 @@ def u_m(state: GuidanceState) -> FloatArray:
     return np.array([*state.u_m, state.phi, state.theta - state.alpha])
 
 
-def row(
-    inputs: Inputs,
-    state: GuidanceState,
-    commands: Commands,
-    route: int,
-    link_age: float,
-    failed: int,
-) -> FloatArray:
-    """A sample of the log, in the order of `names`: inputs, state after the step, commands.
-
-    `route`: a `digest`; `link_age`: time since the last message of an operator, s, 0 without a
-    limit; `failed`: number of failed steps.
-    """
-    return np.array(
-        [
-            *(
-                state.mode,
-                state.lateral,
-                state.vertical,
-                state.leg,
-                route,
-                commands.xtrack,
-                commands.to_go,
-            ),
-            *(state.joining, commands.track, commands.missed),
-            *(state.fence, commands.clearance, commands.predicted),
-            *(commands.phi_c, commands.theta_c, state.climb_c, state.V_c),
-            *(getattr(commands, f"{name}_limited") for name in LIMITED),
-            *(
-                seconds(inputs.pose_age_ns),
-                link_age,
-                failed,
-                inputs.begin,
-                guidance_state.bits(inputs.commands),
-                *inputs.authority,
-            ),
-            *state.target,
-            *(getattr(state, name) for name in STATE),
-            *state.wind,
-            state.loitered,
-            *inputs.pose,
-            *inputs.y,
-            *state.u_m,
-        ],
-        dtype=np.float64,
-    )
+def row(sample: Sample, outputs: Sequence[str]) -> FloatArray:
+    """A sample of the log, in the order of `names`."""
+    values = chain.from_iterable(each.logged(sample) for each in channels(outputs))
+    return np.array([*values], dtype=np.float64)
 
 
 def restored(
     t_ns: int, logged: Mapping[str, float], outputs: Sequence[str]
 ) -> tuple[Inputs, GuidanceState]:
     """The inputs of a step and the state after the step, from a sample of the log."""
+    attributes = {each.attribute: each.restored(logged) for each in channels(outputs)}
 
-    def group(prefix: str, keys: Sequence[str]) -> tuple[float, ...]:
-        return tuple(logged[f"{prefix}.{key}"] for key in keys)
+    def group(prefix: str) -> dict[str, Any]:
+        return {
+            name.removeprefix(prefix): value
+            for name, value in attributes.items()
+            if name.startswith(prefix)
+        }
 
-    target = Target(*group("target", TARGETS))
-    mask = int(logged["given"])
-    commanded = {name: getattr(target, name) for k, name in enumerate(TARGETS) if mask >> k & 1}
-    begin = Begin(int(logged["begin"]))
-    age_ns = nanoseconds(logged["age.pose"])
-    inputs = Inputs(
-        t_ns,
-        begin,
-        group("pose", POSE),
-        age_ns,
-        group("y", outputs),
-        commanded,
-        Authority(*(logged[name] for name in LEARNED)),
-    )
-    phi, theta, alpha, alpha_trim, slip, psi = group("state", STATE)
     state = GuidanceState(
-        t_ns,
-        Mode(int(logged["mode"])),
-        Lateral(int(logged["mode.lateral"])),
-        Vertical(int(logged["mode.vertical"])),
-        target,
-        int(logged["leg"]),
-        phi,
-        theta,
-        alpha,
-        alpha_trim,
-        slip,
-        logged["climb_c"],
-        logged["V_c"],
-        group("u_m", outputs),
-        logged["joining"],
-        (logged["wind.north"], logged["wind.east"]),
-        logged["fence.action"],
-        logged["loitered"],
-        psi,
-        (logged["pose.v_north"], logged["pose.v_east"]),
+        t_ns=t_ns,
+        velocity=(logged["pose.v_north"], logged["pose.v_east"]),
+        **group("state."),
+    )
+    given = attributes["given"]
+    inputs = Inputs(
+        t_ns=t_ns,
+        pose_age_ns=nanoseconds(attributes["pose_age"]),
+        commands={
+            name: value
+            for k, (name, value) in enumerate(state.target._asdict().items())
+            if given >> k & 1
+        },
+        **group("inputs."),
     )
     return inputs, state
 
@@ -512,20 +520,34 @@ class Guidance:
             self._failure = cause
             return None
         inputs = self._inputs(now_ns, pose, y)._replace(commands={})
-        log = row(inputs, state, Commands(), self._digest, self._link_age(now_ns), self.failed)
+        log = self._row(inputs, state, Commands(), now_ns)
         notices = (f"{LAST_GOES_ON}: {cause}",) if is_said else ()
         return GuidanceOutput(u_m(state), log, notices)
+
+    def _row(
+        self, inputs: Inputs, state: GuidanceState, commands: Commands, now_ns: int
+    ) -> FloatArray:
+        """The sample of the log of a step at an instant."""
+        sample = Sample(
+            inputs=inputs,
+            state=state,
+            commands=commands,
+            route=self._digest,
+            link_age=self._link_age(now_ns),
+            failed=self.failed,
+        )
+        return row(sample, self._params.outputs)
 
     def _inputs(self, now_ns: int, pose: StampedVector, y: StampedVector) -> Inputs:
         """What a step takes at an instant."""
         return Inputs(
-            now_ns,
-            self._begin,
-            tuple(pose.value.tolist()),
-            max(now_ns - pose.stamp_ns, 0),
-            tuple(y.value.tolist()),
-            self._given,
-            self._authority,
+            t_ns=now_ns,
+            begin=self._begin,
+            pose=tuple(pose.value.tolist()),
+            pose_age_ns=max(now_ns - pose.stamp_ns, 0),
+            y=tuple(y.value.tolist()),
+            commands=self._given,
+            authority=self._authority,
         )
 
     def _step(self, now_ns: int, t_ns: int) -> GuidanceOutput | None:
@@ -548,7 +570,7 @@ class Guidance:
         inputs = self._inputs(now_ns, pose, y)
         route_notes = self.route.notes if self.route is not None and self._route_waits else ()
         state, commands = step(self._state, inputs, self.route, self._params)
-        log = row(inputs, state, commands, self._digest, self._link_age(now_ns), self.failed)
+        log = self._row(inputs, state, commands, now_ns)
         output = u_m(state)
         if not np.isfinite(np.append(log, output)).all():
             raise ArithmeticError("a value that is not finite")

@@ -187,14 +187,14 @@ def _begin(
         return state
     gains = _gains(params)
     held = GuidanceState(
-        inputs.t_ns - params.period_ns,
-        Mode.ENGAGED,
-        Lateral.PLACE,
-        Vertical.ALTITUDE,
-        Target(V=params.speed)._replace(**hold(pose, inputs.y, params)),
-        0,
-        pose["phi"],
-        pose["theta"],
+        t_ns=inputs.t_ns - params.period_ns,
+        mode=Mode.ENGAGED,
+        lateral=Lateral.PLACE,
+        vertical=Vertical.ALTITUDE,
+        target=Target(V=params.speed)._replace(**hold(pose, inputs.y, params)),
+        leg=0,
+        phi=pose["phi"],
+        theta=pose["theta"],
         alpha=0.0,
         alpha_trim=0.0,
         slip=0.0,

@@ -135,9 +135,15 @@ class _Comparison:
             state, commands = previous, Commands()
         else:
             state, commands = guidance.step(previous, inputs, self._legs[flown], self._params)
-        copied = channels[LINK_AGE], int(channels[FAILED])
-        row = guidance.row(inputs, state, commands, flown, *copied)
-        return np.append(row, guidance.u_m(state))
+        sample = guidance.Sample(
+            inputs=inputs,
+            state=state,
+            commands=commands,
+            route=flown,
+            link_age=channels[LINK_AGE],
+            failed=int(channels[FAILED]),
+        )
+        return np.append(guidance.row(sample, self._outputs), guidance.u_m(state))
 
     def _difference(self, k: int, recorded: FloatArray, computed: FloatArray) -> Difference | None:
         """The first channel of step k with a different bit."""
