@@ -120,6 +120,6 @@ def test_what_was_learned_is_drawn_beside_true_value_and_file(
     ratio = lines[TRUE]["B[q, elevator]"] / lines[FILE]["B[q, elevator]"]
     assert 0.7 <= ratio <= 1.3
     assert ratio != 1.0
-    context = figures.plot_context(flight, {}, {})
+    context = figures.plot_context([RecordedFlight("run", learns, flight, {})])
     names = {trace.name for trace in drawn(figures.learned_figure(context, lines)).data}
     assert {FILE, TRUE} <= names

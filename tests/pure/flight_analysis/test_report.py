@@ -3,7 +3,9 @@
 """The report: its figures, shaded intervals, tables and events, and the size of the page."""
 
 import base64
+import colorsys
 import hashlib
+import math
 import re
 import zlib
 from dataclasses import replace
@@ -22,10 +24,12 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report import comparison, figures, html, plotting
 from flight_analysis.report.display_units import DisplayUnit, state_units
 from flight_analysis.report.html import write_page
-from flight_analysis.report.plotting import Figure, PlotContext, SampleStore
+from flight_analysis.report.plotting import Figure, PlotContext
 from flight_analysis.report.spectra import spectra
 from flight_analysis.report.summary import RecordedFlight, summarise, transients
+from flight_analysis.report.summary_rows import TIMING_COLUMNS, timing_rows
 from flight_analysis.report.tables import events
+from flight_analysis.report.timing import AgeMetrics, LatencyMetrics, TickMetrics
 from flight_core.modes import Mode
 from flight_core.outcome import COMPLETED, Outcome, ended_early
 from flight_core.tape import Signal, Tape
@@ -86,7 +90,8 @@ def complete() -> Tape:
 
 
 def context(tape: Tape, units: dict[str, DisplayUnit] | None = None) -> PlotContext:
-    return figures.plot_context(tape, units or {}, {})
+    run = RecordedFlight("run", find_scenario("osprey_servo"), tape, {})
+    return figures.plot_context([run])._replace(units=units or {})
 
 
 def traces(figure: Figure | None, name: str) -> list[Any]:
@@ -177,7 +182,7 @@ def test_every_colour_of_page_has_dark_counterpart(
         r'<script type="application/json">(.*?)</script>', page_of(tmp_path, servo, complete)
     )
     used = set(re.findall(r"#[0-9a-f]{6}", " ".join(specifications)))
-    assert used - shared <= set(plotting.DARK | figures.DARK | comparison.DARK)
+    assert used - shared <= set(plotting.DARK | figures.DARK)
     assert len(used) > 5
 
 
@@ -236,15 +241,12 @@ def test_every_mode_but_engaged_is_interval_with_name() -> None:
 def test_spectrum_of_commanded_sine_has_peak_there() -> None:
     u = held(1001, elevator=np.sin(2.0 * np.pi * 5.0 * np.arange(1001) / 100.0), thrust=0.0)
     units = {"elevator": DisplayUnit("deg", 1 / DEG)}
-    figure = figures.spectrum_figure({"u": (flight(u=u), 10 * MS)}, {"u": figures.PLANT}, units)
+    figure = figures.spectrum_figure(context(flight(u=u), units))
     assert titles(figure) == ["elevator (deg/√Hz)", "thrust (/√Hz)"]
     elevator = drawn(figure).data[0]
     assert elevator.x[np.argmax(elevator.y)] == pytest.approx(5.0, abs=0.2)
     # eleven samples
-    assert (
-        figures.spectrum_figure({"u": (flight(u=u.until(EPOCH + 100 * MS)), 10 * MS)}, {}, {})
-        is None
-    )
+    assert figures.spectrum_figure(context(flight(u=u.until(EPOCH + 100 * MS)))) is None
 
 
 @pytest.fixture(scope="module")
@@ -280,6 +282,45 @@ def test_a_comparison_is_a_page(tmp_path: Path, pair: list[RecordedFlight]) -> N
         "Output y over the reference y_m",
         "Tracking error e = y - y_m",
     ]
+
+
+def test_figures_of_a_comparison_are_those_of_the_report(pair: list[RecordedFlight]) -> None:
+    """The flights have one reference, which is drawn once. A flight has one colour everywhere."""
+    shown = figures.plot_context(pair)
+    q = {trace.name: trace for trace in drawn(figures.tracking_figure(shown)).data[:3]}
+    assert list(q) == ["y_m", "a", "b"]
+    assert q["y_m"].line.color == figures.REFERENCE
+    errors = {trace.name: trace for trace in drawn(figures.error_figure(shown)).data[:2]}
+    assert errors["b"].y == pytest.approx([0.1 / DEG] * 2)  # deg/s
+    assert [errors[name].line.color for name in "ab"] == [q[name].line.color for name in "ab"]
+    assert len({trace.line.color for trace in q.values()}) == 3
+
+
+def test_colour_of_the_reference_is_that_of_no_flight() -> None:
+    """On light and dark pages 20 deg apart on the circle of hues: red and orange are 30 deg."""
+
+    def hue(colour: str) -> float:
+        return colorsys.rgb_to_hsv(*(int(colour[k : k + 2], 16) for k in (1, 3, 5)))[0] * 360.0
+
+    for palette in (dict(zip(figures.DARK, figures.DARK, strict=True)), figures.DARK):
+        for colour in figures.COLOURS:
+            apart = hue(palette[colour]) - hue(palette[figures.REFERENCE])
+            assert abs(math.remainder(apart, 360.0)) > 20.0, colour
+
+
+def test_every_time_of_the_summary_has_a_heading() -> None:
+    """A metric is declared once, and no metric of the timing is left out of the tables."""
+    kinds: dict[str, Any] = {
+        "ticks": TickMetrics,
+        "latency": LatencyMetrics,
+        "age_of_u": AgeMetrics,
+    }
+    measured = [(topic, name) for topic, kind in kinds.items() for name in kind._fields]
+    assert sorted(column.path for column in TIMING_COLUMNS) == sorted(measured)
+    summary = {topic: dict.fromkeys(kind._fields, 0.0125) for topic, kind in kinds.items()}
+    rows = dict(timing_rows(summary))
+    assert rows["period mean / p99 / max (ms)"] == "12.500 / 12.500 / 12.500"
+    assert len(rows) == len({column.group for column in TIMING_COLUMNS})
 
 
 WINDS: dict[str, dict[str, Any]] = {
@@ -357,8 +398,8 @@ def test_comparison_of_unlike_flights_begins_with_what_differs(
 
 def test_gusts_of_one_flight_are_not_drawn_over_another(unlike: list[RecordedFlight]) -> None:
     gusts, turbulence, gains = unlike
-    assert comparison.plot_context([gusts, turbulence]).intervals == []
-    labels = [each.label for each in comparison.plot_context([gusts, gains]).intervals]
+    assert figures.plot_context([gusts, turbulence]).intervals == []
+    labels = [each.label for each in figures.plot_context([gusts, gains]).intervals]
     assert labels == ["vertical gust"]
 
 
@@ -379,7 +420,7 @@ def test_channels_of_page_and_tables_are_in_order_of_the_controller(servo: Scena
     order = list(servo.controller.outputs)
     assert list(one.summary["errors"]) == order == ["q", "p", "r", "V"]
     assert list(one.summary["inputs"]) == list(servo.controller.inputs)
-    shown = figures.plot_context(tape, one.units, {})
+    shown = figures.plot_context([one])
     labels = ["q (deg/s)", "p (deg/s)", "r (deg/s)", "V (m/s)"]
     assert titles(figures.tracking_figure(shown)) == labels
     assert titles(figures.error_figure(shown)) == labels
@@ -447,7 +488,7 @@ def test_page_has_extremes_of_bins_of_very_long_curve(monkeypatch: pytest.Monkey
     monkeypatch.setattr(plotting, "MAX_STORED", 6)
     stamps = np.array([0, 1, 2, 3, 4, 5, 6, 7, 8, 100, 101], dtype=np.int64)
     values = np.array([1.0, 5.0, 0.0, 2.0, 7.0, 9.0, 8.0, 6.0, 3.0, 4.0, 5.0])
-    shared = PlotContext(Tape({}), {}, [], 1.0, SampleStore())
+    shared = context(Tape({}))
     t, v = (
         shared.samples.packed[name]
         for name in plotting.stored(shared, Signal(stamps, ("q",), values[:, None]), "q", 1.0)

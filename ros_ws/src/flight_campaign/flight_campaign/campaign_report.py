@@ -17,7 +17,6 @@ from flight_analysis.closed_loop.scenario import Scenario, scenario_yaml
 from flight_analysis.linear_loop.loop_margins import LoopMargins
 from flight_analysis.metrics import CAPTURE_TIME
 from flight_analysis.report import plotting
-from flight_analysis.report.comparison import COLOURS
 from flight_analysis.report.display_units import (
     NO_UNIT,
     NO_VALUE,
@@ -25,6 +24,7 @@ from flight_analysis.report.display_units import (
     DisplayUnit,
     display_units,
 )
+from flight_analysis.report.figures import COLOURS
 from flight_analysis.report.html import Line, Page, Section, TableGroup, page_html
 from flight_analysis.report.margin_figures import (
     LEAST_MARGINS,

@@ -441,10 +441,12 @@ def _innovation_page(identification: Identification, name: str) -> Page:
         Interval("held out", start, stop, GUST, False)
         for start, stop in mask_spans(t, identification.held_out)
     ]
-    context = PlotContext(Tape({}), _units(identification), held_out, float(t[-1]), SampleStore())
-    figure = time_series_figure(
-        context, {"nominal": Curve(before, ERROR), "identified": Curve(after, PLANT)}
-    )
+    context = PlotContext({}, _units(identification), held_out, float(t[-1]), SampleStore())
+    curves = {
+        "nominal": Curve(before, ERROR, start_ns=0),
+        "identified": Curve(after, PLANT, start_ns=0),
+    }
+    figure = time_series_figure(context, curves)
     section = Section(
         "Innovations",
         "y less its prediction from the samples before; shaded: not in the fit",

@@ -27,10 +27,8 @@ from rich.text import Text
 from flight_analysis.closed_loop.learning_loop import Entry
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.report.display_units import (
-    QUANTITY_UNITS,
     DisplayUnit,
     format_seconds,
-    format_value,
 )
 from flight_analysis.report.flown_models import flown_loops
 from flight_analysis.report.guided import leg_results
@@ -44,13 +42,16 @@ from flight_analysis.report.summary import (
 )
 from flight_analysis.report.summary_rows import (
     ERROR_COLUMNS,
+    HELD_COLUMNS,
     INPUT_COLUMNS,
     SATURATION_COLUMN,
     Column,
     columns_of,
     input_rows,
     model_rows,
+    segment_table,
     table_rows,
+    timing_rows,
 )
 from flight_core.files import write_file, writing
 from flight_core.parameters import require
@@ -84,10 +85,9 @@ def show_flight(console: Console, flight: RecordedFlight) -> None:
         columns = (*columns_of(INPUT_COLUMNS, summary["inputs"]), SATURATION_COLUMN)
         print_table(console, grouped_table(title, "input", columns, rows))
     if summary["guidance"]:
-        print_table(
-            console,
-            _guidance_table(summary["guidance"]["segments"], taken_over(summary, "guidance")),
-        )
+        title = f"Guidance by segment{taken_over(summary, 'guidance')}"
+        segments = segment_table(summary["guidance"]["segments"], HELD_COLUMNS[:2])
+        print_table(console, grouped_table(title, "segment", *segments))
         if legs := leg_results(summary["guidance"]["legs"]):
             say(console, f"{legs}{taken_over(summary, 'guidance')}")
     if summary["models"]:
@@ -129,24 +129,6 @@ def _show_imported(console: Console, flight: RecordedFlight) -> None:
         )
     for note in summary["notes"]:
         say(console, f"note: {note}")
-
-
-def _guidance_table(segments: Sequence[Mapping[str, Any]], part: str) -> Table:
-    """What guidance held in each segment: rms and largest error."""
-    headings = ("segment", "to (s)", "lateral\nrms", "\nmax", "vertical\nrms", "\nmax", "V\nrms")
-    table = new_table(f"Guidance by segment, in m, m/s and deg{part}", headings)
-    for segment in segments:
-        held = segment["lateral"], segment["vertical"]
-        names = ", ".join(each["quantity"] for each in held)
-        errors = []
-        for each in held:
-            factor = QUANTITY_UNITS[each["quantity"]].factor
-            errors += [format_value(each["rms"], factor), format_value(each["max"], factor)]
-        leg = "" if segment["leg"] is None else f"leg {segment['leg']}: "
-        table.add_row(
-            leg + names, f"{segment['stop']:.1f}", *errors, format_value(segment["V"]["rms"])
-        )
-    return table
 
 
 def model_table(
@@ -288,26 +270,14 @@ def grouped_table(
 
 
 def _timing(summary: Mapping[str, Any]) -> list[str]:
+    """The timing of the controller, a line for each topic of the summary."""
     lines = []
-    if (ticks := summary["ticks"]) is not None:
-        ms = {key: f"{value * 1e3:.3f}" for key, value in ticks.items()}
-        lines.append(
-            f"ticks{taken_over(summary, 'ticks')}: {ticks['ticks']}, {ticks['without_new_y']} "
-            "without a new y;"
-            f" period mean {ms['period_mean']} ms, p99 {ms['period_p99']}, max {ms['period_max']};"
-            f" late p99 {ms['late_p99']} ms, max {ms['late_max']}"
-        )
-    if (latency := summary["latency"]) is not None:
-        median, p99, largest = (f"{value * 1e3:.3f}" for value in latency.values())
-        lines.append(
-            f"y sent to u sent{taken_over(summary, 'latency')}: median {median} ms, p99 {p99}, "
-            f"max {largest}"
-        )
-    if (age := summary["age_of_u"]) is not None:
-        lines.append(
-            f"age of u at the aircraft{taken_over(summary, 'age_of_u')}:"
-            f" mean {1e3 * age['mean']:.1f} ms, max {1e3 * age['max']:.1f}"
-        )
+    for topic in ("ticks", "latency", "age_of_u"):
+        if rows := timing_rows(summary, topic):
+            (first, text), *others = rows
+            parts = [f"{first}{taken_over(summary, topic)}: {text}"]
+            parts += [f"{label}: {text}" for label, text in others]
+            lines.append("; ".join(parts))
     return lines
 
 

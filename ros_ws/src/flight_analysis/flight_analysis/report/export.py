@@ -6,10 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flight_analysis.report import comparison
 from flight_analysis.report.data_frame import data_frame
 from flight_analysis.report.paper import channels_by_title, draw_channel, last_instant
-from flight_analysis.report.summary import RecordedFlight
+from flight_analysis.report.summary import RecordedFlight, labels
 from flight_core.files import replacing
 from flight_core.parameters import require
 
@@ -32,7 +31,7 @@ def signal_table(flights: Sequence[RecordedFlight]) -> "pl.DataFrame":
         return data_frame(flights[0].tape)
     tables = [
         data_frame(flight.tape).select(pl.lit(label).alias("run"), pl.all())
-        for label, flight in zip(comparison.labels(flights), flights, strict=True)
+        for label, flight in zip(labels(flights), flights, strict=True)
     ]
     return pl.concat(tables, how="diagonal")
 

@@ -5,21 +5,30 @@
 The figures do not depend on the aircraft: channels are drawn under their own names.
 """
 
-from collections.abc import Mapping, Sequence
-from itertools import chain, product
+from collections.abc import Callable, Mapping, Sequence
+from itertools import chain, cycle, product
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.metrics import Windows, known_entries, mask_spans, tracking_error, true_error
+from flight_analysis.metrics import (
+    Windows,
+    best_error,
+    known_entries,
+    mask_spans,
+    tracking_error,
+    true_error,
+)
 from flight_analysis.report.display_units import NO_UNIT, DisplayUnit, in_order
 from flight_analysis.report.plotting import (
     Curve,
     Figure,
     Interval,
     PlotContext,
+    Run,
     SampleStore,
     add_line,
     first_in_legend,
@@ -27,6 +36,7 @@ from flight_analysis.report.plotting import (
     time_series_figure,
 )
 from flight_analysis.report.spectra import spectra
+from flight_analysis.report.summary import RecordedFlight, common_units, labels
 from flight_analysis.report.timing import tick_periods
 from flight_core.modes import Mode
 from flight_core.tape import Signal, Tape
@@ -41,7 +51,18 @@ WIND = "#2a7f62"
 GUST = "#7f7f7f"
 END_STOP = "#bbbbbb"
 LIMIT = "#444444"
-DARK = {
+# Okabe and Ito 2008, distinct to the colour blind too, without the orange that REFERENCE has;
+# lighter on a dark page
+FLIGHTS = {
+    "#0072b2": "#4db3ea",
+    "#5e3c99": "#b39ddb",
+    "#009e73": "#3fcf9f",
+    "#cc79a7": "#e8a3c8",
+    "#7a6a00": "#d9c74a",
+}
+COLOURS = tuple(FLIGHTS)
+"""Colours of several flights."""
+DARK = FLIGHTS | {
     PLANT: "#9edbff",
     REFERENCE: "#8f5820",
     ERROR: "#f285b3",
@@ -73,16 +94,31 @@ LIMIT_VIEW_RATIO = 3.0  # a limit is in view where it is at most this many times
 # lower and upper limit by input, SI; infinite without a limit
 Limits = Mapping[str, tuple[float, float]]
 
-Runs = Mapping[str, tuple[Tape, int]]  # tape and period of the ticks in ns, by label of the flight
+SAME_CURVE_TOLERANCE = 1e-3  # of the largest value: closer references are drawn as one curve
 
 
-def plot_context(tape: Tape, units: Mapping[str, DisplayUnit], gusts: Windows) -> PlotContext:
+def plot_context(flights: Sequence[RecordedFlight]) -> PlotContext:
     """The context of a flight: every figure shades the gusts and the failsafe modes of the
-    controller.
+    controller. Of several flights it shades common gusts alone.
     """
-    end = flight_end(tape)
-    intervals = [*gust_intervals(tape, gusts), *mode_intervals(tape, end * MIN_VISIBLE_FRACTION)]
-    return PlotContext(tape, units, intervals, end, SampleStore())
+    longest = max((flight.tape for flight in flights), key=flight_end)
+    end = flight_end(longest)
+    gusts = flights[0].gusts
+    intervals: list[Interval] = []
+    if all(flight.gusts == gusts for flight in flights):
+        intervals += gust_intervals(longest, gusts)
+    if len(flights) == 1:
+        intervals += mode_intervals(longest, end * MIN_VISIBLE_FRACTION)
+    return PlotContext(runs_of(flights), common_units(flights), intervals, end, SampleStore())
+
+
+def runs_of(flights: Sequence[RecordedFlight]) -> dict[str, Run]:
+    """The flights of figures by label, each in its colour."""
+    colours = cycle(COLOURS) if len(flights) > 1 else (PLANT,)
+    return {
+        label: Run(flight.tape, flight.period_ns, colour)
+        for label, flight, colour in zip(labels(flights), flights, colours, strict=False)
+    }
 
 
 def flight_end(tape: Tape) -> float:
@@ -118,20 +154,70 @@ def mode_intervals(tape: Tape, min_length: float = 0.0) -> list[Interval]:
     return intervals
 
 
+def _curves(
+    context: PlotContext, name: str, signal: Callable[[Tape], Signal | None], **style: Any
+) -> dict[str, Curve]:
+    """A curve of each flight with a signal, under its `name`; of several under their labels."""
+    curves = {}
+    for label, run in context.runs.items():
+        if (found := signal(run.tape)) is not None:
+            curve = Curve(found, run.colour, **style)
+            curves[label if context.is_comparison else name] = curve._replace(
+                start_ns=run.tape.start_ns
+            )
+    return curves
+
+
+def _references(context: PlotContext) -> dict[str, Curve]:
+    """The distinct references: one for equal ones."""
+    references: dict[str, Curve] = {}
+    for label, curve in _curves(context, "y_m", lambda tape: tape["y_m"]).items():
+        equal = next(
+            (name for name, reference in references.items() if _is_same_curve(reference, curve)),
+            label,
+        )
+        shown = references.setdefault(equal, curve)
+        if len(curve.signal.stamp_ns) > len(shown.signal.stamp_ns):
+            references[equal] = curve._replace(colour=shown.colour)
+    if len(references) == 1:
+        (curve,) = references.values()
+        return {"y_m": curve._replace(colour=REFERENCE, width=6.0)}
+    return {
+        f"y_m {label}": curve._replace(width=5.0, faint=True) for label, curve in references.items()
+    }
+
+
+def _is_same_curve(first: Curve, second: Curve) -> bool:
+    """Whether two references differ by at most SAME_CURVE_TOLERANCE of the largest value over their
+    common time.
+    """
+    one, two = first.signal, second.signal
+    if set(one.names) != set(two.names) or not (len(one.stamp_ns) and len(two.stamp_ns)):
+        return False
+    t_one, t_two = (curve.signal.stamp_ns - (curve.start_ns or 0) for curve in (first, second))
+    instants = t_one[t_one <= t_two[-1]]
+    for name in one.names:
+        gap = one[name][: len(instants)] - np.interp(instants, t_two, two[name])
+        if np.max(np.abs(gap), initial=0.0) > SAME_CURVE_TOLERANCE * np.max(np.abs(one[name])):
+            return False
+    return True
+
+
 def tracking_figure(context: PlotContext) -> Figure:
-    """Y over y_m of every output."""
-    tape = context.tape
-    return time_series_figure(
-        context, {"y_m": Curve(tape["y_m"], REFERENCE, 6.0), "y": Curve(tape["y"], PLANT)}
-    )
+    """Y over y_m of every output; of several flights over the distinct references."""
+    y = _curves(context, "y", lambda tape: tape.signals.get("y"))
+    return time_series_figure(context, _references(context) | y)
 
 
 def error_figure(context: PlotContext, floors: Mapping[str, float] | None = None) -> Figure:
     """E = y - y_m of every output. With errors of the sensors on the tape, the true error over the
-    measured error.
+    measured error; of several flights the best error of each.
 
     Noise floors, by channel in SI, are lines above and below 0 where wide enough to see.
     """
+    if context.is_comparison:
+        errors = _curves(context, "e", lambda tape: best_error(tape)[1])
+        return time_series_figure(context, errors, height=110)
     measured = Curve(tracking_error(context.tape), ERROR)
     true = true_error(context.tape)
     curves = {"e": measured}
@@ -149,14 +235,16 @@ def error_figure(context: PlotContext, floors: Mapping[str, float] | None = None
     return set_layout(figure, labels=16)
 
 
-def input_figure(context: PlotContext, limits: Mapping[str, Limits]) -> Figure | None:
+def input_figure(
+    context: PlotContext, limits: Mapping[str, Limits] = MappingProxyType({})
+) -> Figure | None:
     """Actuator positions over the command u, at most two kinds of limits as lines, and marks where
-    an input was saturated.
+    an input was saturated; of several flights u alone.
     """
+    curves = _curves(context, "u", lambda tape: tape.signals.get("u"), steps=True)
+    if context.is_comparison or not curves:
+        return time_series_figure(context, curves) if curves else None
     tape = context.tape
-    if "u" not in tape:
-        return None
-    curves = {"u": Curve(tape["u"], PLANT, steps=True)}
     if (position := _truth_group(tape, "actuator")).names:
         curves = {
             "command u": Curve(tape["u"], REFERENCE, 4.0, steps=True),
@@ -292,30 +380,29 @@ def learned_figure(context: PlotContext, lines: Mapping[str, Mapping[str, float]
     return set_layout(figure)
 
 
-def spectrum_figure(
-    runs: Runs, colours: Mapping[str, str], units: Mapping[str, DisplayUnit]
-) -> Figure | None:
+def spectrum_figure(context: PlotContext) -> Figure | None:
     """Amplitude spectral density of u, logarithmic axes: a subplot per channel with the runs.
 
     A run with fewer than MIN_SPECTRUM_SAMPLES is left out; None without a run.
     """
+    units = context.units
     runs = {
-        label: (tape, period_ns)
-        for label, (tape, period_ns) in runs.items()
-        if "u" in tape and len(tape["u"].stamp_ns) >= MIN_SPECTRUM_SAMPLES
+        label: run
+        for label, run in context.runs.items()
+        if "u" in run.tape and len(run.tape["u"].stamp_ns) >= MIN_SPECTRUM_SAMPLES
     }
     if not runs:
         return None
-    names = dict.fromkeys(chain.from_iterable(tape["u"].names for tape, _ in runs.values()))
+    names = dict.fromkeys(chain.from_iterable(run.tape["u"].names for run in runs.values()))
     channels = in_order(names, units)
     columns = min(len(channels), 2)
     figure = Figure(len(channels), columns, 190, spacing=0.2)
-    for label, (tape, period_ns) in runs.items():
-        frequency, densities = spectra(tape["u"], period_ns)
+    for label, run in runs.items():
+        frequency, densities = spectra(run.tape["u"], run.period_ns)
         for name, density in densities.items():
             unit, factor = units.get(name, NO_UNIT)
             style: dict[str, Any] = {
-                "line": {"color": colours[label], "width": 1.4},
+                "line": {"color": run.colour, "width": 1.4},
                 "legendgroup": label,
                 "showlegend": len(runs) > 1 and first_in_legend(figure, label),
                 "hovertemplate": f"%{{y:.3g}} {unit}/√Hz at %{{x:.3g}} Hz",
@@ -347,20 +434,21 @@ def _timing_samples(tape: Tape, period_ns: int) -> dict[str, FloatArray]:
     }
 
 
-def timing_figure(runs: Runs, colours: Mapping[str, str]) -> Figure | None:
+def timing_figure(context: PlotContext) -> Figure | None:
     """Histograms of the controller's timing in ms, on common bins and a logarithmic axis; None for
     zeros alone.
 
     A quantity has a subplot with the runs.
     """
-    timing = {label: _timing_samples(tape, period_ns) for label, (tape, period_ns) in runs.items()}
+    runs = context.runs
+    timing = {label: _timing_samples(run.tape, run.period_ns) for label, run in runs.items()}
     quantities = list(dict.fromkeys(chain.from_iterable(timing.values())))
     if not quantities:
         return None
     columns = min(len(quantities), 2)
     figure = Figure(len(quantities), columns, 150, spacing=0.24)
     for index, quantity in enumerate(quantities):
-        samples = {label: run[quantity] for label, run in timing.items() if quantity in run}
+        samples = {label: each[quantity] for label, each in timing.items() if quantity in each}
         edges = np.histogram_bin_edges(np.concatenate(list(samples.values())), bins=HISTOGRAM_BINS)
         for label, values in samples.items():
             counts = np.histogram(values, edges)[0].astype(float)
@@ -371,7 +459,7 @@ def timing_figure(runs: Runs, colours: Mapping[str, str]) -> Figure | None:
                 "y": counts,
                 "width": float(width),
                 "name": label,
-                "marker": {"color": colours[label]},
+                "marker": {"color": runs[label].colour},
                 "legendgroup": label,
                 "showlegend": len(runs) > 1 and first_in_legend(figure, label),
                 "opacity": 1.0 if len(runs) == 1 else 0.6,

@@ -119,11 +119,10 @@ def _imported_page(flight: RecordedFlight) -> Page:
     """What an autopilot logged of y, u and the pose."""
     tape = flight.tape
     source = flight.summary["source"]
-    context = figures.plot_context(tape, flight.units, {})
+    context = figures.plot_context([flight])
     flight_tables = tables.imported_tables(flight.summary, flight.units)
     colour = figures.PLANT
     pose = None
-    spectrum = figures.spectrum_figure({"u": (tape, flight.period_ns)}, {"u": colour}, flight.units)
     if "pose" in tape:
         pose = time_series_figure(
             context._replace(units=QUANTITY_UNITS), {"pose": Curve(tape["pose"], colour)}, columns=2
@@ -142,9 +141,14 @@ def _imported_page(flight: RecordedFlight) -> Page:
                 "about trim",
                 time_series_figure(context, {"y": Curve(tape["y"], colour)}),
             ),
-            Section("Input u", "about trim", figures.input_figure(context, {})),
+            Section("Input u", "about trim", figures.input_figure(context)),
             Section("Pose", "", pose),
-            Section("Spectrum of u", "amplitude spectral density", spectrum, over_time=False),
+            Section(
+                "Spectrum of u",
+                "amplitude spectral density",
+                figures.spectrum_figure(context),
+                over_time=False,
+            ),
         ],
         context.samples,
         flight.summary["notes"],
@@ -155,7 +159,7 @@ def _imported_page(flight: RecordedFlight) -> Page:
 def _flight_page(flight: RecordedFlight, scenario: Scenario) -> Page:
     units = flight.units
     gusts = flight.gusts
-    context = figures.plot_context(flight.tape, units, gusts)
+    context = figures.plot_context([flight])
     loops = flown_loops(flight.tape, scenario, flight.controllers)
     flight_tables = tables.flight_tables(
         flight.summary, units, tables.events(flight.tape, gusts, scenario)
@@ -181,13 +185,9 @@ def _outcome_line(text: str, flight: RecordedFlight) -> Line:
 
 
 def _comparison_page(flights: Sequence[RecordedFlight]) -> Page:
-    context = comparison.plot_context(flights)
-    colours = comparison.colours(flights)
+    context = figures.plot_context(flights)
+    colours = {label: run.colour for label, run in context.runs.items()}
     scenarios = [flight.scenario for flight in flights if flight.scenario is not None]
-    runs = {
-        label: (flight.tape, flight.period_ns)
-        for label, flight in zip(colours, flights, strict=True)
-    }
     lines = []
     for (label, colour), flight, scenario in zip(colours.items(), flights, scenarios, strict=True):
         text = f"{scenario.name}: {_description(flight, scenario)} ({flight.summary['error']})"
@@ -205,18 +205,11 @@ def _comparison_page(flights: Sequence[RecordedFlight]) -> Page:
         TableGroup(comparison.tick_tables(flights), "Time", "", palette),
     ]
     sections = [
-        Section(
-            "Output y over the reference y_m", "", comparison.tracking_figure(context, flights)
-        ),
-        Section("Tracking error e = y - y_m", "", comparison.error_figure(context, flights)),
-        Section("Input u", "", comparison.input_figure(context, flights)),
-        Section(
-            "Spectrum of u",
-            "",
-            figures.spectrum_figure(runs, colours, context.units),
-            over_time=False,
-        ),
-        Section("Timing of the ticks", "", figures.timing_figure(runs, colours), over_time=False),
+        Section("Output y over the reference y_m", "", figures.tracking_figure(context)),
+        Section("Tracking error e = y - y_m", "", figures.error_figure(context)),
+        Section("Input u", "", figures.input_figure(context)),
+        Section("Spectrum of u", "", figures.spectrum_figure(context), over_time=False),
+        Section("Timing of the ticks", "", figures.timing_figure(context), over_time=False),
     ]
     guided = {
         label: flight
@@ -270,9 +263,7 @@ def _sections(
 ) -> list[Section]:
     floors = {name: metrics["floor"] or 0.0 for name, metrics in flight.summary["errors"].items()}
     limits = figures.input_limits(scenario, flight.tape)
-    run = (flight.tape, flight.period_ns)
-    colour = figures.PLANT
-    spectrum = figures.spectrum_figure({"u": run}, {"u": colour}, context.units)
+    spectrum = figures.spectrum_figure(context)
     trim = _about_trim(scenario)
     return [
         *_guidance_sections(flight, scenario, context),
@@ -309,12 +300,7 @@ def _sections(
             "late: after its deadline; age: of y at the tick; dt: as integrated",
             figures.tick_figure(context),
         ),
-        Section(
-            "Timing of the ticks",
-            "",
-            figures.timing_figure({"": run}, {"": colour}),
-            over_time=False,
-        ),
+        Section("Timing of the ticks", "", figures.timing_figure(context), over_time=False),
     ]
 
 
@@ -402,7 +388,7 @@ def _parts(page: Page) -> Iterator[str]:
     environment.filters |= {"script_json": script_json, "ratio": format_ratio, "css": Markup}
     return environment.get_template("page.html.jinja").generate(
         page=page,
-        dark=plotting.DARK | figures.DARK | comparison.DARK,
+        dark=plotting.DARK | figures.DARK,
         library=pack((HERE / "vendor" / "plotly-basic.min.js").read_bytes()),
         script=Markup((HERE / "page.js").read_text(encoding="utf-8")),  # noqa: S704 - our own file
     )

@@ -13,8 +13,8 @@ import numpy as np
 from flight_analysis.linear_loop.guarantee import Guarantee
 from flight_analysis.linear_loop.input_margins import Margins, disk_gain, disk_phase, loop_transfer
 from flight_analysis.linear_loop.loop_margins import LinearLoop, LoopMargins, loop_margins
-from flight_analysis.report import comparison
 from flight_analysis.report.display_units import NO_VALUE
+from flight_analysis.report.figures import COLOURS
 from flight_analysis.report.flown_models import FlownLoop
 from flight_analysis.report.plotting import Figure, add_line, axis, first_in_legend, set_layout
 from flight_analysis.report.summary_rows import Column
@@ -365,4 +365,4 @@ def _response(loop: LinearLoop) -> tuple[FloatArray, Any]:
 
 
 def _colours(names: Sequence[str]) -> list[str]:
-    return [comparison.COLOURS[k % len(comparison.COLOURS)] for k in range(len(names))]
+    return [COLOURS[k % len(COLOURS)] for k in range(len(names))]

@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from flight_analysis.metrics import best_error
-from flight_analysis.report import comparison
 from flight_analysis.report.display_units import NO_UNIT, channel_label
-from flight_analysis.report.figures import GUST, REFERENCE, flight_end, gust_intervals
-from flight_analysis.report.summary import RecordedFlight
+from flight_analysis.report.figures import GUST, REFERENCE, flight_end, gust_intervals, runs_of
+from flight_analysis.report.summary import RecordedFlight, common_units
 from flight_core.arguments import as_names
 from flight_core.files import replacing
 from flight_core.parameters import one_of, require
@@ -123,7 +122,7 @@ def draw_channel(
     axes: "Axes", flights: Sequence[RecordedFlight], name: str, line_width: float = LINE_WIDTH
 ) -> None:
     """Draw a channel of each flight, with the reference and the gusts of the first."""
-    units = comparison.units(flights)
+    units = common_units(flights)
     plain = name.removeprefix("e.")
     is_error = name != plain
     first = flights[0]
@@ -139,8 +138,7 @@ def draw_channel(
         plot(
             first.tape, first.tape["y_m"], color=REFERENCE, linewidth=3.0 * line_width, label="y_m"
         )
-    for (label, colour), flight in zip(comparison.colours(flights).items(), flights, strict=True):
-        tape = flight.tape
+    for label, (tape, _, colour) in runs_of(flights).items():
         signal = best_error(tape)[1] if is_error else tape.signals.get("y" if is_output else "u")
         if signal is not None and plain in signal.names:
             drawn = {} if is_output else {"drawstyle": "steps-post"}

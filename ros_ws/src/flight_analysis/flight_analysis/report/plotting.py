@@ -139,14 +139,32 @@ class Interval(NamedTuple):
     labelled: bool  # with a label over the interval, else in the legend
 
 
+class Run(NamedTuple):
+    """A flight of a figure."""
+
+    tape: Tape
+    period_ns: int  # of the controller's ticks
+    colour: str
+
+
 class PlotContext(NamedTuple):
     """Common parts of the figures of a page."""
 
-    tape: Tape
+    runs: Mapping[str, Run]  # by label; one, or several that are compared
     units: Mapping[str, DisplayUnit]  # by channel
     intervals: Sequence[Interval]
-    end: float  # of the flight, s
+    end: float  # of the longest flight, s
     samples: SampleStore
+
+    @property
+    def tape(self) -> Tape:
+        """The tape of the flight; of several of the first."""
+        return next(iter(self.runs.values())).tape
+
+    @property
+    def is_comparison(self) -> bool:
+        """Whether the figures have several flights."""
+        return len(self.runs) > 1
 
 
 class Curve(NamedTuple):
@@ -157,6 +175,7 @@ class Curve(NamedTuple):
     width: float = 1.4
     steps: bool = False  # each value is held until the next sample, like u
     faint: bool = False
+    start_ns: int | None = None  # where t is 0; None: the start of the flight of the page
 
 
 class Figure:
@@ -300,7 +319,7 @@ def add_line(
 def _trace(
     context: PlotContext, curve: Curve, channel: str, factor: float, most: int
 ) -> dict[str, Any]:
-    t_ns, values = _drawn(context, curve.signal, channel, factor, curve.steps)
+    t_ns, values = _drawn(context, curve, channel, factor)
     style = {
         "color": curve.colour,
         "width": curve.width,
@@ -324,18 +343,17 @@ def stored(context: PlotContext, signal: Signal, channel: str, factor: float) ->
     """Places of the times and the values of a channel, times a factor, on the page. A long curve is
     there once.
     """
-    t_ns, values = _drawn(context, signal, channel, factor, steps=False)
+    t_ns, values = _drawn(context, Curve(signal, ""), channel, factor)
     return context.samples.times(t_ns), context.samples.values(values)
 
 
 def _drawn(
-    context: PlotContext, signal: Signal, channel: str, factor: float, steps: bool
+    context: PlotContext, curve: Curve, channel: str, factor: float
 ) -> tuple[NDArray[np.int64], FloatArray]:
     """Instants and values of a channel times a factor, with a NaN at the start of a gap."""
-    t_ns, gaps, width = context.samples.instants(
-        signal.stamp_ns, context.tape.start_ns, steps=steps
-    )
-    values = signal[channel] * factor
+    start_ns = context.tape.start_ns if curve.start_ns is None else curve.start_ns
+    t_ns, gaps, width = context.samples.instants(curve.signal.stamp_ns, start_ns, steps=curve.steps)
+    values = curve.signal[channel] * factor
     values = np.insert(values, gaps, np.nan) if len(gaps) else values
     return t_ns, values if width == 1 else _extremes_of_bins(values, width)
 

@@ -132,6 +132,22 @@ class RecordedFlight(NamedTuple):
         return self.scenario.gust_windows()
 
 
+def labels(flights: Sequence[RecordedFlight]) -> list[str]:
+    """Names of the flights; equal names get a number."""
+    names = [flight.name for flight in flights]
+    return [
+        f"{name} ({k})" if names.count(name) > 1 else name for k, name in enumerate(names, start=1)
+    ]
+
+
+def common_units(flights: Sequence[RecordedFlight]) -> dict[str, DisplayUnit]:
+    """Units by channel, of the first flight with the channel."""
+    by_channel: dict[str, DisplayUnit] = {}
+    for flight in reversed(flights):
+        by_channel |= flight.units
+    return by_channel
+
+
 def summarise(
     tape: Tape,
     scenario: Scenario | None = None,

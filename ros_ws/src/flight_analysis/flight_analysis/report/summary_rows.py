@@ -1,29 +1,53 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The columns and rows of the tables of a summary, as text."""
+"""The metrics of a summary, each declared once: its place there, heading, unit and digits; and the
+rows of tables, as text.
+"""
 
 from collections.abc import Mapping, Sequence
+from itertools import groupby
 from typing import Any, NamedTuple
 
 from flight_analysis.metrics import AIRS, CALM
 from flight_analysis.report.display_units import (
     NO_UNIT,
     NO_VALUE,
+    QUANTITY_UNITS,
     DisplayUnit,
     channel_label,
     format_value,
 )
 
+MILLISECONDS = DisplayUnit("ms", 1e3)
+
 
 class Column(NamedTuple):
-    """A column of a table: the heading, the common heading of neighbouring columns above, and the
-    path of the metric.
+    """A column of a table, or a metric: the heading, the common heading of neighbouring columns
+    above, and the path in a summary.
     """
 
     group: str
     head: str
     path: tuple[str, ...] = ()
-    scaled: bool = True  # in the unit of its row
+    unit: DisplayUnit | None = None  # None: that of its row
+    decimals: int | None = None  # after the point; None: three digits in all
+
+    @property
+    def label(self) -> str:
+        """The whole heading."""
+        return f"{self.group} {self.head}".strip()
+
+    def value(self, figures: Mapping[str, Any]) -> float | None:
+        """The metric in the part of a summary that the path begins in, SI; None if missing."""
+        return metric(figures, *self.path)
+
+    def text(self, figures: Mapping[str, Any], row_unit: DisplayUnit = NO_UNIT) -> str:
+        """The metric as text, in its unit or that of the row."""
+        value = self.value(figures)
+        factor = (self.unit or row_unit).factor
+        if value is None or self.decimals is None:
+            return format_value(value, factor)
+        return f"{value * factor:.{self.decimals}f}"
 
 
 RMS_COLUMNS = (
@@ -51,7 +75,7 @@ ERROR_COLUMNS = (
 NOISE_FLOOR_COLUMN = Column("noise", "floor", ("floor",))
 
 
-SWITCH_COLUMN = Column("switches", "(1/s)", ("sign_switches",), scaled=False)
+SWITCH_COLUMN = Column("switches", "(1/s)", ("sign_switches",), NO_UNIT)
 
 
 INPUT_COLUMNS = (
@@ -70,12 +94,39 @@ SATURATION_COLUMN = Column("saturated", "%")
 SETTLING_COLUMNS = {kind: Column("settling (s)", kind) for kind in ("command", "gust")}
 
 
+HELD_COLUMNS = (
+    Column("", "rms", ("rms",)),
+    Column("", "max", ("max",)),
+    Column("", "overshoot", ("overshoot",)),
+    Column("", "settling (s)", ("settling",), NO_UNIT),
+)
+"""Errors of a quantity that guidance held over a segment."""
+
+
+def _ms(group: str, topic: str, **heads: str) -> tuple[Column, ...]:
+    """Times of a topic of the summary, by key with the heading."""
+    return tuple(Column(group, head, (topic, key), MILLISECONDS, 3) for key, head in heads.items())
+
+
+TIMING_COLUMNS = (
+    Column("ticks", "", ("ticks", "ticks"), NO_UNIT, 0),
+    Column("periods without a new y", "", ("ticks", "without_new_y"), NO_UNIT, 0),
+    *_ms("period", "ticks", period_mean="mean", period_p99="p99", period_max="max"),
+    *_ms("jitter", "ticks", jitter="rms"),
+    *_ms("after the deadline", "ticks", late_p99="p99", late_max="max"),
+    *_ms("age of y", "ticks", age_p99="p99"),
+    *_ms("y sent to u sent", "latency", median="median", p99="p99", max="max"),
+    *_ms("age of u at the aircraft", "age_of_u", mean="mean", max="max"),
+)
+"""The timing of the controller."""
+
+
 def columns_of(columns: Sequence[Column], channels: Mapping[str, Any]) -> tuple[Column, ...]:
     """The columns with a value: a part of the flight that did not occur has none."""
     return tuple(
         column
         for column in columns
-        if any(metric(metrics, *column.path) is not None for metrics in channels.values())
+        if any(column.value(metrics) is not None for metrics in channels.values())
     )
 
 
@@ -108,13 +159,45 @@ def table_rows(
     """
     rows = []
     for name, metrics in channels.items():
-        factor = units.get(name, NO_UNIT).factor
-        cells = [
-            format_value(metric(metrics, *column.path), factor if column.scaled else 1.0)
-            for column in columns
-        ]
+        cells = [column.text(metrics, units.get(name, NO_UNIT)) for column in columns]
         rows.append([channel_label(name, units), *cells])
     return rows
+
+
+def timing_rows(summary: Mapping[str, Any], *topics: str) -> list[tuple[str, str]]:
+    """The timing of the controller: a row for the metrics with a common heading, with its unit.
+
+    `topics` of the summary; empty: all.
+    """
+    rows = []
+    for group, metrics in groupby(TIMING_COLUMNS, key=lambda column: column.group):
+        columns = [column for column in metrics if column.value(summary) is not None]
+        if columns and (not topics or columns[0].path[0] in topics):
+            unit = columns[0].unit or NO_UNIT
+            heads = " / ".join(column.head for column in columns)
+            label = f"{group} {heads} ({unit.unit})" if unit.unit else group
+            rows.append((label, " / ".join(column.text(summary) for column in columns)))
+    return rows
+
+
+def segment_table(
+    segments: Sequence[Mapping[str, Any]], held: Sequence[Column] = HELD_COLUMNS
+) -> tuple[list[Column], list[list[str]]]:
+    """Columns and rows of what guidance held in each segment; `held`: of HELD_COLUMNS."""
+    columns = [Column("", head) for head in ("from (s)", "to (s)")]
+    for group in ("lateral", "vertical"):
+        columns += [Column(group, "held"), *(each._replace(group=group) for each in held)]
+    columns += [each._replace(group="V (m/s)") for each in held[:2]]
+    rows = []
+    for segment in segments:
+        name = segment["lateral"]["quantity"] if segment["leg"] is None else f"leg {segment['leg']}"
+        row = [name, f"{segment['start']:.1f}", f"{segment['stop']:.1f}"]
+        for quantity in (segment["lateral"], segment["vertical"]):
+            row.append(channel_label(quantity["quantity"], QUANTITY_UNITS))
+            unit = QUANTITY_UNITS[quantity["quantity"]]
+            row += [each.text(quantity, unit) for each in held]
+        rows.append([*row, *(each.text(segment["V"]) for each in held[:2])])
+    return columns, rows
 
 
 def input_rows(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -> list[list[str]]:

@@ -27,8 +27,10 @@ from flight_analysis.report.summary_rows import (
     columns_of,
     input_rows,
     model_rows,
+    segment_table,
     slowest_settling,
     table_rows,
+    timing_rows,
 )
 from flight_core.modes import Mode
 from flight_core.tape import Tape
@@ -233,23 +235,7 @@ def _error_table(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -
 
 def _guidance_table(summary: Mapping[str, Any]) -> Table:
     guidance = summary["guidance"] or {"segments": (), "legs": ()}
-    metrics = ("rms", "max", "overshoot", "settling")
-    columns = [Column("", head) for head in ("from (s)", "to (s)")]
-    for group in ("lateral", "vertical"):
-        columns += [Column(group, head) for head in ("held", *metrics[:-1], "settling (s)")]
-    columns += [Column("V (m/s)", head) for head in metrics[:2]]
-    rows = []
-    for segment in guidance["segments"]:
-        name = segment["lateral"]["quantity"] if segment["leg"] is None else f"leg {segment['leg']}"
-        row = [name, f"{segment['start']:.1f}", f"{segment['stop']:.1f}"]
-        for quantity in (segment["lateral"], segment["vertical"]):
-            unit, factor = QUANTITY_UNITS[quantity["quantity"]]
-            factors = (factor, factor, factor, 1.0)
-            row += [
-                f"{quantity['quantity']} ({unit})",
-                *map(format_value, (quantity[name] for name in metrics), factors),
-            ]
-        rows.append([*row, *(format_value(segment["V"][name]) for name in metrics[:2])])
+    columns, rows = segment_table(guidance["segments"])
     results = (landing_results(guidance.get("landing")), leg_results(guidance["legs"]))
     legend = sentences(*results, GUIDANCE_LEGEND) if rows else ""
     return Table(f"Guidance by segment{taken_over(summary, 'guidance')}", columns, rows, legend)
@@ -262,30 +248,8 @@ def _model_table(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -
 
 
 def _tick_table(summary: Mapping[str, Any]) -> Table:
-    ticks = summary["ticks"]
-    latency = summary["latency"]
-    rows: list[tuple[str, str]] = []
-
-    def ms(*values: float) -> str:
-        return " / ".join(f"{value * 1e3:.3f}" for value in values)
-
-    if ticks is not None:
-        rows = [
-            ("ticks", f"{ticks['ticks']}"),
-            ("periods without a new y", f"{ticks['without_new_y']}"),
-            (
-                "period mean / p99 / max (ms)",
-                ms(ticks["period_mean"], ticks["period_p99"], ticks["period_max"]),
-            ),
-            ("jitter rms (ms)", ms(ticks["jitter"])),
-            ("after the deadline p99 / max (ms)", ms(ticks["late_p99"], ticks["late_max"])),
-            ("age of y p99 (ms)", ms(ticks["age_p99"])),
-        ]
-        if latency is not None:
-            rows.append(("y sent to u sent median / p99 / max (ms)", ms(*latency.values())))
-        if (age := summary["age_of_u"]) is not None:
-            rows.append(("age of u at the aircraft mean / max (ms)", ms(*age.values())))
-    return Table(f"Ticks of the controller{taken_over(summary, 'ticks')}", [Column("", "")], rows)
+    caption = f"Ticks of the controller{taken_over(summary, 'ticks')}"
+    return Table(caption, [Column("", "")], timing_rows(summary))
 
 
 def _process_table(summary: Mapping[str, Any]) -> Table:
