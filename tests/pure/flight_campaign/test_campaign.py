@@ -599,10 +599,16 @@ def test_campaign_is_not_continued_with_another_definition(flown: Campaign) -> N
     )
 
 
-def command(*arguments: str, cwd: Path) -> "subprocess.Popen[str]":
+def command(*arguments: str, cwd: Path, group: bool = False) -> "subprocess.Popen[str]":
+    """The command, with `group` in a group of processes of its own, as in a terminal."""
     program = [sys.executable, "-m", "flight_cli.cli", "campaign", *arguments, "--json"]
     return subprocess.Popen(
-        program, cwd=cwd, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        program,
+        cwd=cwd,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=group,
     )
 
 
@@ -665,6 +671,22 @@ def test_ctrl_c_prints_the_command_to_resume(tmp_path: Path) -> None:
     assert stopped.returncode == 130, errors
     assert "Traceback" not in errors
     assert f"continue with: rise-di campaign {folder.relative_to(tmp_path)}" in output + errors
+
+
+def test_ctrl_c_ends_the_processes_of_missions(tmp_path: Path) -> None:
+    """A terminal sends the signal to the workers too."""
+    short = ("osprey_route", "--duration", "3", "--aircraft", "400", "--set", "chunk=1")
+    stopped = command(*short, "--set", "runs=part", "--set", "workers=2", cwd=tmp_path, group=True)
+    wait_for_chunks(tmp_path / "part", 1, stopped)
+    workers = psutil.Process(stopped.pid).children(recursive=True)
+    assert len(workers) >= 2
+    os.killpg(stopped.pid, signal.SIGINT)
+    output, errors = stopped.communicate()
+    assert stopped.returncode == 130, errors
+    assert "continue with: rise-di campaign part/" in output + errors
+    assert "Traceback" not in errors
+    _, alive = psutil.wait_procs(workers, timeout=10.0)
+    assert not alive
 
 
 def square(job: engines.Job) -> int:

@@ -206,7 +206,10 @@ def _local_cluster(workers: int, devices: Devices) -> Iterator[Any]:
 
     with dask.config.set(LOST_WORKER_TIMEOUT):
         cluster = LocalCluster(
-            n_workers=workers, threads_per_worker=THREADS if devices else 1, dashboard_address=None
+            n_workers=workers,
+            threads_per_worker=THREADS if devices else 1,
+            dashboard_address=":0",  # a port that no other cluster of the host has
+            silence_logs=logging.CRITICAL,  # of workers that end in a chunk, as after Ctrl-C
         )
         try:
             yield cluster
