@@ -318,7 +318,7 @@ def test_every_time_of_the_summary_has_a_heading() -> None:
     measured = [(topic, name) for topic, kind in kinds.items() for name in kind._fields]
     assert sorted(column.path for column in TIMING_COLUMNS) == sorted(measured)
     summary = {topic: dict.fromkeys(kind._fields, 0.0125) for topic, kind in kinds.items()}
-    rows = dict(timing_rows(summary))
+    rows = {label: text for _, label, text in timing_rows(summary)}
     assert rows["period mean / p99 / max (ms)"] == "12.500 / 12.500 / 12.500"
     assert len(rows) == len({column.group for column in TIMING_COLUMNS})
 

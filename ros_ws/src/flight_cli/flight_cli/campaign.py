@@ -45,6 +45,7 @@ from flight_cli.output import (
     print_table,
     progress_bar,
     say,
+    show_table,
 )
 from flight_cli.words import argument, json_option, option, require_unused, setting
 from flight_core.files import display_path, writing
@@ -200,8 +201,8 @@ def _show_cases(
     for case, figures in enumerate(cases):
         _show(console, definition, case, monte_carlo.tally(case), figures)
         if figures["influence"]["entries"]:
-            _print(console, influence_table(definition.label(case), figures), "entry")
-    _print(console, results, "figure")
+            show_table(console, influence_table(definition.label(case), figures))
+    show_table(console, results)
 
 
 def _named_numbers(option: str, texts: Sequence[str], example: str) -> dict[str, float]:
@@ -268,18 +269,6 @@ def _fly_missing(
         )
         raise typer.Exit(INTERRUPTED) from None
     return flown * seconds / (time.monotonic() - begin)
-
-
-def _print(console: Console, results: Table, first: str) -> None:
-    """Print a table of the page; `first` heads the names of the rows."""
-    table = new_table(
-        escape(f"\n{results.caption}"),
-        (first, *(escape(column.head) for column in results.columns)),
-    )
-    for name, *values in results.rows:
-        table.add_row(escape(name), *values)
-    print_table(console, table)
-    say(console, results.legend, style="dim")
 
 
 def _show(

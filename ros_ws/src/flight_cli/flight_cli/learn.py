@@ -15,16 +15,17 @@ from flight_analysis.closed_loop.replay import recorded_scenario
 from flight_analysis.report.display_units import display_units
 from flight_analysis.report.model_spans import errors_by_model
 from flight_analysis.report.run_folder import log_account
+from flight_analysis.report.tables import model_table
 from flight_cli.log_options import log_namespace, log_scenario, scenario_file, warn_of_lacks
 from flight_cli.output import (
     LATEST,
     entries_as_json,
     entry_table,
-    model_table,
     print_json,
     print_table,
     require_yaml,
     say,
+    show_table,
     write_text,
 )
 from flight_cli.settings import settings_option, with_settings
@@ -77,7 +78,7 @@ class Learn:
                 console, entry_table(f"A and B of the last identification{part}", result.entries)
             )
         if models := [span._asdict() for span in errors_by_model(recorded.tape)]:
-            print_table(console, model_table(models, display_units(flown), part))
+            show_table(console, model_table(models, display_units(flown), part))
         if result.model is not None and self.write is not None:
             write_text("--write", self.write, learned_yaml(result, str(self.run)))
             say(console, f"model: {escape(display_path(self.write))}")

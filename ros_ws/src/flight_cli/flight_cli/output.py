@@ -4,10 +4,10 @@
 
 import json
 import sys
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, redirect_stdout
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from rich import box
 from rich.cells import cell_len
@@ -26,35 +26,14 @@ from rich.text import Text
 
 from flight_analysis.closed_loop.learning_loop import Entry
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.report.display_units import (
-    DisplayUnit,
-    format_seconds,
-)
 from flight_analysis.report.flown_models import flown_loops
-from flight_analysis.report.guided import leg_results
-from flight_analysis.report.summary import (
-    RecordedFlight,
-    command_results,
-    finite_or_null,
-    parts_legend,
-    taken_over,
-    time_flown,
-)
-from flight_analysis.report.summary_rows import (
-    ERROR_COLUMNS,
-    HELD_COLUMNS,
-    INPUT_COLUMNS,
-    SATURATION_COLUMN,
-    Column,
-    columns_of,
-    input_rows,
-    model_rows,
-    segment_table,
-    table_rows,
-    timing_rows,
-)
+from flight_analysis.report.summary import RecordedFlight, command_results, finite_or_null
+from flight_analysis.report.summary_rows import Column
 from flight_core.files import write_file, writing
 from flight_core.parameters import require
+
+if TYPE_CHECKING:
+    from flight_analysis.report.tables import Table as PageTable
 
 # exit status; bad input is 2 (`flight_cli.cli`)
 INTERRUPTED = 130
@@ -67,41 +46,21 @@ LATEST = Path("runs/latest")  # the run of a command that is given none
 
 def show_flight(console: Console, flight: RecordedFlight) -> None:
     """Print the tables of a flight."""
+    from flight_analysis.report import tables  # noqa: PLC0415 - loads the figures of pages
+
     summary = flight.summary
-    units = flight.units
-    if flight.scenario is None:
-        _show_imported(console, flight)
-        return
     if busy := (summary["account"] or {}).get("busy"):
         say(console, busy, style="bold")
-    title = f"Tracking error ({summary['error']}), {time_flown(summary)}"
-    columns = columns_of(ERROR_COLUMNS, summary["errors"])
-    print_table(
-        console,
-        grouped_table(title, "channel", columns, table_rows(summary["errors"], columns, units)),
-    )
-    if rows := input_rows(summary, units):
-        title = f"Inputs about trim, and mean abs(u_dot) per second{taken_over(summary, 'inputs')}"
-        columns = (*columns_of(INPUT_COLUMNS, summary["inputs"]), SATURATION_COLUMN)
-        print_table(console, grouped_table(title, "input", columns, rows))
-    if summary["guidance"]:
-        title = f"Guidance by segment{taken_over(summary, 'guidance')}"
-        segments = segment_table(summary["guidance"]["segments"], HELD_COLUMNS[:2])
-        print_table(console, grouped_table(title, "segment", *segments))
-        if legs := leg_results(summary["guidance"]["legs"]):
-            say(console, f"{legs}{taken_over(summary, 'guidance')}")
-    if summary["models"]:
-        print_table(console, model_table(summary["models"], units, taken_over(summary, "errors")))
-    if flight.controllers:
+    shown = tables.imported_tables if flight.scenario is None else tables.metric_tables
+    for table in shown(summary, flight.units):
+        show_table(console, table)
+    if flight.controllers and flight.scenario is not None:
         _show_margins(console, flight, flight.scenario)
     if commands := command_results(summary):
         say(console, commands)
-    say(console, parts_legend(summary), style="dim")
-    for line in (
-        *_timing(summary),
-        *(f"note: {note}" for note in summary["notes"] if note != busy),
-    ):
-        say(console, line)
+    for note in summary["notes"]:
+        if note != busy:
+            say(console, f"note: {note}")
 
 
 def _show_margins(console: Console, flight: RecordedFlight, scenario: Scenario) -> None:
@@ -111,40 +70,14 @@ def _show_margins(console: Console, flight: RecordedFlight, scenario: Scenario) 
     loops = flown_loops(flight.tape, scenario, flight.controllers)
     if not loops:
         return
-    margins = margin_figures.flown_margin_table(loops)
-    print_table(console, grouped_table(margins.caption, "", margins.columns, margins.rows))
+    show_table(console, margin_figures.flown_margin_table(loops))
 
 
-def _show_imported(console: Console, flight: RecordedFlight) -> None:
-    """Print y and u of a flight that the stack did not fly."""
-    summary = flight.summary
-    for title, key in (("Outputs", "outputs"), ("Inputs", "inputs")):
-        columns = columns_of(INPUT_COLUMNS, summary[key])
-        caption = f"{title} about trim, {format_seconds(summary['duration'])}"
-        print_table(
-            console,
-            grouped_table(
-                caption, "channel", columns, table_rows(summary[key], columns, flight.units)
-            ),
-        )
-    for note in summary["notes"]:
-        say(console, f"note: {note}")
-
-
-def model_table(
-    models: Sequence[Mapping[str, Any]], units: Mapping[str, DisplayUnit], part: str = ""
-) -> Table:
-    """The rms of the error before the first learned model and under each. `part` of the flight that
-    the log has.
-    """
-    headings, rows = model_rows(models, units)
-    table = new_table(
-        f"Rms of the error by model{part}",
-        ["", *(heading.replace(" ", "\n") for heading in headings)],
-    )
-    for row in rows:
-        table.add_row(*row)
-    return table
+def show_table(console: Console, table: "PageTable") -> None:
+    """Print a table of the page with its legend."""
+    print_table(console, grouped_table(table.caption, table.columns, table.rows))
+    if table.legend:
+        say(console, table.legend, style="dim")
 
 
 def entry_table(title: str, entries: Iterable[Entry]) -> Table:
@@ -254,31 +187,18 @@ def flight_progress(
         )
 
 
-def grouped_table(
-    title: str, first: str, columns: Sequence[Column], rows: Iterable[Sequence[str]]
-) -> Table:
-    """A table whose adjacent columns of one group share a heading."""
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=0)
-    table.add_column(f"\n{first}", no_wrap=True)
+def grouped_table(title: str, columns: Sequence[Column], rows: Iterable[Sequence[str]]) -> Table:
+    """A table whose adjacent columns of one group share a heading, after the names of the rows."""
+    table = Table(title=escape(title), title_justify="left", box=box.SIMPLE_HEAD, padding=0)
+    table.show_header = any(column.label for column in columns)
+    table.add_column("", no_wrap=True)
     for column, before in zip(columns, (None, *columns), strict=False):
         begins = before is None or column.group != before.group
         heading = f"{column.group if begins else ''}\n{column.head}"
         table.add_column(heading, justify="right", no_wrap=True)
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*map(escape, row))
     return table
-
-
-def _timing(summary: Mapping[str, Any]) -> list[str]:
-    """The timing of the controller, a line for each topic of the summary."""
-    lines = []
-    for topic in ("ticks", "latency", "age_of_u"):
-        if rows := timing_rows(summary, topic):
-            (first, text), *others = rows
-            parts = [f"{first}{taken_over(summary, topic)}: {text}"]
-            parts += [f"{label}: {text}" for label, text in others]
-            lines.append("; ".join(parts))
-    return lines
 
 
 def parse_numbers(text: str) -> list[float]:

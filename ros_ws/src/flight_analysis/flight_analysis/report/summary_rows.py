@@ -39,7 +39,10 @@ class Column(NamedTuple):
 
     def value(self, figures: Mapping[str, Any]) -> float | None:
         """The metric in the part of a summary that the path begins in, SI; None if missing."""
-        return metric(figures, *self.path)
+        value: Any = figures
+        for key in self.path:
+            value = value.get(key) if isinstance(value, Mapping) else None
+        return value if isinstance(value, float | int) else None
 
     def text(self, figures: Mapping[str, Any], row_unit: DisplayUnit = NO_UNIT) -> str:
         """The metric as text, in its unit or that of the row."""
@@ -130,14 +133,6 @@ def columns_of(columns: Sequence[Column], channels: Mapping[str, Any]) -> tuple[
     )
 
 
-def metric(summary: Mapping[str, Any], *path: str) -> float | None:
-    """A metric by the path in a summary; None for a missing metric."""
-    value: Any = summary
-    for key in path:
-        value = value.get(key) if isinstance(value, Mapping) else None
-    return value if isinstance(value, float | int) else None
-
-
 def model_rows(
     models: Sequence[Mapping[str, Any]], units: Mapping[str, DisplayUnit]
 ) -> tuple[list[str], list[list[str]]]:
@@ -164,30 +159,31 @@ def table_rows(
     return rows
 
 
-def timing_rows(summary: Mapping[str, Any], *topics: str) -> list[tuple[str, str]]:
-    """The timing of the controller: a row for the metrics with a common heading, with its unit.
-
-    `topics` of the summary; empty: all.
+def timing_rows(summary: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    """The timing of the controller: a row for the metrics with a common heading. Topic of the
+    summary, heading with the unit, values.
     """
     rows = []
     for group, metrics in groupby(TIMING_COLUMNS, key=lambda column: column.group):
         columns = [column for column in metrics if column.value(summary) is not None]
-        if columns and (not topics or columns[0].path[0] in topics):
+        if columns:
             unit = columns[0].unit or NO_UNIT
             heads = " / ".join(column.head for column in columns)
             label = f"{group} {heads} ({unit.unit})" if unit.unit else group
-            rows.append((label, " / ".join(column.text(summary) for column in columns)))
+            rows.append(
+                (columns[0].path[0], label, " / ".join(column.text(summary) for column in columns))
+            )
     return rows
 
 
 def segment_table(
-    segments: Sequence[Mapping[str, Any]], held: Sequence[Column] = HELD_COLUMNS
+    segments: Sequence[Mapping[str, Any]],
 ) -> tuple[list[Column], list[list[str]]]:
-    """Columns and rows of what guidance held in each segment; `held`: of HELD_COLUMNS."""
+    """Columns and rows of what guidance held in each segment."""
     columns = [Column("", head) for head in ("from (s)", "to (s)")]
     for group in ("lateral", "vertical"):
-        columns += [Column(group, "held"), *(each._replace(group=group) for each in held)]
-    columns += [each._replace(group="V (m/s)") for each in held[:2]]
+        columns += [Column(group, "held"), *(each._replace(group=group) for each in HELD_COLUMNS)]
+    columns += [each._replace(group="V (m/s)") for each in HELD_COLUMNS[:2]]
     rows = []
     for segment in segments:
         name = segment["lateral"]["quantity"] if segment["leg"] is None else f"leg {segment['leg']}"
@@ -195,8 +191,8 @@ def segment_table(
         for quantity in (segment["lateral"], segment["vertical"]):
             row.append(channel_label(quantity["quantity"], QUANTITY_UNITS))
             unit = QUANTITY_UNITS[quantity["quantity"]]
-            row += [each.text(quantity, unit) for each in held]
-        rows.append([*row, *(each.text(segment["V"]) for each in held[:2])])
+            row += [each.text(quantity, unit) for each in HELD_COLUMNS]
+        rows.append([*row, *(each.text(segment["V"]) for each in HELD_COLUMNS[:2])])
     return columns, rows
 
 

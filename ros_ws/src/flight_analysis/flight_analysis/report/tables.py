@@ -13,9 +13,14 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.metrics import MIN_BAND_NOISE_FLOORS, SETTLING_BAND, SETTLING_DWELL, Windows
 from flight_analysis.report import figures
 from flight_analysis.report.account import account_of_json
-from flight_analysis.report.display_units import QUANTITY_UNITS, DisplayUnit, format_value
+from flight_analysis.report.display_units import (
+    QUANTITY_UNITS,
+    DisplayUnit,
+    format_seconds,
+    format_value,
+)
 from flight_analysis.report.guided import BANDS, landing_results, leg_results
-from flight_analysis.report.summary import parts_legend, taken_over
+from flight_analysis.report.summary import parts_legend, taken_over, time_flown
 from flight_analysis.report.summary_rows import (
     ERROR_COLUMNS,
     INPUT_COLUMNS,
@@ -47,7 +52,7 @@ NOISE_FLOOR_LEGEND = (
     ". noise floor: of y; a smaller error cannot be distinguished from noise or rounding"
 )
 IMPORTED_LEGEND = (
-    "about trim, the median; rate: mean abs of the derivative, in the unit of the row per second"
+    "trim: the median; rate: mean abs of the derivative, in the unit of the row per second"
 )
 INPUT_LEGEND = "u about trim; rate: mean abs(u_dot), in the unit of the row per second"
 GUIDANCE_LEGEND = (
@@ -169,14 +174,11 @@ def events(tape: Tape, gusts: Windows, scenario: Scenario | None = None) -> list
     return sorted(listed, key=lambda event: event.start)
 
 
-def flight_tables(
-    summary: Mapping[str, Any], units: Mapping[str, DisplayUnit], event_list: Sequence[Interval]
-) -> list[Table]:
-    """Tables of the error, the inputs, the events and the ticks; a table without rows is left
-    out.
+def metric_tables(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -> list[Table]:
+    """Tables of the error, the inputs, guidance, the models and the ticks, of page and terminal; a
+    table without rows is left out.
     """
     inputs = (*columns_of(INPUT_COLUMNS, summary["inputs"]), SATURATION_COLUMN)
-    times = [Column("", head) for head in ("from (s)", "to (s)", "")]
     tables = (
         _error_table(summary, units),
         Table(
@@ -185,20 +187,27 @@ def flight_tables(
             input_rows(summary, units),
             INPUT_LEGEND + SATURATION_LEGEND,
         ),
-        Table(
-            f"Events{taken_over(summary, 'ticks')}",
-            times,
-            [
-                (event.name, f"{event.start:.2f}", f"{event.stop:.2f}", event.extent)
-                for event in event_list
-            ],
-        ),
         _guidance_table(summary),
-        _model_table(summary, units),
+        model_table(summary["models"], units, taken_over(summary, "errors")),
         _tick_table(summary),
-        _process_table(summary),
     )
     return [table for table in tables if table.rows]
+
+
+def flight_tables(
+    summary: Mapping[str, Any], units: Mapping[str, DisplayUnit], event_list: Sequence[Interval]
+) -> list[Table]:
+    """The tables of metrics, and those of the events and the processes."""
+    times = [Column("", head) for head in ("from (s)", "to (s)", "")]
+    rows = [
+        (event.name, f"{event.start:.2f}", f"{event.stop:.2f}", event.extent)
+        for event in event_list
+    ]
+    others = (
+        Table(f"Events{taken_over(summary, 'ticks')}", times, rows),
+        _process_table(summary),
+    )
+    return [*metric_tables(summary, units), *(table for table in others if table.rows)]
 
 
 def imported_tables(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -> list[Table]:
@@ -206,8 +215,9 @@ def imported_tables(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]
     tables = []
     for title, key in (("Outputs", "outputs"), ("Inputs", "inputs")):
         columns = columns_of(INPUT_COLUMNS, summary[key])
+        caption = f"{title} about trim, {format_seconds(summary['duration'])}"
         tables.append(
-            Table(title, columns, table_rows(summary[key], columns, units), IMPORTED_LEGEND)
+            Table(caption, columns, table_rows(summary[key], columns, units), IMPORTED_LEGEND)
         )
     flight_account = account_of_json(summary)
     rows = []
@@ -228,7 +238,7 @@ def _error_table(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -
     rows = table_rows(summary["errors"], columns, units)
     for channel, row in zip(summary["errors"], rows, strict=True):
         row.extend(slowest_settling(summary, channel, kind) for kind in settling)
-    caption = f"Tracking error ({summary['error']}){taken_over(summary, 'errors')}"
+    caption = f"Tracking error ({summary['error']}), {time_flown(summary)}"
     legend = f"{parts_legend(summary)}. {ERROR_LEGEND}{NOISE_FLOOR_LEGEND}"
     return Table(caption, (*columns, *(SETTLING_COLUMNS[kind] for kind in settling)), rows, legend)
 
@@ -241,15 +251,24 @@ def _guidance_table(summary: Mapping[str, Any]) -> Table:
     return Table(f"Guidance by segment{taken_over(summary, 'guidance')}", columns, rows, legend)
 
 
-def _model_table(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -> Table:
-    headings, rows = model_rows(summary["models"], units)
-    caption = f"Rms of the error by model{taken_over(summary, 'errors')}"
-    return Table(caption, [Column("", head) for head in headings], rows, MODEL_LEGEND)
+def model_table(
+    models: Sequence[Mapping[str, Any]], units: Mapping[str, DisplayUnit], part: str
+) -> Table:
+    """The rms of the error before the first learned model and under each. `part`: what the log has
+    of the flight, after a comma.
+    """
+    headings, rows = model_rows(models, units)
+    columns = [Column("", head) for head in headings]
+    return Table(f"Rms of the error by model{part}", columns, rows, MODEL_LEGEND)
 
 
 def _tick_table(summary: Mapping[str, Any]) -> Table:
     caption = f"Ticks of the controller{taken_over(summary, 'ticks')}"
-    return Table(caption, [Column("", "")], timing_rows(summary))
+    rows = []
+    for topic, label, text in timing_rows(summary):
+        part = "" if topic == "ticks" else taken_over(summary, topic)
+        rows.append((f"{label}{part}", text))
+    return Table(caption, [Column("", "")], rows)
 
 
 def _process_table(summary: Mapping[str, Any]) -> Table:
