@@ -300,7 +300,7 @@ def _spread_of_entries(definition: Definition) -> str:
 def score_meaning(scenario: Scenario, score_units: Mapping[str, float] | None = None) -> str:
     """What the score of a campaign counts; `score_units` replaces usual units by output, SI."""
     if scenario.guidance is not None:
-        half = CAPTURE_TIME * scenario.aircraft.channels().speed
+        half = CAPTURE_TIME * scenario.guidance.speed
         return (
             f"the largest cross-track error on the route in {half:g} m, {CAPTURE_TIME:g} s "
             "of flight at the trim speed"
