@@ -5,6 +5,7 @@ wrong, and the fallback.
 """
 
 import copy
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -641,6 +642,19 @@ def test_learned_part_keeps_the_margin_of_the_file_and_the_other_part_its_gains(
     assert is_stable(plant_of(model, design.controller), law, loop, aim.margin)
     slow = selected_observer(plain, flight, model, 0.03, uncertain=False, beside=file)
     assert design.cost < slow.cost
+
+
+def test_price_of_a_margin_that_is_asked_for_is_told() -> None:
+    known = {("p", "r"): Known(0, {}, {}, False, (0.0, 0.0))}
+    asked = made_learner(scenario(learn={"updates": [10.0], "margin": 0.04}))
+    proposed, price = asked._designed(OSPREY, known, {})
+    assert proposed.observer is not None
+    assert proposed.observer.margin == 0.04
+    sentence = r"^([\d.]+) times the error of 29 ms of delay margin, since 40 ms are asked for$"
+    times = re.search(sentence, price)
+    assert times is not None, price
+    assert 1.0 <= float(times[1]) < 1.5
+    assert made_learner(scenario())._designed(OSPREY, known, {})[1] == ""
 
 
 @pytest.mark.parametrize("latest", [(0.004, 0.05), (0.03, 0.004)])

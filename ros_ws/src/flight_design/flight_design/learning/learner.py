@@ -8,6 +8,7 @@ model that fails a check is refused with a sentence. The controller refuses para
 own checks at load.
 """
 
+import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -252,9 +253,9 @@ class Learner:
             self._test_next(verdict)
             nothing = "each part flies the law of the start from before on"
             return LearnerResult(None, "; ".join(verdict.refusals) or nothing)
-        self._adopt(verdict, without_model)
+        sentences.append(self._adopt(verdict, without_model))
         refused = [f"refused: {refusal}" for refusal in verdict.refusals]
-        return LearnerResult(self._last, "; ".join(sentences + refused))
+        return LearnerResult(self._last, "; ".join(filter(None, sentences + refused)))
 
     def _verdict(
         self,
@@ -318,9 +319,11 @@ class Learner:
         tested = with_entries(model, tried) if tried else model
         return Verdict(model, known, sentences, refusals, tested)
 
-    def _adopt(self, verdict: Verdict, without_model: dict[tuple[str, ...], str]) -> None:
-        """Design for a verdict, and take it as proposed. Raises ParameterError without a design."""
-        proposed = self._designed(verdict.model, verdict.known, without_model)
+    def _adopt(self, verdict: Verdict, without_model: dict[tuple[str, ...], str]) -> str:
+        """Design for a verdict, and take it as proposed: what `learn.margin` costs. Raises
+        ParameterError without a design.
+        """
+        proposed, price = self._designed(verdict.model, verdict.known, without_model)
         end_ns = self._record.end_ns
         new = [
             *without_model,
@@ -334,6 +337,7 @@ class Learner:
         self._model = verdict.model
         self._dead = without_model
         self._propose(proposed)
+        return price
 
     def _test_next(self, verdict: Verdict) -> None:
         """Note what the next identification tests, on samples that are later than the record."""
@@ -356,7 +360,7 @@ class Learner:
         """The rough airframe by a design for one that errs. Raises ParameterError."""
         name = self._rough.name
         try:
-            proposed = self._designed(self._rough, {}, self._dead)
+            proposed, _ = self._designed(self._rough, {}, self._dead)
         except ParameterError as error:
             self._design_of_rough = None
             raise ParameterError(f"the airframe {name} as it is: {error}") from None
@@ -515,8 +519,9 @@ class Learner:
         model: Airframe,
         known: Mapping[tuple[str, ...], Known],
         dead: Mapping[tuple[str, ...], str],
-    ) -> RiseDiConfig:
-        """The controller of a model, with the law of the start in the parts without one.
+    ) -> tuple[RiseDiConfig, str]:
+        """The controller of a model, with the law of the start in the parts without one, and what
+        `learn.margin` costs, a sentence.
 
         While the rough model flies, a part without a learned model flies by it. Raises
         ParameterError.
@@ -530,13 +535,16 @@ class Learner:
             file = self._design_of_rough(without_learning)
             flying = set(start.outputs) - held
         designed = without_learning
+        price = ""
         if file is not None and not known:
             designed = file.controller
         elif flying:
             latest = dict(chain.from_iterable(value.latest.items() for value in known.values()))
             aim = goal(start, file, model, list(known), latest)
             try:
-                designed = self._design(without_learning, model, aim).controller
+                selected = self._design(without_learning, model, aim)
+                designed = selected.controller
+                price = self._price(selected, model, list(known), latest)
             except ParameterError as error:
                 if aim.margin.max() > margin_of(start):
                     worst = 1e3 * max(latest.values())
@@ -552,6 +560,32 @@ class Learner:
             [output not in flying for output in start.outputs],
             [name in dead.values() for name in start.inputs],
         )
-        return RiseDiConfig.validate_mapping(
+        checked = RiseDiConfig.validate_mapping(
             proposed.model_dump() | {"learn": self._start.model_dump()["learn"]}, "proposal"
+        )
+        return checked, price
+
+    def _price(
+        self,
+        selected: SelectedObserver,
+        model: Airframe,
+        parts: list[tuple[str, ...]],
+        latest: Mapping[str, float],
+    ) -> str:
+        """What the margin of `learn.margin` costs beside that of the loop of the file, a sentence;
+        "" where no other is asked for.
+        """
+        start = self._controller
+        settings = start.learn
+        if settings is None or settings.margin is None or self._design_of_rough is None:
+            return ""
+        plain = start.model_copy(update={"learn": settings.model_copy(update={"margin": None})})
+        without_learning = start.model_copy(update={"learn": None})
+        file = self._design_of_rough(without_learning)
+        kept = goal(plain, file, model, parts, latest)
+        beside = self._design(without_learning, model, kept)
+        ratio = math.exp((selected.cost - beside.cost) / len(start.outputs))
+        return (
+            f"{ratio:.2f} times the error of {1e3 * kept.margin.min():.0f} ms of delay margin, "
+            f"since {1e3 * settings.margin:.0f} ms are asked for"
         )

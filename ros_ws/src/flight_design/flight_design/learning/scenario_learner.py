@@ -96,12 +96,13 @@ def learner(scenario: Scenario, *, real_time: bool = False, quick: bool = False)
             is_free=goal.is_free,
         )
 
+    asked = controller.learn.margin
     of_rough: dict[RiseDiConfig, SelectedObserver] = {}
 
     def design_of_rough(start: RiseDiConfig) -> SelectedObserver:
         """The airframe as one that errs; once for the learners of many aircraft."""
         if start not in of_rough:
-            margin = margin_of(start)
+            margin = margin_of(start) if asked is None else asked
             of_rough[start] = selected_observer(start, scenario, airframe, margin, speeds=speeds)
         return of_rough[start]
 
