@@ -71,7 +71,8 @@ class Campaign:
     """Fly a Monte Carlo campaign: thousands of uncertain aircraft around the airframe of a
     scenario, many at once.
 
-    Aircraft with a learner or a route fly one by one, a tenth of their time on a core each.
+    Aircraft with a route or a learner fly one by one: 7 s of a core a minute of flight, and up to
+    20 s with a learner.
 
     Exit status: 0 all flown, 2 bad input, 130 interrupted; its folder continues it.
     """
