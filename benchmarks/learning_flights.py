@@ -148,6 +148,8 @@ class Row(NamedTuple):
 class Timed:
     """A learner, and how long its steps take on one core."""
 
+    has_fallen_back = False
+
     def __init__(self, own: Learner) -> None:
         self._own, self.steps = own, list[float]()
 

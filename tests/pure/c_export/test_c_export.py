@@ -158,7 +158,8 @@ def any_numbers(sets: list[RiseDiConfig]) -> Recording:
                 now_ns = (
                     start_ns + 10_000_000 * k + int(rng.integers(-2_000_000, 2_000_000)) * (k > 0)
                 )
-                recorder.guard_tick(now_ns, (now_ns, y, y_m, 0), active=True)
+                # inactive at first: with u = 0 nothing has to ramp
+                recorder.guard_tick(now_ns, (now_ns, y, y_m, 0), active=k > 2)
             with suppress(ChannelError):
                 recorder.take_y(StampedVector(-start_ns, np.zeros(m)), start_ns + 5 * 10**8)
             recorder.tick(-start_ns)

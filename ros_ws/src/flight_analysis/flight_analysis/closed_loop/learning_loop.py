@@ -28,6 +28,8 @@ class LearnerResult(NamedTuple):
 class Learner(Protocol):
     """What learns from a flight. Channels in the law's order."""
 
+    has_fallen_back: bool  # whether the law fell back with the last tick
+
     def take(self, stamp_ns: int, y: FloatArray, u: FloatArray, flown: int) -> None:
         """Take y and u, after its limits, of a tick of the engaged law, (m,), and the digest of its
         parameters.

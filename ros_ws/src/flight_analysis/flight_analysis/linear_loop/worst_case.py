@@ -190,7 +190,7 @@ def _growth(part: Channels, d: FloatArray, frequency: float) -> FloatArray:
 
 # The least margins of a box
 
-BEGUN = 8  # corners drawn at the begin, beside those of the slopes at the nominal aircraft
+BEGUN = 16  # corners drawn at the begin, beside those of the slopes at the nominal aircraft
 FOLLOWED = 2  # corners at which a figure is least, from which the walk goes on
 WALKED = 6  # rounds of the walk over the corners
 

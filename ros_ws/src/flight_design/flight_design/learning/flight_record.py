@@ -50,6 +50,11 @@ class FlightRecord:
         return self._samples[-1].stamp_ns if self._samples else 0
 
     @property
+    def flown(self) -> int | None:
+        """Digest of the parameters of the last sample; None without one."""
+        return self._samples[-1].flown if self._samples else None
+
+    @property
     def length(self) -> float:
         """The time that the record covers, lost ticks included, s."""
         if not self._samples:

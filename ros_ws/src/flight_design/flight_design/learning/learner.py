@@ -65,6 +65,9 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 
 # entries at their bound: the right model may have one that hardly shows, wrong ones have two to six
 AT_BOUND = 1
+# of log-likelihood by a loss of effect, beside a fallback: of healthy surfaces at most 34 was seen
+# there, of dead ones 54 to 1500
+FALLBACK_GAIN = 40.0
 # s, of a record: two held-out seconds of the six that `identify` needs at least
 SHORTEST = 20.0 * TRANSIENT
 
@@ -157,6 +160,7 @@ class Learner:
         self._proposed = controller.digest()  # of the last proposal
         self._proposals = set[int]()  # digests of all of them
         self.identification: Identification | None = None  # the last one
+        self.has_fallen_back = False  # whether the law fell back with the last tick
 
     @property
     def model(self) -> Airframe | None:
@@ -170,7 +174,9 @@ class Learner:
         its parameters.
         """
         self._first_ns = stamp_ns if self._first_ns is None else self._first_ns
+        before = self._record.flown
         self._record.take(Sample(stamp_ns, y, u, flown))
+        self.has_fallen_back = before not in {None, flown} and flown not in self._proposals
 
     def propose(self, flown: int, given_up: Sequence[str] = ()) -> LearnerResult:
         """Parameters with the observer and the feedforward of what was identified, or the sentence
@@ -489,30 +495,40 @@ class Learner:
         )
 
     def _changes(self, end_ns: int) -> list[Change]:
-        """Tests of the parts whose window ended RECORD ago or earlier; none where the speed was not
-        steady over the test.
+        """Tests of the parts over the last RECORD; none where the speed was not steady over it, an
+        output oscillated or stood still.
 
-        Nor is there one where the law fell back in these seconds, or an output oscillated: a loop
-        near instability moves y as no model with a stable loop says, and healthy inputs look weak.
+        A part counts RECORD after the window of its model. Without a learned model it is tested
+        beside the file's, and only an input without effect is believed. A loop near instability
+        moves y as no model with a stable loop says: where the law fell back in these seconds, a
+        gain of FALLBACK_GAIN is asked for.
         """
-        tested = {part: known for part, known in self._known.items() if part not in self._changed}
-        old = {
-            part: known
-            for part, known in tested.items()
-            if end_ns - known.end_ns >= nanoseconds(RECORD)
-        }
-        if not old or self._is_sketch:
-            return []
         begin_ns = end_ns - nanoseconds(RECORD)
-        if self._record.fell_back(begin_ns, self._proposals) or self._record.oscillated(begin_ns):
+        if self._is_sketch or self._record.length < RECORD or self._record.oscillated(begin_ns):
             return []
+        learned = {part: known for part, known in self._known.items() if part not in self._changed}
         whole = self._record.recording(begin_ns)
         recent, ratio = self._steady(whole)
-        if len(recent.t) < len(whole.t):
+        has_moved = bool((np.nanmax(recent.y, axis=0) > np.nanmin(recent.y, axis=0)).all())
+        if len(recent.t) < len(whole.t) or not has_moved:
             return []
-        delays = {part: np.array(known.delays) for part, known in old.items()}
+        delays = {part: np.array(known.delays) for part, known in learned.items()}
         changes = change_test(recent, self._at_speed(self._model, ratio), self._actuation, delays)
-        return [change for change in changes if change.outputs in old]
+        has_fallen = self._record.fell_back(begin_ns, self._proposals)
+        counted = []
+        for change in changes:
+            part = change.outputs
+            if part in self._changed or any(is_within(part, outputs) for outputs in self._dead):
+                continue
+            if has_fallen:
+                counts = change.gain >= FALLBACK_GAIN and (bool(change.dead) or part in learned)
+            elif part in learned:
+                counts = end_ns - learned[part].end_ns >= nanoseconds(RECORD)
+            else:
+                counts = bool(change.dead)
+            if counts:
+                counted.append(change)
+        return counted
 
     def _designed(
         self,

@@ -144,10 +144,12 @@ class LearnerNode(FlightNode[LearnerConfig]):
             if self._has_record:
                 self._begin()
             return
+        self._end_ns = sample.stamp_ns + round(age * NANOSECONDS)
         if mode == Mode.ENGAGED:
             self._learner.take(sample.stamp_ns, y, u, int(flown))
+            if self._learner.has_fallen_back:
+                self._updates.fell_back(self._end_ns)
         self._has_record = True
-        self._end_ns = sample.stamp_ns + round(age * NANOSECONDS)
         self._flown = int(flown)
         self._given_up = tuple(
             name for name, is_left in zip(self._start.outputs, given_up, strict=True) if is_left

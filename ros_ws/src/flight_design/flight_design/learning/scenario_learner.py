@@ -278,6 +278,8 @@ def learn_again(tape: Tape, scenario: Scenario) -> LearnResult:
         flown = proposed if ticks.flown is None else int(ticks.flown[k])
         if ticks.mode[k] == Mode.ENGAGED:
             learned.take(int(ticks.stamp_ns[k]), ticks.y[k].copy(), ticks.u[k].copy(), flown)
+            if learned.has_fallen_back:
+                updates.fell_back(now_ns)
         if updates.due(now_ns):
             proposal = learned.propose(flown, ticks.left(k))
             proposed = proposed if proposal.controller is None else proposal.controller.digest()
