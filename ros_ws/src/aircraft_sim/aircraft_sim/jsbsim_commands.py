@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The commands of an aircraft of JSBSim: their properties, and the effect on the accelerations."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from itertools import chain
 from pathlib import Path
 from xml.etree import ElementTree
@@ -34,15 +35,24 @@ CONVENTION = "-cmd-norm"  # at the end of JSBSim's own commands
 LEAST = 1e-6  # m/s^2, rad/s^2
 
 
-def settle(fdm: jsbsim.FGFDMExec, duration: float) -> None:
-    """Run the aircraft with position, velocity, attitude and fuel frozen, for `duration` s."""
+@contextmanager
+def frozen(fdm: jsbsim.FGFDMExec) -> Iterator[None]:
+    """Hold position, velocity, attitude and fuel, while the aircraft runs."""
     before = {path: fdm[path] for path in FROZEN}
     for path, value in FROZEN.items():
         fdm[path] = value
-    for _ in range(round(duration / fdm.get_delta_t())):
-        fdm.run()
-    for path, value in before.items():
-        fdm[path] = value
+    try:
+        yield
+    finally:
+        for path, value in before.items():
+            fdm[path] = value
+
+
+def settle(fdm: jsbsim.FGFDMExec, duration: float) -> None:
+    """Run the frozen aircraft for `duration` s."""
+    with frozen(fdm):
+        for _ in range(round(duration / fdm.get_delta_t())):
+            fdm.run()
 
 
 def engine_count(fdm: jsbsim.FGFDMExec) -> int:
