@@ -56,7 +56,7 @@ from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal
 from flight_design.gains.nominal import sizes
 from flight_design.gains.observer_selection import with_extended_state_observer
-from flight_design.identification.step_identification import NOISE_SHARE
+from flight_design.identification.jsbsim_identification import NOISE_SHARE
 from flight_log.tape_reader import read_run
 
 if TYPE_CHECKING:

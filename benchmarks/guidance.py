@@ -68,7 +68,7 @@ def aircraft_of(name: str) -> Scenario:
     scenario = prepared(original_of(name))
     if name not in CONDITIONS:
         return scenario
-    from flight_design.identification.step_identification import slowest_trim  # noqa: PLC0415 - for these aircraft alone
+    from flight_design.identification.jsbsim_identification import slowest_trim  # noqa: PLC0415 - for these aircraft alone
 
     return scenario.vary(
         guidance={"stall_speed": slowest_trim(scenario.aircraft.flight_condition())}
@@ -83,7 +83,7 @@ def original_of(name: str) -> Scenario:
         return find_scenario(name).vary(aircraft=slower, reference_model={"rate": 100.0})
     if name in {"c172p", "f16"}:
         return find_scenario(f"jsbsim_{name}")
-    from flight_design.identification.step_identification import identify  # noqa: PLC0415 - for this aircraft alone
+    from flight_design.identification.jsbsim_identification import identify  # noqa: PLC0415 - for this aircraft alone
 
     return parse_scenario(
         identify(name, *CONDITIONS[name]).text.encode(), Path(f"jsbsim_{name}.yaml")

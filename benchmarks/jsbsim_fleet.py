@@ -15,12 +15,12 @@ from benchmarks.jsbsim_gains import CONDITIONS
 from aircraft_sim.jsbsim_aircraft import INPUTS, OUTPUTS
 from flight_core.outcome import COMPLETED, FlightEnded
 from flight_core.parameters import ParameterError
-from flight_design.identification.manoeuvre import ManoeuvreResult, fly_all
-from flight_design.identification.step_identification import (
+from flight_design.identification.jsbsim_identification import (
     IdentifiedAircraft,
     identify,
     without_beta,
 )
+from flight_design.identification.manoeuvre import ManoeuvreResult, fly_all
 
 
 def main() -> None:
@@ -49,14 +49,14 @@ def main() -> None:
 
 
 def _row(title: str, aircraft: IdentifiedAircraft) -> str:
-    steps = aircraft.responses
+    linear = aircraft.linear
     pi = fly_all(without_beta(aircraft.scenario()))
     return " | ".join(
         (
             f"| {title}",
-            " / ".join(f"{value:.3g}" for value in np.diag(steps.Omega)),
+            " / ".join(f"{value:.3g}" for value in np.diag(linear.Omega)),
             " ".join(f"{sign:+d}"[0] for sign in aircraft.D),
-            " / ".join(f"{lag:.2g}" for lag in steps.lag),
+            " / ".join(f"{lag:.2g}" for lag in linear.lag),
             f"{aircraft.sideslip_zero:.2g}",
             *(
                 _errors(flight)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Whether `rise-di identify` finds gains for the aircraft of JSBSim that trim, at two speeds each,
-and whether a random search refutes refusals: CSV on standard output.
+"""Gains, margins and errors of the aircraft of JSBSim that trim, at two speeds each, as `rise-di
+identify` finds them, and whether a random search refutes refusals: CSV on standard output.
 
 python -m benchmarks.jsbsim_gains c172p t6texan2
 
@@ -20,13 +20,14 @@ from pathlib import Path
 import numpy as np
 import yaml
 
+from aircraft_sim.jsbsim_aircraft import OUTPUTS
 from flight_analysis.linear_loop.input_margins import input_margins
 from flight_core.outcome import FlightEnded
 from flight_core.parameters import ParameterError
-from flight_design.gains.gain_selection import SOFTENING, Selection, gain_candidates, select_gains
+from flight_design.gains.gain_selection import Selection, gain_candidates, select_gains
 from flight_design.gains.relaxation import binding
 from flight_design.gains.requirement import least_fraction
-from flight_design.identification.step_identification import identify
+from flight_design.identification.jsbsim_identification import IdentifiedAircraft, identify
 
 CONDITIONS = yaml.safe_load(Path(__file__).with_suffix(".yaml").read_text(encoding="utf-8"))
 FIVE = 5
@@ -34,13 +35,20 @@ SECONDS = 10.0  # of processor time a refusal
 WIDEST = np.log([[4000.0], [200.0]])  # factors on integral and bandwidth
 FRESH = 0.3  # of the tries: anywhere; the others begin at the best one
 SPREAD = 0.4  # of a try beside the best one, in the logarithm of a factor
+AIRS = ("calm", "turbulence")
 HEADINGS = (
     "aircraft",
     "speed, m/s",
     "altitude, m",
     "gains for 45 deg",
-    "slower integral of V",
-    "rms of V in calm air, m/s",
+    "least phase margin, deg",
+    "largest sensitivity",
+    "delay margin, ms",
+    *(
+        f"rms of {name} in {air}, {unit}"
+        for air in AIRS
+        for name, unit in (("q", "mrad/s"), ("p", "mrad/s"), ("r", "mrad/s"), ("V", "m/s"))
+    ),
     "flights",
     "gains for {:g} deg",
     "random search",
@@ -52,6 +60,23 @@ def verdict(selection: Selection) -> str:
     if not selection.engineering.unmet:
         return "found"
     return f"refused: {binding(selection).sentence(selection.chosen.outputs)}"
+
+
+def figures(identified: IdentifiedAircraft) -> list[str]:
+    """The margins of the nominal loop, and the errors of the flights."""
+    margins = identified.selection.engineering.margins
+    if margins is None:
+        return [""] * (3 + len(AIRS) * len(OUTPUTS))
+    nominal = margins.nominal
+    rms = [identified.flights[air].rms for air in AIRS]
+    errors = [
+        "" if name not in row else f"{row[name] * (1.0 if name == 'V' else 1e3):.3g}"
+        for row in rms
+        for name in ("q", "p", "r", "V")
+    ]
+    phase = math.degrees(float(nominal.phase.min()))
+    sensitivity = float(nominal.sensitivity.max())
+    return [f"{phase:.1f}", f"{sensitivity:.2f}", f"{1e3 * margins.delay:.1f}", *errors]
 
 
 def searched(selection: Selection) -> str:
@@ -103,16 +128,13 @@ def main() -> None:
                 phase=math.radians(options.phase_margin)
             )
             more = select_gains(selection.study, selection.setting._replace(requirement=needed))
-            outputs = selection.chosen.outputs
-            softening = np.broadcast_to(selection.chosen.softening, len(outputs))
-            slower = softening[outputs.index("V")] / SOFTENING
             row += [
                 verdict(selection),
-                f"{slower:.3g}",
-                f"{identified.flights['calm'].rms['V']:.3g}",
+                *figures(identified),
                 identified.failure or "completed",
                 verdict(more),
             ]
+            print(", ".join(row), file=sys.stderr)
             refused += [(row, each) for each in (selection, more) if each.engineering.unmet]
     for k in np.random.default_rng(1).permutation(len(refused))[:FIVE]:
         row, selection = refused[k]

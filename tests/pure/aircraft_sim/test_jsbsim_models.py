@@ -15,7 +15,7 @@ import pytest
 from tests.builders import aircraft_parameters
 from tests.conftest import refusing
 
-from aircraft_sim import jsbsim_trim
+from aircraft_sim import jsbsim_linearization, jsbsim_trim
 from aircraft_sim.actuators import Actuators
 from aircraft_sim.disturbance import AXES, Gusts
 from aircraft_sim.jsbsim_aircraft import (
@@ -33,7 +33,6 @@ from aircraft_sim.jsbsim_trim import TrimSolution, nearest_trim, trim_solution
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.outcome import FlightEnded
 from flight_core.vectors import FloatArray
-from flight_design.identification import step_identification
 from rise_di import Scenario, fly
 
 pytestmark = pytest.mark.slow
@@ -166,19 +165,20 @@ def test_aircraft_without_rudder_has_three_inputs() -> None:
 
 @pytest.mark.parametrize("effect", [0.0, 0.1])
 def test_rudder_that_moves_nothing_is_seen(effect: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    class Vehicle:
-        def __init__(self, _: FlightCondition) -> None:
-            self.u = np.zeros(4)
+    """The linear aircraft has none then, and r is not commanded."""
 
-        def advance(self, t_ns: int, u: FloatArray, duration_ns: int) -> None:
-            self.u = u
+    def response(_: FlightCondition, __: object, name: str, size: float) -> FloatArray:
+        rows = np.zeros((20, len(jsbsim_linearization.STATES)))
+        effects = {"rudder": effect}
+        output = jsbsim_linearization.driven(name)
+        rows[:, list(jsbsim_linearization.STATES).index(output)] = size * effects.get(name, 1.0)
+        return rows
 
-        def y(self) -> FloatArray:
-            return np.array([0.0, 1.0, 0.0, effect * self.u[3]])
-
-    monkeypatch.setattr(step_identification, "_vehicle", Vehicle)
-    condition = FlightCondition("c172p", 46.3, 1219.2, STEP_NS)
-    assert step_identification.has_rudder(condition) == bool(effect)
+    monkeypatch.setattr(jsbsim_linearization, "_response", response)
+    found = jsbsim_linearization.linearize(FlightCondition("c172p", 46.3, 1219.2, STEP_NS))
+    assert ("rudder" in found.airframe.inputs) == bool(effect)
+    assert ("r" in found.airframe.outputs) == bool(effect)
+    assert "r" in found.airframe.states
 
 
 @pytest.mark.parametrize(

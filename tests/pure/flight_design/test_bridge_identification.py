@@ -117,7 +117,7 @@ def test_channels_of_unknown_aircraft_identified(identified: Identified) -> None
 def test_written_scenario_flies_aircraft_and_tracks(identified: Identified) -> None:
     found = identified.flying
     assert found.controller.D == (1, 1, 1, 1)
-    assert found.scenario.splitlines()[1].startswith("# Phase margins ")
+    assert found.scenario.splitlines()[4].startswith("# Phase margins ")
     tape = simulate(loaded(identified.folder, "flight", found.airframe, found.scenario))
     _, error = best_error(tape)
     rms = {name: error_metrics(error[name]).rms for name in error.names}

@@ -190,48 +190,6 @@ def trimmed_fdm(
     )
 
 
-def sideslip_zero(condition: FlightCondition) -> float:
-    """Rate of decay (negative) or growth of sideslip while p and r are held in trim, 1/s: a zero of
-    the aircraft.
-
-        beta_dot V = Y_beta beta + Y_u u,  0 = N_beta beta + N_u u  ->
-            beta_dot = (Y_beta - Y_u N_u^-1 N_beta) beta / V
-
-    Y is the side acceleration, N are the accelerations of p and r, u is aileron and rudder. Central
-    differences in frozen flight give the derivatives. Gravity is left out: the coupling of bank to
-    sideslip is much slower. Where the rate is positive, Assumption 3 does not hold. Without rudder
-    the aileron holds p, and r follows: the rate is the largest real part of the roots of
-
-        beta_dot = Y beta / V - r,  r_dot = N beta
-
-    with Y and N at the aileron; the damping of yaw, left out, adds decay. Raises
-    FlightEnded.
-    """
-    solution = trim_solution(condition)
-
-    def derivative(name: str, step: float) -> FloatArray:
-        ends = []
-        for sign in (1.0, -1.0):
-            fdm, _ = trimmed_fdm(condition, solution)
-            if name == "beta":
-                fdm[WIND[1]] -= sign * step * condition.speed / FOOT  # wind from the right
-            else:
-                for path, at_one in command_paths(condition.commands()[name], 1):
-                    fdm[path] += at_one * (sign * step)
-            settle(fdm, 0.5)  # long enough for flight control systems, too short for engines
-            ends.append(residuals(fdm)[[1, 3, 5]])
-        return np.asarray((ends[0] - ends[1]) / (2.0 * step))
-
-    beta = derivative("beta", 0.01)
-    held = [name for name in ("aileron", "rudder") if name in condition.inputs()]
-    u = np.column_stack([derivative(name, 0.05) for name in held])
-    if len(held) == 1:
-        side, _, yaw = beta - u[:, 0] * beta[1] / u[1, 0]
-        motion = np.array([[side / condition.speed, -1.0], [yaw, 0.0]])
-        return float(np.linalg.eigvals(motion).real.max())
-    return float(beta[0] - u[0] @ np.linalg.solve(u[1:], beta[1:])) / condition.speed
-
-
 def structure_contacts(fdm: jsbsim.FGFDMExec) -> list[str]:
     """The properties that are 1 while a part of the structure, not a wheel, touches the ground."""
     catalog = fdm.query_property_catalog("contact/unit")

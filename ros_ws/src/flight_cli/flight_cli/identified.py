@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of an aircraft that `rise-di identify` identified by step tests."""
+"""Tables of an aircraft of JSBSim that `rise-di identify` linearised."""
 
 from pathlib import Path
 from typing import Any
@@ -13,16 +13,16 @@ from flight_analysis.report.display_units import display_unit
 from flight_cli.gains import speed_of_margin
 from flight_cli.output import new_table, print_table, say
 from flight_core.units import si_per_unit
-from flight_design.identification.step_identification import IdentifiedAircraft
+from flight_design.identification.jsbsim_identification import IdentifiedAircraft
 
-# the ratio of smallest to largest slope below which an input is reported as not linear
+# the ratio of smallest to largest effect below which an input is reported as not linear
 LINEAR = 0.8
 
 
 def show_identified(console: Console, identified: IdentifiedAircraft) -> None:
-    """Print the trim, the responses, the gains and the flights of an aircraft."""
-    trim = identified.trim
-    steps = identified.responses
+    """Print the trim, the effects, the gains and the flights of an aircraft."""
+    linear = identified.linear
+    trim = linear.trim
     states = dict(zip(STATES, trim.states, strict=True))
     degrees = {name: states[name] / si_per_unit("deg") for name in ("alpha", "beta", "phi")}
     say(
@@ -44,7 +44,7 @@ def show_identified(console: Console, identified: IdentifiedAircraft) -> None:
         "D",
     )
     responses = new_table(
-        "\nStep responses: Omega per unit of a command, rad/s^2 and m/s^2", columns
+        "\nEffects: Omega = C B per unit of a command, rad/s^2 and m/s^2", columns
     )
     inputs = identified.condition.inputs()
     for j, name in enumerate(inputs):
@@ -52,27 +52,27 @@ def show_identified(console: Console, identified: IdentifiedAircraft) -> None:
             name,
             *(f"{value + 0.0:.3f}" for value in (trim.commands[j], trim.lower[j], trim.upper[j])),
         )
-        column = [f"{value:.3g}" if abs(value) > 1e-3 else "0" for value in steps.Omega[:, j]]
+        column = [f"{value:.3g}" if abs(value) > 1e-3 else "0" for value in linear.Omega[:, j]]
         responses.add_row(
-            name, f"{steps.size[j]:.3g}", *column, f"{steps.lag[j]:.3f}", f"{identified.D[j]:+d}"
+            name, f"{linear.size[j]:.3g}", *column, f"{linear.lag[j]:.3f}", f"{identified.D[j]:+d}"
         )
     console.print(stops)
     console.print(responses)
-    for name, spread in zip(inputs, steps.spread, strict=True):
+    for name, spread in zip(inputs, linear.spread, strict=True):
         if spread < LINEAR:
-            differ = f"the slopes of its steps differ by a factor of {1.0 / spread:.2g}"
+            differ = f"the effects of its steps differ by a factor of {1.0 / spread:.2g}"
             console.print(f"{name} is not linear: {differ}; the largest is used")
     if len(inputs) < len(INPUTS):
         console.print("the rudder moves nothing: the scenario has none, and r is not commanded")
-    for sentence in steps.rejected:
-        say(console, f"rejected: {sentence}")
+    for sentence in linear.still:
+        say(console, f"without effect: {sentence}")
 
     _show_gains(console, identified)
     _show_flights(console, identified)
 
 
 def _show_gains(console: Console, identified: IdentifiedAircraft) -> None:
-    steps = identified.responses
+    Omega = identified.linear.Omega
     answer = identified.selection.engineering
     controller = answer.controller
     params = answer.controller.law_params()
@@ -80,7 +80,7 @@ def _show_gains(console: Console, identified: IdentifiedAircraft) -> None:
     table = new_table("\nGains: bandwidth and Lambda in 1/s, beta in units of y / s^2", headings)
     for i, (output, name) in enumerate(zip(controller.outputs, controller.inputs, strict=True)):
         response = (
-            abs(steps.Omega[list(OUTPUTS).index(output), list(INPUTS).index(name)])
+            abs(Omega[list(OUTPUTS).index(output), list(INPUTS).index(name)])
             * params.input_scale[i]
         )
         figures = (params.K[i] * response, params.Lambda[i], params.beta[i], controller.lag[i])
@@ -129,19 +129,19 @@ def _show_flights(console: Console, identified: IdentifiedAircraft) -> None:
 
 
 def identified_as_json(identified: IdentifiedAircraft, path: Path) -> dict[str, Any]:
-    """What the step tests gave, SI."""
-    trim = identified.trim
-    steps = identified.responses
+    """What the identification gave, SI."""
+    linear = identified.linear
+    trim = linear.trim
     outputs = identified.condition.paired_outputs()
     by_input = {
         name: {
             "trim": float(trim.commands[j]),
             "lower": float(trim.lower[j]),
             "upper": float(trim.upper[j]),
-            "step": float(steps.size[j]),
-            "spread": float(steps.spread[j]),
-            "Omega": dict(zip(outputs, steps.Omega[:, j].tolist(), strict=True)),
-            "lag": float(steps.lag[j]),
+            "step": float(linear.size[j]),
+            "spread": float(linear.spread[j]),
+            "Omega": dict(zip(outputs, linear.Omega[:, j].tolist(), strict=True)),
+            "lag": float(linear.lag[j]),
             "D": identified.D[j],
         }
         for j, name in enumerate(identified.condition.inputs())
@@ -153,7 +153,7 @@ def identified_as_json(identified: IdentifiedAircraft, path: Path) -> dict[str, 
         "trim": dict(zip(STATES, trim.states.tolist(), strict=True)),
         "residuals": dict(zip(RESIDUALS, trim.residuals.tolist(), strict=True)),
         "inputs": by_input,
-        "rejected": list(steps.rejected),
+        "without_effect": list(linear.still),
         "coupling": identified.coupling,
         "sideslip_zero": identified.sideslip_zero,
         "lost": identified.failure,

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di identify`: an aircraft of JSBSim by step tests, with its scenario, or A and B of an
+"""`rise-di identify`: an aircraft of JSBSim by linearisation, with its scenario, or A and B of an
 airframe from a flight's log.
 """
 
@@ -66,11 +66,11 @@ from flight_design.gains.relaxation import lacking as what_lacks
 from flight_design.gains.requirement import PHASE_MARGIN, Requirement, requirement
 from flight_design.identification.bridge_identification import AMPLITUDE
 from flight_design.identification.innovation_filters import Actuation, recording
+from flight_design.identification.jsbsim_identification import STEP_MARGIN, IdentifiedAircraft
+from flight_design.identification.jsbsim_identification import identify as identify_aircraft
 from flight_design.identification.manoeuvre import manoeuvre_result
 from flight_design.identification.model_identification import Identification, model_yaml
 from flight_design.identification.model_identification import identify as identify_model
-from flight_design.identification.step_identification import STEP_MARGIN, IdentifiedAircraft
-from flight_design.identification.step_identification import identify as identify_aircraft
 from flight_log.log_content import StoredFile
 from flight_log.tape_reader import RecordedRun, read_run
 from rise_di_controller.params import ControllerConfig
@@ -78,18 +78,18 @@ from rise_di_controller.params import ControllerConfig
 CANNOT_FLY = 3
 REFLY_MARGIN = 0.03  # s
 OF_LOG = ("scenario", "delay", "namespace", "refly")
-OF_STEPS = ("observer", "guidance", "learn", "command")
+OF_JSBSIM = ("observer", "guidance", "learn", "command")
 OF_MARGINS = ("phase_margin", "accept")
-"""Fields for a log alone, for step tests alone, and of required margins."""
+"""Fields for a log alone, for JSBSim alone, and of required margins."""
 BESIDE_BRIDGE = "none beside --bridge"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Identify:
-    """Identify an aircraft of JSBSim by step tests, or A and B of an airframe from the log of a
+    """Identify an aircraft of JSBSim by linearisation, or A and B of an airframe from the log of a
     flight.
 
-    The step tests also select gains, fly the aircraft and write a scenario for `rise-di fly`. A
+    Of JSBSim it also selects gains, flies the aircraft and writes a scenario for `rise-di fly`. A
     model from a log is accepted if it predicts the part of the flight that it was not fitted to
     better than the nominal airframe. With --bridge, each input of the aircraft behind a channel map
     is excited by itself, open loop, and --write is the folder for a scenario that flies it.
@@ -130,7 +130,7 @@ class Identify:
         "Of JSBSim: write a scenario that learns A and B in flight.", default=False
     )
     margin: float | None = setting(
-        "Least delay margin of the loop with an observer, s: 0.03, or 0.015 from step tests."
+        "Least delay margin of the loop with an observer, s: 0.03, or 0.015 of JSBSim."
     )
     bridge: str | None = option(
         "Excite the aircraft behind a channel map, or read the log of such a flight.", metavar="MAP"
@@ -176,7 +176,7 @@ class Identify:
             "one of the two: a learner designs its own observer",
         )
         if log is None:
-            self._identify_by_steps()
+            self._identify_jsbsim()
         else:
             self._identify_log(log)
 
@@ -195,7 +195,7 @@ class Identify:
 
     def _identify_behind_bridge(self, channel_map: str, log: Path | None) -> None:
         require(log is not None or self.source is None, "aircraft", self.source, BESIDE_BRIDGE)
-        require_unused(self, ("altitude", "airframe", "margin", *OF_LOG, *OF_STEPS), BESIDE_BRIDGE)
+        require_unused(self, ("altitude", "airframe", "margin", *OF_LOG, *OF_JSBSIM), BESIDE_BRIDGE)
         if self.write is None:
             raise ParameterError(
                 "identify: found too few arguments, expected --write beside --bridge"
@@ -215,7 +215,7 @@ class Identify:
             link_delay=later,
         ).identify(as_json=self.as_json)
 
-    def _identify_by_steps(self) -> None:
+    def _identify_jsbsim(self) -> None:
         aircraft = self.source
         if aircraft is None or self.speed is None or self.altitude is None:
             raise ParameterError(
@@ -254,7 +254,7 @@ class Identify:
     def _identified_aircraft(
         self, name: str, speed: float, altitude: float, console: Console
     ) -> IdentifiedAircraft:
-        """The aircraft by step tests, with gains and a flight; exits without a trim."""
+        """The aircraft by linearisation, with gains and a flight; exits without a trim."""
         margin = STEP_MARGIN if self.margin is None else self.margin
         texts: dict[str, str] = {}
         for text in self.command or []:
@@ -281,7 +281,7 @@ class Identify:
         """Identify a model from a log, show it and write it. Raises ParameterError for a model that
         is refused.
         """
-        require_unused(self, ("speed", "altitude", *OF_STEPS, *OF_MARGINS), "none beside a log")
+        require_unused(self, ("speed", "altitude", *OF_JSBSIM, *OF_MARGINS), "none beside a log")
         require(
             self.airframe is not None,
             "airframe",

@@ -24,13 +24,13 @@ from flight_core.outcome import End
 from flight_core.parameters import require
 from flight_core.tape import Tape
 from flight_design.gains import first_flight, gain_yaml
+from flight_design.gains.first_scenario import LICENCE
 from flight_design.gains.gain_design import lags_by_input, select_gains
 
 SIZES = (1.0, 0.5, 0.25, 0.125)  # of the commands: the first that flies clear of the end stops
 CLEAR = 0.9  # part of an end stop that u reaches at most
 ANGLE_OF_GUST = {"lateral": "sideslip", "vertical": "angle of attack"}  # of a gust over V0
 SAMPLES = 20  # uncertain airframes for the bounds of the theorem
-LICENCE = "# SPDX-FileCopyrightText: RISE-DI contributors\n# SPDX-License-Identifier: Apache-2.0\n"
 
 
 class NewAirframe(NamedTuple):
@@ -152,8 +152,7 @@ def new_airframe(
         place.mkdir(parents=True, exist_ok=True)
         if not source_is_target:
             write_file(files[0], text_of_airframe)
-        marked = f"# {shortfall}\n" if shortfall else ""
-        write_file(files[1], LICENCE + "#\n" + marked + scenario)
+        write_file(files[1], scenario)
     note = "; ".join(filter(None, (note, _pairing_sentence(airframe))))
     return NewAirframe(*files, airframe, note, shortfall)
 
@@ -182,9 +181,9 @@ def _flying(
     controller = first_flight.placeholder(airframe, lag)
     for size in SIZES:
 
-        def text(path: Path, section: str, size: float = size) -> str:
-            return first_flight.scenario_text(
-                airframe, str(path), str(files[1]), section, lag, size
+        def text(path: Path, section: str, size: float = size, shortfall: str = "") -> str:
+            return first_flight.first_flight(
+                airframe, str(path), str(files[1]), section, lag, size, shortfall
             )
 
         selection = select_gains(trial, _parsed(text(trial, controller), files[1]), samples=SAMPLES)
@@ -198,6 +197,7 @@ def _flying(
         hardest = max(used, key=lambda key: used[key])
         if size == SIZES[-1]:
             shortfall = _shortfall(flown, tape, hardest)
+            scenario = text(files[0], section, shortfall=shortfall)
     return scenario, shortfall
 
 

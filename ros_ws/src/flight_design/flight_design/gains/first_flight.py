@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A first scenario for an airframe: commands, actuators, noise, and gusts of a size that fits the
-aircraft.
+"""A first scenario for an airframe: its channels, assumed actuators, noise, and gusts of a size
+that fits the aircraft.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +15,20 @@ from flight_core.units import ANGLE, ANGULAR_RATE, GRAVITY, SPEED, quantity
 from flight_design.gains import gain_yaml
 from flight_design.gains.channel_signs import MAX_COUPLING
 from flight_design.gains.effectors import Effectors, LawInputs, design_allocation
+from flight_design.gains.first_scenario import (
+    Channel,
+    Sections,
+    first_commands,
+    scenario_text,
+    unit_gains,
+)
+from flight_design.gains.gain_conditions import bandwidths
+from flight_design.gains.gain_selection import (
+    CROSSOVER_LAG_PRODUCTS,
+    DEFAULT_CROSSOVER_LAG_PRODUCT,
+)
 from rise_di_controller.decomposition import search
+from rise_di_controller.linear_loop import Loop
 from rise_di_controller.model_sections import AllocationConfig
 
 # s, servos and engine of a light aircraft, assumed
@@ -26,162 +39,100 @@ STOP = 0.35
 SURFACE_RATE = 1.0
 # m/s^2, rad/s^2: what the end stop of another input gives, assumed
 AUTHORITY = {SPEED: 0.3 * GRAVITY, ANGULAR_RATE: 2.0}
-USED = 0.4  # part of the authority that the edge of a command takes at most
-NOISE = {"V": 0.05, "u": 0.05}  # m/s; 0.001 rad/s of a rate
-SPEEDS = {"V", "u"}  # outputs that a throttle moves slowly
-SOFTENING = 2.75  # 1, width of the softened sign in total lags, that of the shipped scenarios
+NOISE = {"V": 0.05, "u": 0.05}  # m/s
+RATE_NOISE = 0.001  # rad/s, and of another output
 RATE = 200.0  # Hz, of y and y_m
-# rad/s, natural frequency of the reference model at most
-FASTEST = {"q": 3.0, "p": 4.0, "r": 2.0, "V": 1.2}
-LAG_PRODUCT = 0.18  # 1, natural frequency times the lag of the input at most
-
-SCENARIO_YAML = gain_yaml.yaml_template("""\
-# The airframe {{ airframe.name }} at {{ airframe.speed | digits(6) }} m/s: commands on every channel, servos, noise\
-{{ ", gusts" if gusts }}.
-# Lags, end stops, rates and noise are assumed: put those of your aircraft here, then select the gains again:
-# rise-di gains {{ path | line }} --scenario {{ scenario | line }} --write gains.yaml
-
-/**/flight:
-  ros__parameters: {duration: 40.0}        # s
-
-/**/aircraft:
-  ros__parameters:
-    airframe: {{ path | flow }}
-    rate: {{ rate | flow }}                        # Hz, y and truth
-    step: {{ step | flow }}                       # s, of the integration
-{% if gusts %}
-    gusts:                             # 1-cosine; entry in s, peak speed in m/s, distance to the peak in m
-{% for axis, gust in gusts.items() %}
-      {{ axis }}: {{ gust | flow }}
-{% endfor %}
-{% endif %}
-    actuators:                         # {{ inputs | join(", ") }}, from trim, SI
-{% for key, values in actuators.items() %}
-      {{ key }}: {{ values | flow }}
-{% endfor %}
-    sensors: {noise: {{ noise | flow }}, seed: 1}  # {{ outputs | join(", ") }}, rms, SI
-
-/**/reference_model:
-  ros__parameters:
-    rate: {{ rate | flow }}                        # Hz
-    outputs: {{ outputs | flow }}
-    second_order:                      # rad/s and 1
-      natural_frequency: {{ frequency | flow }}
-      damping: {{ damping | flow }}
-    rise: 0.2                          # s, edge of a pulse
-    pulses:                            # s, s, and SI
-{% for name, pulse in pulses.items() %}
-      {{ name }}: {{ pulse | flow }}
-{% endfor %}
-{% if turn %}
-    coordinated_turn: {{ turn | flow }}  # r += g/V0 sin(bank commanded)
-{% endif %}
-
-/**/recorder:
-  ros__parameters: {rate: 100.0}
-
-{{ controller }}""")  # noqa: E501 - a text as it is written
+CONTROL_RATE = 100.0  # Hz, of the law
+DELAY = 0.003  # s, beyond sampling
+APART = 3.0  # s, from a gust to the next
 
 
-def scenario_text(
+def first_flight(
     airframe: Airframe,
     path: str,
     scenario: str,
     controller: str,
     lag: Sequence[float],
-    size: float = 1.0,
+    part: float = 1.0,
+    shortfall: str = "",
 ) -> str:
-    """A scenario file for the airframe in `path`, with the text of the section controller; `size`
-    multiplies the commands.
+    """A scenario file for the airframe in `path`, with the text of the section controller; `part`
+    multiplies the commands, and `shortfall` is its first line.
 
-    Commands move V by 3 % of the trim speed, q by 0.05 rad/s, p by 0.2 rad/s, less where the edge
-    of a command would take more than USED of the input's authority. Gusts have 3 % of the trim
-    speed.
+    The commands are `first_commands`; gusts have 3 % of the trim speed, across it.
     """
-    inputs = list(airframe.inputs)
-    outputs = list(airframe.outputs)
     V0 = airframe.speed
     stops = _stops(airframe)
-    channels = _channels(airframe, lag)
     # a bank turns an aeroplane
-    banks = {"p", "r"} <= set(outputs) and bool({"beta", "v"} & set(airframe.states))
-    turn = {"bank_rate": "p", "turn_rate": "r", "speed": V0} if banks else None
-    commanded = [name for name in outputs if not (name == "r" and turn)]  # turns command r
+    banks = bool({"beta", "v"} & set(airframe.states))
+    channels = _channels(airframe, lag)
+    commands = first_commands(channels, V0 or None, RATE, banks=banks, part=part)
     crosswise = [axis for axis in airframe.gusts if axis != "longitudinal"]
     gusts = {
-        axis: {"start": 32.0 + 3.0 * k, "speed": round(0.03 * V0, 2), "length": round(0.5 * V0, 1)}
+        axis: {
+            "start": commands.gust + APART * k,
+            "speed": round(0.03 * V0, 2),
+            "length": round(0.5 * V0, 1),
+        }
         for k, axis in enumerate(crosswise)
     }
-    return SCENARIO_YAML.render(
-        airframe=airframe,
-        path=path,
-        scenario=scenario,
-        rate=RATE,
-        step=1.0 / RATE,
-        gusts=gusts,
-        inputs=inputs,
-        outputs=outputs,
-        actuators={
+    with_gusts = ", gusts" if gusts else ""
+    assumed = "put those of your aircraft here, then select the gains again:"
+    heading = [
+        shortfall,
+        f"The airframe {airframe.name} at {V0:.6g} m/s: every channel, servos, noise{with_gusts}.",
+        f"Lags, end stops, rates and noise are assumed: {assumed}",
+        f"rise-di gains {path} --scenario {scenario} --write gains.yaml",
+    ]
+    aircraft = {
+        "airframe": path,
+        "rate": RATE,
+        "step": 1.0 / RATE,
+        "gusts": gusts,
+        "actuators": {
             "lag": list(lag),
             "lower": [-stop for stop in stops],
             "upper": stops,
             "rate": _rates(airframe),
         },
-        noise=[NOISE.get(output, 0.001) for output in outputs],
-        frequency=[channels[output].frequency for output in outputs],
-        damping=[1.0 if output in SPEEDS else 0.9 for output in outputs],
-        pulses=_pulses({name: channels[name] for name in commanded}, V0, size),
-        turn=turn,
-        controller=controller,
-    )
+        "sensors": {"noise": [channel.noise for channel in channels.values()], "seed": 1},
+    }
+    sections: Sections = {
+        "flight": {"duration": commands.duration},
+        "aircraft": aircraft,
+        "reference_model": commands.reference,
+        "recorder": {"rate": 100.0},
+        "controller": controller,
+    }
+    return scenario_text(heading, sections)
 
 
-class _Channel(NamedTuple):
-    """A channel of the reference model."""
-
-    authority: float  # y_dot that the input gives at its stop
-    frequency: float  # rad/s, natural, of the reference model
-
-
-def _channels(airframe: Airframe, lag: Sequence[float]) -> dict[str, _Channel]:
+def _channels(airframe: Airframe, lag: Sequence[float]) -> dict[str, Channel]:
     """The channels by output."""
     outputs = list(airframe.outputs)
     if len(airframe.inputs) > len(outputs):
         _, law = _distributed(airframe, lag)
         authority = law.upper
-        lags = law.lag.tolist()
+        lags = law.lag
     else:
-        paired = pairing(airframe)
+        paired = list(pairing(airframe))
         response = np.abs(airframe.matrix_c() @ airframe.matrix_b())[range(len(outputs)), paired]
-        authority = response * np.array(_stops(airframe))[list(paired)]
-        lags = [lag[j] for j in paired]
+        authority = response * np.array(_stops(airframe))[paired]
+        lags = np.array(lag)[paired]
+    products = [CROSSOVER_LAG_PRODUCTS.get(name, DEFAULT_CROSSOVER_LAG_PRODUCT) for name in outputs]
+    bandwidth = bandwidths(Loop(lags, DELAY, 1.0 / CONTROL_RATE), np.array(products))
+    rows = airframe.matrix_c()
+    damping = -np.diag(rows @ airframe.matrix_a() @ np.linalg.pinv(rows))
     return {
-        output: _Channel(
-            float(reach), min(FASTEST.get(output, 1.2), LAG_PRODUCT / max(seconds, 1e-3))
+        output: Channel(
+            motion=output,
+            authority=float(authority[i]),
+            bandwidth=float(bandwidth[i]),
+            noise=NOISE.get(output, RATE_NOISE),
+            damping=max(float(damping[i]), 0.0),
         )
-        for output, reach, seconds in zip(outputs, authority, lags, strict=True)
+        for i, output in enumerate(outputs)
     }
-
-
-def _pulses(channels: Mapping[str, _Channel], V0: float, size: float) -> dict[str, Any]:
-    """Commands by output, one after another: a pulse of V, a pulse each way of the rest."""
-    amplitude = {"q": 0.05, "p": 0.2, "V": 0.03 * V0, "u": 0.03 * V0, "r": 0.03}
-    start = 2.0
-    pulses: dict[str, Any] = {}
-    for output, channel in channels.items():
-        reachable = USED * channel.authority / channel.frequency
-        value = float(f"{size * min(amplitude.get(output, reachable), reachable):.3g}")
-        if output in SPEEDS:
-            pulses[output] = {"start": [start], "stop": [start + 8.0], "value": [value]}
-            start += 4.0
-        else:
-            pulses[output] = {
-                "start": [start, start + 4.0],
-                "stop": [start + 2.0, start + 6.0],
-                "value": [value, -value],
-            }
-            start += 3.0
-    return pulses
 
 
 def _surfaces(airframe: Airframe) -> list[bool]:
@@ -249,17 +200,10 @@ def placeholder(airframe: Airframe, lag: Sequence[float]) -> str:
         "two inputs or more: add a thrust with --set thrust, or a second control",
     )
     values: Mapping[str, Any] = {
-        "rate": 100.0,
+        "rate": CONTROL_RATE,
         "outputs": list(airframe.outputs),
         "inputs": inputs,
-        "D": [1] * m,
-        "k_g": 1.0,
-        "k_d": [1.0] * (m - 1),
-        **dict.fromkeys(("Lambda", "beta", "input_scale", "omega"), [1.0] * m),
-        "sign": "auto",
-        "lag": lags,
-        "delay": 0.003,
-        "softening": SOFTENING,
+        **unit_gains(lags, DELAY),
         "max_age": 0.1,
         "hold": 0.5,
         "ramp": 2.0,

@@ -178,13 +178,17 @@ def _comments(selection: Selection, controller: RiseDiConfig) -> dict[str, str]:
         "D": "signs of the leading minors of C B",
         "input_scale": f"units of u s / units of y: {_shown_response(responses)} / "
         "abs(Omega_ii), Omega = C B",
-        "omega": "abs(Omega_ii) in scaled inputs, the largest within "
-        f"+-{100 * study.uncertainty:g} %",
+        "omega": f"abs(Omega_ii) in scaled inputs{_within(study.uncertainty)}",
         "sign": controller.sampled_sign()[0].name.lower() + " with this lag and delay",
         "lag": "s, actuators",
         "delay": "s, beyond sampling",
         "softening": "1, width of the softened sign in total lags: wider for the phase margin",
     }
+
+
+def _within(uncertainty: float) -> str:
+    """What the largest of uncertain aircraft is taken of; "" without any."""
+    return f", the largest within +-{100 * uncertainty:g} %" if uncertainty else ""
 
 
 def section_yaml(

@@ -20,17 +20,19 @@ from autopilot_bridge.channel_map import to_channel
 from autopilot_bridge.map_rows import UNITS
 from autopilot_bridge.params import ChannelMap
 from control_laws.excitation import ExcitationConfig
-from flight_core.files import comment, dump_yaml
+from flight_core.files import dump_yaml
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray
+from flight_design.gains.first_scenario import RISE, Commands, scenario_text
 from flight_design.gains.ideal_control import ChannelPairing
 from flight_design.identification.open_loop_fit import ChannelModel, fit_channel
 from flight_design.identification.response_identification import MIN_RATIO, Response, Spans
 from flight_design.identification.sign_check import motion_as_channel_grows, output_signs
 from flight_log.engagements import Engagement
+from rise_di_controller.params import ControllerConfig
 
 RATE = 100.0  # Hz, of law and reference model by default
 
@@ -156,8 +158,9 @@ def experiment(
         },
         "controller",
     )
-    none = {"rate": RATE, "outputs": list(pairing.outputs), "rise": 0.1}
-    none["second_order"] = {"natural_frequency": [1.0] * m, "damping": [1.0] * m}
+    second_order = {"natural_frequency": [1.0] * m, "damping": [1.0] * m}
+    reference = {"rate": RATE, "outputs": list(pairing.outputs), "second_order": second_order}
+    still = Commands(reference | {"rise": RISE}, wait + controller.duration)
     heading = (
         f"Experiment on the aircraft behind the map {channel_map.name}: each input is "
         "excited by itself, open loop."
@@ -170,13 +173,7 @@ def experiment(
             speed,
             "signs of the channel map; sizes not known",
         ),
-        scenario_text(
-            [heading],
-            airframe_file,
-            wait + controller.duration,
-            none,
-            controller.model_dump(exclude_defaults=True),
-        ),
+        scenario_text([heading], bridge_sections(airframe_file, still, controller)),
         controller,
     )
 
@@ -466,23 +463,17 @@ def signs_alone(sign: FloatArray) -> Channels:
     return Channels(np.diag(sign), none + np.nan, none, none, none, none, none, none + np.nan)
 
 
-def scenario_text(
-    heading: Sequence[str],
-    airframe_file: str,
-    duration: float,
-    commands: Mapping[str, Any],
-    controller: Mapping[str, Any],
-) -> str:
-    """The text of a scenario; `heading`: the lines at the top."""
-    sections = {
-        "flight": {"duration": float(duration)},
+def bridge_sections(
+    airframe_file: str, commands: Commands, controller: ControllerConfig
+) -> dict[str, Mapping[str, Any]]:
+    """The sections of a scenario for the aircraft behind a bridge."""
+    return {
+        "flight": {"duration": float(commands.duration)},
         "aircraft": {"airframe": airframe_file, "rate": RATE, "step": 1.0 / RATE},
-        "reference_model": {key: value for key, value in commands.items() if value is not None},
-        "controller": _plain(controller),
+        "reference_model": commands.reference,
+        "controller": _plain(controller.model_dump(exclude_defaults=True)),
         "recorder": {"rate": 100.0},
     }
-    body = {f"/**/{name}": {"ros__parameters": values} for name, values in sections.items()}
-    return comment(filter(None, heading)) + dump_yaml(body)
 
 
 def _plain(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A scenario for an aircraft with identified channels: gains, commands and margins."""
 
-from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,7 +9,6 @@ import yaml
 
 from aircraft_sim.airframe import Airframe
 from aircraft_sim.uncertainty import nominal_and_sampled
-from autopilot_bridge.map_rows import UNITS
 from autopilot_bridge.params import ChannelMap
 from flight_analysis.linear_loop.loop_margins import (
     LoopMargins,
@@ -20,6 +18,13 @@ from flight_analysis.linear_loop.loop_margins import (
 )
 from flight_core.vectors import FloatArray
 from flight_design.gains import gain_selection, gain_yaml, ideal_control
+from flight_design.gains.first_scenario import (
+    Channel,
+    Commands,
+    first_commands,
+    scenario_text,
+    unit_gains,
+)
 from flight_design.gains.gain_conditions import bandwidths
 from flight_design.gains.gain_selection import LoopSetting
 from flight_design.gains.ideal_control import ChannelPairing, Manoeuvre, Study
@@ -35,31 +40,16 @@ from flight_design.identification.bridge_identification import (
     WAIT,
     Channels,
     airframe_yaml,
+    bridge_sections,
     channel_pairs,
     controller_values,
     motions,
-    scenario_text,
-)
-from flight_design.identification.manoeuvre import (
-    DAMPING,
-    NATURAL_FREQUENCY,
-    PULSE_P,
-    PULSE_V,
-    reference_parameters,
-    unit_gains,
 )
 from reference_model.params import ReferenceModelConfig
 from rise_di_controller.law import Sign
 from rise_di_controller.linear_loop import Loop
 from rise_di_controller.rise_di_config import RiseDiConfig
 
-# of the loop: the reference model's natural frequency per bandwidth of a channel, at most
-REFERENCE_BANDWIDTH = 0.5
-# of the limit of thrust, which the command of V or climb needs in the end; the rest is for
-# disturbances
-HELD_FRACTION = 0.5
-# rad/s, of the doublets without an airspeed; m/s of the climb: PULSE_V / 2
-HOVER = {"q": PULSE_P, "p": PULSE_P, "r": PULSE_P}
 # s: u may cross from trim to its limit in that time, which bounds beta from below
 FULL_RANGE_TIME = 1.0
 # of the uncertain aircraft whose phase margin counts
@@ -97,8 +87,8 @@ def flying_scenario(
     """
     identified = _Identified(channel_map, channels, speed)
     commands = identified.commands()
-    reference = ReferenceModelConfig.validate_mapping(commands, "reference_model")
-    manoeuvre = Manoeuvre(reference, {}, WAIT + 60.0)
+    reference = ReferenceModelConfig.validate_mapping(commands.reference, "reference_model")
+    manoeuvre = Manoeuvre(reference, {}, commands.duration)
     source = "identified in flight"
     flying = ideal_control.study_airframe(identified.airframe(source), manoeuvre, samples=1)
     studied = identified.of_integrators(manoeuvre)
@@ -110,7 +100,7 @@ def flying_scenario(
         needed,
     )
     turning = identified
-    if commands["coordinated_turn"] is not None:
+    if reference.coordinated_turn is not None:
         turning = identified._replace(channels=_without_sideslip(channels, identified.pairing))
     model = turning.airframe("identified in flight, without sideslip")
     flown = gain_selection.with_feedforward(flown, model)
@@ -118,8 +108,7 @@ def flying_scenario(
         f"The aircraft behind the map {channel_map.name}, with gains from its identified response.",
         gain_yaml.margins_sentence(flown, margins),
     ]
-    values = flown.model_dump(exclude_defaults=True)
-    text = scenario_text(heading, airframe_file, manoeuvre.duration, commands, values)
+    text = scenario_text(heading, bridge_sections(airframe_file, commands, flown))
     lacking = "" if margins is None else unmet(margins, needed, flown.outputs)
     delay = None if margins is None else margins.delay
     return Flyable(flown, delay, lacking, identified.airframe_text(source), text)
@@ -156,16 +145,20 @@ class _Identified(NamedTuple):
         rows = [self.channel_map.inputs[name] for name in self.pairing.inputs]
         return np.array([min(-row.lower, row.upper) for row in rows])
 
-    def commands(self) -> dict[str, Any]:
-        """Commands within reach of the loop: `_commands`."""
+    def commands(self) -> Commands:
+        """Commands within reach of the loop, after WAIT: `first_commands`."""
         crossover = bandwidths(self.loop, np.array(list(self.products.values())))
         authority = np.abs(np.diag(self.channels.Omega)) * self.reach
-        held = HELD_FRACTION * authority / np.maximum(self.channels.damping, 1e-3)
-        by_output = (
-            dict(zip(self.pairing.outputs, values.tolist(), strict=True))
-            for values in (crossover, authority, held)
-        )
-        return _commands(motions(self.channel_map), self.speed, *by_output)
+        channels = {
+            name: Channel(
+                motion=motion,
+                authority=float(authority[i]),
+                bandwidth=float(crossover[i]),
+                damping=max(float(self.channels.damping[i]), 0.0),
+            )
+            for i, (name, motion) in enumerate(motions(self.channel_map).items())
+        }
+        return first_commands(channels, self.speed, RATE, banks=True, wait=WAIT)
 
     def airframe_text(self, source: str) -> str:
         """The text of the airframe file."""
@@ -297,66 +290,3 @@ def _integral(channels: Channels, i: int, crossover: float, total_lag: float) ->
         if np.min(np.abs(1.0 + delayed * (1.0 - 1j * integral / omega))) > 1.0 / MAX_SENSITIVITY
     )
     return float(next(safe, 0.0))
-
-
-def _commands(
-    moved: Mapping[str, str],
-    speed: float | None,
-    bandwidth: Mapping[str, float],
-    authority: Mapping[str, float],
-    held: Mapping[str, float],
-) -> dict[str, Any]:
-    """Commands after WAIT, by a reference model within reach of the loop; V and climb to `held`
-    m/s.
-
-    With an airspeed they are those of `reference_parameters`, in hover doublets of one channel
-    after another and a climb. Arguments, by output: the motion, the bandwidth, rad/s, the
-    authority, y_dot, and the speed that half of it holds.
-    """
-    motion_of = {motion: name for name, motion in moved.items()}
-    cruise = None if speed is None else reference_parameters(speed, authority.get("V", 1.0))
-    fastest = {"climb": NATURAL_FREQUENCY["V"], **NATURAL_FREQUENCY}
-    if cruise is not None:
-        fastest |= dict(
-            zip(cruise["outputs"], cruise["second_order"]["natural_frequency"], strict=True)
-        )
-    limit = {name: REFERENCE_BANDWIDTH * bandwidth[name] for name in moved}
-    pulses = {}
-    for motion, pulse in (_hover_pulses() if cruise is None else cruise["pulses"]).items():
-        if motion in motion_of:
-            edges = {
-                "start": [WAIT + t for t in pulse["start"]],
-                "stop": [WAIT + t for t in pulse["stop"]],
-            }
-            pulses[motion_of[motion]] = pulse | edges
-    for name, pulse in pulses.items():
-        if UNITS[moved[name]] == "m/s":
-            pulse["value"] = [round(min(value, held[name]), 4) for value in pulse["value"]]
-    turns = cruise["coordinated_turn"] if cruise is not None and {"p", "r"} <= set(moved) else None
-    return (cruise or {}) | {
-        "rate": RATE,
-        "outputs": list(moved),
-        "second_order": {
-            "natural_frequency": [
-                round(min(fastest[motion], limit[name]), 4) for name, motion in moved.items()
-            ],
-            "damping": [DAMPING.get(motion, DAMPING["V"]) for motion in moved.values()],
-        },
-        "rise": 0.5,
-        "pulses": pulses,
-        "coordinated_turn": turns,
-    }
-
-
-def _hover_pulses() -> dict[str, dict[str, list[float]]]:
-    """By motion: doublets of 1 s of the rates, back to the attitude before, then a climb of 8 s."""
-    starts = zip(HOVER, (2.0, 8.0, 14.0), strict=True)
-    pulses = {
-        motion: {
-            "start": [t, t + 2.0],
-            "stop": [t + 1.0, t + 3.0],
-            "value": [HOVER[motion], -HOVER[motion]],
-        }
-        for motion, t in starts
-    }
-    return pulses | {"climb": {"start": [20.0], "stop": [28.0], "value": [PULSE_V / 2.0]}}

@@ -34,7 +34,7 @@ STATES = {
 PARTS = (("q",), ("V",), ("p", "r"))  # outputs that couple through B
 
 ROUGH = Unknown(effect=0.1, drift=0.5)
-"""Standard deviation of an entry of B, from step tests, 1, and noise of the disturbances, sizes/s
+"""Standard deviation of an entry of B, 1, and noise of the disturbances, sizes/s
 per root s, beside a sketch. The sketch leaves out slipstream and the change of the trim with
 dynamic pressure: 0.03 to 0.1 rad/s^2 rms over some seconds on the c172p of JSBSim in moderate
 turbulence."""

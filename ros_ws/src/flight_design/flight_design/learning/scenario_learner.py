@@ -26,9 +26,9 @@ from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 from flight_design.gains.gain_design import selected_observer
 from flight_design.gains.observer_search import SelectedObserver
+from flight_design.identification.jsbsim_identification import NOISE, STEP_MARGIN
 from flight_design.identification.likelihood import KNOWN
 from flight_design.identification.sketch import ROUGH, sketched, with_sketch
-from flight_design.identification.step_identification import NOISE, STEP_MARGIN
 from flight_design.learning.designs import Goal, margin_of
 from flight_design.learning.learner import Learner
 from flight_log.tape_reader import RecordedRun

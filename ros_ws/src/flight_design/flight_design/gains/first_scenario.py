@@ -1,0 +1,227 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A first scenario of an aircraft: commands by one rule for all, and the text of the file."""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+from flight_core.files import comment
+from flight_core.units import GRAVITY
+from flight_design.gains import gain_yaml
+from flight_design.gains.gain_selection import SOFTENING
+
+LICENCE = "# SPDX-FileCopyrightText: RISE-DI contributors\n# SPDX-License-Identifier: Apache-2.0\n"
+
+# rad/s, natural frequency of the reference model at most, as in osprey_gust
+FASTEST = {"q": 4.0, "p": 5.0, "r": 4.0}
+FASTEST_SPEED = 1.2  # rad/s, of an airspeed, a climb, and any other output
+OF_BANDWIDTH = 0.5  # of the bandwidth of the loop: what the loop follows without a model
+OF_AUTHORITY = 1.0 / 3.0  # for the command; the rest is for climbs, turns and gusts
+SIZE = {"q": 0.05, "p": 0.15, "r": 0.05, "climb": 1.0}  # rad/s, m/s
+HOVER = 0.15  # rad/s, of a rate without an airspeed
+OF_SPEED = 0.03  # of V0: dynamic pressure changes by 6 %, within what the gains allow
+LARGEST_SPEED = 2.0  # m/s, change of an airspeed at most
+SEEN = 5.0  # times the noise: a command that an error shows beside it
+SPEEDS = {"V", "u", "climb"}  # motions that thrust moves: slow, without overshoot
+
+RISE = 0.2  # s, edge of a pulse, which bounds u_m_dot: short beside the filters
+REST = 2.0  # s, before the first command
+TURNS = ((0.0, 1.0), (2.0, -1.0), (5.0, -1.0), (7.0, 1.0))
+"""Starts, s, and directions of the pulses of a rate: the second pair restores the flight path."""
+PULSE = 1.0  # s, of a rate
+TURNS_TIME = 9.0  # s, of the four pulses
+SPEED_PULSE = 20.0  # s, of an airspeed or a climb
+LAST = 20.0  # s, after the last command: for a gust and the way back
+
+
+class Channel(NamedTuple):
+    """What the commands of an output follow from, SI."""
+
+    motion: str  # q, p, r, V or climb; another output has no size of its own
+    authority: float  # y_dot by the input at its nearer end stop
+    bandwidth: float  # rad/s, of the loop, from lags, delay and rate
+    noise: float = 0.0  # rms a sample
+    damping: float = 0.0  # 1/s, with which y returns
+
+    @property
+    def is_speed(self) -> bool:
+        """Whether thrust moves the output."""
+        return self.motion in SPEEDS
+
+    @property
+    def frequency(self) -> float:
+        """Natural frequency of the reference model, rad/s: half of the bandwidth, or FASTEST."""
+        return min(FASTEST.get(self.motion, FASTEST_SPEED), OF_BANDWIDTH * self.bandwidth)
+
+    def size(self, speed: float | None) -> float:
+        """Height of a pulse, `speed` V0 in m/s, None in hover.
+
+            least(size of the motion, reach), at least SEEN noise
+            reach (frequency / e + damping) = OF_AUTHORITY authority
+
+        A critically damped filter of second order answers a step A at A frequency / e at most, at
+        1 / frequency; A damping holds the end. The size of a pitch rate is 1 g / V0 at most.
+        """
+        reach = OF_AUTHORITY * self.authority / (self.frequency / math.e + self.damping)
+        return max(min(_largest(self.motion, speed), reach), SEEN * self.noise)
+
+
+def _largest(motion: str, speed: float | None) -> float:
+    """Size of a command by its motion alone."""
+    if motion in SIZE and (speed is None) and motion != "climb":
+        return HOVER
+    if motion == "q" and speed is not None:
+        return min(SIZE["q"], GRAVITY / speed)
+    if motion in SIZE:
+        return SIZE[motion]
+    return min(OF_SPEED * speed, LARGEST_SPEED) if motion in SPEEDS and speed else math.inf
+
+
+class Commands(NamedTuple):
+    """The commands of a first flight."""
+
+    reference: dict[str, Any]  # the section reference_model
+    duration: float  # s
+
+    @property
+    def gust(self) -> float:
+        """Instant of a gust after the last command, s."""
+        return self.duration - LAST / 2.0
+
+
+def first_commands(
+    channels: Mapping[str, Channel],
+    speed: float | None,
+    rate: float,
+    *,
+    banks: bool,
+    wait: float = 0.0,
+    part: float = 1.0,
+) -> Commands:
+    """The commands of a first flight by output: rates one after another, then the speeds.
+
+    Frequency and height of each are those of its `Channel`; `part` multiplies the heights. Where
+    the aircraft `banks` to turn, the yaw rate is that of a coordinated turn, g / V0 sin(bank).
+    `speed` is V0, m/s, None in hover; `rate` that of the reference model, Hz; `wait` the time
+    before all commands, s.
+
+    A reference slower than the loop, within the authority of the input: K. J. Astrom, R. M.
+    Murray, "Feedback Systems", 12.2 (two degrees of freedom).
+    """
+    names = {channel.motion: name for name, channel in channels.items()}
+    turn = banks and speed is not None and {"p", "r"} <= set(names)
+    t = wait + REST
+    pulses: dict[str, dict[str, list[float]]] = {}
+    for name, channel in sorted(channels.items(), key=lambda item: item[1].is_speed):
+        height = float(f"{part * channel.size(speed):.3g}")
+        if channel.is_speed:
+            pulses[name] = {"start": [t], "stop": [t + SPEED_PULSE], "value": [height]}
+            t += SPEED_PULSE
+        elif not (turn and channel.motion == "r"):
+            pulses[name] = {
+                "start": [t + start for start, _ in TURNS],
+                "stop": [t + start + PULSE for start, _ in TURNS],
+                "value": [direction * height for _, direction in TURNS],
+            }
+            t += TURNS_TIME
+    reference: dict[str, Any] = {
+        "rate": rate,
+        "outputs": list(channels),
+        "second_order": {
+            "natural_frequency": [round(each.frequency, 4) for each in channels.values()],
+            "damping": [1.0 if each.is_speed else 0.9 for each in channels.values()],
+        },
+        "rise": RISE,
+        "pulses": pulses,
+    }
+    if turn:
+        rates = {"bank_rate": names["p"], "turn_rate": names["r"]}
+        reference["coordinated_turn"] = rates | {"speed": speed}
+    return Commands(reference, t + LAST)
+
+
+def unit_gains(lag: Sequence[float], delay: float) -> dict[str, Any]:
+    """The keys of a controller of channels with lags and a delay, s, whose gains, each 1, are to be
+    selected.
+    """
+    ones = [1.0] * len(lag)
+    return dict.fromkeys(("Lambda", "beta", "input_scale", "omega"), ones) | {
+        "k_g": 1.0,
+        "k_d": ones[1:],
+        "D": [1] * len(lag),
+        "sign": "auto",
+        "softening": SOFTENING,
+        "lag": list(lag),
+        "delay": delay,
+    }
+
+
+COMMENTS = {
+    "flight.duration": "s",
+    "aircraft.speed": "m/s, true airspeed in trim",
+    "aircraft.altitude": "m, above sea level",
+    "aircraft.commands": "the model's own properties, with their values at the command 1",
+    "aircraft.rate": "Hz, y and truth",
+    "aircraft.step": "s, of the integration",
+    "aircraft.gusts": "1-cosine; entry in s, peak speed in m/s, distance to the peak in m",
+    "aircraft.turbulence": "moderate",
+    "aircraft.actuators": "deviations from trim, in the order of the inputs, SI",
+    "aircraft.sensors": "rms a sample, in the order of the outputs, SI",
+    "reference_model.rate": "Hz",
+    "reference_model.second_order": "rad/s and 1, within half of the bandwidth of the loop",
+    "reference_model.rise": "s, edge of a pulse: bounds u_m_dot",
+    "reference_model.pulses": "s, s, and rad/s or m/s, within a third of the authority",
+    "reference_model.coordinated_turn": "r += g/V0 sin(bank commanded)",
+    "reference_model.live": "m/s: the wings are levelled when guidance is lost",
+    "guidance.rate": "Hz; what is left out follows by rule: docs/guidance.md",
+    "guidance.stall_speed": "m/s, the slowest airspeed at which it trims in level flight there",
+    "guidance.program": "s, rad, m",
+    "recorder.rate": "Hz, polling of the subscriptions",
+}
+"""Unit and meaning of a key of a first scenario."""
+
+SCENARIO_YAML = gain_yaml.yaml_template("""\
+{{ heading }}
+{% for name, rows in sections.items() %}
+{% if rows is string %}
+
+{{ rows }}
+{%- else %}
+
+/**/{{ name }}:
+  ros__parameters:
+{% for key, value in rows.items() %}
+{% set note = "  # " ~ comments[name ~ "." ~ key] if (name ~ "." ~ key) in comments else "" %}
+{% if value is mapping and value.values() | select("mapping") | list or key == "actuators" %}
+    {{ key }}:{{ note }}
+{% for part, entry in value.items() %}
+      {{ part }}: {{ entry | flow }}
+{% endfor %}
+{% else %}
+    {{ key }}: {{ value | flow }}{{ note }}
+{% endif %}
+{% endfor %}
+{% endif %}
+{% endfor %}
+""")
+
+
+Sections = Mapping[str, Mapping[str, Any] | str]
+"""Sections of a scenario by name; a text is a whole section."""
+
+
+def scenario_text(heading: Iterable[str], sections: Sections) -> str:
+    """The text of a scenario file: a heading, a comment a line, then the sections.
+
+    `gain_yaml.as_yaml` writes a whole section. Empty lines of the heading, and keys without a
+    value, None or {}, are left out.
+    """
+    kept = {
+        name: rows
+        if isinstance(rows, str)
+        else {key: value for key, value in rows.items() if value is not None and value != {}}
+        for name, rows in sections.items()
+    }
+    lines = LICENCE + "#\n" + comment(filter(None, heading))
+    return SCENARIO_YAML.render(heading=lines.rstrip("\n"), sections=kept, comments=COMMENTS)

@@ -1,0 +1,543 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Identification of an aircraft of JSBSim: its linear airframe, gains, and a scenario.
+
+The airframe is the linearisation of JSBSim about the trim. Its gains are those that
+`rise-di gains` selects for an airframe. No number in this module is specific to an aircraft.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from aircraft_sim.airframe import Airframe
+from aircraft_sim.jsbsim_aircraft import (
+    INPUTS,
+    NONE,
+    OUTPUTS,
+    FlightCondition,
+    NamedProperties,
+    require_aircraft,
+)
+from aircraft_sim.jsbsim_linearization import Linearization, linearize
+from aircraft_sim.jsbsim_trim import NOT_BALANCED, nearest_trim, trim_solution
+from aircraft_sim.sections import Gust
+from aircraft_sim.turbulence import MODERATE_SIGMA
+from flight_analysis.closed_loop.scenario import Scenario, parse_scenario
+from flight_core.outcome import COMPLETED, FlightEnded
+from flight_core.parameters import ParameterError
+from flight_core.rates import nanoseconds
+from flight_core.vectors import FloatArray, selection_matrix
+from flight_design.gains import gain_selection, gain_yaml, ideal_control
+from flight_design.gains.airframe_properties import invariant_zeros
+from flight_design.gains.first_scenario import (
+    Channel,
+    Commands,
+    Sections,
+    first_commands,
+    scenario_text,
+    unit_gains,
+)
+from flight_design.gains.gain_selection import LoopSetting, Selection
+from flight_design.gains.ideal_control import Manoeuvre, Study
+from flight_design.gains.nominal import sizes
+from flight_design.gains.observer_selection import with_extended_state_observer
+from flight_design.gains.requirement import OBSERVER_REQUIREMENT, REQUIREMENT, Requirement
+from flight_design.identification.manoeuvre import (
+    CLIMB,
+    CLIMB_START,
+    GUST_LENGTH,
+    GUST_SPEED,
+    HEIGHTS,
+    RATE,
+    TURN,
+    TURN_START,
+    ManoeuvreResult,
+    fly_all,
+    moderate_turbulence,
+)
+from flight_design.identification.sketch import with_sketch
+from reference_model.params import ReferenceModelConfig
+from rise_di_controller.decomposition import coupling
+from rise_di_controller.law import total_lag
+from rise_di_controller.rise_di_config import LearnConfig, PriorConfig, RiseDiConfig
+
+CONTROL_RATE = 100.0
+STEP = 0.005
+# s, topics: y is at most 5 ms old at a tick, u waits at most 5 ms; half of both, and 1 ms of
+# transport
+DELAY = 0.006
+
+THROTTLE = list(INPUTS).index("throttle")
+
+# of the unit of an output to the noise that an observer expects: 1 mrad/s, 0.01 m/s
+NOISE_SHARE = 100.0
+
+# s, least delay margin: without A the model of an observer has no damping, and less margin than the
+# aircraft
+STEP_MARGIN = 0.015
+LATERAL = ("beta", "p", "r")
+HELD_FACTOR = 2.0  # of a zero of sideslip on the right: as stable as it was unstable
+APART = 5.0  # s, from a gust to the next
+
+NOISE = {"q": 0.001, "V": 0.05, "p": 0.001, "r": 0.001}
+"""rad/s and m/s, rms a sample, of the sensors of an aircraft that learns, assumed: those of a first
+flight."""
+
+
+# The manoeuvre: one rule for all aircraft
+
+# rad, bandwidth of V times the lag of its loop: it costs 26 degrees of phase, for an engine is no
+# lag alone
+FASTEST_V = 0.46
+LIGHT_SIGMA = 1.52  # m/s, of light turbulence at high altitude: 5 ft/s, MIL-F-8785C 3.7.2
+
+
+# Identification
+
+
+class IdentifiedAircraft(NamedTuple):
+    """An identified aircraft with a scenario."""
+
+    linear: Linearization
+    coupling: float  # max abs(U - I), inputs of unit response, outputs in units of the manoeuvre
+    selection: Selection
+    text: str  # of the scenario file
+    sideslip_zero: (
+        float  # 1/s, of sideslip with p and r held; Assumption 3 does not hold if it is positive
+    )
+    flights: dict[str, ManoeuvreResult]  # "calm", "gust", "turbulence"
+
+    @property
+    def condition(self) -> FlightCondition:
+        """The flight condition, without a rudder that moves nothing."""
+        return self.linear.condition
+
+    @property
+    def D(self) -> tuple[int, ...]:  # noqa: N802 - the paper's name
+        """D in the canonical order of the inputs."""
+        controller = self.selection.chosen
+        return tuple(
+            controller.D[controller.inputs.index(name)] for name in self.condition.inputs()
+        )
+
+    def scenario(self) -> Scenario:
+        """The content of the scenario file."""
+        return _load(self.text)
+
+    @property
+    def failure(self) -> str:
+        """Reason of a failure, or "": every flight completes, and in calm air each error is below
+        its command.
+        """
+        for title, flight in self.flights.items():
+            if flight.outcome != str(COMPLETED):
+                return f"{title}: {flight.outcome}"
+        pulses = self.scenario().reference_model.pulses.items()
+        largest = HEIGHTS | {name: max(map(abs, pulse.value)) for name, pulse in pulses}
+        too_large = [
+            name for name, value in self.flights["calm"].rms.items() if not value < largest[name]
+        ]
+        return (
+            f"calm: the error of {', '.join(too_large)} is larger than the command"
+            if too_large
+            else ""
+        )
+
+
+def identify(
+    name: str,
+    speed: float,
+    altitude: float,
+    progress: Callable[[str], None] = lambda _: None,
+    observer_margin: float | None = None,
+    *,
+    guided: bool = False,
+    learns: bool = False,
+    needed: Requirement = REQUIREMENT,
+    named: tuple[tuple[str, NamedProperties], ...] = (),
+) -> IdentifiedAircraft:
+    """Identify an aircraft of JSBSim in a flight condition and select its gains; speed in m/s,
+    altitude in m.
+
+    1. Trim, first in another process, and the airframe: `linearize`. 2. The pairing, with outputs
+    in units of the manoeuvre, and D from the minors. 3. Gains by the engineering procedure for the
+    airframe behind the lags, along the commands and gusts: `gain_selection.select_gains`. The
+    sign of V is that of `airspeed_slew`. With `observer_margin`, the delay margin in s of the
+    loop on y_dot = Omega u, the gains are those for y_dot = Omega u with an extended-state observer
+    beside them. The margins of that loop meet `needed`, with 35 degrees of phase. 4. Simulations
+    of the result: in calm air, with a gust, in turbulence. With `guided` the scenario has guidance
+    by rule in place of the pulses: a turn by 90 degrees and a climb by 100 m. Its stall speed is
+    that of `slowest_trim`, and its sideslip feedback flies an aircraft whose `sideslip_zero` is
+    positive, too. With `learns` the scenario learns in moderate turbulence: the gains begin alone,
+    `observer_margin` is the margin of the designs, and the rough model is the `sketch` of Omega and
+    speed.
+
+    Raises FlightEnded if the aircraft does not trim or does not respond, ParameterError if its
+    outputs and inputs cannot be paired, or if the speed is below guidance's speed floor.
+    """
+    condition = FlightCondition(require_aircraft(name), speed, altitude, nanoseconds(STEP), named)
+    linear = _linear(condition, progress)
+    condition = linear.condition
+    stall = slowest_trim(condition) if guided else None
+    Omega = linear.Omega
+    authority = float(linear.authority()[THROTTLE])
+    heights = np.array([HEIGHTS[name] for name in condition.paired_outputs()])
+    V_bandwidth = airspeed_bandwidth(authority, float(linear.lag[THROTTLE]))
+    zero = sideslip_zero(linear.airframe)
+    progress("gains")
+    setting = _setting(linear, V_bandwidth)._replace(requirement=needed)
+    commands = _commands(linear, setting)
+    studied = _study(with_sideslip_held(linear.airframe, zero), commands)
+    slew = studied.slew.copy()
+    has_observer = observer_margin is not None and not learns
+    if has_observer:
+        studied = _study(_integrators(linear), commands)
+    slew[THROTTLE] = airspeed_slew(V_bandwidth, abs(float(Omega[THROTTLE, THROTTLE])))
+    try:
+        chosen = gain_selection.select_gains(studied._replace(slew=slew), setting)
+    except ParameterError as error:
+        raise ParameterError(f"{error}{_too_weak(linear)}") from None
+    if observer_margin is not None and has_observer:
+        chosen = with_observer(chosen, Omega, observer_margin)
+    text = _text(linear, commands, chosen, stall)
+    flights = fly_all(_load(text), progress)
+    if observer_margin is not None and learns:
+        text = _text(
+            linear, commands, that_learns(chosen, condition, Omega, observer_margin), stall
+        )
+    return IdentifiedAircraft(
+        linear=linear,
+        coupling=coupling(Omega / heights[:, None]),
+        selection=chosen,
+        text=text,
+        sideslip_zero=zero,
+        flights=flights,
+    )
+
+
+def _linear(condition: FlightCondition, progress: Callable[[str], None]) -> Linearization:
+    """The linear aircraft. Raises FlightEnded, with the nearest condition that has a trim."""
+    progress("trim and linearisation")
+    try:
+        return linearize(condition)
+    except FlightEnded as error:
+        if NOT_BALANCED not in str(error):
+            raise
+        progress("trim beside the condition")
+        nearest = nearest_trim(condition) or "no speed or altitude near it has a trim"
+        raise FlightEnded(f"{error}; {nearest}") from None
+
+
+def sideslip_zero(airframe: Airframe) -> float:
+    """Rate of decay (negative) or growth of sideslip while p and r are held, 1/s: a zero.
+
+    Gravity is left out: the coupling of bank to sideslip is much slower.
+    Where the rate is positive, Assumption 3 does not hold. Without a rudder the aileron holds p,
+    and r follows.
+    """
+    states = [airframe.index(name) for name in LATERAL]
+    inputs = [i for i, name in enumerate(airframe.inputs) if name in {"aileron", "rudder"}]
+    outputs = [name for name in airframe.outputs if name in {"p", "r"}]
+    zeros = invariant_zeros(
+        airframe.matrix_a()[np.ix_(states, states)],
+        airframe.matrix_b()[np.ix_(states, inputs)],
+        selection_matrix(outputs, LATERAL),
+    )
+    return float(zeros.real.max())
+
+
+def with_sideslip_held(airframe: Airframe, zero: float) -> Airframe:
+    """The airframe with a damping of sideslip beside it where its zero is on the right.
+
+    The law holds p and r, which a feedback of sideslip alone, as guidance has it, lets fly then.
+    """
+    if zero <= 0.0:
+        return airframe
+    A = airframe.matrix_a()
+    beta = airframe.index("beta")
+    A[beta, beta] -= HELD_FACTOR * zero
+    return airframe.with_matrices(A, airframe.matrix_b(), np.ones((len(A), len(airframe.gusts))))
+
+
+def airspeed_slew(bandwidth: float, effect: float) -> float:
+    """The slew of the throttle behind beta, 1/s, for a bandwidth of V, rad/s, and an effect, m/s^2.
+
+    V holds the wind itself: beta = K bandwidth / 4 sigma, so that the sign moves the throttle no
+    faster than the Lambda of the rule would, bandwidth / 4, in light turbulence of LIGHT_SIGMA.
+    """
+    return bandwidth**2 / 4.0 * LIGHT_SIGMA / (gain_selection.BETA_TO_SLEW * effect)
+
+
+def _too_weak(linear: Linearization) -> str:
+    """The outputs whose own input, at full travel, moves the output less than a tenth of what
+    another input does, in sentences after a "; ".
+    """
+    inputs = linear.condition.inputs()
+    reach = linear.Omega * linear.travel()
+    sentences = []
+    for i, (output, name) in enumerate(zip(linear.airframe.outputs, inputs, strict=True)):
+        if abs(reach[i, i]) < 0.1 * np.abs(reach[i]).max():
+            unit = "m/s^2" if output == "V" else "rad/s^2"
+            row = ", ".join(
+                f"{key} {value:.2g}" for key, value in zip(inputs, reach[i], strict=True)
+            )
+            sentences.append(
+                f"; {name} moves {output} by {reach[i, i]:.2g} {unit} at full travel, too weak at "
+                f"this speed ({row})"
+            )
+    return "".join(sentences)
+
+
+def slowest_trim(condition: FlightCondition) -> float:
+    """The slowest airspeed at which an aircraft trims in level flight at an altitude, within 1 % of
+    the condition's, m/s.
+
+    Below it lift or thrust is not enough, so guidance takes it as the stall speed. By bisection,
+    from 0.2 of the condition's.
+    """
+    slow = 0.2 * condition.speed
+    fast = condition.speed
+    while fast - slow > 0.01 * condition.speed:
+        middle = (slow + fast) / 2.0
+        try:
+            trim_solution(condition._replace(speed=middle))
+            fast = middle
+        except FlightEnded:
+            slow = middle
+    return fast
+
+
+def with_observer(selection: Selection, Omega: FloatArray, margin: float) -> Selection:
+    """The selection with an extended-state observer in its engineering gains; Omega in the
+    aircraft's order.
+    """
+    controller = selection.chosen
+    size = sizes(OUTPUTS[name] for name in controller.outputs)
+    needed = selection.setting.requirement
+    needed = needed._replace(phase=min(needed.phase, OBSERVER_REQUIREMENT.phase))
+    observed = with_extended_state_observer(
+        controller, _in_law_order(Omega, controller), size / NOISE_SHARE, size, margin, needed
+    )
+    return replace(selection, chosen=observed.controller)
+
+
+def _in_law_order(Omega: FloatArray, controller: RiseDiConfig) -> FloatArray:
+    rows = [list(OUTPUTS).index(name) for name in controller.outputs]
+    columns = [list(INPUTS).index(name) for name in controller.inputs]
+    return Omega[np.ix_(rows, columns)]
+
+
+def that_learns(
+    selection: Selection, condition: FlightCondition, Omega: FloatArray, margin: float
+) -> Selection:
+    """A selection with feedforward and observer of a sketch, not yet flying, and `learn`; Omega in
+    the aircraft's order.
+    """
+    start = selection.chosen
+    name = Path(condition.name).stem
+    noise = np.array([NOISE[output] for output in start.outputs])
+    rough = _in_law_order(Omega, start)
+    sketched = with_sketch(start, name, rough, condition.speed, noise, margin)
+    learn = LearnConfig(prior=PriorConfig(sketch=True))
+    return replace(selection, chosen=sketched.model_copy(update={"learn": learn}))
+
+
+def without_beta(scenario: Scenario) -> Scenario:
+    """The same scenario with a negligible beta: a PI controller with the same K and Lambda."""
+    return scenario.vary(controller={"beta": [1e-9] * len(scenario.controller.outputs)})
+
+
+def _study(airframe: Airframe, commands: Commands) -> Study:
+    """The study of an airframe along the commands and gusts, without uncertain ones beside it.
+
+    The equations are those that fly. Aircraft 30 % off besides, entry by entry, may have a zero of
+    sideslip on the right, whose outputs no gains hold.
+    """
+    reference = ReferenceModelConfig.validate_mapping(commands.reference, "reference_model")
+    gusts = {
+        axis: Gust(start=start, speed=GUST_SPEED, length=GUST_LENGTH)
+        for axis, start in (("vertical", commands.gust), ("lateral", commands.gust + APART))
+        if axis in airframe.gusts
+    }
+    manoeuvre = Manoeuvre(reference, gusts, commands.duration)
+    return ideal_control.study_airframe(airframe, manoeuvre, uncertainty=0.0, samples=0)
+
+
+def _integrators(linear: Linearization) -> Airframe:
+    """The airframe y_dot = Omega u: the model of an extended-state observer, and of its gains."""
+    airframe = linear.airframe
+    units = airframe.units_of_outputs()
+    m = len(units)
+    values = airframe.model_dump(exclude={"states", "A", "B", "gravity", "gusts"}) | {
+        "states": units,
+        "A": np.zeros((m, m)).tolist(),
+        "B": linear.Omega.tolist(),
+    }
+    return Airframe.validate_mapping(values, f"airframe {airframe.name}")
+
+
+def airspeed_bandwidth(authority: float, lag: float) -> float:
+    """Bandwidth of V, rad/s, for an authority of the throttle (m/s^2) behind its lag (s): min(0.46
+    / total, authority / sigma).
+
+    The airspeed holds the wind along the path itself. In moderate turbulence, sigma = 3.05 m/s rms,
+    the throttle then moves by its authority rms; with more it goes from stop to stop, and V is off
+    by twice the wind (737).
+    """
+    return min(
+        FASTEST_V / float(total_lag(np.array(lag), DELAY, 1.0 / CONTROL_RATE)),
+        authority / MODERATE_SIGMA,
+    )
+
+
+def _setting(linear: Linearization, V_bandwidth: float) -> LoopSetting:
+    """The loop of the gains. The parameters to be selected are 1."""
+    inputs = list(linear.condition.inputs())
+    trim = linear.trim
+    base = RiseDiConfig.validate_mapping(
+        unit_gains(linear.lag.tolist(), DELAY)
+        | {
+            "rate": CONTROL_RATE,
+            "outputs": list(linear.condition.paired_outputs()),
+            "inputs": inputs,
+            "max_age": 0.1,
+            "hold": 0.5,
+            "ramp": 2.0,
+            "lower": trim.lower[: len(inputs)].tolist(),
+            "upper": trim.upper[: len(inputs)].tolist(),
+        },
+        "controller",
+    )
+    total = total_lag(linear.lag, DELAY, 1.0 / CONTROL_RATE)
+    products = {
+        **gain_selection.CROSSOVER_LAG_PRODUCTS,
+        "V": V_bandwidth * float(total[inputs.index("throttle")]),
+    }
+    return LoopSetting(
+        base,
+        CONTROL_RATE,
+        dict(zip(inputs, linear.lag.tolist(), strict=True)),
+        DELAY,
+        {},
+        crossover_lag_products=products,
+    )
+
+
+def _load(text: str) -> Scenario:
+    return parse_scenario(text.encode(), Path("identified.yaml"))
+
+
+def _commands(linear: Linearization, setting: LoopSetting) -> Commands:
+    """The commands of a linear aircraft in the loop of its gains."""
+    condition = linear.condition
+    products = setting.crossover_lag_products
+    total = total_lag(linear.lag, setting.delay, 1.0 / setting.rate)
+    damping = -np.diag(linear.airframe.matrix_a())
+    channels = {
+        name: Channel(
+            motion=name,
+            authority=float(authority),
+            bandwidth=products[name] / float(lag),
+            damping=max(float(damping[linear.airframe.index(name)]), 0.0),
+        )
+        for name, authority, lag in zip(
+            condition.paired_outputs(), linear.authority(), total, strict=True
+        )
+    }
+    return first_commands(channels, condition.speed, RATE, banks=True)
+
+
+def _text(
+    linear: Linearization, commands: Commands, selection: Selection, stall: float | None
+) -> str:
+    """The scenario file. `stall`: V_s, m/s; guided where it is not None."""
+    condition = linear.condition
+    learns = selection.chosen.learn is not None
+    reference = dict(commands.reference)
+    guidance: dict[str, dict[str, Any]] = {}
+    if stall is not None:
+        for key in ("pulses", "coordinated_turn"):
+            reference.pop(key, None)
+        reference["live"] = {"speed": condition.speed}
+        program = {
+            "heading": {"start": [TURN_START], "value": [TURN]},
+            "altitude": {"start": [CLIMB_START], "value": [condition.altitude + CLIMB]},
+        }
+        guidance["guidance"] = {"rate": 50.0, "stall_speed": stall, "program": program}
+    gust = {"start": commands.gust, "speed": GUST_SPEED, "length": GUST_LENGTH}
+    air = (
+        {
+            "turbulence": moderate_turbulence(condition.altitude),
+            "sensors": {"noise": [NOISE[name] for name in OUTPUTS], "seed": 1},
+        }
+        if learns
+        else {"gusts": {"vertical": gust}}
+    )
+    count = len(condition.inputs())
+    stops = {"lower": linear.trim.lower, "upper": linear.trim.upper}
+    aircraft = {
+        "airframe": condition.title,
+        "speed": condition.speed,
+        "altitude": condition.altitude,
+        "commands": {
+            name: " ".join(f"{path}={at_one!r}" for path, at_one in paths) or NONE
+            for name, paths in condition.named
+        },
+        "rate": RATE,
+        "step": STEP,
+        **air,
+        "actuators": {key: values[:count].tolist() for key, values in stops.items()},
+    }
+    sections: Sections = {
+        "flight": {"duration": commands.duration},
+        "aircraft": aircraft,
+        "reference_model": reference,
+        "controller": gain_yaml.as_yaml(selection),
+        **guidance,
+        "recorder": {"rate": 100.0},
+    }
+    return scenario_text(_heading(linear, selection, stall), sections)
+
+
+def _heading(linear: Linearization, selection: Selection, stall: float | None) -> list[str]:
+    """The first lines of the scenario file."""
+    condition = linear.condition
+    learns = selection.chosen.learn is not None
+    assessed = selection.engineering
+    at = f"{condition.speed:.6g} m/s and {condition.altitude:.6g} m"
+    flight = "commands on every channel" if stall is None else "guidance turns and climbs"
+    air = (
+        "moderate turbulence. It learns A and B in flight: docs/learning.md"
+        if learns
+        else "a gust from above"
+    )
+    options = f"{' --guidance' * (stall is not None)}{' --learn' * learns}"
+    trims = zip(condition.inputs(), linear.trim.commands.tolist(), strict=False)
+    effects = zip(
+        condition.paired_outputs(),
+        condition.inputs(),
+        np.diag(linear.Omega).tolist(),
+        strict=True,
+    )
+    return [
+        gain_yaml.below_requirement(assessed.unmet, assessed.controller.outputs),
+        f"JSBSim's {condition.name} at {at}: {flight}, {air}.",
+        (
+            f"Written by: rise-di identify {condition.title} --speed {condition.speed:.6g} "
+            f"--altitude {condition.altitude:.6g}{options}"
+        ),
+        f"Commands in trim: {', '.join(f'{name} {value:.3g}' for name, value in trims)}.",
+        (
+            "Effects of the linearisation, in rad/s^2 and m/s^2 per unit of command: "
+            f"{', '.join(f'{output} by {name} {value:.3g}' for output, name, value in effects)}."
+        ),
+        (
+            f"beta holds gusts of {GUST_SPEED:g} m/s from above and from the side. That of V is "
+            "K bandwidth / 4 times the rms of a light turbulence,"
+        ),
+        "for V holds the wind itself: more drives the throttle from stop to stop.",
+    ]
