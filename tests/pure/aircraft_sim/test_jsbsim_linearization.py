@@ -54,7 +54,7 @@ def jacobian(linear: Linearization) -> FloatArray:
 
 
 def test_a_is_that_of_jsbsims_own_linearisation(linear: Linearization) -> None:
-    # FGLinearization differences by steps of its own, and starts the engines anew: 3 % and 0.01 SI.
+    # FGLinearization has steps of its own, and starts the engines again: 3 % and 0.01 SI
     fdm, _ = trimmed_fdm(linear.condition, trim_solution(linear.condition))
     own = jsbsim.FGLinearization(fdm)
     places = list(own.x_names)

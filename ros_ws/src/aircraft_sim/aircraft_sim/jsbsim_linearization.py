@@ -78,7 +78,8 @@ def linearize(condition: FlightCondition) -> Linearization:
         x_dot of V, alpha, beta: the accelerations in the axes of the flight path,
             (cos a u_dot + sin a w_dot,  (cos a w_dot - sin a u_dot) / V,  v_dot / V),  a = alpha
         column of V, alpha, beta = -(1, V, V) wind:  air forces see the difference to the wind
-        theta_dot = q cos phi - r sin phi,  phi_dot = p + tan theta (q sin phi + r cos phi)
+        theta_dot = q,  phi_dot = p + tan(theta) r,  gravity: V_dot -= g sin(theta),
+            beta_dot += g cos(theta) / V sin(phi),  for the small bank of a trim
         B_j = x_dot(t_end) / size,  lag_j = step + integral of 1 - x_dot(t) / x_dot(t_end)
 
     u in normalised commands from trim, w along AXES in m/s, lags of the output that an input
@@ -228,14 +229,9 @@ def _airframe(condition: FlightCondition, trim: Trim, B: FloatArray) -> Airframe
         A[:, places[AIR_STATE[axis]]] = -size * column
     for name in RATES:
         A[:, places[name]] = _derivative(condition, trim, name)
-    phi = _trim_state(trim, "phi")
-    slope = math.tan(_trim_state(trim, "theta"))
-    A[places["theta"], [places["q"], places["r"]]] = math.cos(phi), -math.sin(phi)
-    A[places["phi"], [places[name] for name in ("p", "q", "r")]] = (
-        1.0,
-        slope * math.sin(phi),
-        slope * math.cos(phi),
-    )
+    theta = _trim_state(trim, "theta")
+    for into, by, gain in (("theta", "q", 1.0), ("phi", "p", 1.0), ("phi", "r", math.tan(theta))):
+        A[places[into], places[by]] = gain
     gusts = {
         axis: {
             name: V * value
@@ -255,7 +251,10 @@ def _airframe(condition: FlightCondition, trim: Trim, B: FloatArray) -> Airframe
         "outputs": list(condition.paired_outputs()),
         "A": _without_rounding(A).tolist(),
         "B": _without_rounding(B).tolist(),
-        "gravity": _gravity(trim, V),
+        "gravity": [
+            {"into": "V", "angle": "theta", "gain": -GRAVITY},
+            {"into": "beta", "angle": "phi", "gain": GRAVITY * math.cos(theta) / V},
+        ],
         "gusts": gusts,
     }
     return Airframe.validate_mapping(values, f"airframe {condition.title}")
@@ -263,25 +262,3 @@ def _airframe(condition: FlightCondition, trim: Trim, B: FloatArray) -> Airframe
 
 def _without_rounding(matrix: FloatArray) -> FloatArray:
     return np.where(np.abs(matrix) < LEAST, 0.0, matrix)
-
-
-def _gravity(trim: Trim, V: float) -> list[dict[str, str | float]]:
-    """The terms of gravity: its component in the axes of the flight path, differentiated by theta
-    and phi in trim.
-    """
-    alpha, theta, phi = (_trim_state(trim, name) for name in ("alpha", "theta", "phi"))
-    along = np.array([math.cos(alpha), 0.0, math.sin(alpha)])
-    across = np.array([-math.sin(alpha), 0.0, math.cos(alpha)]) / V
-    aside = np.array([0.0, 1.0, 0.0]) / V
-    sin_theta, cos_theta = math.sin(theta), math.cos(theta)
-    sin_phi, cos_phi = math.sin(phi), math.cos(phi)
-    by_angle = {
-        "theta": np.array([-cos_theta, -sin_theta * sin_phi, -sin_theta * cos_phi]),
-        "phi": np.array([0.0, cos_theta * cos_phi, -cos_theta * sin_phi]),
-    }
-    return [
-        {"into": into, "angle": angle, "gain": gain}
-        for into, axis in (("V", along), ("alpha", across), ("beta", aside))
-        for angle, change in by_angle.items()
-        if abs(gain := GRAVITY * float(axis @ change)) > LEAST
-    ]

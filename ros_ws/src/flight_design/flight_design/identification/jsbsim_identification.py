@@ -346,11 +346,6 @@ def that_learns(
     return replace(selection, chosen=sketched.model_copy(update={"learn": learn}))
 
 
-def without_beta(scenario: Scenario) -> Scenario:
-    """The same scenario with a negligible beta: a PI controller with the same K and Lambda."""
-    return scenario.vary(controller={"beta": [1e-9] * len(scenario.controller.outputs)})
-
-
 def _study(airframe: Airframe, commands: Commands) -> Study:
     """The study of an airframe along the commands and gusts, without uncertain ones beside it.
 

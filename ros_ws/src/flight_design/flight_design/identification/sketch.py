@@ -55,7 +55,7 @@ def sketch(
 
     V stands apart: an airspeed holds the wind itself, beside which y hardly shows what alpha and
     theta do to V. The factors are geometric means over the twelve aircraft of
-    `benchmarks.jsbsim_fleet`, from differences of their accelerations in trim; the entries of one
+    `benchmarks.jsbsim_gains`, from differences of their accelerations in trim; the entries of one
     aircraft differ from them by a factor of 1.3 to 3. Arguments: Omega (m, m), rows `outputs`,
     columns `inputs`; input i drives output i. Raises ParameterError for outputs other than q, V, p,
     r.
