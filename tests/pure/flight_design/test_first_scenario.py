@@ -43,7 +43,7 @@ def test_command_needs_at_most_a_third_of_the_authority(
     samples = np.array([y_m.sample(k)[0] for k in range(round(20.0 * 100.0))])
     asked = np.gradient(samples, 0.01) + damping * samples
     assert asked.max() <= authority / 3.0 * 1.01
-    assert samples.max() <= min(2.0, 0.03 * speed) * 1.001
+    assert samples.max() <= min(2.0, 0.03 * speed) * 1.006  # a height has three digits
 
 
 def test_reference_is_slower_than_half_of_the_loop() -> None:
