@@ -33,7 +33,14 @@ from flight_design.identification.model_identification import (
     with_entries,
 )
 from flight_design.identification.model_quality import another_airframe
-from flight_design.learning.change_test import ANGLE, MAX_GAIN, RECORD, Change, change_test
+from flight_design.learning.change_test import (
+    ANGLE,
+    MAX_GAIN,
+    RECORD,
+    Change,
+    believed,
+    change_test,
+)
 from flight_design.learning.designs import (
     Goal,
     goal,
@@ -65,9 +72,6 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 
 # entries at their bound: the right model may have one that hardly shows, wrong ones have two to six
 AT_BOUND = 1
-# of log-likelihood by a loss of effect, beside a fallback: of healthy surfaces at most 34 was seen
-# there, of dead ones 54 to 1500
-FALLBACK_GAIN = 40.0
 # s, of a record: two held-out seconds of the six that `identify` needs at least
 SHORTEST = 20.0 * TRANSIENT
 
@@ -495,13 +499,10 @@ class Learner:
         )
 
     def _changes(self, end_ns: int) -> list[Change]:
-        """Tests of the parts over the last RECORD; none where the speed was not steady over it, an
-        output oscillated or stood still.
+        """Tests of the parts over the last RECORD that count; none where the speed was not steady
+        over it, an output oscillated or stood still.
 
-        A part counts RECORD after the window of its model. Without a learned model it is tested
-        beside the file's, and only an input without effect is believed. A loop near instability
-        moves y as no model with a stable loop says: where the law fell back in these seconds, a
-        gain of FALLBACK_GAIN is asked for.
+        A loop near instability moves y as no model with a stable loop says.
         """
         begin_ns = end_ns - nanoseconds(RECORD)
         if self._is_sketch or self._record.length < RECORD or self._record.oscillated(begin_ns):
@@ -514,21 +515,14 @@ class Learner:
             return []
         delays = {part: np.array(known.delays) for part, known in learned.items()}
         changes = change_test(recent, self._at_speed(self._model, ratio), self._actuation, delays)
+        rested = {part for part, known in learned.items() if known.end_ns <= begin_ns}
         has_fallen = self._record.fell_back(begin_ns, self._proposals)
-        counted = []
-        for change in changes:
-            part = change.outputs
-            if part in self._changed or any(is_within(part, outputs) for outputs in self._dead):
-                continue
-            if has_fallen:
-                counts = change.gain >= FALLBACK_GAIN and (bool(change.dead) or part in learned)
-            elif part in learned:
-                counts = end_ns - learned[part].end_ns >= nanoseconds(RECORD)
-            else:
-                counts = bool(change.dead)
-            if counts:
-                counted.append(change)
-        return counted
+        return [
+            change
+            for change in changes
+            if not any(is_within(change.outputs, part) for part in (*self._dead, *self._changed))
+            and believed(change, learned, rested, has_fallen=has_fallen)
+        ]
 
     def _designed(
         self,
@@ -588,9 +582,7 @@ class Learner:
         parts: list[tuple[str, ...]],
         latest: Mapping[str, float],
     ) -> str:
-        """What the margin of `learn.margin` costs beside that of the loop of the file, a sentence;
-        "" where no other is asked for.
-        """
+        """What `learn.margin` costs beside the margin of the file's loop; "" without it."""
         start = self._controller
         settings = start.learn
         if settings is None or settings.margin is None or self._design_of_rough is None:
