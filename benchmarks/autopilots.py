@@ -226,7 +226,7 @@ def imported_beside(command: Sequence[str], log: Path, run: Path, place: Path) -
     omega: dict[str, dict[str, float]] = {}
     for name, source in (("stack", run), ("imported", bag)):
         read = on_the_ground(
-            *command, str(source), "--write", str(place / f"of_{name}"), "--set", "accept", "--json"
+            *command, str(source), "--write", str(place / f"of_{name}"), "--accept", "--json"
         )
         if read.returncode:
             return {"refused": f"{name}: {read.stderr}"}

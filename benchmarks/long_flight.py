@@ -62,7 +62,7 @@ IN_VIEW = """(() => {
 })()"""  # goes to the first figure; whether all figures in view are drawn  # noqa: E501 - a text as it is written
 MODES = {
     "in lockstep": ["--lockstep"],
-    "in lockstep in one process": ["--lockstep", "--set", "composed"],
+    "in lockstep in one process": ["--lockstep", "--composed"],
     "in real time": [],
 }
 
@@ -104,7 +104,7 @@ def fly(scenario: Path, runs: Path, mode: str) -> tuple[dict[str, list[int]], in
     bytes.
     """
     within = real_time() if mode == "in real time" else ()
-    command = [*within, RISE_DI, "fly", str(scenario), *MODES[mode], "--set", f"runs={runs}"]
+    command = [*within, RISE_DI, "fly", str(scenario), *MODES[mode], "--runs", str(runs)]
     memory: dict[str, list[int]] = {}
     with ExitStack() as stack:
         flight = stack.enter_context(psutil.Popen(command, stdout=subprocess.DEVNULL))

@@ -32,7 +32,7 @@ def main() -> None:
     results = {}
     for name in scenarios():
         with tempfile.TemporaryDirectory() as runs:
-            flight = _run("fly", name, "--lockstep", "--set", "composed", "--set", f"runs={runs}")
+            flight = _run("fly", name, "--lockstep", "--composed", "--runs", str(runs))
             replayed = {"differing": 0} | _run("replay", f"{runs}/latest")
         results[name] = replayed | {"completed": flight.get("outcome", {}).get("status") == 0}
     print(json.dumps(results, indent=1))

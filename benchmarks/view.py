@@ -222,8 +222,8 @@ def flying(runs: Path, seconds: float) -> Iterator[tuple["subprocess.Popen[str]"
         SCENARIO,
         "--duration",
         f"{seconds:g}",
-        "--set",
-        f"runs={runs}",
+        "--runs",
+        str(runs),
         "--json",
     ]
     known = set(runs.iterdir())

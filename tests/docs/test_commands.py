@@ -141,7 +141,7 @@ def test_options_in_the_text_of_pages_exist() -> None:
     for page in PAGES:
         for name, rest in SPAN.findall(page.read_text()):
             command = RISE_DI.commands[name]  # type: ignore[attr-defined]
-            known = {option.split()[0] for parameter in command.params for option in parameter.opts}
+            known = {option for parameter in command.params for option in parameter.opts}
             if options := set(re.findall(r"(?<!\S)--[a-z-]+", rest)) - known:
                 unknown.append(f"{page.relative_to(REPOSITORY)}: rise-di {name}: {options}")
     assert not unknown, "\n".join(unknown)

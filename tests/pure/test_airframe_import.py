@@ -394,14 +394,13 @@ def test_command_writes_airframe_and_scenario(
         "navion.mat",
         "--write",
         ".",
-        "--set",
-        f"speed={NAMES['speed']}",
+        "--speed",
+        str(NAMES["speed"]),
         "--states",
         NAMES["states"],
         "--inputs",
         NAMES["inputs"],
-        "--set",
-        "thrust",
+        "--thrust",
     ]
     result = invoke(*arguments, catch_exceptions=False)
     assert result.exit_code == 0

@@ -234,8 +234,8 @@ class Autopilot:
             channel_map,
             "--duration",
             f"{duration:g}",
-            "--set",
-            f"runs={self.folder / 'runs'}",
+            "--runs",
+            str(self.folder / "runs"),
         )
         return self.start("fly", *arguments, *options)
 

@@ -685,8 +685,8 @@ def test_signs_of_map_compared_with_those_of_controller(sign: int, tmp_path: Pat
         "--bridge",
         str(tmp_path / "map.yaml"),
         "--send",
-        "--set",
-        f"runs={tmp_path / 'runs'}",
+        "--runs",
+        str(tmp_path / "runs"),
     )
     if sign < 0:
         refused = invoke(*words)

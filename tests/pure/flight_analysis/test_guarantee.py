@@ -296,7 +296,7 @@ def test_report_shows_the_guarantee_that_was_computed_for_its_loop(tmp_path: Pat
 def test_command_fails_below_uncertainty_and_writes_an_unstable_aircraft(tmp_path: Path) -> None:
     folder = tmp_path / "first"
     arguments = ["gains", "osprey", "--check", "--guarantee", "--uncertainty", "0.75", "--json"]
-    arguments += ["--set", f"worst={folder}", "--set", "samples=1"]
+    arguments += ["--worst", str(folder), "--samples", "1"]
     result = invoke(*arguments)
     assert result.exit_code == 1, result.output
     promise = json.loads(result.stdout)["guarantee"]
@@ -322,7 +322,7 @@ def test_command_bounds_the_effectors_behind_an_allocation() -> None:
     inputs, and an aircraft of it is unstable earlier.
     """
     words = ["gains", "x8_elevons", "--scenario", "x8_elevons", "--check", "--guarantee", "--json"]
-    done = invoke(*words, "--set", "samples=2")
+    done = invoke(*words, "--samples", "2")
     assert done.exit_code == 1
     promise = kept(boxed("x8_elevons"))  # of the same loop and box
     assert promise is not None

@@ -87,7 +87,7 @@ def test_interrupt_before_flight_leaves_no_folder(
 
     without_ros.setattr("flight_cli.watch.watched", interrupted)
     file = [str(fleet_file(tmp_path, FLEET_OF_TWO))] if words == ["fly"] else []
-    arguments = [*words, *file, "--watch", "--set", f"runs={tmp_path / 'runs'}"]
+    arguments = [*words, *file, "--watch", "--runs", str(tmp_path / "runs")]
     assert invoke(*arguments).exit_code == 130
     assert list((tmp_path / "runs").iterdir()) == []
 
@@ -106,8 +106,8 @@ def test_interrupt_of_reports_shows_what_was_flown(
     arguments = [
         "fly",
         str(fleet_file(tmp_path, FLEET_OF_TWO)),
-        "--set",
-        f"runs={tmp_path / 'runs'}",
+        "--runs",
+        str(tmp_path / "runs"),
         "--json",
     ]
     result = invoke(*arguments)

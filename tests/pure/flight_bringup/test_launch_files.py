@@ -227,8 +227,8 @@ def test_fleet_is_a_process_and_its_end_ends_launch(tmp_path: Path) -> None:
     assert [str(word) for word in fleet.cmd[1:]] == [
         "fly",
         str(file),
-        "--set",
-        "runs=runs",
+        "--runs",
+        "runs",
         "--duration",
         "3.0",
         "--watch",

@@ -621,8 +621,8 @@ def new(aircraft: int, *more: str) -> tuple[str, ...]:
         "5",
         "--aircraft",
         str(aircraft),
-        "--set",
-        "chunk=20",
+        "--chunk",
+        "20",
         "--seed",
         "7",
         *more,
@@ -655,7 +655,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> list[object]:
 def test_killed_campaign_resumes_to_figures_of_uninterrupted_one(
     whole: list[object], tmp_path: Path
 ) -> None:
-    stopped = command(*new(200, "--set", "runs=part", "--set", "workers=1"), cwd=tmp_path)
+    stopped = command(*new(200, "--runs", "part", "--workers", "1"), cwd=tmp_path)
     folder = wait_for_chunks(tmp_path / "part", 2, stopped)
     stopped.send_signal(signal.SIGKILL)
     stopped.communicate()
@@ -666,7 +666,7 @@ def test_killed_campaign_resumes_to_figures_of_uninterrupted_one(
 
 
 def test_ctrl_c_prints_the_command_to_resume(tmp_path: Path) -> None:
-    stopped = command(*new(4000, "--set", "runs=part", "--set", "workers=1"), cwd=tmp_path)
+    stopped = command(*new(4000, "--runs", "part", "--workers", "1"), cwd=tmp_path)
     folder = wait_for_chunks(tmp_path / "part", 1, stopped)
     stopped.send_signal(signal.SIGINT)
     output, errors = stopped.communicate()
@@ -677,8 +677,8 @@ def test_ctrl_c_prints_the_command_to_resume(tmp_path: Path) -> None:
 
 def test_ctrl_c_ends_the_processes_of_missions(tmp_path: Path) -> None:
     """A terminal sends the signal to the workers too."""
-    short = ("osprey_route", "--duration", "3", "--aircraft", "400", "--set", "chunk=1")
-    stopped = command(*short, "--set", "runs=part", "--set", "workers=2", cwd=tmp_path, group=True)
+    short = ("osprey_route", "--duration", "3", "--aircraft", "400", "--chunk", "1")
+    stopped = command(*short, "--runs", "part", "--workers", "2", cwd=tmp_path, group=True)
     wait_for_chunks(tmp_path / "part", 1, stopped)
     workers = psutil.Process(stopped.pid).children(recursive=True)
     assert len(workers) >= 2
@@ -801,7 +801,7 @@ def test_two_dask_workers_give_same_figures_and_killed_one_repeats_only_chunks(
     whole: list[object], tmp_path: Path
 ) -> None:
     spread = command(
-        *new(200, "--set", "runs=spread", "--engine", "dask", "--set", "workers=2"), cwd=tmp_path
+        *new(200, "--runs", "spread", "--engine", "dask", "--workers", "2"), cwd=tmp_path
     )
     wait_for_chunks(tmp_path / "spread", 2, spread)
     workers = [

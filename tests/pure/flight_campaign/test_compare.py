@@ -169,7 +169,7 @@ def test_shipped_gains_are_those_of_the_catalogue(name: str) -> None:
     [
         (["--laws", "rise,magic"], "'magic'"),
         (["--uncertainty", "0.3,1"], "0 and below 1"),
-        (["--set", "gains=nowhere.yaml", "--laws", "pi"], "--tune"),
+        (["--gains", "nowhere.yaml", "--laws", "pi"], "--tune"),
     ],
 )
 def test_bad_input_is_one_sentence(arguments: list[str], words: str) -> None:
@@ -203,8 +203,8 @@ def test_the_command_writes_what_it_shows(
     gains_file: Path, brief_file: Path, tmp_path: Path
 ) -> None:
     path = tmp_path / "compared.json"
-    options = "--laws rise,l1 --aircraft 2 --uncertainty 0.3 --tuning gust --set wind=published"
-    arguments = [*options.split(), "--set", f"gains={gains_file}"]
+    options = "--laws rise,l1 --aircraft 2 --uncertainty 0.3 --tuning gust --wind published"
+    arguments = [*options.split(), "--gains", str(gains_file)]
     result = invoke("compare", brief_file, *arguments, "--json", path)
     assert result.exit_code == 0, result.output
     found = json.loads(path.read_text())
@@ -269,8 +269,8 @@ def test_interrupted_tuning_resumes_with_missing_laws(
         return initial(names[law.title], short)
 
     monkeypatch.setattr(tuning, "tune", tune)
-    options = "--laws rise,pi,l1 --aircraft 1 --tune --set"
-    arguments = ["compare", str(brief_file), *options.split(), f"gains={path}"]
+    options = "--laws rise,pi,l1 --aircraft 1 --tune --gains"
+    arguments = ["compare", str(brief_file), *options.split(), str(path)]
     invoke(*arguments)
     assert list(tuned_gains.load(path)) == ["rise"]
     result = invoke(*arguments)

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import pytest
 import typer
@@ -188,14 +189,14 @@ def test_folder_of_runs_that_is_not_utf_8_is_refused_before_anything_is_made(
         "--in-process",
         "--duration",
         "0.1",
-        "--set",
+        "--runs",
     ]
     shown = subprocess.run(
-        [*map(os.fsencode, words), b"runs=r\xff"], cwd=tmp_path, capture_output=True, check=False
+        [*map(os.fsencode, words), b"r\xff"], cwd=tmp_path, capture_output=True, check=False
     )
     assert shown.returncode == 2
     assert re.fullmatch(
-        rb"error: --set runs: found .*udcff', expected a folder with a name in UTF-8.*\n",
+        rb"error: --runs: found .*udcff', expected a folder with a name in UTF-8.*\n",
         shown.stderr,
     )
     assert list(tmp_path.iterdir()) == []
@@ -205,32 +206,137 @@ def test_the_version_is_that_of_the_package(tmp_path: Path) -> None:
     assert rise_di("--version", cwd=tmp_path).stdout == f"rise-di {version('rise-di')}\n"
 
 
-def options_of(name: str) -> set[str]:
-    """The options of a command; its settings are one, --set."""
+def options_of(name: str) -> list[Any]:
+    """The options of a command."""
     command = typer.main.get_command(application([name])).commands[name]  # type: ignore[attr-defined]
-    return {each.opts[0].split()[0] for each in command.params if each.param_type_name == "option"}
+    return [each for each in command.params if each.param_type_name == "option"]
 
 
-def test_commands_and_options_are_few() -> None:
+def test_commands_are_few_and_so_are_options_beside_the_panel_of_rare_ones() -> None:
     assert len(COMMANDS) <= 20
-    assert {name: found for name in COMMANDS if len(found := options_of(name)) > 10} == {}
+    for name in COMMANDS:
+        assert sum(each.rich_help_panel is None for each in options_of(name)) <= 10, name
+
+
+def test_option_is_a_name_in_small_letters_joined_by_hyphens() -> None:
+    """--set alone takes keys; Ixx and the like are the letters of the field."""
+    for name in COMMANDS:
+        spellings = [spelling for each in options_of(name) for spelling in each.opts]
+        assert [text for text in spellings if not re.fullmatch(r"--[a-zI][a-z0-9-]*", text)] == []
 
 
 def test_what_a_command_writes_is_its_output() -> None:
     """A user who knows one command guesses --output in the next."""
-    for name in ("export", "gains", "identify", "learn", "compare"):
-        command = typer.main.get_command(application([name])).commands[name]  # type: ignore[attr-defined]
-        assert any("--output" in parameter.opts for parameter in command.params), name
+    for name in (
+        "airframes",
+        "compare",
+        "export",
+        "gains",
+        "identify",
+        "import",
+        "learn",
+        "network",
+    ):
+        assert any("--output" in option.opts for option in options_of(name)), name
 
 
-def test_option_that_is_a_setting_names_it() -> None:
-    result = invoke("gains", "osprey", "--y-rate", "50")
-    assert str(result.exception) == "--y-rate: found no option, expected --set y_rate"
-    unknown = invoke("export", "osprey_servo", "--set", "hz=50")
-    assert (
-        str(unknown.exception)
-        == "--set: found 'hz=50', expected one of drawn, duration, rate, runner, samples, seed"
+@pytest.mark.parametrize(
+    "words",
+    [
+        "fly --runs there --duration 3 --composed --use-sim-time --learn --fence a.plan",
+        "fly --route a.gpx --origin 47.4,8.5 --altitude 400 --simplify 50 --line 2",
+        "gains osprey --rate 100 --y-rate 50 --margin 0.04 --page a.html --accept --write g.yaml",
+        "gains osprey --phase-margin 45 --seed 2 --samples 20 --output g.yaml --json",
+        "gains osprey --check --guarantee --late 0.01 --worst folder",
+        "identify log --airframe osprey --scenario osprey_gust --delay 0 --refly --margin 0.03",
+        "identify --bridge px4 --amplitude 0.4 --phase-margin 40 --link-delay 0.1 --output folder",
+        "campaign --runs there --workers 2 --aircraft 9 --seed 3 --wind published --chunk 2",
+        "compare --wind published --gains tuned.yaml --turbulence-seed 4 --output law.yaml",
+        "export osprey_servo --rate 80 --output code --duration 20 --seed 2 --samples 8 --drawn 9",
+        "airframes a.yaml --output here --speed 20 --mass 3 --Ixx 1 --thrust --name own --force",
+        "report --output folder --width 88mm --channels q,V --page both.html --json",
+        "watch --runs there --remap y:=/sensors/y --background a.geojson --origin 1,2 --real",
+        "import log.bin --map px4 --output folder",
+        "learn runs/latest --output model.yaml --set controller.learn.window=40",
+        "guide route.plan --origin 47.4,8.5 --altitude 400",
+        "network --peers 10.0.0.1 --output profile.xml",
+        "play runs/latest --rate 2",
+    ],
+)
+def test_natural_options_are_taken(words: str) -> None:
+    name, *rest = words.split()
+    command = typer.main.get_command(application([name])).commands[name]  # type: ignore[attr-defined]
+    command.make_context(name, rest)
+
+
+KEY = ", or a key of the scenario: --set SECTION.KEY=VALUE"
+
+
+@pytest.mark.parametrize(
+    "words, mend",
+    [
+        ("gains osprey --rates 3", "--rate"),
+        ("gains osprey --y_rate 50", "--y-rate"),
+        ("gains osprey --phase_margin=45", "--phase-margin"),
+        ("campaign --run x", "--runs"),
+        ("campaign --worker 3", "--workers"),
+        ("campaign --jobs 3", "one of rise-di campaign --help"),
+        ("airframes --ixx 3", "one of rise-di airframes --help"),
+        ("gains osprey --set rate=100", "one of rise-di gains --help"),
+        ("fly --run x", f"--runs{KEY}"),
+        # a key of the scenario is never taken for --send, which commands an autopilot
+        ("fly --seed 3", f"one of rise-di fly --help{KEY}"),
+        ("fly --law rise", f"one of rise-di fly --help{KEY}"),
+        ("replay --k-g 2", f"one of rise-di replay --help{KEY}"),
+    ],
+)
+def test_other_option_is_refused_with_its_mend(words: str, mend: str) -> None:
+    error = invoke(*words.split()).exception
+    option = next(word for word in words.split() if word.startswith("--")).partition("=")[0]
+    assert str(error) == f"{option}: found no option, expected {mend}"
+
+
+@pytest.mark.parametrize(
+    "words, refusal",
+    [
+        ("gains osprey --observer --margin 0.9", "--margin: found 0.9, expected 0 to 0.5 s"),
+        ("gains osprey --rate nan", "--rate: found nan, expected 1 to 1000 Hz"),
+        ("gains osprey --late 0.1", "--late: found it alone, expected --guarantee beside it"),
+        ("identify log --link-delay 1", "--link-delay: found 1.0, expected --bridge beside it"),
+        ("campaign --score q", "--score: found 'q', expected a name and a number: q=0.02"),
+        ("fly --in-process --composed", "--in-process: found a flight over topics, in lockstep"),
+        ("fly --in-process --line 2", "--line: found no --route, expected the file of a route"),
+        ("fly --set runs=x", "--set: found 'runs=x', expected a parameter of the scenario"),
+    ],
+)
+def test_refusal_names_the_option_as_it_is_typed(words: str, refusal: str) -> None:
+    assert str(invoke(*words.split()).exception).startswith(refusal)
+
+
+@pytest.mark.parametrize(
+    "words, expected",
+    [
+        ("gains osprey --scenario osprey_s", "osprey_servo"),
+        ("replay runs/latest --set controller.k_g=2 --scenario osprey_s", "osprey_servo"),
+        ("fly osprey_s", "osprey_servo"),
+        ("fly osprey_servo --ru", "--runs"),
+        ("campaign --runs there --engine th", "threads"),
+        ("campaign --workers 2 --distribution co", "corners"),
+        ("compare --turbulence-seed 3 --wind pu", "published"),
+    ],
+)
+def test_shell_completes_after_each_option(words: str, expected: str, tmp_path: Path) -> None:
+    environment = {
+        **os.environ,
+        "_RISE_DI_COMPLETE": "complete_bash",
+        "COMP_WORDS": f"rise-di {words}",
+        "COMP_CWORD": str(len(words.split())),
+    }
+    command = [sys.executable, "-m", "flight_cli.cli"]
+    shown = subprocess.run(
+        command, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False
     )
+    assert expected in shown.stdout.split(), shown.stderr
 
 
 def test_scenarios_are_listed_with_their_sentence_aircraft_and_law() -> None:

@@ -40,7 +40,7 @@ def flown(folder: Path, monkeypatch: pytest.MonkeyPatch, then: Then = lambda run
 
 
 def fly_one_second(folder: Path) -> Any:
-    words = ("fly", "osprey_gust", "--in-process", "--duration", "1", "--set", f"runs={folder}")
+    words = ("fly", "osprey_gust", "--in-process", "--duration", "1", "--runs", str(folder))
     return invoke(*words)
 
 

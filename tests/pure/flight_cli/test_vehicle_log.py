@@ -488,7 +488,7 @@ def test_gains_from_imported_log_state_for_which_link_they_are(
     flight: Flight, tmp_path: Path
 ) -> None:
     bag = imported_bag(tmp_path, flight)
-    identify = ["identify", str(bag), "--bridge", "ardupilot", "--speed", "25", "--set", "accept"]
+    identify = ["identify", str(bag), "--bridge", "ardupilot", "--speed", "25", "--accept"]
     result = invoke(*identify, "--write", tmp_path / "found")
     assert "for 50 ms of further delay over the link (link_delay)" in result.output
     assert result.exit_code == 0

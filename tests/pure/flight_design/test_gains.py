@@ -406,7 +406,7 @@ def rise_di(*arguments: str) -> Result:
 def test_the_command_writes_gains_that_load(tmp_path: Path) -> None:
     path = tmp_path / "gain_conditions.yaml"
     loop = ("--lag", "0.02,0.1,0.02,0.02", "--delay", "0")
-    result = rise_di("gains", "osprey", "--set", "samples=2", "--json", *loop, "--write", str(path))
+    result = rise_di("gains", "osprey", "--samples", "2", "--json", *loop, "--write", str(path))
     assert result.exit_code == 0, result.output
     output = json.loads(result.stdout)
     section = yaml.safe_load(path.read_text())["/**/controller"]["ros__parameters"]
@@ -442,7 +442,7 @@ def test_y_that_is_slower_than_law_counts_as_delay_and_may_be_three_messages_old
 @pytest.mark.parametrize(
     "option, value, expected",
     [
-        ("--set", "rate=nan", "--set rate: found nan, expected 1 to 1000 Hz"),
+        ("--rate", "nan", "--rate: found nan, expected 1 to 1000 Hz"),
         ("--lag", "fast", "--lag: found 'fast', expected seconds separated by commas"),
     ],
 )

@@ -50,11 +50,11 @@ REFUSALS: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: second_stage(find_scenario("osprey_learn"), bridge=True),
         r"controller\.learn: found a bridge, expected a simulated aircraft",
     ),
-    "`--set learn` beside an observer": (
+    "`--learn` beside an observer": (
         lambda: scenario_learner.that_learns(find_scenario("osprey_observer")),
         r"learn: found an observer, expected none: a scenario of the law alone",
     ),
-    "`--set learn` of outputs other than q, V, p, r": (
+    "`--learn` of outputs other than q, V, p, r": (
         lambda: scenario_learner.that_learns(
             load_scenario(REPOSITORY / "examples/hexarotor/hexarotor_flight.yaml").vary(
                 aircraft={"sensors": {"noise": []}}

@@ -398,7 +398,7 @@ def command(*arguments: Any) -> Any:
 def test_command_writes_airframe_and_page_of_innovations(tmp_path: Path) -> None:
     model = tmp_path / "model.yaml"
     result = command(
-        run_folder(tmp_path), "--airframe", "osprey", "--set", "delay=0", "--write", model, "--json"
+        run_folder(tmp_path), "--airframe", "osprey", "--delay", "0", "--write", model, "--json"
     )
     assert result.exit_code == 0
     found = identified("turbulence", 0.3)

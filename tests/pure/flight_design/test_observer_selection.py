@@ -178,13 +178,13 @@ def test_models_that_do_not_fit_are_refused(monkeypatch: pytest.MonkeyPatch) -> 
     "arguments, sentence",
     [
         (
-            ["--set", "model=osprey"],
-            "error: --set model: found osprey, expected observer beside it",
+            ["--model", "osprey"],
+            "error: --model: found osprey, expected observer beside it",
         ),
         (["--observer", "--check"], "error: --observer: found it beside --check"),
         (
-            ["--observer", "--set", "margin=0.9"],
-            "error: --set margin: found 0.9, expected 0 to 0.5 s",
+            ["--observer", "--margin", "0.9"],
+            "error: --margin: found 0.9, expected 0 to 0.5 s",
         ),
     ],
 )

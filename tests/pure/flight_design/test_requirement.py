@@ -270,7 +270,7 @@ def test_a_refusal_names_bound_and_change_and_the_file_is_marked(
     selection = select_gains("osprey", "osprey_servo", samples=0)
     assert lacking(selection, options=("lag", "delay", "rate")) == (
         "phase margin (deg) of V: found 41.99, expected at least 45: the best of the search, bound "
-        "by phase margin (deg) of V; met with --set phase_margin=41"
+        "by phase margin (deg) of V; met with --phase-margin 41"
     )
     eased = select_gains("osprey", "osprey_servo", samples=0, phase_margin=41.0)
     assert not eased.engineering.unmet
@@ -300,14 +300,14 @@ def test_command_shows_trade_and_writes_margins(tmp_path: Path) -> None:
     result = rise_di(
         "gains",
         "osprey",
-        "--set",
-        "samples=2",
-        "--set",
-        "phase-margin=50",
+        "--samples",
+        "2",
+        "--phase-margin",
+        "50",
         "--write",
         str(path),
-        "--set",
-        f"page={page}",
+        "--page",
+        str(page),
     )
     assert result.exit_code == 0, result.output
     assert {"Bode plot of the loop", "Nyquist plot of the loop", "all inputs"} <= set(

@@ -514,8 +514,8 @@ def test_route_file_flown_and_stays_with_flight(tmp_path: Path) -> None:
         ),
         (["guide", "V=30", "V=31"], "guide: found a command twice, or two, expected each once"),
         (
-            ["fly", "--in-process", "--set", "route.origin=47.4,8.5"],
-            "--set route.origin: found no --route, expected the file of a route",
+            ["fly", "--in-process", "--origin", "47.4,8.5"],
+            "--origin: found no --route, expected the file of a route",
         ),
     ],
 )

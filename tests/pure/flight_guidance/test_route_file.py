@@ -300,7 +300,7 @@ def test_mission_counts_from_sea_where_pose_does(tmp_path: Path) -> None:
         waypoint.altitude
         for waypoint in read_route_file(path, ZURICH, 7.0, above_sea=None).waypoints
     ] == [57.0, 107.0]
-    with refusing(r"found an altitude above the home, expected --set route.altitude"):
+    with refusing(r"found an altitude above the home, expected --altitude"):
         read_route_file(path, ZURICH, above_sea=None)
     with refusing("expected an origin"):
         read_route_file(path, None, 7.0, above_sea=None)
@@ -542,16 +542,13 @@ def test_line_of_a_file_with_several_is_chosen(line: str, tmp_path: Path) -> Non
         [north, north + 1112.0], abs=1.0
     )
     assert route.notes == ("1 further lines and 3 wpt beside the trk: no part of the route",)
-    with refusing(r"found 2 trk, expected one, or --set route.line=1 \(morning\), 2 \(evening\)"):
+    with refusing(r"found 2 trk, expected one, or --line 1 \(morning\), 2 \(evening\)"):
         read_route_file(path, ZURICH)
-    with refusing(
-        r"route.line: found '3', which names 0 lines, expected --set route.line=1 "
-        r"\(morning\)"
-    ):
+    with refusing(r"line: found '3', which names 0 lines, expected --line 1 \(morning\)"):
         read_route_file(path, ZURICH, line="3")
     path = tmp_path / "r.plan"
     path.write_text(json.dumps(plan([])))
-    with refusing(r"route\.line: found a mission"):
+    with refusing(r"line: found a mission"):
         read_route_file(path, line=line)
 
 
@@ -763,7 +760,7 @@ ENTITY = '<!DOCTYPE kml [<!ENTITY a "8.5,47.4,500">]>'
         (
             "r.geojson",
             {"features": [line(), line()]},
-            "found 2 LineStrings, expected one, or --set route.line=1, 2",
+            "found 2 LineStrings, expected one, or --line 1, 2",
         ),
         (
             "r.geojson",
@@ -784,7 +781,7 @@ ENTITY = '<!DOCTYPE kml [<!ENTITY a "8.5,47.4,500">]>'
         (
             "r.gpx",
             gpx('<rte><rtept lat="47.4" lon="8.5"/></rte>'),
-            r"route\[0\]: found a rtept without ele, .* --set route.altitude",
+            r"route\[0\]: found a rtept without ele, .* --altitude",
         ),
         ("r.plan", {"fileType": "Plan"}, "found no mission with items"),
         (

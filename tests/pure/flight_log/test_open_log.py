@@ -236,13 +236,9 @@ def test_two_aircraft_are_shown_one_at_time(
     both = [*in_namespace("/uav1", messages), *in_namespace("/uav2", shorter)]
     write_mcap(bag, sorted(both, key=lambda message: message.log_ns))
     for command in ("report", "replay", "check", "identify"):
-        given = (
-            ["--set", "scenario=osprey_gust"]
-            if command == "identify"
-            else ["--scenario", "osprey_gust"]
-        )
+        given = ["--scenario", "osprey_gust"]
         assert "aircraft in the namespaces /uav1, /uav2" in refusal(command, str(bag), *given)
-        third = ["--set", "namespace=uav3"] if command == "identify" else ["--namespace", "uav3"]
+        third = ["--namespace", "uav3"]
         assert "expected one in 'uav3'" in refusal(command, str(bag), *given, *third)
     assert "expected one in 'uav3'" in refusal("watch", str(bag), "--namespace", "uav3")
     assert "expected one in 'uav3'" in refusal("play", str(bag), "--namespace", "uav3")

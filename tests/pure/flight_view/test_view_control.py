@@ -215,7 +215,7 @@ def test_gains_of_bridge_that_sends_need_further_option(
         )
         assert (status, sentence) == (
             403,
-            "the bridge sends to an autopilot: gains need rise-di watch --control --set real",
+            "the bridge sends to an autopilot: gains need rise-di watch --control --real",
         )
 
     async def allowed(desk: Desk) -> None:

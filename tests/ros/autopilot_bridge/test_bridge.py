@@ -303,7 +303,7 @@ def test_identify_excites_autopilot_and_writes_what_flies_it(
     del content["pose"], content["topics"]["/ap/airspeed"], content["topics"]["/ap/pose/filtered"]
     Path(setup.map).write_text(yaml.safe_dump(content, sort_keys=False))
     setup.autopilot()
-    options = ("--speed", "25", "--set", "amplitude=0.3", "--write", "found", "--json")
+    options = ("--speed", "25", "--amplitude", "0.3", "--write", "found", "--json")
     # 0.3 in place of 0.2: on a busy host, whose messages are late, it found Omega within 25 % and
     # refused it.
     identify = start("flight_cli.cli", "identify", "--bridge", setup.map, *options)

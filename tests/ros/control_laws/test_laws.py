@@ -26,7 +26,7 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_log.tape_reader import read_run
 from rise_di_controller import laws
 
-OPTIONS = {"lockstep": ["--lockstep"], "composed": ["--lockstep", "--set", "composed"]}
+OPTIONS = {"lockstep": ["--lockstep"], "composed": ["--lockstep", "--composed"]}
 PULSES = {
     "q": {"start": [0.2], "stop": [1.0], "value": [0.1]},
     "p": {"start": [0.4], "stop": [1.4], "value": [0.4]},
@@ -93,7 +93,7 @@ def test_law_of_another_package_flies_in_lockstep_as_without_ros_and_replayed(
     scenario = scenario_file(tmp_path / "pid.yaml", SECTIONS["pid"])
     runs = []
     for folder, options in OPTIONS.items():
-        start("flight_cli.cli", "fly", str(scenario), *options, "--set", f"runs={folder}").succeed()
+        start("flight_cli.cli", "fly", str(scenario), *options, "--runs", str(folder)).succeed()
         runs.append(tmp_path / folder / "latest")
     first = payloads(runs[0])
     for payload in map(payloads, runs[1:]):

@@ -27,7 +27,7 @@ def publish(made: Peer, *topics: str) -> None:
     "words, topics, status",
     [
         (["fly", "osprey_gust"], ("/y", "/y_m", "/u"), STATUS_BAD_INPUT),
-        (["fly", "osprey_gust", "--set", "composed"], ("/y", "/y_m", "/u"), STATUS_BAD_INPUT),
+        (["fly", "osprey_gust", "--composed"], ("/y", "/y_m", "/u"), STATUS_BAD_INPUT),
         (["fly", "osprey_gust", "--lockstep"], ("/y", "/y_m", "/u"), STATUS_BAD_INPUT),
         (["fly", "osprey_gust", "--bridge", "ardupilot"], ("/y", "/y_m", "/u"), STATUS_BAD_INPUT),
         (

@@ -45,7 +45,7 @@ def test_flights_in_two_namespaces_do_not_mix_and_end_by_interrupts(
     flight, nodes = engaged
     assert len(nodes) == 4
     beside = start(
-        "flight_cli.cli", "fly", "osprey_gust", "--namespace", "uav2", "--set", "runs=beside/runs"
+        "flight_cli.cli", "fly", "osprey_gust", "--namespace", "uav2", "--runs", "beside/runs"
     )
     beside.until(lambda: is_engaged(tmp_path / "beside"), "a flight beside it that has engaged")
     nodes_beside = beside.children()
@@ -123,7 +123,7 @@ def test_second_flight_is_refused_and_killed_node_ends_flight_and_killed_command
 ) -> None:
     flight, nodes = engaged
     beside = start(
-        "flight_cli.cli", "fly", "osprey_gust", "--namespace", "uav2", "--set", "runs=beside/runs"
+        "flight_cli.cli", "fly", "osprey_gust", "--namespace", "uav2", "--runs", "beside/runs"
     )
     beside.until(lambda: is_engaged(tmp_path / "beside"), "a flight beside it that has engaged")
     nodes_beside = beside.children()

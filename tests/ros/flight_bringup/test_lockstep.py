@@ -61,7 +61,7 @@ def scenario_file(
 def fly(start: Start, scenario: Path, runs: str, *options: str, status: int = 0) -> Path:
     """Fly to the end; return the folder of the run."""
     command = start(
-        "flight_cli.cli", "fly", str(scenario), "--lockstep", "--set", f"runs={runs}", *options
+        "flight_cli.cli", "fly", str(scenario), "--lockstep", "--runs", str(runs), *options
     )
     assert command.end() == status, command.output
     return scenario.parent / runs / "latest"
@@ -109,7 +109,7 @@ def test_runs_repeat_to_byte_on_busy_host_in_one_process_and_without_ros_and_are
         busy,
         # with its gust at the limits q is off by more than the linear loop
         fly(start, scenario, "idle", status=STATUS_SHORTFALL),
-        fly(start, scenario, "together", "--set", "composed", status=STATUS_SHORTFALL),
+        fly(start, scenario, "together", "--composed", status=STATUS_SHORTFALL),
     ]
     first, *others = map(payloads, runs)
     for topic in TOPICS:
@@ -179,7 +179,7 @@ def test_diverged_aircraft_ends_flight_with_reason_and_log(start: Start, tmp_pat
     wrong = {"D": [-1, 1, 1, 1]}
     # no saturation limits the wrong input
     scenario = scenario_file(tmp_path, 60.0, "osprey_gust", controller=wrong)
-    command = start("flight_cli.cli", "fly", str(scenario), "--lockstep", "--set", "runs=runs")
+    command = start("flight_cli.cli", "fly", str(scenario), "--lockstep", "--runs", "runs")
     assert command.end() == 3, command.output
     summary = json.loads((tmp_path / "runs" / "latest" / "summary.json").read_text())
     assert re.fullmatch(

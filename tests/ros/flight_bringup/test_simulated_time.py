@@ -125,8 +125,8 @@ def test_fly_is_by_the_clock_of_a_simulator(ends: bool, start: Start, tmp_path: 
     shutil.copy(REPOSITORY / "examples" / "simulator" / "simulator.py", tmp_path)
     apart = ("--ros-args", "-r", "y:=/apart/y", "-r", "u:=/apart/u")
     simulator = start("simulator", "2", *apart)
-    settings = ("use_sim_time", "composed", "aircraft.rate=100", "reference_model.rate=100")
-    words = [word for setting in settings for word in ("--set", setting)]
+    rates = ("--set", "aircraft.rate=100", "--set", "reference_model.rate=100")
+    words = ("--use-sim-time", "--composed", *rates)
     duration = "60" if ends else "2"
     flight = start("flight_cli.cli", "fly", "osprey_servo", "--duration", duration, *words)
     if ends:

@@ -150,12 +150,11 @@ def test_controller_reproduces_flight_to_byte(
         "fly",
         "osprey_gust",
         "--lockstep",
-        "--set",
-        "composed",
+        "--composed",
         "--duration",
         "2",
-        "--set",
-        f"runs={tmp_path}",
+        "--runs",
+        str(tmp_path),
     )
     flight.succeed(120)
     recorded = tmp_path / "latest"

@@ -105,8 +105,8 @@ def test_lockstep_flight_takes_target_and_ends_with_name_of_lost_guidance(
         "fly",
         str(scenario_file(tmp_path, 1e5, "osprey_route")),
         "--lockstep",
-        "--set",
-        "runs=runs",
+        "--runs",
+        "runs",
     )
     command.wait_for_log(tmp_path / "runs", FIRST_CHUNKS)
     assert (

@@ -128,7 +128,7 @@ def dask(
                         "that needs too much memory does"
                     )
                     raise ParameterError(
-                        f"--engine dask: found {failure}, expected a smaller --set chunk"
+                        f"--engine dask: found {failure}, expected a smaller --chunk"
                     ) from None
                 else:
                     return

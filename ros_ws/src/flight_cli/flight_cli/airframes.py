@@ -13,7 +13,15 @@ import typer
 from rich.console import Console
 
 from flight_cli.output import new_table, parse_numbers, print_json, print_table, say
-from flight_cli.words import argument, json_option, option, setting, values_of, warn
+from flight_cli.words import (
+    argument,
+    json_option,
+    option,
+    rare_option,
+    values_of,
+    warn,
+    write_option,
+)
 from flight_core.files import display_path
 from flight_core.parameters import require
 from flight_design.gains.airframe_properties import (
@@ -46,11 +54,11 @@ class Airframes:
         " (.mat), or a text of AVL (system matrix, stability derivatives) or XFLR5.",
         metavar="[AIRFRAME]...",
     )
-    write: Path | None = option(
+    write: Path | None = write_option(
         "Write NAME.yaml and NAME_flight.yaml, an airframe that flies.", metavar="FOLDER"
     )
-    name: str = setting("Name of the airframe; by default that of the file.", default="")
-    speed: str | None = setting('Trim speed, in m/s or with a unit: "176 ft/s".')
+    name: str = rare_option("Name of the airframe; by default that of the file.", default="")
+    speed: str | None = rare_option('Trim speed, in m/s or with a unit: "176 ft/s".')
     states: str = option(
         'States in the order of A, with units: "u: ft/s, w: ft/s, q: rad/s, theta: rad".',
         default="",
@@ -64,19 +72,21 @@ class Airframes:
         '0.987 u + 0.163 w".',
         default="",
     )
-    thrust: bool = setting(
+    thrust: bool = rare_option(
         "Add an input thrust in units of the weight along the flight path.", default=False
     )
     lag: str | None = option("Lags of the actuators in s, in the order of the inputs: 0.05,0.3")
-    mass: str | None = setting('Beside AVL\'s derivatives: "3.2 kg" or "85 slug".')
-    Ixx: str | None = setting('Body axes: "0.2 kg*m^2" or "1048 slug*ft^2".')
-    Iyy: str | None = setting("As Ixx.")
-    Izz: str | None = setting("As Ixx.")
-    Ixz: str | None = setting("As Ixx; by default 0.")
-    density: str | None = setting('"1.225 kg/m^3" or "0.002377 slug/ft^3".')
-    length: str | None = setting("Unit of length of AVL's file, by default m.")
-    source: str = setting("Where the figures come from: a book and a page.", default="")
-    replace: bool = setting("Replace files of these names.", default=False)
+    mass: str | None = rare_option('Beside AVL\'s derivatives: "3.2 kg" or "85 slug".')
+    Ixx: str | None = rare_option('Body axes: "0.2 kg*m^2" or "1048 slug*ft^2".')
+    Iyy: str | None = rare_option("As Ixx.")
+    Izz: str | None = rare_option("As Ixx.")
+    Ixz: str | None = rare_option("As Ixx; by default 0.")
+    density: str | None = rare_option('"1.225 kg/m^3" or "0.002377 slug/ft^3".')
+    length: str | None = rare_option("Unit of length of AVL's file, by default m.")
+    source: str = rare_option("Where the figures come from: a book and a page.", default="")
+    replace: bool = rare_option(
+        "Replace files of these names.", "--replace", "--force", default=False
+    )
     as_json: bool = json_option()
 
     def execute(self) -> None:

@@ -165,7 +165,7 @@ class BridgeExperiment:
         """Airframe and scenario with gains. Raises ParameterError for short margins."""
         airframe = str((self.folder / "airframe.yaml").resolve())
         flyable = flying_scenario(channel_map, channels, self.speed, airframe, self.needed)
-        expected = "the margins, or --set accept beside --bridge"
+        expected = "the margins, or --accept beside --bridge"
         require(self.accept or not flyable.lacking, "identify", flyable.lacking, expected)
         return flyable
 
@@ -374,7 +374,7 @@ def _show_link(console: Console, channel_map: ChannelMap, link_delay: float | No
     if link_delay is None:
         sentence = (
             f"The map {channel_map.name} states no link_delay. Gains and margins are without the "
-            "link: --set link_delay=SECONDS adds its delay."
+            "link: --link-delay SECONDS adds its delay."
         )
     else:
         sentence = (

@@ -47,7 +47,14 @@ from flight_cli.output import (
     say,
     show_table,
 )
-from flight_cli.words import argument, json_option, option, require_unused, setting
+from flight_cli.words import (
+    argument,
+    json_option,
+    option,
+    rare_option,
+    require_unused,
+    scenario_names,
+)
 from flight_core.files import display_path, writing
 from flight_core.parameters import require
 from flight_design.learning.scenario_learner import quick_learner
@@ -82,24 +89,25 @@ class Campaign:
         "Name of a scenario, or path of a scenario file (.yaml); or the folder of an "
         "interrupted campaign to continue.",
         default="osprey_servo",
+        autocompletion=scenario_names,
     )
     aircraft: int = option("How many uncertain aircraft.", default=1000, min=1)
     uncertainty: float = option(
         "Largest relative deviation of each entry of A and B, 0 to 1.", default=0.3
     )
-    wind: WindEffect | None = setting(
+    wind: WindEffect | None = rare_option(
         "Effect of wind: by each aircraft's own A, or that of the airframe; by default "
         "the scenario's."
     )
-    entry: list[str] | None = setting(
+    entry: list[str] | None = rare_option(
         "An entry with a deviation of its own, once for each: 'B[V,thrust]=0.6', "
         "lag=0.5, noise=0.5, delay=0.02 (s)."
     )
-    distribution: Distribution | None = setting(
+    distribution: Distribution | None = rare_option(
         "Of the deviations: uniform, normal with three standard deviations at the "
         "limit, or its two limits."
     )
-    score: list[str] | None = setting(
+    score: list[str] | None = rare_option(
         "Unit of the rms error of an output in the score, SI, as q=0.02; once for each output."
     )
     seed: int = option("Seed of the aircraft.", default=1, min=0)
@@ -108,7 +116,7 @@ class Campaign:
         "or 'beta[V]=0.5,1,2'."
     )
     duration: float | None = option("Seconds to fly, in place of the scenario's.")
-    chunk: int | None = setting(
+    chunk: int | None = rare_option(
         "Aircraft computed at once, by default 1000, on a GPU what its memory holds, with a "
         "learner or a route 4.",
         min=1,
@@ -117,9 +125,9 @@ class Campaign:
         "Threads of this process, or processes and hosts of dask; by default dask with a "
         "learner or a route."
     )
-    workers: int | None = setting("Threads or processes; by default one a core.", min=1)
-    scheduler: str | None = setting("Address of a dask scheduler, as in tcp://host:8786.")
-    runs: Path = setting("Folder that the campaign's folder is made in.", default=Path("runs"))
+    workers: int | None = rare_option("Threads or processes; by default one a core.", min=1)
+    scheduler: str | None = rare_option("Address of a dask scheduler, as in tcp://host:8786.")
+    runs: Path = rare_option("Folder that the campaign's folder is made in.", default=Path("runs"))
     rows: Path | None = option(
         "Write a row an aircraft as Parquet: figures, outcome, drawn entries."
     )

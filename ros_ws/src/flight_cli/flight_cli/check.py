@@ -25,7 +25,7 @@ from autopilot_bridge.params import ChannelMap, load_map
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_cli.log_options import log_namespace, warn_of_lacks_in
 from flight_cli.output import new_table, print_json, print_table, say
-from flight_cli.words import REQUIRED, argument, json_option, option, warn
+from flight_cli.words import REQUIRED, argument, json_option, option, scenario_names, warn
 from flight_design.identification.response_identification import MIN_RATIO
 from flight_design.identification.sign_check import (
     SignCheck,
@@ -53,7 +53,9 @@ class Check:
         "Name of a channel map, or path of one (.yaml).", default=REQUIRED, metavar="MAP"
     )
     airframe: str | None = option("Airframe; by default that of the scenario.")
-    scenario: str = option("Scenario with the controller.", default="osprey_servo")
+    scenario: str = option(
+        "Scenario with the controller.", default="osprey_servo", autocompletion=scenario_names
+    )
     run: Path | None = option(
         "A recorded flight with y and u, each input excited; with a bridge, its engaged time."
     )

@@ -39,7 +39,7 @@ from flight_cli.output import (
     say,
     write_text,
 )
-from flight_cli.words import argument, option, setting, values_of, write_option
+from flight_cli.words import argument, option, rare_option, scenario_names, values_of, write_option
 from flight_core.files import display_path
 from flight_core.parameters import require
 from flight_design.gains import tuned_gains
@@ -137,14 +137,16 @@ class Compare:
     """
 
     scenario: str = argument(
-        "Name of a scenario, or path of a scenario file (.yaml).", default="osprey_servo"
+        "Name of a scenario, or path of a scenario file (.yaml).",
+        default="osprey_servo",
+        autocompletion=scenario_names,
     )
     aircraft: int = option("Uncertain aircraft at each level.", default=200, min=1)
     uncertainty: str = option(
         "Largest relative deviations of A and B, as in 0.3,0.5", default="0.3,0.5"
     )
     seed: int = option("Seed of the uncertain aircraft.", default=1, min=0)
-    wind: WindEffect | None = setting(
+    wind: WindEffect | None = rare_option(
         "Effect of wind: by each aircraft's own A, or that of the airframe; by default "
         "the scenario's."
     )
@@ -159,12 +161,12 @@ class Compare:
     tune: bool = option(
         "First tune the laws that have no gains for this scenario: minutes a law.", default=False
     )
-    turbulence_seed: int = setting(
+    turbulence_seed: int = rare_option(
         "Seed of the turbulence, unlike that of the tuning.",
         default=law_comparison.TURBULENCE_SEED,
         min=0,
     )
-    gains: Path | None = setting("File of tuned gains; by default the one of the stack.")
+    gains: Path | None = rare_option("File of tuned gains; by default the one of the stack.")
     write: Path | None = write_option(
         "File for the gains of one law as a section of a scenario, which flies with "
         "the score shown."

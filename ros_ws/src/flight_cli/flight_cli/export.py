@@ -18,7 +18,8 @@ from flight_cli.words import (
     argument,
     json_option,
     option,
-    setting,
+    rare_option,
+    scenario_names,
     values_of,
 )
 from flight_log.tape_reader import read_run
@@ -40,7 +41,9 @@ class Export:
     """
 
     scenario: str = argument(
-        "Name of a scenario, or path of a scenario file (.yaml).", default=REQUIRED
+        "Name of a scenario, or path of a scenario file (.yaml).",
+        default=REQUIRED,
+        autocompletion=scenario_names,
     )
     folder: Path | None = option(
         "Folder to write the C code and the report of the proof to.", "--c", "--output"
@@ -54,24 +57,24 @@ class Export:
     float32: bool = option(
         "Compute in float. The proof then bounds the difference of u.", default=False
     )
-    duration: float | None = setting(
+    duration: float | None = rare_option(
         "Duration of a flight of the proof, s; else the scenario's, at most 20 s.", min=1.0
     )
-    drawn: int = setting(
+    drawn: int = rare_option(
         "Number of drawn steps of the proof.", default=50_000, min=1, max=10_000_000
     )
-    seed: int = setting("Seed of the drawn inputs.", default=1, min=0)
+    seed: int = rare_option("Seed of the drawn inputs.", default=1, min=0)
     compiler: list[str] | None = option(
         "Command of a C compiler, as 'python -m ziglang cc'; may be repeated. Else gcc "
         "and clang, if there."
     )
-    runner: str = setting(
+    runner: str = rare_option(
         "Command that starts what the compiler makes, as qemu-aarch64.", default=""
     )
-    samples: int | None = setting(
+    samples: int | None = rare_option(
         "Samples of y and of y_m that the controller keeps; else 8 of a module, or 100.", min=4
     )
-    rate: float | None = setting(
+    rate: float | None = rare_option(
         "Rate of law, reference model and y, Hz; the observer is discretised again."
     )
     fmu: bool = option(

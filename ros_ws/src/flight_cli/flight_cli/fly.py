@@ -34,7 +34,15 @@ from flight_cli.fleet import fly_fleet_file, open_fleet
 from flight_cli.output import flight_progress, print_json, show_flight
 from flight_cli.route_options import RouteWords, parse_origin
 from flight_cli.settings import settings_option, with_settings
-from flight_cli.words import argument, json_option, option, require_unused, setting, warn
+from flight_cli.words import (
+    argument,
+    json_option,
+    option,
+    rare_option,
+    require_unused,
+    scenario_names,
+    warn,
+)
 from flight_core.environment import require_ros_environment
 from flight_core.files import display_path
 from flight_core.installation import require_package
@@ -65,6 +73,7 @@ class Fly(RouteWords):
     scenario: str = argument(
         "Name of a scenario, or path of a scenario file (.yaml) or of the file of a fleet.",
         default="osprey_servo",
+        autocompletion=scenario_names,
     )
     duration: float | None = option("Duration in s; by default that of the scenario.")
     settings: list[str] | None = settings_option()
@@ -72,10 +81,10 @@ class Fly(RouteWords):
     lockstep: bool = option(
         "Fly in lockstep over topics, as fast as possible, repeatable to the byte.", default=False
     )
-    composed: bool = setting(
+    composed: bool = rare_option(
         "Fly with all nodes in one process: a third of the processor time.", default=False
     )
-    use_sim_time: bool = setting(
+    use_sim_time: bool = rare_option(
         "Fly by the /clock of a simulator, at any speed of it, in place of real time.",
         default=False,
     )
@@ -86,12 +95,11 @@ class Fly(RouteWords):
     route: Path | None = option(
         f"Fly a route: {', '.join(ENDINGS)}. Guidance starts with it.", metavar="FILE"
     )
-    fence: Path | None = setting(
+    fence: Path | None = rare_option(
         f"Keep the fence of a file: {', '.join(FENCES)}. Rally points are home.",
-        "route.fence",
         metavar="FILE",
     )
-    learn: bool = setting(
+    learn: bool = rare_option(
         "Learn A and B from the signs and sizes of the law alone, with no model of the aircraft.",
         default=False,
     )
@@ -101,7 +109,7 @@ class Fly(RouteWords):
         "Namespace of all nodes, as uav1: one for each aircraft that flies in this domain.",
         default="",
     )
-    runs: Path = setting("Folder that the run's folder is made in.", default=Path("runs"))
+    runs: Path = rare_option("Folder that the run's folder is made in.", default=Path("runs"))
     as_json: bool = json_option()
 
     def execute(self) -> None:
@@ -155,7 +163,7 @@ class Fly(RouteWords):
         needs = {"origin": files, "altitude": files, "simplify": self.route, "line": self.route}
         for name, file in needs.items():
             unset = file is not None or getattr(self, name) in (None, 0.0)
-            require(unset, f"route.{name}", "no --route", "the file of a route: --route FILE")
+            require(unset, f"--{name}", "no --route", "the file of a route: --route FILE")
         return chosen if files is None else self._with_files(chosen)
 
     def _require_one_way(self, *, stepping: bool) -> None:
@@ -194,7 +202,7 @@ class Fly(RouteWords):
             origin = parse_origin(self.origin)
             sections = read_fence_file(self.fence, origin, self.altitude, above_sea=above_sea)
         guided = not sections or scenario.guidance is not None
-        require(guided, "route.fence", "a scenario without guidance", "one with guidance")
+        require(guided, "--fence", "a scenario without guidance", "one with guidance")
         if home := sections.get("home"):
             ground = "" if above_sea or home.get("altitude", 1.0) > 0.0 else ": the ground"
             warn(f"note: home by the fence file: {home}{ground}")

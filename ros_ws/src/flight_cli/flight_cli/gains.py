@@ -48,8 +48,9 @@ from flight_cli.words import (
     argument,
     json_option,
     option,
+    rare_option,
     require_unused,
-    setting,
+    scenario_names,
     values_of,
     write_option,
 )
@@ -126,70 +127,74 @@ class Gains:
     )
     uncertainty: float = option("Largest relative deviation of each entry of A and B.", default=0.3)
     scenario: str = option(
-        "Scenario with the commands, the gusts and the loop.", default="osprey_servo"
+        "Scenario with the commands, the gusts and the loop.",
+        default="osprey_servo",
+        autocompletion=scenario_names,
     )
-    rate: float | None = setting("Rate of the law in Hz; by default that of the scenario.")
-    y_rate: float | None = setting(
+    rate: float | None = rare_option("Rate of the law in Hz; by default that of the scenario.")
+    y_rate: float | None = rare_option(
         "Rate of y in Hz: a period above that of the law counts as delay, and y is "
         "stale after three."
     )
     lag: str | None = option("Lags of the actuators in s, in the airframe's order: 0.02,0.1")
     delay: float | None = option("Pure delay in s; by default that of the scenario.")
-    px4: Path | None = setting(
+    px4: Path | None = rare_option(
         "Parameter file of QGroundControl or ULog of PX4, for the module of export --px4: "
         "rate and delay of the body rates."
     )
-    inputs: str | None = setting("Input of each output, in the airframe's order: rudder,aileron")
-    gamma_2: float = setting(
+    inputs: str | None = rare_option(
+        "Input of each output, in the airframe's order: rudder,aileron"
+    )
+    gamma_2: float = rare_option(
         "gamma_2 of Lemma 1 in 1/s. It is an assumption: nothing bounds it.", default=0.0
     )
-    samples: int = setting(
+    samples: int = rare_option(
         "Number of uncertain airframes for the bounds of the theorem.",
         default=100,
         min=0,
         max=10_000,
     )
-    seed: int = setting("Seed of the uncertain airframes.", default=1, min=0)
+    seed: int = rare_option("Seed of the uncertain airframes.", default=1, min=0)
     write: Path | None = write_option("File for the engineering gains, as a section of a scenario.")
-    feedforward: bool = setting(
+    feedforward: bool = rare_option(
         "Write the airframe too, as the model of the feedforward (an extension).", default=False
     )
     observer: bool = option(
         "Write feedforward and observer, and the gains beside them (an extension).", default=False
     )
-    model: str | None = setting(
+    model: str | None = rare_option(
         "Airframe that the observer takes as its model, as rise-di identify RUN writes it."
     )
-    margin: float = setting(
+    margin: float = rare_option(
         "Least delay margin of the nominal loop with the observer, s.", default=0.03
     )
-    speeds: str | None = setting(
+    speeds: str | None = rare_option(
         "With --observer: models at two parts of the trim speed too, as 0.7,1.4, and a "
         "schedule that flies them."
     )
-    weights: Path | None = setting(
+    weights: Path | None = rare_option(
         "With --observer: file of gains and weights in place of those of a search or a rule; "
         "with accept they are taken as they are."
     )
-    phase_margin: float = setting(
+    phase_margin: float = rare_option(
         "Least phase margin of the loop behind servos, deg; 35 or less with the observer.",
         default=PHASE_MARGIN,
     )
-    theorem: bool = setting(
+    theorem: bool = rare_option(
         "With --write: the gains of Theorem 1, for an ideal loop: --lag 0 --delay 0.", default=False
     )
-    mixing: str = setting(
+    mixing: str = rare_option(
         "diagonal: an input an output; full: inputs of the law, distributed by the inverse of C B.",
         default="diagonal",
     )
-    accept: bool = setting(
+    accept: bool = rare_option(
         "Accept a phase margin below 40 deg, and write gains whose margins fall short.",
         default=False,
     )
     check: bool = option(
         "Check the gain set of the scenario instead of selecting one.", default=False
     )
-    page: Path | None = setting(
+    page: Path | None = rare_option(
         "HTML file for the margins with Bode and Nyquist plots: of the engineering "
         "gains, or with --check."
     )
@@ -198,10 +203,10 @@ class Gains:
         "--guarantee",
         default=False,
     )
-    worst: Path | None = setting(
+    worst: Path | None = rare_option(
         "With --guarantee: folder for the first unstable aircraft, airframe.yaml and scenario.yaml."
     )
-    late: float = setting(
+    late: float = rare_option(
         "With --guarantee: u is late by an unknown time of 0 to this in each input, s.", default=0.0
     )
     as_json: bool = json_option()
@@ -305,7 +310,7 @@ def _write_page(path: Path, answer: Assessment) -> None:
     linear loop.
     """
     loop = answer.loop_with_box()
-    with writing("--set page", path, "a page that can"):
+    with writing("--page", path, "a page that can"):
         write_loop_page(path, f"Loop of {answer.study.airframe.name}", loop)
 
 
@@ -316,7 +321,7 @@ def _require_margins(selection: Selection, *, theorem: bool) -> None:
     if short and not theorem and assessed.controller.observer is None:
         short = lacking(selection, options=("lag", "delay", "rate"))
     if short:
-        raise ParameterError(f"--write: {short}; --set accept writes them all the same")
+        raise ParameterError(f"--write: {short}; --accept writes them all the same")
 
 
 def _show_trade(console: Console, selection: Selection) -> None:

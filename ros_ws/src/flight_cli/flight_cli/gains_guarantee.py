@@ -46,7 +46,7 @@ def write_unstable(folder: Path | None, promise: Guarantee, airframe: str, scena
     )
     require(fits, "worst", airframe, f"the aircraft of {chosen.name}, {chosen.aircraft.airframe}")
     assert promise.unstable is not None  # noqa: S101 - for mypy
-    with writing("--set worst", folder, "a folder that can"):
+    with writing("--worst", folder, "a folder that can"):
         folder.mkdir(parents=True, exist_ok=True)
     path = folder / "airframe.yaml"
     write_text("worst", path, LICENCE + as_yaml(with_entries(frame, promise.unstable.entries)))

@@ -50,8 +50,9 @@ from flight_cli.words import (
     argument,
     json_option,
     option,
+    rare_option,
     require_unused,
-    setting,
+    scenario_names,
     warn,
     write_option,
 )
@@ -109,14 +110,17 @@ class Identify:
         "Scenario file, by default jsbsim_NAME.yaml, which must not exist. With a log: "
         "airframe file for the model, with a page. With --bridge: folder for what flies it."
     )
-    scenario: str | None = setting(
-        "With a log: scenario with lags and delay of the controller; by default that in the log."
+    scenario: str | None = rare_option(
+        "With a log: scenario with lags and delay of the controller; by default that in the log.",
+        autocompletion=scenario_names,
     )
-    delay: float | None = setting(
+    delay: float | None = rare_option(
         "With a log: delay of u, s; by default that of the scenario. One process has none."
     )
-    namespace: str | None = setting("With a log: namespace of the aircraft, if it holds several.")
-    refly: bool = setting(
+    namespace: str | None = rare_option(
+        "With a log: namespace of the aircraft, if it holds several."
+    )
+    refly: bool = rare_option(
         "With a log: fly its scenario with feedforward and observer of the model, in process.",
         default=False,
     )
@@ -129,27 +133,27 @@ class Identify:
     learn: bool = option(
         "Of JSBSim: write a scenario that learns A and B in flight.", default=False
     )
-    margin: float | None = setting(
+    margin: float | None = rare_option(
         "Least delay margin of the loop with an observer, s: 0.03, or 0.015 of JSBSim."
     )
     bridge: str | None = option(
         "Excite the aircraft behind a channel map, or read the log of such a flight.", metavar="MAP"
     )
-    amplitude: float | None = setting(
+    amplitude: float | None = rare_option(
         "With --bridge: amplitude of the excitation, a part of each input's limit; 0.2."
     )
-    phase_margin: float | None = setting(
+    phase_margin: float | None = rare_option(
         "Of JSBSim, or with --bridge: least phase margin of the loop, deg; 45."
     )
-    accept: bool = setting(
+    accept: bool = rare_option(
         "Accept a phase margin below 40 deg, and gains whose margins fall short.", default=False
     )
-    command: list[str] | None = setting(
+    command: list[str] | None = rare_option(
         "Of JSBSim: a model's own property for an input, and its value at full "
         "command; repeat for more.",
         metavar="INPUT:PROPERTY=VALUE",
     )
-    link_delay: float | None = setting(
+    link_delay: float | None = rare_option(
         "With --bridge and a log of rise-di import: delay of the link beyond the log, s; "
         "by default that of the map."
     )
@@ -167,7 +171,7 @@ class Identify:
             self.margin is None or self.refly or self.observer or self.learn,
             "margin",
             self.margin,
-            "--set refly, --observer or --learn beside it",
+            "--refly, --observer or --learn beside it",
         )
         require(
             not (self.observer and self.learn),
@@ -239,7 +243,7 @@ class Identify:
             warn(f"error: {identified.condition.title} does not fly: {identified.failure}")
             raise typer.Exit(CANNOT_FLY)
         if lacking := "" if self.accept else what_lacks(identified.selection):
-            shown = f"{display_path(path)}, which says so in its first line; --set accept takes it"
+            shown = f"{display_path(path)}, which says so in its first line; --accept takes it"
             raise ParameterError(f"identify: {lacking}; the gains are in {shown}")
 
     def _scenario_path(self, name: str) -> Path:
@@ -271,7 +275,7 @@ class Identify:
                     guided=self.guidance,
                     learns=self.learn,
                     needed=self._needed(),
-                    named=named_properties(texts, "--set command"),
+                    named=named_properties(texts, "--command"),
                 )
         except FlightEnded as error:
             warn(f"error: {error}")
@@ -296,7 +300,7 @@ class Identify:
         warn_of_lacks(recorded)
         if recorded.scenario is None:
             raise ParameterError(
-                f"{log}: found a log without its scenario, expected --set scenario=NAME with the "
+                f"{log}: found a log without its scenario, expected --scenario NAME with the "
                 "controller's lags"
             )
         console = Console(quiet=self.as_json)

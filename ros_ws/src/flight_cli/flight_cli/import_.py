@@ -16,7 +16,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.report.run_folder import PROVENANCE, attachments_for
 from flight_cli.output import new_table, print_table, say
-from flight_cli.words import REQUIRED, argument, option, warn
+from flight_cli.words import REQUIRED, argument, option, scenario_names, warn
 from flight_core.files import display_path, dump_yaml, write_file, writing
 from flight_core.outcome import End, Outcome
 from flight_core.parameters import require
@@ -53,9 +53,12 @@ class Import:
     )
     scenario: str | None = option(
         "Scenario of the module of export --px4 that flew, in place of --map: its ticks, for "
-        "replay."
+        "replay.",
+        autocompletion=scenario_names,
     )
-    output: Path | None = option("Folder to create; by default runs/ with the name of the log.")
+    output: Path | None = option(
+        "Folder to create; by default runs/ with the name of the log.", "--output", "--write"
+    )
     start: float | None = option("Begin, s since the begin of the log.", "--from")
     stop: float | None = option("End, s since the begin of the log.", "--until")
     servos: bool = option(

@@ -10,7 +10,7 @@ from typing import Any
 
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.report.run_folder import log_account
-from flight_cli.words import option, warn
+from flight_cli.words import option, scenario_names, warn
 from flight_core.parameters import ParameterError, require
 from flight_log.bag import COMPARED, IMPORTED
 from flight_log.tape_reader import RecordedRun, read_run
@@ -25,7 +25,8 @@ def log_namespace() -> Any:
 
 def log_scenario() -> Any:
     """The option --scenario of a command for a log."""
-    return option("Scenario of the flight, a name or a file; by default that in the log.")
+    text = "Scenario of the flight, a name or a file; by default that in the log."
+    return option(text, autocompletion=scenario_names)
 
 
 def remaps_of(words: list[str] | None) -> dict[str, str]:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import typer
 
-from flight_cli.words import REQUIRED, option
+from flight_cli.words import REQUIRED, option, write_option
 from flight_core.environment import require_ros_environment
 from flight_core.installation import require_package
 
@@ -32,7 +32,7 @@ class Network:
         default=REQUIRED,
         metavar="A,B",
     )
-    write: Path = option(
+    write: Path = write_option(
         "File to write the profile to.", default=Path("network.xml"), metavar="FILE"
     )
     check: bool = option(

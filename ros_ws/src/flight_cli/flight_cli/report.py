@@ -27,7 +27,7 @@ from flight_cli.output import (
     stdout_for,
 )
 from flight_cli.repair import repair_log
-from flight_cli.words import argument, json_option, option, setting, values_of
+from flight_cli.words import argument, json_option, option, rare_option, values_of
 from flight_core.files import display_path
 from flight_core.outcome import SEVEREST
 
@@ -47,8 +47,10 @@ class Report:
     runs: list[Path] | None = argument(
         "Folder of a run, by default runs/latest; several are compared with the first."
     )
-    html: Path | None = setting("Page of a comparison; by default comparison.html beside run 1.")
-    output: Path | None = setting(
+    html: Path | None = rare_option(
+        "Page of a comparison; by default comparison.html beside run 1.", "--page"
+    )
+    output: Path | None = rare_option(
         "Folder for the report of one run, by default that of its log: for archives."
     )
     png: Path | None = option("Write y over y_m, e and u as one PNG figure.")
@@ -66,8 +68,8 @@ class Report:
     figure: Path | None = option(
         "Write a figure for a paper: .pdf, .svg, .eps as vectors, or .png."
     )
-    width: str = setting("Width of the figure: 88mm, 3.5in.", default=WIDTH)
-    channels: str = setting(
+    width: str = rare_option("Width of the figure: 88mm, 3.5in.", default=WIDTH)
+    channels: str = rare_option(
         "Channels of the figure: outputs, inputs, errors, as in q,V,e.q,elevator; by "
         "default each output.",
         default="",

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import overload
 
 from flight_cli.output import parse_numbers
-from flight_cli.words import setting, warn
+from flight_cli.words import rare_option, warn
 from flight_core.parameters import require
 from flight_guidance.route_file import Origin, Waypoint, read_route_file
 
@@ -17,24 +17,20 @@ from flight_guidance.route_file import Origin, Waypoint, read_route_file
 class RouteWords:
     """The words of the commands that read a route file."""
 
-    origin: str | None = setting(
+    origin: str | None = rare_option(
         "Where north = east = 0 for a route in latitudes, degrees; else the file's home.",
-        "route.origin",
         metavar="LAT,LON",
     )
-    altitude: float | None = setting(
+    altitude: float | None = rare_option(
         "Altitude of a route without, or of the ground or home that it counts from, m.",
-        "route.altitude",
     )
-    simplify: float = setting(
+    simplify: float = rare_option(
         "Leave out positions of a route within this distance of the line without them, m.",
-        "route.simplify",
         default=0.0,
         min=0.0,
     )
-    line: str | None = setting(
+    line: str | None = rare_option(
         "Which line of a file with several: a number from 1 on, or a name.",
-        "route.line",
         metavar="LINE",
     )
 
@@ -43,7 +39,7 @@ class RouteWords:
         as `read_route_file`.
         """
         for key, value in (("altitude", self.altitude), ("simplify", self.simplify)):
-            require(value is None or math.isfinite(value), f"route.{key}", value, "a number")
+            require(value is None or math.isfinite(value), f"--{key}", value, "a number")
         route = read_route_file(
             file,
             parse_origin(self.origin),
@@ -67,7 +63,5 @@ def parse_origin(text: str | None) -> Origin | None:
         return None
     numbers = parse_numbers(text)
     fits = len(numbers) == 2 and abs(numbers[0]) <= 90.0 and abs(numbers[1]) <= 180.0
-    require(
-        fits, "route.origin", repr(text), "a latitude and a longitude in degrees, as in 47.38,8.54"
-    )
+    require(fits, "--origin", repr(text), "a latitude and a longitude in degrees, as in 47.38,8.54")
     return Origin(*numbers)

@@ -8,7 +8,7 @@ from rich.console import Console
 
 from flight_analysis.closed_loop.scenario_library import LIBRARY, find_scenario
 from flight_cli.output import new_table, print_json
-from flight_cli.words import argument, json_option
+from flight_cli.words import argument, json_option, scenario_names
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,7 +19,9 @@ class Scenarios:
     """
 
     names: list[str] | None = argument(
-        "Names, or scenario files (.yaml); by default all that ship.", metavar="[SCENARIO]..."
+        "Names, or scenario files (.yaml); by default all that ship.",
+        metavar="[SCENARIO]...",
+        autocompletion=scenario_names,
     )
     as_json: bool = json_option()
 

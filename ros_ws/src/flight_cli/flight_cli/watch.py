@@ -12,7 +12,7 @@ from pathlib import Path
 from flight_bringup.processes import end_with_parent
 from flight_cli.log_options import REMAP, log_scenario, remaps_of, scenario_file
 from flight_cli.route_options import parse_origin
-from flight_cli.words import argument, option, setting, warn
+from flight_cli.words import argument, option, rare_option, warn
 from flight_core.environment import require_ros_environment
 from flight_core.files import display_path
 from flight_core.installation import missing
@@ -61,21 +61,21 @@ class Watch:
     control: bool = option(
         "Let the page command the flight, with a key that this command prints.", default=False
     )
-    real: bool = setting(
+    real: bool = rare_option(
         "As --control, and gains also while a bridge sends to an autopilot.", default=False
     )
     scenario: str | None = log_scenario()
     namespace: str | None = option(
         "Namespace of the aircraft: by default the first in the log, with --control the root."
     )
-    remap: list[str] | None = setting(REMAP, metavar="NAME:=TOPIC")
-    background: Path | None = setting(
-        "GeoJSON of lines, polygons and points for the map, with --set origin.", metavar="FILE"
+    remap: list[str] | None = rare_option(REMAP, metavar="NAME:=TOPIC")
+    background: Path | None = rare_option(
+        "GeoJSON of lines, polygons and points for the map, with --origin.", metavar="FILE"
     )
-    origin: str | None = setting(
+    origin: str | None = rare_option(
         "Where north and east are 0, for the background.", metavar="LAT,LON"
     )
-    runs: Path = setting("Folder of the runs.", default=Path("runs"))
+    runs: Path = rare_option("Folder of the runs.", default=Path("runs"))
 
     def execute(self) -> None:
         """Serve the page, or show the flight elsewhere, until its end."""

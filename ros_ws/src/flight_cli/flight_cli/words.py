@@ -1,11 +1,13 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The words of a command line: options with their help, and settings of a command by --set."""
+"""The words of a command line: options and arguments with their help."""
 
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import MISSING, Field, field, fields
+from difflib import get_close_matches
 from inspect import Parameter, Signature
+from itertools import takewhile
 from typing import Annotated, Any, Protocol, get_type_hints
 
 import typer
@@ -13,8 +15,8 @@ from typer.core import TyperCommand
 
 from flight_core.parameters import ParameterError, require
 
-SET = "--set"
 DECLARE = "declare"  # key of what declares a field to Typer
+ALIKE = 0.85  # of a misspelt option: --run is near to --runs, --seed not to --send
 REQUIRED = MISSING
 """The default of a field without a default."""
 
@@ -34,11 +36,9 @@ def option(text: str, *names: str, default: Any = None, **rules: Any) -> Any:
     )
 
 
-def setting(text: str, name: str = "", default: Any = None, **rules: Any) -> Any:
-    """A setting, --set NAME=VALUE; without `name` by the name of the field."""
-    return _field(
-        lambda own_name: typer.Option(f"{SET} {name or own_name}", help=text, **rules), default
-    )
+def rare_option(text: str, *names: str, default: Any = None, **rules: Any) -> Any:
+    """An option that few need, in a panel of its own."""
+    return option(text, *names, default=default, rich_help_panel="More options", **rules)
 
 
 def argument(text: str, default: Any = None, **rules: Any) -> Any:
@@ -46,9 +46,9 @@ def argument(text: str, default: Any = None, **rules: Any) -> Any:
     return _field(lambda _: typer.Argument(help=text, **rules), default)
 
 
-def write_option(text: str) -> Any:
-    """The option of a file or folder to write: --write, or --output as of `import`."""
-    return option(text, "--write", "--output")
+def write_option(text: str, default: Any = None, **rules: Any) -> Any:
+    """The option of a file or folder to write: --write or --output."""
+    return option(text, "--write", "--output", default=default, **rules)
 
 
 def json_option() -> Any:
@@ -110,56 +110,35 @@ def warn(text: str) -> None:
     print(text, file=sys.stderr)
 
 
+def scenario_names(incomplete: str) -> list[str]:
+    """The scenarios of the library that begin with a word, for the completion of the shell."""
+    from flight_analysis.closed_loop.scenario_library import LIBRARY  # noqa: PLC0415 - --help does without
+
+    names = sorted(path.stem for path in LIBRARY.glob("*.yaml"))
+    return [name for name in names if name.startswith(incomplete)]
+
+
 class Command(TyperCommand):
-    """A command with settings beside options."""
+    """A command whose refusals name the option as it is typed."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the words after the name. Raises ParameterError for an unknown setting."""
-        return super().parse_args(ctx, [*_joined(args, self._spellings())])
+        """Parse the words after the name. Raises ParameterError for an unknown option."""
+        names = [name for each in self.get_params(ctx) for name in each.opts]
+        key = ", or a key of the scenario: --set SECTION.KEY=VALUE" * ("--set" in names)
+        for word in takewhile("--".__ne__, () if ctx.resilient_parsing else args):
+            name = word.partition("=")[0]
+            near = get_close_matches(name, names, n=1, cutoff=ALIKE)
+            mend = near[0] if near else f"one of rise-di {self.name} --help"
+            require(name in names or name[:2] != "--", name, "no option", mend + key)
+        return super().parse_args(ctx, args)
 
     def invoke(self, ctx: Any) -> Any:
-        """Call the function. Raises ParameterError with the spelling of the option for the key."""
+        """Call the function. Raises ParameterError with the option for its name."""
         try:
             return super().invoke(ctx)
         except ParameterError as error:
             key, colon, reason = str(error).partition(":")
-            spellings = self._spellings()
-            if (spelling := spellings.get(key.removeprefix("--").replace("-", "_"), key)) == key:
+            words = {str(each.name): each.opts[0] for each in self.params}
+            if not words.get(key, "").startswith("--"):
                 raise
-            raise ParameterError(f"{spelling}{colon}{reason}") from None
-
-    def _spellings(self) -> dict[str, str]:
-        """The spelling of the options by name without --: `--set rate` for a setting."""
-        options = (parameter for parameter in self.params if parameter.param_type_name == "option")
-        return {
-            option.opts[0]
-            .removeprefix(f"{SET} ")
-            .removeprefix("--")
-            .replace("-", "_"): option.opts[0]
-            for option in options
-        }
-
-
-def _joined(args: Sequence[str], spellings: Mapping[str, str]) -> Iterator[str]:
-    """The words, a setting joined to a single word; further words of --set stay where the command
-    has this option.
-    """
-    settings = {name for name, spelling in spellings.items() if spelling.startswith(f"{SET} ")}
-    words = iter(args)
-    for word in words:
-        option, equals, value = word.partition("=")
-        if word == "--":
-            yield from (word, *words)
-        elif option == SET and (text := value if equals else next(words, None)) is not None:
-            key, *rest = text.split("=", 1)
-            if key.replace("-", "_") in settings:
-                yield "=".join((f"{SET} {key.replace('-', '_')}", *rest))
-            else:
-                known = ", ".join(sorted(settings)) or "no settings"
-                require("set" in spellings, SET, repr(text), f"one of {known}")
-                yield from (SET, text)
-        else:
-            name = option.removeprefix("--").replace("-", "_")
-            spelled = settings & {name, f"route.{name}"} if option.startswith("--") else set()
-            require(not spelled, option, "no option", f"{SET} {min(spelled, default='')}")
-            yield word
+            raise ParameterError(f"{words[key]}{colon}{reason}") from None

@@ -40,7 +40,7 @@ def read_plan(content: bytes, key: str, line: str | None = None) -> Places:
 
 def read_plan_tree(tree: Any, key: str, line: str | None) -> Places:
     """The mission of a plan that is parsed."""
-    require(line is None, "route.line", f"a mission, {key}", "a file with several lines")
+    require(line is None, "line", f"a mission, {key}", "a file with several lines")
     mission = member(tree, "mission")
     rows = member(mission, "items")
     require(isinstance(rows, list), key, "no mission with items", "a plan of QGroundControl")
@@ -49,7 +49,7 @@ def read_plan_tree(tree: Any, key: str, line: str | None) -> Places:
         for number, entry in _plan_items(rows or (), key)
     ]
     fence = plan_fence(tree, key)
-    apart = "the fence and the rally points are no part of the route; --set route.fence keeps them"
+    apart = "the fence and the rally points are no part of the route; --fence keeps them"
     notes = [apart] * bool(fence.zones or fence.rally)
     notes += [f"not read: {FIRST_FENCE}"] * has_first_fence(tree)
     return mission_route(key, items, home_of(member(mission, "plannedHomePosition")), notes)
@@ -121,7 +121,7 @@ COMMA = re.compile(r"-?\d+,\d+")  # of a program in a language with decimal comm
 
 def read_wpl(content: bytes, key: str, line: str | None = None) -> Places:
     """The mission of a QGC WPL 110."""
-    require(line is None, "route.line", f"a mission, {key}", "a file with several lines")
+    require(line is None, "line", f"a mission, {key}", "a file with several lines")
     items, home = wpl_items(content, key)
     note = (
         ""

@@ -170,7 +170,7 @@ def read_route_file(
     )
     content = read_file(path, str(path), "a route file")
     if suffix in YAML:
-        require(line is None, "route.line", f"the route {path}", "a file with several lines")
+        require(line is None, "line", f"the route {path}", "a file with several lines")
         waypoints = list(_read_yaml(content, str(path), origin))
         notes = list[str]()
     else:
@@ -238,7 +238,7 @@ def read_fence_file(
     suffix = path.suffix.lower()
     require(
         suffix in route_formats.FENCES,
-        "route.fence",
+        "fence",
         f"the file {path}",
         f"one that ends in {', '.join(route_formats.FENCES)}",
     )
@@ -344,9 +344,7 @@ class _Heights:
             return self._fixed if altitude is None else altitude
         altitude = _number(place.key, altitude, "altitude")
         if above is Above.GROUND:
-            way_out = (
-                "absolute, or --set route.altitude with the height of the ground: that is not known"
-            )
+            way_out = "absolute, or --altitude with the height of the ground: that is not known"
             require(self._fixed is not None, place.key, place.altitude_text, way_out)
             return altitude + (self._fixed or 0.0)
         if above is Above.SEA and self._above_sea:
@@ -362,7 +360,7 @@ class _Heights:
             self._zero is not None,
             place.key,
             reference,
-            "--set route.altitude with that of the home, as the aircraft counts",
+            "--altitude with that of the home, as the aircraft counts",
         )
         return altitude + (self._zero or 0.0) - (self._sea or 0.0) * (above is Above.SEA)
 
@@ -479,7 +477,7 @@ def _placed(place: Place, origin: Origin | None, heights: _Heights) -> Waypoint:
     if altitude is None and place.altitude_text:
         raise ParameterError(
             f"{key}: found {place.altitude_text}, expected longitude, latitude, altitude, or "
-            "--set route.altitude to fly at"
+            "--altitude to fly at"
         )
     if origin is None:
         raise ParameterError(

@@ -85,7 +85,7 @@ def one_route(
         mismatch = f"{short_repr(line)}, which names {len(chosen)} lines"
         require(
             len(chosen) == 1,
-            "route.line",
+            "line",
             mismatch,
             _choice(lines) if lines else "a file with several lines",
         )
@@ -108,12 +108,12 @@ def one_route(
 
 
 def _choice(lines: Sequence[Geometry]) -> str:
-    """What `--set route.line` may name: "--set route.line=1 (north), 2 or 3 (south)"."""
+    """What `--line` may name: "--line 1 (north), 2 or 3 (south)"."""
     names = [
         f"{k} ({geometry.name})" if geometry.name else f"{k}"
         for k, geometry in enumerate(lines[:SHOWN], start=1)
     ]
-    return f"--set route.line={', '.join(names)}{f' to {len(lines)}' if len(lines) > SHOWN else ''}"
+    return f"--line {', '.join(names)}{f' to {len(lines)}' if len(lines) > SHOWN else ''}"
 
 
 SHOWN = 5

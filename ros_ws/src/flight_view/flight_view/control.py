@@ -414,7 +414,7 @@ class Control:
         if not self._real and "bridge" in self._link.nodes() and self._sends():
             raise RefusedError(
                 HTTPStatus.FORBIDDEN,
-                "the bridge sends to an autopilot: gains need rise-di watch --control --set real",
+                "the bridge sends to an autopilot: gains need rise-di watch --control --real",
             )
 
     def _activate(self, *, active: bool) -> str:

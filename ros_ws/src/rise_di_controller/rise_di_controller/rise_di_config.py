@@ -247,8 +247,8 @@ class RiseDiConfig(ControllerConfig):
             return
         both = self.observer is not None and len(schedule.models) == len(("slow", "fast"))
         expected = (
-            "an observer with slow and fast, as rise-di gains --observer --set "
-            "speeds=LOW,HIGH writes them"
+            "an observer with slow and fast, as rise-di gains --observer "
+            "--speeds LOW,HIGH writes them"
         )
         require(
             both,

@@ -80,7 +80,7 @@ def fly_with_a_fault(
     kills: bool,
 ) -> None:
     """A lockstep flight with a fault at a random instant."""
-    command = start("flight_cli.cli", "fly", str(scenario), "--lockstep", "--set", f"runs={runs}")
+    command = start("flight_cli.cli", "fly", str(scenario), "--lockstep", "--runs", str(runs))
     folder = scenario.parent / runs
     # bytes: the flight has begun, and a chunk of the log is complete
     command.wait_for_log(folder, 200_000)

@@ -173,8 +173,8 @@ def by_rise_di(context: LaunchContext, file: str) -> list[Action]:
         return [Shutdown(reason="flight completed")]
 
     end_with_launch(context)
-    options = ["--set", f"runs={argument(context, 'runs')}"]
-    options += ["--set", "use_sim_time"] * (argument(context, "use_sim_time") == "true")
+    options = ["--runs", argument(context, "runs")]
+    options += ["--use-sim-time"] * (argument(context, "use_sim_time") == "true")
     for name in ("duration", "namespace"):
         if value := context.launch_configurations.get(name):
             options += [f"--{name}", value]

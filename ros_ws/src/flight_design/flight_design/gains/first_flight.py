@@ -197,7 +197,7 @@ def placeholder(airframe: Airframe, lag: Sequence[float]) -> str:
         m > 1,
         "inputs",
         inputs[0],
-        "two inputs or more: add a thrust with --set thrust, or a second control",
+        "two inputs or more: add a thrust with --thrust, or a second control",
     )
     values: Mapping[str, Any] = {
         "rate": CONTROL_RATE,

@@ -22,7 +22,7 @@ def lacking(selection: Selection, *, options: Sequence[str] = ()) -> str:
     the loop that gives the margins, in sentences; "" where nothing is unmet.
 
     A change is a smaller goal, half of the lags, no delay or twice the rate, and each is searched.
-    `options` are the settings of the command that calls, of phase_margin, lag, delay and rate: a
+    `options` are those of the command that calls, of phase_margin, lag, delay and rate: a
     change is named by its option, where it has one.
     """
     assessed = selection.engineering
@@ -50,15 +50,15 @@ def _relaxed(selection: Selection, options: Sequence[str]) -> dict[str, LoopSett
         least = min(float(margins.nominal.phase.min()), setting.requirement.phase)
         phase = math.floor(np.degrees(least) + 1e-6)
         if PHASE_MARGINS[0] <= phase < np.degrees(setting.requirement.phase) - 1e-6:
-            accept = " --set accept" if phase < ACCEPTED_PHASE_MARGIN else ""
+            accept = " --accept" if phase < ACCEPTED_PHASE_MARGIN else ""
             needed = setting.requirement._replace(phase=math.radians(phase))
-            changes[f"--set phase_margin={phase}{accept}"] = setting._replace(requirement=needed)
+            changes[f"--phase-margin {phase}{accept}"] = setting._replace(requirement=needed)
     halved = {name: lag / 2.0 for name, lag in setting.lag.items()}
     lags = ",".join(f"{halved.get(name, 0.0):.4g}" for name in selection.study.airframe.inputs)
     words = {
         "lag": (f"--lag {lags}", "actuators of half the lag"),
         "delay": ("--delay 0", "no delay"),
-        "rate": (f"--set rate={2.0 * setting.rate:g}", f"a law at {2.0 * setting.rate:g} Hz"),
+        "rate": (f"--rate {2.0 * setting.rate:g}", f"a law at {2.0 * setting.rate:g} Hz"),
     }
     settings = {
         "lag": setting._replace(lag=halved),

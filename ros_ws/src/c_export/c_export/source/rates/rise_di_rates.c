@@ -232,7 +232,7 @@ const char *rise_di_refusal_text(rise_di_refusal refusal) {
         "none", "off", "not armed", "no rate control in this mode", "landed", "stale rates", "stale setpoint",
         "a rate or a setpoint that is not finite", "compiler flags that change the bits", "failsafe of the law",
         "a rate too far from its reference", "a torque that is not finite",
-        "rates slower than the controller: export it with --set rate",
+        "rates slower than the controller: export it with --rate",
     };
     return texts[refusal];
 }
