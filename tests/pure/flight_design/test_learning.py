@@ -608,7 +608,8 @@ def test_delay_margin_counts_the_delay_that_was_found(
     sentence = made.propose(0).sentence
     (goal,) = goals
     assert goal.margin[1:3] == approx(margin)
-    late = f"u is up to {1e3 * latest:.0f} ms late: " if margin > 0.03 else ""
+    is_late = latest + 0.01 > (asked or 0.03)
+    late = f"u is up to {1e3 * latest:.0f} ms late: " if is_late else ""
     assert sentence == f"{late}none has it"
     assert made.model is None  # what flies stays
 
@@ -658,6 +659,24 @@ def test_price_of_a_margin_that_is_asked_for_is_told() -> None:
     assert times is not None, price
     assert 1.0 <= float(times[1]) < 1.5
     assert made_learner(scenario())._designed(OSPREY, known, {})[1] == ""
+
+
+def test_margin_that_is_asked_for_flies_where_that_of_the_file_has_no_design(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    known: dict[tuple[str, ...], Known] = {("p", "r"): Known(0, {}, {}, False, (0.0, 0.0))}
+    made = made_learner(scenario(learn={"updates": [10.0], "margin": 0.025}))
+    design = made._design
+
+    def only_asked(start: RiseDiConfig, model: Airframe, goal: Goal) -> SelectedObserver:
+        if goal.margin.min() > 0.025:
+            raise ParameterError("none has it")
+        return design(start, model, goal)
+
+    monkeypatch.setattr(made, "_design", only_asked)
+    proposed, price = made._designed(OSPREY, known, {})
+    assert proposed.observer is not None
+    assert (proposed.observer.margin, price) == (0.025, "")
 
 
 @pytest.mark.parametrize("latest", [(0.004, 0.05), (0.03, 0.004)])

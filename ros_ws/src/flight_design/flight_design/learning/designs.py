@@ -41,6 +41,28 @@ def margin_of(controller: RiseDiConfig) -> float:
     return controller.observer.margin
 
 
+def asked_margin(start: RiseDiConfig) -> float:
+    """The delay margin of `learn.margin`, else that of the start, s."""
+    asked = None if start.learn is None else start.learn.margin
+    return margin_of(start) if asked is None else asked
+
+
+def is_late(start: RiseDiConfig, latest: Mapping[str, float]) -> bool:
+    """Whether the latest delay of an input, s, by name, asks for more than the margin of the start,
+    or than `learn.margin`.
+    """
+    return max(latest.values(), default=0.0) + DELAY_LEFT > asked_margin(start)
+
+
+def price(selected: SelectedObserver, margin: float, beside: SelectedObserver, kept: float) -> str:
+    """What the delay margin of a design, s, costs beside a design that keeps another."""
+    ratio = math.exp((selected.cost - beside.cost) / len(selected.relaxation))
+    return (
+        f"{ratio:.2f} times the error of {1e3 * kept:.0f} ms of delay margin, "
+        f"since {1e3 * margin:.0f} ms are asked for"
+    )
+
+
 def goal(
     start: RiseDiConfig,
     file: SelectedObserver | None,
@@ -85,9 +107,9 @@ def goal(
                 gain=min(needed.gain, most / (most - 1.0)),
                 damping=min(needed.damping, float(margins.damping) / ROUNDED),
             )
-    settings = start.learn
-    if settings is not None and settings.margin is not None:
-        margin = np.full(len(outputs), settings.margin)
+    asked = None if start.learn is None else start.learn.margin
+    if asked is not None:
+        margin = np.full(len(outputs), asked)
     # 0.1 ms, as few digits as the file of a scenario
     late = [round(latest[name] + DELAY_LEFT, 4) if name in latest else 0.0 for name in start.inputs]
     return Goal(np.maximum(margin, late), needed, file, is_free)

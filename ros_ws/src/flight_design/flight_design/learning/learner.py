@@ -8,7 +8,6 @@ model that fails a check is refused with a sentence. The controller refuses para
 own checks at load.
 """
 
-import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -44,7 +43,8 @@ from flight_design.learning.change_test import (
 from flight_design.learning.designs import (
     Goal,
     goal,
-    margin_of,
+    is_late,
+    price,
     with_deviations,
     without_effect,
 )
@@ -333,7 +333,7 @@ class Learner:
         """Design for a verdict, and take it as proposed: what `learn.margin` costs. Raises
         ParameterError without a design.
         """
-        proposed, price = self._designed(verdict.model, verdict.known, without_model)
+        proposed, price_text = self._designed(verdict.model, verdict.known, without_model)
         end_ns = self._record.end_ns
         new = [
             *without_model,
@@ -347,7 +347,7 @@ class Learner:
         self._model = verdict.model
         self._dead = without_model
         self._propose(proposed)
-        return price
+        return price_text
 
     def _test_next(self, verdict: Verdict) -> None:
         """Note what the next identification tests, on samples that are later than the record."""
@@ -545,7 +545,7 @@ class Learner:
             file = self._design_of_rough(without_learning)
             flying = set(start.outputs) - held
         designed = without_learning
-        price = ""
+        price_text = ""
         if file is not None and not known:
             designed = file.controller
         elif flying:
@@ -554,12 +554,12 @@ class Learner:
             try:
                 selected = self._design(without_learning, model, aim)
                 designed = selected.controller
-                price = self._price(selected, model, list(known), latest)
             except ParameterError as error:
-                if aim.margin.max() > margin_of(start):
-                    worst = 1e3 * max(latest.values())
-                    raise ParameterError(f"u is up to {worst:.0f} ms late: {error}") from None
-                raise
+                if not is_late(start, latest):
+                    raise
+                worst = 1e3 * max(latest.values())
+                raise ParameterError(f"u is up to {worst:.0f} ms late: {error}") from None
+            price_text = self._price(selected, model, list(known), latest)
         if flying:
             designed = with_deviations(
                 designed, {k: v for part in known.values() for k, v in part.deviation.items()}
@@ -573,7 +573,7 @@ class Learner:
         checked = RiseDiConfig.validate_mapping(
             proposed.model_dump() | {"learn": self._start.model_dump()["learn"]}, "proposal"
         )
-        return checked, price
+        return checked, price_text
 
     def _price(
         self,
@@ -582,7 +582,7 @@ class Learner:
         parts: list[tuple[str, ...]],
         latest: Mapping[str, float],
     ) -> str:
-        """What `learn.margin` costs beside the margin of the file's loop; "" without it."""
+        """What `learn.margin` costs beside the margin of the file's loop; "" without either."""
         start = self._controller
         settings = start.learn
         if settings is None or settings.margin is None or self._design_of_rough is None:
@@ -591,9 +591,8 @@ class Learner:
         without_learning = start.model_copy(update={"learn": None})
         file = self._design_of_rough(without_learning)
         kept = goal(plain, file, model, parts, latest)
-        beside = self._design(without_learning, model, kept)
-        ratio = math.exp((selected.cost - beside.cost) / len(start.outputs))
-        return (
-            f"{ratio:.2f} times the error of {1e3 * kept.margin.min():.0f} ms of delay margin, "
-            f"since {1e3 * settings.margin:.0f} ms are asked for"
-        )
+        try:
+            beside = self._design(without_learning, model, kept)
+        except ParameterError:  # what was asked for flies: there is nothing to compare with
+            return ""
+        return price(selected, settings.margin, beside, float(kept.margin.min()))

@@ -29,7 +29,7 @@ from flight_design.gains.observer_search import SelectedObserver
 from flight_design.identification.jsbsim_identification import NOISE, STEP_MARGIN
 from flight_design.identification.likelihood import KNOWN
 from flight_design.identification.sketch import ROUGH, sketched, with_sketch
-from flight_design.learning.designs import Goal, margin_of
+from flight_design.learning.designs import Goal, asked_margin
 from flight_design.learning.learner import Learner
 from flight_log.tape_reader import RecordedRun
 from rise_di_controller.internals import GIVEN_UP
@@ -96,13 +96,12 @@ def learner(scenario: Scenario, *, real_time: bool = False, quick: bool = False)
             is_free=goal.is_free,
         )
 
-    asked = controller.learn.margin
     of_rough: dict[RiseDiConfig, SelectedObserver] = {}
 
     def design_of_rough(start: RiseDiConfig) -> SelectedObserver:
         """The airframe as one that errs; once for the learners of many aircraft."""
         if start not in of_rough:
-            margin = margin_of(start) if asked is None else asked
+            margin = asked_margin(controller)
             of_rough[start] = selected_observer(start, scenario, airframe, margin, speeds=speeds)
         return of_rough[start]
 
