@@ -9,10 +9,10 @@ from pytest import approx
 from scipy.linalg import expm
 
 from aircraft_sim import jsbsim_linearization
-from aircraft_sim.airframe import check_identities
+from aircraft_sim.airframe import AIRPLANE_STATES, check_identities
 from aircraft_sim.jsbsim_aircraft import STATES as JSBSIM_STATES
 from aircraft_sim.jsbsim_aircraft import FlightCondition
-from aircraft_sim.jsbsim_linearization import STATES, Linearization, linearize
+from aircraft_sim.jsbsim_linearization import Linearization, linearize
 from aircraft_sim.jsbsim_trim import trim_solution, trimmed_fdm
 from flight_core.outcome import FlightEnded
 from flight_core.rates import nanoseconds
@@ -62,7 +62,7 @@ def test_a_is_that_of_jsbsims_own_linearisation(linear: Linearization) -> None:
     for into, by in ENTRIES:
         (row, unit), (column, per) = NAMES[into], NAMES[by]
         known = own.system_matrix[places.index(row), places.index(column)] * unit / per
-        found = A[list(STATES).index(into), list(STATES).index(by)]
+        found = A[list(AIRPLANE_STATES).index(into), list(AIRPLANE_STATES).index(by)]
         assert found == approx(known, rel=0.03, abs=0.01), (into, by)
 
 
@@ -92,8 +92,8 @@ def test_flight_after_a_kick_follows_the_linear_aircraft(linear: Linearization, 
         fdm.run()
         flown.append([fdm[key.property] * key.si for key in JSBSIM_STATES.values()])
     deviations = np.array(flown) - trim.states
-    x = np.zeros(len(STATES))
-    x[list(STATES).index(rate)] = 0.02
+    x = np.zeros(len(AIRPLANE_STATES))
+    x[list(AIRPLANE_STATES).index(rate)] = 0.02
     step = expm(jacobian(linear) * 0.005)
     predicted = []
     for _ in range(400):
@@ -102,7 +102,7 @@ def test_flight_after_a_kick_follows_the_linear_aircraft(linear: Linearization, 
     moved = ("alpha", "q", "theta") if rate == "q" else ("beta", "p", "r", "phi")
     for name in moved:
         known = deviations[:, list(JSBSIM_STATES).index(name)]
-        found = np.array(predicted)[:, list(STATES).index(name)]
+        found = np.array(predicted)[:, list(AIRPLANE_STATES).index(name)]
         scale = np.max(np.abs(known))
         if scale > 1e-3:  # a state that the kick hardly moves shows rounding
             assert np.max(np.abs(found - known)) < 0.06 * scale, name
@@ -121,7 +121,7 @@ def test_surfaces_act_a_step_later_and_engines_take_seconds(linear: Linearizatio
 
 def test_an_input_without_effect_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     def still(condition: FlightCondition, _: object, name: str, __: float) -> FloatArray:
-        return np.zeros((10, len(STATES)))
+        return np.zeros((10, len(AIRPLANE_STATES)))
 
     monkeypatch.setattr(jsbsim_linearization, "_response", still)
     with pytest.raises(FlightEnded, match=r"^jsbsim:737: q does not respond to elevator within"):
@@ -134,10 +134,10 @@ def test_lag_and_effect_of_a_first_order_input(monkeypatch: pytest.MonkeyPatch) 
 
     def lagged(condition: FlightCondition, _: object, name: str, size: float) -> FloatArray:
         t = 0.005 * np.arange(400)
-        response = np.zeros((len(t), len(STATES)))
+        response = np.zeros((len(t), len(AIRPLANE_STATES)))
         effects = {"elevator": ("q", -3.0), "aileron": ("p", 5.0), "rudder": ("r", -1.0)}
         output, effect = effects.get(name, ("V", 2.0))
-        response[:, list(STATES).index(output)] = effect * size * (1.0 - np.exp(-t / T))
+        response[:, list(AIRPLANE_STATES).index(output)] = effect * size * (1.0 - np.exp(-t / T))
         return response + 0.3 * size**2  # an even part cancels
 
     monkeypatch.setattr(jsbsim_linearization, "_response", lagged)

@@ -17,6 +17,7 @@ from tests.conftest import refusing
 
 from aircraft_sim import jsbsim_linearization, jsbsim_trim
 from aircraft_sim.actuators import Actuators
+from aircraft_sim.airframe import AIRPLANE_STATES
 from aircraft_sim.disturbance import AXES, Gusts
 from aircraft_sim.jsbsim_aircraft import (
     INPUTS,
@@ -168,10 +169,10 @@ def test_rudder_that_moves_nothing_is_seen(effect: float, monkeypatch: pytest.Mo
     """The linear aircraft has none then, and r is not commanded."""
 
     def response(_: FlightCondition, __: object, name: str, size: float) -> FloatArray:
-        rows = np.zeros((20, len(jsbsim_linearization.STATES)))
+        rows = np.zeros((20, len(AIRPLANE_STATES)))
         effects = {"rudder": effect}
         output = jsbsim_linearization.driven(name)
-        rows[:, list(jsbsim_linearization.STATES).index(output)] = size * effects.get(name, 1.0)
+        rows[:, list(AIRPLANE_STATES).index(output)] = size * effects.get(name, 1.0)
         return rows
 
     monkeypatch.setattr(jsbsim_linearization, "_response", response)

@@ -43,6 +43,19 @@ Unit = str  # of `flight_core.units.quantity`
 Matrix = Annotated[tuple[Numbers, ...], Field(min_length=1)]
 
 
+AIRPLANE_STATES = {
+    "V": "m/s",
+    "alpha": "rad",
+    "q": "rad/s",
+    "theta": "rad",
+    "beta": "rad",
+    "p": "rad/s",
+    "r": "rad/s",
+    "phi": "rad",
+}
+"""The states of an airplane with a sketch or a linearisation for a model, and their units."""
+
+
 class Input(Config):
     """An input: the unit of the column of B, the effect of a positive value, and where an engine or
     a rotor stands still.

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import jsbsim
 import numpy as np
 
-from aircraft_sim.airframe import Airframe
+from aircraft_sim.airframe import AIRPLANE_STATES, Airframe
 from aircraft_sim.disturbance import AIR_STATE, AXES
 from aircraft_sim.jsbsim_aircraft import INPUTS, OUTPUTS, FlightCondition, Trim
 from aircraft_sim.jsbsim_aircraft import STATES as JSBSIM_STATES
@@ -24,16 +24,6 @@ from flight_core.rates import seconds
 from flight_core.units import FOOT, GRAVITY
 from flight_core.vectors import FloatArray
 
-STATES = {
-    "V": "m/s",
-    "alpha": "rad",
-    "q": "rad/s",
-    "theta": "rad",
-    "beta": "rad",
-    "p": "rad/s",
-    "r": "rad/s",
-    "phi": "rad",
-}
 RATES = ("p", "q", "r")
 MOTION = 0.01  # rad/s of a rate, and wind over V0: small beside the tables of a model
 SIZES = (0.05, 0.1, 0.2)
@@ -136,7 +126,7 @@ def _steps(condition: FlightCondition, trim: Trim, name: str) -> _Steps | None:
     output = driven(name)
     place = list(INPUTS).index(name)
     travel = MAX_STEP_FRACTION * float(min(-trim.lower[place], trim.upper[place]))
-    row = list(STATES).index(output)
+    row = list(AIRPLANE_STATES).index(output)
     responses = {}
     still = []
     for size in sorted({min(size, travel) for size in SIZES}):
@@ -170,7 +160,7 @@ def _response(condition: FlightCondition, trim: Trim, name: str, size: float) ->
     for path, at_one in command_paths(condition.commands()[name], engine_count(fdm)):
         fdm[path] += at_one * size
     count = round(_duration(name) / fdm.get_delta_t())
-    rows = np.zeros((count, len(STATES)))
+    rows = np.zeros((count, len(AIRPLANE_STATES)))
     with frozen(fdm):
         for row in rows:
             fdm.run()
@@ -221,10 +211,10 @@ def _set_rate(fdm: jsbsim.FGFDMExec, trim: Trim, name: str, value: float) -> Non
 
 def _airframe(condition: FlightCondition, trim: Trim, B: FloatArray) -> Airframe:
     """The airframe of a trim with the columns of its inputs."""
-    places = {name: i for i, name in enumerate(STATES)}
+    places = {name: i for i, name in enumerate(AIRPLANE_STATES)}
     V = condition.speed
     wind = np.column_stack([_derivative(condition, trim, axis) for axis in AXES])
-    A = np.zeros((len(STATES), len(STATES)))
+    A = np.zeros((len(AIRPLANE_STATES), len(AIRPLANE_STATES)))
     for axis, size, column in zip(AXES, (1.0, V, V), wind.T, strict=True):
         A[:, places[AIR_STATE[axis]]] = -size * column
     for name in RATES:
@@ -235,7 +225,7 @@ def _airframe(condition: FlightCondition, trim: Trim, B: FloatArray) -> Airframe
     gusts = {
         axis: {
             name: V * value
-            for name, value in zip(STATES, column.tolist(), strict=True)
+            for name, value in zip(AIRPLANE_STATES, column.tolist(), strict=True)
             if abs(value) > LEAST
         }
         for axis, column in zip(AXES, wind.T, strict=True)
@@ -244,7 +234,7 @@ def _airframe(condition: FlightCondition, trim: Trim, B: FloatArray) -> Airframe
         "name": condition.title,
         "source": f"linearisation of JSBSim at {V:g} m/s and {condition.altitude:g} m",
         "speed": V,
-        "states": STATES,
+        "states": AIRPLANE_STATES,
         "inputs": {
             name: {"unit": "1", "positive": INPUTS[name].positive} for name in condition.inputs()
         },

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from aircraft_sim.airframe import Airframe
+from aircraft_sim.airframe import AIRPLANE_STATES, Airframe
 from aircraft_sim.disturbance import AIR_STATE, AXES
 from aircraft_sim.jsbsim_aircraft import INPUTS
 from aircraft_sim.uncertainty import KINEMATIC
@@ -21,16 +21,6 @@ from flight_design.identification.likelihood import Unknown
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di_config import RiseDiConfig
 
-STATES = {
-    "V": "m/s",
-    "alpha": "rad",
-    "q": "rad/s",
-    "theta": "rad",
-    "beta": "rad",
-    "p": "rad/s",
-    "r": "rad/s",
-    "phi": "rad",
-}
 PARTS = (("q",), ("V",), ("p", "r"))  # outputs that couple through B
 
 ROUGH = Unknown(effect=0.1, drift=0.5)
@@ -81,20 +71,20 @@ def sketch(
         "r": {"beta": 6.0 * size["r"], "p": -0.05 * P, "r": -R},
         "phi": {"p": 1.0},
     }
-    places = list(STATES)
-    A = np.zeros((len(STATES), len(STATES)))
+    places = list(AIRPLANE_STATES)
+    A = np.zeros((len(AIRPLANE_STATES), len(AIRPLANE_STATES)))
     for row, effects in rows.items():
         for column, effect in effects.items():
             A[places.index(row), places.index(column)] = effect
     gravity = np.zeros_like(A)
-    B = np.zeros((len(STATES), len(inputs)))
+    B = np.zeros((len(AIRPLANE_STATES), len(inputs)))
     gravity[places.index("beta"), places.index("phi")] = n
     for part in PARTS:
         columns = [outputs.index(output) for output in part]
         for i in columns:
             B[places.index(outputs[i]), columns] = Omega[i, columns]
     return _airframe(
-        name, "Omega and trim speed", speed, A, B, gravity, tuple(STATES), outputs, inputs
+        name, "Omega and trim speed", speed, A, B, gravity, tuple(AIRPLANE_STATES), outputs, inputs
     )
 
 
@@ -112,12 +102,12 @@ def sketched(name: str, controller: ControllerConfig, speed: float) -> Airframe:
         "the rough model of an aircraft without an airframe file",
     )
     assert model is not None  # noqa: S101 - for the type checker
-    unknown = [state for state in model.states if state not in STATES]
+    unknown = [state for state in model.states if state not in AIRPLANE_STATES]
     require(
         not unknown,
         "controller.feedforward.states",
         ", ".join(unknown),
-        f"some of {', '.join(STATES)}",
+        f"some of {', '.join(AIRPLANE_STATES)}",
     )
     n = len(model.states)
     A = np.reshape(model.A, (n, n))
@@ -188,7 +178,7 @@ def _airframe(
         "name": name,
         "source": source,
         "speed": speed,
-        "states": {state: STATES[state] for state in states},
+        "states": {state: AIRPLANE_STATES[state] for state in states},
         "inputs": {name: {"unit": "1", "positive": _positive(name)} for name in inputs},
         "outputs": list(outputs),
         "A": A.tolist(),
