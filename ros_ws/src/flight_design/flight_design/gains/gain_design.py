@@ -431,9 +431,7 @@ def observed(
     weights: FilePath | None = None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> tuple[RiseDiConfig, str]:
-    """A controller with feedforward and observer of a model, and a sentence on its gains: of
-    `selected_observer`.
-    """
+    """The controller of `selected_observer`, and a sentence on its gains."""
     selected = selected_observer(
         controller,
         scenario,
