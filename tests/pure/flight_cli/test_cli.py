@@ -381,6 +381,29 @@ cli.main()
     assert (ended.returncode, ended.stdout, ended.stderr) == (130, "", "")
 
 
+@pytest.mark.parametrize(
+    "cause, status, words", [("KeyboardInterrupt()", 130, ""), ("OSError()", 1, "Traceback")]
+)
+def test_interrupt_while_a_module_in_c_loads_ends_command_without_traceback(
+    cause: str, status: int, words: str
+) -> None:
+    """pybind11 makes an ImportError of it, as in rclpy; another ImportError is told."""
+    code = f"""
+from flight_cli import cli
+
+def command(prog_name):
+    raise ImportError("initialization failed") from {cause}
+
+cli.application = lambda words: command
+cli.main()
+"""
+    ended = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False
+    )
+    assert (ended.returncode, ended.stdout) == (status, "")
+    assert words in ended.stderr if words else ended.stderr == ""
+
+
 def test_keys_of_the_first_page_are_keys_of_a_scenario() -> None:
     page = (REPOSITORY / "docs" / "get-started.md").read_text()
     keys = re.findall(r"^\| `(\w+\.\w+)` \|", page.partition("15 keys")[2], re.MULTILINE)
