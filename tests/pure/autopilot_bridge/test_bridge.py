@@ -21,8 +21,8 @@ from autopilot_bridge.channel_map import to_raw
 from autopilot_bridge.params import ChannelMap, load_map
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_bringup import fly as flying
-from flight_bringup.fly import _follow_real_time, _Span, interrupt, last
-from flight_bringup.processes import handle_signals
+from flight_bringup.fly import _follow_real_time, _Span, last
+from flight_bringup.interrupt import DeferredInterrupt, handle_signals, interrupt
 from flight_core.outcome import Outcome, ended_early
 from flight_core.rates import nanoseconds
 from flight_core.vectors import ChannelError, FloatArray, StampedVector
@@ -946,7 +946,9 @@ def followed(
     vars(monitor)["clock"] = SimpleNamespace(monotonic_ns=monotonic_ns)
     vars(processes).update(scenario=scenario, monitor=monitor)
     span = _Span(scenario, processes, monitor, begins=begins)
-    return last(_follow_real_time(processes, lambda t, text: None, announce, engaged_for, span))
+    return last(
+        _follow_real_time(processes, lambda t, text: None, announce, engaged_for, span), time.sleep
+    )
 
 
 @pytest.mark.parametrize(
@@ -1066,6 +1068,20 @@ def test_second_signal_does_not_interrupt_clean_up_after_first() -> None:
             clean = True
     assert clean
     assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_signal_in_a_callback_of_a_module_in_c_waits_for_the_next_pause() -> None:
+    """pybind11 made a TypeError of the KeyboardInterrupt in a message that rclpy made."""
+
+    def interrupted_key(value: int) -> int:
+        signal.raise_signal(signal.SIGINT)
+        return value
+
+    handler = DeferredInterrupt(only_in_pauses=True)
+    with handle_signals(handler):
+        assert sorted([2, 1], key=interrupted_key) == [1, 2]
+        with pytest.raises(KeyboardInterrupt):
+            handler.pause(0.0)
 
 
 def test_input_without_effect_by_the_probe_ends_an_engagement_with_its_name() -> None:

@@ -381,18 +381,21 @@ cli.main()
     assert (ended.returncode, ended.stdout, ended.stderr) == (130, "", "")
 
 
+@pytest.mark.parametrize("error", ["ImportError", "TypeError"])
 @pytest.mark.parametrize(
     "cause, status, words", [("KeyboardInterrupt()", 130, ""), ("OSError()", 1, "Traceback")]
 )
-def test_interrupt_while_a_module_in_c_loads_ends_command_without_traceback(
-    cause: str, status: int, words: str
+def test_interrupt_in_a_module_in_c_ends_command_without_traceback(
+    error: str, cause: str, status: int, words: str
 ) -> None:
-    """pybind11 makes an ImportError of it, as in rclpy; another ImportError is told."""
+    """pybind11, and with it rclpy, makes an ImportError of it while it loads, and a TypeError in a
+    callback; an error with another cause is told.
+    """
     code = f"""
 from flight_cli import cli
 
 def command(prog_name):
-    raise ImportError("initialization failed") from {cause}
+    raise {error}("initialization failed") from {cause}
 
 cli.application = lambda words: command
 cli.main()

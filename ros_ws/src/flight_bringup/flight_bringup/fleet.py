@@ -6,7 +6,6 @@ every aircraft.
 
 import signal
 import threading
-import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
@@ -17,9 +16,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 from flight_analysis.closed_loop.scenario import Scenario, require_guidable
 from flight_analysis.closed_loop.scenario_library import find_scenario, with_route
 from flight_analysis.report.run_folder import new_run
-from flight_bringup.fly import POLL_PERIOD, Steps, as_file, follow, interrupt
+from flight_bringup.fly import POLL_PERIOD, Steps, as_file, follow
 from flight_bringup.graph import FIRST_STAGE, LEAD, absolute_namespace, second_stage
-from flight_bringup.processes import FlightProcesses, handle_signals, start_instants
+from flight_bringup.interrupt import DeferredInterrupt, handle_signals
+from flight_bringup.processes import FlightProcesses, start_instants
 from flight_core.arguments import FilePath, as_path
 from flight_core.environment import MAX_PARTICIPANTS, require_ros_environment
 from flight_core.fields import Field
@@ -224,9 +224,9 @@ class _Flight:
     outcome: Outcome = INTERRUPTED
     stopping: threading.Thread | None = None
 
-    def start(self, fleet: Fleet) -> None:
-        """Start the processes. In real time wait until they are ready: a host does not start many
-        at once.
+    def start(self, fleet: Fleet, pause: Callable[[float], None]) -> None:
+        """Start the processes. In real time wait until they are ready, with a `pause` between two
+        looks: a host does not start many at once.
         """
         self.progress(0.0, "starting")
         try:
@@ -238,6 +238,7 @@ class _Flight:
                 one_process=fleet.composed,
                 namespace=absolute_namespace(self.member.name),
                 announce=self._announce,
+                pause=pause,
             ).__enter__()
         except ParameterError as error:
             self.outcome = never_flew(str(error))
@@ -320,6 +321,7 @@ def fly_fleet(
     from flight_bringup.monitor import FlightMonitor  # noqa: PLC0415 - loads rclpy, which other commands do not need
 
     flights: list[_Flight] = []
+    interrupt = DeferredInterrupt(only_in_pauses=True)
     with handle_signals(interrupt), ExitStack() as stack:
         try:
             for member, run in zip(fleet.members, runs, strict=True):
@@ -335,13 +337,13 @@ def fly_fleet(
                 )
                 flights.append(_Flight(member, run, monitor, partial(progress, member.name)))
             for flight in flights:
-                flight.start(fleet)
+                flight.start(fleet, interrupt.pause)
             _begin(flights, fleet)
             while True:
                 going = [flight.step() for flight in flights]
                 if not any(going):
                     break
-                time.sleep(POLL_PERIOD)
+                interrupt.pause(POLL_PERIOD)
         except KeyboardInterrupt:
             pass
         finally:

@@ -3,15 +3,10 @@
 """Fly a scenario: over topics in real time or in lockstep, or in one process."""
 
 import math
-import os
 import re
-import signal
-import sys
 import time
-from collections.abc import Callable, Generator, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Generator, Mapping
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING
 
 from flight_analysis.closed_loop.learning_loop import Learn
@@ -21,13 +16,13 @@ from flight_analysis.closed_loop.simulate import fly
 from flight_analysis.report.display_units import display_units
 from flight_analysis.report.run_folder import FlightResult, attachments_for, new_run, write_report
 from flight_bringup.graph import CONTROLLER, Autopilot
+from flight_bringup.interrupt import DeferredInterrupt, handle_signals
 from flight_bringup.processes import (
     FIRST_U,
     LOG_TIMEOUT,
     SEARCH_TIMEOUT,
     FlightProcesses,
     NotReadyError,
-    handle_signals,
 )
 from flight_core.arguments import FilePath, as_path
 from flight_core.environment import require_ros_environment
@@ -42,7 +37,6 @@ from flight_core.outcome import (
 )
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS, seconds
-from flight_core.signals import handle_shutdown
 from flight_core.tape import Signal
 from flight_log.tape_writer import EXPECTED, TapeWriter
 from rise_di_controller.proposals import Event
@@ -64,18 +58,6 @@ Progress = Callable[[float, str], None]  # flight time in s, and the text beside
 
 Steps = Generator[None, None, Outcome]
 """A flight that is followed: a step looks at it once. It returns the outcome."""
-
-
-def interrupt(number: int, frame: FrameType | None) -> None:
-    """End the flight. A second signal would interrupt the clean-up, in which `subprocess` releases
-    a lock of each process.
-    """
-    handle_shutdown(signal.SIG_IGN)
-    if number == signal.SIGHUP:  # the terminal is lost: writing to it is an error
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        for stream in (sys.stdout, sys.stderr):
-            os.dup2(nowhere, stream.fileno())
-    raise KeyboardInterrupt
 
 
 def fly_over_topics(
@@ -105,6 +87,7 @@ def fly_over_topics(
     require_ros_environment()
     from flight_bringup.monitor import FlightMonitor  # noqa: PLC0415 - loads rclpy, which other commands do not need
 
+    interrupt = DeferredInterrupt(only_in_pauses=True)
     try:
         with (
             handle_signals(interrupt),
@@ -124,10 +107,12 @@ def fly_over_topics(
                 autopilot=autopilot,
                 namespace=namespace,
                 announce=announce,
+                pause=interrupt.pause,
             ) as processes,
         ):
             begun = processes.begin()
-            processes.outcome = begun or last(follow(processes, progress, announce, engaged_for))
+            steps = follow(processes, progress, announce, engaged_for)
+            processes.outcome = begun or last(steps, interrupt.pause)
             return processes.outcome
     except KeyboardInterrupt:
         return INTERRUPTED
@@ -135,15 +120,15 @@ def fly_over_topics(
         return never_flew(str(error))
 
 
-def last(steps: Steps) -> Outcome:
-    """Follow a flight to its end. Returns the outcome."""
+def last(steps: Steps, pause: Callable[[float], None]) -> Outcome:
+    """Follow a flight to its end, with a `pause` between two steps. Returns the outcome."""
     while True:
         try:
             next(steps)
         except StopIteration as end:
             outcome: Outcome = end.value
             return outcome
-        time.sleep(POLL_PERIOD)
+        pause(POLL_PERIOD)
 
 
 def follow(
@@ -325,7 +310,7 @@ def fly_in_process(
     `learn` makes the learner of a scenario that learns. What it does goes to `announce` and to
     log/learner.log, a line each.
     """
-    interrupt = _DeferredInterrupt()
+    interrupt = DeferredInterrupt()
 
     def record(signals: Mapping[str, Signal]) -> None:
         with interrupt.deferred():
@@ -414,30 +399,3 @@ def as_file(scenario: Scenario, run: Path) -> Scenario:
     Raises ParameterError.
     """
     return scenario if _is_its_file(scenario) else written(scenario, run / f"{scenario.name}.yaml")
-
-
-class _DeferredInterrupt:
-    """A signal handler that interrupts the flight between two writes of the log, not within a
-    write.
-    """
-
-    def __init__(self) -> None:
-        self._deferred = False
-        self._pending: tuple[int, FrameType | None] | None = None
-
-    def __call__(self, number: int, frame: FrameType | None) -> None:
-        if self._deferred:
-            self._pending = number, frame
-        else:
-            interrupt(number, frame)
-
-    @contextmanager
-    def deferred(self) -> Iterator[None]:
-        """Within the block a signal waits for its end."""
-        self._deferred = True
-        try:
-            yield
-        finally:
-            self._deferred = False
-        if self._pending is not None:
-            interrupt(*self._pending)

@@ -12,10 +12,10 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Self
 
 from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario
 from flight_bringup.graph import (
@@ -34,6 +34,7 @@ from flight_bringup.graph import (
     start_instant,
     start_lead,
 )
+from flight_bringup.interrupt import handle_signals
 from flight_core.files import dump_yaml, write_file
 from flight_core.outcome import (
     COMPLETED,
@@ -49,7 +50,6 @@ from flight_core.outcome import (
 from flight_core.parameters import ParameterError, nest
 from flight_core.rates import seconds
 from flight_core.scheduling import leave_real_time_priority
-from flight_core.signals import handle_shutdown
 from flight_log.bag import OUTCOME_FILE
 
 if TYPE_CHECKING:
@@ -81,21 +81,6 @@ def start_instants(lead: float, monitor: "FlightMonitor") -> tuple[float, float]
     clock = monitor.clock
     lead = monitor.ahead(lead)
     return start_instant(lead, seconds(clock.time_ns())), seconds(clock.monotonic_ns()) + lead
-
-
-@contextmanager
-def handle_signals(handler: Any) -> Iterator[None]:
-    """Handle the signals of `handle_shutdown` in the block; Python permits handlers in the main
-    thread alone.
-    """
-    before = (
-        handle_shutdown(handler) if threading.current_thread() is threading.main_thread() else {}
-    )
-    try:
-        yield
-    finally:
-        for number, previous in before.items():
-            signal.signal(number, previous)
 
 
 def leave_outcome(run: Path, outcome: Outcome) -> None:
@@ -195,6 +180,7 @@ class FlightProcesses:
     `monitor` reports the nodes that are ready, in the same `namespace`. With an autopilot the
     bridge starts in the aircraft's place. A flight in real time with an aircraft has its t = 0 from
     `begin`, once `match` has seen it ready. `announce` gets a line on processes that were killed.
+    `pause` sleeps for a duration, s, between two looks at nodes that start.
     """
 
     def __init__(
@@ -208,8 +194,10 @@ class FlightProcesses:
         autopilot: Autopilot | None = None,
         namespace: str = "",
         announce: Callable[[str], None] = lambda line: None,
+        pause: Callable[[float], None] = time.sleep,
     ) -> None:
         self._announce = announce
+        self._pause = pause
         self.scenario = scenario
         self._run = run
         self.monitor = monitor
@@ -267,7 +255,7 @@ class FlightProcesses:
                 return outcome
             if time.monotonic() > deadline:
                 return never_flew(f"{'; '.join(waiting)} after {READY_TIMEOUT:g} s")
-            time.sleep(POLL_PERIOD)
+            self._pause(POLL_PERIOD)
         return None
 
     def begin(self, start: tuple[float, float] | None = None) -> Outcome | None:
@@ -342,7 +330,7 @@ class FlightProcesses:
                 raise NotReadyError(
                     f"{late} after {READY_TIMEOUT:g} s; see the logs in {self._run / 'log'}"
                 )
-            time.sleep(POLL_PERIOD)
+            self._pause(POLL_PERIOD)
 
     def ended(self) -> Outcome | None:
         """The outcome by the first process that has ended, or by simulated time; None while all

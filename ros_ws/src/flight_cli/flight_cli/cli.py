@@ -157,10 +157,6 @@ def main() -> None:
         sys.exit(BAD_INPUT)
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
-    except ImportError as error:  # what a module in C makes of Ctrl-C while it loads
-        if not isinstance(error.__cause__, KeyboardInterrupt):
-            raise
-        sys.exit(INTERRUPTED)
     except OSError as error:
         if error.errno not in {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}:
             raise
@@ -170,6 +166,11 @@ def main() -> None:
             file=sys.stderr,
         )
         sys.exit(FAILED)
+    except Exception as error:
+        # what a module in C makes of Ctrl-C: an ImportError while it loads, pybind11's TypeError
+        if not isinstance(error.__cause__, KeyboardInterrupt):
+            raise
+        sys.exit(INTERRUPTED)
 
 
 if __name__ == "__main__":
