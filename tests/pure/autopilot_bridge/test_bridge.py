@@ -946,9 +946,8 @@ def followed(
     vars(monitor)["clock"] = SimpleNamespace(monotonic_ns=monotonic_ns)
     vars(processes).update(scenario=scenario, monitor=monitor)
     span = _Span(scenario, processes, monitor, begins=begins)
-    return last(
-        _follow_real_time(processes, lambda t, text: None, announce, engaged_for, span), time.sleep
-    )
+    steps = _follow_real_time(processes, lambda t, text: None, announce, engaged_for, span)
+    return last(steps, pause=vars(flying)["time"].sleep)
 
 
 @pytest.mark.parametrize(
