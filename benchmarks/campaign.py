@@ -28,16 +28,17 @@ from benchmarks.tables import new_table
 from jax import numpy as jnp
 from rich.console import Console
 
-from aircraft_sim.airframe import load_airframe
+from aircraft_sim.airframes.airframe import load_airframe
 from aircraft_sim.uncertainty import sampled_matrices
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import true_error
-from flight_campaign import batch_matrices, device, engines
-from flight_campaign.batch_schedule import without_branches
+from flight_campaign import engines
+from flight_campaign.batch import batch_matrices, device
+from flight_campaign.batch.batch_schedule import without_branches
+from flight_campaign.batch.campaign_course import build_course
 from flight_campaign.campaign import Campaign, define, fly_chunk, fly_chunk_figures
-from flight_campaign.campaign_course import build_course
 from flight_core.vectors import FloatArray
 
 FINE = 1e-4  # s: a twentieth of the scenario's step, the reference for the integration error

@@ -30,7 +30,7 @@ from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS, period_ns
 from flight_design.gains.gain_design import observed
 from flight_design.learning.scenario_learner import quick_learner
-from rise_di_controller.proposals import Event, EventKind
+from rise_di_controller.learning.proposals import Event, EventKind
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 SCENARIO, DURATION = "osprey_learn", 64.0  # s

@@ -37,7 +37,7 @@ from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_core.outcome import COMPLETED
 from flight_core.parameters import ParameterError
-from flight_guidance.zones import Fence, Zone
+from flight_guidance.fence.zones import Fence, Zone
 
 OSPREY = "osprey"
 AIRCRAFT = (OSPREY, "c172p", "f16", "737")

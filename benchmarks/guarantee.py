@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from aircraft_sim.airframe import Airframe, load_airframe
+from aircraft_sim.airframes.airframe import Airframe, load_airframe
 from aircraft_sim.uncertainty import Spread, as_yaml, drawn_places, with_entries
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
@@ -36,7 +36,7 @@ from flight_analysis.report.shortfalls import judged
 from flight_design.gains.gain_design import select_gains
 from flight_design.identification.likelihood import PRIOR
 from flight_design.learning.scenario_learner import learner
-from rise_di_controller.linear_loop import SPECTRAL_RADIUS_TOLERANCE, closed_loop
+from rise_di_controller.law.linear_loop import SPECTRAL_RADIUS_TOLERANCE, closed_loop
 
 UNCERTAINTY = 0.3
 LATE = 0.01  # s

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from aircraft_sim.jsbsim_aircraft import OUTPUTS
+from aircraft_sim.jsbsim.jsbsim_aircraft import OUTPUTS
 from flight_analysis.linear_loop.input_margins import input_margins
 from flight_core.outcome import FlightEnded
 from flight_core.parameters import ParameterError

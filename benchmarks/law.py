@@ -14,8 +14,8 @@ import numpy as np
 
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.vectors import FloatArray, StampedVector
-from rise_di_controller import guard
-from rise_di_controller.law import engage, step, step_with_anti_windup
+from rise_di_controller.guard import guard
+from rise_di_controller.law.law import engage, step, step_with_anti_windup
 
 REPEATS = 20_000
 

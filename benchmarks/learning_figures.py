@@ -25,11 +25,12 @@ from benchmarks.learning_flights import (
 from benchmarks.tables import plain
 from matplotlib.figure import Figure
 
-from aircraft_sim.airframe import load_airframe
+from aircraft_sim.airframes.airframe import load_airframe
 from aircraft_sim.uncertainty import sampled_matrices
 from control_laws.catalogue import LAWS
 from flight_analysis.closed_loop.scenario_library import find_scenario
-from flight_campaign import batch, tuning
+from flight_campaign.batch import batch
+from flight_campaign.comparison import tuning
 from flight_campaign.statistics import LOSS_OF_TRACK_SCORE
 from flight_core.vectors import FloatArray
 from flight_design.gains.tuned_gains import load, tuned_file

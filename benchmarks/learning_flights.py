@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from aircraft_sim.airframe import Airframe, load_airframe
-from aircraft_sim.turbulence import MODERATE
+from aircraft_sim.airframes.airframe import Airframe, load_airframe
+from aircraft_sim.atmosphere.turbulence import MODERATE
 from aircraft_sim.uncertainty import AIR_RELATIVE, as_yaml, wind_factors
 from flight_analysis.closed_loop.learning_loop import Learn, Learner, LearnerResult
 from flight_analysis.closed_loop.replay import replay
@@ -33,9 +33,9 @@ from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
 from flight_design.gains.gain_design import observed
 from flight_design.learning.scenario_learner import learner
-from rise_di_controller.linear_loop import LinearPlant, Loop, is_stable, linear_law
+from rise_di_controller.law.linear_loop import LinearPlant, Loop, is_stable, linear_law
+from rise_di_controller.learning.proposals import Event
 from rise_di_controller.params import ControllerConfig
-from rise_di_controller.proposals import Event
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 REPOSITORY = Path(__file__).parents[1]

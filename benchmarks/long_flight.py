@@ -36,7 +36,7 @@ from benchmarks.view import Client, figures_of_ticks, watching
 from numpy.typing import NDArray
 from tests.browser import CHROMIUM, Browser
 
-from aircraft_sim.turbulence import MODERATE
+from aircraft_sim.atmosphere.turbulence import MODERATE
 from flight_analysis.closed_loop.guidance_replay import replay_guidance
 from flight_analysis.closed_loop.scenario import Scenario, load_scenario, scenario_yaml
 from flight_analysis.closed_loop.scenario_library import find_scenario

@@ -20,9 +20,9 @@ from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray, StampedVector
 from flight_guidance.guidance import Guidance
 from flight_guidance.guidance_state import Lateral, Mode
-from flight_guidance.lateral import least_radius
 from flight_guidance.params import GuidanceConfig
-from flight_guidance.protection import FLOOR
+from flight_guidance.steering.lateral import least_radius
+from flight_guidance.steering.protection import FLOOR
 
 SIGMA = 1.5  # m/s, of the turbulence
 START = 5.0  # s, of the command

@@ -25,11 +25,11 @@ from benchmarks.routes import duration, errors
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario, with_route
 from flight_analysis.closed_loop.simulate import simulate
-from flight_guidance import lateral_modes
-from flight_guidance.lateral import PathError, PathParams, bank_for
-from flight_guidance.legs import course_and_speed
-from flight_guidance.route_file import Waypoint
-from flight_guidance.vertical import path_angle
+from flight_guidance.modes import lateral_modes
+from flight_guidance.modes.legs import course_and_speed
+from flight_guidance.routes.route_file import Waypoint
+from flight_guidance.steering.lateral import PathError, PathParams, bank_for
+from flight_guidance.steering.vertical import path_angle
 
 LAWS = ("guidance", "L1", "L1 + lead")
 WINDS = (0.0, 0.2, 0.6)  # of V0, to the east

@@ -31,11 +31,11 @@ from flight_analysis.report.guided import flown_legs
 from flight_core.outcome import COMPLETED
 from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
-from flight_guidance import path
 from flight_guidance.guidance_state import Lateral
 from flight_guidance.params import GuidanceConfig
-from flight_guidance.path import Arc, Line, Route
-from flight_guidance.route_file import Waypoint
+from flight_guidance.routes.route_file import Waypoint
+from flight_guidance.steering import path
+from flight_guidance.steering.path import Arc, Line, Route
 
 CALM_LIMIT, LIMIT = 0.35, 0.5
 """s of flight at V0: what guidance claims in calm air, and in wind or turbulence."""

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from aircraft_sim import dynamics, plant
-from aircraft_sim.actuators import Actuators
-from aircraft_sim.disturbance import Gusts
-from aircraft_sim.dynamics import Aircraft
-from aircraft_sim.plant import AircraftState, PlantParams
+from aircraft_sim.atmosphere.disturbance import Gusts
+from aircraft_sim.plant import dynamics, plant
+from aircraft_sim.plant.actuators import Actuators
+from aircraft_sim.plant.dynamics import Aircraft
+from aircraft_sim.plant.plant import AircraftState, PlantParams
 from flight_analysis.closed_loop.scenario import Scenario, scenario_yaml
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.metrics import true_error
@@ -24,8 +24,8 @@ from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 from reference_model import model
 from reference_model.command import Profile, command
-from rise_di_controller import law as rise
-from rise_di_controller.law import LawParams, Sign
+from rise_di_controller.law import law as rise
+from rise_di_controller.law.law import LawParams, Sign
 
 PROTOTYPE_GAINS = {
     "k_g": 1.0,

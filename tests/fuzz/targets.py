@@ -36,8 +36,8 @@ from tests.maps import MAP_FILES
 from tests.vehicle_logs import write_dataflash, write_tlog, write_ulog
 from tests.view_link import NodesInMemory
 
-from aircraft_sim.airframe import LIBRARY as AIRFRAMES
-from aircraft_sim.airframe import load_airframe
+from aircraft_sim.airframes.airframe import LIBRARY as AIRFRAMES
+from aircraft_sim.airframes.airframe import load_airframe
 from aircraft_sim.simulator import Simulator
 from autopilot_bridge.bridge import Bridge
 from autopilot_bridge.params import load_map
@@ -53,7 +53,7 @@ from flight_core.vectors import ChannelError, StampedVector
 from flight_guidance.guidance import Guidance
 from flight_guidance.guidance_state import TARGETS as MODE_TARGETS
 from flight_guidance.params import GuidanceConfig
-from flight_guidance.route_file import ENDINGS, Origin, read_fence_file, read_route_file
+from flight_guidance.routes.route_file import ENDINGS, Origin, read_fence_file, read_route_file
 from flight_log.bag import SCENARIO_MEDIA_TYPE, read_metadata_records
 from flight_log.named_vectors import decoder, tables
 from flight_log.playback import read_playback

@@ -15,7 +15,7 @@ import yaml
 from numpy.testing import assert_allclose, assert_array_equal
 from tests.conftest import refusing
 
-from aircraft_sim.airframe import Airframe, airframes, check_identities, load_airframe
+from aircraft_sim.airframes.airframe import Airframe, airframes, check_identities, load_airframe
 from flight_core.parameters import ParameterError
 from flight_core.units import in_si, quantity, si_per_unit
 from flight_design.gains.airframe_properties import airframe_facts, output_coordinates

@@ -17,8 +17,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from pytest import approx
 from tests.conftest import REPOSITORY, invoke, refusing
 
-from aircraft_sim.airframe import Airframe, load_airframe
-from aircraft_sim.airframe_import import import_airframe
+from aircraft_sim.airframes.airframe import Airframe, load_airframe
+from aircraft_sim.airframes.airframe_import import import_airframe
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_core.parameters import ParameterError

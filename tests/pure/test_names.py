@@ -13,8 +13,8 @@ import yaml
 from tests.conftest import REPOSITORY, refusing
 from tests.maps import MAP_FILES
 
-from aircraft_sim.airframe import LIBRARY as AIRFRAMES
-from aircraft_sim.airframe import Airframe
+from aircraft_sim.airframes.airframe import LIBRARY as AIRFRAMES
+from aircraft_sim.airframes.airframe import Airframe
 from aircraft_sim.params import AircraftConfig
 from autopilot_bridge.params import ChannelMap
 from flight_analysis.closed_loop.scenario import SCHEMAS

@@ -11,7 +11,13 @@ setup(
     "= C x, with gusts.",
     license="Apache-2.0",
     extras_require={"test": ["pytest"]},
-    packages=["aircraft_sim"],
+    packages=[
+        "aircraft_sim",
+        "aircraft_sim.airframes",
+        "aircraft_sim.atmosphere",
+        "aircraft_sim.plant",
+        "aircraft_sim.jsbsim",
+    ],
     package_data={"aircraft_sim": ["py.typed", "airframes/*.yaml"]},
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/aircraft_sim"]),

@@ -11,7 +11,7 @@ setup(
     "comparison of control laws.",
     license="Apache-2.0",
     extras_require={"test": ["pytest"]},
-    packages=["flight_campaign"],
+    packages=["flight_campaign", "flight_campaign.batch", "flight_campaign.comparison"],
     package_data={"flight_campaign": ["py.typed"]},
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/flight_campaign"]),

@@ -11,7 +11,14 @@ setup(
     "outside the control law.",
     license="Apache-2.0",
     extras_require={"test": ["pytest"]},
-    packages=["flight_guidance"],
+    packages=[
+        "flight_guidance",
+        "flight_guidance.routes",
+        "flight_guidance.fence",
+        "flight_guidance.steering",
+        "flight_guidance.modes",
+        "flight_guidance.multicopter",
+    ],
     package_data={"flight_guidance": ["py.typed"]},
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/flight_guidance"]),

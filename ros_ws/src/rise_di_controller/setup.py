@@ -11,7 +11,13 @@ setup(
     "guard, and a ROS 2 node with a fixed rate.",
     license="Apache-2.0",
     extras_require={"test": ["pytest"]},
-    packages=["rise_di_controller"],
+    packages=[
+        "rise_di_controller",
+        "rise_di_controller.law",
+        "rise_di_controller.guard",
+        "rise_di_controller.extensions",
+        "rise_di_controller.learning",
+    ],
     package_data={"rise_di_controller": ["py.typed"]},
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/rise_di_controller"]),

@@ -23,7 +23,7 @@ from flight_ros import reports
 from flight_ros.messages import Encoder
 from flight_ros.reports import Report
 from flight_ros.topics import PROPOSAL
-from rise_di_controller.proposals import designed
+from rise_di_controller.learning.proposals import designed
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 

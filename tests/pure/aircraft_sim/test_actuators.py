@@ -18,10 +18,10 @@ from scipy.integrate import solve_ivp
 from tests.builders import MS, aircraft_parameters, rms
 from tests.closed_loop import PROTOTYPE_SERVO, error
 
-from aircraft_sim import plant
-from aircraft_sim.actuators import Actuators, move, step
-from aircraft_sim.dynamics import x_dot
-from aircraft_sim.plant import AircraftState, PlantParams, advance
+from aircraft_sim.plant import plant
+from aircraft_sim.plant.actuators import Actuators, move, step
+from aircraft_sim.plant.dynamics import x_dot
+from aircraft_sim.plant.plant import AircraftState, PlantParams, advance
 from aircraft_sim.simulator import Simulator
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario

@@ -17,11 +17,13 @@ from scipy.linalg import expm
 from tests.builders import MS, aircraft_parameters
 from tests.conftest import refusing
 
-from aircraft_sim import actuators, dynamics, truth, turbulence
-from aircraft_sim.airframe import load_airframe
-from aircraft_sim.disturbance import Gusts, one_minus_cosine
-from aircraft_sim.dynamics import Aircraft
-from aircraft_sim.plant import AircraftState, advance, initial_state
+from aircraft_sim import truth
+from aircraft_sim.airframes.airframe import load_airframe
+from aircraft_sim.atmosphere import turbulence
+from aircraft_sim.atmosphere.disturbance import Gusts, one_minus_cosine
+from aircraft_sim.plant import actuators, dynamics
+from aircraft_sim.plant.dynamics import Aircraft
+from aircraft_sim.plant.plant import AircraftState, advance, initial_state
 from flight_core.integrators import rk4
 from flight_core.rates import NANOSECONDS
 from flight_core.vectors import FloatArray

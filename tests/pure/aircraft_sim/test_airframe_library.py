@@ -13,7 +13,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from pytest import approx
 
-from aircraft_sim.airframe import LIBRARY, Airframe, load_airframe
+from aircraft_sim.airframes.airframe import LIBRARY, Airframe, load_airframe
 from flight_core.units import si_per_unit
 from flight_core.vectors import FloatArray
 from flight_design.gains.airframe_properties import (
@@ -23,7 +23,7 @@ from flight_design.gains.airframe_properties import (
     invariant_zeros,
     library,
 )
-from rise_di_controller.decomposition import coupling
+from rise_di_controller.law.decomposition import coupling
 
 ALL = tuple(sorted(file.stem for file in LIBRARY.glob("*.yaml")))
 # more inputs than outputs, and what was split

@@ -9,12 +9,12 @@ import pytest
 from pytest import approx
 from tests.conftest import refusing
 
-from aircraft_sim.airframe import load_airframe
-from aircraft_sim.airspeed import at_speed, level_flight
-from aircraft_sim.plant import aircraft_at, initial_state
+from aircraft_sim.airframes.airframe import load_airframe
+from aircraft_sim.airframes.airspeed import at_speed, level_flight
+from aircraft_sim.plant.plant import aircraft_at, initial_state
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_campaign.campaign_course import build_course
+from flight_campaign.batch.campaign_course import build_course
 from flight_core.vectors import FloatArray
 
 OSPREY = load_airframe("osprey")

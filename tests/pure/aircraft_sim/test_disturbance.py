@@ -17,11 +17,19 @@ from scipy.integrate import solve_ivp
 from tests.builders import MS, aircraft_parameters
 from tests.closed_loop import error
 
-from aircraft_sim import dynamics
-from aircraft_sim.airframe import load_airframe
-from aircraft_sim.disturbance import AXES, Bias, Gusts, Sines, bias, one_minus_cosine, sines
-from aircraft_sim.dynamics import Aircraft
-from aircraft_sim.plant import AircraftState, advance
+from aircraft_sim.airframes.airframe import load_airframe
+from aircraft_sim.atmosphere.disturbance import (
+    AXES,
+    Bias,
+    Gusts,
+    Sines,
+    bias,
+    one_minus_cosine,
+    sines,
+)
+from aircraft_sim.plant import dynamics
+from aircraft_sim.plant.dynamics import Aircraft
+from aircraft_sim.plant.plant import AircraftState, advance
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_core.vectors import FloatArray

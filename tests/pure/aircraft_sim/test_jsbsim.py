@@ -20,13 +20,19 @@ from pytest import approx
 from tests.builders import aircraft_parameters, truth_of
 from tests.conftest import REPOSITORY, refusing
 
-from aircraft_sim import jsbsim_aircraft, jsbsim_trim
-from aircraft_sim.actuators import Actuators
-from aircraft_sim.disturbance import AXES, Gusts
-from aircraft_sim.jsbsim_aircraft import INPUTS, Command, FlightCondition, WindModel, aircraft_names
-from aircraft_sim.jsbsim_commands import engine_count
-from aircraft_sim.jsbsim_model import JsbsimModel
+from aircraft_sim.atmosphere.disturbance import AXES, Gusts
+from aircraft_sim.jsbsim import jsbsim_aircraft, jsbsim_trim
+from aircraft_sim.jsbsim.jsbsim_aircraft import (
+    INPUTS,
+    Command,
+    FlightCondition,
+    WindModel,
+    aircraft_names,
+)
+from aircraft_sim.jsbsim.jsbsim_commands import engine_count
+from aircraft_sim.jsbsim.jsbsim_model import JsbsimModel
 from aircraft_sim.params import AircraftConfig
+from aircraft_sim.plant.actuators import Actuators
 from aircraft_sim.simulator import Simulator
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate

@@ -15,10 +15,10 @@ import psutil
 import pytest
 from tests.conftest import refusing
 
-from aircraft_sim import jsbsim_trim
-from aircraft_sim.jsbsim_aircraft import FlightCondition, aircraft_names
-from aircraft_sim.jsbsim_files import WRITERS, model_files
-from aircraft_sim.jsbsim_trim import trimmed_fdm
+from aircraft_sim.jsbsim import jsbsim_trim
+from aircraft_sim.jsbsim.jsbsim_aircraft import FlightCondition, aircraft_names
+from aircraft_sim.jsbsim.jsbsim_files import WRITERS, model_files
+from aircraft_sim.jsbsim.jsbsim_trim import trimmed_fdm
 from flight_core import notes
 from flight_core.outcome import FlightEnded
 

@@ -8,12 +8,12 @@ import pytest
 from pytest import approx
 from scipy.linalg import expm
 
-from aircraft_sim import jsbsim_linearization
-from aircraft_sim.airframe import AIRPLANE_STATES, check_identities
-from aircraft_sim.jsbsim_aircraft import STATES as JSBSIM_STATES
-from aircraft_sim.jsbsim_aircraft import FlightCondition
-from aircraft_sim.jsbsim_linearization import Linearization, linearize
-from aircraft_sim.jsbsim_trim import trim_solution, trimmed_fdm
+from aircraft_sim.airframes.airframe import AIRPLANE_STATES, check_identities
+from aircraft_sim.jsbsim import jsbsim_linearization
+from aircraft_sim.jsbsim.jsbsim_aircraft import STATES as JSBSIM_STATES
+from aircraft_sim.jsbsim.jsbsim_aircraft import FlightCondition
+from aircraft_sim.jsbsim.jsbsim_linearization import Linearization, linearize
+from aircraft_sim.jsbsim.jsbsim_trim import trim_solution, trimmed_fdm
 from flight_core.outcome import FlightEnded
 from flight_core.rates import nanoseconds
 from flight_core.units import FOOT

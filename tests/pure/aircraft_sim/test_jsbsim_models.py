@@ -15,11 +15,10 @@ import pytest
 from tests.builders import aircraft_parameters
 from tests.conftest import refusing
 
-from aircraft_sim import jsbsim_linearization, jsbsim_trim
-from aircraft_sim.actuators import Actuators
-from aircraft_sim.airframe import AIRPLANE_STATES
-from aircraft_sim.disturbance import AXES, Gusts
-from aircraft_sim.jsbsim_aircraft import (
+from aircraft_sim.airframes.airframe import AIRPLANE_STATES
+from aircraft_sim.atmosphere.disturbance import AXES, Gusts
+from aircraft_sim.jsbsim import jsbsim_linearization, jsbsim_trim
+from aircraft_sim.jsbsim.jsbsim_aircraft import (
     INPUTS,
     PREFIX,
     FlightCondition,
@@ -28,9 +27,10 @@ from aircraft_sim.jsbsim_aircraft import (
     require_aircraft,
     root,
 )
-from aircraft_sim.jsbsim_commands import hysteresis_of
-from aircraft_sim.jsbsim_model import JsbsimModel
-from aircraft_sim.jsbsim_trim import TrimSolution, nearest_trim, trim_solution
+from aircraft_sim.jsbsim.jsbsim_commands import hysteresis_of
+from aircraft_sim.jsbsim.jsbsim_model import JsbsimModel
+from aircraft_sim.jsbsim.jsbsim_trim import TrimSolution, nearest_trim, trim_solution
+from aircraft_sim.plant.actuators import Actuators
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.outcome import FlightEnded
 from flight_core.vectors import FloatArray

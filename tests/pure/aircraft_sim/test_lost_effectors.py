@@ -12,10 +12,10 @@ import pytest
 from pytest import approx
 from tests.conftest import REPOSITORY
 
-from aircraft_sim import plant
-from aircraft_sim.actuators import move
-from aircraft_sim.airframe import load_airframe
+from aircraft_sim.airframes.airframe import load_airframe
 from aircraft_sim.params import AircraftConfig
+from aircraft_sim.plant import plant
+from aircraft_sim.plant.actuators import move
 from flight_core.parameters import ParameterError
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray

@@ -13,8 +13,9 @@ from scipy.spatial.transform import Rotation
 from tests.builders import aircraft_parameters
 from tests.conftest import refusing
 
-from aircraft_sim import dynamics, pose
-from aircraft_sim.jsbsim_model import JsbsimModel
+from aircraft_sim import pose
+from aircraft_sim.jsbsim.jsbsim_model import JsbsimModel
+from aircraft_sim.plant import dynamics
 from aircraft_sim.simulator import Simulator
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate

@@ -18,10 +18,11 @@ from scipy.linalg import expm
 from tests.builders import MS, aircraft_parameters, truth_of
 from tests.conftest import refusing
 
-from aircraft_sim import plant, turbulence
-from aircraft_sim.disturbance import AXES
+from aircraft_sim.atmosphere import turbulence
+from aircraft_sim.atmosphere.disturbance import AXES
+from aircraft_sim.atmosphere.turbulence import Dryden, Turbulence, dryden, filters
+from aircraft_sim.plant import plant
 from aircraft_sim.simulator import Simulator
-from aircraft_sim.turbulence import Dryden, Turbulence, dryden, filters
 from flight_core.vectors import FloatArray
 
 pytestmark = pytest.mark.slow

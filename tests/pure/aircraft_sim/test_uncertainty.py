@@ -11,7 +11,7 @@ import pytest
 from pytest import approx
 from scipy.stats import kstest
 
-from aircraft_sim.airframe import LIBRARY, load_airframe
+from aircraft_sim.airframes.airframe import LIBRARY, load_airframe
 from aircraft_sim.uncertainty import (
     Spread,
     as_yaml,

@@ -14,7 +14,7 @@ from scipy.linalg import solve_discrete_are
 from tests.builders import aircraft_parameters, rms, truth_of
 
 from aircraft_sim import vanes
-from aircraft_sim.airframe import load_airframe
+from aircraft_sim.airframes.airframe import load_airframe
 from aircraft_sim.simulator import Simulator
 from control_laws.observer_design import (
     Names,
@@ -33,8 +33,8 @@ from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
 from flight_design.gains.observer_selection import model_for
-from rise_di_controller.control_law import Measurements
-from rise_di_controller.observer import VaneObserverState, correct, without_frozen
+from rise_di_controller.extensions.observer import VaneObserverState, correct, without_frozen
+from rise_di_controller.law.control_law import Measurements
 
 SHIPPED = find_scenario("osprey_vanes")
 # y at the rate of the law: a third of the time of the shipped one

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from pytest import approx
 
+from aircraft_sim.atmosphere.wind_field import Log, Microburst, Power, Table, WindField
 from aircraft_sim.params import AircraftConfig
 from aircraft_sim.simulator import Simulator
-from aircraft_sim.wind_field import Log, Microburst, Power, Table, WindField
 from flight_core.channels import POSE
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from tests.conftest import REPOSITORY, refusing
 
-from aircraft_sim.airframe import load_airframe
+from aircraft_sim.airframes.airframe import load_airframe
 from autopilot_bridge.params import load_map
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate

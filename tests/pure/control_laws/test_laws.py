@@ -19,7 +19,7 @@ from tests.conftest import REPOSITORY, refusing
 from tests.other_laws import COMMON, SECTIONS, example_installed
 from tests.pure.flight_analysis.test_replay import BUSY, equal
 
-from aircraft_sim.airframe import load_airframe
+from aircraft_sim.airframes.airframe import load_airframe
 from control_laws import lqg
 from control_laws.catalogue import LAWS
 from flight_analysis.closed_loop.replay import replay
@@ -30,16 +30,17 @@ from flight_core.vectors import FloatArray, StampedVector
 from flight_design.gains.gain_selection import with_feedforward
 from flight_design.gains.observer_gains import gains_by_rule
 from flight_design.gains.observer_selection import model_for, with_aircraft_observer
-from rise_di_controller import guard, laws
-from rise_di_controller.control_law import Measurements, TunedLaw, field_names, fields, restored
+from rise_di_controller import laws
 from rise_di_controller.controller import Controller
-from rise_di_controller.guard import ControllerState, GuardParams
-from rise_di_controller.law import gain
+from rise_di_controller.extensions.observer import ObserverParams, ObserverState
+from rise_di_controller.guard import guard
+from rise_di_controller.guard.guard import ControllerState, GuardParams
+from rise_di_controller.law.control_law import Measurements, TunedLaw, field_names, fields, restored
+from rise_di_controller.law.law import gain
+from rise_di_controller.law.linear_loop import linear_law
+from rise_di_controller.law.saturation import Limits
 from rise_di_controller.laws import AnyLaw
-from rise_di_controller.linear_loop import linear_law
-from rise_di_controller.observer import ObserverParams, ObserverState
 from rise_di_controller.params import ControllerConfig
-from rise_di_controller.saturation import Limits
 
 AIRFRAME = load_airframe("osprey")
 SERVO = PROTOTYPE_SERVO.vary(

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 from scipy.linalg import solve_discrete_are
 
-from aircraft_sim.airframe import load_airframe
+from aircraft_sim.airframes.airframe import load_airframe
 from aircraft_sim.uncertainty import KINEMATIC, nominal_and_sampled
 from control_laws import observer_design
 from control_laws.nominal_model import NominalModel

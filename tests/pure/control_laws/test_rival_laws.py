@@ -17,9 +17,9 @@ from control_laws import l1, lqi, observed, observer_design, riccati
 from control_laws.catalogue import LAWS, initial_gains
 from control_laws.nominal_model import NominalModel, conditional_integration
 from flight_analysis.closed_loop.scenario_library import find_scenario
-from flight_campaign import tuning
+from flight_campaign.comparison import tuning
 from flight_core.vectors import FloatArray
-from rise_di_controller.control_law import ControlLaw, Measurements
+from rise_di_controller.law.control_law import ControlLaw, Measurements
 
 pytestmark = pytest.mark.slow
 

@@ -13,7 +13,7 @@ import pytest
 from pytest import approx
 from tests.conftest import invoke, refusing
 
-from aircraft_sim.airframe import load_airframe
+from aircraft_sim.airframes.airframe import load_airframe
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.linear_loop import branch_and_bound
 from flight_analysis.linear_loop import guarantee as guarantee_module
@@ -37,7 +37,7 @@ from flight_analysis.linear_loop.worst_case import worst_in_box
 from flight_analysis.report.html import write_loop_page
 from flight_analysis.report.margin_figures import guarantee_text
 from flight_core.vectors import FloatArray
-from rise_di_controller.linear_loop import LinearLaw, LinearPlant, Loop, closed_loop
+from rise_di_controller.law.linear_loop import LinearLaw, LinearPlant, Loop, closed_loop
 
 LIMIT = 1.0 + 1e-6  # abs(z) of the limit of stability
 PERIOD = 0.01

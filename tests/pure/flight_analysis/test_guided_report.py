@@ -25,10 +25,10 @@ from flight_analysis.report.run_folder import read_flight
 from flight_analysis.report.summary import RecordedFlight, summarise
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
-from flight_guidance.fence import Fence, Zone
+from flight_guidance.fence.fence import Fence, Zone
 from flight_guidance.guidance import names
 from flight_guidance.guidance_state import Lateral, Mode, Vertical
-from flight_guidance.path import Arc, Line
+from flight_guidance.steering.path import Arc, Line
 from flight_log.bag import LogAttachments
 from flight_log.tape_writer import write_run
 

@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from pytest import approx
 from tests.conftest import refusing
 
-from aircraft_sim.airframe import load_airframe
+from aircraft_sim.airframes.airframe import load_airframe
 from aircraft_sim.uncertainty import nominal_and_sampled
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
@@ -36,8 +36,8 @@ from flight_analysis.linear_loop.loop_margins import (
     margins,
 )
 from flight_core.vectors import FloatArray
-from rise_di_controller import linear_loop
-from rise_di_controller.linear_loop import LinearLaw, LinearPlant, Loop, linear_law
+from rise_di_controller.law import linear_loop
+from rise_di_controller.law.linear_loop import LinearLaw, LinearPlant, Loop, linear_law
 
 NO_LAG = Loop(np.zeros(1), 0.0, 0.01)
 INTEGRATOR = LinearPlant(np.zeros((1, 1)), np.eye(1), np.eye(1))

@@ -17,7 +17,7 @@ from flight_core.rates import seconds
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import ChannelError, FloatArray, StampedVector
 from rise_di_controller.controller import Controller
-from rise_di_controller.guard import LEAST_DT
+from rise_di_controller.guard.guard import LEAST_DT
 from rise_di_controller.params import ControllerConfig
 
 pytestmark = pytest.mark.slow

@@ -23,7 +23,7 @@ from tests.joint_states import parameter_event
 from tests.recordings import EPOCH, MS, scenario_file, truncate
 from typer.testing import Result
 
-from aircraft_sim.airframe import load_airframe
+from aircraft_sim.airframes.airframe import load_airframe
 from flight_analysis.closed_loop.replay import OPEN_LOOP, ReplayResult, replay
 from flight_analysis.closed_loop.replay_ticks import vary
 from flight_analysis.closed_loop.scenario import load_scenario

@@ -15,7 +15,7 @@ from tests.other_laws import example_installed
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import LIBRARY, find_scenario
 from flight_analysis.linear_loop.loop_margins import margins
-from rise_di_controller.law import Sign
+from rise_di_controller.law.law import Sign
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 pytestmark = pytest.mark.slow

@@ -32,7 +32,7 @@ from scipy.stats import spearmanr
 from tests.closed_loop import error
 from tests.conftest import invoke, refusing
 
-from aircraft_sim.airframe import load_airframe
+from aircraft_sim.airframes.airframe import load_airframe
 from aircraft_sim.uncertainty import Spread
 from flight_analysis.closed_loop.learning_loop import Learn, LearnerResult
 from flight_analysis.closed_loop.scenario import Scenario, load_scenario, scenario_yaml
@@ -42,7 +42,8 @@ from flight_analysis.linear_loop.input_margins import input_margins
 from flight_analysis.linear_loop.loop_margins import linear_loop
 from flight_analysis.report.guided import control_errors
 from flight_analysis.report.run_folder import REPORT, SUMMARY
-from flight_campaign import campaign, device, engines, equipment, single_flights
+from flight_campaign import campaign, engines, equipment, single_flights
+from flight_campaign.batch import device
 from flight_campaign.campaign import CHUNKS, Campaign, define, fly_chunk
 from flight_campaign.campaign_report import figure_rows, overview
 from flight_campaign.definition import Definition, Sweep

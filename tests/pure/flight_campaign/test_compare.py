@@ -18,7 +18,7 @@ from tests.closed_loop import error
 from tests.conftest import invoke, refusing
 from tests.other_laws import SECTIONS
 
-from aircraft_sim.turbulence import MODERATE
+from aircraft_sim.atmosphere.turbulence import MODERATE
 from control_laws.catalogue import LAWS, Gains, initial_gains
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
@@ -26,14 +26,21 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.linear_loop.input_margins import Margins
 from flight_analysis.linear_loop.loop_margins import margins
 from flight_analysis.metrics import error_metrics
-from flight_campaign import batch, law_comparison, registered_laws, tuned_controller, tuning
-from flight_campaign.tuning import GUST, OBJECTIVES, TURBULENCE, Benchmark, nominal_margins
+from flight_campaign.batch import batch
+from flight_campaign.comparison import law_comparison, registered_laws, tuned_controller, tuning
+from flight_campaign.comparison.tuning import (
+    GUST,
+    OBJECTIVES,
+    TURBULENCE,
+    Benchmark,
+    nominal_margins,
+)
 from flight_core.parameters import ParameterError
 from flight_design.gains import tuned_gains
 from flight_design.gains.gain_yaml import section_yaml
 from flight_design.gains.requirement import REQUIREMENT, least_fraction
 from flight_design.gains.tuned_gains import TuningResult
-from rise_di_controller.control_law import Measurements
+from rise_di_controller.law.control_law import Measurements
 from rise_di_controller.laws import AnyLaw
 
 pytestmark = pytest.mark.slow

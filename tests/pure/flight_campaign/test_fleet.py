@@ -14,20 +14,20 @@ from pytest import approx
 from tests.closed_loop import error
 from tests.conftest import refusing
 
-from aircraft_sim.airframe import load_airframe
+from aircraft_sim.airframes.airframe import load_airframe
 from aircraft_sim.uncertainty import gust_directions, sampled_matrices
 from control_laws.nominal_model import campaign_law
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_campaign import batch, batch_allocation, batch_matrices, batch_schedule
-from flight_campaign.batch_loop import FleetResult
-from flight_campaign.campaign_course import build_course
+from flight_campaign.batch import batch, batch_allocation, batch_matrices, batch_schedule
+from flight_campaign.batch.batch_loop import FleetResult
+from flight_campaign.batch.campaign_course import build_course
 from flight_core.vectors import Array, FloatArray
 from flight_design.gains.gain_selection import with_feedforward
-from rise_di_controller.allocation import allocate, allocation
-from rise_di_controller.control_law import ControlLaw, Measurements
-from rise_di_controller.saturation import Limits
+from rise_di_controller.extensions.allocation import allocate, allocation
+from rise_di_controller.law.control_law import ControlLaw, Measurements
+from rise_di_controller.law.saturation import Limits
 
 pytestmark = pytest.mark.slow
 

@@ -27,7 +27,7 @@ SOURCES = Path(__file__).resolve().parents[3] / "ros_ws" / "src"
 OWN_WRITERS = {
     "flight_core/flight_core/files.py": "the door",
     "flight_core/flight_core/isolated.py": "the result of a subprocess, in its temporary folder",
-    "aircraft_sim/aircraft_sim/jsbsim_files.py": "the copy of a model in a temporary folder",
+    "aircraft_sim/aircraft_sim/jsbsim/jsbsim_files.py": "the copy of a model in a temporary folder",
     "flight_core/flight_core/scheduling.py": "a file of /proc",
     "flight_bringup/flight_bringup/fly.py": "the growing log of the learner, a new file",
     "flight_bringup/flight_bringup/processes.py": "the growing output of a process, a new file",

@@ -17,7 +17,7 @@ from tests.builders import aircraft_parameters
 from tests.conftest import REPOSITORY, refusing
 from tools.parameters import PAGE, SECTIONS
 
-from aircraft_sim.airframe import LIBRARY, Airframe, load_airframe
+from aircraft_sim.airframes.airframe import LIBRARY, Airframe, load_airframe
 from flight_analysis.closed_loop.scenario import Scenario, load_scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate

@@ -17,7 +17,7 @@ from scipy.signal import cont2discrete, dlsim
 from tests.conftest import REPOSITORY, invoke, refusing
 from tests.maps import MAP_FILES
 
-from aircraft_sim.airframe import load_airframe
+from aircraft_sim.airframes.airframe import load_airframe
 from aircraft_sim.params import AircraftConfig
 from autopilot_bridge.params import ChannelMap, load_map
 from control_laws import excitation

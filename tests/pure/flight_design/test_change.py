@@ -7,13 +7,13 @@ start.
 import numpy as np
 import pytest
 
-from aircraft_sim.airframe import Airframe
+from aircraft_sim.airframes.airframe import Airframe
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_design.identification.innovation_filters import Actuation, Recording, recording
 from flight_design.learning.change_test import LOSS, change_test
 from flight_design.learning.part_checks import changed
-from rise_di_controller.learned_channels import with_channels_of
+from rise_di_controller.learning.learned_channels import with_channels_of
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 pytestmark = pytest.mark.slow

@@ -13,7 +13,7 @@ import yaml
 from tests.conftest import REPOSITORY, invoke, refusing
 from tests.maps import MAP_FILES, named_map
 
-from aircraft_sim.airframe import load_airframe
+from aircraft_sim.airframes.airframe import load_airframe
 from autopilot_bridge.params import ChannelMap, load_map
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate

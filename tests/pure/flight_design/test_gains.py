@@ -21,7 +21,7 @@ from tests.closed_loop import law_params
 from tests.conftest import invoke, refusing
 from typer.testing import Result
 
-from aircraft_sim.airframe import LIBRARY, load_airframe
+from aircraft_sim.airframes.airframe import LIBRARY, load_airframe
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.linear_loop.delay_margin import delay_margin
@@ -34,10 +34,10 @@ from flight_design.gains.gain_conditions import Bounds, Condition, GainSet
 from flight_design.gains.gain_design import select_gains
 from flight_design.gains.gain_selection import GainAssessment, LoopSetting
 from flight_design.gains.ideal_control import ChannelPairing, Study
-from rise_di_controller.decomposition import decompose
-from rise_di_controller.law import LawParams, Sign, engage, step, tuned
+from rise_di_controller.law.decomposition import decompose
+from rise_di_controller.law.law import LawParams, Sign, engage, step, tuned
+from rise_di_controller.law.linear_loop import LinearLaw, LinearPlant, Loop, linear_law
 from rise_di_controller.laws import AnyLaw
-from rise_di_controller.linear_loop import LinearLaw, LinearPlant, Loop, linear_law
 
 pytestmark = pytest.mark.slow
 

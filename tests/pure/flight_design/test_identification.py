@@ -14,8 +14,8 @@ from pytest import approx
 from tests.conftest import invoke
 from typer.testing import Result
 
-from aircraft_sim.airframe import load_airframe
-from aircraft_sim.jsbsim_aircraft import FlightCondition
+from aircraft_sim.airframes.airframe import load_airframe
+from aircraft_sim.jsbsim.jsbsim_aircraft import FlightCondition
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_core.outcome import FlightEnded

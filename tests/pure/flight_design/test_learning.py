@@ -20,7 +20,7 @@ from scipy import stats
 from tests.conftest import invoke, refusing
 
 import rise_di
-from aircraft_sim.airframe import Airframe, load_airframe
+from aircraft_sim.airframes.airframe import Airframe, load_airframe
 from flight_analysis.closed_loop.learning_loop import Entry, LearnerResult
 from flight_analysis.closed_loop.replay import replay
 from flight_analysis.closed_loop.replay_ticks import vary
@@ -47,14 +47,14 @@ from flight_design.learning.learner import Known, Learner
 from flight_design.learning.scenario_learner import learn_again, learner, with_last_model
 from flight_log.stored_messages import parameter_changes
 from flight_log.tape_reader import read_run
-from rise_di_controller.learned_channels import (
+from rise_di_controller.law.linear_loop import LinearPlant, Loop, is_stable, linear_law
+from rise_di_controller.learning.learned_channels import (
     acting_inputs,
     authority,
     authority_names,
     without_models,
 )
-from rise_di_controller.linear_loop import LinearPlant, Loop, is_stable, linear_law
-from rise_di_controller.proposals import Updates
+from rise_di_controller.learning.proposals import Updates
 from rise_di_controller.rise_di_config import LearnConfig, RiseDiConfig
 
 pytestmark = pytest.mark.slow

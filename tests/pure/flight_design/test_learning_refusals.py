@@ -11,12 +11,13 @@ import pytest
 from pytest import approx
 from tests.conftest import REPOSITORY, refusing
 
-from aircraft_sim.airframe import load_airframe
+from aircraft_sim.airframes.airframe import load_airframe
 from c_export.constants import exportable
 from flight_analysis.closed_loop.scenario import load_scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_bringup.graph import second_stage
-from flight_campaign import single_flights, tuning
+from flight_campaign import single_flights
+from flight_campaign.comparison import tuning
 from flight_design.learning import scenario_learner
 
 PAGE = REPOSITORY / "docs" / "learning.md"

@@ -16,7 +16,7 @@ from flight_design.gains.linear_error import (
     air_response,
     discrete_gust,
 )
-from rise_di_controller.linear_loop import LinearLaw, LinearPlant, Loop
+from rise_di_controller.law.linear_loop import LinearLaw, LinearPlant, Loop
 
 PERIOD = 0.001  # s: a sampled loop is then nearly the continuous one
 GAIN = 4.0  # 1/s

@@ -32,8 +32,8 @@ from flight_design.gains.lyapunov import (
     integral,
     lemma_2,
 )
-from rise_di_controller.decomposition import decompose
-from rise_di_controller.law import LawParams, Sign
+from rise_di_controller.law.decomposition import decompose
+from rise_di_controller.law.law import LawParams, Sign
 
 pytestmark = pytest.mark.slow
 

@@ -18,7 +18,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from pytest import approx
 from tests.conftest import invoke, refusing
 
-from aircraft_sim.airframe import Airframe, load_airframe
+from aircraft_sim.airframes.airframe import Airframe, load_airframe
 from aircraft_sim.uncertainty import as_yaml
 from control_laws.nominal_model import NominalModel
 from control_laws.observer_design import Names

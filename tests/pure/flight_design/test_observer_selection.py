@@ -16,7 +16,7 @@ from tests.builders import rms
 from tests.closed_loop import PROTOTYPE_SERVO
 from tests.conftest import REPOSITORY, invoke, refusing
 
-from aircraft_sim.airframe import load_airframe
+from aircraft_sim.airframes.airframe import load_airframe
 from aircraft_sim.uncertainty import nominal_and_sampled
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
@@ -36,7 +36,7 @@ from flight_design.gains.observer_selection import (
     with_extended_state_observer,
 )
 from flight_design.gains.requirement import Requirement
-from rise_di_controller.linear_loop import LinearPlant, Loop, is_stable, linear_law
+from rise_di_controller.law.linear_loop import LinearPlant, Loop, is_stable, linear_law
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 pytestmark = pytest.mark.slow

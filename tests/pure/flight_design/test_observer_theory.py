@@ -18,16 +18,16 @@ from scipy.linalg import block_diag, eigvals, solve_continuous_are, solve_contin
 from scipy.signal import lsim, place_poles
 from tests.closed_loop import law_params
 
-from aircraft_sim.airframe import Airframe, load_airframe
+from aircraft_sim.airframes.airframe import Airframe, load_airframe
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
-from flight_campaign import law_comparison, tuning
+from flight_campaign.comparison import law_comparison, tuning
 from flight_core.vectors import FloatArray
 from flight_design.gains.airframe_properties import invariant_zeros
 from flight_design.gains.ideal_control import manoeuvre, study_airframe
 from flight_design.gains.lyapunov import KnownPlant, fly
 from flight_design.gains.tuned_gains import TuningResult
-from rise_di_controller.law import LawParams, Sign
+from rise_di_controller.law.law import LawParams, Sign
 
 pytestmark = pytest.mark.slow
 

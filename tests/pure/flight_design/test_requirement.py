@@ -18,7 +18,7 @@ from pytest import approx
 from tests.conftest import invoke, refusing
 from typer.testing import Result
 
-from aircraft_sim.airframe import Airframe
+from aircraft_sim.airframes.airframe import Airframe
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.linear_loop.input_margins import input_margins
@@ -44,7 +44,7 @@ from flight_design.gains.requirement import (
 )
 from flight_design.gains.trade import trade
 from reference_model.params import ReferenceModelConfig
-from rise_di_controller.linear_loop import LinearLaw, LinearPlant, Loop
+from rise_di_controller.law.linear_loop import LinearLaw, LinearPlant, Loop
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 pytestmark = pytest.mark.slow

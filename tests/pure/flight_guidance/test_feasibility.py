@@ -14,8 +14,8 @@ from tests.conftest import REPOSITORY, refusing
 from flight_analysis.closed_loop.scenario_library import find_scenario, with_route
 from flight_core.parameters import ParameterError
 from flight_guidance.feasibility import Performance, flyable, speeds
-from flight_guidance.path import Arc, Line, Route, along, route_outline
-from flight_guidance.route_file import Waypoint, read_route
+from flight_guidance.routes.route_file import Waypoint, read_route
+from flight_guidance.steering.path import Arc, Line, Route, along, route_outline
 
 CAN = Performance(
     speed=40.0, stall_speed=25.0, bank=math.radians(30.0), roll_rate=0.45, climb=2.5, sink=4.0,

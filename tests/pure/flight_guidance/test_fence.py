@@ -22,7 +22,7 @@ from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray, StampedVector
-from flight_guidance.fence import (
+from flight_guidance.fence.fence import (
     BACK,
     HOME,
     LEFT,
@@ -34,12 +34,12 @@ from flight_guidance.fence import (
     room_at_home,
     turn_clearance,
 )
+from flight_guidance.fence.ways import onto_orbit, ways
+from flight_guidance.fence.zones import Fence, Zone, clearance
 from flight_guidance.guidance import Guidance, GuidanceOutput
 from flight_guidance.guidance_state import Lateral
-from flight_guidance.modes import holding, motion_of
+from flight_guidance.modes.modes import holding, motion_of
 from flight_guidance.params import GuidanceConfig
-from flight_guidance.ways import onto_orbit, ways
-from flight_guidance.zones import Fence, Zone, clearance
 
 pytestmark = pytest.mark.slow
 

@@ -15,10 +15,12 @@ from tests.conftest import refusing
 from flight_core.channels import POSE
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray
-from flight_guidance import modes, path, protection
-from flight_guidance.attitude import AttitudeParams, body_rates
 from flight_guidance.guidance_state import Vertical
-from flight_guidance.lateral import (
+from flight_guidance.modes import modes
+from flight_guidance.params import GuidanceConfig
+from flight_guidance.steering import path, protection
+from flight_guidance.steering.attitude import AttitudeParams, body_rates
+from flight_guidance.steering.lateral import (
     PathError,
     PathParams,
     bank_for,
@@ -29,9 +31,8 @@ from flight_guidance.lateral import (
     path_acceleration,
     slip_estimate,
 )
-from flight_guidance.params import GuidanceConfig
-from flight_guidance.path import Arc, Line
-from flight_guidance.vertical import (
+from flight_guidance.steering.path import Arc, Line
+from flight_guidance.steering.vertical import (
     VerticalParams,
     alpha_estimate,
     climb_for,

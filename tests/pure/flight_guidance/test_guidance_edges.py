@@ -28,16 +28,16 @@ from flight_core.channels import POSE, SIDES, UNKNOWN
 from flight_core.outcome import COMPLETED
 from flight_core.vectors import Array, ChannelError, FloatArray, StampedVector
 from flight_guidance import guidance as module
-from flight_guidance.attitude import AttitudeParams, body_rates, yaw_for_bank
-from flight_guidance.fence import Motion, last_safe_turn, turn_clearance
+from flight_guidance.fence.fence import Motion, last_safe_turn, turn_clearance
+from flight_guidance.fence.zones import Fence, Zone
 from flight_guidance.guidance import Guidance
 from flight_guidance.guidance_state import Begin, Mode
-from flight_guidance.lateral import PathError, PathParams, path_acceleration
 from flight_guidance.params import GuidanceConfig
-from flight_guidance.protection import bank_limit
 from flight_guidance.reach import AUTHORITY
-from flight_guidance.vertical import path_angle
-from flight_guidance.zones import Fence, Zone
+from flight_guidance.steering.attitude import AttitudeParams, body_rates, yaw_for_bank
+from flight_guidance.steering.lateral import PathError, PathParams, path_acceleration
+from flight_guidance.steering.protection import bank_limit
+from flight_guidance.steering.vertical import path_angle
 
 pytestmark = pytest.mark.slow
 

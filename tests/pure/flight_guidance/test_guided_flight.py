@@ -26,13 +26,14 @@ from flight_bringup.graph import GUIDANCE, second_stage
 from flight_core.parameters import ParameterError
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import ChannelError, FloatArray, StampedVector
-from flight_guidance import guidance, modes
+from flight_guidance import guidance
 from flight_guidance.guidance import Guidance
 from flight_guidance.guidance_state import Lateral, Mode, Vertical
+from flight_guidance.modes import modes
 from flight_guidance.params import GuidanceConfig
-from flight_guidance.path import Route
-from flight_guidance.protection import climb_range
-from flight_guidance.route_file import Waypoint, read_route
+from flight_guidance.routes.route_file import Waypoint, read_route
+from flight_guidance.steering.path import Route
+from flight_guidance.steering.protection import climb_range
 from flight_log.named_vectors import PATH, typestore
 from flight_log.tape_reader import read_run
 

@@ -22,8 +22,8 @@ from flight_core.outcome import End, Outcome
 from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
 from flight_guidance.guidance_state import Lateral
-from flight_guidance.landing import flare_climb, time_to_touch
-from flight_guidance.modes import holding
+from flight_guidance.modes.landing import flare_climb, time_to_touch
+from flight_guidance.modes.modes import holding
 from flight_guidance.notices import LEARNED
 from flight_guidance.params import GuidanceConfig
 from flight_guidance.reach import Authority

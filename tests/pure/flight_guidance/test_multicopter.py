@@ -20,9 +20,10 @@ from flight_core.kinematics import thrust_axis
 from flight_core.tape import Tape
 from flight_core.units import GRAVITY
 from flight_core.vectors import ChannelError, StampedVector
-from flight_guidance import guidance_state, multicopter
+from flight_guidance import guidance_state
 from flight_guidance.guidance import Guidance
 from flight_guidance.guidance_state import Mode
+from flight_guidance.multicopter import multicopter
 from flight_guidance.params import GuidanceConfig
 from reference_model.reference import Reference
 

@@ -10,7 +10,6 @@ from pytest import approx
 from flight_core.channels import POSE
 from flight_core.units import GRAVITY
 from flight_core.vectors import StampedVector
-from flight_guidance import modes
 from flight_guidance.guidance import Guidance
 from flight_guidance.guidance_state import (
     Begin,
@@ -18,10 +17,11 @@ from flight_guidance.guidance_state import (
     GuidanceState,
     Inputs,
 )
+from flight_guidance.modes import modes
+from flight_guidance.modes.targets import reach_sentence, within_reach
 from flight_guidance.notices import LEARNED, Notices
 from flight_guidance.params import GuidanceConfig
 from flight_guidance.reach import AUTHORITY, Authority, RollTest
-from flight_guidance.targets import reach_sentence, within_reach
 
 SPEED = 25.0  # m/s
 FREQUENCY = 5.0  # of p, rad/s

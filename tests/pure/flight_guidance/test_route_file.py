@@ -16,8 +16,8 @@ from pymap3d.vincenty import vdist
 from pytest import approx
 from tests.conftest import refusing
 
-from flight_guidance import route_formats
-from flight_guidance.route_file import (
+from flight_guidance.routes import route_formats
+from flight_guidance.routes.route_file import (
     MAX_DISTANCE,
     SEMI_MAJOR,
     Origin,

@@ -19,16 +19,22 @@ from flight_core.rates import nanoseconds
 from flight_core.tape import Signal, Tape
 from flight_core.units import GRAVITY
 from flight_core.vectors import ChannelError, StampedVector
-from flight_guidance import guidance, path
+from flight_guidance import guidance
 from flight_guidance.guidance import Guidance
 from flight_guidance.guidance_state import Lateral, Mode
-from flight_guidance.lateral import PathParams, largest_wind, least_radius, path_acceleration
 from flight_guidance.notices import LEARNED
 from flight_guidance.params import GuidanceConfig
-from flight_guidance.path import Arc, Line
 from flight_guidance.reach import Authority
-from flight_guidance.route_file import Waypoint
-from flight_guidance.wind import WIND_TIME, wind_estimate, wind_of
+from flight_guidance.routes.route_file import Waypoint
+from flight_guidance.steering import path
+from flight_guidance.steering.lateral import (
+    PathParams,
+    largest_wind,
+    least_radius,
+    path_acceleration,
+)
+from flight_guidance.steering.path import Arc, Line
+from flight_guidance.steering.wind import WIND_TIME, wind_estimate, wind_of
 
 SPEED, R = 25.0, 144.0  # m/s and m, of the osprey by rule
 FOLLOW = PathParams(period=16.5, damping=0.75, capture=math.radians(30.0))

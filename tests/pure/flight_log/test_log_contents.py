@@ -18,7 +18,7 @@ import pytest
 from tests.conftest import REPOSITORY, refusing
 from tests.joint_states import vector
 
-from aircraft_sim.airframe import load_airframe
+from aircraft_sim.airframes.airframe import load_airframe
 from flight_analysis.closed_loop.scenario import (
     SCHEMAS,
     ParameterOverrides,

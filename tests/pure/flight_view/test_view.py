@@ -33,8 +33,8 @@ from tornado.websocket import WebSocketClientConnection, websocket_connect
 
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.tape import Tape
-from flight_guidance.path import route_outline
-from flight_guidance.route_file import Origin, Waypoint
+from flight_guidance.routes.route_file import Origin, Waypoint
+from flight_guidance.steering.path import route_outline
 from flight_log.bag import BagWriter, LogAttachments
 from flight_log.disk import try_lock
 from flight_log.engagements import KEY_VALUE

@@ -13,14 +13,14 @@ from scipy.optimize import linprog
 from tests.conftest import REPOSITORY, refusing
 from tests.maps import named_map
 
-from aircraft_sim.airframe import load_airframe
+from aircraft_sim.airframes.airframe import load_airframe
 from flight_analysis.closed_loop.replay import replay
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_core.vectors import FloatArray
 from flight_design.identification.sign_check import check_scenario
-from rise_di_controller.allocation import Allocation, allocate, allocation
-from rise_di_controller.saturation import Limits
+from rise_di_controller.extensions.allocation import Allocation, allocate, allocation
+from rise_di_controller.law.saturation import Limits
 
 DT = 0.01
 

@@ -17,12 +17,12 @@ from hypothesis import strategies as st
 from tests import closed_loop
 from tests.closed_loop import law_params, still_air
 
-from aircraft_sim import dynamics
-from aircraft_sim.dynamics import Aircraft
+from aircraft_sim.plant import dynamics
+from aircraft_sim.plant.dynamics import Aircraft
 from flight_core.integrators import rk4
 from flight_core.vectors import FloatArray
-from rise_di_controller.decomposition import decompose, leading_minors, signs
-from rise_di_controller.law import LawParams, Sign, gain
+from rise_di_controller.law.decomposition import decompose, leading_minors, signs
+from rise_di_controller.law.law import LawParams, Sign, gain
 
 pytestmark = pytest.mark.slow
 

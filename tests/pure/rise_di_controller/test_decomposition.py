@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.testing import assert_allclose, assert_array_equal
 
-from aircraft_sim.airframe import load_airframe
+from aircraft_sim.airframes.airframe import load_airframe
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
-from rise_di_controller.decomposition import (
+from rise_di_controller.law.decomposition import (
     SDU,
     DecompositionError,
     Pairing,

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from flight_core.vectors import FloatArray
-from rise_di_controller import divergence
+from rise_di_controller.learning import divergence
 
 DT, DURATION, BEFORE = 0.01, 30.0, 0.02  # s, s; rms of the error under the law of the start, rad/s
 T = DT * np.arange(round(DURATION / DT))

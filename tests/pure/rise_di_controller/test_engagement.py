@@ -16,14 +16,14 @@ import numpy as np
 import pytest
 from tests.closed_loop import CALM_SERVO
 
-from aircraft_sim import dynamics, plant
+from aircraft_sim.plant import dynamics, plant
 from flight_analysis.closed_loop.simulate import simulate
 from flight_core.modes import Mode
 from flight_core.rates import seconds
 from flight_core.vectors import FloatArray, StampedVector
-from rise_di_controller import guard
-from rise_di_controller.guard import ControllerState
-from rise_di_controller.law import LawParams, control, retune
+from rise_di_controller.guard import guard
+from rise_di_controller.guard.guard import ControllerState
+from rise_di_controller.law.law import LawParams, control, retune
 from rise_di_controller.params import ControllerConfig
 
 pytestmark = pytest.mark.slow

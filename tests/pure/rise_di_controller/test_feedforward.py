@@ -13,7 +13,7 @@ from pytest import approx
 from tests.closed_loop import PROTOTYPE_SERVO, error
 from tests.conftest import refusing
 
-from aircraft_sim.airframe import load_airframe
+from aircraft_sim.airframes.airframe import load_airframe
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_core.integrators import rk4
@@ -21,10 +21,11 @@ from flight_core.modes import Mode
 from flight_core.vectors import FloatArray, StampedVector
 from flight_design.gains.gain_selection import with_feedforward
 from flight_design.gains.ideal_control import manoeuvre, study_airframe
-from rise_di_controller import feedforward, guard
-from rise_di_controller import law as rise
-from rise_di_controller.feedforward import Nominal, nominal_model
-from rise_di_controller.guard import ControllerState
+from rise_di_controller.extensions import feedforward
+from rise_di_controller.extensions.feedforward import Nominal, nominal_model
+from rise_di_controller.guard import guard
+from rise_di_controller.guard.guard import ControllerState
+from rise_di_controller.law import law as rise
 from rise_di_controller.laws import AnyLaw
 from rise_di_controller.params import ControllerConfig
 

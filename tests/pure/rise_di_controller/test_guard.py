@@ -15,11 +15,12 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.modes import Mode
 from flight_core.vectors import ChannelError, FloatArray, StampedVector
-from rise_di_controller import guard, internals
+from rise_di_controller import internals
 from rise_di_controller.controller import Controller
-from rise_di_controller.guard import ControllerState, align
+from rise_di_controller.guard import guard
+from rise_di_controller.guard.guard import ControllerState, align
 from rise_di_controller.internals import Saturation
-from rise_di_controller.law import (
+from rise_di_controller.law.law import (
     LawState,
     Sign,
     control,
@@ -28,8 +29,8 @@ from rise_di_controller.law import (
     step,
     step_with_anti_windup,
 )
+from rise_di_controller.law.saturation import Limits, saturate
 from rise_di_controller.params import ControllerConfig
-from rise_di_controller.saturation import Limits, saturate
 
 MS = 1_000_000
 PARAMS = find_scenario("osprey_gust").controller

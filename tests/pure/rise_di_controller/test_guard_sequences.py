@@ -14,7 +14,7 @@ from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.modes import Mode
 from flight_core.rates import seconds
 from flight_core.vectors import FloatArray, StampedVector
-from rise_di_controller import guard
+from rise_di_controller.guard import guard
 
 MS = 1_000_000
 SLEW = 0.5  # limit of abs(u_dot), rad/s and 1/s

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from pytest import approx
 from tests.closed_loop import law_params
 
-from rise_di_controller.law import (
+from rise_di_controller.law.law import (
     LawParams,
     LawState,
     Sign,
@@ -23,7 +23,7 @@ from rise_di_controller.law import (
     step,
     step_with_anti_windup,
 )
-from rise_di_controller.saturation import Limits, limited_integral
+from rise_di_controller.law.saturation import Limits, limited_integral
 
 DT = 0.1
 

@@ -9,10 +9,10 @@ import pytest
 
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.vectors import FloatArray, StampedVector
-from rise_di_controller import feedforward
-from rise_di_controller.control_law import Measurements
 from rise_di_controller.controller import Controller
-from rise_di_controller.guard import ControllerState, law_within_limits
+from rise_di_controller.extensions import feedforward
+from rise_di_controller.guard.guard import ControllerState, law_within_limits
+from rise_di_controller.law.control_law import Measurements
 
 OBSERVER = find_scenario("osprey_observer").controller
 PERIOD_NS = 10_000_000

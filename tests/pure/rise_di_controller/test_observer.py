@@ -8,16 +8,16 @@ import numpy as np
 from pytest import approx
 
 from flight_core.vectors import FloatArray, StampedVector
-from rise_di_controller.control_law import ControlLaw, Measurements, TunedLaw
-from rise_di_controller.guard import initial_state, retune
-from rise_di_controller.observer import (
+from rise_di_controller.extensions.observer import (
     ObserverParams,
     ObserverState,
     PastTick,
     estimates_after,
     with_observer,
 )
-from rise_di_controller.saturation import Limits
+from rise_di_controller.guard.guard import initial_state, retune
+from rise_di_controller.law.control_law import ControlLaw, Measurements, TunedLaw
+from rise_di_controller.law.saturation import Limits
 
 DT = np.float64(0.1)
 TRIM = 10.0

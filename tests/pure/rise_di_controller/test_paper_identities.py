@@ -5,8 +5,8 @@
 its repair.
 
 The closed loop here is the continuous one of the paper, (1), (2), (20), (21), integrated to 1e-10,
-to check the paper. The sampled law is `rise_di_controller.law`; the last test of the first part
-shows that it converges to the continuous one.
+to check the paper. The sampled law is `rise_di_controller.law.law`. The last test of the first
+part shows that it converges to the continuous one.
 """
 
 from collections.abc import Callable
@@ -22,16 +22,16 @@ from pytest import approx
 from scipy.integrate import cumulative_trapezoid, solve_ivp
 from tests.closed_loop import law_params, reference_outputs
 
-from aircraft_sim import dynamics
 from aircraft_sim.params import AircraftConfig
+from aircraft_sim.plant import dynamics
 from aircraft_sim.sections import Gust
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray
 from flight_design.gains.lyapunov import KnownPlant, decay_matrix, evidence, example, fly
 from reference_model.command import Profile
 from reference_model.model import Model, second_order
-from rise_di_controller.decomposition import DecompositionError, decompose
-from rise_di_controller.law import LawParams, Sign, engage, gain, step
+from rise_di_controller.law.decomposition import DecompositionError, decompose
+from rise_di_controller.law.law import LawParams, Sign, engage, gain, step
 
 pytestmark = pytest.mark.slow
 

@@ -14,12 +14,12 @@ from flight_analysis.closed_loop.replay import replay
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_campaign.batch import vehicle
+from flight_campaign.batch.batch import vehicle
 from flight_core.channels import LEAST_EFFECT, UNKNOWN, without_effect
 from flight_core.parameters import ParameterError
 from flight_core.rates import nanoseconds
 from flight_core.tape import Tape
-from rise_di_controller.probe import EffectTest, Probe
+from rise_di_controller.guard.probe import EffectTest, Probe
 
 WINDOW = 6.0  # s, by default
 JAMMED = 8.0  # s

@@ -21,7 +21,7 @@ from flight_core.parameters import flatten
 from flight_core.rates import NANOSECONDS, nanoseconds
 from flight_core.vectors import StampedVector
 from rise_di_controller.controller import Controller, ControlOutput
-from rise_di_controller.learned_channels import (
+from rise_di_controller.learning.learned_channels import (
     acting_inputs,
     authority,
     authority_names,
@@ -31,7 +31,7 @@ from rise_di_controller.learned_channels import (
     with_channels_of,
     without_models,
 )
-from rise_di_controller.proposals import (
+from rise_di_controller.learning.proposals import (
     DESIGNED,
     Event,
     EventKind,

@@ -16,10 +16,10 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_core.modes import Mode
 from flight_core.vectors import ChannelError, FloatArray, StampedVector
 from rise_di_controller.controller import Controller
-from rise_di_controller.feedforward import parts_of
+from rise_di_controller.extensions.feedforward import parts_of
+from rise_di_controller.guard.samples import MOVING, STILL
 from rise_di_controller.laws import AnyLaw
 from rise_di_controller.params import ControllerConfig
-from rise_di_controller.samples import MOVING, STILL
 
 MS = 1_000_000  # ns
 PERIOD_NS = 10 * MS

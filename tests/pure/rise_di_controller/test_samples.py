@@ -19,10 +19,10 @@ import rise_di
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.modes import Mode
 from flight_core.vectors import FloatArray, StampedVector
-from rise_di_controller import guard
 from rise_di_controller.controller import Controller
+from rise_di_controller.extensions.observer import initial_estimates
+from rise_di_controller.guard import guard
 from rise_di_controller.laws import AnyLaw
-from rise_di_controller.observer import initial_estimates
 
 PERIOD_NS = 10_000_000  # 100 Hz, of all scenarios below
 SERVO, OBSERVER = (find_scenario(name).controller for name in ("osprey_servo", "osprey_observer"))

@@ -17,8 +17,8 @@ from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
-from rise_di_controller.control_law import Measurements, TunedLaw
-from rise_di_controller.schedule import SCALE_RANGE, target_scale
+from rise_di_controller.extensions.schedule import SCALE_RANGE, target_scale
+from rise_di_controller.law.control_law import Measurements, TunedLaw
 
 pytestmark = pytest.mark.slow
 

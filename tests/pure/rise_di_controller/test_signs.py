@@ -15,7 +15,7 @@ import pytest
 import yaml
 from tests.closed_loop import CALM_SERVO, error, fly, law_params, still_air
 
-from aircraft_sim.airframe import LIBRARY
+from aircraft_sim.airframes.airframe import LIBRARY
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import error_metrics

@@ -13,8 +13,8 @@ from pytest import approx
 from tests.conftest import refusing
 
 import rise_di
-from aircraft_sim.airframe import Airframe, load_airframe
-from aircraft_sim.airspeed import at_speed
+from aircraft_sim.airframes.airframe import Airframe, load_airframe
+from aircraft_sim.airframes.airspeed import at_speed
 from aircraft_sim.uncertainty import as_yaml
 from flight_analysis.closed_loop.replay import replay
 from flight_analysis.closed_loop.scenario_library import find_scenario
@@ -29,10 +29,10 @@ from flight_design.gains.observer_search import SelectedObserver
 from flight_design.identification.model_quality import best_known
 from flight_design.learning.designs import Goal
 from flight_design.learning.learner import Learner
-from rise_di_controller.control_law import Measurements
 from rise_di_controller.controller import Controller
-from rise_di_controller.linear_loop import LinearPlant, Loop, linear_law
-from rise_di_controller.proposals import Event, Learning, Proposal, designed
+from rise_di_controller.law.control_law import Measurements
+from rise_di_controller.law.linear_loop import LinearPlant, Loop, linear_law
+from rise_di_controller.learning.proposals import Event, Learning, Proposal, designed
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 pytestmark = pytest.mark.slow

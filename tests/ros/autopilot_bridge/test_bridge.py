@@ -28,7 +28,7 @@ from tests.ros.conftest import Process, Start
 from tests.ros.peer import Peer, peer, stamp_ns
 from tests.ros.waiting import HostDelays
 
-from aircraft_sim.airframe import load_airframe
+from aircraft_sim.airframes.airframe import load_airframe
 from flight_core.modes import Mode
 from flight_core.outcome import STATUS_SHORTFALL
 from flight_core.rates import NANOSECONDS

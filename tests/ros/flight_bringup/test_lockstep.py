@@ -20,7 +20,7 @@ from tests.recordings import require_equal_bits
 from tests.ros.conftest import Process, Start
 from tests.ros.waiting import HostDelays
 
-from aircraft_sim.airframe import load_airframe
+from aircraft_sim.airframes.airframe import load_airframe
 from flight_analysis.closed_loop.replay import replay
 from flight_analysis.closed_loop.scenario import load_scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario

@@ -21,7 +21,7 @@ from flight_core.outcome import COMPLETED
 from flight_core.rates import nanoseconds
 from flight_design.learning.scenario_learner import learner
 from flight_log.tape_reader import read_run
-from rise_di_controller.proposals import Event
+from rise_di_controller.learning.proposals import Event
 
 
 def scenario(folder: Path, **learn: object) -> Scenario:

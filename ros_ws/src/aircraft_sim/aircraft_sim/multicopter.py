@@ -8,8 +8,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from aircraft_sim.dynamics import Forcing
 from aircraft_sim.params import AircraftConfig
+from aircraft_sim.plant.dynamics import Forcing
 from aircraft_sim.state_space_model import POSE_STATES, StateSpaceModel
 from flight_core.channels import VERTICAL, vertical
 from flight_core.kinematics import euler_rates, thrust_axis

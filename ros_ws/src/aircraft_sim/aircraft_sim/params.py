@@ -10,19 +10,19 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 
-from aircraft_sim import effector_faults, uncertainty
-from aircraft_sim.actuators import Actuators
-from aircraft_sim.airframe import (
+from aircraft_sim import uncertainty
+from aircraft_sim.airframes.airframe import (
     EULER_STATES,
     Airframe,
     Unit,
     euler_kinematics,
     load_airframe,
 )
-from aircraft_sim.airspeed import over_airspeed
-from aircraft_sim.disturbance import AXES, ROTARY, Bias, Gusts, Sines
-from aircraft_sim.dynamics import Aircraft, Coupling
-from aircraft_sim.jsbsim_aircraft import (
+from aircraft_sim.airframes.airspeed import over_airspeed
+from aircraft_sim.atmosphere.disturbance import AXES, ROTARY, Bias, Gusts, Sines
+from aircraft_sim.atmosphere.turbulence import Turbulence, dryden, filters
+from aircraft_sim.atmosphere.wind_field import RelativeWind
+from aircraft_sim.jsbsim.jsbsim_aircraft import (
     INPUTS,
     OUTPUTS,
     PREFIX,
@@ -31,7 +31,10 @@ from aircraft_sim.jsbsim_aircraft import (
     named_properties,
     require_aircraft,
 )
-from aircraft_sim.plant import Drift, PlantParams
+from aircraft_sim.plant import effector_faults
+from aircraft_sim.plant.actuators import Actuators
+from aircraft_sim.plant.dynamics import Aircraft, Coupling
+from aircraft_sim.plant.plant import Drift, PlantParams
 from aircraft_sim.pose import Start, every
 from aircraft_sim.sections import (
     ActuatorConfig,
@@ -51,9 +54,7 @@ from aircraft_sim.sections import (
     wind_field_of,
 )
 from aircraft_sim.sensors import Sensors
-from aircraft_sim.turbulence import Turbulence, dryden, filters
 from aircraft_sim.vanes import VaneSensorsConfig
-from aircraft_sim.wind_field import RelativeWind
 from flight_core import parameters
 from flight_core.channels import POSE, vertical
 from flight_core.fields import Field

@@ -9,8 +9,9 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from aircraft_sim import effector_faults, wind_field
-from aircraft_sim.turbulence import HIGH, LOW, LOWEST
+from aircraft_sim.atmosphere import wind_field
+from aircraft_sim.atmosphere.turbulence import HIGH, LOW, LOWEST
+from aircraft_sim.plant import effector_faults
 from aircraft_sim.uncertainty import AIR_RELATIVE, Distribution, Spread, WindEffect
 from flight_core.fields import Field
 from flight_core.parameters import (

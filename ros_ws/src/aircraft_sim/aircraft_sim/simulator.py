@@ -70,7 +70,7 @@ class Simulator:
         self._largest = plausible.largest(self.outputs)
         self._model: FlightDynamicsModel  # in trim at t = 0
         if parameters.is_jsbsim:
-            from aircraft_sim.jsbsim_model import JsbsimModel  # noqa: PLC0415 - other aircraft fly without JSBSim
+            from aircraft_sim.jsbsim.jsbsim_model import JsbsimModel  # noqa: PLC0415 - other aircraft fly without JSBSim
 
             self._model = JsbsimModel(
                 parameters.flight_condition(), parameters.actuator_model(), parameters.wind_model()

@@ -6,10 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from aircraft_sim import plant, pose, truth, turbulence, vanes, wind_field
-from aircraft_sim.disturbance import AXES
-from aircraft_sim.dynamics import Forcing
+from aircraft_sim import pose, truth, vanes
+from aircraft_sim.atmosphere import turbulence, wind_field
+from aircraft_sim.atmosphere.disturbance import AXES
 from aircraft_sim.params import AircraftConfig
+from aircraft_sim.plant import plant
+from aircraft_sim.plant.dynamics import Forcing
 from flight_core.kinematics import heading_rate
 from flight_core.rates import divide, seconds
 from flight_core.vectors import FloatArray

@@ -6,9 +6,10 @@ controller receives it.
 
 import numpy as np
 
-from aircraft_sim import dynamics, turbulence
-from aircraft_sim.airframe import Airframe
-from aircraft_sim.plant import AircraftState, PlantParams
+from aircraft_sim.airframes.airframe import Airframe
+from aircraft_sim.atmosphere import turbulence
+from aircraft_sim.plant import dynamics
+from aircraft_sim.plant.plant import AircraftState, PlantParams
 from flight_core.vectors import FloatArray
 
 

@@ -11,8 +11,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from aircraft_sim import random_streams
-from aircraft_sim.airframe import Airframe
-from aircraft_sim.disturbance import AIR_STATE
+from aircraft_sim.airframes.airframe import Airframe
+from aircraft_sim.atmosphere.disturbance import AIR_STATE
 from flight_core.files import dump_yaml
 from flight_core.parameters import require
 from flight_core.vectors import FloatArray

@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from aircraft_sim import random_streams
-from aircraft_sim.airframe import Airframe
+from aircraft_sim.airframes.airframe import Airframe
 from aircraft_sim.sections import Times
 from flight_core.fields import Field
 from flight_core.parameters import Config, require, require_length

@@ -18,15 +18,15 @@ from flight_core.rates import period_ns, seconds
 from flight_core.vectors import FloatArray
 from reference_model.model import stepper
 from reference_model.params import ReferenceModelConfig
-from rise_di_controller.allocation import HALVINGS, RELAXATION, SMALL, SWEEPS
-from rise_di_controller.feedforward import LONGEST_PART
-from rise_di_controller.guard import LEAST_DT, MIN_SLOPE_SPAN, SAMPLE_BUFFER_SIZE
-from rise_di_controller.observer import ObserverParams
+from rise_di_controller.extensions.allocation import HALVINGS, RELAXATION, SMALL, SWEEPS
+from rise_di_controller.extensions.feedforward import LONGEST_PART
+from rise_di_controller.extensions.observer import ObserverParams
+from rise_di_controller.extensions.schedule import ScheduleParams, airspeed_range
+from rise_di_controller.guard.guard import LEAST_DT, MIN_SLOPE_SPAN, SAMPLE_BUFFER_SIZE
+from rise_di_controller.guard.samples import AGREEING, FIRST_NS, MEMORY, MOVING, STILL, TIMES
+from rise_di_controller.law.saturation import Limits
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di_config import RiseDiConfig
-from rise_di_controller.samples import AGREEING, FIRST_NS, MEMORY, MOVING, STILL, TIMES
-from rise_di_controller.saturation import Limits
-from rise_di_controller.schedule import ScheduleParams, airspeed_range
 
 SCALARS = frozenset(
     {"period", "dt_least", "dt_largest", "speed", "time", "V_least", "V_largest", "fade_rate"}

@@ -29,13 +29,13 @@ from flight_core.rates import NANOSECONDS, seconds
 from flight_core.vectors import ChannelError, FloatArray, StampedVector
 from reference_model.params import ReferenceModelConfig
 from reference_model.reference import Reference
-from rise_di_controller import feedforward
-from rise_di_controller.allocation import Allocation, allocate, reached
-from rise_di_controller.control_law import Measurements, fields, restored
-from rise_di_controller.feedforward import FeedforwardState, Nominal
-from rise_di_controller.guard import LEAST_DT, SAMPLE_BUFFER_SIZE
+from rise_di_controller.extensions import feedforward
+from rise_di_controller.extensions.allocation import Allocation, allocate, reached
+from rise_di_controller.extensions.feedforward import FeedforwardState, Nominal
+from rise_di_controller.guard.guard import LEAST_DT, SAMPLE_BUFFER_SIZE
+from rise_di_controller.law.control_law import Measurements, fields, restored
+from rise_di_controller.law.saturation import saturate
 from rise_di_controller.rise_di_config import RiseDiConfig
-from rise_di_controller.saturation import saturate
 
 # start of the drawn stamps: float64 does not resolve 1 ns there
 EPOCH_NS = 1_795_000_000_000_000_000

@@ -23,10 +23,11 @@ from flight_core.rates import NANOSECONDS
 from flight_core.text import printable
 from flight_core.vectors import ChannelError, FloatArray, StampedVector
 from flight_log.tape_reader import RecordedRun
-from rise_di_controller import guard, internals
-from rise_di_controller.control_law import fields
+from rise_di_controller import internals
 from rise_di_controller.controller import Controller, ControlOutput
-from rise_di_controller.guard import SAMPLE_BUFFER_SIZE, TickInputs
+from rise_di_controller.guard import guard
+from rise_di_controller.guard.guard import SAMPLE_BUFFER_SIZE, TickInputs
+from rise_di_controller.law.control_law import fields
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 START, TAKE_Y, TAKE_Y_M, TICK, RETUNE, RESTART, GUARD_TICK, LOAD, TAKE_U_M, STEP_REFERENCE = range(

@@ -22,7 +22,7 @@ from flight_core.files import write_file, writing
 from flight_core.parameters import ParameterError, require
 from flight_core.vectors import FloatArray
 from reference_model.params import ReferenceModelConfig
-from rise_di_controller.guard import SAMPLE_BUFFER_SIZE
+from rise_di_controller.guard.guard import SAMPLE_BUFFER_SIZE
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 SOURCE = Path(str(files("c_export"))) / "source"

@@ -13,10 +13,10 @@ import numpy as np
 from control_laws import indi, l1, lqg, lqi, mackunis, observed, pi, rise_di_law
 from control_laws.nominal_model import NominalModel
 from flight_core.vectors import FloatArray
-from rise_di_controller import law as rise
-from rise_di_controller.control_law import ControlLaw
-from rise_di_controller.law import Sign
-from rise_di_controller.observer import ObserverParams, with_observer
+from rise_di_controller.extensions.observer import ObserverParams, with_observer
+from rise_di_controller.law import law as rise
+from rise_di_controller.law.control_law import ControlLaw
+from rise_di_controller.law.law import Sign
 
 Gains = dict[str, FloatArray]  # gains by name, shape (m, N), or (1, N) for all channels; positive
 

@@ -12,9 +12,9 @@ import numpy as np
 from flight_core.fields import Field
 from flight_core.parameters import NonNegative, NonNegatives, Positives, require, require_length
 from flight_core.vectors import Array, FloatArray, array_namespace
-from rise_di_controller.control_law import ControlLaw, Measurements, without_limits
+from rise_di_controller.law.control_law import ControlLaw, Measurements, without_limits
+from rise_di_controller.law.saturation import Limits, saturate
 from rise_di_controller.params import ControllerConfig
-from rise_di_controller.saturation import Limits, saturate
 
 DOUBLETS = 8.0  # widths: a doublet of 2, a gap of 1, the opposite doublet of 4, a gap of 1
 

@@ -10,10 +10,10 @@ from control_laws.nominal_model import NominalModel, filter_gain, saturate
 from flight_core.fields import Field
 from flight_core.parameters import Numbers, ParameterError, Positives, require, require_length
 from flight_core.vectors import Array, FloatArray, array_namespace
-from rise_di_controller.control_law import ControlLaw, Measurements, without_limits
-from rise_di_controller.decomposition import DecompositionError, signs
+from rise_di_controller.law.control_law import ControlLaw, Measurements, without_limits
+from rise_di_controller.law.decomposition import DecompositionError, signs
+from rise_di_controller.law.saturation import Limits
 from rise_di_controller.params import ControllerConfig
-from rise_di_controller.saturation import Limits
 
 ADAPTATION_POLE = 1.0
 """1/s, of the predictor. It scales the estimate by a dt / (exp(a dt) - 1), 0.995 at 100 Hz; K

@@ -9,9 +9,9 @@ from typing import NamedTuple
 from control_laws.nominal_model import NominalModel, saturate
 from flight_core.parameters import require
 from flight_core.vectors import Array, FloatArray
-from rise_di_controller.control_law import ControlLaw, Measurements, without_limits
+from rise_di_controller.law.control_law import ControlLaw, Measurements, without_limits
+from rise_di_controller.law.saturation import Limits
 from rise_di_controller.params import ControllerConfig
-from rise_di_controller.saturation import Limits
 
 
 class LqgParams(NamedTuple):

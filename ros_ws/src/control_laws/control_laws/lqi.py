@@ -19,10 +19,10 @@ from control_laws.nominal_model import (
 )
 from control_laws.riccati import gain_of
 from flight_core.vectors import Array, FloatArray, array_namespace
-from rise_di_controller.control_law import ControlLaw, Measurements
-from rise_di_controller.linear_loop import zero_order_hold
+from rise_di_controller.law.control_law import ControlLaw, Measurements
+from rise_di_controller.law.linear_loop import zero_order_hold
+from rise_di_controller.law.saturation import Limits
 from rise_di_controller.params import ControllerConfig
-from rise_di_controller.saturation import Limits
 
 LEAK = 0.01
 """1/s, decay of the angles and of y_m in the design model: modes out of reach of inputs and cost

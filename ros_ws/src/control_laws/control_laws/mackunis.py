@@ -14,9 +14,9 @@ from control_laws.nominal_model import (
     saturate,
 )
 from flight_core.vectors import Array, FloatArray, array_namespace
-from rise_di_controller.control_law import ControlLaw, Measurements
+from rise_di_controller.law.control_law import ControlLaw, Measurements
+from rise_di_controller.law.saturation import Limits
 from rise_di_controller.params import ControllerConfig
-from rise_di_controller.saturation import Limits
 
 
 class MacKunisParams(NamedTuple):

@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flight_core.vectors import Array, FloatArray, array_namespace
-from rise_di_controller import saturation
-from rise_di_controller.control_law import ControlLaw, Measurements, without_limits
-from rise_di_controller.saturation import Limits
+from rise_di_controller.law import saturation
+from rise_di_controller.law.control_law import ControlLaw, Measurements, without_limits
+from rise_di_controller.law.saturation import Limits
 
 
 class NominalModel(NamedTuple):

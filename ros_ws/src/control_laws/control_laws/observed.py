@@ -18,8 +18,8 @@ from control_laws.observer_design import (
     extended_state_observer,
 )
 from flight_core.vectors import FloatArray
-from rise_di_controller.observer import ObserverParams
-from rise_di_controller.saturation import Limits
+from rise_di_controller.extensions.observer import ObserverParams
+from rise_di_controller.law.saturation import Limits
 
 PART = 0.6
 WITHIN = 0.1

@@ -6,7 +6,7 @@ and weights at once.
 Two models: `aircraft_observer` knows A, B, f, wind and lags of an airframe,
 `extended_state_observer` Omega and lags alone. A, B, wind and the weights may have leading axes,
 broadcast together: N aircraft, or N sets of weights, are N designs. Phi, Gamma, H, L, F are the
-matrices of the observer of `rise_di_controller.observer`.
+matrices of the observer of `rise_di_controller.extensions.observer`.
 """
 
 from collections.abc import Callable
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from control_laws.nominal_model import NominalModel
 from control_laws.riccati import correction_of, diagonal, gain_of, transpose
 from flight_core.vectors import FloatArray
-from rise_di_controller.linear_loop import zero_order_hold
+from rise_di_controller.law.linear_loop import zero_order_hold
 
 Correction = Callable[[FloatArray, FloatArray, FloatArray, FloatArray], FloatArray]
 """`riccati.correction_of`, or another function for the same gain."""

@@ -10,9 +10,9 @@ from control_laws.nominal_model import NominalModel, saturate
 from flight_core.fields import Field
 from flight_core.parameters import NonNegatives, Positives, require_length
 from flight_core.vectors import Array, FloatArray, array_namespace
-from rise_di_controller.control_law import ControlLaw, Measurements, without_limits
+from rise_di_controller.law.control_law import ControlLaw, Measurements, without_limits
+from rise_di_controller.law.saturation import Limits, limited_integral
 from rise_di_controller.params import ControllerConfig
-from rise_di_controller.saturation import Limits, limited_integral
 
 
 class PiParams(NamedTuple):

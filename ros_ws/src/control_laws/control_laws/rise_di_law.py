@@ -6,7 +6,7 @@ import numpy as np
 
 from control_laws.nominal_model import NominalModel
 from flight_core.vectors import FloatArray
-from rise_di_controller.law import LawParams
+from rise_di_controller.law.law import LawParams
 
 
 def params_of(gains: dict[str, FloatArray], model: NominalModel) -> LawParams:

@@ -26,7 +26,7 @@ from flight_core.fields import Field
 from flight_core.files import read_yaml
 from flight_core.outcome import COMPLETED, INTERRUPTED, Outcome, never_flew
 from flight_core.parameters import Config, NonNegative, Number, ParameterError, Positive, require
-from flight_guidance.route_file import Origin, read_route
+from flight_guidance.routes.route_file import Origin, read_route
 
 if TYPE_CHECKING:
     from flight_bringup.monitor import FlightMonitor

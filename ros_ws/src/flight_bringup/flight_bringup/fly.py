@@ -39,7 +39,7 @@ from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS, seconds
 from flight_core.tape import Signal
 from flight_log.tape_writer import EXPECTED, TapeWriter
-from rise_di_controller.proposals import Event
+from rise_di_controller.learning.proposals import Event
 
 if TYPE_CHECKING:
     from flight_bringup.monitor import FlightMonitor

@@ -14,7 +14,7 @@ from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario, r
 from flight_analysis.report.run_folder import attachments_for
 from flight_core import topics
 from flight_core.parameters import require
-from rise_di_controller.proposals import AUTHORITY_TICKS
+from rise_di_controller.learning.proposals import AUTHORITY_TICKS
 
 
 class NodeSpec(NamedTuple):

@@ -14,7 +14,7 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from aircraft_sim.airframe import load_airframe
+from aircraft_sim.airframes.airframe import load_airframe
 from aircraft_sim.uncertainty import (
     Spread,
     WindEffect,
@@ -26,7 +26,7 @@ from flight_analysis.linear_loop.guarantee import Guarantee
 from flight_analysis.linear_loop.kept_guarantee import kept
 from flight_analysis.linear_loop.loop_margins import LoopMargins, margins, scenario_loop
 from flight_campaign import equipment, single_flights
-from flight_campaign.campaign_course import Course, build_course
+from flight_campaign.batch.campaign_course import Course, build_course
 from flight_campaign.definition import Definition, Sweep
 from flight_campaign.engines import Engine, Job
 from flight_campaign.influence import RANKED, influence
@@ -35,12 +35,12 @@ from flight_campaign.single_flights import MakeLearner
 from flight_campaign.statistics import Tally, score_units
 from flight_core.files import replacing, write_file, writing
 from flight_core.parameters import ParameterError, require
-from rise_di_controller.control_law import TunedLaw
+from rise_di_controller.law.control_law import TunedLaw
 
 if TYPE_CHECKING:
     import polars as pl
 
-    from flight_campaign.batch_loop import Vehicle
+    from flight_campaign.batch.batch_loop import Vehicle
 
 DEFINITION = "campaign.json"
 CHUNKS = "chunks"
@@ -146,7 +146,7 @@ def _default_chunk(scenario: Scenario, aircraft: int) -> int:
         return 1
     if single_flights.flies_alone(scenario):
         return single_flights.CHUNK
-    from flight_campaign.device import chunk_of_device  # noqa: PLC0415 - JAX, which the command needs only for flights
+    from flight_campaign.batch.device import chunk_of_device  # noqa: PLC0415 - JAX, which the command needs only for flights
 
     return chunk_of_device(aircraft)
 
@@ -198,8 +198,8 @@ def fly_chunk_figures(text: str, job: Job) -> Chunk:
 
 def _fly_at_once(text: str, case: int, first: int, count: int, size: int) -> Chunk:
     """The first `count` of the `size` aircraft from number `first`, which fly at once."""
-    from flight_campaign import batch  # noqa: PLC0415 - JAX, which the command needs only for flights
-    from flight_campaign.device import turn  # noqa: PLC0415 - as above
+    from flight_campaign.batch import batch  # noqa: PLC0415 - JAX, which the command needs only for flights
+    from flight_campaign.batch.device import turn  # noqa: PLC0415 - as above
     from flight_campaign.drawn_fleet import drawn_fleet  # noqa: PLC0415 - as above
 
     definition = Definition.model_validate_json(text)
@@ -235,7 +235,7 @@ class _Shared(NamedTuple):
 @lru_cache(maxsize=8)
 def _prepare(text: str, case: int) -> _Shared:
     """Data that all chunks of a case share."""
-    from flight_campaign import batch  # noqa: PLC0415 - as above
+    from flight_campaign.batch import batch  # noqa: PLC0415 - as above
 
     scenario = Definition.model_validate_json(text).scenario(case)
     law = scenario.controller.tuned_law()

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from aircraft_sim.airframe import load_airframe
+from aircraft_sim.airframes.airframe import load_airframe
 from aircraft_sim.uncertainty import WindEffect, as_yaml, with_entries
 from flight_analysis.closed_loop.scenario import Scenario, scenario_yaml
 from flight_analysis.linear_loop.loop_margins import LoopMargins

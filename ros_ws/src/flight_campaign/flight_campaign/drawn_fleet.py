@@ -8,10 +8,11 @@ import numpy as np
 
 from aircraft_sim.uncertainty import drawn_entries, gust_directions, sampled_matrices
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_campaign import batch, batch_matrices, equipment
-from flight_campaign.batch_loop import Vehicle
-from flight_campaign.batch_matrices import Fleet
-from flight_campaign.campaign_course import Course
+from flight_campaign import equipment
+from flight_campaign.batch import batch, batch_matrices
+from flight_campaign.batch.batch_loop import Vehicle
+from flight_campaign.batch.batch_matrices import Fleet
+from flight_campaign.batch.campaign_course import Course
 from flight_campaign.definition import Definition
 from flight_core.vectors import FloatArray
 

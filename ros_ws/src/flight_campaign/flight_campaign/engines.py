@@ -64,7 +64,7 @@ def threads(workers: int | None = None) -> Engine:
     """
 
     def fly(work: Work, jobs: Iterable[Job]) -> Iterator[tuple[Job, Any]]:
-        from flight_campaign import device  # noqa: PLC0415 - JAX takes a second
+        from flight_campaign.batch import device  # noqa: PLC0415 - JAX takes a second
 
         count = workers or device.threads()
         waiting = iter(jobs)
@@ -180,7 +180,7 @@ def _results(
 
 
 def _separate_devices() -> Devices:
-    from flight_campaign.device import separate_devices  # noqa: PLC0415 - JAX takes a second
+    from flight_campaign.batch.device import separate_devices  # noqa: PLC0415 - JAX takes a second
 
     return separate_devices()
 
@@ -202,7 +202,7 @@ def _local_cluster(workers: int, devices: Devices) -> Iterator[Any]:
     import dask  # noqa: PLC0415 - half a second
     from distributed import LocalCluster  # noqa: PLC0415 - as above
 
-    from flight_campaign.device import THREADS  # noqa: PLC0415 - JAX
+    from flight_campaign.batch.device import THREADS  # noqa: PLC0415 - JAX
 
     with dask.config.set(LOST_WORKER_TIMEOUT):
         cluster = LocalCluster(

@@ -25,7 +25,7 @@ from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
 from flight_guidance.guidance_state import Lateral
 from flight_guidance.params import GuidanceConfig
-from rise_di_controller.proposals import UNVERIFIED, Event, EventKind
+from rise_di_controller.learning.proposals import UNVERIFIED, Event, EventKind
 
 MakeLearner = Callable[[Scenario], Learn | None]
 """Makes the learner of a scenario, as `flight_design.learning.scenario_learner.learner`. Raises

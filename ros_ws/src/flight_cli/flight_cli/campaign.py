@@ -143,7 +143,7 @@ class Campaign:
             require(self.rows.parent.is_dir(), "rows", self.rows, expected)
         monte_carlo = self._continued() if Path(self.scenario).is_dir() else self._begun()
         alone = flies_alone(monte_carlo.definition.scenario())
-        from flight_campaign.device import device_name  # noqa: PLC0415 - JAX takes a second
+        from flight_campaign.batch.device import device_name  # noqa: PLC0415 - JAX takes a second
 
         place = "" if alone or self.scheduler is not None else f" on {device_name()}"
         speed = _fly_missing(monte_carlo, self._engine(alone=alone), place, quiet=self.as_json)

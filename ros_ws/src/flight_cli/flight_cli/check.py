@@ -11,7 +11,7 @@ from pathlib import Path
 import typer
 from rich.console import Console
 
-from aircraft_sim.airframe import load_airframe
+from aircraft_sim.airframes.airframe import load_airframe
 from autopilot_bridge.channel_map import version_faults
 from autopilot_bridge.map_check import (
     CheckedRow,

@@ -24,11 +24,12 @@ from flight_analysis.linear_loop.input_margins import Margins
 from flight_analysis.linear_loop.loop_margins import loop_margins, scenario_loop
 from flight_analysis.report.display_units import display_units
 from flight_analysis.report.summary import finite_or_null
-from flight_campaign import engines, law_comparison, registered_laws, tuned_controller
-from flight_campaign import tuning as gain_tuning
+from flight_campaign import engines
 from flight_campaign.campaign_report import WIND_EFFECTS
-from flight_campaign.law_comparison import LawResult
-from flight_campaign.tuning import Benchmark
+from flight_campaign.comparison import law_comparison, registered_laws, tuned_controller
+from flight_campaign.comparison import tuning as gain_tuning
+from flight_campaign.comparison.law_comparison import LawResult
+from flight_campaign.comparison.tuning import Benchmark
 from flight_cli.output import (
     COUNT_COLUMNS,
     LICENCE,

@@ -48,8 +48,8 @@ from flight_core.files import display_path
 from flight_core.installation import require_package
 from flight_core.outcome import End, Outcome
 from flight_core.parameters import ParameterError, require
-from flight_guidance.route_file import ENDINGS, read_fence_file
-from flight_guidance.route_formats import FENCES
+from flight_guidance.routes.route_file import ENDINGS, read_fence_file
+from flight_guidance.routes.route_formats import FENCES
 
 # fields of a flight of one aircraft alone
 OF_AIRCRAFT = (

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from aircraft_sim.airframe import load_airframe
+from aircraft_sim.airframes.airframe import load_airframe
 from aircraft_sim.uncertainty import as_yaml, with_entries
 from flight_analysis.closed_loop.scenario import scenario_yaml
 from flight_analysis.closed_loop.scenario_library import find_scenario

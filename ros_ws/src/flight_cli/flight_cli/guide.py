@@ -20,7 +20,7 @@ from flight_cli.words import (
 from flight_core.environment import require_ros_environment
 from flight_core.parameters import ParameterError, require
 from flight_guidance.guidance_state import TARGETS
-from flight_guidance.targets import ANGLES
+from flight_guidance.modes.targets import ANGLES
 
 REFUSED = 1
 SERVICES = {

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from aircraft_sim.jsbsim_aircraft import INPUTS, OUTPUTS, RESIDUALS, STATES
+from aircraft_sim.jsbsim.jsbsim_aircraft import INPUTS, OUTPUTS, RESIDUALS, STATES
 from flight_analysis.report.display_units import display_unit
 from flight_cli.gains import speed_of_margin
 from flight_cli.output import new_table, print_table, say

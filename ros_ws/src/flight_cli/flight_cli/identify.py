@@ -15,8 +15,8 @@ import numpy as np
 import typer
 from rich.console import Console
 
-from aircraft_sim.airframe import Airframe, load_airframe
-from aircraft_sim.jsbsim_aircraft import PREFIX, named_properties, require_aircraft
+from aircraft_sim.airframes.airframe import Airframe, load_airframe
+from aircraft_sim.jsbsim.jsbsim_aircraft import PREFIX, named_properties, require_aircraft
 from flight_analysis.closed_loop.replay import recorded_parameters, recorded_scenario
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate

@@ -10,7 +10,7 @@ from typing import overload
 from flight_cli.output import parse_numbers
 from flight_cli.words import rare_option, warn
 from flight_core.parameters import require
-from flight_guidance.route_file import Origin, Waypoint, read_route_file
+from flight_guidance.routes.route_file import Origin, Waypoint, read_route_file
 
 
 @dataclass(frozen=True, kw_only=True)

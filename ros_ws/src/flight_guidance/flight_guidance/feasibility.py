@@ -12,12 +12,12 @@ from typing import NamedTuple
 import numpy as np
 
 from flight_core.parameters import ParameterError, require
-from flight_guidance import path, protection
+from flight_guidance.fence.zones import Fence, clearance, described
 from flight_guidance.guidance_state import LARGEST
-from flight_guidance.lateral import least_period, least_radius
-from flight_guidance.path import Leg, Line, Loiter, Point, Route
-from flight_guidance.route_file import Waypoint
-from flight_guidance.zones import Fence, clearance, described
+from flight_guidance.routes.route_file import Waypoint
+from flight_guidance.steering import path, protection
+from flight_guidance.steering.lateral import least_period, least_radius
+from flight_guidance.steering.path import Leg, Line, Loiter, Point, Route
 
 HEADWIND = 1.2
 """Least ratio of the airspeed to the wind: against the wind the aircraft still goes ahead by a

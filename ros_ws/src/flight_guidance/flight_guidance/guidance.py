@@ -25,7 +25,7 @@ from flight_core.vectors import (
     require_newer,
     require_not_future,
 )
-from flight_guidance import guidance_state, modes, multicopter, path, targets
+from flight_guidance import guidance_state
 from flight_guidance.guidance_state import (
     TARGETS,
     Begin,
@@ -38,6 +38,8 @@ from flight_guidance.guidance_state import (
     Target,
     Vertical,
 )
+from flight_guidance.modes import modes, targets
+from flight_guidance.multicopter import multicopter
 from flight_guidance.notices import (
     FAILED,
     LAST_GOES_ON,
@@ -46,8 +48,9 @@ from flight_guidance.notices import (
     STALE_TIME,
 )
 from flight_guidance.params import GuidanceConfig
-from flight_guidance.path import Line, Route
 from flight_guidance.reach import Authority, RollTest, authority_of
+from flight_guidance.steering import path
+from flight_guidance.steering.path import Line, Route
 
 LIMITED = ("bank", "theta", "climb", "V", "slew")
 STATE = ("phi", "theta", "alpha", "alpha_trim", "slip", "psi")

@@ -7,16 +7,16 @@ from enum import IntEnum
 from typing import NamedTuple
 
 from flight_core.vectors import Scalar
-from flight_guidance.attitude import AttitudeParams
-from flight_guidance.lateral import (
+from flight_guidance.fence.zones import Fence
+from flight_guidance.reach import Authority
+from flight_guidance.steering.attitude import AttitudeParams
+from flight_guidance.steering.lateral import (
     PathParams,
 )
-from flight_guidance.reach import Authority
-from flight_guidance.vertical import (
+from flight_guidance.steering.vertical import (
     VerticalParams,
 )
-from flight_guidance.wind import Wind
-from flight_guidance.zones import Fence
+from flight_guidance.steering.wind import Wind
 
 LARGEST = 1e9
 """Largest value of pose, y and target, SI. The squares of larger values overflow; the orbit of the

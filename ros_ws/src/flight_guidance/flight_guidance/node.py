@@ -25,14 +25,14 @@ from flight_core.parameters import ParameterError, require
 from flight_core.publisher_lock import PublisherLock, require_sender
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns, seconds
 from flight_core.vectors import ChannelError, StampedVector, select
-from flight_guidance import path
 from flight_guidance.guidance import Guidance, GuidanceOutput
 from flight_guidance.guidance_state import Mode
-from flight_guidance.modes import yaw_rate
+from flight_guidance.modes.modes import yaw_rate
 from flight_guidance.odometry import BODY, MAP, ROUTE_FRAMES, body_velocity, quaternion
 from flight_guidance.params import GuidanceConfig
 from flight_guidance.reach import AUTHORITY as AUTHORITY_CHANNELS
-from flight_guidance.route_file import Origin, Waypoint, geographic
+from flight_guidance.routes.route_file import Origin, Waypoint, geographic
+from flight_guidance.steering import path
 from flight_ros.flight_node import FlightNode
 from flight_ros.lockstep import LockstepInputs
 from flight_ros.messages import NO_CHANNELS, Decoder, NamedDecoder, NamedSample, require_size

@@ -15,9 +15,9 @@ import numpy as np
 
 from flight_core.failures import Failures
 from flight_core.vectors import Array, Scalar, array_namespace
-from flight_guidance.fence import RIGHT
+from flight_guidance.fence.fence import RIGHT
 from flight_guidance.guidance_state import LARGEST, Lateral
-from flight_guidance.landing import Landing
+from flight_guidance.modes.landing import Landing
 from flight_guidance.reach import Authority
 
 DWELL = 10.0

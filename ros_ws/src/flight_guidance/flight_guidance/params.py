@@ -26,10 +26,10 @@ from flight_core.parameters import (
 )
 from flight_core.rates import nanoseconds, period_ns
 from flight_core.units import GRAVITY
-from flight_guidance import multicopter_rules, protection, reach
-from flight_guidance.attitude import AttitudeParams
+from flight_guidance import reach
 from flight_guidance.feasibility import Performance, as_route, flyable, require_inside, speeds
-from flight_guidance.fence import MARGIN, Motion, room_at_home
+from flight_guidance.fence.fence import MARGIN, Motion, room_at_home
+from flight_guidance.fence.zones import Fence, Zone, clearance, described
 from flight_guidance.guidance_state import (
     MULTICOPTER,
     TARGETS,
@@ -38,16 +38,18 @@ from flight_guidance.guidance_state import (
     Limits,
     MulticopterParams,
 )
-from flight_guidance.landing import Lander, Landing, landing_at
-from flight_guidance.lateral import PathParams, largest_wind, least_period, least_radius
-from flight_guidance.multicopter_rules import route_through
+from flight_guidance.modes.landing import Lander, Landing, landing_at
+from flight_guidance.modes.targets import reach_sentence, read_target
+from flight_guidance.multicopter import multicopter_rules
+from flight_guidance.multicopter.multicopter_rules import route_through
 from flight_guidance.notices import Notices
-from flight_guidance.path import Route
-from flight_guidance.route_file import Waypoint
+from flight_guidance.routes.route_file import Waypoint
 from flight_guidance.sections import HomeConfig, LandingConfig, RouteConfig, Steps, ZoneConfig
-from flight_guidance.targets import reach_sentence, read_target
-from flight_guidance.vertical import VerticalParams, path_lag
-from flight_guidance.zones import Fence, Zone, clearance, described
+from flight_guidance.steering import protection
+from flight_guidance.steering.attitude import AttitudeParams
+from flight_guidance.steering.lateral import PathParams, largest_wind, least_period, least_radius
+from flight_guidance.steering.path import Route
+from flight_guidance.steering.vertical import VerticalParams, path_lag
 
 BY_RULE = ("outputs", "natural_frequency", "speed", "throttle_authority", "roll_authority")
 FLOOR_FRACTION = 0.8

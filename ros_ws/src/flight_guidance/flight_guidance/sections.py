@@ -14,8 +14,8 @@ from flight_core.parameters import (
     require,
     require_length,
 )
-from flight_guidance.route_file import Waypoint
-from flight_guidance.zones import Zone
+from flight_guidance.fence.zones import Zone
+from flight_guidance.routes.route_file import Waypoint
 
 
 class Steps(Config):

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from flight_core.files import read_file
 from flight_core.parameters import ParameterError, require
-from flight_guidance.path import Point
-from flight_guidance.route_file import Origin, placed_lines
+from flight_guidance.routes.route_file import Origin, placed_lines
+from flight_guidance.steering.path import Point
 
 Line = list[Point]  # north, east, m; a single point is a mark
 

@@ -17,7 +17,7 @@ from flight_core.modes import Mode
 from flight_core.rates import NANOSECONDS
 from flight_guidance import guidance_state
 from flight_guidance.params import GuidanceConfig
-from flight_guidance.route_file import Waypoint
+from flight_guidance.routes.route_file import Waypoint
 
 KINDS: dict[str, type[IntEnum]] = {
     "": Mode,

@@ -29,7 +29,7 @@ from flight_core.tape import Signal, Tape
 from flight_core.text import printable
 from flight_core.vectors import FloatArray
 from flight_guidance.odometry import ROUTE_FRAMES
-from flight_guidance.route_file import Waypoint
+from flight_guidance.routes.route_file import Waypoint
 from flight_log.bag import CHANNEL_UNITS, LOST_MESSAGES, SCENARIO_MEDIA_TYPE, full_names
 from flight_log.disk import is_locked
 from flight_log.engagements import ENGAGEMENT, KEY_VALUE

@@ -3,7 +3,7 @@
 # The names of the interface with their modules. Type checkers read them here, and __init__.py
 # loads them from here.
 
-from aircraft_sim.airframe import Airframe, airframes, load_airframe
+from aircraft_sim.airframes.airframe import Airframe, airframes, load_airframe
 from flight_analysis.closed_loop.replay import ReplayResult, recorded_scenario, replay
 from flight_analysis.closed_loop.scenario import Scenario, scenario_yaml
 from flight_analysis.closed_loop.scenario_library import find_scenario, scenarios
@@ -32,15 +32,15 @@ from rise_di.flight_env import FlightEnv, FlightVectorEnv
 from rise_di.in_memory import simulate
 from rise_di.own_airframe import NewAirframe, new_airframe
 from rise_di.own_loop import Loop, as_control, fly_plant
-from rise_di_controller.control_law import ControlLaw, Measurements, TunedLaw, without_limits
 from rise_di_controller.controller import Controller
-from rise_di_controller.decomposition import decompose
-from rise_di_controller.law import LawParams, LawState, Sign, engage, step
+from rise_di_controller.law.control_law import ControlLaw, Measurements, TunedLaw, without_limits
+from rise_di_controller.law.decomposition import decompose
+from rise_di_controller.law.law import LawParams, LawState, Sign, engage, step
+from rise_di_controller.law.saturation import Limits, limited_integral, saturate
 from rise_di_controller.laws import names as laws
 from rise_di_controller.laws import schema as law_schema
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di_config import RiseDiConfig
-from rise_di_controller.saturation import Limits, limited_integral, saturate
 
 __all__ = [
     "Airframe",

@@ -22,7 +22,7 @@ from flight_core.rates import period_ns, seconds
 from flight_core.text import printable
 from flight_design.learning.scenario_learner import with_last_model
 from flight_log.tape_reader import RecordedRun, read_run
-from rise_di_controller.guard import SAMPLE_BUFFER_SIZE
+from rise_di_controller.guard.guard import SAMPLE_BUFFER_SIZE
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 PART = 50_000  # drawn steps of a recording

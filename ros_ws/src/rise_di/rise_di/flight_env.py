@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from aircraft_sim.uncertainty import gust_directions, sampled_matrices
 from flight_analysis.closed_loop.scenario import Scenario, as_scenario
 from flight_analysis.closed_loop.stations import AircraftStation, Loop, ReferenceStation, Topics
-from flight_campaign.campaign_course import HOLD, build_course
+from flight_campaign.batch.campaign_course import HOLD, build_course
 from flight_campaign.statistics import LOSS_OF_TRACK_SCORE, score_units
 from flight_core.arguments import as_count, as_number
 from flight_core.installation import require_package
@@ -270,7 +270,7 @@ class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray
     metadata = {"render_modes": [], "autoreset_mode": gymnasium.vector.AutoresetMode.NEXT_STEP}  # noqa: RUF012 - as above
 
     def __init__(self, scenario: Scenario, num_envs: int, uncertainty: float = 0.3) -> None:
-        from flight_campaign import batch, batch_matrices  # noqa: PLC0415 - JAX, a second to load
+        from flight_campaign.batch import batch, batch_matrices  # noqa: PLC0415 - JAX, a second to load
 
         self.scenario = as_scenario(scenario)
         self.num_envs = as_count(num_envs, "num_envs", 1)

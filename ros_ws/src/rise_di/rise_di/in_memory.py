@@ -14,8 +14,8 @@ from flight_core.tape import Tape
 from flight_guidance.guidance import Guidance
 from flight_guidance.params import GuidanceConfig
 from rise_di_controller.controller import Controller
+from rise_di_controller.learning.proposals import Event
 from rise_di_controller.params import ControllerConfig
-from rise_di_controller.proposals import Event
 
 
 def simulate(

@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from aircraft_sim.airframe import Airframe
-from aircraft_sim.airframe_import import Named, import_airframe
-from aircraft_sim.disturbance import AIR_STATE
+from aircraft_sim.airframes.airframe import Airframe
+from aircraft_sim.airframes.airframe_import import Named, import_airframe
+from aircraft_sim.atmosphere.disturbance import AIR_STATE
 from aircraft_sim.uncertainty import as_yaml
 from flight_analysis.closed_loop.scenario import Scenario, parse_scenario
 from flight_analysis.closed_loop.simulate import simulate

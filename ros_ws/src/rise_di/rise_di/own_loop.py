@@ -25,11 +25,11 @@ from flight_core.rates import nanoseconds, period_ns, seconds
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray, StampedVector, as_array
 from reference_model.params import ReferenceModelConfig
-from rise_di_controller.control_law import Measurements, fields, restored
 from rise_di_controller.controller import Controller, ControlOutput
-from rise_di_controller.guard import law_within_limits
+from rise_di_controller.guard.guard import law_within_limits
+from rise_di_controller.law.control_law import Measurements, fields, restored
+from rise_di_controller.law.linear_loop import linear_law
 from rise_di_controller.laws import AnyLaw
-from rise_di_controller.linear_loop import linear_law
 from rise_di_controller.params import ControllerConfig
 
 if TYPE_CHECKING:

@@ -16,10 +16,12 @@ from flight_core.modes import Mode
 from flight_core.parameters import require
 from flight_core.rates import seconds
 from flight_core.vectors import FloatArray, StampedVector, require_newer, require_not_future
-from rise_di_controller import divergence, guard, internals, samples
-from rise_di_controller.control_law import TunedLaw
+from rise_di_controller import internals
+from rise_di_controller.guard import guard, samples
+from rise_di_controller.guard.probe import EffectTest
+from rise_di_controller.law.control_law import TunedLaw
+from rise_di_controller.learning import divergence
 from rise_di_controller.params import ControllerConfig, as_controller
-from rise_di_controller.probe import EffectTest
 
 
 class ControlOutput(NamedTuple):

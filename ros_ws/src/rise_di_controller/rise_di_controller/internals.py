@@ -10,8 +10,8 @@ from enum import IntEnum
 import numpy as np
 
 from flight_core.vectors import FloatArray
-from rise_di_controller.control_law import ControlLaw, field_names, fields
-from rise_di_controller.guard import ControllerState, GuardParams, TickInputs
+from rise_di_controller.guard.guard import ControllerState, GuardParams, TickInputs
+from rise_di_controller.law.control_law import ControlLaw, field_names, fields
 
 SCALARS = ("mode", "dt", "y_m_offset", "late", "age", "number", "parameters")
 OUTPUT_GROUPS = ("y", "y_m", "e")

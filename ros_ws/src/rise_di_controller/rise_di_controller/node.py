@@ -40,9 +40,15 @@ from flight_ros.topics import (
 )
 from rise_di_controller.controller import Controller, ControlOutput
 from rise_di_controller.laws import AnyLaw
-from rise_di_controller.learned_channels import authority_names
+from rise_di_controller.learning.learned_channels import authority_names
+from rise_di_controller.learning.proposals import (
+    AUTHORITY_TICKS,
+    Event,
+    EventKind,
+    Learning,
+    Proposal,
+)
 from rise_di_controller.params import ControllerConfig
-from rise_di_controller.proposals import AUTHORITY_TICKS, Event, EventKind, Learning, Proposal
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 LONG_MAX_AGE = 1.0  # s, from which a failsafe is named as late

@@ -32,20 +32,36 @@ from flight_core.parameters import (
 )
 from flight_core.rates import divide, nanoseconds, period_ns
 from flight_core.vectors import FloatArray, selection_matrix
-from rise_di_controller import internals, samples
-from rise_di_controller.control_law import ControlLaw, Measurements, TunedLaw, fields
-from rise_di_controller.feedforward import (
+from rise_di_controller import internals
+from rise_di_controller.extensions.feedforward import (
     LONGEST_PART,
     ZERO_REAL_PART,
     Nominal,
     zero_dynamics,
 )
-from rise_di_controller.guard import GuardParams
-from rise_di_controller.linear_loop import LinearPlant, Loop, is_stable, linear_law, spectral_radius
-from rise_di_controller.model_sections import AllocationConfig, FeedforwardConfig, ObserverConfig
-from rise_di_controller.observer import ObserverParams, filter_matrix, with_observer, without_frozen
-from rise_di_controller.probe import LARGEST, Probe, ProbeConfig
-from rise_di_controller.saturation import Limits
+from rise_di_controller.extensions.model_sections import (
+    AllocationConfig,
+    FeedforwardConfig,
+    ObserverConfig,
+)
+from rise_di_controller.extensions.observer import (
+    ObserverParams,
+    filter_matrix,
+    with_observer,
+    without_frozen,
+)
+from rise_di_controller.guard import samples
+from rise_di_controller.guard.guard import GuardParams
+from rise_di_controller.guard.probe import LARGEST, Probe, ProbeConfig
+from rise_di_controller.law.control_law import ControlLaw, Measurements, TunedLaw, fields
+from rise_di_controller.law.linear_loop import (
+    LinearPlant,
+    Loop,
+    is_stable,
+    linear_law,
+    spectral_radius,
+)
+from rise_di_controller.law.saturation import Limits
 
 # of the delay margin, where the nominal loop with an observer has to be stable
 MARGIN_PARTS = (0.0, 0.5, 1.0)

@@ -21,12 +21,8 @@ from flight_core.parameters import (
 )
 from flight_core.vectors import FloatArray
 from rise_di_controller import internals
-from rise_di_controller.control_law import ControlLaw, TunedLaw
-from rise_di_controller.feedforward import Nominal
-from rise_di_controller.guard import GuardParams
-from rise_di_controller.law import CONTROL_LAWS, LawParams, Sign, gain, total_lag
-from rise_di_controller.params import ControllerConfig
-from rise_di_controller.schedule import (
+from rise_di_controller.extensions.feedforward import Nominal
+from rise_di_controller.extensions.schedule import (
     OverSpeed,
     ScheduleParams,
     nominal_of,
@@ -36,6 +32,10 @@ from rise_di_controller.schedule import (
     side_by_side,
     with_schedule,
 )
+from rise_di_controller.guard.guard import GuardParams
+from rise_di_controller.law.control_law import ControlLaw, TunedLaw
+from rise_di_controller.law.law import CONTROL_LAWS, LawParams, Sign, gain, total_lag
+from rise_di_controller.params import ControllerConfig
 
 # s, over which a new observer runs before it flies: its disturbances then hold what the law held
 HISTORY = 5.0

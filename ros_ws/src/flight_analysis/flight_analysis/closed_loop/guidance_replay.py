@@ -19,8 +19,8 @@ from flight_guidance import guidance
 from flight_guidance.guidance_state import Begin, Commands, GuidanceState, Inputs
 from flight_guidance.notices import FAILED, LINK_AGE
 from flight_guidance.params import GuidanceConfig
-from flight_guidance.path import Route
-from flight_guidance.route_file import Waypoint
+from flight_guidance.routes.route_file import Waypoint
+from flight_guidance.steering.path import Route
 
 
 class GuidanceReplay(NamedTuple):

@@ -11,8 +11,8 @@ from flight_analysis.closed_loop.stations import ControllerStation, Topics
 from flight_core.modes import Mode
 from flight_core.vectors import FloatArray, StampedVector
 from rise_di_controller.controller import Controller
-from rise_di_controller.learned_channels import authority_names, outputs_without
-from rise_di_controller.proposals import AUTHORITY_TICKS, Learning, Proposal, designed
+from rise_di_controller.learning.learned_channels import authority_names, outputs_without
+from rise_di_controller.learning.proposals import AUTHORITY_TICKS, Learning, Proposal, designed
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 

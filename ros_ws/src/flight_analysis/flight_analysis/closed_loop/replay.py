@@ -24,7 +24,7 @@ from flight_log.log_content import StoredFile
 from flight_log.provenance import recorded_arithmetic
 from flight_log.stored_messages import parameter_changes
 from flight_log.tape_reader import RecordedRun, read_run
-from rise_di_controller.guard import ControllerState
+from rise_di_controller.guard.guard import ControllerState
 from rise_di_controller.laws import AnyLaw
 from rise_di_controller.params import OF_NODE, ControllerConfig, as_controller
 

@@ -14,9 +14,11 @@ from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray, StampedVector
 from flight_log.flight_processes import controller_starts
-from rise_di_controller import feedforward, guard, internals
-from rise_di_controller.control_law import TunedLaw, restored
-from rise_di_controller.guard import ControllerState, GuardParams, Vanes
+from rise_di_controller import internals
+from rise_di_controller.extensions import feedforward
+from rise_di_controller.guard import guard
+from rise_di_controller.guard.guard import ControllerState, GuardParams, Vanes
+from rise_di_controller.law.control_law import TunedLaw, restored
 from rise_di_controller.laws import AnyLaw
 from rise_di_controller.params import ControllerConfig
 

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from aircraft_sim.airframe import load_airframe
+from aircraft_sim.airframes.airframe import load_airframe
 from aircraft_sim.params import AircraftConfig
 from aircraft_sim.pose import every
 from flight_core.arguments import FilePath, as_instance, as_path
@@ -20,11 +20,11 @@ from flight_core.files import dump_yaml, is_file, read_file
 from flight_core.parameters import Config, ParameterError, one_of, require, require_channels
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns
 from flight_core.scenario_file import A_SCENARIO, Sections, parse_sections
+from flight_guidance.fence.zones import described
 from flight_guidance.params import GuidanceConfig
-from flight_guidance.zones import described
 from flight_recorder.params import RecorderConfig
 from reference_model.params import ReferenceModelConfig
-from rise_di_controller.decomposition import DecompositionError, signs
+from rise_di_controller.law.decomposition import DecompositionError, signs
 from rise_di_controller.laws import AnyLaw
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di_config import RiseDiConfig

@@ -13,7 +13,7 @@ from flight_core.arguments import FilePath
 from flight_core.files import find_file, names_in, write_file, writing
 from flight_core.scenario_file import A_SCENARIO
 from flight_guidance.feasibility import speeds
-from flight_guidance.route_file import Waypoint
+from flight_guidance.routes.route_file import Waypoint
 
 LIBRARY = Path(str(files("flight_analysis"))) / "scenarios"
 

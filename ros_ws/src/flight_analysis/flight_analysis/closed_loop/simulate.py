@@ -27,8 +27,8 @@ from flight_core.vectors import ChannelError
 from flight_guidance.guidance import Guidance
 from flight_guidance.params import GuidanceConfig
 from rise_di_controller.controller import Controller
+from rise_di_controller.learning.proposals import Event, Learning
 from rise_di_controller.params import ControllerConfig
-from rise_di_controller.proposals import Event, Learning
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 Record = Callable[[Mapping[str, Signal]], None]

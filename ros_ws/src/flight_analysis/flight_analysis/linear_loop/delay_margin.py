@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from flight_core.vectors import FloatArray
-from rise_di_controller.linear_loop import LinearLaw, LinearPlant, Loop, is_stable
+from rise_di_controller.law.linear_loop import LinearLaw, LinearPlant, Loop, is_stable
 
 MAX_DELAY_MARGIN = 0.5
 """s, upper end of the search for a delay margin. A loop that tolerates more is slower than any loop

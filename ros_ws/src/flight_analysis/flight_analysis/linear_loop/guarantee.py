@@ -22,7 +22,7 @@ from flight_analysis.linear_loop.uncertain_loop import (
 from flight_analysis.linear_loop.worst_case import first_unstable, worst_in_box
 from flight_core.parameters import require
 from flight_core.vectors import FloatArray
-from rise_di_controller.linear_loop import Loop, closed_loop, is_stable
+from rise_di_controller.law.linear_loop import Loop, closed_loop, is_stable
 
 LARGEST = 0.99  # part of an entry up to which an unstable aircraft is sought
 WIDEST_DISK = 2.0  # a disk of 2 leaves 180 deg

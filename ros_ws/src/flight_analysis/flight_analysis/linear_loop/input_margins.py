@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flight_core.vectors import FloatArray
-from rise_di_controller.linear_loop import (
+from rise_di_controller.law.linear_loop import (
     SPECTRAL_RADIUS_TOLERANCE,
     LinearLaw,
     LinearPlant,

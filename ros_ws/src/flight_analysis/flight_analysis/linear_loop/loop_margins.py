@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from aircraft_sim.airframe import Airframe, load_airframe
+from aircraft_sim.airframes.airframe import Airframe, load_airframe
 from aircraft_sim.uncertainty import UNIFORM, Spread, drawn_places, nominal_and_sampled
 from flight_analysis.closed_loop.scenario import Scenario, as_scenario
 from flight_analysis.linear_loop.delay_margin import MAX_DELAY_MARGIN, delay_margin
@@ -18,8 +18,8 @@ from flight_analysis.linear_loop.worst_case import worst_in_box
 from flight_core.arguments import as_count, as_number
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
-from rise_di_controller.law import Sign
-from rise_di_controller.linear_loop import (
+from rise_di_controller.law.law import Sign
+from rise_di_controller.law.linear_loop import (
     SPECTRAL_RADIUS_TOLERANCE,
     LinearLaw,
     LinearPlant,

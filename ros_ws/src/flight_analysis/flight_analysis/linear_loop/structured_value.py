@@ -17,7 +17,7 @@ import numpy as np
 
 from flight_analysis.linear_loop.uncertain_loop import Channels, ComplexArray
 from flight_core.vectors import FloatArray
-from rise_di_controller.linear_loop import SPECTRAL_RADIUS_TOLERANCE
+from rise_di_controller.law.linear_loop import SPECTRAL_RADIUS_TOLERANCE
 
 RADIUS = 1.0 + SPECTRAL_RADIUS_TOLERANCE  # abs(z) of the limit of stability
 

@@ -33,7 +33,7 @@ from flight_analysis.linear_loop.uncertain_loop import (
     uncertain_loop,
 )
 from flight_core.vectors import FloatArray
-from rise_di_controller.linear_loop import (
+from rise_di_controller.law.linear_loop import (
     SPECTRAL_RADIUS_TOLERANCE,
     LinearLaw,
     LinearPlant,

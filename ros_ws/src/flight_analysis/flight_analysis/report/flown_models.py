@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from aircraft_sim.airframe import Airframe, load_airframe
+from aircraft_sim.airframes.airframe import Airframe, load_airframe
 from flight_analysis.closed_loop.replay_ticks import Change, vary
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.linear_loop.loop_margins import (

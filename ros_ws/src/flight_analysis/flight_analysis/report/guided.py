@@ -17,6 +17,7 @@ from flight_core.outcome import End
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
+from flight_guidance.fence.zones import clearance
 from flight_guidance.guidance import WIND
 from flight_guidance.guidance_state import (
     LATERAL,
@@ -27,8 +28,7 @@ from flight_guidance.guidance_state import (
 )
 from flight_guidance.notices import FAILED, LINK_AGE, Notice
 from flight_guidance.params import GuidanceConfig
-from flight_guidance.path import Route, is_orbit, leg_places, lengths_after, route_outline
-from flight_guidance.zones import clearance
+from flight_guidance.steering.path import Route, is_orbit, leg_places, lengths_after, route_outline
 
 UNITS: Mapping[str, str] = {
     **dict.fromkeys(("phi", "theta", "heading", "course"), "rad"),

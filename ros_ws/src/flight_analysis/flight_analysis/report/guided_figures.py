@@ -29,10 +29,10 @@ from flight_analysis.report.plotting import (
 from flight_core.modes import Mode as ControllerMode
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
-from flight_guidance.fence import Fence
+from flight_guidance.fence.fence import Fence
 from flight_guidance.guidance_state import Lateral, Mode, Vertical
-from flight_guidance.path import Route, leg_places, route_outline
-from flight_guidance.wind import wind_of
+from flight_guidance.steering.path import Route, leg_places, route_outline
+from flight_guidance.steering.wind import wind_of
 
 TRACK_POINTS = 2400
 TRACK_HEIGHT = 560  # pixels

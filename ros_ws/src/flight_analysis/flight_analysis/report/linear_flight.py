@@ -14,9 +14,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from aircraft_sim import dynamics
-from aircraft_sim.airframe import Airframe
+from aircraft_sim.airframes.airframe import Airframe
 from aircraft_sim.params import AircraftConfig
+from aircraft_sim.plant import dynamics
 from flight_analysis.linear_loop.loop_margins import (
     distribution,
     is_literal,
@@ -30,7 +30,7 @@ from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray
-from rise_di_controller.linear_loop import (
+from rise_di_controller.law.linear_loop import (
     SPECTRAL_RADIUS_TOLERANCE,
     LinearLaw,
     LinearPlant,

@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from aircraft_sim.jsbsim_files import model_files
+from aircraft_sim.jsbsim.jsbsim_files import model_files
 from aircraft_sim.uncertainty import as_yaml
 from flight_analysis.closed_loop.replay import recorded_changes
 from flight_analysis.closed_loop.scenario import (

@@ -14,7 +14,7 @@ with e of the linear loop by `linear_flight.error_pair`. The floor is
 - SPEED_PART of the trim speed where the model of the aircraft is unknown, and with it the drag;
 - the least errors of a divergence, 0.1 rad/s and 1 m/s, where the wind is unknown.
 
-A controller keeps a learned model below the least errors (`rise_di_controller.divergence`).
+`rise_di_controller.learning.divergence` keeps a learned model below the least errors.
 """
 
 from typing import NamedTuple
@@ -31,8 +31,8 @@ from flight_core.rates import seconds
 from flight_core.tape import Signal, Tape
 from flight_core.units import SPEED, quantity
 from flight_core.vectors import FloatArray
-from rise_di_controller.divergence import HARMLESS, LEAST, LEAST_RATE, WINDOW, period
 from rise_di_controller.internals import Saturation
+from rise_di_controller.learning.divergence import HARMLESS, LEAST, LEAST_RATE, WINDOW, period
 from rise_di_controller.params import ControllerConfig
 
 FACTOR = 2.0
@@ -47,7 +47,7 @@ END = 1.0
 """s, length of the end of a flight: an error that grows is larger there than over WINDOW."""
 
 SPEED_PART = 0.05
-"""Of the trim speed: guidance keeps V by the climb beyond (`flight_guidance.protection`)."""
+"""Of the trim speed. Beyond, `flight_guidance.steering.protection` keeps V by the climb."""
 
 SATURATED = 0.5  # of the ticks: a stable loop of the osprey has 0.14 at most in moderate gusts
 SIDE = 0.1  # of the ticks, on either side

@@ -16,12 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eig, eigvals, qr
 
-from aircraft_sim.airframe import Airframe, airframes, load_airframe
+from aircraft_sim.airframes.airframe import Airframe, airframes, load_airframe
 from flight_core.arguments import FilePath
 from flight_core.parameters import require
 from flight_core.vectors import FloatArray
 from flight_design.gains.effectors import LAW_INPUT
-from rise_di_controller.decomposition import (
+from rise_di_controller.extensions.feedforward import ZERO_REAL_PART
+from rise_di_controller.law.decomposition import (
     MANY,
     DecompositionError,
     Pairing,
@@ -30,7 +31,6 @@ from rise_di_controller.decomposition import (
     search,
     signs,
 )
-from rise_di_controller.feedforward import ZERO_REAL_PART
 
 ComplexArray = NDArray[np.complex128]
 

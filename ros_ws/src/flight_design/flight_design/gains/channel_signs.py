@@ -9,7 +9,7 @@ import numpy as np
 from flight_core.parameters import ParameterError, require
 from flight_core.vectors import FloatArray
 from flight_design.gains.ideal_control import ChannelPairing
-from rise_di_controller.decomposition import MANY, DecompositionError, coupling, search, signs
+from rise_di_controller.law.decomposition import MANY, DecompositionError, coupling, search, signs
 
 MAX_COUPLING = 10.0
 """Upper bound of max abs(U - I) for a pairing of inputs and outputs. The value is 25 on the

@@ -9,10 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from aircraft_sim.airframe import Airframe
+from aircraft_sim.airframes.airframe import Airframe
 from flight_core.parameters import require
 from flight_core.vectors import FloatArray
-from rise_di_controller.model_sections import AllocationConfig
+from rise_di_controller.extensions.model_sections import AllocationConfig
 
 LAW_INPUT = "v_"  # begin of the name of an input of the law: v_q is that of the output q
 DIGITS = 10  # of T and effect in a file: their product is I to 1e-9

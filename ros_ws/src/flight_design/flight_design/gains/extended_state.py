@@ -10,7 +10,7 @@ import numpy as np
 
 from control_laws.observer_design import ExtendedStateWeights
 from flight_core.vectors import FloatArray
-from rise_di_controller.model_sections import FeedforwardConfig
+from rise_di_controller.extensions.model_sections import FeedforwardConfig
 from rise_di_controller.params import ControllerConfig
 
 EXTENDED_STATE_PRODUCTS: Mapping[str, tuple[float, ...]] = {

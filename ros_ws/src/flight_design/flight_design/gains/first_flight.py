@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from aircraft_sim.airframe import Airframe
+from aircraft_sim.airframes.airframe import Airframe
 from flight_core.parameters import require
 from flight_core.units import ANGLE, ANGULAR_RATE, GRAVITY, SPEED, quantity
 from flight_design.gains import gain_yaml
@@ -27,9 +27,9 @@ from flight_design.gains.gain_selection import (
     CROSSOVER_LAG_PRODUCTS,
     DEFAULT_CROSSOVER_LAG_PRODUCT,
 )
-from rise_di_controller.decomposition import search
-from rise_di_controller.linear_loop import Loop
-from rise_di_controller.model_sections import AllocationConfig
+from rise_di_controller.extensions.model_sections import AllocationConfig
+from rise_di_controller.law.decomposition import search
+from rise_di_controller.law.linear_loop import Loop
 
 # s, servos and engine of a light aircraft, assumed
 SURFACE_LAG = 0.05

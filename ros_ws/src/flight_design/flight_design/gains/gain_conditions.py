@@ -7,7 +7,7 @@ both.
 The theorem's conditions are sufficient, not necessary, and they contain no actuator.
 `theorem_gains` meets them all; behind servos its result is unstable. `engineering_gains` starts
 from the lag of the loop. `check` evaluates the theorem's conditions on a gain set, `check_loop`
-those of the loop. `rise_di_controller.linear_loop` has the linear loop and its delay margin.
+those of the loop. `rise_di_controller.law.linear_loop` has the linear loop and its delay margin.
 
 The crossover lag product of a channel is its bandwidth times the lag of its loop, in rad. It is the
 phase that the lag costs at the crossover: 57.3 degrees times the product. A loop that integrates
@@ -26,10 +26,10 @@ import numpy as np
 
 from flight_core.parameters import require
 from flight_core.vectors import FloatArray
-from rise_di_controller import law
-from rise_di_controller.decomposition import decompose
-from rise_di_controller.law import MIN_GAIN, LawParams, Sign
-from rise_di_controller.linear_loop import Loop
+from rise_di_controller.law import law
+from rise_di_controller.law.decomposition import decompose
+from rise_di_controller.law.law import MIN_GAIN, LawParams, Sign
+from rise_di_controller.law.linear_loop import Loop
 
 MIN_K = 1.5
 """1/s, lower bound of K, since (22) requires K > 1. A slower channel gets this K and a smaller

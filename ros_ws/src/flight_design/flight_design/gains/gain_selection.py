@@ -18,7 +18,7 @@ from typing import Generic, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from aircraft_sim.airframe import Airframe
+from aircraft_sim.airframes.airframe import Airframe
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.linear_loop.loop_margins import (
     LinearLoop,
@@ -46,10 +46,10 @@ from flight_design.gains.requirement import (
     conditions,
     within_requirement,
 )
-from rise_di_controller.decomposition import DecompositionError, signs
-from rise_di_controller.law import Sign
-from rise_di_controller.linear_loop import Loop, is_stable
-from rise_di_controller.model_sections import FeedforwardConfig
+from rise_di_controller.extensions.model_sections import FeedforwardConfig
+from rise_di_controller.law.decomposition import DecompositionError, signs
+from rise_di_controller.law.law import Sign
+from rise_di_controller.law.linear_loop import Loop, is_stable
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di_config import RiseDiConfig
 

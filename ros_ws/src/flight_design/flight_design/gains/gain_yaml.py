@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jinja2 import Environment, StrictUndefined, Template
 
-from aircraft_sim.airframe import Airframe
+from aircraft_sim.airframes.airframe import Airframe
 from flight_analysis.linear_loop.loop_margins import LoopMargins, law_order
 from flight_core.arguments import as_instance
 from flight_core.files import parse_yaml
@@ -18,13 +18,13 @@ from flight_core.text import printable
 from flight_core.vectors import FloatArray
 from flight_design.gains.gain_conditions import Condition
 from flight_design.gains.gain_selection import Selection, response
-from rise_di_controller.law import Sign
-from rise_di_controller.model_sections import (
+from rise_di_controller.extensions.model_sections import (
     AllocationConfig,
     FeedforwardConfig,
     ObserverConfig,
     VanesConfig,
 )
+from rise_di_controller.law.law import Sign
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di_config import RiseDiConfig
 

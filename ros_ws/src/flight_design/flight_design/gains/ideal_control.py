@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from aircraft_sim import dynamics
-from aircraft_sim.airframe import Airframe
-from aircraft_sim.disturbance import Gusts
-from aircraft_sim.dynamics import Aircraft
+from aircraft_sim.airframes.airframe import Airframe
+from aircraft_sim.atmosphere.disturbance import Gusts
+from aircraft_sim.plant import dynamics
+from aircraft_sim.plant.dynamics import Aircraft
 from aircraft_sim.sections import Gust
 from aircraft_sim.uncertainty import nominal_and_sampled
 from flight_analysis.closed_loop.scenario import Scenario
@@ -24,7 +24,7 @@ from flight_design.gains.airframe_properties import fastest_zero, output_coordin
 from reference_model import model
 from reference_model.command import command
 from reference_model.params import ReferenceModelConfig
-from rise_di_controller.feedforward import ZERO_REAL_PART
+from rise_di_controller.extensions.feedforward import ZERO_REAL_PART
 
 STEP = 0.01
 """s, step of the ideal control. It resolves a gust of one second and hidden modes up to 10 1/s to

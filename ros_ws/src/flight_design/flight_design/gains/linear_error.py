@@ -10,7 +10,7 @@ import numpy as np
 from flight_analysis.linear_loop.loop_margins import LinearLoop
 from flight_core.vectors import FloatArray
 from flight_design.gains.ideal_control import STEP
-from rise_di_controller.linear_loop import (
+from rise_di_controller.law.linear_loop import (
     LinearLaw,
     LinearPlant,
     Loop,

@@ -15,13 +15,13 @@ from typing import NamedTuple
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
 
-from aircraft_sim import dynamics
+from aircraft_sim.plant import dynamics
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_core.integrators import rk4
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
-from rise_di_controller.decomposition import decompose
-from rise_di_controller.law import LawParams, Sign, engage, step
+from rise_di_controller.law.decomposition import decompose
+from rise_di_controller.law.law import LawParams, Sign, engage, step
 
 
 class KnownPlant(NamedTuple):

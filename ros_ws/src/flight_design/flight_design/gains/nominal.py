@@ -6,12 +6,12 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from aircraft_sim.airframe import Airframe
+from aircraft_sim.airframes.airframe import Airframe
 from aircraft_sim.uncertainty import KINEMATIC
 from control_laws.nominal_model import NominalModel
 from flight_core.units import LENGTH, SPEED, quantity
 from flight_core.vectors import FloatArray
-from rise_di_controller.linear_loop import Loop
+from rise_di_controller.law.linear_loop import Loop
 
 SIZES = {SPEED: 1.0, LENGTH: 1.0}  # m/s, m: the units of states in weights, "sizes"
 ANGLE_SIZE = 0.1  # rad (/s), and of states without a dimension

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from aircraft_sim.turbulence import MODERATE, dryden
+from aircraft_sim.atmosphere.turbulence import MODERATE, dryden
 from control_laws.nominal_model import NominalModel
 from control_laws.observer_design import Weights
 from flight_core.arguments import as_numbers

@@ -40,9 +40,15 @@ from flight_design.gains.requirement import (
     fractions,
     nominal_conditions,
 )
-from rise_di_controller.control_law import TunedLaw
-from rise_di_controller.law import MIN_GAIN, gain
-from rise_di_controller.linear_loop import (
+from rise_di_controller.extensions.model_sections import (
+    FeedforwardConfig,
+    ObserverConfig,
+    VanesConfig,
+)
+from rise_di_controller.extensions.observer import without_frozen
+from rise_di_controller.law.control_law import TunedLaw
+from rise_di_controller.law.law import MIN_GAIN, gain
+from rise_di_controller.law.linear_loop import (
     LinearLaw,
     LinearPlant,
     Loop,
@@ -50,8 +56,6 @@ from rise_di_controller.linear_loop import (
     linear_law,
     spectral_radius,
 )
-from rise_di_controller.model_sections import FeedforwardConfig, ObserverConfig, VanesConfig
-from rise_di_controller.observer import without_frozen
 from rise_di_controller.rise_di_config import RiseDiConfig, SpeedConfig
 
 MOVES = Moves(mending=((1,),), cheaper=((-1,), (1,)), begin=4, is_joint=True)

@@ -14,10 +14,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from aircraft_sim.airframe import Airframe
-from aircraft_sim.airspeed import at_speed
-from aircraft_sim.disturbance import AIR_STATE, AXES
-from aircraft_sim.turbulence import MODERATE, dryden, roll_gust
+from aircraft_sim.airframes.airframe import Airframe
+from aircraft_sim.airframes.airspeed import at_speed
+from aircraft_sim.atmosphere.disturbance import AIR_STATE, AXES
+from aircraft_sim.atmosphere.turbulence import MODERATE, dryden, roll_gust
 from aircraft_sim.uncertainty import nominal_and_sampled
 from control_laws.nominal_model import NominalModel
 from control_laws.observer_design import (
@@ -48,8 +48,8 @@ from flight_design.gains.observer_search import (
     least_error,
 )
 from flight_design.gains.requirement import OBSERVER_REQUIREMENT, Requirement
-from rise_di_controller.linear_loop import LinearPlant
-from rise_di_controller.model_sections import VanesConfig, require_signs
+from rise_di_controller.extensions.model_sections import VanesConfig, require_signs
+from rise_di_controller.law.linear_loop import LinearPlant
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di_config import RiseDiConfig
 

@@ -33,7 +33,7 @@ from flight_design.gains.constrained_search import (
 )
 from flight_design.gains.gain_conditions import Condition, failing
 from flight_design.gains.linear_error import linear_error
-from rise_di_controller.linear_loop import LinearLaw, LinearPlant
+from rise_di_controller.law.linear_loop import LinearLaw, LinearPlant
 from rise_di_controller.params import ControllerConfig
 
 Controller = TypeVar("Controller", bound=ControllerConfig)

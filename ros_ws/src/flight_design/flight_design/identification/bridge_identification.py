@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import yaml
 
-from aircraft_sim.airframe import Airframe
+from aircraft_sim.airframes.airframe import Airframe
 from autopilot_bridge.channel_map import to_channel
 from autopilot_bridge.map_rows import UNITS
 from autopilot_bridge.params import ChannelMap

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import yaml
 
-from aircraft_sim.airframe import Airframe
+from aircraft_sim.airframes.airframe import Airframe
 from aircraft_sim.uncertainty import nominal_and_sampled
 from autopilot_bridge.params import ChannelMap
 from flight_analysis.linear_loop.loop_margins import (
@@ -46,8 +46,8 @@ from flight_design.identification.bridge_identification import (
     motions,
 )
 from reference_model.params import ReferenceModelConfig
-from rise_di_controller.law import Sign
-from rise_di_controller.linear_loop import Loop
+from rise_di_controller.law.law import Sign
+from rise_di_controller.law.linear_loop import Loop
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 # s: u may cross from trim to its limit in that time, which bounds beta from below

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
-from aircraft_sim.airframe import Airframe
-from aircraft_sim.disturbance import AXES, ROTARY
-from aircraft_sim.turbulence import MODERATE, dryden, roll_gust
+from aircraft_sim.airframes.airframe import Airframe
+from aircraft_sim.atmosphere.disturbance import AXES, ROTARY
+from aircraft_sim.atmosphere.turbulence import MODERATE, dryden, roll_gust
 from control_laws import observer_design
 from control_laws.nominal_model import NominalModel
 from control_laws.observer_design import Names, ObserverModel, Weights
@@ -24,7 +24,7 @@ from flight_core.rates import NANOSECONDS
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
 from flight_design.gains.nominal import nominal_model, sizes
-from rise_di_controller.linear_loop import Loop
+from rise_di_controller.law.linear_loop import Loop
 
 # s at the begin of a recording whose innovations do not count: the filter starts from y alone
 TRANSIENT = 0.5

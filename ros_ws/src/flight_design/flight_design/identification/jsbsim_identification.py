@@ -13,8 +13,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from aircraft_sim.airframe import Airframe
-from aircraft_sim.jsbsim_aircraft import (
+from aircraft_sim.airframes.airframe import Airframe
+from aircraft_sim.atmosphere.turbulence import MODERATE_SIGMA
+from aircraft_sim.jsbsim.jsbsim_aircraft import (
     INPUTS,
     NONE,
     OUTPUTS,
@@ -22,10 +23,9 @@ from aircraft_sim.jsbsim_aircraft import (
     NamedProperties,
     require_aircraft,
 )
-from aircraft_sim.jsbsim_linearization import Linearization, linearize
-from aircraft_sim.jsbsim_trim import NOT_BALANCED, nearest_trim, trim_solution
+from aircraft_sim.jsbsim.jsbsim_linearization import Linearization, linearize
+from aircraft_sim.jsbsim.jsbsim_trim import NOT_BALANCED, nearest_trim, trim_solution
 from aircraft_sim.sections import Gust
-from aircraft_sim.turbulence import MODERATE_SIGMA
 from flight_analysis.closed_loop.scenario import Scenario, parse_scenario
 from flight_core.outcome import COMPLETED, FlightEnded
 from flight_core.parameters import ParameterError
@@ -61,8 +61,8 @@ from flight_design.identification.manoeuvre import (
 )
 from flight_design.identification.sketch import with_sketch
 from reference_model.params import ReferenceModelConfig
-from rise_di_controller.decomposition import coupling
-from rise_di_controller.law import total_lag
+from rise_di_controller.law.decomposition import coupling
+from rise_di_controller.law.law import total_lag
 from rise_di_controller.rise_di_config import LearnConfig, PriorConfig, RiseDiConfig
 
 CONTROL_RATE = 100.0

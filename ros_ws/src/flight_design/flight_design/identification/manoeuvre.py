@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from aircraft_sim.turbulence import HIGH, LOW, LOWEST, MODERATE_SIGMA, MODERATE_WIND
+from aircraft_sim.atmosphere.turbulence import HIGH, LOW, LOWEST, MODERATE_SIGMA, MODERATE_WIND
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import best_error, error_metrics, saturation_shares

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from aircraft_sim.airframe import Airframe
+from aircraft_sim.airframes.airframe import Airframe
 from aircraft_sim.uncertainty import AIR_RELATIVE, as_yaml, wind_factors
 from control_laws.nominal_model import NominalModel
 from flight_analysis.closed_loop.learning_loop import Entry

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from aircraft_sim.airframe import Airframe
+from aircraft_sim.airframes.airframe import Airframe
 from flight_analysis.closed_loop.learning_loop import Entry
 from flight_core.vectors import FloatArray
 from flight_design.gains.ideal_control import ChannelPairing

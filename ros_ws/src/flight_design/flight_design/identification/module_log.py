@@ -15,7 +15,8 @@ from flight_core.rates import NANOSECONDS, seconds
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray, StampedVector
 from flight_log.vehicle_tables import Table, VehicleLog
-from rise_di_controller import guard, internals
+from rise_di_controller import internals
+from rise_di_controller.guard import guard
 from rise_di_controller.params import ControllerConfig
 
 STATUS = "rise_di_status"

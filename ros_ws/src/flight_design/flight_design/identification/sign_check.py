@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from aircraft_sim.airframe import Airframe, load_airframe
+from aircraft_sim.airframes.airframe import Airframe, load_airframe
 from autopilot_bridge.map_rows import MOTIONS, UNITS, InputRow, OutputRow
 from autopilot_bridge.params import ChannelMap
 from flight_analysis.closed_loop.replay import recorded_parameters
@@ -25,7 +25,7 @@ from flight_design.identification.response_identification import (
     identify_response,
 )
 from flight_log.tape_reader import read_run
-from rise_di_controller.decomposition import signs
+from rise_di_controller.law.decomposition import signs
 
 OPEN_LOOP = "excitation"  # the law that does not use y
 

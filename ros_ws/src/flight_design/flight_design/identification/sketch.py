@@ -8,9 +8,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from aircraft_sim.airframe import AIRPLANE_STATES, Airframe
-from aircraft_sim.disturbance import AIR_STATE, AXES
-from aircraft_sim.jsbsim_aircraft import INPUTS
+from aircraft_sim.airframes.airframe import AIRPLANE_STATES, Airframe
+from aircraft_sim.atmosphere.disturbance import AIR_STATE, AXES
+from aircraft_sim.jsbsim.jsbsim_aircraft import INPUTS
 from aircraft_sim.uncertainty import KINEMATIC
 from flight_core.parameters import require
 from flight_core.units import GRAVITY

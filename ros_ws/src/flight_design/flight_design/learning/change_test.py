@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from aircraft_sim.airframe import Airframe
+from aircraft_sim.airframes.airframe import Airframe
 from control_laws.nominal_model import NominalModel
 from flight_core.vectors import FloatArray
 from flight_design.identification.innovation_filters import (

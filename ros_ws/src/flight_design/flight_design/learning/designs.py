@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from aircraft_sim.airframe import Airframe
+from aircraft_sim.airframes.airframe import Airframe
 from flight_analysis.closed_loop.learning_loop import Entry
 from flight_analysis.linear_loop.delay_margin import delay_margin
 from flight_analysis.linear_loop.input_margins import input_margins

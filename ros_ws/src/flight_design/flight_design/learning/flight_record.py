@@ -9,11 +9,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from aircraft_sim.airframe import Airframe
+from aircraft_sim.airframes.airframe import Airframe
 from flight_core.rates import nanoseconds, seconds
 from flight_core.vectors import FloatArray
 from flight_design.identification.innovation_filters import Recording
-from rise_di_controller import divergence
+from rise_di_controller.learning import divergence
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 # 1, rms of the airspeed about its mean in a record of one speed: effects of surfaces then vary by 4

@@ -16,8 +16,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from aircraft_sim.airframe import Airframe
-from aircraft_sim.airspeed import at_speed, exponents, level_flight
+from aircraft_sim.airframes.airframe import Airframe
+from aircraft_sim.airframes.airspeed import at_speed, exponents, level_flight
 from flight_analysis.closed_loop.learning_loop import Entry, LearnerResult
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import nanoseconds, seconds
@@ -66,8 +66,12 @@ from flight_design.learning.part_checks import (
     unproven,
     weaker,
 )
-from rise_di_controller.learned_channels import outputs_without, with_channels_of, without_models
-from rise_di_controller.proposals import UNVERIFIED
+from rise_di_controller.learning.learned_channels import (
+    outputs_without,
+    with_channels_of,
+    without_models,
+)
+from rise_di_controller.learning.proposals import UNVERIFIED
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 # entries at their bound: the right model may have one that hardly shows, wrong ones have two to six

@@ -30,7 +30,7 @@ from flight_ros.reports import Report
 from flight_ros.ticker import Tick
 from flight_ros.topics import INTERNALS, LEARNED, LOCKSTEP, PROPOSAL, RECORD_FOREIGN
 from rise_di_controller.internals import GIVEN_UP
-from rise_di_controller.proposals import Updates
+from rise_di_controller.learning.proposals import Updates
 
 PERIOD_NS = NANOSECONDS // 10
 NICE = 10  # of a search in real time, above the nodes of the loop: it takes a core for seconds

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from aircraft_sim.airframe import Airframe
+from aircraft_sim.airframes.airframe import Airframe
 from flight_analysis.closed_loop.learning_loop import Entry
 from flight_design.identification.likelihood import MAX_DELAY_ERROR, PRIOR
 from flight_design.identification.model_identification import Part

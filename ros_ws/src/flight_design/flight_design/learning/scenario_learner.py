@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from aircraft_sim.airframe import Airframe, load_airframe
-from aircraft_sim.jsbsim_aircraft import PREFIX
+from aircraft_sim.airframes.airframe import Airframe, load_airframe
+from aircraft_sim.jsbsim.jsbsim_aircraft import PREFIX
 from aircraft_sim.uncertainty import as_yaml
 from flight_analysis.closed_loop.learning_loop import Entry, Learn
 from flight_analysis.closed_loop.replay import recorded_changes, recorded_parameters
@@ -33,7 +33,7 @@ from flight_design.learning.designs import Goal, asked_margin
 from flight_design.learning.learner import Learner
 from flight_log.tape_reader import RecordedRun
 from rise_di_controller.internals import GIVEN_UP
-from rise_di_controller.proposals import Updates
+from rise_di_controller.learning.proposals import Updates
 from rise_di_controller.rise_di_config import LearnConfig, PriorConfig, RiseDiConfig
 
 

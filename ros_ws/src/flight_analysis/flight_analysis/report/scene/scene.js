@@ -13,8 +13,8 @@ const REVERSED = ["nose down", "roll left", "nose left"]; // motions by a positi
 const MAX_TRAIL = 1500; // points
 const MAX_GAP = 0.5; // s between two poses, above which nothing is interpolated
 const WRAPPED = new Set(["phi", "psi"]); // in (-pi, pi]
-export const ON_ROUTE = 4; // flight_guidance.modes.Lateral.ROUTE
-const IN_ORBIT = 3; // flight_guidance.modes.Lateral.ORBIT
+export const ON_ROUTE = 4; // flight_guidance.modes.modes.Lateral.ROUTE
+const IN_ORBIT = 3; // flight_guidance.modes.modes.Lateral.ORBIT
 const CLICK = 4; // px, that a pointer moves at most between down and up
 const MAX_WIND = 10; // m/s, drawn as one span
 

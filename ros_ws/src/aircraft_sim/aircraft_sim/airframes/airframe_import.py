@@ -1,0 +1,293 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Airframes from the models of other tools: python-control, SciPy, MATLAB, AVL, XFLR5, and matrices
+with named states.
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from aircraft_sim.airframes import identities
+from aircraft_sim.airframes.airframe import Airframe, load_airframe
+from aircraft_sim.airframes.model_readers import MOVES, Model, read_model
+from flight_core.parameters import ParameterError, one_of, require
+from flight_core.units import GRAVITY, in_si, quantity
+from flight_core.vectors import FloatArray
+
+Named = str | Mapping[str, Any] | Sequence[str]
+"""Names with units: "u: ft/s, w: ft/s", a dictionary, or a list of names of states in SI."""
+
+AIR = {"longitudinal": ("V", "u"), "lateral": ("beta", "v"), "vertical": ("alpha", "w")}
+"""By axis of the wind the states that measure motion relative to the air."""
+
+
+def import_airframe(
+    source: Any,
+    *,
+    name: str = "",
+    speed: str | float | None = None,
+    states: Named = (),
+    inputs: Named = (),
+    outputs: str | Sequence[str] = (),
+    thrust: bool = False,
+    text: str = "",
+    **body: str | float,
+) -> tuple[Airframe, str]:
+    """An airframe from the model of another tool, checked against physics, and a sentence on what
+    it was made of.
+
+    Args:
+        source: A state space of python-control or SciPy, or the path of a MATLAB file (.mat), of an
+            airframe file (.yaml), or of a text of AVL (system matrix, or stability derivatives) or
+            XFLR5 (state matrices).
+        name: Name of the airframe; empty: that of the file.
+        speed: Trim speed, a number in m/s or with a unit: "176 ft/s".
+        states: Names of the states in the order of A, with units: "u: ft/s, w: ft/s, q: rad/s,
+            theta: rad".
+        inputs: Names of the inputs in the order of B, with units and effects: "elevator: rad nose
+            down, thrust: 1 more thrust".
+        outputs: As many as inputs, or fewer: names of states or of rows of C with units ("V:
+            ft/s"), or sums: "q, V = 0.987 u + 0.163 w".
+            Empty: q, V, p, r by elevator, thrust, aileron, rudder.
+        thrust: Whether to add an input thrust in units of the weight along the flight path, for a
+            model without a thrust.
+        text: Where the figures come from.
+        body: mass, Ixx, Iyy, Izz, Ixz, density of the aircraft of AVL's derivatives, and its unit
+            of length, `length`.
+
+    Raises ParameterError with one sentence.
+    """
+    label = str(source) if isinstance(source, str | Path) else type(source).__name__
+    entered_speed = None if speed is None else in_si(speed, "speed", "m/s")
+    if isinstance(source, str | Path) and Path(source).suffix in {".yaml", ""}:
+        options = {"speed": speed, "states": states, "inputs": inputs, "outputs": outputs}
+        options |= {"thrust": thrust, "text": text, **body}
+        return _of_file(source, name, options), f"airframe file {label}"
+    named_states = _named(states, "states")
+    named_inputs = _named(inputs, "inputs")
+    model = read_model(source, named_states, named_inputs, entered_speed, body)
+    speed_used = entered_speed if entered_speed is not None else model.speed
+    if speed_used is None:
+        raise ParameterError("speed: found none, expected the trim speed, as 53.6 or 176 ft/s")
+    title = name or Path(label).stem
+    _check_identities(model, title, speed_used)
+    if thrust:
+        model = _with_thrust(model)
+    frame = _airframe(
+        model, title, speed_used, outputs, text or f"{model.note or 'matrices'} of {label}"
+    )
+    return frame, model.note or f"matrices of {label}"
+
+
+def _of_file(source: str | Path, name: str, options: Mapping[str, Any]) -> Airframe:
+    """The airframe of an airframe file, with another name unless empty; no option fits beside
+    the file.
+    """
+    for key, value in options.items():
+        require(not value, key, f"{value!r} beside an airframe file", "none: the file has it")
+    loaded = load_airframe(source)
+    return loaded.model_copy(update={"name": name}) if name else loaded
+
+
+def _named(names: Named, key: str) -> dict[str, Any]:
+    """Names and what is said of each; {} for none."""
+    if isinstance(names, str):
+        parts = [part.strip() for part in names.split(",")] if names.strip() else []
+        split = [(part.partition(":")[0].strip(), part.partition(":")[2].strip()) for part in parts]
+        require(len({name for name, _ in split}) == len(split), key, names, "each name once")
+        return dict(split)
+    if isinstance(names, Mapping):
+        return dict(names)
+    return dict.fromkeys(names, "")
+
+
+def _check_identities(model: Model, name: str, speed: float) -> None:
+    """Raise ParameterError for a model that breaks an identity of physics; trim speed in m/s."""
+    effects = {key: channel.get("positive", "") for key, channel in model.inputs.items()}
+    units = tuple(channel["unit"] for channel in model.inputs.values())
+    none = np.zeros_like(model.A)
+    identities.check(
+        identities.Model(name, model.states, effects, units, speed, model.A, model.B, none)
+    )
+
+
+def _with_thrust(model: Model) -> Model:
+    """The model with an input thrust: V_dot, or u_dot, = g, in units of the weight along the flight
+    path.
+    """
+    require(
+        "thrust" not in model.inputs, "thrust", "an input thrust in the model", "none to add one"
+    )
+    state = next((name for name in AIR["longitudinal"] if name in model.states), None)
+    if state is None:
+        raise ParameterError(f"thrust: found the states {', '.join(model.states)}, expected V or u")
+    column = np.zeros((len(model.A), 1))
+    column[list(model.states).index(state)] = GRAVITY / quantity(model.states[state]).si
+    channel = {"unit": "1", "positive": "more thrust, in units of the weight"}
+    D = None if model.D is None else np.hstack([model.D, np.zeros((len(model.D), 1))])
+    return model._replace(
+        inputs=model.inputs | {"thrust": channel}, B=np.hstack([model.B, column]), D=D
+    )
+
+
+def _airframe(
+    model: Model, name: str, speed: float, outputs: str | Sequence[str], source: str
+) -> Airframe:
+    names = list(model.states)
+    wanted = (
+        [part.strip() for part in outputs.split(",")]
+        if isinstance(outputs, str) and outputs
+        else list(outputs)
+    )
+    wanted = wanted or _default_outputs(model)
+    fewer = f"{len(model.inputs)} or fewer, as many as inputs or fewer"
+    require(0 < len(wanted) <= len(model.inputs), "outputs", ", ".join(wanted) or "none", fewer)
+    labels = model.outputs if model.C is not None and len(model.outputs) == len(model.C) else ()
+    rows, units = _rows_of_outputs(model, wanted, labels)
+    shown = list(rows)
+    selects = all(
+        output in names and np.array_equal(row, np.eye(len(names))[names.index(output)])
+        for output, row in rows.items()
+    )
+    values: dict[str, Any] = {
+        "name": name,
+        "source": source,
+        "speed": speed,
+        "states": model.states,
+        "inputs": {
+            key: channel | {"positive": channel.get("positive") or _effect(model, key)}
+            for key, channel in model.inputs.items()
+        },
+        "outputs": shown,
+        "A": model.A.tolist(),
+        "B": model.B.tolist(),
+    }
+    if not selects:
+        values |= {"C": np.array([*rows.values()]).tolist(), "output_units": units}
+    if model.D is not None and np.any(model.D):
+        used = [labels.index(output) for output in shown if output in labels] or list(
+            range(len(model.D))
+        )
+        values["D"] = model.D[used].tolist()
+    frame = Airframe.validate_mapping(values, f"airframe {name}")
+    return Airframe.validate_mapping(
+        frame.model_dump(exclude_defaults=True) | {"gusts": _gusts(frame)}, f"airframe {name}"
+    )
+
+
+def _rows_of_outputs(
+    model: Model, wanted: Sequence[str], labels: Sequence[str]
+) -> tuple[dict[str, FloatArray], dict[str, str]]:
+    """Rows of C by output, and units of the outputs that are no states; `labels` name the rows of
+    the model's own C.
+    """
+    names = list(model.states)
+    identity = np.eye(len(names))
+    own_C = model.C
+    if own_C is not None and np.array_equal(own_C, identity):
+        own_C = None
+    rows: dict[str, FloatArray] = {}
+    units = {}
+    for k, text in enumerate(wanted):
+        output, unit, row = _output(text, names)
+        require(output not in rows, "outputs", f"{output} twice", "each once")
+        if row is None and own_C is not None and output in labels:
+            row = own_C[labels.index(output)]
+        elif row is None and own_C is not None and not labels and len(own_C) == len(wanted):
+            row = own_C[k]
+        elif row is None:
+            if output not in names:
+                raise ParameterError(
+                    f"outputs: found {output!r}, expected {one_of(names, output)}, a row of C, "
+                    "or a sum: V = 0.99 u + 0.1 w"
+                )
+            row = identity[names.index(output)]
+        rows[output] = row
+        if output not in names:
+            terms = {model.states[names[j]] for j in np.flatnonzero(row)}
+            units[output] = unit or (terms.pop() if len(terms) == 1 else "")
+    return rows, units
+
+
+def _output(text: str, names: Sequence[str]) -> tuple[str, str, FloatArray | None]:
+    """Name, unit and row of C of an output: "q", "V: ft/s", "V = 0.987 u + 0.163 w"."""
+    name, equals, terms = (part.strip() for part in text.partition("="))
+    if not equals:
+        name, _, unit = (part.strip() for part in text.partition(":"))
+        return name, unit, None
+    row = np.zeros(len(names))
+    parts = re.findall(r"([-+]?)\s*(\d*\.?\d*(?:[eE][-+]?\d+)?)\s*\*?\s*([A-Za-z_]\w*)", terms)
+    spelled = "".join(f"{sign}{factor}{state}" for sign, factor, state in parts)
+    require(
+        spelled == re.sub(r"[\s*]", "", terms) != "",
+        "outputs",
+        repr(text),
+        "a sum of states, as V = 0.987 u + 0.163 w",
+    )
+    for sign, factor, state in parts:
+        require(state in names, "outputs", repr(text), f"states: {', '.join(names)}")
+        row[names.index(state)] += (-1.0 if sign == "-" else 1.0) * float(factor or 1.0)
+    return name, "", row
+
+
+def _default_outputs(model: Model) -> list[str]:
+    """q, V, p, r by elevator, thrust, aileron, rudder; V = u cos(alpha_0) + w sin(alpha_0) of body
+    axes, by u_dot = -W0 q.
+    """
+    outputs = []
+    for name in model.inputs:
+        output = MOVES[name][0] if name in MOVES else ""
+        if output == "V" and "V" not in model.states and {"u", "w", "q"} <= model.states.keys():
+            u, w, q = (list(model.states).index(state) for state in ("u", "w", "q"))
+            alpha = float(np.arctan2(-model.A[u, q], model.A[w, q]))
+            output = (
+                f"V = {np.cos(alpha):.6f} u {'-' if alpha < 0.0 else '+'} "
+                f"{abs(np.sin(alpha)):.6f} w"
+            )
+        require(
+            bool(output),
+            "outputs",
+            f"none beside the input {name}",
+            "an output for each input, as in q, V",
+        )
+        outputs.append(output)
+    return outputs
+
+
+def _effect(model: Model, name: str) -> str:
+    """What a positive value of an input does, from the sign of B."""
+    state, up, down = MOVES.get(name, ("", "", ""))
+    state = "u" if state == "V" and "V" not in model.states else state
+    if state not in model.states:
+        return "not stated"
+    value = model.B[list(model.states).index(state), list(model.inputs).index(name)]
+    return up if value > 0.0 else down if value < 0.0 else "not stated"
+
+
+def _gusts(frame: Airframe) -> dict[str, dict[str, float]]:
+    """What wind adds to x_dot, per w / V0: minus the column of the state that moves relative to the
+    air; not to angles, h.
+    """
+    A = frame.matrix_a()
+    names = list(frame.states)
+    gusts = {}
+    for axis, states in AIR.items():
+        state = next((state for state in states if state in names), None)
+        if state is not None:
+            per_speed = 1.0 if state in {"alpha", "beta"} else frame.speed
+            column = -A[:, names.index(state)] * per_speed
+            moved = {
+                name: float(f"{value:.6g}")
+                for name, value in zip(names, column, strict=True)
+                if value != 0.0
+            }
+            gusts[axis] = {
+                name: value
+                for name, value in moved.items()
+                if name not in {"theta", "phi", "psi", "h", "altitude"}
+            }
+    return gusts

@@ -1,0 +1,179 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""An airframe away from the trim speed: A, B and trim in level flight at the same altitude, by
+powers of the airspeed.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from aircraft_sim.airframes.airframe import Airframe
+from aircraft_sim.atmosphere.disturbance import ROTARY
+from aircraft_sim.plant.plant import OverAirspeed
+from flight_core.parameters import require
+from flight_core.vectors import FloatArray
+
+SPEED = "speed"
+INCIDENCE = "incidence"
+RATE = "rate"
+ANGLE = "angle"
+STATES: Mapping[str, str] = {
+    "V": SPEED,
+    "alpha": INCIDENCE,
+    "beta": INCIDENCE,
+    **dict.fromkeys(("p", "q", "r"), RATE),
+    **dict.fromkeys(("theta", "phi", "psi"), ANGLE),
+}
+"""Kinds of the states whose exponents are known, by name."""
+
+EXPONENTS: Mapping[str, Mapping[str, float]] = {
+    SPEED: {SPEED: 1.0, INCIDENCE: 2.0, RATE: 1.0, ANGLE: 0.0},
+    INCIDENCE: {SPEED: -2.0, INCIDENCE: 1.0, RATE: 0.0, ANGLE: -1.0},
+    RATE: {SPEED: 1.0, INCIDENCE: 2.0, RATE: 1.0, ANGLE: 0.0},
+    ANGLE: {SPEED: 0.0, INCIDENCE: 0.0, RATE: 0.0, ANGLE: 0.0},
+}
+"""Exponents of the ratio of airspeeds in the entries of A, by the kinds of row and column.
+
+In level flight lift is weight at any speed: alpha_dot = q - L / (m V) + g / V with L of V^2 about
+the trim, so A[alpha,V] is -2 g / V^2.
+"""
+
+OF_SURFACE = {SPEED: 2.0, INCIDENCE: 1.0, RATE: 2.0, ANGLE: 0.0}
+OF_THRUST = {SPEED: 0.0, INCIDENCE: -1.0, RATE: 0.0, ANGLE: 0.0}
+"""The same of B, by the kind of the row."""
+
+WIND_STATE = {
+    "longitudinal": SPEED,
+    "lateral": INCIDENCE,
+    "vertical": INCIDENCE,
+    **dict.fromkeys(ROTARY, RATE),
+}
+"""Kind of the state in which wind along an axis acts, relative to the air."""
+
+TRIM_STEPS = 20  # of the airspeed: the trim from 1 to 1.4 V0 is exact to 1e-4 of it
+# V / V0 of the trims of a simulated aircraft, linear in between
+SLOWEST = 0.5
+FASTEST = 2.0
+SPACING = 0.05
+
+
+class Exponents(NamedTuple):
+    """Exponents of the ratio of airspeeds in the entries of an airframe's matrices, SI."""
+
+    A: FloatArray  # (n, n)
+    B: FloatArray  # (n, p)
+    gravity: FloatArray  # (n, n)
+    wind: FloatArray  # (n, G)
+
+
+def exponents(airframe: Airframe, thrust: str) -> Exponents:
+    """The exponents for the input `thrust`. Raises ParameterError for a state whose exponents are
+    not known.
+    """
+    unknown = [name for name in airframe.states if name not in STATES]
+    require(
+        not unknown,
+        f"airframe {airframe.name}",
+        f"the states {', '.join(unknown)}",
+        f"some of {', '.join(STATES)}",
+    )
+    kinds = [STATES[name] for name in airframe.states]
+    n = len(kinds)
+    axes = [WIND_STATE[axis] for axis in airframe.gusts]
+    effects = [OF_THRUST if name == thrust else OF_SURFACE for name in airframe.inputs]
+    A = np.zeros((n, n))
+    B = np.zeros((n, len(effects)))
+    gravity = np.zeros((n, n))
+    wind = np.zeros((n, len(axes)))
+    for i, row in enumerate(kinds):
+        A[i] = [EXPONENTS[row][column] for column in kinds]
+        B[i] = [effect[row] for effect in effects]
+        gravity[i] = EXPONENTS[row][ANGLE]
+        wind[i] = [EXPONENTS[row][kind] - float(kind == INCIDENCE) for kind in axes]
+    return Exponents(A, B, gravity, wind)
+
+
+def at_speed(airframe: Airframe, ratio: float, thrust: str) -> Airframe:
+    """The airframe trimmed at `ratio` times its speed V0, shape and units as before.
+
+    Moments by an angle of incidence or by a surface grow with V^2, dampings with V, what a force
+    does to an angle of incidence with the force over V; thrust, gravity and kinematics stay, and so
+    does lift, the weight. Every entry is scaled by a power of the ratio: EXPONENTS, OF_SURFACE and
+    OF_THRUST for the input `thrust`. Wind acts by the new A. Derivatives are those of the trim: no
+    Mach number, none changes with C_L. Source: B. L. Stevens, F. L. Lewis, "Aircraft Control and
+    Simulation", 2.6, dimensional derivatives. Raises as `exponents`.
+    """
+    powers = exponents(airframe, thrust)
+    wind = ratio ** (powers.wind + 1.0)  # the file has the effect per w / V0
+    moved = airframe.with_matrices(
+        airframe.matrix_a() * ratio**powers.A, airframe.matrix_b() * ratio**powers.B, wind
+    )
+    gravity = [
+        {**term.model_dump(), "gain": term.gain * ratio ** EXPONENTS[STATES[term.into]][ANGLE]}
+        for term in airframe.gravity
+    ]
+    changed = {"speed": ratio * airframe.speed, "gravity": gravity}
+    return type(airframe).validate_mapping(
+        moved.model_dump() | changed, f"airframe {airframe.name}"
+    )
+
+
+def level_flight(airframe: Airframe, ratio: float, thrust: str) -> tuple[FloatArray, FloatArray]:
+    """Trim at `ratio` times V0 as deviations x, (n,), and u, (p,), from the trim at V0, SI.
+
+        (A + gravity) dx + B du = 0,
+            dx = dV, dalpha = dtheta in level flight, along the ratio from 1 on
+
+    with A, B of the airspeed and the least du where several inputs serve, in TRIM_STEPS steps.
+    Raises as `exponents`.
+    """
+    names = list(airframe.states)
+    powers = exponents(airframe, thrust)
+    width = (ratio - 1.0) / TRIM_STEPS
+    A = airframe.matrix_a()
+    gravity = airframe.matrix_gravity()
+    B = airframe.matrix_b()
+    faster = np.array([float(name == "V") for name in names])
+    higher = np.array([float(name in ("alpha", "theta")) for name in names])
+    x = np.zeros(len(names))
+    u = np.zeros(B.shape[1])
+    for k in range(TRIM_STEPS):
+        middle = 1.0 + width * (k + 0.5)
+        moved = A * middle**powers.A + gravity * middle**powers.gravity
+        dx = airframe.speed * width * faster
+        change = np.linalg.lstsq(
+            np.column_stack([moved @ higher, B * middle**powers.B]), -moved @ dx, rcond=None
+        )[0]
+        x = x + dx + change[0] * higher
+        u = u + change[1:]
+    return x, u
+
+
+def over_airspeed(airframe: Airframe, thrust: str) -> OverAirspeed:
+    """How matrices and trim of an airframe follow the airspeed. Raises as `exponents`, and without
+    V or a speed.
+    """
+    require(
+        "V" in airframe.states and airframe.speed > 0.0,
+        "over_airspeed",
+        f"{airframe.name} without V or speed",
+        "both",
+    )
+    require(
+        thrust in airframe.inputs,
+        "over_airspeed",
+        thrust,
+        f"an input: {', '.join(airframe.inputs)}",
+    )
+    ratio = np.arange(SLOWEST, FASTEST + SPACING / 2.0, SPACING)
+    trims = [level_flight(airframe, float(part), thrust) for part in ratio]
+    powers = exponents(airframe, thrust)
+    return OverAirspeed(
+        airframe.speed,
+        airframe.index("V"),
+        *powers,
+        ratio,
+        *map(np.array, zip(*trims, strict=True)),
+    )

@@ -1,0 +1,3 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Aircraft of JSBSim: files, trim, commands, flight and linearisation."""

@@ -1,0 +1,316 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Aircraft of JSBSim: names, channel tables, flight condition, wind. The import of JSBSim waits for
+the first use.
+
+JSBSim uses feet and normalised commands from stop to stop. u, y and truth are deviations from trim
+in SI. The tables INPUTS and STATES alone map between the two, with units and signs.
+"""
+
+import difflib
+import math
+import os
+import re
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+from xml.etree import ElementTree
+
+from aircraft_sim.airframes.airframe import Unit
+from aircraft_sim.atmosphere.disturbance import Gusts
+from aircraft_sim.atmosphere.turbulence import Turbulence
+from aircraft_sim.atmosphere.wind_field import RelativeWind
+from flight_core.parameters import ParameterError, require
+from flight_core.units import FOOT
+from flight_core.vectors import FloatArray
+
+# prefix of `airframe` in a scenario for an aircraft of JSBSim, as in jsbsim:c172p
+PREFIX = "jsbsim:"
+# environment: a folder with aircraft, engine and systems in place of the package's
+ROOT_VARIABLE = "JSBSIM_ROOT"
+# of the file of a model
+SUFFIX = ".xml"
+MODEL_ELEMENT = "fdm_config"
+
+
+class Command(NamedTuple):
+    """An input: a normalised command of JSBSim, unit 1."""
+
+    property: str
+    trim_property: str | None  # the trim's own part of the command; JSBSim limits the sum of both
+    lower: float  # end stops of the whole command
+    upper: float
+    each_engine: bool
+    positive: str  # the effect of a positive value, in models that follow JSBSim's convention
+    named: "NamedProperties" = ()  # by the user, in place of `property` and `trim_property`
+
+
+NamedProperties = tuple[tuple[str, float], ...]
+"""Properties of a model, and the value of each at the command 1; empty without rudder."""
+
+NONE = "none"
+
+
+# outside of JSBSim's settings
+PROPERTY = re.compile(r"(?!simulation/)[A-Za-z][\w-]*(\[\d+\])?(/[A-Za-z][\w-]*(\[\d+\])?)+")
+
+
+def named_properties(
+    commands: Mapping[str, str], key: str
+) -> tuple[tuple[str, NamedProperties], ...]:
+    """The user's own properties by input, of texts such as "fcs/cmdAilR_rad=0.5
+    fcs/cmdAilL_rad=-0.5".
+
+    The number is the property's value at the command 1, which is the default; "none" of a rudder
+    is a model without rudder. Raises ParameterError for an unknown input, for what is no property
+    of an aircraft, and for the value 0.
+    """
+    named = list[tuple[str, NamedProperties]]()
+    for name, text in commands.items():
+        require(name in INPUTS, key, repr(name), f"an input: {', '.join(INPUTS)}")
+        paths = []
+        if (name, text.strip()) == ("rudder", NONE):
+            named.append((name, ()))
+            continue
+        for word in text.split():
+            path, _, number = word.partition("=")
+            at_one = _number(number or "1")
+            fits = PROPERTY.fullmatch(path) is not None and math.isfinite(at_one) and at_one != 0.0
+            require(
+                fits,
+                f"{key}.{name}",
+                repr(word),
+                "PROPERTY=VALUE of the aircraft, as fcs/cmdElev_rad=0.5",
+            )
+            paths.append((path, at_one))
+        require(bool(paths), f"{key}.{name}", repr(text), "a property of the aircraft")
+        named.append((name, tuple(paths)))
+    return tuple(named)
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
+class Quantity(NamedTuple):
+    """A state: a property of JSBSim and the SI value of the unit."""
+
+    property: str
+    si: float
+    unit: Unit | None  # the display unit of an output, None for other states
+
+
+INPUTS: Mapping[str, Command] = {
+    "elevator": Command(
+        "fcs/elevator-cmd-norm", "fcs/pitch-trim-cmd-norm", -1.0, 1.0, False, "nose down"
+    ),
+    "throttle": Command("fcs/throttle-cmd-norm", None, 0.0, 1.0, True, "more thrust"),
+    "aileron": Command(
+        "fcs/aileron-cmd-norm", "fcs/roll-trim-cmd-norm", -1.0, 1.0, False, "roll right"
+    ),
+    "rudder": Command(
+        "fcs/rudder-cmd-norm", "fcs/yaw-trim-cmd-norm", -1.0, 1.0, False, "nose left"
+    ),
+}
+
+STATES: Mapping[str, Quantity] = {
+    "q": Quantity("velocities/q-rad_sec", 1.0, "rad/s"),  # FRD body axes, nose up +
+    "V": Quantity("velocities/vt-fps", FOOT, "m/s"),  # true airspeed
+    "p": Quantity("velocities/p-rad_sec", 1.0, "rad/s"),  # roll right +
+    "r": Quantity("velocities/r-rad_sec", 1.0, "rad/s"),  # nose right +
+    "alpha": Quantity("aero/alpha-rad", 1.0, None),
+    "theta": Quantity("attitude/theta-rad", 1.0, None),
+    "beta": Quantity("aero/beta-rad", 1.0, None),
+    "phi": Quantity("attitude/phi-rad", 1.0, None),
+    "altitude": Quantity("position/h-sl-ft", FOOT, None),
+}
+"""States x.* of `truth`, deviations from trim: the outputs in the order of y, then the rest."""
+
+OUTPUTS: Mapping[str, Unit] = {
+    name: quantity.unit for name, quantity in STATES.items() if quantity.unit is not None
+}
+
+RESIDUALS: Mapping[str, float] = {
+    "udot-ft_sec2": FOOT,
+    "vdot-ft_sec2": FOOT,
+    "wdot-ft_sec2": FOOT,
+    "pdot-rad_sec2": 1.0,
+    "qdot-rad_sec2": 1.0,
+    "rdot-rad_sec2": 1.0,
+}
+"""Accelerations that are zero in trim, with the SI value of their units."""
+
+
+class FlightCondition(NamedTuple):
+    """An aircraft of JSBSim in a flight condition: level, straight, gear up, engines running,
+    heading north, no wind.
+    """
+
+    name: str  # of the aircraft, without PREFIX, or the absolute path of its model
+    speed: float  # true airspeed, m/s
+    altitude: float  # above sea level, m
+    step_ns: int  # of the integration
+    named: tuple[tuple[str, NamedProperties], ...] = ()  # the user's own properties, by input
+
+    @property
+    def title(self) -> str:
+        """The aircraft's name in messages, with PREFIX."""
+        return f"{PREFIX}{self.name}"
+
+    def commands(self) -> dict[str, Command]:
+        """INPUTS, with the user's own properties."""
+        named = dict(self.named)
+        return {
+            name: command._replace(trim_property=None, named=named[name])
+            if named.get(name)
+            else command
+            for name, command in INPUTS.items()
+        }
+
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the inputs in the order of INPUTS, without a missing rudder."""
+        return tuple(INPUTS)[:-1] if ("rudder", ()) in self.named else tuple(INPUTS)
+
+    def paired_outputs(self) -> tuple[str, ...]:
+        """The outputs paired with `inputs`, in the order of OUTPUTS."""
+        return tuple(OUTPUTS)[: len(self.inputs())]
+
+
+class Trim(NamedTuple):
+    """A trimmed flight condition."""
+
+    commands: FloatArray  # (4,) whole commands in the order of INPUTS
+    lower: FloatArray  # (4,) end stops as deviations from them
+    upper: FloatArray  # (4,)
+    states: FloatArray  # (9,) in the order of STATES, SI
+    residuals: FloatArray  # (6,) remaining accelerations in the order of RESIDUALS, SI
+
+
+class WindModel(NamedTuple):
+    """Wind along the AXES of `disturbance`."""
+
+    gusts: Gusts
+    turbulence: Turbulence | None  # of one step; None without turbulence
+    over_place: RelativeWind | None = None  # None: the wind is the same everywhere
+
+
+@cache
+def aircraft_names() -> tuple[str, ...]:
+    """Names of the aircraft of JSBSim. Raises ParameterError where JSBSim is not installed."""
+    return tuple(
+        sorted(
+            path.parent.name
+            for path in (root() / "aircraft").glob("*/*.xml")
+            if path.stem == path.parent.name
+        )
+    )
+
+
+def root() -> Path:
+    """The folder with JSBSim's folders aircraft, engine and systems: $JSBSIM_ROOT, or in the
+    package jsbsim.
+
+    Raises ParameterError where JSBSim is not installed, and for a $JSBSIM_ROOT that is no such
+    folder.
+    """
+    try:
+        import jsbsim  # noqa: PLC0415 - other aircraft fly without it
+    except ModuleNotFoundError:
+        raise ParameterError(
+            "airframe: found no Python package jsbsim, expected it for an aircraft of JSBSim"
+        ) from None
+    chosen = os.environ.get(ROOT_VARIABLE)
+    if not chosen:
+        return Path(jsbsim.get_default_root_dir())
+    folder = Path(chosen).expanduser().absolute()
+    parts = ("aircraft", "engine")
+    require(
+        all((folder / part).is_dir() for part in parts),
+        ROOT_VARIABLE,
+        chosen,
+        f"a folder with {' and '.join(parts)}",
+    )
+    return folder
+
+
+def require_aircraft(airframe: str) -> str:
+    """Name of the aircraft in "jsbsim:NAME", or the absolute path of the model in "jsbsim:PATH".
+
+    PATH is the XML file of a model, or its folder; its text has a "/" or ends with ".xml". Raises
+    ParameterError, for a name with the closest known name, for a path with what is there.
+    """
+    name = airframe.removeprefix(PREFIX)
+    if "/" in name or name.endswith(SUFFIX):
+        return str(_model_file(Path(name).expanduser().absolute(), airframe))
+    near = difflib.get_close_matches(name, aircraft_names(), n=1, cutoff=0.4)
+    form = f"{PREFIX}PATH with a /, the XML file or the folder of your own"
+    near = [f"./{name}"] if Path(name).is_dir() else near
+    guess = f"{PREFIX}{near[0]} perhaps" if near else f"a name in {root() / 'aircraft'}"
+    require(name in aircraft_names(), "airframe", f"{airframe!r}", f"{guess}, or {form}")
+    return name
+
+
+def foreign_model(name: str) -> Path | None:
+    """The file of an aircraft's model that is not one of the package jsbsim: the user's own, or of
+    $JSBSIM_ROOT; else None.
+    """
+    if Path(name).is_absolute():
+        return Path(name)
+    return root() / "aircraft" / name / f"{name}{SUFFIX}" if os.environ.get(ROOT_VARIABLE) else None
+
+
+def root_of(model: Path) -> Path:
+    """The folder of the engines and systems of a model: $JSBSIM_ROOT, the ROOT of
+    ROOT/aircraft/NAME/NAME.xml, or the package.
+
+    JSBSim looks for the files of a model beside the model first.
+    """
+    folder = model.parents[min(2, len(model.parents) - 1)]
+    is_tree = (
+        not os.environ.get(ROOT_VARIABLE)
+        and model.parents[1].name == "aircraft"
+        and (folder / "engine").is_dir()
+    )
+    return folder if is_tree else root()
+
+
+def _model_file(path: Path, airframe: str) -> Path:
+    """The XML file of a model, from the path of the file or the folder. Raises ParameterError."""
+    expected = "the XML file of an aircraft of JSBSim (fdm_config), or its folder"
+    if not path.is_dir():
+        require(path.is_file(), "airframe", f"{airframe!r}, where no file is", expected)
+        element = _first_element(path)
+        require(
+            element == MODEL_ELEMENT,
+            "airframe",
+            f"{airframe!r}, a file with {element or 'no XML'}",
+            expected,
+        )
+        return path
+    named = path / f"{path.name}{SUFFIX}"
+    if named.is_file():
+        return _model_file(named, airframe)
+    models = sorted(
+        file for file in path.glob(f"*{SUFFIX}") if _first_element(file) == MODEL_ELEMENT
+    )
+    names = ", ".join(model.name for model in models) or "no model"
+    require(
+        len(models) == 1,
+        "airframe",
+        f"{airframe!r}, a folder with {names}",
+        f"a folder with one model, or {expected}",
+    )
+    return models[0]
+
+
+def _first_element(path: Path) -> str:
+    """Name of the first element of an XML file; "" for a file that is not XML."""
+    try:
+        _, element = next(ElementTree.iterparse(path, events=("start",)))  # noqa: S314 - no entity is in a first element
+        return str(element.tag)
+    except (ElementTree.ParseError, OSError, StopIteration, UnicodeError):
+        return ""

@@ -1,0 +1,192 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The commands of an aircraft of JSBSim: their properties, and the effect on the accelerations."""
+
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from itertools import chain
+from pathlib import Path
+from xml.etree import ElementTree
+
+import jsbsim
+import numpy as np
+
+from aircraft_sim.jsbsim.jsbsim_aircraft import RESIDUALS, Command
+from aircraft_sim.jsbsim.jsbsim_files import model_files
+from flight_core.vectors import FloatArray
+
+FROZEN: Mapping[str, float] = {
+    "simulation/integrator/rate/rotational": 0.0,  # the integration scheme: none
+    "simulation/integrator/rate/translational": 0.0,
+    "simulation/integrator/position/rotational": 0.0,
+    "simulation/integrator/position/translational": 0.0,
+    "propulsion/fuel_freeze": 1.0,
+}
+"""Properties that freeze position, velocity, attitude and fuel. Engines and flight control systems
+still run."""
+
+PART = 0.2  # of a command, moved to see the effect
+MOVED = 0.5  # s of frozen flight after it: an engine begins to respond
+AFTERWARDS = 10.0  # s: an engine returns
+# of the difference between two equal runs, of an engine that settles: a change beyond is an effect
+NOISE = 2.0
+SYSTEMS = ("flight_control", "autopilot", "system")
+CONVENTION = "-cmd-norm"  # at the end of JSBSim's own commands
+LEAST = 1e-6  # m/s^2, rad/s^2
+
+
+@contextmanager
+def frozen(fdm: jsbsim.FGFDMExec) -> Iterator[None]:
+    """Hold position, velocity, attitude and fuel, while the aircraft runs."""
+    before = {path: fdm[path] for path in FROZEN}
+    for path, value in FROZEN.items():
+        fdm[path] = value
+    try:
+        yield
+    finally:
+        for path, value in before.items():
+            fdm[path] = value
+
+
+def settle(fdm: jsbsim.FGFDMExec, duration: float) -> None:
+    """Run the frozen aircraft for `duration` s."""
+    with frozen(fdm):
+        for _ in range(round(duration / fdm.get_delta_t())):
+            fdm.run()
+
+
+def engine_count(fdm: jsbsim.FGFDMExec) -> int:
+    """Number of engines."""
+    return int(fdm.get_propulsion().get_num_engines())
+
+
+def command_paths(command: Command, engines: int) -> list[tuple[str, float]]:
+    """The properties of a command with the value of each at the command 1, a property per engine
+    for one of the engines.
+    """
+    if command.named:
+        return list(command.named)
+    return (
+        [(f"{command.property}[{i}]", 1.0) for i in range(engines)]
+        if command.each_engine
+        else [(command.property, 1.0)]
+    )
+
+
+def set_command(fdm: jsbsim.FGFDMExec, command: Command, value: float) -> None:
+    """Set the properties of a command."""
+    for path, at_one in command_paths(command, engine_count(fdm)):
+        fdm[path] = at_one * value
+
+
+def residuals(fdm: jsbsim.FGFDMExec) -> FloatArray:
+    """The accelerations in the order of RESIDUALS, SI."""
+    return np.array([fdm[f"accelerations/{name}"] * si for name, si in RESIDUALS.items()])
+
+
+def commands_and_limits(
+    fdm: jsbsim.FGFDMExec, inputs: Iterable[Command]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Whole commands, the trim's part included, and the distances to the lower and upper stops,
+    shapes (4,).
+    """
+    inputs = list(inputs)
+    first = [command_paths(command, 1)[0] for command in inputs]
+    commands = np.array([fdm[path] / at_one for path, at_one in first])
+    trim = np.array(
+        [0.0 if command.trim_property is None else fdm[command.trim_property] for command in inputs]
+    )
+    lower = np.array([command.lower for command in inputs])
+    upper = np.array([command.upper for command in inputs])
+    return (
+        commands + trim,
+        lower - np.minimum(commands, commands + trim),
+        upper - np.maximum(commands, commands + trim),
+    )
+
+
+def without_effect(fdm: jsbsim.FGFDMExec, commands: Mapping[str, Command]) -> list[str]:
+    """The inputs that move no acceleration of the frozen aircraft, whose engines run."""
+    return [
+        name
+        for name, command in commands.items()
+        if not _moves(
+            fdm,
+            command_paths(command, engine_count(fdm)),
+            -PART if fdm[_first(command)] > PART else PART,
+        )
+    ]
+
+
+def _first(command: Command) -> str:
+    return command_paths(command, 1)[0][0]
+
+
+def _moves(fdm: jsbsim.FGFDMExec, paths: Iterable[tuple[str, float]], part: float) -> bool:
+    """Whether properties move an acceleration by more than two equal runs differ."""
+    before = {path: fdm[path] for path, _ in paths}
+    runs = []
+    for moved in (0.0, 0.0, part):
+        for path, at_one in paths:
+            fdm[path] = before[path] + moved * at_one
+        settle(fdm, MOVED)
+        runs.append(residuals(fdm))
+    for path, value in before.items():
+        fdm[path] = value
+    settle(fdm, AFTERWARDS)
+    first, again, changed = runs
+    return bool(np.max(np.abs(changed - again)) > LEAST + NOISE * np.max(np.abs(again - first)))
+
+
+def sentence_without_effect(
+    fdm: jsbsim.FGFDMExec, commands: Mapping[str, Command], names: Iterable[str], model: Path | None
+) -> str:
+    """A sentence on inputs without effect: the properties that move nothing, and those that the
+    model reads.
+    """
+    parts = [
+        f"{name}: {' and '.join(path for path, _ in command_paths(commands[name], 1))}"
+        for name in names
+    ]
+    manager = fdm.get_property_manager()
+    read = (
+        [] if model is None else [path for path in _read_by_model(model) if manager.hasNode(path)]
+    )
+    acting = [path for path in read if _moves(fdm, [(path, 1.0)], PART)]
+    reads = (
+        f"; its flight control reads {', '.join(acting)}: name them in `commands`" if acting else ""
+    )
+    return f"{', '.join(parts)} moves no acceleration{reads}"
+
+
+def hysteresis_of(model: Path | None) -> str:
+    """The end of a sentence on a trim that fails, where servos of a model hold their output while a
+    command moves little; empty without such.
+    """
+    members = {} if model is None else model_files(model).members
+    if not any(b"<hysteresis_width>" in content for content in members.values()):
+        return ""
+    return "; servos of the model have a hysteresis_width, which hides a small command: remove it"
+
+
+def _read_by_model(model: Path) -> list[str]:
+    """The properties that the control systems of a model read or declare, and no component
+    writes.
+    """
+    read: set[str] = set()
+    written: set[str] = set()
+    for content in model_files(model).members.values():
+        tree = ElementTree.fromstring(content)  # noqa: S314 - model_files has read it
+        for element in chain.from_iterable(
+            section.iter() for section in tree.iter() if section.tag in SYSTEMS
+        ):
+            text = (element.text or "").strip()
+            if element.tag in {"input", "p", "property"}:
+                read.add(text.lstrip("-"))
+            elif element.tag == "output":
+                written.add(text)
+            elif name := element.get("name"):
+                written |= {name, f"fcs/{'-'.join(name.lower().split())}"}
+    return sorted(
+        path for path in read - written if path.startswith("fcs/") and not path.endswith(CONVENTION)
+    )

@@ -1,0 +1,251 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The files of a foreign model of JSBSim, found as JSBSim finds files, and what the model may not
+do.
+
+JSBSim loads a copy of these files alone. Sources: JSBSim 1.3, FGModelLoader.cpp (a name without
+".xml" gets it), FindFullPathName of FGModel, FGFCS and FGPropulsion (the folders),
+FGFDMExec::LoadModel (input and output), FGPropagate.cpp and FGLinearization.cpp (properties that
+write a file), sg_path.cxx (a backslash is a slash).
+"""
+
+import io
+import zipfile
+from collections.abc import Iterator, Mapping
+from itertools import chain
+from pathlib import Path, PurePosixPath
+from types import MappingProxyType
+from typing import NamedTuple
+from xml.etree import ElementTree
+from xml.parsers import expat
+from xml.sax.saxutils import quoteattr
+
+from aircraft_sim.jsbsim.jsbsim_aircraft import SUFFIX, root_of
+from flight_core.files import open_nonblocking
+from flight_core.parameters import ParameterError, require
+
+# sections of a model that open a socket or write a file; within a section they name properties
+LEFT_OUT = ("input", "output")
+CHILD = "child"  # a section with the name of a further model, which JSBSim does not support yet
+# properties of simulation/: JSBSim writes a file where one is set
+WRITERS = ("do_linearization", "write-state-file")
+
+ENGINE_FOLDERS = ("Engines", "engines", "Engine", "engine")
+FOLDERS: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {"engine": ENGINE_FOLDERS, "thruster": ENGINE_FOLDERS, "system": ("", "Systems", "systems")}
+)
+"""Folders beside the model in which JSBSim looks for the file of an element; "" is the folder of
+the model itself."""
+ROOT_FOLDERS: Mapping[str, str] = MappingProxyType(
+    {"engine": "engine", "thruster": "engine", "system": "systems"}
+)
+"""The folder of the root in which JSBSim looks next."""
+SECTIONS = frozenset(
+    {
+        "metrics",
+        "mass_balance",
+        "ground_reactions",
+        "external_reactions",
+        "buoyant_forces",
+        "propulsion",
+        "autopilot",
+    }
+    | {"flight_control", "aerodynamics", "planet"}
+)
+"""Further elements whose file JSBSim reads. An element with an attribute `file` beyond these needs
+no file."""
+
+
+MOST_BYTES = 16 << 20  # of a file: the largest of JSBSim's own has a third of a megabyte
+
+
+class ModelFiles(NamedTuple):
+    """A model and the named files, as a root of JSBSim."""
+
+    model: str  # its path in the root
+    # content by path: aircraft/NAME/ has what is beside the model, engine/ and systems/ the rest
+    members: Mapping[str, bytes]
+    left_out: tuple[str, ...]  # the sections that are not loaded, as <output name="x.csv">
+
+    def write(self, root: Path) -> Path:
+        """Write the files below a folder, the new root; the path of the model there."""
+        for name, content in self.members.items():
+            path = root / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(content)
+        return root / self.model
+
+    def archive(self) -> bytes:
+        """A zip file of the root, the same bytes for the same files. Unpacked,
+        jsbsim:FOLDER/aircraft/NAME flies the same.
+        """
+        content = io.BytesIO()
+        with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
+            for name, member in self.members.items():
+                archive.writestr(zipfile.ZipInfo(name), member, zipfile.ZIP_DEFLATED)
+        return content.getvalue()
+
+
+class _Place(NamedTuple):
+    """A file for JSBSim: the path in the new root, and the place of the source."""
+
+    member: str
+    path: Path
+
+
+def model_files(model: Path) -> ModelFiles:
+    """The files of a model that is not the package's.
+
+    Raises ParameterError for a file that is missing, cut short, or outside of the folders of the
+    model and its root, also through a link, for a child model, and for a property that writes a
+    file.
+    """
+    first = _Place(f"aircraft/{model.stem}/{model.name}", model)
+    members: dict[str, bytes] = {}
+    left_out: tuple[str, ...] = ()
+    waiting = [first]
+    missing = dict[str, str]()
+    while waiting:
+        place = waiting.pop()
+        if place.member in members:
+            continue
+        content = _content(place.path)
+        tree = _parsed(content, place.path)
+        _require_no_writer(tree, place.path)
+        if place == first:
+            left_out = _leave_out(tree, model)
+            content = (
+                ElementTree.tostring(tree, encoding="utf-8", xml_declaration=True)
+                if left_out
+                else content
+            )
+        members[place.member] = content
+        for element in tree.iter():
+            if (name := element.get("file")) and (
+                element.tag in ROOT_FOLDERS or element.tag in SECTIONS
+            ):
+                source = next(_places(model, element.tag, _relative(name, place.path)), None)
+                waiting += [] if source is None else [source]
+                missing |= {name: element.tag} if source is None else {}
+    if missing:
+        raise ParameterError(_sentence(model, missing))
+    return ModelFiles(first.member, dict(sorted(members.items())), left_out)
+
+
+def _places(model: Path, element: str, name: str) -> Iterator[_Place]:
+    """The files of a name in the folders of an element, in JSBSim's order. Raises ParameterError
+    for a link to elsewhere.
+    """
+    root = root_of(model)
+    folders = [
+        (f"aircraft/{model.stem}/{folder}", model.parent, folder)
+        for folder in FOLDERS.get(element, ("",))
+    ]
+    if (root_folder := ROOT_FOLDERS.get(element)) is not None:
+        folders.append((root_folder, root, root_folder))
+    for member, base, folder in folders:
+        path = base / folder / name
+        if path.is_file():
+            inside = path.resolve().is_relative_to(base.resolve())
+            require(
+                inside,
+                str(model),
+                f"the file {name}, a link to {path.resolve()}",
+                f"a file below {base}",
+            )
+            yield _Place(f"{member}/{name}".replace("//", "/"), path)
+
+
+def _relative(name: str, path: Path) -> str:
+    """The path of a named file with the suffix. Raises ParameterError where the path leaves the
+    folder.
+    """
+    plain = PurePosixPath(name.replace("\\", "/"))
+    inside = not plain.is_absolute() and ".." not in plain.parts
+    require(
+        inside, str(path), f"the file {name!r}", "one below the folder of the model, without .."
+    )
+    return str(plain).removesuffix(SUFFIX) + SUFFIX
+
+
+def _sentence(model: Path, missing: Mapping[str, str]) -> str:
+    """A sentence on missing files, by name with the element: the files of elements like the
+    first.
+    """
+    element = next(iter(missing.values()))
+    names = sorted(
+        {
+            name.removesuffix(SUFFIX)
+            for name, tag in missing.items()
+            if FOLDERS.get(tag) == FOLDERS.get(element)
+        }
+    )
+    folders = [str(model.parent / FOLDERS.get(element, ("",))[0])]
+    if (root_folder := ROOT_FOLDERS.get(element)) is not None:
+        folders.append(str(root_of(model) / root_folder))
+    return f"no {SUFFIX} of {', '.join(names)} is in {' or '.join(folders)}"
+
+
+def _content(path: Path) -> bytes:
+    try:
+        with open_nonblocking(path) as stream:
+            content = stream.read(MOST_BYTES + 1)
+    except OSError as error:
+        raise ParameterError(
+            f"{path}: cannot be read ({error.strerror}), expected a file of a model"
+        ) from None
+    require(
+        len(content) <= MOST_BYTES, str(path), f"more than {MOST_BYTES} bytes", "a file of a model"
+    )
+    return content
+
+
+def _parsed(content: bytes, path: Path) -> ElementTree.Element:
+    """The elements as JSBSim reads them: names as they stand, without namespaces. Raises
+    ParameterError.
+    """
+    builder = ElementTree.TreeBuilder()
+    parser = expat.ParserCreate()
+    parser.buffer_text = True
+    parser.StartElementHandler = builder.start
+    parser.EndElementHandler = builder.end
+    parser.CharacterDataHandler = builder.data
+    try:
+        parser.Parse(content, True)
+    except expat.ExpatError as error:
+        raise ParameterError(f"{path}: found XML with {error}, expected a whole file") from None
+    return builder.close()
+
+
+def _leave_out(tree: ElementTree.Element, model: Path) -> tuple[str, ...]:
+    """Remove the sections LEFT_OUT of a model; their texts. Raises ParameterError for a child
+    model.
+    """
+    require(
+        tree.find(CHILD) is None,
+        str(model),
+        "a child model",
+        "none: JSBSim does not support it yet",
+    )
+    sections = [section for section in tree if section.tag in LEFT_OUT]
+    for section in sections:
+        tree.remove(section)
+    return tuple(map(_start_tag, sections))
+
+
+def _start_tag(element: ElementTree.Element) -> str:
+    attributes = [f"{key}={quoteattr(text)}" for key, text in element.items()]
+    return f"<{' '.join([element.tag, *attributes])}>"
+
+
+def _require_no_writer(tree: ElementTree.Element, path: Path) -> None:
+    """Raise ParameterError for a property whose value JSBSim answers with a file."""
+    attributes = chain.from_iterable(element.attrib.values() for element in tree.iter())
+    text = "".join([*tree.itertext(), *attributes])
+    for name in WRITERS:
+        require(
+            name not in text,
+            str(path),
+            f"the property simulation/{name}, which writes a file",
+            "a model without it",
+        )

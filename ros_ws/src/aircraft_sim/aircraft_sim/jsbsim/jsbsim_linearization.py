@@ -1,0 +1,260 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Linearisation of an aircraft of JSBSim about its trim: an airframe, and the lags of its inputs.
+
+The derivatives are central differences of JSBSim's own accelerations in frozen flight, where
+engines and flight control systems run and the motion stands still.
+"""
+
+import math
+from typing import NamedTuple
+
+import jsbsim
+import numpy as np
+
+from aircraft_sim.airframes.airframe import AIRPLANE_STATES, Airframe
+from aircraft_sim.atmosphere.disturbance import AIR_STATE, AXES
+from aircraft_sim.atmosphere.wind_field import body_axes
+from aircraft_sim.jsbsim.jsbsim_aircraft import INPUTS, OUTPUTS, FlightCondition, Trim
+from aircraft_sim.jsbsim.jsbsim_aircraft import STATES as JSBSIM_STATES
+from aircraft_sim.jsbsim.jsbsim_commands import (
+    command_paths,
+    engine_count,
+    frozen,
+    residuals,
+    settle,
+)
+from aircraft_sim.jsbsim.jsbsim_trim import WIND, trim_solution, trimmed_fdm
+from flight_core.outcome import FlightEnded
+from flight_core.rates import seconds
+from flight_core.units import FOOT, GRAVITY
+from flight_core.vectors import FloatArray
+
+RATES = ("p", "q", "r")
+MOTION = 0.01  # rad/s of a rate, and wind over V0: small beside the tables of a model
+SIZES = (0.05, 0.1, 0.2)
+"""Steps of a command: the small ones stay linear, the large ones exceed a hysteresis and reach a
+rate limit."""
+MAX_STEP_FRACTION = 0.9  # upper bound of a step, as a fraction of the distance to the end stop
+SURFACE_TIME = 0.5  # s of frozen flight: long enough for flight control systems
+ENGINE_TIME = 20.0  # s: a turbine at altitude spools up in less
+STILL = 1e-6  # m/s^2, rad/s^2: an acceleration that a step does not move
+LEAST = 1e-6  # SI: an entry below it is rounding
+
+
+class Linearization(NamedTuple):
+    """An aircraft of JSBSim about its trim: an airframe, and what the steps of its inputs show."""
+
+    condition: FlightCondition  # without a rudder that moves nothing
+    trim: Trim
+    airframe: Airframe
+    lag: FloatArray  # (m,) s, of each input's own output, the longest of all sizes
+    size: FloatArray  # (m,) of the step with the largest effect, which counts
+    spread: FloatArray  # (m,) smallest effect of all sizes over the largest: 1 is linear
+    still: tuple[str, ...]  # steps without an effect, in sentences
+
+    @property
+    def Omega(self) -> FloatArray:  # noqa: N802 - the paper's name
+        """C B, (m, m), 1/s of the outputs per unit of a command."""
+        return np.asarray(self.airframe.matrix_c() @ self.airframe.matrix_b())
+
+    def travel(self) -> FloatArray:
+        """The distance of each input to its nearer end stop, (m,)."""
+        return np.minimum(-self.trim.lower, self.trim.upper)[: len(self.lag)]
+
+    def authority(self) -> FloatArray:
+        """y_dot of each output by its own input at the nearer end stop, (m,), SI."""
+        return np.abs(np.diag(self.Omega)) * self.travel()
+
+
+def linearize(condition: FlightCondition) -> Linearization:
+    """The linear aircraft about the trim of a flight condition.
+
+        x = (V, alpha, q, theta, beta, p, r, phi),  x_dot = A x + gravity sin(x) + B u + wind w
+        x_dot of V, alpha, beta: the accelerations in the axes of the flight path,
+            (cos a u_dot + sin a w_dot,  (cos a w_dot - sin a u_dot) / V,  v_dot / V),  a = alpha
+        column of V, alpha, beta = -(1, V, V) wind:  air forces see the difference to the wind
+        theta_dot = q,  phi_dot = p + tan(theta) r,  gravity: V_dot -= g sin(theta),
+            beta_dot += g cos(theta) / V sin(phi),  for the small bank of a trim
+        B_j = x_dot(t_end) / size,  lag_j = step + integral of 1 - x_dot(t) / x_dot(t_end)
+
+    u in normalised commands from trim, w along AXES in m/s, lags of the output that an input
+    drives. The step is JSBSim's: a command acts a step later. Attitude acts by gravity alone, and
+    altitude not at all. Raises FlightEnded without a trim, and for an output that its input does
+    not move.
+    """
+    solution = trim_solution(condition)
+    _, trim = trimmed_fdm(condition, solution)
+    steps = [_steps(condition, trim, name) for name in condition.inputs()]
+    if steps[-1] is None and condition.inputs()[-1] == "rudder":
+        steps = steps[:-1]
+        condition = condition._replace(named=(*condition.named, ("rudder", ())))
+    for name, step in zip(condition.inputs(), steps, strict=True):
+        if step is None:
+            raise FlightEnded(
+                f"{condition.title}: {driven(name)} does not respond to {name} within "
+                f"{_duration(name):g} s, by steps of {SIZES[0]:g} to {SIZES[-1]:g}"
+            )
+    moved = [step for step in steps if step is not None]
+    B = np.column_stack([step.effect for step in moved])
+    return Linearization(
+        condition=condition,
+        trim=trim,
+        airframe=_airframe(condition, trim, B),
+        lag=np.array([step.lag for step in moved]),
+        size=np.array([step.size for step in moved]),
+        spread=np.array([step.spread for step in moved]),
+        still=tuple(sentence for step in moved for sentence in step.still),
+    )
+
+
+def driven(name: str) -> str:
+    """The output that an input drives."""
+    return list(OUTPUTS)[list(INPUTS).index(name)]
+
+
+def _duration(name: str) -> float:
+    return ENGINE_TIME if INPUTS[name].each_engine else SURFACE_TIME
+
+
+class _Steps(NamedTuple):
+    """The steps of an input."""
+
+    effect: FloatArray  # (n,) column of B
+    lag: float
+    size: float
+    spread: float
+    still: tuple[str, ...]
+
+
+def _steps(condition: FlightCondition, trim: Trim, name: str) -> _Steps | None:
+    """The response to steps of an input both ways; None where its output does not move."""
+    output = driven(name)
+    place = list(INPUTS).index(name)
+    travel = MAX_STEP_FRACTION * float(min(-trim.lower[place], trim.upper[place]))
+    row = list(AIRPLANE_STATES).index(output)
+    responses = {}
+    still = []
+    for size in sorted({min(size, travel) for size in SIZES}):
+        ends = [_response(condition, trim, name, sign * size) for sign in (1.0, -1.0)]
+        response = (ends[0] - ends[1]) / (2.0 * size)
+        if abs(response[-1, row]) > STILL:
+            responses[size] = response
+        else:
+            still.append(f"{name} by {size:.3g}: {output} does not move")
+    if not responses:
+        return None
+    effects = {size: abs(float(response[-1, row])) for size, response in responses.items()}
+    size = max(effects, key=lambda key: effects[key])
+    period = seconds(condition.step_ns)
+    lags = [
+        period * (1.0 + float(np.sum(1.0 - response[:, row] / response[-1, row])))
+        for response in responses.values()
+    ]
+    return _Steps(
+        effect=responses[size][-1],
+        lag=max(*lags, 0.0),
+        size=size,
+        spread=min(effects.values()) / effects[size],
+        still=tuple(still),
+    )
+
+
+def _response(condition: FlightCondition, trim: Trim, name: str, size: float) -> FloatArray:
+    """x_dot at each step of frozen flight after a step of an input, (N, n)."""
+    fdm, _ = trimmed_fdm(condition, trim_solution(condition))
+    for path, at_one in command_paths(condition.commands()[name], engine_count(fdm)):
+        fdm[path] += at_one * size
+    count = round(_duration(name) / fdm.get_delta_t())
+    rows = np.zeros((count, len(AIRPLANE_STATES)))
+    with frozen(fdm):
+        for row in rows:
+            fdm.run()
+            row[:] = _x_dot(fdm, condition, trim)
+    return rows
+
+
+def _x_dot(fdm: jsbsim.FGFDMExec, condition: FlightCondition, trim: Trim) -> FloatArray:
+    """The derivatives from the accelerations, (n,); 0 of the attitude."""
+    u_dot, v_dot, w_dot, p_dot, q_dot, r_dot = residuals(fdm)
+    alpha = _trim_state(trim, "alpha")
+    along = math.cos(alpha) * u_dot + math.sin(alpha) * w_dot
+    across = math.cos(alpha) * w_dot - math.sin(alpha) * u_dot
+    V = condition.speed
+    return np.array([along, across / V, q_dot, 0.0, v_dot / V, p_dot, r_dot, 0.0])
+
+
+def _trim_state(trim: Trim, name: str) -> float:
+    return float(trim.states[list(JSBSIM_STATES).index(name)])
+
+
+def _derivative(condition: FlightCondition, trim: Trim, name: str) -> FloatArray:
+    """Change of x_dot by a unit of a rate, rad/s, or of the wind along an axis, m/s, (n,)."""
+    ends = []
+    for sign in (1.0, -1.0):
+        fdm, _ = trimmed_fdm(condition, trim_solution(condition))
+        if name in RATES:
+            _set_rate(fdm, trim, name, sign * MOTION)
+        else:
+            axes = body_axes(_trim_state(trim, "phi"), 0.0, 0.0)
+            wind = sign * MOTION * condition.speed * axes[AXES.index(name)]
+            for path, value in zip(WIND, (wind / FOOT).tolist(), strict=True):
+                fdm[path] = value
+        settle(fdm, SURFACE_TIME)
+        ends.append(_x_dot(fdm, condition, trim))
+    size = MOTION if name in RATES else MOTION * condition.speed
+    return np.asarray((ends[0] - ends[1]) / (2.0 * size))
+
+
+def _set_rate(fdm: jsbsim.FGFDMExec, trim: Trim, name: str, value: float) -> None:
+    """Give an aircraft in trim a body rate, rad/s; engines and systems keep their state."""
+    for key in ("alpha", "phi"):
+        fdm[f"ic/{key}-rad"] = _trim_state(trim, key)
+    fdm["ic/gamma-deg"] = fdm["ic/beta-rad"] = 0.0
+    fdm[f"ic/{name}-rad_sec"] = value
+    fdm.run_ic()
+
+
+def _airframe(condition: FlightCondition, trim: Trim, B: FloatArray) -> Airframe:
+    """The airframe of a trim with the columns of its inputs."""
+    places = {name: i for i, name in enumerate(AIRPLANE_STATES)}
+    V = condition.speed
+    wind = np.column_stack([_derivative(condition, trim, axis) for axis in AXES])
+    A = np.zeros((len(AIRPLANE_STATES), len(AIRPLANE_STATES)))
+    for axis, size, column in zip(AXES, (1.0, V, V), wind.T, strict=True):
+        A[:, places[AIR_STATE[axis]]] = -size * column
+    for name in RATES:
+        A[:, places[name]] = _derivative(condition, trim, name)
+    theta = _trim_state(trim, "theta")
+    for into, by, gain in (("theta", "q", 1.0), ("phi", "p", 1.0), ("phi", "r", math.tan(theta))):
+        A[places[into], places[by]] = gain
+    gusts = {
+        axis: {
+            name: V * value
+            for name, value in zip(AIRPLANE_STATES, column.tolist(), strict=True)
+            if abs(value) > LEAST
+        }
+        for axis, column in zip(AXES, wind.T, strict=True)
+    }
+    values = {
+        "name": condition.title,
+        "source": f"linearisation of JSBSim at {V:g} m/s and {condition.altitude:g} m",
+        "speed": V,
+        "states": AIRPLANE_STATES,
+        "inputs": {
+            name: {"unit": "1", "positive": INPUTS[name].positive} for name in condition.inputs()
+        },
+        "outputs": list(condition.paired_outputs()),
+        "A": _without_rounding(A).tolist(),
+        "B": _without_rounding(B).tolist(),
+        "gravity": [
+            {"into": "V", "angle": "theta", "gain": -GRAVITY},
+            {"into": "beta", "angle": "phi", "gain": GRAVITY * math.cos(theta) / V},
+        ],
+        "gusts": gusts,
+    }
+    return Airframe.validate_mapping(values, f"airframe {condition.title}")
+
+
+def _without_rounding(matrix: FloatArray) -> FloatArray:
+    return np.where(np.abs(matrix) < LEAST, 0.0, matrix)

@@ -1,0 +1,269 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Flight dynamics model of JSBSim: a six-degree-of-freedom aircraft, flown around a trim point like
+the linear aircraft.
+"""
+
+import math
+
+import jsbsim
+import numpy as np
+
+from aircraft_sim import pose
+from aircraft_sim.atmosphere import turbulence
+from aircraft_sim.atmosphere.disturbance import AXES, one_minus_cosine
+from aircraft_sim.atmosphere.wind_field import body_axes
+from aircraft_sim.ground import touch
+from aircraft_sim.jsbsim import jsbsim_trim
+from aircraft_sim.jsbsim.jsbsim_aircraft import INPUTS, OUTPUTS, STATES, FlightCondition, WindModel
+from aircraft_sim.jsbsim.jsbsim_commands import command_paths, engine_count, settle
+from aircraft_sim.params import AircraftConfig
+from aircraft_sim.plant import actuators
+from aircraft_sim.plant.actuators import Actuators
+from aircraft_sim.plant.plant import DIVERGENCE_LIMIT
+from aircraft_sim.vanes import ANGLES
+from flight_core.outcome import FlightEnded
+from flight_core.rates import divide, seconds
+from flight_core.units import FOOT
+from flight_core.vectors import FloatArray
+
+CLIMB = "velocities/h-dot-fps"
+POSE = (
+    ("attitude/phi-rad", 1.0),
+    ("attitude/theta-rad", 1.0),
+    ("attitude/psi-rad", 1.0),
+    ("position/h-sl-ft", FOOT),
+    ("velocities/v-north-fps", FOOT),
+    ("velocities/v-east-fps", FOOT),
+    (CLIMB, FOOT),
+    ("aero/beta-rad", 1.0),
+)
+"""Properties of the pose other than the position, with the SI value of their units."""
+
+THROTTLE = list(INPUTS).index("throttle")
+
+LEAST_FUEL = 1.0
+"""lb, of all tanks: an engine that stops with less is out of fuel."""
+
+
+class JsbsimModel:
+    """An aircraft of JSBSim behind its actuators, in trim at t = 0: a
+    `simulator.FlightDynamicsModel`.
+
+    A step of the integration, from t_k to t_k + dt:
+
+        position+ = actuators.apply_faults(t_k, position, actuators.step(position, u, dt))
+        wind+     = gusts(t_k + dt) + turbulence.wind(z+), along the heading, to the right and down
+        commands  = trim + actuators.effect(t_k, position+), then JSBSim runs
+
+    Engines whose throttle is lost have the throttle at 0 and no fuel or ignition.
+
+    JSBSim integrates the forces of the step before, then computes the forces of the new commands
+    and the new wind: commands and wind act a step later. JSBSim computes forces at an instant, t_k
+    + dt, so the position at this instant is right: the mean over the past step would be half a step
+    older.
+
+    Raises FlightEnded where the aircraft does not trim, crashes or hangs. An isolated process tries
+    the aircraft first.
+    """
+
+    def __init__(
+        self, condition: FlightCondition, actuator_model: Actuators, wind_model: WindModel
+    ) -> None:
+        self.condition = condition
+        self._fdm, self.trim = jsbsim_trim.trimmed_fdm(
+            condition, jsbsim_trim.trim_solution(condition)
+        )
+        engines = engine_count(self._fdm)
+        self._commands = [  # of an input: the nodes, their values in trim and at the command 1
+            [
+                (node := self._node(path), node.get_double_value(), at_one)
+                for path, at_one in command_paths(command, engines)
+            ]
+            for command in map(condition.commands().__getitem__, condition.inputs())
+        ]
+        self._wind_nodes = [self._node(path) for path in jsbsim_trim.WIND]
+        self._state_nodes = [
+            (self._node(quantity.property), quantity.si) for quantity in STATES.values()
+        ]
+        self._heading, self._height, self._contact = (
+            self._node(path)
+            for path in (jsbsim_trim.HEADING, jsbsim_trim.HEIGHT, jsbsim_trim.CONTACT)
+        )
+        # the number and the flag of the engines that can stop: an electric engine has no flag
+        running = {i + 1: self._node(jsbsim_trim.running_property(i)) for i in range(engines)}
+        self._engines = {
+            number: node for number, node in running.items() if node.get_double_value()
+        }
+        self._cut = False
+        self._fuel, self._climb = self._node(jsbsim_trim.FUEL), self._node(CLIMB)
+        self._structure = [self._node(path) for path in jsbsim_trim.structure_contacts(self._fdm)]
+        inputs = condition.inputs()
+        self._no_thrust = np.where(
+            [INPUTS[name].each_engine for name in inputs], -self.trim.commands[: len(inputs)], 0.0
+        )
+        self._actuator_model = actuator_model._replace(no_thrust=self._no_thrust)
+        self._wind_model = wind_model
+        self._z = (
+            None
+            if wind_model.turbulence is None
+            else turbulence.initial_state(wind_model.turbulence)
+        )
+        self._position = np.zeros(len(inputs))
+        self._altitude = self._node("position/h-sl-ft")
+        self._position_ground = np.zeros(2)  # to the north and the east of the start
+        self._apply_wind(self._wind(0))
+        # one step: the wind of t = 0 acts from t = 0 on
+        settle(self._fdm, seconds(condition.step_ns))
+        self._x = self._deviations()
+        self._pose_nodes = [(self._node(path), si) for path, si in POSE]
+        self._velocity = self._ground_velocity()
+        self.truth_names = (
+            *(f"x.{name}" for name in STATES),
+            *(f"gust.{name}" for name in AXES),
+            *(f"actuator.{name}" for name in inputs),
+        )
+
+    def advance(self, t_ns: int, u: FloatArray, duration_ns: int) -> None:
+        """From t to t + duration with the command u held, shape (m,), deviations from trim.
+
+        Raises FlightEnded where JSBSim fails, an engine stops or the aircraft touches the ground.
+        """
+        step_ns = self.condition.step_ns
+        model = self._actuator_model
+        sink = -FOOT * self._climb.get_double_value()
+        dt = seconds(step_ns)
+        steps = divide(duration_ns, step_ns, "step", "the duration")
+        filters = self._wind_model.turbulence
+        normals = () if filters is None else turbulence.normals(t_ns // step_ns, steps, filters)
+        for k in range(steps):
+            t = seconds(t_ns + k * step_ns)
+            position = actuators.step(
+                self._position, u, dt, actuators.in_force(t, self._position, model)
+            )
+            self._position = actuators.apply_faults(t, self._position, position, model)
+            deviations = actuators.effect(t, self._position, model).tolist()
+            for nodes, deviation in zip(self._commands, deviations, strict=True):
+                for node, value, at_one in nodes:
+                    node.set_double_value(value + at_one * deviation)
+            self._cut_engines(model.lost_at is not None and bool(t >= model.lost_at[THROTTLE]))
+            if filters is not None:
+                self._z = turbulence.step(self._z, normals[k], filters)
+            after_ns = t_ns + (k + 1) * step_ns
+            air = self._wind_model
+            blows = air.turbulence is not None or air.over_place is not None
+            if blows or air.gusts.speed.any():
+                self._apply_wind(self._wind(after_ns))
+            try:
+                self._fdm.run()
+            except jsbsim.BaseError as error:
+                title = self.condition.title
+                after = seconds(after_ns)
+                raise FlightEnded(
+                    f"{title} failed at t = {after:.2f} s: {jsbsim_trim.error_text(error)}"
+                ) from None
+        self._x = self._deviations()
+        before = self._velocity
+        self._velocity = self._ground_velocity()
+        self._position_ground = self._position_ground + seconds(duration_ns) / 2.0 * (
+            before + self._velocity
+        )
+        self._require_flight(t_ns + duration_ns, sink)
+
+    def _require_flight(self, t_ns: int, sink: float) -> None:
+        """Raise FlightEnded on the ground, after a sink in m/s, and where an engine stopped."""
+        if self._height.get_double_value() < 0.0 or abs(self._contact.get_double_value()) > 0.0:
+            is_on_wheels = not any(node.get_double_value() for node in self._structure)
+            raise touch(self.condition.title, t_ns, sink, is_on_wheels=is_on_wheels)
+        if stopped := [
+            str(number) for number, node in self._engines.items() if not node.get_double_value()
+        ]:
+            why = ", out of fuel" if self._fuel.get_double_value() < LEAST_FUEL else ""
+            raise FlightEnded(
+                f"{self.condition.title}: engine {', '.join(stopped)} stopped at t = "
+                f"{seconds(t_ns):.2f} s{why}"
+            )
+
+    def y(self) -> FloatArray:
+        """[q, V, p, r], deviations from trim, shape (4,)."""
+        return self._x[: len(OUTPUTS)]
+
+    def air_angles(self, t_ns: int) -> FloatArray:
+        """See `simulator.FlightDynamicsModel`; alpha and beta of JSBSim are those relative to the
+        air.
+        """
+        return self._x[[list(STATES).index(name) for name in ANGLES]]
+
+    def truth(self, t_ns: int) -> FloatArray:
+        """Values in the order of `truth_names`."""
+        return np.concatenate([self._x, self._wind(t_ns), self._position])
+
+    def pose(self) -> FloatArray:
+        """See `simulator.FlightDynamicsModel`. Position is integrated from the velocity by the
+        trapezoidal rule.
+        """
+        phi, theta, psi, altitude, *velocity, beta = (
+            node.get_double_value() * si for node, si in self._pose_nodes
+        )
+        return np.array(
+            [phi, theta, pose.wrapped(psi), *self._position_ground, altitude, *velocity, beta]
+        )
+
+    def _ground_velocity(self) -> FloatArray:
+        return np.array([node.get_double_value() * si for node, si in self._pose_nodes[4:6]])
+
+    def diverged(self) -> bool:
+        """Whether a state is not finite, or above DIVERGENCE_LIMIT in any component."""
+        return not bool(np.all(np.abs(self._x) < DIVERGENCE_LIMIT))
+
+    def retune(self, t_ns: int, parameters: AircraftConfig) -> None:
+        """See `simulator.FlightDynamicsModel`."""
+        self._actuator_model = parameters.actuator_model()._replace(no_thrust=self._no_thrust)
+        self._wind_model = self._wind_model._replace(gusts=parameters.gust_arrays(AXES))
+
+    def _cut_engines(self, cut: bool) -> None:
+        """Stop the engines with the begin of their loss, and start them with its end. Whether they
+        run is then no outcome.
+        """
+        if cut == self._cut:
+            return
+        jsbsim_trim.cut_engines(self._fdm, cut)
+        self._cut = cut
+        self._engines = {}  # one that was cut off may need longer than a step to run again
+
+    def _deviations(self) -> FloatArray:
+        return (
+            np.array([node.get_double_value() * si for node, si in self._state_nodes])
+            - self.trim.states
+        )
+
+    def _node(self, path: str) -> jsbsim.FGPropertyNode:
+        node = self._fdm.get_property_manager().get_node(path)
+        if node is None:  # the trim has checked that it exists
+            raise FlightEnded(f"{self.condition.title} cannot be flown: it has no property {path}")
+        return node
+
+    def _wind(self, t_ns: int) -> FloatArray:
+        """Wind along AXES in m/s, shape (3,), at the instant of the turbulence's state."""
+        gusts = one_minus_cosine(
+            np.array(seconds(t_ns)), self._wind_model.gusts, np.array(self.condition.speed)
+        )
+        filters = self._wind_model.turbulence
+        if (over_place := self._wind_model.over_place) is not None:
+            altitude = self._altitude.get_double_value() * FOOT
+            north, east = self._position_ground.tolist()
+            here = over_place.at(seconds(t_ns), north, east, altitude)
+            gusts = gusts + body_axes(0.0, 0.0, self._heading.get_double_value()) @ here
+        return np.asarray(gusts if filters is None else gusts + turbulence.wind(self._z, filters))
+
+    def _apply_wind(self, wind: FloatArray) -> None:
+        along, right, down = (wind / FOOT).tolist()
+        heading = self._heading.get_double_value()
+        north = math.cos(heading)
+        east = math.sin(heading)
+        for node, value in zip(
+            self._wind_nodes,
+            (along * north - right * east, along * east + right * north, down),
+            strict=True,
+        ):
+            node.set_double_value(value)

@@ -1,0 +1,157 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Equation (1), the aircraft: x_dot = A x + f(x, t) + B u, y = C x, in deviations from trim.
+
+f(x, t) = f_state(x) + f_time(t). `x_dot` computes the sum at an instant. `plant.advance` computes
+f_time once for the instants of the steps.
+"""
+
+from typing import Any, NamedTuple
+
+from aircraft_sim.atmosphere.disturbance import Bias, Gusts, Sines, bias, one_minus_cosine, sines
+from flight_core.vectors import Array, array_namespace
+
+
+class Coupling(NamedTuple):
+    """P products of two states: f += gain @ (x[first] x[second])."""
+
+    gain: Array  # (n, P)
+    first: Array  # (P,) indices in x
+    second: Array  # (P,)
+
+
+class EulerKinematics(NamedTuple):
+    """Nonlinear kinematics in place of the linear kinematics of A. Angles belong to the stability
+    axes: 0 in trim.
+    """
+
+    select: Array  # (5, n), picks phi, theta, p, q, r
+    into: Array  # (n, 3), adds to alpha_dot, phi_dot, theta_dot
+    linear: (
+        Array  # (3, n), rows of A that they replace: none of alpha_dot, those of phi_dot, theta_dot
+    )
+    turn_rate: Array  # () g/V0, 1/s
+
+
+class Aircraft(NamedTuple):
+    """Matrices of equation (1) and the terms of f as arrays, SI and radians. None: the term is
+    absent.
+    """
+
+    A: Array  # (n, n)
+    B: Array  # (n, m)
+    C: Array  # (m, n)
+    gravity: Array  # (n, n), gravity @ sin(x)
+    gust_direction: Array  # (n, G), change of x_dot for 1 m/s of wind along each axis
+    gusts: Gusts
+    speed: Array  # () trim speed V0, m/s
+    coupling: Coupling | None = None
+    bias: Bias | None = None
+    sines: Sines | None = None
+    kinematics: EulerKinematics | None = None
+    # (n,) of x_dot, where the matrices are those of another airspeed than the trim's
+    trim: Array | None = None
+
+
+def f(t: Any, x: Array, params: Aircraft, turbulence: Array | None = None) -> Array:
+    """Uncertain part of equation (1), shape (n,):
+
+        f = gravity @ sin(x) + gain @ (x[first] x[second]) + gust_direction @ (w(t) + turbulence) +
+        bias(t) + sines(t)
+            + kinematics(x)
+
+    `turbulence` is the wind along the G axes, shape (G,), m/s; None: no turbulence. x may hold N
+    states in columns, (n, N).
+    """  # noqa: D400, D415 - what follows is an equation
+    return f_state(x, params) + f_time(t, wind(t, params, turbulence), params)
+
+
+def x_dot(t: Any, x: Array, u: Array, params: Aircraft, turbulence: Array | None = None) -> Array:
+    """Equation (1): A x + f(x, t) + B u, shape (n,)."""
+    return x_dot_forced(x, f_time(t, wind(t, params, turbulence), params) + params.B @ u, params)
+
+
+def x_dot_forced(x: Array, forced: Array, params: Aircraft) -> Array:
+    """A x + f_state(x) + forced, shape (n,): equation (1) with forced = f_time + B u."""
+    # dot: a third of the time of @ for a few states, the same bits
+    return params.A.dot(x) + f_state(x, params) + forced
+
+
+def f_state(x: Array, params: Aircraft) -> Array:
+    """The state-dependent part of f: gravity @ sin(x) + gain @ (x[first] x[second]) +
+    kinematics(x), shape (n,).
+    """
+    total = params.gravity.dot(array_namespace(x).sin(x))
+    if params.coupling is not None:
+        gain, first, second = params.coupling
+        total = total + gain @ (x[first] * x[second])
+    return total if params.kinematics is None else total + kinematics(x, params.kinematics)
+
+
+def kinematics(x: Array, params: EulerKinematics) -> Array:
+    """Difference of the nonlinear and the linear kinematics, shape (n,):
+
+        alpha_dot += g/V0 (cos phi cos theta - 1)
+        phi_dot    = p + tan theta (q sin phi + r cos phi)
+        theta_dot  = q cos phi - r sin phi
+
+    The first term is the loss of lift along the vertical in a bank. Source: B. L. Stevens, F. L.
+    Lewis, Aircraft Control and Simulation, 2nd ed. (2003), eqs. (1.3-22), (2.4-5).
+    """  # noqa: D400, D415 - what follows is an equation
+    xp = array_namespace(x)
+    phi, theta, p, q, r = params.select @ x
+    sine = xp.sin(phi)
+    cosine = xp.cos(phi)
+    rates = [
+        params.turn_rate * (cosine * xp.cos(theta) - 1.0),
+        p + xp.tan(theta) * (q * sine + r * cosine),
+        q * cosine - r * sine,
+    ]
+    return params.into @ (xp.stack(rates) - params.linear @ x)
+
+
+def f_time(t: Any, wind: Array, params: Aircraft) -> Array:
+    """The time-dependent part of f: gust_direction @ wind + bias(t) + sines(t), shape (n,); wind of
+    shape (G,), m/s.
+    """
+    total = params.gust_direction @ wind
+    if params.bias is not None:
+        total = total + bias(t, params.bias)
+    if params.sines is not None:
+        total = total + sines(t, params.sines)
+    return total
+
+
+def wind(t: Any, params: Aircraft, turbulence: Array | None = None) -> Array:
+    """The wind along the G axes, shape (G,), m/s: gusts + turbulence."""
+    gusts = one_minus_cosine(t, params.gusts, params.speed)
+    return gusts if turbulence is None else gusts + turbulence
+
+
+class Forcing(NamedTuple):
+    """Wind and f_time at T instants."""
+
+    wind: Array  # (T, G) speed of the gusts along the G axes, m/s
+    rate: Array  # (T, n) f_time in this wind
+
+
+def at_times(t: Array, params: Aircraft) -> Forcing:
+    """Forcing by the gusts, biases and sines at T instants, t of shape (T,)."""
+
+    def column(term: Any) -> Any:
+        return (
+            None
+            if term is None
+            else type(term)(*(None if values is None else values[:, None] for values in term))
+        )
+
+    columns = params._replace(
+        gusts=column(params.gusts), bias=column(params.bias), sines=column(params.sines)
+    )
+    gusts = wind(t, columns)
+    return Forcing(gusts.T, f_time(t, gusts, columns).T)
+
+
+def y(x: Array, params: Aircraft) -> Array:
+    """Measured output y = C x, shape (m,)."""
+    return params.C.dot(x)

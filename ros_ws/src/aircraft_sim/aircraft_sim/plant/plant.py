@@ -1,0 +1,202 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The simulated plant: equation (1) behind actuators, integrated in fixed steps, with zero-order
+hold of u.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from aircraft_sim.atmosphere import turbulence
+from aircraft_sim.atmosphere.turbulence import Turbulence
+from aircraft_sim.plant import actuators, dynamics
+from aircraft_sim.plant.actuators import Actuators
+from aircraft_sim.plant.dynamics import Aircraft, Forcing
+from flight_core.integrators import rk4
+from flight_core.rates import divide, seconds
+from flight_core.vectors import Array, array_namespace
+
+# SI. A state above this limit counts as diverged; no state of an aircraft in flight comes near it.
+DIVERGENCE_LIMIT = 1e6
+
+SHORTEST_DRIFT = 1e-9  # s, for duration 0, which has no division by 0 then
+
+
+class Drift(NamedTuple):
+    """A change of A, B and the effect of wind in flight: factors of their entries after `duration`,
+    linear in time before.
+    """
+
+    start: float  # s of flight time
+    duration: float  # s, 0 for a change at once
+    A: Array  # (n, n)
+    B: Array  # (n, m)
+    wind: Array  # (n, G)
+
+
+def share(t: Array, start: Any, duration: Any) -> Array:
+    """How far a drift acts at t: 0 before the start, 1 after the duration."""
+    xp = array_namespace(t)
+    part = xp.minimum((t - start) / xp.maximum(duration, SHORTEST_DRIFT), 1.0)
+    return xp.where(t >= start, xp.where(duration > 0.0, part, 1.0), 0.0)
+
+
+class OverAirspeed(NamedTuple):
+    """How A, B and the trim follow the airspeed V0 + V: exponents of the ratio to V0, and trims at
+    K ratios.
+    """
+
+    speed: float  # V0, m/s
+    place: int  # of V in x
+    A: Array  # (n, n) exponents of the entries
+    B: Array  # (n, m)
+    gravity: Array  # (n, n)
+    wind: Array  # (n, G)
+    ratio: Array  # (K,) rising
+    x: Array  # (K, n) of the trims, deviations from that at V0
+    u: Array  # (K, m)
+
+
+class PlantParams(NamedTuple):
+    """Parameters of the plant: aircraft, actuators, integration step, turbulence, drift, and what
+    follows the airspeed.
+    """
+
+    aircraft: Aircraft
+    actuators: Actuators
+    step_ns: int  # of the integration
+    turbulence: Turbulence | None = None  # of one step; None without turbulence
+    drift: Drift | None = None
+    over_airspeed: OverAirspeed | None = None  # None: A and B are those of the trim speed
+
+
+def aircraft_at(t_ns: int, plant: PlantParams, x: Array | None = None) -> Aircraft:
+    """The aircraft at t in the state x, (n,), at the trim without x: its A, B and effect of wind
+    times 1 + share (factor - 1).
+
+    Over the airspeed the entries are times powers of r = 1 + V / V0, and about the trim of r, (x_r,
+    u_r):
+
+        x_dot = A x + gravity sin(x) + B u + trim,  trim = -(A x_r + gravity sin(x_r) + B u_r)
+    """
+    if plant.over_airspeed is not None and x is not None:
+        return _at_airspeed(x, plant.aircraft, plant.over_airspeed)
+    aircraft = plant.aircraft
+    drift = plant.drift
+    if drift is None:
+        return aircraft
+    part = share(np.array(seconds(t_ns)), drift.start, drift.duration)
+    A, B, wind = (1.0 + part * (factor - 1.0) for factor in (drift.A, drift.B, drift.wind))
+    return aircraft._replace(
+        A=aircraft.A * A, B=aircraft.B * B, gust_direction=aircraft.gust_direction * wind
+    )
+
+
+def _at_airspeed(x: Array, aircraft: Aircraft, over: OverAirspeed) -> Aircraft:
+    """The aircraft at the airspeed of a state, within the ratios of the trims."""
+    least, most = over.ratio[[0, -1]].tolist()
+    r = min(max(1.0 + x[over.place].item() / over.speed, least), most)
+    A, B, gravity = (
+        matrix * r**powers
+        for matrix, powers in (
+            (aircraft.A, over.A),
+            (aircraft.B, over.B),
+            (aircraft.gravity, over.gravity),
+        )
+    )
+    x_r = np.array([np.interp(r, over.ratio, column) for column in over.x.T])
+    u_r = np.array([np.interp(r, over.ratio, column) for column in over.u.T])
+    trim = -(A @ x_r + gravity @ np.sin(x_r) + B @ u_r)
+    wind = aircraft.gust_direction * r**over.wind
+    return aircraft._replace(A=A, B=B, gravity=gravity, gust_direction=wind, trim=trim)
+
+
+class AircraftState(NamedTuple):
+    """State of the plant, deviations from trim, SI."""
+
+    x: Array  # (n,)
+    position: Array  # (m,) of the actuators
+    turbulence: Array | None = None  # (s,) of the turbulence filters; None without turbulence
+
+
+def initial_state(plant: PlantParams) -> AircraftState:
+    """The state in trim: x = 0, actuators at 0, turbulence filters in a sample of their stationary
+    distribution.
+    """
+    xp = array_namespace(plant.aircraft.A)
+    z = None if plant.turbulence is None else turbulence.initial_state(plant.turbulence)
+    return AircraftState(
+        xp.zeros_like(plant.aircraft.A[0, :]), xp.zeros_like(plant.aircraft.B[0, :]), z
+    )
+
+
+def forcing(t_ns: int, steps: int, plant: PlantParams, x: Array | None = None) -> Forcing:
+    """Forcing at the beginnings, middles and ends of some steps from t and x on: 2 steps + 1
+    instants; the aircraft of then.
+    """
+    halves = array_namespace(plant.aircraft.A).arange(2 * steps + 1, dtype=plant.aircraft.A.dtype)
+    return dynamics.at_times(
+        seconds(t_ns) + seconds(plant.step_ns) / 2.0 * halves, aircraft_at(t_ns, plant, x)
+    )
+
+
+def advance(
+    t_ns: int,
+    state: AircraftState,
+    u: Array,
+    duration_ns: int,
+    plant: PlantParams,
+    forced: Forcing | None = None,
+) -> AircraftState:
+    """State at t + duration from the state at t, with the command u held (zero-order hold).
+
+    A step dt, from t_k on, is
+
+        position+, mean = actuators.move(t_k, position, u, dt)
+        x+  = Runge-Kutta step of equation (1) with the input `mean` and the turbulence at t_k
+        z+              = turbulence.step(z, n_k)
+
+    The mean position over the step acts during the whole step: the error against the continuous
+    actuator is of second order in dt, and an ideal actuator passes u on without delay, to the last
+    bit. The turbulence at the beginning of the step acts during the whole step: the spectrum is
+    exact at the steps, with a hold in between. Time is counted in ns, so steps add up exactly.
+
+    The aircraft of t acts during the whole duration. n_k follow from the seed. `forced` is the
+    `forcing` of these steps, from a caller that has computed it. Raises ParameterError where the
+    step does not divide the duration.
+    """
+    x, position, z = state
+    aircraft = aircraft_at(t_ns, plant, x)
+    filters = plant.turbulence
+    steps = divide(duration_ns, plant.step_ns, "step", "the duration")
+    dt = seconds(plant.step_ns)
+    normals = () if filters is None else turbulence.normals(t_ns // plant.step_ns, steps, filters)
+
+    def x_dot(since: float, x: Array, forced: Array, params: Aircraft) -> Array:
+        return dynamics.x_dot_forced(x, forced[round(2.0 * since / dt)], params)
+
+    rate = (forcing(t_ns, steps, plant, x) if forced is None else forced).rate
+    for k in range(steps):
+        position, mean = actuators.move(
+            seconds(t_ns + k * plant.step_ns), position, u, dt, plant.actuators
+        )
+        held = (
+            aircraft.B.dot(mean) if aircraft.trim is None else aircraft.B.dot(mean) + aircraft.trim
+        )
+        if filters is not None:
+            held = held + aircraft.gust_direction @ turbulence.wind(z, filters)
+            z = turbulence.step(z, normals[k], filters)
+        x = rk4(x_dot, 0.0, x, rate[2 * k : 2 * k + 3] + held, aircraft, dt)
+    return AircraftState(x, position, z)
+
+
+def diverged(state: AircraftState) -> bool:
+    """Whether a state is not finite, or above DIVERGENCE_LIMIT in any component."""
+    # the comparison is false for NaN too
+    return not all(abs(x) < DIVERGENCE_LIMIT for x in state.x.tolist())
+
+
+def output(state: AircraftState, plant: PlantParams) -> Array:
+    """The outputs y = C x, before any sensor, shape (m,)."""
+    return dynamics.y(state.x, plant.aircraft)

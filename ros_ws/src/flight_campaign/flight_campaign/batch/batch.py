@@ -1,0 +1,263 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Vectorised Monte Carlo simulation: N uncertain aircraft through one course under any law, as in
+the single-process loop.
+
+The last axis of every array is the aircraft, so that one line of a law or of the actuators acts on
+all of them.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import jax
+import numpy as np
+from jax import numpy as jnp
+from numpy.typing import NDArray
+
+from aircraft_sim.plant.actuators import Actuators
+from aircraft_sim.plant.dynamics import Aircraft, Coupling
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_campaign import equipment
+from flight_campaign.batch import batch_allocation, batch_loop
+from flight_campaign.batch.batch_loop import (
+    FleetResult,
+    LoopState,
+    Sample,
+    Timing,
+    Vehicle,
+    figures,
+)
+from flight_campaign.batch.batch_matrices import Fleet, remainder_rows
+from flight_campaign.batch.batch_schedule import Schedule
+from flight_campaign.batch.campaign_course import Course, Segments
+from flight_campaign.batch.device import schedule_of_device
+from flight_core.parameters import require
+from flight_core.rates import seconds
+from flight_core.vectors import Array, FloatArray
+from rise_di_controller.law.control_law import ControlLaw
+from rise_di_controller.law.saturation import Limits
+
+jax.config.update("jax_enable_x64", True)  # float64 as everywhere else in the stack
+
+
+def vehicle(scenario: Scenario) -> Vehicle:
+    """The shared properties of all aircraft of a scenario."""
+    plant = scenario.aircraft.plant()
+    channels = scenario.aircraft.channels()
+    aircraft = plant.aircraft
+    errors = scenario.aircraft.sensor_arrays()
+    order = [list(channels.outputs).index(name) for name in scenario.controller.outputs]
+    quantum = None if errors.quantum is None else errors.quantum[order]
+    expected = "none: a campaign flies without it"
+    require(scenario.controller.probe is None, "controller.probe", "a section", expected)
+    guard = scenario.controller.guard()
+    states, remainder = _reduced(aircraft)
+    effectors = list(channels.inputs)
+    return Vehicle(
+        outputs=tuple(np.argmax(aircraft.C[order], axis=1).tolist()),
+        inputs=tuple(effectors.index(name) for name in scenario.controller.effectors),
+        remainder_states=tuple(states.tolist()),
+        vanes=tuple(scenario.aircraft.load()[0].index(name) for name in scenario.controller.vanes),
+        remainder=remainder,
+        actuators=Actuators(
+            *(None if values is None else values[:, None] for values in plant.actuators)
+        ),
+        limits=Limits(*(values[:, None] for values in guard.limits)),
+        quantum=None if quantum is None else quantum[:, None],
+        dt=seconds(plant.step_ns),
+        allocation=None
+        if guard.allocation is None
+        else batch_allocation.with_column_limits(guard.allocation),
+    )
+
+
+def shared(params: Any) -> Any:
+    """Parameters of a law for one aircraft, (m,), as those of a fleet, (m, 1); matrices stay, which
+    all aircraft share.
+    """
+    return jax.tree.map(
+        lambda value: np.asarray(value)[:, None] if np.ndim(value) == 1 else np.asarray(value),
+        params,
+    )
+
+
+def with_equipment(
+    vehicle: Vehicle, scenario: Scenario, values: Mapping[str, FloatArray]
+) -> Vehicle:
+    """The vehicle with the lags and the noise of N aircraft, by name as from `equipment.drawn`."""
+    channels = scenario.aircraft.channels()
+    aircraft = scenario.aircraft
+    if any(name.startswith("lag[") for name in values):
+        lag = equipment.in_order(values, "lag", tuple(channels.inputs), aircraft.actuators.lag)
+        vehicle = replace(vehicle, actuators=vehicle.actuators._replace(lag=_rows(lag)))
+    if any(name.startswith("noise[") for name in values):
+        noise = aircraft.sensors.noise
+        drawn = equipment.in_order(values, "noise", tuple(channels.outputs), noise)
+        more = [
+            value / published - 1.0 if published else 0.0
+            for value, published in zip(drawn, noise, strict=True)
+        ]
+        by_name = dict(zip(channels.outputs, more, strict=True))
+        noisier = _rows([by_name[name] for name in scenario.controller.outputs])
+        vehicle = replace(vehicle, noisier=noisier)
+    return vehicle
+
+
+def _rows(values: Sequence[Any]) -> Array:
+    """Numbers, and arrays of shape (N,), as rows."""
+    return jnp.stack(jnp.broadcast_arrays(*map(jnp.asarray, values)))
+
+
+def _reduced(aircraft: Aircraft) -> tuple[NDArray[np.int64], Aircraft]:
+    """Indices of the states in the remainder, and the aircraft reduced to them and to
+    `remainder_rows`.
+    """
+    rows = remainder_rows(aircraft)
+    coupling = aircraft.coupling
+    kinematics = aircraft.kinematics
+    in_remainder = aircraft.gravity.any(axis=0)
+    if coupling is not None:
+        in_remainder[[*coupling.first, *coupling.second]] = True
+    if kinematics is not None:
+        in_remainder = in_remainder | kinematics.select.any(axis=0) | kinematics.linear.any(axis=0)
+    states = np.flatnonzero(in_remainder)
+    if coupling is not None:
+        first, second = (
+            np.searchsorted(states, place) for place in (coupling.first, coupling.second)
+        )
+        coupling = Coupling(coupling.gain[rows], first, second)
+    if kinematics is not None:
+        kinematics = kinematics._replace(
+            select=kinematics.select[:, states],
+            into=kinematics.into[rows],
+            linear=kinematics.linear[:, states],
+        )
+    gravity = aircraft.gravity[np.ix_(rows, states)]
+    return states, aircraft._replace(gravity=gravity, coupling=coupling, kinematics=kinematics)
+
+
+def fly(
+    fleet: Fleet,
+    vehicle: Vehicle,
+    course: Course,
+    control_law: ControlLaw,
+    params: Any,
+    schedule: Schedule | None = None,
+) -> FleetResult:
+    """Fly N aircraft through the course under one law, from trim at rest.
+
+    At each tick: sensors, step of the law (or engagement, or a missed sample, by the course's
+    phase), actuators over the K steps to the next tick, aircraft. The remainder s at the middle of
+    a tick is extrapolated from this tick and the previous. Arguments: `params` of the law, (m, 1)
+    or (m, N); of one aircraft, (m,), where all fly the same, as `shared` makes them. `schedule`
+    divides the ticks into compiled loops; None: as is fastest on the device. The figures stay the
+    same.
+    """
+    timing = _timing(fleet, course)
+    constants = batch_loop.Constants(fleet._replace(blocks=()), vehicle, params)
+    segments = jax.tree.map(jnp.asarray, course.segments)
+    compiled: dict[str, Any] = {"control_law": control_law, "timing": timing}
+    first = jax.tree.map(lambda values: values[0], segments)
+    state = batch_loop.begin(constants, first, **compiled)
+    k = 0
+    for run in (schedule or schedule_of_device())(course):
+        # The branches of an allocation stay; unrolled they would compile for minutes.
+        looped = run if vehicle.allocation is None else run._replace(unroll=1)
+        state = batch_loop.fly_run(state, constants, segments, k, run=looped, **compiled)
+        k += run.length
+    return figures(state, k, course.period)
+
+
+def on_host(result: FleetResult) -> FleetResult:
+    """The figures as arrays of NumPy, after the flights."""
+    return jax.tree.map(np.asarray, result)
+
+
+def _timing(fleet: Fleet, course: Course) -> Timing:
+    late = int(np.max(np.asarray(fleet.late)))
+    return Timing(fleet.blocks, course.steps, course.late, late)
+
+
+class Stepper:
+    """The flights of `fly` tick by tick, with u from outside: `sense`, then `advance`, for each
+    tick of the course.
+    """
+
+    def __init__(self, fleet: Fleet, vehicle: Vehicle, course: Course) -> None:
+        self.ticks = len(course.segments.t)
+        self._course = course
+        self._k = 0
+        self._timing = _timing(fleet, course)
+        self._fleet, self._vehicle, self._segments = jax.device_put(
+            (fleet._replace(blocks=()), vehicle, course.segments)
+        )
+        self._state = self._begin = batch_loop.in_trim(fleet, vehicle, self._timing)
+
+    @property
+    def t(self) -> float:
+        """Time of the present tick, s."""
+        return self._k * self._course.period
+
+    @property
+    def bounded(self) -> NDArray[np.bool_]:
+        """Which aircraft have not diverged, (N,)."""
+        return np.asarray(self._state.bounded)
+
+    def sense(self) -> tuple[FloatArray, FloatArray]:
+        """The y and y_m of the present tick, each (m, N), in the law's order."""
+        self._state, sample = _sense_once(self._state, self._segments, self._k, self._vehicle)
+        y = np.asarray(sample.y)
+        return y, np.broadcast_to(np.asarray(sample.y_m), y.shape)
+
+    def advance(self, u: FloatArray) -> None:
+        """To the next tick with the command u, (p, N), in the order of the controller's
+        effectors.
+        """
+        self._state = _advance_once(
+            self._state,
+            u,
+            self._segments,
+            self._k,
+            self._fleet,
+            self._vehicle,
+            self._timing,
+        )
+        self._k += 1
+
+    def restart(self, which: NDArray[np.bool_]) -> None:
+        """Set some aircraft, (N,), into trim at the present tick. Their figures begin again."""
+        self._state = jax.tree.map(partial(jnp.where, which), self._begin, self._state)
+
+    def result(self) -> FleetResult:
+        """The figures after the last tick."""
+        return figures(self._state, self.ticks, self._course.period)
+
+
+@jax.jit
+def _sense_once(
+    now: LoopState, segments: Segments, k: int, vehicle: Vehicle
+) -> tuple[LoopState, Sample]:
+    return batch_loop.sense(now, jax.tree.map(lambda values: values[k], segments), vehicle)
+
+
+@partial(jax.jit, static_argnames=("timing",))
+def _advance_once(
+    now: LoopState,
+    command: Array,
+    segments: Segments,
+    k: int,
+    fleet: Fleet,
+    vehicle: Vehicle,
+    timing: Timing,
+) -> LoopState:
+    return batch_loop.advance(
+        now,
+        command,
+        jax.tree.map(lambda values: values[k], segments),
+        fleet,
+        vehicle,
+        timing,
+    )

@@ -1,0 +1,382 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The closed loop of N aircraft from tick to tick, compiled: sensors, law, actuators, aircraft.
+
+Between two ticks of the controller an aircraft is linear up to a small remainder: all steps of its
+integration are one matrix product.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import chain
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jax import numpy as jnp
+from numpy.typing import NDArray
+
+from aircraft_sim import sensors
+from aircraft_sim.plant import actuators, dynamics
+from aircraft_sim.plant.actuators import Actuators
+from aircraft_sim.plant.dynamics import Aircraft
+from aircraft_sim.plant.plant import DIVERGENCE_LIMIT
+from flight_campaign.batch.batch_allocation import allocate
+from flight_campaign.batch.batch_matrices import Fleet, StateBlock, at
+from flight_campaign.batch.batch_schedule import ASKED, Kind, Run
+from flight_campaign.batch.campaign_course import Segments
+from flight_core.arithmetic import product
+from flight_core.vectors import Array
+from rise_di_controller.extensions.allocation import Allocation, reached
+from rise_di_controller.law.control_law import ControlLaw, Measurements
+from rise_di_controller.law.saturation import Limits, saturate
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=("remainder", "actuators", "limits", "quantum", "noisier", "dt", "allocation"),
+    meta_fields=("outputs", "inputs", "remainder_states", "vanes"),
+)
+@dataclass(frozen=True)
+class Vehicle:
+    """Properties that all aircraft of a fleet share."""
+
+    # Constants of the compiled loop: a device then takes rows without looking up where they are.
+    outputs: tuple[int, ...]  # (m,) indices of the outputs in the state, in the law's order
+    inputs: tuple[int, ...]  # (p,) indices of the effectors in the airframe's order
+    remainder_states: tuple[int, ...]  # (c,) indices of the states in the nonlinear remainder
+    vanes: tuple[int, ...]  # indices in the state of what the vanes read
+    # reduced to the remainder: f_state of x[remainder_states] gives the rows `remainder_rows`
+    remainder: Aircraft
+    actuators: Actuators  # (p, 1), airframe's order
+    limits: Limits  # (m, 1), law's order: of u, as the controller has them
+    quantum: Array | None  # (m, 1), law's order
+    dt: float  # s, of a step of the integration
+    allocation: Allocation | None  # None: the inputs of the law are the effectors
+    # (m, N), law's order: noise in parts of the noise of the course, less 1; None: 0
+    noisier: Array | None = None
+
+
+class FleetResult(NamedTuple):
+    """Metrics of N flights, by channel in the law's order, over the controller's ticks. Errors are
+    the true ones, C x - y_m.
+    """
+
+    rms: Array  # (m, N)
+    max: Array  # (m, N)
+    slew: Array  # (p, N) mean abs(u_dot) by effector, units of u / s
+    diverged: Array  # (N,) bool: the state exceeded DIVERGENCE_LIMIT, the other figures are invalid
+
+
+def rows_of(array: Array, places: Sequence[int] | NDArray[np.int64]) -> Array:
+    """The rows at known places, as slices, which the compiler of a GPU fuses with their use."""
+    if not len(places):
+        return array[:0]
+    return jnp.stack([jax.lax.index_in_dim(array, int(k), keepdims=False) for k in places])
+
+
+def remainder_of(states: Array, aircraft: Aircraft) -> Array:
+    """Nonlinear remainder of f_state, (q, N): gravity @ (sin(x) - x) + gain @ (x[first] x[second])
+    + kinematics(x).
+    """
+    return dynamics.f_state(states, aircraft) - aircraft.gravity @ states
+
+
+class Timing(NamedTuple):
+    """Constants of the compiled loop. Hashable."""
+
+    blocks: tuple[StateBlock, ...]
+    steps: int  # of the integration in a tick
+    y_late: int  # ticks
+    u_late: int  # ticks, the largest
+
+
+class Sample(NamedTuple):
+    """What a law takes at a tick, (m, N) or (m, 1)."""
+
+    y: Array
+    y_m: Array  # at the stamp of y
+    y_m_dot: Array
+
+
+class LoopState(NamedTuple):
+    """State of the closed loop from tick to tick."""
+
+    x: Array  # (n, N)
+    position: Array  # (p, N) airframe's order
+    remainder: Array  # (q, N) of the previous tick
+    law: Any
+    u: Array  # (m, N) law's order
+    command: Array  # (p, N) the effectors; u without an allocation
+    y_before: Array  # (y_late, m, N) newest first
+    command_before: Array  # (u_late, p, N)
+    squares: Array  # (m, N) sums over the ticks
+    max: Array
+    travel: Array  # (p, N) sum of abs(command - previous command)
+    bounded: Array  # (N,) whether the state stayed below DIVERGENCE_LIMIT
+
+
+class Constants(NamedTuple):
+    """Inputs that stay from tick to tick: arguments, so that the compiler folds no arrays."""
+
+    fleet: Fleet  # without its blocks
+    vehicle: Vehicle
+    params: Any  # of the law
+
+
+@partial(jax.jit, static_argnames=("control_law", "timing"))
+def begin(
+    constants: Constants, first: Segments, *, control_law: ControlLaw, timing: Timing
+) -> LoopState:
+    """The state before the first tick, in trim, the law not yet engaged."""
+    fleet, vehicle, params = constants
+    start = in_trim(fleet, vehicle, timing)
+    none = 0.0 * start.u
+
+    def stepped() -> Any:
+        measured = _measured(start, first, Sample(none, none, none), fleet, vehicle)
+        engaged = control_law.engage(measured, params)
+        return control_law.limited(engaged, measured, first.dt, params, vehicle.limits)[0]
+
+    law = jax.tree.map(lambda like: jnp.zeros(like.shape, like.dtype), jax.eval_shape(stepped))
+    return start._replace(law=law)
+
+
+@partial(jax.jit, static_argnames=("run", "control_law", "timing"), donate_argnames=("state",))
+def fly_run(
+    state: LoopState,
+    constants: Constants,
+    segments: Segments,
+    first: int,
+    *,
+    run: Run,
+    control_law: ControlLaw,
+    timing: Timing,
+) -> LoopState:
+    """The state after the ticks of a run, the first of number `first`."""
+    size = len(run.pattern)
+
+    def patterns(values: Array) -> Array:
+        chosen = jax.lax.dynamic_slice_in_dim(jnp.asarray(values), first, run.length)
+        return chosen.reshape(run.length // size, size, *values.shape[1:])
+
+    def pattern(now: LoopState, ticks: Any) -> tuple[LoopState, None]:
+        for k, kind in enumerate(run.pattern):
+            at_tick = jax.tree.map(lambda values, k=k: values[k], ticks)
+            now = tick(now, at_tick, kind, constants, control_law, timing)
+        return now, None
+
+    return jax.lax.scan(pattern, state, jax.tree.map(patterns, segments), unroll=run.unroll)[0]
+
+
+def _chosen(
+    known: int | None, asked: Array, branches: Sequence[Callable[..., Any]], *arguments: Any
+) -> Any:
+    """The result of the known branch, or of the branch that the tick asks for."""
+    if known is None:
+        return jax.lax.switch(asked, branches, *arguments)
+    return branches[known](*arguments)
+
+
+def tick(
+    now: LoopState,
+    segment: Segments,
+    kind: Kind,
+    constants: Constants,
+    control_law: ControlLaw,
+    timing: Timing,
+) -> LoopState:
+    """The state at the next tick."""
+    fleet, vehicle, params = constants
+    measure = partial(_measured, fleet=fleet, vehicle=vehicle)
+
+    # Each branch calls `measure`: the compiler then removes the measurements that its law does not
+    # use.
+    def engage(now: LoopState, *measured: Any) -> tuple[Any, Array, Array]:
+        started = control_law.engage(measure(now, *measured), params)
+        law = jax.tree.map(
+            lambda value, like: jnp.broadcast_to(value, like.shape).astype(like.dtype),
+            started,
+            now.law,
+        )
+        return law, now.u, now.command
+
+    def step(now: LoopState, segment: Segments, sample: Sample) -> tuple[Any, Array, Array]:
+        measured = measure(now, segment, sample)
+        limits = vehicle.limits
+        allocation = vehicle.allocation
+        if allocation is None:
+            law, _, u = control_law.limited(now.law, measured, segment.dt, params, limits)
+            return law, u, u
+        # As the guard: what the effectors give limits the law.
+        _, u_free = control_law.step(now.law, measured, segment.dt, params)
+        _, reachable = allocate(
+            saturate(u_free, now.u, segment.dt, limits), now.command, segment.dt, allocation
+        )
+        law, _, u = control_law.limited(
+            now.law, measured, segment.dt, params, reached(u_free, reachable)
+        )
+        command, u = allocate(u, now.command, segment.dt, allocation)
+        return law, u, command
+
+    def hold(now: LoopState, *measured: Any) -> tuple[Any, Array, Array]:
+        return control_law.missed(now.law, measure(now, *measured), params), now.u, now.command
+
+    sensed, sample = sense(now, segment, vehicle)
+    law, u, command = _chosen(kind.phase, segment.phase, (hold, engage, step), now, segment, sample)
+    commanded = sensed._replace(law=law, u=u)
+    return advance(commanded, command, segment, fleet, vehicle, timing, kind)
+
+
+def _measured(
+    now: LoopState, segment: Segments, sample: Sample, fleet: Fleet, vehicle: Vehicle
+) -> Measurements:
+    """What a law takes at a tick."""
+    y, y_m, y_m_dot = sample
+    measured = dict(zip(vehicle.outputs, y, strict=True))
+    x = jnp.stack([measured.get(k, row) for k, row in enumerate(now.x)])
+    matrices = at(segment.t, fleet)
+    acting = _product(
+        matrices.rate, [*now.x, *actuators.effect(segment.t, now.position, vehicle.actuators)]
+    )
+    moving = acting + fleet.wind * _product(matrices.forced_rate, segment.forcing_now)
+    u_trim = segment.u_ff[:, None] + 0.0 * y
+    x_air = x - fleet.wind * segment.air[:, None]
+    vane = vane_m = None
+    if vehicle.vanes:
+        vane = jnp.stack([x_air[place] for place in vehicle.vanes]) + segment.vane_error[:, None]
+        vane_m = segment.vane_m[:, None] + 0.0 * vane
+    position = rows_of(now.position, vehicle.inputs)
+    if vehicle.allocation is not None:
+        position = product(vehicle.allocation.effect, position)
+    return Measurements(y, y_m, y_m_dot, u_trim, now.u, position, x, x_air, moving, vane, vane_m)
+
+
+def sense(now: LoopState, segment: Segments, vehicle: Vehicle) -> tuple[LoopState, Sample]:
+    """The sample of a tick for the law; the figures take the true error."""
+    true = rows_of(now.x, vehicle.outputs)
+    e = true - segment.y_m[:, None]
+    y = true + segment.error[:, None]
+    if vehicle.noisier is not None:
+        y = y + vehicle.noisier * segment.noise[:, None]
+    if vehicle.quantum is not None:
+        y = sensors.quantised(y, vehicle.quantum)
+    arriving = jnp.concatenate([y[None], now.y_before])
+    y = arriving[-1]
+    y_before = arriving[:-1]
+    sensed = now._replace(
+        y_before=y_before,
+        squares=now.squares + e * e,
+        max=jnp.maximum(now.max, jnp.abs(e)),
+        bounded=now.bounded
+        & (jnp.max(jnp.abs(now.x), axis=0) < DIVERGENCE_LIMIT),  # False for NaN too
+    )
+    return sensed, Sample(y, segment.sampled_y_m[:, None], segment.sampled_y_m_dot[:, None])
+
+
+def advance(
+    now: LoopState,
+    command: Array,
+    segment: Segments,
+    fleet: Fleet,
+    vehicle: Vehicle,
+    timing: Timing,
+    kind: Kind = ASKED,
+) -> LoopState:
+    """The state at the next tick, with the command of this one."""
+    blocks = timing.blocks
+    u_late = timing.u_late
+    # of the states in the order of the blocks
+    places = np.argsort([*chain.from_iterable(block.rows for block in blocks)])
+    history = jnp.concatenate([command[None], now.command_before])
+    acting = (
+        command
+        if not u_late
+        else jnp.sum(
+            jnp.where(jnp.arange(u_late + 1)[:, None, None] == fleet.late, history, 0.0), 0
+        )
+    )
+    times = segment.t + np.arange(timing.steps) * vehicle.dt
+    position, means = _actuated(now.position, acting, times, vehicle, unroll=kind is not ASKED)
+    remainder = remainder_of(rows_of(now.x, vehicle.remainder_states), vehicle.remainder)
+    moves = [*now.x, *chain(*means), *(1.5 * remainder - 0.5 * now.remainder)]
+    matrices = at(segment.t, fleet)
+    parts = []
+    for matrix, block in zip(matrices.tick, blocks, strict=True):
+        parts.append(_product(matrix, [moves[j] for j in block.columns]))
+    x = rows_of(jnp.concatenate(parts), places)
+    x = _chosen(
+        kind.forced,
+        jnp.any(segment.forcing != 0.0).astype(int),
+        (lambda x: x, lambda x: x + fleet.wind * _product(matrices.forced, segment.forcing)),
+        x,
+    )
+    return now._replace(
+        x=x,
+        position=position,
+        remainder=remainder,
+        command=command,
+        command_before=history[:u_late],
+        travel=now.travel + jnp.abs(command - now.command),
+    )
+
+
+def _actuated(
+    position: Array, acting: Array, times: Array, vehicle: Vehicle, *, unroll: bool
+) -> tuple[Array, Array]:
+    """The positions of the actuators after the steps at some times, and their means in each."""
+    commanded = rows_of(acting, np.argsort(vehicle.inputs))
+
+    def move(before: Array, t: Array) -> tuple[Array, Array]:
+        return actuators.move(t, before, commanded, vehicle.dt, vehicle.actuators)
+
+    # A loop of its own: without one the compiler of a CPU computes all mean positions again for
+    # each state that they act on.
+    return jax.lax.scan(move, position, times, unroll=unroll)
+
+
+@partial(jax.jit, static_argnames=("ticks",))
+def figures(end: LoopState, ticks: int, period: Array) -> FleetResult:
+    """The figures of flights at their end."""
+    return FleetResult(
+        jnp.sqrt(end.squares / ticks),
+        end.max,
+        end.travel / ((ticks - 1) * period),
+        ~end.bounded,
+    )
+
+
+def in_trim(fleet: Fleet, vehicle: Vehicle, timing: Timing) -> LoopState:
+    """The state of the closed loop before the first tick, without that of the law."""
+    n = len(fleet.forced)
+    count = len(fleet.wind)
+    m = len(vehicle.outputs)
+    p = len(vehicle.inputs)
+    none = jnp.zeros((m, count))
+    command = jnp.zeros((p, count))
+    return LoopState(
+        jnp.zeros((n, count)),
+        command,
+        jnp.zeros((len(vehicle.remainder.gravity), count)),
+        None,
+        none,
+        command,
+        jnp.zeros((timing.y_late, m, count)),
+        jnp.zeros((timing.u_late, p, count)),
+        none,
+        none,
+        command,
+        jnp.ones(count, dtype=bool),
+    )
+
+
+def _product(matrices: Array, vector: Any) -> Array:
+    """The matrix-vector product of each aircraft, compiled to one loop; 0 for matrices without a
+    column.
+    """
+    return (
+        product(matrices, vector)
+        if matrices.shape[1]
+        else jnp.zeros((matrices.shape[0], matrices.shape[-1]))
+    )

@@ -1,0 +1,319 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The course of the aircraft of a campaign, tick by tick: reference, wind, errors of the sensors,
+feedforward.
+
+The course does not depend on the aircraft and is computed once, with the functions of the
+simulation in one process.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aircraft_sim import sensors
+from aircraft_sim.airframes.airframe import Airframe
+from aircraft_sim.atmosphere import turbulence
+from aircraft_sim.atmosphere.disturbance import AIR_STATE
+from aircraft_sim.plant import plant as plant_model
+from aircraft_sim.plant.plant import PlantParams
+from aircraft_sim.sensors import Sensors
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_core.parameters import require
+from flight_core.rates import divide, nanoseconds, period_ns, seconds
+from flight_core.vectors import FloatArray
+from reference_model.reference import Reference
+from rise_di_controller.extensions import feedforward
+from rise_di_controller.extensions.feedforward import Nominal
+
+HOLD, ENGAGE, STEP = range(3)
+"""Action of a controller at a tick: it holds u without a new y, it engages, or it takes a step of
+its law."""
+
+
+class Segments(NamedTuple):
+    """The changing parts of a course, tick by tick."""
+
+    t: FloatArray  # (T,) s
+    phase: NDArray[np.int32]  # (T,) HOLD, ENGAGE or STEP
+    dt: FloatArray  # (T,) s since the previous sample, inside the controller's range
+    y_m: FloatArray  # (T, m) the reference at the tick
+    sampled_y_m: (
+        FloatArray  # (T, m) the reference at the stamp of the y of the tick, and its derivative
+    )
+    sampled_y_m_dot: FloatArray  # (T, m)
+    u_ff: FloatArray  # (T, m) feedforward
+    error: FloatArray  # (T, m) sensor error of the y of the tick
+    noise: FloatArray  # (T, m) noise in it
+    # (T, K r) mean over each of the steps from here to the next tick: wind along `axes`, basis' @
+    # the rest
+    forcing: FloatArray
+    forcing_now: FloatArray  # (T, r) at the tick
+    air: FloatArray  # (T, n) wind's contribution to alpha and beta, rad
+    vane_m: FloatArray  # (T, k) readings of the vanes in the reference motion, rad
+    vane_error: FloatArray  # (T, k) sensor error of the vanes, rad
+
+
+class Course(NamedTuple):
+    """T ticks of the controller, the last at the end of the flight; channels in the law's order,
+    states in the airframe's.
+    """
+
+    segments: Segments
+    # (g,) indices of the axes of the airframe's gusts along which there is wind
+    axes: NDArray[np.int64]
+    # (n, r - g) orthonormal directions in x_dot of f_time without wind: biases and sines
+    basis: FloatArray
+    order: NDArray[np.int64]  # (m,) indices of the law's outputs in y
+    late: int  # delay of y, ticks
+    u_late: int  # delay of u, ticks
+    period: float  # s, of the ticks
+    steps: int  # of the integration from tick to tick
+
+
+def require_flyable(scenario: Scenario) -> None:
+    """Raise ParameterError for an aircraft or a controller beyond a campaign."""
+    aircraft = scenario.aircraft
+    controller = scenario.controller
+    require(
+        not aircraft.is_jsbsim,
+        "airframe",
+        aircraft.airframe,
+        "an airframe with matrices: JSBSim flies one at a time",
+    )
+    fixed = getattr(controller, "learn", None) is None
+    require(
+        fixed, "controller.learn", "a section", "none: only rise-di fly and rise-di campaign learn"
+    )
+    at_trim = controller.guard().over_speed is None
+    require(
+        at_trim,
+        "controller.schedule",
+        "models at other speeds",
+        "none: the aircraft of a campaign fly at their trim speed",
+    )
+    for key in ("shear", "microburst"):
+        expected = "none: in a campaign the wind is the same everywhere"
+        require(getattr(aircraft, key) is None, f"aircraft.{key}", "a section", expected)
+    expected = "linear or euler: a campaign flies no multicopter"
+    require(aircraft.kinematics != "thrust", "aircraft.kinematics", "thrust", expected)
+    fixed = aircraft.over_airspeed is None
+    require(
+        fixed,
+        "aircraft.over_airspeed",
+        aircraft.over_airspeed,
+        "none: the aircraft of a campaign keep their trim speed",
+    )
+
+
+def _references(scenario: Scenario, ticks: int, tick_ns: int) -> tuple[FloatArray, FloatArray]:
+    """y_m and its derivative at the ticks, in the law's order, each (T, m)."""
+    reference = Reference(scenario.reference_model)
+    places = [scenario.reference_model.outputs.index(name) for name in scenario.controller.outputs]
+    y_m = np.zeros((ticks, len(places)))
+    y_m_dot = np.zeros_like(y_m)
+    for k in range(ticks):
+        y_m[k] = reference.sample(k * tick_ns // reference.period_ns)[places]
+        y_m_dot[k] = reference.rate()[places]
+    return y_m, y_m_dot
+
+
+def build_course(scenario: Scenario) -> Course:
+    """The course of a scenario, with the feedforward of the controller.
+
+    Raises ParameterError for a scenario beyond a campaign: an aircraft of JSBSim, a delay of y or u
+    by a part of a tick, dropouts of a y with a different rate than the ticks, or dropouts longer
+    than the age limit; for vanes with faults.
+    """
+    aircraft = scenario.aircraft
+    controller = scenario.controller
+    require_flyable(scenario)
+    airframe = aircraft.load()[0]
+    plant = aircraft.plant()
+    tick_ns = period_ns(controller.rate, "controller.rate")
+    sample_ns = period_ns(aircraft.rate, "aircraft.rate")
+    ticks = nanoseconds(scenario.flight.duration) // tick_ns + 1
+    steps = divide(tick_ns, plant.step_ns, "step", "a tick")
+    outputs = list(aircraft.channels().outputs)
+    order = np.array([outputs.index(name) for name in controller.outputs])
+
+    errors = aircraft.sensor_arrays()
+    late = divide(errors.delay_ns, tick_ns, "sensors.delay", "a tick") if errors.delay_ns else 0
+    lossless = errors.dropout == 0.0 or tick_ns == sample_ns
+    require(
+        lossless,
+        "aircraft.rate",
+        f"{aircraft.rate:g} Hz",
+        f"controller.rate ({controller.rate:g} Hz) with dropouts",
+    )
+    vanes = [outputs.index(name) for name in controller.vanes]
+    u_delay_ns = nanoseconds(aircraft.actuators.delay)
+    u_late = divide(u_delay_ns, tick_ns, "actuators.delay", "a tick") if u_delay_ns else 0
+    _require_plain_vanes(scenario, late)
+    error, noise = _sensor_errors(errors, ticks, tick_ns // sample_ns, len(outputs))
+    y_m, y_m_dot = _references(scenario, ticks, tick_ns)
+    arrives = [sensors.arrives(k, errors) for k in range(ticks)]
+    phase, dt = _phases(ticks, late, seconds(tick_ns), scenario.controller.max_age, arrives)
+    used = np.maximum(np.arange(ticks) - late, 0)
+    wind, timed = _forcing(ticks, steps, plant)
+    axes, basis, (over_step, now) = _reduced(wind, timed)
+    guard = controller.guard()
+    u_ff, x_m = _feedforward(guard.nominal, phase, dt, y_m[used], seconds(tick_ns))
+    segments = Segments(
+        np.arange(ticks) * np.float64(seconds(tick_ns)),
+        phase,
+        dt,
+        y_m,
+        y_m[used],
+        y_m_dot[used],
+        u_ff,
+        error[:, order],
+        noise[:, order],
+        over_step.reshape(ticks, -1),
+        now,
+        _air_angles(wind.at_tick, airframe),
+        x_m[:, guard.vanes],
+        error[:, vanes],
+    )
+    return Course(segments, axes, basis, order, late, u_late, seconds(tick_ns), steps)
+
+
+def _phases(
+    ticks: int, late: int, period: float, max_age: float, arrives: list[bool]
+) -> tuple[NDArray[np.int32], FloatArray]:
+    phase = np.full(ticks, HOLD, dtype=np.int32)
+    dt = np.zeros(ticks)
+    last: int | None = None
+    for k in range(late, ticks):
+        if not arrives[k - late]:
+            continue
+        if last is None:
+            phase[k] = ENGAGE
+        else:
+            gap = (k - last + late) * period
+            require(gap <= max_age, "sensors.dropout", f"{gap:g} s without y", "less than max_age")
+            phase[k] = STEP
+            dt[k] = (k - last) * period
+        last = k
+    return phase, dt
+
+
+def _require_plain_vanes(scenario: Scenario, late: int) -> None:
+    """Raise ParameterError for vanes beyond a campaign: late, frozen, with losses or steps."""
+    vanes = scenario.aircraft.vanes
+    sensors_of = scenario.aircraft.sensors
+    key = "aircraft.vanes"
+    if scenario.controller.vanes:
+        require(
+            not late,
+            "sensors.delay",
+            f"{sensors_of.delay:g} s beside vanes",
+            "0: a campaign has no late vanes",
+        )
+        plain = (
+            vanes.dropout == 0.0
+            and not np.isfinite(vanes.frozen_at).any()
+            and not any(sensors_of.quantisation)
+        )
+        require(
+            plain,
+            key,
+            "a vane that freezes, loses readings or has steps",
+            "none: rise-di fly --in-process has these",
+        )
+
+
+def _feedforward(
+    nominal: Nominal | None,
+    phase: NDArray[np.int32],
+    dt: FloatArray,
+    y_m: FloatArray,
+    period: float,
+) -> tuple[FloatArray, FloatArray]:
+    """u_ff at the ticks, (T, m), and the state of the nominal model, (T, n); n = 0 without a
+    model.
+    """
+    u_ff = np.zeros_like(y_m)
+    if nominal is None:
+        return u_ff, np.zeros((len(y_m), 0))
+    x_m = np.zeros((len(y_m), len(nominal.A)))
+    state = feedforward.initial_state(y_m[0], nominal)
+    for k, action in enumerate(phase):
+        if action == ENGAGE:
+            state = feedforward.initial_state(y_m[k], nominal)
+        elif action == STEP:
+            parts = feedforward.parts_of(round(dt[k] / period), 1)
+            state, u_ff[k] = feedforward.step(state, y_m[k], dt[k], nominal, parts)
+        elif k:
+            u_ff[k] = u_ff[k - 1]
+        x_m[k] = state.x
+    return u_ff, x_m
+
+
+def _sensor_errors(
+    errors: Sensors, ticks: int, samples: int, channels: int
+) -> tuple[FloatArray, FloatArray]:
+    """Errors of y at the ticks, each `samples` samples, and the noise in them, (T, channels)."""
+    error = np.zeros((ticks, channels))
+    noise = np.zeros_like(error)
+    drift = sensors.initial_drift(errors)
+    bias = 0.0 if errors.bias is None else errors.bias
+    for k in range(ticks):
+        error[k], drift = sensors.error(k * samples, drift, errors)
+        noise[k] = error[k] - bias - drift.value
+    return error, noise
+
+
+class _Forcing(NamedTuple):
+    """A part of the forcing in time."""
+
+    over_step: FloatArray  # (T K, ...) mean over each step of the integration
+    at_tick: FloatArray  # (T, ...)
+
+
+def _reduced(
+    wind: _Forcing, timed: _Forcing
+) -> tuple[NDArray[np.int64], FloatArray, tuple[FloatArray, FloatArray]]:
+    """`axes` and `basis` of a course, and the forcing along both over steps and at ticks."""
+    axes = np.flatnonzero(wind.over_step.any(axis=0))
+    _, sizes, rows = np.linalg.svd(timed.over_step, full_matrices=False)
+    basis = rows[sizes > 1e-12 * max(sizes[0], 1e-300)].T
+    over_step, now = (
+        np.concatenate([blowing[:, axes], forcing @ basis], axis=1)
+        for blowing, forcing in zip(wind, timed, strict=True)
+    )
+    return axes, basis, (over_step, now)
+
+
+def _forcing(ticks: int, steps: int, plant: PlantParams) -> tuple[_Forcing, _Forcing]:
+    """The wind along the G axes, m/s, and f_time without wind, n rows of x_dot."""
+    no_effect = np.zeros_like(plant.aircraft.gust_direction)
+    forced = plant_model.forcing(
+        0, ticks * steps, plant._replace(aircraft=plant.aircraft._replace(gust_direction=no_effect))
+    )
+    wind, timed = (
+        # Simpson's rule, as in Runge-Kutta
+        _Forcing((part[:-1:2] + 4.0 * part[1::2] + part[2::2]) / 6.0, part[: -1 : 2 * steps])
+        for part in forced
+    )
+    if (air := plant.turbulence) is not None:
+        turbulent = np.zeros_like(wind.over_step)
+        z = turbulence.initial_state(air)
+        normals = turbulence.normals(0, ticks * steps, air)
+        for k in range(ticks * steps):
+            turbulent[k] = turbulence.wind(z, air)
+            z = turbulence.step(z, normals[k], air)
+        wind = _Forcing(wind.over_step + turbulent, wind.at_tick + turbulent[::steps])
+    return wind, timed
+
+
+def _air_angles(wind: FloatArray, airframe: Airframe) -> FloatArray:
+    """Contribution of the wind at the ticks, shape (T, G), to alpha and beta, rad, in the order of
+    the states, shape (T, n).
+    """
+    angles = np.zeros((len(wind), len(airframe.states)))
+    for place, axis in enumerate(airframe.gusts):
+        if axis in {"lateral", "vertical"} and AIR_STATE[axis] in airframe.states:
+            angles[:, airframe.index(AIR_STATE[axis])] = wind[:, place] / airframe.speed
+    return angles

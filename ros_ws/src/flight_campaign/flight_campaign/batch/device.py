@@ -1,0 +1,67 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The device of JAX that aircraft fly on, and what follows from its kind and its memory."""
+
+import os
+from contextlib import AbstractContextManager, nullcontext
+from threading import Lock
+
+import jax
+
+from flight_campaign.batch.batch_schedule import Schedule, with_branches, without_branches
+
+CPU_CHUNK = 1000  # aircraft at once; with their matrices, 2 MB, they stay in the caches of a core
+LARGEST_CHUNK = 250_000  # of a device: more at once were not faster on one H200
+BYTES = 16_384  # of memory an aircraft; osprey_servo needed 11,300 on one H200 (JAX 0.11.2)
+THREADS = 3  # of a device: a chunk is drawn, one flies, one is written
+
+VISIBLE = {"cuda": "CUDA_VISIBLE_DEVICES", "rocm": "HIP_VISIBLE_DEVICES"}
+"""Variables of the environment that name the devices of a process, by a word of the platform."""
+
+_TURN = Lock()
+
+
+def is_cpu() -> bool:
+    """Whether JAX computes on the processor."""
+    return jax.default_backend() == "cpu"
+
+
+def device_name() -> str:
+    """The device, for people: NVIDIA H200, or the cores of the processor."""
+    return f"{threads()} CPU cores" if is_cpu() else jax.devices()[0].device_kind
+
+
+def schedule_of_device() -> Schedule:
+    """The schedule that is fastest on the device."""
+    return with_branches if is_cpu() else without_branches
+
+
+def threads() -> int:
+    """How many threads keep the device busy: one a core of a CPU."""
+    return os.cpu_count() or 1 if is_cpu() else THREADS
+
+
+def turn() -> AbstractContextManager[object]:
+    """The turn of a chunk on the device: one chunk flies, while others are drawn or written."""
+    return nullcontext() if is_cpu() else _TURN
+
+
+def chunk_of_device(aircraft: int) -> int:
+    """How many of these aircraft fly at once: what fits into the memory, in chunks of one size."""
+    if is_cpu():
+        return CPU_CHUNK
+    memory = (jax.devices()[0].memory_stats() or {}).get("bytes_limit", BYTES * LARGEST_CHUNK)
+    most = max(min(LARGEST_CHUNK, memory // BYTES), 1)
+    chunks = -(-aircraft // most)
+    return -(-aircraft // chunks)
+
+
+def separate_devices() -> list[dict[str, str]]:
+    """Environments of processes, of which each sees one device of this host; [] for a CPU."""
+    devices = jax.local_devices()
+    platform = devices[0].client.platform_version
+    variable = next((VISIBLE[word] for word in VISIBLE if word in platform), None)
+    if variable is None:
+        return []
+    every = ",".join(str(number) for number in range(len(devices)))
+    return [{variable: name} for name in os.environ.get(variable, every).split(",")]

@@ -1,0 +1,193 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Comparison of tuned laws on the same aircraft, winds, noise and limits: nominal, uncertain, and
+with delayed inputs.
+"""
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aircraft_sim.uncertainty import nominal_and_sampled
+from control_laws.catalogue import LAWS, Law
+from flight_analysis.linear_loop.input_margins import Margins
+from flight_campaign.batch import batch
+from flight_campaign.batch.batch_matrices import Fleet
+from flight_campaign.comparison.tuning import (
+    GUST,
+    TURBULENCE,
+    Benchmark,
+    as_gains,
+    benchmark_fleet,
+    nominal_margins,
+    score,
+)
+from flight_campaign.statistics import LOSS_OF_TRACK_SCORE
+from flight_core.vectors import FloatArray
+from flight_design.gains.tuned_gains import TuningResult
+from rise_di_controller.law.control_law import ControlLaw
+
+DELAY_TICKS = (1, 2, 3, 4, 6)  # delays of u: 10 to 60 ms at 100 Hz
+TURBULENCE_SEED = 3  # of a comparison, unlike that of the tuning
+
+
+class Scores(NamedTuple):
+    """Scores of the uncertain aircraft of a level in a wind."""
+
+    mean: float  # infinite if one diverged
+    worst: float
+    # fraction with loss of track, a score above LOSS_OF_TRACK_SCORE; includes diverged ones
+    lost: float
+
+
+class Level(NamedTuple):
+    """Results of a law on the uncertain aircraft of a level, u in time."""
+
+    uncertainty: float
+    scores: dict[str, Scores]  # by wind
+
+
+class LawResult(NamedTuple):
+    """Results of a law; channels in the law's order, SI."""
+
+    law: str
+    objective: str  # what it was tuned on
+    costs: list[float]  # of the seeds of its tuning; empty for gains of a scenario
+    scores: dict[str, float]  # on the nominal aircraft, by wind
+    levels: tuple[Level, ...]
+    # by delay of u in s: fraction of the aircraft of the first level that lose track in gusts
+    lost_late: dict[float, float]
+    rms: FloatArray  # (m,) of the true error, nominal aircraft in gusts
+    slew: FloatArray  # (m,) mean abs(u_dot), nominal aircraft in gusts
+    # of the nominal aircraft; None for a law without a linear loop from y to u
+    margins: Margins | None
+
+
+def compare(
+    benchmark: Benchmark,
+    tuned: Mapping[str, Mapping[str, TuningResult]],
+    aircraft: int,
+    levels: Sequence[float],
+    seed: int,
+    delays: Sequence[int] = DELAY_TICKS,
+    laws: Mapping[str, Law] = LAWS,
+) -> Iterator[LawResult]:
+    """Simulate the laws with their gain sets on the same flights; a thread flies a law.
+
+    The flights, by wind: the nominal aircraft and `aircraft` uncertain aircraft of `seed` per
+    level. In gusts also the aircraft of the first level with u late by `delays`, ticks. Raises
+    ParameterError for an uncertainty outside [0, 1).
+    """
+    airframe, _ = benchmark.scenario.aircraft.load()
+    sampled = [nominal_and_sampled(airframe, level, aircraft, seed) for level in levels]
+    A_by_level, B_by_level = zip(*sampled, strict=True)
+    A = _nominal_once(A_by_level)
+    B = _nominal_once(B_by_level)
+    in_time = np.arange(len(A))
+    parts = np.split(in_time[1:], len(levels))
+    first = in_time[1 : 1 + aircraft]
+    numbers = np.concatenate([in_time, np.tile(first, len(delays))])
+    late = np.concatenate([0 * in_time, np.repeat(np.array(delays, dtype=int), aircraft)])
+    flights = {
+        GUST: benchmark_fleet(A[numbers], B[numbers], late, GUST, benchmark),
+        TURBULENCE: benchmark_fleet(A, B, 0 * in_time, TURBULENCE, benchmark),
+    }
+
+    study = _Study(benchmark, flights, levels, parts, delays)
+
+    def results(name: str) -> list[LawResult]:
+        control_law = laws[name].control_law(benchmark.model)  # of all gain sets: compiled once
+        return [
+            study.result(name, laws[name], control_law, objective, gains)
+            for objective, gains in tuned[name].items()
+        ]
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for scored in pool.map(results, tuned):
+            yield from scored
+
+
+class _Study(NamedTuple):
+    """The flights that all laws fly."""
+
+    benchmark: Benchmark
+    flights: Mapping[str, Fleet]  # by wind
+    levels: Sequence[float]
+    parts: Sequence[NDArray[np.int64]]  # places of the aircraft of each level
+    delays: Sequence[int]
+
+    def result(
+        self,
+        name: str,
+        law: Law,
+        control_law: ControlLaw,
+        objective: str,
+        gains: TuningResult,
+    ) -> LawResult:
+        """The figures of a law with a gain set."""
+        benchmark = self.benchmark
+        params = law.params(as_gains(gains), benchmark.model)
+        flown = {}
+        for wind, disturbed in self.flights.items():
+            course = benchmark.courses[wind][law.feedforward]
+            flown[wind] = batch.fly(disturbed, benchmark.vehicle, course, control_law, params)
+        scores = {wind: score(each, benchmark.unit) for wind, each in flown.items()}
+        in_time = 1 + sum(map(len, self.parts))
+        delayed = scores[GUST][in_time:].reshape(len(self.delays), len(self.parts[0]))
+        by_level = []
+        for level, part in zip(self.levels, self.parts, strict=True):
+            costs = {wind: _scores(of_wind[part]) for wind, of_wind in scores.items()}
+            by_level.append(Level(level, costs))
+        lost = {}
+        for ticks, costs_late in zip(self.delays, delayed, strict=True):
+            lost[ticks * benchmark.model.period] = _lost(costs_late)
+        return LawResult(
+            name,
+            objective,
+            gains.costs,
+            {wind: float(costs[0]) for wind, costs in scores.items()},
+            tuple(by_level),
+            lost,
+            np.asarray(flown[GUST].rms)[:, 0],
+            np.asarray(flown[GUST].slew)[:, 0],
+            _margins(law, gains, benchmark),
+        )
+
+
+def _nominal_once(matrices: Sequence[FloatArray]) -> FloatArray:
+    """The matrices of all levels in order, with the nominal aircraft of the first level alone."""
+    return np.concatenate([matrices[0], *(level[1:] for level in matrices[1:])])
+
+
+def score_cells(result: LawResult) -> list[str]:
+    """The scores of a law as cells of a table: by wind the score of the nominal aircraft, then mean
+    (worst) by level.
+    """
+    cells = []
+    for wind, nominal in result.scores.items():
+        uncertain = (level.scores[wind] for level in result.levels)
+        cells += [
+            f"{nominal:.2f}",
+            *(f"{scores.mean:.2f} ({scores.worst:.2f})" for scores in uncertain),
+        ]
+    return cells
+
+
+def _margins(law: Law, gains: TuningResult, benchmark: Benchmark) -> Margins | None:
+    if not law.has_margins:
+        return None
+    return Margins(
+        *(values[0] for values in nominal_margins(law, as_gains(gains), benchmark.model))
+    )
+
+
+def _scores(scores: FloatArray) -> Scores:
+    return Scores(float(np.mean(scores)), float(np.max(scores)), _lost(scores))
+
+
+def _lost(scores: FloatArray) -> float:
+    return float(np.mean(scores > LOSS_OF_TRACK_SCORE))

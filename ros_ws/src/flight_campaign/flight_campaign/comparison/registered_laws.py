@@ -1,0 +1,154 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Registered laws beside the laws of the catalogue: the controller of a scenario and the gains in
+the scenario.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from typing import Any
+
+import jax
+import numpy as np
+
+from control_laws.catalogue import LAWS, NONE, Gains, Law
+from control_laws.nominal_model import NominalModel
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_campaign.batch.campaign_course import build_course
+from flight_campaign.comparison.tuning import Benchmark
+from flight_core.parameters import ParameterError, require
+from flight_core.vectors import FloatArray
+from flight_design.gains.tuned_gains import TuningResult
+from rise_di_controller import laws
+from rise_di_controller.law.law import Sign
+from rise_di_controller.params import ControllerConfig
+from rise_di_controller.rise_di_config import RiseDiConfig
+
+
+def own_gains(controller: ControllerConfig) -> dict[str, list[float]]:
+    """The positive numbers of the law itself by name, without matrices."""
+    names = (
+        name for name in type(controller).model_fields if name not in ControllerConfig.model_fields
+    )
+    values = {name: np.atleast_1d(getattr(controller, name)) for name in names}
+    return {
+        name: value.tolist()
+        for name, value in values.items()
+        if value.dtype == np.float64 and (value > 0.0).all()
+    }
+
+
+def registered_law(controller: ControllerConfig, name: str) -> Law:
+    """The law of a controller, with the gains as the start of a search; the rest of the controller
+    stays.
+    """
+    start = own_gains(controller)
+    scalars = {key for key in start if not isinstance(getattr(controller, key), tuple)}
+
+    def params(gains: Gains, model: NominalModel) -> Any:
+        count = max(gain.shape[-1] for gain in gains.values()) if gains else 1
+        wide = {key: np.broadcast_to(gain, (len(gain), count)) for key, gain in gains.items()}
+        each = []
+        for k in range(count):
+            values = {key: _value(gain[:, k], key in scalars) for key, gain in wide.items()}
+            tuned = (
+                type(controller)
+                .validate_mapping(controller.model_dump() | values, name)
+                .tuned_law()
+            )
+            each.append(tuned.params)
+        return jax.tree.map(_last, *each)
+
+    return Law(
+        f"law {controller.law}, gains of the scenario",
+        controller.law,
+        "y",
+        "own parameters",
+        lambda model: controller.tuned_law().control_law,
+        params,
+        tuple(start),
+        NONE if controller.feedforward is None else name,
+        {key: np.array(value)[:, None] for key, value in start.items()},
+        not isinstance(controller, RiseDiConfig) or controller.sampled_sign()[0] is Sign.SOFT,
+    )
+
+
+def _value(gain: FloatArray, scalar: bool) -> float | list[float]:
+    return float(gain[0]) if scalar else gain.tolist()
+
+
+def _last(*leaves: Any) -> FloatArray:
+    """A parameter of N candidates, with the candidates in the last axis; (m, 1) for equal
+    values.
+    """
+    first = np.asarray(leaves[0], dtype=np.float64)
+    if all(np.array_equal(first, leaf) for leaf in leaves):
+        return first if first.ndim != 1 else first[:, None]
+    return np.stack([np.asarray(leaf, dtype=np.float64) for leaf in leaves], axis=-1)
+
+
+def find_laws(
+    names: Iterable[str], scenario: Scenario, others: Mapping[str, Scenario]
+) -> dict[str, ControllerConfig | None]:
+    """For each name the controller that flies, None for a law of the catalogue.
+
+    Beside the catalogue a name may be the law of the scenario's own controller, or a key of
+    `others`: scenarios given in place of a law. Raises ParameterError for an unknown name, for an
+    allocation, and for a controller with a different rate or order of the channels.
+    """
+    effectors = "none: the laws that are compared command the effectors"
+    require(scenario.controller.allocation is None, "controller.allocation", "a section", effectors)
+    controllers: dict[str, ControllerConfig | None] = {}
+    for name in names:
+        if name in others:
+            controller = others[name].controller
+        elif name in LAWS:
+            controllers[name] = None
+            continue
+        elif name == scenario.controller.law:
+            controller = scenario.controller
+        else:
+            flown = (
+                "the path of a scenario file whose controller flies it"
+                if name in laws.names()
+                else "a scenario file"
+            )
+            raise ParameterError(
+                f"--laws: found {name!r}, expected laws among {', '.join(LAWS)}, or {flown}"
+            )
+        for key in ("outputs", "inputs", "rate"):
+            expected = getattr(scenario.controller, key)
+            require(
+                getattr(controller, key) == expected,
+                f"--laws: {name}: {key}",
+                getattr(controller, key),
+                f"{expected}, as in {scenario.name}",
+            )
+        # in a benchmark topics have no delay
+        controllers[name] = controller.model_copy(update={"delay": 0.0})
+    return controllers
+
+
+def entries(controllers: Mapping[str, ControllerConfig | None]) -> dict[str, Law]:
+    """The laws by name: of the catalogue, or of a controller."""
+    return {
+        name: LAWS[name] if controller is None else registered_law(controller, name)
+        for name, controller in controllers.items()
+    }
+
+
+def with_courses(
+    benchmark: Benchmark, controllers: Mapping[str, ControllerConfig | None]
+) -> Benchmark:
+    """The benchmark with the courses of the feedforwards of these controllers."""
+    courses = {wind: dict(by_law) for wind, by_law in benchmark.courses.items()}
+    for name, controller in controllers.items():
+        if controller is not None and controller.feedforward is not None:
+            for wind, scenario in benchmark.scenarios.items():
+                courses[wind][name] = build_course(replace(scenario, controller=controller))
+    return benchmark._replace(courses=courses)
+
+
+def as_tuned(controller: ControllerConfig) -> TuningResult:
+    """The gains of a controller in place of the result of a search: without a cost."""
+    return TuningResult(own_gains(controller), float("nan"), 0, [], 0)

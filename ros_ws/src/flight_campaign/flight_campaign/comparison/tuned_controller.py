@@ -1,0 +1,139 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Tuned gains of a comparison as the controller of a scenario, under the registered law of the same
+equations.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from control_laws.catalogue import AIRCRAFT, INTEGRATORS, LAWS
+from control_laws.observed import PART, aircraft_design, extended_state_design
+from control_laws.observer_design import Names
+from flight_campaign.comparison.tuning import Benchmark, as_gains
+from flight_core.parameters import require
+from flight_core.vectors import FloatArray
+from flight_design.gains.extended_state import integrator_model
+from flight_design.gains.gain_conditions import MIN_K, split_gain
+from flight_design.gains.gain_selection import with_feedforward
+from flight_design.gains.tuned_gains import TuningResult
+from rise_di_controller.extensions.model_sections import FeedforwardConfig, ObserverConfig
+from rise_di_controller.law.law import MIN_GAIN
+from rise_di_controller.laws import AnyLaw
+from rise_di_controller.params import ControllerConfig
+
+FROM_Y = ("rise_di", "pi", "l1", "lqg")
+REGISTERED = {name: law.law for name, law in LAWS.items() if law.law in FROM_Y}
+"""The registered law of a law of the catalogue: of those that measure y alone and that a scenario
+can fly."""
+
+RISE_DI_GAINS = ("K", "Lambda", "beta", "softening", "omega")
+DESIGNS = {
+    "rise_observer": aircraft_design,
+    "pi_observer": aircraft_design,
+    "lqg": aircraft_design,
+    "eso": extended_state_design,
+}
+
+
+def require_registered(name: str) -> None:
+    """Raises ParameterError for a law that no scenario flies."""
+    require(name in REGISTERED, "--write", f"the law {name}", f"one of {', '.join(REGISTERED)}")
+
+
+def tuned_controller(name: str, tuned: TuningResult, benchmark: Benchmark) -> ControllerConfig:
+    """The controller that flies as a law of the catalogue with tuned gains, in the inputs of the
+    benchmark: 1 / abs(Omega_ii).
+
+    Topics have no delay, as in the benchmark. Raises ParameterError for a law that no scenario
+    flies.
+    """
+    require_registered(name)
+    model = benchmark.model
+    base = benchmark.scenario.controller
+    shared = set(ControllerConfig.model_fields) - {"law", "feedforward", "observer"}
+    values = {
+        key: value for key, value in base.model_dump(exclude_none=True).items() if key in shared
+    }
+    values |= {
+        "law": REGISTERED[name],
+        "input_scale": model.input_scale.tolist(),
+        "D": [int(sign) for sign in model.D],
+    }
+    feedforward = _feedforward(name, benchmark)
+    if feedforward is not None:
+        values["feedforward"] = feedforward.model_dump(exclude_none=True)
+    if name in DESIGNS:
+        values["observer"] = _observer(name, tuned, benchmark).model_dump()
+    gains = as_gains(tuned)
+    if REGISTERED[name] == "rise_di":
+        law_gains = {
+            key: np.broadcast_to(gains[key][:, 0], model.lag.shape)
+            for key in RISE_DI_GAINS
+            if key in gains
+        }
+        values |= _rise_di(law_gains, model.input_scale)
+    elif REGISTERED[name] != "lqg":
+        values |= {
+            key: tuned.gains[key] for key in ("K", "Lambda", "bandwidth") if key in tuned.gains
+        }
+    if REGISTERED[name] == "l1":
+        values["Omega"] = model.Omega.ravel().tolist()
+    return AnyLaw.validate_mapping(values, "controller")
+
+
+def _rise_di(gains: dict[str, FloatArray], input_scale: FloatArray) -> dict[str, Any]:
+    """Parameters of RISE-DI: a K that (22) does not have is a larger one with a smaller input
+    scale, the same loop.
+    """
+    K = gains["K"]
+    least = max(MIN_K, float(K[-1]))
+    permitted = np.maximum(K, least + np.append(np.full(len(K) - 1, MIN_GAIN), 0.0))
+    share = K / permitted
+    k_g, k_d = split_gain(permitted)
+    return {
+        "k_g": k_g,
+        "k_d": k_d.tolist(),
+        "Lambda": gains["Lambda"].tolist(),
+        "beta": (gains["beta"] / share).tolist(),
+        "omega": (gains["omega"] * share if "omega" in gains else share).tolist(),
+        "input_scale": (input_scale * share).tolist(),
+        "softening": gains["softening"].tolist() if "softening" in gains else 1.0,
+        "sign": "soft" if "softening" in gains else "implicit",
+    }
+
+
+def _feedforward(name: str, benchmark: Benchmark) -> FeedforwardConfig | None:
+    """The model of the feedforward of a law."""
+    controller = benchmark.scenario.controller
+    if LAWS[name].feedforward == AIRCRAFT:
+        return with_feedforward(controller, benchmark.scenario.aircraft.load()[0]).feedforward
+    return (
+        integrator_model(controller, benchmark.model.Omega)
+        if LAWS[name].feedforward == INTEGRATORS
+        else None
+    )
+
+
+def _observer(name: str, tuned: TuningResult, benchmark: Benchmark) -> ObserverConfig:
+    """The observer of a law, with its bound of u_o; the margin is that of the search, so none is
+    required of it.
+    """
+    controller = benchmark.scenario.controller
+    airframe = benchmark.scenario.aircraft.load()[0]
+    integrators = LAWS[name].feedforward == INTEGRATORS
+    states, axes = (
+        (controller.outputs, ()) if integrators else (tuple(airframe.states), tuple(airframe.gusts))
+    )
+    design = DESIGNS[name](
+        as_gains(tuned), benchmark.model, Names(states, controller.inputs, controller.outputs, axes)
+    )
+    matrices = {
+        key: np.asarray(getattr(design, key)).ravel().tolist() for key in ("Phi", "Gamma", "L", "F")
+    }
+    part = 1.0 if name == "lqg" else PART
+    return ObserverConfig.validate_mapping(
+        matrices | {"rate": controller.rate, "states": design.states, "part": part, "margin": 0.0},
+        "observer",
+    )

@@ -1,0 +1,414 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""One tuning procedure for every law: CMA-ES over the logarithms of its gains, on the nominal
+aircraft and around it.
+"""
+
+import os
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from itertools import product
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from aircraft_sim.atmosphere.turbulence import MODERATE
+from aircraft_sim.plant.plant import PlantParams
+from aircraft_sim.uncertainty import gust_directions, nominal_and_sampled
+from control_laws.catalogue import AIRCRAFT, INTEGRATORS, NONE, Gains, Law, initial_gains
+from control_laws.nominal_model import NominalModel
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.linear_loop.input_margins import Margins, input_margins
+from flight_analysis.linear_loop.loop_margins import law_order
+from flight_campaign import statistics
+from flight_campaign.batch import batch, batch_matrices
+from flight_campaign.batch.batch_loop import FleetResult, Vehicle
+from flight_campaign.batch.batch_matrices import Fleet
+from flight_campaign.batch.campaign_course import Course, build_course, require_flyable
+from flight_campaign.statistics import score_units
+from flight_core.vectors import Array, FloatArray
+from flight_design.gains.extended_state import integrator_model
+from flight_design.gains.gain_selection import with_feedforward
+from flight_design.gains.nominal import ACTIVITY_UNIT, nominal_model
+from flight_design.gains.requirement import REQUIREMENT, Requirement, least_fractions
+from flight_design.gains.tuned_gains import TuningResult
+from rise_di_controller.law.control_law import TunedLaw
+from rise_di_controller.law.linear_loop import LinearPlant, Loop, linear_law
+
+GUST = "gust"
+TURBULENCE = "turbulence"
+"""The winds of a benchmark: that of its scenario, and turbulence in its place."""
+
+TUNING_TURBULENCE_SEED = 40  # of the turbulence in a cost; a comparison flies another one
+
+
+class Objective(NamedTuple):
+    """The flights of a cost: every aircraft with u in time, and some with u late."""
+
+    title: str
+    weights: dict[str, float]  # by wind
+    delay: int  # of the late u, in multiples of `Benchmark.delay`
+    all_late: bool  # u is late on all aircraft, not on the nominal one alone
+    requirement: Requirement | None = None  # of the nominal loop of a law that has margins
+
+
+# Turbulence has half the weight, since scores in it are about twice those in the gusts.
+OBJECTIVES = {
+    "gust": Objective("gusts", {GUST: 1.0}, 1, all_late=False),
+    "gust_turbulence": Objective(
+        "gusts and turbulence", {GUST: 1.0, TURBULENCE: 0.5}, 1, all_late=False
+    ),
+    "delay": Objective(
+        "gusts and turbulence with a large delay", {GUST: 1.0, TURBULENCE: 0.5}, 2, all_late=True
+    ),
+    "margins": Objective(
+        "gusts and turbulence within margins of 45 deg and 6 dB",
+        {GUST: 1.0, TURBULENCE: 0.5},
+        1,
+        False,
+        REQUIREMENT,
+    ),
+}
+
+UNCERTAIN_AIRCRAFT = 12
+UNCERTAINTY = 0.4
+UNCERTAINTY_SEED = 40
+"""Number, +-fraction and seed of the uncertain aircraft. Campaigns and comparisons use other seeds
+by default."""
+
+DELAY_TICKS = 2
+"""Delay of u in the late flights of a cost: 20 ms at 100 Hz. Without actuators it is one tick: the
+loop's lag is 15 ms."""
+
+POPULATION = 16
+GENERATIONS = 88
+GENERATIONS_PER_GAIN = 6
+INITIAL_SIGMA = 0.4
+"""A search has GENERATIONS, or GENERATIONS_PER_GAIN times its gains if that is more: from 15 gains
+on. INITIAL_SIGMA is the first standard deviation of log(gain)."""
+
+# of the candidates of a generation, flown side by side; a flight in a smaller part takes more
+# processor time
+PARTS = 2
+
+# cost of a flight that diverged, of a loop without any margin, and upper bound of every other cost
+MAX_COST = 1000.0
+# s. Step of the integration, or one tick if that is shorter. The scores are within 1 % of those of
+# a finer step.
+STEP = 0.005
+
+
+class Benchmark(NamedTuple):
+    """The setting in which laws are tuned and compared: one scenario in two winds, channels in the
+    law's order.
+    """
+
+    scenario: Scenario
+    model: NominalModel
+    unit: FloatArray  # (m,) of the errors in a score
+    activity_unit: FloatArray  # (m,) of the mean abs(u_dot) in a cost
+    plant: PlantParams
+    vehicle: Vehicle
+    scenarios: dict[str, Scenario]  # by wind
+    courses: dict[str, dict[str, Course]]  # by wind and by the model of the feedforward
+    delay: int  # ticks, delay of u in the late flights of a cost
+
+
+def build_benchmark(scenario: Scenario, turbulence_seed: int = TUNING_TURBULENCE_SEED) -> Benchmark:
+    """The benchmark of a scenario: its manoeuvre, actuators and noise; y, y_m and law at one rate,
+    topics without delay.
+
+    Its winds are those of the scenario, and turbulence of `turbulence_seed` alone, `turbulence_of`.
+    Raises ParameterError for a scenario that a campaign cannot fly, and for outputs whose unit has
+    no score.
+    """
+    require_flyable(scenario)
+    scenario = scenario.vary(
+        aircraft={
+            "rate": scenario.controller.rate,
+            "step": min(STEP, 1.0 / scenario.controller.rate),
+        },
+        reference_model={"rate": scenario.controller.rate},
+        controller={"delay": 0.0, "feedforward": None, "observer": None},
+    )
+    airframe, _ = scenario.aircraft.load()
+    controller = scenario.controller
+    with_model = scenario.vary(controller=with_feedforward(controller, airframe).model_dump())
+    air = turbulence_of(scenario) | {"seed": turbulence_seed}
+    turbulent = with_model.vary(aircraft={"gusts": {}, "turbulence": air})
+    rows, columns = law_order(airframe, controller)
+    actuators = scenario.aircraft.actuators
+    m = len(controller.inputs)
+
+    def in_law_order(limits: Iterable[float], default: float) -> FloatArray:
+        values = list(limits) or [default] * m
+        return np.array([values[column] for column in columns])
+
+    unit = score_units(controller.outputs, airframe.units_of_outputs())
+    noise = scenario.aircraft.sensor_arrays().noise[rows]
+    loop = Loop(np.array(controller.lag), 0.0, 1.0 / controller.rate)
+    model = nominal_model(
+        airframe,
+        controller.outputs,
+        controller.inputs,
+        np.where(noise > 0.0, noise, unit / 10.0),
+        loop,
+    )
+    model = model._replace(
+        D=np.array(controller.D, dtype=np.float64),
+        lower=in_law_order(actuators.lower, -np.inf),
+        upper=in_law_order(actuators.upper, np.inf),
+    )
+    return Benchmark(
+        scenario,
+        model,
+        unit,
+        np.array([ACTIVITY_UNIT[airframe.inputs[name].unit] for name in controller.inputs]),
+        scenario.aircraft.plant(),
+        batch.vehicle(scenario),
+        {GUST: with_model, TURBULENCE: turbulent},
+        {GUST: _courses(with_model), TURBULENCE: _courses(turbulent)},
+        DELAY_TICKS if any(controller.lag) else 1,
+    )
+
+
+def turbulence_of(scenario: Scenario) -> dict[str, float]:
+    """The turbulence of a benchmark: altitude and intensity of that of the scenario; moderate at
+    100 m where it has none.
+    """
+    turbulence = scenario.aircraft.turbulence
+    return (
+        MODERATE
+        if turbulence is None
+        else turbulence.model_dump(exclude={"seed"}, exclude_none=True)
+    )
+
+
+def _courses(scenario: Scenario) -> dict[str, Course]:
+    """The course of a scenario whose controller has the aircraft as the model of its feedforward,
+    by the model of that.
+    """
+    course, controller, (airframe, _) = (
+        build_course(scenario),
+        scenario.controller,
+        scenario.aircraft.load(),
+    )
+    rows, columns = law_order(airframe, controller)
+    Omega = airframe.matrix_c()[rows] @ airframe.matrix_b()[:, columns]
+    integrators = scenario.vary(
+        controller={"feedforward": integrator_model(controller, Omega).model_dump()}
+    )
+    none = course.segments._replace(u_ff=np.zeros_like(course.segments.u_ff))
+    return {
+        NONE: course._replace(segments=none),
+        AIRCRAFT: course,
+        INTEGRATORS: build_course(integrators),
+    }
+
+
+def score(result: FleetResult, unit: FloatArray) -> FloatArray:
+    """Sum over the channels of rms of the true error / unit, shape (N,); infinite if a flight
+    diverged.
+    """
+    total = statistics.score(np.asarray(result.rms), unit)
+    return np.where(np.asarray(result.diverged) | ~np.isfinite(total), np.inf, total)
+
+
+def cost(result: FleetResult, benchmark: Benchmark) -> FloatArray:
+    """Score + sum over the channels of mean abs(u_dot) / activity_unit, shape (N,), at most
+    MAX_COST.
+    """
+    activity = np.sum(np.asarray(result.slew) / benchmark.activity_unit[:, None], axis=0)
+    total = score(result, benchmark.unit) + activity
+    return np.where(np.isfinite(total), np.minimum(total, MAX_COST), MAX_COST)
+
+
+def benchmark_fleet(
+    A: FloatArray, B: FloatArray, late: Array, wind: str, benchmark: Benchmark
+) -> Fleet:
+    """Aircraft in a wind of the benchmark, u late by whole ticks; shapes as in `fleet.assemble`."""
+    aircraft = benchmark.scenario.aircraft
+    directions = gust_directions(aircraft.sampled_airframe(), A, aircraft.uncertainty.wind)
+    return batch_matrices.assemble(
+        A, B, benchmark.plant, benchmark.courses[wind][NONE], late=late, gust_directions=directions
+    )
+
+
+class Evaluation(NamedTuple):
+    """The flights of a cost in one wind, and their weights."""
+
+    wind: str
+    fleet: Fleet
+    weight: FloatArray  # (F,) of their costs in the sum
+
+
+def evaluations(objective: Objective, benchmark: Benchmark) -> list[Evaluation]:
+    """Flights of one evaluation of the cost, by wind: all aircraft with u in time, and the late
+    ones.
+
+        cost = sum over the winds of weight (mean over the aircraft with u in time + mean over the
+        late ones)
+
+    No flight is in calm air: in the flights with gusts the manoeuvre comes first, in calm air.
+    """
+    airframe, _ = benchmark.scenario.aircraft.load()
+    A, B = nominal_and_sampled(airframe, UNCERTAINTY, UNCERTAIN_AIRCRAFT, UNCERTAINTY_SEED)
+    aircraft = np.arange(len(A))
+    delayed = aircraft if objective.all_late else aircraft[:1]
+    numbers = np.concatenate([aircraft, delayed])
+    counts = [len(A), len(delayed)]
+    late = np.repeat([0, objective.delay * benchmark.delay], counts)
+    share = np.repeat([1.0 / count for count in counts], counts)
+    return [
+        Evaluation(
+            wind, benchmark_fleet(A[numbers], B[numbers], late, wind, benchmark), weight * share
+        )
+        for wind, weight in objective.weights.items()
+    ]
+
+
+def repeat_flights(flights: Fleet, times: int) -> Fleet:
+    """The same flights several times, one set after the other."""
+    tiled = jax.tree.map(
+        lambda array: np.tile(np.asarray(array), times), flights._replace(blocks=())
+    )
+    return tiled._replace(blocks=flights.blocks)
+
+
+def spread_over(params: Any, single: Any, flights: int) -> Any:
+    """Parameters of several candidates, each for all of its flights: (.., candidates) -> (..,
+    candidates flights).
+
+    `single` are the parameters of one candidate. What has the same shape in both is common to all
+    candidates, and stays.
+    """
+
+    def spread(leaf: FloatArray, single_leaf: FloatArray) -> FloatArray:
+        return leaf if leaf.shape == single_leaf.shape else np.repeat(leaf, flights, axis=-1)
+
+    return jax.tree.map(spread, params, single)
+
+
+def generation_count(law: Law, benchmark: Benchmark) -> int:
+    """Generations of a search."""
+    return max(
+        GENERATIONS,
+        GENERATIONS_PER_GAIN * sum(map(len, initial_gains(law, benchmark.model).values())),
+    )
+
+
+def tune(
+    law: Law,
+    objective: Objective,
+    benchmark: Benchmark,
+    seeds: tuple[int, ...],
+    generations: int | None = None,
+    progress: Callable[[int, float], None] | None = None,
+) -> TuningResult:
+    """Gains of the smallest cost that CMA-ES finds from the initial ones, the best of several
+    seeds; all seeds run together.
+
+    The cost of a candidate is the weighted sum over the flights of `evaluations`. A loop with a
+    part of the margins that the objective requires costs MAX_COST times the rest. Threads fly a
+    part of the candidates in one wind each. `progress` receives the generation and the smallest
+    cost so far. Source: N. Hansen, A. Ostermeier, Evolutionary Computation 9(2), 2001; the package
+    `cma`.
+    """
+    import cma  # noqa: PLC0415 - it imports matplotlib, which nothing here uses
+
+    begin = initial_gains(law, benchmark.model)
+    origin = np.log(np.concatenate(list(begin.values()))[:, 0])
+    ends = np.cumsum([len(gain) for gain in begin.values()])[:-1]
+
+    def gains_of(vectors: FloatArray) -> Gains:
+        """Gains by name, shape (size, N), of logarithms (N, d)."""
+        return dict(zip(begin, np.split(np.exp(vectors.T), ends), strict=True))
+
+    together = POPULATION * len(seeds) // PARTS
+    flights = [
+        evaluation._replace(fleet=repeat_flights(evaluation.fleet, together))
+        for evaluation in evaluations(objective, benchmark)
+    ]
+    each = len(flights[0].weight)
+    control_law = law.control_law(benchmark.model)
+    single = law.params(begin, benchmark.model)
+
+    def costs(job: tuple[Any, Evaluation]) -> FloatArray:
+        """Costs of a part of the candidates in one wind, (together,)."""
+        params, flown = job
+        course = benchmark.courses[flown.wind][law.feedforward]
+        result = batch.fly(flown.fleet, benchmark.vehicle, course, control_law, params)
+        return cost(result, benchmark).reshape(together, each) @ flown.weight
+
+    lacking = partial(_lacking, law, objective, benchmark)
+    options = {"popsize": POPULATION, "verbose": -9}
+    searches = [
+        cma.CMAEvolutionStrategy(origin, INITIAL_SIGMA, options | {"seed": seed}) for seed in seeds
+    ]
+    best: list[tuple[float, FloatArray]] = [(np.inf, origin)] * len(seeds)
+    generations = generation_count(law, benchmark) if generations is None else generations
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for generation in range(generations):
+            asked = [np.array(search.ask()) for search in searches]
+            parts = [gains_of(part) for part in np.split(np.concatenate(asked), PARTS)]
+            params = [
+                spread_over(law.params(part, benchmark.model), single, each) for part in parts
+            ]
+            weighted = np.array(list(pool.map(costs, product(params, flights))))
+            by_part = weighted.reshape(PARTS, len(flights), together).sum(axis=1)
+            by_part += np.array(list(pool.map(lacking, parts)))
+            by_search = by_part.reshape(len(seeds), POPULATION)
+            best = [_after(*each) for each in zip(searches, asked, by_search, best, strict=True)]
+            if progress is not None:
+                progress(generation + 1, min(value for value, _ in best))
+    winner = int(np.argmin([value for value, _ in best]))
+    gains = _rounded(gains_of(best[winner][1][None]))
+    lowest = [round(value, 4) for value, _ in best]
+    return TuningResult(gains, lowest[winner], seeds[winner], lowest, generations * POPULATION)
+
+
+def nominal_margins(law: Law, gains: Gains, model: NominalModel) -> Margins:
+    """Margins of a law around the nominal aircraft for N sets of gains, (m, N) or (1, N), shapes
+    (N, m) and (N,), without those of all inputs at once.
+
+    u has no delay, as in a benchmark.
+    """
+    tuned = TunedLaw(law.control_law(model), law.params(gains, model))
+    count = max((gain.shape[-1] for gain in gains.values()), default=1)
+    plant = LinearPlant(model.A + model.gravity, model.B, model.C)
+    candidates = linear_law(tuned, len(model.lag), model.period, count)
+    loop = Loop(model.lag, 0.0, model.period)
+    return input_margins(plant, candidates, loop, together=False)
+
+
+def _lacking(law: Law, objective: Objective, benchmark: Benchmark, gains: Gains) -> FloatArray:
+    """Costs of the missing margins of N candidates, (N,)."""
+    if objective.requirement is None or not law.has_margins:
+        return np.zeros(next(iter(gains.values())).shape[-1])
+    margins = nominal_margins(law, gains, benchmark.model)
+    fractions = least_fractions(margins, objective.requirement)
+    return np.asarray(MAX_COST * (1.0 - np.minimum(fractions, 1.0)))
+
+
+def _rounded(gains: Gains) -> dict[str, list[float]]:
+    """The gains of the first candidate, to five digits."""
+    first = {}
+    for name, gain in gains.items():
+        first[name] = [float(f"{value:.5g}") for value in gain[:, 0]]
+    return first
+
+
+def _after(
+    search: Any, asked: FloatArray, values: FloatArray, best: tuple[float, FloatArray]
+) -> tuple[float, FloatArray]:
+    """The least cost so far and its candidate, after the search took the costs of those asked."""
+    search.tell(list(asked), list(values))
+    least = int(np.argmin(values))
+    return (float(values[least]), asked[least]) if values[least] < best[0] else best
+
+
+def as_gains(tuned: TuningResult) -> Gains:
+    """Gains of shape (m, 1) and (1, 1)."""
+    return {name: np.array(values)[:, None] for name, values in tuned.gains.items()}

@@ -1,0 +1,214 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Fence: zones to stay in and zones to keep out of, kept by the last safe turn.
+
+Each step predicts the turn at the largest bank to either side, until the course points along the
+way home. Once the better of the two turns comes nearer to the fence than MARGIN of flight, the
+aircraft flies the better turn, then home. From outside the aircraft flies back inside the shortest
+way, then home. Functions take Python floats, or arrays with an element per aircraft of a fleet.
+"""
+
+import math
+from itertools import product
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from flight_core.units import GRAVITY
+from flight_core.vectors import Array, Scalar, array_namespace
+from flight_guidance.fence.ways import POINTS, Ways, line_clearance, ways
+from flight_guidance.fence.zones import Fence, Zone, clearance
+from flight_guidance.steering.lateral import LARGEST_SLIP
+from flight_guidance.steering.protection import forward
+
+__all__ = ["Fence", "Zone", "clearance"]
+
+MARGIN = 0.5
+"""s of flight over ground: the largest cross-track error that guidance claims in wind and
+turbulence."""
+
+HOMEWARD = math.radians(20.0)
+"""Angle before the bearing of the way home at which the turn ends."""
+
+AHEAD = math.radians(60.0)
+"""Angle between the course and the bearing of the way home up to which an aircraft flies along the
+way."""
+
+LEAST_TURN = math.radians(5.0)
+"""Bank of the longest predicted turn: 2 min at 20 m/s.
+
+A turn at a smaller bank is predicted for as long. At a bank of 0, at 1.1 V_s and below, the
+prediction is the straight way.
+"""
+
+SHARES = (1.0, 1.0 - LARGEST_SLIP)
+"""Shares of the coordinated turn that the predicted turns have; the nearer turn counts.
+
+r follows psi' = g tan(phi) / V, but the aircraft flies along chi = psi + beta: a growing sideslip,
+and k_beta beta in r_m, take from the turn. Of the osprey with every entry of A and B off by up to
+30 % the sideslip takes 0.19, of JSBSim's f16 0.09.
+"""
+
+
+class Motion(NamedTuple):
+    """What the prediction takes of an aircraft, and the limits of the turn."""
+
+    north: Scalar  # m
+    east: Scalar  # m
+    phi: Scalar  # rad, once a roll that has begun ends
+    heading: Scalar  # rad, psi + beta
+    speed: Scalar  # airspeed, m/s
+    wind: tuple[Scalar, Scalar]  # where the air moves to: north, east, m/s
+    bank: Scalar  # largest bank, rad
+    roll_rate: float  # rad/s
+    # s, of the turn behind the commanded bank: half of 1 / k_phi, and `turn_lag`
+    lag: float
+
+
+def _remaining(side: Array, bearing: Array, course: Array) -> Array:
+    """Angle of a turn to a side from the course to a bearing, rad, 0 to 2 pi."""
+    return side * (bearing - course) % (2.0 * math.pi)
+
+
+def _bearing(chart: Ways, fence: Fence, north: Array, east: Array) -> Array:
+    """Bearing of the way home, rad."""
+    aim_north, aim_east, _ = chart.aim(fence, north, east)
+    return array_namespace(north).atan2(aim_east - east, aim_north - north)
+
+
+def turn_clearance(fence: Fence, motion: Motion) -> tuple[Array, Array]:
+    """Least clearance of the turn to the right and to the left, m.
+
+        phi' = p_max after the lag, to the largest bank;  chi' = share g tan(phi) / V;
+            [n, e]' = V [cos, sin](chi) + W
+
+    until the course is HOMEWARD before the way home, at the latest after nearly a full turn, at
+    LEAST_TURN or more. Trapezoidal rule over POINTS.
+    """
+    xp = array_namespace(motion.phi)
+    axes = (1,) * np.ndim(motion.phi)
+    turns = np.array([*product((1.0, -1.0), SHARES)])
+    side, share = (column.reshape(-1, 1, *axes) for column in turns.T)
+    aim = side * motion.bank
+    turn = share * GRAVITY / forward(motion.speed)
+    rolled = motion.lag + abs(aim - motion.phi) / motion.roll_rate
+    longest = (
+        motion.lag
+        + 2.0 * motion.bank / motion.roll_rate
+        + 1.95 * math.pi / (turn * xp.tan(xp.maximum(motion.bank, LEAST_TURN)))
+    )
+    t = np.linspace(0.0, 1.0, POINTS).reshape(-1, *axes) * longest
+    reach = motion.roll_rate * xp.maximum(t - motion.lag, 0.0)
+    phi = motion.phi + xp.minimum(xp.maximum(aim - motion.phi, -reach), reach)
+    chi = motion.heading + _integral(turn * xp.tan(phi), longest)
+    v_north = motion.speed * xp.cos(chi) + motion.wind[0]
+    v_east = motion.speed * xp.sin(chi) + motion.wind[1]
+    north = motion.north + _integral(v_north, longest)
+    east = motion.east + _integral(v_east, longest)
+    remaining = _remaining(
+        side, _bearing(ways(fence), fence, north, east), xp.atan2(v_east, v_north)
+    )
+    homeward = (remaining < HOMEWARD) & (t > rolled)
+    after = xp.cumsum(homeward, axis=1) - homeward > 0
+    nearest = xp.min(xp.where(after, math.inf, clearance(fence.zones, north, east)), axis=1)
+    right_turn, left_turn = (xp.min(nearest[k : k + len(SHARES)], axis=0) for k in (0, len(SHARES)))
+    return right_turn, left_turn
+
+
+COURSES = 24
+"""Courses and directions of the wind of `room_at_home`."""
+
+
+def room_at_home(fence: Fence, motion: Motion, wind: float) -> float:
+    """Least clearance of the better turn from home onto the orbit, m, of COURSES courses in a wind,
+    m/s, from COURSES sides.
+
+    `motion`: the aircraft at home. An aircraft comes over home on any course, and its turn onto the
+    orbit leaves the orbit by up to twice the radius of the turn.
+    """
+    angles = np.linspace(0.0, 2.0 * math.pi, COURSES, endpoint=False)
+    from_sides = angles if wind else angles[:1]
+    heading, side = (grid.ravel() for grid in np.meshgrid(angles, from_sides))
+    turning = motion._replace(
+        north=np.full(heading.shape, motion.north),
+        east=np.full(heading.shape, motion.east),
+        phi=np.zeros(heading.shape),
+        heading=heading,
+        wind=(wind * np.cos(side), wind * np.sin(side)),
+    )
+    return float(np.min(np.maximum(*turn_clearance(fence, turning))))
+
+
+def _integral(rate: Array, longest: Array) -> Array:
+    """Integral from 0 over the axis 1 of a rate at POINTS equal times up to `longest`, by the
+    trapezoidal rule.
+    """
+    xp = array_namespace(rate)
+    steps = 0.5 * (rate[:, 1:] + rate[:, :-1]) * (longest / (POINTS - 1))
+    return xp.concat([xp.zeros_like(rate[:, :1]), xp.cumsum(steps, axis=1)], axis=1)
+
+
+class Escape(NamedTuple):
+    """Result of `last_safe_turn`."""
+
+    action: Any  # RIGHT, LEFT, HOME, BACK, AROUND or 0
+    begins: Any  # whether the fence begins to act
+    clearance: Any  # m, now
+    predicted: Any  # m, least clearance of the best way
+    course: Any  # rad, over ground: of the way home
+
+
+RIGHT = 1.0
+LEFT = -1.0
+HOME = 2.0
+BACK = 3.0
+AROUND = 4.0
+"""Actions of the fence; 0 is none.
+
+A turn to the right, to the left; the way home in a straight line; the way back from outside, the
+shortest way; the way home around a zone or a corner.
+"""
+
+
+def last_safe_turn(fence: Fence, action: Scalar, motion: Motion) -> Escape:
+    """The action of the fence after a step, from the action before.
+
+    A turn begins where the better turn comes nearer to the fence than MARGIN of flight. It ends
+    HOMEWARD before the way home, and beyond where the way is free. On the way home a turn begins
+    only where it keeps farther from the fence than the way that is flown, and the clearance of now
+    is enough. Outside no turn begins: the aircraft flies back until it is MARGIN inside.
+    """
+    if isinstance(motion.phi, float):
+        north, east, phi = map(np.float64, (motion.north, motion.east, motion.phi))
+        motion = motion._replace(north=north, east=east, phi=phi)
+    xp = array_namespace(motion.phi)
+    place = (motion.north, motion.east)
+    v_north = motion.speed * xp.cos(motion.heading) + motion.wind[0]
+    v_east = motion.speed * xp.sin(motion.heading) + motion.wind[1]
+    course = xp.atan2(v_east, v_north)
+    margin = MARGIN * xp.hypot(v_north, v_east)
+    *aim, straight = ways(fence).aim(fence, *place)
+    bearing = xp.atan2(aim[1] - place[1], aim[0] - place[0])
+    now = clearance(fence.zones, *place)
+    is_outside = (now < 0.0) | ((action == BACK) & (now < margin))
+    homeward = xp.where(straight, HOME, AROUND)
+
+    right_turn, left_turn = turn_clearance(fence, motion)
+    turn = xp.maximum(right_turn, left_turn)
+    flies_home = action != 0.0
+    along = flies_home & (xp.cos(bearing - course) > math.cos(AHEAD))
+    way = xp.where(along, line_clearance(fence, *place, *aim), -math.inf)
+    predicted = xp.maximum(turn, way)
+    needed = xp.where(flies_home, xp.minimum(margin, now), margin)
+    must_turn = (predicted < needed) & (turn > way)
+    remaining = _remaining(action, bearing, course)
+    passed = (remaining > math.pi) & (way >= needed)
+    turns = (abs(action) == RIGHT) & (remaining >= HOMEWARD) & ~passed
+
+    after = xp.where(
+        must_turn,
+        xp.where(right_turn >= left_turn, RIGHT, LEFT),
+        xp.where(flies_home, homeward, 0.0),
+    )
+    after = xp.where(turns, action, xp.where(is_outside, BACK, after))
+    return Escape(after, (action == 0.0) & (after != 0.0), now, predicted, bearing)

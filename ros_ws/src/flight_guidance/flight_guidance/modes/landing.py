@@ -1,0 +1,175 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A landing on a line of a route: the flare by height, the nose along the line, the go-around.
+
+The line to a waypoint on the ground is the glide path, which the modes of a route hold. From the
+height of the flare on each step has commands of its own. The log has these commands, so the
+landing is computed again from the log like any flight.
+"""
+
+import math
+from collections.abc import Mapping
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from flight_core.kinematics import clip
+from flight_core.parameters import require
+from flight_core.units import GRAVITY
+from flight_guidance.fence.zones import Zone, clearance
+from flight_guidance.guidance_state import GuidanceParams, GuidanceState, Lateral, Mode
+from flight_guidance.modes.legs import course_and_speed
+from flight_guidance.sections import LandingConfig
+from flight_guidance.steering import path
+from flight_guidance.steering.path import Line, Point, Route
+
+FLARE = 5.0
+"""s of the sink on the glide path. The flight path lags behind the pitch by 2 s."""
+
+STRAIGHT_DEG = 1.0
+STRAIGHT = math.radians(STRAIGHT_DEG)
+"""Largest corner at the waypoint on the ground: the wings stay level there."""
+
+WING_LOW = math.radians(5.0)
+"""Largest bank near the ground, rad: a low wing of 2.5 m per metre of height touches at 22 deg."""
+
+YAW_GAIN = 1.0
+"""1/s, from the angle between the nose and the line to the yaw rate: 2 s take the crab out."""
+
+FASTEST_YAW = math.radians(6.0)
+"""rad/s."""
+
+
+class Landing(NamedTuple):
+    """A landing at the end of a line of a route."""
+
+    leg: int  # the line
+    around: int  # the line of a go-around
+    place: Point  # its end, on the ground
+    ground: float  # m, altitude there
+    course: float  # rad
+    slope: float  # of the glide path, below 0
+    flare: float  # m, height at which the flare begins
+    sink: float  # m/s, at the touch
+    decrab: float  # m, height below which the nose turns along the line
+    V: float  # m/s, from the flare on
+    box: Zone | None  # where the aircraft is to touch; None: anywhere
+
+
+def landing_at(
+    place: Point, route: Route, section: LandingConfig, box: Zone | None, params: GuidanceParams
+) -> Landing:
+    """The landing at a place. Raises ParameterError where no line of the route descends to the
+    place and goes straight on.
+    """
+    key = f"landing.waypoint {section.waypoint}"
+    lines = [k for k, leg in enumerate(route.legs) if isinstance(leg, Line)]
+    cut = max(route.radius * math.tan(STRAIGHT / 2.0), 1.0)  # by the fillet of a corner
+    pairs = [
+        (leg, around)
+        for leg, around in pairwise(lines)
+        if math.dist(path.outline(route.legs[leg], place)[-1], place) <= cut
+    ]
+    straight = f"a line to it, and one on to the next waypoint within {STRAIGHT_DEG:g} deg of it"
+    require(bool(pairs), key, "a corner, a circle or no line", straight)
+    leg, around = pairs[0]
+    line = route.legs[leg]
+    ground, slope = route.profile(leg, path.length(line))
+    require(slope < 0.0, key, f"a line with the slope {slope:g}", "one that descends")
+    speed = route.V[leg]
+    return Landing(
+        leg,
+        around,
+        place,
+        ground,
+        path.end_course(line),
+        slope,
+        section.flare or FLARE * -slope * speed,
+        section.sink,
+        section.decrab,
+        section.V or speed,
+        box,
+    )
+
+
+def flare_climb(height: float, path_sink: float, landing: Landing) -> float:
+    """Commanded climb rate, m/s, in the flare: from that of the glide path to -sink in proportion
+    to the height, m.
+    """
+    share = min(max(height / landing.flare, 0.0), 1.0)
+    return -(landing.sink + max(path_sink - landing.sink, 0.0) * share)
+
+
+def time_to_touch(height: float, path_sink: float, landing: Landing) -> float:
+    """Time of `flare_climb` from a height to the ground, s: the integral of dh / sink(h)."""
+    rate = max(path_sink - landing.sink, 1e-3) / landing.flare
+    return math.log1p(rate * max(height, 0.0) / landing.sink) / rate
+
+
+class Lander:
+    """The commands of a landing, step by step."""
+
+    def __init__(self, landing: Landing, params: GuidanceParams) -> None:
+        self._landing = landing
+        self._params = params
+        self._flares = False
+
+    def leave(self) -> None:
+        """Leave the landing to commands of an operator."""
+        self._flares = False
+
+    def commands(
+        self, state: GuidanceState, pose: Mapping[str, float], route: Route
+    ) -> dict[str, float]:
+        """Commands of the step after a state; none above the flare."""
+        landing = self._landing
+        height = pose["altitude"] - landing.ground
+        if state.mode is not Mode.ENGAGED:
+            return {}
+        on_line = state.lateral is Lateral.ROUTE and state.leg == landing.leg and not state.joining
+        self._flares = self._flares or (on_line and height <= landing.flare)
+        if not self._flares:
+            return {}
+        course, ground_speed = course_and_speed(pose)
+        path_sink = min(-landing.slope * ground_speed, self._params.vertical.sink)
+        if height > landing.decrab and self._misses(height, path_sink, pose):
+            self._flares = False
+            return self._go_around(pose, route)
+        ahead = height + self._params.vertical.alpha_time * pose["climb"]
+        given = {"climb": flare_climb(ahead, path_sink, landing), "V": landing.V}
+        if height > landing.decrab or "r" not in self._params.outputs:
+            return given
+        return given | self._along_line(pose, math.sin(course - landing.course) * ground_speed)
+
+    def _misses(self, height: float, path_sink: float, pose: Mapping[str, float]) -> bool:
+        """Whether the aircraft would touch outside of the box."""
+        if self._landing.box is None:
+            return False
+        time = time_to_touch(height, path_sink, self._landing)
+        north, east = (
+            np.array([pose[axis] + time * pose[f"v_{axis}"]]) for axis in ("north", "east")
+        )
+        return float(clearance((self._landing.box,), north, east)[0]) < 0.0
+
+    def _go_around(self, pose: Mapping[str, float], route: Route) -> dict[str, float]:
+        """The line of a go-around, from the nearest point on."""
+        leg = self._landing.around
+        along = path.nearest(route.legs[leg], (pose["north"], pose["east"]))
+        return {"leg": float(leg), "along": along}
+
+    def _along_line(self, pose: Mapping[str, float], drift: float) -> dict[str, float]:
+        """The nose along the line, and the upwind wing low against the drift, m/s.
+
+        r = k (course - psi),  g tan(phi) = -w^2 e - 2 zeta w drift,  w = 2 pi / P
+        """
+        landing = self._landing
+        w = 2.0 * math.pi / self._params.path.period
+        north, east = pose["north"] - landing.place[0], pose["east"] - landing.place[1]
+        beside = east * math.cos(landing.course) - north * math.sin(landing.course)
+        wanted = -(w**2) * beside - 2.0 * self._params.path.damping * w * drift
+        off = math.remainder(landing.course - pose["psi"], 2.0 * math.pi)
+        return {
+            "phi": clip(math.atan(wanted / GRAVITY), WING_LOW),
+            "r": clip(YAW_GAIN * off, FASTEST_YAW),
+        }

@@ -1,0 +1,171 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The bank that a lateral mode asks for: a heading or a course, an orbit, a leg of a route, or the
+action of the fence.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+from flight_core.units import GRAVITY
+from flight_core.vectors import Scalar, array_namespace
+from flight_guidance.fence.fence import BACK, RIGHT, Escape
+from flight_guidance.guidance_state import GuidanceParams, GuidanceState, Lateral, Mode
+from flight_guidance.modes.legs import EXIT, course_and_speed, has_loitered, leaves
+from flight_guidance.steering import path
+from flight_guidance.steering.lateral import (
+    PathError,
+    bank_for,
+    course_acceleration,
+    path_acceleration,
+    turn_towards,
+)
+from flight_guidance.steering.path import Arc, Point, Route
+from flight_guidance.steering.vertical import path_angle
+
+STEEPEST = math.radians(89.0)
+"""Largest bank that a mode asks for, before protection."""
+
+NOWHERE = PathError(0.0, 0.0, 0.0)
+"""The error of a mode without a path."""
+
+
+def lateral_bank(
+    state: GuidanceState,
+    pose: Mapping[str, float],
+    speed: float,
+    route: Route | None,
+    params: GuidanceParams,
+) -> tuple[float, PathError, float]:
+    """Bank asked for by the lateral mode, rad; error beside the path, and distance to the end of
+    the leg, m.
+    """
+    if state.mode is not Mode.ENGAGED:
+        return 0.0, NOWHERE, 0.0
+    if state.lateral is Lateral.PHI:
+        return state.target.phi, NOWHERE, 0.0
+    if state.lateral in {Lateral.HEADING, Lateral.COURSE}:
+        asked = (state.target.course, *course_and_speed(pose))
+        if state.lateral is Lateral.HEADING:
+            asked = (state.target.heading, state.psi, speed)
+        angle = path_angle(pose["climb"], speed)
+        return bank_for(course_acceleration(*asked, params.k_chi), angle, STEEPEST), NOWHERE, 0.0
+    if state.lateral is Lateral.ROUTE and route is not None:
+        if state.joining:
+            return _onto_leg(state, pose, speed, route, params)
+        return _along_leg(state, pose, speed, route, params)
+    target = state.target
+    orbit = _wide_enough(Arc((target.north, target.east), target.radius), params)
+    position = (pose["north"], pose["east"])
+    error = path.error(orbit, position)
+    entered: Callable[[Point], Any] = partial(path.entered, orbit, None)
+    wanted = follow(error, error.curvature, entered, state.slip, pose, speed, params)
+    return wanted, error, path.to_go(orbit, position)
+
+
+def _wide_enough(orbit: Arc, params: GuidanceParams) -> Arc:
+    """An orbit of at least the least radius, which grows as the largest bank falls in flight."""
+    return orbit._replace(
+        radius=math.copysign(max(abs(orbit.radius), params.limits.radius), orbit.radius)
+    )
+
+
+def _onto_leg(
+    state: GuidanceState,
+    pose: Mapping[str, float],
+    speed: float,
+    route: Route,
+    params: GuidanceParams,
+) -> tuple[float, PathError, float]:
+    """`lateral_bank` on the circle onto a leg."""
+    position = (pose["north"], pose["east"])
+    flown, _ = course_and_speed(pose)
+    start, course = route.start(state.leg, state.target.along)
+    radius = state.joining * route.radius
+    error = path.circle_error(path.joining_centre(start, course, radius), radius, position)
+
+    def joined(place: Point) -> Any:
+        return path.joined(start, course, route.near(state.leg), place, flown)
+
+    entry = path.error(route.legs[state.leg], start).curvature
+    wanted = follow(error, entry, joined, state.slip, pose, speed, params)
+    return wanted, error, path.joining_length(start, course, radius, position, flown)
+
+
+def _along_leg(
+    state: GuidanceState,
+    pose: Mapping[str, float],
+    speed: float,
+    route: Route,
+    params: GuidanceParams,
+) -> tuple[float, PathError, float]:
+    """`lateral_bank` on a leg of the route."""
+    position = (pose["north"], pose["east"])
+    leg = route.legs[state.leg]
+    if isinstance(leg, Arc) and leg.end is None:
+        leg = _wide_enough(leg, params)
+    error = path.error(leg, position)
+    following = None if leg.end is None else route.legs[state.leg + 1]
+    entry = error.curvature
+    if following is not None and leg.end is not None:
+        entry = path.error(following, leg.end).curvature
+    entered: Callable[[Point], Any] = partial(path.entered, leg, following)
+    if following is not None and path.is_orbit(leg) and has_loitered(state, pose, route):
+        near = route.near(state.leg)
+        late = leaves(leg, near, pose, position) and not leaves(
+            leg, EXIT * course_and_speed(pose)[1], pose, position
+        )
+        if not late:
+            entered = partial(leaves, leg, near, pose)
+    wanted = follow(error, entry, entered, state.slip, pose, speed, params)
+    return wanted, error, path.to_go(leg, position)
+
+
+def follow(
+    error: PathError,
+    entry: Scalar,
+    entered: Callable[[Point], Any],
+    slip: Scalar,
+    pose: Mapping[str, Scalar],
+    speed: Scalar,
+    params: GuidanceParams,
+) -> Scalar:
+    """Bank to follow a path, rad, before protection. `entry` is the curvature of the following leg
+    at the start, 1/m.
+
+    `entry` replaces the curvature of the leg early, by the lag of the bank: as soon as `entered`
+    holds for the position a mean lag ahead. The mean lag of a change of the bank d is abs(d) / (2
+    p_max) + 1 / (2 k_phi), a ramp, then the loop of the bank; without rudder and the lag of the
+    turn behind the bank.
+    """
+    course, ground_speed = course_and_speed(pose)
+    xp = array_namespace(ground_speed)
+    change = xp.atan(ground_speed**2 * entry / GRAVITY) + xp.atan(
+        ground_speed**2 * -error.curvature / GRAVITY
+    )
+    attitude = params.attitude
+    lag = abs(change) / (2.0 * attitude.roll_rate) + 0.5 / attitude.k_phi + params.turn_lag
+    ahead = (pose["north"] + lag * pose["v_north"], pose["east"] + lag * pose["v_east"])
+    error = error._replace(curvature=xp.where(entered(ahead), entry, error.curvature))
+    acceleration = path_acceleration(error, course, ground_speed, params.path) + slip
+    return bank_for(acceleration, path_angle(pose["climb"], speed), STEEPEST)
+
+
+def escaping_bank(
+    escape: Escape,
+    wanted: Scalar,
+    pose: Mapping[str, Scalar],
+    speed: Scalar,
+    params: GuidanceParams,
+) -> Scalar:
+    """Bank by the action of the fence, rad, in place of `wanted` by the lateral mode: that of a
+    turn, or of a course.
+    """
+    course, ground_speed = course_and_speed(pose)
+    xp = array_namespace(ground_speed)
+    acceleration = params.k_chi * ground_speed * turn_towards(escape.course - course)
+    towards = bank_for(acceleration, path_angle(pose["climb"], speed), STEEPEST)
+    wanted = xp.where(escape.action >= BACK, towards, wanted)
+    return xp.where(abs(escape.action) == RIGHT, escape.action * params.limits.bank, wanted)

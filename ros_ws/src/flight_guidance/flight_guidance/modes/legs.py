@@ -1,0 +1,189 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A route in flight: how the legs are joined, followed and ended."""
+
+import math
+from collections.abc import Callable, Mapping
+
+from flight_core.vectors import Scalar, array_namespace
+from flight_guidance.fence.fence import HOME
+from flight_guidance.guidance_state import (
+    Channels,
+    GuidanceState,
+    Lateral,
+    Mode,
+    Vertical,
+)
+from flight_guidance.steering import path
+from flight_guidance.steering.path import Arc, Leg, Loiter, Point, Route
+
+EXIT = 0.5
+"""s of flight beyond the end of a circle within which an aircraft leaves; later it flies another
+turn."""
+
+
+LEVEL = 5.0
+"""m. Largest distance from the altitude at which an aircraft leaves a loiter."""
+
+
+def along_route(
+    state: GuidanceState, pose: Mapping[str, float], dt: float, route: Route
+) -> tuple[GuidanceState, float]:
+    """The state on the leg once the leg is joined, or on the next leg once the leg is passed; and
+    the distance missed by, m.
+    """
+    position = (pose["north"], pose["east"])
+    leg = route.legs[state.leg]
+    near = route.near(state.leg)
+    if state.joining:
+        start, course = route.start(state.leg, state.target.along)
+        if path.joined(start, course, near, position, course_and_speed(pose)[0]):
+            state = on_leg(state, state.leg, route)
+        return state, 0.0
+    if isinstance(leg, Arc) and leg.loiter is not None and leg.end is not None:
+        state = _loitering(state, leg, leg.loiter, pose, dt)
+        ends = has_loitered(state, pose, route) and leaves(
+            leg, EXIT * course_and_speed(pose)[1], pose, position
+        )
+        return on_leg(state, state.leg + 1, route) if ends else state, 0.0
+    if leg.end is None or not path.passed(leg, position):
+        return state, 0.0
+    distance = math.dist(leg.end, position)  # after a sharp corner, too, the next leg is joined
+    return joining(state, state.leg + 1, 0.0, pose, route), distance if distance > near else 0.0
+
+
+def _loitering(
+    state: GuidanceState, leg: Arc, loiter: Loiter, pose: Mapping[str, float], dt: float
+) -> GuidanceState:
+    """The state with the share of a loiter that is flown, from within 1 s of flight of the circle
+    on.
+    """
+    error, (course, ground_speed) = (
+        path.error(leg, (pose["north"], pose["east"])),
+        course_and_speed(pose),
+    )
+    if not state.loitered and abs(error.e) > ground_speed:
+        return state
+    share = dt / loiter.wait if loiter.wait else 1.0
+    if loiter.turns:
+        along = ground_speed * math.cos(course - error.track)
+        share = min(share, dt * along / (2.0 * math.pi * abs(leg.radius) * loiter.turns))
+    return state._replace(loitered=min(state.loitered + share, 1.0))
+
+
+def has_loitered(state: GuidanceState, pose: Mapping[str, float], route: Route) -> bool:
+    """Whether the loiter of the leg is over, at the altitude of the leg."""
+    return state.loitered >= 1.0 and abs(pose["altitude"] - route.altitude[state.leg]) <= LEVEL
+
+
+def leaves(leg: Leg, reach: float, pose: Mapping[str, float], position: Point) -> bool:
+    """Whether a position is beyond the end of a circle, within `reach`, m, by an aircraft that
+    flies the course there.
+    """
+    return leg.end is not None and bool(
+        path.joined(leg.end, path.end_course(leg), reach, position, course_and_speed(pose)[0])
+    )
+
+
+def with_commands(
+    state: GuidanceState,
+    commands: Mapping[str, float],
+    pose: Mapping[str, float],
+    route: Route | None,
+    channels: Channels,
+    follow: Callable[[GuidanceState, Route], tuple[GuidanceState, float]],
+    join: Callable[[GuidanceState, int, float, Route], GuidanceState],
+) -> tuple[GuidanceState, float]:
+    """The modes and commands in force: of the next leg by `follow` once a leg is passed, then the
+    commands given. `join`: the state on the way to a leg, from a distance along the leg on.
+
+    A lateral command ends the leg: the command may come with a new route, and so with new legs.
+    Returns further the distance from the end of a leg that ends here and is missed, m.
+    """
+    moved = channels.lateral.keys() & commands.keys()
+    missed = 0.0
+    on_route = state.mode is Mode.ENGAGED and state.lateral is Lateral.ROUTE and not moved
+    if on_route and route is not None:
+        state, missed = follow(state, route)
+    if not commands:
+        return on_profile(state, pose, route), missed
+    state = state._replace(target=state.target._replace(**commands))
+    if state.fence >= HOME and moved:
+        state = state._replace(fence=0.0)
+    for name in commands:
+        state = state._replace(
+            lateral=channels.lateral.get(name, state.lateral),
+            vertical=channels.vertical.get(name, state.vertical),
+        )
+    if "leg" in commands and route is not None:
+        held = state.vertical
+        state = join(state, int(commands["leg"]), commands.get("along", 0.0), route)
+        state = state._replace(target=state.target._replace(**commands))
+        if channels.vertical.keys() & commands.keys():
+            state = state._replace(vertical=held)
+    if state.vertical is Vertical.PROFILE and state.lateral is not Lateral.ROUTE:
+        state = state._replace(vertical=Vertical.ALTITUDE)  # that of now
+    return on_profile(state, pose, route), missed
+
+
+def on_leg(state: GuidanceState, leg: int, route: Route) -> GuidanceState:
+    """The state on a leg of the route, with the leg's altitude and airspeed."""
+    target = state.target._replace(V=route.V[leg], along=0.0)
+    return state._replace(
+        leg=leg, target=target, vertical=Vertical.PROFILE, joining=0.0, loitered=0.0
+    )
+
+
+def on_profile(
+    state: GuidanceState, pose: Mapping[str, float], route: Route | None
+) -> GuidanceState:
+    """The state with the altitude and the climb rate of the leg at the nearest point, or where the
+    aircraft joins the leg.
+    """
+    flies = (
+        state.mode is Mode.ENGAGED
+        and state.lateral is Lateral.ROUTE
+        and state.vertical is Vertical.PROFILE
+    )
+    if not flies or route is None:
+        return state
+    leg = route.legs[state.leg]
+    climb = 0.0
+    if state.joining or (path.is_orbit(leg) and leg.end is not None and not state.loitered):
+        altitude = route.joining_altitude(state.leg, state.target.along)
+    else:
+        altitude, slope = route.profile(state.leg, path.nearest(leg, (pose["north"], pose["east"])))
+        if slope:
+            course = path.end_course(leg)
+            climb = slope * (pose["v_north"] * math.cos(course) + pose["v_east"] * math.sin(course))
+    return state._replace(target=state.target._replace(altitude=altitude, climb=climb))
+
+
+def joining(
+    state: GuidanceState, leg: int, along: float, pose: Mapping[str, float], route: Route
+) -> GuidanceState:
+    """The state on the way to a point of a leg, at the altitude and the airspeed there; on the leg
+    where the point is near.
+    """
+    state = on_leg(state, leg, route)
+    flown = route.legs[leg]
+    if path.is_orbit(flown):  # the law of circles leads to an orbit from afar
+        return state
+    start, course = route.start(leg, along)
+    position = (pose["north"], pose["east"])
+    side = path.joining(
+        start, course, route.radius, route.near(leg), position, course_and_speed(pose)[0]
+    )
+    if isinstance(flown, Arc) and side:  # the circle of the arc itself
+        side = math.copysign(1.0, flown.radius)
+    if side and not along and route.from_V:
+        state = state._replace(target=state.target._replace(V=route.from_V[leg]))
+    return state._replace(joining=side, target=state.target._replace(along=along if side else 0.0))
+
+
+def course_and_speed(pose: Mapping[str, Scalar]) -> tuple[Scalar, Scalar]:
+    """Course, rad, and speed over ground, m/s, at least 1."""
+    v_north = pose["v_north"]
+    v_east = pose["v_east"]
+    xp = array_namespace(v_north)
+    return xp.atan2(v_east, v_north), xp.maximum(xp.hypot(v_north, v_east), 1.0)

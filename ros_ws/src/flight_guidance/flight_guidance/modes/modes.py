@@ -1,0 +1,430 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Modes of guidance: a step from pose, y and target to u_m.
+
+Lateral: hold a bank, a heading or a course, or follow an orbit or a route. Vertical: hold a pitch,
+a climb rate or an altitude. The law holds the airspeed; guidance limits the command. The step has
+no clock and no hidden state: the state is in the log, so a sample of the log can be computed again
+from the sample before.
+"""
+
+import math
+from collections.abc import Mapping
+from functools import reduce
+from operator import or_
+from typing import Any
+
+from flight_core.channels import POSE
+from flight_core.kinematics import clip, euler_rates, heading_rate, tilt, turn_rate
+from flight_core.rates import seconds
+from flight_core.units import GRAVITY
+from flight_core.vectors import Scalar, array_namespace
+from flight_guidance.fence.fence import AROUND, BACK, HOME, Escape, Motion, last_safe_turn
+from flight_guidance.guidance_state import (
+    LARGEST,
+    Begin,
+    Commands,
+    GuidanceParams,
+    GuidanceState,
+    Inputs,
+    Lateral,
+    Mode,
+    Target,
+    Vertical,
+    begun_again,
+)
+from flight_guidance.modes.lateral_modes import escaping_bank, lateral_bank
+from flight_guidance.modes.legs import along_route, joining, with_commands
+from flight_guidance.modes.targets import hold, home, permitted_speed, within_reach
+from flight_guidance.steering import protection
+from flight_guidance.steering.attitude import BodyRates, body_rates, yaw_for_bank
+from flight_guidance.steering.lateral import heading_estimate, slip_estimate
+from flight_guidance.steering.path import Route
+from flight_guidance.steering.vertical import (
+    alpha_estimate,
+    climb_for,
+    climb_speed,
+    path_angle,
+    pitch_for,
+    slewed,
+)
+from flight_guidance.steering.wind import Wind, wind_estimate, wind_of
+
+LONGEST_LEAD = 0.5
+"""s. Largest age of a pose over which its attitude is brought to now: the rates change within a
+second."""
+
+
+def holding(
+    t_ns: int, pose: Mapping[str, Scalar], speed: Scalar, params: GuidanceParams
+) -> GuidanceState:
+    """The state before the first step, at t: holds the heading, the altitude and the airspeed of
+    now.
+    """
+    alpha = pose["theta"] - path_angle(pose["climb"], speed)
+    return GuidanceState(
+        t_ns=t_ns - params.period_ns,
+        mode=Mode.ENGAGED,
+        lateral=Lateral.HEADING,
+        vertical=Vertical.ALTITUDE,
+        target=Target()._replace(**hold(pose, speed, params)),
+        leg=0,
+        phi=pose["phi"],
+        theta=pose["theta"],
+        alpha=alpha,
+        alpha_trim=array_namespace(alpha).maximum(alpha, 0.0),
+        slip=0.0 * speed,
+        climb_c=pose["climb"],
+        V_c=speed,
+        u_m=(0.0,) * len(params.outputs),
+        wind=_measured_wind(pose, speed),
+        psi=pose["psi"],
+    )
+
+
+def begin(state: GuidanceState | None, inputs: Inputs, params: GuidanceParams) -> GuidanceState:
+    """The state before a step, with filters at the measured values where the filters begin."""
+    if state is not None and inputs.begin is Begin.NO:
+        return state
+    held = holding(
+        inputs.t_ns, dict(zip(POSE, inputs.pose, strict=True)), airspeed(inputs.y, params), params
+    )
+    return begun_again(held, state, inputs, params)
+
+
+def hold_now(
+    pose: Mapping[str, float], y: tuple[float, ...], params: GuidanceParams
+) -> dict[str, float]:
+    """Commands to hold the heading, the altitude and the airspeed of a pose and a y."""
+    return hold(pose, airspeed(y, params), params)
+
+
+def airspeed(y: tuple[float, ...], params: GuidanceParams) -> float:
+    """True airspeed V0 + V, m/s, at least half of V0."""
+    return float(true_airspeed(y[params.outputs.index("V")], params))
+
+
+def true_airspeed(V: Scalar, params: GuidanceParams) -> Scalar:
+    """`airspeed` from the channel V of y, m/s."""
+    return array_namespace(V).maximum(params.speed + V, params.speed / 2.0)
+
+
+def yaw_rate(y: Mapping[str, Scalar], phi: Scalar, theta: Scalar, speed: Scalar) -> Scalar:
+    """The measured r, or that of a coordinated turn for an aircraft without rudder, rad/s."""
+    return y["r"] if "r" in y else turn_rate(phi, theta, 0.0, speed)
+
+
+def step(
+    state: GuidanceState | None, inputs: Inputs, route: Route | None, params: GuidanceParams
+) -> tuple[GuidanceState, Commands]:
+    """A step: attitude, commands, u_m.
+
+    1. Attitude: phi and theta of pose, brought to now over the age of pose by Euler's kinematics
+       with p, q, r of y, and psi by `heading_estimate`. While pose is stale: Euler's kinematics
+       alone (`Mode.DEAD_RECKONING`). After `hold` the attitude is unknown (`Mode.POSE_LOST`) until
+       pose returns; then wings level and the altitude of then.
+    2. Commands: the next leg at the end of a leg, then the commands given. A leg is joined by a
+       circle that touches the leg at the start, unless the aircraft is near; a leg whose end the
+       aircraft passes far away is missed.
+    3. The fence: the last safe turn, then home, in place of the lateral mode.
+    4. Protection in this order: bank, airspeed, climb, pitch; roll rate and load in
+       `attitude.body_rates`; slew of u_m.
+    5. u_m: p, q, r by `attitude.body_rates`, V_m = V_c - V0. In POSE_LOST p, q, r are 0.
+    """
+    params = within_reach(params, inputs.authority)
+    state = begin(state, inputs, params)
+    dt = seconds(inputs.t_ns - state.t_ns)
+    speed = airspeed(inputs.y, params)
+    state = _with_attitude(state, inputs, dt, params)
+    pose = dict(zip(POSE, inputs.pose, strict=True))
+    y = dict(zip(params.outputs, inputs.y, strict=True))
+    if params.channels.lateral.keys() & inputs.commands.keys():
+        state = state._replace(target=state.target._replace(r=0.0))
+    state, missed = with_commands(
+        state,
+        inputs.commands,
+        pose,
+        route,
+        params.channels,
+        lambda state, route: along_route(state, pose, dt, route),
+        lambda state, leg, along, route: joining(state, leg, along, pose, route),
+    )
+    state, escape = _within_fence(state, pose, y, speed, params)
+    wanted, error, to_go = lateral_bank(state, pose, speed, route, params)
+    if state.mode is Mode.ENGAGED:
+        wanted = escaping_bank(escape, wanted, pose, speed, params)
+    state, commands = command(state, pose, y, wanted, dt, params)
+    commands = commands._replace(xtrack=error.e, track=error.track, to_go=to_go, missed=missed)
+    commands = commands._replace(clearance=escape.clearance, predicted=escape.predicted)
+    velocity = (pose["v_north"], pose["v_east"])
+    return state._replace(t_ns=inputs.t_ns, velocity=velocity), commands
+
+
+def _wanted_rates(
+    state: GuidanceState,
+    pose: Mapping[str, Scalar],
+    r: Scalar,
+    phi_c: Scalar,
+    theta_c: Scalar,
+    speed: Scalar,
+    params: GuidanceParams,
+) -> BodyRates:
+    """Body rates to the commanded attitude, rad/s; none after the loss of the pose, and none of a
+    dead output.
+    """
+    flies = state.mode is Mode.ENGAGED
+    attitude = params.attitude._replace(n_alpha=1.0 / (state.alpha_trim + 0.05))
+    beta = pose["beta"] if flies else 0.0
+    flat = flies and state.lateral is Lateral.PHI and state.target.r != 0.0
+    rates = body_rates(
+        phi_c, theta_c, state.phi, state.theta, r, 0.0 if flat else beta, speed, attitude
+    )
+    if flat:  # the sideslip is wanted
+        rates = rates._replace(r=rates.r + state.target.r)
+    if state.mode is Mode.POSE_LOST:
+        rates = BodyRates(0.0, 0.0, 0.0)
+    rates = rates._replace(**dict.fromkeys(params.dead, 0.0))
+    if not params.rolls:
+        rates = rates._replace(r=yaw_for_bank(phi_c, state.phi, speed))
+    return rates
+
+
+def command(
+    state: GuidanceState,
+    pose: Mapping[str, Scalar],
+    y: Mapping[str, Scalar],
+    phi_wanted: Scalar,
+    dt: float,
+    params: GuidanceParams,
+) -> tuple[GuidanceState, Commands]:
+    """Protection and u_m of `step`, from the bank asked for by the lateral mode, rad. `t_ns` of the
+    state stays.
+
+    The values may be arrays with an element per aircraft of a fleet; the modes hold for the whole
+    fleet.
+    """
+    speed = true_airspeed(y["V"], params)
+    limits = params.limits
+    flies = state.mode is Mode.ENGAGED
+    if flies:
+        state = _with_estimates(state, pose, y, speed, dt, params)
+
+    xp = array_namespace(speed)
+    bank = protection.bank_limit(limits.bank, limits.stall_speed, speed)
+    phi_c = clip(phi_wanted, bank)
+    climb_c, climb_limited = _climb(state, pose, speed, dt, params) if flies else (0.0, False)
+    theta_wanted = pitch_for(climb_c, speed, state.alpha)
+    if flies and state.vertical is Vertical.THETA:
+        theta_wanted = _pitch_within(state, pose["altitude"], speed, params)
+        climb_limited = theta_wanted != state.target.theta
+    theta_c = xp.minimum(xp.maximum(theta_wanted, limits.least_pitch), limits.largest_pitch)
+
+    V_asked = state.target.V
+    if flies and "q" in params.dead:
+        V_asked = V_asked + climb_speed(climb_c - pose["climb"], speed)
+    V_wanted = permitted_speed(V_asked, params)
+    V_c = slewed(state.V_c, V_wanted, params.slew[params.outputs.index("V")], dt)
+
+    r = yaw_rate(y, state.phi, state.theta, speed)
+    rates = _wanted_rates(state, pose, r, phi_c, theta_c, speed, params)
+    wanted = {"V": V_c - params.speed, **rates._asdict()}
+    u_m = tuple(
+        wanted[name] if name == "V" else slewed(before, wanted[name], rate, dt)
+        for name, before, rate in zip(params.outputs, state.u_m, params.slew, strict=True)
+    )
+    commands = Commands(
+        phi_c,
+        theta_c,
+        bank_limited=(phi_c != phi_wanted) | (abs(phi_c) == bank),
+        theta_limited=theta_c != theta_wanted,
+        climb_limited=climb_limited,
+        V_limited=V_wanted != state.target.V,
+        slew_limited=reduce(
+            or_, (value != wanted[name] for name, value in zip(params.outputs, u_m, strict=True))
+        ),
+    )
+    return state._replace(climb_c=climb_c, V_c=V_c, u_m=u_m), commands
+
+
+def _with_estimates(
+    state: GuidanceState,
+    pose: Mapping[str, Scalar],
+    y: Mapping[str, Scalar],
+    speed: Scalar,
+    dt: float,
+    params: GuidanceParams,
+) -> GuidanceState:
+    """The state with new estimates of the angle of attack, the slip and the wind."""
+    alpha = alpha_estimate(state.alpha, state.theta, pose["climb"], speed, dt, params.vertical)
+    turn = GRAVITY * array_namespace(speed).tan(tilt(state.phi))
+    r = yaw_rate(y, state.phi, state.theta, speed)
+    flown = speed * heading_rate(state.phi, state.theta, y["q"], r)
+    rolling = abs(y["p"]) / params.attitude.roll_rate
+    slip = slip_estimate(state.slip, turn, flown, rolling, dt, params.vertical.alpha_time)
+    return state._replace(
+        alpha=alpha, slip=slip, wind=wind_estimate(state.wind, _measured_wind(pose, speed), dt)
+    )
+
+
+def _with_attitude(
+    state: GuidanceState, inputs: Inputs, dt: float, params: GuidanceParams
+) -> GuidanceState:
+    """Mode, and attitude from pose or by dead reckoning."""
+    pose = dict(zip(POSE, inputs.pose, strict=True))
+    if inputs.pose_age_ns <= params.max_age_ns:
+        if state.mode is Mode.POSE_LOST:  # the aircraft may be anywhere by now
+            after_loss = (
+                home(pose, params)
+                if params.home.after_loss
+                else {"phi": 0.0, "altitude": pose["altitude"]}
+            )
+            lateral = Lateral.ORBIT if params.home.after_loss else Lateral.PHI
+            level = state._replace(
+                lateral=lateral,
+                vertical=Vertical.ALTITUDE,
+                target=state.target._replace(**after_loss),
+                fence=0.0,
+            )
+            state = begin(level, inputs._replace(begin=Begin.AGAIN), params)
+        state = state._replace(mode=Mode.ENGAGED, phi=pose["phi"], theta=pose["theta"])
+        since = min(seconds(inputs.pose_age_ns), LONGEST_LEAD)
+    else:
+        lost = inputs.pose_age_ns > params.max_age_ns + params.hold_ns
+        state = state._replace(mode=Mode.POSE_LOST if lost else Mode.DEAD_RECKONING)
+        since = dt
+    y = dict(zip(params.outputs, inputs.y, strict=True))
+    r = yaw_rate(y, state.phi, state.theta, airspeed(inputs.y, params))
+    phi_dot, theta_dot = euler_rates(state.phi, state.theta, y["p"], y["q"], r)
+    phi = state.phi + since * phi_dot
+    theta = state.theta + since * theta_dot
+    psi_dot = heading_rate(state.phi, state.theta, y["q"], r)
+    measured = pose["psi"] + since * psi_dot if state.mode is Mode.ENGAGED else None
+    psi = heading_estimate(state.psi, measured, psi_dot, dt)
+    return state._replace(phi=math.remainder(phi, 2.0 * math.pi), theta=theta, psi=psi)
+
+
+def motion_of(
+    state: GuidanceState,
+    pose: Mapping[str, Scalar],
+    y: Mapping[str, Scalar],
+    speed: Scalar,
+    params: GuidanceParams,
+) -> Motion:
+    """What the fence predicts a turn from. A roll that has begun goes on for the lag of the bank, 1
+    / (2 k_phi).
+    """
+    bank = protection.bank_limit(params.limits.bank, params.limits.stall_speed, speed)
+    lag = 0.5 / params.attitude.k_phi
+    r = yaw_rate(y, state.phi, state.theta, speed)
+    phi_dot, _ = euler_rates(state.phi, state.theta, y["p"], y["q"], r)
+    return Motion(
+        pose["north"],
+        pose["east"],
+        clip(state.phi + lag * phi_dot, bank),
+        pose["psi"] + pose["beta"],
+        speed,
+        state.wind,
+        bank,
+        params.attitude.roll_rate,
+        lag + params.turn_lag,
+    )
+
+
+def _within_fence(
+    state: GuidanceState,
+    pose: Mapping[str, float],
+    y: Mapping[str, float],
+    speed: float,
+    params: GuidanceParams,
+) -> tuple[GuidanceState, Escape]:
+    """The state with the action of the fence; home is the target from the begin of the action on.
+
+    A lateral command during a turn is flown after the turn, unless the aircraft is outside.
+    """
+    if params.fence is None or state.mode is not Mode.ENGAGED:
+        return state, Escape(state.fence, False, LARGEST, LARGEST, 0.0)
+    escape = Escape(
+        *map(
+            float,
+            last_safe_turn(params.fence, state.fence, motion_of(state, pose, y, speed, params)),
+        )
+    )
+    commanded = (
+        state.lateral is not Lateral.ORBIT
+        or (state.target.north, state.target.east) != params.home[:2]
+    )
+    if commanded and escape.action in {HOME, AROUND}:
+        escape = escape._replace(action=0.0)
+    elif escape.begins or (commanded and escape.action == BACK):
+        target = state.target._replace(**home(pose, params))
+        state = state._replace(
+            lateral=Lateral.ORBIT, vertical=Vertical.ALTITUDE, target=target, joining=0.0
+        )
+    return state._replace(fence=escape.action), escape
+
+
+def _measured_wind(pose: Mapping[str, Scalar], speed: Scalar) -> Wind:
+    return wind_of(
+        pose["v_north"], pose["v_east"], pose["climb"], pose["psi"] + pose["beta"], speed
+    )
+
+
+def _climb(
+    state: GuidanceState,
+    pose: Mapping[str, Scalar],
+    speed: Scalar,
+    dt: float,
+    params: GuidanceParams,
+) -> tuple[Scalar, Any]:
+    """Commanded climb rate, m/s, and whether protection limits the rate."""
+    if state.vertical is Vertical.THETA:
+        return pose["climb"], False  # the start value for the modes CLIMB and ALTITUDE
+    vertical = params.vertical
+    target = state.target
+    wanted = (
+        target.climb
+        if state.vertical is Vertical.CLIMB
+        else climb_for(target.altitude - pose["altitude"], vertical)
+    )
+    if state.vertical is Vertical.PROFILE:
+        wanted = wanted + target.climb
+    least, largest = protection.climb_range(
+        vertical.climb, vertical.sink, state.V_c - speed, params.speed
+    )
+    xp = array_namespace(speed)
+    lower, upper = _climb_within(pose["altitude"], params)
+    least = xp.maximum(least, lower)
+    largest = xp.minimum(largest, upper)
+    fast = protection.sink_limit(vertical.climb, vertical.sink, speed, params.limits.largest_speed)
+    least = xp.maximum(least, fast)
+    largest = xp.minimum(
+        largest, protection.climb_limit(vertical.climb, vertical.sink, speed, params.limits.floor)
+    )
+    permitted = xp.minimum(xp.maximum(wanted, least), largest)
+    return slewed(state.climb_c, permitted, vertical.acceleration, dt), permitted != wanted
+
+
+def _pitch_within(
+    state: GuidanceState, altitude: Scalar, speed: Scalar, params: GuidanceParams
+) -> Scalar:
+    """The commanded pitch, rad, within that of the climb rates to the least and the largest
+    altitude.
+    """
+    if not any(map(math.isfinite, (params.limits.lowest, params.limits.highest))):
+        return state.target.theta
+    xp = array_namespace(speed)
+    least, largest = (
+        pitch_for(rate, speed, state.alpha) for rate in _climb_within(altitude, params)
+    )
+    return xp.minimum(xp.maximum(state.target.theta, least), largest)
+
+
+def _climb_within(altitude: Scalar, params: GuidanceParams) -> tuple[Scalar, Scalar]:
+    """Least and largest climb rate by the least and the largest altitude, m/s: those of `climb_for`
+    to the bounds.
+    """
+    vertical = params.vertical
+    limits = params.limits
+    return climb_for(limits.lowest - altitude, vertical), climb_for(
+        limits.highest - altitude, vertical
+    )

@@ -1,0 +1,224 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The targets that an operator may command: the limits of the parameters and of a learned model, to
+hold and to fly home.
+"""
+
+import math
+from collections.abc import Mapping
+
+from flight_core.units import GRAVITY
+from flight_core.vectors import ChannelError, Scalar, array_namespace
+from flight_guidance import reach
+from flight_guidance.guidance_state import (
+    LARGEST,
+    GuidanceParams,
+)
+from flight_guidance.reach import Authority
+from flight_guidance.steering import path
+from flight_guidance.steering.path import Route
+
+
+def within_reach(params: GuidanceParams, authority: Authority) -> GuidanceParams:
+    """The parameters with limits by a model learned in flight, where less than their own.
+
+    Climb and sink by the throttle, the roll rate by the aileron, by the rules of the parameters.
+    Reversals of the bank fit into the period of path following, and orbits have the radius for the
+    bank. Where p has no aileron, or ignores its command, the largest bank is YAWED_BANK. Without a
+    throttle there is no climb, and the sink stays: pitch then flies the airspeed at the floor.
+    """
+    if authority == Authority():
+        return params
+    rolls = min(authority.p, authority.roll) >= reach.LEAST
+    dead = tuple(name for name in ("q", "p") if getattr(authority, name) < reach.LEAST)
+    limits = params.limits
+    attitude = params.attitude
+    vertical = params.vertical
+    climb, sink = reach.climb_rates(authority.down, authority.up, params.speed)
+    vertical = vertical._replace(climb=min(vertical.climb, climb))
+    if authority.down >= reach.LEAST:
+        vertical = vertical._replace(sink=min(vertical.sink, sink))
+    rate = attitude.roll_rate
+    bank = min(limits.bank, reach.YAWED_BANK)
+    if rolls:
+        rate = min(rate, reach.roll_rate(authority.p, 4.0 * attitude.k_phi))
+        bank = limits.bank * min(1.0, params.path.period / reach.least_period(limits.bank, rate))
+    # the airspeed flies the climb: its command moves by the bandwidth of V, 1 m/s each
+    if "q" in dead:
+        faster = tuple(
+            4.0 * rate if name == "V" else rate
+            for name, rate in zip(params.outputs, params.slew, strict=True)
+        )
+        params = params._replace(slew=faster)
+    radius = limits.radius * (math.tan(0.8 * limits.bank) / math.tan(0.8 * bank))
+    return params._replace(
+        dead=dead,
+        rolls=rolls,
+        vertical=vertical,
+        limits=limits._replace(bank=bank, radius=radius),
+        attitude=attitude._replace(roll_rate=rate),
+    )
+
+
+def reach_sentence(params: GuidanceParams, authority: Authority) -> str:
+    """The limits by what is learned in flight, as a sentence; empty where the own limits are
+    less.
+    """
+    now = within_reach(params, authority)
+    parts = [
+        f"no {command}: {name} has no input with an effect"
+        for name, command in DEAD.items()
+        if name in now.dead
+    ]
+    if not authority.roll:
+        parts.append("the yaw rate flies the bank: p ignores its command")
+    if min(authority.down, authority.up) < reach.LEAST:
+        parts.append("no climb: V has no input with an effect")
+    for name, nominal, limit, unit in (
+        ("bank", math.degrees(params.limits.bank), math.degrees(now.limits.bank), "deg"),
+        (
+            "roll rate",
+            math.degrees(params.attitude.roll_rate),
+            math.degrees(now.attitude.roll_rate),
+            "deg/s",
+        ),
+        ("climb", params.vertical.climb, now.vertical.climb, "m/s"),
+        ("sink", params.vertical.sink, now.vertical.sink, "m/s"),
+    ):
+        if 0.0 < limit < nominal:
+            parts.append(f"{name} at most {limit:.2g} {unit}")
+    return ", ".join(parts)
+
+
+DEAD = {"p": "roll rate", "q": "pitch rate"}
+"""Commands that end where an output has no input with an effect."""
+
+
+ANGLES = ("phi", "heading", "course", "theta", "r")
+"""Channels of Target in rad, and r in rad/s."""
+
+UNITS = {"climb": "m/s", "altitude": "m", "V": "m/s"}
+
+
+def read_target(
+    values: Mapping[str, float],
+    params: GuidanceParams,
+    route: Route | None,
+    what: str = "target",
+    *,
+    degrees: bool = False,
+) -> None:
+    """Raise ChannelError for commands of no mode or two modes, of no leg of the route, or beyond
+    the limits.
+
+    `degrees`: the sentence has angles in degrees, as an operator types angles; else in rad.
+    """
+    channels = params.channels
+    lateral_modes = {mode for name, mode in channels.lateral.items() if name in values}
+    vertical_modes = {mode for name, mode in channels.vertical.items() if name in values}
+    commanded = [name for name in channels.known() if name != "r" or "r" in params.outputs]
+    unknown = [name for name in values if name not in commanded]
+    if unknown or not values:
+        raise ChannelError(
+            "name",
+            f"{what}: found {', '.join(unknown) or 'no channel'}, expected some of "
+            f"{', '.join(commanded)}",
+        )
+    if len(lateral_modes) > 1 or len(vertical_modes) > 1:
+        raise ChannelError(
+            "name",
+            f"{what}: found {', '.join(values)}, expected one lateral and one vertical command "
+            "at most",
+        )
+    for mode in lateral_modes & channels.together.keys():
+        *before, last = channels.together[mode]
+        if not {*before, last} <= values.keys():
+            group = f"{', '.join(before)} and {last} together"
+            raise ChannelError("name", f"{what}: found {', '.join(values)}, expected {group}")
+    for name, needed in (("r", "phi"), ("along", "leg")):
+        if name in values and needed not in values:
+            raise ChannelError(
+                "name", f"{what}: found {name} without {needed}, expected {needed} too"
+            )
+    for name, value in values.items():
+        if abs(value) > LARGEST:
+            raise ChannelError(
+                "bounds", f"{what}.{name}: found {value:g}, expected at most {LARGEST:g} either way"
+            )
+    _require_limits(values, params, what, degrees=degrees)
+    limits = params.limits
+    if "radius" in values and abs(values["radius"]) < limits.radius:
+        expected = f"at least {math.ceil(limits.radius)} m either way"
+        raise ChannelError(
+            "bounds", f"{what}.radius: found {values['radius']:g} m, expected {expected}"
+        )
+    _read_leg(values, route, what)
+
+
+def _require_limits(
+    values: Mapping[str, float], params: GuidanceParams, what: str, *, degrees: bool
+) -> None:
+    """Raise ChannelError for an angle, a climb, an altitude or an airspeed beyond the limits."""
+    limits = params.limits
+    vertical = params.vertical
+    for name, least, largest in (
+        ("phi", -limits.bank, limits.bank),
+        ("r", -(turn := GRAVITY * math.tan(limits.bank) / params.speed), turn),
+        ("theta", limits.least_pitch, limits.largest_pitch),
+        ("climb", -vertical.sink, vertical.climb),
+        ("altitude", limits.lowest, limits.highest),
+        ("V", limits.floor, limits.largest_speed),
+    ):
+        if name in values and not least <= values[name] <= largest:
+            factor = math.degrees(1.0) if degrees and name in ANGLES else 1.0
+            unit = UNITS.get(name, "deg" if degrees else "rad") + "/s" * (name == "r")
+            entered = f"{values[name] * factor:.6g}"
+            expected = f"{least * factor:.6g} to {largest * factor:.6g} {unit}"
+            raise ChannelError("bounds", f"{what}.{name}: found {entered}, expected {expected}")
+
+
+def _read_leg(values: Mapping[str, float], route: Route | None, what: str) -> None:
+    """Raise ChannelError for a leg that the route does not have."""
+    if "leg" in values and route is None:
+        raise ChannelError("bounds", f"{what}.leg: found no route, expected one")
+    if "leg" in values and route is not None and values["leg"] not in range(len(route.legs)):
+        expected = f"a whole number from 0 to {len(route.legs) - 1}"
+        raise ChannelError("bounds", f"{what}.leg: found {values['leg']:g}, expected {expected}")
+    if (
+        "along" in values
+        and route is not None
+        and not 0.0 <= values["along"] <= (longest := path.length(route.legs[int(values["leg"])]))
+    ):
+        expected = f"0 to {longest:.6g} m, the length of the leg; 0 for an arc"
+        raise ChannelError(
+            "bounds", f"{what}.along: found {values['along']:g} m, expected {expected}"
+        )
+
+
+def hold(pose: Mapping[str, Scalar], speed: Scalar, params: GuidanceParams) -> dict[str, Scalar]:
+    """Commands to hold the heading, the altitude and the airspeed of now, within the limits of the
+    airspeed.
+    """
+    return {
+        "heading": pose["psi"],
+        "altitude": pose["altitude"],
+        "V": permitted_speed(speed, params),
+    }
+
+
+def permitted_speed(speed: Scalar, params: GuidanceParams) -> Scalar:
+    """An airspeed within the limits, m/s."""
+    xp = array_namespace(speed)
+    return xp.minimum(xp.maximum(speed, params.limits.floor), params.limits.largest_speed)
+
+
+def home(pose: Mapping[str, float], params: GuidanceParams) -> dict[str, float]:
+    """Commands to orbit home clockwise on the least radius, or of a multicopter to hover there, at
+    the altitude of home or of now.
+    """
+    place = params.home
+    altitude = pose["altitude"] if place.altitude is None else place.altitude
+    over_home = {"north": place.north, "east": place.east, "altitude": altitude}
+    if params.multicopter is not None:
+        return over_home
+    return over_home | {"radius": float(math.ceil(params.limits.radius))}

@@ -1,0 +1,503 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Guidance of a multicopter: place, velocity, acceleration, direction of the thrust, body rates.
+
+The heading is apart: no lateral mode needs a nose. As `modes.step`, the step has no clock and no
+hidden state.
+"""
+
+import cmath
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from flight_core.channels import POSE, VERTICAL, vertical
+from flight_core.kinematics import clip, euler_rates, heading_rate, thrust_axis, tilt
+from flight_core.rates import seconds
+from flight_core.units import GRAVITY
+from flight_guidance.fence.fence import (
+    AROUND,
+    BACK,
+    HOME,
+    MARGIN,
+    Escape,
+    Fence,
+    clearance,
+)
+from flight_guidance.fence.ways import line_clearance, ways
+from flight_guidance.guidance_state import (
+    LARGEST,
+    Begin,
+    Commands,
+    GuidanceParams,
+    GuidanceState,
+    Inputs,
+    Lateral,
+    Mode,
+    MulticopterParams,
+    Target,
+    Vertical,
+    begun_again,
+)
+from flight_guidance.modes.legs import has_loitered, on_leg, with_commands
+from flight_guidance.modes.targets import home
+from flight_guidance.steering import path
+from flight_guidance.steering.lateral import PathError
+from flight_guidance.steering.path import Arc, Point, Route
+from flight_guidance.steering.vertical import VerticalParams, climb_for, slewed
+
+NEAR = 0.5
+"""s of flight from a place within which the place counts as reached, at least 0.5 m."""
+
+ACROSS = math.sin(math.radians(60.0))
+"""Largest share of the speed towards a path, as guidance of airplanes has it."""
+
+WIND_TIME = 3.0
+"""T, s: long against a leg's end, short against a leg."""
+
+LONGEST_LEAD = 0.5
+"""s. Largest age of a pose over which the attitude is brought to now."""
+
+
+class Wanted(NamedTuple):
+    """What a lateral mode asks for. Complex numbers are vectors: north and i east."""
+
+    velocity: complex = 0.0  # m/s, over ground
+    ahead: complex = 0.0  # m/s, the velocity once the tilt has followed
+    acceleration: complex = 0.0  # m/s^2, of the way itself
+    error: PathError = PathError(0.0, 0.0, 0.0)
+    to_go: float = 0.0  # m
+
+
+def _gains(params: GuidanceParams) -> MulticopterParams:
+    assert params.multicopter is not None  # noqa: S101 - `guidance.step` has looked
+    return params.multicopter
+
+
+def hold(
+    pose: Mapping[str, float], _y: tuple[float, ...], params: GuidanceParams
+) -> dict[str, float]:
+    """Commands to hover where the aircraft stops, v abs(v) / (2 a) ahead, with the heading and the
+    altitude of now.
+    """
+    stop = _stop(pose, _gains(params))
+    place = {"north": stop.real, "east": stop.imag}
+    return place | {"heading": pose["psi"], "altitude": pose["altitude"]}
+
+
+def _velocity(pose: Mapping[str, float]) -> complex:
+    return complex(pose["v_north"], pose["v_east"])
+
+
+def _place(pose: Mapping[str, float]) -> complex:
+    return complex(pose["north"], pose["east"])
+
+
+def _parts(vector: complex) -> tuple[float, float]:
+    return vector.real, vector.imag
+
+
+def _stop(pose: Mapping[str, float], gains: MulticopterParams) -> complex:
+    """Where the aircraft stops, m."""
+    v = _velocity(pose)
+    return _place(pose) + (gains.lead + abs(v) / (2.0 * gains.braking)) * v
+
+
+def step(
+    state: GuidanceState | None, inputs: Inputs, route: Route | None, params: GuidanceParams
+) -> tuple[GuidanceState, Commands]:
+    """A step: attitude, commands, u_m.
+
+        v_c = towards the place or the path, within V
+        a_c = a_ff + k_v (v_c - v) + d (v_ff - W),  within g tan(bank)
+        [p, q] = k_tilt (angle from the thrust to [a_c, g]),  r = k_psi (heading - psi)
+
+    1. Attitude: of pose, brought to now by p, q, r of y. While pose is stale the thrust is
+       vertical; after `hold` the rates are 0 until pose returns.
+    2. Commands: the next leg at the end of a leg, then the commands given.
+    3. The fence: the place where the aircraft stops stays inside, else the way home.
+    4. W, the wind, by `_with_wind`: what holds the aircraft back is drag in a wind.
+    5. The climb rate by the altitude, as of an airplane.
+
+    a_ff and v_ff are those of the path `lead` ahead, for the tilt comes later by as much.
+    """
+    gains = _gains(params)
+    pose = dict(zip(POSE, inputs.pose, strict=True))
+    state = _begin(state, inputs, pose, params)
+    dt = seconds(inputs.t_ns - state.t_ns)
+    state = _with_attitude(state, inputs, pose, dt, params)
+    state, missed = with_commands(
+        state,
+        inputs.commands,
+        pose,
+        route,
+        params.channels,
+        lambda state, route: _along_route(state, pose, dt, route),
+        lambda state, leg, _, route: on_leg(state, leg, route)._replace(joining=1.0),
+    )
+    state = _with_wind(state, pose, dt, params)
+    state, escape = _within_fence(state, pose, params)
+    flies = state.mode is Mode.ENGAGED
+    speed = min(max(state.target.V, 0.0), params.limits.largest_speed)
+    state = state._replace(V_c=slewed(state.V_c, speed, gains.braking, dt))
+    wanted = _wanted(state, pose, route, escape, params)
+    if flies and state.lateral is not Lateral.PHI:
+        state = state._replace(V_c=min(state.V_c, abs(wanted.velocity)))
+    phi_c, theta_c, limited = _attitude_for(state, pose, wanted, params)
+    state, climb_limited = _with_climb(state, pose, dt, params)
+    rates = _rates(state, phi_c, theta_c, gains)
+    name = vertical(params.outputs)
+    values = rates | {name: VERTICAL[name] * state.climb_c}
+    u_m = tuple(
+        slewed(before, values[channel], rate, dt)
+        for channel, before, rate in zip(params.outputs, state.u_m, params.slew, strict=True)
+    )
+    commands = Commands(
+        phi_c,
+        theta_c,
+        wanted.error.e,
+        wanted.to_go,
+        wanted.error.track,
+        missed,
+        escape.clearance,
+        escape.predicted,
+        bank_limited=limited,
+        theta_limited=limited,
+        climb_limited=climb_limited,
+        V_limited=flies and speed != state.target.V,
+        slew_limited=any(
+            values[channel] != value for channel, value in zip(params.outputs, u_m, strict=True)
+        ),
+    )
+    return state._replace(t_ns=inputs.t_ns, u_m=u_m), commands
+
+
+def _begin(
+    state: GuidanceState | None,
+    inputs: Inputs,
+    pose: Mapping[str, float],
+    params: GuidanceParams,
+) -> GuidanceState:
+    """The state before a step; where the filters begin, that of a hover where the aircraft
+    stops.
+    """
+    if state is not None and inputs.begin is Begin.NO:
+        return state
+    gains = _gains(params)
+    held = GuidanceState(
+        t_ns=inputs.t_ns - params.period_ns,
+        mode=Mode.ENGAGED,
+        lateral=Lateral.PLACE,
+        vertical=Vertical.ALTITUDE,
+        target=Target(V=params.speed)._replace(**hold(pose, inputs.y, params)),
+        leg=0,
+        phi=pose["phi"],
+        theta=pose["theta"],
+        alpha=0.0,
+        alpha_trim=0.0,
+        slip=0.0,
+        climb_c=pose["climb"],
+        V_c=abs(_velocity(pose)),
+        u_m=(0.0,) * len(params.outputs),
+        psi=pose["psi"],
+        wind=_parts(_velocity(pose) - _by_tilt(pose, pose, gains) / gains.drag),
+        velocity=_parts(_velocity(pose)),
+    )
+    return begun_again(held, state, inputs, params, "wind")
+
+
+def _with_attitude(
+    state: GuidanceState,
+    inputs: Inputs,
+    pose: Mapping[str, float],
+    dt: float,
+    params: GuidanceParams,
+) -> GuidanceState:
+    """Mode, and attitude from pose or by dead reckoning. A pose that returns after a loss begins a
+    hover, or the way home.
+    """
+    age_ns = inputs.pose_age_ns
+    since = dt
+    if age_ns <= params.max_age_ns:
+        if state.mode is Mode.POSE_LOST:
+            state = _begin(None, inputs, pose, params)
+            if params.home.after_loss:
+                state = state._replace(target=state.target._replace(**home(pose, params)))
+        state = state._replace(
+            mode=Mode.ENGAGED, phi=pose["phi"], theta=pose["theta"], psi=pose["psi"]
+        )
+        since = min(seconds(age_ns), LONGEST_LEAD)
+    else:
+        lost = age_ns > params.max_age_ns + params.hold_ns
+        state = state._replace(mode=Mode.POSE_LOST if lost else Mode.DEAD_RECKONING)
+    p, q, r = (inputs.y[params.outputs.index(name)] for name in ("p", "q", "r"))
+    phi_dot, theta_dot = euler_rates(state.phi, state.theta, p, q, r)
+    psi = state.psi + since * heading_rate(state.phi, state.theta, q, r)
+    return state._replace(
+        phi=math.remainder(state.phi + since * phi_dot, 2.0 * math.pi),
+        theta=state.theta + since * theta_dot,
+        psi=math.remainder(psi, 2.0 * math.pi),
+    )
+
+
+def _is_near(state: GuidanceState, pose: Mapping[str, float], place: Point) -> bool:
+    return abs(complex(*place) - _place(pose)) <= NEAR * max(float(state.target.V), 1.0)
+
+
+def _stops(route: Route, number: int) -> bool:
+    """Whether an aircraft stops at the end of a leg: before a hover, and where a corner has no
+    fillet.
+    """
+    following = next(iter(route.legs[number + 1 :]), None)
+    hovers = following is not None and path.is_orbit(following)
+    return hovers or bool(path.turns_back(route.legs[number], following))
+
+
+def _along_route(
+    state: GuidanceState, pose: Mapping[str, float], dt: float, route: Route
+) -> tuple[GuidanceState, float]:
+    """The state on the leg once its start is reached, or on the next leg once the leg is passed or
+    its wait is over; and the distance missed by, m.
+    """
+    position = (pose["north"], pose["east"])
+    leg = route.legs[state.leg]
+    if state.joining:
+        start, _ = route.start(state.leg, state.target.along)
+        joins = path.is_orbit(leg) or _is_near(state, pose, start)
+        return (on_leg(state, state.leg, route) if joins else state), 0.0
+    if leg.end is None:
+        return state, 0.0
+    if isinstance(leg, Arc) and leg.loiter is not None:
+        if state.loitered or _is_near(state, pose, leg.centre):
+            share = dt / leg.loiter.wait
+            state = state._replace(loitered=min(state.loitered + share, 1.0))
+        ends = has_loitered(state, pose, route)
+        return on_leg(state, state.leg + 1, route) if ends else state, 0.0
+    stopped = _stops(route, state.leg) and _is_near(state, pose, leg.end)
+    if not stopped and not path.passed(leg, position):
+        return state, 0.0
+    distance = math.dist(leg.end, position)
+    missed = distance if distance > route.near(state.leg) else 0.0
+    return on_leg(state, state.leg + 1, route), missed
+
+
+def _within_fence(
+    state: GuidanceState, pose: Mapping[str, float], params: GuidanceParams
+) -> tuple[GuidanceState, Escape]:
+    """The state with the action of the fence; home is the target from the begin of the action on.
+
+    The action begins where the way to a stop comes nearer to the fence than MARGIN of flight.
+    """
+    fence = params.fence
+    if fence is None or state.mode is not Mode.ENGAGED:
+        return state, Escape(state.fence, False, LARGEST, LARGEST, 0.0)
+    position = (np.float64(pose["north"]), np.float64(pose["east"]))
+    margin = MARGIN * max(abs(_velocity(pose)), 1.0)
+    now = float(clearance(fence.zones, *position))
+    predicted = float(line_clearance(fence, *position, *_parts(_stop(pose, _gains(params)))))
+    action = _action(fence, position, now)
+    begins = state.fence == 0.0 and predicted < margin
+    if begins:
+        target = state.target._replace(**home(pose, params))
+        state = state._replace(
+            lateral=Lateral.PLACE, vertical=Vertical.ALTITUDE, target=target, joining=0.0
+        )
+    flown = action if begins or state.fence != 0.0 else 0.0
+    return state._replace(fence=flown), Escape(flown, begins, now, predicted, 0.0)
+
+
+def _action(fence: Fence, position: tuple[Any, Any], now: float) -> float:
+    """The action of a fence that acts: home in a straight line or around, or back inside."""
+    if now < 0.0:
+        return BACK
+    return HOME if bool(ways(fence).aim(fence, *position)[2]) else AROUND
+
+
+def _wanted(
+    state: GuidanceState,
+    pose: Mapping[str, float],
+    route: Route | None,
+    escape: Escape,
+    params: GuidanceParams,
+) -> Wanted:
+    """What the lateral mode asks for; the way around a fence in its place."""
+    gains = _gains(params)
+    target = state.target
+    place = (target.north, target.east)
+    if state.mode is not Mode.ENGAGED or state.lateral is Lateral.PHI:
+        return Wanted()
+    if escape.action in {AROUND, BACK} and params.fence is not None:
+        position = (np.float64(pose["north"]), np.float64(pose["east"]))
+        north, east, _ = ways(params.fence).aim(params.fence, *position)
+        place = (float(north), float(east))
+    elif state.lateral is Lateral.COURSE:
+        velocity = cmath.rect(state.V_c, target.course)
+        return Wanted(velocity, velocity, error=PathError(0.0, target.course, 0.0))
+    elif state.lateral is Lateral.ROUTE and route is not None:
+        leg = route.legs[state.leg]
+        if not state.joining and not path.is_orbit(leg):
+            return _on_path(state, pose, route, gains)
+        place = route.start(state.leg, target.along)[0]
+    return _to_place(complex(*place), state, pose, gains)
+
+
+def _approach(distance: float, speed: float, gains: MulticopterParams) -> tuple[float, float]:
+    """Speed towards a place at a distance, m/s, and its slope over the distance, 1/s: `climb_for`
+    with `k_p`, which falls by `braking`.
+    """
+    params = VerticalParams(gains.k_p, 2.0 * gains.braking, speed, speed, 0.0)
+    allowed = float(climb_for(distance, params))
+    slope = min(gains.k_p, gains.braking / max(allowed, 1e-6))
+    return allowed, 0.0 if allowed >= speed else slope
+
+
+def _to_place(
+    place: complex, state: GuidanceState, pose: Mapping[str, float], gains: MulticopterParams
+) -> Wanted:
+    """Towards a place, with the deceleration of the way."""
+    distance, course = cmath.polar(place - _place(pose))
+    speed, slope = _approach(distance, state.V_c, gains)
+    velocity = cmath.rect(speed, course)
+    closing = (_velocity(pose) * cmath.rect(1.0, -course)).real
+    brake = cmath.rect(-slope * closing, course)
+    return Wanted(velocity, velocity, brake, PathError(distance, course, 0.0), distance)
+
+
+def _on_path(
+    state: GuidanceState, pose: Mapping[str, float], route: Route, gains: MulticopterParams
+) -> Wanted:
+    """Along a line or a fillet of the route."""
+    leg = route.legs[state.leg]
+    position = (pose["north"], pose["east"])
+    error = path.error(leg, position)
+    to_go = path.to_go(leg, position)
+    speed = state.V_c
+    slope = 0.0
+    if _stops(route, state.leg):
+        speed, slope = _approach(max(to_go, 0.0), speed, gains)
+    across = -clip(gains.k_p * error.e, ACROSS * speed)
+    velocity = complex(math.sqrt(speed**2 - across**2), across)  # along, and i to the right
+    later = _parts(_place(pose) + gains.lead * _velocity(pose))
+    entered = leg
+    if path.passed(leg, later) and not _stops(route, state.leg):
+        entered = route.legs[state.leg + 1]
+    error_later = path.error(entered, later)
+    track = cmath.rect(1.0, error_later.track)
+    bend = complex(-slope * speed, speed**2 * error_later.curvature)
+    now = velocity * cmath.rect(1.0, error.track)
+    return Wanted(now, velocity * track, bend * track, error, to_go)
+
+
+def _by_tilt(
+    attitude: Mapping[str, float], pose: Mapping[str, float], gains: MulticopterParams
+) -> complex:
+    """Acceleration by an attitude, (g + d climb) tan(tilt), m/s^2."""
+    angles = (tilt(attitude["phi"]), tilt(attitude["theta"]), attitude["psi"])
+    north, east, up = thrust_axis(*angles)
+    return _lift(pose, gains) / up * complex(north, east)
+
+
+def _with_wind(
+    state: GuidanceState, pose: Mapping[str, float], dt: float, params: GuidanceParams
+) -> GuidanceState:
+    """The state with the wind of a step later, m/s.
+
+        W' = (v' - (g + d climb) tan(tilt) + d (v - W)) / (d T)
+
+    A low-pass of the wind that explains the acceleration of the pose. The tilt is that of the
+    pose, so commands that are not flown move no wind. W is within what the largest tilt holds.
+    """
+    gains = _gains(params)
+    v = _velocity(pose)
+    if state.mode is not Mode.ENGAGED:
+        return state._replace(velocity=_parts(v))
+    wind = complex(*state.wind)
+    attitude = {"phi": state.phi, "theta": state.theta, "psi": state.psi}
+    unexplained = gains.drag * (v - wind) - _by_tilt(attitude, pose, gains)
+    wind += (v - complex(*state.velocity) + dt * unexplained) / (gains.drag * WIND_TIME)
+    limit = GRAVITY * math.tan(params.limits.bank) / gains.drag
+    return state._replace(wind=_parts(_within(wind, limit)), velocity=_parts(v))
+
+
+def _within(vector: complex, largest: float) -> complex:
+    return vector * min(1.0, largest / max(abs(vector), 1e-6))
+
+
+def _lift(pose: Mapping[str, float], gains: MulticopterParams) -> float:
+    """Vertical part of the thrust in steady flight, g + d climb, m/s^2, at least half of g."""
+    return max(GRAVITY + gains.drag * pose["climb"], GRAVITY / 2.0)
+
+
+def _attitude_for(
+    state: GuidanceState, pose: Mapping[str, float], wanted: Wanted, params: GuidanceParams
+) -> tuple[float, float, bool]:
+    """Bank and pitch for the wanted acceleration, rad, and whether the tilt is limited."""
+    gains = _gains(params)
+    largest = params.limits.bank
+    if state.mode is not Mode.ENGAGED:
+        return 0.0, 0.0, False
+    if state.lateral is Lateral.PHI:
+        asked = complex(state.target.phi, state.target.theta)
+        angles = _within(asked, largest)
+        return angles.real, angles.imag, angles != asked
+    needed = (
+        wanted.acceleration
+        + gains.k_v * (wanted.velocity - _velocity(pose))
+        + gains.drag * (wanted.ahead - complex(*state.wind))
+    )
+    lift = _lift(pose, gains)
+    level = _within(needed, lift * math.tan(largest))
+    ahead, right = _parts(level * cmath.rect(1.0, -state.psi))
+    return math.atan2(right, math.hypot(ahead, lift)), math.atan2(-ahead, lift), level != needed
+
+
+def _with_climb(
+    state: GuidanceState, pose: Mapping[str, float], dt: float, params: GuidanceParams
+) -> tuple[GuidanceState, bool]:
+    """The state with the commanded climb rate, and whether the altitudes limit the rate."""
+    vertical_params = params.vertical
+    wanted = 0.0
+    permitted = 0.0
+    if state.mode is Mode.ENGAGED:
+        wanted = state.target.climb
+        if state.vertical is not Vertical.CLIMB:
+            profile = wanted if state.vertical is Vertical.PROFILE else 0.0
+            wanted = profile + climb_for(state.target.altitude - pose["altitude"], vertical_params)
+        least = climb_for(params.limits.lowest - pose["altitude"], vertical_params)
+        most = climb_for(params.limits.highest - pose["altitude"], vertical_params)
+        permitted = float(min(max(wanted, least), most))
+    climb_c = slewed(state.climb_c, permitted, vertical_params.acceleration, dt)
+    return state._replace(climb_c=float(climb_c)), bool(permitted != wanted)
+
+
+def _rates(
+    state: GuidanceState, phi_c: float, theta_c: float, gains: MulticopterParams
+) -> dict[str, float]:
+    """Body rates that turn the thrust into its direction by the shortest way, and the heading at
+    its rate, the inverse of `kinematics.heading_rate`, rad/s.
+
+        [p, q] = k_tilt angle [d_y, -d_x] / sqrt(d_x^2 + d_y^2),  angle = atan2(sqrt(..), -d_z)
+
+    with d, the direction [phi_c, theta_c] in body axes: the reduced quaternion error, without a
+    singularity short of a thrust downwards. Source: D. Brescianini, R. D'Andrea, Tilt-prioritized
+    quadrocopter attitude control, IEEE Trans. Control Systems Technology 28 (2020).
+    """
+    if state.mode is Mode.POSE_LOST:
+        return dict.fromkeys("pqr", 0.0)
+    x = -math.cos(phi_c) * math.sin(theta_c)
+    z = -math.cos(phi_c) * math.cos(theta_c)
+    ahead = math.cos(state.theta) * x - math.sin(state.theta) * z
+    down = math.sin(state.theta) * x + math.cos(state.theta) * z
+    right = math.cos(state.phi) * math.sin(phi_c) + math.sin(state.phi) * down
+    down = math.cos(state.phi) * down - math.sin(state.phi) * math.sin(phi_c)
+    sine = math.hypot(ahead, right)
+    rate = min(gains.k_tilt * math.atan2(sine, -down), gains.tilt_rate) / max(sine, 1e-9)
+    q = -rate * ahead
+    turn = 0.0
+    if state.mode is Mode.ENGAGED:
+        turn = gains.k_psi * math.remainder(state.target.heading - state.psi, 2.0 * math.pi)
+    phi = tilt(state.phi)
+    r = (clip(turn, gains.yaw_rate) * math.cos(state.theta) - q * math.sin(phi)) / math.cos(phi)
+    return {"p": rate * right, "q": q, "r": float(r)}

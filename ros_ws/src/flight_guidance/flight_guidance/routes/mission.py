@@ -1,0 +1,203 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Items of a mission of MAVLink, in the order of flight (MAVLink guide, MAV_CMD and MAV_FRAME)."""
+
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import Any, NamedTuple
+
+from flight_core.parameters import require
+from flight_guidance.routes.route_places import Above, Home, Place, Places
+
+FRAMES = {0: Above.SEA, 5: Above.SEA, 3: Above.HOME, 6: Above.HOME}  # MAV_FRAME
+TERRAIN = (10, 11)
+# MAV_CMD, and SPEED_TYPE
+WAYPOINT = 16
+LAND = 21
+SPLINE = 82
+JUMP = 177
+CHANGE_SPEED = 178
+AIRSPEED = 0
+UNLIMITED, TURNS, TIME, TO_ALTITUDE = LOITERS = 17, 18, 19, 31  # NAV_LOITER_...
+COMMANDS = {
+    17: "NAV_LOITER_UNLIM",
+    18: "NAV_LOITER_TURNS",
+    19: "NAV_LOITER_TIME",
+    31: "NAV_LOITER_TO_ALT",
+    20: "NAV_RETURN_TO_LAUNCH",
+    21: "NAV_LAND",
+    22: "NAV_TAKEOFF",
+    84: "NAV_VTOL_TAKEOFF",
+    85: "NAV_VTOL_LAND",
+    16: "NAV_WAYPOINT",
+    82: "NAV_SPLINE_WAYPOINT",
+    93: "NAV_DELAY",
+    178: "DO_CHANGE_SPEED",
+    177: "DO_JUMP",
+    189: "DO_LAND_START",
+    206: "DO_SET_CAM_TRIGG_DIST",
+    201: "DO_SET_ROI",
+    183: "DO_SET_SERVO",
+    179: "DO_SET_HOME",
+    601: "DO_JUMP_TAG",
+    34: "DO_ORBIT",
+    35: "DO_FIGURE_EIGHT",
+    36: "NAV_ARC_WAYPOINT",
+    94: "NAV_PAYLOAD_PLACE",
+    5000: "NAV_FENCE_RETURN_POINT",
+    5001: "NAV_FENCE_POLYGON_VERTEX_INCLUSION",
+    5100: "NAV_RALLY_POINT",
+    5002: "NAV_FENCE_POLYGON_VERTEX_EXCLUSION",
+    5003: "NAV_FENCE_CIRCLE_INCLUSION",
+    5004: "NAV_FENCE_CIRCLE_EXCLUSION",
+}
+MEANINGS = {
+    179: "heights above the home stay above the first home, and not above that of DO_SET_HOME",
+    601: "DO_JUMP_TAG repeats items, which are flown once here",
+}
+# after which an autopilot flies no item: a loiter without end, the return, the landings
+LAST = (UNLIMITED, 20, LAND, 85)
+OTHER_WAYS = (34, 35, 36, 94)  # to a place, no line and no loiter
+
+
+class Item(NamedTuple):
+    """An item of a mission."""
+
+    name: str  # "NAV_LAND (item 5)"
+    frame: int
+    command: int
+    params: Sequence[Any]  # seven
+    number: Any  # by which a DO_JUMP names the item
+    goes_on: bool = True  # autocontinue: without it an autopilot waits for the pilot after the item
+
+
+def named(command: int, number: int) -> str:
+    """The name of a command, by pymavlink where COMMANDS lacks the command, and the number of the
+    item.
+    """
+    name = COMMANDS.get(command, f"MAV_CMD {command}")
+    if command not in COMMANDS:
+        with suppress(ModuleNotFoundError):
+            from pymavlink.dialects.v20 import ardupilotmega  # noqa: PLC0415 - an extra
+
+            known = ardupilotmega.enums["MAV_CMD"].get(command)
+            name = name if known is None else f"{known.name.removeprefix('MAV_CMD_')} ({command})"
+    return f"{name} (item {number})"
+
+
+MOST_ITEMS = 20_000
+
+
+def _in_order(key: str, items: Sequence[Item]) -> list[int]:
+    """The positions of the items in the order of flight, with the jumps that are followed, up to an
+    item of LAST.
+
+    A DO_JUMP leads to an item as often as it says, with a negative number for good; a jump back for
+    good ends the order. Raises ParameterError for a jump to no item, for a loop inside of a loop,
+    which PX4 begins again and ArduPilot does not, and for more than MOST_ITEMS.
+    """
+    places = {items[k].number: k for k in reversed(range(len(items)))}
+    repetitions: dict[int, float] = {}  # repetitions of a jump
+    order: list[int] = []
+    k = steps = 0
+    while k < len(items) and not (order and items[order[-1]].command in LAST):
+        place = k
+        name, _, command, params, *_ = items[place]
+        k += 1
+        steps += 1
+        require(
+            steps <= MOST_ITEMS,
+            key,
+            f"more than {MOST_ITEMS} items by the repetitions of {name}",
+            "fewer",
+        )
+        if command != JUMP:
+            order.append(place)
+            continue
+        target = params[0]
+        count = -0.5 if params[1] is None else float(params[1])
+        if not count:
+            continue
+        require(
+            target in places and count.is_integer(),
+            key,
+            f"{name} to {target}",
+            "a jump to an item, a whole number of times",
+        )
+        if count < 0.0 and places[target] <= place:
+            break
+        remaining = repetitions.get(place, count)
+        require(
+            count < 0.0 or remaining >= 0.0,
+            key,
+            f"{name}, a loop inside of a loop",
+            "loops one after the other",
+        )
+        repetitions[place] = remaining - 1.0 if count > 0.0 else count
+        order.append(place)
+        k = places[target] if remaining else k
+    return order
+
+
+def mission_route(
+    key: str, items: Sequence[Item], home: Home | None, notes: Sequence[str] = ()
+) -> Places:
+    """The waypoints and loiters of a mission in the order of flight; the items that are not flown
+    in notes.
+    """
+    places: list[Place] = []
+    flown: set[int] = set()
+    circles: list[str] = []  # of a radius, negative to the left
+    speed: Any = None
+    for k in _in_order(key, items):
+        item = items[k]
+        require(item.command not in OTHER_WAYS, key, item.name, "waypoints and loiters")
+        before = places[-1] if places and item.command in LOITERS else None
+        if item.command in (WAYPOINT, SPLINE, *LOITERS) and (any(item.params[4:6]) or before):
+            loiter = {
+                TURNS: {"turns": item.params[0]},
+                TIME: {"wait": item.params[0]},
+                TO_ALTITUDE: {"climbs": True},
+            }
+            places.append(
+                _mission_place(key, item, speed, before)._replace(**loiter.get(item.command, {}))
+            )
+            if item.command in LOITERS and (
+                radius := item.params[1 if item.command == TO_ALTITUDE else 2]
+            ):
+                circles.append(f"{radius:g} m of {item.name}")
+        elif (
+            item.command == CHANGE_SPEED
+            and item.params[0] == AIRSPEED
+            and (item.params[1] or 0) > 0
+        ):
+            speed = item.params[1]
+        elif item.command != JUMP:
+            continue
+        flown.add(k)
+    skipped = [item.name for k, item in enumerate(items) if k not in flown]
+    sentences = [f"not flown: {', '.join(dict.fromkeys(skipped))}"] * bool(skipped)
+    sentences += [
+        sentence
+        for command, sentence in MEANINGS.items()
+        if any(item.command == command for item in items)
+    ]
+    waits = [item.name for k, item in enumerate(items) if k in flown and not item.goes_on]
+    sentences += [f"flown on without autocontinue: {', '.join(dict.fromkeys(waits))}"] * bool(waits)
+    circle_note = "circles are clockwise, of the radius of the route"
+    sentences += [f"{circle_note}, in place of {', '.join(dict.fromkeys(circles))}"] * bool(circles)
+    return Places(places, (*notes, *sentences), home)
+
+
+def _mission_place(key: str, item: Item, speed: Any, before: Place | None) -> Place:
+    """The place of an item; of a loiter without a latitude and a longitude the place before."""
+    latitude, longitude, altitude = item.params[4:7]
+    if not (latitude or longitude) and before is not None:
+        latitude = before.latitude
+        longitude = before.longitude
+        if not altitude:
+            return before._replace(turns=0.0, wait=0.0, climbs=False, speed=speed)
+    frame_text = f"the frame {item.frame}{', above the ground' if item.frame in TERRAIN else ''}"
+    expected = "0 or 3: above the sea or the home, for the height of the ground is not known"
+    require(item.frame in FRAMES, f"{key}: {item.name}", frame_text, expected)
+    return Place("route", latitude, longitude, altitude, speed, FRAMES[item.frame])

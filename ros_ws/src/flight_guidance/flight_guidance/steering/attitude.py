@@ -1,0 +1,93 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Attitude: body rates to hold or reach a bank and a pitch, in a coordinated turn."""
+
+import math
+from typing import NamedTuple
+
+from flight_core.kinematics import body_rates as inverse
+from flight_core.kinematics import clip, tilt, turn_rate
+from flight_core.units import GRAVITY
+from flight_core.vectors import Scalar, array_namespace
+from flight_guidance.steering.protection import forward
+
+YAW_TO_BANK = 1.5
+"""1/s. A yaw rate of 0.1 rad/s rolls the osprey by 0.02 rad/s, and 0.004 where A and B are 30 % off
+for the worse."""
+
+SKIDDING = 1.6
+"""Bank of the osprey in a turn by the rudder over that of a coordinated turn at the same rate: the
+sideslip rolls until then. 1.3 to 1.7 where A and B are 30 % off."""
+
+LARGEST_YAW = math.radians(20.0)
+"""Bank whose turn rate the yaw rate has at most: the rudder of the osprey is at half of its
+stop."""
+
+
+class AttitudeParams(NamedTuple):
+    """Gains and limits of the attitude loop."""
+
+    k_phi: float  # 1/s, a quarter of the reference's bandwidth of p: damping 0.74
+    k_theta: float  # 1/s, a quarter of the bandwidth of q
+    roll_rate: float  # largest phi_dot, rad/s
+    load: float  # largest change of the load factor, 1
+    n_alpha: Scalar  # slope of the load factor over the angle of attack, 1/rad
+    k_beta: float  # 1/s, 0 where beta is not measured
+    turn_lead: float = 0.0  # s, by which r leads the bank
+
+
+class BodyRates(NamedTuple):
+    """Commands of the reference model, rad/s, FRD."""
+
+    p: Scalar
+    q: Scalar
+    r: Scalar
+
+
+def body_rates(
+    phi_c: Scalar,
+    theta_c: Scalar,
+    phi: Scalar,
+    theta: Scalar,
+    r: Scalar,
+    beta: Scalar,
+    speed: Scalar,
+    params: AttitudeParams,
+) -> BodyRates:
+    """Rates to bring phi and theta to their commands, by the inverse of Euler's equations in a
+    coordinated turn:
+
+        phi_dot_c   = clip(k_phi (phi_c - phi), +-roll_rate),
+            theta_dot_c = clip(k_theta (theta_c - theta), +-load g/V)
+        r_m = psi_dot cos(phi_l) cos(theta) - theta_dot_c sin(phi_l) + k_beta beta,
+            psi_dot = g tan(phi_l) / V,  phi_l = phi + turn_lead phi_dot_c
+        q_m = (theta_dot_c + r sin(phi)) / cos(phi) + phi_dot_c tan(phi) / (cos(phi) n_alpha)
+        p_m = phi_dot_c - tan(theta) (q_m sin(phi) + r cos(phi))
+
+    with the measured r where r is not tracked exactly. `turn_lead` makes up for the lag of the turn
+    behind the bank, by the reference model of r and by the sideslip of a roll. The last term of q_m
+    leads the angle of attack of the turn. Arguments: angles in rad, `speed` V in m/s. Source: R. W.
+    Beard, T. W. McLain, Small Unmanned Aircraft (2012), chapters 2 and 9.
+    """  # noqa: D400, D415 - what follows is an equation
+    speed = forward(speed)
+    phi_dot = clip(params.k_phi * (phi_c - phi), params.roll_rate)
+    theta_dot = clip(params.k_theta * (theta_c - theta), params.load * GRAVITY / speed)
+    lead = phi_dot * array_namespace(phi).tan(tilt(phi)) / params.n_alpha
+    p, q = inverse(phi, theta, phi_dot, theta_dot + lead, r)
+    turn = turn_rate(phi + params.turn_lead * phi_dot, theta, theta_dot, speed)
+    return BodyRates(p, q, turn + params.k_beta * beta)
+
+
+def yaw_for_bank(phi_c: Scalar, phi: Scalar, speed: Scalar) -> Scalar:
+    """Yaw rate for a bank without an aileron, rad/s: of the turn, and more to roll there, within
+    +-g tan(LARGEST_YAW) / V.
+
+        r_m = g tan(phi_c) / V + k (SKIDDING phi_c - phi),  k = YAW_TO_BANK
+
+    phi_c is that of a coordinated turn at the same rate. A yaw rolls an aircraft to the same side:
+    the outer wing is faster, and the dihedral rolls away from the sideslip.
+    """
+    xp = array_namespace(phi)
+    turn = GRAVITY / forward(speed)
+    off = SKIDDING * phi_c - phi
+    return clip(turn * xp.tan(phi_c) + YAW_TO_BANK * off, turn * math.tan(LARGEST_YAW))

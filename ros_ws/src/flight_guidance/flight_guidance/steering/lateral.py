@@ -1,0 +1,151 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Lateral: the acceleration to the right to hold a heading or course, or to follow a path, and the
+bank for it.
+"""
+
+import math
+from typing import NamedTuple
+
+from flight_core.kinematics import clip
+from flight_core.units import GRAVITY
+from flight_core.vectors import Scalar, array_namespace
+from flight_guidance import reach
+from flight_guidance.steering.protection import forward
+
+# Largest share of a turn lost to a sideslip; the f16 of JSBSim in an orbit, with the rudder at the
+# stop: 0.09.
+LARGEST_SLIP = 0.2
+
+HEADING_TIME = 2.0
+"""s. Ten poses of a receiver of 5 Hz; a bias of the gyro of 1 mrad/s then turns the heading by 0.1
+deg."""
+
+
+class PathError(NamedTuple):
+    """Where the aircraft is beside a path."""
+
+    e: Scalar  # cross-track error, m, positive to the right of the path
+    track: Scalar  # course of the path at its nearest point, rad
+    curvature: Scalar  # of the path there, 1/m, positive to the right
+
+
+class PathParams(NamedTuple):
+    """Parameters of path following."""
+
+    period: float  # P, s
+    damping: float  # zeta, 1
+    capture: float  # largest angle at which the path is approached, rad
+
+
+def turn_towards(difference: Scalar) -> Scalar:
+    """Normalised turn for a difference of courses, within +-1: the sine up to 90 deg, +-1 beyond.
+
+    A sine alone would leave an aircraft on the opposite course there.
+    """
+    xp = array_namespace(difference)
+    sine = xp.sin(difference)
+    return xp.where(xp.cos(difference) > 0.0, sine, xp.copysign(1.0, sine))
+
+
+def heading_estimate(psi: float, measured: float | None, psi_dot: float, dt: float) -> float:
+    """Heading a step later, rad, from the heading rate of y, rad/s, and the heading of pose; None
+    where pose is stale.
+
+        psi+ = psi + dt psi_dot + (1 - exp(-dt/T)) (measured - psi - dt psi_dot),  T = HEADING_TIME
+
+    A complementary filter: noise of pose is smoothed, the gyro has no lag. A bias of the gyro turns
+    the heading by T times it.
+    """
+    predicted = psi + dt * psi_dot
+    off = 0.0 if measured is None else math.remainder(measured - predicted, 2.0 * math.pi)
+    return math.remainder(predicted + (1.0 - math.exp(-dt / HEADING_TIME)) * off, 2.0 * math.pi)
+
+
+def course_acceleration(course_c: float, course: float, speed: float, k: float) -> float:
+    """A = k V turn_towards(course_c - course), m/s^2. Also for a heading."""
+    return float(k * speed * turn_towards(math.remainder(course_c - course, 2.0 * math.pi)))
+
+
+def path_acceleration(
+    error: PathError, course: Scalar, ground_speed: Scalar, params: PathParams
+) -> Scalar:
+    """Acceleration to the right to follow a path, m/s^2:
+
+        x       = min(abs(e) / (v_g P zeta), 1),  look-ahead angle l = pi/2 (1 - x)^2
+        bearing = track - sign(e) min(pi/2 - l, max(capture, acos(1 / max(1 - kappa e, 1))))
+        a = (4 pi zeta / P) v_g turn_towards(bearing - course) + sin(l)^2 kappa / (1 - kappa e)
+        v_g^2 cos(course - track)
+
+    Outside a circle of radius R, at the distance d from the centre, 1 - kappa e = d / R: acos(R /
+    d) is the angle between the tangent to the circle and the track, so an aircraft from afar flies
+    along the tangent. Near a line e'' + 2 zeta w e' + w^2 e = 0 with w = 2 pi / P. The velocity is
+    over ground, so a wind changes nothing. On the inner side of an arc, e is limited to half of the
+    radius. Source: PX4-Autopilot, src/lib/npfg/DirectionalGuidance.cpp, without the adaptation to
+    wind.
+    """  # noqa: D400, D415 - what follows is an equation
+    e, track, kappa = error
+    xp = array_namespace(e)
+    x = xp.minimum(abs(e) / (forward(ground_speed) * params.period * params.damping), 1.0)
+    look_ahead = math.pi / 2.0 * (1.0 - x) ** 2
+    tangent = xp.acos(1.0 / xp.maximum(1.0 - kappa * e, 1.0))
+    bearing = track - xp.copysign(
+        xp.minimum(math.pi / 2.0 - look_ahead, xp.maximum(tangent, params.capture)), e
+    )
+    feedback = (
+        4.0
+        * math.pi
+        * params.damping
+        / params.period
+        * ground_speed
+        * turn_towards(bearing - course)
+    )
+    bend = kappa / (1.0 - xp.minimum(kappa * e, 0.5))
+    return feedback + xp.sin(look_ahead) ** 2 * bend * ground_speed**2 * xp.cos(course - track)
+
+
+def slip_estimate(
+    slip: Scalar, turn: Scalar, flown: Scalar, rolling: Scalar, dt: float, time: float
+) -> Scalar:
+    """Loss of turn by a sideslip at a bank, a step later, m/s^2; `turn` = g tan(phi), `flown` = V
+    psi_dot:
+
+        slip+ = slip + (1 - exp(-dt/T)) max(1 - rolling / 0.2, 0) (turn - flown - slip) within
+        +-LARGEST_SLIP abs(turn)
+
+    `rolling` is abs(p) / p_max: the turn lags the bank by the reference model of r, so a roll looks
+    like a sideslip. A bias of the gyro of r looks like a sideslip too; the bound is 0 in straight
+    flight and keeps the bias out there. Added to the acceleration of a path, the estimate keeps an
+    aircraft on an arc in a turn that is not coordinated.
+    """  # noqa: D400, D415 - what follows is an equation
+    steady = array_namespace(slip).maximum(1.0 - rolling / 0.2, 0.0)
+    return clip(
+        slip + (1.0 - math.exp(-dt / time)) * steady * (turn - flown - slip),
+        LARGEST_SLIP * abs(turn),
+    )
+
+
+def bank_for(acceleration: Scalar, path_angle: Scalar, limit: float) -> Scalar:
+    """Bank of a coordinated turn, rad: atan(a / (g cos(gamma))) within +-limit."""
+    xp = array_namespace(acceleration)
+    return clip(xp.atan(acceleration / (GRAVITY * xp.cos(path_angle))), limit)
+
+
+def least_period(speed: float, bank: float, roll_rate: float) -> float:
+    """Least period of path following, s: max(14, 1.5 V / (g tan(phi_max)), 9.3 phi_max / p_max).
+
+    The last term is `reach.least_period`.
+    """
+    return max(14.0, 1.5 * speed / (GRAVITY * math.tan(bank)), reach.least_period(bank, roll_rate))
+
+
+def largest_wind(speed: float, wind: float, bank: float) -> float:
+    """Wind in which a circle of `least_radius` for `wind` takes the whole bank, m/s: (V + W)
+    sqrt(tan(b) / tan(0.8 b)) - V.
+    """
+    return (speed + wind) * math.sqrt(math.tan(bank) / math.tan(0.8 * bank)) - speed
+
+
+def least_radius(speed: float, wind: float, bank: float) -> float:
+    """Least radius of a circle flown in a wind, m: (V + W)^2 / (g tan(0.8 phi_max))."""
+    return (speed + wind) ** 2 / (GRAVITY * math.tan(0.8 * bank))

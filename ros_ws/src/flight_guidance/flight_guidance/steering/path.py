@@ -1,0 +1,514 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Paths: lines and arcs in the local tangent plane, and routes of waypoints whose corners are
+fillets.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from itertools import pairwise
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+from flight_core.parameters import ParameterError, require
+from flight_core.vectors import Scalar, array_namespace
+from flight_guidance.steering.lateral import PathError
+
+Point = tuple[Scalar, Scalar]  # north, east, m
+
+SHARPEST = math.radians(150.0)
+"""Largest turn of a fillet, which cuts the corner by 2.8 radii. A sharper corner is passed, and the
+next leg joined."""
+
+JOINED = math.radians(30.0)
+"""Largest difference between the course flown and that of a leg where an aircraft leaves the
+joining circle for the leg."""
+
+OPPOSITE = math.radians(120.0)
+"""Difference of courses beyond which an aircraft near the start of a leg turns onto the leg by the
+joining circle too."""
+
+SLACK = 0.1
+"""rad. A tangent that touches the joining circle by less beyond the point of the leg needs no
+further turn of 360 deg."""
+
+SHORTEST = 1e-3
+"""m. A fillet with ends nearer to the waypoint is left out: waypoints on a straight line have a
+fillet by rounding alone."""
+
+
+class Line(NamedTuple):
+    """A straight leg."""
+
+    start: Point
+    end: Point
+
+
+class Loiter(NamedTuple):
+    """What an aircraft does on a circle before it flies on; at the end it is at the altitude of the
+    leg.
+    """
+
+    turns: float = 0.0  # 1
+    wait: float = 0.0  # s
+
+
+class Arc(NamedTuple):
+    """A leg on a circle, less than a full turn; without an end an orbit, with a loiter an orbit
+    until the loiter is flown.
+    """
+
+    centre: Point
+    radius: float  # m, positive to the right (clockwise from above), negative to the left
+    end: Point | None = None
+    loiter: Loiter | None = None
+
+
+Leg = Line | Arc
+
+
+class Route(NamedTuple):
+    """Legs, with altitudes and airspeeds per leg, taken from the waypoint at the end of the leg."""
+
+    legs: tuple[Leg, ...]
+    altitude: tuple[float, ...]  # m
+    V: tuple[float, ...]  # m/s
+    from_altitude: tuple[float, ...] = ()  # m, of the waypoint that the leg leaves
+    from_V: tuple[float, ...] = ()  # m/s, likewise
+    slopes: bool = False  # whether the altitude changes along a line; else at the begin of a leg
+    notes: tuple[str, ...] = ()  # sentences on what is flown otherwise than the waypoints say
+
+    @property
+    def radius(self) -> float:
+        """Radius of the last orbit and of the fillets, m."""
+        return abs(self.legs[-1].radius) if isinstance(self.legs[-1], Arc) else 0.0
+
+    def near(self, leg: int) -> float:
+        """Distance from the end of a leg within which the leg counts as flown, m: the radius, at
+        least 1 s of flight.
+        """
+        return max(self.radius, self.V[leg])
+
+    def start(self, leg: int, along: float = 0.0) -> tuple[Point, float]:
+        """The start of a leg, of a line the point at a distance along, m, and the course there,
+        rad; the centre of an orbit.
+        """
+        flown = self.legs[leg]
+        if isinstance(flown, Line):
+            course = course_of(flown.start, flown.end)
+            return _along(flown.start, course, along), course
+        if is_orbit(flown):
+            return flown.centre, 0.0
+        before = self.legs[leg - 1]  # an arc follows a line
+        return before.end or flown.centre, end_course(before)
+
+    def profile(self, leg: int, along: float) -> tuple[float, float]:
+        """The altitude at a distance along a leg, m, and its slope, 1: a straight line from
+        waypoint to waypoint, or a step.
+        """
+        altitude = self.altitude[leg]
+        distance = length(self.legs[leg])
+        if not self.slopes or not distance:
+            return altitude, 0.0
+        slope = (altitude - self.from_altitude[leg]) / distance
+        return altitude - slope * (distance - along), slope
+
+    def joining_altitude(self, leg: int, along: float) -> float:
+        """The altitude at which the aircraft joins a leg at a distance along the leg, m."""
+        if along or not self.from_altitude:
+            return self.profile(leg, along)[0]
+        return self.from_altitude[leg]
+
+
+def is_orbit(leg: Leg) -> bool:
+    """Whether a leg is a full circle, with a loiter or for good."""
+    return isinstance(leg, Arc) and (leg.end is None or leg.loiter is not None)
+
+
+def length(leg: Leg) -> float:
+    """Length of a line, m; 0 for an arc."""
+    return math.dist(leg.start, leg.end) if isinstance(leg, Line) else 0.0
+
+
+def along(start: Point, end: Point, share: float) -> Point:
+    """The point at a share of the way from a start to an end."""
+    return start[0] + share * (end[0] - start[0]), start[1] + share * (end[1] - start[1])
+
+
+def nearest(leg: Leg, position: Point) -> float:
+    """Distance along a line from the start to the point nearest to a position, m, from 0 to the
+    length; 0 for an arc.
+    """
+    return (
+        min(max(length(leg) - to_go(leg, position), 0.0), length(leg))
+        if isinstance(leg, Line)
+        else 0.0
+    )
+
+
+def course_of(start: Point, end: Point) -> float:
+    """Course from a start to an end, rad from north."""
+    return math.atan2(end[1] - start[1], end[0] - start[0])
+
+
+def error(leg: Leg, position: Point) -> PathError:
+    """The cross-track error of a position, and course and curvature of the leg at the nearest
+    point.
+    """
+    if isinstance(leg, Line):
+        return line_error(leg.start, course_of(leg.start, leg.end), position)
+    return circle_error(leg.centre, leg.radius, position)
+
+
+def line_error(start: Point, track: Scalar, position: Point) -> PathError:
+    """`error` beside a line from a point on a course, rad."""
+    xp = array_namespace(track)
+    north = position[0] - start[0]
+    east = position[1] - start[1]
+    return PathError(east * xp.cos(track) - north * xp.sin(track), track, 0.0)
+
+
+def circle_error(centre: Point, radius: Scalar, position: Point) -> PathError:
+    """`error` beside a circle, radius in m, positive to the right."""
+    xp = array_namespace(radius)
+    north = position[0] - centre[0]
+    east = position[1] - centre[1]
+    side = xp.copysign(1.0, radius)
+    bearing = xp.atan2(east, north)  # from the centre
+    return PathError(
+        side * (abs(radius) - xp.hypot(north, east)), bearing + side * math.pi / 2.0, 1.0 / radius
+    )
+
+
+def end_course(leg: Leg) -> float:
+    """Course at the end of a leg, rad. An orbit has none: raises ValueError."""
+    if isinstance(leg, Line):
+        return course_of(leg.start, leg.end)
+    if leg.end is None:
+        raise ValueError("an orbit has no end")
+    return float(error(leg, leg.end).track)
+
+
+def passed(leg: Leg, position: Point) -> bool:
+    """Whether a position lies beyond the half plane at the end of a leg, across the course there.
+    Never for an orbit.
+    """
+    return (
+        leg.end is not None
+        and not is_orbit(leg)
+        and bool(is_beyond(leg.end, end_course(leg), position))
+    )
+
+
+def is_beyond(end: Point, course: Scalar, position: Point) -> Any:
+    """Whether a position lies beyond the half plane through a point across a course, rad."""
+    xp = array_namespace(course)
+    north = position[0] - end[0]
+    east = position[1] - end[1]
+    return north * xp.cos(course) + east * xp.sin(course) >= 0.0
+
+
+def entered(leg: Leg, following: Leg | None, position: Point) -> bool:
+    """Whether a position lies beyond the end of a leg, but not beyond a following arc."""
+    return passed(leg, position) and not (
+        isinstance(following, Arc) and passed(following, position)
+    )
+
+
+def to_go(leg: Leg, position: Point) -> float:
+    """Distance along a leg from the point nearest to a position to the end, m; 0 for an orbit."""
+    if leg.end is None or is_orbit(leg):
+        return 0.0
+    if isinstance(leg, Line):
+        course = end_course(leg)
+        return float(
+            (leg.end[0] - position[0]) * math.cos(course)
+            + (leg.end[1] - position[1]) * math.sin(course)
+        )
+    turn = course_of(leg.centre, leg.end) - course_of(leg.centre, position)
+    return leg.radius * math.remainder(turn, 2.0 * math.pi)
+
+
+# Joining a leg: the aircraft flies along the tangent to a circle that touches the leg at a point,
+# and round the circle onto it.
+
+
+def joining_centre(point: Point, course: Scalar, radius: Scalar) -> Point:
+    """Centre of the circle that touches a course, rad, at a point; the radius is positive to the
+    right, m.
+    """
+    xp = array_namespace(course)
+    return point[0] - radius * xp.sin(course), point[1] + radius * xp.cos(course)
+
+
+def joining_length(
+    point: Point, course: Scalar, radius: Scalar, position: Point, flown: Scalar
+) -> Scalar:
+    """Length of the way onto a course at a point, m: R abs(turn) + sqrt(d^2 - R^2) + R sweep.
+
+    turn: from the course flown to the tangent; d: distance from the centre of the joining circle;
+    sweep: from the point where the tangent touches the circle to the point of the leg. `flown` and
+    `course` in rad.
+    """
+    xp = array_namespace(radius)
+    centre = joining_centre(point, course, radius)
+    north = position[0] - centre[0]
+    east = position[1] - centre[1]
+    side = xp.copysign(1.0, radius)
+    R = abs(radius)
+    d = xp.hypot(north, east)
+    touch = xp.atan2(east, north) + side * xp.acos(R / xp.maximum(d, R))  # bearing from the centre
+    turn = touch + side * math.pi / 2.0 - flown
+    sweep = (side * (course - touch) - math.pi / 2.0 + SLACK) % (2.0 * math.pi) - SLACK
+    turned = xp.atan2(xp.sin(turn), xp.cos(turn))
+    return R * abs(turned) + xp.sqrt(xp.maximum(d * d - R * R, 0.0)) + R * xp.maximum(sweep, 0.0)
+
+
+def joining(
+    point: Point, course: Scalar, radius: Scalar, near: Scalar, position: Point, flown: Scalar
+) -> Scalar:
+    """Side of the shorter joining circle onto a course at a point: 1 turns to the right, -1 to the
+    left, 0 needs none.
+
+    None is needed within `near`, m, and within OPPOSITE of the course.
+    """
+    right_way, left_way = (
+        joining_length(point, course, side * radius, position, flown) for side in (1.0, -1.0)
+    )
+    xp = array_namespace(right_way)
+    far = (xp.hypot(position[0] - point[0], position[1] - point[1]) > near) | (
+        xp.cos(flown - course) < math.cos(OPPOSITE)
+    )
+    return xp.where(far, xp.where(right_way <= left_way, 1.0, -1.0), 0.0)
+
+
+def joined(point: Point, course: Scalar, near: Scalar, position: Point, flown: Scalar) -> Any:
+    """Whether an aircraft is beyond a point of a leg, within `near`, m, and within JOINED of the
+    course of the leg.
+    """
+    xp = array_namespace(course)
+    is_near = xp.hypot(position[0] - point[0], position[1] - point[1]) <= near
+    return (
+        is_near & is_beyond(point, course, position) & (xp.cos(flown - course) >= math.cos(JOINED))
+    )
+
+
+def outline(leg: Leg, start: Point) -> list[Point]:
+    """Points along a leg from the start, for drawing: at most 10 deg apart on an arc; an orbit is
+    at least a full turn.
+    """
+    if isinstance(leg, Line):
+        return [leg.start, leg.end]
+    side = math.copysign(1.0, leg.radius)
+    first = course_of(leg.centre, start)
+    turn = 2.0 * math.pi if is_orbit(leg) else 0.0
+    if leg.end is not None:
+        turn += side * (course_of(leg.centre, leg.end) - first) % (2.0 * math.pi)
+    count = math.ceil(turn / math.radians(10.0)) + 1
+    return [
+        _along(leg.centre, first + side * turn * k / (count - 1), abs(leg.radius))
+        for k in range(count)
+    ]
+
+
+def route_outline(route: Route) -> list[tuple[float, float, float]]:
+    """Points along a route, for drawing: north, east and altitude, m."""
+    points: list[tuple[float, float, float]] = []
+    for number, leg in enumerate(route.legs):
+        start = (
+            leg.start
+            if isinstance(leg, Line)
+            else points[-1][:2]
+            if points
+            else _along(leg.centre, 0.0, abs(leg.radius))
+        )
+        points += [
+            (*point, route.profile(number, nearest(leg, point))[0]) for point in outline(leg, start)
+        ]
+    return points
+
+
+def lengths_after(route: Route) -> list[float]:
+    """Length of the legs after each leg, m, without the last orbit, which has no end."""
+    lengths = []
+    point = route.start(0)[0]
+    for leg in route.legs[:-1]:
+        points = outline(leg, leg.start if isinstance(leg, Line) else point)
+        lengths.append(sum(map(math.dist, points, points[1:])))
+        point = points[-1]
+    return [sum(lengths[number + 1 :]) for number in range(len(route.legs))]
+
+
+def leg_places(route: Route) -> dict[int, Point]:
+    """Where the number of a leg is drawn: the middle of a line, the centre of a circle; the fillets
+    have none.
+    """
+    places: dict[int, Point] = {}
+    for number, leg in enumerate(route.legs):
+        if isinstance(leg, Line):
+            places[number] = along(leg.start, leg.end, 0.5)
+        elif is_orbit(leg):
+            places[number] = leg.centre
+    return places
+
+
+def distance_from(legs: Sequence[Leg], point: Point) -> float:
+    """Distance of a point from the lines, the fillets and the endless orbit of a route, m."""
+    distances = []
+    for leg in legs:
+        if isinstance(leg, Line):
+            distances.append(
+                math.dist(point, along(leg.start, leg.end, nearest(leg, point) / length(leg)))
+            )
+        elif leg.loiter is None:
+            distances.append(abs(math.dist(point, leg.centre) - abs(leg.radius)))
+            if leg.end is not None:
+                distances.append(math.dist(point, leg.end))
+    return min(distances)
+
+
+def turns_back(leg: Leg, following: Leg | None) -> bool:
+    """Whether a corner between two lines is beyond SHARPEST."""
+    if not isinstance(leg, Line) or not isinstance(following, Line):
+        return False
+    return abs(math.remainder(end_course(following) - end_course(leg), 2.0 * math.pi)) > SHARPEST
+
+
+def leads(legs: Sequence[Leg]) -> list[int]:
+    """Numbers of the waypoints at the ends of the legs of a route; a fillet at a waypoint leads to
+    the next waypoint.
+    """
+    numbers = []
+    number = 0
+    for leg in legs:
+        number += isinstance(leg, Line)
+        numbers.append(number + 1 if isinstance(leg, Arc) and not is_orbit(leg) else number)
+    return numbers
+
+
+class ShortLegError(ParameterError):
+    """A leg is too short for its fillets."""
+
+    def __init__(self, sentence: str, number: int) -> None:
+        super().__init__(sentence)
+        self.number = number  # of the waypoint at the end of the leg
+
+
+def route(
+    waypoints: Sequence[Point],
+    radius: float,
+    least: float,
+    loiters: Mapping[int, Loiter] = MappingProxyType({}),
+) -> tuple[Leg, ...]:
+    """Legs through waypoints with fillets of a radius in the corners, m, then an orbit round the
+    last waypoint, clockwise.
+
+    A corner of the turn tau begins and ends radius tan(tau / 2) from the waypoint; one beyond
+    SHARPEST has no fillet. At a waypoint of `loiters`, by the number, a clockwise circle round the
+    waypoint takes the place of the fillet. Lines touch circles and the orbit; a line too short for
+    a tangent leads to the waypoint. Raises ParameterError for fewer than two waypoints, a radius
+    below `least` (`lateral.least_radius`), and a waypoint within the circle of a loiter;
+    ShortLegError for a leg too short for the fillets. Source: R. W. Beard, T. W. McLain, Small
+    Unmanned Aircraft (2012), algorithm 8.
+    """
+    require(len(waypoints) >= 2, "route", f"{len(waypoints)} waypoints", "two or more")
+    require(
+        radius >= least,
+        "guidance.radius",
+        f"{radius:g} m",
+        f"at least {math.ceil(least)} m at this speed, wind and bank",
+    )
+    legs: list[Leg] = []
+    first = 0
+    last = len(waypoints) - 1
+    for k in [*sorted(number for number in loiters if number < last), last]:
+        if k > 0:
+            lines = _between_circles(waypoints[first : k + 1], radius, first, leaves=bool(legs))
+            if legs and isinstance(circle := legs[-1], Arc):
+                legs[-1] = circle._replace(
+                    end=lines[0].start if isinstance(lines[0], Line) else None
+                )
+            legs += lines
+        legs.append(Arc(waypoints[k], radius, None, None if k == last else loiters[k]))
+        first = k
+    return tuple(legs)
+
+
+def _between_circles(
+    waypoints: Sequence[Point], radius: float, first: int, *, leaves: bool
+) -> list[Leg]:
+    """Lines and fillets onto a clockwise circle round the last waypoint, from a circle round the
+    first where `leaves`.
+
+    `first`: number of the first waypoint. The centre of a clockwise circle is on the right of the
+    tangent.
+    """
+    points = list(waypoints)
+    if leaves:
+        (centre, after), distance = points[:2], math.dist(*points[:2])
+        gap = f"{distance:g} m from the loiter before"
+        require(
+            distance > radius,
+            f"route[{first + 1}]",
+            gap,
+            f"more than {radius:g} m, the radius of the circle",
+        )
+        bearing = course_of(centre, after)
+        if len(points) == 2:  # to a circle of the same radius
+            start, end = (_along(point, bearing - math.pi / 2.0, radius) for point in points)
+            return [Line(start, end)]
+        points[0] = _along(
+            after, bearing + math.asin(radius / distance), -math.sqrt(distance**2 - radius**2)
+        )
+    before, last = points[-2:]
+    distance = math.dist(before, last)
+    if distance > radius:
+        course = course_of(before, last) - math.asin(radius / distance)
+        with suppress(ParameterError):
+            return filleted(
+                [*points[:-1], _along(before, course, math.sqrt(distance**2 - radius**2))],
+                radius,
+                first,
+            )
+    return filleted(points, radius, first)
+
+
+def filleted(waypoints: Sequence[Point], radius: float, first: int = 0) -> list[Leg]:
+    """Lines through waypoints, and the fillets in the corners. Raises as `route`; `first`: number
+    of the first waypoint.
+    """
+    turns = [0.0]
+    for before, corner, after in zip(waypoints, waypoints[1:], waypoints[2:], strict=False):
+        turn = math.remainder(course_of(corner, after) - course_of(before, corner), 2.0 * math.pi)
+        turns.append(turn if abs(turn) <= SHARPEST else 0.0)
+    turns.append(0.0)
+    cut = [radius * math.tan(abs(turn) / 2.0) for turn in turns]
+    legs: list[Leg] = []
+    start = waypoints[0]
+    for k, (start_point, end_point) in enumerate(pairwise(waypoints)):
+        length = math.dist(start_point, end_point)
+        needed = cut[k] + cut[k + 1]
+        if length <= needed:
+            expected = f"expected more than {math.ceil(needed)} m, for fillets of {radius:g} m"
+            number = first + k + 1
+            raise ShortLegError(
+                f"route[{number}]: found {length:g} m from the waypoint before, {expected}", number
+            )
+        course = course_of(start_point, end_point)
+        turn = turns[k + 1]
+        end = _along(end_point, course, -cut[k + 1])
+        legs.append(Line(start, end))
+        if cut[k + 1] > SHORTEST:
+            side = math.copysign(1.0, turn)
+            start = _along(end_point, course + turn, cut[k + 1])
+            legs.append(
+                Arc(_along(end, course + side * math.pi / 2.0, radius), side * radius, start)
+            )
+        else:
+            start = end_point
+    return legs
+
+
+def _along(point: Point, course: float, distance: float) -> Point:
+    return point[0] + distance * math.cos(course), point[1] + distance * math.sin(course)

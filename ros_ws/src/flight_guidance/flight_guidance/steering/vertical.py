@@ -1,0 +1,99 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Vertical: climb rate from the altitude, pitch from the climb rate."""
+
+import math
+from typing import NamedTuple
+
+from flight_core.kinematics import clip
+from flight_core.units import GRAVITY
+from flight_core.vectors import Scalar, array_namespace
+from flight_guidance.steering.protection import forward
+
+STALL_ANGLE = 0.3
+"""rad from zero lift, C_Lmax / C_Lalpha: 1.45 and 4.9 1/rad, of a clean wing of aspect ratio 7 by
+lifting-line theory."""
+
+
+CLIMB_BANDWIDTH = 0.4
+"""1/s, of the climb rate by the airspeed: a third of the osprey's bandwidth of V, which adds 37 deg
+of lag there."""
+
+
+class VerticalParams(NamedTuple):
+    """Gains and limits of the vertical loop."""
+
+    k_h: float  # 1/s
+    acceleration: float  # permitted vertical acceleration a, m/s^2
+    climb: float  # largest climb rate, m/s
+    sink: float  # largest sink rate, m/s
+    alpha_time: float  # time constant of the angle of attack's low-pass, s
+
+
+def climb_for(error: Scalar, params: VerticalParams) -> Scalar:
+    """Climb rate for an error of altitude (command less altitude, m), in m/s, within -sink and
+    climb:
+
+        k_h e  near,  sign(e) sqrt(a (abs(e) - e_l / 2))  from e_l = a / (2 k_h^2) on
+
+    The two branches and the slopes agree at e_l. Far away the climb rate falls by a/2 a second:
+    slow enough for the aircraft.
+    """  # noqa: D400, D415 - what follows is an equation
+    k_h = params.k_h
+    a = params.acceleration
+    near = a / (2.0 * k_h * k_h)
+    xp = array_namespace(error)
+    far = xp.copysign(xp.sqrt(a * xp.maximum(abs(error) - near / 2.0, 0.0)), error)
+    return xp.minimum(
+        xp.maximum(xp.where(abs(error) <= near, k_h * error, far), -params.sink), params.climb
+    )
+
+
+def slewed(value: Scalar, target: Scalar, rate: float, dt: float) -> Scalar:
+    """A value moved towards a target by at most rate dt."""
+    return value + clip(target - value, rate * dt)
+
+
+def alpha_estimate(
+    alpha: Scalar, theta: Scalar, climb: Scalar, speed: Scalar, dt: float, params: VerticalParams
+) -> Scalar:
+    """Low-pass of theta - gamma a step later, gamma = asin(climb / V).
+
+        alpha+ = alpha + (1 - exp(-dt/T)) (theta - gamma - alpha)
+
+    The filter replaces an integrator: bumpless, without windup, right in any bank, speed or trim.
+    """
+    return alpha + (1.0 - math.exp(-dt / params.alpha_time)) * (
+        theta - path_angle(climb, speed) - alpha
+    )
+
+
+def pitch_for(climb: Scalar, speed: Scalar, alpha: Scalar) -> Scalar:
+    """Pitch for a climb rate, rad: theta_c = asin(climb / V) + alpha."""
+    return path_angle(climb, speed) + alpha
+
+
+def climb_speed(error: Scalar, speed: Scalar) -> Scalar:
+    """Command of the airspeed, m/s, over the target, for an error of the climb rate without an
+    elevator: K V / (2 g) error.
+
+    At a constant angle of attack the lift goes with V^2, so h_ddot = 2 g dV / V, and the error
+    decays at K = CLIMB_BANDWIDTH.
+    """
+    return CLIMB_BANDWIDTH * speed / (2.0 * GRAVITY) * error
+
+
+def path_lag(stall_speed: float, speed: float) -> float:
+    """Time constant of the flight path behind the pitch, s.
+
+        T_L = V alpha_1 / g,  alpha_1 = 0.3 rad (V_s / V)^2
+
+    V gamma_dot = g (alpha - alpha_1) / alpha_1 near level flight; alpha_1 is the angle of attack
+    there, from zero lift.
+    """
+    return STALL_ANGLE * stall_speed**2 / (GRAVITY * speed)
+
+
+def path_angle(climb: Scalar, speed: Scalar) -> Scalar:
+    """Flight path angle in the air mass, rad: asin(climb / V)."""
+    return array_namespace(climb).asin(clip(climb / forward(speed), 1.0))

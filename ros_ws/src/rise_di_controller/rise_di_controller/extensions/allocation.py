@@ -1,0 +1,162 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Allocation of the m inputs v of a law to p >= m effectors u, inside end stops and rates: u = T v,
+effect u = v.
+
+The law, its gains and its theorem stay m x m in v. T is a right inverse of `effect`, so what one
+effector gives the others need not give. Every sum has a stated order, so u has the same bits on
+every host.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from flight_core.arithmetic import product
+from flight_core.vectors import Array, FloatArray, array_namespace
+from rise_di_controller.law.saturation import LEAST_DIVISOR, Limits, bounds
+
+SWEEPS = 10
+"""Most sweeps over the effectors of an exchange."""
+
+RELAXATION = 1.9
+"""Excess over a stop times this is exchanged: 1 is a projection on the stop. Of 500 demands that T
+v does not meet and some u inside the stops does, drawn on 3 to 8 effectors, ten sweeps meet 82 %
+with 1 and 99 % with 1.9."""
+
+HALVINGS = 5
+"""Of the part of an input that cannot be met. Of 300 demands beyond the stops, the first input gets
+99 % of what a linear program finds for it with 5, 92 % with 3."""
+
+SMALL = 1e-9  # of the diagonal of `exchange`: an effector that no other one replaces
+
+
+class Allocation(NamedTuple):
+    """Parameters of an allocation."""
+
+    T: FloatArray  # (p, m) u = T v
+    effect: FloatArray  # (m, p) v of u, effect T = I
+    exchange: FloatArray  # (p, p) I - T effect: the motions of u without effect on v
+    order: tuple[int, ...]  # inputs of the law, the one that keeps its effect the longest first
+    limits: Limits  # (p,) of u
+
+
+def allocation(
+    T: FloatArray, effect: FloatArray, order: Sequence[int], limits: Limits
+) -> Allocation:
+    """The parameters with `exchange`."""
+    columns = [product(T, column) for column in effect.T]
+    return Allocation(T, effect, np.eye(len(T)) - np.column_stack(columns), tuple(order), limits)
+
+
+def allocate(
+    v: FloatArray, u_before: FloatArray, dt: Array, params: Allocation
+) -> tuple[FloatArray, FloatArray]:
+    """U (p,) inside its limits for a demanded v (m,), and the v that u gives; without a limit T v
+    and v, to the last bit.
+
+    Where T v is beyond an end stop, `exchange w` passes what the effector lacks to the others, one
+    stop after the other. Where that is not enough, the inputs of the law are added in the order of
+    priority, each as far as the stops let it:
+
+        u += s (T_i v_i + exchange w),  s the largest in [0, 1] inside the end stops, from u = 0
+
+    From u_before towards this u the same holds inside the rates, with the change of v for v.
+
+    Source: pseudo-inverse with redistribution and priority, T. A. Johansen, T. I. Fossen, "Control
+    allocation - a survey", Automatica 49(5), 2013, section 2; the exchange is the relaxation method
+    of T. S. Motzkin, I. J. Schoenberg, Canadian Journal of Mathematics 6, 1954.
+    """
+    low, high = bounds(u_before, dt, params.limits)
+    u = product(params.T, v)
+    if _inside(u, low, high):
+        return u, v
+    stops = params.limits
+    target = _exchanged(u, stops.lower, stops.upper, params.exchange)
+    if not _inside(target, stops.lower, stops.upper):
+        target = _towards(
+            np.zeros_like(u),
+            [params.T[:, i] * v[i] for i in params.order],
+            stops.lower,
+            stops.upper,
+            params,
+        )
+    u = target
+    if not _inside(target, low, high):
+        start = np.minimum(np.maximum(u_before, low), high)
+        change = product(params.effect, target - start)
+        u = _towards(start, [params.T[:, i] * change[i] for i in params.order], low, high, params)
+        u = _towards(u, [product(params.exchange, target - u)], low, high, params)
+    return u, product(params.effect, u)
+
+
+def reached(v_free: Array, v: Array) -> Limits:
+    """The limits that take v_free to the v that the effectors give, for the anti-windup of a
+    law.
+    """
+    xp = array_namespace(v)
+    infinite = xp.full_like(v, xp.inf)
+    return Limits(xp.where(v_free < v, v, -infinite), xp.where(v_free > v, v, infinite), infinite)
+
+
+def _inside(u: FloatArray, low: FloatArray, high: FloatArray) -> bool:
+    return bool(((u >= low) & (u <= high)).all())
+
+
+def _towards(
+    start: FloatArray,
+    moves: list[FloatArray],
+    low: FloatArray,
+    high: FloatArray,
+    params: Allocation,
+) -> FloatArray:
+    """U after the moves, each as far as the limits let it, from a start inside; u stays inside.
+
+    HALVINGS find the part of a move, then the rest of the way is straight.
+    """
+    u = start
+    for move in moves:
+        begin = u
+        target = _exchanged(u + move, low, high, params.exchange)
+        if _inside(target, low, high):
+            u = target
+            continue
+        part = 0.0
+        size = 1.0
+        for _ in range(HALVINGS):
+            size *= 0.5
+            halfway = _exchanged(begin + (part + size) * move, low, high, params.exchange)
+            if _inside(halfway, low, high):
+                u = halfway
+                part = part + size
+            else:
+                target = halfway
+        step = target - u
+        room = np.where(step > 0.0, high - u, low - u)
+        limited = np.abs(step) > np.maximum(np.abs(room), LEAST_DIVISOR)
+        last = float(
+            np.min(np.where(limited, room, 1.0) / np.where(limited, step, 1.0), initial=1.0)
+        )
+        u = np.minimum(np.maximum(u + last * step, low), high)
+    return u
+
+
+def _exchanged(
+    u: FloatArray, low: FloatArray, high: FloatArray, exchange: FloatArray
+) -> FloatArray:
+    """U with the same effect, inside its limits where the sweeps find such a u."""
+    columns = exchange.T.tolist()
+    ends = list(enumerate(zip(low.tolist(), high.tolist(), strict=True)))
+    moved = u.tolist()
+    for _ in range(SWEEPS):
+        inside = True
+        for j, (least, largest) in ends:
+            excess = moved[j] - min(max(moved[j], least), largest)
+            if excess != 0.0 and abs(columns[j][j]) > SMALL:
+                inside = False
+                part = RELAXATION * excess / columns[j][j]
+                moved = [value - part * move for value, move in zip(moved, columns[j], strict=True)]
+        if inside:
+            break
+    return np.array(moved)

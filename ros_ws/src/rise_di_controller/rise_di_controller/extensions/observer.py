@@ -1,0 +1,283 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Observer, an extension of the paper, off by default: estimates of states, wind and disturbances
+correct the trim of a law.
+
+The observer extends any control law: the law's own equations do not change. The matrices are
+parameters, so nothing is solved here. See docs/theory.md.
+"""
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from flight_core.arithmetic import inverse, product
+from flight_core.vectors import Array, FloatArray, array_namespace
+from rise_di_controller.law.control_law import ControlLaw, Measurements
+from rise_di_controller.law.saturation import Limits, saturate
+
+
+class VaneParams(NamedTuple):
+    """Parameters of k vanes, sensors beside y for the observer alone: a reading is H z beyond the
+    reference motion.
+    """
+
+    H: Array  # (k, s)
+    # (k, s, m + 1) gains of a vane, added to L; the last column acts on the innovation of the vane
+    L: Array
+    least: (
+        Array  # (k,) mean square of the motion of a reading below which the vane counts as frozen
+    )
+    time: Array  # () s, over which the motion is averaged
+
+
+class ObserverParams(NamedTuple):
+    """Parameters of the extended law and of the observer, s estimates; a matrix may have the N
+    aircraft as the last axis.
+
+    The model of the deviation from the reference, u held over a period: z+ = Phi z + Gamma (u -
+    u_trim), e = H z.
+    """
+
+    law: Any  # parameters of the extended law
+    Phi: Array  # (s, s)
+    Gamma: Array  # (s, m)
+    H: Array  # (m, s)
+    L: Array  # (s, m) correction of the estimates by the innovation
+    F: Array  # (m, s) u per estimate
+    limits: Limits  # of u_o
+    fade_rate: Array  # () 1/s, inverse of the fade-in time of u_o after engagement
+    vanes: VaneParams | None = None  # None: the observer of y alone
+
+
+class PastTick(NamedTuple):
+    """A tick in the record from which a new observer starts."""
+
+    e: Array | None  # (m,); None for a tick without a y
+    u: Array  # (m,) u less the trim and the feedforward of the tick
+    y_m: Array  # (m,)
+    dt: Array  # () length of the tick, s
+    scale: Array | None = None  # (m,) factor of input_scale, beside a schedule
+
+
+class ObserverState(NamedTuple):
+    """State of the extended law and of the observer between two ticks."""
+
+    law: Any
+    z: Array  # (s,) estimates, predicted for the next tick
+    u_o: Array  # (m,) the observer's contribution to the trim
+    sigma: Array  # (1,) fade-in after engagement, 0 to 1
+
+
+class VaneObserverState(NamedTuple):
+    """State of an observer with vanes."""
+
+    law: Any
+    z: Array
+    u_o: Array
+    sigma: Array
+    vane_mean: Array  # (k,) mean of the readings
+    vane_square: Array  # (k,) mean square of the readings around it
+    vane_measures: Array  # (k,) 1 for a vane in use, 0 for a still vane
+
+
+def predict(z: Array, u: Array, params: ObserverParams) -> Array:
+    """Estimates a period later: Phi z + Gamma u, with u the deviation from u_trim."""
+    return product(params.Phi, z) + product(params.Gamma, u)
+
+
+def initial_estimates(e: Array, params: ObserverParams) -> Array:
+    """Estimates at engagement: H'e, the outputs at the errors and the rest 0."""
+    return product(params.H.swapaxes(0, 1), e)
+
+
+def estimates_after(
+    history: tuple[PastTick, ...], change: Array, filters: Sequence[ObserverParams]
+) -> Array:
+    """Estimates of the filter over the last ticks, predicted for the next tick.
+
+        z = (I - Phi (I - L H))^-1 (mean(Phi L e) + mean(Gamma (u - change)))
+            the steady state at the means
+        z = z + L (e - H z),  z = Phi z + Gamma (u - change)                       over the ticks,
+        that is z = (Phi - Phi L H) z + Phi L e + Gamma (u - change)
+
+    So the filter knows what the law held: to estimate it takes longer than the record. A tick
+    without a y has no correction. The products with e and u are taken of all ticks of a filter at
+    once, in a third of the time. Arguments: `history` with a y at least; `change` of the
+    feedforward since then, (m,); the `filters` of the ticks.
+    """
+    known = np.array([tick.e is not None for tick in history])
+    e = np.array([np.zeros_like(change) if tick.e is None else tick.e for tick in history]).T
+    u = np.array([tick.u - change for tick in history]).T
+    tick_filters = np.array([id(params) for params in filters])
+    by_e, by_u = np.zeros((2, len(filters[0].Phi), len(history)))
+    steps: dict[int, tuple[Array, Array]] = {}
+    for params in {id(params): params for params in filters}.values():
+        ticks = tick_filters == id(params)
+        gain = product(params.Phi, params.L)
+        by_e[:, ticks] = product(gain, e[:, ticks])
+        by_u[:, ticks] = product(params.Gamma, u[:, ticks])
+        steps[id(params)] = params.Phi, params.Phi - product(gain, params.H)
+    _, corrected = steps[id(filters[0])]
+    z = product(
+        inverse(np.eye(len(corrected)) - corrected),
+        np.mean(by_e[:, known], axis=1) + np.mean(by_u, axis=1),
+    )
+    for place, has_y, addend in zip(tick_filters.tolist(), known, (by_e + by_u).T, strict=True):
+        predicted, corrected = steps[place]
+        z = product(corrected if has_y else predicted, z) + addend
+    return z
+
+
+def moving(
+    state: VaneObserverState, reading: Array, dt: Array, params: VaneParams
+) -> VaneObserverState:
+    """The state with the motion of the readings, and the vanes in use.
+
+        part    = min(dt / time, 1)
+        mean   += part (reading - mean)
+        square += part ((reading - mean)^2 - square)
+        measures 1 where square > least, else 0
+
+    A frozen vane has electrical noise alone, of less than `least`. So has a vane in calm air,
+    without wind to tell.
+    """
+    xp = array_namespace(reading)
+    part = xp.minimum(dt / params.time, 1.0 + 0.0 * dt)
+    mean = state.vane_mean + part * (reading - state.vane_mean)
+    square = state.vane_square + part * ((reading - mean) ** 2 - state.vane_square)
+    measures = xp.where(square > params.least, 1.0, 0.0)
+    return state._replace(vane_mean=mean, vane_square=square, vane_measures=measures)
+
+
+def by_vanes(
+    z: Array, innovation: Array, deviation: Array, measures: Array, params: VaneParams
+) -> Array:
+    """Correction by the vanes in use, (s,): sum of L_v [e - H z, deviation_v - H_v z].
+
+    Arguments: the innovation of y, (m,); `deviation` of the readings from the reference motion,
+    (k,).
+    """
+    xp = array_namespace(z)
+    residual = deviation - product(params.H, z)
+    total = 0.0 * z
+    for v in range(len(params.H)):
+        total = total + measures[v] * product(
+            params.L[v], xp.concat([innovation, residual[v : v + 1]])
+        )
+    return total
+
+
+def without_frozen(params: ObserverParams, frozen: Sequence[bool]) -> ObserverParams:
+    """Parameters for frozen vanes: never in use, and the rest in use from the first motion on."""
+    if params.vanes is None:
+        return params
+    return params._replace(vanes=params.vanes._replace(least=np.where(frozen, np.inf, 0.0)))
+
+
+def filter_matrix(params: ObserverParams) -> FloatArray:
+    """Phi (I - L H - sum of L_v [H, H_v]), (s, s): the estimates from tick to tick, with the vanes
+    of a finite `least`.
+    """
+    corrected = params.L @ params.H
+    if params.vanes is not None:
+        for row, gain, least in zip(
+            params.vanes.H, params.vanes.L, params.vanes.least, strict=True
+        ):
+            corrected = corrected + np.isfinite(least) * (gain @ np.vstack([params.H, row]))
+    return np.asarray(params.Phi @ (np.eye(len(params.Phi)) - corrected))
+
+
+def correct(state: Any, measured: Measurements, dt: Array, params: ObserverParams) -> Any:
+    """Correction by the measured error, and the contribution to the trim.
+
+        z     = z + L (e - H z) + by_vanes
+        sigma = min(1, sigma + dt fade_rate)
+        u_o   = -sigma F z, inside limits of magnitude and rate
+
+    The limits bound u_o and u_o_dot for any measurement. The fade-in makes the engagement bumpless.
+    """
+    e = measured.y - measured.y_m
+    innovation = e - product(params.H, state.z)
+    z = state.z + product(params.L, innovation)
+    if params.vanes is not None and measured.vane is not None:
+        state = moving(state, measured.vane, dt, params.vanes)
+        z = z + by_vanes(
+            state.z, innovation, measured.vane - measured.vane_m, state.vane_measures, params.vanes
+        )
+    sigma = array_namespace(e).minimum(state.sigma + dt * params.fade_rate, 1.0 + 0.0 * state.sigma)
+    u_o = saturate(-sigma * product(params.F, z), state.u_o, dt, params.limits)
+    return state._replace(z=z, u_o=u_o, sigma=sigma)
+
+
+def _at_engagement(
+    law_state: Any, measured: Measurements, params: ObserverParams, *, vanes: bool
+) -> Any:
+    """The state at engagement: estimates from the first e, u_o = 0."""
+    e = measured.y - measured.y_m
+    zero = array_namespace(e).zeros_like(e)
+    state = ObserverState(law_state, initial_estimates(e, params), zero, zero[:1])
+    if not vanes or measured.vane is None:
+        return state
+    none = 0.0 * measured.vane
+    return VaneObserverState(*state, measured.vane, none, none)
+
+
+@lru_cache(maxsize=64)
+def with_observer(law: ControlLaw, *, vanes: bool = False) -> ControlLaw:
+    """A control law from the trim u_trim + u_o; the observer takes u after saturation
+    (anti-windup), and its vanes.
+
+        u_o by `correct`
+        u   = law(y, y_m) from the trim u_trim + u_o
+        z  += Phi z + Gamma (u - u_trim)        for the next tick, and again per missed tick
+
+    The law takes the measured e, not the estimate.
+    """
+
+    def corrected(
+        state: Any, measured: Measurements, dt: Array, params: ObserverParams
+    ) -> tuple[Any, Measurements]:
+        state = correct(state, measured, dt, params)
+        return state, measured._replace(u_trim=measured.u_trim + state.u_o)
+
+    def predicted(
+        state: Any, law_state: Any, u: Array, measured: Measurements, params: ObserverParams
+    ) -> Any:
+        return state._replace(law=law_state, z=predict(state.z, u - measured.u_trim, params))
+
+    def engage(measured: Measurements, params: ObserverParams) -> Any:
+        return _at_engagement(law.engage(measured, params.law), measured, params, vanes=vanes)
+
+    def step(
+        state: Any, measured: Measurements, dt: Array, params: ObserverParams
+    ) -> tuple[Any, Array]:
+        state, inner = corrected(state, measured, dt, params)
+        law_state, u = law.step(state.law, inner, dt, params.law)
+        return predicted(state, law_state, u, measured, params), u
+
+    def limited(
+        state: Any, measured: Measurements, dt: Array, params: ObserverParams, limits: Limits
+    ) -> tuple[Any, Array, Array]:
+        state, inner = corrected(state, measured, dt, params)
+        law_state, u_free, u = law.limited(state.law, inner, dt, params.law, limits)
+        return predicted(state, law_state, u, measured, params), u_free, u
+
+    def retune(state: Any, old: ObserverParams, new: ObserverParams) -> Any:
+        return state._replace(law=law.retune(state.law, old.law, new.law))
+
+    def missed(state: Any, measured: Measurements, params: ObserverParams) -> Any:
+        law_state = law.missed(state.law, measured, params.law)
+        return predicted(state, law_state, measured.u_before, measured, params)
+
+    return ControlLaw(
+        VaneObserverState if vanes else ObserverState,
+        engage,
+        step,
+        limited,
+        retune,
+        missed,
+        inner=law,
+    )

@@ -1,0 +1,246 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Schedule of input_scale over dynamic pressure, an extension of the paper, off by default.
+
+A control surface answers with the dynamic pressure: Omega grows with V^2, and the delay margin of
+fixed gains falls as much. The schedule keeps Omega input_scale near the value of the trim. The
+schedule extends a law with the parameter input_scale; the law's own equations do not change. The
+models of a feedforward and of an observer beside it are those of the airspeed too.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from flight_core.vectors import Array, FloatArray, array_namespace
+from rise_di_controller.extensions.feedforward import Nominal
+from rise_di_controller.extensions.observer import ObserverParams
+from rise_di_controller.law.control_law import ControlLaw, Measurements
+from rise_di_controller.law.saturation import Limits
+
+SCALE_RANGE = (0.3, 3.0)
+"""Least and largest factor of input_scale: from 1.83 to 0.58 of the trim speed."""
+
+
+# a unit of V / V0: the models change every 0.2 m/s at 25 m/s, so that most ticks find theirs made
+STEPS = 128
+
+
+class OverSpeed(NamedTuple):
+    """A model over the airspeed, from `least` to `most` of d = V / V0 - 1."""
+
+    model: Callable[[float], Any]  # of d, in whole STEPS
+    least: float
+    most: float
+    airspeed: FloatArray  # (m,) 1 for the output V, else 0
+
+    def at_scale(self, scale: FloatArray) -> Any:
+        """The model where the factors of input_scale are `scale`, (m,): they are (V0 / V)^2 in all
+        channels but V.
+        """
+        d = 1.0 / math.sqrt(((1.0 - self.airspeed) * scale).max()) - 1.0
+        return self.model(round(min(max(d, self.least), self.most) * STEPS) / STEPS)
+
+    def at_scales(self, scales: FloatArray) -> list[Any]:
+        """The models of T factors, (T, m), as from `at_scale`, at once."""
+        d = 1.0 / np.sqrt(((1.0 - self.airspeed) * scales).max(axis=1)) - 1.0
+        return [
+            self.model(place)
+            for place in (np.round(np.clip(d, self.least, self.most) * STEPS) / STEPS).tolist()
+        ]
+
+
+def over_speed(
+    ratios: tuple[float, float],
+    values: tuple[FloatArray, FloatArray, FloatArray],
+    airspeed: FloatArray,
+    model: Callable[[FloatArray, FloatArray], Any],
+) -> OverSpeed:
+    """The model of matrices trim + d (slope + d curvature), through `values` at the trim speed and
+    at two ratios to it.
+
+    The first ratio is below 1, the second above. What turns y_dot into u, as F of an observer and
+    the inverse of Omega, is over the factor of input_scale in `values`: `model` takes the matrices
+    and these factors, (m,).
+    """
+    trim, slow, fast = values
+    least, most = (ratio - 1.0 for ratio in ratios)
+    curvature = ((fast - trim) / most - (slow - trim) / least) / (most - least)
+    slope = (slow - trim) / least - least * curvature
+
+    @lru_cache(maxsize=512)
+    def model_at(d: float) -> Any:
+        return model(
+            trim + d * (slope + d * curvature), airspeed + (1.0 - airspeed) / (1.0 + d) ** 2
+        )
+
+    return OverSpeed(model_at, least, most, airspeed)
+
+
+class ScheduleParams(NamedTuple):
+    """Parameters of the extended law and of the schedule over m channels."""
+
+    law: Any  # parameters of the extended law
+    speed: Array  # () trim speed V0, m/s
+    airspeed: Array  # (m,) 1 for the output V, else 0
+    time: Array  # () time constant, s
+    # the law's parameters over the airspeed, of a law with an observer
+    observer: OverSpeed | None = None
+
+
+class ScheduleState(NamedTuple):
+    """State of the extended law and of the schedule between two ticks."""
+
+    law: Any
+    scale: Array  # (m,) factor of input_scale
+
+
+def airspeed_range(params: ScheduleParams) -> tuple[Array, Array]:
+    """Airspeeds where the factor is the largest and the least of SCALE_RANGE, m/s."""
+    return params.speed / math.sqrt(SCALE_RANGE[1]), params.speed / math.sqrt(SCALE_RANGE[0])
+
+
+def target_scale(y: Array, params: ScheduleParams) -> Array:
+    """Factor of input_scale at the airspeed V0 + V of y, shape (m,): (V0 / (V0 + V))^2 within
+    SCALE_RANGE; 1 in channel V.
+
+    A ratio of dynamic pressures at equal density: for V in y as equivalent airspeed at any
+    altitude, for true airspeed near the altitude of the trim. A thrust does not follow the ratio.
+    """
+    xp = array_namespace(y)
+    least, largest = airspeed_range(params)
+    V = params.speed + (params.airspeed * y).sum(axis=0)
+    ratio = params.speed / xp.minimum(xp.maximum(V, least + 0.0 * V), largest + 0.0 * V)
+    return params.airspeed + (1.0 - params.airspeed) * (ratio * ratio)
+
+
+def side_by_side(params: ObserverParams, scale: FloatArray) -> FloatArray:
+    """[Phi, Gamma, L, F'] of an observer with the factors `scale` of input_scale, (s, s + 3 m)."""
+    return np.hstack([params.Phi, params.Gamma, params.L, (params.F / scale[:, None]).T])
+
+
+def observer_of(
+    observer: ObserverParams, matrices: FloatArray, scale: FloatArray
+) -> ObserverParams:
+    """An observer with other matrices, the inverse of `side_by_side`."""
+    s, m = observer.Gamma.shape
+    F = np.ascontiguousarray(matrices[:, s + 2 * m :].T) * scale[:, None]
+    return observer._replace(
+        Phi=matrices[:, :s], Gamma=matrices[:, s : s + m], L=matrices[:, s + m : s + 2 * m], F=F
+    )
+
+
+def nominal_side_by_side(nominal: Nominal, scale: FloatArray) -> FloatArray:
+    """[A, gravity, B, path A, path gravity, inverse'] of a feedforward with the factors `scale`;
+    the last in n rows.
+    """
+    n, m = nominal.B.shape
+    inverse = np.zeros((n, m))
+    inverse[:m] = (nominal.inverse / scale[:, None]).T
+    return np.hstack(
+        [nominal.A, nominal.gravity, nominal.B, nominal.path_A, nominal.path_gravity, inverse]
+    )
+
+
+def nominal_of(nominal: Nominal, matrices: FloatArray, scale: FloatArray) -> Nominal:
+    """A nominal model of other matrices, the inverse of `nominal_side_by_side`."""
+    n, m = nominal.B.shape
+    ends = (0, n, 2 * n, 2 * n + m, 3 * n + m, 4 * n + m, 4 * n + 2 * m)
+    A, gravity, B, path_A, path_gravity, inverse = (
+        matrices[:, first:last] for first, last in pairwise(ends)
+    )
+    inverse = inverse[:m].T * scale[:, None]
+    return nominal._replace(
+        A=A, gravity=gravity, B=B, path_A=path_A, path_gravity=path_gravity, inverse=inverse
+    )
+
+
+def law_at(params: ScheduleParams, scale: Array) -> Any:
+    """Parameters of the extended law at an airspeed: input_scale times `scale`, with an observer
+    the models there.
+    """
+    return _scaled(
+        params.law if params.observer is None else params.observer.at_scale(scale), scale
+    )
+
+
+def _scaled(params: Any, scale: Array) -> Any:
+    """Parameters of the extended law with input_scale times `scale`."""
+    if isinstance(params, ObserverParams):
+        return params._replace(law=_scaled(params.law, scale))
+    return params._replace(input_scale=params.input_scale * scale)
+
+
+def observers_of(params: Any, scales: Sequence[Array | None]) -> list[ObserverParams]:
+    """The observers of some ticks, with the factors of input_scale there beside a schedule."""
+    if not isinstance(params, ScheduleParams):
+        return [params] * len(scales)
+    return (
+        [params.law] * len(scales)
+        if params.observer is None
+        else params.observer.at_scales(np.array(scales))
+    )
+
+
+@lru_cache(maxsize=64)
+def with_schedule(law: ControlLaw) -> ControlLaw:
+    """A control law with input_scale scheduled over the dynamic pressure:
+
+        scale += min(dt / time, 1) (target_scale(y) - scale)
+        the law is retuned to input_scale scale (bumpless transfer), then takes the step
+
+    The retuning keeps u: the schedule acts on u_dot alone. Engagement starts at target_scale(y). An
+    observer keeps the estimates, of the same meaning at every speed, and u_o goes on to -F z at its
+    own rate.
+    """  # noqa: D400, D415 - what follows is an equation
+
+    def followed(
+        state: ScheduleState, y: Array, dt: Array, params: ScheduleParams
+    ) -> ScheduleState:
+        xp = array_namespace(y)
+        part = xp.minimum(dt / params.time, 1.0 + 0.0 * dt)
+        scale = state.scale + part * (target_scale(y, params) - state.scale)
+        return ScheduleState(
+            law.retune(state.law, _scaled(params.law, state.scale), _scaled(params.law, scale)),
+            scale,
+        )
+
+    def engage(measured: Measurements, params: ScheduleParams) -> ScheduleState:
+        scale = target_scale(measured.y, params)
+        return ScheduleState(law.engage(measured, law_at(params, scale)), scale)
+
+    def step(
+        state: ScheduleState, measured: Measurements, dt: Array, params: ScheduleParams
+    ) -> tuple[ScheduleState, Array]:
+        state = followed(state, measured.y, dt, params)
+        law_state, u = law.step(state.law, measured, dt, law_at(params, state.scale))
+        return state._replace(law=law_state), u
+
+    def limited(
+        state: ScheduleState,
+        measured: Measurements,
+        dt: Array,
+        params: ScheduleParams,
+        limits: Limits,
+    ) -> tuple[ScheduleState, Array, Array]:
+        state = followed(state, measured.y, dt, params)
+        law_state, u_free, u = law.limited(
+            state.law, measured, dt, law_at(params, state.scale), limits
+        )
+        return state._replace(law=law_state), u_free, u
+
+    def retune(state: ScheduleState, old: ScheduleParams, new: ScheduleParams) -> ScheduleState:
+        return state._replace(
+            law=law.retune(state.law, _scaled(old.law, state.scale), _scaled(new.law, state.scale))
+        )
+
+    def missed(
+        state: ScheduleState, measured: Measurements, params: ScheduleParams
+    ) -> ScheduleState:
+        return state._replace(law=law.missed(state.law, measured, law_at(params, state.scale)))
+
+    return ControlLaw(ScheduleState, engage, step, limited, retune, missed, inner=law)

@@ -1,0 +1,597 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Guard of the control law: saturation, engagement, retuning and failsafe. Pure, like the law; for
+every control law.
+
+- Saturation: magnitude and rate limits of u (`saturation.saturate`). Anti-windup is part of the law
+  (`ControlLaw.limited`).
+- Allocation: u to more effectors than the law has inputs, inside the limits of the effectors
+  (`allocation.allocate`).
+- Watchdog: an input older than `max_age` is stale (`tick`).
+- Failsafe for stale inputs: hold u, then ramp u to trim (modes HOLD, RAMP, TRIM).
+- Bumpless transfer: engagement and re-engagement start from the present u, with the law's state as
+  at the first engagement.
+- Finite: a sample with NaN or infinity is as none, and a law whose u or state would not be finite
+  engages again.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from flight_core.failsafe import failsafe_scale
+from flight_core.modes import Mode
+from flight_core.rates import seconds
+from flight_core.vectors import Array, FloatArray, StampedVector
+from rise_di_controller.extensions import feedforward, observer
+from rise_di_controller.extensions.allocation import Allocation, allocate, reached
+from rise_di_controller.extensions.feedforward import FeedforwardState, Nominal
+from rise_di_controller.extensions.observer import ObserverParams, ObserverState, PastTick
+from rise_di_controller.extensions.schedule import OverSpeed, ScheduleState, law_at, observers_of
+from rise_di_controller.guard.probe import Probe
+from rise_di_controller.guard.samples import SampleLimits
+from rise_di_controller.law.control_law import Measurements, TunedLaw, fields
+from rise_di_controller.law.law import LawState, shifted
+from rise_di_controller.law.saturation import Limits, saturate
+
+# Least distance of two samples for a slope, as a fraction of the extrapolation. Closer samples are
+# noisier: the extrapolation would amplify the noise of the difference more than 20 times.
+MIN_SLOPE_SPAN = 0.05
+
+LARGEST_VANE = np.pi  # rad, where the motion of a vane ends
+
+# Samples kept of y and of y_m, so that y_m at the stamp of y is kept: 0.1 s at 1 kHz, more at lower
+# rates.
+SAMPLE_BUFFER_SIZE = 100
+
+
+class GuardParams(NamedTuple):
+    """Watchdog and failsafe times, saturation limits, and the nominal model of the feedforward."""
+
+    period_ns: int  # of the controller's ticks
+    max_age_ns: int  # an older sample is stale
+    hold_ns: int  # failsafe: how long u is held
+    ramp_ns: int  # failsafe: how long u then takes to trim
+    deactivation_holds: bool  # whether u is held when deactivated; otherwise u ramps to trim
+    limits: Limits
+    samples: SampleLimits  # of y and y_m, for the controller
+    nominal: Nominal | None = None  # None: no feedforward
+    # ticks over which a new observer runs before it flies; 0: it starts from the present error
+    history: int = 0
+    allocation: Allocation | None = None  # None: the inputs of the law are the effectors
+    # states of the nominal model read by vanes; the readings follow the outputs in y
+    vanes: tuple[int, ...] = ()
+    # the nominal model over the airspeed, beside a schedule; None: the one of the trim
+    over_speed: OverSpeed | None = None
+    probe: Probe | None = None  # added to u_trim; None: no probe
+
+    @property
+    def longest_ns(self) -> int:
+        """Longest time between two y of a step of the law; after more the law engages again.
+
+        The last tick with a y within the age limit may be a period before the tick of the next y.
+        A step integrates the whole time: with half of the ticks lost, an upper limit of 3 periods
+        increases the error by 15 % in q and 22 % in r.
+        """
+        return self.max_age_ns + self.period_ns
+
+
+# periods. Least dt of a step: it keeps a burst of samples from exciting the sign term.
+LEAST_DT = 0.2
+
+
+class Vanes(NamedTuple):
+    """Readings of the k vanes at the last step."""
+
+    reading: FloatArray  # (k,)
+    reference: FloatArray  # (k,) of the motion of the nominal model
+
+
+class ControllerState(NamedTuple):
+    """State of the controller between two ticks."""
+
+    mode: Mode
+    law: Any  # state of the control law; None until engaged
+    y: StampedVector | None  # of the last step
+    y_m: FloatArray | None  # the reference at the stamp of y
+    u: FloatArray  # commanded, after saturation
+    u_free: FloatArray  # before saturation
+    u_trim: FloatArray  # u at engagement, term of u added by the law
+    failsafe_start_ns: int  # when the inputs became stale, or the controller was deactivated
+    u_failsafe: FloatArray  # u at the start of the failsafe
+    u_ff: FloatArray  # the feedforward, 0 where there is none
+    feedforward: FeedforwardState | None = None
+    # times of the present failsafe: new parameters count from the next failsafe on, so that u does
+    # not jump
+    hold_ns: int = 0
+    ramp_ns: int = 0
+    history: tuple[PastTick, ...] = ()
+    # (p,) commanded, with an allocation; u is the input of the law that they give
+    effectors: FloatArray | None = None
+    effectors_failsafe: FloatArray | None = None  # at the start of the failsafe
+    vanes: Vanes | None = None  # None without vanes
+
+    @property
+    def command(self) -> FloatArray:
+        """What is published: the effectors, or u without an allocation."""
+        return self.u if self.effectors is None else self.effectors
+
+
+class TickInputs(NamedTuple):
+    """Inputs of a tick, for the log. The tick recomputed from these inputs gives u to the last
+    bit.
+    """
+
+    stamp_ns: int  # of y, and so of u; the instant of the tick where no y is used
+    y: FloatArray
+    y_m: FloatArray  # interpolated to the stamp of y
+    y_m_offset: float  # stamp of the newest y_m minus stamp of y, s
+    dt: float  # step of the law, s; 0 without a step
+
+
+def initial_state(m: int, allocation: Allocation | None = None) -> ControllerState:
+    """The state before the first sample: u = 0."""
+    zero = np.zeros(m)
+    effectors = None if allocation is None else np.zeros(len(allocation.T))
+    return ControllerState(
+        Mode.WAITING, None, None, None, zero, zero, zero, 0, zero, zero, effectors=effectors
+    )
+
+
+def align(samples: Sequence[StampedVector], stamp_ns: int, reach_ns: int) -> FloatArray | None:
+    """The signal at an instant, shape (m,); None where neither interpolation nor extrapolation is
+    possible.
+
+    A sample with the stamp of the instant is returned unchanged. Between two samples the signal is
+    linear. Beyond the newest sample the signal is extrapolated by at most `reach_ns`, with the
+    slope to the newest sample at least MIN_SLOPE_SPAN `reach_ns` older. Without an older sample,
+    the newest sample is held.
+
+    Arguments: samples with increasing stamps.
+    """
+    for sample in reversed(samples):
+        if sample.stamp_ns == stamp_ns:
+            return sample.value
+    older = [sample for sample in samples if sample.stamp_ns < stamp_ns]
+    newer = [sample for sample in samples if sample.stamp_ns > stamp_ns]
+    if older and newer:
+        before = older[-1]
+        after = newer[0]
+    elif not older or stamp_ns - older[-1].stamp_ns > reach_ns:
+        return None
+    else:
+        after = older[-1]
+        spaced = [
+            sample
+            for sample in older
+            if after.stamp_ns - sample.stamp_ns >= MIN_SLOPE_SPAN * reach_ns
+        ]
+        if not spaced:
+            return after.value
+        before = spaced[-1]
+    fraction = (stamp_ns - before.stamp_ns) / (after.stamp_ns - before.stamp_ns)
+    return before.value + fraction * (after.value - before.value)
+
+
+def _with_history(
+    state: ControllerState,
+    stepped: ControllerState,
+    inputs: TickInputs,
+    missed: int,
+    guard: GuardParams,
+) -> ControllerState:
+    """The state after a step of the law with the past ticks, missed ticks included."""
+    scale = getattr(stepped.law, "scale", None)
+    nominal = np.float64(seconds(guard.period_ns))
+    lost = (
+        PastTick(None, state.u - state.u_trim - state.u_ff, state.y_m, nominal, scale),
+    ) * missed
+    last = PastTick(
+        inputs.y - inputs.y_m,
+        stepped.u - state.u_trim - stepped.u_ff,
+        inputs.y_m,
+        np.float64(inputs.dt),
+        scale,
+    )
+    return stepped._replace(history=(*state.history, *lost, last)[-guard.history :])
+
+
+def tick(
+    state: ControllerState,
+    now_ns: int,
+    y: StampedVector | None,
+    y_m: Sequence[StampedVector],
+    guard: GuardParams,
+    law: TunedLaw,
+    active: bool = True,
+    u_ff_recorded: FloatArray | None = None,
+    vane_m_recorded: FloatArray | None = None,
+) -> tuple[ControllerState, TickInputs | None]:
+    """A tick of the controller: (state, now, y, y_m) -> (state, inputs of the tick), u in state.u.
+
+    Fresh inputs engage or re-engage the law with u_trim = u (bumpless transfer). A new y is a step
+    of the law with the measured dt, at least LEAST_DT periods; after more than `longest_ns` the law
+    engages again. `ControlLaw.missed` predicts over every whole period without a y before the step.
+    The law adds to u_trim, or to u_trim + u_ff with a feedforward. Without a new y nothing changes.
+    Stale inputs start the failsafe: HOLD (nothing is integrated), then RAMP to trim, then TRIM.
+    Where `active` is false the mode is INACTIVE, and u is held or ramps to trim; with fresh inputs
+    u is published at trim before the first engagement too. Returns None for the inputs where
+    nothing is to be published.
+
+    Arguments: `y` the newest sample, `y_m` the last samples with increasing stamps, in the law's
+    order; readings of vanes follow the outputs in y. `u_ff_recorded` and `vane_m_recorded` replace
+    a feedforward of unknown state, in replay.
+    """
+    vane = None
+    if guard.vanes and y is not None:
+        m = len(state.u)
+        vane = _readings(y.value[m:], state.vanes)
+        y = y._replace(value=y.value[:m])
+    reference = None if y is None else _fresh_reference(now_ns, y, y_m, guard)
+    if (
+        not active
+        and state.law is None
+        and y is not None
+        and reference is not None
+        and not state.u.any()
+    ):
+        return state._replace(mode=Mode.INACTIVE), TickInputs(now_ns, y.value, reference, 0.0, 0.0)
+    if not active or y is None or reference is None:
+        return _failsafe(state, now_ns, guard, active)
+    inputs = TickInputs(y.stamp_ns, y.value, reference, seconds(y_m[-1].stamp_ns - y.stamp_ns), 0.0)
+    return _with_sample(state, y, inputs, vane, guard, law, u_ff_recorded, vane_m_recorded)
+
+
+def _with_sample(
+    state: ControllerState,
+    y: StampedVector,
+    inputs: TickInputs,
+    vane: FloatArray | None,
+    guard: GuardParams,
+    law: TunedLaw,
+    u_ff_recorded: FloatArray | None,
+    vane_m_recorded: FloatArray | None,
+) -> tuple[ControllerState, TickInputs | None]:
+    """A tick with fresh inputs: an engagement, a step of the law, or nothing without a new y."""
+    last = state.y
+    if state.law is None or last is None or state.y_m is None or state.mode is not Mode.ENGAGED:
+        return _engaged(state, y, inputs, vane, guard, law, vane_m_recorded), inputs
+    span_ns = y.stamp_ns - last.stamp_ns
+    if span_ns <= 0:
+        return state, None
+    if span_ns > guard.longest_ns:
+        return _engaged(state, y, inputs, vane, guard, law, vane_m_recorded), inputs
+    period = seconds(guard.period_ns)
+    dt = max(seconds(span_ns), LEAST_DT * period)
+    u_trim = _probed_trim(state, y.stamp_ns, guard)
+    u_ff = state.u_ff
+    ff_state = state.feedforward
+    missed = max(round(dt / period) - 1, 0)
+    zero = np.zeros_like(u_ff)
+    held = Measurements(last.value, state.y_m, zero, u_trim + u_ff, state.u)
+    law_state = _predicted(state.law, held, missed, law)
+    model = _nominal(guard, law_state)
+    if model is not None and ff_state is not None:
+        parts = feedforward.parts_of(span_ns, guard.period_ns)
+        ff_state, u_ff = feedforward.step(ff_state, inputs.y_m, dt, model, parts)
+        u_trim = u_trim + u_ff
+    elif u_ff_recorded is not None:
+        u_ff = u_ff_recorded
+        u_trim = u_trim + u_ff
+    vanes = _vanes(vane, ff_state, guard, vane_m_recorded)
+    slope = (inputs.y_m - state.y_m) / dt
+    vane_m = None if vanes is None else vanes.reference
+    measured = Measurements(y.value, inputs.y_m, slope, u_trim, state.u, vane=vane, vane_m=vane_m)
+    after, u_free, u, effectors = law_within_limits(
+        law_state, measured, dt, law, guard, state.effectors
+    )
+    stepped = state._replace(
+        law=after,
+        y=y,
+        y_m=inputs.y_m,
+        u=u,
+        u_free=u_free,
+        u_ff=u_ff,
+        feedforward=ff_state,
+        effectors=effectors,
+        vanes=vanes,
+    )
+    if not _is_finite(stepped):
+        return _engaged(state, y, inputs, vane, guard, law, vane_m_recorded), inputs
+    inputs = inputs._replace(dt=dt)
+    if guard.history:
+        stepped = _with_history(state, stepped, inputs, missed, guard)
+    return stepped, inputs
+
+
+def _predicted(law_state: Any, held: Measurements, missed: int, law: TunedLaw) -> Any:
+    """The state of the law over periods without a y, u held."""
+    for _ in range(missed):
+        law_state = law.control_law.missed(law_state, held, law.params)
+    return law_state
+
+
+def _probed_trim(state: ControllerState, stamp_ns: int, guard: GuardParams) -> FloatArray:
+    """The trim of an engagement, with the probe at the stamp of y, (m,)."""
+    return state.u_trim if guard.probe is None else state.u_trim + guard.probe.at(stamp_ns)
+
+
+def _fresh_reference(
+    now_ns: int, y: StampedVector, y_m: Sequence[StampedVector], guard: GuardParams
+) -> FloatArray | None:
+    """The reference at the stamp of y, (m,); None where y or y_m is stale or not finite, or has no
+    sample near that stamp.
+    """
+    if not y_m or max(abs(now_ns - sample.stamp_ns) for sample in (y, y_m[-1])) > guard.max_age_ns:
+        return None
+    reference = align(y_m, y.stamp_ns, guard.period_ns)
+    return None if reference is None or not np.isfinite(y.value + reference).all() else reference
+
+
+def _engaged(
+    state: ControllerState,
+    y: StampedVector,
+    inputs: TickInputs,
+    vane: FloatArray | None,
+    guard: GuardParams,
+    law: TunedLaw,
+    vane_m_recorded: FloatArray | None,
+) -> ControllerState:
+    """The state at an engagement: the law begins from the present u."""
+    reference = inputs.y_m
+    zero = np.zeros_like(state.u)
+    ff_state = (
+        None if guard.nominal is None else feedforward.initial_state(reference, guard.nominal)
+    )
+    measured = Measurements(y.value, reference, zero, state.u, state.u, vane=vane)
+    u_trim = state.u
+    if guard.probe is not None:
+        u_trim = u_trim - guard.probe.at(y.stamp_ns)  # so that u goes on
+    return state._replace(
+        mode=Mode.ENGAGED,
+        law=law.control_law.engage(measured, law.params),
+        y=y,
+        y_m=reference,
+        u_trim=u_trim,
+        u_free=state.u,
+        u_ff=zero,
+        feedforward=ff_state,
+        history=(),
+        vanes=_vanes(vane, ff_state, guard, vane_m_recorded),
+    )
+
+
+def _is_finite(state: ControllerState) -> bool:
+    """Whether u and what the next u comes from are finite."""
+    arrays = [state.u, state.u_free, state.u_ff, *fields(state.law).values()]
+    if state.effectors is not None:
+        arrays.append(state.effectors)
+    if state.feedforward is not None:
+        arrays += [state.feedforward.x, state.feedforward.u, state.feedforward.u_0]
+    return bool(np.isfinite(np.concatenate(arrays)).all())
+
+
+def _readings(reading: FloatArray, before: Vanes | None) -> FloatArray:
+    """The readings of the vanes, (k,): one that no vane gives is that of the tick before, so the
+    vane counts as still.
+    """
+    last = np.zeros_like(reading) if before is None else before.reading
+    return np.where(np.abs(reading) <= LARGEST_VANE, reading, last)
+
+
+def _nominal(guard: GuardParams, law: Any) -> Nominal | None:
+    """The nominal model of the feedforward, at the speed of a schedule if any; None without a
+    feedforward.
+    """
+    if guard.nominal is None or guard.over_speed is None:
+        return guard.nominal
+    nominal: Nominal = guard.over_speed.at_scale(law.scale)
+    return nominal
+
+
+def _vanes(
+    reading: FloatArray | None,
+    state: FeedforwardState | None,
+    guard: GuardParams,
+    recorded: FloatArray | None,
+) -> Vanes | None:
+    """The readings, and the states of the nominal model along y_m as readings of the reference
+    motion; None without vanes.
+    """
+    if reading is None:
+        return None
+    return Vanes(reading, recorded if state is None else state.x[list(guard.vanes)])  # type: ignore[arg-type]
+
+
+def law_within_limits(
+    state: Any,
+    measured: Measurements,
+    dt: Array,
+    law: TunedLaw,
+    guard: GuardParams,
+    effectors: FloatArray | None,
+) -> tuple[Any, FloatArray, FloatArray, FloatArray | None]:
+    """A step of the law inside its limits and those of the effectors: state, u before saturation,
+    u, effectors.
+
+    Arguments: `effectors` (p,) of the last tick, None without an allocation.
+    """
+    after, u_free = law.control_law.step(state, measured, dt, law.params)
+    u, effector_values = _within_effectors(
+        saturate(u_free, measured.u_before, dt, guard.limits), effectors, dt, guard
+    )
+    # otherwise `limited` gives the same and takes three times as long
+    if not np.array_equal(u, u_free):
+        limits = guard.limits if guard.allocation is None else reached(u_free, u)
+        after, u_free, u = law.control_law.limited(state, measured, dt, law.params, limits)
+        u, effector_values = _within_effectors(u, effectors, dt, guard)
+    return after, u_free, u, effector_values
+
+
+def _within_effectors(
+    u: FloatArray, before: FloatArray | None, dt: Array, guard: GuardParams
+) -> tuple[FloatArray, FloatArray | None]:
+    """The u that the effectors give for a u, and the effectors; u and None without an
+    allocation.
+    """
+    if guard.allocation is None or before is None:
+        return u, None
+    effectors, u = allocate(u, before, dt, guard.allocation)
+    return u, effectors
+
+
+def retune(
+    state: ControllerState,
+    old: TunedLaw,
+    new: TunedLaw,
+    guards: tuple[GuardParams, GuardParams] | None = None,
+) -> ControllerState:
+    """State for new parameters of the law, without a jump of u (bumpless transfer).
+
+    An observer with the same matrices continues. With a history of the last ticks a new observer
+    and a new feedforward go on in the same motion: z comes from the new filter over these ticks,
+    and u_o goes on where an observer acts. Without a history the observer starts again from the
+    present error, and u_o and u_ff become part of u_trim. A schedule has the models of the present
+    speed, and over the record those of every tick. Arguments: `guards`, old and new, with the
+    models of the feedforward.
+    """
+    y = state.y
+    y_m = state.y_m
+    if state.law is None or y is None or y_m is None:
+        return state
+    law = new.control_law.retune(state.law, old.params, new.params)
+    before, after = (None, None) if guards is None else (_nominal(guard, law) for guard in guards)
+    other_nominal = not _same_arrays(before, after)
+    observing = law
+    observers = (old.params, new.params)
+    if isinstance(law, ScheduleState):
+        observing, observers = law.law, tuple(law_at(params, law.scale) for params in observers)
+    other_model = isinstance(
+        observing, (ObserverState, observer.VaneObserverState)
+    ) and _is_replaced(*observers)
+    if (
+        len(state.history) > 1
+        and isinstance(observing, ObserverState)
+        and isinstance(observing.law, LawState)
+    ):
+        change: Array = np.zeros_like(state.u)  # of u_ff
+        if other_nominal:
+            state, change = _with_nominal(state, y_m, after)
+        if other_model or other_nominal:
+            filters = observers_of(new.params, [tick.scale for tick in state.history])
+            z = observer.estimates_after(state.history, change, filters)
+            observing = _with_estimates(state, observing, z, change, observers)
+    else:
+        if other_model and not _same_model(*observers):
+            z = observer.initial_estimates(y.value - y_m, observers[1])
+            state = state._replace(u_trim=state.u_trim + observing.u_o)
+            observing = observing._replace(
+                z=z, u_o=np.zeros_like(observing.u_o), sigma=np.zeros_like(observing.sigma)
+            )
+        if other_nominal:
+            start = None if after is None else feedforward.initial_state(y_m, after)
+            state = state._replace(
+                u_trim=state.u_trim + state.u_ff, u_ff=np.zeros_like(state.u_ff), feedforward=start
+            )
+    if isinstance(law, ScheduleState):
+        observing = law._replace(law=observing)
+    return state._replace(law=observing)
+
+
+def _with_estimates(
+    state: ControllerState,
+    observing: ObserverState,
+    z: Array,
+    change: Array,
+    observers: tuple[ObserverParams, ...],
+) -> ObserverState:
+    """The observer of new parameters in the same motion, from its estimates z and the change of
+    u_ff, (m,).
+
+    u_o goes on to -F z at its own rate. Of a channel without an observer before it takes the part
+    of the law: what the law has integrated beside an observer stays there, which would take it long
+    to integrate again.
+    """
+    law_part = state.u - state.u_trim - state.u_ff
+    limits = observers[1].limits
+    acted, acts = ((params.limits.upper > 0.0) & np.any(params.F, axis=1) for params in observers)
+    goes_on = np.where(acted, observing.u_o - change, law_part)
+    u_o = np.where(acts, np.clip(goes_on, limits.lower, limits.upper), 0.0)
+    inner = shifted(
+        observing.law, law_part - u_o - (law_part + change - observing.u_o), observers[1].law
+    )
+    return ObserverState(inner, z, u_o, np.ones_like(observing.sigma))
+
+
+def _with_nominal(
+    state: ControllerState, y_m: FloatArray, nominal: Nominal | None
+) -> tuple[ControllerState, Array]:
+    """The state with the feedforward of another model in the same motion, and the change of u_ff,
+    (m,).
+    """
+    u_ff = np.zeros_like(state.u)
+    goes_on = None
+    if nominal is not None:
+        earlier = state.history[-2]
+        last = state.history[-1]
+        goes_on = feedforward.continued(
+            state.feedforward, y_m, (last.y_m - earlier.y_m) / last.dt, last.dt, nominal
+        )
+        u_ff = feedforward.acting(goes_on.u - goes_on.u_0, nominal)
+    return state._replace(u_ff=u_ff, feedforward=goes_on), u_ff - state.u_ff
+
+
+def _is_replaced(old: ObserverParams, new: ObserverParams) -> bool:
+    """Whether the model of the observer changes, or the observer is added or removed."""
+    return not _same_model(old, new) or bool(np.any(old.limits.upper) != np.any(new.limits.upper))
+
+
+def _same_model(old: ObserverParams, new: ObserverParams) -> bool:
+    same = all(
+        np.array_equal(getattr(old, name), getattr(new, name))
+        for name in ("Phi", "Gamma", "H", "L", "F")
+    )
+    return same and _same_arrays(old.vanes, new.vanes)
+
+
+def _same_arrays(old: tuple[Any, ...] | None, new: tuple[Any, ...] | None) -> bool:
+    if old is None or new is None:
+        return old is new
+    return all(np.array_equal(before, after) for before, after in zip(old, new, strict=True))
+
+
+def _failsafe(
+    state: ControllerState, now_ns: int, guard: GuardParams, active: bool
+) -> tuple[ControllerState, TickInputs | None]:
+    """A tick without fresh inputs, or of a deactivated controller."""
+    y = state.y
+    y_m = state.y_m
+    if y is None or y_m is None:
+        return state._replace(mode=Mode.WAITING if active else Mode.INACTIVE), None
+    was_active = state.mode is not Mode.INACTIVE
+    if state.mode in {Mode.ENGAGED, Mode.WAITING} or was_active != active:
+        hold_ns = guard.hold_ns if active else 0
+        state = state._replace(
+            failsafe_start_ns=now_ns,
+            u_failsafe=state.u,
+            effectors_failsafe=state.effectors,
+            hold_ns=hold_ns,
+            ramp_ns=guard.ramp_ns,
+        )
+    elapsed_ns = now_ns - state.failsafe_start_ns
+    held = not active and guard.deactivation_holds
+    scale = 1.0 if held else failsafe_scale(elapsed_ns, state.hold_ns, state.ramp_ns)
+    if not active:
+        mode = Mode.INACTIVE
+    elif scale == 1.0:
+        mode = Mode.HOLD
+    else:
+        mode = Mode.RAMP if scale > 0.0 else Mode.TRIM
+    u = state.u_failsafe if scale == 1.0 else scale * state.u_failsafe
+    effectors = state.effectors_failsafe
+    if effectors is not None and scale != 1.0:
+        effectors = scale * effectors
+    return state._replace(mode=mode, u=u, u_free=u, effectors=effectors), TickInputs(
+        now_ns, y.value, y_m, 0.0, 0.0
+    )

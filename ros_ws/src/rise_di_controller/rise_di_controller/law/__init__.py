@@ -1,0 +1,3 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The law of the paper, the protocol of every law, and its linear loop."""

@@ -1,0 +1,135 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Protocol of a control law: pure functions over a state. Controller, replay and campaigns fly
+every law by the protocol.
+
+A law with validated parameters is a subclass of `params.ControllerConfig`. The controller finds the
+subclass by name under the entry point group `laws.GROUP`. See docs/laws.md.
+"""
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+from flight_core.vectors import Array, array_namespace
+from rise_di_controller.law.saturation import Limits
+
+
+class Measurements(NamedTuple):
+    """Inputs of a law at a tick: SI units, deviations from trim, channels in the law's order.
+
+    A single aircraft has arrays of (m,). A campaign has N aircraft in the last axis, (m, N), or (m,
+    1) for shared values. The fields from `position` to `y_dot` are not on the topics. Campaigns
+       alone have these fields, for laws with more sensors.
+    """
+
+    y: Array  # measured outputs
+    y_m: Array  # reference at the stamp of y
+    y_m_dot: Array  # slope of y_m since the previous tick
+    u_trim: Array  # the law adds to this input: u at engagement, and the feedforward
+    u_before: Array  # the last command, after saturation
+    position: Array | None = None  # of the actuators
+    # (n, N) state: measured values of the outputs, true values of the remaining states
+    x: Array | None = None
+    x_air: Array | None = None  # (n, N) x with alpha and beta relative to the air
+    y_dot: Array | None = None  # true derivative of C x, free of noise and delay
+    vane: Array | None = None  # (k,) readings of the vanes of an observer, rad
+    # (k,) those of the reference motion, from the model of the feedforward
+    vane_m: Array | None = None
+
+
+def _no_prediction(state: Any, measured: Measurements, params: Any) -> Any:
+    return state
+
+
+class ControlLaw(NamedTuple):
+    """A control law as pure functions of state and parameters, with NumPy and JAX arrays.
+
+    The state is a NamedTuple of arrays, (m,) or (m, N). The log holds the fields by name, so replay
+    can continue from any tick. The parameters are any NamedTuple of arrays.
+
+    `engage` makes the state at engagement: u has to be u_trim then. `step` is a tick of dt seconds
+    without limits. `limited` is the same tick inside limits, with the law's anti-windup: where no
+    limit acts, `limited` gives the bits of `step`. `retune` makes the state for new parameters,
+    without a jump of u. `missed` predicts the state over one period without a sample, u held.
+    """
+
+    state: type[Any]
+    engage: Callable[[Measurements, Any], Any]  # (measured, params) -> state
+    # (state, measured, dt, params) -> (state, u)
+    step: Callable[[Any, Measurements, Array, Any], tuple[Any, Array]]
+    limited: Callable[[Any, Measurements, Array, Any, Limits], tuple[Any, Array, Array]]
+    """(state, measured, dt, params, limits) -> (state, u before saturation, u)"""
+    retune: Callable[[Any, Any, Any], Any]  # (state, old params, new params) -> state
+    # (state, measured, params) -> state
+    missed: Callable[[Any, Measurements, Any], Any] = _no_prediction
+    # the law extended by this law; the state field `law` is the state of `inner`
+    inner: "ControlLaw | None" = None
+
+
+class TunedLaw(NamedTuple):
+    """A control law with parameters.
+
+    Attributes:
+        control_law: The law.
+        params: Parameters of the law, a NamedTuple of arrays.
+
+    Examples:
+        >>> rise_di.find_scenario("osprey_servo").controller.tuned_law().params.K.shape
+        (4,)
+    """
+
+    control_law: ControlLaw
+    params: Any
+
+
+def without_limits(
+    limited: Callable[[Any, Measurements, Array, Any, Limits], tuple[Any, Array, Array]],
+) -> Callable[[Any, Measurements, Array, Any], tuple[Any, Array]]:
+    """The function `step` of a law from the function `limited`, with infinite limits.
+
+    Args:
+        limited: A tick inside limits: (state, measurements, dt, params, limits) -> (state, u before
+            saturation, u).
+
+    Returns:
+        A tick without limits: (state, measurements, dt, params) -> (state, u), u of shape (m,).
+
+    Examples:
+        >>> law = rise_di.find_scenario("osprey_servo").controller.control_law()
+        >>> callable(rise_di.without_limits(law.limited))
+        True
+    """
+
+    def step(state: Any, measured: Measurements, dt: Array, params: Any) -> tuple[Any, Array]:
+        infinite = array_namespace(measured.y).inf + 0.0 * measured.y
+        after, u, _ = limited(state, measured, dt, params, Limits(-infinite, infinite, infinite))
+        return after, u
+
+    return step
+
+
+def fields(state: Any) -> dict[str, Array]:
+    """The arrays of a law's state by name; arrays of an extended law first."""
+    values: dict[str, Array] = {}
+    for name, value in state._asdict().items():
+        values |= fields(value) if hasattr(value, "_asdict") else {name: value}
+    return values
+
+
+def restored(law: ControlLaw, values: Any) -> Any:
+    """The state of a law from the arrays by name, the inverse of `fields`."""
+    inner = {} if law.inner is None else {"law": restored(law.inner, values)}
+    return law.state(
+        **inner, **{name: values[name] for name in law.state._fields if name not in inner}
+    )
+
+
+@lru_cache(maxsize=64)
+def field_names(law: ControlLaw) -> tuple[str, ...]:
+    """Names of the arrays of a law's state, in the order of `fields`."""
+    inner_names = () if law.inner is None else field_names(law.inner)
+    return (
+        *inner_names,
+        *(name for name in law.state._fields if law.inner is None or name != "law"),
+    )

@@ -1,0 +1,270 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The sampled linear loop of a control law around a model, with actuators and delay: its
+stability.
+"""
+
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from flight_core.parameters import require
+from flight_core.vectors import FloatArray
+from rise_di_controller.extensions.observer import ObserverParams
+from rise_di_controller.law.control_law import Measurements, TunedLaw, fields, restored
+from rise_di_controller.law.law import LawParams, Sign, total_lag
+
+SPECTRAL_RADIUS_TOLERANCE = 1e-6
+"""A spectral radius above 1 by more than this is unstable. Angles that integrate the outputs give a
+double eigenvalue 1, which rounding splits by the root of the rounding error, 1e-8."""
+
+ROOT = np.sqrt(3.0)  # of the second Legendre polynomial, normalised: ROOT (2 s - 1)
+
+SMALL = (
+    2.0**-40
+    # size of the steps from 0: below every limit and every width of a sign; a power of two loses no
+    # digit
+)
+
+
+class LinearPlant(NamedTuple):
+    """x_dot = A x + B u_a, y = C x with an actuator per input, lag_i u_a,i_dot = u_i - u_a,i; the
+    law's order, SI.
+    """
+
+    A: FloatArray  # (n, n)
+    B: FloatArray  # (n, m)
+    C: FloatArray  # (m, n), with k vanes (m + k, n)
+
+
+class Loop(NamedTuple):
+    """Actuators, delay and sampling between y and the response of the aircraft, over m channels."""
+
+    lag: FloatArray  # (m,) time constants of the actuators, s; 0 without an actuator
+    delay: float  # pure delay beyond sampling, s
+    period: float  # of the law, s
+
+    @property
+    def total(self) -> FloatArray:
+        """Lag of the loop, shape (m,), s."""
+        return np.asarray(total_lag(self.lag, self.delay, self.period))
+
+
+class LinearLaw(NamedTuple):
+    """A law near e = 0 with k values in the state: z+ = A z + B y, u = C z + D y, at y_m = 0;
+    leading axes are batches.
+    """
+
+    A: FloatArray  # (..., k, k)
+    B: FloatArray  # (..., k, m), with vanes these in further columns, as in D
+    C: FloatArray  # (..., m, k)
+    D: FloatArray  # (..., m, m)
+
+
+def linear_law(law: TunedLaw, m: int, period: float, candidates: int | None = None) -> LinearLaw:
+    """A law's step near e = 0 over m channels: a column is the response to SMALL in a value of the
+    state or of y.
+
+    An observer has faded in, and its vanes measure: a column each, after those of y. With
+    `candidates` N the parameters have N sets of gains as the last axis, and the matrices have them
+    as the first. Raises ParameterError for the literal sign: not linear anywhere.
+    """
+    control_law, params = law
+    core = params
+    while hasattr(core, "law"):  # under an observer or a schedule
+        core = core.law
+    literal = isinstance(core, LawParams) and core.sign is Sign.LITERAL
+    require(not literal, "sign", "literal", "soft or implicit, which are linear near e = 0")
+    sets = () if candidates is None else (candidates,)
+    at_once = candidates is None and _takes_columns(params)
+    if at_once:
+        params = _for_columns(params)
+        sets = (1,)
+    zero = np.zeros((m, *sets))
+    vanes = getattr(params, "vanes", None)
+    none = None if vanes is None else np.zeros((len(vanes.H), *sets))
+    wide = m if none is None else m + len(none)
+    if vanes is not None:
+        params = params._replace(
+            vanes=vanes._replace(least=np.where(np.isinf(vanes.least), np.inf, -1.0))
+        )
+    still = Measurements(zero, zero, zero, zero, zero, vane=none, vane_m=none)
+    at_engagement = fields(control_law.engage(still, params))
+    at_rest = {
+        name: np.broadcast_to(value, (len(value), *sets)) for name, value in at_engagement.items()
+    }
+    if "sigma" in at_rest:
+        at_rest["sigma"] = np.ones((1, *sets))
+    ends = np.cumsum([len(value) for value in at_rest.values()])
+    size = int(ends[-1]) if len(ends) else 0
+
+    def step(z: FloatArray, y: FloatArray) -> FloatArray:
+        parts = dict(zip(at_rest, np.split(z, ends[:-1]), strict=True)) if size else {}
+        now = still._replace(y=y[:m], vane=None if none is None else y[m:])
+        state, u = control_law.step(restored(control_law, parts), now, np.float64(period), params)
+        return np.concatenate([*fields(state).values(), u])
+
+    begin = np.concatenate([*at_rest.values(), np.zeros((wide, *sets))])
+    equilibrium = step(begin[:size], begin[size:])
+    if at_once:
+        moved = begin + SMALL * np.eye(size + wide)
+        matrix = (step(moved[:size], moved[size:]) - equilibrium) / SMALL
+    else:
+        units = SMALL * np.eye(size + wide).reshape(size + wide, size + wide, *(1 for _ in sets))
+        columns = [
+            (step((begin + unit)[:size], (begin + unit)[size:]) - equilibrium) / SMALL
+            for unit in units
+        ]
+        matrix = np.array(columns).T
+    above = matrix[..., :size, :]
+    below = matrix[..., size:, :]
+    return LinearLaw(above[..., :size], above[..., size:], below[..., :size], below[..., size:])
+
+
+def _takes_columns(params: Any) -> bool:
+    """Whether a law is known to take columns side by side: RISE-DI, also under an observer."""
+    if isinstance(params, ObserverParams) and params.vanes is None:
+        params = params.law
+    return isinstance(params, LawParams)
+
+
+def _for_columns(params: Any) -> Any:
+    """Parameters of a law for columns side by side: a vector (k,) becomes (k, 1)."""
+    values = []
+    for value in params:
+        if hasattr(value, "_asdict"):
+            values.append(_for_columns(value))
+        else:
+            values.append(value[:, None] if np.ndim(value) == 1 else value)
+    return type(params)(*values)
+
+
+def zero_order_hold(A: FloatArray, B: FloatArray, period: float) -> tuple[FloatArray, FloatArray]:
+    """exp(A period) and integral_0^period exp(A s) ds B: the input held over a period; leading axes
+    are batches.
+
+    Source: C. Van Loan, IEEE TAC 23(3), 1978.
+    """
+    n, m = B.shape[-2:]
+    block = np.zeros((*np.broadcast_shapes(A.shape[:-2], B.shape[:-2]), n + m, n + m))
+    block[..., :n, :n] = A
+    block[..., :n, n:] = B
+    exponential = _exponential((block * period).tobytes(), block.shape)
+    return exponential[..., :n, :n], exponential[..., :n, n:]
+
+
+@lru_cache(maxsize=64)
+def _exponential(matrices: bytes, shape: tuple[int, ...]) -> FloatArray:
+    """Exp of matrices. Cached, since new gains in flight are checked with the same plant."""
+    from scipy.linalg import expm  # noqa: PLC0415 - a controller without an observer starts without it
+
+    exponential = np.asarray(expm(np.frombuffer(matrices).reshape(shape).copy()), dtype=np.float64)
+    exponential.flags.writeable = False  # the cache returns the array again
+    return exponential
+
+
+class SampledPlant(NamedTuple):
+    """Aircraft, actuators and delay from tick to tick: x+ = A x + B u, y = C x; leading axes are
+    batches.
+    """
+
+    A: FloatArray  # (..., k, k)
+    B: FloatArray  # (..., k, m)
+    C: FloatArray  # (..., m, k)
+
+
+def sampled_plant(
+    plant: LinearPlant, loop: Loop, extra: FloatArray, *, rising: bool = False
+) -> SampledPlant:
+    """The exact motion over a period, with k = n + m + held m states: x, the actuators, u of
+    earlier ticks.
+
+    u of a tick is held for a period and reaches actuator i after delay + extra_i, s, shape (m,).
+    With `rising` u of a tick multiplies ROOT (2 s - 1), s from 0 to 1 over the period, in place of
+    1: the second Legendre polynomial.
+    Source: K. J. Astrom, B. Wittenmark, "Computer-Controlled Systems", section 2.3, for the
+    sampling of a plant with delay.
+    """
+    n, m = plant.B.shape[-2:]
+    batch = np.broadcast_shapes(plant.A.shape[:-2], plant.B.shape[:-2])
+    has_lag = loop.lag > 0.0
+    # without an actuator: any rate, unused
+    rate = np.where(has_lag, 1.0 / np.where(has_lag, loop.lag, 1.0), 1.0)
+    motion = np.zeros((*batch, n + m, n + m))
+    drive = np.zeros((*batch, n + m, m))
+    motion[..., :n, :n] = plant.A
+    motion[..., :n, n:] = plant.B * has_lag
+    motion[..., n:, n:] = -np.diag(rate)
+    drive[..., :n, :] = plant.B * ~has_lag
+    drive[..., n:, :] = np.diag(rate * has_lag)
+    ticks = np.floor((loop.delay + extra) / loop.period + 1e-9).astype(int)
+    part = np.maximum(loop.delay + extra - ticks * loop.period, 0.0)
+    held = int(ticks.max()) + 1  # earlier ticks whose u still acts, the newest first
+
+    size = n + m + held * m
+    A = np.zeros((*batch, size, size))
+    B = np.zeros((*batch, size, m))
+    C = np.zeros((*batch, len(plant.C), size))
+    C[..., :n] = plant.C
+    A[..., : n + m, : n + m], _ = zero_order_hold(motion, drive, loop.period)
+    # effect of u of this tick, then of earlier ticks
+    inputs = np.zeros((*batch, n + m, m + held * m))
+    for i in range(m):
+        split = loop.period - part[i]
+        transition, new = _driven(motion, drive, split, 0.0, loop.period if rising else None)
+        begin = split / loop.period
+        _, old = _driven(motion, drive, part[i], begin, loop.period if rising else None)
+        inputs[..., ticks[i] * m + i] += new[..., i]
+        inputs[..., (ticks[i] + 1) * m + i] += (transition @ old)[..., i]
+    B[..., : n + m, :] = inputs[..., :m]
+    A[..., : n + m, n + m :] = inputs[..., m:]
+    B[..., n + m : n + 2 * m, :] = np.eye(m)
+    A[..., n + 2 * m :, n + m : -m] = np.eye((held - 1) * m)
+    return SampledPlant(A, B, C)
+
+
+def _driven(
+    motion: FloatArray, drive: FloatArray, time: float, begin: float, period: float | None
+) -> tuple[FloatArray, FloatArray]:
+    """The transition over a time, s, and the motion by an input held, or with a period by ROOT (2 s
+    - 1), s rising from `begin` by time / period.
+    """
+    transition, held = zero_order_hold(motion, drive, time)
+    if period is None:
+        return transition, held
+    k, m = drive.shape
+    ramp = np.zeros((k + m, k + m))
+    ramp[:k, :k] = motion
+    ramp[:k, k:] = drive
+    slope = np.vstack([np.zeros((k, m)), np.eye(m) / period])
+    risen = zero_order_hold(ramp, slope, time)[1][:k]
+    return transition, ROOT * (2.0 * (begin * held + risen) - held)
+
+
+def closed_loop(plant: LinearPlant, law: LinearLaw, loop: Loop, extra: FloatArray) -> FloatArray:
+    """A period of the sampled loop as a matrix, exact: stable if no eigenvalue lies outside the
+    unit circle.
+
+    The state is the state of `sampled_plant`, then the state of the law. Leading axes of plant and
+    law are batches.
+    """
+    A, B, C = sampled_plant(plant, loop, extra)
+    k = A.shape[-1]
+    size = A.shape[-1] + law.A.shape[-1]
+    matrix = np.zeros((*np.broadcast_shapes(A.shape[:-2], law.A.shape[:-2]), size, size))
+    matrix[..., :k, :k] = A + B @ law.D @ C
+    matrix[..., :k, k:] = B @ law.C
+    matrix[..., k:, :k] = law.B @ C
+    matrix[..., k:, k:] = law.A
+    return matrix
+
+
+def spectral_radius(matrix: FloatArray) -> float:
+    """Largest magnitude of an eigenvalue."""
+    return float(np.max(np.abs(np.linalg.eigvals(matrix)), initial=0.0))
+
+
+def is_stable(plant: LinearPlant, law: LinearLaw, loop: Loop, extra: FloatArray) -> bool:
+    """Whether no eigenvalue of `closed_loop` lies outside the unit circle, up to rounding."""
+    return spectral_radius(closed_loop(plant, law, loop, extra)) <= 1.0 + SPECTRAL_RADIUS_TOLERANCE

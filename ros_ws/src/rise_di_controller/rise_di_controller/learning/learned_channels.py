@@ -1,0 +1,178 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Channels of a controller with a learned model, and those that fly the law of the start."""
+
+from collections.abc import Collection, Sequence
+from typing import Any
+
+import numpy as np
+
+from flight_core.channels import SIDES, UNKNOWN
+from flight_core.parameters import SMALLEST
+from flight_core.vectors import FloatArray
+from rise_di_controller.law.law import MIN_GAIN
+from rise_di_controller.params import ControllerConfig
+from rise_di_controller.rise_di_config import RiseDiConfig
+
+
+def with_channels_of(
+    start: RiseDiConfig, designed: RiseDiConfig, bare: Sequence[bool], dead: Sequence[bool]
+) -> RiseDiConfig:
+    """A controller with the gains of `start` in some channels, without feedforward and observer
+    there; not checked.
+
+    A gain K below that of the last channel is this one with a smaller input scale: the same loop. A
+    dead input gets the least input scale, so that the law holds it.
+    """
+    law = start.law_params()
+    design = designed.law_params()
+    last = design.K[-1]
+    channels = np.array(bare)
+    K = np.where(channels, np.maximum(law.K, last + MIN_GAIN), design.K)
+    K[-1] = last
+    share = np.where(channels, law.K / K, 1.0)
+    scale = np.where(channels, law.input_scale * share, design.input_scale)
+    factors = {"beta": 1.0 / share, "Lambda": 1.0, "omega": share, "softening": 1.0}
+    changed: dict[str, Any] = {
+        name: tuple(
+            np.where(
+                channels, np.array(getattr(start, name)) * factor, getattr(designed, name)
+            ).tolist()
+        )
+        for name, factor in factors.items()
+    }
+    changed["k_d"] = tuple((K[:-1] - last).tolist())
+    changed["input_scale"] = tuple(np.where(dead, SMALLEST, scale).tolist())
+    observer = designed.observer
+    feedforward = designed.feedforward
+    schedule = designed.schedule
+    if channels.any() and observer is not None and feedforward is not None:
+
+        def without(F: Sequence[float]) -> dict[str, Any]:
+            return {
+                "F": tuple((np.reshape(F, (len(bare), -1)) * ~channels[:, None]).ravel().tolist())
+            }
+
+        acting = feedforward.inputs or start.inputs
+        flown = tuple(
+            name
+            for name, is_bare in zip(start.inputs, bare, strict=True)
+            if name in acting and not is_bare
+        )
+        changed["observer"] = observer.model_copy(update=without(observer.F))
+        if schedule is not None and schedule.slow is not None and schedule.fast is not None:
+            slow, fast = (model.model_copy(update=without(model.F)) for model in schedule.models)
+            changed["schedule"] = schedule.model_copy(update={"slow": slow, "fast": fast})
+        changed["feedforward"] = feedforward.model_copy(update={"inputs": flown or None})
+    return designed.model_copy(update=changed)
+
+
+def acting_inputs(parameters: RiseDiConfig) -> tuple[str, ...]:
+    """The inputs with a feedforward or an observer: those of the parts with a model."""
+    feedforward = parameters.feedforward
+    observer = parameters.observer
+    inputs = parameters.inputs
+    fed = () if feedforward is None else feedforward.inputs or inputs
+    models = () if parameters.schedule is None else parameters.schedule.models
+    F = np.hstack(
+        [
+            np.reshape(model.F, (len(inputs), -1))
+            for model in (observer, *models)
+            if model is not None
+        ]
+    )
+    return tuple(name for name, row in zip(inputs, F, strict=True) if name in fed or row.any())
+
+
+def authority_names(outputs: Sequence[str]) -> tuple[str, ...]:
+    """Channels of the topic `authority`."""
+    return tuple(f"{side}.{name}" for side in SIDES for name in outputs)
+
+
+def authority(flown: RiseDiConfig, start: RiseDiConfig) -> FloatArray:
+    """Least change of the outputs by the paired inputs, from trim to the lower and the upper limit,
+    (2m,), units/s:
+
+        y_dot_i = abs(Omega_ii) exp(-2 s_i) abs(limit of u_i),
+            Omega = C B of the model learned in flight
+
+    with s_i the standard deviation of Omega_ii over Omega_ii: two deviations less for a small s_i,
+    and above 0 for any. Beside models at further speeds it is the least over the speeds.
+    For an input without effect 0; UNKNOWN without a limit, and for an output under the law of the
+    start.
+    """  # noqa: D400, D415 - what follows is an equation
+    m = len(flown.outputs)
+    model = flown.feedforward
+    acting = acting_inputs(flown)
+    dead = np.array(flown.input_scale) <= SMALLEST
+    bounds = np.where(dead, 0.0, np.full((2, m), UNKNOWN))
+    if model is None or flown.models() == start.models():
+        return bounds.ravel()
+    rows = [model.states.index(name) for name in flown.outputs]
+    both = (model.B, model.deviation or (0.0,) * len(model.B))
+    B, deviation = (np.reshape(values, (-1, m))[rows].diagonal() for values in both)
+    least = np.abs(B) * np.exp(-2.0 * deviation / np.abs(B))
+    for scheduled in () if flown.schedule is None else flown.schedule.models:
+        least = least * np.minimum(
+            np.abs(np.reshape(scheduled.B, (-1, m))[rows].diagonal() / B), 1.0
+        )
+    for k, limits in enumerate((flown.lower, flown.upper)):
+        if limits is None:
+            continue
+        side = np.where(B > 0.0, k, 1 - k)
+        known = ~dead & [name in acting for name in flown.inputs]
+        bounds[side[known], np.flatnonzero(known)] = (least * np.abs(limits))[known]
+    return bounds.ravel()
+
+
+def fallen_back(start: RiseDiConfig, flown: RiseDiConfig, bare: Sequence[bool]) -> RiseDiConfig:
+    """What flies, with the law of the start in further channels; the start itself where no channel
+    keeps a model.
+    """
+    acting = acting_inputs(flown)
+    is_first = flown.models() == start.models()
+    if is_first or all(
+        is_bare or name not in acting for name, is_bare in zip(flown.inputs, bare, strict=True)
+    ):
+        return start
+    mixed = with_channels_of(start, flown, bare, [scale <= SMALLEST for scale in flown.input_scale])
+    return RiseDiConfig.validate_mapping(mixed.model_dump(), "controller", check=False)
+
+
+def outputs_without(parameters: ControllerConfig) -> tuple[str, ...]:
+    """Outputs without a model to the end of the engagement, by `learn.without`."""
+    learn = parameters.learn if isinstance(parameters, RiseDiConfig) else None
+    return () if learn is None else learn.without or ()
+
+
+def without_models(
+    start: RiseDiConfig, flown: RiseDiConfig, outputs: Collection[str]
+) -> RiseDiConfig:
+    """What flies, with the law of the start in some outputs to the end of the engagement, added to
+    `learn.without`.
+    """
+    fallen = fallen_back(start, flown, [name in outputs for name in start.outputs])
+    assert start.learn is not None  # noqa: S101 - a controller that learns
+    bare_outputs = tuple(
+        name for name in start.outputs if name in {*outputs_without(flown), *outputs}
+    )
+    return fallen.model_copy(
+        update={"learn": start.learn.model_copy(update={"without": bare_outputs or None})}
+    )
+
+
+def coupled(parameters: RiseDiConfig, names: Collection[str]) -> list[bool]:
+    """Mask of the outputs that the model of the feedforward couples with some of them, (m,)."""
+    model = parameters.feedforward
+    assert model is not None  # noqa: S101 - a learned model flies
+    n = len(model.states)
+    A, gravity, B = (
+        np.reshape(values, (n, -1)) != 0.0
+        for values in (model.A, model.gravity or np.zeros(n), model.B)
+    )
+    links = A | gravity | (B @ B.T) | np.eye(n, dtype=bool)
+    reached = np.linalg.matrix_power((links | links.T).astype(float), n) > 0.0
+    states = [model.states.index(name) for name in names]
+    return [
+        bool(np.any(reached[model.states.index(output), states])) for output in parameters.outputs
+    ]

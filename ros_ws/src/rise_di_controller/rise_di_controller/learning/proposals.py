@@ -1,0 +1,516 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Models learned in flight, on the side of the controller: when identifications begin, which
+proposals fly, the fallback.
+
+Pure: for the node and for the loop in one process.
+"""
+
+from collections import Counter, deque
+from collections.abc import Callable, Collection, Generator, Mapping, Sequence
+from enum import StrEnum
+from typing import Any, NamedTuple
+
+from flight_core.modes import Mode
+from flight_core.parameters import SMALLEST, ParameterError, flatten, require
+from flight_core.rates import nanoseconds, seconds
+from flight_core.vectors import FloatArray
+from rise_di_controller.controller import Controller, Prepared, prepared, preparing
+from rise_di_controller.learning.learned_channels import (
+    authority,
+    coupled,
+    fallen_back,
+    outputs_without,
+    without_models,
+)
+from rise_di_controller.params import ControllerConfig
+from rise_di_controller.rise_di_config import LearnConfig, RiseDiConfig
+
+DESIGNED = frozenset(
+    {
+        "k_g",
+        "k_d",
+        "Lambda",
+        "beta",
+        "softening",
+        "input_scale",
+        "omega",
+        "sign",
+        "feedforward",
+        "observer",
+        "schedule",
+    }
+)
+"""Parameters, or groups of them, that a proposal may change: what `rise-di gains --observer`
+designs, at every speed."""
+
+OPTIONAL = ("feedforward.inputs", "feedforward.gravity", "feedforward.deviation")
+"""Parameters of a design that it may lack: a part that was not learned had no feedforward, and has
+one with its model."""
+
+
+class EventKind(StrEnum):
+    """What an event of the learning is, also in the messages of the topic `learning`."""
+
+    FLIES = "flies"  # the controller has taken a proposal
+    REFUSED = "refused"  # a proposal fails a check of the controller
+    NO_MODEL = "no model"  # the learner has refused what it identified
+    FALLBACK = "fallback"  # to the law of the start, in all parts or in some
+    # the law was deactivated, and begins again with the parameters of the start
+    RESTART = "restart"
+
+
+class Proposal(NamedTuple):
+    """What a learner found in its window, as the controller receives it."""
+
+    stamp_ns: int  # the end of the window: the instant of its last tick
+    start: int  # digest of the parameters of the start, for which the learner was started
+    flown: int  # digest of the parameters that flew at the end of the window
+    # all of DESIGNED by dotted name, None for what is gone; empty where no model is proposed
+    change: Mapping[str, Any]
+    sentence: str  # what was learned, or why there is no model
+
+
+class Event(NamedTuple):
+    """What became of a proposal, or a fallback: a change of the parameters by dotted name, or none,
+    and why.
+    """
+
+    stamp_ns: int
+    kind: EventKind
+    change: Mapping[str, Any]
+    sentence: str
+
+
+UNVERIFIED = "until a model is learned"
+"""Ends the sentence of a proposal of the rough model before any record."""
+
+FALLBACKS = 2
+"""Fallbacks of a part in an engagement after which the part has no further model: the second model
+was certified, too."""
+
+AUTHORITY_TICKS = 10
+"""Ticks of the controller from one sample of `authority` to the next."""
+
+
+class Fallback(NamedTuple):
+    """A fallback to the law of the start in all parts."""
+
+    flown: int  # digest of the parameters before
+    input_scale: tuple[float, ...]  # of these
+    fallen: int  # digest of the parameters after
+
+    def outlived_by(self, proposal: Proposal, flown: int) -> bool:
+        """Whether a proposal beside the parameters before holds an input more, one without effect,
+        and nothing else changed.
+        """
+        scale = proposal.change.get("input_scale")
+        if (proposal.flown, flown) != (self.flown, self.fallen) or not isinstance(scale, Sequence):
+            return False
+        return any(new == SMALLEST < old for new, old in zip(scale, self.input_scale, strict=False))
+
+
+AFTER_FALLBACK = 4.0  # s, from a fallback to the test of its cause
+
+
+class Updates:
+    """When proposals are due: at the first tick, with the rough model as it is, then at the first
+    tick at or after each of the times, counted from the first tick; and AFTER_FALLBACK after a
+    fallback.
+    """
+
+    def __init__(self, settings: LearnConfig) -> None:
+        self._check_ns = nanoseconds(settings.check)
+        self._times_ns = deque(map(nanoseconds, (0.0, *settings.updates)))
+        self._spacing_ns = nanoseconds(settings.spacing()) // 2
+        self._first_ns: int | None = None
+        self._last_ns: int | None = None  # the last that was due
+        self._test_ns: int | None = None  # the next test of the cause of a fallback
+        self._tested_ns: int | None = None  # the last one
+
+    def fell_back(self, now_ns: int) -> None:
+        """Note a fallback."""
+        self._test_ns = now_ns + nanoseconds(AFTER_FALLBACK)
+
+    def due(self, now_ns: int) -> bool:
+        """Whether an identification begins at this tick. Call it at each tick in order.
+
+        A proposal half of `learn.spacing` after another would be refused: the test of a fallback
+        waits so long, and a time so soon after such a test is left out.
+        """
+        self._first_ns = now_ns if self._first_ns is None else self._first_ns
+        due = False
+        while now_ns - self._first_ns >= self._times_ns[0]:
+            due = True
+            last_ns = self._times_ns.popleft()
+            if not self._times_ns:
+                self._times_ns.append(last_ns + self._check_ns)
+        is_test = self._test_ns is not None and now_ns >= self._test_ns
+        soon_ns = now_ns - self._spacing_ns
+        if due and (self._tested_ns is None or self._tested_ns <= soon_ns):
+            self._last_ns = now_ns
+        elif is_test and (self._last_ns is None or self._last_ns <= soon_ns):
+            self._last_ns = self._tested_ns = now_ns
+        else:
+            return False
+        if is_test:
+            self._test_ns = None
+        return True
+
+
+class Learning:
+    """The proposals of a flight and the fallback, stepped between two ticks of the controller.
+
+    In simulated time a proposal acts `learn.latency` after the end of its window, for which the
+    flight waits. Else it acts when it is certified: a part of the certificate a step, so that no
+    tick waits for it.
+    """
+
+    def __init__(
+        self, parameters: RiseDiConfig, announce: Callable[[Event], None], *, simulated: bool
+    ) -> None:
+        assert parameters.learn is not None  # noqa: S101 - the caller makes none without it
+        self.start = parameters
+        self._digest = parameters.digest()
+        self._settings = parameters.learn
+        self._announce = announce
+        self._simulated = simulated
+        self._updates = Updates(parameters.learn)
+        # ends of the windows whose proposals have not acted, in simulated time
+        self._due = deque[int]()
+        self._received: dict[int, Proposal] = {}  # by the end of the window, in simulated time
+        self._certificate: tuple[Proposal, Generator[None, None, Prepared]] | None = None
+        self._spacing_ns = nanoseconds(parameters.learn.spacing()) // 2
+        # end of the window of the last proposal that was not refused at once
+        self._last_ns: int | None = None
+        # when the law was last inactive: an earlier window is of another engagement
+        self._since_ns: int | None = None
+        self._fallback: Fallback | None = None  # the last one
+        self._fallbacks = Counter[str]()  # of this engagement, by output
+        self._diverged = set[int]()  # digests of the parameters that diverged in this engagement
+
+    def authority(self, controller: Controller) -> FloatArray:
+        """`authority` of what flies."""
+        flown = controller.parameters
+        assert isinstance(flown, RiseDiConfig)  # noqa: S101 - a proposal is of the law of the start
+        return authority(flown, self.start)
+
+    def ticked(self, controller: Controller, now_ns: int) -> bool:
+        """Note a tick; whether an identification begins with it. None begins while the law is
+        deactivated.
+        """
+        due = controller.mode is not Mode.INACTIVE and self._updates.due(now_ns)
+        if due and self._simulated:
+            self._due.append(now_ns)
+        return due
+
+    def waits(self, now_ns: int) -> bool:
+        """In simulated time: whether the tick at `now_ns` waits for a proposal."""
+        return any(
+            self._acts_ns(end_ns) <= now_ns and end_ns not in self._received for end_ns in self._due
+        )
+
+    def receive(self, proposal: Proposal, controller: Controller, now_ns: int) -> None:
+        """Take a proposal, or refuse it with an event."""
+        if refusal := self._refusal(proposal, now_ns, controller):
+            self._refuse(refusal, now_ns)
+        elif self._simulated:
+            self._received[proposal.stamp_ns] = proposal
+        else:
+            self._last_ns = proposal.stamp_ns
+            self._begin(proposal, controller, now_ns)
+
+    def step(self, controller: Controller, now_ns: int) -> ControllerConfig | None:
+        """Certify, let the proposals act that are due, and fall back where the law diverges.
+
+        A deactivated law begins again with the parameters of the start: it may have been
+        deactivated because of its model. Returns the parameters that the controller has taken; None
+        where it keeps its own.
+        """
+        if controller.mode is Mode.INACTIVE:
+            return self._begin_again(controller, now_ns)
+        adopted = None
+        while (
+            self._due and self._acts_ns(self._due[0]) <= now_ns and self._due[0] in self._received
+        ):
+            self._begin(self._received.pop(self._due.popleft()), controller, now_ns)
+            adopted = self._certify(controller, now_ns) or adopted
+        if not self._simulated:
+            adopted = self._certify(controller, now_ns)
+        if oscillations := controller.oscillations():
+            adopted = self._end_oscillations(oscillations, controller, now_ns)
+        elif diverging := controller.diverging():
+            adopted = self._end_divergence(diverging, controller, now_ns)
+        return adopted
+
+    def _end_divergence(
+        self, diverging: Collection[str], controller: Controller, now_ns: int
+    ) -> RiseDiConfig:
+        """Take the law of the start; a part that has now fallen back FALLBACKS times keeps it to
+        the end of the engagement.
+        """
+        flown = controller.parameters
+        assert isinstance(flown, RiseDiConfig)  # noqa: S101 - for the type checker
+        part = [
+            name
+            for name, diverges in zip(flown.outputs, coupled(flown, diverging), strict=True)
+            if diverges
+        ]
+        self._fallbacks.update(part)
+        ended = [name for name in part if self._fallbacks[name] >= FALLBACKS]
+        fallen = without_models(self.start, self.start, {*outputs_without(flown), *ended})
+        lasting = f", in {', '.join(ended)} to the end of the engagement" * bool(ended)
+        reason = " and ".join(f"{name} diverges{' again' * bool(ended)}" for name in diverging)
+        self._fallback = Fallback(controller.digest, flown.input_scale, fallen.digest())
+        self._updates.fell_back(now_ns)
+        self._diverged.add(controller.digest)
+        what = f"falls back to the law of the start{lasting}: {reason}"
+        self._take(controller, now_ns, prepared(fallen), EventKind.FALLBACK, what)
+        return fallen
+
+    def _end_oscillations(
+        self, periods: Mapping[str, float], controller: Controller, now_ns: int
+    ) -> RiseDiConfig:
+        """Take the law of the start, to the end of the engagement, in the parts of the model whose
+        outputs oscillate.
+        """
+        flown = controller.parameters
+        assert isinstance(flown, RiseDiConfig)  # noqa: S101 - for the type checker
+        bare = coupled(flown, periods)
+        fallen = without_models(
+            self.start,
+            flown,
+            [name for name, is_bare in zip(flown.outputs, bare, strict=True) if is_bare],
+        )
+        rates = " and ".join(
+            f"{name} oscillates at {1.0 / period:.2g} Hz" for name, period in periods.items()
+        )
+        outputs = ", ".join(
+            name for name, is_bare in zip(flown.outputs, bare, strict=True) if is_bare
+        )
+        what = (
+            f"falls back to the law of the start in {outputs}, to the end of the engagement: "
+            f"{rates}"
+        )
+        self._take(controller, now_ns, prepared(fallen), EventKind.FALLBACK, what)
+        return fallen
+
+    def _begin_again(self, controller: Controller, now_ns: int) -> ControllerConfig | None:
+        """Forget what is under way; the parameters of the start where a learned model flew."""
+        self._updates = Updates(self._settings)
+        self._certificate = None
+        self._last_ns = None
+        self._since_ns = now_ns
+        self._due.clear()
+        self._received.clear()
+        self._fallbacks.clear()
+        self._diverged.clear()
+        if not controller.has_learned_model and outputs_without(
+            controller.parameters
+        ) == outputs_without(self.start):
+            return None
+        what = "goes back to the law of the start: it was deactivated"
+        self._take(controller, now_ns, prepared(self.start), EventKind.RESTART, what)
+        return self.start
+
+    def _acts_ns(self, end_ns: int) -> int:
+        return end_ns + nanoseconds(self._settings.latency)
+
+    def _refusal(self, proposal: Proposal, now_ns: int, controller: Controller) -> str:
+        """Why a proposal is not certified at all; empty for one that may be. Costs microseconds,
+        whatever the proposal.
+        """
+        window = f"a window that ends {seconds(now_ns - proposal.stamp_ns):.3g} s ago"
+        if proposal.start != self._digest:
+            return (
+                f"found a proposal for the parameters {proposal.start}, expected "
+                f"{self._digest}, those of the start"
+            )
+        if self._simulated:
+            known = proposal.stamp_ns in self._due and proposal.stamp_ns not in self._received
+            return (
+                ""
+                if known
+                else f"found {window}, expected that of an identification that is due, once"
+            )
+        longest = nanoseconds(self._settings.window)
+        if self._since_ns is not None:
+            longest = min(longest, now_ns - self._since_ns)
+        if not 0 <= now_ns - proposal.stamp_ns <= longest:
+            return f"found {window}, expected 0 to {seconds(longest):.3g} s"
+        if self._certificate is not None:
+            return f"found {window} while another proposal is certified, expected one at a time"
+        if self._last_ns is not None and proposal.stamp_ns - self._last_ns < self._spacing_ns:
+            later = (
+                f"one that ends at least {seconds(self._spacing_ns):g} s after that of the "
+                "last proposal"
+            )
+            return f"found {window}, expected {later}"
+        return self._unfit(proposal, controller)
+
+    def _begin(self, proposal: Proposal, controller: Controller, now_ns: int) -> None:
+        if proposal.change:
+            self._certificate = (
+                proposal,
+                _certificate(controller.parameters, proposal.change, self.start),
+            )
+        elif proposal.sentence:
+            self._announce(Event(now_ns, EventKind.NO_MODEL, {}, f"no model: {proposal.sentence}"))
+
+    def _certify(self, controller: Controller, now_ns: int) -> ControllerConfig | None:
+        """A part of the certificate, in simulated time all of it; the parameters taken at its
+        end.
+        """
+        if self._certificate is None:
+            return None
+        proposal, certificate = self._certificate
+        try:
+            next(certificate)
+            while self._simulated:
+                next(certificate)
+        except StopIteration as end:
+            self._certificate = None
+            refusal = self._unfit(proposal, controller)
+            if end.value.digest in self._diverged:
+                refusal = "found parameters that diverged in this engagement, expected others"
+            if not refusal:
+                bare_outputs = ", ".join(outputs_without(end.value.parameters))
+                without = f", without {bare_outputs}" if bare_outputs else ""
+                what = f"flies {proposal.sentence}{without}"
+                self._take(controller, now_ns, end.value, EventKind.FLIES, what)
+                return controller.parameters
+        except ArithmeticError as error:
+            refusal = (
+                f"found numbers too large or too small ({error.args[-1]}), expected those "
+                "of a flight"
+            )
+        except (
+            ValueError
+        ) as error:  # ParameterError, or a matrix of which LAPACK finds no eigenvalues
+            refusal = str(error)
+        else:
+            return None
+        self._certificate = None
+        self._refuse(refusal, now_ns)
+        return None
+
+    def _unfit(self, proposal: Proposal, controller: Controller) -> str:
+        """The refusal of a proposal for a law that is not engaged, or that lost the race with
+        another change; else empty.
+
+        An input that has lost its effect has none after a fallback either, which its loss may have
+        caused.
+        """
+        if controller.mode is not Mode.ENGAGED:
+            return (
+                f"found the mode {controller.mode.name}, expected a model only while the law "
+                "is engaged"
+            )
+        if proposal.flown == controller.digest:
+            return ""
+        if self._fallback is not None and self._fallback.outlived_by(proposal, controller.digest):
+            return ""
+        return (
+            f"found a proposal beside the parameters {proposal.flown}, expected "
+            f"{controller.digest}: they changed meanwhile"
+        )
+
+    def _take(
+        self, controller: Controller, now_ns: int, new: Prepared, kind: EventKind, sentence: str
+    ) -> None:
+        change = changes(controller.parameters, new.parameters)
+        controller.retune(new)
+        self._announce(Event(now_ns, kind, change, sentence))
+
+    def _refuse(self, refusal: str, now_ns: int) -> None:
+        self._announce(Event(now_ns, EventKind.REFUSED, {}, f"refused: {refusal}"))
+
+
+def _certificate(
+    flown: ControllerConfig, change: Mapping[str, Any], start: RiseDiConfig
+) -> Generator[None, None, Prepared]:
+    """The flown parameters with a change, checked as at load, in parts of at most about 1 ms.
+    Raises ParameterError.
+    """
+    foreign = sorted(name for name in change if name.split(".")[0] not in DESIGNED)
+    require(
+        not foreign,
+        "proposal",
+        f"a change of {', '.join(foreign)}",
+        f"changes of {', '.join(sorted(DESIGNED))} alone",
+    )
+    proposed = RiseDiConfig.validate_mapping(flown.changed(change), "controller", check=False)
+    yield
+    require(proposed.observer is not None, "proposal", "no observer", "one")
+    assert proposed.observer is not None  # noqa: S101 - for the type checker
+    assert start.observer is not None  # noqa: S101 - a controller that learns has one
+    require(
+        proposed.observer.states == start.observer.states,
+        "controller.observer.states",
+        ", ".join(proposed.observer.states),
+        f"those of the start: {', '.join(start.observer.states)}",
+    )
+    speeds = _speeds(start)
+    require(
+        _speeds(proposed) == speeds,
+        "controller.schedule",
+        _speeds(proposed) or "none",
+        f"that of the start: {speeds or 'none'}",
+    )
+    least = start.observer.margin
+    if start.learn is not None:
+        least = start.learn.least_margin(least)
+    margin = proposed.observer.margin
+    require(
+        margin >= least,
+        "controller.observer.margin",
+        f"{margin:g} s",
+        f"at least {least:g} s",
+    )
+    if bare_outputs := outputs_without(flown):
+        others = f"one of other outputs than {', '.join(bare_outputs)}, by learn.without"
+        require(proposed.feedforward is not None, "proposal", "no feedforward", others)
+        bare = coupled(proposed, bare_outputs)
+        proposed = fallen_back(start, proposed, bare)
+        require(not all(bare), "proposal", "no model", others)
+        yield
+    try:
+        yield from proposed.checks()
+    except ParameterError as error:
+        raise ParameterError(f"controller.{error}") from None
+    ready = yield from preparing(proposed)
+    yield
+    return ready
+
+
+def _speeds(parameters: RiseDiConfig) -> str:
+    """The speeds of the models, and how the schedule follows; empty without a schedule."""
+    schedule = parameters.schedule
+    if schedule is None:
+        return ""
+    ratios = " and ".join(f"{model.ratio!r}" for model in schedule.models)
+    return f"{schedule.speed!r} m/s, {schedule.time!r} s, models at {ratios or 'no'} times it"
+
+
+def designed(old: ControllerConfig, new: ControllerConfig) -> dict[str, Any]:
+    """All of DESIGNED of a new set by dotted name; None for what an old set, or what flies
+    meanwhile, may have besides.
+    """
+    before, after = (
+        {
+            name: value
+            for name, value in flatten(parameters.model_dump())
+            if name.split(".")[0] in DESIGNED
+        }
+        for parameters in (old, new)
+    )
+    return dict.fromkeys([*before, *OPTIONAL]) | after
+
+
+def changes(old: ControllerConfig, new: ControllerConfig) -> dict[str, Any]:
+    """What differs between two parameter sets, by dotted name; None for a parameter that is
+    gone.
+    """
+    before = dict(flatten(old.model_dump()))
+    after = dict(flatten(new.model_dump()))
+    return {name: after.get(name) for name in before | after if before.get(name) != after.get(name)}
