@@ -52,9 +52,28 @@ HEAD = """\
 For you if you want to check a figure. Each link leads to the figures of a measurement, with goals, command, revision, host and date;
 `docs/evidence/tables/` has tables of other pages. `make evidence ARGS="--again NAME"` measures again and writes this page: NAME is that
 of the file. The programs of learning, guidance and real autopilots write their files themselves. Limits of all measurements: one host,
-the loopback interface, simulated aircraft. In turbulence a figure is the worst of the seeds. A baseline is the least program that does
-the same on this host. Flights of real autopilots before 2026-11-23 take the times of their commands some seconds early: measure their
-rms again.
+the loopback interface, simulated aircraft. In turbulence a figure is the worst of the seeds. Flights of real autopilots before 2026-11-23
+take the times of their commands some seconds early: measure their rms again.
+
+## How to read a table
+
+    name,value,unit,baseline,goal,command,revision,host,date
+    "controller, tick to u, 100 Hz: CPU",830,us each,"bare echo, single, 100 Hz: CPU",<= 2 x baseline,python -m benchmarks.speed ...
+
+A table is a CSV file: your spreadsheet opens it, `pandas.read_csv` reads it. Its first row names each column with quantity and unit.
+
+| column | holds |
+|---|---|
+| name | "subject: figure" |
+| value, unit | the figure; a word where the result is one |
+| baseline | the name of the row that the value is compared with: the least program that does the same on this host |
+| goal | the limit: `<= 2`, `>= 0.05`, or `<= 2 x baseline` for a ratio; empty where the figure is told alone |
+| command | what measures it again |
+| revision | the commit that was measured; `-dirty` with changes beside it |
+| host, date | where and when; `busy with other work`: times are longer than on an idle host |
+
+Most tables in `tables/` have a row a case instead, and the column `conditions` says what was flown. "mean (worst)" is over the aircraft of the row, "+-30 %" draws
+each entry of A and B within 30 % of the airframe's, and a [score](glossary.md) sums the errors of the outputs.
 """  # noqa: E501 - a text as it is written
 
 
