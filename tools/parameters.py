@@ -33,7 +33,7 @@ file:
 
 Units are SI and radians. Without a type a value is a number. `= 0.2` is a default. A key without a default and without *optional* is required.
 A list has an entry a channel. NAME is a name of yours. No number is above 1e9, no time limit above 1e6 s. The instant `.inf` is never.
-Optional keys of `guidance` follow [rules](../guidance.md#numbers-by-rule). `examples/scenarios/` sets the rarer keys.
+Optional keys of `guidance` follow [rules](guidance.md#numbers-by-rule). `examples/scenarios/` sets the rarer keys.
 The node `bridge` has no section: `-p` sets its keys. `python -m tools.parameters` writes this page.
 """  # noqa: E501 - a text as it is written
 SHARED = {

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Writes the table of topics in docs/interfaces.md, and the access control policy of DDS Security,
+"""Writes the table of topics in docs/topics.md, and the access control policy of DDS Security,
 from flight_core.topics.
 """
 
@@ -12,7 +12,7 @@ from autopilot_bridge.params import LIBRARY, load_map
 from flight_core.topics import FLIGHT, NODES, TOPICS, VECTOR, Topic, published_by
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-PAGE = REPOSITORY / "docs" / "interfaces.md"
+PAGE = REPOSITORY / "docs" / "topics.md"
 POLICY = (
     REPOSITORY
     / "ros_ws"

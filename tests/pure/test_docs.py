@@ -23,10 +23,12 @@ LINKED = (
     "fly-a-route",
     "glossary",
     "guidance",
-    "interfaces",
     "laws",
+    "log",
+    "outcomes",
     "symbols",
     "theory",
+    "topics",
 )
 TEXTS = {".py", ".md", ".yaml", ".xml", ".jinja", ".js", ".sh", ".c"}
 FOLDERS = ("ros_ws/src", "examples", "tests", "benchmarks", "tools", "docs", "docker")

@@ -22,7 +22,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from rise_di_controller import internals
 
 PAGE = (REPOSITORY / "docs" / "symbols.md").read_text()
-INTERFACES = (REPOSITORY / "docs" / "interfaces.md").read_text()
+TOPICS = (REPOSITORY / "docs" / "topics.md").read_text()
 LAST_EQUATION = 52  # of the paper
 
 
@@ -143,7 +143,7 @@ def test_interfaces_explains_each_published_channel(
     topic: str, channels: Mapping[str, Sequence[str]]
 ) -> None:
     patterns = [
-        pattern for head, _ in rows(INTERFACES, f"channels of `{topic}`") for pattern in spans(head)
+        pattern for head, _ in rows(TOPICS, f"channels of `{topic}`") for pattern in spans(head)
     ]
     assert [
         name

@@ -60,7 +60,7 @@ def frozen() -> tuple[Scenario, Tape]:
 
 
 def test_vane_reads_angle_relative_to_air() -> None:
-    # AIR_STATE of docs/interfaces.md: alpha less the wind down over V0, beta less the wind to the
+    # AIR_STATE of docs/topics.md: alpha less the wind down over V0, beta less the wind to the
     # right over V0.
     gusts = {
         "vertical": {"start": 0.0, "speed": 5.0, "length": 5.0},

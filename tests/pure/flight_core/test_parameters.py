@@ -293,7 +293,7 @@ SET_BY_THE_FLIGHT = {
 }
 """Keys that `rise-di fly` and the launch files set, by the scenario and the options."""
 IN_NO_FILE = {
-    "aircraft.commands",  # by the airframe of JSBSim: docs/interfaces.md has a line
+    "aircraft.commands",  # by the airframe of JSBSim: docs/topics.md has a line
     *("controller.feedforward.inputs", "controller.feedforward.deviation"),  # of learned models
     *(f"controller.learn.{key}" for key in ("prior", "prior.file", "prior.off", "without")),
     "controller.learn.margin",  # another than that of the file's loop is a choice of the user

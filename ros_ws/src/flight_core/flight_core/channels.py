@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Channels shared by several nodes, by name: docs/interfaces.md."""
+"""Channels shared by several nodes, by name: docs/topics.md."""
 
 from collections.abc import Sequence
 

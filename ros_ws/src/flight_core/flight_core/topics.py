@@ -4,7 +4,7 @@
 say of them.
 
 Transport, recorder and launch read this table. `python -m tools.topics` writes the table of
-docs/interfaces.md and the access control policy from it.
+docs/topics.md and the access control policy from it.
 """
 
 from importlib import import_module

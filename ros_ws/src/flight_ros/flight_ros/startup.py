@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 USAGE = """usage: {program} --ros-args --params-file SCENARIO.yaml [-p NAME:=VALUE ...] [-r __ns:=/NAMESPACE] [-r NAME:=TOPIC]
 
 A node of a flight. SCENARIO.yaml has a section for each node, by its name; -p replaces a parameter of it. The parameters are in
-docs/reference/parameters.md, the topics in docs/interfaces.md. `rise-di fly` starts all nodes of a scenario."""  # noqa: E501 - a text as it is written
+docs/reference/parameters.md, the topics in docs/topics.md. `rise-di fly` starts all nodes of a scenario."""  # noqa: E501 - a text as it is written
 
 BAD_ENVIRONMENT = 2  # exit status, as of invalid parameters
 

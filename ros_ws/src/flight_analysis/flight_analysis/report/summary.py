@@ -154,7 +154,7 @@ def summarise(
     outcome: Outcome | None = None,
     flight_account: Account | None = None,
 ) -> dict[str, Any]:
-    """The metrics of a flight, SI, ready for JSON. docs/interfaces.md, section Figures, explains
+    """The metrics of a flight, SI, ready for JSON. docs/log.md, section Figures, explains
     the keys.
 
     Args:
