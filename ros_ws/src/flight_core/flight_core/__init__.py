@@ -1,5 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Basics of the RISE-DI flight stack without ROS: parameters, named vectors, rates, integrators,
-scenario files, the tape.
+"""Basics of the RISE-DI flight stack without ROS.
+
+Parameters, named vectors, rates, integrators, scenario files, outcomes and the tape.
 """

@@ -16,8 +16,9 @@ T = TypeVar("T")
 
 
 def as_path(value: FilePath, key: str, expected: str) -> Path:
-    """The path of a text or a path-like object. Raises ParameterError for a value of a different
-    type and for an empty text.
+    """The path of a text or a path-like object.
+
+    Raises ParameterError for a value of a different type and for an empty text.
     """
     text = os.fspath(value) if isinstance(value, str | os.PathLike) else b""
     require(isinstance(text, str) and text != "", key, short_repr(value), expected)
@@ -27,8 +28,9 @@ def as_path(value: FilePath, key: str, expected: str) -> Path:
 def as_number(
     value: object, key: str, least: float, most: float = math.inf, unit: str = ""
 ) -> float:
-    """A finite number from `least` to `most`. Raises ParameterError, with the unit, for a different
-    value.
+    """A finite number from `least` to `most`.
+
+    Raises ParameterError, with the unit, for a different value.
     """
     bounds = (
         f"{least:g} or more{', ' * bool(unit)}" if most == math.inf else f"{least:g} to {most:g} "
@@ -52,8 +54,9 @@ def _bounded(
 
 
 def as_numbers(value: object, key: str, expected: str) -> tuple[float, ...]:
-    """Finite numbers from a list, a tuple or an array, or from a single number. Raises
-    ParameterError for a different value.
+    """Finite numbers from a list, a tuple or an array, or from a single number.
+
+    Raises ParameterError for a different value.
     """
     problems = Problems()
     read = kind_of(float | tuple[float, ...]).read(value, key, problems)
@@ -62,8 +65,9 @@ def as_numbers(value: object, key: str, expected: str) -> tuple[float, ...]:
 
 
 def as_names(value: object, key: str, expected: str) -> tuple[str, ...]:
-    """Names from a list, a tuple or an array, or from a text with commas. Raises ParameterError for
-    other values.
+    """Names from a list, a tuple or an array, or from a text with commas.
+
+    Raises ParameterError for other values.
     """
     if isinstance(value, str):
         value = value.split(",") if value else ()

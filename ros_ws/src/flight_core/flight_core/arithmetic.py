@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Arithmetic of law, observer and feedforward with a stated order of operations, every operation
-rounded once to float64.
+"""Arithmetic of law, observer and feedforward with a stated order of operations.
 
-So u does not depend on the BLAS or the libm of a host, and C code without libraries gives the same
-bits. NumPy is exact to the bit. XLA, the compiler of JAX, may contract a product and a sum into a
-fused multiply-add, with a single rounding: JAX is near.
+Every operation is rounded once to float64. So u does not depend on the BLAS or the libm of a host,
+and C code without libraries gives the same bits. NumPy is exact to the bit. XLA, the compiler of
+JAX, may contract a product and a sum into a fused multiply-add, with a single rounding: JAX is
+near.
 """
 
 import math
@@ -32,11 +32,10 @@ ROUNDING = 1.5 * 2.0**52
 
 
 def product(matrix: Array, vector: Array) -> Array:
-    """Sum of matrix[:, j] vector[j] over the columns j = 0, 1, ..., in this order; the shape is
-    (k,) or (k, N).
+    """Sum of matrix[:, j] vector[j] over the columns j = 0, 1, ..., in this order.
 
     Shapes: matrix (k, s) and vector (s,) or (s, N), or N matrices (k, s, N) and vectors (s, N), s >
-    0.
+    0. The result is (k,) or (k, N).
     """
     if matrix.ndim == 2 and isinstance(vector, np.ndarray) and vector.ndim == 1:
         return np.add.accumulate(matrix * vector, axis=1)[:, -1]
@@ -49,11 +48,11 @@ def product(matrix: Array, vector: Array) -> Array:
 
 
 def sine(x: Scalar) -> Scalar:
-    """Sine of an angle in rad, with an error below 5e-16 up to MAX_ANGLE: r = x - k pi, then the
-    Taylor series up to r^19.
+    """Sine of an angle in rad, with an error below 5e-16 up to MAX_ANGLE.
 
-    k is the integer nearest to x / pi, pi is PI_HIGH + PI_LOW to 82 bits, and sin(x) is sin(r) for
-    even k, -sin(r) for odd k. The remainder of the series is at most (pi / 2)^21 / 21! = 2.6e-16.
+    r = x - k pi, then the Taylor series up to r^19. k is the integer nearest to x / pi, pi is
+    PI_HIGH + PI_LOW to 82 bits, and sin(x) is sin(r) for even k, -sin(r) for odd k. The remainder
+    of the series is at most (pi / 2)^21 / 21! = 2.6e-16.
     """
     xp = array_namespace(x)
     x = xp.minimum(xp.maximum(x, -MAX_ANGLE), MAX_ANGLE)
@@ -73,8 +72,9 @@ def _rounded(x: Scalar) -> Scalar:
 
 
 def inverse(matrix: FloatArray) -> FloatArray:
-    """Inverse of a regular matrix (m, m) by Gauss-Jordan elimination with the largest pivot of each
-    column.
+    """Inverse of a regular matrix (m, m), by Gauss-Jordan elimination.
+
+    The pivot is the largest entry of each column.
     """
     m = len(matrix)
     rows = np.hstack([matrix, np.eye(m)])

@@ -31,10 +31,10 @@ _LIBC = ctypes.CDLL(None, use_errno=True)
 
 
 def confine(folder: Path) -> list[str]:
-    """Take this process off the network, and let it change files beneath `folder` alone; it must
-    have one thread.
+    """Take this process off the network, and let it change files beneath `folder` alone.
 
-    Returns a sentence for a measure without support by the kernel.
+    The process must have one thread. Returns a sentence for a measure without support by the
+    kernel.
     """
     ways = []
     if _LIBC.unshare(CLONE_NEWUSER | CLONE_NEWNET):

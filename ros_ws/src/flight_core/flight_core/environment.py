@@ -31,8 +31,9 @@ MAX_DOMAIN = 232  # a higher domain has port numbers above 65535 (DDSI-RTPS 2.3,
 
 
 def require_ros_environment() -> None:
-    """Raise ParameterError with the mend where no node can start: clock, logs, shared memory,
-    loopback, domain, middleware.
+    """Raise ParameterError with the mend where no node can start.
+
+    Checks clock, logs, shared memory, loopback, domain and middleware.
     """
     _require_clock()
     _require_domain()
@@ -81,8 +82,9 @@ def _require_middleware() -> None:
 
 
 def _require_shared_memory() -> None:
-    """Rclpy writes a page of shared memory when it is loaded: on a full file system that is a bus
-    error.
+    """Raise ParameterError for a full file system of shared memory.
+
+    Rclpy writes a page of it when it is loaded: on a full file system that is a bus error.
     """
     try:
         state = os.statvfs(SHARED_MEMORY)
@@ -118,8 +120,9 @@ def _require_log_settings() -> None:
 
 
 def log_folder() -> Path | None:
-    """The folder for the logs of nodes, as rcl_logging_interface has it; None without any of its
-    variables.
+    """The folder for the logs of nodes, as rcl_logging_interface has it.
+
+    None without any of its variables.
     """
     for variable, inside in (("ROS_LOG_DIR", ""), ("ROS_HOME", "log"), ("HOME", ".ros/log")):
         if value := os.environ.get(variable):

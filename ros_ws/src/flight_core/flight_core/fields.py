@@ -1,7 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Values of a parameter set: permission by an annotation, and the sentence about a value not
-permitted.
+"""Values of a parameter set: permission by an annotation, and the sentence about a refused value.
 
 Types are strict. An int is accepted as a float, a sequence as a tuple, an array or a scalar of
 NumPy as lists and numbers, and a path as a str; nothing else is converted. The annotations are
@@ -263,8 +262,9 @@ SIMPLE: Mapping[Any, Callable[..., Kind]] = MappingProxyType(
 
 
 def kind_of(annotation: Any, rules: Mapping[str, Any] = MappingProxyType({})) -> Kind:
-    """Values permitted by an annotation under rules, e.g. gt. Raises TypeError for an unknown
-    annotation or rule.
+    """Values permitted by an annotation under rules, e.g. gt.
+
+    Raises TypeError for an unknown annotation or rule.
     """
     origin = get_origin(annotation)
     parts = get_args(annotation)

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Input and output files: existence checks, YAML, atomic replacement, sentences for unreadable or
-unwritable files.
+"""Input and output files: existence checks, YAML, atomic replacement.
+
+A file that cannot be read or written is a ParameterError with a sentence.
 """
 
 import errno
@@ -60,11 +61,11 @@ LEADING_ZERO = re.compile(r"[-+]?0[0-9]+")
 
 
 class _Loader(Composer, yaml.CSafeLoader):
-    """Reads numbers as YAML 1.2, rejects duplicate keys and an expansion of aliases to more than
-    MAX_YAML_NODES values.
+    """Reads numbers as YAML 1.2, and rejects duplicate keys.
 
-    PyYAML keeps the last of duplicate keys. libyaml parses, nine times as fast as Python. Python
-    composes: where nesting is deep, libyaml's binding exhausts the stack.
+    An expansion of aliases to more than MAX_YAML_NODES values is rejected too. PyYAML keeps the
+    last of duplicate keys. libyaml parses, nine times as fast as Python. Python composes: where
+    nesting is deep, libyaml's binding exhausts the stack.
     """
 
     def __init__(self, stream: str) -> None:
@@ -115,15 +116,17 @@ _Loader.add_constructor(INT_TAG, _integer)
 
 
 def dump_yaml(value: object, *, flow: bool | None = None) -> str:
-    """A value as YAML text for `parse_yaml`: lists of scalars in one line, everything in blocks
-    with flow False.
+    """A value as YAML text for `parse_yaml`.
+
+    Lists of scalars stand in one line; with flow False everything stands in blocks.
     """
     return yaml.dump(value, Dumper=_Dumper, sort_keys=False, default_flow_style=flow, width=128)
 
 
 def _expanded_size(node: yaml.Node, sizes: dict[int, float]) -> float:
-    """Number of nodes after expansion of aliases; infinite for a recursive node. `sizes` caches by
-    identity.
+    """Number of nodes after expansion of aliases; infinite for a recursive node.
+
+    `sizes` caches by identity.
     """
     if isinstance(node, yaml.ScalarNode):
         return 1
@@ -137,8 +140,9 @@ def _expanded_size(node: yaml.Node, sizes: dict[int, float]) -> float:
 
 
 def comment(lines: Iterable[str]) -> str:
-    """Lines as comments of a YAML file; unprintable characters, such as line ends of a file's name,
-    as escapes.
+    """Lines as comments of a YAML file.
+
+    Unprintable characters, such as line ends of a file's name, become escapes.
     """
     return "".join(f"# {printable(line)}".rstrip() + "\n" for line in lines)
 
@@ -165,12 +169,10 @@ EXAMPLES = "examples/"  # a path that begins so is also one from the root of the
 
 
 def find_file(name: FilePath, library: Path, key: str, kind: str) -> Path:
-    """The file of a name in a library, or the path of a .yaml file. Raises ParameterError with the
-    names.
+    """The file of a name in a library, or the path of a .yaml file.
 
-    A path that begins with `examples/` is found from any working folder.
-
-    `key` and `kind` are of the sentence: "scenario", "a scenario file".
+    A path that begins with `examples/` is found from any working folder. `key` and `kind` are of
+    the sentence: "scenario", "a scenario file". Raises ParameterError with the names.
     """
     expected = f"one of {', '.join(names_in(library))}, or the path of {kind} (.yaml)"
     text = os.fspath(as_path(name, key, expected))
@@ -185,25 +187,26 @@ def find_file(name: FilePath, library: Path, key: str, kind: str) -> Path:
 
 
 def display_path(path: Path) -> str:
-    """A path, relative to the working folder where the path is below; unprintable
-    characters as escapes.
+    """A path, relative to the working folder where the path is below.
+
+    Unprintable characters become escapes.
     """
     return printable(str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path))
 
 
 def open_nonblocking(path: str | Path) -> BinaryIO:
-    """Open a file for reading. A pipe without a writer reads as empty and does not block. Raises
-    OSError, ValueError.
+    """Open a file for reading; a pipe without a writer reads as empty and does not block.
+
+    Raises OSError, ValueError.
     """
     return open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))
 
 
 @contextmanager
 def writing(key: str, path: str | Path, expected: str) -> Iterator[None]:
-    """Turn an OSError inside the block into a ParameterError: `key`, the unwritable `path`, and
-    `expected`.
+    """Turn an OSError inside the block into a ParameterError.
 
-    `key` may be empty.
+    Its sentence has `key`, the unwritable `path`, and `expected`. `key` may be empty.
     """
     try:
         yield
@@ -215,10 +218,10 @@ def writing(key: str, path: str | Path, expected: str) -> Iterator[None]:
 
 
 def read_file(path: Path, key: str, expected: str) -> bytes:
-    """Content of an input file of at most MAX_FILE_BYTES. Raises ParameterError for an unreadable
-    or longer file.
+    """Content of an input file of at most MAX_FILE_BYTES.
 
-    `key` names the file in the sentence, `expected` the right content.
+    `key` names the file in the sentence, `expected` the right content. Raises ParameterError for an
+    unreadable or longer file.
     """
     try:
         with open_nonblocking(path) as stream:
@@ -236,8 +239,9 @@ def limited(content: bytes, key: str, expected: str) -> bytes:
 
 
 def read_yaml(path: Path, key: str, expected: str) -> Any:
-    """Content of a YAML file. Raises ParameterError as `read_file`, and for what is not YAML or has
-    a duplicate key.
+    """Content of a YAML file.
+
+    Raises ParameterError as `read_file`, and for what is not YAML or has a duplicate key.
     """
     return parse_yaml(read_file(path, key, expected), key, expected)
 
@@ -256,8 +260,9 @@ def parse_yaml(content: bytes | str, key: str, expected: str) -> Any:
 
 
 def require_no_octal(content: bytes | str, key: str) -> None:
-    """Raise ParameterError for YAML with a number that begins with 0: rcl reads 0100 as 64, by
-    strtoll with base 0.
+    """Raise ParameterError for YAML with a number that begins with 0.
+
+    Rcl reads 0100 as 64, by strtoll with base 0.
     """
     numbers = []
     with suppress(*NOT_YAML):  # rcl has its own sentence for it
@@ -276,13 +281,12 @@ def require_no_octal(content: bytes | str, key: str) -> None:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[BinaryIO]:
-    """Write a file atomically: the stream becomes the file at `path` once the block ends, and is
-    removed after an error.
+    """Write a file atomically: the stream becomes the file at `path` once the block ends.
 
-    After a crash, a kill or a full disk the file has either the new or the old content. The stream
-    is a fresh file in the same folder, so nothing is written through a link at `path`: the file
-    replaces the link. Raises OSError, also for an existing `path` that is no regular file, e.g. a
-    folder or a device.
+    After an error the stream is removed. After a crash, a kill or a full disk the file has either
+    the new or the old content. The stream is a fresh file in the same folder, so nothing is written
+    through a link at `path`: the file replaces the link. Raises OSError, also for an existing
+    `path` that is no regular file, e.g. a folder or a device.
     """
     with suppress(FileNotFoundError):  # also of a link to nothing
         mode = path.stat().st_mode
@@ -307,8 +311,9 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
 
 
 def _umask() -> int:
-    """The permissions withheld from new files of this process. umask(2) returns the mask only while
-    setting a new mask.
+    """The permissions withheld from new files of this process.
+
+    Umask(2) returns the mask only while setting a new mask.
     """
     mask = os.umask(0o077)
     os.umask(mask)

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What installs a missing Python package: make in a checkout, elsewhere pip with an extra of what
-`rise-di` came from.
+"""What installs a missing Python package.
+
+In a checkout it is make, elsewhere pip with an extra of what `rise-di` came from.
 """
 
 import json
@@ -41,16 +42,18 @@ MESSAGE_SUFFIXES = ("_msgs", "_interfaces", "_srvs")
 
 
 def require_package(package: str, remark: str = "") -> None:
-    """Raise ParameterError, with the remark at the end of the sentence, where a Python package is
-    not installed.
+    """Raise ParameterError where a Python package is not installed.
+
+    The sentence ends with the remark.
     """
     if find_spec(package) is None:
         raise ParameterError(missing(package) + remark)
 
 
 def missing(package: str) -> str:
-    """A sentence on a package that is not installed: "found no Python package jax, expected it:
-    make setup-all".
+    """A sentence on a package that is not installed.
+
+    For example "found no Python package jax, expected it: make setup-all".
     """
     in_checkout = (CHECKOUT / "Makefile").is_file() and (CHECKOUT / "ros_ws").is_dir()
     has_messages = package.endswith(MESSAGE_SUFFIXES)
@@ -72,12 +75,11 @@ def missing(package: str) -> str:
 
 
 def _pip_command(extra: str) -> str:
-    """The command that installs an extra of the stack from where the stack came: a checkout, a
-    wheel, a repository, an index.
+    """The command that installs an extra of the stack from where the stack came.
 
-    A checkout that is not released must not send its user to an index, where a foreign package may
-    have this name. Source: PEP 610, direct_url.json, which an installation from an index does not
-    have.
+    That is a checkout, a wheel, a repository or an index. A checkout that is not released must not
+    send its user to an index, where a foreign package may have this name. Source: PEP 610,
+    direct_url.json, which an installation from an index does not have.
     """
     try:
         origin = distribution("rise-di").read_text("direct_url.json")

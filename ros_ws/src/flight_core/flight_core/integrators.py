@@ -16,11 +16,10 @@ def rk4(
     params: Any,
     dt: Any,
 ) -> Array:
-    """A step of the classical fourth-order Runge-Kutta method: x(t + dt) from x(t), with u held
-    over the step.
+    """A step of the classical fourth-order Runge-Kutta method, with u held over the step.
 
-    x+ = x + dt/6 (k1 + 2 k2 + 2 k3 + k4), local error O(dt^5). Works on any array type. Source:
-    Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, table 1.2.
+    x(t + dt) = x + dt/6 (k1 + 2 k2 + 2 k3 + k4), local error O(dt^5). Works on any array type.
+    Source: Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, table 1.2.
     """
     k1 = x_dot(t, x, u, params)
     k2 = x_dot(t + dt / 2, x + dt / 2 * k1, u, params)

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Process isolation: what reads foreign models and logs runs in a subprocess of limited time,
-memory, files and network.
+"""Process isolation: what reads foreign models and logs runs in a subprocess.
+
+The subprocess has limited time, memory, files and network.
 """
 
 import json
@@ -39,8 +40,9 @@ sender's choice."""
 
 
 class IsolatedCallError(RuntimeError):
-    """The subprocess crashed or timed out. The message is the rest of a sentence: "was killed by
-    SIGSEGV".
+    """The subprocess crashed or timed out.
+
+    The message is the rest of a sentence: "was killed by SIGSEGV".
     """
 
 
@@ -101,8 +103,9 @@ def call(
 
 
 class _Reader(pickle.Unpickler):
-    """Reads plain values, arrays, and named tuples of a module. Raises IsolatedCallError for
-    another name.
+    """Reads plain values, arrays, and named tuples of a module.
+
+    Raises IsolatedCallError for another name.
     """
 
     def __init__(self, stream: Any, module: str) -> None:
@@ -130,8 +133,9 @@ class _Writer(pickle.Pickler):
 
 
 def main() -> None:
-    """Entry point of the subprocess: limits, then the call in JSON; the result goes into the file
-    RESULT.
+    """Entry point of the subprocess: limits, then the call in JSON.
+
+    The result goes into the file RESULT.
     """
     timeout, memory, module, name, arguments = json.loads(sys.argv[1])
     # that of the user, which no process may raise

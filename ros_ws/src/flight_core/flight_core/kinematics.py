@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Euler's kinematics of bank and pitch, and their inverse in a coordinated turn. Angles in rad,
-rates in rad/s, body axes FRD.
+"""Euler's kinematics of bank and pitch, and their inverse in a coordinated turn.
 
-Arguments are Python floats, or arrays with a value per aircraft of a fleet.
-Source: R. W. Beard, T. W. McLain, Small Unmanned Aircraft (2012), chapters 2, 3 and 9.
+Angles in rad, rates in rad/s, body axes FRD. Arguments are Python floats, or arrays with a value
+per aircraft of a fleet. Source: R. W. Beard, T. W. McLain, Small Unmanned Aircraft (2012), chapters
+2, 3 and 9.
 """
 
 import math
@@ -19,8 +19,9 @@ MAX_TILT = math.radians(80.0)
 def euler_rates(
     phi: Scalar, theta: Scalar, p: Scalar, q: Scalar, r: Scalar
 ) -> tuple[Scalar, Scalar]:
-    """phi_dot = p + tan(theta) (q sin(phi) + r cos(phi)) and theta_dot = q cos(phi) - r
-    sin(phi).
+    """Rates of bank and pitch, rad/s.
+
+    phi_dot = p + tan(theta) (q sin(phi) + r cos(phi)), theta_dot = q cos(phi) - r sin(phi).
     """
     xp = array_namespace(phi)
     turn = q * xp.sin(phi) + r * xp.cos(phi)
@@ -28,16 +29,18 @@ def euler_rates(
 
 
 def heading_rate(phi: Scalar, theta: Scalar, q: Scalar, r: Scalar) -> Scalar:
-    """Rate of the heading, rad/s: psi_dot = (q sin(phi) + r cos(phi)) / cos(theta). Source:
-    Stevens, Lewis, eq. (1.3-22).
+    """Rate of the heading, rad/s: psi_dot = (q sin(phi) + r cos(phi)) / cos(theta).
+
+    Source: Stevens, Lewis, eq. (1.3-22).
     """
     xp = array_namespace(phi)
     return (q * xp.sin(phi) + r * xp.cos(phi)) / xp.cos(tilt(theta))
 
 
 def turn_rate(phi: Scalar, theta: Scalar, theta_dot: Scalar, speed: Scalar) -> Scalar:
-    """R of a coordinated turn: psi_dot cos(phi) cos(theta) - theta_dot sin(phi), psi_dot = g
-    tan(phi) / V; speed V in m/s.
+    """Yaw rate r of a coordinated turn, rad/s, at the speed V in m/s.
+
+    r = psi_dot cos(phi) cos(theta) - theta_dot sin(phi), psi_dot = g tan(phi) / V.
     """
     xp = array_namespace(phi)
     phi = tilt(phi)

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A limit of memory for a node: one packet to its middleware may not take the memory of the
-host.
+"""A limit of memory for a node.
+
+One packet to its middleware may not take the memory of the host.
 """
 
 import resource
@@ -14,12 +15,11 @@ DATA_LIMIT = (
 
 
 def limit_memory(limit: int = DATA_LIMIT) -> None:
-    """Limit the data of this process and its later children to `limit` bytes, or to a lower limit
-    of the user (ulimit -d).
+    """Limit the data of this process and its later children to `limit` bytes.
 
-    An allocation beyond it fails: Python raises MemoryError, and the middleware, which does not
-    expect that, ends the process. Source: getrlimit(2), RLIMIT_DATA: heap and private writable
-    mappings, thread stacks included.
+    A lower limit of the user (ulimit -d) stays. An allocation beyond it fails: Python raises
+    MemoryError, and the middleware, which does not expect that, ends the process. Source:
+    getrlimit(2), RLIMIT_DATA: heap and private writable mappings, thread stacks included.
     """
     soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
     lowest = min([limit, *(bound for bound in (soft, hard) if bound != resource.RLIM_INFINITY)])

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Mode of the controller: published by the controller in `internals`, read by guidance, log and
-page.
+"""Mode of the controller.
+
+The controller publishes it in `internals`; guidance, log and page read it.
 """
 
 from enum import IntEnum

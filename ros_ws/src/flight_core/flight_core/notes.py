@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Notes to the user of a process: once each, on the standard error where no logging is
-configured.
+"""Notes to the user of a process, once each.
+
+They go to the standard error where no logging is configured.
 """
 
 import logging

@@ -136,8 +136,9 @@ def ended_early(reason: str) -> Outcome:
 
 
 def log_ends_at(held: float, duration: float) -> Outcome:
-    """The outcome of a flight of `duration` s whose log holds y, y_m and u up to the flight time
-    `held`, s; -inf: none.
+    """The outcome of a flight of `duration` s whose log ends early.
+
+    It holds y, y_m and u up to the flight time `held`, s; -inf: none.
     """
     part = f"up to t = {held:.3f} of" if held >= 0.0 else "of"
     verb = "holds" if held >= 0.0 else "does not hold"

@@ -22,8 +22,9 @@ from flight_core.text import bounded
 
 
 class ParameterError(ValueError):
-    """An invalid parameter or parameter set. The message is one sentence for the user, printable
-    and bounded.
+    """An invalid parameter or parameter set.
+
+    The message is one sentence for the user, printable and bounded.
 
     Args:
         sentence: The key, the value that was found, and the expected value.
@@ -40,8 +41,9 @@ class ParameterError(ValueError):
 
 @dataclass_transform(kw_only_default=True, frozen_default=True, field_specifiers=(Field,))
 class Config:
-    """Base of every parameter set: frozen, finite, strictly typed (an int is accepted as a float),
-    without unknown keys.
+    """Base of every parameter set: frozen, finite, strictly typed, without unknown keys.
+
+    An int is accepted as a float.
     """
 
     model_fields: ClassVar[dict[str, FieldInfo]] = {}
@@ -108,8 +110,9 @@ class Config:
     def read(
         cls, values: Mapping[Any, Any], key: str, problems: Problems, *, check: bool = True
     ) -> Self | None:
-        """Build the set from a nested mapping; None, and a sentence in `problems`, for a value not
-        permitted.
+        """Build the set from a nested mapping.
+
+        None, and a sentence in `problems`, for a value not permitted.
         """
         before = len(problems.sentences())
         content = {}
@@ -144,8 +147,9 @@ class Config:
         return built
 
     def changed(self, changes: Mapping[str, Any]) -> dict[str, Any]:
-        """The values with changes by dotted name, not validated; None removes a parameter. Raises
-        ParameterError.
+        """The values with changes by dotted name, not validated.
+
+        None removes a parameter. Raises ParameterError.
         """
         flat = dict(flatten(self.model_dump()))
         for name in changes:
@@ -175,8 +179,9 @@ class Config:
         exclude_defaults: bool = False,
         exclude_unset: bool = False,
     ) -> dict[str, Any]:
-        """The set as nested dicts, in mode json with lists in place of tuples. `exclude` has fields
-        of this set alone.
+        """The set as nested dicts, in mode json with lists in place of tuples.
+
+        `exclude` has fields of this set alone.
         """
 
         def plain(value: Any) -> Any:
@@ -216,8 +221,9 @@ class Config:
 
     @classmethod
     def model_validate_json(cls, text: str) -> Self:
-        """Build the set from JSON. Raises ParameterError, and ValueError for a text that is not
-        JSON.
+        """Build the set from JSON.
+
+        Raises ParameterError, and ValueError for a text that is not JSON.
         """
         try:
             values = json.loads(text)
@@ -267,8 +273,9 @@ Signs = Annotated[tuple[Literal[1, -1], ...], Field(min_length=1)]
 
 
 def require(condition: bool, key: str, actual: object, expected: str) -> None:
-    """Raise ParameterError naming `key`, what was found and what is expected, unless the condition
-    holds.
+    """Raise ParameterError unless the condition holds.
+
+    The sentence names `key`, what was found and what is expected.
     """
     if not condition:
         raise ParameterError(f"{key}: found {actual}, expected {expected}")
@@ -322,8 +329,9 @@ def require_channels(key: str, names: Sequence[str], expected: Sequence[str], ow
 
 
 def flatten(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Nested mapping -> (dotted name, value) pairs, the parameter names of ROS 2; None values are
-    left out.
+    """Nested mapping -> (dotted name, value) pairs, the parameter names of ROS 2.
+
+    None values are left out.
     """
     for key, value in mapping.items():
         if isinstance(value, Mapping):
@@ -333,8 +341,9 @@ def flatten(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str,
 
 
 def nest(flat: Mapping[str, Any]) -> dict[str, Any]:
-    """Dotted names -> nested mapping, the inverse of `flatten`. Raises ParameterError for a name of
-    a value and of a group.
+    """Dotted names -> nested mapping, the inverse of `flatten`.
+
+    Raises ParameterError for a name of a value and of a group.
     """
     tree: dict[str, Any] = {}
     for name, value in flat.items():

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The largest values of the outputs of an aircraft: a sample beyond is wrong, and an aircraft
-beyond is lost.
+"""The largest values of the outputs of an aircraft.
+
+A sample beyond is wrong, and an aircraft beyond is lost.
 """
 
 from collections.abc import Sequence

@@ -1,7 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Publisher lock of a topic with a single publisher: samples of a conflicting publisher are
-ignored.
+"""Publisher lock of a topic: samples of a second publisher are ignored.
 
 A message names the publisher in `frame_id`, e.g. "/controller#4711".
 """
@@ -24,12 +23,11 @@ def require_sender(sender: str, expected: str) -> None:
 
 
 class PublisherLock:
-    """Locks to the first publisher of a topic, until the samples time out; then to the next
-    publisher.
+    """Locks to the first publisher of a topic, until the samples time out.
 
-    A restarted node, of the same name, may take over earlier than a different node. Overruns of the
-    receiving node do not count: the first sample after an overrun may come from a different
-    publisher.
+    Then it locks to the next publisher. A restarted node, of the same name, may take over earlier
+    than a different node. Overruns of the receiving node do not count: the first sample after an
+    overrun may come from a different publisher.
 
     The middleware numbers the messages of a publisher. Numbers that go back tell of two publishers
     under the name. Neither is admitted, because either may be forged.
@@ -55,8 +53,9 @@ class PublisherLock:
         return self.publisher is None or self.age_ns(now_ns) > max_age_ns
 
     def holds(self, sender: str, now_ns: int) -> bool:
-        """Whether this is the locked publisher, whose last sample is within the age limit of a
-        restart.
+        """Whether this is the locked publisher, and it has not timed out.
+
+        Its last sample is within the age limit of a restart.
         """
         return sender == self.publisher and not self.timed_out(now_ns, self._timeouts_ns()[0])
 
@@ -65,8 +64,9 @@ class PublisherLock:
         self._overrun_ns += duration_ns
 
     def check(self, sender: str, now_ns: int) -> None:
-        """Raise ChannelError, reason "sender", for a sample of a second publisher before the locked
-        publisher times out.
+        """Raise ChannelError, reason "sender", for a sample of a second publisher.
+
+        It may take over once the locked publisher has timed out.
         """
         if sender == self.publisher:
             return
@@ -93,12 +93,11 @@ class PublisherLock:
         return changed
 
     def require_alone(self, sender: str, sequence: int, now_ns: int) -> None:
-        """Raise ChannelError, reason "sender", for a sample of the locked name where the sequence
-        went back in the last SHARED_NS: two publishers send under the name.
+        """Raise ChannelError, reason "sender", where two publishers send under the locked name.
 
-        `sequence`: the number of the message by the middleware; 0 is unknown. After a timeout a
-        lower number is of a restarted publisher. Called with samples of a valid stamp and content:
-        a replay stops nothing.
+        That is so for SHARED_NS after the sequence went back. `sequence` is the number of the
+        message by the middleware; 0 is unknown. After a timeout a lower number is of a restarted
+        publisher. Called with samples of a valid stamp and content: a replay stops nothing.
         """
         if sender != self.publisher:
             return

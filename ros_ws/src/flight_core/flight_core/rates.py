@@ -18,8 +18,9 @@ def nanoseconds(time: float) -> int:
 
 
 def period_ns(rate: float, key: str) -> int:
-    """Period of a rate in Hz. Raises ParameterError naming `key` where 1e9 / rate is not a whole
-    number of nanoseconds.
+    """Period of a rate in Hz.
+
+    Raises ParameterError naming `key` where 1e9 / rate is not a whole number of nanoseconds.
     """
     period = nanoseconds(1.0 / rate)
     is_whole = abs(period * rate - NANOSECONDS) < 1e-3
@@ -28,8 +29,9 @@ def period_ns(rate: float, key: str) -> int:
 
 
 def divide(whole_ns: int, part_ns: int, key: str, whole_name: str) -> int:
-    """Number of parts in the whole. Raises ParameterError naming `key` unless the number is an
-    integer.
+    """Number of parts in the whole.
+
+    Raises ParameterError naming `key` unless the number is an integer.
     """
     # asked first: the sentence takes longer than the division
     if part_ns <= 0 or whole_ns % part_ns:

@@ -21,12 +21,11 @@ A_SCENARIO = "a scenario file"
 def parse_sections(
     content: bytes, path: Path, expected: tuple[str, ...], optional: tuple[str, ...] = ()
 ) -> Sections:
-    """Sections of the content of a scenario file by node name, e.g. {"controller": {"rate": 100.0,
-    ...}}.
+    """Sections of a scenario file by node name, e.g. {"controller": {"rate": 100.0, ...}}.
 
-    Raises ParameterError with the path for content that is no scenario file or too long, has a
-    duplicate key, or lacks or adds a section. A section in `optional` may be absent, or an empty
-    mapping: every parameter by default.
+    A section in `optional` may be absent, or an empty mapping: every parameter by default. Raises
+    ParameterError with the path for content that is no scenario file or too long, has a duplicate
+    key, or lacks or adds a section.
     """
     tree = parse_yaml(limited(content, str(path), A_SCENARIO), str(path), A_SCENARIO)
     require(

@@ -23,14 +23,13 @@ ATTRIBUTES = "=IIQiIQQQ"
 
 
 def lower_real_time_priority(levels: int) -> None:
-    """Lower the real-time priority (chrt) of every thread of this process, if any, by `levels`; the
-    lowest is 1.
+    """Lower the real-time priority (chrt) of every thread of this process, if any.
 
-    Threads started later inherit the priority. Processes of equal priority do not preempt:
-    compression in the recorder delays a tick of the law by milliseconds, and a tick of the law, of
-    up to 3 ms, the next y_m. Rate-monotonic priorities, the lower the longer the period, are the
-    optimal fixed priorities. Source: sched(7); C. L. Liu and J. W. Layland, Journal of the ACM
-    20(1), 1973, theorem 2.
+    It falls by `levels`; the lowest is 1. Threads started later inherit the priority. Processes of
+    equal priority do not preempt: compression in the recorder delays a tick of the law by
+    milliseconds, and a tick of the law, of up to 3 ms, the next y_m. Rate-monotonic priorities, the
+    lower the longer the period, are the optimal fixed priorities. Source: sched(7); C. L. Liu and
+    J. W. Layland, Journal of the ACM 20(1), 1973, theorem 2.
     """
     if (policy := os.sched_getscheduler(0)) in REAL_TIME:
         _schedule_threads(
@@ -56,10 +55,10 @@ def _schedule_threads(policy: int, priority: int) -> None:
 
 
 def disable_timer_slack() -> None:
-    """Set the timer slack of the main thread to the minimum. By default Linux delays a wake-up by
-    up to 50 us to save power.
+    """Set the timer slack of the main thread to the minimum.
 
-    Source: prctl(2), PR_SET_TIMERSLACK. Threads of real-time priority have no timer slack.
+    By default Linux delays a wake-up by up to 50 us to save power. Threads of real-time priority
+    have no timer slack. Source: prctl(2), PR_SET_TIMERSLACK.
     """
     with suppress(OSError):  # /proc is missing or read-only: ticks keep the slack
         TIMER_SLACK.write_text("1", encoding="utf-8")

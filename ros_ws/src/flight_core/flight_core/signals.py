@@ -7,11 +7,10 @@ from typing import Any
 
 
 def handle_shutdown(handler: Any) -> dict[signal.Signals, Any]:
-    """Handle SIGINT, SIGTERM, and SIGHUP of a lost terminal or connection. Returns the handlers
-    before.
+    """Handle SIGINT, SIGTERM, and SIGHUP of a lost terminal or connection.
 
     An ignored SIGINT is handled too, as in a command started in the background by a shell. An
-    ignored SIGHUP stays ignored, for nohup.
+    ignored SIGHUP stays ignored, for nohup. Returns the handlers before.
     """
     ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     numbers = [signal.SIGINT, signal.SIGTERM, *([] if ignored else [signal.SIGHUP])]

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The tape: the in-memory log of a flight, from a single process, over topics or read from a
-bag.
+"""The tape: the in-memory log of a flight.
+
+It comes from a flight in a single process or over topics, or from a bag.
 """
 
 from collections.abc import Mapping, Sequence

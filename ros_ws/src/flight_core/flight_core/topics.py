@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The topics of a flight: name, message, publishers, subscribers, and what the log and the pages
-say of them.
+"""The topics of a flight.
 
+A row has name, message, publishers, subscribers, and what the log and the pages say of the topic.
 Transport, recorder and launch read this table. `python -m tools.topics` writes the table of
 docs/topics.md and the access control policy from it.
 """
@@ -52,8 +52,9 @@ class Topic(NamedTuple):
 
     @property
     def type(self) -> Any:
-        """The class of the messages. Raises ImportError or AttributeError where the package lacks
-        the message.
+        """The class of the messages.
+
+        Raises ImportError or AttributeError where the package lacks the message.
         """
         if not isinstance(self.message, str):
             return self.message

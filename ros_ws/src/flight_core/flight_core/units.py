@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Units of airframe files. Values are converted to SI once, at load; the code uses SI and
-radians.
+"""Units of airframe files.
+
+Values are converted to SI once, at load; the code uses SI and radians.
 """
 
 import re
@@ -78,8 +79,9 @@ Source: B. N. Taylor, A. Thompson, Guide for the Use of the International System
 
 @lru_cache(maxsize=256)
 def quantity(unit: str, key: str = "unit") -> Quantity:
-    """The SI value and the dimension of a unit, such as "ft/s^2". Raises ParameterError with `key`
-    for an unknown unit.
+    """The SI value and the dimension of a unit, such as "ft/s^2".
+
+    Raises ParameterError with `key` for an unknown unit.
     """
     total = Quantity(1.0)
     for part in re.findall(r"[*/]?[^*/]*", unit)[:-1] or [""]:
@@ -98,18 +100,18 @@ def quantity(unit: str, key: str = "unit") -> Quantity:
 
 
 def si_per_unit(unit: str) -> float:
-    """SI value of 1 of a unit, the factor of a value in that unit. Raises ParameterError for an
-    unknown unit.
+    """SI value of 1 of a unit, the factor of a value in that unit.
+
+    Raises ParameterError for an unknown unit.
     """
     return quantity(unit).si
 
 
 def in_si(value: str | float, key: str, like: str) -> float:
-    """A number of SI, or a text of a number with a unit ("176 ft/s"), in SI; `like`: an SI unit of
-    the same dimension.
+    """A number of SI, or a text of a number with a unit ("176 ft/s"), in SI.
 
-    Raises ParameterError for a text without a finite number, an unknown unit, and a unit of a
-    different dimension.
+    `like` is an SI unit of the same dimension. Raises ParameterError for a text without a finite
+    number, an unknown unit, and a unit of a different dimension.
     """
     parsed = re.fullmatch(
         r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)(?:\s*)(\D.*)?", str(value).strip()

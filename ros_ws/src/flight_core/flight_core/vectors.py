@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Named vectors: values with their channel names. Channels are matched by name, never by
-position.
+"""Named vectors: values with their channel names.
+
+Channels are matched by name, never by position.
 """
 
 import math
@@ -85,8 +86,9 @@ def array_namespace(array: Scalar) -> Any:
 
 
 def as_array(value: Any, key: str, expected: str) -> FloatArray:
-    """The value as an array of float64. Raises ParameterError for what is no array of real
-    numbers.
+    """The value as an array of float64.
+
+    Raises ParameterError for what is no array of real numbers.
     """
     try:
         if not np.iscomplexobj(value):
@@ -115,8 +117,9 @@ class StampedVector(NamedTuple):
 
 
 class ChannelError(ValueError):
-    """An invalid sample. `reason` is a short word for counters; the message is a sentence,
-    printable and bounded.
+    """An invalid sample.
+
+    `reason` is a short word for counters; the message is a sentence, printable and bounded.
     """
 
     def __init__(self, reason: str, sentence: str) -> None:
@@ -125,8 +128,9 @@ class ChannelError(ValueError):
 
 
 def require_newer(stamp_ns: int, last_ns: int, what: str = "sample") -> None:
-    """Raise ChannelError, reason "order", unless a stamp is newer than the last stamp; `what` names
-    the sample.
+    """Raise ChannelError, reason "order", unless a stamp is newer than the last stamp.
+
+    `what` names the sample.
     """
     if stamp_ns <= last_ns:
         raise ChannelError(
@@ -135,8 +139,9 @@ def require_newer(stamp_ns: int, last_ns: int, what: str = "sample") -> None:
 
 
 def require_not_future(stamp_ns: int, now_ns: int, max_age_ns: int) -> None:
-    """Raise ChannelError, reason "future", for a stamp ahead of the clock by more than the age
-    limit.
+    """Raise ChannelError, reason "future", for a stamp too far ahead of the clock.
+
+    The limit is that of the age.
     """
     if stamp_ns > now_ns + max_age_ns:
         raise ChannelError(FUTURE, f"stamp {seconds(stamp_ns - now_ns):g} s ahead of the clock")
@@ -156,11 +161,11 @@ def require_not_old(stamp_ns: int, now_ns: int, max_age_ns: int) -> None:
 def select(
     wanted: Sequence[str], names: Sequence[str], values: Sequence[float] | FloatArray
 ) -> FloatArray:
-    """Values of the wanted channels, in the wanted order: v_i = values[names.index(wanted_i)],
-    shape (len(wanted),).
+    """Values of the wanted channels, in the wanted order, shape (len(wanted),).
 
-    Raises ChannelError with reason "length" (names and values differ in number), "name" (a wanted
-    channel is missing or duplicated) or "finite" (a wanted value is NaN or infinite).
+    v_i = values[names.index(wanted_i)]. Raises ChannelError with reason "length" (names and values
+    differ in number), "name" (a wanted channel is missing or duplicated) or "finite" (a wanted
+    value is NaN or infinite).
     """
     if len(names) != len(values):
         raise ChannelError("length", f"{len(names)} names for {len(values)} values")
@@ -175,8 +180,9 @@ def select(
 
 
 def selection_matrix(wanted: Sequence[str], names: Sequence[str]) -> FloatArray:
-    """1 where a row of `wanted` and a column of `names` are the same channel, else 0: the product
-    with values selects.
+    """The matrix that selects the wanted channels by its product with values.
+
+    1 where a row of `wanted` and a column of `names` are the same channel, else 0.
     """
     matrix = np.zeros((len(wanted), len(names)))
     for row, channel in zip(matrix, wanted, strict=True):

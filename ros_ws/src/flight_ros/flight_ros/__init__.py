@@ -1,5 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Shared ROS code of the RISE-DI flight stack: topics, parameters, messages as named vectors, base
-class of a node.
+"""Shared ROS code of the RISE-DI flight stack.
+
+Topics, parameters, messages as named vectors, and the base class of a node.
 """

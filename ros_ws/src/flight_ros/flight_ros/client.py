@@ -25,8 +25,9 @@ NODES = ("controller", "guidance", "bridge", "aircraft")  # of an aircraft
 
 
 def start_middleware() -> None:
-    """Start rclpy in the default context. Raises ParameterError with the reason where the
-    middleware does not start.
+    """Start rclpy in the default context.
+
+    Raises ParameterError with the reason where the middleware does not start.
     """
     transport.prepare()
     try:
@@ -39,9 +40,9 @@ def start_middleware() -> None:
 
 
 class Client:
-    """A node in the default context, or that of a `parent`, whose cancellation ends the waits of
-    both.
+    """A node in the default context.
 
+    With a `parent` it is a node in the parent's context, whose cancellation ends the waits of both.
     A context manager: the middleware always shuts down.
     """
 
@@ -107,8 +108,9 @@ class Client:
             rclpy.spin_once(self._node, timeout_sec=0.02)
 
     def _elsewhere(self) -> list[str]:
-        """The namespaces of the aircraft in the graph where none is in this namespace; "/" is the
-        root.
+        """The namespaces of the aircraft in the graph where none is in this namespace.
+
+        "/" is the root.
         """
         seen = {
             namespace

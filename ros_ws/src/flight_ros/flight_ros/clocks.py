@@ -1,11 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Clocks of the nodes of an aircraft on several hosts: offset and delay, measured in both
-directions.
+"""Clocks of the nodes of an aircraft on several hosts: offset and delay.
 
-A node i publishes once a second, on `clocks`, the least difference D_ij = (clock of i at the
-reception) - (clock of the sender) of the messages of a node j. With the delay d of a message and
-theta_j, the clock of j less that of i,
+Both directions are measured. A node i publishes once a second, on `clocks`, the least difference
+D_ij = (clock of i at the reception) - (clock of the sender) of the messages of a node j. With the
+delay d of a message and theta_j, the clock of j less that of i,
 
     D_ij = d_ji - theta_j,   D_ji = d_ij + theta_j,   so theta_j = (D_ji - D_ij) / 2
         where d_ij = d_ji.
@@ -65,8 +64,9 @@ class ClockOfPeer(NamedTuple):
 
 
 class Peers:
-    """The differences of clocks as a node sees them, and as its peers report them. Times in s and
-    ns.
+    """The differences of clocks as a node sees them, and as its peers report them.
+
+    Times in s and ns.
     """
 
     def __init__(self, own_name: str, host: float = 0.0) -> None:
@@ -103,8 +103,9 @@ class Peers:
             known.pop(name, None)
 
     def differences(self) -> dict[str, float]:
-        """The report of a node: the least difference of every peer, and the figures for nodes of
-        this host.
+        """The report of a node: the least difference of every peer.
+
+        It has the figures for nodes of this host too.
         """
         return {HOST: self._host, AHEAD: self.ahead} | {
             name: min(seen) for name, seen in self._seen.items()
@@ -136,8 +137,9 @@ class PeerClocks:
         self._decoder = NamedDecoder()
 
     def exchange(self, ahead_ns: int) -> None:
-        """Once a second: take the reports, send a report. `ahead_ns`: the system clock less the
-        time of the node.
+        """Once a second: take the reports, send a report.
+
+        `ahead_ns`: the system clock less the time of the node.
         """
         self._peers.ahead = (time.time_ns() - ahead_ns - time.monotonic_ns()) / NANOSECONDS
         for sample, received in self._refusals.decoded(
@@ -159,8 +161,9 @@ class PeerClocks:
         return self._peers.clocks()
 
     def told_of(self, sender: str) -> str:
-        """The end of a sentence on a stamp of a node whose clock differs; empty without a known
-        difference.
+        """The end of a sentence on a stamp of a node whose clock differs.
+
+        Empty without a known difference.
         """
         clock = self.clocks().get(sender)
         return (

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Compatibility of the publishers and subscribers of a topic: message type and quality of service
-(QoS).
+"""Compatibility of the publishers and subscribers of a topic.
+
+Message type and quality of service (QoS) have to match.
 """
 
 import os
@@ -34,8 +35,9 @@ def type_name(message: type) -> str:
 def require_no_publishers(
     node: Node, topics: Iterable[str], expected: str, duration: float = 0.0
 ) -> None:
-    """Raise ParameterError where a topic has a publisher already. `duration`, s: to discover the
-    publishers.
+    """Raise ParameterError where a topic has a publisher already.
+
+    `duration`, s: to discover the publishers.
     """
     end = time.monotonic() + duration
     names = [node.resolve_topic_name(topic) for topic in topics]
@@ -50,8 +52,9 @@ def require_no_publishers(
 
 
 def mismatch(peer: TopicEndpointInfo, message_type: str, qos: QoSProfile) -> str:
-    """Why a peer exchanges no messages with a local endpoint of this message type and QoS; empty if
-    both match.
+    """Why a peer exchanges no messages with a local endpoint of this message type and QoS.
+
+    Empty if both match.
     """
     node = f"{peer.node_namespace.rstrip('/')}/{peer.node_name}"
     publishes = peer.endpoint_type == TopicEndpointTypeEnum.PUBLISHER
@@ -74,16 +77,15 @@ class EndpointMonitor:
         self._throttle = Throttle(LOG_PERIOD_NS)
 
     def mismatches(self, subscription: PolledSubscription) -> list[str]:
-        """A sentence for every publisher with a type or QoS unfit for a subscription of the
-        node.
-        """
+        """A sentence for every publisher with a type or QoS unfit for a subscription."""
         kind = type_name(subscription.topic.type)
         peers = self._node.get_publishers_info_by_topic(subscription.name)
         return [sentence for peer in peers if (sentence := mismatch(peer, kind, subscription.qos))]
 
     def unexpected(self, subscription: PolledSubscription) -> str:
-        """A sentence where nodes of several names publish a topic of a single node; else empty. A
-        restarted node keeps the name.
+        """A sentence where nodes of several names publish a topic of a single node; else empty.
+
+        A restarted node keeps the name.
         """
         if subscription.topic not in OF_ONE_NODE:
             return ""
@@ -92,16 +94,15 @@ class EndpointMonitor:
         return f"published by {', '.join(names)}, expected one node" if len(names) > 1 else ""
 
     def check_publishers(self, subscription: PolledSubscription) -> None:
-        """Log an error for each publisher that does not match a subscription of the node, and for
-        unexpected nodes.
+        """Log an error for each publisher that does not match a subscription of the node.
+
+        Unexpected nodes are logged too.
         """
         sentences = [*self.mismatches(subscription), self.unexpected(subscription)]
         self._log(subscription.name, sentences)
 
     def check_subscribers(self, publisher: Publisher) -> None:
-        """Log an error for each subscriber of a topic that does not match a publisher of the
-        node.
-        """
+        """Log an error for each subscriber that does not match a publisher of the node."""
         topic = publisher.topic_name
         # The graph reports the QoS of both sides in the same terms. A new publisher is not in it
         # yet.

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Event loop of a node: ticks on the monotonic clock or by /clock, or lockstep steps; services in
-between, clean shutdown.
+"""Event loop of a node: ticks on the monotonic clock or by /clock, or lockstep steps.
+
+Services are served in between, and the shutdown is clean.
 """
 
 import gc
@@ -66,8 +67,9 @@ IDLE_POLL_PERIOD = 0.02  # s, the longest sleep, so that signals and service cal
 
 
 class _Stop:
-    """Set by a signal handler, without a lock: the lock of an Event deadlocks when a second signal
-    interrupts the first handler.
+    """Set by a signal handler, without a lock.
+
+    The lock of an Event deadlocks when a second signal interrupts the first handler.
     """
 
     requested = False
@@ -79,12 +81,11 @@ class _Stop:
 def run(
     *make_nodes: Callable[[], FlightNode[Any]], early_participant: Participant | None = None
 ) -> None:
-    """Run a node, or several in one thread, until SIGINT, SIGTERM or SIGHUP. The exit status is
-    then 0.
+    """Run a node, or several in one thread, until SIGINT, SIGTERM or SIGHUP.
 
-    Other exit statuses: 2 for invalid parameters, 3 for a flight that cannot continue, 5 for a
-    landing, 6 where another node has ended, 1 for an unexpected exception. The `early_participant`
-    of flight_ros.startup is destroyed once the nodes exist.
+    The exit status is then 0. Other exit statuses: 2 for invalid parameters, 3 for a flight that
+    cannot continue, 5 for a landing, 6 where another node has ended, 1 for an unexpected exception.
+    The `early_participant` of flight_ros.startup is destroyed once the nodes exist.
 
     Ticks run on the monotonic clock in the main thread and poll the subscriptions. In lockstep
     there are no ticks: a node advances when its input has arrived. The executor serves parameters
@@ -123,8 +124,9 @@ def _make_nodes(
 
 
 def _run_to_end(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> int | None:
-    """Run nodes. Returns the exit status; None where nodes with the same parameters are to begin
-    again.
+    """Run nodes. Returns the exit status.
+
+    None: nodes with the same parameters are to begin again.
     """
     node = nodes[0]
     status: int | None = 0
@@ -223,11 +225,10 @@ def _run_lockstep(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> None:
 
 
 def require_input(nodes: Sequence[FlightNode[Any]], advance_ns: int, began: bool) -> None:
-    """Raise FlightEnded where a lockstep flight waits for ever: for a sample that was refused, or
-    for its first one.
+    """Raise FlightEnded where a lockstep flight waits for ever.
 
-    `advance_ns`: when it last advanced. A flight that began waits for a peer that is stopped, for
-    instance in a debugger.
+    It waits for a sample that was refused, or for its first one. `advance_ns`: when it last
+    advanced. A flight that began waits for a peer that is stopped, for instance in a debugger.
     """
     for node in nodes:
         awaited = node.awaited_topic()
@@ -270,8 +271,9 @@ class RealTime:
         return True
 
     def report(self) -> None:
-        """Do the next reports, some after a tick: the reports together may exceed a
-        period of 2 ms.
+        """Do the next reports, some after a tick.
+
+        The reports together may exceed a period of 2 ms.
         """
         now_ns = time.monotonic_ns()
         if now_ns >= self._report_ns:
@@ -310,8 +312,9 @@ def _start_instants(
 
 
 def _run_real_time(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> None:
-    """Run nodes in a thread, a tick at a time: of several due nodes the first node's, by the
-    order of the nodes.
+    """Run nodes in a thread, a tick at a time.
+
+    Of several due nodes the first node's, by the order of the nodes.
     """
     executor = _start(nodes)
     starts = _start_instants(nodes, executor, stop)

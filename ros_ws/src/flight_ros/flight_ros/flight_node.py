@@ -64,8 +64,9 @@ CLOCK_STEP_NS = NANOSECONDS // 20
 
 
 class FlightNode(Node, Generic[P]):
-    """A node with fixed ticks or in lockstep. A subclass defines its rate and the work of
-    a tick or step.
+    """A node with fixed ticks or in lockstep.
+
+    A subclass defines its rate and the work of a tick or step.
     """
 
     def __init__(self, name: str, schema: type[P]) -> None:
@@ -128,11 +129,10 @@ class FlightNode(Node, Generic[P]):
         return self.host is not self.simulated or self.simulated.known()
 
     def start_ns(self) -> int | None:
-        """System time of tick 0, ns: the parameter `start_time`; where it is -1 the topic
-        `start`, None before its message.
+        """System time of tick 0, ns: the parameter `start_time`.
 
-        Where it is 0 the next whole period of the system clock, so that nodes of equal rates tick
-        together.
+        Where it is -1 the topic `start`, None before its message. Where it is 0 the next whole
+        period of the system clock, so that nodes of equal rates tick together.
         """
         start_time = getattr(self.parameters, "start_time", 0.0)
         if start_time < 0.0:
@@ -148,9 +148,7 @@ class FlightNode(Node, Generic[P]):
         raise NotImplementedError
 
     def awaited_topic(self) -> str:
-        """Lockstep: the topic whose next message this node waits for; empty if it waits for
-        none.
-        """
+        """Lockstep: the topic whose next message this node waits for; empty for none."""
         return ""
 
     def status(self) -> tuple[bytes, str, dict[str, object]]:
@@ -161,8 +159,9 @@ class FlightNode(Node, Generic[P]):
         """Called once when the node ends, also after an error."""
 
     def on_parameters(self, parameters: P) -> None:
-        """Called with a valid new set in flight, before it becomes `self.parameters`. A
-        ParameterError refuses it.
+        """Called with a valid new set in flight, before it becomes `self.parameters`.
+
+        A ParameterError refuses it.
         """
 
     # Used by a subclass
@@ -174,8 +173,9 @@ class FlightNode(Node, Generic[P]):
         return now_ns - now_ns % period_ns + period_ns
 
     def advertise(self, topic: Topic) -> Callable[[bytes], None]:
-        """Create a publisher of serialised messages on a topic of the flight. Returns the function
-        that publishes one.
+        """Create a publisher of serialised messages on a topic of the flight.
+
+        Returns the function that publishes one.
         """
         qos = LOCKSTEP if self.parameters.lockstep else publisher_qos(self.period_ns())
         publisher = self.create_publisher(topic.type, topic.name, qos)
@@ -183,8 +183,9 @@ class FlightNode(Node, Generic[P]):
         return publisher.publish
 
     def subscribe(self, topic: Topic, qos: QoSProfile | None = None) -> PolledSubscription:
-        """Create a subscription that is polled at the tick, as bytes. Its publishers are checked
-        once a second.
+        """Create a subscription that is polled at the tick, as bytes.
+
+        Its publishers are checked once a second.
         """
         default = LOCKSTEP if self.parameters.lockstep else NEWEST_SAMPLES
         subscription = PolledSubscription(self, topic, qos or default, raw=True)
@@ -202,8 +203,9 @@ class FlightNode(Node, Generic[P]):
         qos: QoSProfile | None = None,
         max_size: int | None = None,
     ) -> Receiver[S]:
-        """Create a subscription with its `Receiver`. Overruns of this node are no silence of the
-        publisher.
+        """Create a subscription with its `Receiver`.
+
+        Overruns of this node are no silence of the publisher.
         """
         subscription = self.subscribe(topic, qos)
         receiver = Receiver(
@@ -223,21 +225,24 @@ class FlightNode(Node, Generic[P]):
         return Encoder(names, self.instance)
 
     def now_ns(self) -> int:
-        """The time of the ticks, ns: the system clock at the start plus the monotonic time since
-        then.
+        """The time of the ticks, ns.
+
+        It is the system clock at the start plus the monotonic time since then.
         """
         return self.host.monotonic_ns() + self.time_offset_ns
 
     def clock_step_ns(self) -> int:
-        """How far the system clock is ahead of the time of the ticks; 0 for less than
-        CLOCK_STEP_NS, which is no step.
+        """How far the system clock is ahead of the time of the ticks, ns.
+
+        0 for less than CLOCK_STEP_NS, which is no step.
         """
         step_ns = self.host.time_ns() - self.now_ns()
         return step_ns if abs(step_ns) > CLOCK_STEP_NS else 0
 
     def adopt(self, parameters: P) -> None:
-        """Replace the parameters by a valid set of the node's own choice: a parameter event
-        without a check.
+        """Replace the parameters by a valid set of the node's own choice.
+
+        A parameter event tells of it; there is no check.
         """
         before, after = (
             dict(flatten(values.model_dump())) for values in (self.parameters, parameters)
@@ -263,10 +268,10 @@ class FlightNode(Node, Generic[P]):
     def warn_no_publisher(
         self, subscription: PolledSubscription, lack: str = "no publisher"
     ) -> None:
-        """Called at each tick without a sample of a topic: logs a warning after 3 s, then every 2
-        s.
+        """Warn of a topic without a publisher, at each tick without a sample.
 
-        `lack` is the cause where the topic has no publisher.
+        The warning is logged after 3 s, then every 2 s. `lack` is the cause where the topic has no
+        publisher.
         """
         now_ns = time.monotonic_ns()
         last_ns, log_ns = self._waiting.get(subscription.name, (0, 0))
@@ -289,8 +294,9 @@ class FlightNode(Node, Generic[P]):
         self.get_logger().warning(f"waiting for {subscription.name}: {cause}")
 
     def _change_parameters(self, changes: list[Parameter]) -> SetParametersResult:
-        """Accept a change of tunable parameters as a whole, or reject it with a sentence and change
-        nothing.
+        """Accept a change of tunable parameters as a whole, or reject it with a sentence.
+
+        A rejected change changes nothing.
         """
         if self._adopted is not None:
             self.parameters = self._adopted
@@ -345,8 +351,9 @@ class FlightNode(Node, Generic[P]):
         self._tick_times.end()
 
     def check_clock(self) -> None:
-        """Log an error after a step of the system clock. The node keeps its time; a node
-        with a later start has the new time.
+        """Log an error after a step of the system clock.
+
+        The node keeps its time; a node with a later start has the new time.
         """
         step_ns = self.host.time_ns() - self.now_ns()
         if abs(step_ns - self._clock_step_ns) > CLOCK_STEP_NS:
@@ -363,8 +370,9 @@ class FlightNode(Node, Generic[P]):
             self._clock_step_ns = step_ns
 
     def compare_clocks(self) -> None:
-        """Exchange the clocks of the nodes. Log a warning where a clock begins to differ from
-        the node's own, and once it agrees.
+        """Exchange the clocks of the nodes.
+
+        Log a warning where a clock begins to differ from the node's own, and once it agrees.
         """
         if self.clocks is not None:
             self.clocks.exchange(time.time_ns() - self.now_ns())
@@ -377,11 +385,10 @@ class FlightNode(Node, Generic[P]):
             self.warn_no_publisher(self.simulated.subscription)
 
     def graph_checks(self) -> list[Callable[[], None]]:
-        """Checks of the graph, a topic each: to ask the middleware for all topics takes about a
-        period of 2 ms.
+        """Checks of the graph, a topic each.
 
-        They log an error for a peer with a wrong message type or incompatible QoS: its topic
-        would stay silent.
+        To ask the middleware for all topics takes about a period of 2 ms. The checks log an error
+        for a peer with a wrong message type or incompatible QoS: its topic would stay silent.
         """
         return [
             *(
@@ -399,10 +406,10 @@ class FlightNode(Node, Generic[P]):
         return self.parameters.lockstep
 
     def require_flight(self) -> None:
-        """Raise FlightEnded after the loss of a peer of a lockstep flight, and report the loss to
-        the other peers.
+        """Raise FlightEnded after the loss of a peer of a lockstep flight.
 
-        In simulated time raise ClockRestarted after a jump of /clock.
+        The other peers get a report of the loss. In simulated time raise ClockRestarted after a
+        jump of /clock.
         """
         if self.simulated is not None:
             self.simulated.require_one_simulation()
@@ -428,8 +435,9 @@ class FlightNode(Node, Generic[P]):
         )
 
     def publish_diagnostics(self) -> None:
-        """Publish the 1 Hz report: loop period, compute time, missed ticks (overruns), rejected
-        samples and more.
+        """Publish the 1 Hz report.
+
+        It has loop period, compute time, missed ticks (overruns), rejected samples and more.
         """
         level, sentence, further = self.status()
         if conflict := self.refusals.conflict():

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Liveliness monitor of a lockstep flight: detects the loss of a peer by DDS liveliness, a watchdog
-inside the middleware.
+"""Liveliness monitor of a lockstep flight.
+
+It detects the loss of a peer by DDS liveliness, a watchdog inside the middleware.
 """
 
 import time

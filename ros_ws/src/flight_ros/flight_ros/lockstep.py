@@ -19,8 +19,9 @@ class Instant(NamedTuple):
 
 
 class LockstepInputs:
-    """y and a second signal, brought together. A step waits for the y of its instant and the second
-    signal up to it.
+    """y and a second signal, brought together.
+
+    A step waits for the y of its instant and the second signal up to it.
     """
 
     def __init__(

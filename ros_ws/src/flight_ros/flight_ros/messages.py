@@ -1,12 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Named vectors as messages: sensor_msgs/JointState with name = channels, position = values, stamp
-= the sample's instant.
+"""Named vectors as messages of sensor_msgs/JointState.
 
-The channels are constant during a flight. So the bytes of a message are laid out once, and each
-sample changes only its stamp and its values. The layout is several times faster than the
-serialisation of the middleware, and repeatable to the byte: the middleware leaves uninitialised
-memory between two strings.
+name = channels, position = values, stamp = the sample's instant. The channels are constant during a
+flight. So the bytes of a message are laid out once, and each sample changes only its stamp and its
+values. The layout is several times faster than the serialisation of the middleware, and repeatable
+to the byte: the middleware leaves uninitialised memory between two strings.
 """
 
 import math
@@ -54,8 +53,9 @@ def to_message(
 
 
 def from_message(message: JointState, wanted: Sequence[str]) -> StampedVector:
-    """The wanted channels of a message. Raises ChannelError for invalid names, lengths or
-    values.
+    """The wanted channels of a message.
+
+    Raises ChannelError for invalid names, lengths or values.
     """
     stamp = message.header.stamp
     value = select(wanted, message.name, message.position)
@@ -115,8 +115,9 @@ class Decoder:
         self._sender = ""
 
     def decode(self, raw: bytes) -> StampedVector | None:
-        """The sample; None for a vector without channels. Raises ChannelError for an invalid
-        message.
+        """The sample; None for a vector without channels.
+
+        Raises ChannelError for an invalid message.
         """
         if not self._fixed or self._fixed_part(raw) != self._fixed:
             message = _message(raw)
@@ -162,8 +163,9 @@ class NamedSample(NamedTuple):
 
 
 class NamedDecoder:
-    """Decodes all channels of the messages of a topic whose channels vary; several times slower
-    than Decoder.
+    """Decodes all channels of the messages of a topic whose channels vary.
+
+    It is several times slower than Decoder.
     """
 
     def decode(self, raw: bytes) -> NamedSample:

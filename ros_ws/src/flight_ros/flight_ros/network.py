@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Profile of the middleware for nodes on several hosts: unicast over UDP between the addresses of
-the hosts alone.
+"""Profile of the middleware for nodes on several hosts.
+
+It is unicast over UDP between the addresses of the hosts alone.
 """
 
 import ipaddress
@@ -41,8 +42,9 @@ def addresses(text: str) -> tuple[str, ...]:
 
 
 def own_address(peers: Sequence[str], local: Collection[str]) -> str:
-    """The address of this host among the peers, by the addresses of its interfaces. Raises
-    ParameterError.
+    """The address of this host among the peers, by the addresses of its interfaces.
+
+    Raises ParameterError.
     """
     matches = [address for address in peers if address in local]
     named = ", ".join(sorted(local)) or "none"
@@ -56,8 +58,9 @@ def own_address(peers: Sequence[str], local: Collection[str]) -> str:
 
 
 def network_profile(own_host: str, peers: Sequence[str]) -> str:
-    """The loopback profile with the address of this host in place of 127.0.0.1, and the hosts as
-    initial peers.
+    """The loopback profile with the address of this host in place of 127.0.0.1.
+
+    The hosts are its initial peers.
     """
     text = LOOPBACK_PROFILE.read_text(encoding="utf-8")
     locators = "".join(

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""ROS parameters of a node as a validated set. The overrides are validated as a whole; then each
-parameter is declared.
+"""ROS parameters of a node as a validated set.
+
+The overrides are validated as a whole; then each parameter is declared.
 """
 
 import sys
@@ -26,11 +27,10 @@ ROS_PARAMETERS = ("use_sim_time", "start_type_description_service", "qos_overrid
 
 
 def read_parameters(node: Node, schema: type[P]) -> P:
-    """Validate the overrides of a node created with
-    automatically_declare_parameters_from_overrides. Raises ParameterError.
+    """Validate the overrides of a node, and declare its parameters.
 
-    Then every parameter of the set is declared with its description, read-only unless it is
-    tunable.
+    The node was created with automatically_declare_parameters_from_overrides. Every parameter of
+    the set is declared with its description, read-only unless it is tunable. Raises ParameterError.
     """
     _require_no_octal(sys.argv)
     overrides = nest(_overrides(node))
@@ -84,8 +84,9 @@ def _require_no_octal(arguments: Sequence[str]) -> None:
 
 
 def changed(node: Node, parameters: P, changes: list[Parameter]) -> P:
-    """The set with some parameters changed, validated as a whole. Raises ParameterError, also for a
-    parameter of `learned`.
+    """The set with some parameters changed, validated as a whole.
+
+    Raises ParameterError, also for a parameter of `learned`.
     """
     for change in changes:
         is_own = change.name.split(".")[0] in parameters.learned()

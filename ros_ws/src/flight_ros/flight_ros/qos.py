@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Quality of service (QoS) of recorded topics: the strongest compatible profile, and rosbag2's form
-of offered profiles.
+"""Quality of service (QoS) of recorded topics.
+
+The strongest compatible profile, and rosbag2's form of offered profiles.
 """
 
 from collections.abc import Sequence

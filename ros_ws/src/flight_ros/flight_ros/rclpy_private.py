@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The private names of rclpy 7.1 in the stack, checked by
-tests/ros/flight_ros/test_rclpy_private.py.
+"""The private names of rclpy 7.1 in the stack.
+
+`tests/ros/flight_ros/test_rclpy_private.py` checks them.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,8 +33,9 @@ ARGUMENT_ERRORS = (
 
 
 def create_participant(name: str, context: Context) -> Participant:
-    """Create a node without topics, parameters or services, so that its process has a DDS
-    participant.
+    """Create a node without topics, parameters or services.
+
+    Its process has a DDS participant then.
     """
     with context.handle:
         return _rclpy.Node(name, "", context.handle, None, False, False)
@@ -45,8 +47,9 @@ def destroy_participant(participant: Participant) -> None:
 
 
 def take_messages(subscription: Subscription, limit: int) -> list[tuple[Any, Any]]:
-    """At most `limit` messages (or their bytes) with their metadata, oldest first, without an
-    executor.
+    """At most `limit` messages (or their bytes) with their metadata, oldest first.
+
+    No executor takes part.
     """
     handle = subscription.handle
     kind = subscription.msg_type
@@ -68,8 +71,9 @@ class WaitSet:
         self._wait_set = _rclpy.WaitSet(len(self._handles), 0, 0, 0, 0, 0, context.handle)
 
     def wait(self, timeout_ns: int) -> bool:
-        """Wait for a message on one of them or for the timeout. Returns whether there is a
-        message.
+        """Wait for a message on one of them or for the timeout.
+
+        Returns whether there is a message.
         """
         wait_set = self._wait_set
         wait_set.clear_entities()
@@ -80,8 +84,9 @@ class WaitSet:
 
 
 def answer_invalid_transitions(node: Node) -> None:
-    """Let a lifecycle node answer a request for an invalid transition with success false. rclpy
-    raises, and sends no answer.
+    """Let a lifecycle node answer a request for an invalid transition with success false.
+
+    Rclpy raises, and sends no answer.
     """
     service = node._service_change_state
     change_state = service.callback
@@ -129,8 +134,9 @@ def refuse_foreign_parameters(node: Node) -> None:
 
 
 def ready_callback(executor: SingleThreadedExecutor) -> Callable[[], None] | None:
-    """A callback that is ready, None if there is none, without blocking. Its call raises what the
-    callback raises.
+    """A callback that is ready, None if there is none, without blocking.
+
+    Its call raises what the callback raises.
     """
     try:
         handler, _, _ = executor.wait_for_ready_callbacks(0, None, lambda: False)

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Receivers: the samples of a topic, checked and taken at a tick. Refused samples are counted and
-logged.
+"""Receivers: the samples of a topic, checked and taken at a tick.
+
+Refused samples are counted and logged.
 """
 
 import time
@@ -88,8 +89,9 @@ class Refusals:
         messages: Iterable[ReceivedMessage],
         decode: Callable[[bytes], T],
     ) -> list[tuple[T, ReceivedMessage]]:
-        """Decoded messages with their metadata. A message is refused where `decode` raises
-        ChannelError.
+        """Decoded messages with their metadata.
+
+        A message is refused where `decode` raises ChannelError.
         """
         pairs = []
         for received in messages:
@@ -104,8 +106,9 @@ class Refusals:
         return [stamp_ns for stamp_ns, _ in self.decoded(source, messages, stamp_of)]
 
     def since(self, subscription: PolledSubscription, begin_ns: int) -> str:
-        """The last refusal of a topic since an instant of the monotonic clock, with age and count;
-        empty without one.
+        """The last refusal of a topic since an instant of the monotonic clock.
+
+        It has age and count; empty without one.
         """
         refused_ns, sentence = self.last.get(subscription.name, (0, ""))
         if not sentence or refused_ns < begin_ns:
@@ -117,8 +120,9 @@ class Refusals:
         return f"{count} samples refused, the last {age:.1f} s ago: {sentence}"
 
     def conflict(self) -> str:
-        """The last sample of a conflicting publisher since the last call, as a sentence; empty
-        without a conflict.
+        """The last sample of a conflicting publisher since the last call, as a sentence.
+
+        Empty without a conflict.
         """
         sentence = self._conflict
         self._conflict = ""
@@ -166,8 +170,9 @@ class Receiver(Generic[S]):
         return self.subscription.name
 
     def poll(self, now_ns: int, limit: int | None = None) -> list[bool]:
-        """Take the messages since the last call, at most `limit`. Returns whether each message was
-        valid.
+        """Take the messages since the last call, at most `limit`.
+
+        Returns whether each message was valid.
         """
         return [
             self.take_message(received.message, now_ns, received.sequence)
@@ -175,8 +180,9 @@ class Receiver(Generic[S]):
         ]
 
     def take_message(self, raw: bytes, now_ns: int, sequence: int = 0) -> bool:
-        """Check and take a message. Returns whether the message was valid. `sequence`: as of
-        `PublisherLock.require_alone`.
+        """Check and take a message. Returns whether the message was valid.
+
+        `sequence`: as of `PublisherLock.require_alone`.
         """
         try:
             require_size(raw, self._max_size)
@@ -199,8 +205,9 @@ class Receiver(Generic[S]):
         return True
 
     def slowness(self, max_age_ns: int) -> str:
-        """Why samples at their rate exceed an age limit at times, as a sentence; empty where FEWEST
-        of them fit.
+        """Why samples at their rate exceed an age limit at times, as a sentence.
+
+        Empty where FEWEST of them fit.
         """
         if (
             len(self._stamps_ns) < RECENT
@@ -220,8 +227,9 @@ class Receiver(Generic[S]):
         return f"{slow}: {mend}" if fit < FEWEST else ""
 
     def receive(self) -> list[S | None]:
-        """Lockstep: decode the messages since the last call, for `accept`. None: without channels,
-        or refused.
+        """Lockstep: decode the messages since the last call, for `accept`.
+
+        None: without channels, or refused.
         """
         samples: list[S | None] = []
         for received in self.subscription.take():

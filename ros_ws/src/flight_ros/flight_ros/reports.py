@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Reports as messages: diagnostic_msgs/DiagnosticArray with a stamp, a sentence and named values,
-which are JSON.
+"""Reports as messages of diagnostic_msgs/DiagnosticArray.
+
+A report has a stamp, a sentence and named values, which are JSON.
 """
 
 import json

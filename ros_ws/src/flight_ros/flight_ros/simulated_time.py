@@ -59,15 +59,17 @@ class SimulatedTime:
     monotonic_ns = time_ns
 
     def sleep(self, duration: float, /) -> None:
-        """Wait for the next message, at most LONGEST_WAIT_NS of the host: a duration of simulated
-        time has no length there.
+        """Wait for the next message, at most LONGEST_WAIT_NS of the host.
+
+        A duration of simulated time has no length there.
         """
         self._wait_set = self._wait_set or WaitSet([self.subscription.entity], self._context)
         self._wait_set.wait(LONGEST_WAIT_NS)
 
     def at(self, system_ns: int) -> int:
-        """The simulated time at an instant of the system clock, between two messages in
-        proportion.
+        """The simulated time at an instant of the system clock.
+
+        Between two messages it is in proportion.
         """
         received_ns = self._received_ns
         instants_ns = self._instants_ns

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Start of a node's process: an early DDS participant starts discovery while the modules of the
-node are imported.
+"""Start of a node's process: an early DDS participant starts discovery.
 
-Discovery takes 0.2 s, and the import of NumPy and of a node nearly as long. Both run at the same
-time, so that a node restarts sooner. For this reason this module imports rclpy and little else.
+Meanwhile the modules of the node are imported. Discovery takes 0.2 s, and the import of NumPy and
+of a node nearly as long. Both run at the same time, so that a node restarts sooner. For this reason
+this module imports rclpy and little else.
 """
 
 import gc
@@ -33,11 +33,10 @@ BAD_ENVIRONMENT = 2  # exit status, as of invalid parameters
 
 
 def start_nodes(*nodes: str, early: bool = True, lower_by: int = 0) -> None:
-    """Run nodes, each "module:class", by `flight_ros.event_loop.run`. A signal during the start
-    ends with exit status 0 too.
+    """Run nodes, each "module:class", by `flight_ros.event_loop.run`.
 
-    `early`: create a DDS participant before the imports. `lower_by`: levels of real-time priority,
-    more for nodes of a longer period.
+    A signal during the start ends with exit status 0 too. `early`: create a DDS participant before
+    the imports. `lower_by`: levels of real-time priority, more for nodes of a longer period.
     """
     if {"--help", "-h"} & {*sys.argv[1:]}:
         print(USAGE.format(program=os.path.basename(sys.argv[0])))  # noqa: PTH119 - pathlib takes as long to import as the rest
@@ -59,8 +58,9 @@ def start_nodes(*nodes: str, early: bool = True, lower_by: int = 0) -> None:
 
 
 def _create_early_participant() -> "Participant | None":
-    """A node without topics. It is hidden, as its name begins with _ (ROS 2 design, topic and
-    service names).
+    """A node without topics.
+
+    It is hidden, as its name begins with _ (ROS 2 design, topic and service names).
     """
     import rclpy  # noqa: PLC0415 - on a full /dev/shm the import itself is a bus error
     from rclpy.signals import SignalHandlerOptions  # noqa: PLC0415

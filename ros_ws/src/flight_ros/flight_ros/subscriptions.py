@@ -1,10 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Polled subscriptions: a tick takes the newest messages at any rate of the publisher, without an
-executor.
+"""Polled subscriptions: a tick takes the newest messages at any rate of the publisher.
 
-Polling takes about 1 us if there is no message. A flood of messages causes no callbacks, and a
-clock that is set back has no effect.
+No executor takes part. Polling takes about 1 us if there is no message. A flood of messages causes
+no callbacks, and a clock that is set back has no effect.
 """
 
 from typing import Any, NamedTuple
@@ -51,8 +50,9 @@ class PolledSubscription:
         self.name = str(self.entity.topic_name)  # the full name
 
     def take(self, most: int | None = None) -> list[ReceivedMessage]:
-        """The messages since the last call, oldest first, at most `most`, by default the depth of
-        the queue.
+        """The messages since the last call, oldest first.
+
+        At most `most`, by default the depth of the queue.
         """
         return [
             ReceivedMessage(

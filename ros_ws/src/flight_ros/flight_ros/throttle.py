@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Throttle of repeated log lines. That of rclpy counts by the line of code, not by topic and
-reason.
+"""Throttle of repeated log lines.
+
+That of rclpy counts by the line of code, not by topic and reason.
 """
 
 import time

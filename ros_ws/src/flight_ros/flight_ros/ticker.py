@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Ticker: a fixed rate with absolute deadlines, without drift: on the monotonic clock, or in
-simulated time.
+"""Ticker: a fixed rate with absolute deadlines, without drift.
+
+It ticks on the monotonic clock, or in simulated time.
 """
 
 import math
@@ -42,10 +43,9 @@ class Tick(NamedTuple):
 
 
 class Ticker:
-    """Deadlines start + k period, in ns of host.monotonic_ns(); `host` is the module `time` by
-    default.
+    """Deadlines start + k period, in ns of host.monotonic_ns().
 
-    Without `spin` a wait does not busy-wait.
+    `host` is the module `time` by default. Without `spin` a wait does not busy-wait.
     """
 
     def __init__(
@@ -64,8 +64,9 @@ class Ticker:
         ) / 1e9
 
     def wait(self, most: float) -> None:
-        """Sleep until the next deadline, at most `most` s. The last part before the deadline is a
-        busy-wait.
+        """Sleep until the next deadline, at most `most` s.
+
+        The last part before the deadline is a busy-wait.
         """
         pause = self.remaining()
         if pause > self._spin_time:
@@ -84,8 +85,9 @@ class Ticker:
 
 
 class TickTimes:
-    """Periods and compute times of the ticks since the last report, and the number of missed
-    ticks.
+    """Periods and compute times of the ticks since the last report.
+
+    The number of missed ticks is beside them.
     """
 
     def __init__(self) -> None:

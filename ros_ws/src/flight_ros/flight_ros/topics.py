@@ -76,11 +76,11 @@ def publisher_qos(period_ns: int) -> QoSProfile:
 
 
 class NodeState(StrEnum):
-    """State of a node on `node_state`, in order. READY: its event loop runs. MATCHED, in real time:
-    each input has a publisher.
+    """State of a node on `node_state`, in order.
 
-    FLYING: the aircraft has taken the first u of a flight in real time. COMPLETED: it has completed
-    a lockstep flight.
+    READY: its event loop runs. MATCHED, in real time: each input has a publisher. FLYING: the
+    aircraft has taken the first u of a flight in real time. COMPLETED: it has completed a lockstep
+    flight.
     """
 
     READY = "ready"

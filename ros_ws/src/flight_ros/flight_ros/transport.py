@@ -18,8 +18,9 @@ LOOPBACK_PROFILE = Path(str(files("flight_ros"))) / "loopback.xml"
 
 
 def environment() -> dict[str, str]:
-    """Environment variables that select the loopback transport; empty if the user has configured a
-    profile.
+    """Environment variables that select the loopback transport.
+
+    Empty if the user has configured a profile.
     """
     if PROFILE_VARIABLE in os.environ:
         return {}
@@ -28,10 +29,10 @@ def environment() -> dict[str, str]:
 
 
 def prepare() -> None:
-    """Set the environment before rclpy starts. Raises ParameterError if the profile cannot be read
-    as XML.
+    """Set the environment before rclpy starts.
 
-    Raises as `require_ros_environment`, too.
+    Raises ParameterError if the profile cannot be read as XML, and as `require_ros_environment`
+    does.
     """
     require_ros_environment()
     os.environ.update(environment())
@@ -47,8 +48,9 @@ def prepare() -> None:
 
 
 def open_to_network() -> list[str]:
-    """UDP sockets of this process on all interfaces in spite of the loopback profile; there should
-    be none.
+    """UDP sockets of this process on all interfaces in spite of the loopback profile.
+
+    There should be none.
     """
     if os.environ.get(PROFILE_VARIABLE) != str(LOOPBACK_PROFILE):
         return []
