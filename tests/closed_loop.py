@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Builders that the tests of the closed loop share: parameters of the law, reference outputs,
-flights without a scenario.
+"""Builders that the tests of the closed loop share.
+
+They make parameters of the law, reference outputs, and flights without a scenario.
 """
 
 import math
@@ -49,8 +50,9 @@ ms."""
 def calm_osprey(
     duration: float, wind: tuple[float, float] = (0.0, 0.0), **guidance: Any
 ) -> Scenario:
-    """The osprey of osprey_route in a steady wind without noise, in larger steps than the
-    scenario's, with a section of guidance in place of the route.
+    """The osprey of osprey_route in a steady wind without noise.
+
+    Its steps are larger than the scenario's, and a section of guidance replaces the route.
     """
     return find_scenario("osprey_route").vary(
         flight={"duration": duration},
@@ -78,8 +80,9 @@ def in_calm_air(path: Path, **guidance: object) -> Path:
 def law_params(
     K: Any, Lambda: Any, beta: Any, D: Any = 1.0, sign: Sign = Sign.IMPLICIT, **others: Any
 ) -> LawParams:
-    """Parameters of the law. A number holds for each channel; input_scale, omega and eps are 1
-    unless given.
+    """Parameters of the law.
+
+    A number holds for each channel; input_scale, omega and eps are 1 by default.
     """
     values = {"K": np.atleast_1d(K), "Lambda": Lambda, "beta": beta, "D": D}
     values |= {"input_scale": 1.0, "omega": 1.0, "eps": 1.0} | others
@@ -120,8 +123,9 @@ def fly(
     bound: float,
     x_0: FloatArray | None = None,
 ) -> FloatArray:
-    """The errors e at 0, dt, 2 dt, ..., shape (ticks, m), until one is above the bound, which ends
-    the flight.
+    """The errors e at 0, dt, 2 dt, ..., shape (ticks, m).
+
+    An error above the bound ends the flight.
 
     The law acts on the aircraft through ideal actuators. The flight starts from x_0, or from trim.
     """

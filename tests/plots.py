@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The figures of a report as the Python library plotly reads them: it refuses names and values that
-plotly.js does not know.
+"""The figures of a report as the Python library plotly reads them.
+
+It refuses names and values that plotly.js does not know.
 """
 
 import plotly.graph_objects as go

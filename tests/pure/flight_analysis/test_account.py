@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The account of a flight: every command says what a log lacks, and no figure stands for more than
-was recorded.
+"""The account of a flight says what a log lacks.
+
+Every command says so, and no figure stands for more than was recorded.
 """
 
 import json
@@ -86,9 +87,7 @@ def replayed(log: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
 def test_whole_log_lacks_nothing(
     whole: Path, figures: dict[str, Any], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The expected counts by hand: 500 Hz, 100 Hz and 50 Hz over two seconds, both ends
-    included.
-    """
+    """The counts by hand: 500 Hz, 100 Hz and 50 Hz over two seconds, both ends included."""
     assert (figures["outcome"]["sentence"], figures["notes"], figures["account"]["lacks"]) == (
         "completed",
         [],
@@ -197,8 +196,10 @@ def test_flight_counts_from_its_first_u(
 def test_clock_that_stands_now_and_then_is_named(
     share: float, named: bool, tape: Tape, osprey_gust: Scenario
 ) -> None:
-    """Each sample has its own instant: more than a hundredth with that of the sample before is a
-    fault of the clock, not of the recorder.
+    """A hundredth of the samples may have the instant of the sample before.
+
+    Every sample has an instant of its own: more of them are a fault of the clock, not of the
+    recorder.
     """
     y = tape["y"]
     stamp_ns = y.stamp_ns.copy()
@@ -246,8 +247,9 @@ def test_replay_without_some_y_is_incomplete(
 def test_samples_that_busy_host_withheld_are_no_lack_of_log(
     of_y: str, lost: int, lacks: bool, tape: Tape, osprey_gust: Scenario
 ) -> None:
-    """The last 0.1 s of a flight in real time, where the numbers of the messages tell whether the
-    pose was sent.
+    """The last 0.1 s of a flight in real time.
+
+    The numbers of the messages tell whether the pose was sent.
     """
     begin_ns = NANOSECONDS * 1_795_000_000
     until = 1.8 if of_y == "after" else 2.0
@@ -263,8 +265,9 @@ def test_samples_that_busy_host_withheld_are_no_lack_of_log(
 
 
 def foreign_flight(rate: float, ticks_held: slice) -> Tape:
-    """Ten seconds of an aircraft of another maker, whose timer has 0.3 ms of jitter, under a
-    controller of 100 Hz that publishes u at each tick with a new y.
+    """Ten seconds of an aircraft of another maker, whose timer has 0.3 ms of jitter.
+
+    The controller has 100 Hz and publishes u at each tick with a new y.
     """
     rng = np.random.default_rng(3)
     y_t = np.arange(0.0, 10.0, 1.0 / rate)
@@ -377,8 +380,10 @@ def test_first_sample_that_a_busy_recorder_stored_late_before_a_pause_stays(late
 @pytest.mark.parametrize("size", [400, 60])
 @pytest.mark.parametrize("live", [0, 100])
 def test_pause_in_history_of_publisher_is_no_step_of_clock(live: int, size: int) -> None:
-    """A recorder that joins late stores 3 s of history at once, with 0.6 s in which the publisher
-    paused; `live` samples come later. The same pause is a step where the log goes on in between.
+    """A recorder that joins late stores 3 s of history at once.
+
+    The publisher paused for 0.6 s in it; `live` samples come later. The same pause is a step where
+    the log goes on in between.
     """
     (stamp_ns,) = stamps(range(1000, 1300))
     stamp_ns[200:] += nanoseconds(0.6)
@@ -431,8 +436,9 @@ def test_samples_before_the_flight_stand_for_none_of_the_flight(
 
 
 def test_rms_is_weighted_by_time() -> None:
-    """Of a second with e = 3, nine tenths are missing after a second with e = 1: by hand sqrt((1 +
-    9) / 2).
+    """Of a second with e = 3, nine tenths are missing after a second with e = 1.
+
+    By hand the rms is sqrt((1 + 9) / 2).
     """
     t = np.concatenate([np.arange(0.0, 1.0, 0.001), np.arange(1.0, 2.0, 0.01)])
     e = np.where(t < 1.0, 1.0, 3.0)
@@ -442,8 +448,9 @@ def test_rms_is_weighted_by_time() -> None:
 
 
 def test_process_has_ready_time_of_its_own_start() -> None:
-    """A controller that was killed and started again, of two aircraft, beside a recorder without
-    samples.
+    """A controller of two aircraft that was killed and started again.
+
+    A recorder without samples stands beside.
     """
     second = NANOSECONDS
     ready = [

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The age of u at the aircraft: read from diagnostics of an independent publisher, judged by the
-delay margin of the gains.
+"""The age of u at the aircraft, judged by the delay margin of the gains.
+
+An independent publisher sends the diagnostics with the age.
 """
 
 from dataclasses import replace
@@ -61,8 +62,9 @@ def margin() -> float:
 def test_age_of_u_beside_delay_margin_of_gains(
     beyond: float, verdict: str, tape: Tape, margin: float
 ) -> None:
-    """`beyond` is the age beyond the delay of the gains and their margin, s; an age as planned has
-    no note.
+    """`beyond` is the age beyond the delay of the gains and their margin, s.
+
+    An age as planned has no note.
     """
     mean = max(SERVO.controller.delay + margin + beyond, 0.0)
     figures = summarise(

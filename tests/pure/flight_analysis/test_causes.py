@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The cause that an account names has its evidence in the log: no damage of a log is told as a busy
-host.
+"""The cause that an account names has its evidence in the log.
+
+No damage of a log is told as a busy host.
 """
 
 import json
@@ -57,8 +58,9 @@ class Messages(list[Sent]):
 
 
 def read_messages(log: Path) -> Messages:
-    """The messages of a log by the time of day, numbered as by its publishers, stored 1 ms after
-    the stamp.
+    """The messages of a log by the time of day, numbered as by its publishers.
+
+    A message is stored 1 ms after the stamp.
     """
     numbers: Counter[str] = Counter()
     messages = []
@@ -284,8 +286,9 @@ def test_short_hole_that_is_the_lack_is_named(
 def test_outcome_of_another_flight_beside_a_log_is_not_believed(
     beside: str, numbered: Messages, recorded: Path, tmp_path: Path
 ) -> None:
-    """A log without its outcome in a folder of another name, with a summary that names no flight,
-    and with the outcome of a launch.
+    """A log without its outcome in a folder of another name.
+
+    Beside it are a summary that names no flight, and the outcome of a launch.
     """
     half = damaged(numbered, "cut", 0.5, 0.0, "")
     log = write_messages(recorded / "run_0.mcap", tmp_path / "other" / "run_0.mcap", half)
@@ -325,8 +328,9 @@ def test_leap_of_all_topics_is_told_and_figures_are_over_flight_time(
 def test_pause_of_all_processes_is_no_leap_of_the_clock(
     numbered: Messages, recorded: Path, tmp_path: Path
 ) -> None:
-    """The flight goes on in the pause, as the flight times of truth tell, and the numbers go on
-    behind the pause.
+    """The flight goes on in the pause, as the flight times of truth tell.
+
+    The numbers go on behind the pause.
     """
     kept = [
         sent
@@ -349,8 +353,9 @@ def test_pause_of_all_processes_is_no_leap_of_the_clock(
 
 
 def test_rate_of_another_aircraft_is_that_of_its_log(tape: Tape, osprey_gust: Scenario) -> None:
-    """Each fifth sample of 500 Hz, numbered without a gap, beside the processes of a controller and
-    no aircraft.
+    """Each fifth sample of 500 Hz, numbered without a gap.
+
+    The processes are those of a controller, and no aircraft.
     """
     signals = {name: tape[name] for name in ("y_m", "u", "internals")}
     every = np.arange(len(tape["y"].stamp_ns)) % 5 == 0

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The margins of a flight that learned are those of each model that flew, around the file and
-around the true aircraft.
+"""The margins of a flight that learned are those of each model that flew.
+
+The models fly around the file and around the true aircraft.
 """
 
 from pathlib import Path

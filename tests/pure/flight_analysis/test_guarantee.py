@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The guarantee for every aircraft of a box: closed forms, corners, and SLICOT as an independent
-program where installed.
+"""The guarantee for every aircraft of a box: closed forms and corners.
+
+SLICOT is an independent program where installed.
 """
 
 import itertools
@@ -156,8 +157,9 @@ def test_loop_with_entries_pulled_out_is_the_exact_loop(name: str) -> None:
 
 @pytest.mark.parametrize("late", [0.003, 0.012, 0.026])
 def test_channels_of_a_delay_hold_each_constant_delay(late: float) -> None:
-    """A delay of j + f periods is a_i = 1 for i < j, a_j = f, b_j = f (1 - f), each within its
-    range: the spectral radius is that of the exact loop.
+    """A delay of j + f periods is a_i = 1 for i < j, a_j = f, b_j = f (1 - f).
+
+    Each is within its range: the spectral radius is that of the exact loop.
     """
     linear = boxed("osprey_servo", 0.5)
     assert linear.box is not None
@@ -202,8 +204,9 @@ def test_guarantee_with_a_late_input_is_below_each_constant_delay() -> None:
 
 
 def test_bound_from_zero_holds_where_a_delay_has_no_effect() -> None:
-    """At 0 rad/s a constant delay changes nothing, so the scaling of 0 says nothing of its
-    channels: the limit of c172p, u up to 10 ms late, was 33 % beside 76 % found.
+    """At 0 rad/s a constant delay changes nothing: the scaling of 0 is silent on its channels.
+
+    The limit of c172p, u up to 10 ms late, was 33 % beside 76 % found.
     """
     c172p = find_scenario("jsbsim_c172p")
     promise = guarantee(scenario_loop(c172p, c172p.controller, 1, 0.3), 0.01)
@@ -318,8 +321,10 @@ def test_frequency_without_proof_leaves_no_guarantee_and_no_error(
 
 
 def test_command_bounds_the_effectors_behind_an_allocation() -> None:
-    """An elevon acts on q and on p at once: the box of the file is larger than that of the law's
-    inputs, and an aircraft of it is unstable earlier.
+    """An elevon acts on q and on p at once.
+
+    The box of the file is larger than that of the law's inputs, and an aircraft of it is unstable
+    earlier.
     """
     words = ["gains", "x8_elevons", "--scenario", "x8_elevons", "--check", "--guarantee", "--json"]
     done = invoke(*words, "--samples", "2")

@@ -39,8 +39,9 @@ SPEED = 40.0  # m/s, trim
 
 
 def log(**channels: ArrayLike) -> Tape:
-    """A guided flight of 40 s to the north in steady level flight, except for these channels; `_`
-    stands for a dot.
+    """A guided flight of 40 s to the north in steady level flight, except for these channels.
+
+    `_` stands for a dot.
     """
     given = {name.replace("__", "."): value for name, value in channels.items()}
     level: dict[str, Any] = dict.fromkeys(names(("q", "V", "p", "r")), 0.0) | {

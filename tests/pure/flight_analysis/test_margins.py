@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Margins of the sampled loop: closed forms, python-control as an independent program, worst of
-uncertain aircraft.
+"""Margins of the sampled loop, and the worst of uncertain aircraft.
+
+They are checked by closed forms, and by python-control as an independent program.
 """
 
 import math
@@ -191,8 +192,9 @@ def test_scaled_norm_of_triangle_is_diagonal() -> None:
 
 
 def pi_of_python_control(scenario: Scenario) -> control.StateSpace:
-    """K(z) of RISE-DI inside its softened sign, from (20) to (22): a trapezoid and backward Euler;
-    u = -K e.
+    """K(z) of RISE-DI inside its softened sign, from (20) to (22); u = -K e.
+
+    The integrals are a trapezoid and backward Euler.
     """
     params = scenario.rise_di().law_params()
     T = 1.0 / scenario.controller.rate
@@ -216,8 +218,9 @@ def pi_of_python_control(scenario: Scenario) -> control.StateSpace:
 def loops_of_python_control(
     scenario: Scenario,
 ) -> tuple[list[control.StateSpace], control.StateSpace]:
-    """L_i with the other inputs closed, and the closed loop, in python-control; delay 0 or one
-    period.
+    """L_i with the other inputs closed, and the closed loop, in python-control.
+
+    The delay is 0 or one period.
     """
     plant = plant_of(scenario)
     controller = scenario.controller

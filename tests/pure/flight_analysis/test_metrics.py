@@ -92,8 +92,9 @@ def test_turn_and_capture_replace_commands_of_guided_flight() -> None:
 
 
 def guided(**channels: Any) -> list[Any]:
-    """Kind, start and stop of the transients of 20 s of guidance at 40 m/s, with these channels
-    from 5 to 8 s.
+    """Kind, start and stop of the transients of 20 s of guidance at 40 m/s.
+
+    The guidance has these channels from 5 to 8 s.
     """
     t = np.arange(0.0, 20_000.0, 20.0)
     level = {"phi_c": 0.0, "climb_c": 0.0, "xtrack": 0.0, "V_c": 40.0}

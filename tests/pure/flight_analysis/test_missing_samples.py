@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Which missing samples of a log are a lack: a topic alone is excused by what its own sensor drops,
-and a silence is named.
+"""Which missing samples of a log are a lack.
+
+A topic alone is excused by what its own sensor drops, and a silence is named.
 """
 
 from collections.abc import Mapping
@@ -31,8 +32,9 @@ def scenario(**aircraft: object) -> Scenario:
 
 
 def lacks(flown: Scenario, duration: int, kept: Mapping[str, Kept]) -> tuple[str, ...]:
-    """What the log of a flight of whole seconds lacks; `kept`: which samples of a topic it has,
-    (N,), all of the others.
+    """What the log of a flight of whole seconds lacks.
+
+    `kept`: which samples of a topic it has, (N,), all of the others.
     """
     signals = {}
     for name, rate in RATES.items():

@@ -16,8 +16,9 @@ from flight_analysis.report.summary import RecordedFlight
 
 
 def test_pdf_has_the_width_and_vectors(flight: RecordedFlight, tmp_path: Path) -> None:
-    """88 mm are 249.4 points of 1/72 inch. Paths are operators l and S in the stream; there is no
-    image, no Type 3 font.
+    """88 mm are 249.4 points of 1/72 inch.
+
+    Paths are operators l and S in the stream; there is no image, no Type 3 font.
     """
     write_figure(tmp_path / "fig.pdf", [flight], "88mm", "q,V")
     content = (tmp_path / "fig.pdf").read_bytes()

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Random sequences of samples, losses, faults of y and changes through the whole controller: what u
-may do, and the replay of the log.
+"""Random sequences of samples, losses, faults of y and changes through the controller.
+
+They check what u may do, and the replay of the log.
 """
 
 from typing import Any, NamedTuple

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Replay of recorded flights: equal to the last bit through failsafes and lost samples, and a
-single changed bit is found.
+"""Replay of recorded flights is equal to the last bit.
+
+That holds through failsafes and lost samples, and a single changed bit is found.
 """
 
 import contextlib

@@ -59,8 +59,9 @@ def held(count: int = 101, /, **channels: Any) -> Signal:
 
 
 def ticks(count: int = 101, /, **channels: Any) -> Signal:
-    """Internals of a controller at 100 Hz that was on time and never saturated, except in the
-    channels given.
+    """Internals of a controller at 100 Hz that was on time and never saturated.
+
+    `channels` replace channels.
     """
     limited = {f"limited.{name}": Saturation.NO for name in INPUTS}
     integrals = {f"{group}.{name}": 0.0 for group in ("integral_e", "Pi") for name in OUTPUTS}
@@ -379,8 +380,9 @@ def unlike(servo: Scenario) -> list[RecordedFlight]:
 def test_comparison_of_unlike_flights_begins_with_what_differs(
     unlike: list[RecordedFlight], tmp_path: Path
 ) -> None:
-    """The parameters are by hand those of the three scenarios. A ratio beside other wind is neither
-    better nor worse; one under other gains is.
+    """The parameters are by hand those of the three scenarios.
+
+    A ratio beside other wind is neither better nor worse; one under other gains is.
     """
     listed = {each.key: each.texts for each in comparison.conditions(unlike)}
     assert listed["aircraft.turbulence.wind"] == ("none", "8", "none")

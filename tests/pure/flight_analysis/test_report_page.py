@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The report page in a browser: it draws without errors, in light and dark, and a zoom shows all
-samples.
+"""The report page in a browser draws without errors, in light and dark.
+
+A zoom shows all samples.
 """
 
 import base64
@@ -34,8 +35,9 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 
 @pytest.fixture(scope="module")
 def servo() -> RecordedFlight:
-    """Seven seconds with noise and commands from 2 s on: more samples than are drawn before a
-    zoom.
+    """Seven seconds with noise and commands from 2 s on.
+
+    These are more samples than are drawn before a zoom.
     """
     scenario = find_scenario("osprey_servo", 7.0)
     return recorded("servo", scenario, simulate(scenario))

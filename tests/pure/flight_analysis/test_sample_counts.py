@@ -1,7 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How many samples a log should hold comes from what flew: the rate of a publisher that is not of
-the stack, that of /clock, and each publisher for itself.
+"""How many samples a log should hold comes from what flew.
+
+A publisher that is not of the stack has a rate of its own, as has /clock, and each publisher counts
+for itself.
 """
 
 from collections.abc import Callable
@@ -161,8 +163,10 @@ LOSSES: dict[str, Callable[[Instants], NDArray[np.bool_]]] = {
 def test_loss_of_a_foreign_publisher_is_told(
     topic: str, loss: str, is_numbered: bool, servo: Scenario
 ) -> None:
-    """Of 100 Hz. Messages that the recorder lost leave gaps in the numbers, and those never sent do
-    not: of 60 % never sent at random no run is whole, and nothing tells of the rate.
+    """The publisher has 100 Hz.
+
+    Messages that the recorder lost leave gaps in the numbers, and those never sent do not: of 60 %
+    never sent at random no run is whole, and nothing tells of the rate.
     """
     t = timer(100.0)
     keep = LOSSES[loss](t)
@@ -188,8 +192,9 @@ def test_timer_by_a_coarse_clock_has_its_mean_period(period: float) -> None:
 
 
 def test_two_senders_of_u_count_each_for_itself(servo: Scenario) -> None:
-    """Another controller sends 4 of its ticks amid those of the flight, with the numbers 1 to 4:
-    the flight's own u is whole.
+    """Another controller sends 4 of its ticks amid those of the flight, numbered 1 to 4.
+
+    The flight's own u is whole.
     """
     t = np.arange(0.0, END, 0.01)
     tape = flight(

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The osprey with servos agrees with a prototype of this law, another program with the same
-equations, to 10 %.
+"""The osprey with servos agrees with a prototype of this law to 10 %.
+
+The prototype is another program with the same equations.
 
 y, y_m and the law share 100 Hz, topics take no time, and the softened sign is three total lags
 wide. The prototype's figures have two or three digits, so rounding takes up to 5 % of the 10 %.

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A flight succeeds where it shows what is asked for: faults are injected, and 0 is given only for
-errors as those of the flight without the fault.
+"""A flight succeeds where it shows what is asked for.
+
+Faults are injected, and 0 is returned only for errors as those of the flight without the fault.
 """
 
 from collections.abc import Callable

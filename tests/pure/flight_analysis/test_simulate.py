@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The closed loop in one process: its tracking error, and the order of the error in the sampling
-period.
+"""The closed loop in one process.
+
+The tests measure its tracking error, and the order of the error in the sampling period.
 """
 
 from collections.abc import Callable, Mapping

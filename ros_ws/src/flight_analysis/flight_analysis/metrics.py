@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Metrics of a flight as pure functions of the tape: error, noise floor, ultimate bound, settling,
-saturation, ticks.
+"""Metrics of a flight as pure functions of the tape.
+
+They are error, noise floor, ultimate bound, settling, saturation and ticks.
 """
 
 import math
@@ -54,8 +55,10 @@ an engagement. UNKNOWN_AIR: no simulated aircraft flew."""
 
 
 def parts_legend(air: str, *, is_guided: bool) -> str:
-    """Legend of the tables: the parts of a flight. The keys are "whole", `air`, "command" and
-    "gust"; of a guided flight "turn" and "capture" replace "command".
+    """Legend of the tables: the parts of a flight.
+
+    The keys are "whole", `air`, "command" and "gust"; of a guided flight "turn" and "capture"
+    replace "command".
     """
     after = f"to {SETTLING_DWELL:g} s after its end"
     others = f"{air}: all other times, except {SETTLING_DWELL:g} s after engagement"
@@ -75,8 +78,9 @@ def parts_legend(air: str, *, is_guided: bool) -> str:
 
 
 class Transient(NamedTuple):
-    """An engagement, a command, a gust, a turn or a capture, from the first to the last instant in
-    s of flight time.
+    """An engagement, a command, a gust, a turn or a capture.
+
+    The span is from the first to the last instant, in s of flight time.
     """
 
     kind: str  # "engagement", "command", "gust", "turn" or "capture"
@@ -85,8 +89,9 @@ class Transient(NamedTuple):
     stop: float
 
     def excites(self, channel: str) -> bool:
-        """Whether a channel is excited: a command excites a channel, any further transient every
-        channel.
+        """Whether a channel is excited.
+
+        A command excites a channel, any further transient every channel.
         """
         return self.kind != "command" or self.name == channel
 
@@ -107,10 +112,10 @@ class InputMetrics(NamedTuple):
 
 
 def tracking_error(tape: Tape) -> Signal:
-    """Measured error e = y - y_m at every y inside the time range of y_m, shape (N, m), channels of
-    y that y_m has.
+    """Measured error e = y - y_m at every y inside the time range of y_m, shape (N, m).
 
-    y_m is interpolated linearly. The law sees this error with the sensors' noise.
+    Channels of y outside of y_m are left out. y_m is interpolated linearly. The law sees this error
+    with the sensors' noise.
     """
     names = _controlled(tape)
     return _minus_reference(
@@ -119,8 +124,9 @@ def tracking_error(tape: Tape) -> Signal:
 
 
 def _controlled(tape: Tape) -> tuple[str, ...]:
-    """The channels of y that y_m has: y may have more. Raises ParameterError where they share
-    none.
+    """The channels of y that y_m has: y may have more.
+
+    Raises ParameterError where they share none.
     """
     names = tuple(name for name in tape["y"].names if name in tape["y_m"].names)
     require(
@@ -133,11 +139,10 @@ def _controlled(tape: Tape) -> tuple[str, ...]:
 
 
 def true_error(tape: Tape) -> Signal | None:
-    """True error C x - y_m at every sample of `truth` inside the time range of y_m, shape (N, m),
-    channels as above.
+    """True error C x - y_m at every sample of `truth`, shape (N, m), inside the time of y_m.
 
-    Errors of the sensors are excluded, lost samples included. None unless `truth` has "x.output"
-    for every channel, as in a simulation.
+    The channels are as in `tracking_error`. Errors of the sensors are excluded, lost samples
+    included. None unless `truth` has "x.output" for every channel, as in a simulation.
     """
     if "truth" not in tape:
         return None
@@ -214,8 +219,9 @@ def engagements(tape: Tape) -> list[Transient]:
 
 
 def live_commands(tape: Tape) -> list[Transient]:
-    """Changes of a live command, from `u_m`. Changes of a channel less than SETTLING_DWELL apart
-    are a single transient.
+    """Changes of a live command, from `u_m`.
+
+    Changes of a channel less than SETTLING_DWELL apart are a single transient.
     """
     if "u_m" not in tape:
         return []
@@ -237,10 +243,10 @@ def live_commands(tape: Tape) -> list[Transient]:
 
 
 def guided_transients(tape: Tape) -> list[Transient]:
-    """Turns and captures of a guided flight, from `guidance`, as `parts_legend` says; `u_m` never
-    rests.
+    """Turns and captures of a guided flight, from `guidance`, as `parts_legend` says.
 
-    Transients of a kind less than SETTLING_DWELL apart are a single transient.
+    `u_m` never rests then. Transients of a kind less than SETTLING_DWELL apart are a single
+    transient.
     """
     if "guidance" not in tape:
         return []
@@ -263,10 +269,10 @@ def guided_transients(tape: Tape) -> list[Transient]:
 def mask_spans(
     t: FloatArray, mask: NDArray[np.bool_], min_length: float = 0.0
 ) -> list[tuple[float, float]]:
-    """Start and stop of the runs of True in a mask of shape (N,), s; a run stops at the next False
-    sample.
+    """Start and stop of the runs of True in a mask of shape (N,), s.
 
-    Spans less than `min_length` apart are merged, and shorter spans are lengthened to `min_length`.
+    A run stops at the next False sample. Spans less than `min_length` apart are merged, and shorter
+    spans are lengthened to `min_length`.
     """
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]])))
     spans: list[tuple[float, float]] = []
@@ -282,9 +288,7 @@ def mask_spans(
 def in_spans(
     t: FloatArray, spans: Iterable[tuple[float, float]], settle: float = 0.0
 ) -> NDArray[np.bool_]:
-    """Mask of the ascending instants t inside a span or up to `settle` seconds later, shape
-    (N,).
-    """
+    """Mask of the ascending instants t inside a span or up to `settle` s later, shape (N,)."""
     inside = np.zeros(len(t), dtype=bool)
     for start, stop in spans:
         inside[np.searchsorted(t, start) : np.searchsorted(t, stop + settle, side="right")] = True
@@ -297,11 +301,11 @@ def part_masks(
     settle: float = SETTLING_DWELL,
     air: str = CALM,
 ) -> dict[str, NDArray[np.bool_]]:
-    """Masks of the instants t of shape (N,) by part of the flight: "whole", `air`, "command",
-    "gust".
+    """Masks of the instants t of shape (N,) by part of the flight.
 
-    Of a guided flight "capture" and "turn" replace "command". An instant counts to the last
-    matching part in this order. `air` has no transient of any kind.
+    The parts are "whole", `air`, "command" and "gust". Of a guided flight "capture" and "turn"
+    replace "command". An instant counts to the last matching part in this order. `air` has no
+    transient of any kind.
     """
     kinds = {transient.kind for transient in transients}
     commands = ["capture", "turn"] if kinds & {"capture", "turn"} else ["command"]
@@ -321,11 +325,10 @@ def part_masks(
 
 
 def sample_times(stamp_ns: NDArray[np.int64]) -> FloatArray:
-    """Time that a sample stands for, s, shape (N,): half of the intervals to both neighbours, each
-    at most LONGEST_INTERVAL.
+    """Time that a sample stands for, s, shape (N,).
 
-    The first and the last sample stand for a whole interval, so that equal intervals give equal
-    times.
+    A sample has half of the intervals to the neighbours, at most LONGEST_INTERVAL long. The first
+    and the last sample stand for a whole interval, so that equal intervals give equal times.
     """
     if len(stamp_ns) < 2:
         return np.ones(len(stamp_ns))
@@ -366,8 +369,9 @@ def error_metrics(errors: ArrayLike, times: FloatArray | None = None) -> ErrorMe
 
 
 def known_entries(learned: Signal) -> list[str]:
-    """Entries of A and B in samples of `learned` whose least deviation is below MAX_DEVIATION of
-    the value.
+    """Entries of A and B in samples of `learned` that the flight shows.
+
+    Their least deviation is below MAX_DEVIATION of the value.
     """
     values = learned.group("value")
     deviations = learned.group("deviation")
@@ -401,11 +405,10 @@ def errors_by_part(
 
 
 def settling_bands(tape: Tape) -> dict[str, float]:
-    """Half-width of the settling band by channel, SI: SETTLING_BAND max abs(y_m), or max abs(e)
-    where y_m is zero.
+    """Half-width of the settling band by channel, SI: SETTLING_BAND max abs(y_m).
 
-    The band of a measured error is at least MIN_BAND_NOISE_FLOORS noise floors wide, else noise
-    alone leaves it.
+    Where y_m is zero max abs(e) takes the place of max abs(y_m). The band of a measured error is at
+    least MIN_BAND_NOISE_FLOORS noise floors wide, else noise alone leaves it.
     """
     kind, error = best_error(tape)
     floors = noise_floor(tape) if kind == MEASURED_ERROR else {}
@@ -425,11 +428,10 @@ def settling_bands(tape: Tape) -> dict[str, float]:
 def settling_time(
     t: FloatArray, e: FloatArray, band: float, leaves: float, dwell: float = SETTLING_DWELL
 ) -> float | None:
-    """Time from t[0] until abs(e) <= band holds for `dwell` s or to the last sample, s. Shapes
-    (N,).
+    """Time from t[0] until abs(e) <= band holds for `dwell` s or to the last sample, s.
 
-    0 where abs(e) stays in the band for the first `leaves` s: a later excursion has a different
-    cause. None where abs(e) does not return to the band, or there is no sample.
+    Shapes (N,). 0 where abs(e) stays in the band for the first `leaves` s: a later excursion has a
+    different cause. None where abs(e) does not return to the band, or there is no sample.
     """
     if len(t) == 0:
         return None
@@ -452,11 +454,11 @@ class Settling(NamedTuple):
 
 
 def settling_times(tape: Tape, transients: Sequence[Transient]) -> list[Settling]:
-    """Settling time of `best_error` into `settling_bands` from the start of the transients, by
-    excited channel.
+    """Settling times of `best_error` into `settling_bands`, by excited channel.
 
-    The time counts up to the next transient of the channel. Transients after the end of the flight
-    are left out, and turns and captures, whose commands move to the end.
+    A time begins with the start of a transient. The time counts up to the next transient of the
+    channel. Transients after the end of the flight are left out, and turns and captures, whose
+    commands move to the end.
     """
     _, error = best_error(tape)
     t = (error.stamp_ns - tape.start_ns) / 1e9
@@ -491,11 +493,10 @@ def inputs_by_part(
     topic: str = "u",
     air: str = CALM,
 ) -> dict[str, dict[str, InputMetrics]]:
-    """Control effort by input and part: rms and max abs(u) about trim, and mean abs(u_dot); of y
-    with `topic`.
+    """Control effort by input and part: rms and max abs(u) about trim, and mean abs(u_dot).
 
-    mean abs(u_dot) = sum abs(u_k - u_(k-1)) / sum (t_k - t_(k-1)) over the steps with an end in the
-    part; NaN without a step.
+    `topic` y gives the same of y. mean abs(u_dot) = sum abs(u_k - u_(k-1)) / sum (t_k - t_(k-1))
+    over the steps with an end in the part; NaN without a step.
     """
     if topic not in tape:
         return {}
@@ -517,8 +518,9 @@ def inputs_by_part(
 
 
 def saturation_shares(tape: Tape) -> dict[str, dict[str, float]]:
-    """Fraction of the ticks with a saturated input, by input and by kind of saturation:
-    "magnitude", "rate".
+    """Fraction of the ticks with a saturated input, by input and by kind of saturation.
+
+    The kinds are "magnitude" and "rate".
     """
     limited = tape["internals"].group("limited") if "internals" in tape else None
     if limited is None or len(limited.stamp_ns) == 0:

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Replay of guidance: every step computed again from the logged inputs and the state of the sample
-before.
+"""Replay of guidance from the log: every step is computed again.
+
+A step has the logged inputs and the state of the sample before.
 """
 
 from collections.abc import Iterator, Mapping
@@ -43,9 +44,7 @@ def _waypoints(rows: FloatArray) -> list[Waypoint]:
 
 
 def known_routes(tape: Tape, parameters: GuidanceConfig) -> dict[int, Route]:
-    """The route of the section and the routes of the topic `route`, by digest, as `guidance` logs
-    them.
-    """
+    """Routes of the section and of the topic `route`, by digest as in the log of guidance."""
     lists = [list(parameters.waypoints())]
     if "route" in tape:
         received = tape["route"]

@@ -17,9 +17,7 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 
 
 class LearnerResult(NamedTuple):
-    """Result of an identification in flight: parameters to fly with, or the reason why there are
-    none.
-    """
+    """Result of an identification in flight: parameters to fly with, or why there are none."""
 
     controller: RiseDiConfig | None
     sentence: str
@@ -31,8 +29,9 @@ class Learner(Protocol):
     has_fallen_back: bool  # whether the law fell back with the last tick
 
     def take(self, stamp_ns: int, y: FloatArray, u: FloatArray, flown: int) -> None:
-        """Take y and u, after its limits, of a tick of the engaged law, (m,), and the digest of its
-        parameters.
+        """Take y and u, (m,), and the digest of the parameters of a tick of the engaged law.
+
+        u is after the limits.
         """
 
     def propose(self, flown: int, given_up: Sequence[str]) -> LearnerResult:
@@ -47,10 +46,10 @@ Learn = Callable[[RiseDiConfig], Learner]
 
 
 class Entry(NamedTuple):
-    """An entry of A or B: its nominal value in SI, its relative error, and the standard deviation
-    of that after the flight.
+    """An entry of A or B with the error by the flight.
 
-    Where the nominal value is 0 both are in parts of another `unit`.
+    The fields are the nominal value in SI, the relative error, and the standard deviation of the
+    error after the flight. Where the nominal value is 0 both are in parts of another `unit`.
     """
 
     matrix: str
@@ -73,8 +72,10 @@ class Entry(NamedTuple):
 
 
 class Learned(NamedTuple):
-    """Channels of the topic `learned`: `proposed`, and value and deviation of entries of A and B in
-    the rows of the outputs.
+    """Channels of the topic `learned`.
+
+    They are `proposed`, and the value and the deviation of entries of A and B in the rows of the
+    outputs.
     """
 
     names: tuple[str, ...]
@@ -117,8 +118,9 @@ class Identifications:
 
 
 def as_received(proposal: LearnerResult, start: RiseDiConfig, end_ns: int, flown: int) -> Proposal:
-    """A proposal as the controller receives it: with the end of its window, and the digest of what
-    flew then.
+    """A proposal as the controller receives it.
+
+    The proposal has the end of the window, and the digest of the parameters in force there.
     """
     change = {} if proposal.controller is None else designed(start, proposal.controller)
     return Proposal(end_ns, start.digest(), flown, change, proposal.sentence)
@@ -154,8 +156,9 @@ class ProposalStation:
 
 
 class LearnerStation:
-    """The learner: records of the ticks of the controller, and a proposal where an identification
-    is due.
+    """The learner: records of the ticks of the controller, and proposals.
+
+    A proposal is made where an identification is due.
     """
 
     def __init__(

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Replay of a recorded flight: every tick of the controller computed again from the logged inputs
-and compared bit by bit.
+"""Replay of a recorded flight: every tick of the controller is computed again.
+
+The inputs come from the log, and every tick is compared bit by bit.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -53,8 +54,9 @@ class Difference(NamedTuple):
 
 
 class ReplayResult(NamedTuple):
-    """The N ticks of a log as recorded and as computed, in k channels: the channels of `internals`,
-    then of the topic u.
+    """The N ticks of a log as recorded and as computed, in k channels.
+
+    First come the channels of `internals`, then the channels of u.
     """
 
     names: tuple[str, ...]
@@ -86,8 +88,9 @@ class ReplayResult(NamedTuple):
         return not self.different().any() and not self.other_parameters.any()
 
     def first(self) -> Difference | None:
-        """The first difference in the first different tick, in a channel of u if possible; None
-        without a difference.
+        """The first difference in the first different tick; None without a difference.
+
+        A channel of u goes before a channel of `internals`.
         """
         different = self.different()
         rows = np.flatnonzero(different.any(axis=1))
@@ -120,8 +123,9 @@ class ReplayResult(NamedTuple):
 
 
 def recorded_parameters(scenario: StoredFile) -> ControllerConfig:
-    """The controller's section of the scenario in a log; further sections are not validated. Raises
-    ParameterError.
+    """The parameters of the controller in the scenario of a log.
+
+    Further sections are not validated. Raises ParameterError.
     """
     sections = parse_scenario_sections(scenario.content, Path(scenario.name))
     return AnyLaw.validate_mapping(sections["controller"], "controller")
@@ -305,7 +309,8 @@ class _Steps:
 def _recorded(
     run: Tape | RecordedRun, parameters: ControllerConfig | None, changes: Sequence[Change] | None
 ) -> tuple[Tape, ControllerConfig, Sequence[Change]]:
-    """The tape of a run, with the parameters and the changes of the run where none are given.
+    """The tape of a run, with the parameters and the changes of the run for None.
+
     Raises ParameterError.
     """
     if isinstance(run, Tape):
@@ -329,8 +334,9 @@ def _recorded(
 
 
 def recorded_changes(run: RecordedRun, parameters: ControllerConfig) -> Sequence[Change]:
-    """The changes in flight of the parameters of the recorded controller, in order; those of the
-    tape without a log.
+    """The changes in flight of the parameters of the recorded controller, in order.
+
+    Without a log the changes of the tape are taken.
     """
     if run.path is None:
         return run.tape.changes
@@ -372,8 +378,9 @@ def _few(notes: Sequence[str]) -> tuple[str, ...]:
 
 
 def _controller_at(processes: Mapping[str, Process], stamp_ns: int) -> str:
-    """The name of the last controller to begin before an instant, after a comma; empty where the
-    log has no name.
+    """The name of the last controller to begin before an instant, after a comma.
+
+    Empty where the log has no name.
     """
     known = [
         (process.first_ns, name)

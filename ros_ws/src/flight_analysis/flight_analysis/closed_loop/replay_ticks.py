@@ -31,8 +31,9 @@ Change = Mapping[str, Any]
 
 
 def vary(parameters: ControllerConfig, changes: Mapping[str, Any]) -> ControllerConfig:
-    """Parameters with changes by dotted name, validated; None removes a parameter. Raises
-    ParameterError.
+    """Parameters with changes by dotted name, validated; None removes a parameter.
+
+    Raises ParameterError.
     """
     return AnyLaw.validate_mapping(parameters.changed(changes), "controller")
 
@@ -60,8 +61,9 @@ class ParametersInForce:
     def change(
         self, digest: int, number: int, state: ControllerState | None
     ) -> ControllerState | None:
-        """Apply the changes up to the parameters with a digest, if any. Returns the state
-        afterwards.
+        """Apply the changes up to the parameters with a digest, if any.
+
+        Returns the state afterwards.
         """
         if digest == self.digest or digest in self._unmatched:
             return state
@@ -137,8 +139,9 @@ class Ticks:
     def state(
         self, k: int, limits: GuardParams, law: TunedLaw, computed: ControllerState | None = None
     ) -> ControllerState:
-        """The recorded state after a tick. Values outside the log come from the computed state, if
-        any.
+        """The recorded state after a tick.
+
+        Values outside the log come from the computed state, if there is one.
         """
         row = {name: values[k] for name, values in self._groups.items()}
         law_state = restored(law.control_law, row)
@@ -173,8 +176,9 @@ class Ticks:
     def tick(
         self, k: int, state: ControllerState, limits: GuardParams, law: TunedLaw
     ) -> tuple[ControllerState, FloatArray]:
-        """A tick: (state afterwards, row of `internals`); the row is NaN for a tick without
-        output.
+        """A tick: (state afterwards, row of `internals`).
+
+        The row is NaN for a tick without output.
         """
         stamp_ns = int(self.stamp_ns[k])
         y = None
@@ -212,8 +216,9 @@ class Ticks:
 
 
 def _checked_internals(tape: Tape, names: Sequence[str]) -> Signal:
-    """The channels `names` of `internals`, in this order. Raises ParameterError for other channels
-    or values.
+    """The channels `names` of `internals`, in this order.
+
+    Raises ParameterError for other channels or values.
     """
     require(
         "internals" in tape,
@@ -258,8 +263,9 @@ def _tick_order(
 def _as_published(
     tape: Tape, topic: str, names: Sequence[str], stamp_ns: NDArray[np.int64], otherwise: FloatArray
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Samples of a topic at these stamps, shape (N, m), else the values `otherwise`; and the mask
-    of stamps with a sample.
+    """Samples of a topic at these stamps, shape (N, m), and the mask of stamps with a sample.
+
+    A stamp without a sample has the values of `otherwise`.
     """
     matched = np.zeros(len(stamp_ns), dtype=bool)
     if topic not in tape or not set(names) <= set(tape[topic].names):

@@ -68,11 +68,11 @@ class Scenario:
 
     @classmethod
     def from_parts(cls, name: str, **sections: Mapping[str, Any] | Config) -> "Scenario":
-        """A scenario without a file: flight, aircraft, reference_model, controller and, if any,
-        recorder and guidance.
+        """A scenario without a file.
 
-        The value of a section is a mapping of parameters, or a parameter set. Lists may be arrays.
-        Without `recorder` the recorder writes at RECORDER_RATE.
+        The sections are flight, aircraft, reference_model, controller and, if any, recorder and
+        guidance. The value of a section is a mapping of parameters, or a parameter set. Lists may
+        be arrays. Without `recorder` the recorder writes at RECORDER_RATE.
 
         Args:
             name: Name of the scenario.
@@ -156,8 +156,9 @@ class Scenario:
         return values
 
     def rise_di(self) -> RiseDiConfig:
-        """The parameters of a controller with RISE-DI. Raises ParameterError for a different
-        law.
+        """The parameters of a controller with RISE-DI.
+
+        Raises ParameterError for a different law.
         """
         if not isinstance(self.controller, RiseDiConfig):
             expected = "rise_di, which has the gains of (20) to (22)"
@@ -182,8 +183,9 @@ class Scenario:
         return "wind" if any(aircraft.wind) else "calm"
 
     def gust_windows(self) -> dict[str, tuple[float, float]]:
-        """Start and stop of the gusts, s: entry and entry + 2 H / V0. A repeated gust has a number
-        from the second time on.
+        """Start and stop of the gusts, s: entry and entry + 2 H / V0.
+
+        A repeated gust has a number from the second time on.
         """
         speed = self.aircraft.channels().speed
         windows = {}
@@ -318,10 +320,10 @@ def guidance_by_rule(
 def scenario_yaml(
     scenario: Scenario, overrides: Mapping[str, Mapping[str, Any]] | None = None
 ) -> str:
-    """The text of a scenario file with every parameter, defaults included. `overrides` replace
-    parameters by section.
+    """The text of a scenario file with every parameter, defaults included.
 
-    A parameter with the value None or empty, the default, is left out.
+    `overrides` replace parameters by section. A parameter with the value None or empty, the
+    default, is left out.
 
     Args:
         scenario: The scenario to write.
@@ -407,8 +409,9 @@ def check_together(scenario: Scenario) -> None:
 
 
 def limits_beyond_stops(scenario: Scenario) -> tuple[str, ...]:
-    """A sentence for each limit of the controller outside the end stops of the actuators: the
-    anti-windup starts too late.
+    """A sentence for each limit of the controller outside the end stops of the actuators.
+
+    There the anti-windup starts too late.
     """
     controller = scenario.controller
     actuators = scenario.aircraft.actuators
@@ -440,10 +443,10 @@ def limits_beyond_stops(scenario: Scenario) -> tuple[str, ...]:
 
 
 def require_guidable(scenario: Scenario) -> None:
-    """Raise ParameterError where guidance would fly a simulated airframe that a bank does not turn,
-    or from outside of a fence.
+    """Raise ParameterError for a scenario that guidance cannot fly.
 
-    Behind a bridge the airframe of the scenario does not fly.
+    A bank does not turn the simulated airframe, or the flight begins outside of a fence. Behind a
+    bridge the airframe of the scenario does not fly.
     """
     aircraft = scenario.aircraft
     guidance = scenario.guidance
@@ -512,8 +515,10 @@ def _check_guidance(scenario: Scenario, guidance: GuidanceConfig) -> None:
 
 
 def opposite_signs(scenario: Scenario) -> tuple[str, ...]:
-    """A sentence where D contradicts the signs of C B of the airframe file: the law then drives y
-    away from y_m. None beside an allocation, or without an airframe file.
+    """A sentence where D contradicts the signs of C B of the airframe file.
+
+    The law then drives y away from y_m. There is none beside an allocation, or without an airframe
+    file.
     """
     controller = scenario.controller
     aircraft = scenario.aircraft

@@ -64,10 +64,10 @@ def with_route(
     waypoints: Sequence[Waypoint],
     fence: Mapping[str, Any] = MappingProxyType({}),
 ) -> Scenario:
-    """The scenario with a route that guidance flies from the start, in place of its route and its
-    program of targets.
+    """The scenario with a route that guidance flies from the start.
 
-    `fence`: further sections of guidance, as of `read_fence_file`.
+    The route of the scenario and the program of targets give way. `fence`: further sections of
+    guidance, as of `read_fence_file`.
 
     Raises ParameterError where it cannot be flown.
     """
@@ -90,8 +90,9 @@ def with_route(
 
 
 def written(scenario: Scenario, path: Path) -> Scenario:
-    """A scenario that differs from its file, as a file of its own. Raises ParameterError where it
-    cannot be written.
+    """A scenario that differs from its file, as a file of its own.
+
+    Raises ParameterError where it cannot be written.
     """
     with writing("", path, "a folder that can"):
         write_file(path, scenario_yaml(scenario))

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The closed loop in one process, without ROS: the code of the nodes, called in the order of the
-data flow.
+"""The closed loop in one process, without ROS.
+
+The code of the nodes is called in the order of the data flow.
 """
 
 from collections.abc import Callable, Mapping
@@ -62,11 +63,11 @@ def simulate(
     learn: Learn | None = None,
     announce: Callable[[Event], None] = lambda event: None,
 ) -> Tape:
-    """The tape of a flight in memory, SI and radians, with the reason of an early end. Raises
-    ParameterError for no Scenario, and for one that learns without `learn`.
+    """The tape of a flight in memory, SI and radians, with the reason of an early end.
 
-    `progress` is called with the flight time, s, once per simulated second. `announce` takes the
-    events of the learning.
+    Raises ParameterError for no Scenario, and for one that learns without `learn`. `progress` is
+    called with the flight time, s, once per simulated second. `announce` takes the events of the
+    learning.
     """
     as_scenario(scenario)
     change = (
@@ -102,13 +103,13 @@ def fly(
     learn: Learn | None = None,
     announce: Callable[[Event], None] = lambda event: None,
 ) -> Outcome:
-    """Fly a scenario and return the outcome. `record` takes the samples once per simulated second
-    and at the end.
+    """Fly a scenario and return the outcome.
 
-    `progress` is called with the flight time after `record`. `guide` makes the guidance of a
-    scenario with guidance; the default receives the true pose. `control` makes the controller.
-    `learn` makes the learner of a scenario that learns, and `announce` takes the events of the
-    learning. Raises ParameterError for such a scenario without `learn`.
+    `record` takes the samples once per simulated second and at the end. `progress` is called with
+    the flight time after `record`. `guide` makes the guidance of a scenario with guidance; the
+    default receives the true pose. `control` makes the controller. `learn` makes the learner of a
+    scenario that learns, and `announce` takes the events of the learning. Raises ParameterError for
+    such a scenario without `learn`.
 
     Order at an instant: y of the aircraft, y_m of the reference model, u_m of guidance, proposals
     of the learner, u of the controller. A flight that diverges or is interrupted (Ctrl-C) ends

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The loop of a flight in one process: stations with the code of the nodes step in the order of the
-data flow.
+"""The loop of a flight in one process.
+
+Stations with the code of the nodes step in the order of the data flow.
 """
 
 import math
@@ -50,8 +51,9 @@ class Loop:
         self.t_ns = -self._base_ns
 
     def run(self, end_ns: int) -> None:
-        """Step up to and including the instant `end_ns`. `t_ns` is the present instant, also after
-        an error.
+        """Step up to and including the instant `end_ns`.
+
+        `t_ns` is the present instant, also after an error.
         """
         for t_ns in range(self.t_ns + self._base_ns, end_ns + 1, self._base_ns):
             self.t_ns = t_ns
@@ -61,9 +63,7 @@ class Loop:
 
 
 class Topics:
-    """The samples of the topics: kept for the tape, if `recorded`, and handed to the
-    subscribers.
-    """
+    """The samples of the topics, handed to the subscribers and, if `recorded`, kept."""
 
     def __init__(self, *, recorded: bool = True) -> None:
         self._recorded = recorded
@@ -81,8 +81,9 @@ class Topics:
         return self._names[topic]
 
     def subscribe(self, topic: str, take: Take, channels: Sequence[str] | None = None) -> None:
-        """Hand each sample of a topic to `take`: these channels in this order; None: all
-        channels.
+        """Hand each sample of a topic to `take`.
+
+        `channels` of the topic come in this order; None: every channel.
         """
         self._subscriptions[topic].append((channels, take))
 

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Proof that each aircraft of a box is stable where one bound of the whole box is too large: the
-box is halved along one parameter, and each half again, over the frequencies that are left.
+"""Proof of stability for every aircraft of a box, where a bound of the whole box is too large.
 
+The box is halved along one parameter, and each half again, over the frequencies that are left.
 Source: M. P. Newlin, P. M. Young, International Journal of Robust and Nonlinear Control 7, 1997.
 """
 
@@ -55,11 +55,11 @@ class Region(NamedTuple):
 
 
 def boxes_until_proved(part: Channels, size: float, disk: float, most: int) -> int | None:
-    """The number of boxes bounded until the loop is proved stable for all abs(d_i) <= size, every
-    delay of the part and complex disks of a size in its channels of disks; None if `most` are not
-    enough.
+    """The number of boxes bounded until the loop is proved stable; None if `most` are too few.
 
-    The loop of d = 0 is stable. None of the box has a mode on abs(z) = RADIUS, so none leaves.
+    The proof holds for every abs(d_i) <= size, every delay of the part, and complex disks of a size
+    in the channels of disks. The loop of d = 0 is stable. None of the box has a mode on abs(z) =
+    RADIUS, so none leaves.
     """
     highest = np.pi / part.period
     half = np.r_[np.full(len(part.entries), size), np.ones(part.late)]
@@ -85,8 +85,9 @@ def boxes_until_proved(part: Channels, size: float, disk: float, most: int) -> i
 
 
 def _from_zero(part: Channels, near: Scaling, scale: FloatArray) -> tuple[float, float] | None:
-    """The frequencies from 0 on at which a D and a G hold that fit a slow motion: a delay has no
-    effect at 0 rad/s, so that the D of 0 may hold nowhere above.
+    """The frequencies from 0 on at which a D and a G hold that fit a slow motion.
+
+    A delay has no effect at 0 rad/s, so that the D of 0 may hold nowhere above.
     """
     slow = SLOW * np.pi / part.period
     M = scale[:, None] * part.response(slow, RADIUS)

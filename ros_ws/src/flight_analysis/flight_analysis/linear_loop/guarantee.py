@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What holds for every aircraft of a box: up to which deviation the loop is stable, and which disk
-margins remain.
+"""What holds for every aircraft of a box.
 
-The deviations are constant in time and the loop is linear: no saturation, no rate limit.
+The guarantee has the deviation up to which the loop is stable, and the remaining disk margins. The
+deviations are constant in time and the loop is linear: no saturation, no rate limit.
 """
 
 from typing import NamedTuple
@@ -62,8 +62,10 @@ class Guarantee(NamedTuple):
 
 
 def guarantee(linear: LinearLoop, late: float = 0.0) -> Guarantee:
-    """The guarantee for the box of a loop, with u late by an unknown constant time of 0 to `late`,
-    s, in each input. Raises ParameterError for a loop without a box.
+    """The guarantee for the box of a loop, with u late in each input.
+
+    u is late by an unknown constant time of 0 to `late`, s. Raises ParameterError for a loop
+    without a box.
     """
     box = linear.box
     require(box is not None, "uncertainty", "0", "an uncertainty above 0 for a guarantee")
@@ -117,8 +119,10 @@ def _disk(whole: UncertainLoop, inputs: tuple[int, ...], least: float) -> float:
 
 
 def _proved(parts: list[Channels], least: float, *, disks: bool, exact: bool = False) -> float:
-    """The largest size proved beside the least one found that is too large, 0 for none: of the
-    deviations, or of the disks beside the whole box. With `exact` least itself may be proved.
+    """The largest size proved beside the least one found that is too large, 0 for none.
+
+    The size is of the deviations, or of the disks beside the whole box. With `exact` least itself
+    may be proved.
     """
     if exact and _boxes(parts, least, BOXES, disks=disks) is not None:
         return least

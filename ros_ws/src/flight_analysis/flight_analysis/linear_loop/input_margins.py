@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Margins of the sampled linear loop of a law at the inputs of an aircraft: phase, gain,
-sensitivity, disk margin, damping.
+"""Margins of the sampled linear loop of a law at the inputs of an aircraft.
+
+They are phase, gain, sensitivity, disk margin and damping.
 
 With P(z) from u to y, the sampled aircraft with actuators and delay, and K(z) from y to u, the law:
 
@@ -58,8 +59,9 @@ MAX_REFINED = 40
 
 
 class Margins(NamedTuple):
-    """Margins at m inputs, shapes (..., m), and of the loop as a whole, (...). An unstable loop has
-    none: 0, 1, infinite S.
+    """Margins at m inputs, shapes (..., m), and of the loop as a whole, (...).
+
+    An unstable loop has none: 0, 1, infinite S.
     """
 
     stable: NDArray[np.bool_]  # (...) whether no eigenvalue lies outside the unit circle
@@ -117,8 +119,9 @@ class SlowModes(NamedTuple):
 
 
 def slow_modes(plant: LinearPlant, law: LinearLaw, loop: Loop) -> SlowModes:
-    """The slow modes of an aircraft: p = log(eigenvalue) / T, frequency abs(p), damping -Re p /
-    abs(p).
+    """The slow modes of an aircraft: frequency abs(p) and damping -Re p / abs(p).
+
+    p = log(eigenvalue) / T.
     """
     eigenvalues = np.linalg.eigvals(closed_loop(plant, law, loop, np.zeros(len(loop.lag))))
     return _slow_modes(eigenvalues.astype(np.complex128), loop.period)
@@ -141,13 +144,13 @@ def loop_transfer(plant: LinearPlant, law: LinearLaw, loop: Loop, w: FloatArray)
 def input_margins(
     plant: LinearPlant, law: LinearLaw, loop: Loop, *, together: bool = True
 ) -> Margins:
-    """Margins of an aircraft, or of N: A (N, n, n) and B (N, n, m) of the plant, and one law or a
-    law for each of them.
+    """Margins of an aircraft, or of N aircraft.
 
-    Crossings of the grid of frequencies are refined to rounding, peaks to 1e-3 of the height. The
-    phase margin is the smallest abs(angle(-L_i)) at abs(L_i) = 1, the gain margins are 1 / abs(L_i)
-    at real L_i < 0, next to 1 on either side. The disk margin is 1 / max_w abs(S_ii - 1/2) of an
-    input, and with independent disks in the inputs at once
+    N aircraft have A (N, n, n) and B (N, n, m) of the plant, and a common law or a law for each
+    aircraft. Crossings of the grid of frequencies are refined to rounding, peaks to 1e-3 of the
+    height. The phase margin is the smallest abs(angle(-L_i)) at abs(L_i) = 1, the gain margins are
+    1 / abs(L_i) at real L_i < 0, next to 1 on either side. The disk margin is 1 / max_w abs(S_ii -
+    1/2) of an input, and with independent disks in the inputs at once
 
         1 / max_w min_D norm(D (S - I/2) D^-1, 2),  D diagonal
 
@@ -168,8 +171,10 @@ def input_margins(
 
 
 def phase_margins(plant: LinearPlant, law: LinearLaw, loop: Loop) -> FloatArray:
-    """The `phase` of `input_margins` alone, (..., m), without the search for gain margins and
-    peaks, to 1e-8: a loop with independent modes is a sum over them.
+    """The `phase` of `input_margins` alone, (..., m), to 1e-8.
+
+    There is no search for gain margins and peaks. A loop with independent modes is a sum over the
+    modes.
     """
     parts = []
     for aircraft, its_law in _batches(plant, law):
@@ -197,8 +202,9 @@ def _batch_shape(plant: LinearPlant, law: LinearLaw) -> tuple[int, ...]:
 
 
 class SchurForm(NamedTuple):
-    """The closed loop in Schur form: v = d + L (z - T)^-1 R d, from a disturbance d of the inputs
-    to v = d + u.
+    """The closed loop in Schur form, from a disturbance d of the inputs to v = d + u.
+
+    v = d + L (z - T)^-1 R d.
     """
 
     T: ComplexArray  # (N, k, k) upper triangular, or (N, k) a diagonal
@@ -243,8 +249,9 @@ def schur_form(plant: LinearPlant, law: LinearLaw, loop: Loop) -> SchurForm:
 def _modal_form(
     plant: LinearPlant, law: LinearLaw, loop: Loop
 ) -> tuple[SchurForm, NDArray[np.bool_]]:
-    """As `schur_form` with a diagonal T, and whether the modes of each loop are independent: the
-    condition of their vectors is at most MOST_CONDITION.
+    """As `schur_form` with a diagonal T, and whether the modes of a loop are independent.
+
+    They are independent where the condition of their vectors is at most MOST_CONDITION.
     """
     A, B, K = _from_inputs_to_inputs(plant, law, loop)
     eigenvalues, modes = (part.astype(np.complex128) for part in np.linalg.eig(A))
@@ -262,8 +269,9 @@ def _modal_form(
 def _from_inputs_to_inputs(
     plant: LinearPlant, law: LinearLaw, loop: Loop
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The closed loops of N aircraft from a disturbance d of the inputs to u: z+ = A z + B d, u = K
-    z.
+    """The closed loops of N aircraft from a disturbance d of the inputs to u.
+
+    z+ = A z + B d, u = K z.
     """
     no_delay = np.zeros(len(loop.lag))
     N, _, m = plant.B.shape
@@ -274,8 +282,9 @@ def _from_inputs_to_inputs(
 
 
 def _sensitivity(form: SchurForm, z: ComplexArray) -> ComplexArray:
-    """S at the points z (N, F), shape (N, F, m, m), by back substitution for the points of a part
-    at once; with a diagonal T a sum over the modes.
+    """S at the points z (N, F), shape (N, F, m, m), by back substitution.
+
+    The points of a part are solved at once. With a diagonal T, S is a sum over the modes.
     """
     (N, k, m), F = form.R.shape, z.shape[1]
     if form.T.ndim == z.ndim:
@@ -345,8 +354,9 @@ def _loop_of_sensitivity(S: ComplexArray) -> ComplexArray:
 
 
 def _frequencies(eigenvalues: ComplexArray, period: float) -> FloatArray:
-    """Grids of the aircraft, (N, F), rad/s, ascending: a common grid, and the frequencies of the
-    modes.
+    """Grids of the aircraft, (N, F), rad/s, ascending.
+
+    They are a common grid, and the frequencies of the modes.
     """
     highest = np.pi / period
     turns = np.log(np.where(np.abs(eigenvalues) > VANISHED, eigenvalues, VANISHED)) / period
@@ -357,8 +367,9 @@ def _frequencies(eigenvalues: ComplexArray, period: float) -> FloatArray:
 
 
 def _around_peaks(S: ComplexArray, w: FloatArray) -> FloatArray:
-    """Four points on either side of the peaks of S_ii, of S_ii - 1/2 and of norms over the inputs,
-    (N, G), S balanced.
+    """Four points on either side of each peak, (N, G).
+
+    S_ii, S_ii - 1/2 and norms over the inputs, S balanced, have the peaks.
     """
     diagonal = np.einsum("NFii->NFi", S)
     half = S - np.eye(S.shape[-1]) / 2.0
@@ -393,8 +404,9 @@ def _refined(
     period: float,
     residual: Callable[[ComplexArray], FloatArray],
 ) -> tuple[FloatArray, ComplexArray]:
-    """Frequencies of residual(L_i) = 0 in the intervals of some crossings, and L_i there: regula
-    falsi, Illinois.
+    """Frequencies of residual(L_i) = 0 in the intervals of some crossings, and L_i there.
+
+    The method is regula falsi, Illinois.
     """
     aircraft, place, channel = places
     # of the input of each crossing alone
@@ -450,8 +462,9 @@ def _phase_margins(
 def _gain_margins(
     form: SchurForm, w: FloatArray, L: ComplexArray, period: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Factors next to 1 below and above for L_i = -1, (N, m); L_i is real at w = 0 and at pi / T
-    too.
+    """Factors next to 1 below and above for L_i = -1, (N, m).
+
+    L_i is real at w = 0 and at pi / T too.
     """
     imaginary = np.imag(L) / (1.0 + np.abs(L))
     imaginary[:, -1] = 0.0  # rounding apart
@@ -488,8 +501,9 @@ def _narrow(decrease: FloatArray, increase: FloatArray, place: tuple[int, int], 
 
 
 def _balanced(matrices: ComplexArray) -> ComplexArray:
-    """D M D^-1, (..., m, m), with about equal norms of row i and column i without the diagonal:
-    Osborne's iteration.
+    """D M D^-1, (..., m, m), with about equal norms of row i and column i without the diagonal.
+
+    The method is Osborne's iteration.
     """
     M = matrices.copy()
     off = ~np.eye(matrices.shape[-1], dtype=bool)
@@ -513,12 +527,11 @@ def norm_bound(matrices: ComplexArray) -> FloatArray:
 
 
 def scaled_norm(matrices: ComplexArray) -> FloatArray:
-    """min_D norm(D M D^-1, 2) over diagonal D > 0, M (P, m, m): the bound of the structured
-    singular value, (P,).
+    """min_D norm(D M D^-1, 2) over diagonal D > 0, M (P, m, m), shape (P,).
 
-    Osborne's iteration, then descent along d log norm / d log D_i = abs(u_i)^2 - abs(v_i)^2, u and
-    v the singular vectors. Any D gives an upper bound: an early end is conservative. Source: A.
-    Packard, J. Doyle, Automatica 29(1), 1993.
+    The result bounds the structured singular value. Osborne's iteration, then descent along d log
+    norm / d log D_i = abs(u_i)^2 - abs(v_i)^2, u and v the singular vectors. Any D gives an upper
+    bound: an early end is conservative. Source: A. Packard, J. Doyle, Automatica 29(1), 1993.
     """
     M = _balanced(matrices)
     best = np.full(len(M), np.inf)
@@ -531,8 +544,9 @@ def scaled_norm(matrices: ComplexArray) -> FloatArray:
 
 
 def _largest_norm(balanced: ComplexArray) -> FloatArray:
-    """Largest `scaled_norm` over the second axis of (N, F, m, m): the peak of an upper bound is
-    refined to convergence.
+    """Largest `scaled_norm` over the second axis of (N, F, m, m).
+
+    The peak of an upper bound is refined to convergence.
     """
     bounds = norm_bound(balanced)
     rows = np.arange(len(balanced))

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Guarantees that were computed, kept by the loop: a report shows the one of its loop, and computes
-none.
+"""Computed guarantees, kept by the loop.
 
-The folder is rise-di/guarantees in $XDG_CACHE_HOME, or in ~/.cache. A file is named by the digest
-of the nominal loop and of the shape of its box, so that a changed gain, airframe, allocation or
-deviation of an entry has none. The size of the box is in the guarantee.
+A report shows the guarantee of the loop, and computes none. The folder is rise-di/guarantees in
+$XDG_CACHE_HOME, or in ~/.cache. A file is named by the digest of the nominal loop and of the shape
+of its box, so that a changed gain, airframe, allocation or deviation of an entry has none. The size
+of the box is in the guarantee.
 """
 
 import hashlib

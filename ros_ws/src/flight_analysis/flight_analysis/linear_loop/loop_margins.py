@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Margins of the linear loop of a scenario under the law of its controller, on the nominal and on
-uncertain aircraft.
+"""Margins of the linear loop of a scenario under the law of the controller.
+
+They are taken on the nominal and on uncertain aircraft.
 """
 
 from typing import Any, NamedTuple
@@ -75,13 +76,12 @@ def margins(
     seed: int = 1,
     spread: Spread = UNIFORM,
 ) -> LoopMargins:
-    """Margins of a scenario's loop: of the nominal aircraft, and the least that a search finds
-    among uncertain aircraft.
+    """Margins of a scenario's loop, and the least among uncertain aircraft.
 
-    Every entry of A and B of an uncertain aircraft is off by up to `uncertainty`, or as `spread`
-    says, the rows of angles excepted. Samples count for the number of stable aircraft alone: the
-    least margins are at corners, where none falls. The controller gives lags and delay. The
-    uncertainty of the scenario itself is left out.
+    A search finds the least. Every entry of A and B of an uncertain aircraft is off by up to
+    `uncertainty`, or as `spread` says, the rows of angles excepted. Samples count for the number of
+    stable aircraft alone: the least margins are at corners, where none falls. The controller gives
+    lags and delay. The uncertainty of the scenario itself is left out.
 
     Args:
         scenario: The flight: aircraft and controller.
@@ -189,8 +189,9 @@ def scenario_loop(
     seed: int = 1,
     spread: Spread = UNIFORM,
 ) -> LinearLoop:
-    """The loop of a controller around the nominal and uncertain aircraft of a scenario. Raises as
-    `margins`.
+    """The loop of a controller around the nominal and uncertain aircraft of a scenario.
+
+    Raises as `margins`.
     """
     airframe = _model(scenario, controller)
     A, B = nominal_and_sampled(airframe, uncertainty, aircraft, seed, spread)
@@ -204,10 +205,9 @@ def scenario_loop(
 def linear_loop(
     controller: ControllerConfig, airframe: Airframe, A: FloatArray, B: FloatArray
 ) -> LinearLoop:
-    """The loop of a controller around N aircraft, A (N, n, n) and B (N, n, m) with the states and
-    channels of an airframe.
+    """The loop of a controller around N aircraft, A (N, n, n) and B (N, n, m).
 
-    Raises ParameterError for the literal sign.
+    An airframe has the states and channels. Raises ParameterError for the literal sign.
     """
     rows, columns = law_order(airframe, controller)
     loop = loop_of(controller)
@@ -234,8 +234,9 @@ def box_of(
     uncertainty: float,
     spread: Spread = UNIFORM,
 ) -> Box:
-    """The box of the aircraft that `nominal_and_sampled` draws around an airframe file, in the
-    law's order; behind an allocation B of each effector is uncertain.
+    """The box of the aircraft that `nominal_and_sampled` draws around an airframe file.
+
+    The channels are in the law's order. Behind an allocation B of every effector is uncertain.
     """
     seen = through_allocation(airframe, controller)
     T = distribution(airframe, controller)[:, law_order(seen, controller)[1]]
@@ -261,8 +262,9 @@ def _some(plant: LinearPlant, chosen: slice) -> LinearPlant:
 
 
 def through_allocation(airframe: Airframe, controller: ControllerConfig) -> Airframe:
-    """The airframe that the law of a controller sees: with its inputs v, u = T v; without an
-    allocation as it is.
+    """The airframe as the law of a controller sees it: with the inputs v, u = T v.
+
+    Without an allocation the airframe stays.
     """
     if not _has_effectors(airframe, controller):
         return airframe
@@ -270,8 +272,9 @@ def through_allocation(airframe: Airframe, controller: ControllerConfig) -> Airf
 
 
 def distribution(airframe: Airframe, controller: ControllerConfig) -> FloatArray:
-    """T (p, m) with the rows in the order of the inputs of an airframe; I without an allocation of
-    these.
+    """T (p, m) with the rows in the order of the inputs of an airframe.
+
+    I without an allocation of these.
     """
     allocation = controller.allocation
     if allocation is None or not _has_effectors(airframe, controller):
@@ -281,18 +284,19 @@ def distribution(airframe: Airframe, controller: ControllerConfig) -> FloatArray
 
 
 def _has_effectors(airframe: Airframe, controller: ControllerConfig) -> bool:
-    """Whether an allocation stands between the law and the inputs of an airframe: the model of an
-    aircraft of JSBSim has the inputs of the law.
+    """Whether an allocation stands between the law and the inputs of an airframe.
+
+    The model of an aircraft of JSBSim has the inputs of the law.
     """
     return controller.allocation is not None and set(airframe.inputs) != set(controller.inputs)
 
 
 def delay_margins(scenario: Scenario, controller: ControllerConfig) -> dict[str, Any]:
-    """Delay margin of the nominal linear loop, s: u late in every channel, in a single channel by
-    output; the least allowed.
+    """Delay margins of the nominal linear loop, s.
 
-    Empty without a linear loop: an aircraft of JSBSim, the literal sign. 0 where the loop is
-    unstable with its own lag.
+    They are u late in every channel, in a single channel by output, and the least allowed. Empty
+    without a linear loop: an aircraft of JSBSim, the literal sign. 0 where the loop is unstable
+    with its own lag.
     """
     if scenario.aircraft.is_jsbsim or is_literal(controller):
         return {}
@@ -325,11 +329,10 @@ def law_order(airframe: Airframe, controller: ControllerConfig) -> tuple[list[in
 
 
 def _model(scenario: Scenario, controller: ControllerConfig) -> Airframe:
-    """The airframe of a scenario, or y_dot = Omega u of the inputs of the law from the controller
-    of an aircraft of JSBSim.
+    """The airframe of a scenario, or y_dot = Omega u for an aircraft of JSBSim.
 
-    Omega comes from the feedforward, or from abs(Omega_ii) = omega / input_scale of RISE-DI, an
-    upper bound.
+    The law has the inputs, and the controller gives Omega. Omega comes from the feedforward, or
+    from abs(Omega_ii) = omega / input_scale of RISE-DI, an upper bound.
     """
     aircraft = scenario.aircraft
     if not aircraft.is_jsbsim:

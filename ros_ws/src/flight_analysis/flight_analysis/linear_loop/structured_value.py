@@ -48,8 +48,9 @@ class Scaling(NamedTuple):
 
 
 def balanced(M: ComplexArray) -> FloatArray:
-    """Find log D, (p,), that makes row and column of a channel about equally large: Osborne's
-    iteration.
+    """Find log D, (p,), that makes row and column of a channel about equally large.
+
+    The method is Osborne's iteration.
     """
     t = np.zeros(len(M))
     sizes = np.abs(M) ** 2
@@ -74,10 +75,10 @@ def bound_at(M: ComplexArray, scaling: Scaling) -> FloatArray:
 
 
 def tightened(M: ComplexArray, real: int, start: Scaling, target: float) -> tuple[float, Scaling]:
-    """A bound of M, (p, p), the first `real` channels real, by D and G from a search; below
-    `target` D and G in the middle of those with the target.
+    """A bound of M, (p, p), the first `real` channels real, with the D and G of a search.
 
-    The method of centres on the linear matrix inequality
+    Below `target` D and G are in the middle of the set with the target. The method of centres on
+    the linear matrix inequality
 
         F = level D - N* D N - j (G N - N* G) > 0,  trace D = p,  D > 0,  abs(g_i) < LARGEST_G
 
@@ -106,8 +107,10 @@ def tightened(M: ComplexArray, real: int, start: Scaling, target: float) -> tupl
 def tightened_at(
     part: Channels, w: float, scaled: ComplexArray, start: Scaling
 ) -> tuple[float, Scaling]:
-    """A bound of a scaled M(w) of a part as by `tightened` to 1: by D and G of the means over a
-    period where these suffice, the D of the second coefficients so that rows and columns balance.
+    """A bound of a scaled M(w) of a part as by `tightened` to 1.
+
+    D and G of the means over a period are taken where these suffice. The D of the second
+    coefficients then balances rows and columns.
     """
     k = len(part.entries)
     kept = np.r_[0:k, part.uncertain : len(scaled)]
@@ -219,8 +222,9 @@ def crossings(part: Channels, scaling: Scaling, scale: FloatArray) -> FloatArray
 def interval_at(
     part: Channels, w: float, scaling: Scaling, scale: FloatArray
 ) -> tuple[float, float] | None:
-    """The frequencies around w at which a D and a G of w hold diag(scale) M below 1, rad/s; None
-    for none.
+    """The frequencies around w at which a D and a G of w hold diag(scale) M below 1, rad/s.
+
+    None where there are none.
     """
     ends = crossings(part, scaling, scale)
     highest = np.pi / part.period

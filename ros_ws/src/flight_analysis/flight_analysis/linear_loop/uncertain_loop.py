@@ -46,8 +46,9 @@ PATTERN_PARTS = (1e-3, 1e-2, 0.06, 0.25)  # of pi / T: where the pattern of M is
 
 
 class Box(NamedTuple):
-    """Uncertain entries of a plant, k of them: d_i in [-1, 1] changes A by E_i d_i F_i, B by E_i
-    d_i G_i.
+    """The k uncertain entries of a plant, d_i in [-1, 1].
+
+    d_i changes A by E_i d_i F_i, and B by E_i d_i G_i.
     """
 
     names: tuple[str, ...]
@@ -64,8 +65,9 @@ def aircraft_at(plant: LinearPlant, box: Box, d: FloatArray) -> LinearPlant:
 
 
 class Late(NamedTuple):
-    """l real channels of a delay, those of w_0 first, j by j with m inputs each: W_l w, Z_l zeta +
-    V_l v.
+    """l real channels of a delay: W_l w, Z_l zeta + V_l v.
+
+    The channels of w_0 come first, j by j with m inputs.
     """
 
     W: FloatArray  # (q, l)
@@ -91,8 +93,9 @@ class UncertainLoop(NamedTuple):
 def uncertain_loop(
     plant: LinearPlant, law: LinearLaw, loop: Loop, box: Box, late: float = 0.0
 ) -> UncertainLoop:
-    """The loop of a plant, A (n, n), with the entries of a box pulled out, and u late by an unknown
-    time of 0 to `late`, s.
+    """The loop of a plant, A (n, n), with the entries of a box pulled out.
+
+    u is late by an unknown time of 0 to `late`, s.
     """
     n, m = plant.B.shape
     k = len(box.names)
@@ -145,8 +148,9 @@ def uncertain_loop(
 
 
 def _coefficients(matrix: FloatArray, n: int, k: int) -> FloatArray:
-    """The Legendre coefficients of k channels, from the integrals of z behind n states, and the
-    integrals of these.
+    """The Legendre coefficients of k channels.
+
+    They come from the integrals of z behind n states, and the integrals of these.
     """
     once = matrix[n : n + k]
     twice = matrix[n + k : n + 2 * k]
@@ -156,10 +160,10 @@ def _coefficients(matrix: FloatArray, n: int, k: int) -> FloatArray:
 def _with_late(
     exact: UncertainLoop, late: float, ramps: SampledPlant, n: int, k: int
 ) -> UncertainLoop:
-    """A loop, n states of the aircraft and k entries, with the channels of a delay, the middle of
-    their ranges as its own delay, from the motion by w_1.
+    """A loop, n states of the aircraft and k entries, with the channels of a delay.
 
-    The states of w_1 of earlier ticks, c of them, and u of earlier ticks follow its own.
+    The middle of the ranges is the delay of the loop. The channels come from the motion by w_1. The
+    states of w_1 of earlier ticks, c of them, and u of earlier ticks follow its own.
     """
     m, q = exact.K.shape
     size = n + TERMS * k
@@ -236,8 +240,9 @@ class Channels(NamedTuple):
         return np.asarray(self.Z @ np.linalg.solve(motion, self.W.astype(complex)) + self.D)
 
     def closed(self, d: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """State matrices of the loops of deviations d, (N, k) of this part, and the matrices left
-        and right of a change of d.
+        """State matrices of the loops of deviations d, (N, k) of this part.
+
+        The second and third are the matrices left and right of a change of d.
         """
         wide = np.tile(d, TERMS)
         p = self.uncertain
@@ -259,8 +264,9 @@ class Channels(NamedTuple):
 
 
 def every_channel(loop: UncertainLoop, inputs: tuple[int, ...] = ()) -> Channels:
-    """All entries of the box as channels, and disks in some inputs, v added to u and u + v / 2:
-    S - I / 2.
+    """All entries of the box as channels, and disks in some inputs.
+
+    v is added to u and u + v / 2: S - I / 2.
     """
     chosen = list(inputs)
     q, p = loop.W.shape
@@ -288,8 +294,9 @@ def every_channel(loop: UncertainLoop, inputs: tuple[int, ...] = ()) -> Channels
 def sensitivity_slopes(
     loop: UncertainLoop, d: FloatArray, w: FloatArray
 ) -> tuple[ComplexArray, ComplexArray]:
-    """S, (F, m, m), of the aircraft of deviations d, (k,), at frequencies w, rad/s, and its slopes
-    along d, (F, k, m, m).
+    """S, (F, m, m), of the aircraft of deviations d, (k,), and its slopes along d, (F, k, m, m).
+
+    They are taken at frequencies w, rad/s.
     """
     A, left, right = every_channel(loop).closed(d[None])
     wide = np.tile(d, TERMS)
@@ -307,10 +314,10 @@ def sensitivity_slopes(
 
 
 def parts_of(loop: UncertainLoop, inputs: tuple[int, ...] = ()) -> list[Channels]:
-    """The strongly connected parts of the loop, reduced; with disks in some inputs the parts with
-    those.
+    """The strongly connected parts of the loop, reduced.
 
-    The structured singular value of a block triangular matrix is the largest of the blocks.
+    With disks in some inputs only parts with such inputs count. The structured singular value of a
+    block triangular matrix is the largest of the blocks.
     """
     from scipy.sparse import csr_array  # noqa: PLC0415 - a flight starts without it
     from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
@@ -340,8 +347,9 @@ def parts_of(loop: UncertainLoop, inputs: tuple[int, ...] = ()) -> list[Channels
 
 
 def _reduced(every: Channels, channels: IntArray) -> Channels:
-    """Some channels without the states that no w of these moves or no z of these shows: kept
-    constants, integrals, the rest of the loop.
+    """Some channels without the states that no w of these moves or no z of these shows.
+
+    Such states are kept constants, integrals, and the rest of the loop.
     """
     A = every.A
     W = every.W[:, channels]

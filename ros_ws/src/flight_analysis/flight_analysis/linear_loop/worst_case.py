@@ -51,8 +51,9 @@ REAL = 1e-9  # part of an eigenvalue up to which its imaginary part counts as ro
 
 
 def first_unstable(part: Channels, entries: int, largest: float) -> list[FloatArray]:
-    """Deviations, (entries,), of unstable aircraft of a part, up to a largest size, each smaller
-    than the one before: by a divergence at 0 rad/s, then by modes at the frequencies up to pi / T.
+    """Deviations, (entries,), of unstable aircraft of a part, up to a largest size.
+
+    The size falls: by a divergence at 0 rad/s, then by modes at the frequencies up to pi / T.
     """
     highest = np.pi / part.period
     count = int(np.ceil(np.log(highest / SLOWEST) / (2.0 * np.log(NEAR))))
@@ -70,12 +71,11 @@ def first_unstable(part: Channels, entries: int, largest: float) -> list[FloatAr
 
 
 def _divergence(part: Channels) -> tuple[float, FloatArray]:
-    """The least size found at which an eigenvalue leaves at z = 1, infinite for none, and its
-    corner.
+    """The least size found at which an eigenvalue leaves at z = 1, and the corner.
 
-    det(I - size M diag(s)) = 0 at the largest real eigenvalue 1 / size of M diag(s). Each s goes to
-    the side to which the eigenvalue rises, from STARTS corners. The coefficients beyond the means
-    of a period are left out.
+    The size is infinite where there is none. det(I - size M diag(s)) = 0 at the largest real
+    eigenvalue 1 / size of M diag(s). Each s goes to the side to which the eigenvalue rises, from
+    STARTS corners. The coefficients beyond the means of a period are left out.
     """
     k = len(part.entries)
     M = part.response(0.0, 1.0 + SPECTRAL_RADIUS_TOLERANCE)[:k, :k].real
@@ -100,11 +100,11 @@ def _divergence(part: Channels) -> tuple[float, FloatArray]:
 
 
 def _oscillation(part: Channels, frequency: float, largest: float) -> tuple[float, FloatArray]:
-    """The least size of an unstable deviation found near a frequency, rad/s, infinite for none,
-    and its corner.
+    """The least size of an unstable deviation found near a frequency, rad/s, and the corner.
 
-    From STARTS corners: up to the size at which a mode near the frequency leaves abs(z) < 1, then
-    to the corner to which abs(z) grows, until the size no longer falls.
+    The size is infinite where there is none. From STARTS corners: up to the size at which a mode
+    near the frequency leaves abs(z) < 1, then to the corner to which abs(z) grows, until the size
+    no longer falls.
     """
     rng = np.random.default_rng(SEED)
     k = len(part.entries)
@@ -318,8 +318,9 @@ def _slopes(
 def _crossed(
     w: FloatArray, L: ComplexArray, values: FloatArray, distance: FloatArray
 ) -> tuple[FloatArray, ComplexArray]:
-    """Frequencies of the nearest zero of `values`, (F, m), by input, and d log L / d w there, (m,);
-    the lowest frequency without a zero.
+    """Frequencies of the nearest zero of `values`, (F, m), by input, and d log L / d w, (m,).
+
+    Without a zero the lowest frequency stands.
     """
     columns = np.arange(values.shape[1])
     crosses = np.signbit(values[:-1]) != np.signbit(values[1:])
@@ -334,8 +335,9 @@ def _crossed(
 
 
 def _damping_slope(uncertain: UncertainLoop, d: FloatArray) -> FloatArray:
-    """The slope of the least damping of a slow mode along the deviations at d, (k,), up to a
-    factor: zeta = -cos(angle(log z)).
+    """The slope of the least damping of a slow mode along the deviations at d, (k,).
+
+    The slope has an unknown factor: zeta = -cos(angle(log z)).
     """
     every = every_channel(uncertain)
     A, left, right = every.closed(d[None])

@@ -125,10 +125,11 @@ def planned_end_ns(tape: Tape) -> int | None:
 def account(
     tape: Tape, scenario: Scenario | None, outcome: Outcome = COMPLETED, *, simulated: bool = True
 ) -> Account:
-    """The account of a flight: from t = 0 to the planned end where the log knows both, else from
-    the first sample of a topic to the last sample of any.
+    """The account of a flight.
 
-    `simulated`: the aircraft of the scenario flew, no autopilot.
+    The account begins at t = 0 and ends at the planned end where the log knows both, else from the
+    first sample of a topic to the last sample of any. `simulated`: the aircraft of the scenario
+    flew, no autopilot.
     """
     planned_ns = planned_end_ns(tape)
     span = _span(tape, planned_ns, outcome, simulated=simulated)
@@ -178,8 +179,9 @@ def _span(tape: Tape, planned_ns: int | None, outcome: Outcome, *, simulated: bo
 
 
 def _processes(tape: Tape) -> dict[str, ProcessAccount]:
-    """The processes in flight time. In lockstep the stamps are no times of day, and when a process
-    was ready is not known.
+    """The processes in flight time.
+
+    In lockstep the stamps are no times of day, and when a process was ready is not known.
     """
 
     def flight_time(stamp_ns: int | None) -> float | None:
@@ -202,8 +204,9 @@ def _too_busy(parts: Sequence[str]) -> str:
 
 
 def lost_log_parts(notes: Iterable[str], *, planned: bool) -> list[str]:
-    """Parts of a bag that are missing, and leaps of the clock. A truncated end counts where no
-    planned end does.
+    """Parts of a bag that are missing, and leaps of the clock.
+
+    A truncated end counts where no planned end does.
     """
     kinds = PARTS if not planned else PARTS[:2]
     missing = re.compile("|".join(map(re.escape, kinds)))
@@ -215,8 +218,9 @@ def lost_log_parts(notes: Iterable[str], *, planned: bool) -> list[str]:
 
 
 def _absent(tape: Tape, scenario: Scenario | None) -> list[str]:
-    """The channels of the scenario that the samples of y, y_m and u do not have, a sentence a
-    topic.
+    """The channels of the scenario that the samples of y, y_m and u do not have.
+
+    There is a sentence a topic.
     """
     if scenario is None:
         return []
@@ -233,11 +237,10 @@ def _absent(tape: Tape, scenario: Scenario | None) -> list[str]:
 def _late_first_u(
     tape: Tape, topics: Mapping[str, TopicAccount], scenario: Scenario | None
 ) -> float | None:
-    """Flight time of the first u where it came more than SILENCE after the first y could; None for
-    one in time.
+    """Flight time of the first u that came more than SILENCE after the first y could.
 
-    The numbers of the ticks tell of a first u before the log. A controller that a user activates
-    has none in time.
+    None for a u in time. The numbers of the ticks tell of a first u before the log. A controller
+    that a user activates has none in time.
     """
     if scenario is None or not (scenario.controller.autostart and scenario.controller.start_active):
         return None

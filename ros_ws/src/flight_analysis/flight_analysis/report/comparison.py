@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Comparison of several flights, channels matched by name: ratios of metrics to the first
-flight, and the conditions that differ.
+"""Comparison of several flights, channels matched by name.
+
+The comparison has ratios of metrics to the first flight, and the conditions that differ.
 """
 
 from collections.abc import Mapping, Sequence
@@ -123,8 +124,9 @@ def _text(value: object) -> str:
 
 
 def alike(flights: Sequence[RecordedFlight], *, timed: bool = False) -> tuple[bool, ...]:
-    """Whether each flight had the conditions of the first, but for the controller; `timed`: with
-    the same time.
+    """Whether each flight had the conditions of the first, but for the controller.
+
+    `timed`: with the same time.
     """
     rows = [
         row
@@ -140,8 +142,9 @@ def alike(flights: Sequence[RecordedFlight], *, timed: bool = False) -> tuple[bo
 def metric_tables(
     flights: Sequence[RecordedFlight], key: str, columns: Sequence[Column], *, lower_is_better: bool
 ) -> list[ComparisonTable]:
-    """Metrics of "errors" or "inputs" of the summaries: a table per channel, a row per column with
-    a value.
+    """Metrics of "errors" or "inputs" of the summaries: a table per channel.
+
+    A table has a row per column with a value.
     """
     display = common_units(flights)
     same = alike(flights)

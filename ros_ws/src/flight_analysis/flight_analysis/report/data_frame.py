@@ -14,12 +14,11 @@ if TYPE_CHECKING:  # it loads in some tenths of a second
 
 
 def data_frame(tape: Tape) -> "pl.DataFrame":
-    """The signals as a table, SI: a row per instant with a sample of any topic, a column
-    "topic.channel" per channel.
+    """The signals as a table, SI: a column "topic.channel" per channel.
 
-    The first columns are "stamp_ns" (int64) and "t" = (stamp_ns - start) / 1e9. A topic without a
-    sample at an instant has nulls there. Of two samples with equal stamps the table holds the
-    later.
+    There is a row per instant with a sample of any topic. The first columns are "stamp_ns" (int64)
+    and "t" = (stamp_ns - start) / 1e9. A topic without a sample at an instant has nulls there. Of
+    two samples with equal stamps the table holds the later.
 
     Args:
         tape: A flight.

@@ -42,8 +42,9 @@ DEGREES = {"rad": "deg", "rad/s": "deg/s"}
 
 
 def display_unit(unit: str) -> DisplayUnit:
-    """The display unit of a unit of the airframe file: deg for rad, deg/s for rad/s, otherwise the
-    same unit.
+    """The display unit of a unit of the airframe file.
+
+    Radians become deg, rad/s deg/s; any further unit stays.
     """
     shown = DEGREES.get(unit, unit)
     return DisplayUnit(shown, 1.0 / si_per_unit(shown))

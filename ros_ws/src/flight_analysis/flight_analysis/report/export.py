@@ -22,8 +22,9 @@ DPI = 120
 
 
 def signal_table(flights: Sequence[RecordedFlight]) -> "pl.DataFrame":
-    """The table of a flight, or of several flights with the name of the flight in a first column
-    "run".
+    """The table of a flight, or of several flights.
+
+    Of several flights the name of the flight is in a first column "run".
     """
     import polars as pl  # noqa: PLC0415
 
@@ -49,8 +50,9 @@ def write_parquet(path: Path, flights: Sequence[RecordedFlight]) -> None:
 
 
 def write_png(path: Path, flights: Sequence[RecordedFlight]) -> None:
-    """Write y over y_m, the best error, and u of a flight or several flights: a column a quantity,
-    a row a channel.
+    """Write y over y_m, the best error, and u of a flight or several flights.
+
+    There is a column a quantity, and a row a channel.
     """
     from matplotlib.figure import Figure  # noqa: PLC0415
 

@@ -98,8 +98,10 @@ SAME_CURVE_TOLERANCE = 1e-3  # of the largest value: closer references are drawn
 
 
 def plot_context(flights: Sequence[RecordedFlight]) -> PlotContext:
-    """The context of a flight: every figure shades the gusts and the failsafe modes of the
-    controller. Of several flights it shades common gusts alone.
+    """The context of a flight or of several flights.
+
+    Every figure shades the gusts and the failsafe modes of the controller. Of several flights it
+    shades common gusts alone.
     """
     longest = max((flight.tape for flight in flights), key=flight_end)
     end = flight_end(longest)
@@ -188,8 +190,9 @@ def _references(context: PlotContext) -> dict[str, Curve]:
 
 
 def _is_same_curve(first: Curve, second: Curve) -> bool:
-    """Whether two references differ by at most SAME_CURVE_TOLERANCE of the largest value over their
-    common time.
+    """Whether two references are the same curve over the common time.
+
+    They differ by at most SAME_CURVE_TOLERANCE of the largest value.
     """
     one, two = first.signal, second.signal
     if set(one.names) != set(two.names) or not (len(one.stamp_ns) and len(two.stamp_ns)):
@@ -210,10 +213,10 @@ def tracking_figure(context: PlotContext) -> Figure:
 
 
 def error_figure(context: PlotContext, floors: Mapping[str, float] | None = None) -> Figure:
-    """E = y - y_m of every output. With errors of the sensors on the tape, the true error over the
-    measured error; of several flights the best error of each.
+    """E = y - y_m of every output; of several flights the best error of each.
 
-    Noise floors, by channel in SI, are lines above and below 0 where wide enough to see.
+    With errors of the sensors on the tape, the true error is drawn over the measured error. Noise
+    floors, by channel in SI, are lines above and below 0 where wide enough to see.
     """
     if context.is_comparison:
         errors = _curves(context, "e", lambda tape: best_error(tape)[1])
@@ -238,8 +241,9 @@ def error_figure(context: PlotContext, floors: Mapping[str, float] | None = None
 def input_figure(
     context: PlotContext, limits: Mapping[str, Limits] = MappingProxyType({})
 ) -> Figure | None:
-    """Actuator positions over the command u, at most two kinds of limits as lines, and marks where
-    an input was saturated; of several flights u alone.
+    """Actuator positions over the command u; of several flights u alone.
+
+    At most two kinds of limits are lines, and marks show where an input was saturated.
     """
     curves = _curves(context, "u", lambda tape: tape.signals.get("u"), steps=True)
     if context.is_comparison or not curves:
@@ -287,8 +291,10 @@ def input_figure(
 
 
 def input_limits(scenario: Scenario, tape: Tape) -> dict[str, Limits]:
-    """Limits of u by kind and by input: end stops of the actuators where these are simulated, and
-    limits of the controller.
+    """Limits of u by kind and by input.
+
+    They are the end stops of the actuators where these are simulated, and the limits of the
+    controller.
     """
     actuators = scenario.aircraft.actuators
     controller = scenario.controller
@@ -340,10 +346,10 @@ LEARNED_LINES: tuple[dict[str, Any], ...] = (
 
 
 def learned_figure(context: PlotContext, lines: Mapping[str, Mapping[str, float]]) -> Figure | None:
-    """Entries of A and B over time, as identified in flight, with bars of two deviations; open
-    marks: no model was proposed. `lines`: known values by entry, by label.
+    """Entries of A and B over time, as identified in flight, with bars of two deviations.
 
-    None without a learner. An entry that is not among `known_entries` is left out.
+    An open mark has no proposed model. `lines`: known values by entry, by label. None without a
+    learner. An entry that is not among `known_entries` is left out.
     """
     if "learned" not in context.tape:
         return None
@@ -435,10 +441,9 @@ def _timing_samples(tape: Tape, period_ns: int) -> dict[str, FloatArray]:
 
 
 def timing_figure(context: PlotContext) -> Figure | None:
-    """Histograms of the controller's timing in ms, on common bins and a logarithmic axis; None for
-    zeros alone.
+    """Histograms of the controller's timing in ms; None for zeros alone.
 
-    A quantity has a subplot with the runs.
+    They have common bins and a logarithmic axis. A quantity has a subplot with the runs.
     """
     runs = context.runs
     timing = {label: _timing_samples(run.tape, run.period_ns) for label, run in runs.items()}
@@ -505,8 +510,9 @@ def sensor_figure(context: PlotContext) -> Figure | None:
 
 
 def tick_figure(context: PlotContext) -> Figure | None:
-    """Lateness, age of y and dt of the controller's ticks; None for ticks in time with a fresh y
-    alone.
+    """Lateness, age of y and dt of the controller's ticks.
+
+    None for ticks in time with a fresh y alone.
     """
     tape = context.tape
     channels = ("late", "age", "dt")
@@ -542,9 +548,7 @@ def _nonzero_group(tape: Tape, group: str) -> Signal:
 
 
 def _saturated(tape: Tape, name: str, kind: Saturation) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """The instants of `internals`, and the mask of the instants of a kind of saturation of an
-    input.
-    """
+    """The instants of `internals`, and a mask of a kind of saturation of an input."""
     channel = f"limited.{name}"
     if "internals" not in tape or channel not in tape["internals"].names:
         return np.zeros(0), np.zeros(0, dtype=bool)

@@ -15,11 +15,11 @@ NEVER_ENGAGED = never_flew("the controller never engaged")
 
 
 def outcome_of_log(tape: Tape, scenario: Scenario, *, simulated: bool) -> Outcome:
-    """The outcome of a flight that left none, as one of nodes that were started one by one; UNKNOWN
-    of a part of a flight.
+    """The outcome of a flight without a recorded outcome, as of nodes started singly.
 
-    The flight is completed where the log holds y, y_m and u for the duration in the log, else that
-    of the scenario. An autopilot may end the last engagement, and with it u, before.
+    A part of a flight has UNKNOWN. The flight is completed where the log holds y, y_m and u for the
+    duration in the log, else that of the scenario. An autopilot may end the last engagement, and
+    with it u, before.
     """
     is_part = bool(lost_log_parts(tape.notes, planned=False)) or any(
         recording.step_ns for recording in tape.recording.values()
@@ -40,11 +40,10 @@ def outcome_of_log(tape: Tape, scenario: Scenario, *, simulated: bool) -> Outcom
 
 
 def flown(tape: Tape) -> Tape:
-    """The tape up to the controller's last tick: later samples belong to the shutdown of the
-    processes.
+    """The tape up to the controller's last tick.
 
-    A u that ends much earlier than y and y_m, or before the end of a whole flight, is a gap of the
-    log: nothing is cut there.
+    Later samples belong to the shutdown of the processes. A u that ends much earlier than y and
+    y_m, or before the end of a whole flight, is a gap of the log: nothing is cut there.
     """
     ticks = [
         int(tape[name].stamp_ns[-1]) for name in TICKS if name in tape and len(tape[name].stamp_ns)

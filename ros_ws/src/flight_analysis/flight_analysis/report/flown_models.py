@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The flown parameters of the controller with the linear loops, around the aircraft of the file and
-around the true aircraft of a simulation.
+"""The parameters of the controller that flew, with the linear loops.
+
+A loop is around the aircraft of the file, or around the true aircraft of a simulation.
 """
 
 import re
@@ -56,8 +57,9 @@ class FlownLoop(NamedTuple):
 def flown_controllers(
     tape: Tape, start: ControllerConfig, changes: Sequence[Change]
 ) -> tuple[FlownController, ...]:
-    """The flown parameters in order, of the start and after the changes in flight, by the digests
-    of the ticks.
+    """The parameters that flew in order: of the start and after the changes in flight.
+
+    The digests of the ticks tell them.
     """
     known = {start.digest(): start}
     latest = start
@@ -109,8 +111,10 @@ def _loop_around(airframe: Airframe, controller: ControllerConfig) -> LinearLoop
 
 
 def learned_lines(tape: Tape, scenario: Scenario) -> dict[str, dict[str, float]]:
-    """The values of the entries in the topic `learned`, SI: of the true aircraft where a simulation
-    flew, and of the file. Empty for an aircraft of JSBSim.
+    """The values of the entries in the topic `learned`, SI.
+
+    The file has values, and the true aircraft where a simulation flew. Empty for an aircraft of
+    JSBSim.
     """
     if "learned" not in tape or scenario.aircraft.is_jsbsim:
         return {}

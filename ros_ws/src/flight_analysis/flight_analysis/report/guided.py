@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of merit of a guided flight: the segments, by mode and leg, with the errors of the held
-quantities.
+"""Figures of merit of a guided flight.
+
+They are the segments, by mode and leg, with the errors of the held quantities.
 """
 
 import math
@@ -52,8 +53,9 @@ PATHS = (Lateral.ORBIT, Lateral.ROUTE, Lateral.PLACE)
 
 
 class Held(NamedTuple):
-    """Errors of a held quantity over a segment, in SI. A segment with a begin outside the band has
-    overshoot and settling.
+    """Errors of a held quantity over a segment, in SI.
+
+    A segment with a begin outside the band has overshoot and settling.
     """
 
     quantity: str
@@ -87,8 +89,9 @@ class Segment(NamedTuple):
 
 
 def segments(tape: Tape) -> list[Segment]:
-    """The segments of a guided flight, from `guidance`. Commands less than SETTLING_DWELL apart
-    begin a single segment.
+    """The segments of a guided flight, from `guidance`.
+
+    Commands less than SETTLING_DWELL apart begin a single segment.
     """
     t = tape.time("guidance")
     errors = control_errors(tape)
@@ -177,8 +180,10 @@ def unflown_legs(tape: Tape, section: GuidanceConfig) -> range:
 
 
 def orbit_missed_by(tape: Tape, section: GuidanceConfig) -> float:
-    """Distance from the circle of the last orbit at the end of the flight, m; 0 of an orbit that is
-    joined, within the distance at which a leg counts as flown, and of a flight that ends elsewhere.
+    """Distance from the circle of the last orbit at the end of the flight, m.
+
+    0 of an orbit that is joined, within the distance at which a leg counts as flown, and of a
+    flight that ends elsewhere.
     """
     log = tape["guidance"]
     if log["mode.lateral"][-1] != Lateral.ROUTE or log["joining"][-1] != 0.0:
@@ -192,8 +197,9 @@ def orbit_missed_by(tape: Tape, section: GuidanceConfig) -> float:
 
 
 def touched_beside(tape: Tape, section: GuidanceConfig) -> float:
-    """Distance from the touch-down zone at the end of the flight, m; 0 inside, and without a
-    zone.
+    """Distance from the touch-down zone at the end of the flight, m.
+
+    0 inside, and without a zone.
     """
     if section.touchdown is None or "pose" not in tape or not len(tape["pose"].stamp_ns):
         return 0.0
@@ -218,8 +224,9 @@ class Touch(NamedTuple):
 
 
 def landing_touch(tape: Tape, section: GuidanceConfig | None) -> Touch | None:
-    """The figures of a landing; None without a section `landing`, and of a flight that did not
-    land.
+    """The figures of a landing.
+
+    None without a section `landing`, and of a flight that did not land.
     """
     if section is None or section.landing is None or tape.outcome.end is not End.LANDED:
         return None
@@ -256,8 +263,9 @@ class Outside(NamedTuple):
 
 
 def time_outside(tape: Tape, section: GuidanceConfig | None) -> Outside | None:
-    """Time outside of the fence by `pose`, as of the first step of guidance; None without a fence,
-    or without a pose then.
+    """Time outside of the fence by `pose`, as of the first step of guidance.
+
+    None without a fence, or without a pose then.
     """
     fence = None if section is None else section.fence_zones()
     pose = _guided_pose(tape)
@@ -267,8 +275,9 @@ def time_outside(tape: Tape, section: GuidanceConfig | None) -> Outside | None:
 
 
 def altitude_excess(tape: Tape, section: GuidanceConfig | None) -> Outside | None:
-    """Time above the ceiling and below the altitude floor by `pose`, as of the first step of
-    guidance; None without limits, or without a pose then.
+    """Time above the ceiling and below the altitude floor by `pose`.
+
+    Time counts as of the first step of guidance. None without limits, or without a pose then.
     """
     pose = _guided_pose(tape)
     if section is None or (section.ceiling is None and section.altitude_floor is None):
@@ -319,8 +328,9 @@ def mission_drawing(section: GuidanceConfig, routes: Sequence[Route]) -> dict[st
 
 
 def leg_results(legs: Sequence[Mapping[str, Any]]) -> str:
-    """The legs of a summary with their results: "legs: 0 flown, 1 missed by 321 m, 2 not ended";
-    empty without legs.
+    """The legs of a summary with their results; empty without legs.
+
+    An example is "legs: 0 flown, 1 missed by 321 m, 2 not ended".
     """
     results = [
         f"{leg['leg']} {leg['result']}" + (f" by {leg['missed']:.0f} m" if leg["missed"] else "")
@@ -348,10 +358,10 @@ def landing_results(landing: Mapping[str, Any] | None) -> str:
 
 
 def control_errors(tape: Tape) -> dict[str, FloatArray]:
-    """Errors of the quantities of guidance, measured less commanded, at the samples of `guidance`,
-    shape (N,).
+    """Errors of the quantities of guidance, measured less commanded, shape (N,).
 
-    The cross-track error comes from the log, positive to the right. Angles are within half a turn.
+    They are taken at the samples of `guidance`. The cross-track error comes from the log, positive
+    to the right. Angles are within half a turn.
     """
     log = tape["guidance"]
     pose = tape["guidance"].group("pose")
@@ -372,8 +382,9 @@ def control_errors(tape: Tape) -> dict[str, FloatArray]:
 
 
 def flown_speed(tape: Tape, trim: float) -> FloatArray:
-    """Airspeed at the samples of `guidance`, m/s: `trim` and V of y; of a multicopter the speed
-    over ground.
+    """Airspeed at the samples of `guidance`, m/s: `trim` and V of y.
+
+    A multicopter has the speed over ground.
     """
     log = tape["guidance"]
     over_ground: FloatArray = np.hypot(log["pose.v_north"], log["pose.v_east"])
@@ -414,8 +425,9 @@ def _segment_figures(segment: Segment) -> dict[str, Any]:
 
 
 def guidance_summary(tape: Tape, section: GuidanceConfig | None = None) -> dict[str, Any] | None:
-    """The figures of a guided flight as `summary.json` holds them, SI; None for a flight without
-    guidance.
+    """The figures of a guided flight as `summary.json` holds them, SI.
+
+    None for a flight without guidance.
     """
     if "guidance" not in tape or len(tape["guidance"].stamp_ns) == 0:
         return None

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of a guided flight: ground track, altitude, airspeed and attitude over their commands,
-cross-track error.
+"""Figures of a guided flight.
+
+They are ground track, altitude, airspeed and attitude over their commands, and cross-track error.
 """
 
 import math
@@ -88,10 +89,10 @@ def flown_routes(scenario: Scenario | None, tape: Tape) -> list[Route]:
 def track_figure(
     tape: Tape, routes: Sequence[Route], speed: float, fence: Fence | None = None
 ) -> Figure:
-    """Ground track over the routes with their fillets, equal axes, and arrows of the wind. `speed`:
-    trim speed V0, m/s.
+    """Ground track over the routes with their fillets, equal axes, and arrows of the wind.
 
-    With the numbers of lines and circles, the start, the end, and the fence with home.
+    `speed`: trim speed V0, m/s. With the numbers of lines and circles, the start, the end, and the
+    fence with home.
     """
     figure = tracks_figure({"flown": (tape, PLANT)}, routes)
     pose = tape["guidance"].group("pose")
@@ -136,8 +137,9 @@ def _add_fence(figure: Figure, fence: Fence) -> None:
 
 
 def tracks_figure(tracks: Mapping[str, tuple[Tape, str]], routes: Sequence[Route]) -> Figure:
-    """Ground tracks over routes, equal axes: the tape of a guided flight and the colour by
-    label.
+    """Ground tracks over routes, equal axes.
+
+    `tracks`: the tape of a guided flight and the colour by label.
     """
     figure = Figure(1, 1, TRACK_HEIGHT)
     for route in routes:
@@ -160,8 +162,7 @@ def tracks_figure(tracks: Mapping[str, tuple[Tape, str]], routes: Sequence[Route
 
 
 def mean_wind(tape: Tape, speed: float, parts: int = WIND_ARROWS) -> FloatArray:
-    """Mean wind over equal parts of the flight, to the north and to the east, m/s, shape (parts,
-    2).
+    """Mean wind over equal parts of the flight, north and east, m/s, shape (parts, 2).
 
     The wind is the velocity over ground less the velocity through the air, V cos(gamma) along psi +
     beta, with V = V0 + V of y.
@@ -207,8 +208,9 @@ AIRSPEED = "airspeed"  # absolute: V is the deviation from the trim speed
 
 
 def vertical_figure(context: PlotContext, speed: float, bounds: Bounds) -> Figure:
-    """Altitude and airspeed over their commands, with the limits of the commands. `speed`: trim
-    speed V0, m/s.
+    """Altitude and airspeed over their commands, with the limits of the commands.
+
+    `speed`: trim speed V0, m/s.
     """
     log = context.tape["guidance"]
     commanded = np.where(
@@ -236,8 +238,9 @@ def attitude_figure(context: PlotContext, bounds: Bounds) -> Figure:
 
 
 def cross_track_figure(context: PlotContext) -> Figure | None:
-    """Cross-track error while a path is followed, by leg of the route; None for a flight without a
-    path.
+    """Cross-track error while a path is followed, by leg of the route.
+
+    None for a flight without a path.
     """
     log = context.tape["guidance"]
     lateral = log["mode.lateral"]

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The report as an HTML page without network access: tables and figures of a flight, or a
-comparison of flights.
+"""The report as an HTML page without network access.
+
+The page has tables and figures of a flight, or a comparison of flights.
 """
 
 import base64
@@ -50,8 +51,9 @@ HERE = Path(__file__).parent
 
 
 class Line(NamedTuple):
-    """A line under the title: colour, label and outcome of a flight, and text; any part may be
-    empty.
+    """A line under the title: colour, label and outcome of a flight, and text.
+
+    Any part may be empty.
     """
 
     text: str

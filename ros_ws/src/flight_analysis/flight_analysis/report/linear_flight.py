@@ -77,10 +77,10 @@ class ErrorPair(NamedTuple):
 def error_pair(
     tape: Tape, controller: ControllerConfig, aircraft: AircraftConfig | None
 ) -> ErrorPair | None:
-    """The errors of a flight and of the linear loop; None without an error, and of a law without
-    feedback.
+    """The errors of a flight and of the linear loop.
 
-    `aircraft`: of the simulation; None of an unknown plant.
+    None without an error, and of a law without feedback. `aircraft`: of the simulation; None of an
+    unknown plant.
     """
     kind, error = best_error(tape)
     names = tuple(name for name in controller.outputs if name in error.names)
@@ -151,8 +151,9 @@ def _linear_error(
     y_m: FloatArray,
     e_0: FloatArray,
 ) -> FloatArray:
-    """The error of the linear loop around the aircraft, (N, m): from the drift on the larger error
-    of the loops before and after.
+    """The error of the linear loop around the aircraft, (N, m).
+
+    From the drift on the larger error of the loops before and after counts.
     """
     config = controller
     if is_literal(controller):
@@ -241,8 +242,9 @@ def _at(tape: Tape, topic: str, name: str, ticks: FloatArray) -> FloatArray:
 
 
 def _between(tape: Tape, signal: Signal, values: FloatArray, ticks: FloatArray) -> FloatArray:
-    """Values at the samples of a signal, (K,), at the ticks, (N,), between the finite ones; 0
-    without any.
+    """Values at the samples of a signal, (K,), at the ticks, (N,), between the finite ones.
+
+    They are 0 without any.
     """
     is_finite = np.isfinite(values)
     if not is_finite.any():
@@ -252,10 +254,10 @@ def _between(tape: Tape, signal: Signal, values: FloatArray, ticks: FloatArray) 
 
 
 def _noise(tape: Tape, controller: ControllerConfig, ticks: FloatArray) -> FloatArray:
-    """The errors of the sensors in the log less the mean over NOISE_TIME, (N, m), units of y; 0
-    where the log has none.
+    """The errors of the sensors in the log less the mean over NOISE_TIME, (N, m).
 
-    A bias and a drift are no noise: the law follows them, and the aircraft is off by as much.
+    They have the units of y, and are 0 where the log has none. A bias and a drift are no noise: the
+    law follows them, and the aircraft is off by as much.
     """
     from scipy.ndimage import uniform_filter1d  # noqa: PLC0415 - loads SciPy, which few flights need
 
@@ -288,8 +290,10 @@ def _disturbance(
 def _disturbance_of_speed(
     tape: Tape, controller: ControllerConfig, ticks: FloatArray
 ) -> FloatArray:
-    """The disturbance d of y_dot = Omega u + d, (N, m), by `truth` of JSBSim: weight along the
-    flight path and wind on the airspeed; 0 of the rates, and where the log has none.
+    """The disturbance d of y_dot = Omega u + d, (N, m), by `truth` of JSBSim.
+
+    Weight along the flight path and wind act on the airspeed. The rates have 0, and a log without
+    them.
 
         V_dot = -g sin(theta) - W_dot
     """
@@ -307,8 +311,9 @@ def _disturbance_of_speed(
 
 
 def _active(tape: Tape, ticks: FloatArray) -> NDArray[np.bool_]:
-    """Mask of the ticks from the first engagement on without those of an inactive controller; none
-    without `internals`.
+    """Mask of the ticks from the first engagement on without those of an inactive controller.
+
+    No tick counts without `internals`.
     """
     if "internals" not in tape:
         return np.zeros(len(ticks), dtype=bool)

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Margins of a linear loop as rows of a table, as figures of a file, and as Bode and Nyquist
-plots.
+"""Margins of a linear loop as a table, as figures of a file, and as plots.
+
+The plots are after Bode and Nyquist.
 """
 
 import math
@@ -54,8 +55,9 @@ def decibels(factor: FloatArray | float) -> FloatArray:
 
 
 def margin_rows(margins: LoopMargins) -> list[list[str]]:
-    """A row an input, then ALL_INPUTS, with the cells of MARGIN_COLUMNS: nominal (worst uncertain
-    aircraft).
+    """A row an input, then ALL_INPUTS, with the cells of MARGIN_COLUMNS.
+
+    A cell reads: nominal (worst uncertain aircraft).
     """
     columns = _values(margins.nominal, (*margins.channel_delay, margins.delay))
     uncertain = columns
@@ -272,8 +274,9 @@ def guarantee_as_json(promise: Guarantee) -> dict[str, Any]:
 
 
 def bode_figure(loops: Mapping[str, LinearLoop]) -> Figure:
-    """Gain and phase of L_i over the frequency, nominal aircraft: a column an input, the loops by
-    label.
+    """Gain and phase of L_i over the frequency, nominal aircraft.
+
+    There is a column an input, with the loops by label.
     """
     inputs = _inputs(loops)
     count = len(inputs)
@@ -307,8 +310,9 @@ def bode_figure(loops: Mapping[str, LinearLoop]) -> Figure:
 
 
 def nyquist_figure(loops: Mapping[str, LinearLoop]) -> Figure:
-    """L_i around the point -1, with the unit circle and the circle of sensitivity 2: a subplot an
-    input, the loops by label.
+    """L_i around the point -1, with the unit circle and the circle of sensitivity 2.
+
+    There is a subplot an input, with the loops by label.
     """
     inputs = _inputs(loops)
     figure = Figure(len(inputs), min(len(inputs), 2), 420)

@@ -32,8 +32,10 @@ class ModelSpan(NamedTuple):
 
 
 def model_names(first: Sequence[float], proposed: Sequence[float]) -> list[str]:
-    """Names of parameters in the order of their first instants, s: "start", "file" before the first
-    instant at which a model was `proposed`, then "model 1" and so on.
+    """Names of parameters in the order of their first instants, s.
+
+    They are "start", "file" before the first instant at which a model was `proposed`, then "model
+    1" and so on.
     """
     names = ["start"]
     for time in first[1:]:
@@ -68,10 +70,9 @@ def flown_parameters(tape: Tape) -> list[ParameterSpan]:
 
 
 def errors_by_model(tape: Tape) -> list[ModelSpan]:
-    """Rms of `best_error` before the first model of a learner and under each model; empty for a
-    tape without a learner.
+    """Rms of `best_error` before the first model of a learner and under every model.
 
-    The time in which the law is not engaged does not count.
+    Empty for a tape without a learner. The time in which the law is not engaged does not count.
     """
     if "learned" not in tape or "internals" not in tape:
         return []

@@ -49,8 +49,9 @@ def write_figure(
     width: str | float = WIDTH,
     channels: str | Sequence[str] = (),
 ) -> None:
-    """Write a figure for a paper: a row a channel, y over y_m, the error or u, in the width of a
-    column.
+    """Write a figure for a paper in the width of a column.
+
+    A row is a channel: y over y_m, the error or u.
 
     Args:
         path: File: .pdf, .svg and .eps have vectors and text, .png pixels.

@@ -57,8 +57,9 @@ class Instants(NamedTuple):
 
 
 class SampleStore:
-    """The samples of the long curves of a page, packed. Equal arrays are stored once, under a hash
-    of the content.
+    """The samples of the long curves of a page, packed.
+
+    Equal arrays are stored once, under a hash of the content.
     """
 
     def __init__(self) -> None:
@@ -94,11 +95,10 @@ class SampleStore:
         return self._times[id(t_ns)][0]
 
     def values(self, values: FloatArray) -> str:
-        """Store values as float32, rounded to MANTISSA bits: noise does not compress, and a pixel
-        shows fewer digits.
+        """Store values as float32, rounded to MANTISSA bits.
 
-        Their bits are stored as steps modulo 2^32, the first from 0, since successive samples
-        hardly differ.
+        Noise does not compress, and a pixel shows fewer digits. Their bits are stored as steps
+        modulo 2^32, the first from 0, since successive samples hardly differ.
         """
         spare = 24 - MANTISSA
         bits = values.astype("<f4").view("<u4")
@@ -179,11 +179,11 @@ class Curve(NamedTuple):
 
 
 class Figure:
-    """Subplots for plotly.js: the traces `data` and the `layout`; `x` and `y` are the axes by
-    subplot.
+    """Subplots for plotly.js: the traces `data` and the `layout`.
 
-    `count` subplots are filled row by row, `height` pixels high, with `spacing` between the rows as
-    a fraction of the figure. Source of the names: https://plotly.com/javascript/reference.
+    `x` and `y` are the axes by subplot. `count` subplots are filled row by row, `height` pixels
+    high, with `spacing` between the rows as a fraction of the figure. Source of the names:
+    https://plotly.com/javascript/reference.
     """
 
     def __init__(self, count: int, columns: int, height: int, spacing: float | None = None) -> None:
@@ -226,8 +226,9 @@ def axis(name: str, index: int) -> str:
 def time_series_figure(
     context: PlotContext, curves: Mapping[str, Curve], *, columns: int = 1, height: int = 150
 ) -> Figure:
-    """A subplot of `height` pixels per channel, with the curves of the channel; two columns are
-    filled row by row.
+    """A subplot of `height` pixels per channel, with the curves of the channel.
+
+    Two columns are filled row by row.
     """
     names = dict.fromkeys(chain.from_iterable(curve.signal.names for curve in curves.values()))
     channels = in_order(names, context.units)
@@ -258,8 +259,9 @@ def time_series_figure(
 
 
 def set_layout(figure: Figure, labels: int = 6, below: int = 40) -> Figure:
-    """Set size, margins and colours: the legend and `labels` pixels above the rows, the axis
-    `below` the rows.
+    """Set size, margins and colours of a figure.
+
+    The legend and `labels` pixels are above the rows, the axis `below` the rows.
     """
     above = 24 * any(trace.get("showlegend") for trace in figure.data) + labels
     rows = figure.height * figure.rows
@@ -340,8 +342,9 @@ def _trace(
 
 
 def stored(context: PlotContext, signal: Signal, channel: str, factor: float) -> tuple[str, str]:
-    """Places of the times and the values of a channel, times a factor, on the page. A long curve is
-    there once.
+    """Places of the times and the values of a channel, times a factor, on the page.
+
+    A long curve is there once.
     """
     t_ns, values = _drawn(context, Curve(signal, ""), channel, factor)
     return context.samples.times(t_ns), context.samples.values(values)
@@ -359,8 +362,9 @@ def _drawn(
 
 
 def _extremes_of_bins(values: FloatArray, width: int) -> FloatArray:
-    """Smallest and largest value of each bin in their order, two a bin; a NaN in place of the
-    second in a bin with a gap.
+    """Smallest and largest value of each bin in their order, two a bin.
+
+    A bin with a gap has a NaN in place of the second.
     """
     bins = _bins(values, width)
     gaps = np.isnan(bins)

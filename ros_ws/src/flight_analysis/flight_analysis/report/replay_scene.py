@@ -37,8 +37,9 @@ class Replay(NamedTuple):
 
 
 def replay(flight: RecordedFlight, context: PlotContext) -> Replay | None:
-    """The replay of a flight with a logged attitude, else None. Adds the poses to the samples of
-    the page.
+    """The replay of a flight with a logged attitude, else None.
+
+    Adds the poses to the samples of the page.
     """
     tape = flight.tape
     topics = {}
@@ -78,8 +79,9 @@ def replay(flight: RecordedFlight, context: PlotContext) -> Replay | None:
 
 
 def _topic(context: PlotContext, signal: Signal, channels: dict[str, str]) -> dict[str, Any]:
-    """Where times and values of channels are, with the factors of their units; `channels` maps
-    names to names of the units.
+    """Where times and values of channels are, with the factors of their units.
+
+    `channels` maps names to names of the units.
     """
     stored_channels = {}
     times = ""
@@ -105,8 +107,9 @@ def _thinned(pose: Signal) -> Signal:
 
 
 def _code() -> str:
-    """The scripts as a function with an immediate call: modules without imports, exports, comment
-    lines and indentation.
+    """The scripts as a function with an immediate call.
+
+    They are modules without imports, exports, comment lines and indentation.
     """
     text = "\n".join(path.read_text(encoding="utf-8") for path in SCRIPTS)
     text = re.sub(r"^(import |\s*//).*\n|^\s+", "", text, flags=re.MULTILINE)

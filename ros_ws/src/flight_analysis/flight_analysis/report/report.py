@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The report of recorded runs: the page of one run or of a comparison, and the data for other
-programs.
+"""The report of recorded runs.
+
+The outputs are the page of a run or of a comparison, and the data for further programs.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -56,8 +57,9 @@ def report(
     remaps: Mapping[str, str] = {},
     scenario: FilePath | None = None,
 ) -> Report:
-    """Write the report page of a recorded run, or a page that compares several runs with the first,
-    as `rise-di report` does.
+    """Write the report page of a recorded run, or of a comparison of several runs.
+
+    Several runs are compared with the first, as `rise-di report` does.
 
     Args:
         runs: Folders of runs, or MCAP files.

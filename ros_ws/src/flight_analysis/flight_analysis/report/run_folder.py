@@ -1,7 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The folder of a run: created before a flight, with the attachments of the log; read back and
-reported on afterwards.
+"""The folder of a run.
+
+The folder is created before a flight, with the attachments of the log. Afterwards the run is read
+back and reported.
 """
 
 import json
@@ -78,8 +80,9 @@ class UnwrittenReportError(ParameterError):
 
 
 def new_run(scenario: Scenario, runs: Path, kind: str = "") -> Path:
-    """Create the folder of a new run, runs/<UTC stamp>-<kind><scenario>. Raises ParameterError for
-    a failure.
+    """Create the folder of a new run, runs/<UTC stamp>-<kind><scenario>.
+
+    Raises ParameterError for a failure.
     """
     place = str(runs.absolute())
     is_text = not any("\ud800" <= character <= "\udfff" for character in place)
@@ -99,8 +102,9 @@ def new_run(scenario: Scenario, runs: Path, kind: str = "") -> Path:
 
 
 def remove_empty(*runs: Path) -> None:
-    """Remove the folders of runs without a file: those of flights that were interrupted before they
-    began.
+    """Remove the folders of runs without a file.
+
+    Such a flight was interrupted before the begin.
     """
     for run in runs:
         with suppress(OSError):
@@ -113,13 +117,13 @@ def attachments_for(
     overrides: Mapping[str, ParameterOverrides] | None = None,
     further: Sequence[Path] = (),
 ) -> LogAttachments:
-    """The attachments of the log of a flight, written into the folder of the run where they are not
-    files yet.
+    """The attachments of the log of a flight.
 
-    These are the scenario, the airframe or the user's own model of JSBSim, every parameter after
-    validation, `further` files, and the provenance.
-    `overrides` are parameters of the scenario's nodes by the node's name; None for a flight without
-    nodes. Raises ParameterError where a file cannot be written.
+    They are written into the folder of the run where they are not files yet. These are the
+    scenario, the airframe or the user's own model of JSBSim, every parameter after validation,
+    `further` files, and the provenance. `overrides` are parameters of the scenario's nodes by the
+    node's name; None for a flight without nodes. Raises ParameterError where a file cannot be
+    written.
     """
     attached = [_write(run / PARAMETERS, scenario_yaml(scenario, overrides)), *further]
     if not scenario.aircraft.is_jsbsim:
@@ -142,13 +146,12 @@ def read_accounted(
     scenario: FilePath | None = None,
     remaps: Mapping[str, str] = {},
 ) -> RecordedRun:
-    """Read the folder or a file of a run: named vectors by topic name (without the namespace),
-    samples by stamp.
+    """Read the folder or a file of a run: named vectors by topic name, samples by stamp.
 
-    The bag comes from this stack or from `ros2 bag record`: MCAP, in one or several files,
-    compressed or not. A truncated MCAP file is read up to the last complete chunk.
-    `run.tape.account` has the share of each topic, and `run.tape.notes` say what the log lacks; a
-    log without a scenario has no account.
+    The topic name is without the namespace. The bag comes from this stack or from `ros2 bag
+    record`: MCAP, in one or several files, compressed or not. A truncated MCAP file is read up to
+    the last complete chunk. `run.tape.account` has the share of each topic, and `run.tape.notes`
+    say what the log lacks; a log without a scenario has no account.
 
     Args:
         run: Folder of a run, or a file of the bag.
@@ -246,8 +249,9 @@ def _controllers(
 
 
 def log_account(recorded: RecordedRun) -> Account | None:
-    """What a log lacks; None for a log without a flight, and without a scenario that can be
-    read.
+    """What a log lacks.
+
+    None for a log without a flight, and without a scenario that can be read.
     """
     if not {*AIRCRAFT_TOPICS} & {*recorded.tape.signals}:
         return None
@@ -265,8 +269,9 @@ def log_account(recorded: RecordedRun) -> Account | None:
 
 
 def _engaged(tape: Tape, flown: Sequence[Engagement]) -> Tape:
-    """The engaged part of a flight with a bridge, for the figures. Without an engagement: the whole
-    tape, for the duration.
+    """The engaged part of a flight with a bridge, for the figures.
+
+    Without an engagement the whole tape counts, for the duration.
     """
     end_ns = max(
         (int(signal.stamp_ns[-1]) for signal in tape.signals.values() if len(signal.stamp_ns)),
@@ -293,8 +298,9 @@ def _engagement(tape: Tape, flown: Engagement) -> dict[str, Any]:
 
 
 def recorded_scenario(run: Path, namespace: str | None = None) -> Scenario:
-    """The scenario in a log, written beside the log. Raises ParameterError where the log holds
-    none.
+    """The scenario in a log, written beside the log.
+
+    Raises ParameterError where the log holds none.
     """
     recorded = read_run(run, namespace)
     scenario = _scenario_in(recorded, run)
@@ -309,8 +315,9 @@ def _scenario_in(recorded: RecordedRun, run: Path) -> Scenario:
 
 
 def _write_scenario(recorded: RecordedRun, path: Path) -> None:
-    """Write the scenario of a log, once. Raises ParameterError where a file with different content
-    has the name.
+    """Write the scenario of a log, once.
+
+    Raises ParameterError where a file with different content has the name.
     """
     if recorded.scenario is None:
         return
@@ -334,13 +341,13 @@ def write_report(
     scenario: FilePath | None = None,
     remaps: Mapping[str, str] = {},
 ) -> FlightResult:
-    """Read the bag back, write scenario, summary.json and report.html, and link runs/latest to the
-    run.
+    """Read the bag back and write scenario, summary.json and report.html.
 
-    The files go beside the log, or into the new folder `output`. Without an outcome the report of
-    an old run is written again and runs/latest stays. A `scenario` in place of the scenario in the
-    log is not written. Raises ParameterError as `read_flight` does, before any file is written,
-    and UnwrittenReportError where a file cannot be written.
+    runs/latest becomes a link to the run. The files go beside the log, or into the new folder
+    `output`. Without an outcome the report of an old run is written again and runs/latest stays. A
+    `scenario` in place of the scenario in the log is not written. Raises ParameterError as
+    `read_flight` does, before any file is written, and UnwrittenReportError where a file cannot be
+    written.
     """
     from flight_analysis.report.html import write_page  # noqa: PLC0415 - loads jinja2, which a flight does not need
 
@@ -364,8 +371,9 @@ def write_report(
 
 
 def write_empty_summary(run: Path, scenario: Scenario, outcome: Outcome) -> dict[str, Any]:
-    """Write summary.json of a flight with an end before the first sample. The log does not change.
-    Raises ParameterError.
+    """Write summary.json of a flight with an end before the first sample.
+
+    The log does not change. Raises ParameterError.
     """
     summary = empty_summary(scenario, outcome)
     with writing("", run, "a folder that can"):
@@ -380,18 +388,19 @@ def _folder(run: Path) -> Path:
 
 
 def _identity(recorded: RecordedRun) -> dict[str, Any]:
-    """What distinguishes a flight from others: the stamp of t = 0, ns, and the time of day of the
-    start where the log has it.
+    """What distinguishes a flight from others.
+
+    The stamp of t = 0, ns, and the time of day of the start, if logged, tell.
     """
     started = recorded.metadata.get(FLIGHT, {}).get("start")
     return {"start_ns": recorded.tape.start_ns, "started": started}
 
 
 def _previous_outcome(recorded: RecordedRun, folder: Path | None, scenario: Scenario) -> Outcome:
-    """The outcome in the log, else in the summary of this flight, else the outcome that a launch
-    left beside a log with the name of the folder.
+    """The outcome in the log, else in the summary of this flight, else from a launch.
 
-    The samples in the log tell the outcome of nodes started by hand.
+    A launch leaves the outcome beside a log with the name of the folder. The samples in the log
+    tell the outcome of nodes started by hand.
     """
     tape = recorded.tape
     outcome = tape.outcome

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The samples of a flight by topic: how many its log should hold, how many it holds, and how many
-were never sent.
+"""The samples of a flight by topic.
+
+An account has the planned samples, the samples in the log, and the samples never sent.
 """
 
 import math
@@ -179,8 +180,9 @@ def _periods(tape: Tape, scenario: Scenario, *, simulated: bool) -> dict[str, in
 
 
 def _is_of_stack(tape: Tape, name: str) -> bool:
-    """Whether a node of the stack sent a topic, by the names of the processes; a flight in one
-    process has no names. A foreign controller has no `internals`.
+    """Whether a node of the stack sent a topic, by the names of the processes.
+
+    A flight in one process has no names. A foreign controller has no `internals`.
     """
     if name in TICKS and ("internals" in tape or "u" not in tape):
         return True
@@ -213,12 +215,11 @@ def _period(tape: Tape, name: str, nominal_ns: int) -> int:
 
 
 def period_of(stamp_ns: NDArray[np.int64], lost: int, otherwise_ns: int) -> int:
-    """The period at which a publisher sent samples, ns, by their stamps, shape (N,), and the number
-    of lost messages.
+    """The period at which a publisher sent samples, ns, by their stamps, shape (N,).
 
-    A steady publisher takes the same time for any STEADY_RUN samples, within an interval: by a
-    coarse clock the intervals differ. Where samples are missing the times scatter, and the
-    quickest tenth of short runs has the period.
+    `lost`: the number of lost messages. A steady publisher takes the same time for any STEADY_RUN
+    samples, within an interval: by a coarse clock the intervals differ. Where samples are missing
+    the times scatter, and the quickest tenth of short runs has the period.
     """
     stamp_ns = np.unique(stamp_ns)
     intervals_ns = np.diff(stamp_ns)
@@ -239,11 +240,10 @@ def period_of(stamp_ns: NDArray[np.int64], lost: int, otherwise_ns: int) -> int:
 
 
 def _with_unsent(tape: Tape, name: str, topic: TopicAccount, step_ns: int) -> TopicAccount:
-    """The account of a topic with the instants between the first and the last sample that the
-    publisher left out.
+    """The account of a topic with the instants that the publisher left out.
 
-    The numbers of the messages are the proof: no number is missing beside lost messages and samples
-    left out.
+    They lie between the first and the last sample. The numbers of the messages are the proof: no
+    number is missing beside lost messages and samples left out.
     """
     recording = tape.recording.get(name, Recording(0))
     if (
@@ -259,8 +259,9 @@ def _with_unsent(tape: Tape, name: str, topic: TopicAccount, step_ns: int) -> To
 
 
 def _of_foreign(topic: TopicAccount) -> TopicAccount:
-    """The account of a topic of a publisher with an unknown plan: the samples sent are whole, up to
-    a tenth below the rate, without a silence.
+    """The account of a topic of a publisher with an unknown plan.
+
+    The samples sent are whole, up to a tenth below the rate, without a silence.
     """
     is_silent = topic.gap is not None and topic.gap > SILENCE
     if topic.expected is None or is_silent or topic.unsent > (1.0 - LEAST) * topic.expected:
@@ -269,8 +270,9 @@ def _of_foreign(topic: TopicAccount) -> TopicAccount:
 
 
 def ends_last(tape: Tape, name: str) -> bool:
-    """Whether a topic ends later than every further topic of the flight: a leap of the clock may be
-    the gap.
+    """Whether a topic ends later than every further topic of the flight.
+
+    A leap of the clock may be the gap.
     """
     ends = {
         topic: int(signal.stamp_ns[-1])
@@ -282,11 +284,11 @@ def ends_last(tape: Tape, name: str) -> bool:
 
 
 def _unsent_rest(tape: Tape, name: str, step_ns: int, end_ns: int) -> int:
-    """The number of instants from the last sample of a topic to the end, where the publisher left
-    them out.
+    """The number of instants from the last sample of a topic to the end without a sample.
 
-    The numbers of the messages are the proof: the next sample comes after the end, or the aircraft
-    sent y at further instants alone. A log that ends with the topic proves nothing.
+    Only instants that the publisher left out count. The numbers of the messages are the proof:
+    the next sample comes after the end, or the aircraft sent y at further instants alone. A log
+    that ends with the topic proves nothing.
     """
     signal = tape.signals.get(name)
     if signal is None or tape.recording.get(name, Recording(0)).lost != 0:
@@ -309,8 +311,9 @@ def _unsent_rest(tape: Tape, name: str, step_ns: int, end_ns: int) -> int:
 
 
 def _ticks(tape: Tape, scenario: Scenario, end_ns: int) -> tuple[int, float]:
-    """The number of ticks of the controller up to the end, and the engaged time, s. The numbers of
-    the ticks count for each publisher alone.
+    """The number of ticks of the controller up to the end, and the engaged time, s.
+
+    The numbers of the ticks count for each publisher alone.
     """
     step_ns = period_ns(scenario.controller.rate, "controller.rate")
     begins = [
@@ -350,8 +353,10 @@ def _ticks(tape: Tape, scenario: Scenario, end_ns: int) -> tuple[int, float]:
 
 
 def _instants_with_y(tape: Tape, internals: Signal, step_ns: int) -> int:
-    """The number of ticks with a new y or in a failsafe: a foreign aircraft has a rate of y of its
-    own, and the controller publishes u with a new y alone.
+    """The number of ticks with a new y or in a failsafe.
+
+    A foreign aircraft has a rate of y of its own, and the controller publishes u with a new y
+    alone.
     """
     age_ns = internals["age"] * NANOSECONDS
     first_tick_ns = internals.stamp_ns[0] + age_ns[0]
@@ -386,8 +391,9 @@ def _topic(
 
 
 def _latest(scenario: Scenario) -> dict[str, float]:
-    """How long before the end the last sample of a topic may be stamped, s: the delay, and the
-    period of a slow pose.
+    """How long before the end the last sample of a topic may be stamped, s.
+
+    The delay counts, and the period of a slow pose.
     """
     aircraft = scenario.aircraft
     return {

@@ -15,13 +15,12 @@ MAX_WINDOW = 8192
 
 
 def spectra(signal: Signal, period_ns: int) -> tuple[FloatArray, dict[str, FloatArray]]:
-    """Amplitude spectral density of the channels by Welch's method: frequencies in Hz, and values
-    in unit / sqrt(Hz).
+    """Amplitude spectral density of the channels by Welch's method.
 
-    The Hann windows span a tenth of the flight, at most MAX_WINDOW, overlap by half, without the
-    mean. A missing sample repeats the last sample, for LONGEST_INTERVAL at most: a gap of the log
-    may be of any length. The square of the density, integrated over the frequencies, is the
-    variance. Source: Welch 1967.
+    Frequencies are in Hz, and values in unit / sqrt(Hz). The Hann windows span a tenth of the
+    flight, at most MAX_WINDOW, overlap by half, without the mean. A missing sample repeats the last
+    sample, for LONGEST_INTERVAL at most: a gap of the log may be of any length. The square of the
+    density, integrated over the frequencies, is the variance. Source: Welch 1967.
     """
     places = np.round((signal.stamp_ns - signal.stamp_ns[0]) / period_ns).astype(np.int64)
     longest = max(round(LONGEST_INTERVAL * NANOSECONDS / period_ns), 1)
@@ -34,10 +33,10 @@ def spectra(signal: Signal, period_ns: int) -> tuple[FloatArray, dict[str, Float
 
 
 def _welch(values: FloatArray, rate: float, window: int) -> tuple[FloatArray, FloatArray]:
-    """Frequencies, Hz, and one-sided power spectral density of the columns, (F, m), as of
-    `scipy.signal.welch`.
+    """Frequencies, Hz, and one-sided power spectral density of the columns, (F, m).
 
-    scipy.signal takes half a second to load, a tenth of a whole flight in one process.
+    The result is as by `scipy.signal.welch`. scipy.signal takes half a second to load, a tenth of a
+    whole flight in one process.
     """
     hann = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(window) / window)
     # (parts, m, window)

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Metrics of a flight for `summary.json` and the tables, with the units and columns of the
-tables.
+"""Metrics of a flight for `summary.json` and the tables.
+
+The tables have units and columns.
 """
 
 import math
@@ -80,10 +81,10 @@ def pulse_edges(scenario: Scenario) -> list[Transient]:
 
 
 def transients(scenario: Scenario, tape: Tape) -> list[Transient]:
-    """Engagements, commands and gusts. From the first live command on, live commands replace the
-    commands of the scenario.
+    """Engagements, commands and gusts.
 
-    Turns and captures replace the commands of a guided flight.
+    From the first live command on, live commands replace the commands of the scenario. Turns and
+    captures replace the commands of a guided flight.
     """
     windows = scenario.gust_windows() if is_simulated(tape) else {}
     gusts = [Transient("gust", name, *window) for name, window in windows.items()]
@@ -154,8 +155,9 @@ def summarise(
     outcome: Outcome | None = None,
     flight_account: Account | None = None,
 ) -> dict[str, Any]:
-    """The metrics of a flight, SI, ready for JSON. docs/log.md, section Figures, explains
-    the keys.
+    """The metrics of a flight, SI, ready for JSON.
+
+    docs/log.md, section Figures, explains the keys.
 
     Args:
         tape: A flight with y and y_m.
@@ -248,11 +250,10 @@ def _finite(metrics: TickMetrics | LatencyMetrics | AgeMetrics | None) -> dict[s
 
 
 def summarise_imported(tape: Tape, source: Mapping[str, str]) -> dict[str, Any]:
-    """The metrics of a flight that the stack did not fly: of y and u about trim, and the account of
-    the topics.
+    """The metrics of a flight that the stack did not fly.
 
-    It has no reference, and so no error. `source`: of `rise-di import`, the metadata record
-    IMPORTED.
+    y and u about trim have metrics, and the topics an account. It has no reference, and so no
+    error. `source`: of `rise-di import`, the metadata record IMPORTED.
     """
     flight_account = account(tape, None)
     deviations = {}
@@ -274,11 +275,11 @@ def summarise_imported(tape: Tape, source: Mapping[str, str]) -> dict[str, Any]:
 
 
 def late_u(scenario: Scenario, age: AgeMetrics | None) -> list[str]:
-    """The sentence on u older at the aircraft than planned, beside the delay margin of the gains;
-    empty for u as planned.
+    """The sentence on u older at the aircraft than planned; empty for u as planned.
 
-    The linear loop has the delay of the controller's parameters; further delay takes from the delay
-    margin, computed where u is more than a period older.
+    The sentence has the delay margin of the gains too. The linear loop has the delay of the
+    controller's parameters; further delay takes from the delay margin, computed where u is more
+    than a period older.
     """
     controller = scenario.controller
     if age is None or age.mean - controller.delay < 1.0 / controller.rate:
@@ -314,8 +315,9 @@ def _commands(tape: Tape, events: Sequence[Transient], end: float) -> Commands:
 
 
 def command_results(summary: Mapping[str, Any]) -> str:
-    """The commands that the flight did not fly, and the targets: "8 of 24 commands flown"; empty
-    without any.
+    """The commands that the flight did not fly, and the targets; empty without any.
+
+    An example is "8 of 24 commands flown".
     """
     flight_account = account_of_json(summary)
     if flight_account is None or flight_account.commands is None:
@@ -340,10 +342,10 @@ BUSY = 0.05  # share of the ticks without a new y of a host that is too busy
 def _with_late_ticks(
     flight_account: Account, ticks: TickMetrics | None, scenario: Scenario
 ) -> Account:
-    """The account with the ticks that found no new y although the log has every y: the host is too
-    busy.
+    """The account with the ticks that found no new y although the log has every y.
 
-    The rate of y is that of the scenario: a foreign aircraft and an autopilot have their own.
+    The host is too busy then. The rate of y is that of the scenario: a foreign aircraft and an
+    autopilot have their own.
     """
     log_complete = (
         not (flight_account.over("y", "internals") and not flight_account.busy)
@@ -389,8 +391,9 @@ flight."""
 
 
 def taken_over(summary: Mapping[str, Any], table: str) -> str:
-    """The part of the flight over which the figures of a table are taken, after a comma; empty for
-    the whole flight.
+    """The part of the flight over which the figures of a table are taken, after a comma.
+
+    Empty for the whole flight.
     """
     flight_account = account_of_json(summary)
     truth = ("truth",) if table == "errors" and summary["error"] == TRUE_ERROR else ()
@@ -404,8 +407,9 @@ def time_flown(summary: Mapping[str, Any]) -> str:
 
 
 def engagement_notes(flown: Sequence[Mapping[str, Any]], *, has_figures: bool) -> list[str]:
-    """Sentences on the engagements of a flight with a bridge, with figures unless shorter than a
-    sample.
+    """Sentences on the engagements of a flight with a bridge.
+
+    They have figures unless shorter than a sample.
     """
     if not flown:
         return ["never engaged: the figures are of an aircraft that this controller did not fly"]
@@ -427,8 +431,9 @@ def engagement_notes(flown: Sequence[Mapping[str, Any]], *, has_figures: bool) -
 
 
 def mode_notes(tape: Tape, part: str) -> list[str]:
-    """A sentence on a controller that did not fly the law for more than 1 % of the ticks from its
-    first engagement on. `part`: that the log has of the ticks.
+    """A sentence on a controller that did not fly the law for more than 1 % of the ticks.
+
+    The ticks count from the first engagement on. `part`: that the log has of the ticks.
     """
     if "internals" not in tape:
         return []

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The metrics of a summary, each declared once: its place there, heading, unit and digits; and the
-rows of tables, as text.
+"""The metrics of a summary, declared once, and the rows of tables, as text.
+
+A metric has a place in the summary, a heading, a unit and digits.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,8 +23,10 @@ MILLISECONDS = DisplayUnit("ms", 1e3)
 
 
 class Column(NamedTuple):
-    """A column of a table, or a metric: the heading, the common heading of neighbouring columns
-    above, and the path in a summary.
+    """A column of a table, or a metric.
+
+    The fields are the heading, the common heading of neighbouring columns above, and the path in a
+    summary.
     """
 
     group: str
@@ -149,8 +152,9 @@ def model_rows(
 def table_rows(
     channels: Mapping[str, Any], columns: Sequence[Column], units: Mapping[str, DisplayUnit]
 ) -> list[list[str]]:
-    """Rows for "errors" or "inputs" of a summary: the channel with the unit, then a cell per
-    column.
+    """Rows for "errors" or "inputs" of a summary.
+
+    A row has the channel with the unit, then a cell per column.
     """
     rows = []
     for name, metrics in channels.items():
@@ -160,8 +164,9 @@ def table_rows(
 
 
 def timing_rows(summary: Mapping[str, Any]) -> list[tuple[str, str, str]]:
-    """The timing of the controller: a row for the metrics with a common heading. Topic of the
-    summary, heading with the unit, values.
+    """The timing of the controller: a row for the metrics with a common heading.
+
+    A row has the topic of the summary, the heading with the unit, and the values.
     """
     rows = []
     for group, metrics in groupby(TIMING_COLUMNS, key=lambda column: column.group):
@@ -197,8 +202,9 @@ def segment_table(
 
 
 def input_rows(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -> list[list[str]]:
-    """Rows for the flight's INPUT_COLUMNS and SATURATION_COLUMN: ticks with saturation in percent,
-    by magnitude / by rate.
+    """Rows for the flight's INPUT_COLUMNS and SATURATION_COLUMN.
+
+    Ticks with saturation are in percent, by magnitude / by rate.
     """
     rows = table_rows(summary["inputs"], columns_of(INPUT_COLUMNS, summary["inputs"]), units)
     for row, metrics in zip(rows, summary["inputs"].values(), strict=True):

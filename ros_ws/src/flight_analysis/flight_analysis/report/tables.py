@@ -95,8 +95,9 @@ class Table(NamedTuple):
 
 
 class Interval(NamedTuple):
-    """A gust, a fault, a failsafe mode, a saturation or a still vane, from the first to the last
-    instant in s.
+    """A gust, a fault, a failsafe mode, a saturation or a still vane.
+
+    The span is from the first to the last instant in s.
     """
 
     name: str
@@ -106,8 +107,9 @@ class Interval(NamedTuple):
 
 
 def _stands_still(measures: FloatArray, tape: Tape, time: float) -> NDArray[np.bool_]:
-    """Ticks in which a vane stands still, shape (N,): from an engagement on once the vane has moved
-    or `time` s have passed.
+    """Ticks in which a vane stands still, shape (N,).
+
+    They count from an engagement on once the vane has moved or `time` s have passed.
     """
     internals = tape["internals"]
     t = tape.time("internals")
@@ -120,10 +122,10 @@ def _stands_still(measures: FloatArray, tape: Tape, time: float) -> NDArray[np.b
 
 
 def events(tape: Tape, gusts: Windows, scenario: Scenario | None = None) -> list[Interval]:
-    """Gusts, faults of effectors, modes but ENGAGED, saturations of the inputs, and still vanes, in
-    order of the start.
+    """Gusts, faults of effectors, modes but ENGAGED, saturations, and still vanes.
 
-    The scenario comes from the tape; the tape of a log has no scenario and needs the argument.
+    The order is that of the start. The saturations are of the inputs. The scenario comes from the
+    tape; the tape of a log has no scenario and needs the argument.
     """
     flown = scenario if scenario is not None else tape.scenario
     listed = []
@@ -175,8 +177,9 @@ def events(tape: Tape, gusts: Windows, scenario: Scenario | None = None) -> list
 
 
 def metric_tables(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -> list[Table]:
-    """Tables of the error, the inputs, guidance, the models and the ticks, of page and terminal; a
-    table without rows is left out.
+    """Tables of the error, the inputs, guidance, the models and the ticks.
+
+    Page and terminal have these tables. A table without rows is left out.
     """
     inputs = (*columns_of(INPUT_COLUMNS, summary["inputs"]), SATURATION_COLUMN)
     tables = (
@@ -254,8 +257,9 @@ def _guidance_table(summary: Mapping[str, Any]) -> Table:
 def model_table(
     models: Sequence[Mapping[str, Any]], units: Mapping[str, DisplayUnit], part: str
 ) -> Table:
-    """The rms of the error before the first learned model and under each. `part`: what the log has
-    of the flight, after a comma.
+    """The rms of the error before the first learned model and under every model.
+
+    `part`: what the log has of the flight, after a comma.
     """
     headings, rows = model_rows(models, units)
     columns = [Column("", head) for head in headings]

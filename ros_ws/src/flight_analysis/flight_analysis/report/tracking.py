@@ -111,8 +111,9 @@ def _floor(pair: ErrorPair, i: int, speed: float, unit: str) -> float:
 
 
 def _worst(pair: ErrorPair, i: int, group: list[int], floor: float) -> Excess | None:
-    """The part of a flight with the largest error over the allowed error; None within. `group`:
-    the airspeed, or the rates.
+    """The part of a flight with the largest error over the allowed error; None within.
+
+    `group`: the airspeed, or the rates.
     """
     edges = np.flatnonzero(np.diff(np.concatenate([[False], pair.is_flown, [False]])))
     spans = list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
@@ -130,8 +131,9 @@ def _worst(pair: ErrorPair, i: int, group: list[int], floor: float) -> Excess | 
 def _largest_excess(
     pair: ErrorPair, i: int, group: list[int], floor: float, span: tuple[int, int]
 ) -> Excess:
-    """The part of WINDOW in a span of ticks with the largest rms error over the allowed error; a
-    shorter span is a single part.
+    """The part of WINDOW in a span of ticks with the largest rms over the allowed error.
+
+    A shorter span is a single part.
     """
     start, stop = span
     count = min(_ticks(pair, WINDOW), stop - start)
@@ -184,11 +186,10 @@ def _shortfall(excess: Excess, pair: ErrorPair, i: int, unit: DisplayUnit) -> Sh
 
 
 def saturation_notes(tape: Tape) -> list[str]:
-    """Sentences on inputs that went from limit to limit in SATURATED of the ticks of WINDOW, with
-    SIDE or more on either side.
+    """Sentences on inputs that went from limit to limit in SATURATED of the ticks of WINDOW.
 
-    A climb at full throttle stays on one side. A limit of the rate does not count: noise reaches
-    the rate of a slow engine to either side.
+    SIDE or more of these are on either side. A climb at full throttle stays on one side. A limit of
+    the rate does not count: noise reaches the rate of a slow engine to either side.
     """
     if "internals" not in tape:
         return []
