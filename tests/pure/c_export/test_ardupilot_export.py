@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di export --ardupilot`: the files compile beside a stub of ArduPlane's headers, and each
-name that the shell takes from ArduPlane is in the stub.
+"""`rise-di export --ardupilot`: the files compile beside a stub of ArduPlane's headers.
+
+Each name that the shell takes from ArduPlane is in the stub.
 """
 
 import shutil

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di export`: C code beside the Python controller, bit by bit; mutants of the C code,
-sanitizers, refusals.
+"""`rise-di export`: C code beside the Python controller, bit by bit.
+
+Further tests are of mutants of the C code, sanitizers and refusals.
 """
 
 import ctypes
@@ -116,8 +117,9 @@ class Case(NamedTuple):
 
 
 def export_case(name: str, folder: Path) -> Case:
-    """Short flights at the rate of the controller, 1500 drawn calls, and 300 steps with each
-    parameter set; a tenth where Python allocates.
+    """Short flights at the rate of the controller, 1500 drawn calls, and 300 steps.
+
+    The steps are with each parameter set; a tenth where Python allocates.
     """
     rate = SCENARIOS[name]().controller.rate
     slow = {"rate": rate, "step": min(0.005, 1.0 / rate)}
@@ -141,8 +143,9 @@ def export_case(name: str, folder: Path) -> Case:
 
 
 def any_numbers(sets: list[RiseDiConfig]) -> Recording:
-    """Ticks of the guard with y and y_m of any size, infinite and NaN too, at stamps up to both
-    ends of int64.
+    """Ticks of the guard with y and y_m of any size, infinite and NaN too.
+
+    The stamps go up to both ends of int64.
     """
     rng = np.random.default_rng(5)
     recorder = Recorder(sets)
@@ -226,8 +229,9 @@ def test_bits_do_not_depend_on_optimisation(
 
 
 def test_contraction_does_not_start(case: Case, tmp_path: Path) -> None:
-    """A fused multiply-add has a single rounding: without -ffp-contract=off nothing flies where the
-    processor has it.
+    """A fused multiply-add has a single rounding.
+
+    Without -ffp-contract=off nothing flies where the processor has it.
     """
     if " fma " not in Path("/proc/cpuinfo").read_text():
         pytest.skip("no fused multiply-add on this processor")
@@ -298,8 +302,9 @@ def is_found(case: Case, mutant: str, folder: Path) -> bool:
 def test_check_names_an_edit_out_of_bounds(
     name: str, exported: Callable[[str], Case], tmp_path: Path
 ) -> None:
-    """Each set of the proof passes; each real beyond each of its finite bounds, each NaN and each
-    odd integer is named.
+    """Each set of the proof passes, and each value out of bounds is named.
+
+    That is each real beyond each of its finite bounds, each NaN and each odd integer.
     """
     case = exported(name)
     build(
@@ -478,8 +483,9 @@ def test_refusals_are_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 
 def test_proof_of_a_log_takes_changes_of_parameters(monkeypatch: pytest.MonkeyPatch) -> None:
-    """New gains in flight are an event of the recording, and every u is that of the log; without
-    the changes it is refused.
+    """New gains in flight are an event of the recording, and every u is that of the log.
+
+    Without the changes it is refused.
     """
     scenario = find_scenario("osprey_servo", 2.0)
     change = {"k_g": 2.0}

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Wrappers of the exported code: the library that replays logs, a caller of a library at 250 Hz,
-the unit of FMI 2.0.
+"""Wrappers of the exported code.
+
+They are the library that replays logs, a caller of a library at 250 Hz, and the unit of FMI 2.0.
 """
 
 import importlib.util
@@ -75,8 +76,9 @@ class Call(NamedTuple):
 
 
 def jittering_calls(count: int, seed: int) -> list[Call]:
-    """Calls at 250 Hz, late by up to a quarter of a period; a fifth of y and a tenth of y_m lost; a
-    second without y.
+    """Calls at 250 Hz, late by up to a quarter of a period.
+
+    A fifth of y and a tenth of y_m are lost; a second is without y.
     """
     rng = np.random.default_rng(seed)
     calls = []
@@ -96,8 +98,9 @@ def jittering_calls(count: int, seed: int) -> list[Call]:
 
 @pytest.mark.parametrize("name", ["osprey_servo", "osprey_observer"])
 def test_caller_at_250_hz(name: str, c_controller: Callable[[RiseDiConfig], CController]) -> None:
-    """The caller of the page on export, with jitter and lost samples: u and mode are those of the
-    Python controller.
+    """The caller of the page on export, with jitter and lost samples.
+
+    u and mode are those of the Python controller.
     """
     controller = find_scenario(name).controller
     if controller.observer is None:  # the matrices of an observer hold at the rate of its design
@@ -168,8 +171,10 @@ def flown(unit: Path, tape: Tape, outputs: Sequence[str], **start: float) -> Flo
 
 
 def test_fmu_flies_to_the_bit(unit: Path, tmp_path: Path) -> None:
-    """FMPy, an independent host of FMI, steps the unit with y and y_m of a flight in one
-    process; a gain set before the flight is that of Python, and the sources compile by CMake.
+    """FMPy, an independent host of FMI, steps the unit with y and y_m of a flight.
+
+    The flight is in one process. A gain set before the flight is that of Python, and the sources
+    compile by CMake.
     """
     scenario = find_scenario("osprey_observer", 5.0).vary(
         aircraft={"rate": 100.0, "step": 0.005}, reference_model={"rate": 100.0}
@@ -291,8 +296,9 @@ int main(void) {
 
 @pytest.fixture(scope="module")
 def code(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The code of osprey_observer, with a feedforward and so with the sine, and a program that
-    starts it.
+    """The code of osprey_observer, and a program that starts it.
+
+    It has a feedforward and so the sine.
     """
     folder = tmp_path_factory.mktemp("code")
     write_code(
@@ -306,8 +312,9 @@ def code(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def started(code: Path, compiler: Sequence[str], flags: Sequence[str]) -> int:
-    """Exit status of the program: 0 where the controller starts, 1 where it does not and then
-    refuses every call.
+    """Exit status of the program: 0 where the controller starts.
+
+    It is 1 where it does not and then refuses every call.
     """
     build([*compiler, *FLAGS, *flags, "-o", "starter", "starter.c", "rise_di.c"], code)
     return subprocess.run(["./starter"], cwd=code, check=False).returncode
@@ -315,8 +322,9 @@ def started(code: Path, compiler: Sequence[str], flags: Sequence[str]) -> int:
 
 @pytest.mark.parametrize("flags", FAST_MATH)
 def test_controller_does_not_start_under_flags_that_change_bits(flags: str, code: Path) -> None:
-    """Where no macro tells of them, the test of rise_di_start does, at each optimisation: 0.3 is
-    not rounded to 0 then.
+    """Where no macro tells of them, the test of rise_di_start does, at each optimisation.
+
+    0.3 is not rounded to 0 then.
     """
     for level in ("-O1", "-O3"):
         assert started(code, ["gcc"], [level, *flags.split(), *WITHOUT_MACROS]) == 1
@@ -334,8 +342,9 @@ HAS_FMA = CPU.is_file() and " fma " in CPU.read_text()
 
 
 def test_twelve_of_twelve_wrong_flags_are_refused(code: Path) -> None:
-    """By the compiler, or by rise_di_start; the last needs a processor with a fused
-    multiply-add.
+    """The compiler refuses them, or rise_di_start.
+
+    The last needs a processor with a fused multiply-add.
     """
 
     def is_refused(flags: str) -> bool:
@@ -363,8 +372,9 @@ def test_calls_before_the_start_are_refused(code: Path) -> None:
 def test_wrong_samples_are_lost_as_by_controller(
     c_controller: Callable[[RiseDiConfig], CController],
 ) -> None:
-    """A spike, a jump that stays, noise that grows, y_m beyond its bound: the same samples are
-    lost, u has the same bits.
+    """The same samples are lost, and u has the same bits.
+
+    They are a spike, a jump that stays, noise that grows, and y_m beyond its bound.
     """
     config = exportable(find_scenario("osprey_observer").controller)
     rng = np.random.default_rng(4)

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di export --px4`: what the module decides, in a host build without PX4; its C++ beside a
-stub of PX4's headers.
+"""`rise-di export --px4`: what the module decides, in a host build without PX4.
+
+Its C++ compiles beside a stub of PX4's headers.
 """
 
 import ctypes
@@ -219,8 +220,9 @@ def test_falls_back_in_the_same_cycle(
 
 
 def test_samples_that_stop_are_told_by_their_age(shell: Shell) -> None:
-    """The cycle goes on without samples: the spare flies once they are older than the limit of 0.02
-    s.
+    """The cycle goes on without samples.
+
+    The spare flies once they are older than the limit of 0.02 s.
     """
     shell.fly(20)
     stamp_us = shell.now_us
@@ -229,16 +231,18 @@ def test_samples_that_stop_are_told_by_their_age(shell: Shell) -> None:
 
 
 def test_y_is_of_the_instant_before_the_filters_of_the_rates(shell: Shell) -> None:
-    """By their delay: y_m of that instant is compared, so the rates, not what the filters leave of
-    them, follow the reference.
+    """By their delay y_m of that instant is compared.
+
+    So the rates, not what the filters leave of them, follow the reference.
     """
     shell.fly(20, filter_us=5600)
     assert shell.values[20] == shell.now_us - 5600
 
 
 def test_reference_follows_the_setpoint(shell: Shell) -> None:
-    """y_m is that of Python at the instants of the periods, for any rates that come faster; a pause
-    starts it again.
+    """y_m is that of Python at the instants of the periods, for any rates that come faster.
+
+    A pause starts it again.
     """
     shell.fly(2, enabled=False)
     shell.fly(300, setpoint=(0.3, -0.2, 0.1), rates=(0.3, -0.2, 0.1), enabled=False)
@@ -250,8 +254,9 @@ def test_reference_follows_the_setpoint(shell: Shell) -> None:
 
 
 def test_torque_follows_the_dynamic_pressure(library: Path) -> None:
-    """The same error at twice the airspeed: a quarter of the torque; without an airspeed no
-    scale.
+    """The same error at twice the airspeed has a quarter of the torque.
+
+    Without an airspeed there is no scale.
     """
     rise = {}
     for airspeed in (8.0, 11.5, 16.0, float("nan"), 0.0):
@@ -268,8 +273,9 @@ def test_torque_follows_the_dynamic_pressure(library: Path) -> None:
 
 
 def test_limits_are_those_of_the_torque(library: Path) -> None:
-    """In slow flight the torque of 1 comes at a smaller u: the law stops there and does not wind
-    up.
+    """In slow flight the torque of 1 comes at a smaller u.
+
+    The law stops there and does not wind up.
     """
     shell = Shell(library)
     shell.fly(400, setpoint=(5.0, 0.0, 0.0), airspeed=8.0, max_error=30.0)
@@ -345,8 +351,10 @@ def test_refuses_what_no_rate_controller_is(tmp_path: Path) -> None:
 
 
 def flown_table(shell: Shell, controller: ControllerConfig) -> Table:
-    """rise_di_status of a flight: rates at twice the rate of the law with jitter, slow and fast, a
-    hand-back of 0.2 s.
+    """rise_di_status of a flight.
+
+    The rates come at twice the rate of the law with jitter, slow and fast, with a hand-back of 0.2
+    s.
     """
     rng = np.random.default_rng(7)
     rows: list[dict[str, Any]] = []
@@ -382,8 +390,9 @@ def flown_table(shell: Shell, controller: ControllerConfig) -> Table:
 
 
 def test_log_of_the_module_replays_to_the_bit(shell: Shell, folder: Path) -> None:
-    """Python computes the u of each tick: from the y, y_m and limits of rise_di_status alone. After
-    a gap of the log it begins again with the next engagement.
+    """Python computes the u of each tick from rise_di_status alone.
+
+    It takes the y, y_m and limits. After a gap of the log it begins again with the next engagement.
     """
     controller = find_scenario(str(OBSERVER)).controller
     table = flown_table(shell, controller)

@@ -1,7 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The controller of body rates inside an autopilot: the exported C code, source/rates that decides
-which controller flies, and the autopilot's shell, source/px4 or source/ardupilot.
+"""The controller of body rates inside an autopilot.
+
+The parts are the exported C code, source/rates that decides which controller flies, and the
+autopilot's shell, source/px4 or source/ardupilot.
 """
 
 import shutil
@@ -96,8 +98,10 @@ def write_module(
     float32: bool,
     samples: int = SAMPLES,
 ) -> list[Path]:
-    """Write the module of an autopilot to a folder: for PX4 that of EXTERNAL_MODULES_LOCATION, for
-    ArduPlane files for its tree, with two lines of it in hooks.txt. Raises ParameterError.
+    """Write the module of an autopilot to a folder.
+
+    For PX4 the folder is EXTERNAL_MODULES_LOCATION, for ArduPlane files for the tree, with two
+    lines of the tree in hooks.txt. Raises ParameterError.
 
     The outputs are body rates. An input of u at the upper end stop of its actuator is a torque of
     1, in ArduPlane a deflection of 45 degrees, with the sign of D.

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of controller and reference model in C: rise_di_parameters.h, and struct
-rise_di_parameters as bytes.
+"""Parameters of controller and reference model in C.
+
+They are rise_di_parameters.h, and struct rise_di_parameters as bytes.
 """
 
 import math
@@ -80,8 +81,9 @@ REALS: Mapping[str, float] = MappingProxyType(
 
 
 class Constant(NamedTuple):
-    """A member of struct rise_di_parameters: whole numbers (int, tuple) or reals (array), of a
-    matrix row by row.
+    """A member of struct rise_di_parameters.
+
+    The value is whole numbers (int, tuple) or reals (array), of a matrix row by row.
     """
 
     name: str
@@ -89,8 +91,9 @@ class Constant(NamedTuple):
 
 
 class Sizes(NamedTuple):
-    """Dimensions of the exported controller; 0 without an allocation, a feedforward or an
-    observer.
+    """Dimensions of the exported controller.
+
+    They are 0 without an allocation, a feedforward or an observer.
     """
 
     m: int  # channels
@@ -101,8 +104,9 @@ class Sizes(NamedTuple):
 
 
 def exportable(controller: ControllerConfig) -> RiseDiConfig:
-    """The controller, under RISE-DI. Raises ParameterError for a different law, and for models that
-    are learned or off.
+    """The controller, under RISE-DI.
+
+    Raises ParameterError for a different law, and for models that are learned or off.
     """
     require(
         isinstance(controller, RiseDiConfig),
@@ -159,8 +163,9 @@ def sizes(controller: RiseDiConfig) -> Sizes:
 
 
 def constants(controller: RiseDiConfig) -> list[Constant]:
-    """Members of struct rise_di_parameters in the order of rise_di.h; infinite where there is no
-    limit.
+    """Members of struct rise_di_parameters in the order of rise_di.h.
+
+    They are infinite where there is no limit.
     """
     guard = controller.guard()
     law = controller.law_params()
@@ -217,8 +222,9 @@ def _limits(name: str, limits: Limits) -> dict[str, FloatArray]:
 
 
 def packed(controller: RiseDiConfig, *, float32: bool) -> bytes:
-    """The bytes of struct rise_di_parameters: whole numbers of 64 bits, then the reals without a
-    gap, filled to 8 bytes.
+    """The bytes of struct rise_di_parameters.
+
+    They are whole numbers of 64 bits, then the reals without a gap, filled to 8 bytes.
     """
     real = np.float32 if float32 else np.float64
     content = b"".join(
@@ -259,6 +265,7 @@ def header(
     samples: int = SAMPLE_BUFFER_SIZE,
 ) -> str:
     """The text of rise_di_parameters.h; without a reference model where `reference` is None.
+
     `samples` of y and of y_m are kept.
     """
     r = 0 if reference is None else len(reference.model().A_m)
@@ -359,8 +366,9 @@ def _rows(members: list[Constant], numbers: Callable[[FloatArray], str]) -> list
 def _initialiser(
     name: str, value: int | tuple[int, ...] | FloatArray, numbers: Callable[[FloatArray], str]
 ) -> str:
-    """A number, a list in braces; the first and the last list of a nested struct open and close the
-    braces of the struct.
+    """A number, or a list in braces, as C initialises it.
+
+    The first and the last list of a nested struct open and close the braces of the struct.
     """
     if isinstance(value, int):
         return str(value)
@@ -374,10 +382,10 @@ def _initialiser(
 
 
 def _strings(names: tuple[str, ...]) -> str:
-    """String literals of C; a character other than a letter, a digit or one of "_. " as the octal
-    escape of each of its bytes.
+    """String literals of C.
 
-    Of names from a parameter set none has such a character.
+    A character other than a letter, a digit or one of "_. " is the octal escape of each of its
+    bytes. Of names from a parameter set none has such a character.
     """
     return ", ".join(f'"{"".join(map(_octal, name))}"' for name in names)
 

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Drawn inputs for the proof: calls of a controller with any timing, and single steps from any
-state.
+"""Drawn inputs for the proof.
+
+They are calls of a controller with any timing, and single steps from any state.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -44,8 +45,10 @@ EPOCH_NS = 1_795_000_000_000_000_000
 def drawn_calls(
     sets: Sequence[RiseDiConfig], ticks: int, seed: int, samples: int = SAMPLE_BUFFER_SIZE
 ) -> Recording:
-    """Drawn samples: jitter, lost, late, early, repeated stamps, errors of any size, jumps, new
-    parameters, deactivation.
+    """Drawn calls of a controller with faults of every kind.
+
+    They have jitter, lost, late and early samples, repeated stamps, errors of any size, jumps, new
+    parameters and deactivation.
     """
     rng = np.random.default_rng(seed)
     controller = sets[0]
@@ -103,8 +106,9 @@ def drawn_calls(
 
 
 def _jumps(unit: FloatArray, rng: np.random.Generator) -> Iterator[FloatArray]:
-    """What is added to samples of y, (m,): in one of 50, and in some after it, up to 10^5 units, so
-    that they are lost.
+    """What is added to samples of y, (m,).
+
+    One sample of 50, and some samples after, get up to 10^5 units, and are lost.
     """
     m = len(unit)
     off = np.zeros_like(unit)
@@ -119,8 +123,9 @@ def _jumps(unit: FloatArray, rng: np.random.Generator) -> Iterator[FloatArray]:
 def drawn_standstill(
     sets: Sequence[RiseDiConfig], ticks: int, seed: int, samples: int = SAMPLE_BUFFER_SIZE
 ) -> Recording:
-    """Samples of y with noise, and stretches of up to twelve equal samples, at the ticks and half a
-    period before.
+    """Samples of y with noise, and stretches of up to twelve equal samples.
+
+    They come at the ticks and half a period before.
     """
     rng = np.random.default_rng(seed)
     period_ns = sets[0].guard().period_ns
@@ -141,8 +146,9 @@ def drawn_standstill(
 
 
 def drawn_steps(sets: Sequence[RiseDiConfig], index: int, steps: int, seed: int) -> Recording:
-    """Single steps of an engaged controller from drawn states, with the parameters of an index, all
-    computed at once.
+    """Single steps of an engaged controller from drawn states, computed at once.
+
+    The parameters are the set of an index.
 
     Errors from 0.001 to 300 widths of the softened sign. dt from 0.2 to 10 periods, so with up to 9
     missed samples, where no gap engages the law again.
@@ -186,8 +192,9 @@ def drawn_steps(sets: Sequence[RiseDiConfig], index: int, steps: int, seed: int)
 
 
 def drawn_commands(reference: ReferenceModelConfig, steps: int, seed: int) -> Recording:
-    """Live commands for the reference model: of any size, beyond the bounds, late, repeated, lost
-    for longer than `max_age`.
+    """Live commands for the reference model.
+
+    They are of any size, beyond the bounds, late, repeated, and lost for longer than `max_age`.
     """
     rng = np.random.default_rng(seed)
     model = Reference(
@@ -344,8 +351,9 @@ def _fed_forward(
 def _given(
     u: FloatArray, before: FloatArray | None, dt: FloatArray, params: Allocation | None
 ) -> tuple[FloatArray, FloatArray | None]:
-    """The u that the effectors give for a u, and the effectors, both by column; u and None without
-    an allocation.
+    """The u of the effectors for a u, and the effectors, by column.
+
+    Without an allocation they are u and None.
     """
     if params is None or before is None:
         return u, None

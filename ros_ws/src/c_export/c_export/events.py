@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Calls of a controller in order, as events, with the state after each tick: in flights with
-faults, and of a log.
+"""Calls of a controller in order, as events, with the state after each tick.
+
+The flights are those with faults, or that of a log.
 """
 
 from collections import deque
@@ -51,8 +52,9 @@ NOTHING = np.zeros(0)
 
 
 class Recording(NamedTuple):
-    """Events, and the state of the Python controller or reference model after each of the T
-    ticks.
+    """Events, and the state of the controller or reference model after each of the T ticks.
+
+    The Python code has the state.
     """
 
     name: str
@@ -103,11 +105,11 @@ def numbered(groups: Mapping[str, int]) -> Iterator[str]:
 
 
 class Recorder(Controller):
-    """A controller that records its calls and its states. `sets` are the parameters that `retune`
-    may take, the first at first.
+    """A controller that records its calls and its states.
 
-    `before_tick` is called with the recorder and the instant before each tick, and returns whether
-    the controller is active. `samples` of y and of y_m are kept.
+    `sets` are the parameters that `retune` may take, the first at first. `before_tick` is called
+    with the recorder and the instant before each tick, and returns whether the controller is
+    active. `samples` of y and of y_m are kept.
     """
 
     def __init__(
@@ -200,8 +202,9 @@ class Recorder(Controller):
     def guard_tick(
         self, now_ns: int, sample: tuple[int, FloatArray, FloatArray, int] | None, *, active: bool
     ) -> None:
-        """A tick with stamp, y, y_m at the stamp, and the distance of the newest y_m in ns; None
-        without samples.
+        """A tick with stamp, y, y_m at the stamp, and the distance of the newest y_m in ns.
+
+        `sample` is None without samples.
         """
         y = None
         y_m = []
@@ -258,8 +261,9 @@ class Recorder(Controller):
 
 
 def parameter_sets(controller: RiseDiConfig) -> list[RiseDiConfig]:
-    """The controller, then valid changes of its parameters: gains, limits, signs, times, schedule,
-    observer, stops.
+    """The controller, then valid changes of its parameters.
+
+    They change gains, limits, signs, times, schedule, observer and stops.
     """
     widths = np.array(controller.input_scale) * controller.law_params().eps
     bound = np.minimum(10.0 * widths, 0.1 * np.array(controller.upper or 10.0 * widths)).tolist()
@@ -353,10 +357,10 @@ def _faults(duration: float, sets: Sequence[RiseDiConfig]) -> Callable[[Recorder
 
 
 def run_recording(run: RecordedRun) -> tuple[list[RiseDiConfig], Recording, int]:
-    """The parameters of a log and their changes in flight, the ticks of the log, and the number of
-    ticks with the u of the log.
+    """The parameters of a log and their changes in flight, and the ticks of the log.
 
-    Raises ParameterError for parameters in force that the changes of the log do not lead to.
+    The third result is the number of ticks with the u of the log. Raises ParameterError for
+    parameters in force that the changes of the log do not lead to.
     """
     sets = [exportable(recorded_parameters(run.scenario_file()))]
     changes = [*recorded_changes(run, sets[0])]

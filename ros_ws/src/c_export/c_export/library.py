@@ -28,8 +28,9 @@ MOST = float(np.finfo(np.float64).max)  # in place of infinity, as in the C code
 
 
 class CController:
-    """A controller in C, with the calls of `rise_di_controller.controller.Controller`; p values of
-    u.
+    """A controller in C, with the calls of `rise_di_controller.controller.Controller`.
+
+    u has p values.
     """
 
     def __init__(self, library: Path, p: int) -> None:
@@ -84,8 +85,9 @@ class CController:
 
 
 def build_library(code: Path, compiler: Sequence[str], path: Path) -> Path:
-    """Compile exported code of float64 to a shared library for CController. Raises
-    ParameterError.
+    """Compile exported code of float64 to a shared library for CController.
+
+    Raises ParameterError.
     """
     return _shared(code, compiler, "library.c", path)
 
@@ -243,8 +245,10 @@ DESCRIPTION = """<?xml version="1.0" encoding="UTF-8"?>
 
 
 def model_description(controller: RiseDiConfig, scenario: str, units: Units) -> str:
-    """modelDescription.xml of the unit. Inputs y, y_m, active, y_new, y_m_new; outputs u and mode;
-    parameters TUNABLE; a step is a tick.
+    """modelDescription.xml of the unit.
+
+    The inputs are y, y_m, active, y_new, y_m_new, the outputs u and mode, the parameters TUNABLE. A
+    step is a tick.
     """
     variables = _channels(controller, units)
     begin = 2 * len(controller.outputs) + 1
@@ -268,8 +272,9 @@ def build_fmu(
     path: Path,
     units: Units,
 ) -> Path:
-    """Compile exported code to a co-simulation unit of FMI 2.0 for this machine (linux64), with the
-    sources for others. Raises ParameterError.
+    """Compile exported code to a co-simulation unit of FMI 2.0 for this machine (linux64).
+
+    The unit has the sources for others. Raises ParameterError.
     """
     with tempfile.TemporaryDirectory(prefix="rise_di_fmu_") as name:
         library = _shared(code, compiler, "fmu.c", Path(name) / "rise_di.so")

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The exported C code, compiled and compared with the Python controller: every u and every state,
-bit by bit.
+"""The exported C code, compiled and compared with the Python controller.
+
+Every u and every state is compared bit by bit.
 """
 
 import json
@@ -61,8 +62,9 @@ class Comparison(NamedTuple):
     modes_equal: bool  # whether modes and times are equal
 
     def holds(self, *, float32: bool) -> bool:
-        """Whether every bit is equal; in float32 whether every mode is equal, and u within
-        FLOAT32_BOUND.
+        """Whether every bit is equal, or the difference in float32 is within its bound.
+
+        In float32 every mode is equal, and u within FLOAT32_BOUND.
         """
         return (
             self.modes_equal and self.deviation <= FLOAT32_BOUND if float32 else self.differing == 0
@@ -78,10 +80,10 @@ def write_code(
     float32: bool,
     samples: int = SAMPLE_BUFFER_SIZE,
 ) -> list[Path]:
-    """Write the C code of a controller and of a reference model to a folder; remove the report and
-    the unit of earlier code.
+    """Write the C code of a controller and of a reference model to a folder.
 
-    The controller keeps `samples` of y and of y_m. Raises ParameterError.
+    The report and the unit of earlier code are removed. The controller keeps `samples` of y and of
+    y_m. Raises ParameterError.
     """
     require(samples >= LEAST_SAMPLES, "samples", samples, f"{LEAST_SAMPLES} or more")
     with writing("c", folder, "a folder that can"):
@@ -96,8 +98,9 @@ def write_code(
 
 
 def compilers(named: Sequence[str] = ()) -> list[list[str]]:
-    """Commands of the C compilers: the named ones, or all of COMPILERS on the PATH. Raises
-    ParameterError for none.
+    """Commands of the C compilers: `names`, or the COMPILERS on the PATH.
+
+    Raises ParameterError for none.
     """
     commands = [words(command) for command in named] or [
         [name] for name in COMPILERS if shutil.which(name)
@@ -114,8 +117,9 @@ def compilers(named: Sequence[str] = ()) -> list[list[str]]:
 def words(
     command: str, option: str = "compiler", expected: str = "the command of a C compiler"
 ) -> list[str]:
-    """The words of a command, as a shell reads them. Raises ParameterError for what is no
-    program.
+    """The words of a command, as a shell reads them.
+
+    Raises ParameterError for what is no program.
     """
     try:
         parts = shlex.split(command)
@@ -140,8 +144,9 @@ class Program:
         float32: bool = False,
         flags: Sequence[str] = FLAGS, source: str | None = None, runner: Sequence[str] = (),
     ) -> None:  # fmt: skip
-        """Compile; `source` replaces the text of rise_di.c, `runner` starts the program. Raises
-        ParameterError.
+        """Compile; `source` replaces the text of rise_di.c, `runner` starts the program.
+
+        Raises ParameterError.
         """
         self._folder = folder
         self._runner = runner
@@ -165,8 +170,9 @@ class Program:
         (self._folder / "sets").write_bytes(content)
 
     def run(self, recording: Recording) -> tuple[np.ndarray, FloatArray, Mapping[str, int]]:
-        """Integers and reals of the states of C, as the recording has them, and what the program
-        prints.
+        """Integers and reals of the states of C, as the recording has them.
+
+        The third result is what the program prints.
         """
         (self._folder / "events").write_bytes(recording.events.tobytes())
         (self._folder / "loaded").write_bytes(recording.loaded.tobytes())
@@ -248,10 +254,10 @@ def prove(
     float32: bool,
     runner: Sequence[str] = (),
 ) -> Proof:
-    """Compile the code in a folder with each compiler, and compare the states of C with the
-    recordings.
+    """Compile the code in a folder with each compiler, and compare it with the recordings.
 
-    `runner` starts the programs of a compiler for a different machine, as qemu does.
+    The states of C are compared. `runner` starts the programs of a compiler for a different
+    machine, as qemu does.
 
     With g++ a program whose reals count gives the largest number of operations of a call.
     """
@@ -340,10 +346,10 @@ def version(compiler: Sequence[str]) -> str:
 
 
 def footprint(code: Path, compiler: Sequence[str], folder: Path) -> dict[str, int]:
-    """Bytes of machine code and constants, and of the stack: the sum of all frames. What is unknown
-    is left out.
+    """Bytes of machine code and constants, and of the stack: the sum of all frames.
 
-    No function calls itself, so no chain of calls needs more stack than the sum.
+    What is unknown is left out. No function calls itself, so no chain of calls needs more stack
+    than the sum.
     """
     for name in (*CODE, PARAMETERS):
         shutil.copyfile(code / name, folder / name)
