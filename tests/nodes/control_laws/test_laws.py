@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The controller's node under another law: a controller that it cannot fly, and new gains of a law
-of another package.
+"""The controller's node under another law.
+
+The tests are of a controller that it cannot fly, and of new gains of a law of another package.
 """
 
 from pathlib import Path

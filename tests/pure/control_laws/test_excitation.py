@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The excitation of an identification: doublets and a multisine on one input after another, by
-closed forms.
+"""The excitation of an identification, by closed forms.
+
+It has doublets and a multisine on one input after another.
 """
 
 from dataclasses import replace

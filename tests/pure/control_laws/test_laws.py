@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The control laws of the controller through their one protocol: engagement, limits, retuning,
-replay, observer, refusals.
+"""The control laws of the controller through their one protocol.
+
+The tests are of engagement, limits, retuning, replay, observer and refusals.
 """
 
 from collections.abc import Iterator
@@ -64,8 +65,9 @@ def _example(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @cache
 def sections() -> dict[str, dict[str, Any]]:
-    """Sections of a controller by a name; "observer" in it: the observer for osprey_servo by rule,
-    with 20 ms of margin.
+    """Sections of a controller by a name.
+
+    With "observer" in the name it is the observer for osprey_servo by rule, with 20 ms of margin.
     """
     rise = SERVO.rise_di()
     leading = with_feedforward(rise, AIRFRAME).model_dump()
@@ -151,8 +153,9 @@ def bits(state: Any) -> dict[str, bytes]:
 
 
 def first_change(name: str, parameters: Any, e: FloatArray, u: FloatArray) -> FloatArray:
-    """The largest change of u in the first tick after an engagement at a constant error, by the
-    gains alone.
+    """The largest change of u in the first tick after an engagement at a constant error.
+
+    It comes by the gains alone.
     """
     law = name.partition(",")[0]
     if law == "lqg":
@@ -309,8 +312,9 @@ def test_every_law_flies_and_replays(name: str) -> None:
 
 
 def test_only_gains_change_in_flight() -> None:
-    """Neither the law nor its channels change in flight. The models do so by a learner alone, of
-    RISE-DI.
+    """Neither the law nor its channels change in flight.
+
+    The models do so by a learner alone, of RISE-DI.
     """
     assert {"K", "Lambda", "lead", "filter_time", "upper", "hold"} <= controller("pid").tunable()
     for name in (*NAMES, *OBSERVED):
@@ -680,8 +684,9 @@ def test_an_invalid_observer_is_refused() -> None:
 
 
 def test_unfit_feedforward_refused() -> None:
-    """A nominal model with a different D is refused, and a model with a zero in the right half
-    plane.
+    """A nominal model with a different D is refused.
+
+    So is a model with a zero in the right half plane.
     """
     values = sections()["pi, observer"]
     B = np.reshape(values["feedforward"]["B"], (-1, 4))

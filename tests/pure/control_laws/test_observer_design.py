@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Design of the observer: its models against an integrator of scipy, its gains against scipy's
-Riccati solver.
+"""Design of the observer.
+
+Its models stand against an integrator of scipy, its gains against scipy's Riccati solver.
 """
 
 import numpy as np
@@ -47,8 +48,9 @@ def osprey() -> NominalModel:
 
 
 def weights(*batch: int) -> Weights:
-    """Weights around those that a tuning found for the osprey; with leading axes, random ones
-    around these.
+    """Weights around those that a tuning found for the osprey.
+
+    With leading axes they are random ones around these.
     """
     middle = Weights(
         *map(np.array, ([0.05] * M, [0.3] * M, [0.9, 0.4, 0.4], [4.7, 0.6, 1.9], [0.004]))

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Each control law against an independent result: a closed form, another recursion, an exact
-integration of a known plant.
+"""Each control law against an independent result.
+
+It is a closed form, another recursion, or an exact integration of a known plant.
 """
 
 from typing import Any, NamedTuple
@@ -81,8 +82,9 @@ def fly(
     model: NominalModel,
     Omega: float | None = None,
 ) -> Flight:
-    """The exact flight of y_dot = Omega u + d with u held over a tick and d its mean over one, y_m
-    = 0, actuators ideal.
+    """The exact flight of y_dot = Omega u + d, y_m = 0, actuators ideal.
+
+    u is held over a tick, and d is its mean over one.
     """
     response = model.Omega[0, 0] if Omega is None else Omega
     measured = at(y)

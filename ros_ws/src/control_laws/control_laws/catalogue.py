@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Catalogue of the compared laws: their measurements, model data, tuned gains, and the initial
-gains of a search.
+"""Catalogue of the compared laws.
+
+A row has the measurements, the model data, the tuned gains, and the initial gains of a search.
 """
 
 from collections.abc import Callable
@@ -75,8 +76,9 @@ class Law(NamedTuple):
 
     @property
     def has_margins(self) -> bool:
-        """Whether it has a linear loop from y to u: not with further measurements or the implicit
-        sign.
+        """Whether the law has a linear loop from y to u.
+
+        A law with further measurements or the implicit sign has none.
         """
         return self.linear and self.measurements == "y"
 
@@ -98,8 +100,9 @@ def initial_gains(law: Law, model: NominalModel) -> Gains:
 def _over(
     law_params: Callable[[Gains, NominalModel], Any], part: float = observed.PART
 ) -> Callable[[Gains, NominalModel], ObserverParams]:
-    """Parameters of an observer with the aircraft's model over a law, from the function for the
-    law's own parameters.
+    """Parameters of an observer with the aircraft's model over a law.
+
+    `law_params` is the function for the law's own parameters.
     """
     return lambda gains, model: observed.observer_params(
         observed.aircraft_design(gains, model), law_params(gains, model), model, part

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Excitation of the inputs in turn, open loop and without control: doublets and a multisine, for an
-identification.
+"""Excitation of the inputs in turn, open loop and without control.
+
+Doublets and a multisine excite the inputs for an identification.
 """
 
 from functools import cached_property
@@ -65,11 +66,10 @@ def signal(elapsed: Array, params: ExcitationParams) -> Array:
 def multisine(
     period: float, lowest: float, highest: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Harmonics of 1 / period from `lowest` to `highest`, Hz, phases, and parts of a peak of 1;
-    shapes (h,).
+    """Harmonics of 1 / period from `lowest` to `highest`, Hz, phases, and parts of a peak of 1.
 
-    phase_k = -pi k (k - 1) / h keeps the peak low. Source: M. R. Schroeder, IEEE Trans. Information
-    Theory 16(1), 1970.
+    Shapes (h,). phase_k = -pi k (k - 1) / h keeps the peak low. Source: M. R. Schroeder, IEEE
+    Trans. Information Theory 16(1), 1970.
     """
     harmonic = np.arange(
         max(round(lowest * period), 1), max(int(highest * period), 1) + 1, dtype=np.float64

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Incremental nonlinear dynamic inversion (INDI) from y, y_m, the measured actuator positions and
-the nominal Omega.
+"""Incremental nonlinear dynamic inversion (INDI).
+
+The law takes y, y_m, the measured actuator positions and the nominal Omega.
 """
 
 from typing import NamedTuple

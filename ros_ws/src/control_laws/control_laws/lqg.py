@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Linear-quadratic Gaussian control (LQG): the trim corrected by the observer, and no further
-feedback.
+"""Linear-quadratic Gaussian control (LQG).
+
+The observer corrects the trim, and there is no further feedback.
 """
 
 from typing import NamedTuple

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""LQI: model following by linear-quadratic design with integral action, from the full state x (or
-x_air) and y_m.
+"""LQI: model following by linear-quadratic design with integral action.
+
+The law takes the full state x (or x_air) and y_m.
 """
 
 from typing import NamedTuple
@@ -36,11 +37,11 @@ class LqiParams(NamedTuple):
 
 
 def control_law(_: NominalModel, *, vanes: bool) -> ControlLaw:
-    """State feedback and integral: u = -gain [x, y_m, y_m_dot, integral of e], with `vanes` x
-    relative to the air.
+    """State feedback and integral: u = -gain [x, y_m, y_m_dot, integral of e].
 
-    The integral is a trapezoid with conditional integration (anti-windup): integration of channel i
-    stops while u_i is saturated and the increment has the sign of the excess.
+    With `vanes` x is relative to the air. The integral is a trapezoid with conditional integration
+    (anti-windup): integration of channel i stops while u_i is saturated and the increment has the
+    sign of the excess.
     """
 
     def limited(
@@ -82,8 +83,9 @@ class LqiConfig(ControllerConfig):
 
 
 def design(model: NominalModel, fade: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The nominal aircraft with the reference and the integral of e, sampled with u held over a
-    period: F, G and E.
+    """The nominal aircraft with the reference and the integral of e: F, G and E.
+
+    The model is sampled with u held over a period.
 
     z+ = F z + G u; the cost is on E z, e and the integral of e. Shapes (n + 3 m, n + 3 m), (n + 3
     m, m) and (2 m, n + 3 m).
@@ -114,8 +116,9 @@ def design(model: NominalModel, fade: float) -> tuple[FloatArray, FloatArray, Fl
 
 
 def lqi_params(gains: dict[str, FloatArray], model: NominalModel) -> LqiParams:
-    """The gain for the least sum of e'Q e + q'Q_i q + u'R u over z+ = F z + G u, for N sets of
-    weights: (m, n + 3 m, N).
+    """The gain of the least cost over z+ = F z + G u, for N sets of weights: (m, n + 3 m, N).
+
+    The cost is the sum of e'Q e + q'Q_i q + u'R u.
 
         Q = 1 / size^2,  Q_i = integral^2 / size^2,  R = (effort / input_scale)^2 / size^2,
             q the integral of e

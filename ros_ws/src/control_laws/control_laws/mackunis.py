@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The acceleration-based RISE inversion of MacKunis et al. from y, y_m, the nominal Omega, and
-optionally a perfect y_dot.
+"""The acceleration-based RISE inversion of MacKunis et al.
+
+The law takes y, y_m, the nominal Omega, and optionally a perfect y_dot.
 """
 
 from typing import NamedTuple
@@ -94,10 +95,10 @@ class MacKunisConfig(ControllerConfig):
 
 
 def mackunis_params(gains: dict[str, FloatArray], model: NominalModel) -> MacKunisParams:
-    """Parameters from gains K, Lambda, beta (m, N), softening (1, N) and, without ideal y_dot,
-    filter (1, N), rad/s.
+    """Parameters from the gains of a search.
 
-    eps = beta / K softening: inside eps the sign adds K / softening to K.
+    They are K, Lambda, beta (m, N), softening (1, N) and, without ideal y_dot, filter (1, N),
+    rad/s. eps = beta / K softening: inside eps the sign adds K / softening to K.
     """
     K = gains["K"]
     beta = gains["beta"]

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The nominal model of a model-based law, and the common parts of laws: saturation of u,
-anti-windup of integrals.
+"""The nominal model of a model-based law, and the common parts of laws.
 
-Channels are in the law's order, states in the airframe's.
+The parts are saturation of u, and anti-windup of integrals. Channels are in the law's order, states
+in the airframe's.
 """
 
 from collections.abc import Callable
@@ -18,8 +18,9 @@ from rise_di_controller.law.saturation import Limits
 
 
 class NominalModel(NamedTuple):
-    """The nominal aircraft, SI, and the loop around the aircraft. The docstring of a law names the
-    fields in use.
+    """The nominal aircraft, SI, and the loop around the aircraft.
+
+    The docstring of a law names the fields in use.
     """
 
     A: FloatArray  # (n, n)
@@ -63,8 +64,9 @@ def campaign_law(
     engage: Callable[[Measurements, Any], Any],
     limited: Callable[[Any, Measurements, Array, Any, Limits], tuple[Any, Array, Array]],
 ) -> ControlLaw:
-    """A control law flown by campaigns only, for lack of topics with the measurements. No retuning
-    in flight.
+    """A control law flown by campaigns only, for lack of topics with the measurements.
+
+    No retuning in flight.
     """
 
     def retune(state: Any, old: Any, new: Any) -> Any:
@@ -87,8 +89,9 @@ def start_integral(measured: Measurements, _: Any) -> ErrorIntegral:
 
 
 def state_of(measured: Measurements, *, vanes: bool = False) -> Array:
-    """The full state, shape (n, N), with `vanes` relative to the air. Raises ValueError where x is
-    not measured.
+    """The full state, shape (n, N), with `vanes` relative to the air.
+
+    Raises ValueError where x is not measured.
     """
     x = measured.x_air if vanes else measured.x
     if x is None:
@@ -97,8 +100,9 @@ def state_of(measured: Measurements, *, vanes: bool = False) -> Array:
 
 
 def saturate(u: Array, measured: Measurements, dt: Array, limits: Limits) -> tuple[Array, Array]:
-    """Saturation: the commanded u inside its limits, and the excess of the requested u, shapes
-    (m,).
+    """Saturation of u, shape (m,).
+
+    The results are the commanded u inside the limits, and the excess of the requested u.
     """
     commanded = saturation.saturate(u, measured.u_before, dt, limits)
     return commanded, u - commanded
@@ -115,7 +119,8 @@ def conditional_integration(before: Array, after: Array, effect: Array, excess: 
 
 
 def filter_gain(rate: Array, dt: Array) -> Array:
-    """1 - exp(-rate dt): gain of a first-order low-pass filter on the input in a tick, exact for a
-    held input.
+    """1 - exp(-rate dt): gain of a first-order low-pass filter on the input in a tick.
+
+    The gain is exact for a held input.
     """
     return -array_namespace(rate).expm1(-rate * dt)

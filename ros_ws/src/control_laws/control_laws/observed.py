@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Observers over any law, for many sets of weights at once: parameters from the gains of a
-search.
+"""Observers over any law, for many sets of weights at once.
+
+Their parameters come from the gains of a search.
 """
 
 from typing import Any
@@ -31,8 +32,9 @@ s: the defaults of `ObserverConfig`."""
 def observer_params(
     design: ObserverDesign, law_params: Any, model: NominalModel, part: float = PART
 ) -> ObserverParams:
-    """Parameters of an observer over the law of `law_params`, from N designs; u_o within `part` of
-    the limits.
+    """Parameters of an observer over the law of `law_params`, from N designs.
+
+    u_o is within `part` of the limits.
     """
 
     def aircraft_last(matrices: FloatArray) -> FloatArray:
@@ -50,8 +52,9 @@ def observer_params(
 def aircraft_design(
     gains: dict[str, FloatArray], model: NominalModel, names: Names | None = None
 ) -> ObserverDesign:
-    """Designs with the aircraft's model from effort, drift (m, N), gust, wind_time (G, N) and loose
-    (1, N) or (n, N).
+    """Designs with the aircraft's model from the gains of a search.
+
+    They are effort, drift (m, N), gust, wind_time (G, N) and loose (1, N) or (n, N).
     """
     weights = Weights(*(gains[name].T for name in Weights._fields))
     return aircraft_observer(model, names or unnamed(model), weights)

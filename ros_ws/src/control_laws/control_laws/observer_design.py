@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Design of the observer: model in discrete time and two linear-quadratic gains, for many models
-and weights at once.
+"""Design of the observer, for many models and weights at once.
+
+The design is a model in discrete time and two linear-quadratic gains.
 
 Two models: `aircraft_observer` knows A, B, f, wind and lags of an airframe,
 `extended_state_observer` Omega and lags alone. A, B, wind and the weights may have leading axes,
@@ -39,8 +40,9 @@ class Names(NamedTuple):
 
 
 class Weights(NamedTuple):
-    """Weights of the design with the aircraft's model. The units of the states are
-    `NominalModel.size`, "sizes" below.
+    """Weights of the design with the aircraft's model.
+
+    The units of the states are `NominalModel.size`, "sizes" below.
     """
 
     effort: FloatArray  # (.., m) error at the cost of an input of unit response, s
@@ -62,8 +64,9 @@ class ExtendedStateWeights(NamedTuple):
 
 
 class ObserverModel(NamedTuple):
-    """A model of the deviation from the reference, u held over a period: z+ = Phi z + Gamma (u -
-    u_ff), e = H z.
+    """A model of the deviation from the reference, u held over a period.
+
+    z+ = Phi z + Gamma (u - u_ff), e = H z.
     """
 
     # names of z, e.g. x.alpha, position.elevator, wind.vertical, disturbance.q
@@ -74,8 +77,9 @@ class ObserverModel(NamedTuple):
 
 
 class ObserverDesign(NamedTuple):
-    """A model with gains: z_hat = z + L (e - H z), u - u_ff = -F z_hat, z+ = Phi z_hat + Gamma (u -
-    u_ff).
+    """A model with gains: z_hat = z + L (e - H z), u - u_ff = -F z_hat.
+
+    z+ = Phi z_hat + Gamma (u - u_ff).
     """
 
     states: tuple[str, ...]
@@ -87,8 +91,9 @@ class ObserverDesign(NamedTuple):
 
 
 def aircraft_model(model: NominalModel, names: Names, wind_time: FloatArray) -> ObserverModel:
-    """The aircraft around the reference, actuators, wind and a disturbance per output: z = [x,
-    position, w, d].
+    """The aircraft around the reference, with actuators, wind and a disturbance per output.
+
+    z = [x, position, w, d].
 
         x_dot        = (A + gravity) x + B position + wind w + C' d
         position_dot = (u - u_ff - position) / lag,  w_dot = -w / wind_time,  d_dot = -LEAK d
@@ -123,8 +128,9 @@ def aircraft_model(model: NominalModel, names: Names, wind_time: FloatArray) -> 
 
 
 def extended_state_model(model: NominalModel, names: Names, decay: FloatArray) -> ObserverModel:
-    """Outputs as integrals of Omega times the actuators and a disturbance of second order: z = [x,
-    position, d, d_dot].
+    """Outputs as integrals of Omega times the actuators and a disturbance of second order.
+
+    z = [x, position, d, d_dot].
 
         x_dot        = Omega position + d,  position_dot = (u - u_ff - position) / lag
         d_dot        = disturbance_rate - LEAK d,  disturbance_rate_dot = -decay disturbance_rate
@@ -159,8 +165,9 @@ def _sampled(
     C: FloatArray,
     model: NominalModel,
 ) -> ObserverModel:
-    """A model in discrete time; the actuators' positions are the states p, the first states have
-    the outputs C.
+    """A model in discrete time.
+
+    The actuators' positions are the states p, the first states have the outputs C.
     """
     lag, (m, n) = np.maximum(model.lag, MIN_LAG), C.shape
     drive = np.zeros((motion.shape[-1], m))
@@ -214,11 +221,11 @@ def vane_correction(
     row: FloatArray,
     noise: float,
 ) -> FloatArray:
-    """Gains of a vane beside L of `aircraft_correction`, (s, m + 1): the filter of y and the vane
-    less the filter of y.
+    """Gains of a vane beside L of `aircraft_correction`, (s, m + 1).
 
-    The last column acts on the vane: a reading beyond the reference motion is `row` z, (s,), with
-    white `noise`, rms. `weights` without and with the vane.
+    They are the filter of y and the vane less the filter of y. The last column acts on the vane: a
+    reading beyond the reference motion is `row` z, (s,), with white `noise`, rms. `weights` without
+    and with the vane.
     """
     alone = aircraft_correction(sampled, model, weights[0])
     with_vane = sampled._replace(H=np.vstack([sampled.H, row]))
@@ -259,8 +266,9 @@ def _correction(
     intensities: list[FloatArray],
     correction: Correction = correction_of,
 ) -> FloatArray:
-    """L for white noise of these intensities, shapes (.., k), on the states in order, SI per root
-    s.
+    """L for white noise of these intensities, shapes (.., k).
+
+    The noise is on the states in order, SI per root s.
     """
     batch = np.broadcast_shapes(*(intensity.shape[:-1] for intensity in intensities))
     process = np.concatenate(

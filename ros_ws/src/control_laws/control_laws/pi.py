@@ -50,8 +50,9 @@ def _engage(measured: Measurements, params: PiParams) -> PiState:
 def _limited(
     state: PiState, measured: Measurements, dt: Array, params: PiParams, limits: Limits
 ) -> tuple[PiState, Array, Array]:
-    """U = u_trim - input_scale D K (e - e_0 + Lambda integral of e), a trapezoid with anti-windup
-    (`limited_integral`).
+    """PI: u = u_trim - input_scale D K (e - e_0 + Lambda integral of e).
+
+    The integral is a trapezoid with anti-windup (`limited_integral`).
     """
     e = measured.y - measured.y_m
     after = PiState(state.e_0, e, state.integral_e + dt * (e + state.e) / 2.0)
@@ -72,8 +73,9 @@ def _limited(
 
 
 def _retune(state: PiState, old: PiParams, new: PiParams) -> PiState:
-    """The same u with new parameters (bumpless transfer): e_0 takes the difference, so Lambda may
-    be 0.
+    """The same u with new parameters (bumpless transfer).
+
+    e_0 takes the difference, so Lambda may be 0.
     """
     asked = -new.D * _u(state, old) / (new.input_scale * new.K)
     return state._replace(e_0=state.e + new.Lambda * state.integral_e - asked)

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Linear-quadratic design for many models and sets of weights at once: the discrete Riccati
-equation.
+"""Linear-quadratic design for many models and sets of weights at once.
+
+The discrete Riccati equation is solved.
 
 Leading axes of the arguments of a function are broadcast together.
 """
@@ -54,8 +55,9 @@ def diagonal(values: FloatArray) -> FloatArray:
 
 
 def gain_of(F: FloatArray, G: FloatArray, Q: FloatArray, R: FloatArray) -> FloatArray:
-    """The gain (R + G'P G)^-1 G'P F of u = -gain z for the least sum of z'Q z + u'R u, shape (..,
-    m, s).
+    """The gain (R + G'P G)^-1 G'P F of u = -gain z, shape (.., m, s).
+
+    The sum is the least of z'Q z + u'R u.
     """
     P = riccati(F, G, Q, R)
     return np.asarray(np.linalg.solve(R + transpose(G) @ P @ G, transpose(G) @ P @ F))
@@ -64,12 +66,11 @@ def gain_of(F: FloatArray, G: FloatArray, Q: FloatArray, R: FloatArray) -> Float
 def correction_of(
     F: FloatArray, H: FloatArray, process: FloatArray, noise: FloatArray
 ) -> FloatArray:
-    """The gain S H'(H S H' + noise)^-1 of the stationary Kalman filter z + gain (y - H z), shape
-    (.., s, m).
+    """The gain S H'(H S H' + noise)^-1 of the stationary Kalman filter, shape (.., s, m).
 
-    S is the covariance of the predicted state. Arguments: covariances `process` of the state in a
-    step, (.., s, s), and `noise` of y, (.., m, m); H (.., m, s). Source: B. D. O. Anderson, J. B.
-    Moore, "Optimal Filtering", 4.4.
+    The filter is z + gain (y - H z). S is the covariance of the predicted state. Arguments:
+    covariances `process` of the state in a step, (.., s, s), and `noise` of y, (.., m, m); H (..,
+    m, s). Source: B. D. O. Anderson, J. B. Moore, "Optimal Filtering", 4.4.
     """
     S = riccati(transpose(F), transpose(H), process, noise)
     return transpose(np.asarray(np.linalg.solve(H @ S @ transpose(H) + noise, H @ S)))
@@ -78,8 +79,9 @@ def correction_of(
 def corrections_near(
     F: FloatArray, H: FloatArray, process: FloatArray, noise: FloatArray
 ) -> FloatArray:
-    """Gains of `correction_of` for models that differ little from the first one, exact to first
-    order in the difference.
+    """Gains of `correction_of` for models close to the first model.
+
+    The gains are exact to first order in the difference.
 
     With the gain K of the first model and A = F (I - K H), the covariance of a model with F_i is S
     + dS,
