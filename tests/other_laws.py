@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Sections `controller` of osprey_servo under other laws: those of docs/laws.md, and that of the
-example package.
+"""Sections `controller` of osprey_servo under other laws.
+
+They are those of docs/laws.md, and that of the example package.
 """
 
 import re
@@ -40,8 +41,9 @@ SECTIONS["pid"] = _section((EXAMPLE / "osprey_pid.yaml").read_text())
 
 @contextmanager
 def example_installed(folder: Path) -> Iterator[None]:
-    """The example as an installed package: its modules, and the metadata with its entry point in a
-    folder.
+    """The example as an installed package.
+
+    It has its modules, and the metadata with its entry point in a folder.
     """
     metadata = folder / "pid_law-0.1.0.dist-info"
     metadata.mkdir()

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Send PX4 to a place, as "Go to location" of a ground station does, over the loopback profile of
-the stack.
+"""Send PX4 to a place, as "Go to location" of a ground station does.
+
+The command goes over the loopback profile of the stack.
 
     .venv/bin/python examples/px4_airplane/reposition.py LATITUDE LONGITUDE ALTITUDE
         # degrees, degrees, m above sea level

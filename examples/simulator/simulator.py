@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A simulator with its own clock: `python simulator.py 3` flies at 3 times real time, `python
-simulator.py 0` in lockstep.
+"""A simulator with its own clock.
+
+`python simulator.py 3` flies at 3 times real time, `python simulator.py 0` in lockstep.
 """
 
 import signal

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""PID control of each output, with a filtered derivative: an example of a control law in a package
-of its own.
+"""PID control of each output, with a filtered derivative.
+
+It is an example of a control law in a package of its own.
 """
 
 from typing import NamedTuple
@@ -46,8 +47,9 @@ class PidState(NamedTuple):
 
 
 def u_from_trim(state: PidState, params: PidParams) -> Array:
-    """Deviation of u from trim, shape (m,): -input_scale D K (e - e_0 + Lambda integral of e + lead
-    e_dot).
+    """Deviation of u from trim, shape (m,).
+
+    It is -input_scale D K (e - e_0 + Lambda integral of e + lead e_dot).
     """
     terms = state.e - state.e_0 + params.Lambda * state.integral_e + params.lead * state.e_dot
     return -params.input_scale * params.D * params.K * terms
@@ -101,8 +103,9 @@ CONTROL_LAW = ControlLaw(PidState, engage, without_limits(limited), limited, ret
 
 
 class PidConfig(ControllerConfig):
-    """The controller under PID control: the parameters of a scenario's section beside those of
-    every law.
+    """The controller under PID control.
+
+    It has the parameters of a scenario's section beside those of every law.
     """
 
     K: Positives = Field(description="proportional gains in scaled inputs, 1/s")

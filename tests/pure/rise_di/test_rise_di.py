@@ -1,7 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The Python interface `rise_di`: its names, its laziness, its types, flights and logs, the
-sentences about wrong input.
+"""The Python interface `rise_di`.
+
+The tests are of its names, its laziness, its types, flights and logs, and the sentences about wrong
+input.
 """
 
 import re

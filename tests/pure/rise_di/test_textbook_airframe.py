@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The lateral motion of the Boeing 747 of NASA CR-2144 (Heffley, Jewell; Mach 0.8, 40 000 ft),
-typed in as its tables print it.
+"""The lateral motion of the Boeing 747 of NASA CR-2144, typed in as its tables print it.
+
+The condition is Mach 0.8, 40 000 ft (Heffley, Jewell).
 """
 
 from pathlib import Path

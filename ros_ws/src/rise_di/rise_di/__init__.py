@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The Python interface of the RISE-DI flight stack, in one import. A name loads its module at its
-first use; none needs ROS.
+"""The Python interface of the RISE-DI flight stack, in one import.
+
+A name loads its module at its first use; none needs ROS.
 
     import rise_di
 

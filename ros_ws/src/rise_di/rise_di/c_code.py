@@ -69,8 +69,9 @@ def export(
     rate: float | None = None,
     proof: bool = True,
 ) -> Exported:
-    """Write the controller of a scenario as C99, compile it, and prove that C and Python give the
-    same bits.
+    """Write the controller of a scenario as C99, compile and prove the code.
+
+    The proof is that C and Python give the same bits.
 
     Args:
         scenario: Name, path of a scenario file (.yaml), or a Scenario.
@@ -136,8 +137,9 @@ def export(
 
 
 def at_rate(scenario: Scenario, rate: float) -> Scenario:
-    """A scenario with law, reference model and y at another rate, Hz. Raises ParameterError where
-    the observer has less than its delay margin there.
+    """A scenario with law, reference model and y at another rate, Hz.
+
+    Raises ParameterError where the observer has less than its delay margin there.
     """
     rate = as_number(rate, "rate", *RATES, "Hz")
     controller = exportable(scenario.controller)
@@ -182,8 +184,9 @@ def _units(scenario: Scenario, controller: RiseDiConfig) -> Units:
 
 
 def _logged(run: FilePath | RecordedRun, controller: RiseDiConfig, title: str) -> Material:
-    """The parameters and the ticks of a flight, and a line on their u. Raises ParameterError for a
-    flight with other parameters.
+    """The parameters and the ticks of a flight, and a line on their u.
+
+    Raises ParameterError for a flight with other parameters.
     """
     sets, recording, equal = run_recording(run if isinstance(run, RecordedRun) else read_run(run))
     same = sets[0].digest() == controller.digest()
@@ -201,8 +204,9 @@ def _flown(scenario: Scenario, drawn: int, seed: int, samples: int) -> Material:
 def _recordings(
     scenario: Scenario, sets: Sequence[RiseDiConfig], drawn: int, seed: int, samples: int
 ) -> Iterator[Recording]:
-    """Flights, drawn commands; `drawn` steps and a tenth as many calls, in parts, so that a part
-    fits in memory.
+    """Flights, drawn commands; `drawn` steps and a tenth as many calls.
+
+    The parts fit in memory.
     """
     yield from flight_recordings(scenario, sets, samples)
     yield drawn_commands(scenario.reference_model, max(drawn // 10, 1000), seed)

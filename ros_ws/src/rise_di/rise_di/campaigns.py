@@ -43,8 +43,10 @@ class CampaignResult(NamedTuple):
     figures: dict[str, Any]
 
     def rows(self) -> "pl.DataFrame":
-        """A row an aircraft, SI: seed, number, factor of the sweep, whether it diverged or lost
-        track, figures, drawn entries.
+        """A row an aircraft, SI.
+
+        The columns are seed, number, factor of the sweep, divergence, loss of track, figures, and
+        drawn entries.
 
         The entries have names as "A[q,alpha]", "B[V,thrust]", "lag[elevator]", "noise[q]" and
         "delay". The figures of a diverged aircraft are null.
@@ -69,8 +71,9 @@ def fly_campaign(
     runs: FilePath = "runs",
     progress: Progress | None = None,
 ) -> CampaignResult:
-    """Fly thousands of uncertain aircraft around the airframe of a scenario, and write the report
-    of the campaign. After Ctrl-C `resume_campaign` continues.
+    """Fly thousands of uncertain aircraft around the airframe of a scenario.
+
+    The report of the campaign is written too. After Ctrl-C `resume_campaign` continues.
 
     Args:
         scenario: Name, path of a scenario file (.yaml), or a Scenario.

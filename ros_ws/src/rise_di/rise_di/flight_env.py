@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The aircraft of a scenario as environments of gymnasium: the agent takes the place of the
-controller, a tick a step.
+"""The aircraft of a scenario as environments of gymnasium.
+
+The agent takes the place of the controller, a tick a step.
 """
 
 from typing import Any, NamedTuple
@@ -53,8 +54,9 @@ def _channels(scenario: Scenario) -> _Channels:
 
 
 def _without_models(scenario: Scenario) -> Scenario:
-    """The scenario with the law alone, in whose place the agent acts: models of a law, or a
-    learner, bind no agent.
+    """The scenario with the law alone, in whose place the agent acts.
+
+    Models of a law, or a learner, bind no agent.
     """
     models = ("feedforward", "observer", "schedule", "learn")
     return scenario.vary(
@@ -65,8 +67,9 @@ def _without_models(scenario: Scenario) -> Scenario:
 
 
 def _is_newest_last(scenario: Scenario) -> bool:
-    """Whether the last sample of a tick is the newest y in every tick, so that earlier samples need
-    no measurement.
+    """Whether the last sample of a tick is the newest y in every tick.
+
+    Earlier samples need no measurement then.
     """
     aircraft = scenario.aircraft
     plain = aircraft.sensors.delay == 0.0 and aircraft.sensors.dropout == 0.0
@@ -81,8 +84,9 @@ def _is_newest_last(scenario: Scenario) -> bool:
 
 
 def _actions(values: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
-    """Inputs of a step. Raises ParameterError for another shape, and for values that are not finite
-    numbers.
+    """Inputs of a step.
+
+    Raises ParameterError for another shape, and for values that are not finite numbers.
     """
     expected = f"finite numbers of shape {shape}"
     u = as_array(values, "action", expected)
@@ -152,8 +156,9 @@ class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[FloatArray, dict[str, Any]]:
-        """Trim at t = 0. A seed repeats the aircraft, the noise and the turbulence of an
-        episode.
+        """Trim at t = 0.
+
+        A seed repeats the aircraft, the noise and the turbulence of an episode.
 
         Args:
             seed: Seed of the draws; None: the draws go on.

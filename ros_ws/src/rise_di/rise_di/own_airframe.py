@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""An airframe of the user's own, with a scenario that flies, as `rise-di airframes --write` writes
-both.
+"""An airframe of the user's own, with a scenario that flies.
+
+`rise-di airframes --write` writes the same two files.
 """
 
 import tempfile
@@ -68,8 +69,9 @@ def new_airframe(
     replace: bool = False,
     **body: str | float,
 ) -> NewAirframe:
-    """Write NAME.yaml, an airframe, and NAME_flight.yaml, a scenario with selected gains that has
-    been flown once.
+    """Write NAME.yaml, an airframe, and NAME_flight.yaml, a scenario.
+
+    The scenario has selected gains and has been flown once.
 
     Args:
         source: A state space of python-control or SciPy, or the path of a MATLAB file (.mat), of an
@@ -170,8 +172,10 @@ def _pairing_sentence(airframe: Airframe) -> str:
 def _flying(
     airframe: Airframe, trial: Path, files: tuple[Path, Path], lag: Sequence[float]
 ) -> tuple[str, str]:
-    """The text of a scenario with selected gains whose flight ends as planned, clear of the end
-    stops, and ""; else that of the least commands, and what its flight lacks.
+    """The text of a scenario with selected gains whose flight ends as planned, and "".
+
+    The flight is clear of the end stops. Without such a flight: the text with the least commands,
+    and what this flight lacks.
 
     `trial`: the airframe's file of the trial flights; `files`: airframe and scenario as the text
     names them.
@@ -208,8 +212,10 @@ def _used(flown: Scenario, tape: Tape) -> dict[str, float]:
 
 
 def _shortfall(flown: Scenario, tape: Tape, hardest: str) -> str:
-    """What the flight of a scenario lacks: the input that reaches its stop, whether commands or
-    gusts ask for it, the state or gust that asks most of it, and how much.
+    """What the flight of a scenario lacks.
+
+    The sentence names the input at a stop, whether commands or gusts ask for the travel, the state
+    or gust with the largest share, and the share.
 
     The input that holds y is u = -Omega^+ C (A x + f), f with the gusts.
     """

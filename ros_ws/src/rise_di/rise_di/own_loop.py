@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The controller in a loop of the user's own: tick by tick, around a plant that is a function, and
-in python-control.
+"""The controller in a loop of the user's own, tick by tick.
+
+The loop is around a plant that is a function, or in python-control.
 """
 
 import warnings
@@ -41,8 +42,9 @@ deviations from trim."""
 
 
 class Loop:
-    """The controller behind its guard, a call a tick. The node runs the same `Controller`, so u has
-    the same bits.
+    """The controller behind its guard, a call a tick.
+
+    The node runs the same `Controller`, so u has the same bits.
 
     Args:
         controller: Parameters of the controller, or a mapping of these as in the section
@@ -73,8 +75,9 @@ class Loop:
 
     @property
     def mode(self) -> Mode:
-        """Mode of the guard: WAITING until y and y_m are fresh, then ENGAGED; a failsafe where they
-        are old.
+        """Mode of the guard.
+
+        WAITING until y and y_m are fresh, then ENGAGED; a failsafe where they are old.
         """
         return self._controller.mode
 
@@ -172,8 +175,9 @@ def fly_plant(
     reference_model: ReferenceModelConfig | Mapping[str, Any],
     duration: float,
 ) -> Tape:
-    """Fly a plant of the user's own under the controller and return the tape: y, y_m, u and
-    internals.
+    """Fly a plant of the user's own under the controller and return the tape.
+
+    The tape has y, y_m, u and internals.
 
     `plant(t, u, dt)` advances by dt with u held and returns y; the first call has t = dt = 0.
     Outputs and inputs have the order of the controller. A plant that raises FlightEnded ends the
@@ -286,8 +290,9 @@ def _reference_model(
 def as_control(
     controller: ControllerConfig | Mapping[str, Any], *, linear: bool = False
 ) -> "control.NonlinearIOSystem":
-    """The engaged law as a discrete system of python-control, with limits and anti-windup:
-    `y_NAME`, `y_m_NAME` -> `u_NAME`.
+    """The engaged law as a discrete system of python-control: `y_NAME`, `y_m_NAME` -> `u_NAME`.
+
+    The law has limits and anti-windup.
 
     The period is that of the controller. The state is that of the law, then u and y_m of the last
     tick; from 0 the flight starts in trim. With an allocation the outputs are the effectors, at the
