@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Live commands u_m of the reference model's node: one publisher, the ending when it falls silent,
-and lockstep.
+"""Live commands u_m of the reference model's node.
+
+The tests are of one publisher, the ending when it falls silent, and lockstep.
 """
 
 from pathlib import Path

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Live commands u_m: bounds, age limit, and the ending that levels the wings when their publisher
-is lost.
+"""Live commands u_m: bounds, age limit, and the ending when their publisher is lost.
+
+The ending levels the wings.
 
 A stand-in for guidance rolls each aircraft into a bank: p_m = k (phi_c - phi), the turn
 coordinated. It ends at several instants of the roll-in.
@@ -136,8 +137,9 @@ AIRCRAFT: dict[str, tuple[Any, float]] = {
 
 
 def flight(scenario: Scenario, bank_deg: float, lost: float, duration: float) -> FloatArray:
-    """Samples [t, phi] of a flight whose guidance rolls to a bank from t = 1 s and falls silent at
-    `lost`, shape (N, 2).
+    """Samples [t, phi] of a flight, shape (N, 2).
+
+    Its guidance rolls to a bank from t = 1 s and falls silent at `lost`.
     """
     speed = scenario.aircraft.channels().speed
     varied = scenario.vary(

@@ -11,8 +11,9 @@ from flight_core.vectors import Array, array_namespace
 
 
 class Profile(NamedTuple):
-    """Commands on m channels, at most E edges each (unused edges have change 0). Times in s, values
-    in the channel's unit.
+    """Commands on m channels, at most E edges a channel (unused edges have change 0).
+
+    Times are in s, values in the channel's unit.
     """
 
     time: Array  # (m, E) start of each edge

@@ -39,8 +39,9 @@ class Live(NamedTuple):
 
 
 def take(t_ns: int, u_m: FloatArray, attitude: FloatArray | None, params: LiveParams) -> Live:
-    """The state after a new u_m. Raises ChannelError, reason "bounds", for a command out of
-    bounds.
+    """The state after a new u_m.
+
+    Raises ChannelError, reason "bounds", for a command out of bounds.
     """
     if (np.abs(u_m) > params.bounds).any():
         raise ChannelError(
@@ -85,8 +86,9 @@ def commands(t_ns: int, live: Live, y_m: FloatArray, params: LiveParams) -> Floa
 
 
 def dead_reckon(live: Live, y_m: FloatArray, period_ns: int, params: LiveParams) -> Live:
-    """The state a period later: the attitude moves by Euler's equations with the reference rates,
-    as the law tracks them.
+    """The state a period later: the attitude moves by Euler's equations.
+
+    The rates are the reference rates, which the law tracks.
     """
     if live.attitude is None or params.channels is None or params.speed is None:
         return live

@@ -54,20 +54,19 @@ def stepper(dt: float, params: Model) -> Stepper:
 
 
 def step(x_m: Array, u_m: Array, matrices: Stepper) -> Array:
-    """x_m(t + dt), shape (n,), from x_m(t) and u_m at t, t + dt/2 and t + dt as a vector of shape
-    (3m,).
+    """x_m(t + dt), shape (n,), from x_m(t) and u_m.
 
-    The sums have the order of `product`, so exported C code gives the same bits.
+    `u_m`, shape (3m,), is u_m at t, t + dt/2 and t + dt. The sums have the order of `product`, so
+    exported C code gives the same bits.
     """
     return product(matrices.Phi, x_m) + product(matrices.Gamma, u_m)
 
 
 def second_order(natural_frequency: FloatArray, damping: FloatArray) -> Model:
-    """A filter per channel: y_m,i'' + 2 damping_i w_i y_m,i' + w_i^2 y_m,i = w_i^2 u_m,i, with n =
-    2m.
+    """A filter of second order per channel, n = 2m.
 
-    The states are [y_m,1, y_m,1', y_m,2, ...]. C selects the outputs, as (2) requires.
-    Arguments: shape (m,), rad/s and 1.
+    y_m,i'' + 2 damping_i w_i y_m,i' + w_i^2 y_m,i = w_i^2 u_m,i. The states are [y_m,1, y_m,1',
+    y_m,2, ...]. C selects the outputs, as (2) requires. Arguments: shape (m,), rad/s and 1.
     """
     m = len(natural_frequency)
     model = Model(np.zeros((2 * m, 2 * m)), np.zeros((2 * m, m)), np.zeros((m, 2 * m)))

@@ -29,8 +29,9 @@ class Command(NamedTuple):
 
 
 class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
-    """Computes x_m(k) from x_m(k-1) at tick k and publishes y_m(k). Commands are the scenario's
-    profile until u_m is received.
+    """Computes x_m(k) from x_m(k-1) at tick k and publishes y_m(k).
+
+    Commands are the scenario's profile until u_m is received.
 
     In lockstep the node publishes y_m up to the instant of clock and computes the next y_m ahead.
     Where `u_m_rate` is set u_m comes first: every instant of u_m has exactly one y_m,
@@ -133,8 +134,9 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
             advanced = True
 
     def _commands_known(self) -> bool:
-        """Lockstep: whether u_m of the instant before the next sample is here, if there is one; it
-        is taken.
+        """Lockstep: whether u_m of the instant before the next sample is here, if any.
+
+        The u_m is taken.
         """
         t_ns = (self._number - 1) * self.period_ns()
         if not self._u_m_ns or t_ns < 0 or t_ns % self._u_m_ns:

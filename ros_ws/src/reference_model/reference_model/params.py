@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of the reference model: validation, and conversion to the arrays of model and
-profile.
+"""Parameters of the reference model.
+
+They are validated, and converted to the arrays of model and profile.
 """
 
 import math
@@ -56,8 +57,9 @@ class Sine(Config):
 
 
 class CoordinatedTurn(Config):
-    """Adds the turn rate of a coordinated turn, g/V0 sin(integral of the commanded bank rate), to a
-    channel.
+    """Adds the turn rate of a coordinated turn to a channel.
+
+    The rate is g/V0 sin(integral of the commanded bank rate).
     """
 
     bank_rate: str = Field(description="the channel whose integral is the bank angle, e.g. p")
@@ -66,8 +68,9 @@ class CoordinatedTurn(Config):
 
 
 class LiveCommands(Config):
-    """Live commands on the topic u_m in place of the profile, and their ending when their publisher
-    is lost.
+    """Live commands on the topic u_m in place of the profile.
+
+    They end when their publisher is lost.
     """
 
     max_age: Annotated[float, Field(gt=0, le=1e6)] = Field(
@@ -238,11 +241,10 @@ class ReferenceModelConfig(NodeConfig):
         return Model(np.reshape(self.linear.A_m, (n, n)), np.reshape(self.linear.B_m, (n, m)), C)
 
     def live_params(self) -> LiveParams:
-        """Limits of u_m and the gains of the ending: a quarter of the reference's bandwidths of p
-        and q.
+        """Limits of u_m and the gains of the ending.
 
-        With a second-order reference of damping 0.9 this gain gives the loop of the angle a damping
-        of about 0.74.
+        The gains are a quarter of the reference's bandwidths of p and q. With a second-order
+        reference of damping 0.9 this gain gives the loop of the angle a damping of about 0.74.
         """
         section = self.live
         channels = None
@@ -269,8 +271,9 @@ class ReferenceModelConfig(NodeConfig):
         )
 
     def profile(self) -> Profile:
-        """The commands u_m(t) as arrays over the outputs: two edges per pulse, padded with edges of
-        height 0.
+        """The commands u_m(t) as arrays over the outputs.
+
+        There are two edges per pulse, padded with edges of height 0.
         """
         m = len(self.outputs)
         edges = 2 * max((len(pulses.start) for pulses in self.pulses.values()), default=0)

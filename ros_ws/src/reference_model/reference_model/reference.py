@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The reference model without ROS: y_m sample by sample. Used by the node and by the simulation in
-one process.
+"""The reference model without ROS: y_m sample by sample.
+
+The node and the simulation in a single process use this class.
 """
 
 import numpy as np
@@ -20,8 +21,9 @@ BLOCK = 100  # steps for which the profile is evaluated at once
 
 
 class Reference:
-    """Equation (2) with the state x_m at the instants k periods. The commands are the profile's
-    until the first live u_m.
+    """Equation (2) with the state x_m at the instants k periods.
+
+    The commands are the profile's until the first live u_m.
     """
 
     def __init__(self, parameters: ReferenceModelConfig) -> None:
@@ -55,8 +57,9 @@ class Reference:
         return self._x_m
 
     def source(self) -> str:
-        """Where the commands come from at the last sample: "profile", "live commands", or "ending"
-        of a timed-out u_m.
+        """Where the commands come from at the last sample.
+
+        The source is "profile", "live commands", or "ending" of a timed-out u_m.
         """
         if self._live is None:
             return "profile"
@@ -133,8 +136,9 @@ class Reference:
         return applied
 
     def _block(self, number: int) -> FloatArray:
-        """Commands of the profile at the starts, middles and ends of BLOCK steps, ten times faster
-        than BLOCK calls.
+        """Commands of the profile at the starts, middles and ends of BLOCK steps.
+
+        A block is ten times faster than BLOCK calls.
         """
         u_m: FloatArray = command(
             seconds(self.period_ns) * (number + np.arange(2 * BLOCK + 1) / 2.0), self._profile
