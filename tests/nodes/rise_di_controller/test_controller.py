@@ -1,7 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The controller's node: bumpless engagement, failsafe for stale inputs, malformed samples,
-parameters, lifecycle, overruns.
+"""The controller's node.
+
+The tests are of bumpless engagement, the failsafe for stale inputs, malformed samples, parameters,
+lifecycle and overruns.
 """
 
 import math
@@ -436,8 +438,9 @@ def test_waits_for_configure_and_activate_without_autostart(osprey_gust: Scenari
 def test_deactivated_controller_publishes_trim_but_standby_that_was_never_activated_nothing(
     osprey_gust: Scenario,
 ) -> None:
-    """A bridge engages with a fresh u. Beside another controller the u of a standby would be a
-    conflict.
+    """A bridge engages with a fresh u.
+
+    Beside another controller the u of a standby would be a conflict.
     """
     with flying(osprey_gust, autostart="false") as flight:
         assert flight.transition(Transition.TRANSITION_CONFIGURE)
@@ -475,8 +478,9 @@ def test_invalid_transition_refused_and_node_goes_on(flight: Flight) -> None:
 
 
 def test_tick_rate_is_kept_over_overruns(flight: Flight) -> None:
-    """Deadlines are absolute: after an overrun a tick is late, and the ones that it skipped are
-    counted.
+    """Deadlines are absolute.
+
+    After an overrun a tick is late, and the ones that it skipped are counted.
     """
     flight.engage()
     flight.run(2.0, silent=True)  # in the failsafe each tick publishes internals
@@ -613,8 +617,9 @@ def test_sample_without_stamp_is_no_old_one(flight: Flight) -> None:
 
 
 def test_node_waits_for_the_next_whole_period(flight: Flight) -> None:
-    """1 ms after whole periods of the system clock, where the y and y_m of the instant have
-    arrived.
+    """The node waits until 1 ms after whole periods of the system clock.
+
+    The y and y_m of the instant have arrived there.
     """
     flight.engage()
     assert set(flight.at() % (10 * MS)) == {MS}

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Allocation of the inputs of a law to more effectors: stops, rates, priority, and a flight that
-replays to the bit.
+"""Allocation of the inputs of a law to more effectors.
+
+The tests are of stops, rates and priority, and of a flight that replays to the bit.
 """
 
 from typing import Any
@@ -73,8 +74,10 @@ def test_effectors_stay_inside_stops_and_rates_and_give_what_is_returned(size: f
 
 
 def test_effectors_beyond_their_stops_leave_the_others_the_whole_demand() -> None:
-    """New stops of 0.5 leave the first effector at 0.6; it moves back to 0.4 to 0.5 in a tick. The
-    change of effect that is asked for counts from there on, not from where it was.
+    """New stops of 0.5 leave the first effector at 0.6.
+
+    It moves back to 0.4 to 0.5 in a tick. The change of effect that is asked for counts from there
+    on, not from where it was.
     """
     T = np.array([[0.5], [0.5]])
     limits = Limits(np.full(2, -0.5), np.full(2, 0.5), np.full(2, 0.2 / DT))
@@ -94,8 +97,9 @@ def most(params: Allocation, v: FloatArray) -> float:
 
 
 def test_what_some_effectors_inside_the_stops_give_is_given() -> None:
-    """Ten sweeps met 98.8 % of 500 demands to 1 %, here about 50 at 0.9 of what a linear program
-    finds: three may miss.
+    """Ten sweeps met 98.8 % of 500 demands to 1 %.
+
+    Here about 50 are at 0.9 of what a linear program finds: three may miss.
     """
     misses = hard = 0
     for params, v in demands(3, 100, 1.0):
@@ -122,8 +126,9 @@ def test_beyond_the_stops_the_first_input_keeps_what_a_linear_program_finds_for_
 
 
 def full_mixing(**changes: Any) -> dict[str, Any]:
-    """A section controller of osprey_servo with inputs v = C B u, the inverse found here by NumPy
-    alone.
+    """A section controller of osprey_servo with inputs v = C B u.
+
+    NumPy alone finds the inverse here.
     """
     # per deg and %
     Omega = np.array(
@@ -165,8 +170,9 @@ def mixed(**changes: Any) -> dict[str, Any]:
 
 
 def test_a_flight_with_an_allocation_at_its_stops_tracks_and_replays_to_the_bit() -> None:
-    """The elevator has a third of what the commands take: the allocation binds, and the integrals
-    of q do not wind up.
+    """The elevator has a third of what the commands take.
+
+    The allocation binds, and the integrals of q do not wind up.
     """
     stop = [0.01, 0.5, 0.3, 0.3]
     scenario = find_scenario("osprey_servo", 10.0).vary(
@@ -193,8 +199,9 @@ def test_a_flight_with_an_allocation_at_its_stops_tracks_and_replays_to_the_bit(
     ],
 )
 def test_shipped_aircraft_track_without_an_effector(name: str, effector: str, channel: str) -> None:
-    """Half of the effect is left, which D = I survives: e within twice that of the whole aircraft,
-    15 mrad/s; u inside.
+    """Half of the effect is left, which D = I survives.
+
+    e is within twice that of the whole aircraft, 15 mrad/s; u is inside.
     """
     scenario = find_scenario(name)
     lost = scenario.aircraft.actuators.model_dump() | {"faults": [f"{effector} lost 1"]}
@@ -211,8 +218,9 @@ def test_shipped_aircraft_track_without_an_effector(name: str, effector: str, ch
 
 
 def test_a_vehicle_that_is_no_aeroplane_flies_and_replays(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Six rotors, no V, no guidance; 64 mrad/s off at most in the two commands of 0.5 rad/s, so a
-    sixth of these.
+    """The vehicle has six rotors, no V, and no guidance.
+
+    It is 64 mrad/s off at most in the two commands of 0.5 rad/s, so a sixth of these.
     """
     monkeypatch.chdir(REPOSITORY)  # the scenario names its airframe from there
     path = "examples/hexarotor/hexarotor_flight.yaml"

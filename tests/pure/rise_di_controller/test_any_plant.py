@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Theorem 1 on random aircraft: with the right D and gains by the rules, e converges to the
-ultimate bound of sampling.
+"""Theorem 1 on random aircraft, with the right D and gains by the rules.
+
+e converges to the ultimate bound of sampling.
 
 An aircraft is drawn in coordinates (y, z) that show its zero dynamics, z_dot = A_zy y + A_zz z at y
 = y_m, and then rotated. The law has D and gains only. `gains` computes them from the true aircraft,
@@ -64,8 +65,9 @@ def abscissa(matrix: FloatArray) -> float:
 
 
 def random_task(n: int, m: int, seed: int) -> Task:
-    """Random task of relative degree one, C B = S D U. The aircraft and its zero dynamics have at
-    least MIN_DAMPING.
+    """Random task of relative degree one, C B = S D U.
+
+    The aircraft and its zero dynamics have at least MIN_DAMPING.
     """
     m = min(m, n - 1)
     rng = np.random.default_rng(seed)  # n > m
@@ -91,8 +93,9 @@ def random_task(n: int, m: int, seed: int) -> Task:
 
 
 def slew_of_the_ideal_control(task: Task, scale: FloatArray) -> FloatArray:
-    """Slew v*_dot over a flight, shape (N, m), of the input v* = u / scale that keeps e = 0, by
-    finite differences.
+    """Slew v*_dot over a flight, shape (N, m), of the input v* = u / scale that keeps e = 0.
+
+    It is by finite differences.
     """
     aircraft = task.aircraft
     rotation = task.rotation
@@ -150,8 +153,9 @@ def gains(task: Task, sign: Sign) -> LawParams:
 
 
 def fly(task: Task, law: LawParams, dt: float) -> FloatArray:
-    """The errors e at 0, dt, 2 dt, ..., shape (ticks, m), until one is above 100, which ends the
-    flight.
+    """The errors e at 0, dt, 2 dt, ..., shape (ticks, m).
+
+    An error above 100 ends the flight.
     """
     y_m = [task.reference.at(k * dt) for k in range(round(DURATION / dt) + 1)]
     x_0 = task.rotation[:, : len(task.D)] @ (y_m[0] + task.e_0)

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""No event in any mode makes u jump: u of the controller, u that the aircraft applies, and u that a
-bridge sends.
+"""No event in any mode makes u jump.
+
+u is that of the controller, that which the aircraft applies, and that which a bridge sends.
 
 u of the controller moves by a step of the law, by the ramp to trim or by the rate limit.
 """
@@ -146,8 +147,9 @@ class Loop:
         self._u_ns = now_ns
 
     def _step_of_the_law(self, logged: Mapping[str, float]) -> FloatArray:
-        """The largest change of u in a tick of dt, e_p the error one tick ago; 0 at an engagement,
-        where dt is 0.
+        """The largest change of u in a tick of dt; 0 at an engagement, where dt is 0.
+
+        e_p is the error one tick ago.
 
         input_scale (K abs(e - e_p + Lambda dt (e + e_p) / 2) + dt beta), equation (23), and what
         the limits kept back one tick ago; but at most SLEW dt. SLEW dt where u is outside of new
@@ -280,8 +282,9 @@ class Applied:
         self.u: list[float] = []
 
     def fly(self, duration: float, publisher: str | None = None, u: float | None = None) -> None:
-        """Fly with the messages of a publisher, None: without messages. `u`: in place of the u of
-        PUBLISHED.
+        """Fly with the messages of a publisher, None: without messages.
+
+        `u`: in place of the u of PUBLISHED.
         """
         for _ in range(round(duration / STEP)):
             now_ns = nanoseconds(self._number * STEP)
@@ -298,8 +301,9 @@ class Applied:
 )  # s: in time, held, in the ramp twice, at trim
 @pytest.mark.parametrize("publisher", ["first", "restarted"])
 def test_u_that_returns_does_not_jump(publisher: str, silence: float) -> None:
-    """A publisher goes on with another u after the ramp has begun, a restarted publisher at any
-    time.
+    """A publisher goes on with another u after the ramp has begun.
+
+    A restarted publisher does so at any time.
     """
     u = PUBLISHED["first" if publisher == "first" and silence < HELD else "restarted"]
     aircraft = Applied()
@@ -325,8 +329,9 @@ def test_no_sequence_of_publishers_and_silences_makes_applied_u_jump(
 
 @pytest.mark.parametrize("duration", [0.05, 0.12, 0.2, 1.0])
 def test_overrun_leaves_u_where_aircraft_has_it(duration: float) -> None:
-    """With equal age limit, hold and ramp, u of controller and aircraft are equal within two
-    periods of the ramp.
+    """The age limit, hold and ramp are equal.
+
+    u of controller and aircraft are equal within two periods of the ramp.
     """
     loop = engaged()
     before = loop.u
@@ -350,8 +355,9 @@ COMMANDED = 1.5  # u of the active controller, beyond the limits of each input o
 
 
 class Engagement:
-    """A bridge at 100 Hz with y, a controller and a conflicting controller of opposite u, far from
-    trim while ENGAGED.
+    """A bridge at 100 Hz with y, a controller and a conflicting controller of opposite u.
+
+    The aircraft is far from trim while ENGAGED.
 
     The node of the bridge activates the controller at an engagement. Each sent u is checked.
     """

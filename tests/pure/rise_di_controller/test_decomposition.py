@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Omega = S D U: the factors, the dependence of D, refusals, and the pairing of channels with D =
-I.
+"""Omega = S D U: the factors, the dependence of D, and refusals.
+
+Further tests are of the pairing of channels with D = I.
 """
 
 import math

@@ -54,8 +54,9 @@ def noise(frequency: float, damping: float) -> FloatArray:
 def flown(
     e: FloatArray, learned: NDArray[np.bool_] = LEARNED, before: float = BEFORE
 ) -> divergence.Oscillations:
-    """The error of 20 s of the law of the start, then e under a learned model, until an oscillation
-    is found.
+    """The error of 20 s of the law of the start, then e under a learned model.
+
+    It ends where an oscillation is found.
     """
     found = divergence.Oscillations(divergence.least(("q",)))
     for value in before * noise(1.0, 0.5)[:2000]:

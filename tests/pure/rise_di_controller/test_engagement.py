@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Bumpless transfer in flight: engagement, re-engagement and new gains do not make u jump, and
-tracking recovers.
+"""Bumpless transfer in flight: no event makes u jump, and tracking recovers.
+
+The events are engagement, re-engagement and new gains.
 
 The servos are those of scenario osprey_servo, without noise, with sines as commands, at 100 Hz and
 in steps of 5 ms. The loop calls the controller as the node does. Events happen at ten random
@@ -130,8 +131,9 @@ def instants(seed: int) -> list[int]:
 
 
 def step_of_the_law(tick: Tick) -> FloatArray:
-    """Largest change of u by (23) in a tick: input_scale (K abs(e - e_p + Lambda dt (e + e_p) / 2)
-    + dt beta).
+    """Largest change of u by (23) in a tick.
+
+    It is input_scale (K abs(e - e_p + Lambda dt (e + e_p) / 2) + dt beta).
     """
     assert tick.before.law is not None
     assert tick.after.law is not None
@@ -148,8 +150,9 @@ def step_of_the_law(tick: Tick) -> FloatArray:
 
 
 def assert_no_jumps(records: list[Tick]) -> None:
-    """Check that u changes only by a step of the law or by the ramp to trim, and not at all at an
-    engagement.
+    """Check that u changes only by a step of the law or by the ramp to trim.
+
+    It does not change at all at an engagement.
     """
     for tick in records:
         if tick.after.mode is Mode.ENGAGED:
@@ -166,8 +169,9 @@ def engagements(records: list[Tick]) -> list[int]:
 
 
 def assert_bumpless_re_engagement(records: list[Tick], modes: set[Mode]) -> None:
-    """Ten re-engagements from these modes without a jump of u, after each of which tracking
-    recovers.
+    """Ten re-engagements from these modes without a jump of u.
+
+    After each of them tracking recovers.
 
     One second after each engagement q, p and r are close to the undisturbed flight; V, which is
     slower, is nearer to it. Measured: within 4 mrad/s and 0.43 m/s, after errors of up to 120
@@ -281,8 +285,9 @@ OFF_TRIM = {"q": 0.1, "V": 2.0, "p": 0.2, "r": 0.1}
 
 @cache
 def upset(*, latched: bool) -> tuple[FloatArray, FloatArray]:
-    """Errors e (600, 4) and inputs u (600, 4) of 6 s in the law's order. Without latching e_0 is
-    0.
+    """Errors e (600, 4) and inputs u (600, 4) of 6 s in the law's order.
+
+    Without latching e_0 is 0.
     """
     x = np.zeros(len(AIRFRAME.states))
     for name, value in OFF_TRIM.items():

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Feedforward: its numbers, its effect on the error, that it is off by default, and bumpless
-transfer.
+"""Feedforward: its numbers, its effect on the error, and bumpless transfer.
+
+It is off by default.
 """
 
 from collections.abc import Callable, Mapping
@@ -77,8 +78,9 @@ def small_aircraft(rate: float = 100.0, **model: Any) -> ControllerConfig:
 
 
 def reference(t: float) -> FloatArray:
-    """A reference that is at rest until 0 and moves afterwards, with a continuous second
-    derivative.
+    """A reference that is at rest until 0 and moves afterwards.
+
+    Its second derivative is continuous.
     """
     t = max(t, 0.0)
     return np.array([np.sin(t) ** 3, (1.0 - np.cos(2.0 * t)) ** 2 / 2.0])
@@ -91,8 +93,9 @@ def nominal_of(params: ControllerConfig) -> Nominal:
 
 
 def largest_error(params: ControllerConfig) -> float:
-    """Largest error in 6 s with the guard, sampled at the controller's rate, integrated in steps of
-    a tenth of a period.
+    """Largest error in 6 s with the guard, sampled at the controller's rate.
+
+    The steps of the integration are a tenth of a period.
     """
     limits = params.guard()
     law = params.tuned_law()
@@ -202,8 +205,9 @@ def ticks(
     y: Callable[[float], FloatArray],
     missing: tuple[float, float] = (9.0, 9.0),
 ) -> list[ControllerState]:
-    """States at every 10 ms from 0.5 to 1.5 s, while the reference moves; no samples are received
-    in `missing`.
+    """States at every 10 ms from 0.5 to 1.5 s, while the reference moves.
+
+    No samples are received in `missing`.
     """
     state = guard.initial_state(2)
     states = []

@@ -175,8 +175,9 @@ def test_a_repeated_sample_changes_nothing() -> None:
 
 
 def test_failsafe_holds_ramps_and_re_engages(osprey_gust: Scenario) -> None:
-    """The input holds, then ramps to trim, and fresh samples re-engage the law without a jump of
-    u.
+    """The input holds, then ramps to trim.
+
+    Fresh samples re-engage the law without a jump of u.
     """
     params = osprey_gust.vary(controller={"max_age": 0.1, "hold": 0.2, "ramp": 0.4}).controller
     y = sample(10, 1.1)

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Any sequence of samples, losses, overruns and activations: when the guard engages, how far u
-moves, when u is at trim.
+"""Any sequence of samples, losses, overruns and activations.
+
+The tests are of when the guard engages, how far u moves, and when u is at trim.
 """
 
 import numpy as np
@@ -56,8 +57,9 @@ class Sequence(RuleBasedStateMachine):
 
     @rule(active=st.booleans(), policy=st.sampled_from([*PARAMS]))
     def activate(self, active: bool, policy: str) -> None:
-        """Activate or deactivate, with what u does after a deactivation; a held u may not change to
-        a ramp.
+        """Activate or deactivate, with what u does after a deactivation.
+
+        A held u may not change to a ramp.
         """
         if self.state.mode is not Mode.INACTIVE:
             self.guard = PARAMS[policy]

@@ -171,8 +171,9 @@ def test_retuned_law_keeps_its_input_also_where_the_sign_of_an_effect_changes() 
 def test_outward_increment_is_reduced_by_what_is_beyond(
     before: float, after: float, change: float, beyond: float, expected: float
 ) -> None:
-    """The formula of the docstring: a part of the increment where change and beyond have one sign,
-    else `after` to the bit.
+    """The formula of the docstring: a part of the increment, or `after` to the bit.
+
+    It is a part where change and beyond have one sign.
     """
     values = (np.array([value]) for value in (before, after, change, beyond))
     limited = limited_integral(*values)

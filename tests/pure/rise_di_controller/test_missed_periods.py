@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Lost samples of y: law and observer predict over each period without a sample, no more and no
-less.
+"""Lost samples of y.
+
+Law and observer predict over each period without a sample, no more and no less.
 """
 
 import numpy as np
@@ -68,8 +69,9 @@ def by_hand(state: ControllerState, y: FloatArray, lost: int, predicted: int) ->
 
 @pytest.mark.parametrize("lost", [0, 1, 2, 5])
 def test_law_predicts_over_every_lost_period(lost: int) -> None:
-    """The observer's estimates and u are those of as many predictions as samples are lost; those of
-    one more or one less differ.
+    """The observer's estimates and u are those of as many predictions as samples are lost.
+
+    Those of one more or one less differ.
     """
     before, after, y = flown(lost)
     expected = by_hand(before, y, lost, lost)
@@ -81,8 +83,9 @@ def test_law_predicts_over_every_lost_period(lost: int) -> None:
 
 
 def test_prediction_keeps_the_estimates_of_a_motion_that_is_lost() -> None:
-    """Where no y comes the estimates move on as the model does: after ten lost samples they are
-    nearer to those without a loss than estimates that stood still.
+    """Where no y comes the estimates move on as the model does.
+
+    After ten lost samples they are nearer to those without a loss than estimates that stood still.
     """
     lost = 9
     before, after, y = flown(lost)

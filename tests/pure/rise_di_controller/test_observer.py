@@ -49,8 +49,9 @@ def measured(e: float, u_before: float = TRIM) -> Measurements:
 
 
 def respond(errors: list[float], observer: ObserverParams) -> list[float]:
-    """The inputs u less the trim for a series of errors, of which the first is that of
-    engagement.
+    """The inputs u less the trim for a series of errors.
+
+    The first error is that of engagement.
     """
     law = with_observer(TRIM_LAW)
     state = law.engage(measured(errors[0]), observer)
@@ -116,8 +117,9 @@ def test_filter_starts_in_its_steady_state_and_predicts_where_no_y_came() -> Non
 
 
 def test_new_observer_without_record_starts_from_error_and_trim_keeps_contribution() -> None:
-    """As after the first tick: u stays 10.7, the estimate begins as at engagement, z = H'e =
-    0.5.
+    """As after the first tick u stays 10.7.
+
+    The estimate begins as at engagement, z = H'e = 0.5.
     """
     law = with_observer(TRIM_LAW)
     old = params()

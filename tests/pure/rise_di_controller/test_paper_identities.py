@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
 # ruff: noqa: D102, N802 - functions have the symbols of the paper as names
-"""The equations of the paper on a random plant; then each of its errata as a counterexample, and
-its repair.
+"""The equations of the paper on a random plant, and its errata.
+
+Each erratum has a counterexample, and its repair.
 
 The closed loop here is the continuous one of the paper, (1), (2), (20), (21), integrated to 1e-10,
 to check the paper. The sampled law is `rise_di_controller.law.law`. The last test of the first
@@ -41,8 +42,9 @@ DIFFERENCED = 1e-5
 
 
 class Problem(NamedTuple):
-    """A plant (1) with f = W sin(G x + omega t), a model (2) with u_m = a sin(nu t + 1), and
-    gains.
+    """A plant (1) with f = W sin(G x + omega t), a model (2), and gains.
+
+    The model has u_m = a sin(nu t + 1).
     """
 
     A: FloatArray
@@ -81,8 +83,9 @@ class Problem(NamedTuple):
 
 
 def random_problem(seed: int, n: int = 6, m: int = 3) -> Problem:
-    """Random plant with Omega = S D U: B = C^+ Omega plus a part that C does not see. A and A_m are
-    shifted to be Hurwitz.
+    """Random plant with Omega = S D U: B = C^+ Omega plus a part that C does not see.
+
+    A and A_m are shifted to be Hurwitz.
     """
     rng = np.random.default_rng(seed)
 
@@ -117,8 +120,9 @@ def random_problem(seed: int, n: int = 6, m: int = 3) -> Problem:
 
 @dataclass(frozen=True)
 class Loop:
-    """The closed loop (1), (2), (20), (21) over an interval in which no e_i changes sign, and its
-    signals at an instant.
+    """The closed loop (1), (2), (20), (21), and its signals at an instant.
+
+    No e_i changes sign over the interval.
     """
 
     p: Problem
@@ -187,8 +191,9 @@ class Loop:
         return np.asarray(self.M @ self.unforced(t) + self.e(t))
 
     def split(self, t: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Equations (17), (18) with x_urho = 0, so c1 = 0 in (7): N_d, N~, and the term that the
-        paper puts into N~.
+        """Equations (17), (18) with x_urho = 0, so c1 = 0 in (7).
+
+        They give N_d, N~, and the term that the paper puts into N~.
 
         x_o = C^+ C x is the part that the outputs show, x_u the rest, likewise for the model. The
         term is -M C A_m x_mu_dot.
@@ -416,8 +421,9 @@ def test_sampled_law_converges_to_20_with_period(loop: Loop, sign: Sign) -> None
 
 
 def at_rest() -> Loop:
-    """The instant t = 0 of a loop with z = 0: y on y_m, and f such that y_dot is on y_m_dot with u
-    = 0.
+    """The instant t = 0 of a loop with z = 0.
+
+    y is on y_m, and f is such that y_dot is on y_m_dot with u = 0.
     """
     p = random_problem(4)
     x_m = np.array([0.4, -0.8, 0.5, 0.9, -0.3, 0.7])
@@ -494,8 +500,9 @@ def test_bound_30_sums_row_of_U() -> None:
 
 
 def coupled_flight(beta: FloatArray) -> float:
-    """The largest e after 6 s with U_12 = 3 in the small example and K_1 increased as step 3
-    requires.
+    """The largest e after 6 s with U_12 = 3 in the small example.
+
+    K_1 is increased as step 3 requires.
     """
     case = example(0.0025, 15.0)
     S, D = decompose(case.plant.C @ case.plant.B)[:2]
@@ -525,8 +532,9 @@ def test_beta_that_counts_entry_ij_of_U_tracks() -> None:
 
 
 def lemma_1_ratio(T: float) -> float:
-    """The ratio of the integrals of abs(e_dot) and abs(e) over 1..T for e = sin(t^2)/t, in s = t^2,
-    8 midpoints a radian.
+    """The ratio of the integrals of abs(e_dot) and abs(e) over 1..T for e = sin(t^2)/t.
+
+    It is computed in s = t^2, 8 midpoints a radian.
     """
     ds = (T * T - 1.0) / round(8 * T * T)
     s = np.arange(1.0 + ds / 2.0, T * T, ds)
@@ -565,8 +573,9 @@ def test_gamma_2_grows_as_period_falls() -> None:
 def replayed(
     cycle: counterexample.Cycle, e_dot_0: float, dt: float = 2e-4, acts: float = 1.0
 ) -> float:
-    """The largest e in the last half second of 4 s under the sampled law: y_dot = u + f(t), f the
-    recorded one, e(0) = 0.
+    """The largest e in the last half second of 4 s under the sampled law.
+
+    y_dot = u + f(t), f the recorded one, e(0) = 0.
 
     f is periodic, with f(t + half a period) = -f(t) up to a constant, which sets e_dot(0) = f(0):
     the law engages with u = 0.
@@ -655,8 +664,9 @@ def test_invertible_matrix_may_lack_decomposition() -> None:
 
 
 def hidden_state(pole: float) -> tuple[float, float]:
-    """The largest x_2 and the last e of x_1_dot = x_2 + u, x_2_dot = pole x_2 + x_1, y = x_1 on sin
-    t: its zero is `pole`.
+    """The largest x_2 and the last e of a plant whose zero is `pole`, on sin t.
+
+    x_1_dot = x_2 + u, x_2_dot = pole x_2 + x_1, y = x_1.
     """
     plant = KnownPlant(
         np.array([[0.0, 1.0], [1.0, pole]]), np.eye(2, 1), np.eye(1, 2), lambda *_: np.zeros(2)
@@ -693,8 +703,9 @@ def test_servo_between_u_and_plant_makes_Omega_zero() -> None:
 
 
 def behind_a_servo(T_eps: float) -> float:
-    """The largest e over eps in the last of 10 s: y_dot = u behind a servo of 20 ms, softened sign,
-    e(0) = eps / 2.
+    """The largest e over eps in the last of 10 s: y_dot = u behind a servo of 20 ms.
+
+    The sign is softened, and e(0) = eps / 2.
     """
     tau, K, beta, dt = 0.02, 10.0, 3.0, 0.0005
     plant = KnownPlant(
@@ -727,8 +738,9 @@ V, ALPHA, Q, THETA = range(4)
 
 
 def gravity_slope(q: float) -> float:
-    """The V part of f_dot in level flight at the pitch rate q: the difference of f over 1 us of
-    theta_dot = q.
+    """The V part of f_dot in level flight at the pitch rate q.
+
+    It is the difference of f over 1 us of theta_dot = q.
     """
     aircraft = osprey()
     x = np.zeros(8)
@@ -773,8 +785,9 @@ def test_bound_7_fails_in_gust() -> None:
 
 
 def largest_y_m_ddot(model: Model, rise: float) -> float:
-    """The peak of abs(y_m_ddot) for a command that rises to one within `rise` seconds, by second
-    differences.
+    """The peak of abs(y_m_ddot) for a command that rises to one within `rise` seconds.
+
+    It is by second differences.
     """
     one = np.ones((1, 1))
     zero = np.zeros(1)

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Proposals of a learner as the controller takes or refuses them, in real time and in simulated
-time.
+"""Proposals of a learner as the controller takes or refuses them.
+
+They come in real time and in simulated time.
 """
 
 import math
@@ -532,8 +533,9 @@ def test_part_has_no_further_model_after_its_second_fallback(
 
 
 def test_margin_of_a_proposal_is_certified_to_its_end() -> None:
-    """The model has 31 ms. A learner that found u 20 ms late asks for 30 ms, one that found it 40
-    ms late for 50 ms.
+    """The model has 31 ms.
+
+    A learner that found u 20 ms late asks for 30 ms, one that found it 40 ms late for 50 ms.
     """
     flight = Flight()
     flight.receive(CHANGE | {"observer.margin": 0.05})
@@ -547,8 +549,9 @@ def test_margin_of_a_proposal_is_certified_to_its_end() -> None:
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_authority_towards_each_limit_is_that_of_the_limit(sign: float) -> None:
-    """An elevator of -0.1 and +0.4 rad: with an effect B of 56.15 / s^2 it has 5.615 rad/s^2 down
-    and 22.46 up.
+    """An elevator of -0.1 and +0.4 rad has 5.615 rad/s^2 down and 22.46 up.
+
+    Its effect B is 56.15 / s^2.
     """
     whole = RiseDiConfig.validate_mapping(START.changed(CHANGE), "whole")
     assert whole.feedforward is not None

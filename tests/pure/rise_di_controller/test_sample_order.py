@@ -144,8 +144,10 @@ def test_noise_of_the_first_second_is_learned() -> None:
 
 @pytest.mark.parametrize("after, taken", [(1.0, True), (50.0, False), (70.0, False)])
 def test_knock_opens_the_test_of_jumps_for_less_than_a_minute(after: float, taken: bool) -> None:
-    """A change of 0.5 rad/s at 5 s, within the power of the inputs: five times as much is possible
-    then, and less from second to second. After a minute 2 rad/s are as impossible as before.
+    """A change of 0.5 rad/s at 5 s is within the power of the inputs.
+
+    Five times as much is possible then, and less from second to second. After a minute 2 rad/s are
+    as impossible as before.
     """
     controller = Controller(SERVO)
     calm = noise()

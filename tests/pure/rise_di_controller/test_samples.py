@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Samples that no aircraft can give are lost, a state that is not finite begins again, and u is a
-number whatever comes.
+"""Samples that no aircraft can give are lost.
+
+A state that is not finite begins again, and u is a number whatever comes.
 """
 
 from collections.abc import Iterable
@@ -41,8 +42,9 @@ def noisy(ticks: int, seed: int = 1) -> FloatArray:
 def flown(
     controller: Controller, y: Iterable[FloatArray | None], first: int = 0
 ) -> tuple[FloatArray, list[Mode], list[str]]:
-    """The u after each tick, (T, m), the modes, and why samples are lost. None: no sample of y
-    comes; y_m is always 0.
+    """The u after each tick, (T, m), the modes, and why samples are lost.
+
+    None: no sample of y comes; y_m is always 0.
     """
     u = []
     modes = []
@@ -72,8 +74,10 @@ def without_sample(observed: bool) -> FloatArray:
 def test_wrong_sample_is_as_one_that_did_not_arrive(
     observed: bool, channel: int, size: float
 ) -> None:
-    """To the bit. Twice the change that full inputs make in a period is 0.7 rad/s and 4 m/s: 3
-    rad/s and 30 m/s are above.
+    """To the bit.
+
+    Twice the change that full inputs make in a period is 0.7 rad/s and 4 m/s: 3 rad/s and 30 m/s
+    are above.
     """
     config = OBSERVER if observed else SERVO
     unit = np.array([1.0, 1.0, 1.0, 10.0])
@@ -88,8 +92,9 @@ def test_wrong_sample_is_as_one_that_did_not_arrive(
 
 @pytest.mark.parametrize("channel, bound", [(0, 34.9066), (3, 340.0)])
 def test_bounds_hold_from_the_first_sample_on(channel: int, bound: float) -> None:
-    """2000 deg/s, the range of a gyro, and the speed of sound: of y and of y_m, so that the law
-    never engages with more.
+    """The bounds are 2000 deg/s, the range of a gyro, and the speed of sound.
+
+    They are those of y and of y_m, so that the law never engages with more.
     """
     controller = Controller(SERVO)
     unit = np.eye(4)[channel]
@@ -116,8 +121,9 @@ def test_bound_is_a_parameter() -> None:
 
 
 def test_jump_that_stays_is_taken_at_its_third_sample() -> None:
-    """Then the law engages again, from the u of then and with the estimates of the new y: nothing
-    is locked out for ever.
+    """The law engages again, from the u of then and with the estimates of the new y.
+
+    Nothing is locked out for ever.
     """
     controller = Controller(OBSERVER)
     before, _, _ = flown(controller, noisy(SPIKE))
@@ -136,8 +142,9 @@ def test_jump_that_stays_is_taken_at_its_third_sample() -> None:
 
 
 def test_samples_that_disagree_are_all_lost() -> None:
-    """The failsafe begins as without samples, and ends with the third sample in a row that
-    agrees.
+    """The failsafe begins as without samples.
+
+    It ends with the third sample in a row that agrees.
     """
     controller = Controller(SERVO)
     flown(controller, noisy(SPIKE))
@@ -153,8 +160,9 @@ def test_samples_that_disagree_are_all_lost() -> None:
 
 
 def test_samples_that_never_agree_are_taken_again() -> None:
-    """2 rad/s more and less in turn: the possible change of 0.6 rad/s grows with the periods since
-    the last sample taken.
+    """The y is 2 rad/s more and less in turn.
+
+    The possible change of 0.6 rad/s grows with the periods since the last sample taken.
     """
     controller = Controller(SERVO)
     flown(controller, noisy(SPIKE))
@@ -178,8 +186,9 @@ def test_abrupt_motion_within_the_power_of_the_inputs_is_taken() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["osprey_turbulence", "osprey_vanes", "x8_elevons"])
 def test_flights_lose_no_sample(name: str) -> None:
-    """Every sample of y after the first tick becomes a tick: gusts, turbulence, commands and
-    engagement are possible motion.
+    """Every sample of y after the first tick becomes a tick.
+
+    Gusts, turbulence, commands and engagement are possible motion.
     """
     scenario = find_scenario(name, 4.0).vary(
         aircraft={"rate": 100.0, "step": 0.005}, reference_model={"rate": 100.0}
@@ -193,8 +202,9 @@ def test_flights_lose_no_sample(name: str) -> None:
 
 @pytest.mark.parametrize("reading", [1e308, -4.0, np.nan])
 def test_reading_beyond_half_a_turn_is_that_of_the_tick_before(reading: float) -> None:
-    """A vane alone does not take y from the law: it stands still, and a vane that stands still is
-    left out.
+    """A vane alone does not take y from the law.
+
+    It stands still, and a vane that stands still is left out.
     """
     config = find_scenario("osprey_vanes").controller
     readings = 0.02 * np.random.default_rng(2).normal(size=(SPIKE + 1, 2))

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Flights in saturation: the effect of anti-windup and of a rate limit, and no effect without
-saturation.
+"""Flights in saturation: the effect of anti-windup and of a rate limit.
+
+Without saturation they have no effect.
 
 The servos are those of scenario osprey_servo, without noise, with tighter stops of one actuator.
 "guarded": the controller has the stops as its limits. "unguarded": only the actuators have them,
@@ -33,8 +34,9 @@ UNGUARDED: dict[str, Any] = {"lower": None, "upper": None, "slew": None}
 
 
 def with_stops(name: str, stop: float, *, guarded: bool) -> Scenario:
-    """The scenario with the stops of one actuator at -stop and stop; `guarded` is whether the
-    controller has these limits.
+    """The scenario with the stops of one actuator at -stop and stop.
+
+    `guarded` is whether the controller has these limits.
     """
     actuators = SERVO.aircraft.actuators.model_dump()
     # all stops are symmetric

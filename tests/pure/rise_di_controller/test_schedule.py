@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Schedule of input_scale over dynamic pressure: its equation, bumpless, in flight with a delay,
-replayed.
+"""Schedule of input_scale over dynamic pressure.
+
+The tests are of its equation, bumpless transfer, a flight with a delay, and replay.
 """
 
 from functools import cache
@@ -105,8 +106,9 @@ def rms(tape: Tape) -> dict[str, float]:
 
 
 def test_schedule_keeps_delayed_loop_at_rest() -> None:
-    """At 1.8 times the dynamic pressure the loop with delay stays at rest with the schedule
-    alone.
+    """At 1.8 times the dynamic pressure the loop with delay stays at rest.
+
+    It does so with the schedule alone.
     """
     # Without it, the loop with 30 ms of delay is in a limit cycle of tens of mrad/s in q. The
     # margin at trim is 18 ms.

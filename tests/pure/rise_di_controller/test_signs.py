@@ -29,8 +29,9 @@ UNLIMITED = CALM_SERVO.vary(aircraft={"actuators": {}}, controller={"lower": Non
 
 
 def trailing_edge_down(scenario: Scenario, folder: Path) -> Scenario:
-    """The same flight with an airframe whose positive elevator pitches the nose down; D is
-    unchanged.
+    """The same flight with an airframe whose positive elevator pitches the nose down.
+
+    D is unchanged.
     """
     airframe = yaml.safe_load((LIBRARY / "osprey.yaml").read_text())
     elevator = list(airframe["inputs"]).index("elevator")

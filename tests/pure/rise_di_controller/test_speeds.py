@@ -1,7 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""An observer over the airspeed: the airframe at another speed, models between the speeds, flights
-with u late, replay.
+"""An observer over the airspeed.
+
+The tests are of the airframe at another speed, models between the speeds, flights with u late, and
+replay.
 """
 
 from pathlib import Path
@@ -69,8 +71,9 @@ def margin(controller: RiseDiConfig, ratio: float) -> float:
 
 
 def test_short_period_is_as_fast_as_the_aircraft_and_a_turn_as_wide() -> None:
-    """An aircraft of one shape moves alike along its path: frequencies and rates by a surface grow
-    with V.
+    """An aircraft of one shape moves alike along its path.
+
+    Frequencies and rates by a surface grow with V.
     """
     places = [OSPREY.index(name) for name in ("alpha", "q")]
     moved = at_speed(OSPREY, 1.3, "thrust")
@@ -209,8 +212,9 @@ LEARNS = find_scenario("osprey_learn_speeds").rise_di()
 
 
 class Learns:
-    """A controller that learns beside a schedule, at 1.2 of the trim speed for 6 s, and the
-    proposals of its flight.
+    """A controller that learns beside a schedule, and the proposals of its flight.
+
+    It flies at 1.2 of the trim speed for 6 s.
     """
 
     def __init__(self, scheduled: RiseDiConfig) -> None:

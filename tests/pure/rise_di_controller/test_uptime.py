@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A month of uptime, and stamps of any year: times are whole nanoseconds, so that u does not depend
-on when a flight began.
+"""A month of uptime, and stamps of any year.
+
+Times are whole nanoseconds, so that u does not depend on when a flight began.
 """
 
 import numpy as np
@@ -17,8 +18,9 @@ LATEST = 2**31 - 1  # s: the last second of a stamp of ROS 2
 
 
 def flown(scenario: str, start: int) -> tuple[list[FloatArray], list[FloatArray]]:
-    """Values of u and internals over two seconds with a failsafe between them, from an instant in s
-    on.
+    """Values of u and internals over two seconds, from an instant in s on.
+
+    A failsafe is between them.
     """
     parameters = find_scenario(scenario).controller
     controller = Controller(parameters)

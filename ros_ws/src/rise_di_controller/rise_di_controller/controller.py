@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The controller without ROS: buffers y and y_m, steps the guarded law, returns u and a log. For
-node and simulation.
+"""The controller without ROS, for node and simulation.
+
+The controller buffers y and y_m, steps the guarded law, and returns u and a log.
 """
 
 from collections import deque
@@ -35,15 +36,17 @@ class ControlOutput(NamedTuple):
 
     @property
     def internals(self) -> FloatArray:
-        """Values for the log in the order of `Controller.names`. Computed on access, so u is
-        published first.
+        """Values for the log in the order of `Controller.names`.
+
+        They are computed on access, so u is published first.
         """
         return self.log()
 
 
 class Prepared(NamedTuple):
-    """What a controller makes of parameters before they are in force: a third of the time of a
-    change in flight.
+    """What a controller makes of parameters before they are in force.
+
+    To prepare takes a third of the time of a change in flight.
     """
 
     parameters: ControllerConfig
@@ -147,21 +150,24 @@ class Controller:
 
     @property
     def has_learned_model(self) -> bool:
-        """Whether feedforward and observer are others than at the start, as a learner proposes
-        them.
+        """Whether feedforward and observer differ from the start.
+
+        A learner proposes the models.
         """
         return not self._first_law
 
     def restart(self) -> None:
-        """Engage the law again with the next fresh y and y_m, from the u of then (bumpless
-        transfer); a failsafe goes on.
+        """Engage the law again with the next fresh y and y_m, from the u of then.
+
+        The transfer is bumpless. A failsafe goes on.
         """
         if self._state.mode is Mode.ENGAGED:
             self._state = self._state._replace(mode=Mode.WAITING)
 
     def retune(self, parameters: "ControllerConfig | Prepared") -> None:
-        """Replace the parameters between two ticks without a jump of u (bumpless transfer). Equal
-        parameters change nothing.
+        """Replace the parameters between two ticks without a jump of u (bumpless transfer).
+
+        Equal parameters change nothing.
 
         Args:
             parameters: The new parameters, or the parameters as prepared outside of a tick.
@@ -242,8 +248,9 @@ class Controller:
         )
 
     def oscillations(self) -> dict[str, float]:
-        """Periods, s, of the outputs that oscillate under a model learned in flight, more than
-        before.
+        """Periods, s, of the outputs that oscillate under a model learned in flight.
+
+        They oscillate more than before.
         """
         if self._first_law or not self._oscillations.periods.any():
             return {}
@@ -315,8 +322,9 @@ class Controller:
         return ""
 
     def _lost(self, last: StampedVector | None, sample: StampedVector, now_ns: int) -> str:
-        """Why a sample of m values is beyond the bounds; empty for one inside. Raises
-        ChannelError.
+        """Why a sample of m values is beyond the bounds; empty for one inside.
+
+        Raises ChannelError.
         """
         require_not_future(sample.stamp_ns, now_ns, self._guard.max_age_ns)
         if last is not None:
@@ -324,8 +332,9 @@ class Controller:
         return samples.bound_violation(sample.value, self._parameters.outputs, self._guard.samples)
 
     def restarted(self) -> str:
-        """Why the law has engaged again by itself since the last call, as a sentence; empty if it
-        has not.
+        """Why the law has engaged again by itself since the last call, as a sentence.
+
+        Empty without an engagement.
         """
         sentence = self._restarted
         self._restarted = ""
@@ -399,8 +408,9 @@ class Controller:
         self._state = state
 
     def overrun(self, last_ns: int, now_ns: int) -> tuple[int, ...]:
-        """Instants of further ticks before the tick at `now_ns`, where the last tick is longer ago
-        than the age limit.
+        """Instants of further ticks before the tick at `now_ns`.
+
+        There are some where the last tick is longer ago than the age limit.
 
         The aircraft has started a failsafe for u meanwhile. Two ticks without fresh inputs bring u
         of the controller to the failsafe u of the aircraft: the re-engagement is bumpless.
@@ -416,8 +426,9 @@ class Controller:
         return (begin_ns + self.period_ns, now_ns) if now_ns > begin_ns else ()
 
     def _newest_paired_y(self) -> StampedVector | None:
-        """The newest y up to a period after the newest y_m: with a late y_m an earlier y is used,
-        and no failsafe starts.
+        """The newest y up to a period after the newest y_m.
+
+        With a late y_m an earlier y is used, and no failsafe starts.
         """
         newest = self._y[-1] if self._y else None
         if not self._y_m:
@@ -456,8 +467,9 @@ class Controller:
 
 
 def _with_feedforward(parameters: ControllerConfig) -> NDArray[np.bool_]:
-    """Mask of the channels with a feedforward, (m,): a learner leaves out those that fly the law of
-    the start.
+    """Mask of the channels with a feedforward, (m,).
+
+    A learner leaves out the channels under the law of the start.
     """
     some = None if parameters.feedforward is None else parameters.feedforward.inputs
     return np.array([some is None or name in some for name in parameters.inputs])

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The controller's log: a named vector per tick. With the parameters the log is enough to recompute
-u.
+"""The controller's log: a named vector per tick.
+
+With the parameters the log is enough to recompute u.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The control laws of the controller, by name: RISE-DI, and the laws registered by installed
-packages.
+"""The control laws of the controller, by name.
+
+They are RISE-DI, and the laws registered by installed packages.
 
 A package registers a law by an entry point in setup.py; see docs/laws.md:
 
@@ -87,8 +88,9 @@ def schema(name: object) -> type[ControllerConfig]:
 
 
 class AnyLaw(ControllerConfig):
-    """The section `controller` of a scenario: the parameters of the law named by the key `law`,
-    RISE-DI by default.
+    """The section `controller` of a scenario.
+
+    The key `law` names the law, RISE-DI by default.
     """
 
     @classmethod

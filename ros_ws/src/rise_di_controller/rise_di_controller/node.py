@@ -61,8 +61,9 @@ two."""
 
 
 class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
-    """At each tick it takes the received y and y_m, steps the law and publishes u with the stamp of
-    y.
+    """Takes y and y_m at every tick, steps the law and publishes u.
+
+    u has the stamp of y.
 
     In lockstep the number of samples of y gives the time. A tick waits for the y and the y_m of its
     instant. It publishes exactly one u, without channels where the controller has no output.
@@ -160,8 +161,9 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         return self._y.subscription, self._y_m.subscription
 
     def start_ns(self) -> int:
-        """BEHIND_NS, or half a period where that is less, after a whole period of the system
-        clock.
+        """BEHIND_NS after a whole period of the system clock.
+
+        Half a period where this is less.
         """
         return self.next_period_ns() + min(BEHIND_NS, self.period_ns() // 2)
 
@@ -188,8 +190,9 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
     def _taking(
         self, take: Callable[[StampedVector, int], str]
     ) -> Callable[[StampedVector, int], None]:
-        """`take`, with a ChannelError for a sample that is lost, so that the receiver counts and
-        logs it.
+        """`take`, with a ChannelError for a sample that is lost.
+
+        So the receiver counts and logs the loss.
         """
 
         def taking(sample: StampedVector, now_ns: int) -> None:
@@ -237,8 +240,9 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         return None if self.parameters.lockstep else PublisherLock(self._timeouts_ns)
 
     def _timeouts_ns(self) -> tuple[int, int]:
-        """Ages above which a publisher has timed out: for the same node in another process, and for
-        another node.
+        """Ages above which a publisher has timed out, ns.
+
+        The first is for the same node in a new process, the second for a different node.
 
         Another one may take over once the failsafe has brought u to trim.
         """
@@ -330,8 +334,9 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
             self.adopt(parameters)
 
     def _publish_authority(self, now_ns: int) -> None:
-        """Tell guidance what the inputs can do, by the model that flies. Without a learner nothing
-        is told.
+        """Tell guidance what the inputs can do, by the model that flies.
+
+        Without a learner nothing is told.
         """
         if self._learning is not None:
             self._send_authority(
@@ -339,8 +344,9 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
             )
 
     def _has_proposal(self, now_ns: int) -> bool:
-        """Lockstep: whether the proposal has arrived for which the step of an instant waits, if
-        any.
+        """Lockstep: whether the proposal for which the step of an instant waits has arrived.
+
+        True where none is due.
         """
         if self._learning is None:
             return True

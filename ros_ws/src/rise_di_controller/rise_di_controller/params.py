@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of the controller under any control law: validation, and conversion to the arrays of
-guard, feedforward, observer.
+"""Parameters of the controller under any control law.
+
+They are validated, and converted to the arrays of guard, feedforward and observer.
 
 The parameters of a law are a subclass; `AnyLaw.validate_mapping` finds it by the name of the law.
 """
@@ -79,8 +80,9 @@ longest that the law takes."""
 
 
 class ControllerConfig(NodeConfig):
-    """Parameters of the controller node that every control law has. A subclass has those of one
-    law, as fields.
+    """Parameters of the controller node that every control law has.
+
+    A subclass has the parameters of a law, as fields.
 
     Args:
         values: Values by name of the parameter.
@@ -155,8 +157,9 @@ class ControllerConfig(NodeConfig):
 
     @classmethod
     def tunable(cls) -> frozenset[str]:
-        """Parameters that may change in flight: those of the law and the guard. Those that name
-        channels or signs may not.
+        """Parameters that may change in flight: those of the law and the guard.
+
+        Names of channels and signs may not.
         """
         common = {"lag", "delay", "max_age", "hold", "ramp", "lower", "upper", "slew", "y_max"}
         return frozenset(common | (set(cls.model_fields) - set(ControllerConfig.model_fields)))
@@ -166,10 +169,9 @@ class ControllerConfig(NodeConfig):
             pass
 
     def checks(self) -> Iterator[None]:
-        """The relations between the values, checked in parts of at most about 1 ms, for a
-        controller that flies meanwhile.
+        """The relations between the values, checked in parts of at most about 1 ms.
 
-        Raises ParameterError.
+        A controller flies meanwhile. Raises ParameterError.
         """
         period = period_ns(self.rate, "rate")
         if self.lockstep:
@@ -284,8 +286,9 @@ class ControllerConfig(NodeConfig):
         )
 
     def _check_observer(self, observer: ObserverConfig, nominal: Nominal) -> Iterator[None]:
-        """Sizes, stable filter and feedback, and the delay margin of the nominal loop, which
-        certifies what flies.
+        """Sizes, stable filter and feedback, and the delay margin of the nominal loop.
+
+        The delay margin certifies what flies.
         """
         expected = (
             tuple(f"x.{name}" for name in self.feedforward.states) if self.feedforward else ()
@@ -368,8 +371,9 @@ class ControllerConfig(NodeConfig):
         )
 
     def check_law(self) -> None:
-        """Checks of the law's own parameters against each other and the channels. Raises
-        ParameterError.
+        """Checks of the law's own parameters against each other and the channels.
+
+        Raises ParameterError.
         """
 
     def control_law(self) -> ControlLaw:
@@ -432,8 +436,9 @@ class ControllerConfig(NodeConfig):
 
     @property
     def effectors(self) -> tuple[str, ...]:
-        """The channels of u as published: the effectors of an allocation, else the inputs of the
-        law.
+        """The channels of u as published.
+
+        They are the effectors of an allocation, else the inputs of the law.
         """
         return self.inputs if self.allocation is None else self.allocation.effectors
 
@@ -443,8 +448,9 @@ class ControllerConfig(NodeConfig):
         return guard.limits if guard.allocation is None else guard.allocation.limits
 
     def given_up(self) -> FloatArray:
-        """1 for an output without a model to the end of the engagement, else 0, (m,); empty without
-        a learner.
+        """1 for an output without a model to the end of the engagement, else 0, (m,).
+
+        Empty without a learner.
         """
         return np.zeros(0)
 
@@ -461,8 +467,9 @@ class ControllerConfig(NodeConfig):
         )
 
     def _flown_nominal(self) -> Nominal | None:
-        """The nominal model along y_m. Beside an observer of part 0 no input is added: only a
-        learner needs the states.
+        """The nominal model along y_m.
+
+        Beside an observer of part 0 no input is added: only a learner needs the states.
         """
         nominal = self.nominal()
         if nominal is None or self.observer is None or self.observer.part > 0.0:

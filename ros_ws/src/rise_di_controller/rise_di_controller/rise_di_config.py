@@ -42,8 +42,9 @@ HISTORY = 5.0
 
 
 class SpeedConfig(Config):
-    """The models of feedforward and observer at another airspeed. SI units, matrices row by row as
-    in these sections.
+    """The models of feedforward and observer at another airspeed.
+
+    SI units, matrices row by row as in these sections.
     """
 
     ratio: Positive = Field(description="this airspeed over the trim speed")
@@ -97,8 +98,9 @@ LEAST_MARGIN = 0.02  # s, delay margin of a learned model, two periods of a law 
 
 
 class LearnConfig(Config):
-    """Learning in the air, an extension of the paper: A and B are identified in flight, and the
-    observer is designed again.
+    """Learning in the air, an extension of the paper.
+
+    A and B are identified in flight, and the observer is designed again.
     """
 
     window: Annotated[float, Field(ge=6, le=600)] = Field(
@@ -126,8 +128,10 @@ class LearnConfig(Config):
     )
 
     def least_margin(self, margin: float) -> float:
-        """The least delay margin of a learned model, s, beside that of the start: `margin`, or at
-        most LEAST_MARGIN, since the loop of the file may keep less around the aircraft.
+        """The least delay margin of a learned model, s, beside that of the start.
+
+        The margin is `margin`, or at most LEAST_MARGIN, since the loop of the file may keep less
+        around the aircraft.
         """
         return min(margin, LEAST_MARGIN) if self.margin is None else self.margin
 
@@ -188,8 +192,9 @@ class RiseDiConfig(ControllerConfig):
         return frozenset({"feedforward", "observer"})
 
     def check_law(self) -> None:
-        """A value per channel; k_d has no value for the last. A schedule needs V, and no model of
-        the trim besides.
+        """A value per channel; k_d has no value for the last.
+
+        A schedule needs V, and no model of the trim besides.
         """
         require_length("k_d", self.k_d, self.outputs[:-1])
         for key in ("Lambda", "beta", "omega"):
@@ -227,8 +232,9 @@ class RiseDiConfig(ControllerConfig):
             )
 
     def _check_schedule(self, schedule: ScheduleConfig) -> None:
-        """V is an output beside others, and a feedforward and an observer have models below and
-        above the trim speed.
+        """A schedule has V and further outputs, and models below and above the trim speed.
+
+        The models are of a feedforward and an observer.
         """
         followed = "V" in self.outputs and len(self.outputs) > 1
         require(
@@ -271,8 +277,9 @@ class RiseDiConfig(ControllerConfig):
         )
 
     def checks(self) -> Iterator[None]:
-        """Beside models at two more speeds: of the controller at the trim speed, at these speeds,
-        and halfway to either.
+        """Beside models at two more speeds, the checks of the controller at several speeds.
+
+        They are the trim speed, these speeds, and halfway to either.
         """
         if self.schedule is None or not self.schedule.models:
             yield from super().checks()
@@ -300,8 +307,9 @@ class RiseDiConfig(ControllerConfig):
                 ) from None
 
     def at_speed(self, ratio: float) -> Self:
-        """The parameters that fly at a part of the trim speed in steady flight, with the models of
-        there and no schedule.
+        """The parameters that fly at a part of the trim speed in steady flight.
+
+        They have the models of there and no schedule.
 
         Args:
             ratio: Airspeed as a part of the trim speed.
@@ -327,8 +335,9 @@ class RiseDiConfig(ControllerConfig):
         return self.model_copy(update=sections | {"input_scale": input_scale, "schedule": None})
 
     def _with_models(self, models: SpeedConfig) -> Self:
-        """The parameters with `models` in place of the models of the trim speed, and no
-        schedule.
+        """The parameters with `models` in place of the models of the trim speed.
+
+        They have no schedule.
         """
         sections: dict[str, Any] = {"schedule": None}
         for key, names in (
@@ -357,8 +366,9 @@ class RiseDiConfig(ControllerConfig):
         return over_speed((slow.ratio, fast.ratio), (at_trim, at_slow, at_fast), airspeed, model)
 
     def _nominal_over_speed(self, at_trim: Nominal) -> OverSpeed:
-        """The model of the feedforward over the airspeed, with leads and inputs of the model at the
-        trim speed.
+        """The model of the feedforward over the airspeed.
+
+        Leads and inputs come from the model at the trim speed.
         """
 
         def matrices(config: RiseDiConfig, scale: FloatArray) -> FloatArray:
@@ -445,8 +455,9 @@ class RiseDiConfig(ControllerConfig):
         )
 
     def summary(self) -> str:
-        """How the sign is sampled, and the reason as a sentence; whether input_scale is
-        scheduled.
+        """How the sign is sampled, and the reason as a sentence.
+
+        The sentence says whether input_scale is scheduled.
         """
         return self.sampled_sign()[1] + (
             "" if self.schedule is None else "; input_scale follows the dynamic pressure"

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Allocation of the m inputs v of a law to p >= m effectors u, inside end stops and rates: u = T v,
-effect u = v.
+"""Allocation of the m inputs v of a law to p >= m effectors u, inside end stops and rates.
+
+u = T v, effect u = v.
 
 The law, its gains and its theorem stay m x m in v. T is a right inverse of `effect`, so what one
 effector gives the others need not give. Every sum has a stated order, so u has the same bits on
@@ -53,8 +54,9 @@ def allocation(
 def allocate(
     v: FloatArray, u_before: FloatArray, dt: Array, params: Allocation
 ) -> tuple[FloatArray, FloatArray]:
-    """U (p,) inside its limits for a demanded v (m,), and the v that u gives; without a limit T v
-    and v, to the last bit.
+    """The u (p,) inside the limits for a demanded v (m,), and the v by this u.
+
+    Without a limit they are T v and v, to the last bit.
 
     Where T v is beyond an end stop, `exchange w` passes what the effector lacks to the others, one
     stop after the other. Where that is not enough, the inputs of the law are added in the order of
@@ -92,8 +94,9 @@ def allocate(
 
 
 def reached(v_free: Array, v: Array) -> Limits:
-    """The limits that take v_free to the v that the effectors give, for the anti-windup of a
-    law.
+    """The limits from v_free to the v of the effectors.
+
+    The anti-windup of a law takes these limits.
     """
     xp = array_namespace(v)
     infinite = xp.full_like(v, xp.inf)

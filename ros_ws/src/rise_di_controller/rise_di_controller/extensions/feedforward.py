@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Feedforward by model inversion, an extension of the paper, off by default: the input of a nominal
-model along y_m.
+"""Feedforward by model inversion, an extension of the paper, off by default.
+
+The feedforward is the input of a nominal model along y_m.
 
 The feedforward uses y_m only, no state of the aircraft, and does not change the law. See
 docs/theory.md.
@@ -27,8 +28,9 @@ LONGEST_PART = 10
 
 
 class Nominal(NamedTuple):
-    """Nominal model of the aircraft: x_dot = A x + f(x) + B u, y = C x, in deviations from trim, SI
-    and radians.
+    """Nominal model of the aircraft: x_dot = A x + f(x) + B u, y = C x.
+
+    The model is in deviations from trim, SI and radians.
     """
 
     A: Array  # (n, n)
@@ -89,10 +91,10 @@ def initial_state(y_m: Array, nominal: Nominal) -> FeedforwardState:
 def continued(
     state: FeedforwardState | None, y_m: Array, y_m_dot: Array, dt: Array, nominal: Nominal
 ) -> FeedforwardState:
-    """State for a new model in the same motion: x and u_0 stay, where there are any, and u is that
-    of the new model.
+    """State for a new model in the same motion.
 
-    u_ff goes on at u - u_0. Arguments: y_m_dot and dt of the last tick.
+    x and u_0 stay, where there are any, and the new model gives u. u_ff goes on at u - u_0.
+    Arguments: y_m_dot and dt of the last tick.
     """
     start = initial_state(y_m, nominal)
     if state is not None and state.x.shape == start.x.shape:
@@ -101,16 +103,18 @@ def continued(
 
 
 def ideal(x: Array, y_m_dot: Array, nominal: Nominal) -> Array:
-    """Input for the motion y_m_dot of the outputs of the nominal model: Omega^-1 (y_m_dot - C (A x
-    + f(x))), shape (m,).
+    """Input for the motion y_m_dot of the outputs of the nominal model, shape (m,).
+
+    u = Omega^-1 (y_m_dot - C (A x + f(x))).
     """
     drift = product(nominal.A, x) + product(nominal.gravity, sines(x, nominal))
     return product(nominal.inverse, y_m_dot - product(nominal.C, drift))
 
 
 def x_dot(t: Array, x: Array, forced: Array, nominal: Nominal) -> Array:
-    """Nominal model under the ideal input, shape (n,): A x + f(x) + B ideal(x, y_m_dot), so C x_dot
-    = y_m_dot.
+    """Nominal model under the ideal input, shape (n,).
+
+    x_dot = A x + f(x) + B ideal(x, y_m_dot), so C x_dot = y_m_dot.
 
     As (I - B Omega^-1 C) (A x + f(x)) + forced, with forced = B Omega^-1 y_m_dot.
     """
@@ -130,8 +134,9 @@ def sines(x: Array, nominal: Nominal) -> Array:
 
 
 def parts_of(span_ns: int, period_ns: int) -> int:
-    """Number of Runge-Kutta steps over the time between two ticks, each of at most LONGEST_PART
-    periods.
+    """Number of Runge-Kutta steps over the time between two ticks.
+
+    A step has at most LONGEST_PART periods.
     """
     return max(-(-span_ns // (LONGEST_PART * period_ns)), 1)
 

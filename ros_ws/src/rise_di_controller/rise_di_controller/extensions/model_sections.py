@@ -60,8 +60,9 @@ def require_signs(Omega: FloatArray, D: Sequence[int], where: str) -> None:
 
 
 class FeedforwardConfig(Config):
-    """The nominal model of the feedforward, an extension of the paper. SI units, matrices row by
-    row.
+    """The nominal model of the feedforward, an extension of the paper.
+
+    SI units, matrices row by row.
     """
 
     states: Names = Field(description="the states of the model, the outputs among them")
@@ -81,8 +82,9 @@ class FeedforwardConfig(Config):
     )
 
     def nominal(self, outputs: Sequence[str], inputs: Sequence[str], D: Sequence[int]) -> Nominal:
-        """The arrays of the feedforward. Raises ParameterError for sizes that do not match and for
-        a C B whose D differs.
+        """The arrays of the feedforward.
+
+        Raises ParameterError for sizes that do not match and for a C B whose D differs.
         """
         n = len(self.states)
         m = len(outputs)
@@ -114,8 +116,9 @@ class FeedforwardConfig(Config):
 
 
 class VanesConfig(Config):
-    """Vanes of an observer: channels of y beside the outputs, for the observer alone; SI, row by
-    row.
+    """Vanes of an observer: channels of y beside the outputs, for the observer alone.
+
+    SI, row by row.
     """
 
     channels: Names = Field(
@@ -153,8 +156,9 @@ class VanesConfig(Config):
 
 
 class ObserverConfig(Config):
-    """An observer of the nominal model, an extension of the paper, with its matrices as designed;
-    SI, row by row.
+    """An observer of the nominal model, an extension of the paper.
+
+    The matrices are as designed; SI, row by row.
     """
 
     rate: Positive = Field(description="the rate of the law for which the matrices hold, Hz")
@@ -213,8 +217,9 @@ class ObserverConfig(Config):
 
 
 class AllocationConfig(Config):
-    """An allocation of the inputs of the law to as many effectors or more, an extension of the
-    paper. SI, row by row.
+    """An allocation of the inputs of the law to as many effectors or more.
+
+    An extension of the paper. SI, row by row.
     """
 
     effectors: Names = Field(description="the channels of u that are published")
@@ -241,8 +246,9 @@ class AllocationConfig(Config):
         )
 
     def arrays(self, inputs: Sequence[str]) -> Allocation:
-        """The arrays of the allocation. Raises ParameterError for sizes that do not match and for
-        an effect T that is not I.
+        """The arrays of the allocation.
+
+        Raises ParameterError for sizes that do not match and for an effect T that is not I.
         """
         p = len(self.effectors)
         m = len(inputs)

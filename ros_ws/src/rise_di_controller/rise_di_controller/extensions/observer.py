@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Observer, an extension of the paper, off by default: estimates of states, wind and disturbances
-correct the trim of a law.
+"""Observer, an extension of the paper, off by default.
+
+Estimates of states, wind and disturbances correct the trim of a law.
 
 The observer extends any control law: the law's own equations do not change. The matrices are
 parameters, so nothing is solved here. See docs/theory.md.
@@ -20,8 +21,9 @@ from rise_di_controller.law.saturation import Limits, saturate
 
 
 class VaneParams(NamedTuple):
-    """Parameters of k vanes, sensors beside y for the observer alone: a reading is H z beyond the
-    reference motion.
+    """Parameters of k vanes, sensors beside y for the observer alone.
+
+    A reading is H z beyond the reference motion.
     """
 
     H: Array  # (k, s)
@@ -34,8 +36,9 @@ class VaneParams(NamedTuple):
 
 
 class ObserverParams(NamedTuple):
-    """Parameters of the extended law and of the observer, s estimates; a matrix may have the N
-    aircraft as the last axis.
+    """Parameters of the extended law and of the observer, s estimates.
+
+    A matrix may have the N aircraft as the last axis.
 
     The model of the deviation from the reference, u held over a period: z+ = Phi z + Gamma (u -
     u_trim), e = H z.
@@ -178,8 +181,9 @@ def without_frozen(params: ObserverParams, frozen: Sequence[bool]) -> ObserverPa
 
 
 def filter_matrix(params: ObserverParams) -> FloatArray:
-    """Phi (I - L H - sum of L_v [H, H_v]), (s, s): the estimates from tick to tick, with the vanes
-    of a finite `least`.
+    """Phi (I - L H - sum of L_v [H, H_v]), (s, s): the estimates from tick to tick.
+
+    Vanes with a finite `least` count.
     """
     corrected = params.L @ params.H
     if params.vanes is not None:
@@ -227,8 +231,9 @@ def _at_engagement(
 
 @lru_cache(maxsize=64)
 def with_observer(law: ControlLaw, *, vanes: bool = False) -> ControlLaw:
-    """A control law from the trim u_trim + u_o; the observer takes u after saturation
-    (anti-windup), and its vanes.
+    """A control law from the trim u_trim + u_o.
+
+    The observer takes u after saturation (anti-windup), and the vanes.
 
         u_o by `correct`
         u   = law(y, y_m) from the trim u_trim + u_o

@@ -39,8 +39,9 @@ class OverSpeed(NamedTuple):
     airspeed: FloatArray  # (m,) 1 for the output V, else 0
 
     def at_scale(self, scale: FloatArray) -> Any:
-        """The model where the factors of input_scale are `scale`, (m,): they are (V0 / V)^2 in all
-        channels but V.
+        """The model where the factors of input_scale are `scale`, (m,).
+
+        The factors are (V0 / V)^2 in every channel but V.
         """
         d = 1.0 / math.sqrt(((1.0 - self.airspeed) * scale).max()) - 1.0
         return self.model(round(min(max(d, self.least), self.most) * STEPS) / STEPS)
@@ -60,12 +61,12 @@ def over_speed(
     airspeed: FloatArray,
     model: Callable[[FloatArray, FloatArray], Any],
 ) -> OverSpeed:
-    """The model of matrices trim + d (slope + d curvature), through `values` at the trim speed and
-    at two ratios to it.
+    """The model of matrices trim + d (slope + d curvature).
 
-    The first ratio is below 1, the second above. What turns y_dot into u, as F of an observer and
-    the inverse of Omega, is over the factor of input_scale in `values`: `model` takes the matrices
-    and these factors, (m,).
+    The matrices go through `values` at the trim speed and at two ratios to it. The first ratio is
+    below 1, the second above. What turns y_dot into u, as F of an observer and the inverse of
+    Omega, is over the factor of input_scale in `values`: `model` takes the matrices and these
+    factors, (m,).
     """
     trim, slow, fast = values
     least, most = (ratio - 1.0 for ratio in ratios)
@@ -105,8 +106,9 @@ def airspeed_range(params: ScheduleParams) -> tuple[Array, Array]:
 
 
 def target_scale(y: Array, params: ScheduleParams) -> Array:
-    """Factor of input_scale at the airspeed V0 + V of y, shape (m,): (V0 / (V0 + V))^2 within
-    SCALE_RANGE; 1 in channel V.
+    """Factor of input_scale at the airspeed V0 + V of y, shape (m,).
+
+    The factor is (V0 / (V0 + V))^2 within SCALE_RANGE, and 1 in channel V.
 
     A ratio of dynamic pressures at equal density: for V in y as equivalent airspeed at any
     altitude, for true airspeed near the altitude of the trim. A thrust does not follow the ratio.
@@ -135,8 +137,9 @@ def observer_of(
 
 
 def nominal_side_by_side(nominal: Nominal, scale: FloatArray) -> FloatArray:
-    """[A, gravity, B, path A, path gravity, inverse'] of a feedforward with the factors `scale`;
-    the last in n rows.
+    """The matrices of a feedforward side by side, with the factors `scale`.
+
+    They are [A, gravity, B, path A, path gravity, inverse'], the last in n rows.
     """
     n, m = nominal.B.shape
     inverse = np.zeros((n, m))
@@ -160,8 +163,9 @@ def nominal_of(nominal: Nominal, matrices: FloatArray, scale: FloatArray) -> Nom
 
 
 def law_at(params: ScheduleParams, scale: Array) -> Any:
-    """Parameters of the extended law at an airspeed: input_scale times `scale`, with an observer
-    the models there.
+    """Parameters of the extended law at an airspeed.
+
+    They have input_scale times `scale`, and with an observer the models there.
     """
     return _scaled(
         params.law if params.observer is None else params.observer.at_scale(scale), scale

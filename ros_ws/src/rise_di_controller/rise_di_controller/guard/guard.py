@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Guard of the control law: saturation, engagement, retuning and failsafe. Pure, like the law; for
-every control law.
+"""Guard of the control law: saturation, engagement, retuning and failsafe.
+
+The guard is pure, like the law, and fits every control law.
 
 - Saturation: magnitude and rate limits of u (`saturation.saturate`). Anti-windup is part of the law
   (`ControlLaw.limited`).
@@ -119,8 +120,9 @@ class ControllerState(NamedTuple):
 
 
 class TickInputs(NamedTuple):
-    """Inputs of a tick, for the log. The tick recomputed from these inputs gives u to the last
-    bit.
+    """Inputs of a tick, for the log.
+
+    The tick recomputed from these inputs gives u to the last bit.
     """
 
     stamp_ns: int  # of y, and so of u; the instant of the tick where no y is used
@@ -140,8 +142,9 @@ def initial_state(m: int, allocation: Allocation | None = None) -> ControllerSta
 
 
 def align(samples: Sequence[StampedVector], stamp_ns: int, reach_ns: int) -> FloatArray | None:
-    """The signal at an instant, shape (m,); None where neither interpolation nor extrapolation is
-    possible.
+    """The signal at an instant, shape (m,).
+
+    None where neither interpolation nor extrapolation is possible.
 
     A sample with the stamp of the instant is returned unchanged. Between two samples the signal is
     linear. Beyond the newest sample the signal is extrapolated by at most `reach_ns`, with the
@@ -320,8 +323,9 @@ def _probed_trim(state: ControllerState, stamp_ns: int, guard: GuardParams) -> F
 def _fresh_reference(
     now_ns: int, y: StampedVector, y_m: Sequence[StampedVector], guard: GuardParams
 ) -> FloatArray | None:
-    """The reference at the stamp of y, (m,); None where y or y_m is stale or not finite, or has no
-    sample near that stamp.
+    """The reference at the stamp of y, (m,).
+
+    None where y or y_m is stale or not finite, or has no sample near that stamp.
     """
     if not y_m or max(abs(now_ns - sample.stamp_ns) for sample in (y, y_m[-1])) > guard.max_age_ns:
         return None
@@ -373,16 +377,18 @@ def _is_finite(state: ControllerState) -> bool:
 
 
 def _readings(reading: FloatArray, before: Vanes | None) -> FloatArray:
-    """The readings of the vanes, (k,): one that no vane gives is that of the tick before, so the
-    vane counts as still.
+    """The readings of the vanes, (k,).
+
+    A missing reading repeats the tick before, so the vane counts as still.
     """
     last = np.zeros_like(reading) if before is None else before.reading
     return np.where(np.abs(reading) <= LARGEST_VANE, reading, last)
 
 
 def _nominal(guard: GuardParams, law: Any) -> Nominal | None:
-    """The nominal model of the feedforward, at the speed of a schedule if any; None without a
-    feedforward.
+    """The nominal model of the feedforward, at the speed of a schedule if any.
+
+    None without a feedforward.
     """
     if guard.nominal is None or guard.over_speed is None:
         return guard.nominal
@@ -396,8 +402,9 @@ def _vanes(
     guard: GuardParams,
     recorded: FloatArray | None,
 ) -> Vanes | None:
-    """The readings, and the states of the nominal model along y_m as readings of the reference
-    motion; None without vanes.
+    """The readings, and the states of the nominal model along y_m; None without vanes.
+
+    The states are the readings of the reference motion.
     """
     if reading is None:
         return None
@@ -412,8 +419,9 @@ def law_within_limits(
     guard: GuardParams,
     effectors: FloatArray | None,
 ) -> tuple[Any, FloatArray, FloatArray, FloatArray | None]:
-    """A step of the law inside its limits and those of the effectors: state, u before saturation,
-    u, effectors.
+    """A step of the law inside the limits of the law and of the effectors.
+
+    The results are the state, u before saturation, u, and the effectors.
 
     Arguments: `effectors` (p,) of the last tick, None without an allocation.
     """
@@ -432,8 +440,9 @@ def law_within_limits(
 def _within_effectors(
     u: FloatArray, before: FloatArray | None, dt: Array, guard: GuardParams
 ) -> tuple[FloatArray, FloatArray | None]:
-    """The u that the effectors give for a u, and the effectors; u and None without an
-    allocation.
+    """The u of the effectors for a u, and the effectors.
+
+    Without an allocation they are u and None.
     """
     if guard.allocation is None or before is None:
         return u, None
@@ -506,8 +515,9 @@ def _with_estimates(
     change: Array,
     observers: tuple[ObserverParams, ...],
 ) -> ObserverState:
-    """The observer of new parameters in the same motion, from its estimates z and the change of
-    u_ff, (m,).
+    """The observer of new parameters in the same motion.
+
+    The observer goes on from the estimates z and the change of u_ff, (m,).
 
     u_o goes on to -F z at its own rate. Of a channel without an observer before it takes the part
     of the law: what the law has integrated beside an observer stays there, which would take it long
@@ -527,8 +537,9 @@ def _with_estimates(
 def _with_nominal(
     state: ControllerState, y_m: FloatArray, nominal: Nominal | None
 ) -> tuple[ControllerState, Array]:
-    """The state with the feedforward of another model in the same motion, and the change of u_ff,
-    (m,).
+    """The state with the feedforward of another model in the same motion.
+
+    The second result is the change of u_ff, (m,).
     """
     u_ff = np.zeros_like(state.u)
     goes_on = None

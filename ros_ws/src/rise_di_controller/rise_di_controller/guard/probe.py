@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Probe of the inputs while engaged, and the test of the answer: a surface that is stuck in trim
-shows no error in calm air.
+"""Probe of the inputs while engaged, and the test of the answer.
+
+A surface that is stuck in trim shows no error in calm air.
 
 Each probed input has a sine of its own frequency beside what the law commands. Over a window all
 sines are orthogonal, also to the frequencies between, where the disturbances are measured.
@@ -74,8 +75,9 @@ class Probe(NamedTuple):
     window_ns: int
 
     def at(self, stamp_ns: int) -> FloatArray:
-        """Amplitude sin(2 pi harmonic t / window) at a stamp, (m,): the same in flight and in
-        replay.
+        """Amplitude sin(2 pi harmonic t / window) at a stamp, (m,).
+
+        Flight and replay have the same value.
         """
         part = (stamp_ns % self.window_ns) / self.window_ns
         return np.asarray(self.amplitude * np.sin(2.0 * np.pi * self.harmonic * part))

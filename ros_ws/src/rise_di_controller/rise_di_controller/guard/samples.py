@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Which samples the controller takes. An impossible sample is lost, as a sample that did not
-arrive.
+"""Which samples the controller takes.
+
+An impossible sample is lost, as a sample that did not arrive.
 
 - `beyond`: a value is beyond the bound of the output. No sensor gives such a value.
 - `step`: y changes faster than an aircraft can. The test compares y with the y before and has no
@@ -92,8 +93,9 @@ class SampleState(NamedTuple):
 def bounds(
     names: Sequence[str], authority: FloatArray, largest: Sequence[float] | None, period_ns: int
 ) -> SampleLimits:
-    """The limits of outputs by name; `authority`: y_dot by the full inputs, (m,), units of y / s;
-    `largest`: of parameters.
+    """The limits of outputs by name.
+
+    `authority`: y_dot by the full inputs, (m,), units of y / s; `largest`: of parameters.
     """
     least = [LEAST.get(name, LEAST_RATE) for name in names]
     reach = np.maximum(AUTHORITY * authority * seconds(period_ns), least)
@@ -102,8 +104,9 @@ def bounds(
 
 
 def bound_violation(value: FloatArray, names: Sequence[str], limits: SampleLimits) -> str:
-    """The first of the m values that is beyond its bound, or NaN, as a sentence; empty for values
-    inside.
+    """The first of the m values beyond the bound, or NaN, as a sentence.
+
+    Empty for values inside.
     """
     inside = np.abs(value) <= limits.largest
     if inside.all():

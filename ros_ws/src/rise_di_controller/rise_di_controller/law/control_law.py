@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Protocol of a control law: pure functions over a state. Controller, replay and campaigns fly
-every law by the protocol.
+"""Protocol of a control law: pure functions over a state.
+
+Controller, replay and campaigns fly every law by the protocol.
 
 A law with validated parameters is a subclass of `params.ControllerConfig`. The controller finds the
 subclass by name under the entry point group `laws.GROUP`. See docs/laws.md.

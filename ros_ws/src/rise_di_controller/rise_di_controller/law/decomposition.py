@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""SDU decomposition Omega = C B = S D U, equations (10)-(11). The law has to know D alone of the
-aircraft.
+"""SDU decomposition Omega = C B = S D U, equations (10)-(11).
+
+The law has to know D alone of the aircraft.
 
 D depends on the order of the channels, on the pairing of inputs with outputs and on the signs of
 the inputs, so D is validated together with the channels. U measures the quality of the pairing:
@@ -39,8 +40,9 @@ Order = tuple[tuple[int, ...], tuple[int, ...]]
 
 
 class DecompositionError(ParameterError):
-    """A matrix without S D U. `minor` is the number of the first minor zero or nearly so, None if
-    not square.
+    """A matrix without S D U.
+
+    `minor` is the number of the first minor zero or nearly so, None if not square.
     """
 
     def __init__(self, sentence: str, minor: int | None = None) -> None:
@@ -57,8 +59,9 @@ class SDU(NamedTuple):
 
 
 class Pairing(NamedTuple):
-    """A choice of channels with D = I: Omega[outputs][:, inputs] * signs, channel k of the law is
-    row and column k.
+    """A choice of channels with D = I: Omega[outputs][:, inputs] * signs.
+
+    Channel k of the law is row and column k.
     """
 
     outputs: tuple[int, ...]  # row of Omega by channel
@@ -98,25 +101,26 @@ def decompose(Omega: ArrayLike) -> SDU:
 
 
 def signs(Omega: FloatArray) -> FloatArray:
-    """D of Omega, shape (m,): D_k = sign(Delta_k / Delta_(k-1)). Raises DecompositionError as
-    `decompose` does.
+    """D of Omega, shape (m,): D_k = sign(Delta_k / Delta_(k-1)).
+
+    Raises DecompositionError as `decompose` does.
     """
     return np.sign(_eliminate(Omega)[1])
 
 
 def leading_minors(Omega: FloatArray) -> FloatArray:
-    """Determinants Delta_k of the first k rows and columns, k = 1 .. m, shape (m,). Minors of zero
-    are allowed.
+    """Determinants Delta_k of the first k rows and columns, k = 1 .. m, shape (m,).
 
-    Raises DecompositionError if Omega is not square or not finite.
+    Minors of zero are allowed. Raises DecompositionError if Omega is not square or not finite.
     """
     matrix = _square(Omega)
     return np.array([np.linalg.det(matrix[:k, :k]) for k in range(1, len(matrix) + 1)])
 
 
 def unit_diagonal(Omega: FloatArray) -> FloatArray:
-    """Omega in inputs scaled to unit response, v_i = abs(Omega_ii) u_i: Omega_ij / abs(Omega_jj),
-    shape (m, m).
+    """Omega in inputs scaled to unit response, v_i = abs(Omega_ii) u_i, shape (m, m).
+
+    An entry is Omega_ij / abs(Omega_jj).
 
     Raises DecompositionError if Omega is not square or not finite, or if an output does not respond
     to the paired input.
@@ -133,8 +137,9 @@ def unit_diagonal(Omega: FloatArray) -> FloatArray:
 
 
 def coupling(Omega: FloatArray) -> float:
-    """Coupling max abs(U - I) of `unit_diagonal(Omega)`, in inputs of unit response; a large value
-    is a bad pairing.
+    """Coupling max abs(U - I) of `unit_diagonal(Omega)`, in inputs of unit response.
+
+    A large value is a bad pairing.
 
     Infinite where an output does not respond to the paired input. The coupling depends on the units
     of y, not on the units or signs of u. Raises DecompositionError as `decompose` does.
@@ -144,8 +149,9 @@ def coupling(Omega: FloatArray) -> float:
 
 
 def search(Omega: FloatArray, largest_U: float = math.inf) -> Pairing | None:
-    """The smallest change of the channels to D = I, or None where no order that was tried gives D =
-    I.
+    """The smallest change of the channels to D = I.
+
+    None where no tried order gives D = I.
 
     Up to MANY channels, every order of the outputs is combined with every order of the inputs:
     (m!)^2. Of more channels three orders are tried: the given one, the inputs by the largest
@@ -183,7 +189,9 @@ def search(Omega: FloatArray, largest_U: float = math.inf) -> Pairing | None:
 
 
 def _likely_orders(matrix: FloatArray) -> Iterable[Order]:
-    """The given order, the inputs with the largest product of responses, and the order of complete
+    """The likely orders for D = I.
+
+    The orders are the given order, the inputs with the largest product of responses, and complete
     pivoting.
     """
     from scipy.optimize import linear_sum_assignment  # noqa: PLC0415 - a sixth of a second, which few channels do not need
@@ -237,8 +245,9 @@ def _square(Omega: ArrayLike) -> FloatArray:
 
 
 def _sizes(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Scales (m,) and (m,) of rows and columns: the largest abs(Omega_ij) / (rows_i columns_j) is 1
-    in every row and column.
+    """Scales (m,) and (m,) of rows and columns.
+
+    The largest abs(Omega_ij) / (rows_i columns_j) is 1 in every row and column.
 
     The scales follow the units of the channels, so a comparison with the scales does not depend on
     units. A row or column of zeros keeps the scale 1. Source: D. Ruiz, "A Scaling Algorithm to
@@ -256,10 +265,10 @@ def _sizes(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _eliminate(Omega: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """L, p, W and L^-1 of Omega = L diag(p) W without pivoting, L unit lower and W unit upper
-    triangular.
+    """L, p, W and L^-1 of Omega = L diag(p) W without pivoting.
 
-    p_k = (L^-1)_k Omega (W^-1)_k gives the certainty of the sign of p_k.
+    L is unit lower and W unit upper triangular. p_k = (L^-1)_k Omega (W^-1)_k gives the certainty
+    of the sign of p_k.
     """
     remainder = _square(Omega)
     m = len(remainder)

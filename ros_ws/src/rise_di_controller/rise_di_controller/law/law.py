@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The control law, equations (20)-(22), as a pure step: from y and y_m only, without A, B, f or any
-acceleration.
+"""The control law, equations (20)-(22), as a pure step.
+
+The inputs are y and y_m only, without A, B, f or any acceleration.
 
 `CONTROL_LAWS` has the law in the protocol of `control_law`, with anti-windup and retuning.
 """
@@ -80,23 +81,26 @@ class LawState(NamedTuple):
 
 
 def gain(k_g: Array, k_d: Array) -> Array:
-    """Diagonal of K, equation (22): K = I + k_g I + diag(k_d, 0), shape (m,), from k_g () and k_d
-    (m - 1,).
+    """Diagonal of K, equation (22): K = I + k_g I + diag(k_d, 0), shape (m,).
+
+    k_g is () and k_d (m - 1,).
     """
     xp = array_namespace(k_d)
     return 1.0 + k_g + xp.concat([k_d, xp.zeros(1, dtype=k_d.dtype)])
 
 
 def total_lag(lag: Array, delay: float, period: float) -> Array:
-    """Lag from y to the actuator positions: actuator + 1.5 period (sampling and hold) + delay,
-    shape of `lag`, s.
+    """Lag from y to the actuator positions, shape of `lag`, s.
+
+    The lag is actuator + 1.5 period (sampling and hold) + delay.
     """
     return lag + 1.5 * period + delay
 
 
 def engage(y: Array, y_m: Array) -> LawState:
-    """State at engagement: e_0 = y - y_m, integral_e = 0, Pi = 0. So u = 0 at engagement (bumpless
-    transfer).
+    """State at engagement: e_0 = y - y_m, integral_e = 0, Pi = 0.
+
+    So u = 0 at engagement (bumpless transfer).
 
     Args:
         y: Outputs, shape (m,), SI.
@@ -202,8 +206,9 @@ def step_with_anti_windup(
     params: LawParams,
     limits: Limits,
 ) -> tuple[LawState, Array, Array]:
-    """A step of the law with anti-windup: (law state, u before saturation, u commanded), u of shape
-    (m,).
+    """A step of the law with anti-windup.
+
+    The results are (law state, u before saturation, u commanded), u of shape (m,).
 
     Conditional integration. Where u_trim + u exceeds a magnitude or rate limit, an outward
     increment of integral_e or of Pi is reduced; an inward increment stays. The increment of
@@ -241,8 +246,9 @@ def step_with_anti_windup(
 
 
 def retune(state: LawState, old: LawParams, new: LawParams) -> LawState:
-    """State for new parameters, without a jump of u (bumpless transfer): Pi absorbs the change of
-    the linear term.
+    """State for new parameters, without a jump of u (bumpless transfer).
+
+    Pi absorbs the change of the linear term.
 
     Pi+ = -D u / input_scale - K (e - e_0 + Lambda integral_e), with the new D, input_scale, K,
     Lambda and u of the old parameters. The remaining states stay. Equation (23) continues from the

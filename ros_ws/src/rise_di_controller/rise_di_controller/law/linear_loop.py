@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The sampled linear loop of a control law around a model, with actuators and delay: its
-stability.
+"""The sampled linear loop of a control law around a model: its stability.
+
+The loop has actuators and delay.
 """
 
 from functools import lru_cache
@@ -29,8 +30,9 @@ SMALL = (
 
 
 class LinearPlant(NamedTuple):
-    """x_dot = A x + B u_a, y = C x with an actuator per input, lag_i u_a,i_dot = u_i - u_a,i; the
-    law's order, SI.
+    """x_dot = A x + B u_a, y = C x with an actuator per input, in the law's order, SI.
+
+    lag_i u_a,i_dot = u_i - u_a,i.
     """
 
     A: FloatArray  # (n, n)
@@ -52,8 +54,9 @@ class Loop(NamedTuple):
 
 
 class LinearLaw(NamedTuple):
-    """A law near e = 0 with k values in the state: z+ = A z + B y, u = C z + D y, at y_m = 0;
-    leading axes are batches.
+    """A law near e = 0 with k values in the state: z+ = A z + B y, u = C z + D y, at y_m = 0.
+
+    Leading axes are batches.
     """
 
     A: FloatArray  # (..., k, k)
@@ -63,8 +66,9 @@ class LinearLaw(NamedTuple):
 
 
 def linear_law(law: TunedLaw, m: int, period: float, candidates: int | None = None) -> LinearLaw:
-    """A law's step near e = 0 over m channels: a column is the response to SMALL in a value of the
-    state or of y.
+    """A law's step near e = 0 over m channels.
+
+    A column is the response to SMALL in a value of the state or of y.
 
     An observer has faded in, and its vanes measure: a column each, after those of y. With
     `candidates` N the parameters have N sets of gains as the last axis, and the matrices have them
@@ -141,10 +145,9 @@ def _for_columns(params: Any) -> Any:
 
 
 def zero_order_hold(A: FloatArray, B: FloatArray, period: float) -> tuple[FloatArray, FloatArray]:
-    """exp(A period) and integral_0^period exp(A s) ds B: the input held over a period; leading axes
-    are batches.
+    """exp(A period) and integral_0^period exp(A s) ds B: the input held over a period.
 
-    Source: C. Van Loan, IEEE TAC 23(3), 1978.
+    Leading axes are batches. Source: C. Van Loan, IEEE TAC 23(3), 1978.
     """
     n, m = B.shape[-2:]
     block = np.zeros((*np.broadcast_shapes(A.shape[:-2], B.shape[:-2]), n + m, n + m))
@@ -165,8 +168,9 @@ def _exponential(matrices: bytes, shape: tuple[int, ...]) -> FloatArray:
 
 
 class SampledPlant(NamedTuple):
-    """Aircraft, actuators and delay from tick to tick: x+ = A x + B u, y = C x; leading axes are
-    batches.
+    """Aircraft, actuators and delay from tick to tick: x+ = A x + B u, y = C x.
+
+    Leading axes are batches.
     """
 
     A: FloatArray  # (..., k, k)
@@ -177,8 +181,9 @@ class SampledPlant(NamedTuple):
 def sampled_plant(
     plant: LinearPlant, loop: Loop, extra: FloatArray, *, rising: bool = False
 ) -> SampledPlant:
-    """The exact motion over a period, with k = n + m + held m states: x, the actuators, u of
-    earlier ticks.
+    """The exact motion over a period, with k = n + m + held m states.
+
+    They are x, the actuators, and u of earlier ticks.
 
     u of a tick is held for a period and reaches actuator i after delay + extra_i, s, shape (m,).
     With `rising` u of a tick multiplies ROOT (2 s - 1), s from 0 to 1 over the period, in place of
@@ -227,8 +232,9 @@ def sampled_plant(
 def _driven(
     motion: FloatArray, drive: FloatArray, time: float, begin: float, period: float | None
 ) -> tuple[FloatArray, FloatArray]:
-    """The transition over a time, s, and the motion by an input held, or with a period by ROOT (2 s
-    - 1), s rising from `begin` by time / period.
+    """The transition over a time, s, and the motion by an input held.
+
+    With a period the input is ROOT (2 s - 1), s rising from `begin` by time / period.
     """
     transition, held = zero_order_hold(motion, drive, time)
     if period is None:
@@ -243,8 +249,9 @@ def _driven(
 
 
 def closed_loop(plant: LinearPlant, law: LinearLaw, loop: Loop, extra: FloatArray) -> FloatArray:
-    """A period of the sampled loop as a matrix, exact: stable if no eigenvalue lies outside the
-    unit circle.
+    """A period of the sampled loop as a matrix, exact.
+
+    The loop is stable if no eigenvalue lies outside the unit circle.
 
     The state is the state of `sampled_plant`, then the state of the law. Leading axes of plant and
     law are batches.

@@ -11,8 +11,9 @@ LEAST_DIVISOR = 2.0**-126
 
 
 class Limits(NamedTuple):
-    """Saturation limits, as deviations from trim in units of u; infinite where there is no
-    limit.
+    """Saturation limits, as deviations from trim in units of u.
+
+    They are infinite where there is no limit.
 
     Attributes:
         lower: Least u, shape (m,).
@@ -30,10 +31,10 @@ class Limits(NamedTuple):
 
 
 def saturate(u: Array, u_before: Array, dt: Array, limits: Limits) -> Array:
-    """Saturation of u, shape (m,): clipped to [lower, upper] and to u_before +- rate dt. Inside, u
-    returns to the last bit.
+    """Saturation of u, shape (m,): clipped to [lower, upper] and to u_before +- rate dt.
 
-    Where u_before is outside of new limits, u moves to the limits at the rate.
+    Inside, u returns to the last bit. Where u_before is outside of new limits, u moves to the
+    limits at the rate.
 
     Args:
         u: Command, shape (m,).
@@ -64,8 +65,9 @@ def bounds(u_before: Array, dt: Array, limits: Limits) -> tuple[Array, Array]:
 
 
 def limited_integral(before: Array, after: Array, change: Array, beyond: Array) -> Array:
-    """An integral after a tick, shape (m,): an outward increment beyond a limit is reduced
-    (anti-windup).
+    """An integral after a tick, shape (m,), with anti-windup.
+
+    An outward increment beyond a limit is reduced:
 
         before + max(1 - beyond / change, 0) (after - before)
             where change beyond > 0, otherwise `after`, to the last bit

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a law with a learned model diverges or oscillates: the error beside the error of the law
-of the start.
+"""Whether a law with a learned model diverges or oscillates.
+
+The error is compared with the error under the law of the start.
 """
 
 from collections import deque
@@ -32,8 +33,9 @@ HARMLESS = 0.2  # of the rms errors that do not count as a divergence
 
 
 class Errors(NamedTuple):
-    """Mean squares of e = y - y_m, (m,): the running mean, and the largest mean under the first
-    law.
+    """Mean squares of e = y - y_m, (m,).
+
+    They are the running mean, and the largest mean under the first law.
     """
 
     now: FloatArray
@@ -46,16 +48,18 @@ def least(outputs: tuple[str, ...]) -> FloatArray:
 
 
 def step(errors: Errors, e: FloatArray, dt: float, *, first_law: bool) -> Errors:
-    """A tick: now += (1 - exp(-dt / MEMORY)) (e^2 - now); `largest` is held unless the first law
-    flies.
+    """A tick: now += (1 - exp(-dt / MEMORY)) (e^2 - now).
+
+    `largest` is held unless the first law flies.
     """
     now = errors.now - np.expm1(-dt / MEMORY) * (e**2 - errors.now)
     return Errors(now, np.maximum(errors.largest, now) if first_law else errors.largest)
 
 
 def diverging(errors: Errors, least: FloatArray, learned: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Outputs, (m,), whose rms error is above FACTOR times its largest under the first law, and
-    above `least`.
+    """Outputs, (m,), that diverge under a learned model.
+
+    Their rms error is above FACTOR times its largest under the first law, and above `least`.
 
     Only outputs with a learned model count, mask (m,): further outputs fly the first law.
     """
@@ -63,8 +67,9 @@ def diverging(errors: Errors, least: FloatArray, learned: NDArray[np.bool_]) -> 
 
 
 class Oscillations:
-    """The error e over the last WINDOW, and in which outputs it oscillates, by more than under the
-    first law.
+    """The error e over the last WINDOW, and in which outputs it oscillates.
+
+    Only more than under the first law counts.
 
     A limit cycle repeats itself: e is like e a period earlier, over the whole window. Wind and
     single commands do not.
@@ -84,8 +89,9 @@ class Oscillations:
         self._first_law = True
 
     def take(self, e: FloatArray, dt: float, learned: NDArray[np.bool_] | None) -> None:
-        """Record a tick, and test once a second. `learned`: outputs with a learned model, (m,);
-        None under the first law.
+        """Record a tick, and test once a second.
+
+        `learned`: outputs with a learned model, (m,); None under the first law.
         """
         if (learned is None) is not self._first_law:
             self._first_law = learned is None
@@ -119,16 +125,18 @@ class Oscillations:
 
 
 def oscillating(y: FloatArray, least: FloatArray) -> NDArray[np.bool_]:
-    """Outputs, (m,), that oscillate over a record y, (N, m), by more than HARMLESS of `least`, also
-    by repeated commands.
+    """Outputs, (m,), that oscillate over a record y, (N, m).
+
+    They move by more than HARMLESS of `least`. Repeated commands count too.
     """
     moving = np.var(y, axis=0) > HARMLESS**2 * least
     return np.array([bool(moves) and period(x) > 0 for x, moves in zip(y.T, moving, strict=True)])
 
 
 def period(x: FloatArray) -> int:
-    """The period of an oscillation that fills a record, (N,), in samples, at most N / 4; 0 without
-    one.
+    """The period of an oscillation that fills a record, (N,), in samples.
+
+    At most N / 4, and 0 without an oscillation.
 
         r_k = N / (N - k) sum x_i x_(i+k) / sum x_i^2,  x less its mean
 

@@ -18,8 +18,9 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 def with_channels_of(
     start: RiseDiConfig, designed: RiseDiConfig, bare: Sequence[bool], dead: Sequence[bool]
 ) -> RiseDiConfig:
-    """A controller with the gains of `start` in some channels, without feedforward and observer
-    there; not checked.
+    """A controller with the gains of `start` in some channels; not checked.
+
+    These channels are without feedforward and observer.
 
     A gain K below that of the last channel is this one with a smaller input scale: the same loop. A
     dead input gets the least input scale, so that the law holds it.
@@ -90,8 +91,9 @@ def authority_names(outputs: Sequence[str]) -> tuple[str, ...]:
 
 
 def authority(flown: RiseDiConfig, start: RiseDiConfig) -> FloatArray:
-    """Least change of the outputs by the paired inputs, from trim to the lower and the upper limit,
-    (2m,), units/s:
+    """Least change of the outputs by the paired inputs, (2m,), units/s.
+
+    From trim to the lower and the upper limit:
 
         y_dot_i = abs(Omega_ii) exp(-2 s_i) abs(limit of u_i),
             Omega = C B of the model learned in flight
@@ -100,7 +102,7 @@ def authority(flown: RiseDiConfig, start: RiseDiConfig) -> FloatArray:
     and above 0 for any. Beside models at further speeds it is the least over the speeds.
     For an input without effect 0; UNKNOWN without a limit, and for an output under the law of the
     start.
-    """  # noqa: D400, D415 - what follows is an equation
+    """
     m = len(flown.outputs)
     model = flown.feedforward
     acting = acting_inputs(flown)
@@ -126,8 +128,9 @@ def authority(flown: RiseDiConfig, start: RiseDiConfig) -> FloatArray:
 
 
 def fallen_back(start: RiseDiConfig, flown: RiseDiConfig, bare: Sequence[bool]) -> RiseDiConfig:
-    """What flies, with the law of the start in further channels; the start itself where no channel
-    keeps a model.
+    """What flies, with the law of the start in further channels.
+
+    The start itself where no channel keeps a model.
     """
     acting = acting_inputs(flown)
     is_first = flown.models() == start.models()
@@ -148,8 +151,9 @@ def outputs_without(parameters: ControllerConfig) -> tuple[str, ...]:
 def without_models(
     start: RiseDiConfig, flown: RiseDiConfig, outputs: Collection[str]
 ) -> RiseDiConfig:
-    """What flies, with the law of the start in some outputs to the end of the engagement, added to
-    `learn.without`.
+    """What flies, with the law of the start in some outputs.
+
+    The outputs keep this law to the end of the engagement, and are added to `learn.without`.
     """
     fallen = fallen_back(start, flown, [name in outputs for name in start.outputs])
     assert start.learn is not None  # noqa: S101 - a controller that learns

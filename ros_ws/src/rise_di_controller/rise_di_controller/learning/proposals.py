@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Models learned in flight, on the side of the controller: when identifications begin, which
-proposals fly, the fallback.
+"""Models learned in flight, on the side of the controller.
 
-Pure: for the node and for the loop in one process.
+The module decides on the begin of identifications, the proposals to fly, and the fallback. Pure:
+for the node and for the loop in one process.
 """
 
 from collections import Counter, deque
@@ -72,8 +72,9 @@ class Proposal(NamedTuple):
 
 
 class Event(NamedTuple):
-    """What became of a proposal, or a fallback: a change of the parameters by dotted name, or none,
-    and why.
+    """What became of a proposal, or a fallback.
+
+    The fields are a change of the parameters by dotted name, or none, and the reason.
     """
 
     stamp_ns: int
@@ -101,8 +102,9 @@ class Fallback(NamedTuple):
     fallen: int  # digest of the parameters after
 
     def outlived_by(self, proposal: Proposal, flown: int) -> bool:
-        """Whether a proposal beside the parameters before holds an input more, one without effect,
-        and nothing else changed.
+        """Whether a proposal beside the parameters before holds an input more.
+
+        This input has no effect, and nothing else changed.
         """
         scale = proposal.change.get("input_scale")
         if (proposal.flown, flown) != (self.flown, self.fallen) or not isinstance(scale, Sequence):
@@ -114,9 +116,10 @@ AFTER_FALLBACK = 4.0  # s, from a fallback to the test of its cause
 
 
 class Updates:
-    """When proposals are due: at the first tick, with the rough model as it is, then at the first
-    tick at or after each of the times, counted from the first tick; and AFTER_FALLBACK after a
-    fallback.
+    """When proposals are due.
+
+    They are due at the first tick, with the rough model as it is, then at the first tick at or
+    after every time of the list, counted from the first tick; and AFTER_FALLBACK after a fallback.
     """
 
     def __init__(self, settings: LearnConfig) -> None:
@@ -196,8 +199,9 @@ class Learning:
         return authority(flown, self.start)
 
     def ticked(self, controller: Controller, now_ns: int) -> bool:
-        """Note a tick; whether an identification begins with it. None begins while the law is
-        deactivated.
+        """Note a tick; whether an identification begins there.
+
+        None begins while the law is deactivated.
         """
         due = controller.mode is not Mode.INACTIVE and self._updates.due(now_ns)
         if due and self._simulated:
@@ -246,8 +250,9 @@ class Learning:
     def _end_divergence(
         self, diverging: Collection[str], controller: Controller, now_ns: int
     ) -> RiseDiConfig:
-        """Take the law of the start; a part that has now fallen back FALLBACKS times keeps it to
-        the end of the engagement.
+        """Take the law of the start in the parts of the model that diverge.
+
+        A part with FALLBACKS fallbacks keeps this law to the end of the engagement.
         """
         flown = controller.parameters
         assert isinstance(flown, RiseDiConfig)  # noqa: S101 - for the type checker
@@ -271,8 +276,9 @@ class Learning:
     def _end_oscillations(
         self, periods: Mapping[str, float], controller: Controller, now_ns: int
     ) -> RiseDiConfig:
-        """Take the law of the start, to the end of the engagement, in the parts of the model whose
-        outputs oscillate.
+        """Take the law of the start in the parts of the model whose outputs oscillate.
+
+        These parts keep the law to the end of the engagement.
         """
         flown = controller.parameters
         assert isinstance(flown, RiseDiConfig)  # noqa: S101 - for the type checker
@@ -317,8 +323,9 @@ class Learning:
         return end_ns + nanoseconds(self._settings.latency)
 
     def _refusal(self, proposal: Proposal, now_ns: int, controller: Controller) -> str:
-        """Why a proposal is not certified at all; empty for one that may be. Costs microseconds,
-        whatever the proposal.
+        """Why a proposal is not certified at all; empty for one that may be.
+
+        Costs microseconds, whatever the proposal.
         """
         window = f"a window that ends {seconds(now_ns - proposal.stamp_ns):.3g} s ago"
         if proposal.start != self._digest:
@@ -358,8 +365,9 @@ class Learning:
             self._announce(Event(now_ns, EventKind.NO_MODEL, {}, f"no model: {proposal.sentence}"))
 
     def _certify(self, controller: Controller, now_ns: int) -> ControllerConfig | None:
-        """A part of the certificate, in simulated time all of it; the parameters taken at its
-        end.
+        """A part of the certificate, in simulated time the whole.
+
+        Returns the parameters taken at the end.
         """
         if self._certificate is None:
             return None
@@ -395,8 +403,9 @@ class Learning:
         return None
 
     def _unfit(self, proposal: Proposal, controller: Controller) -> str:
-        """The refusal of a proposal for a law that is not engaged, or that lost the race with
-        another change; else empty.
+        """The refusal of a proposal that the law cannot take; else empty.
+
+        The law is not engaged, or the proposal lost the race with a further change.
 
         An input that has lost its effect has none after a fallback either, which its loss may have
         caused.
@@ -429,8 +438,9 @@ class Learning:
 def _certificate(
     flown: ControllerConfig, change: Mapping[str, Any], start: RiseDiConfig
 ) -> Generator[None, None, Prepared]:
-    """The flown parameters with a change, checked as at load, in parts of at most about 1 ms.
-    Raises ParameterError.
+    """The parameters in force with a change, checked as at load.
+
+    The checks come in parts of at most about 1 ms. Raises ParameterError.
     """
     foreign = sorted(name for name in change if name.split(".")[0] not in DESIGNED)
     require(
@@ -493,8 +503,9 @@ def _speeds(parameters: RiseDiConfig) -> str:
 
 
 def designed(old: ControllerConfig, new: ControllerConfig) -> dict[str, Any]:
-    """All of DESIGNED of a new set by dotted name; None for what an old set, or what flies
-    meanwhile, may have besides.
+    """All of DESIGNED of a new set by dotted name.
+
+    None for what an old set, or what flies meanwhile, may have besides.
     """
     before, after = (
         {
@@ -508,8 +519,9 @@ def designed(old: ControllerConfig, new: ControllerConfig) -> dict[str, Any]:
 
 
 def changes(old: ControllerConfig, new: ControllerConfig) -> dict[str, Any]:
-    """What differs between two parameter sets, by dotted name; None for a parameter that is
-    gone.
+    """What differs between two parameter sets, by dotted name.
+
+    None for a parameter that is gone.
     """
     before = dict(flatten(old.model_dump()))
     after = dict(flatten(new.model_dump()))
