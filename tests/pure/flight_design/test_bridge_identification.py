@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""From a channel map to gains without a model: experiment, response, and a scenario that flies the
-aircraft.
+"""From a channel map to gains without a model.
+
+The steps are an experiment, the response, and a scenario that flies the aircraft.
 """
 
 from dataclasses import replace
@@ -53,8 +54,9 @@ OSPREY = load_airframe("osprey")
 
 
 def aircraft() -> AircraftConfig:
-    """The osprey with servos and noise, and y late by DELAY: what the map's aircraft is not known
-    to be.
+    """The osprey with servos and noise, and y late by DELAY.
+
+    The map does not know so much of its aircraft.
     """
     servo = find_scenario("osprey_servo")
     sensors = servo.aircraft.sensors.model_dump() | {"delay": DELAY}
@@ -64,8 +66,9 @@ def aircraft() -> AircraftConfig:
 
 
 def loaded(folder: Path, name: str, airframe: str, scenario: str) -> Scenario:
-    """A scenario and its airframe as files, as the command writes them, with the real aircraft in
-    the airframe's place.
+    """A scenario and its airframe as files, as the command writes them.
+
+    The real aircraft stands in the airframe's place.
     """
     (folder / f"{name}_airframe.yaml").write_text(airframe)
     (folder / f"{name}.yaml").write_text(scenario)
@@ -145,8 +148,9 @@ def test_gains_from_log_of_the_board_are_for_the_delay_of_the_link_too(
 
 @pytest.fixture(scope="module")
 def of_second_order(tmp_path_factory: pytest.TempPathFactory) -> tuple[Channels, Flyable]:
-    """Channels that are known, and their flight: q stiff, r and V damped, p with y_dot = Omega
-    u.
+    """Channels that are known, and their flight.
+
+    q is stiff, r and V are damped, and p has y_dot = Omega u.
     """
     damping, stiffness, zero = (
         np.array([values.get(name, 0.0) for name in MAP.outputs])
@@ -200,8 +204,9 @@ def test_channel_of_which_nothing_is_certain_refused(identified: Identified) -> 
 
 
 class Known(NamedTuple):
-    """y'' + damping y' + stiffness y = Omega v', v with a lag, y late by a delay; by default a
-    channel of first order.
+    """y'' + damping y' + stiffness y = Omega v', v with a lag, y late by a delay.
+
+    By default it is a channel of first order.
     """
 
     Omega: float = 80.0
@@ -280,8 +285,9 @@ def test_fast_oscillation_of_light_airplane_found() -> None:
 
 
 def thrust_with_phugoid(amplitude: float) -> Tape:
-    """V by thrust in Lanchester's phugoid, behind a servo of 0.1 s, and the climb of the pose;
-    noise as of an airspeed sensor.
+    """V by thrust in Lanchester's phugoid, behind a servo of 0.1 s, and the climb of the pose.
+
+    The noise is that of an airspeed sensor.
 
     V_dot = -0.5 V + 14 v - g gamma,
         gamma_dot = 2 g V / SPEED^2: weight is lift at SPEED, and lift grows with its square.
@@ -385,8 +391,9 @@ HOVER_MAP = load_map(str(QUADROTOR / "map.yaml"))
 
 
 def test_quadrotor_identified_and_flown_without_a_name_of_a_fixed_wing(tmp_path: Path) -> None:
-    """The airframe of the example, whose channels are q, p, r and a vertical speed, by an
-    experiment without an airspeed.
+    """The airframe of the example by an experiment without an airspeed.
+
+    Its channels are q, p, r and a vertical speed.
     """
     frame = str(QUADROTOR / "airframe.yaml")
 

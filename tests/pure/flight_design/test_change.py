@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The test for a loss of effect, in a flight with damage, and channels that keep the law of the
-start.
+"""The test for a loss of effect, in a flight with damage.
+
+Channels keep the law of the start.
 """
 
 import numpy as np
@@ -25,8 +26,9 @@ FAULTS = ["elevator lost 0", "aileron weak 0"]
 
 @pytest.fixture(scope="module")
 def damaged() -> tuple[Recording, Airframe]:
-    """8 s in light turbulence, with a bank, without elevator and with half of the aileron, and the
-    aircraft before.
+    """8 s in light turbulence with a bank, and the aircraft before.
+
+    The elevator is lost, and half of the aileron.
     """
     flown = find_scenario("osprey_servo").vary(
         aircraft={
@@ -63,8 +65,9 @@ def test_lost_elevator_is_dead_and_weak_aileron_changed(
 def test_loss_within_what_a_model_may_err_is_no_change(
     damaged: tuple[Recording, Airframe], model: float, *, found: bool
 ) -> None:
-    """Half of the effect beside a model that has already most of the loss: 17 and 31 % are left to
-    find.
+    """Half of the effect is lost beside a model that has already most of the loss.
+
+    17 and 31 % are left to find.
     """
     recorded, airframe = damaged
     B = airframe.matrix_b() * np.array([1.0, 1.0, model, 1.0])
@@ -85,8 +88,9 @@ def law_of(controller: RiseDiConfig) -> tuple[np.ndarray, ...]:
 
 
 def test_channels_keep_the_law_of_the_start() -> None:
-    """Gains from e, its integral and the sign to u are those of each, and u_o and u_ff are 0 in the
-    others.
+    """Gains from e, its integral and the sign to u are those of each.
+
+    u_o and u_ff are 0 in the others.
     """
     start, designed = (
         find_scenario(name).rise_di() for name in ("osprey_servo", "osprey_observer")

@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
 # ruff: noqa: N802 - D and U are the paper's names
-"""Gains: Theorem 1 worked by hand, the engineering procedure on the osprey, refusals, and the
-predicted delay margin.
+"""Gains: Theorem 1 worked by hand, and the engineering procedure on the osprey.
+
+Further tests are of refusals, and of the predicted delay margin.
 """
 
 import json
@@ -55,8 +56,9 @@ HAND = Bounds(
 
 @pytest.fixture(scope="module")
 def osprey() -> Study:
-    """The osprey and twenty airframes around it along the manoeuvre of the default scenario, with
-    its gusts.
+    """The osprey and twenty airframes around it along the manoeuvre of the default scenario.
+
+    Its gusts blow.
     """
     scenario = find_scenario("osprey_gust")
     return ideal_control.study_airframe(
@@ -278,8 +280,9 @@ def osprey_loop(
     K: tuple[float, ...] = (18.0, 2.0, 18.0, 9.0),
     Lambda: tuple[float, ...] = (5.0, 0.5, 5.0, 3.0),
 ) -> tuple[LinearPlant, LinearLaw]:
-    """The osprey with given gains in the order q, V, p, r, and a softened sign so many total lags
-    wide.
+    """The osprey with gains in the order q, V, p, r.
+
+    `factor`: width of the softened sign in total lags.
     """
     A = AIRFRAME.matrix_a() + AIRFRAME.matrix_gravity()
     B = AIRFRAME.matrix_b()
@@ -319,8 +322,9 @@ def scalar(omega: float, T_eps: float) -> LawParams:
 
 
 def grows(params: LawParams, omega: float, lag: float, delay: float) -> bool:
-    """Whether y_dot = omega u_a behind a servo and a delay diverges under `law.step`; u delayed by
-    whole quarter milliseconds.
+    """Whether y_dot = omega u_a behind a servo and a delay diverges under `law.step`.
+
+    u is delayed by whole quarter milliseconds.
 
     Between these instants plant and servo are solved exactly. e stays within 1e-3 eps, inside the
     width of the sign.
@@ -416,8 +420,9 @@ def test_the_command_writes_gains_that_load(tmp_path: Path) -> None:
 
 
 def test_y_that_is_slower_than_law_counts_as_delay_and_may_be_three_messages_old() -> None:
-    """1.5 periods of 1 / 9.9 Hz, the airspeed of PX4, less 1.5 of 1 / 50 Hz are 121.515 ms. A
-    faster y changes nothing.
+    """1.5 periods of 1 / 9.9 Hz, the airspeed of PX4, less 1.5 of 1 / 50 Hz are 121.515 ms.
+
+    A faster y changes nothing.
 
     An age limit of 0.1 s would be over before the next message of such a y.
     """
@@ -453,8 +458,9 @@ def test_an_invalid_loop_is_refused(option: str, value: str, expected: str) -> N
 
 
 def test_command_shows_the_airframe_of_a_file(tmp_path: Path) -> None:
-    """The poles are those that Nelson prints for the Navion: -2.51 +-2.59j and -0.017 +-0.213j, p.
-    158.
+    """The poles are those that Nelson prints for the Navion.
+
+    They are -2.51 +-2.59j and -0.017 +-0.213j, p. 158.
     """
     own = tmp_path / "own.yaml"
     own.write_text(

@@ -1,7 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Learning in the air: a flight that learns beside the law alone, its replay, proposals that are
-wrong, and the fallback.
+"""Learning in the air.
+
+The tests have a flight that learns beside the law alone, its replay, proposals that are wrong, and
+the fallback.
 """
 
 import copy
@@ -175,8 +177,9 @@ def test_learned_model_lowers_errors_without_jump_of_u(flown: Flown) -> None:
 
 
 def test_feedforward_goes_on_in_the_turn_that_was_commanded_before_the_switch(flown: Flown) -> None:
-    """The model flies in a turn from 18 s on. The reference is a flight in which it flew before the
-    turn, too.
+    """The model flies in a turn from 18 s on.
+
+    The reference is a flight in which it flew before the turn, too.
     """
     model = scenario().rise_di()
     for change in parameter_changes(flown.run, "/controller", RiseDiConfig.model_fields):
@@ -212,8 +215,9 @@ def test_log_teaches_what_flight_taught_and_model_starts_next_flight(
 
 
 def test_log_teaches_with_other_settings(flown: Flown) -> None:
-    """The flight has other parameters than what this learner proposes: it knows no refusal, and
-    identifies once a window.
+    """The flight has other parameters than what this learner proposes.
+
+    It knows no refusal, and identifies once a window.
     """
     result = invoke("learn", flown.run, "--set", "controller.learn.updates=[10,20]")
     first, second = (line for line in result.output.splitlines() if line.startswith("t ="))
@@ -496,8 +500,9 @@ def test_part_that_the_controller_took_back_is_not_proposed_again(
 def test_input_is_dead_only_where_a_free_a_predicts_as_well_without_it(
     gain: float, sentence: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An aircraft whose A was wrong had a rudder with 13 % of its effect by the test, and 82 % with
-    A free.
+    """An aircraft whose A was wrong had a rudder with 13 % of its effect by the test.
+
+    With A free it had 82 %.
     """
     made = made_learner(scenario())
 
@@ -615,8 +620,10 @@ def test_delay_margin_counts_the_delay_that_was_found(
 
 
 def test_learned_part_keeps_the_margin_of_the_file_and_the_other_part_its_gains() -> None:
-    """An elevator with 1.4 of its effect: the loop of the file is faster around it, and keeps less
-    than the 30 ms that it was designed for.
+    """The elevator has 1.4 of its effect.
+
+    The loop of the file is faster around it, and keeps less than the 30 ms that it was designed
+    for.
     """
     start = scenario().rise_di()
     plain = start.model_copy(update={"learn": None})
@@ -702,8 +709,9 @@ def test_late_thrust_costs_the_elevator_no_margin(
 
 
 def test_model_of_a_late_u_has_margin_behind_its_delay_and_errs_less_than_the_law_alone() -> None:
-    """No file says that u is 40 ms late: with the margin of the start alone the loop is unstable
-    from the first model on.
+    """No file says that u is 40 ms late.
+
+    With the margin of the start alone the loop is unstable from the first model on.
     """
     actuators = scenario().aircraft.actuators.model_dump() | {"delay": 0.04}
     late = scenario().vary(aircraft={"actuators": actuators}, flight={"duration": 26.0})
@@ -759,8 +767,9 @@ def test_damage_counts_by_its_gain_beside_a_fallback_and_not_in_an_oscillation(
     counts: bool,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """In a q oscillation of 2.2 Hz, after two fallbacks, a healthy engine had no effect by this
-    test.
+    """A healthy engine had no effect by this test.
+
+    It flew in a q oscillation of 2.2 Hz, after two fallbacks.
     """
     made = made_learner(scenario(learn={"updates": [10.0]}))
     monkeypatch.setattr(design_learner, "change_test", Mock(return_value=(change,)))
@@ -794,8 +803,9 @@ def test_flight_without_learner_is_refused() -> None:
 
 
 def test_law_with_wrong_model_falls_back_and_replay_is_equal() -> None:
-    """A model without the delay of the aircraft, and a feedback five times too strong: the model
-    alone is certified.
+    """A model without the delay of the aircraft, and a feedback five times too strong.
+
+    The model alone is certified.
     """
     margin = {"observer": scenario().rise_di().model_dump()["observer"] | {"margin": 0.0}}
     late = scenario(learn={"updates": [6.0], "latency": 0.0}, **margin).vary(

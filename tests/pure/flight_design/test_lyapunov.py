@@ -55,8 +55,9 @@ def fly_example(dt: float, duration: float, **gains: Any) -> tuple[Example, LawP
 def osprey(
     rate: float, beta_factor: float = 1.0, duration: float = 12.0
 ) -> tuple[Scenario, KnownPlant, Evidence]:
-    """The default scenario at another rate of the law, with both gusts in its first twelve
-    seconds.
+    """The default scenario at another rate of the law.
+
+    Both gusts are in its first twelve seconds.
     """
     scenario = find_scenario("osprey_gust")
     starts = {"lateral": 4.0, "vertical": 8.0}

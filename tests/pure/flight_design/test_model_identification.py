@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Identification from a log: flights of aircraft whose A and B are known, and systems whose
-innovations are known.
+"""Identification from a log.
+
+The tests fly aircraft whose A and B are known, and systems whose innovations are known.
 """
 
 import json
@@ -136,8 +137,9 @@ def test_entries_that_matter_found_within_deviations(air: str, uncertainty: floa
 
 
 def test_effects_of_inputs_are_found_in_air_that_turns() -> None:
-    """Without a span the filter has no rotary gust: p and r are refused, four entries at a
-    bound.
+    """Without a span the filter has no rotary gust.
+
+    p and r are refused, four entries at a bound.
 
     The deviations are for the levels of the wind as found: the rudder is 3.4 of them off.
     """
@@ -204,8 +206,9 @@ def test_flight_without_noise_that_is_mostly_at_rest_has_deviations() -> None:
 
 
 def test_coupled_parts_are_identified_together(tmp_path: Path) -> None:
-    """The elevator rolls this aircraft with a tenth of the effect of the ailerons, and its roll
-    pitches it.
+    """The elevator rolls this aircraft with a tenth of the effect of the ailerons.
+
+    Its roll pitches it.
     """
     A = OSPREY.matrix_a()
     B = OSPREY.matrix_b()
@@ -272,8 +275,9 @@ def test_y_taken_at_stamps_of_u() -> None:
 
 
 def test_log_that_shows_no_model_is_refused() -> None:
-    """An output that never changes, and a gap of twelve days, which must not be filled with
-    samples.
+    """An output never changes, and a gap has twelve days.
+
+    The gap must not be filled with samples.
     """
     tape = flight("gust", 0.5)
     y = tape["y"]

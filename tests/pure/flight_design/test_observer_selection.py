@@ -1,7 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Selection of an observer: shipped scenarios, delay margin, models that are refused, the one
-without A, the command.
+"""Selection of an observer.
+
+The tests are of shipped scenarios, the delay margin, models that are refused, the observer without
+A, and the command.
 """
 
 import math
@@ -197,8 +199,9 @@ def test_command_refuses_options_that_contradict_each_other(
 
 
 def test_aircraft_that_no_gains_hold_do_not_count() -> None:
-    """With q, p, r held alpha and beta move by A - B (C B)^-1 C A: where it is unstable, no
-    observer has a margin.
+    """With q, p, r held alpha and beta move by A - B (C B)^-1 C A.
+
+    Where it is unstable, no observer has a margin.
     """
     folder = REPOSITORY / "examples" / "px4_airplane"
     airframe = load_airframe(str(folder / "rates_airframe.yaml"))

@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
 # ruff: noqa: N802 - functions have the symbols of the page as names
-"""The observer of docs/theory.md in continuous time: the Proposition, Lemma A, Lemma B and the
-error inside the softened sign.
+"""The observer of docs/theory.md in continuous time.
+
+The tests are of the Proposition, Lemma A, Lemma B and the error inside the softened sign.
 
 Observers here are designed with the Riccati solver of scipy, in this file. Plants are random, with
 stable zero dynamics, or the osprey. Loops are those of `flight_design.gains.lyapunov.fly`: the
@@ -80,8 +81,9 @@ class Hidden(NamedTuple):
 
 
 def random_plant(seed: int, U_12: float = 0.0) -> Plant:
-    """Random plant with D = diag(1, -1), U_12 as given, and zeros with a real part of at most
-    -1.
+    """Random plant with D = diag(1, -1) and U_12.
+
+    Its zeros have a real part of at most -1.
     """
     rng = np.random.default_rng(seed)
     zero_dynamics = rng.normal(size=(N - M, N - M))
@@ -112,8 +114,9 @@ def linear_quadratic(
     process: FloatArray,
     noise: FloatArray,
 ) -> Observer:
-    """F of the cost z'Q z + u'R u, L of the intensities of process and measurement noise, for (A_z,
-    B_z, H).
+    """F of the cost z'Q z + u'R u, L of the intensities of process and measurement noise.
+
+    The model is (A_z, B_z, H).
     """
     A_z, B_z, H = model
     F = np.linalg.solve(R, B_z.T @ solve_continuous_are(A_z, B_z, Q, R))
@@ -147,8 +150,9 @@ def osprey() -> tuple[Airframe, Plant]:
 
 
 def osprey_observer() -> Observer:
-    """Observer of states, wind along three axes and a disturbance of each output, zeta = [x, w, d];
-    ideal actuators.
+    """Observer of states, wind along three axes and a disturbance of each output.
+
+    zeta = [x, w, d], and the actuators are ideal.
 
     Weights of q, V, p, r: effort in s, drift in units/s per root s. Of the wind: m/s per root s and
     s.
@@ -202,8 +206,9 @@ def test_observer_keeps_C_B_and_so_S_D_U_and_relative_degree(seed: int) -> None:
 
 
 def arbitrary_observer(rng: np.random.Generator) -> Observer:
-    """Random matrices with random stable poles of the filter: the model need not be that of the
-    aircraft.
+    """Random matrices with random stable poles of the filter.
+
+    The model need not be that of the aircraft.
     """
     s = N + M
     A_z = rng.normal(size=(s, s))
@@ -320,8 +325,9 @@ def short() -> Scenario:
 
 
 def slews_of_the_osprey() -> tuple[FloatArray, FloatArray]:
-    """Largest rates of u*, u* - u_ff and u_law* = S_o (u* - u_ff), rows, by input: nominal, and the
-    mean of 20 at +-30 %.
+    """Largest rates of u*, u* - u_ff and u_law* = S_o (u* - u_ff), rows, by input.
+
+    They are nominal, and the mean of 20 at +-30 %.
     """
     airframe, _ = osprey()
     observer = osprey_observer()
@@ -369,8 +375,9 @@ def test_without_fade_in_observer_moves_inputs_at_once() -> None:
 
 
 class CrossTerms(NamedTuple):
-    """G, and W(s) = W_e + W_eta (s I - A_eta)^-1 B_eta of Lemma A, in z = [e, r] and eta, with
-    Lambda = I.
+    """G, and W(s) = W_e + W_eta (s I - A_eta)^-1 B_eta of Lemma A.
+
+    They are in z = [e, r] and eta, with Lambda = I.
     """
 
     G: FloatArray
@@ -396,8 +403,9 @@ def cross_terms(plant: Plant) -> CrossTerms:
 
 
 def least_gain(plant: Plant) -> float:
-    """k* of Lemma A for Lambda = I: lambda_max(G + G')/2 + max norm(W(j omega))^2 / 4, on a grid of
-    1e-3 to 1e4 rad/s.
+    """k* of Lemma A for Lambda = I: lambda_max(G + G')/2 + max norm(W(j omega))^2 / 4.
+
+    The grid has 1e-3 to 1e4 rad/s.
     """
     terms = cross_terms(plant)
     size = max(
@@ -408,8 +416,9 @@ def least_gain(plant: Plant) -> float:
 
 
 def form_of(terms: CrossTerms, of_r: FloatArray, P: FloatArray) -> FloatArray:
-    """Q_w for w = [e, r, eta], Lambda = I: e'e + r'(of_r - G) r + r'(W_e e + W_eta eta) - eta'(A'P
-    + P A) eta - 2 eta'P B e.
+    """Q_w for w = [e, r, eta], Lambda = I.
+
+    It is e'e + r'(of_r - G) r + r'(W_e e + W_eta eta) - eta'(A'P + P A) eta - 2 eta'P B e.
     """
     m = len(terms.G)
     n = len(terms.A_eta)
@@ -454,8 +463,9 @@ def waves(seed: int) -> tuple[Wave, Wave]:
 def classical_beta(
     plant: Plant, seed: int, observer: Observer | None
 ) -> tuple[FloatArray, FloatArray]:
-    """Bounds of abs(N_d) and of abs(N_d) + abs(N_d_dot) / Lambda by channel, Lambda = 1: sums of
-    amplitudes.
+    """Bounds of abs(N_d) and of abs(N_d) + abs(N_d_dot) / Lambda by channel, Lambda = 1.
+
+    They are sums of amplitudes.
     """
     sizes = [(wave.omega, np.abs(slew_left(plant, wave, observer))) for wave in waves(seed)]
     return np.sum([size for _, size in sizes], axis=0), np.sum(
@@ -466,8 +476,9 @@ def classical_beta(
 def flown_error(
     plant: Plant, seed: int, observer: Observer | None, params: LawParams, dt: float = 0.01
 ) -> tuple[FloatArray, FloatArray]:
-    """Times and e, shape (ticks, M), between 12 and 16 s: the sampled law, plant and observer in
-    continuous time.
+    """Times and e, shape (ticks, M), between 12 and 16 s.
+
+    The law is sampled, plant and observer are in continuous time.
     """
     push, reference = waves(seed)
     t: FloatArray = np.asarray(dt * np.arange(round(16.0 / dt) + 1), dtype=np.float64)
@@ -524,8 +535,9 @@ EPS = np.array([0.01, 0.01])
 
 
 def ultimate_bound(plant: Plant, K: FloatArray, zeta: float) -> float:
-    """The smallest bound of Lemma B over a grid of kappa and k_2, with P of A_eta' P + P A_eta =
-    -kappa I.
+    """The smallest bound of Lemma B over a grid of kappa and k_2.
+
+    P is that of A_eta' P + P A_eta = -kappa I.
     """
     U = np.abs(plant.U)
     terms = cross_terms(plant)
@@ -546,8 +558,9 @@ def ultimate_bound(plant: Plant, K: FloatArray, zeta: float) -> float:
 
 
 def largest_w(plant: Plant, K: FloatArray, kind: str) -> tuple[float, float]:
-    """Largest norm of w after 6 of 12 s under an adverse u_o with abs(u_o_dot) = NU, and the bound
-    of abs(N_d); softened sign.
+    """Largest norm of w after 6 of 12 s under an adverse u_o, and the bound of abs(N_d).
+
+    abs(u_o_dot) = NU, and the sign is softened.
 
     adverse: u_o_dot = NU sgn((D U)' r), which raises r' D U u_o_dot most; bounded: the same between
     limits of 0.5; square: a sign that alternates every pi s.
@@ -667,8 +680,9 @@ them; in the gusts alone."""
 
 
 def as_pi(course: tuning.Benchmark, law: str, objective: str, channels: int) -> FloatArray:
-    """Factors of the score if the softened sign is made linear in the first channels: nominal, mean
-    of four at +-30 %.
+    """Factors of the score if the softened sign is made linear in the first channels.
+
+    They are nominal, and the mean of four at +-30 %.
     """
     tuned = GAINS[law][objective]
     gains = {name: np.array(values) for name, values in tuned.gains.items()}

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The parameters of ArduPilot against the channel maps. Expected values are by its formulas for
-channels and servos.
+"""The parameters of ArduPilot against the channel maps.
+
+Expected values are by its formulas for channels and servos.
 """
 
 from collections.abc import Mapping
@@ -36,8 +37,9 @@ PARAMETERS = {
 def agreement(
     channel_map: ChannelMap, values: Mapping[str, float], later: Mapping[str, float] | None = None
 ) -> str:
-    """The sentence of `require_agreement` for parameters at the samples, and others that the log
-    has after them.
+    """The sentence of `require_agreement` for parameters at the samples.
+
+    `later`: others that the log has after them.
     """
     sticks = [stick_of(channel_map, name) for name in channel_map.inputs]
     recorded = {name: (ParameterRecord(0, value),) for name, value in values.items()}
@@ -99,8 +101,9 @@ def test_parameter_that_the_log_lacks_is_told_and_not_assumed() -> None:
 
 @pytest.mark.parametrize("name", MAPS)
 def test_map_of_a_reversed_channel_agrees_with_the_reversal_alone(name: str) -> None:
-    """With RC2_REVERSED a larger pulse is nose down: so is the motion of the row for an increasing
-    raw value.
+    """With RC2_REVERSED a larger pulse is nose down.
+
+    So is the motion of the row for an increasing raw value.
     """
     reversed_map = changed(name, "inputs", positive="nose down")
     assert agreement(reversed_map, PARAMETERS | {"RC2_REVERSED": 1.0}) == ""

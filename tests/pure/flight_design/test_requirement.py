@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Margins as a requirement: gains whose measured margins meet it, checked by python-control, and
-what a margin costs.
+"""Margins as a requirement: gains whose measured margins meet it, and what a margin costs.
+
+python-control checks them.
 """
 
 import math
@@ -56,8 +57,9 @@ RESPONSE = {"elevator": -8.0, "throttle": 3.0}  # abs(Omega_ii)
 
 
 def integrators() -> Airframe:
-    """q_dot = -8 elevator, V_dot = 3 throttle: a loop that python-control has channel by
-    channel.
+    """q_dot = -8 elevator, V_dot = 3 throttle.
+
+    It is a loop that python-control has channel by channel.
     """
     return Airframe.validate_mapping(
         {
@@ -98,8 +100,9 @@ def selected(phase_margin: float, V_product: float = 0.46) -> RiseDiConfig:
 
 
 def of_python_control(controller: RiseDiConfig, channel: int) -> tuple[float, float]:
-    """Phase margin, deg, and largest sensitivity of K (1 + integral dt z / (z - 1)) and the sampled
-    lag and integrator.
+    """Phase margin, deg, and largest sensitivity, by python-control.
+
+    They are those of K (1 + integral dt z / (z - 1)) and the sampled lag and integrator.
     """
     params = controller.law_params()
     name = controller.inputs[channel]

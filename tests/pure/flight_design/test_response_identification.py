@@ -24,8 +24,9 @@ STEP = 0.001  # s
 def flown(
     doublets: float, noise: float = 1e-3, seed: int = 1, seconds: float = 40.0
 ) -> tuple[Signal, Signal]:
-    """y_dot = -DAMPING y + OMEGA v behind lags and a delay, in coloured disturbances; y arrives 50
-    times a second, irregularly.
+    """y_dot = -DAMPING y + OMEGA v behind lags and a delay, in coloured disturbances.
+
+    y arrives 50 times a second, irregularly.
 
     Exact at every millisecond for inputs that are held. The inputs are doublets in turn.
     """

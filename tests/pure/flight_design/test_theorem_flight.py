@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Theorem 1 in flight: the F-4C of the tutorial in an ideal loop, under gains that meet each
-condition.
+"""Theorem 1 in flight: the F-4C of the tutorial in an ideal loop.
+
+Its gains meet each condition.
 """
 
 import re

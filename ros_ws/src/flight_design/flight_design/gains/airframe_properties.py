@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The theorem's assumptions on an airframe, checked on the matrices: Remark 1 and Assumptions 1 and
-3 as a table.
+"""The theorem's assumptions on an airframe, checked on the matrices.
 
-Assumption 2 (f is C1, f and f_dot bounded) has no check here: the file's schema bounds gusts and
-sine terms, which are C1 and have bounded rates for bounded angular rates.
+The table has Remark 1 and Assumptions 1 and 3. Assumption 2 (f is C1, f and f_dot bounded) has no
+check here: the file's schema bounds gusts and sine terms, which are C1 and have bounded rates for
+bounded angular rates.
 """
 
 from collections.abc import Sequence
@@ -76,8 +76,9 @@ class AirframeFacts(NamedTuple):
 
     @property
     def in_theorem(self) -> bool:
-        """Whether the checks hold: Assumption 1, D exists (10)-(11), no zero in the right half
-        plane.
+        """Whether the checks hold.
+
+        They are Assumption 1, D exists (10)-(11), and no zero in the right half plane.
         """
         return (
             self.controllable
@@ -87,8 +88,9 @@ class AirframeFacts(NamedTuple):
 
     @property
     def remedy(self) -> str:
-        """Change for D = I, as text: "none needed", "flip rudder", "pair p-rudder, r-aileron, flip
-        rudder", "none".
+        """Change for D = I, as text.
+
+        Examples are "none needed", "flip rudder", "pair p-rudder, r-aileron, flip rudder", "none".
         """
         if self.pairing is None:
             return "none" if self.m <= MANY else "none of three orders tried"
@@ -105,13 +107,12 @@ class AirframeFacts(NamedTuple):
 
 
 def airframe_facts(airframe: FilePath | Airframe) -> AirframeFacts:
-    """Poles, zeros, Omega = C B with D, and Assumptions 1 and 3 of an airframe, or of a name or
-    file; SI.
+    """Poles, zeros, Omega = C B with D, and Assumptions 1 and 3 of an airframe; SI.
 
-    Source: Assumptions 1 and 3, equations (10)-(11) and Remark 1 of Tanyer, Tatlicioglu,
-    Zergeroglu. Zeros are of the linear part (A, B, C): f is left out. A published A may contain
-    gravity. More inputs than outputs count as m inputs of the law through the pseudo-inverse of C
-    B, in SI.
+    The airframe may be a name or a file. Source: Assumptions 1 and 3, equations (10)-(11) and
+    Remark 1 of Tanyer, Tatlicioglu, Zergeroglu. Zeros are of the linear part (A, B, C): f is left
+    out. A published A may contain gravity. More inputs than outputs count as m inputs of the law
+    through the pseudo-inverse of C B, in SI.
 
     Args:
         airframe: Name in the library, path of an airframe file (.yaml), or an Airframe.
@@ -166,8 +167,9 @@ def airframe_facts(airframe: FilePath | Airframe) -> AirframeFacts:
 
 
 def library() -> list[AirframeFacts]:
-    """Facts of every airframe of the library, by name. Raises ParameterError for an invalid
-    file.
+    """Facts of every airframe of the library, by name.
+
+    Raises ParameterError for an invalid file.
     """
     return [airframe_facts(load_airframe(name)) for name in airframes()]
 
@@ -188,18 +190,19 @@ def invariant_zeros(A: FloatArray, B: FloatArray, C: FloatArray) -> ComplexArray
 
 
 def fastest_zero(A: FloatArray, B: FloatArray, C: FloatArray) -> float:
-    """The largest real part of the zeros, 1/s; minus infinity without a zero. With one above 0 the
-    aircraft diverges while y is held.
+    """The largest real part of the zeros, 1/s; minus infinity without a zero.
+
+    With one above 0 the aircraft diverges while y is held.
     """
     return float(np.max(invariant_zeros(A, B, C).real, initial=-np.inf))
 
 
 def output_coordinates(C: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """P (n, m), N (n, n - m) and H (n, n - m) with x = P y + N eta, eta = H' x: the outputs, and n
-    - m states beside them.
+    """P (n, m), N (n, n - m) and H (n, n - m) with x = P y + N eta, eta = H' x.
 
-    C (m, n) of full rank, else ParameterError. The states of eta are those that C contains least,
-    by a QR decomposition with pivoting. C that selects states gives P = C', N = H.
+    y are the outputs, and eta the n - m remaining states. C (m, n) of full rank, else
+    ParameterError. The states of eta are those that C contains least, by a QR decomposition with
+    pivoting. C that selects states gives P = C', N = H.
     """
     m, n = C.shape
     _, R, pivots = qr(C, pivoting=True)
@@ -233,8 +236,9 @@ def marginal_sentence(facts: Sequence[AirframeFacts]) -> str:
 
 
 def zero_dynamics(zeros: ComplexArray) -> ZeroDynamics:
-    """Half plane of the zeros, 1/s, shape (n - m,), for (5)-(9); within ZERO_REAL_PART they are on
-    the imaginary axis.
+    """Half plane of the zeros, 1/s, shape (n - m,), for (5)-(9).
+
+    Within ZERO_REAL_PART they are on the imaginary axis.
     """
     rightmost = float(np.max(zeros.real, initial=-np.inf))
     if rightmost > ZERO_REAL_PART:
@@ -243,10 +247,9 @@ def zero_dynamics(zeros: ComplexArray) -> ZeroDynamics:
 
 
 def controllable(A: FloatArray, B: FloatArray) -> bool:
-    """Assumption 1 by the test of Popov, Belevitch and Hautus: rank [A - s I, B] = n at every
-    eigenvalue s of A.
+    """Assumption 1 by the test of Popov, Belevitch and Hautus.
 
-    Shapes: A (n, n), B (n, m).
+    rank [A - s I, B] = n at every eigenvalue s of A. Shapes: A (n, n), B (n, m).
     """
     n = len(A)
     modes = (np.hstack([A - s * np.eye(n), B]) for s in eigvals(A))

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Design of an allocation: T for the effectors of an airframe, and the loop that the law sees
-through T.
+"""Design of an allocation for the effectors of an airframe.
+
+The results are T, and the loop as the law sees it through T.
 """
 
 from collections.abc import Sequence
@@ -44,8 +45,9 @@ class LawInputs(NamedTuple):
 def design_allocation(
     airframe: Airframe, effectors: Effectors, priority: Sequence[str] = ()
 ) -> tuple[AllocationConfig, LawInputs]:
-    """The allocation by the weighted pseudo-inverse of Omega = C B, (m, p), and the inputs of the
-    law: C B T = I.
+    """The allocation and the inputs of the law: C B T = I.
+
+    The allocation is the weighted pseudo-inverse of Omega = C B, (m, p).
 
         T = W^-1 Omega' (Omega W^-1 Omega')^-1,  W = diag(((lag_j + SERVO) / range_j)^2),
             effect = Omega
@@ -109,8 +111,9 @@ def _require_effectors(airframe: Airframe, effectors: Effectors) -> None:
 
 
 def _pseudo_inverse(airframe: Airframe, Omega: FloatArray, effectors: Effectors) -> FloatArray:
-    """T, (p, m), by the weights of `design_allocation`. Raises ParameterError for dependent rows
-    of Omega.
+    """T, (p, m), by the weights of `design_allocation`.
+
+    Raises ParameterError for dependent rows of Omega.
     """
     reach = (effectors.upper - effectors.lower) / 2.0 / (effectors.lag + SERVO)
     scaled = Omega * reach
@@ -126,8 +129,9 @@ def _pseudo_inverse(airframe: Airframe, Omega: FloatArray, effectors: Effectors)
 
 
 def _alone(T: FloatArray, sides: tuple[FloatArray, FloatArray]) -> FloatArray:
-    """The largest v_i >= 0 alone inside the ends; `sides`: the ends in the direction -T_ji and
-    +T_ji, of either sign.
+    """The largest v_i >= 0 alone inside the ends.
+
+    `sides`: the ends in the direction -T_ji and +T_ji, of either sign.
     """
     against, along = (np.abs(side)[:, None] for side in sides)
     counts = np.abs(T) > SMALL * np.abs(T).max(axis=0)

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Gains beside an extended state observer: an integrator for each output, known by its sign and
-size alone.
+"""Gains beside an extended state observer.
+
+The aircraft is an integrator for each output, known by sign and size alone.
 """
 
 from collections.abc import Mapping
@@ -29,16 +30,18 @@ DEFAULT_PRODUCTS = EXTENDED_STATE_PRODUCTS["p"]
 
 
 def extended_state_weights(outputs: tuple[str, ...], T: FloatArray) -> ExtendedStateWeights:
-    """Weights of an extended-state observer from the total lags of the loop, (m,), s, by
-    EXTENDED_STATE_PRODUCTS.
+    """Weights of an extended-state observer by EXTENDED_STATE_PRODUCTS.
+
+    `T`: the total lags of the loop, (m,), s.
     """
     products = np.array([EXTENDED_STATE_PRODUCTS.get(name, DEFAULT_PRODUCTS) for name in outputs]).T
     return ExtendedStateWeights(products[0] * T, *(products[1:] / T))
 
 
 def integrator_model(controller: ControllerConfig, Omega: FloatArray) -> FeedforwardConfig:
-    """The model y_dot = Omega u of a feedforward, Omega (m, m) in the law's order; lead = lag +
-    delay + half a period.
+    """The model y_dot = Omega u of a feedforward, Omega (m, m) in the law's order.
+
+    lead = lag + delay + half a period.
     """
     return FeedforwardConfig(
         states=controller.outputs,

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A first scenario for an airframe: its channels, assumed actuators, noise, and gusts of a size
-that fits the aircraft.
+"""A first scenario for an airframe.
+
+The scenario has the channels, assumed actuators, noise, and gusts in proportion to the aircraft.
 """
 
 from collections.abc import Mapping, Sequence
@@ -56,10 +57,10 @@ def first_flight(
     part: float = 1.0,
     shortfall: str = "",
 ) -> str:
-    """A scenario file for the airframe in `path`, with the text of the section controller; `part`
-    multiplies the commands, and `shortfall` is its first line.
+    """A scenario file for the airframe in `path`, with the text of the section controller.
 
-    The commands are `first_commands`; gusts have 3 % of the trim speed, across it.
+    `part` multiplies the commands, and `shortfall` is the first line. The commands are
+    `first_commands`; gusts have 3 % of the trim speed, across it.
     """
     V0 = airframe.speed
     stops = _stops(airframe)
@@ -140,8 +141,9 @@ def _surfaces(airframe: Airframe) -> list[bool]:
 
 
 def _stops(airframe: Airframe) -> list[float]:
-    """The end stop of each input: STOP of a surface, of another input what gives AUTHORITY on the
-    output that it moves.
+    """The end stop of every input.
+
+    A surface has STOP, a further input what gives AUTHORITY on the driven output.
     """
     Omega = np.abs(airframe.matrix_c() @ airframe.matrix_b())
     authorities = np.array(
@@ -214,8 +216,9 @@ def placeholder(airframe: Airframe, lag: Sequence[float]) -> str:
 
 
 def pairing(airframe: Airframe) -> tuple[int, ...]:
-    """The input of each output, as the smallest change that gives D = I within MAX_COUPLING, else
-    in their order.
+    """The input of every output, as the smallest change to D = I within MAX_COUPLING.
+
+    Where there is none, the inputs are in their order.
     """
     best = search(airframe.matrix_c() @ airframe.matrix_b(), MAX_COUPLING)
     if best is None:

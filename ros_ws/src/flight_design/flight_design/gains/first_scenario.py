@@ -142,8 +142,9 @@ def first_commands(
 
 
 def unit_gains(lag: Sequence[float], delay: float) -> dict[str, Any]:
-    """The keys of a controller of channels with lags and a delay, s, whose gains, each 1, are to be
-    selected.
+    """The keys of a controller of channels with lags and a delay, s.
+
+    The gains, 1 here, are to be selected.
     """
     ones = [1.0] * len(lag)
     return dict.fromkeys(("Lambda", "beta", "input_scale", "omega"), ones) | {

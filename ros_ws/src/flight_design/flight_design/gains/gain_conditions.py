@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
 # ruff: noqa: N802 - K, U, Phi and N_d are the paper's names
-"""Gains of the law: Theorem 1 as a procedure, the engineering procedure, and the conditions on
-both.
+"""Gains of the law: two procedures, and the conditions on the gains.
+
+The procedures are Theorem 1 and the engineering procedure.
 
 The theorem's conditions are sufficient, not necessary, and they contain no actuator.
 `theorem_gains` meets them all; behind servos its result is unstable. `engineering_gains` starts
@@ -82,8 +83,9 @@ class Bounds(NamedTuple):
 
 
 class Condition(NamedTuple):
-    """One condition on a gain set: value >= bound, value <= bound, or, if it is strict, value >
-    bound.
+    """A condition on a gain set: value >= bound or value <= bound.
+
+    A strict bound means value > bound.
     """
 
     name: str
@@ -111,8 +113,9 @@ class Condition(NamedTuple):
 
     @property
     def margin(self) -> float:
-        """Factor by which it is met: below 1 if it fails, 0 if no gain can meet it, NaN for a lower
-        bound of 0.
+        """Factor by which it is met: below 1 if it fails, 0 if no gain can meet it.
+
+        NaN for a lower bound of 0.
         """
         if self.at_least:
             return self.value / self.bound if self.bound > 0.0 else math.nan
@@ -121,8 +124,9 @@ class Condition(NamedTuple):
         return self.bound / self.value if self.value > 0.0 else math.inf
 
     def sentence(self, channels: Sequence[str]) -> str:
-        """In the form of errors: "beta (30) of q: found 15, expected at least 29.1"; `channels` are
-        the names of y.
+        """In the form of errors: "beta (30) of q: found 15, expected at least 29.1".
+
+        `channels` are the names of y.
         """
         where = self.name if self.channel is None else f"{self.name} of {channels[self.channel]}"
         return f"{where}: found {self.value:.4g}, expected {self.side} {self.bound:.4g}"
@@ -137,11 +141,11 @@ def failing(conditions: Sequence[Condition]) -> tuple[Condition, ...]:
 
 
 def bound_U(Omegas: FloatArray) -> FloatArray:
-    """Largest abs(U_ij), j > i, over samples of Omega, zero elsewhere; Omegas (N, m, m), result (m,
-    m).
+    """Largest abs(U_ij), j > i, over samples of Omega, zero elsewhere.
 
-    U is that of Omega = S D U (11). The result bounds the off-diagonal entries of D U D as well:
-    their sizes are the same. Raises DecompositionError for a sample without decomposition.
+    Omegas (N, m, m), result (m, m). U is that of Omega = S D U (11). The result bounds the
+    off-diagonal entries of D U D as well: their sizes are the same. Raises DecompositionError for a
+    sample without decomposition.
     """
     return np.asarray(np.max([np.triu(np.abs(decompose(Omega).U), 1) for Omega in Omegas], axis=0))
 
@@ -171,15 +175,17 @@ def least_beta(Lambda: FloatArray, bounds: Bounds) -> FloatArray:
 
 
 def zeta_Phi(i: int, K: FloatArray, U: FloatArray) -> float:
-    """Bound of abs(Phi_i) / norm(z), (25)-(27), 1/s: the norm over j > i of zeta_U,ij k_j. K (m,),
-    U (m, m).
+    """Bound of abs(Phi_i) / norm(z), (25)-(27), 1/s.
+
+    The bound is the norm over j > i of zeta_U,ij k_j. K (m,), U (m, m).
     """
     return float(np.linalg.norm(U[i, i + 1 :] * K[i + 1 :]))
 
 
 def theorem_gains(bounds: Bounds, Lambda: FloatArray) -> GainSet:
-    """Gains that meet (22), (29), (30) and steps 2 and 3 of Theorem 1 for the bounds given, shape
-    as in the fields.
+    """Gains to meet (22), (29), (30) and steps 2 and 3 of Theorem 1 for the bounds given.
+
+    The shape is as in the fields.
 
         least = min(Lambda, 1), the decay of e and r before N~ and Phi
         k_g   = 1.5 rho^2 / (4 least)                                     step 2
@@ -203,8 +209,9 @@ def theorem_gains(bounds: Bounds, Lambda: FloatArray) -> GainSet:
 
 
 def check(gains: GainSet, bounds: Bounds) -> tuple[Condition, ...]:
-    """Conditions of Theorem 1 on a gain set: (29), (30) from the last channel up, then steps 2 and
-    3.
+    """Conditions of Theorem 1 on a gain set.
+
+    They are (29), (30) from the last channel up, then steps 2 and 3.
 
         beta_i >= (zeta_Nd,i + sum_(j>i) zeta_U,ij beta_j) (1 + gamma_2,i / Lambda_i), beta_j those
         of the gain set k_g >= rho^2 / (4 min(Lambda, 1))
@@ -250,20 +257,20 @@ def check(gains: GainSet, bounds: Bounds) -> tuple[Condition, ...]:
 
 
 def bandwidths(loop: Loop, crossover_lag_product: FloatArray) -> FloatArray:
-    """Bandwidth of each channel, crossover_lag_product_i / (lag_i + 1.5 period + delay), shape
-    (m,), rad/s.
+    """Bandwidths of the channels, shape (m,), rad/s.
 
-    A product of 0.63 rad costs 36 degrees of phase at the crossover: the phase margin is 90 - 36 =
-    54 degrees. Source: this project.
+    Bandwidth i is crossover_lag_product_i / (lag_i + 1.5 period + delay). A product of 0.63 rad
+    costs 36 degrees of phase at the crossover: the phase margin is 90 - 36 = 54 degrees. Source:
+    this project.
     """
     return np.asarray(crossover_lag_product / loop.total)
 
 
 def split_gain(K: FloatArray) -> tuple[float, FloatArray]:
-    """k_g and k_d of (22) for K = 1 + k_g + (k_d, 0), shape (m,), 1/s. k_d is at least 0.01: (22)
-    requires it to be positive.
+    """k_g and k_d of (22) for K = 1 + k_g + (k_d, 0), shape (m,), 1/s.
 
-    Raises ParameterError if the last K is not the smallest or not above 1: (22) has no such K.
+    k_d is at least 0.01: (22) requires it to be positive. Raises ParameterError if the last K is
+    not the smallest or not above 1: (22) has no such K.
     """
     require(
         float(K[-1]) <= float(K.min()),
@@ -306,11 +313,11 @@ def engineering_gains(
 
 
 def N_d(Omega: FloatArray, v_dot: FloatArray) -> FloatArray:
-    """N_d of (17) along the ideal control v*, at e = 0: -D U v*_dot, shape of v_dot, (..., m),
-    units of y / s^2.
+    """N_d of (17) along the ideal control v*, at e = 0: -D U v*_dot.
 
-    From Omega v*_dot = y_m_ddot - C (A x_dot + f_dot) and N_d = M (C A x_dot + C f_dot - y_m_ddot),
-    M Omega = D U. Omega (m, m) in the inputs of v. Raises DecompositionError if it has no S D U.
+    N_d has the shape of v_dot, (..., m), and units of y / s^2. From Omega v*_dot = y_m_ddot - C (A
+    x_dot + f_dot) and N_d = M (C A x_dot + C f_dot - y_m_ddot), M Omega = D U. Omega (m, m) in the
+    inputs of v. Raises DecompositionError if it has no S D U.
     """
     factors = decompose(Omega)
     return np.asarray(-v_dot @ (factors.D[:, None] * factors.U).T)

@@ -86,12 +86,11 @@ def select_gains(
     mixing: str = DIAGONAL,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Selection:
-    """Gains for an airframe by Theorem 1 and by the engineering procedure, with every condition on
-    both.
+    """Gains for an airframe by Theorem 1 and by the engineering procedure.
 
-    The commands, the gusts and the loop are those of the scenario.
-    `scenario.vary(controller=selection.chosen)` flies the engineering gains; `gains_yaml` writes
-    them as a section of a scenario file.
+    A gain set comes with every condition. The commands, the gusts and the loop are those of the
+    scenario. `scenario.vary(controller=selection.chosen)` flies the engineering gains; `gains_yaml`
+    writes them as a section of a scenario file.
 
     Args:
         airframe: Name in the library, path of an airframe file (.yaml), or an Airframe.
@@ -177,8 +176,9 @@ def select_gains(
 
 
 def _beside_observer(required: Requirement, *, as_read: bool) -> Requirement:
-    """A requirement for a loop with an observer; `as_read` from a file, the gains need no more than
-    a stable loop.
+    """A requirement for a loop with an observer.
+
+    `as_read` from a file, the gains need no more than a stable loop.
     """
     if as_read:
         return STABLE
@@ -248,8 +248,9 @@ def study(
     samples: int,
     seed: int,
 ) -> Study:
-    """The airframe that the law of a controller sees, and uncertain airframes around it, along the
-    commands and gusts of a scenario. Raises ParameterError.
+    """The airframe as the law of a controller sees it, and uncertain airframes around.
+
+    They fly along the commands and gusts of a scenario. Raises ParameterError.
     """
     seen = through_allocation(airframe, controller)
     behind = None if seen is airframe else Effected(airframe, distribution(airframe, controller))
@@ -271,11 +272,10 @@ def _loop(
     lag: ArrayLike | None,
     delay: float | None,
 ) -> LoopSetting:
-    """The loop of a scenario with another rate of the law or of y, Hz, lag or delay, s. Raises
-    ParameterError.
+    """The loop of a scenario with another rate of the law or of y, Hz, lag or delay, s.
 
-    The law steps with each y, so the lag of sampling is 1.5 periods of y. Those of the law are
-    counted from its own rate.
+    Raises ParameterError. The law steps with each y, so the lag of sampling is 1.5 periods of y.
+    Those of the law are counted from its own rate.
     """
     loop = gain_selection.loop_setting(scenario)
     if rate is not None:
@@ -295,8 +295,9 @@ def _loop(
 
 
 def _mixed(loop: LoopSetting, scenario: Scenario, airframe: Airframe, mixing: str) -> LoopSetting:
-    """The loop with an allocation where the airframe or the mixing asks for one, else with the
-    limits of the actuators.
+    """The loop with an allocation where the airframe or the mixing asks for one.
+
+    Otherwise the loop has the limits of the actuators.
     """
     if mixing == FULL or len(airframe.inputs) > len(airframe.outputs):
         return _allocated(loop, scenario, airframe)
@@ -304,8 +305,9 @@ def _mixed(loop: LoopSetting, scenario: Scenario, airframe: Airframe, mixing: st
 
 
 def _with_limits(loop: LoopSetting, scenario: Scenario, airframe: Airframe) -> LoopSetting:
-    """The loop with limits of u within the end stops of the scenario's actuators; without limits
-    for another aircraft.
+    """The loop with limits of u within the end stops of the scenario's actuators.
+
+    The loop of a different aircraft has no limits.
     """
     aircraft = scenario.aircraft
     if aircraft.is_jsbsim or load_airframe(aircraft.airframe).name != airframe.name:
@@ -339,8 +341,9 @@ def _pairing(
 
 
 def _without_allocation(loop: LoopSetting, scenario: Scenario) -> LoopSetting:
-    """The loop of a scenario with an allocation for the inputs of its aircraft, with the lags of
-    the actuators.
+    """The loop of a scenario with an allocation for the inputs of the aircraft.
+
+    The lags are of the actuators.
     """
     if loop.base.allocation is None:
         return loop
@@ -514,8 +517,9 @@ def selected_observer(
 def _noise(
     controller: RiseDiConfig, scenario: Scenario, model: Airframe
 ) -> tuple[FloatArray, dict[str, float]]:
-    """Rms per sample of the outputs, (m,), and of the vanes in use, by channel; some for none of a
-    perfect sensor.
+    """Rms per sample of the outputs, (m,), and of the vanes in use, by channel.
+
+    A perfect sensor has a small noise here.
     """
     channels = scenario.aircraft.channels().outputs
     measured = scenario.aircraft.sensors.noise or (0.0,) * len(channels)
@@ -571,8 +575,9 @@ def _shipped(name: str) -> Scenario:
 
 
 def _tuned_scenario(scenario: Scenario) -> Scenario:
-    """The scenario itself if it has tuned gains, else one that ships with the same airframe and
-    actuators and has them.
+    """A scenario with tuned gains: itself, or a shipped scenario.
+
+    The shipped scenario has the same airframe and actuators.
     """
     shipped = (_shipped(path.stem) for path in sorted(tuned_gains.TUNED.glob("*.yaml")))
     model = scenario.aircraft.airframe, scenario.aircraft.actuators.lag

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Gain selection for an airframe: its ideal control along a manoeuvre, two gain sets, and their
-assessment.
+"""Gain selection for an airframe: two gain sets, and their assessment.
+
+The gain sets come from the ideal control of the airframe along a manoeuvre.
 
 `study_airframe` finds the rates of the ideal control, on the airframe as published and on uncertain
 ones around it. `select_gains` derives two gain sets, of Theorem 1 and of the engineering procedure.
@@ -115,15 +116,17 @@ class GainAssessment(NamedTuple, Generic[Controller]):
 
     @property
     def delay_margin(self) -> float | None:
-        """Delay margin of the nominal aircraft with the delay in all channels, s; None for the
-        literal sign.
+        """Delay margin of the nominal aircraft with the delay in every channel, s.
+
+        None for the literal sign.
         """
         return None if self.margins is None else self.margins.delay
 
     @property
     def channel_margins(self) -> tuple[float, ...]:
-        """Delay margins of the nominal aircraft with the delay in one channel alone, s; none for
-        the literal sign.
+        """Delay margins of the nominal aircraft with the delay in a single channel, s.
+
+        Empty for the literal sign.
         """
         return () if self.margins is None else self.margins.channel_delay
 
@@ -133,8 +136,9 @@ class GainAssessment(NamedTuple, Generic[Controller]):
 
     @property
     def has_requirement(self) -> bool:
-        """Whether margins are asked of the loop: not of an ideal loop with the implicit or the
-        literal sign.
+        """Whether margins are asked of the loop.
+
+        They are not of an ideal loop with the implicit or the literal sign.
         """
         return any(condition.name in REQUIRED for condition in self.loop)
 
@@ -164,8 +168,9 @@ def loop_with_box(study: Study, controller: ControllerConfig) -> LinearLoop:
 
 @dataclass(frozen=True)
 class Selection:
-    """Both gain sets for an airframe. A set is assessed on first use, for the margins of all
-    samples cost most.
+    """The two gain sets for an airframe.
+
+    A set is assessed on first use, for the margins of all samples cost most.
     """
 
     study: Study
@@ -186,8 +191,9 @@ class Selection:
 
 
 def select_gains(study: Study, setting: LoopSetting) -> Selection:
-    """Two gain sets for an airframe: the literal one of Theorem 1 and that of the engineering
-    procedure.
+    """Two gain sets for an airframe: by Theorem 1 and by the engineering procedure.
+
+    The set by Theorem 1 is literal.
 
     Both have the same channels (the fastest first, so that the last has the smallest K), inputs
     scaled by 1 / abs(Omega_ii) and D from the minors. The theorem's set is `theorem_gains` with
@@ -211,10 +217,10 @@ def select_gains(study: Study, setting: LoopSetting) -> Selection:
 def gain_candidates(
     study: Study, setting: LoopSetting
 ) -> Callable[[FloatArray, FloatArray], Candidate[RiseDiConfig]]:
-    """A function of `slower` and `lower`, (m,) each, that gives the engineering gains with the
-    bandwidth lower by the second and the integral slower by both, and their loop.
+    """A function of `slower` and `lower`, (m,), to the engineering gains and the loop.
 
-    Raises ParameterError as `select_gains`.
+    The bandwidth is lower by `lower`, and the integral slower by `slower` and `lower`. Raises
+    ParameterError as `select_gains`.
     """
     paired = _paired(study, setting)
     limits = (
@@ -307,8 +313,9 @@ def _controller(
     response: FloatArray,
     slower: FloatArray,
 ) -> RiseDiConfig:
-    """The controller with gains; the integral is `slower`, and abs(Omega_ii) is `response` in the
-    scaled inputs.
+    """The controller with gains.
+
+    The integral is `slower`, and abs(Omega_ii) is `response` in the scaled inputs.
     """
     channels = paired.channels
     scale = paired.unit * response
@@ -345,11 +352,11 @@ def _controller(
 
 
 def with_feedforward(controller: Controller, airframe: Airframe) -> Controller:
-    """The same controller with the airframe as the nominal model of its feedforward, an extension
-    of the paper.
+    """The same controller with the airframe as the nominal model of its feedforward.
 
-    lead = lag + delay + half a period, of the controller. Raises ParameterError for an airframe
-    that cannot be the model, such as one with a zero in the right half plane.
+    A feedforward is an extension of the paper. lead = lag + delay + half a period, of the
+    controller. Raises ParameterError for an airframe that cannot be the model, such as one with a
+    zero in the right half plane.
     """
     for name in controller.outputs:
         require(
@@ -375,11 +382,10 @@ def with_feedforward(controller: Controller, airframe: Airframe) -> Controller:
 def check_gains(
     scenario: Scenario, study: Study, gamma_2: float = 0.0
 ) -> GainAssessment[ControllerConfig]:
-    """Every condition on the gain set of a scenario's controller, for an airframe studied along the
-    scenario's manoeuvre.
+    """Every condition on the gain set of a scenario's controller.
 
-    Raises ParameterError for other outputs than those of the airframe, and if D or the pairing
-    contradict the airframe.
+    The airframe is studied along the scenario's manoeuvre. Raises ParameterError for other outputs
+    than those of the airframe, and if D or the pairing contradict the airframe.
     """
     known = scenario.controller.outputs
     frame = study.airframe
@@ -415,8 +421,9 @@ def loop_setting(scenario: Scenario, gamma_2: float = 0.0) -> LoopSetting:
 def assess_gains(
     study: Study, controller: Controller, setting: LoopSetting
 ) -> GainAssessment[Controller]:
-    """Every condition on a gain set. Rate, lag and delay are the controller's; gamma_2 and rate
-    limits are the setting's.
+    """Every condition on a gain set.
+
+    Rate, lag and delay are the controller's; gamma_2 and rate limits are the setting's.
 
     Theorem: see `_theorem`. Loop: `check_loop` without an observer, the fraction of the samples for
     which the linear loop is stable, and its delay margin on the nominal airframe, which should be
@@ -500,8 +507,9 @@ def _rise_di_conditions(
 
 
 def response(study: Study, controller: ControllerConfig) -> FloatArray:
-    """abs(Omega_ii) in the scaled inputs of a controller, law's order, (m,): 1, or less in a
-    channel too slow for (22).
+    """abs(Omega_ii) in the scaled inputs of a controller, law's order, (m,).
+
+    A channel too slow for (22) has less than 1, any further channel 1.
     """
     rows, columns = law_order(study.airframe, controller)
     scale = getattr(controller, "input_scale", 1.0)
@@ -509,12 +517,11 @@ def response(study: Study, controller: ControllerConfig) -> FloatArray:
 
 
 def stable_speed_ratio(study: Study, controller: ControllerConfig) -> float:
-    """Airspeed over that of the trim up to which the delay margin lasts with fixed gains; 0 without
-    one at trim.
+    """Airspeed over that of the trim up to which the delay margin lasts with fixed gains.
 
-    The response to every input but that of V grows with V^2, all else is that of the trim. The
-    answer is rounded down to SPEED_STEP, and infinite where the linear loop is stable up to
-    MAX_SPEED_RATIO. Raises ParameterError for the literal sign.
+    0 without a delay margin at trim. The response to every input but that of V grows with V^2, all
+    else is that of the trim. The answer is rounded down to SPEED_STEP, and infinite where the
+    linear loop is stable up to MAX_SPEED_RATIO. Raises ParameterError for the literal sign.
     """
     loop = linear_loop(controller, study.airframe, study.A[:1], study.B[:1])
     steps = round(1.0 / SPEED_STEP)
@@ -538,8 +545,9 @@ def _bounds(
     Lambda: FloatArray,
     gamma_2: float,
 ) -> tuple[Bounds, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Bounds of Theorem 1 in inputs scaled by `scale` (m,); which samples have this D; which of
-    them have stable zeros too.
+    """Bounds of Theorem 1 in inputs scaled by `scale` (m,), with two masks of the samples.
+
+    The first mask has the samples with this D, the second only samples with stable zeros too.
     """
     C = study.C[rows]
     Omegas = C @ study.B[:, :, columns] * scale

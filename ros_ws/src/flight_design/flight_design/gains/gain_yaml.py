@@ -33,8 +33,9 @@ PLAIN = re.compile(r"[A-Za-z/][A-Za-z0-9_./:-]*")
 
 
 def yaml_flow(value: Any, precision: int = 6) -> str:
-    """A value in YAML's flow style. Floats have six digits and always a point, which YAML 1.1
-    requires of a float.
+    """A value in YAML's flow style.
+
+    Floats have six digits and always a point, which YAML 1.1 requires of a float.
     """
     if isinstance(value, (list, tuple)):
         return f"[{', '.join(yaml_flow(entry, precision) for entry in value)}]"
@@ -112,8 +113,9 @@ def _listed(values: FloatArray) -> str:
 
 
 def as_yaml(selection: Selection, *, theorem: bool = False) -> str:
-    """The engineering gain set as the section `/**/controller` of a scenario file, with units and
-    reasons in comments.
+    """The engineering gain set as the section `/**/controller` of a scenario file.
+
+    Comments have units and reasons.
 
     Args:
         selection: The result of `select_gains`.
@@ -199,8 +201,9 @@ def section_yaml(
     comments: Mapping[str, str],
     unmet: Sequence[Condition] = (),
 ) -> str:
-    """A controller as the section `/**/controller` of a scenario file; the description of a
-    parameter without a comment. `unmet` margins are named first.
+    """A controller as the section `/**/controller` of a scenario file.
+
+    A parameter without a comment gets the description. `unmet` margins are named first.
     """
     parameters = [
         (key, value, comments.get(key, type(controller).model_fields[key].description))
@@ -227,8 +230,9 @@ def below_requirement(unmet: Sequence[Condition], outputs: Sequence[str]) -> str
 
 
 def margins_sentence(controller: ControllerConfig, margins: LoopMargins | None) -> str:
-    """The margins of a loop in a sentence: nominal and worst phase margins; "" without a softened
-    sign, or unstable.
+    """The margins of a loop in a sentence: nominal and worst phase margins.
+
+    "" without a softened sign, or unstable.
     """
     implicit = (
         isinstance(controller, RiseDiConfig) and controller.sampled_sign()[0] is Sign.IMPLICIT
@@ -252,8 +256,9 @@ def margins_sentence(controller: ControllerConfig, margins: LoopMargins | None) 
 
 
 def _shown_response(responses: FloatArray) -> str:
-    """The factors of 1 / abs(Omega_ii): 1, or less in a channel that is too slow for a K of
-    (22).
+    """The factors of 1 / abs(Omega_ii).
+
+    They are 1, or less in a channel that is too slow for a K of (22).
     """
     factors = [f"{value:.3g}" for value in responses]
     return "1" if set(factors) == {"1"} else f"({', '.join(factors)})"
@@ -262,8 +267,9 @@ def _shown_response(responses: FloatArray) -> str:
 def _sections(
     controller: ControllerConfig, airframe: Airframe
 ) -> dict[str, tuple[str, dict[str, Any]]]:
-    """The sections allocation, feedforward and observer, if any: a comment, and each parameter in
-    flow style.
+    """The sections allocation, feedforward and observer, if any.
+
+    A section has a comment, and the parameters in flow style.
     """
     along = f"the input of {airframe.name} along y_m is added; SI, a line a state, lead in s"
     corrects = (
@@ -322,8 +328,9 @@ def _columns_of(
 def _matrix_rows(
     section: AllocationConfig | FeedforwardConfig | ObserverConfig | VanesConfig, m: int
 ) -> dict[str, Any]:
-    """Entries of each parameter in flow style, a matrix in rows; ten digits in an allocation and an
-    observer.
+    """Entries of each parameter in flow style, a matrix in rows.
+
+    Numbers of an allocation and an observer have ten digits.
     """
     rows: dict[str, Any] = {}
     columns_of = _columns_of(section, m)

@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""An airframe along a manoeuvre: the ideal control of the published airframe and of uncertain
-ones.
-"""
+"""The ideal control along a manoeuvre, of the published airframe and of uncertain airframes."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -54,8 +52,9 @@ class Effected(NamedTuple):
 
 
 class Study(NamedTuple):
-    """An airframe along a manoeuvre: the nominal one first, then N - 1 uncertain ones; airframe's
-    order, SI.
+    """The nominal airframe, then N - 1 uncertain airframes, along a manoeuvre.
+
+    The channels are in the airframe's order, SI.
     """
 
     airframe: Airframe
@@ -125,8 +124,9 @@ def study_airframe(
     seed: int = 1,
     effected: Effected | None = None,
 ) -> Study:
-    """Rates of the ideal control along a manoeuvre, on the airframe as published and on uncertain
-    ones.
+    """Rates of the ideal control along a manoeuvre.
+
+    The airframe as published has rates, and uncertain airframes.
 
     The ideal control keeps y on y_m. With x = P y_m + N eta, eta the states beside the outputs
     (`output_coordinates`):
@@ -254,8 +254,9 @@ def _ideal_rates(
 def _references(
     manoeuvre: Manoeuvre, airframe: Airframe
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """y_m and its two derivatives every STEP / 2, for the stages of Runge-Kutta; airframe's order,
-    each (2 T - 1, m).
+    """y_m and its two derivatives every STEP / 2, for the stages of Runge-Kutta.
+
+    The order is the airframe's, the shape (2 T - 1, m).
     """
     matrices = manoeuvre.reference.model()
     profile = manoeuvre.reference.profile()
@@ -276,8 +277,9 @@ def _references(
 
 
 def _columns(airframe: Airframe, gusts: Mapping[str, Gust], columns: int) -> Aircraft:
-    """The aircraft with f for states in columns, shape (n, columns), the last column without
-    gusts.
+    """The aircraft with f for states in columns, shape (n, columns).
+
+    The last column is without gusts.
     """
     gust_on = np.append(np.ones(columns - 1), 0.0)
     profiles = np.array([(gust.start, gust.speed, gust.length) for gust in gusts.values()]).reshape(

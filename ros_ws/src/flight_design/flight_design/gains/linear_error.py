@@ -115,8 +115,9 @@ def _gust_energy(
 def _turbulent(
     matrix: FloatArray, blown: FloatArray, noise: FloatArray, period: float, air: Air
 ) -> tuple[FloatArray, FloatArray]:
-    """The covariance of the state of a loop in turbulence and noise, the wind below, and the
-    transition of this state.
+    """The covariance of the state of a loop in turbulence and noise, and the transition.
+
+    In the state the wind stands below the loop.
     """
     size, G = blown.shape
     kept = np.exp(-period / air.time)
@@ -136,11 +137,11 @@ def _turbulent(
 
 
 def linear_error(loop: LinearLoop, u_dot: FloatArray) -> FloatArray:
-    """Rms of e of the nominal linear loop that has to give the ideal control u*, (..., m), SI; the
-    leading axes are those of the laws of the loop.
+    """Rms of e of the nominal linear loop under the ideal control u*, (..., m), SI.
 
-    u* keeps y on y_m, so e is the response of the loop to the disturbance -u* at the input of the
-    aircraft, from trim on. `u_dot` (T, m) is the rate of u* every STEP, inputs in the law's order.
+    The loop has to give u*. The leading axes are from the laws of the loop. u* keeps y on y_m, so e
+    is the response of the loop to the disturbance -u* at the input of the aircraft, from trim on.
+    `u_dot` (T, m) is the rate of u* every STEP, inputs in the law's order.
     """
     period = loop.loop.period
     u = np.concatenate(

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's Lyapunov functions along a flight of a known plant: evidence for the theorem, not
-part of the law.
+"""The paper's Lyapunov functions along a flight of a known plant.
+
+They are evidence for the theorem, not part of the law.
 
 All quantities are in the law's channel order and its scaled inputs v (u = input_scale v), with
 Omega = C B in these inputs. Time derivatives are central differences over the samples of a flight.
@@ -25,8 +26,9 @@ from rise_di_controller.law.law import LawParams, Sign, engage, step
 
 
 class KnownPlant(NamedTuple):
-    """Equation (1), x_dot = A x + f(t, x) + B v, y = C x, with outputs and scaled inputs v in the
-    law's order.
+    """Equation (1), x_dot = A x + f(t, x) + B v, y = C x.
+
+    Outputs and scaled inputs v are in the law's order.
     """
 
     A: FloatArray  # (n, n)
@@ -36,8 +38,9 @@ class KnownPlant(NamedTuple):
 
 
 class FlightSamples(NamedTuple):
-    """Signals of a flight at N >= 3 ticks of the law, input of `evidence`; the first tick is the
-    engagement.
+    """Signals of a flight at N >= 3 ticks of the law, input of `evidence`.
+
+    The first tick is the engagement.
     """
 
     t: FloatArray  # (N,) s
@@ -62,11 +65,11 @@ class Evidence(NamedTuple):
 
 
 def from_tape(scenario: Scenario, tape: Tape) -> tuple[KnownPlant, FlightSamples]:
-    """Plant and samples of a scenario's tape at the ticks of the law, in its channel order and
-    scaled inputs.
+    """Plant and samples of a scenario's tape at the ticks of the law.
 
-    Raises ValueError if a tick has no sample of `truth` or `y_m` with its stamp. The tape is that
-    of a simulation in one process or of a bag with an exact clock.
+    The channels are in the law's order, in scaled inputs. Raises ValueError if a tick has no sample
+    of `truth` or `y_m` with its stamp. The tape is that of a simulation in one process or of a bag
+    with an exact clock.
     """
     airframe, aircraft = scenario.aircraft.load()
     controller = scenario.controller
@@ -95,11 +98,11 @@ def from_tape(scenario: Scenario, tape: Tape) -> tuple[KnownPlant, FlightSamples
 def fly(
     plant: KnownPlant, y_m: FloatArray, dt: float, params: LawParams, x_0: FloatArray
 ) -> FlightSamples:
-    """The plant under the law from x_0, engaged at t = 0: one tick and one Runge-Kutta step per dt,
-    v held between ticks.
+    """The plant under the law from x_0, engaged at t = 0.
 
-    Arguments: `y_m` the reference at the ticks, shape (N, m); `dt` in s; `params` with input_scale
-    1, since B acts on v; `x_0` shape (n,).
+    A dt has a tick and a Runge-Kutta step, v held between ticks. Arguments: `y_m` the reference at
+    the ticks, shape (N, m); `dt` in s; `params` with input_scale 1, since B acts on v; `x_0` shape
+    (n,).
     """
 
     def x_dot(t: float, x: FloatArray, v: FloatArray, _: None) -> FloatArray:
@@ -156,8 +159,9 @@ def evidence(
 
 
 def decay_matrix(plant: KnownPlant, params: LawParams) -> FloatArray:
-    """Q of V2_dot = -z' Q z along every flight of the continuous law, z = [e; r], symmetric, shape
-    (2m, 2m).
+    """Q of V2_dot = -z' Q z along every flight of the continuous law, shape (2m, 2m).
+
+    z = [e; r], and Q is symmetric.
 
     z' Q z = e' Lambda e - r' N~ + r' D U D K r with N~ = G (r - Lambda e) + e, G = M (C A C^+ +
     Lambda). Q contains neither beta nor N_d. Steps 2 and 3 of Theorem 1 are sufficient for Q > 0:
@@ -176,8 +180,9 @@ def decay_matrix(plant: KnownPlant, params: LawParams) -> FloatArray:
 
 
 def lemma_2(plant: KnownPlant, signals: Evidence, params: LawParams) -> float:
-    """The constant zeta_b of (47) that Lemma 2 gives for a flight: P >= 0 then follows from (29),
-    (30).
+    """The constant zeta_b of (47) that Lemma 2 gives for a flight.
+
+    P >= 0 then follows from (29), (30).
 
         zeta_i = max_t abs(N_d,i) + sum_(j>i) abs(U_ij) beta_j  lower bound of beta_i in (29), (30)
         gamma_2,i = Lambda_i (beta_i / zeta_i - 1)  the largest that (29), (30) allow
@@ -201,8 +206,9 @@ def lemma_2(plant: KnownPlant, signals: Evidence, params: LawParams) -> float:
 
 
 def integral(signal: FloatArray, t: FloatArray) -> FloatArray:
-    """integral_0^t of a sampled signal by the trapezoid rule, 0 at the first sample, shape of the
-    signal: (N,) or (N, m).
+    """integral_0^t of a sampled signal by the trapezoid rule, 0 at the first sample.
+
+    The shape is as of the signal: (N,) or (N, m).
     """
     return np.asarray(cumulative_trapezoid(signal, t, axis=0, initial=0))
 
@@ -217,12 +223,11 @@ class Example(NamedTuple):
 
 
 def example(dt: float, duration: float) -> Example:
-    """Four states, two inputs, Omega = S D U with D = diag(1, -1) and a full U, a persistent
-    disturbance and reference.
+    """Four states and two inputs, Omega = S D U with D = diag(1, -1) and a full U.
 
-    It is well conditioned (M between 0.8 and 1.3, zeros -1.48 and -1.02). Its gains meet the
-    conditions of Theorem 1 on this flight: `decay_matrix` is positive definite and `lemma_2` finds
-    a constant. Times in s.
+    The disturbance and the reference are persistent. It is well conditioned (M between 0.8 and 1.3,
+    zeros -1.48 and -1.02). Its gains meet the conditions of Theorem 1 on this flight:
+    `decay_matrix` is positive definite and `lemma_2` finds a constant. Times in s.
     """
     D = np.array([1.0, -1.0])
     U = np.array([[1.0, 0.4], [0.0, 1.0]])

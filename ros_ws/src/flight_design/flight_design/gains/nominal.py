@@ -30,10 +30,10 @@ def sizes(units: Iterable[str]) -> FloatArray:
 def nominal_model(
     airframe: Airframe, outputs: Sequence[str], inputs: Sequence[str], noise: FloatArray, loop: Loop
 ) -> NominalModel:
-    """The model of an airframe with its channels in this order, without limits, and with D = I
-    until a caller sets D.
+    """The model of an airframe with channels in this order, without limits.
 
-    Arguments: `noise` of the outputs, (m,), rms per sample, and `loop`, in this order.
+    D = I until a caller sets D. Arguments: `noise` of the outputs, (m,), rms per sample, and
+    `loop`, in this order.
     """
     rows = [airframe.outputs.index(name) for name in outputs]
     columns = [list(airframe.inputs).index(name) for name in inputs]

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Gains of the law beside an observer, with the weights of the observer: by a rule, beside a
-sketch, and of a search.
+"""Gains of the law beside an observer, with the weights of the observer.
+
+They come by a rule, beside a sketch, and of a search.
 """
 
 from collections.abc import Mapping
@@ -22,8 +23,9 @@ SHARE = 0.9  # of the integral gain of PI that is Lambda; the rest is the slope 
 
 
 class ObserverGains(NamedTuple):
-    """Gains of the law in scaled inputs with abs(Omega_ii) of 1, and weights of the observer; the
-    law's order.
+    """Gains of the law in scaled inputs with abs(Omega_ii) of 1, and weights of the observer.
+
+    They are in the law's order.
     """
 
     K: FloatArray  # (m,) 1/s
@@ -34,8 +36,9 @@ class ObserverGains(NamedTuple):
 
 
 def gains_by_rule(model: NominalModel, axes: tuple[str, ...], speed: float) -> ObserverGains:
-    """Gains from the lags of the loop, as a start: they were found on the `osprey` and scale with
-    the total lag T.
+    """Gains from the lags of the loop, as a start.
+
+    They were found on the `osprey` and scale with the total lag T.
 
         effort = 0.38 T,  drift = 0.4 0.035 s / T,  loose = 0.0036,  K = 0.026 / T,  Lambda = K / 4
         wind: 0.12 of Dryden's noise sqrt(2 V0 / L) sigma, with 17 times its time L / V0
@@ -98,11 +101,10 @@ def read_gains(path: Path, T: FloatArray, axes: int, states: int) -> ObserverGai
 
 
 def gains_of_search(gains: Mapping[str, list[float]], T: FloatArray) -> ObserverGains:
-    """Gains as `rise-di compare --tune` finds them for rise_observer or pi_observer, by name; T the
-    total lag, (m,), s.
+    """Gains as `rise-di compare --tune` finds them for rise_observer or pi_observer, by name.
 
-    PI with K and Lambda is RISE-DI inside its softened sign with the same K, SHARE Lambda, and 1 /
-    (softening T) of the rest.
+    T is the total lag, (m,), s. PI with K and Lambda is RISE-DI inside its softened sign with the
+    same K, SHARE Lambda, and 1 / (softening T) of the rest.
     """
     values = {name: np.array(row, dtype=np.float64) for name, row in gains.items()}
     weights = Weights(**{name: values[name] for name in Weights._fields})

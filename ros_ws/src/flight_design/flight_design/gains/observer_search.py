@@ -186,8 +186,10 @@ class ObserverSearch(NamedTuple):
         return descend(assess, start, moves, lowest_of, highest_of)
 
     def _trial(self, place: Place, needed: Requirement, least: float) -> Trial[_Loops]:
-        """The trial at a place. Beside one with the margins and the cost `least`, the margins of a
-        trial that is late or costs more are not computed.
+        """The trial at a place.
+
+        Beside one with the margins and the cost `least`, the margins of a trial that is late or
+        costs more are not computed.
         """
         loops = self._loops(place)
         if least < math.inf:
@@ -260,8 +262,9 @@ class ObserverSearch(NamedTuple):
         return float(np.maximum(1.0 - np.concatenate(goals), 0.0).sum())
 
     def _cost(self, loops: _Loops) -> float:
-        """The logarithms of error and activity in wind and noise, in units of a score, summed over
-        the channels; without `air` those of the relaxation.
+        """The logarithms of error and activity in wind and noise, summed over the channels.
+
+        They are in units of a score. Without `air` the relaxation counts.
         """
         if self.air is None:
             return float(np.log(loops.relaxation).sum())
@@ -310,8 +313,9 @@ class ObserverSearch(NamedTuple):
 def least_error(
     searches: Sequence[ObserverSearch], progress: Callable[[str], None] = lambda _: None
 ) -> SelectedObserver:
-    """The best of the searches of several gain sets. Raises ParameterError where none has the
-    margins.
+    """The best of the searches of several gain sets.
+
+    Raises ParameterError where none has the margins.
     """
     trials = [search.best(progress) for search in searches]
     place = 0
@@ -345,8 +349,9 @@ def _parameters(
     relaxation: FloatArray,
     vanes: VanesConfig | None,
 ) -> RiseDiConfig:
-    """The parameters with gains and matrices. A K below MIN_K is MIN_K with a smaller input scale:
-    the same loop.
+    """The parameters with gains and matrices.
+
+    A K below MIN_K is MIN_K with a smaller input scale: the same loop.
     """
     K = gains.K / relaxation
     permitted = np.maximum(K, MIN_K + MIN_GAIN)

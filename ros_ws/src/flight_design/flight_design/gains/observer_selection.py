@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Observer selection: the sections feedforward and observer of a controller, and the gains of the
-law beside it.
+"""Observer selection: the sections feedforward and observer of a controller.
+
+The gains of the law are selected too.
 
 `with_aircraft_observer` takes the model of an airframe, `with_extended_state_observer` Omega and
 the lags alone. Both give a controller whose nominal linear loop has a delay margin and meets a
@@ -66,8 +67,9 @@ STILL = 1.4  # of the noise of a vane: a motion of less counts as none
 
 
 def model_for(airframe: Airframe, controller: ControllerConfig, noise: FloatArray) -> NominalModel:
-    """The model of an airframe for a controller, in the law's order. `noise` of the measured
-    outputs, (m,), rms per sample.
+    """The model of an airframe for a controller, in the law's order.
+
+    `noise` of the measured outputs, (m,), rms per sample.
     """
     model = nominal_model(
         airframe, controller.outputs, controller.inputs, noise, loop_of(controller)
@@ -99,8 +101,9 @@ def with_aircraft_observer(
     is_free: Sequence[bool] | None = None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> SelectedObserver:
-    """The controller with the feedforward and the observer of an airframe, and the gains of the law
-    beside it.
+    """The controller with the feedforward and the observer of an airframe.
+
+    The gains of the law are selected beside the observer.
 
     The gains are relaxed, or made faster, channel by channel: the error of the linear loop in
     moderate turbulence with the noise of the sensors is the least with which the loop has its
@@ -160,9 +163,9 @@ def with_aircraft_observer(
 
 
 def _air(airframe: Airframe, model: NominalModel, vanes: Mapping[str, float]) -> Air:
-    """Moderate turbulence, a gust from below and one from the side, and the noise of outputs and
-    vanes. The air rolls, too: without that nothing but noise would move a symmetrical aircraft in
-    roll.
+    """Moderate turbulence, gusts from below and from the side, noise of outputs and vanes.
+
+    The air rolls, too: without that nothing but noise would move a symmetrical aircraft in roll.
     """
     speed = airframe.speed
     spectrum = dryden(**MODERATE, sigma=0.0)
@@ -227,8 +230,9 @@ class _AircraftDesigns(NamedTuple):
         return cls(with_feedforward(bare, airframe), airframe, noise, model, names)
 
     def plant(self, count: int, vanes: Iterable[str]) -> LinearPlant:
-        """The nominal aircraft and those of `count` uncertain ones that gains can hold, the vanes
-        below the outputs.
+        """The nominal aircraft, and the controllable part of `count` uncertain aircraft.
+
+        The vanes stand below the outputs.
         """
         A, B = nominal_and_sampled(self.airframe, WORST_UNCERTAINTY, count, WORST_SEED)
         _, columns = law_order(self.airframe, self.base)
@@ -304,8 +308,9 @@ def with_extended_state_observer(
     margin: float,
     needed: Requirement = OBSERVER_REQUIREMENT,
 ) -> SelectedObserver:
-    """The controller with an observer from Omega and lags alone: no A, no f, no wind. Its gains
-    stay, but for the margin.
+    """The controller with an observer from Omega and lags alone: no A, no f, no wind.
+
+    Its gains stay, but for the margin.
 
     The model of its feedforward is y_dot = Omega u, that of its observer y_dot = diag(Omega) u:
     with all of Omega the elevator would correct V, and turn the aircraft for it. Arguments: Omega

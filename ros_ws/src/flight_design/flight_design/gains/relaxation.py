@@ -18,8 +18,10 @@ def binding(selection: Selection) -> Condition:
 
 
 def lacking(selection: Selection, *, options: Sequence[str] = ()) -> str:
-    """The bound that binds the best gains of the search, each unmet condition, and each change of
-    the loop that gives the margins, in sentences; "" where nothing is unmet.
+    """What binds the best gains of the search, in sentences; "" where nothing is unmet.
+
+    The sentences name the binding bound, every unmet condition, and every change of the loop to the
+    margins.
 
     A change is a smaller goal, half of the lags, no delay or twice the rate, and each is searched.
     `options` are those of the command that calls, of phase_margin, lag, delay and rate: a

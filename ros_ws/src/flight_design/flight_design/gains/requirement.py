@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The margins that a loop has to have, as conditions, and the search for gains whose measured
-margins meet the requirement.
+"""The required margins of a loop, and the search for gains with these margins.
+
+Every margin is a condition, and the search measures the margins.
 
 The margins are those of the sampled loop with actuators, delay and hold
 (`flight_analysis.linear_loop.input_margins`). 45 degrees and 6 dB are those of MIL-F-9490D,
@@ -79,8 +80,9 @@ class Requirement(NamedTuple):
 
     @property
     def uncertain_phase(self) -> float:
-        """Phase margin of the worst uncertain aircraft, rad: never above what is asked of the
-        nominal aircraft.
+        """Phase margin of the worst uncertain aircraft, rad.
+
+        The nominal aircraft has to have as much.
         """
         return min(self.worst_phase, self.phase)
 
@@ -102,8 +104,9 @@ costs phase."""
 
 
 def requirement(phase_margin: float, *, accept: bool = False) -> Requirement:
-    """The requirement with a phase margin in deg. Raises ParameterError for less than 40 deg
-    without `accept`.
+    """The requirement with a phase margin in deg.
+
+    Raises ParameterError for less than 40 deg without `accept`.
     """
     phase_margin = as_number(phase_margin, "phase_margin", *PHASE_MARGINS, "deg")
     expected = f"at least {ACCEPTED_PHASE_MARGIN:g} deg, or accept beside it"
@@ -112,10 +115,10 @@ def requirement(phase_margin: float, *, accept: bool = False) -> Requirement:
 
 
 def above_zeros(needed: Requirement, plant: LinearPlant) -> Requirement:
-    """A requirement with a damping within reach of a loop around an aircraft: at most about the
-    damping of the zeros.
+    """A requirement with a damping within reach of a loop around an aircraft.
 
-    No feedback moves a zero, and a loop with small errors has modes near the zeros.
+    The damping is at most about that of the zeros. No feedback moves a zero, and a loop with small
+    errors has modes near the zeros.
     """
     zeros = invariant_zeros(plant.A, plant.B, plant.C[: plant.B.shape[-1]])  # without vanes
     modes = zeros[(np.abs(zeros.imag) > NO_MOTION) & (np.abs(zeros) > NO_MOTION)]
@@ -124,11 +127,10 @@ def above_zeros(needed: Requirement, plant: LinearPlant) -> Requirement:
 
 
 def fractions(margins: Margins, needed: Requirement) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """What is found over what is needed, at least 1 where the requirement holds, for m inputs,
-    (..., m), (..., m), (...).
+    """What is found over what is needed, for m inputs, (..., m), (..., m), (...).
 
-    The first is the lesser of phase and sensitivity, the second that of the gain, in dB, the third
-    that of the damping.
+    A fraction is at least 1 where the requirement holds. The first is the lesser of phase and
+    sensitivity, the second that of the gain, in dB, the third that of the damping.
     """
     with np.errstate(divide="ignore"):
         phase = np.minimum(margins.phase / needed.phase, needed.sensitivity / margins.sensitivity)
@@ -136,8 +138,9 @@ def fractions(margins: Margins, needed: Requirement) -> tuple[FloatArray, FloatA
 
 
 def least_fractions(margins: Margins, needed: Requirement) -> FloatArray:
-    """The least of `fractions` of each loop, (...): at least 1 where the requirement holds, 0 for
-    an unstable loop.
+    """The least of `fractions` of a loop, (...).
+
+    A fraction is at least 1 where the requirement holds, 0 for an unstable loop.
     """
     phase, gain, damping = fractions(margins, needed)
     least = np.minimum(np.minimum(phase.min(axis=-1), gain.min(axis=-1)), damping)
@@ -197,8 +200,9 @@ def within_requirement(
     needed: Requirement,
     u_dot: FloatArray,
 ) -> Candidate[Controller]:
-    """The candidate of the least error whose measured margins meet a requirement; where the search
-    finds none, the candidate that lacks least.
+    """The candidate of the least error whose measured margins meet a requirement.
+
+    Where the search finds none, the candidate with the least shortage is taken.
 
     `build(slower, lower)` gives a controller with the integral slower by both factors, the
     bandwidth lower by the second, a factor a channel, (m,), 1 by the rule at the least. The error
@@ -228,8 +232,9 @@ class _Measured(NamedTuple, Generic[Controller]):
 
 
 class _Loops(Generic[Controller]):
-    """The loops of a search, each built and measured once. A place has the exponents of `slower`,
-    then those of `lower`.
+    """The loops of a search, built and measured once.
+
+    A place has the exponents of `slower`, then those of `lower`.
     """
 
     def __init__(
@@ -298,8 +303,10 @@ class _Loops(Generic[Controller]):
     def _fastest_integrals(
         self, assess: Assess[_Measured[Controller]]
     ) -> Trial[_Measured[Controller]]:
-        """The trial with the bandwidths of the rule and the fastest integrals with which each
-        channel has its own margins; by the rule in a channel without such an integral.
+        """The trial with the bandwidths of the rule and the fastest integrals within the margins.
+
+        Every channel has margins by itself. A channel without such an integral gets the integral by
+        the rule.
 
         All channels double and bisect their exponents at once, since channels couple little. Where
         the result lacks a margin, its channel gets a slower integral, step by step.

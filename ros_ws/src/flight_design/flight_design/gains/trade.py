@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What a phase margin costs: the error of the linear loop along a manoeuvre, for gains selected by
-several requirements.
+"""What a phase margin costs: the error of the linear loop along a manoeuvre.
+
+The gains are selected by several requirements.
 """
 
 import math
@@ -30,8 +31,9 @@ class TradeRow(NamedTuple):
 def trade(
     selection: Selection, phase_margins: Sequence[float] = TRADED_PHASE_MARGINS
 ) -> tuple[TradeRow, ...]:
-    """The engineering gains of a selection for other phase margins, deg, and their errors on the
-    nominal aircraft.
+    """The engineering gains of a selection for further phase margins, deg.
+
+    The errors are of the nominal aircraft.
     """
     nominal = _nominal(selection.study)
     rows = []

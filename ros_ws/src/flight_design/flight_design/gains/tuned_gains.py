@@ -45,8 +45,9 @@ def tuned_file(scenario: Scenario) -> Path:
 
 
 def load(path: Path) -> dict[str, dict[str, TuningResult]]:
-    """Tuned gains by law and objective; empty if there is no file. Raises ParameterError for an
-    unreadable file.
+    """Tuned gains by law and objective; empty if there is no file.
+
+    Raises ParameterError for an unreadable file.
     """
     if not path.exists():
         return {}
@@ -70,8 +71,9 @@ def _load(path: Path, _changed_ns: int) -> dict[str, dict[str, TuningResult]]:
 
 
 def find(scenario: Scenario, law: str, objective: str) -> TuningResult | None:
-    """The tuned gains of a law in a scenario, None without any. Raises ParameterError for an
-    unreadable file.
+    """The tuned gains of a law in a scenario, None without any.
+
+    Raises ParameterError for an unreadable file.
     """
     return load(tuned_file(scenario)).get(law, {}).get(objective)
 
@@ -79,10 +81,10 @@ def find(scenario: Scenario, law: str, objective: str) -> TuningResult | None:
 def save(
     path: Path, tuned: Mapping[str, Mapping[str, TuningResult]], order: Sequence[str], command: str
 ) -> None:
-    """Write tuned gains, costs and the tuning command; laws as in the catalogue first, objectives
-    as given.
+    """Write tuned gains, costs and the tuning command.
 
-    Raises ParameterError where the file cannot be written.
+    Laws are in the order of the catalogue first, objectives as given. Raises ParameterError where
+    the file cannot be written.
     """
     known = set().union(*tuned.values())
     objectives = [name for name in order if name in known]

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""From a channel map to gains without a model: the scenario of an experiment, and a scenario for
-the aircraft.
+"""From a channel map to gains without a model.
+
+The results are the scenario of an experiment, and a scenario for the aircraft.
 
 The experiment excites the inputs in turn, open loop. `identify_response` estimates Omega, lags and
 delays from the log. The airframe of the scenarios is y_dot = Omega u: nothing further is known of
@@ -103,8 +104,9 @@ def has_airspeed(channel_map: ChannelMap) -> bool:
 
 
 def require_envelope(channel_map: ChannelMap) -> None:
-    """Raise ParameterError for a map without limits of the speeds, and of a measured attitude:
-    nothing further guards.
+    """Raise ParameterError for a map without limits of the speeds, and of a measured attitude.
+
+    Nothing further guards.
     """
     needed: list[str] = [name for name in ("phi", "theta") if name in channel_map.pose]
     needed += [name for name, motion in motions(channel_map).items() if UNITS[motion] == "m/s"]
@@ -134,8 +136,9 @@ def experiment(
     airframe_file: str,
     wait: float = WAIT,
 ) -> Experiment:
-    """The experiment of a channel map: every input at `amplitude` of the smaller limit; `speed` in
-    trim, m/s, None in hover.
+    """The experiment of a channel map: every input at `amplitude` of the smaller limit.
+
+    `speed` in trim, m/s, None in hover.
     """
     pairing, sign = channel_pairs(channel_map)
     rows = [channel_map.inputs[name] for name in pairing.inputs]
@@ -182,8 +185,9 @@ WHOLE = 0.95  # of the planned duration: reports of the engagement are late by l
 
 
 def cut_short(flown: Sequence[Engagement], duration: float) -> str:
-    """When and why the bridge released before the end of an experiment, as a sentence; empty for a
-    whole one.
+    """When and why the bridge released before the end of an experiment, as a sentence.
+
+    Empty for a whole experiment.
 
     Arguments: the engagements of the log; the planned duration, s.
     """
@@ -203,8 +207,9 @@ def cut_short(flown: Sequence[Engagement], duration: float) -> str:
 def channel_models(
     channel_map: ChannelMap, tape: Tape, spans: Spans, speed: float | None
 ) -> list[ChannelModel | None]:
-    """The models of the channels of a map from the log of an experiment, engaged in `spans`; None
-    for no model.
+    """The models of the channels of a map from the log of an experiment; None for no model.
+
+    The aircraft is engaged in `spans`.
 
     Arguments: `speed` in trim, m/s, None in hover. V has no model without a measured climb: the
     phugoid, which thrust excites too, would be taken for a response to thrust. A climb in hover is
@@ -313,8 +318,9 @@ def join(
 
 
 def over_link(channels: Channels, link_delay: float) -> Channels:
-    """Channels identified from a log of the autopilot's board, as the law meets them over the link:
-    delay + link_delay, s.
+    """Channels identified from a log of the autopilot's board, as met by the law over the link.
+
+    Their delay is delay + link_delay, s.
     """
     return channels._replace(delay=channels.delay + link_delay)
 
@@ -322,8 +328,9 @@ def over_link(channels: Channels, link_delay: float) -> Channels:
 def measured_trims(
     channel_map: ChannelMap, would_send: Signal, engaged_ns: int
 ) -> dict[str, float]:
-    """The commands in trim by input, from what the bridge sent in the pause after an engagement,
-    when u was 0; SI.
+    """The commands in trim by input, SI.
+
+    They are what the bridge sent in the pause after an engagement, when u was 0.
     """
     stamps = (would_send.stamp_ns - engaged_ns) / NANOSECONDS
     still = (stamps > 0.2 * PAUSE) & (stamps < 0.8 * PAUSE)
@@ -345,10 +352,9 @@ def measured_trims(
 def within_range(
     channel_map: ChannelMap, trims: Mapping[str, float]
 ) -> tuple[ChannelMap, list[str]]:
-    """A map whose limits around trims stay in the ranges of the fields, and a sentence for each
-    narrower one.
+    """A map whose limits around trims stay in the ranges of the fields.
 
-    Raises ParameterError for a trim at a stop.
+    A narrower limit has a sentence. Raises ParameterError for a trim at a stop.
     """
     values = channel_map.model_dump(exclude_unset=True)
     sentences = []
@@ -379,8 +385,9 @@ def within_range(
 
 
 def map_text(channel_map: ChannelMap, trims: Mapping[str, float], source: str) -> str:
-    """The text of a channel map with measured trims. A captured trim is measured again at every
-    engagement.
+    """The text of a channel map with measured trims.
+
+    A captured trim is measured again at every engagement.
     """
     values = channel_map.model_dump(exclude_unset=True)
     values["source"] = f"{values['source']}; trims measured in {source}"

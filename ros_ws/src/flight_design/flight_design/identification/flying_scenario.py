@@ -201,10 +201,10 @@ class _Identified(NamedTuple):
 def _within_margins(
     controller: RiseDiConfig, study: Study, needed: Requirement
 ) -> tuple[RiseDiConfig, LoopMargins | None]:
-    """The controller with slower integrals and lower bandwidths where the loop around the airframe
-    of a study lacks margins; the margins.
+    """The controller with slower integrals and lower bandwidths where the loop lacks margins.
 
-    A bandwidth falls with the input scale: K of (22) stays.
+    The loop is around the airframe of a study. The margins are the second result. A bandwidth falls
+    with the input scale: K of (22) stays.
     """
     if controller.sampled_sign()[0] is not Sign.SOFT:
         return controller, None
@@ -230,8 +230,9 @@ def _within_margins(
 
 
 def _without_sideslip(channels: Channels, pairing: ChannelPairing) -> Channels:
-    """Channels of r with damping alone: the stiffness of a straight flight would skid in a
-    coordinated turn.
+    """Channels of r with damping alone.
+
+    The stiffness of a straight flight would skid in a coordinated turn.
 
     The stiffness of r is N_beta, and beta_dot = -r + g / V phi is 0 there: a rudder against the
     stiffness would skid.
@@ -268,8 +269,9 @@ def _with_integrals(
 
 
 def _integral(channels: Channels, i: int, crossover: float, total_lag: float) -> float:
-    """The integral of a channel, 1/s, for a crossover of the loop at `crossover`, rad/s, or the
-    largest safe integral below.
+    """The integral of a channel, 1/s, for a crossover of the loop at `crossover`, rad/s.
+
+    The largest safe integral is the upper bound.
     """
     omega = np.geomspace(0.1, 1e3, 400) * crossover
 

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The observer's Kalman filter over a recorded flight: y and u in equal periods, innovations of
-many models side by side.
+"""The observer's Kalman filter over a recorded flight.
+
+y and u come in equal periods, and the innovations of many models side by side.
 """
 
 from collections.abc import Iterable, Sequence
@@ -154,10 +155,9 @@ def delayed(u: FloatArray, periods: float) -> FloatArray:
 
 
 def measured_noise(y: FloatArray, size: FloatArray) -> FloatArray:
-    """Noise of each channel a sample, rms, from the third differences of y, shape (T, m): their
-    variance is 20 times that of y.
+    """Noise of each channel a sample, rms, from the third differences of y, shape (T, m).
 
-    At least MIN_NOISE of `size`, the unit of the channel.
+    Their variance is 20 times that of y. At least MIN_NOISE of `size`, the unit of the channel.
     """
     third = np.diff(y, n=3, axis=0)
     spread = np.nanmedian(np.abs(third), axis=0) / 0.6745  # of a normal distribution
@@ -188,8 +188,9 @@ class FilterBank(NamedTuple):
         )
 
     def lifted(self, level: int, seen: Sequence[bool]) -> FloatArray:
-        """HOLD periods as a step, (N, HOLD m + s, ..): from z, then y and u of the periods, then
-        sin(x) - x, to r and z.
+        """HOLD periods as a step, (N, HOLD m + s, ..).
+
+        The map leads from z, then y and u of the periods, then sin(x) - x, to r and z.
         """
         H = self.sampled.H
         Phi = self.sampled.Phi[:, 0]
@@ -260,8 +261,9 @@ class Passage:
     def run(
         self, z: FloatArray, first: int = 0, last: int | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """Innovations in some blocks, (N, periods, m), NaN where y is lost, from z, (N, s), on; and
-        z after them.
+        """Innovations in some blocks, (N, periods, m), from z, (N, s), on; and z afterwards.
+
+        They are NaN where y is lost.
         """
         (N, m, s), steps = self._shape, self._steps
         kind = self._kind[first:last]
@@ -297,13 +299,12 @@ def in_rolling_air(airframe: Airframe) -> Airframe:
 def wind_model(
     axes: Sequence[str], speed: float, span: float | None = None
 ) -> tuple[FloatArray, FloatArray]:
-    """Time constants, s, and noises, m/s per root s, of winds of first order like Dryden's moderate
-    turbulence, (G,) each.
+    """Time constants, s, and noises, m/s per root s, of winds of first order, (G,) each.
 
-    They have its spectrum at low and at high frequencies. With T = L / V0 that is 2 sigma^2 T / (1
-    + (T omega)^2) along the flight and sigma^2 T (1 + 3 (T omega)^2) / (1 + (T omega)^2)^2 across
-    it. The rotary gust in roll, rad/s, is that of `roll_gust`. Arguments: `speed` V0 and `span` in
-    SI.
+    The winds are like Dryden's moderate turbulence. They have its spectrum at low and at high
+    frequencies. With T = L / V0 that is 2 sigma^2 T / (1 + (T omega)^2) along the flight and
+    sigma^2 T (1 + 3 (T omega)^2) / (1 + (T omega)^2)^2 across it. The rotary gust in roll, rad/s,
+    is that of `roll_gust`. Arguments: `speed` V0 and `span` in SI.
     """
     spectrum = dryden(**MODERATE, sigma=0.0)
     along = np.array([axis == "longitudinal" for axis in AXES])
@@ -400,8 +401,9 @@ def filter_bank(
     span: float | None = None,
     shear: FloatArray | None = None,
 ) -> FilterBank:
-    """The filters of models with A (N, n, n), B (N, n, m) and wind (N, n, G) at the trim speed V0,
-    m/s, z = [x, w, v, a, ..].
+    """The filters of models with A (N, n, n), B (N, n, m) and wind (N, n, G).
+
+    They are at the trim speed V0, m/s, z = [x, w, v, a, ..].
 
         w_dot = v - w / wind_time + noise,  v_dot = a - v / GUST_TIME,
             a_dot = -a / RATE_TIME + noise
@@ -485,8 +487,9 @@ def _block(parts: Sequence[NDArray[np.int32]], label: np.int32) -> Block:
 
 
 def blocks(model: NominalModel) -> list[Block]:
-    """The parts of an aircraft that neither A, gravity, B, C nor the wind couple; one where a part
-    is not square.
+    """The parts of an aircraft that neither A, gravity, B, C nor the wind couple.
+
+    A single part where a part is not square.
     """
     (n, m), G = model.B.shape, model.wind.shape[1]
     coupled = np.zeros((n + 2 * m + G, n + 2 * m + G))

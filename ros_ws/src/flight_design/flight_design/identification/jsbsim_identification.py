@@ -130,8 +130,9 @@ class IdentifiedAircraft(NamedTuple):
 
     @property
     def failure(self) -> str:
-        """Reason of a failure, or "": every flight completes, and in calm air each error is below
-        its command.
+        """Reason of a failure, or "".
+
+        Without a failure every flight completes, and in calm air the errors are below the commands.
         """
         for title, flight in self.flights.items():
             if flight.outcome != str(COMPLETED):
@@ -160,8 +161,9 @@ def identify(
     needed: Requirement = REQUIREMENT,
     named: tuple[tuple[str, NamedProperties], ...] = (),
 ) -> IdentifiedAircraft:
-    """Identify an aircraft of JSBSim in a flight condition and select its gains; speed in m/s,
-    altitude in m.
+    """Identify an aircraft of JSBSim in a flight condition and select gains.
+
+    The speed is in m/s, the altitude in m.
 
     1. Trim, first in another process, and the airframe: `linearize`. 2. The pairing, with outputs
     in units of the manoeuvre, and D from the minors. 3. Gains by the engineering procedure for the
@@ -273,8 +275,9 @@ def airspeed_slew(bandwidth: float, effect: float) -> float:
 
 
 def _too_weak(linear: Linearization) -> str:
-    """The outputs whose own input, at full travel, moves the output less than a tenth of what
-    another input does, in sentences after a "; ".
+    """The outputs whose own input is too weak, in sentences after a "; ".
+
+    At full travel the own input moves the output less than a tenth of what a further input does.
     """
     inputs = linear.condition.inputs()
     reach = linear.Omega * linear.travel()
@@ -293,8 +296,9 @@ def _too_weak(linear: Linearization) -> str:
 
 
 def slowest_trim(condition: FlightCondition) -> float:
-    """The slowest airspeed at which an aircraft trims in level flight at an altitude, within 1 % of
-    the condition's, m/s.
+    """The slowest airspeed at which an aircraft trims in level flight at an altitude, m/s.
+
+    The error is at most 1 % of the condition's.
 
     Below it lift or thrust is not enough, so guidance takes it as the stall speed. By bisection,
     from 0.2 of the condition's.
@@ -312,8 +316,9 @@ def slowest_trim(condition: FlightCondition) -> float:
 
 
 def with_observer(selection: Selection, Omega: FloatArray, margin: float) -> Selection:
-    """The selection with an extended-state observer in its engineering gains; Omega in the
-    aircraft's order.
+    """The selection with an extended-state observer in its engineering gains.
+
+    Omega is in the aircraft's order.
     """
     controller = selection.chosen
     size = sizes(OUTPUTS[name] for name in controller.outputs)
@@ -334,8 +339,9 @@ def _in_law_order(Omega: FloatArray, controller: RiseDiConfig) -> FloatArray:
 def that_learns(
     selection: Selection, condition: FlightCondition, Omega: FloatArray, margin: float
 ) -> Selection:
-    """A selection with feedforward and observer of a sketch, not yet flying, and `learn`; Omega in
-    the aircraft's order.
+    """A selection with feedforward and observer of a sketch, not yet flying, and `learn`.
+
+    Omega is in the aircraft's order.
     """
     start = selection.chosen
     name = Path(condition.name).stem
@@ -376,8 +382,9 @@ def _integrators(linear: Linearization) -> Airframe:
 
 
 def airspeed_bandwidth(authority: float, lag: float) -> float:
-    """Bandwidth of V, rad/s, for an authority of the throttle (m/s^2) behind its lag (s): min(0.46
-    / total, authority / sigma).
+    """Bandwidth of V, rad/s, for an authority of the throttle (m/s^2) behind its lag (s).
+
+    The bandwidth is min(0.46 / total, authority / sigma).
 
     The airspeed holds the wind along the path itself. In moderate turbulence, sigma = 3.05 m/s rms,
     the throttle then moves by its authority rms; with more it goes from stop to stop, and V is off

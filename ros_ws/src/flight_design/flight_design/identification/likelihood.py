@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The likelihood of A and B over one block of a flight: innovations of the observer's filter at the
-levels of the wind.
+"""The likelihood of A and B over one block of a flight.
+
+The observer's filter gives the innovations at the levels of the wind.
 """
 
 from collections.abc import Sequence
@@ -65,8 +66,9 @@ def held_out(periods: int, span: int) -> NDArray[np.bool_]:
 
 
 class Innovations(NamedTuple):
-    """Innovations of one model over a recording, each span at the level of the wind that predicts
-    it best.
+    """Innovations of a model over a recording.
+
+    A span has the level of the wind with the best prediction.
     """
 
     r: FloatArray  # (T, m) in units of y, NaN where y is lost
@@ -83,8 +85,9 @@ class Normalised(NamedTuple):
 
 
 def normalised(r: FloatArray, covariance: FloatArray, place: NDArray[np.int64]) -> Normalised:
-    """Innovations r, (N, T, m), with covariances (N, levels, m, m); `place` is the level of a
-    sample among these, (T,).
+    """Normalised innovations r, (N, T, m), with covariances (N, levels, m, m).
+
+    `place` is the level of a sample among these, (T,).
     """
     root = np.linalg.cholesky(covariance)
     inverse = np.linalg.inv(root)
@@ -105,8 +108,9 @@ class Models(NamedTuple):
 
 
 class Unknown(NamedTuple):
-    """Standard deviations of what else is identified, 0: known; of B; and the noise of the
-    disturbances.
+    """Standard deviations of what else is identified, 0 where known.
+
+    The fields are the deviations of B, and the noise of the disturbances.
     """
 
     delay: float = 0.0  # s, of u
@@ -140,8 +144,9 @@ class Fit(NamedTuple):
 
 
 def units(model: NominalModel, *, coupled: bool = False) -> tuple[FloatArray, FloatArray]:
-    """Units of the errors of A and B, SI, 0 for an entry that is known: nominal values, and 0 in
-    the rows of angles.
+    """Units of the errors of A and B, SI, 0 for a known entry.
+
+    They are the nominal values, and 0 in the rows of angles.
 
     If `coupled`, an entry that is 0 has the unit COUPLING of the largest effect on its row, in
     units of motion; the columns of angles stay 0.
@@ -184,8 +189,9 @@ class Likelihood:
         *,
         coupled: bool = False,
     ) -> None:
-        """The prior of each error of A is PRIOR; `believe` replaces it. The delay of u is `delay`,
-        s, where it is known.
+        """The prior of each error of A is PRIOR; `believe` replaces it.
+
+        The delay of u is `delay`, s, where it is known.
 
         The starts of the search take means of `factor` periods, by default of the shortest lag. If
         `coupled`, the entries that are 0 are identified too.
@@ -258,8 +264,9 @@ class Likelihood:
         self._begin = slice(self._shear.stop, self._shear.stop + len(self._angles))
 
     def with_errors(self, thetas: FloatArray) -> NominalModel:
-        """The models of relative errors (N, p): A (N, n, n), B (N, n, m), and wind (N, n, G) that
-        acts by the model's own A.
+        """The models of relative errors (N, p): A (N, n, n), B (N, n, m), and wind (N, n, G).
+
+        The wind acts by the model's own A.
         """
         matrices = []
         parts = np.split(thetas, [np.count_nonzero(self._units[0]), self.count], axis=1)[:2]
@@ -278,8 +285,9 @@ class Likelihood:
     def models(
         self, thetas: FloatArray, levels: NDArray[np.int64], *, near: bool = False
     ) -> Models:
-        """The filters of theta, (N, p), at the winds of some levels; all may be `near` the first
-        theta.
+        """The filters of theta, (N, p), at the winds of some levels.
+
+        All may be `near` the first theta.
         """
         levels = np.unique(levels)
         strength = np.exp(thetas[:, self._winds])
@@ -365,8 +373,9 @@ class Likelihood:
         return normalised(r, models.bank.covariance, place)
 
     def passed(self, theta: FloatArray, levels: NDArray[np.int64]) -> Normalised:
-        """Innovations of a theta, (p,), at given levels, without a new passage after `levels` of
-        this theta.
+        """Innovations of a theta, (p,), at some levels.
+
+        There is no new passage after `levels` of this theta.
         """
         if (
             self._passed is not None
@@ -425,8 +434,9 @@ class Likelihood:
         ]
 
     def named(self) -> list[str]:
-        """Names of the parameters theta, (p,): those of the entries, the winds, the angles, the
-        delay.
+        """Names of the parameters theta, (p,).
+
+        The order is entries, winds, angles, delay.
         """
         angles = [self.names.states[k] for k in self._angles]
         names = [entry.name for entry in self.nominal_entries()]
@@ -436,8 +446,9 @@ class Likelihood:
         return names + others[: len(self.prior) - len(names)]
 
     def model_errors(self, airframe: Airframe) -> FloatArray:
-        """Theta, (p,), of a model in the winds and with the delay of theta = 0, within the
-        bounds.
+        """Theta, (p,), of a model in the winds and with the delay of theta = 0.
+
+        Theta is within the bounds.
         """
         A = airframe.matrix_a()
         B = airframe.matrix_b()
@@ -463,8 +474,9 @@ class Likelihood:
         ]
 
     def strange_air(self, fit: Fit) -> str:
-        """The state that the slope of the wind moves most, if by the bound of the search: the wind
-        then stands for another aircraft.
+        """The state that the slope of the wind moves most, if by the bound of the search.
+
+        The wind then stands for a different aircraft.
         """
         effects = np.abs(fit.theta[self._shear])
         bounds = self._upper[self._shear]
@@ -488,10 +500,10 @@ class Likelihood:
         return self.known() & ~held_out(len(self._y), self._spans[0].stop)
 
     def _counted(self, theta: FloatArray, levels: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Mask of the samples to count, (T,): not of spans without a level to explain them, nor of
-        gusts if these are FEW.
+        """Mask of the samples to count, (T,).
 
-        RECOVERY spans afterwards do not count either.
+        Spans without an explaining level do not count, nor gusts if these are FEW. RECOVERY spans
+        afterwards do not count either.
         """
         _, (e,), _ = self.passed(theta, levels)
         square = np.array(
@@ -509,8 +521,9 @@ class Likelihood:
     def _costs(
         self, innovations: Normalised, used: NDArray[np.bool_], thetas: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Costs of some models, the normalised innovations used, (N, samples, m), and their sum log
-        det S / 2.
+        """Costs of some models, the normalised innovations used, and their sum log det S / 2.
+
+        The innovations are (N, samples, m).
         """
         e = innovations.e[:, used]
         total = np.sum(innovations.half_log_det[:, used], axis=1)

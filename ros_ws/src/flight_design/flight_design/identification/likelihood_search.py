@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The search of the most probable A and B of one block: Gauss-Newton with damping, from several
-starts.
+"""The search of the most probable A and B of one block.
+
+The method is Gauss-Newton with damping, from several starts.
 """
 
 from collections.abc import Callable, Iterable
@@ -55,8 +56,9 @@ class Search(Likelihood):
         begin: FloatArray | None = None,
         flown: FloatArray | None = None,
     ) -> Fit:
-        """The theta that minimises N/2 sum_i log mean r_i^2 + sum log det S / 2 + |theta / prior|^2
-        / 2 where `used`, (T,).
+        """The theta of the least cost where `used`, (T,).
+
+        The cost is N/2 sum_i log mean r_i^2 + sum log det S / 2 + |theta / prior|^2 / 2.
 
         r are the normalised innovations, S their covariance, N the number of samples. The cost has
         further minima: a wrong wind explains a wrong model. So the search begins several times,
@@ -80,8 +82,9 @@ class Search(Likelihood):
         return self._fit_at(min(best, steady, key=lambda end: end.cost), same, used, flown)
 
     def fit_alike(self, used: NDArray[np.bool_], flown: FloatArray | None = None) -> Fit | None:
-        """The minimum of `fit` in air that is the same in every span, from one start: the model
-        that has `flown`, or the nominal one, in moderate turbulence.
+        """The minimum of `fit` in air as in every span, from a single start.
+
+        The start is the model that has `flown`, or the nominal one, in moderate turbulence.
 
         None where fewer than ALIKE of the spans have the same level.
         """
@@ -103,8 +106,9 @@ class Search(Likelihood):
         used: NDArray[np.bool_],
         flown: FloatArray | None,
     ) -> Fit:
-        """The fit at the end of a search, other models at their best levels: those by theta, or the
-        `same` one in all spans where it costs less.
+        """The fit at the end of a search, further models at their best levels.
+
+        These are the levels by theta, or the `same` level in every span where the cost is less.
         """
         theta = best.theta
         deviation = np.sqrt(np.diag(np.linalg.inv(best.hessian)))
@@ -147,8 +151,9 @@ class Search(Likelihood):
     def _started(
         self, theta: FloatArray, levels: NDArray[np.int64] | None, *, winds: bool
     ) -> FloatArray:
-        """Theta, (p,), after steps on means over the shortest lag, with the level of a span by
-        theta or with `levels`. `winds`: whether their strengths are free.
+        """Theta, (p,), after steps on means over the shortest lag.
+
+        The level of a span is by theta or from `levels`. `winds`: whether their strengths are free.
         """
         free = np.ones(len(theta), dtype=bool)
         free[self._winds] = winds
@@ -170,8 +175,10 @@ class Search(Likelihood):
         used: NDArray[np.bool_],
         unsettled: int = 1,
     ) -> End:
-        """The end of the search from a start, with the levels of the spans by theta or given. Every
-        span counts in the first step and in `unsettled` further steps, which never end the search.
+        """The end of the search from a start.
+
+        The level of a span is by theta, or from `levels`. Every span counts in the first step and
+        in `unsettled` further steps, which never end the search.
         """
         for iteration in range(STEPS):
             self.progress()
@@ -192,8 +199,9 @@ class Search(Likelihood):
         used: NDArray[np.bool_],
         free: NDArray[np.bool_],
     ) -> tuple[FloatArray, FloatArray, float]:
-        """Theta after a step of Gauss-Newton with damping, the Hessian before, and by how much the
-        cost is less.
+        """Theta after a step of Gauss-Newton with damping, and the Hessian before.
+
+        The third result is by how much the cost is less.
 
         The derivatives are differences, the filters side by side. The Hessian is J'J + prior^-2,
         with J the derivatives of the innovations over their rms. Source: L. Ljung, "System
@@ -233,8 +241,9 @@ class Search(Likelihood):
         return best, hessian, progressed
 
     def flying(self, flown: FloatArray, parts: Iterable[tuple[Likelihood, Fit]]) -> Innovations:
-        """The innovations of a model that flies, theta (p,), with winds, angles and delays of
-        parts.
+        """The innovations of a model that flies, theta (p,).
+
+        Winds, angles and delays come from the parts.
         """
         theta = np.where(self._errors, flown, self.joined(parts))
         return self.predicted(theta, self.levels(theta))
@@ -261,11 +270,10 @@ def damped_steps(
     upper: FloatArray,
     free: NDArray[np.bool_],
 ) -> FloatArray:
-    """Steps -(hessian + d diag hessian)^-1 slope for every damping d, and fractions of the first,
-    (k, p).
+    """Damped steps -(hessian + d diag hessian)^-1 slope, and fractions of the first, (k, p).
 
-    Only the free parameters move, mask (p,), and none outwards at its bound. Source: D. W.
-    Marquardt, J. SIAM 11(2), 1963.
+    A damping d has a step. Only the free parameters move, mask (p,), and none outwards at its
+    bound. Source: D. W. Marquardt, J. SIAM 11(2), 1963.
     """
     steps = np.zeros((len(DAMPINGS), len(theta)))
     while True:

@@ -47,8 +47,9 @@ Stamps = NDArray[np.int64]
 
 
 class Window(NamedTuple):
-    """What is taken of a log, s since its first sample of the output `instant`; None: the flight
-    that is found.
+    """What is taken of a log, s since its first sample of the output `instant`.
+
+    None: the flight that is found.
     """
 
     start: float | None
@@ -56,8 +57,9 @@ class Window(NamedTuple):
 
 
 class Imported(NamedTuple):
-    """The tape of a log, the parameters of the autopilot at the first sample, and sentences on what
-    stays unknown.
+    """The tape of a log, and what is known of its autopilot.
+
+    The parameters of the autopilot are from the first sample. Sentences name what stays unknown.
     """
 
     tape: Tape
@@ -144,8 +146,9 @@ def _speed(
     stamps: Stamps,
     servos: bool,
 ) -> FloatArray | None:
-    """The airspeed, or a multicopter's thrust, as evidence of flight; None where the map has
-    neither.
+    """The airspeed, or a multicopter's thrust, as evidence of flight.
+
+    None where the map has neither.
     """
     for name, row in channel_map.outputs.items():
         if row.motion[0] == "V":
@@ -221,8 +224,9 @@ def _messages(log: VehicleLog, quantity: str) -> str:
 
 
 class _Reader(NamedTuple):
-    """The command of an input: SI = line(raw). The raw value of the map's field comes from the
-    pulse of a stick or a servo.
+    """The command of an input: SI = line(raw).
+
+    The raw value of the map's field comes from the pulse of a stick or a servo.
     """
 
     log: VehicleLog
@@ -296,8 +300,9 @@ def _commands(
 
 
 def _torque(log: VehicleLog, name: str, row: InputRow, servos: bool) -> _Reader:
-    """The output of a multicopter's rate controller: no mode has sticks that are commands. It is
-    normalised as PX4's.
+    """The output of a multicopter's rate controller: no mode has sticks that are commands.
+
+    It is normalised as PX4's.
     """
     quantity, sign = row.motion
     sources = log.format.torques.get(quantity, ()) if log.format else ()
@@ -320,8 +325,9 @@ def _torque(log: VehicleLog, name: str, row: InputRow, servos: bool) -> _Reader:
 def _flight(
     log: VehicleLog, stamps: Stamps, speed: FloatArray | None, window: Window, *, needs_manual: bool
 ) -> tuple[int, int]:
-    """First and last instant that are taken: the window, or the longest stretch in the air, for
-    sticks in MANUAL.
+    """First and last instant that are taken.
+
+    The window is taken, or the longest stretch in the air, for sticks in MANUAL.
     """
     start_ns = int(stamps[0])
     keep = np.ones(len(stamps), dtype=bool)

@@ -28,8 +28,9 @@ CLIMB_START = 30.0
 
 
 def moderate_turbulence(altitude: float) -> dict[str, Any]:
-    """Parameters of moderate turbulence at an altitude, m; at high altitude the intensity is 10
-    ft/s.
+    """Parameters of moderate turbulence at an altitude, m.
+
+    At high altitude the intensity is 10 ft/s.
     """
     values: dict[str, Any] = {"altitude": max(altitude, LOWEST), "seed": 1}
     if altitude < HIGH:
@@ -66,8 +67,9 @@ class ManoeuvreResult(NamedTuple):
 def fly_all(
     scenario: Scenario, progress: Callable[[str], None] = lambda _: None
 ) -> dict[str, ManoeuvreResult]:
-    """Fly a scenario of `identify` three times: "calm", with its "gust", and in moderate
-    "turbulence" without the gust.
+    """Fly a scenario of `identify` three times.
+
+    The flights are "calm", with its "gust", and in moderate "turbulence" without the gust.
     """
     turbulence = moderate_turbulence(scenario.aircraft.flight_condition().altitude)
     flights = {}

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Identification of A and B from the log of one flight: maximum a posteriori over the innovations
-of the observer's filter.
+"""Identification of A and B from the log of one flight.
+
+The estimate is maximum a posteriori over the innovations of the observer's filter.
 
 It takes y and u alone, u after its limits. Two of three seconds fit the model, and every third one,
 held out, validates it. The scale of alpha or beta cannot be told from y; such entries stay near
@@ -304,8 +305,9 @@ def joined(parts: Sequence[Innovations], blocks: Sequence[Block]) -> Innovations
 
 
 def model_yaml(identified: Identification, origin: str) -> str:
-    """The identified airframe as the text of an airframe file. The header has its origin, held-out
-    figures and deviations.
+    """The identified airframe as the text of an airframe file.
+
+    The header has its origin, held-out figures and deviations.
     """
     lines = [f"The airframe {identified.airframe.name}, with A and B identified from {origin}.", ""]
     lines.append(

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How well a model predicts held-out samples, and the reasons against a model, each a sentence, or
-empty.
+"""How well a model predicts held-out samples, and the reasons against a model.
+
+A reason is a sentence, or empty.
 """
 
 from collections.abc import Iterable
@@ -48,8 +49,9 @@ def prediction(innovations: Innovations, held_out: NDArray[np.bool_]) -> Predict
 
 
 def whiteness(e: FloatArray, held_out: NDArray[np.bool_]) -> FloatArray:
-    """Mean of n_k rho_k^2 over the lags k = 1 .. LAGS, (m,), rho_k the autocorrelation of n_k pairs
-    of held-out samples.
+    """Mean of n_k rho_k^2 over the lags k = 1 .. LAGS, (m,).
+
+    rho_k is the autocorrelation of n_k pairs of held-out samples.
 
     It is 1 for white noise, with a standard deviation of sqrt(2 / LAGS). Arguments: e (T, m),
     held_out (T,). Source: G. M. Ljung, G. E. P. Box, Biometrika 65(2), 1978, here for the pairs
@@ -59,8 +61,9 @@ def whiteness(e: FloatArray, held_out: NDArray[np.bool_]) -> FloatArray:
 
 
 def correlation(e: FloatArray, before: FloatArray, used: NDArray[np.bool_]) -> FloatArray:
-    """Mean of n_k rho_k^2 over the lags k = 1 .. LAGS, (m, k), rho_k the correlation of e with what
-    was k samples `before`.
+    """Mean of n_k rho_k^2 over the lags k = 1 .. LAGS, (m, k).
+
+    rho_k is the correlation of e with what was k samples `before`.
 
     It is 1 for independent white noises. Arguments: e (T, m), before (T, k), `used` (T,), mask of n
     samples.
@@ -108,8 +111,9 @@ def best_known(entries: Iterable[Entry], outputs: Iterable[str]) -> list[Entry]:
 
 
 def too_little_excitation(entries: Iterable[Entry], outputs: Iterable[str]) -> str:
-    """The output whose inputs are known worst, if the best known effect on it has a deviation above
-    MAX_DEVIATION.
+    """The output whose inputs are known worst, or empty.
+
+    The best known effect there has a deviation above MAX_DEVIATION.
     """
     worst = max(best_known(entries, outputs), key=lambda effect: effect.deviation)
     if worst.deviation <= MAX_DEVIATION:
@@ -157,8 +161,9 @@ def _minor_signs(Omega: FloatArray) -> list[float]:
 
 
 def other_signs(nominal: Airframe, identified: Airframe, channels: ChannelPairing) -> str:
-    """D of the law where the identified model has another: D follows from the signs of the leading
-    minors of C B.
+    """D of the law where the identified model has a different D.
+
+    D follows from the signs of the leading minors of C B.
     """
     columns = [list(nominal.inputs).index(name) for name in channels.inputs]
     order = np.ix_([nominal.outputs.index(name) for name in channels.outputs], columns)
@@ -173,8 +178,9 @@ def other_signs(nominal: Airframe, identified: Airframe, channels: ChannelPairin
 
 
 def no_better(before: Prediction, after: Prediction) -> str:
-    """Whether the model does not predict the held-out samples better, or neither with white nor
-    with whiter innovations.
+    """A sentence where the model does not predict the held-out samples better.
+
+    There is a sentence too where the innovations are neither white nor whiter.
     """
     if after.log_likelihood <= before.log_likelihood:
         return (

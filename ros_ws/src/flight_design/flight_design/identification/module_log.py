@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A flight of the exported controller inside PX4, from the topic rise_di_status of a ULog: the
-ticks as `internals`, so that replay computes them again.
+"""A flight of the exported controller inside PX4, from the topic rise_di_status of a ULog.
+
+The ticks become `internals`, and replay computes the ticks again.
 """
 
 from collections.abc import Mapping

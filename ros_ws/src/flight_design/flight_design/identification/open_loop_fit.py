@@ -76,8 +76,9 @@ class ChannelModel(NamedTuple):
 
     @property
     def usable(self) -> bool:
-        """Whether gain and phase of the loop are certain, and a feedforward can fly the zero: noise
-        may be as large as y.
+        """Whether gain and phase of the loop are certain, and a feedforward can fly the zero.
+
+        Noise may be as large as y.
         """
         gain, phase = self.at_loop_frequency()
         is_certain = gain.is_certain and phase.deviation <= 1.0 / MIN_CERTAINTY
@@ -169,8 +170,9 @@ def fit_channel(
 
 
 def _decay(t: FloatArray, damping: float) -> FloatArray:
-    """Beside a constant and t: the decay of a first value, exp(-damping t), or t^2 for a damping of
-    0.
+    """The third function of time beside a constant and t.
+
+    The function is the decay of a first value, exp(-damping t), or t^2 for a damping of 0.
     """
     x = damping * t
     return np.where(x > 1e-4, (np.expm1(-x) + x) / max(damping, 1e-9) ** 2, 0.5 * t**2)
@@ -185,8 +187,9 @@ def _has_zero_of_its_own(theta: FloatArray) -> bool:
 def _simulated(
     t: FloatArray, t_u: FloatArray, impulse: FloatArray, theta: FloatArray
 ) -> FloatArray:
-    """Output of the model from rest at the instants t, (N,). `impulse` is the integral of u, held
-    between t_u.
+    """Output of the model from rest at the instants t, (N,).
+
+    `impulse` is the integral of u, held between t_u.
     """
     delay, lag, Omega, damping, stiffness, slow = theta
     grid = np.arange(0.0, t[-1] + 2.0 * STEP, STEP)
@@ -221,8 +224,9 @@ def _search(residuals: Any, values: FloatArray, order: int, amplitude: float) ->
 
 
 def _model(fit: Any, misfit: float, period: float) -> ChannelModel:
-    """Standard errors with the correlation of the output error. Source: L. Ljung, 9.4 (coloured
-    errors).
+    """The model of a fit, with standard errors by the correlation of the output error.
+
+    Source: L. Ljung, 9.4 (coloured errors).
     """
     e = fit.fun
     lags = max(round(CORRELATION / period), 1)

@@ -53,8 +53,9 @@ MENDS = {  # by a part of the name of the parameter; no mend reverses what the p
 
 
 class Stick(NamedTuple):
-    """What a map says of an input and of the transmitter's channel. `trim_line` turns the pulse,
-    us, into the raw value.
+    """What a map says of an input and of the transmitter's channel.
+
+    `trim_line` turns the pulse, us, into the raw value.
     """
 
     axis: str  # ROLL, PITCH, THROTTLE or YAW
@@ -86,8 +87,9 @@ class Stick(NamedTuple):
         }
 
     def raw(self, deflection: FloatArray) -> FloatArray:
-        """The raw value of a part of full deflection: -1 to 1 about the middle, for a throttle 0 to
-        1 from the lower end.
+        """The raw value of a part of full deflection.
+
+        The part is -1 to 1 about the middle, for a throttle 0 to 1 from the lower end.
         """
         low, high = self.raw_range
         part = (1.0 + self.raw_sign * deflection) / 2.0 if self.is_centred else deflection
@@ -95,8 +97,9 @@ class Stick(NamedTuple):
 
 
 def stick_of(channel_map: ChannelMap, name: str) -> Stick:
-    """What a map says of the channel of an input. Raises ParameterError for an input without a
-    channel.
+    """What a map says of the channel of an input.
+
+    Raises ParameterError for an input without a channel.
     """
     row = channel_map.inputs[name]
     trim = channel_map.trims.get(name)
@@ -134,8 +137,9 @@ class Servo(NamedTuple):
 
 
 def servo_of(stick: Stick, name: str, values: Mapping[str, float]) -> Servo:
-    """The first servo with the function of an input. `values`: the parameters at the samples.
-    Raises ParameterError.
+    """The first servo with the function of an input.
+
+    `values`: the parameters at the samples. Raises ParameterError.
     """
     function = FUNCTIONS[stick.axis]
     outputs = [
@@ -221,10 +225,10 @@ def require_agreement(name_of_map: str, rows: Iterable[Agreement]) -> str:
 
 
 def changes(recorded: Parameters, start_ns: int, first_ns: int, last_ns: int) -> list[str]:
-    """Sentences on the decisive parameters that change before or after the samples from `first_ns`
-    to `last_ns`.
+    """Sentences on the decisive parameters that change beside the samples.
 
-    `start_ns` is the begin of the log. Raises ParameterError for a change between the samples.
+    They change before `first_ns` or after `last_ns`, the first and the last sample. `start_ns` is
+    the begin of the log. Raises ParameterError for a change between the samples.
     """
     between = []
     outside = []

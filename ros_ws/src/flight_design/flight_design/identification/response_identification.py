@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Input-output response of an aircraft from a log of y and u: Omega, lags and delays with standard
-errors, without a model.
+"""Input-output response of an aircraft from a log of y and u, without a model.
+
+Omega, lags and delays have standard errors.
 
 A predictor of every sample of y from earlier samples and from u is fitted by least squares, long
 enough to include the disturbances. The step response of the predictor is the step response of the
@@ -67,8 +68,9 @@ Spans = Sequence[tuple[int, int]]
 
 
 class Response(NamedTuple):
-    """Response of m outputs to m inputs, output i driven by input i; SI. A refused channel has a
-    row of NaN in the results.
+    """Response of m outputs to m inputs, output i driven by input i; SI.
+
+    A refused channel has a row of NaN in the results.
 
     y_i_dot = sum_j Omega_ij v_j + slower terms,   lag_j v_j_dot = u_j(t - delay_j) - v_j
     """
@@ -115,8 +117,9 @@ def identify_response(
     excitation: Signal | None = None,
     engaged: Spans | None = None,
 ) -> Response:
-    """Omega, lag and delay of every channel of a log, with standard errors, or a refusal of the
-    channel.
+    """Omega, lag and delay of every channel of a log, or a refusal of the channel.
+
+    They have standard errors.
 
     Arguments: `y`, `u` (after limits) at their stamps of a clock, regular or not; `outputs` and
     `inputs` the channels in pairs; `excitation` what moves u from outside in a closed loop, such as
@@ -156,8 +159,9 @@ def identify_response(
 
 
 class Layout(NamedTuple):
-    """What the predictor of y(k) has: samples of y and windows of samples before k, ends in sample
-    periods.
+    """What the predictor of y(k) has: samples of y and windows of samples before k.
+
+    Ends are in sample periods.
     """
 
     period: float  # s, of y
@@ -191,11 +195,10 @@ class Layout(NamedTuple):
         return np.asarray(np.exp(-self.period * np.array(middles) / MEMORY))
 
     def u_root(self) -> FloatArray:
-        """Root of the covariance of the coefficients of u before the fit, relative: they are smooth
-        and decay.
+        """Root of the covariance of the coefficients of u before the fit, relative.
 
-        The kernel is exp(-max(s, t) / MEMORY) over window times s and t. Source: T. Chen, H.
-        Ohlsson, L. Ljung, Automatica 48, 2012.
+        They are smooth and decay. The kernel is exp(-max(s, t) / MEMORY) over window times s and t.
+        Source: T. Chen, H. Ohlsson, L. Ljung, Automatica 48, 2012.
         """
         ends = np.array(self.u_windows)
         late = self.period * np.mean(ends, axis=1)
@@ -259,10 +262,9 @@ class _Predictor(NamedTuple):
     roots: FloatArray  # (m, m lags, m lags) roots of the covariance of each column
 
     def step_responses(self) -> FloatArray:
-        """Responses of every output to a unit step of every input, (1 + DRAWS, K, m, m): the
-        estimate, then draws.
+        """Responses of every output to a unit step of every input, (1 + DRAWS, K, m, m).
 
-        At K whole periods after the step, up to HORIZON.
+        The estimate comes first, then draws. At K whole periods after the step, up to HORIZON.
         """
         m = self.coefficients.shape[1]
         layout = self.layout
@@ -324,8 +326,9 @@ def _fit(rows: Sequence[_Rows], layout: Layout, m: int) -> _Predictor:
 
 
 def explained(signal: Signal, names: Sequence[str], excitation: Signal, spans: Spans) -> FloatArray:
-    """Share of the variance of the channels explained by the excitation, (k,); 1 without
-    disturbances.
+    """Share of the variance of the channels explained by the excitation, (k,).
+
+    The share is 1 without disturbances.
 
     The channel is a sum of means of the excitation over windows before, up to LOOP_MEMORY. FOLDS
     parts of the flight are predicted with coefficients from the rest. Source of the
@@ -445,8 +448,9 @@ def _refusal(output: str, name: str, column: Column, j: int, still: str, share: 
 
 
 def _too_little_share(output: str, name: str, share: float) -> str:
-    """The share is P / (P + Q) with P the power of the excitation and Q the power of the
-    disturbances.
+    """The sentence on a channel with too little share of the excitation.
+
+    The share is P / (P + Q) with P the power of the excitation and Q the power of the disturbances.
     """
     factor = math.sqrt((1.0 - share) / max(share, 0.05) / (1.0 / MIN_SHARE - 1.0))
     excited = (

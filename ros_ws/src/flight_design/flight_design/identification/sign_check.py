@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Sign check: D of the controller against the signs of a channel map, an airframe and a recorded
-flight.
+"""Sign check: D of the controller against what moves the aircraft.
+
+A channel map, an airframe and a recorded flight have signs.
 """
 
 from collections.abc import Iterable, Sequence
@@ -54,8 +55,9 @@ class SignCheck(NamedTuple):
 
 
 def require_signs(channel_map: ChannelMap, scenario: Scenario) -> None:
-    """Raise ParameterError if a map contradicts the D of a scenario's controller, for the
-    scenario's airframe.
+    """Raise ParameterError if a map contradicts the D of a scenario's controller.
+
+    The check is for the scenario's airframe.
     """
     contradictions = check_scenario(
         channel_map, scenario, load_airframe(scenario.aircraft.airframe), None
@@ -71,10 +73,10 @@ def check_scenario(
     bag: Path | None,
     namespace: str | None = None,
 ) -> SignCheck:
-    """Check a channel map against a scenario's controller, for an airframe and optionally a
-    recorded flight.
+    """Check a channel map against a scenario's controller, for an airframe.
 
-    `namespace` selects the aircraft of a log with several.
+    A recorded flight, if any, is checked too. `namespace` selects the aircraft of a log with
+    several.
     """
     controller = scenario.controller
     outputs = controller.outputs
@@ -114,8 +116,9 @@ def recorded_response(
     namespace: str | None = None,
     channel_map: ChannelMap | None = None,
 ) -> Response:
-    """Response of the aircraft in a log, from the time of an acting u: the whole flight, or the
-    engagements of a bridge.
+    """Response of the aircraft in a log, from the time of an acting u.
+
+    The time is the whole flight, or the engagements of a bridge.
 
     y_m excites the loop of a flight under a law. Without y_m, and under the law `excitation`, u
     itself is the excitation. Raises ParameterError for a log without y and u, for a bridge without
@@ -171,8 +174,9 @@ def check(
     D: tuple[int, ...],
     measured: Response | None = None,
 ) -> SignCheck:
-    """D of diag(output signs) Omega diag(input signs) against the controller's, and against a
-    recorded flight.
+    """D of diag(output signs) Omega diag(input signs) against the controller's.
+
+    A recorded flight is compared too.
 
     Arguments: Omega = C B of the airframe, (m, m), in the map's order; the channels and D in the
     controller's. Raises ParameterError if the map does not fit the airframe, or if Omega has no D.
@@ -227,8 +231,9 @@ def check_effectors(
     effectors: tuple[str, ...],
     effect: FloatArray,
 ) -> SignCheck:
-    """The sign of each effector against `effect` of an allocation, (m, p), in the output that the
-    effector moves most.
+    """The signs of the effectors against `effect` of an allocation, (m, p).
+
+    The output with the largest motion by an effector decides.
 
     `Omega` as in `check`, (m, p). An output counts by the largest effect on it. D of a channel is
     the sign of its effect.
@@ -267,8 +272,9 @@ def _places(names: Iterable[str], among: Iterable[str]) -> list[int]:
 
 
 def output_signs(channel_map: ChannelMap) -> FloatArray:
-    """+1 for an output with the sign of the stack (q nose up, p roll right, r nose right, V faster,
-    climb up), otherwise -1.
+    """+1 for an output with the sign of the stack, otherwise -1.
+
+    The signs of the stack are q nose up, p roll right, r nose right, V faster, climb up.
 
     Shape (m,) in the map's order. The motion of a row says what a channel of another name is.
     Raises ParameterError where the motion of q, p, r or V is that of another channel, and for two
@@ -315,8 +321,9 @@ def input_signs(channel_map: ChannelMap, Omega: FloatArray) -> FloatArray:
 
 
 def through(channel_map: ChannelMap, Omega: FloatArray) -> FloatArray:
-    """Omega between the channels of the map: diag(output signs) Omega diag(input signs), shape (m,
-    m).
+    """Omega between the channels of the map, shape (m, m).
+
+    The result is diag(output signs) Omega diag(input signs).
     """
     return output_signs(channel_map)[:, None] * Omega * input_signs(channel_map, Omega)
 

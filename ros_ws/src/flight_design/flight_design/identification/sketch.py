@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The sketch of an aircraft without an airframe file: a rough model from Omega and the trim speed,
-for a learner.
+"""The sketch of an aircraft without an airframe file.
+
+A sketch is a rough model from Omega and the trim speed, for a learner.
 """
 
 from collections.abc import Sequence
@@ -33,8 +34,9 @@ turbulence."""
 def sketch(
     name: str, Omega: FloatArray, outputs: Sequence[str], inputs: Sequence[str], speed: float
 ) -> Airframe:
-    """A rough airframe with the zeros of a rigid symmetric aircraft, from Omega = C B and the trim
-    speed V0, m/s.
+    """A rough airframe with the zeros of a rigid symmetric aircraft.
+
+    The model comes from Omega = C B and the trim speed V0, m/s.
 
         V_dot     = -0.26 n V + Omega_V u                          n = g / V0
         alpha_dot = -11 n alpha + q                                lift slope over lift coefficient
@@ -134,8 +136,10 @@ def with_sketch(
     noise: FloatArray,
     margin: float,
 ) -> RiseDiConfig:
-    """A controller with feedforward and observer of a sketch, not yet flying; Omega (m, m) and
-    `noise`, (m,), in the law's order, `margin` the least delay margin, s. Raises ParameterError.
+    """A controller with feedforward and observer of a sketch, not yet flying.
+
+    Omega (m, m) and `noise`, (m,), are in the law's order, `margin` is the least delay margin, s.
+    Raises ParameterError.
     """
     rough = sketch(name, Omega, start.outputs, start.inputs, speed)
     model = model_for(rough, start, noise)

@@ -55,10 +55,9 @@ def no_column(m: int) -> Column:
 def second_order(
     t: FloatArray, delay: float, lag: float, damping: float, stiffness: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Step responses y of y'' + damping y' + stiffness y = v' and = v, from rest, with lag v' = u(t
-    - delay) - v.
+    """Step responses y of y'' + damping y' + stiffness y = v' and = v, from rest.
 
-    Shapes (N,).
+    lag v' = u(t - delay) - v. Shapes (N,).
     """
     begin = np.maximum(t - delay, 0.0)
     # z, z', v; y = z' or z
@@ -75,8 +74,9 @@ def second_order(
 
 
 def fitted_column(t: FloatArray, responses: FloatArray, j: int) -> Column:
-    """Delay, lag and Omega_jj of input j from output j, then Omega_ij of the further outputs with
-    this delay and lag.
+    """Delay, lag and Omega_jj of input j from output j, then Omega_ij of the further outputs.
+
+    These have the same delay and lag.
 
     Arguments: t (N,); responses (1 + DRAWS, N, m), the estimate first.
     """
@@ -125,8 +125,9 @@ def begins_with_Omega(t: FloatArray, theta: FloatArray) -> bool:  # noqa: N802 -
 
 
 def _significance(t: FloatArray, responses: FloatArray, theta: FloatArray, size: float) -> float:
-    """Chi squared of no response against the fitted response, up to EARLY after delay and lag, less
-    the parameters.
+    """Chi squared of no response against the fitted response, less the parameters.
+
+    Time counts up to EARLY after delay and lag.
     """
     early = t <= theta[0] + theta[1] + EARLY
     first, second = second_order(t[early], *theta[[0, 1, 3, 4]])
@@ -142,10 +143,9 @@ def _significance(t: FloatArray, responses: FloatArray, theta: FloatArray, size:
 
 
 def _whitener(responses: FloatArray) -> FloatArray:
-    """W with W (s - true s) of covariance I, (N, N), of responses (1 + DRAWS, N), to FLOOR of the
-    largest value.
+    """W with W (s - true s) of covariance I, (N, N), of responses (1 + DRAWS, N).
 
-    0 for the responses of a constant output.
+    W is exact to FLOOR of the largest value. 0 for the responses of a constant output.
     """
     values, vectors = np.linalg.eigh(np.atleast_2d(np.cov(responses[1:].T)))
     floor = (FLOOR * np.max(np.abs(responses[0]))) ** 2 + RANK * values[-1]
