@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The bridge node: the unchanged controller flies a simulated autopilot through the map
-examples/maps/ardupilot_2024.yaml.
+"""The bridge node: the unchanged controller flies a simulated autopilot through a map.
 
-tests/ros/autopilot.py is no autopilot. These tests show that frames, signs, rates and engagement
-agree with the map, not that the map agrees with ArduPilot.
+The map is examples/maps/ardupilot_2024.yaml. tests/ros/autopilot.py is no autopilot. These tests
+show that frames, signs, rates and engagement agree with the map, not that the map agrees with
+ArduPilot.
 """
 
 import math
@@ -97,8 +97,9 @@ class Setup:
         return seconds(self.world.clock.now_ns - self.begin_ns)
 
     def start(self, **changes: Any) -> Any:
-        """Start the bridge with the map after some changes of it: of a key, or of the keys of a
-        row.
+        """Start the bridge with the map after some changes of it.
+
+        A change is of a key, or of the keys of a row.
         """
         content = yaml.safe_load(self.map.read_text())
         for key, value in changes.items():
@@ -462,8 +463,9 @@ def test_max_engaged_is_announced_and_then_releases(setup: Setup) -> None:
 def test_stale_u_sends_neutral_then_release_values_then_nothing_each_for_its_time(
     setup: Setup,
 ) -> None:
-    """The publisher of u stays alive and u returns: the age of u counts, not the presence of a
-    publisher.
+    """The publisher of u stays alive and u returns.
+
+    The age of u counts, not the presence of a publisher.
     """
     neutral = 0.4  # s
     setup.start(silence={"neutral": neutral})
@@ -616,8 +618,9 @@ def test_message_that_is_none_of_its_type_refused_and_counted(setup: Setup) -> N
 
 
 def test_imu_and_odometry_of_simulator_become_y_and_pose_in_namespace() -> None:
-    """The messages are of a publisher in the frames of REP 103; SciPy gives orientation and
-    velocity in the body axes.
+    """The messages are of a publisher in the frames of REP 103.
+
+    SciPy gives orientation and velocity in the body axes.
     """
     phi = 0.3
     theta = -0.2

@@ -107,8 +107,9 @@ def test_inputs_are_written_into_real_messages(name: str) -> None:
 
 
 class Px4:
-    """Publishes y and its mode as PX4 does, and takes the messages to which PX4 subscribes: a
-    command changes the mode.
+    """Publishes y and its mode as PX4 does, and takes the messages to which PX4 subscribes.
+
+    A command changes the mode.
     """
 
     HOLD, OFFBOARD, ARMED = 4, 14, 2
@@ -142,8 +143,9 @@ class Px4:
             world.create_subscription(getattr(types, name), f"/fmu/in/{topic}", received.append, 5)
 
     def publish(self) -> None:
-        """Publish y, the mode, and u: elevator 0.02 rad. Offboard is entered with a heartbeat
-        alone.
+        """Publish y, the mode, and u: elevator 0.02 rad.
+
+        Offboard is entered with a heartbeat alone.
         """
         commands = [
             (command.param2, command.param3)
@@ -164,8 +166,9 @@ class Px4:
 
 
 def test_bridge_flies_px4_in_offboard_and_returns_it_to_hold() -> None:
-    """Heartbeats from the request on, setpoints in offboard; a release ends both and requests
-    Hold.
+    """Heartbeats come from the request on, setpoints in offboard.
+
+    A release ends both and requests Hold.
     """
     needs("px4_msgs")
     with world_of("-p", "map:=px4", "-p", "dry_run:=false") as world:

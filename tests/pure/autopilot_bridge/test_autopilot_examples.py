@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The examples of autopilots: airframe, scenario and map fit together. docs/autopilots-reference.md
-says how they flew.
+"""The examples of autopilots: airframe, scenario and map fit together.
+
+docs/autopilots-reference.md says how they flew.
 """
 
 import shutil

@@ -19,8 +19,9 @@ class Sequence:
         self.lock = AutopilotLock(nanoseconds(SILENCE))
 
     def takes(self, now: float, since_boot: float | None, address: str = FIRST) -> bool:
-        """Take a message where the lock lets it pass. Returns whether the autopilot is another one,
-        or has started again.
+        """Take a message where the lock lets it pass.
+
+        Returns whether the autopilot is another one, or has started again.
         """
         message = address, None if since_boot is None else nanoseconds(since_boot), nanoseconds(now)
         self.lock.check(*message)
@@ -58,8 +59,9 @@ def test_late_messages_of_one_clock_are_taken() -> None:
 
 @pytest.mark.parametrize("drift", [-1e-3, 1e-3])
 def test_clock_that_drifts_stays_that_of_the_autopilot(drift: float) -> None:
-    """A crystal drifts by less than 1e-4. In an hour 1e-3 is 3.6 s, beyond the tolerance of a
-    jump.
+    """A crystal drifts by less than 1e-4.
+
+    In an hour 1e-3 is 3.6 s, beyond the tolerance of a jump.
     """
     sequence = Sequence()
     sequence.takes(0.0, 100.0)
@@ -70,8 +72,9 @@ def test_clock_that_drifts_stays_that_of_the_autopilot(drift: float) -> None:
 
 @pytest.mark.parametrize("since_boot", [0.0, 3.9, 7.2, 400.0])
 def test_another_clock_at_the_address_is_refused(since_boot: float) -> None:
-    """Behind by more than the tolerance of 1 s, or ahead by more than it: the next one is due at
-    6.1 s.
+    """The other clock is behind or ahead by more than the tolerance of 1 s.
+
+    The next message is due at 6.1 s.
     """
     sequence = Sequence()
     sequence.takes(10.0, 5.0)

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The bridge without ROS: engagement, failsafe, pilot override, saturation, stamps; the tests give
-the time.
+"""The bridge without ROS: engagement, failsafe, pilot override, saturation, stamps.
+
+The tests give the time.
 """
 
 import signal
@@ -425,8 +426,9 @@ def test_condition_that_is_not_reported_any_more_ends_engagement() -> None:
 
 
 def fly(bridge: Bridge, begin: float, end: float, **status: float) -> Phase:
-    """Fresh inputs ten times a second, and the phase at the end. A status of NaN is not
-    received.
+    """Fresh inputs ten times a second, and the phase at the end.
+
+    A status of NaN is not received.
     """
     for t in np.arange(begin, end, 0.1).tolist():
         receive_outputs(bridge, t, tuple(bridge.outputs), 20.0)
@@ -566,8 +568,9 @@ def test_ardupilot_is_not_engaged_while_pilots_switch_is_on() -> None:
 
 
 def mavlink_bridge(override_time: float = 0.5, max_engaged: float = 120.0) -> Bridge:
-    """A bridge with the map of ArduPilot over MAVLink, ready in MANUAL; the parameter
-    RC_OVERRIDE_TIME in s.
+    """A bridge with the map of ArduPilot over MAVLink, ready in MANUAL.
+
+    The parameter RC_OVERRIDE_TIME is in s.
     """
     bridge = new_bridge(
         unlimited("ardupilot_mavlink").model_copy(update={"max_engaged": max_engaged})
@@ -580,8 +583,9 @@ def mavlink_bridge(override_time: float = 0.5, max_engaged: float = 120.0) -> Br
 
 
 def receive_mavlink(bridge: Bridge, t: float) -> None:
-    """y, u and the conditions of the map of ArduPilot over MAVLink, in MANUAL, armed and in the
-    air.
+    """y, u and the conditions of the map of ArduPilot over MAVLink.
+
+    The aircraft is in MANUAL, armed and in the air.
     """
     receive_outputs(bridge, t, tuple(bridge.outputs))
     receive_u(bridge, t)
@@ -659,9 +663,7 @@ def test_pilot_who_takes_over_during_a_release_keeps_the_mode() -> None:
 
 
 def with_failsafe() -> Bridge:
-    """A bridge with the map of PX4 whose request for Hold is not sent after a release by the
-    pilot.
-    """
+    """A bridge with the map of PX4 whose request for Hold is not sent after a pilot's release."""
     content = unlimited("px4").model_dump()
     content["messages"]["leave"]["when"] = "failsafe"
     return new_bridge(ChannelMap.validate_mapping(content, "map"))
@@ -684,8 +686,9 @@ def test_mode_is_asked_for_after_each_engagement_and_not_after_one_that_did_not_
 
 
 def test_lost_transmitter_asks_for_the_mode() -> None:
-    """A condition that does not hold is a choice of the pilot or the autopilot, but for the loss of
-    the transmitter.
+    """A condition that does not hold is a choice of the pilot or the autopilot.
+
+    The loss of the transmitter is none.
     """
     bridge = with_failsafe()
     refresh(bridge, 0.0, offboard=14.0)
@@ -938,8 +941,9 @@ def followed(
     engaged_for: float = np.inf,
     begins: bool = False,
 ) -> Outcome:
-    """The outcome of a flight of osprey_gust, 60 s, with an autopilot or else with an aircraft that
-    begins it.
+    """The outcome of a flight of osprey_gust, 60 s.
+
+    It is flown with an autopilot, or else with an aircraft that begins it.
     """
     scenario = find_scenario("osprey_gust")
     monotonic_ns = lambda: round(1e9 * vars(flying)["time"].monotonic())  # noqa: E731 - a stand-in
@@ -964,8 +968,9 @@ def followed(
 def test_flight_ends_once_log_holds_it(
     begins: bool, until: float | None, end: float, outcome: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A log that stops is waited for for 5 s. With an autopilot (not `begins`) u may end, or never
-    begin.
+    """A log that stops is waited for for 5 s.
+
+    With an autopilot (not `begins`) u may end, or never begin.
     """
     now = [0.0]
 
@@ -1054,8 +1059,9 @@ def test_step_of_system_clock_does_not_end_flight(monkeypatch: pytest.MonkeyPatc
 
 
 def test_second_signal_does_not_interrupt_clean_up_after_first() -> None:
-    """`subprocess` releases a lock in a `finally`; one that stays locked made a flight wait for its
-    nodes without end.
+    """`subprocess` releases a lock in a `finally`.
+
+    A lock that stays locked made a flight wait for its nodes without end.
     """
     before = signal.getsignal(signal.SIGINT)
     clean = False

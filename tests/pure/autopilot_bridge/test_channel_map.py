@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Channel maps: each row of each map against hand-worked values, the conversion, and the refusals
-of invalid maps.
+"""Channel maps: each row of each map against hand-worked values.
 
-Plain objects with the published fields (tests/published_messages.py) replace the messages, because
-px4_msgs may not be installed. Tests with real messages: tests/nodes/autopilot_bridge/test_bridge.py
-and test_published_messages.py.
+The conversion and the refusals of invalid maps are tested too. Plain objects with the published
+fields (tests/published_messages.py) replace the messages, because px4_msgs may not be installed.
+Tests with real messages: tests/nodes/autopilot_bridge/test_bridge.py and
+test_published_messages.py.
 """
 
 import json
@@ -116,8 +116,9 @@ def test_each_input_sent_in_autopilots_unit_and_sign(name: str) -> None:
 
 @pytest.mark.parametrize("name", FOREIGN_MAPS)
 def test_each_field_of_map_published_and_accepts_values_of_map(name: str) -> None:
-    """A float32 has 24 bits, so a value is kept to 1e-7 of its size; an integer field rounds to
-    half a unit.
+    """A float32 has 24 bits, so a value is kept to 1e-7 of its size.
+
+    An integer field rounds to half a unit.
     """
     channel_map = named_map(name)
     foreign = {key: kind_ for key, _, kind_ in channel_map.used_topics() if kind_ in PUBLISHED}
@@ -209,8 +210,9 @@ def test_lost_message_does_not_end_engagement(name: str) -> None:
 
 
 def test_check_map_tells_which_rows_hold_for_each_release(tmp_path: Path) -> None:
-    """By definitions as a release publishes them. "2" has another topic for the status, and no true
-    airspeed.
+    """The definitions are as a release publishes them.
+
+    "2" has another topic for the status, and no true airspeed.
     """
     versions = {"1": {"VehicleStatus": 1}, "2": {"VehicleStatus": 4}}
     for release, of_release in versions.items():
@@ -318,8 +320,9 @@ TURN_FLU_FRD = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
 def test_attitude_of_map_is_that_of_body_frd_in_ned(
     name: str, phi: float, theta: float, psi: float
 ) -> None:
-    """Checked by SciPy's rotations. PX4 publishes body FRD in NED, the others body FLU in ENU (REP
-    103).
+    """The attitude is checked by SciPy's rotations.
+
+    PX4 publishes body FRD in NED, the others body FLU in ENU (REP 103).
     """
     frd_in_ned = Rotation.from_euler("ZYX", [psi, theta, phi])
     channel_map = shipped(name)
@@ -375,8 +378,9 @@ def test_position_and_velocity_are_north_east_and_up(name: str) -> None:
 def test_velocity_in_body_axes_of_odometry_is_turned_to_the_world(
     phi: float, theta: float, psi: float
 ) -> None:
-    """Odometry has its twist in the body frame, FLU (nav_msgs, REP 103). SciPy turns 4 m/s north, 3
-    east, 2 up into it.
+    """Odometry has its twist in the body frame, FLU (nav_msgs, REP 103).
+
+    SciPy turns 4 m/s north, 3 east, 2 up into it.
     """
     flu_in_enu = TURN_NED_ENU * Rotation.from_euler("ZYX", [psi, theta, phi]) * TURN_FLU_FRD
     x, y, z, w = (2.0 * flu_in_enu.as_quat()).tolist()  # a quaternion of any length

@@ -221,8 +221,9 @@ def test_override_reaches_the_autopilot_and_leaves_other_channels(ends: Ends) ->
 
 
 def test_second_sender_is_conflict_is_not_taken_and_gets_nothing(ends: Ends) -> None:
-    """One autopilot is flown, as on a topic. Another one may be a second aircraft, or a program of
-    this host.
+    """One autopilot is flown, as on a topic.
+
+    Another one may be a second aircraft, or a program of this host.
     """
     made, port, queue = ends.started("ATTITUDE")
     autopilot = ends.peer(port)
@@ -289,8 +290,9 @@ def test_conflict_of_second_sender_ends_after_its_last_message(
 
 
 def test_second_clock_behind_the_address_of_the_autopilot_is_conflict(ends: Ends) -> None:
-    """Two autopilots with one number behind a router have one address, and times since boot of
-    their own.
+    """Two autopilots with one number behind a router have one address.
+
+    They have times since boot of their own.
     """
     made, port, queue = ends.started("ATTITUDE")
     router = ends.peer(port)
@@ -308,8 +310,9 @@ def test_second_clock_behind_the_address_of_the_autopilot_is_conflict(ends: Ends
 
 
 def test_messages_of_other_components_of_the_system_are_not_taken(ends: Ends) -> None:
-    """A gimbal (component 154) and a companion computer (191) send an ATTITUDE too, of themselves,
-    on the link or beside it.
+    """A gimbal (component 154) and a companion computer (191) send an ATTITUDE of themselves too.
+
+    They send it on the link or beside it.
     """
     made, port, queue = ends.started("ATTITUDE")
     autopilot = ends.peer(port)
@@ -385,8 +388,9 @@ def test_other_bridge_is_conflict(ends: Ends) -> None:
 
 
 def test_bridge_is_no_ground_station_but_by_the_messages_of_its_map(ends: Ends) -> None:
-    """ArduPilot counts messages of its ground station for FS_GCS_ENABL: a dry run, which sends none
-    of the map, has none.
+    """ArduPilot counts messages of its ground station for FS_GCS_ENABL.
+
+    A dry run, which sends none of the map, has none.
     """
     made, port = ends.started(parameters=("RC_OVERRIDE_TIME",), ATTITUDE=40.0)
     peer = ends.peer(port)
@@ -526,8 +530,10 @@ def test_ground_station_that_falls_silent_ends_the_engagement(ends: Ends, clock:
 def test_numbers_of_ground_stations_are_those_of_the_autopilot(
     ends: Ends, clock: Clock, parameters: dict[str, float], dropped: str, watched: int
 ) -> None:
-    """ArduPilot, GCS.h, sysid_is_gcs: from MAV_GCS_SYSID to MAV_GCS_SYSID_HI; before, SYSID_MYGCS.
-    Overrides of another number have no effect. The bridge sends as 255.
+    """The numbers are those from MAV_GCS_SYSID to MAV_GCS_SYSID_HI; before, SYSID_MYGCS.
+
+    Source: ArduPilot, GCS.h, sysid_is_gcs. Overrides of another number have no effect. The bridge
+    sends as 255.
     """
     made, _ = ends.link()
     made._take(received(BEAT), SENDER, 0)
@@ -616,8 +622,9 @@ def test_autopilot_whose_clock_begins_again_is_not_told_to_have_another_passphra
 def test_passphrase_holds_in_a_process_that_has_not_seen_mavlink_2(
     ends: Ends, phrase: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A connection of pymavlink begins with MAVLink 1, which has no signatures, unless an earlier
-    one has set this variable.
+    """A connection of pymavlink begins with MAVLink 1, which has no signatures.
+
+    It does not where an earlier connection has set this variable.
     """
     monkeypatch.delenv("MAVLINK20", raising=False)
     made, port, queue = ends.started("HEARTBEAT", passphrase_file=phrase)
@@ -636,8 +643,9 @@ def test_silence_of_the_autopilot_is_told(ends: Ends, monkeypatch: pytest.Monkey
 def test_map_of_ardupilot_asks_for_loiter_after_a_release_that_no_pilot_requested(
     name: str, key: str
 ) -> None:
-    """The numbers of the modes are those that pymavlink has of ArduPlane, MAV_CMD those of
-    common.xml.
+    """The numbers of the modes are those that pymavlink has of ArduPlane.
+
+    MAV_CMD are those of common.xml.
     """
     row = named_map(name).messages["mode_after"]
     assert row.when == "failsafe"

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The rates of a link's messages: which are slow, requested again, refuse and end an engagement.
-The tests give the time.
+"""The rates of a link's messages: which are slow, and what follows.
+
+A slow rate is requested again, refuses and ends an engagement. The tests give the time.
 """
 
 import numpy as np
@@ -47,8 +48,9 @@ def test_rates_are_unknown_for_two_seconds_and_then_as_requested() -> None:
 
 
 def test_rate_that_a_ground_station_takes_is_requested_again_and_ends_no_engagement() -> None:
-    """From 40 to 4 Hz the count of 2 s is below 70 % after 2 s (1 - 0.7) / (1 - 0.1) = 0.67 s. The
-    request mends it.
+    """The request mends a rate that fell from 40 to 4 Hz.
+
+    The count of 2 s is below 70 % after 2 s (1 - 0.7) / (1 - 0.1) = 0.67 s.
     """
     stream = Stream().run(10.0)
     stream.run(10.8, ATTITUDE=4.0)

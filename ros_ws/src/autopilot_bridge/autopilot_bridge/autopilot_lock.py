@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Lock of a MAVLink link to the first autopilot, by the address of the packets and the time since
-boot in the messages.
+"""Lock of a MAVLink link to the first autopilot.
+
+An autopilot is known by the address of its packets and by the time since boot in its messages.
 """
 
 from flight_core.publisher_lock import SENDER, PublisherLock
@@ -12,8 +13,7 @@ CLOCK_TOLERANCE_NS = NANOSECONDS  # autopilots that were switched on within it a
 
 
 class AutopilotLock:
-    """Locks to the first autopilot until silence, then to the next autopilot, as a topic to a
-    publisher.
+    """Locks to the first autopilot until silence, then to the next one, as a topic to a publisher.
 
     Two autopilots behind the same address differ by the time since boot in their messages. The time
     since boot of an autopilot never goes back, and advances by the time that passes here at most. A
@@ -43,8 +43,7 @@ class AutopilotLock:
         self._starts.overran(duration_ns)
 
     def check(self, address: str, since_boot_ns: int | None, now_ns: int) -> None:
-        """Raise ChannelError, reason "sender", for a message of a second sender before the silence
-        of the first.
+        """Raise ChannelError, reason "sender", for a second sender before the silence of the first.
 
         `since_boot_ns` is None for a message without the time since boot.
         """
@@ -68,8 +67,9 @@ class AutopilotLock:
             raise ChannelError(SENDER, sentence) from None
 
     def refresh(self, address: str, since_boot_ns: int | None, now_ns: int) -> bool:
-        """Lock to the sender of a message after `check`. Returns whether the sender is new, or has
-        started again.
+        """Lock to the sender of a message after `check`.
+
+        Returns whether the sender is new, or has started again.
         """
         changed = self._addresses.refresh(address, now_ns)
         if changed:
@@ -89,8 +89,9 @@ class AutopilotLock:
         return changed
 
     def _start(self, since_boot_ns: int, now_ns: int) -> str:
-        """The name of the start to which a time since boot belongs: the locked start, or a new name
-        by the instant of boot.
+        """The name of the start to which a time since boot belongs.
+
+        It is the locked start, or a new name by the instant of boot.
         """
         boot_ns = now_ns - since_boot_ns
         advances = (

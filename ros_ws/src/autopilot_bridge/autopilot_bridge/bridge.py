@@ -1,10 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Bridge to an autopilot, without ROS: y from its messages, setpoints for u to it, engagement,
-pilot override and failsafe.
+"""Bridge to an autopilot, without ROS: y from its messages, setpoints for u to it.
 
-It reads no clock: every instant is an argument, in ns of one clock. The watchdogs of y and u end an
-engagement.
+It has the engagement, the pilot override and the failsafe. It reads no clock: every instant is an
+argument, in ns of one clock. The watchdogs of y and u end an engagement.
 """
 
 import math
@@ -50,8 +49,9 @@ def trim_key(name: str) -> str:
 
 
 class Bridge:
-    """The newest y and u, the phase and the pilot override. Only `engage` engages: the bridge never
-    re-engages by itself.
+    """The newest y and u, the phase and the pilot override.
+
+    Only `engage` engages: the bridge never re-engages by itself.
     """
 
     def __init__(self, channel_map: ChannelMap, *, dry_run: bool) -> None:
@@ -100,11 +100,11 @@ class Bridge:
     # Inputs
 
     def take_output(self, name: str, raw: float, stamp_ns: int, now_ns: int) -> None:
-        """Take a value of a channel of y, of the pose or of a trim's source: sign scale raw +
-        offset.
+        """Take a value of a channel of y, of the pose or of a trim's source.
 
-        Raises ChannelError: reason "stamp" where the stamp differs from now by more than the age
-        limit, reason "order" where it is not later than the previous one.
+        The channel becomes sign scale raw + offset. Raises ChannelError: reason "stamp" where the
+        stamp differs from now by more than the age limit, reason "order" where it is not later than
+        the previous one.
         """
         row = self._rows[name]
         if abs(now_ns - stamp_ns) > nanoseconds(row.max_age):
@@ -138,8 +138,9 @@ class Bridge:
         return takeover_ns, takeover_ns
 
     def max_u_age_ns(self) -> int:
-        """Age limit of a u by the stamp, the instant of a y: a played log does not begin to fly the
-        autopilot.
+        """Age limit of a u by the stamp, the instant of a y.
+
+        By this limit a played log does not begin to fly the autopilot.
         """
         return self._max_age_ns + self._max_y_age_ns
 
@@ -149,16 +150,18 @@ class Bridge:
         self._u = sample.value
 
     def take_effects(self, sample: StampedVector, now_ns: int) -> None:
-        """Take the effects of the inputs by the probe of the controller, shape (m,) in the map's
-        order. An input without effect ends an engagement.
+        """Take the effects of the inputs by the probe of the controller, (m,) in the map's order.
+
+        An input without effect ends an engagement.
         """
         stuck = without_effect(self.inputs, sample.value.tolist())
         if stuck and self.phase is Phase.ENGAGED:
             self.disengage(stuck, now_ns)
 
     def take_condition(self, name: str, raw: float, now_ns: int) -> None:
-        """Take the field of a condition. A condition that is lost ends an engagement at the next
-        step.
+        """Take the field of a condition.
+
+        A condition that is lost ends an engagement at the next step.
         """
         self.conditions.take_condition(name, raw, now_ns)
 
@@ -167,8 +170,9 @@ class Bridge:
         self._parameters[name] = value
 
     def take_override(self, name: str, raw: float, now_ns: int) -> None:
-        """Take the field of a pilot override. Beyond its threshold the bridge disengages at
-        once.
+        """Take the field of a pilot override.
+
+        Beyond its threshold the bridge disengages at once.
         """
         self.conditions.take_override(name, raw, now_ns)
         if self._is_active(name, now_ns):
@@ -177,15 +181,17 @@ class Bridge:
     # State
 
     def stale(self, now_ns: int) -> dict[str, str]:
-        """The stale channels of y and of the envelope, each with what is wrong: "0.30 s old
-        (/topic)".
+        """The stale channels of y and of the envelope, each with what is wrong.
+
+        For example "0.30 s old (/topic)".
         """
         watched = dict.fromkeys((*self.outputs, *self.channel_map.envelope))
         return {name: reason for name in watched if (reason := self._staleness(name, now_ns))}
 
     def _staleness(self, name: str, now_ns: int) -> str:
-        """What is wrong with a channel; empty where it is fresh, and where its last value is
-        held.
+        """What is wrong with a channel.
+
+        Empty where it is fresh, and where its last value is held.
         """
         row = self._rows[name]
         if isinstance(row, OutputRow) and row.held and name in self._readings:
@@ -193,8 +199,9 @@ class Bridge:
         return staleness(row.topic, self._readings.get(name), row.max_age, now_ns)
 
     def _outside(self, section: str = "envelope") -> str:
-        """The channels that are outside the limits of a section of the map, as a sentence. All of
-        them were received.
+        """The channels that are outside the limits of a section of the map, as a sentence.
+
+        All of them were received.
         """
         what = "the envelope" if section == "envelope" else section
         values = (
@@ -208,11 +215,10 @@ class Bridge:
         )
 
     def _does_not_answer(self, now_ns: int) -> str:
-        """The inputs that stay at a limit for longer than their rows allow, as a sentence: the
-        aircraft does not follow.
+        """The inputs that stay at a limit for longer than their rows allow, as a sentence.
 
-        The limits of the law may be narrower than those of the map: a large u that does not change
-        is at one.
+        The aircraft does not follow such an input. The limits of the law may be narrower than those
+        of the map: a large u that does not change is at one.
         """
         sentences = []
         inside, small = (
@@ -231,8 +237,9 @@ class Bridge:
         return "; ".join(sentences)
 
     def _lost(self, now_ns: int) -> str:
-        """Why the autopilot is not to be commanded any more, whatever y and u are, as a sentence;
-        empty where it is.
+        """Why the autopilot is not to be commanded any more, whatever y and u are, as a sentence.
+
+        Empty where it is.
         """
         unmet = (self.conditions.unmet(now_ns, awaited=awaited) for awaited in (False, True))
         return sentences(self.conflict, *unmet)
@@ -271,10 +278,10 @@ class Bridge:
         )
 
     def refusal(self, now_ns: int) -> str:
-        """Why `engage` would be refused now; empty where it would not. Awaited conditions do not
-        count.
+        """Why `engage` would be refused now; empty where it would not.
 
-        A dry run states the reason that there would be with `dry_run: false` too.
+        Awaited conditions do not count. A dry run states the reason that there would be with
+        `dry_run: false` too.
         """
         checks: tuple[Callable[[int], str], ...] = (
             lambda _: self.conflict,
@@ -320,8 +327,9 @@ class Bridge:
         return f"pilot override active: {', '.join(active)}" if active else ""
 
     def _missing(self, now_ns: int) -> str:
-        """What is stale of y, of envelope and engage_if, of the trims' sources and of u, as a
-        sentence.
+        """What is stale of the inputs of the bridge, as a sentence.
+
+        They are y, envelope and engage_if, the trims' sources and u.
         """
         keys = (*map(trim_key, self.channel_map.trims), *self.channel_map.engage_if)
         sources = {key: stale for key in keys if (stale := self._staleness(key, now_ns))}
@@ -338,8 +346,9 @@ class Bridge:
         return ""
 
     def _beyond_range(self, name: str) -> str:
-        """Why the limits around the trim of a captured input leave the range of its field; empty
-        where they do not.
+        """Why the limits around the trim of a captured input leave the range of its field.
+
+        Empty where they do not.
         """
         row = self.channel_map.inputs[name]
         trim = self.trim(name)
@@ -352,11 +361,11 @@ class Bridge:
         )
 
     def engage(self, now_ns: int, *, blind: bool = False) -> str:
-        """Engage, or begin to: the phase tells. Returns the reason of a refusal as a sentence,
-        empty where there is none.
+        """Engage, or begin to: the phase tells.
 
-        `blind`: without regard to the loss of the transmitter, and without end. A request while
-        engaged starts the time of `max_engaged` again.
+        Returns the reason of a refusal as a sentence, empty where there is none. `blind`: without
+        regard to the loss of the transmitter, and without end. A request while engaged starts the
+        time of `max_engaged` again.
         """
         if self.phase is Phase.ENGAGED:
             self.conditions.blind |= blind
@@ -377,8 +386,9 @@ class Bridge:
         self._end_ns = None if bound is None else now_ns + nanoseconds(bound)
 
     def _continue_engagement(self, now_ns: int) -> None:
-        """Engage once the awaited conditions hold; give up after their time, or where something
-        else would refuse.
+        """Engage once the awaited conditions hold.
+
+        Give up after their time, or where something else would refuse.
         """
         self.reason = self.conditions.unmet(now_ns, awaited=True)
         timed_out = now_ns - self._phase_ns > nanoseconds(self.channel_map.engage_timeout)
@@ -444,8 +454,9 @@ class Bridge:
     # Outputs
 
     def y(self, now_ns: int) -> StampedVector | None:
-        """Sample of y at the stamp of the map's output `instant`; None where it was returned before
-        or a channel is stale.
+        """Sample of y at the stamp of the map's output `instant`.
+
+        None where it was returned before or a channel is stale.
         """
         newest = self._readings.get(self.channel_map.instant)
         if (
@@ -460,8 +471,9 @@ class Bridge:
         )
 
     def _value(self, name: str) -> float:
-        """The newest value of a channel. A captured output is 0 until it is engaged, then its
-        change since engagement.
+        """The newest value of a channel.
+
+        A captured output is 0 until it is engaged, then its change since engagement.
         """
         value = self._readings[name].value
         row = self.channel_map.outputs.get(name)
@@ -470,16 +482,18 @@ class Bridge:
         return value - self._zero[name] if self._is_captured() else 0.0
 
     def _is_captured(self) -> bool:
-        """Whether the trims are those captured at engagement; otherwise they follow their
-        sources.
+        """Whether the trims are those captured at engagement.
+
+        Otherwise they follow their sources.
         """
         return self.phase in {Phase.ENGAGED, Phase.NEUTRAL, Phase.RELEASE} and bool(
             self._zero or self._trim
         )
 
     def trim(self, name: str) -> float:
-        """The trim of an input: captured at engagement where `trims` has its source, which it
-        follows until then.
+        """The trim of an input.
+
+        Where `trims` has its source, the trim follows the source, and is captured at engagement.
         """
         row = self.channel_map.inputs[name]
         source = self._readings.get(trim_key(name))
@@ -488,10 +502,10 @@ class Bridge:
         return row.trim if source is None else to_channel(source.value, row.line)
 
     def pose(self, now_ns: int) -> tuple[tuple[str, ...], StampedVector] | None:
-        """Names and values of the fresh channels of the pose, at the stamp of its first row; None
-        where that is not new.
+        """Names and values of the fresh channels of the pose, at the stamp of its first row.
 
-        psi is in -pi..pi. A channel that was not received or is stale is left out.
+        None where that stamp is not new. psi is in -pi..pi. A channel that was not received or is
+        stale is left out.
         """
         first = next(iter(self.channel_map.pose), None)
         newest = None if first is None else self._readings.get(first)
@@ -505,8 +519,9 @@ class Bridge:
         return names, StampedVector(newest.stamp_ns, np.array(list(values.values())))
 
     def raw_u(self) -> FloatArray:
-        """Raw values of the newest u after saturation, shape (m,): raw of trim + min(max(u, lower),
-        upper).
+        """Raw values of the newest u after saturation, shape (m,).
+
+        They are the raw values of trim + min(max(u, lower), upper).
         """
         u = np.minimum(np.maximum(self._u, self._lower), self._upper)
         return np.array(

@@ -30,8 +30,9 @@ SEA_LEVEL_DENSITY = 1.225
 
 
 class Line(NamedTuple):
-    """Channel = sign scale raw + offset. The channel is in SI and radians, the raw value in the
-    autopilot's unit.
+    """Channel = sign scale raw + offset.
+
+    The channel is in SI and radians, the raw value in the autopilot's unit.
     """
 
     sign: int  # +1 or -1
@@ -50,8 +51,9 @@ def to_raw(channel: float, line: Line) -> float:
 
 
 def get_field(message: Any, path: str) -> Any:
-    """Value at a path such as "twist.angular.y" or "axes[1]". Raises ChannelError, reason "field",
-    where there is none.
+    """Value at a path such as "twist.angular.y" or "axes[1]".
+
+    Raises ChannelError, reason "field", where there is none.
     """
     value = message
     for name, place in STEP.findall(path):
@@ -65,10 +67,10 @@ def get_field(message: Any, path: str) -> Any:
 
 
 def set_field(message: Any, path: str, value: Any) -> None:
-    """Set the value at a path. A number for an integer field is rounded. Raises ChannelError,
-    reason "field" or "range".
+    """Set the value at a path.
 
-    An integer field refuses NaN, infinity and values outside the range of its type.
+    A number for an integer field is rounded. An integer field refuses NaN, infinity and values
+    outside the range of its type. Raises ChannelError, reason "field" or "range".
     """
     current = get_field(message, path)
     if isinstance(current, int | np.integer) and isinstance(value, float):
@@ -100,15 +102,17 @@ def _norm(vector: Any) -> float:
 
 
 def _airspeed_of_pressure(pressure: Any) -> float:
-    """Indicated airspeed sqrt(2 dp / rho_0), m/s, of a dynamic pressure in Pa; 0 for a negative
-    one, which is noise.
+    """Indicated airspeed sqrt(2 dp / rho_0), m/s, of a dynamic pressure in Pa.
+
+    0 for a negative pressure, which is noise.
     """
     return math.sqrt(2.0 * max(float(pressure), 0.0) / SEA_LEVEL_DENSITY)
 
 
 def _quaternion(field: Any) -> tuple[float, float, float, float]:
-    """(w, x, y, z), of length 1, of a quaternion with members w, x, y, z, or with four elements in
-    this order, as PX4 publishes it.
+    """(w, x, y, z), of length 1, of a quaternion.
+
+    It has members w, x, y, z, or four elements in this order, as PX4 publishes it.
     """
     w, x, y, z = (field.w, field.x, field.y, field.z) if hasattr(field, "w") else field
     w, x, y, z = float(w), float(x), float(y), float(z)
@@ -119,8 +123,9 @@ def _quaternion(field: Any) -> tuple[float, float, float, float]:
 
 
 def _roll(field: Any) -> float:
-    """Roll angle of a quaternion, rad: the last of the rotations about z, y, x from the world to
-    the body.
+    """Roll angle of a quaternion, rad.
+
+    It is the last of the rotations about z, y, x from the world to the body.
     """
     w, x, y, z = _quaternion(field)
     return math.atan2(2.0 * (w * x + y * z), w * w - x * x - y * y + z * z)
@@ -166,11 +171,10 @@ COMPONENTS: Mapping[str, str] = MappingProxyType(
 
 
 def _turned(message: Any, path: str, attitude: str) -> float:
-    """Component of R(q) v: the vector v of the path VECTOR.x, .y or .z, turned from the body to the
-    world.
+    """Component of R(q) v: the vector v turned from the body to the world.
 
-    `attitude`: the path of the quaternion q. R(q) v = v + 2 (w r x v + r x (r x v)) with q =
-    (w, r), |q| = 1.
+    v is that of the path VECTOR.x, .y or .z. `attitude`: the path of the quaternion q. R(q) v = v +
+    2 (w r x v + r x (r x v)) with q = (w, r), |q| = 1.
     """
     vector, _, axis = path.rpartition(".")
     v = np.array([float(get_field(message, f"{vector}.{name}")) for name in "xyz"])
@@ -181,8 +185,9 @@ def _turned(message: Any, path: str, attitude: str) -> float:
 
 
 def read_raw(message: Any, path: str, function: str, turned_by: str | None = None) -> float:
-    """Raw value of a row. Raises ChannelError: reason "field" where the field is missing, "finite"
-    where it is not finite.
+    """Raw value of a row.
+
+    Raises ChannelError: reason "field" where the field is missing, "finite" where it is not finite.
     """
     value = get_field(message, path)
     try:
@@ -198,8 +203,9 @@ def read_raw(message: Any, path: str, function: str, turned_by: str | None = Non
 
 
 def message_type(name: str, load: Callable[[str], Any] = importlib.import_module) -> type:
-    """The class of "package/msg/Type" or "package/srv/Type". Raises ParameterError with the package
-    to install.
+    """The class of "package/msg/Type" or "package/srv/Type".
+
+    Raises ParameterError with the package to install.
     """
     package, section, kind = name.split("/")
     try:
@@ -246,8 +252,9 @@ def version_fault(topic: str, message_class: Any) -> str:
 def version_faults(
     topics: Iterable[tuple[str, str]], load: Callable[[str], Any] = importlib.import_module
 ) -> list[str]:
-    """`version_fault` of topics and types, for the message packages that are installed; the rest is
-    not known.
+    """`version_fault` of topics and types, for the message packages that are installed.
+
+    The rest is not known.
     """
     faults = []
     for topic, kind in dict.fromkeys(topics):

@@ -34,14 +34,13 @@ class EngagementClient(Client):
         self._u_subscription = PolledSubscription(self._node, U, NEWEST_SAMPLES, raw=True)
 
     def engage(self, progress: Callable[[str], None], *, blind: bool = False) -> str:
-        """Wait for u at trim and engage the bridge, which activates the controller. Returns the
-        reason of a refusal, or "".
+        """Wait for u at trim and engage the bridge, which activates the controller.
 
-        An engaged bridge takes the request at once: the time of `max_engaged` starts again.
-        `blind`: without regard to the loss of the transmitter. `progress` is called with what the
-        bridge waits for, and with what it lacks once it is engaged. An engagement that is not
-        waited for any more, as after Ctrl-C, is withdrawn: the autopilot must not change its mode
-        later.
+        Returns the reason of a refusal, or "". An engaged bridge takes the request at once: the
+        time of `max_engaged` starts again. `blind`: without regard to the loss of the transmitter.
+        `progress` is called with what the bridge waits for, and with what it lacks once it is
+        engaged. An engagement that is not waited for any more, as after Ctrl-C, is withdrawn: the
+        autopilot must not change its mode later.
         """
         self._spin_until(
             lambda: bool(self._received_phases()),
@@ -90,8 +89,9 @@ class EngagementClient(Client):
         )
 
     def _withdraw(self) -> None:
-        """Request to disengage, and wait for an answer at most WITHDRAW_TIMEOUT: a bridge that is
-        stopped answers later.
+        """Request to disengage, and wait for an answer at most WITHDRAW_TIMEOUT.
+
+        A bridge that is stopped answers later.
         """
         client = self._node.create_client(SetBool, ENGAGE)
         if client.wait_for_service(WITHDRAW_TIMEOUT):
@@ -113,8 +113,9 @@ class EngagementClient(Client):
         return self._phases
 
     def _settled(self, progress: Callable[[str], None]) -> bool:
-        """Whether the bridge has engaged, or has given up after it began to. Reports from before
-        the request do not count.
+        """Whether the bridge has engaged, or has given up after it began to.
+
+        Reports from before the request do not count.
         """
         phases = [phase for phase, _ in self._received_phases()]
         while phases and phases[0] not in {"ENGAGING", "ENGAGED"}:

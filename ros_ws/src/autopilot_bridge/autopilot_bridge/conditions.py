@@ -49,8 +49,9 @@ class Conditions:
         }
 
     def unmet(self, now_ns: int, *, awaited: bool) -> str:
-        """The conditions that do not hold, as a sentence; those that an engagement awaits, or the
-        others.
+        """The conditions that do not hold, as a sentence.
+
+        They are those that an engagement awaits, or the others.
         """
         rows = (
             (name, row)
@@ -70,10 +71,10 @@ class Conditions:
         )
 
     def is_contradicted(self) -> bool:
-        """Whether a condition does not hold by its last value: the pilot or the autopilot chose
-        another mode, or has landed.
+        """Whether a condition does not hold by its last value.
 
-        One that tells the loss of the transmitter does not count: the pilot cannot take over then.
+        The pilot or the autopilot chose another mode then, or has landed. A condition that tells
+        the loss of the transmitter does not count: the pilot cannot take over then.
         """
         rows = self._map.conditions.items()
         readings = ((row, self._conditions.get(name)) for name, row in rows if not row.transmitter)
@@ -82,8 +83,9 @@ class Conditions:
         )
 
     def is_active(self, name: str, now_ns: int, *, engaged: bool) -> bool:
-        """Whether a pilot override is active. It ends with its topic: an old one does not block an
-        engagement.
+        """Whether a pilot override is active.
+
+        It ends with its topic: an old one does not block an engagement.
         """
         row = self._map.overrides[name]
         reading = self._overrides.get(name)
@@ -107,10 +109,9 @@ class Conditions:
         return f"a pilot override has no effect: {'; '.join(silent)}" if silent else ""
 
     def blindness(self, *, bounded: bool) -> str:
-        """What an engagement that does not see the loss of the transmitter lacks, and what still
-        releases, as a sentence.
+        """What an engagement lacks that does not see the loss of the transmitter, as a sentence.
 
-        `bounded`: whether `max_engaged` ends it.
+        The sentence also has what still releases. `bounded`: whether `max_engaged` ends it.
         """
         if self.watches_transmitter and not self.blind:
             return ""
@@ -147,8 +148,9 @@ def staleness(topic: str, reading: Reading | None, max_age: float, now_ns: int) 
 
 
 def joined(faults: Mapping[str, str]) -> str:
-    """What is wrong with some channels, by name, as a sentence in which channels with the same
-    fault stand together.
+    """What is wrong with some channels, by name, as a sentence.
+
+    Channels with the same fault stand together in it.
     """
     names: dict[str, list[str]] = {}
     for name, fault in faults.items():

@@ -37,8 +37,9 @@ VERSION = "MESSAGE_VERSION"  # the constant of PX4's definitions
 
 
 class CheckedRow(NamedTuple):
-    """A field that a row of a map reads or sets, and why the row does not hold, by release; empty
-    where it holds.
+    """A field that a row of a map reads or sets, and its faults by release.
+
+    A fault is why the row does not hold; empty where it holds.
     """
 
     key: str
@@ -48,8 +49,9 @@ class CheckedRow(NamedTuple):
 
 
 def definitions_below(folder: Path, kinds: Iterable[str]) -> Types:
-    """Message types and those that they contain, of the packages below a folder. Raises
-    ParameterError where it has none.
+    """Message types of the packages below a folder, and those that they contain.
+
+    Raises ParameterError where it has none.
     """
     expected = (
         "a folder with the sources of a message package: package.xml, msg/*.msg and srv/*.srv"
@@ -80,10 +82,9 @@ def definitions_below(folder: Path, kinds: Iterable[str]) -> Types:
 
 
 def installed_definitions(kinds: Iterable[str]) -> Types:
-    """The message types of the installed packages, and those of MAVLink in pymavlink; the rest is
-    absent.
+    """The message types of the installed packages, and those of MAVLink in pymavlink.
 
-    Raises ParameterError for one of MAVLink without pymavlink.
+    The rest is absent. Raises ParameterError for one of MAVLink without pymavlink.
     """
     types: dict[str, tuple[Any, Any]] = {}
     for kind in kinds:
@@ -103,8 +104,9 @@ def installed_definitions(kinds: Iterable[str]) -> Types:
 
 
 def check_map(channel_map: ChannelMap, releases: Iterable[Types]) -> list[CheckedRow]:
-    """Each field that a map uses, against the definitions of some releases. A definition without a
-    version has version 0.
+    """Each field that a map uses, against the definitions of some releases.
+
+    A definition without a version has version 0.
     """
     releases = list(releases)
     rows = []
@@ -169,8 +171,9 @@ def _fault(types: Types, topic: str, kind: str, path: str, components: str | Non
 
 
 def _has(known: Types, field: Any, components: str) -> bool:
-    """Whether a field has components, as members or in an array; without components, whether it is
-    a number.
+    """Whether a field has components, as members or in an array.
+
+    Without components: whether it is a number.
     """
     node, content = field
     if node is Nodetype.NAME:

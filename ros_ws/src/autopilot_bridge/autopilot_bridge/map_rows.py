@@ -63,8 +63,9 @@ Value = bool | Integer | Raw | str | tuple[Integer, ...] | tuple[Raw, ...]
 
 
 class Row(Config):
-    """Common part of the rows of a map: channel = sign scale raw + offset, with frame and
-    source.
+    """Common part of the rows of a map: channel = sign scale raw + offset.
+
+    A row has a frame and a source.
     """
 
     field: str = Field(
@@ -139,8 +140,9 @@ class MeasuredRow(Row):
 
 
 class PoseRow(MeasuredRow):
-    """A channel of the pose, an absolute value. `sign` and `offset` bring it to FRD, north, east,
-    up from the frame it has.
+    """A channel of the pose, an absolute value.
+
+    `sign` and `offset` bring it to FRD, north, east, up from the frame it has.
     """
 
 
@@ -165,8 +167,9 @@ class OutputRow(MeasuredRow, MovingRow):
 
 
 class InputRow(MovingRow):
-    """A channel of u, the deviation from trim: message and field of its setpoint. trim + u = sign
-    scale raw + offset.
+    """A channel of u, the deviation from trim: trim + u = sign scale raw + offset.
+
+    The row has the message and the field of its setpoint.
     """
 
     message: str = Field(description="the message with the field, one of `messages`")
@@ -193,8 +196,9 @@ class InputRow(MovingRow):
 
 
 class MessageRow(Config):
-    """A message to the autopilot, or a request of a service. A message without a field of an input
-    is a heartbeat.
+    """A message to the autopilot, or a request of a service.
+
+    A message without a field of an input is a heartbeat.
     """
 
     topic: TopicName = Field(description="the autopilot's topic or service")
@@ -245,8 +249,9 @@ class WatchedRow(Config):
 
 
 class ConditionRow(WatchedRow):
-    """A condition of the engagement: the field has one of some values. The bridge disengages where
-    it has not.
+    """A condition of the engagement: the field has one of some values.
+
+    The bridge disengages where it has not.
     """
 
     one_of: Numbers = Field(
@@ -304,8 +309,9 @@ class OverrideRow(WatchedRow):
     )
 
     def is_active(self, raw: float, at_engagement: float | None) -> bool:
-        """Whether the override is active. `at_engagement` is its value at engagement; None where it
-        is not engaged.
+        """Whether the override is active.
+
+        `at_engagement` is its value at engagement; None where it is not engaged.
         """
         raw = self.masked(raw)
         if self.moved is not None:
@@ -366,8 +372,9 @@ class LinkConfig(Config):
 
 
 class SilenceConfig(Config):
-    """Failsafe for a u that times out while engaged: neutral values, then release values, then
-    nothing.
+    """Failsafe for a u that times out while engaged.
+
+    The bridge sends neutral values, then release values, then nothing.
     """
 
     max_age: Positive = Field(description="the age above which u has timed out, s")

@@ -78,8 +78,9 @@ class ReceivedMessage(NamedTuple):
 
 
 def message_type(name: str) -> Any:
-    """A class with the numeric fields of a message, all zero; `fields` has the names. Raises
-    ParameterError for no message.
+    """A class with the numeric fields of a message, all zero; `fields` has the names.
+
+    Raises ParameterError for no message.
     """
     require_package("pymavlink")
     from pymavlink.dialects.v20 import ardupilotmega as dialect  # noqa: PLC0415 - an extra
@@ -143,12 +144,11 @@ def _connection(config: LinkConfig) -> Any:
 
 
 class Link:
-    """A connection. `start` begins to receive; `problem` and `conflict` are sentences, empty where
-    there is none.
+    """A connection, which receives from `start` on.
 
-    Messages of the sender in `AutopilotLock` alone are taken, and over UDP no other address gets
-    messages. `parameters` are names of parameters of the autopilot that are read; `further` are
-    those that some releases lack.
+    `problem` and `conflict` are sentences, empty where there is none. Messages of the sender in
+    `AutopilotLock` alone are taken, and over UDP no other address gets messages. `parameters` are
+    names of parameters of the autopilot that are read; `further` are those that some releases lack.
 
     With a passphrase each message is signed, and messages without a valid signature are refused.
     Source: MAVLink guide, message signing; the key of a passphrase is that of MAVProxy and Mission
@@ -190,8 +190,9 @@ class Link:
 
     @property
     def conflict(self) -> str:
-        """Who else sends as the autopilot or as the bridge, or a setting without which no
-        engagement works.
+        """Who else sends as the autopilot or as the bridge, or a setting that prevents engagement.
+
+        Without that setting of the autopilot no engagement works.
         """
         second = self._second if time.monotonic() - self._second_at <= SILENCE else ""
         return sentences(self._clash, second)
@@ -205,8 +206,9 @@ class Link:
         self._thread.start()
 
     def send(self, message: Any) -> None:
-        """Send a message of `message_type` to the autopilot, with the number of the ground
-        station.
+        """Send a message of `message_type` to the autopilot.
+
+        It has the number of the ground station.
         """
         fields = message.packed.fieldnames
         values = {field: getattr(message, field) for field in fields}
@@ -271,8 +273,9 @@ class Link:
         )
 
     def lost(self) -> str:
-        """What ends an engagement, as a sentence: a rate that stays slow, or the silence of the
-        ground station.
+        """What ends an engagement, as a sentence.
+
+        It is a rate that stays slow, or the silence of the ground station.
         """
         now = time.monotonic()
         limit = self._config.station_silence
@@ -287,8 +290,9 @@ class Link:
         return sentences(self._rates.lasting(now), station)
 
     def station(self) -> str:
-        """What the autopilot's failsafe FS_GCS_ENABL watches while RC overrides are sent, as a
-        sentence.
+        """What the autopilot's failsafe FS_GCS_ENABL watches, as a sentence.
+
+        It watches while RC overrides are sent.
         """
         system = self._stations_text()
         limit = self._config.station_silence
@@ -340,8 +344,9 @@ class Link:
                 self._take(message, address, received_ns)
 
     def _packet(self) -> tuple[bytes, Address]:
-        """The next bytes, empty after a silence of POLL, and their sender: over TCP and a serial
-        line the URL.
+        """The next bytes, empty after a silence of POLL, and their sender.
+
+        Over TCP and a serial line the sender is the URL.
         """
         if not self._connection.select(POLL):
             return b"", ()
@@ -351,8 +356,9 @@ class Link:
         return self._connection.recv(self._parser.bytes_needed()), (self._config.url,)
 
     def _parsed(self, data: bytes, address: Address) -> Sequence[Any]:
-        """The messages of a packet. Messages in several packets are read from the locked sender
-        alone.
+        """The messages of a packet.
+
+        Messages in several packets are read from the locked sender alone.
         """
         if not self._is_udp or _text(address) == self._lock.address:
             return self._parser.parse_buffer(data) or ()
@@ -367,8 +373,9 @@ class Link:
         return parser
 
     def _signature_fault(self, packet: bytes) -> str:
-        """Why the signature of a packet was refused: 6 bytes of a time, 10 us each, and 6 of a hash
-        (MAVLink guide).
+        """Why the signature of a packet was refused.
+
+        A signature has 6 bytes of a time, 10 us each, and 6 of a hash (MAVLink guide).
         """
         signing = self._connection.mav.signing
         if hashlib.sha256(signing.secret_key + packet[:-6]).digest()[:6] != packet[-6:]:
@@ -431,8 +438,9 @@ class Link:
             queue.append(ReceivedMessage(message, received_ns))
 
     def _admits(self, message: Any, address: Address, now: float) -> bool:
-        """Whether a message of the autopilot is from the locked sender. Rates are requested from a
-        new sender.
+        """Whether a message of the autopilot is from the locked sender.
+
+        Rates are requested from a new sender.
         """
         sender = _text(address)
         before = self._lock.address
@@ -467,8 +475,9 @@ class Link:
         return True
 
     def _request(self, now: float) -> None:
-        """Request one rate after another, and slow ones again: an answer does not say to which
-        message it belongs.
+        """Request one rate after another, and slow ones again.
+
+        An answer does not say to which message it belongs.
         """
         self._to_request |= self._rates.step(now)
         if (

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the messages of a link come at their requested rates. It reads no clock: every instant is
-an argument, in s.
+"""Whether the messages of a link come at their requested rates.
+
+It reads no clock: every instant is an argument, in s.
 """
 
 from collections import deque
@@ -54,8 +55,9 @@ class MessageRates:
         return {name: rate.requested for name, rate in self._rates.items() if rate.step(now)}
 
     def slow(self, now: float) -> dict[str, str]:
-        """Sentences on messages by name: slow now, or slow less than REMEMBERED ago after a granted
-        rate.
+        """Sentences on slow messages by name.
+
+        A message is slow now, or was less than REMEMBERED ago after a granted rate.
         """
         sentences = {name: rate.sentence(name, now) for name, rate in self._rates.items()}
         return {name: sentence for name, sentence in sentences.items() if sentence}
@@ -133,8 +135,9 @@ class _Rate:
             self._instants.popleft()
 
     def _present(self) -> float:
-        """The mean rate of the newest messages, Hz: the count still has messages from before a
-        fall.
+        """The mean rate of the newest messages, Hz.
+
+        The count still has messages from before a fall.
         """
         if len(self._instants) <= GAPS:
             return len(self._instants) / self._window

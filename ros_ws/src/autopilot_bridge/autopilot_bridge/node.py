@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The bridge node, in place of the aircraft node: y from an autopilot and setpoints for u to it, by
-a channel map.
+"""The bridge node, in place of the aircraft node.
+
+It makes y from the messages of an autopilot and setpoints for u to it, by a channel map.
 """
 
 import os
@@ -71,8 +72,10 @@ NamedRow = tuple[str, MeasuredRow | WatchedRow]
 
 
 class BridgeNode(FlightNode[BridgeConfig]):
-    """At each tick it polls the autopilot's topics, publishes a new y, takes the newest u and sends
-    the due messages.
+    """The node of `Bridge`: at each tick it polls the topics, publishes y and sends setpoints.
+
+    It polls the autopilot's topics, publishes a new y, takes the newest u and sends the due
+    messages.
     """
 
     def __init__(self) -> None:
@@ -249,8 +252,9 @@ class BridgeNode(FlightNode[BridgeConfig]):
         self._bridge.take_effects(sample, now_ns)
 
     def _pause_ns(self) -> int:
-        """Time since the tick before began, also that of a suspended host, in which the clock of
-        the ticks stands still.
+        """Time since the tick before began.
+
+        It includes the time of a suspended host, in which the clock of the ticks stands still.
         """
         return self._boot_ns() - self._began_ns
 
@@ -272,8 +276,9 @@ class BridgeNode(FlightNode[BridgeConfig]):
         )
 
     def _disengage_after_pause(self, now_ns: int) -> None:
-        """Disengage where the bridge did not run: the autopilot, or its pilot, may fly on its own
-        law since then.
+        """Disengage where the bridge did not run.
+
+        The autopilot, or its pilot, may fly on its own law since then.
         """
         pause_ns = self._pause_ns()
         self._began_ns += pause_ns
@@ -289,8 +294,9 @@ class BridgeNode(FlightNode[BridgeConfig]):
         now_ns: int,
         step_ns: int,
     ) -> None:
-        """Give the fields of a message to the bridge. The system clock, of which its stamps are, is
-        ahead by `step_ns`.
+        """Give the fields of a message to the bridge.
+
+        The system clock, of which its stamps are, is ahead by `step_ns`.
         """
         if isinstance(subscription, MavlinkReader):
             message = raw
@@ -359,8 +365,9 @@ class BridgeNode(FlightNode[BridgeConfig]):
         return response
 
     def _activate(self, active: bool) -> None:
-        """Request that the controller is active: only while engaged, so that its integrals do not
-        wind up.
+        """Request that the controller is active.
+
+        It is so only while engaged, so that its integrals do not wind up.
         """
         self._awaits_controller = active and not self._controller.service_is_ready()
         if not self._controller.service_is_ready():
@@ -493,10 +500,10 @@ class BridgeNode(FlightNode[BridgeConfig]):
         return next(iter((*faults, *refused)), "no sample of its publisher arrives")
 
     def graph_checks(self) -> list[Callable[[], None]]:
-        """Also report a topic to which the autopilot subscribes with another type or an
-        incompatible quality of service.
+        """Also report a topic to which the autopilot cannot be connected.
 
-        A topic with another publisher ends the engagement.
+        The autopilot subscribes to it with another type or an incompatible quality of service. A
+        topic with another publisher ends the engagement.
         """
         outgoing = (
             partial(self.endpoints.check_subscribers, outgoing_message.publisher)
@@ -506,11 +513,11 @@ class BridgeNode(FlightNode[BridgeConfig]):
         return [*super().graph_checks(), *outgoing, self._find_conflicts]
 
     def _find_conflicts(self) -> None:
-        """Tell the bridge which topics have two publishers: of two autopilots y would be mixed, and
-        both would be flown.
+        """Tell the bridge which topics have two publishers.
 
-        Checked are the topics that the bridge reads, and the topics of setpoints. Several
-        transmitters may override, and any node may request a mode.
+        Of two autopilots y would be mixed, and both would be flown. Checked are the topics that the
+        bridge reads, and the topics of setpoints. Several transmitters may override, and any node
+        may request a mode.
         """
         read = set()
         for subscription, rows in self._readers:
@@ -537,9 +544,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         self._watch_link()
 
     def _watch_link(self) -> None:
-        """Tell the bridge what is wrong with topics and link, and the parameters of the
-        autopilot.
-        """
+        """Tell the bridge what is wrong with topics, link and parameters of the autopilot."""
         bridge = self._bridge
         link = self._link
         bridge.conflict = self._conflict

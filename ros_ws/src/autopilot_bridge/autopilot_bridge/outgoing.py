@@ -92,8 +92,9 @@ def field_type(name: str) -> Any:
 
 
 def require_field(empty: Any, name: str, row: MeasuredRow | WatchedRow) -> None:
-    """Raise ParameterError for a field that is missing. One inside a sequence is checked with the
-    first message only.
+    """Raise ParameterError for a field that is missing.
+
+    A field inside a sequence is checked with the first message only.
     """
     if "[" in row.field:
         return

@@ -140,8 +140,9 @@ class ChannelMap(Config):
         self._check_parameters()
 
     def _check_inputs(self) -> None:
-        """Check the fields of the inputs, and the values in trim and at the limits against the
-        range of the field.
+        """Check the fields of the inputs, and their values against the range of the field.
+
+        The values are those in trim and at the limits.
         """
         owners: dict[tuple[str, str], str] = {}
         for name, row in self.inputs.items():
@@ -318,8 +319,9 @@ class ChannelMap(Config):
 
     @property
     def recorded_topics(self) -> list[str]:
-        """The topics that the log has: those with a quality of service, and what comes over
-        MAVLink.
+        """The topics that the log has.
+
+        They are those with a quality of service, and what comes over MAVLink.
         """
         rows = chain.from_iterable(named.values() for named in self._readers().values())
         read = [row.topic for row in rows if row.topic.startswith(f"{MAVLINK}/")]
@@ -339,11 +341,10 @@ class ChannelMap(Config):
         return topics
 
     def used_fields(self) -> list[tuple[str, str, str, str, str | None]]:
-        """(key of the row, topic, type, path of the field, its components) of each field that is
-        read or set.
+        """Each field that is read or set, as (key of the row, topic, type, path, components).
 
-        The components are those of `COMPONENTS` for a field that a function reads, None for another
-        one.
+        The path is that of the field. The components are those of `COMPONENTS` for a field that a
+        function reads, None for another one.
         """
         fields: list[tuple[str, str, str, str, str | None]] = []
         for kind, named in self._readers().items():
@@ -377,6 +378,7 @@ def maps() -> list[str]:
 
 def find_map(name: str) -> Path:
     """The file of a channel map, by its name in the library or by its path, which ends in .yaml.
+
     Raises ParameterError.
     """
     return find_file(name, LIBRARY, "map", "a channel map").absolute()
