@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A lockstep flight of the nodes is equal to the byte to the loop in one process, under each law
-and with guidance.
+"""A lockstep flight of the nodes is equal to the byte to the loop in one process.
+
+It is so under each law and with guidance.
 """
 
 import json
@@ -68,8 +69,9 @@ def flown(scenario: Scenario, folder: Path) -> World:
 
 
 def require_equal(world: World, scenario: Scenario) -> None:
-    """Assert that each sample of the loop in one process was published, to the byte, and no other
-    one.
+    """Assert that each sample of the loop in one process was published, to the byte.
+
+    No other one was published.
     """
     tape = simulate(scenario)
     assert {"y", "y_m", "u", "internals", "truth"} <= tape.signals.keys()
@@ -83,8 +85,9 @@ def require_equal(world: World, scenario: Scenario) -> None:
 
 
 def varied(folder: Path, name: str, **sections: Any) -> Scenario:
-    """A second of a scenario with commands, disturbances and lost samples, and with changes to its
-    sections.
+    """A second of a scenario with commands, disturbances and lost samples.
+
+    Its sections have changes.
     """
     changes = {"flight": {"duration": 1.0}, "aircraft": ROUGH, **sections}
     return load_scenario(scenario_file(folder / "varied.yaml", find_scenario(name).path, **changes))
@@ -152,8 +155,9 @@ def test_flight_that_waits_for_a_refused_sample_ends_with_the_reason(
 def test_node_names_and_passes_on_the_role_that_a_peer_reports(
     osprey_gust: Scenario, tmp_path: Path
 ) -> None:
-    """A reference model reports the loss of the controller; a report of the node itself, and of no
-    role, has no effect.
+    """A reference model reports the loss of the controller.
+
+    A report of the node itself, and of no role, has no effect.
     """
     with lockstep(osprey_gust, tmp_path) as (world, nodes):
         aircraft = nodes[-1]

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The access control policy allows no wildcard, one client of services, and the topics of the one
-table.
+"""The access control policy.
+
+It allows no wildcard, one client of services, and the topics of the one table.
 """
 
 import pytest
@@ -18,8 +19,9 @@ def test_the_policy_allows_no_wildcard() -> None:
 def test_policy_allows_no_service_request_but_those_of_bridge_to_controller_and_autopilot(
     node: str,
 ) -> None:
-    """The controller is active only while the bridge is engaged. ArduPilot is asked for a mode
-    after a release.
+    """The controller is active only while the bridge is engaged.
+
+    ArduPilot is asked for a mode after a release.
     """
     requested = {"/controller/change_state", "/controller/get_state", "/ap/mode_switch"}
     assert allowed()[node].request == (frozenset(requested) if node == "bridge" else frozenset())

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The processes of a flight, each a program of the test: what ended a flight is named, and a log
-has time to be closed.
+"""The processes of a flight, each a program of the test.
+
+What ended a flight is named, and a log has time to be closed.
 """
 
 import time

@@ -95,8 +95,9 @@ def described(name: str) -> Sequence[Any]:
 
 
 def started(name: str, pushed: str = "", **given: object) -> tuple[list[Any], LaunchContext]:
-    """The actions of a launch with arguments once the domain is known, and its context. `pushed` is
-    the namespace of a launch file that includes it.
+    """The actions of a launch with arguments once the domain is known, and its context.
+
+    `pushed` is the namespace of a launch file that includes it.
     """
     actions, context = begun(name, pushed, **given)
     assert not nodes(actions)  # none before the domain is known
@@ -243,9 +244,7 @@ def test_fleet_is_a_process_and_its_end_ends_launch(tmp_path: Path) -> None:
 
 @pytest.fixture(params=CASES, ids=lambda case: "-".join((case[0], *case[1])))
 def case(request: pytest.FixtureRequest, short: Path, tmp_path: Path) -> Case:
-    """A launch: its actions, its context, and the nodes expected in its first and its second
-    stage.
-    """
+    """A launch: its actions, its context, and the nodes of its first and its second stage."""
     name, given, first, then = request.param
     log = {"run": str(short)} if name == "replay" else {}
     return (*started(name, **given, **log, runs=tmp_path / "runs"), first, then)
@@ -358,8 +357,9 @@ def test_launch_flies_beside_another_namespace_and_plays_beside_a_reference_mode
 
 
 def flown_to(context: LaunchContext, actions: Sequence[Any], instant: float) -> list[Any]:
-    """The actions that follow when the log holds y, y_m and u up to an instant, s of the system
-    clock.
+    """The actions that follow when the log holds y, y_m and u up to an instant.
+
+    The instant is in s of the system clock.
     """
     sec, nanosec = divmod(nanoseconds(instant), NANOSECONDS)
     context.ros_node.subscriptions["/recorded"](Time(sec=sec, nanosec=nanosec))
@@ -372,8 +372,9 @@ FLYING = ("recorder", "controller", "aircraft", "reference_model")
 def all_matched(
     follow: Sequence[Any], context: LaunchContext, names: Sequence[str] = FLYING
 ) -> list[Any]:
-    """The actions once these nodes are matched; a node may be flying before this launch has
-    discovered it.
+    """The actions once these nodes are matched.
+
+    A node may be flying before this launch has discovered it.
     """
     states = {"aircraft": NodeState.FLYING}
     return [

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Margins of scenarios that ship and of examples: behind servos the requirement holds, or the first
-line says why not.
+"""Margins of scenarios that ship and of examples.
+
+Behind servos the requirement holds, or the first line says why not.
 """
 
 import math

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A fleet: several aircraft at once over topics, with a namespace, nodes, a log and a report for
-every aircraft.
+"""A fleet: several aircraft at once over topics.
+
+Every aircraft has a namespace, nodes, a log and a report.
 """
 
 import signal
@@ -38,8 +39,9 @@ Overrides = dict[str, dict[str, object]]
 
 
 def is_fleet(name: FilePath) -> bool:
-    """Whether the path names the file of a fleet, with aircraft by name; a scenario has sections of
-    nodes.
+    """Whether the path names the file of a fleet, with aircraft by name.
+
+    A scenario has sections of nodes.
     """
     with suppress(ParameterError):
         content = read_yaml(Path(name), str(name), A_FLEET)
@@ -95,8 +97,9 @@ class FleetConfig(Config):
 
 @dataclass(frozen=True)
 class Member:
-    """An aircraft of a fleet: name and namespace, scenario, and t = 0 after t = 0 of the fleet,
-    s.
+    """An aircraft of a fleet: name and namespace, scenario, and its t = 0.
+
+    t = 0 comes after t = 0 of the fleet, s.
     """
 
     name: str
@@ -126,8 +129,10 @@ class Fleet:
 def read_fleet(
     file: FilePath, duration: float | None = None, *, use_sim_time: bool = False
 ) -> Fleet:
-    """Read the file of a fleet; `duration` in s replaces the duration of the file, `use_sim_time`
-    is by /clock. Raises ParameterError.
+    """Read the file of a fleet.
+
+    `duration` in s replaces the duration of the file, `use_sim_time` is by /clock. Raises
+    ParameterError.
     """
     path = as_path(file, "fleet", A_FLEET)
     content = read_yaml(path, str(path), A_FLEET)
@@ -225,8 +230,9 @@ class _Flight:
     stopping: threading.Thread | None = None
 
     def start(self, fleet: Fleet, pause: Callable[[float], None]) -> None:
-        """Start the processes. In real time wait until they are ready, with a `pause` between two
-        looks: a host does not start many at once.
+        """Start the processes, and in real time wait until they are ready.
+
+        A `pause` between two looks is due: a host does not start many at once.
         """
         self.progress(0.0, "starting")
         try:
@@ -249,8 +255,9 @@ class _Flight:
                 self.begin((0.0, 0.0))
 
     def begin(self, start: tuple[float, float]) -> None:
-        """Begin with t = 0 at an instant of the system clock and of the monotonic clock, s; in
-        lockstep it has begun.
+        """Begin with t = 0 at an instant of the system clock and of the monotonic clock, s.
+
+        In lockstep the flight has begun.
         """
         if self.processes is None or self.stopping is not None:
             return
@@ -270,8 +277,9 @@ class _Flight:
         return self.steps is not None
 
     def end(self, outcome: Outcome) -> None:
-        """Stop the processes, in another thread: a recorder takes a while to close a log, and the
-        fleet flies on.
+        """Stop the processes, in another thread.
+
+        A recorder takes a while to close a log, and the fleet flies on.
         """
         self.outcome = outcome
         self.steps = None

@@ -151,11 +151,10 @@ def follow(
 
 
 class _Span:
-    """Begin and end of a flight in real time: the aircraft takes u, and the log holds y, y_m and u
-    to the end.
+    """Begin and end of a flight in real time.
 
-    A flight with an autopilot, or with a controller that a user activates, may fly without u:
-    `begins` is False.
+    The aircraft takes u, and the log holds y, y_m and u to the end. A flight with an autopilot, or
+    with a controller that a user activates, may fly without u: `begins` is False.
     """
 
     def __init__(
@@ -266,8 +265,10 @@ def _follow_lockstep(
     progress: Progress,
     announce: Callable[[str], None],
 ) -> Steps:
-    """The real-time factor counts from the first instant in the log. The flight ends with the last
-    u, and a complete log.
+    """The steps of a lockstep flight, from the first instant to the last.
+
+    The real-time factor counts from the first instant in the log. The flight ends with the last u,
+    and a complete log.
     """
     scenario = processes.scenario
     # the last instant is the aircraft's last whole period
@@ -304,11 +305,10 @@ def fly_in_process(
     learn: Learn | None = None,
     announce: Callable[[str], None] = lambda line: None,
 ) -> Outcome:
-    """Fly in one process without ROS, as fast as the machine allows, and write the bag into `run`.
-    Returns the outcome.
+    """Fly in one process without ROS, and write the bag into `run`; return the outcome.
 
-    `learn` makes the learner of a scenario that learns. What it does goes to `announce` and to
-    log/learner.log, a line each.
+    The flight is as fast as the machine allows. `learn` makes the learner of a scenario that
+    learns. What it does goes to `announce` and to log/learner.log, a line each.
     """
     interrupt = DeferredInterrupt()
 
@@ -348,11 +348,10 @@ def fly_and_report(
     progress: Callable[[float], None] | None = None,
     learn: Learn | None = None,
 ) -> FlightResult:
-    """Fly a scenario in one process, its log and report in a new folder of `runs`, as `rise-di fly
-    --in-process` does.
+    """Fly a scenario in one process, its log and report in a new folder of `runs`.
 
-    A scenario that differs from its file is written beside the log. The log holds the
-    outcome of a flight that ended early.
+    `rise-di fly --in-process` does the same. A scenario that differs from its file is written
+    beside the log. The log holds the outcome of a flight that ended early.
 
     Args:
         scenario: Name, path of a scenario file (.yaml), or a Scenario.
@@ -396,6 +395,7 @@ def _is_its_file(scenario: Scenario) -> bool:
 
 def as_file(scenario: Scenario, run: Path) -> Scenario:
     """The scenario with a file that holds it: its own, or a new one in the folder of the run.
+
     Raises ParameterError.
     """
     return scenario if _is_its_file(scenario) else written(scenario, run / f"{scenario.name}.yaml")

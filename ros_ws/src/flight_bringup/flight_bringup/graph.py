@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The graph of a flight: nodes, start order, parameter overrides. Launch files and process runner
-share the graph.
+"""The graph of a flight: nodes, start order, parameter overrides.
+
+Launch files and process runner share the graph.
 """
 
 import re
@@ -51,8 +52,9 @@ NAME = re.compile(r"[A-Za-z](_?[A-Za-z0-9])*")
 
 
 def absolute_namespace(namespace: str) -> str:
-    """The namespace of an aircraft as "/uav1"; "" is the root. Raises ParameterError for a name
-    that ROS 2 does not permit.
+    """The namespace of an aircraft as "/uav1"; "" is the root.
+
+    Raises ParameterError for a name that ROS 2 does not permit.
     """
     words = [word for word in namespace.split("/") if word]
     for word in words:
@@ -84,12 +86,12 @@ def find_autopilot(map_name: str, *, dry_run: bool) -> Autopilot:
 
 
 def require_limits(autopilot: Autopilot, scenario: Scenario) -> None:
-    """Raise ParameterError where the controller may command more than the map sends; a dry run
-    sends nothing.
+    """Raise ParameterError where the controller may command more than the map sends.
 
-    The bridge would clip u, and the anti-windup of the law would not know. The limits of the
-    scenario are not narrowed here: the log holds the parameters that flew. A controller with a held
-    u while inactive is refused, too: the bridge engages only from a u near trim.
+    A dry run sends nothing. The bridge would clip u, and the anti-windup of the law would not know.
+    The limits of the scenario are not narrowed here: the log holds the parameters that flew. A
+    controller with a held u while inactive is refused, too: the bridge engages only from a u near
+    trim.
     """
     if autopilot.dry_run:
         return
@@ -128,11 +130,11 @@ def require_limits(autopilot: Autopilot, scenario: Scenario) -> None:
 
 
 def second_stage(scenario: Scenario, *, bridge: bool = False) -> tuple[NodeSpec, ...]:
-    """The second stage of a scenario: aircraft or bridge, the reference model, and guidance and the
-    learner where it has them.
+    """The second stage of a scenario.
 
-    Raises ParameterError where guidance cannot fly the simulated aircraft, and for a bridge beside
-    a learner.
+    It has the aircraft or the bridge, the reference model, and guidance and the learner where the
+    scenario has them. Raises ParameterError where guidance cannot fly the simulated aircraft, and
+    for a bridge beside a learner.
     """
     if not bridge:
         require_guidable(scenario)
@@ -157,18 +159,18 @@ LEAD = 0.5  # s, from the sending of t = 0 on `start` to t = 0: a busy host deli
 
 
 def start_lead(startup: float) -> float:
-    """Time from the start of the second stage to t = 0, s, given the time until the first stage was
-    ready.
+    """Time from the start of the second stage to t = 0, s.
 
-    The second stage gets half as long again as the first stage took. The nodes get half a second
-    for discovery.
+    `startup` is the time until the first stage was ready. The second stage gets half as long again
+    as the first stage took. The nodes get half a second for discovery.
     """
     return 0.5 + 1.5 * startup
 
 
 def start_instant(lead: float, now: float) -> float:
-    """Time of t = 0, s, `lead` from `now`: a whole 0.01 s, so nodes with and without `start_time`
-    tick together.
+    """Time of t = 0, s, `lead` from `now`.
+
+    It is a whole 0.01 s, so nodes with and without `start_time` tick together.
     """
     return round(now + lead, 2)
 
@@ -189,15 +191,15 @@ def parameter_overrides(
     use_sim_time: bool = False,
     autopilot: Autopilot | None = None,
 ) -> ParameterOverrides:
-    """The parameters of a process beside the section of the scenario file; "node:name" for several
-    nodes.
+    """The parameters of a process beside the section of the scenario file.
 
-    Real time: the nodes with a t = 0 get the instant, or ON_START. Lockstep: the aircraft gets the
-    rate of u and the duration, controller and guidance the rate of y, the reference model the rate
-    of u_m. Guidance gets the numbers by rule, the learner the scenario. The recorder gets the files
-    to attach to the log; this function writes the files into the folder of the run. With an
-    autopilot the bridge gets the channel map, the recorder the topics of the autopilot, and the
-    controller starts inactive. With `use_sim_time` every node ticks by /clock.
+    For several nodes the keys are "node:name". Real time: the nodes with a t = 0 get the instant,
+    or ON_START. Lockstep: the aircraft gets the rate of u and the duration, controller and guidance
+    the rate of y, the reference model the rate of u_m. Guidance gets the numbers by rule, the
+    learner the scenario. The recorder gets the files to attach to the log; this function writes the
+    files into the folder of the run. With an autopilot the bridge gets the channel map, the
+    recorder the topics of the autopilot, and the controller starts inactive. With `use_sim_time`
+    every node ticks by /clock.
     """
     clock: ParameterOverrides = {"use_sim_time": True} if use_sim_time else {}
     if spec is BRIDGE:

@@ -17,8 +17,9 @@ from flight_core.signals import handle_shutdown
 
 @contextmanager
 def handle_signals(handler: Any) -> Iterator[None]:
-    """Handle the signals of `handle_shutdown` in the block; Python permits handlers in the main
-    thread alone.
+    """Handle the signals of `handle_shutdown` in the block.
+
+    Python permits handlers in the main thread alone.
     """
     before = (
         handle_shutdown(handler) if threading.current_thread() is threading.main_thread() else {}
@@ -31,8 +32,10 @@ def handle_signals(handler: Any) -> Iterator[None]:
 
 
 def interrupt(number: int, frame: FrameType | None) -> None:
-    """End the flight. A second signal would interrupt the clean-up, in which `subprocess` releases
-    a lock of each process.
+    """End the flight.
+
+    A second signal would interrupt the clean-up, in which `subprocess` releases a lock of each
+    process.
     """
     handle_shutdown(signal.SIG_IGN)
     if number == signal.SIGHUP:  # the terminal is lost: writing to it is an error
@@ -43,9 +46,11 @@ def interrupt(number: int, frame: FrameType | None) -> None:
 
 
 class DeferredInterrupt:
-    """A signal handler that interrupts outside the blocks of `deferred`, such as a write of the
-    log. With `only_in_pauses` it interrupts in `pause` alone: an exception in Python that a module
-    in C has called, such as a message that rclpy makes, becomes an error of that module.
+    """A signal handler that interrupts outside the blocks of `deferred`.
+
+    Such a block is a write of the log. With `only_in_pauses` it interrupts in `pause` alone: an
+    exception in Python that a module in C has called, such as a message that rclpy makes, becomes
+    an error of that module.
     """
 
     def __init__(self, *, only_in_pauses: bool = False) -> None:

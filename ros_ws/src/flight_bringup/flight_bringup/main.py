@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The nodes of a flight in one process, over the same topics; guidance and the learner where the
-arguments name them.
+"""The nodes of a flight in one process, over the same topics.
+
+Guidance and the learner are among them where the arguments name them.
 """
 
 import sys

@@ -43,8 +43,9 @@ MODES = {float(mode): mode.name for mode in Mode}
 
 
 class FlightMonitor(Client):
-    """Monitors a flight: states of its nodes, internals of the controller, in lockstep the progress
-    of the log.
+    """Monitors a flight: the states of its nodes and the internals of the controller.
+
+    In lockstep it also follows the progress of the log.
     """
 
     def __init__(
@@ -101,8 +102,9 @@ class FlightMonitor(Client):
         return "ended early: /clock has no publisher: its simulator ended" if gone else ""
 
     def is_ready(self, node: str, pid: int) -> bool:
-        """Whether the loop of a node runs. The process id tells it from a node of that name in
-        another flight.
+        """Whether the loop of a node runs.
+
+        The process id tells it from a node of that name in another flight.
         """
         return self._state(node, pid) in {*NodeState}
 
@@ -144,8 +146,9 @@ class FlightMonitor(Client):
         ]
 
     def learned(self) -> list[tuple[float, str]]:
-        """What became of proposals of a learner since the last call: instants by the clock of the
-        stamps, s, and sentences.
+        """What became of proposals of a learner since the last call.
+
+        Each is an instant by the clock of the stamps, s, and a sentence.
         """
         return [
             (seconds(report.stamp_ns), bounded(report.sentence))
@@ -153,15 +156,18 @@ class FlightMonitor(Client):
         ]
 
     def recorded(self) -> float | None:
-        """The flight time up to which the log of a lockstep flight is complete, s; None without a
-        change.
+        """The flight time up to which the log of a lockstep flight is complete, s.
+
+        None without a change.
         """
         stamps = self._decoded(self._recorded, stamp_of)
         return seconds(stamps[-1]) if stamps else None
 
     def require_free_domain(self) -> None:
-        """Raise ParameterError where the namespace already has an aircraft or a reference model in
-        this domain. Waits until the publishers are known, DISCOVERY_TIME after the start.
+        """Raise ParameterError where the namespace already has an aircraft or a reference model.
+
+        It looks in this domain. It waits until the publishers are known, DISCOVERY_TIME after the
+        start.
         """
         remaining = self._created + DISCOVERY_TIME - time.monotonic()
         require_no_publishers(self._node, LOOP_INPUTS, FREE_DOMAIN, remaining)

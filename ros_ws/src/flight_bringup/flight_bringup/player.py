@@ -62,12 +62,12 @@ class Player(Client):
         stamps_now: bool,
         progress: Callable[[int], None] | None = None,
     ) -> None:
-        """Publish all messages, the first one immediately, each other one at its time since the
-        first one over `rate`.
+        """Publish all messages with their timing over `rate`.
 
-        Deadlines are absolute on the monotonic clock. `stamps_now` moves the stamps: the age of a
-        message against the system clock becomes its age in the log over `rate`. `progress` is
-        called with the instant of the log, ns, ten times a second.
+        The first one is sent immediately, each other one at its time since the first one over
+        `rate`. Deadlines are absolute on the monotonic clock. `stamps_now` moves the stamps: the
+        age of a message against the system clock becomes its age in the log over `rate`. `progress`
+        is called with the instant of the log, ns, ten times a second.
         """
         begin_ns = begin_system_ns = first_ns = clock_ns = progress_ns = 0
         for due_ns, topic, message, stamped in messages:
@@ -108,8 +108,9 @@ def _sleep_until(deadline_ns: int) -> None:
 
 
 def unsendable(types: Mapping[str, str]) -> dict[str, str]:
-    """The topics with a message type that is not installed, with the type, or with a name that no
-    topic of ROS may have.
+    """The topics that cannot be sent, each with its type.
+
+    The message type is not installed, or no topic of ROS may have the name.
     """
     lacking = {}
     for topic, name in types.items():

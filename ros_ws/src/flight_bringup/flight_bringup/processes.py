@@ -69,8 +69,9 @@ POLL_PERIOD = 0.005  # s, while nodes start
 
 
 def end_with_parent() -> list[str]:
-    """Prefix of a command: SIGTERM when this process dies. Needs setpriv of util-linux, empty
-    without it.
+    """Prefix of a command: SIGTERM when this process dies.
+
+    It needs setpriv of util-linux, and is empty without it.
     """
     setpriv = shutil.which("setpriv")
     return [setpriv, "--pdeathsig", "TERM"] if setpriv else []
@@ -84,8 +85,9 @@ def start_instants(lead: float, monitor: "FlightMonitor") -> tuple[float, float]
 
 
 def leave_outcome(run: Path, outcome: Outcome) -> None:
-    """Leave the outcome of a flight for the recorder; `Path()` records none. A full disk costs the
-    log the outcome alone.
+    """Leave the outcome of a flight for the recorder; `Path()` records none.
+
+    A full disk costs the log the outcome alone.
     """
     if run.name:
         with suppress(OSError, ParameterError):
@@ -101,8 +103,10 @@ class NotReadyError(ParameterError):
 
 
 class NodeProcess:
-    """One node as a process. The output goes to a file; `lines` holds the last lines, `cause` the
-    line with the reason of the end, also before a long traceback.
+    """One node as a process.
+
+    The output goes to a file; `lines` holds the last lines, `cause` the line with the reason of the
+    end, also before a long traceback.
     """
 
     def __init__(
@@ -246,8 +250,9 @@ class FlightProcesses:
         self.start_time, self.started = start
 
     def match(self) -> Outcome | None:
-        """Wait until each node is ready and each input has a publisher. Returns the outcome of a
-        flight that cannot begin.
+        """Wait until each node is ready and each input has a publisher.
+
+        Returns the outcome of a flight that cannot begin.
         """
         deadline = time.monotonic() + READY_TIMEOUT
         while self._on_start and (waiting := self._unmatched()):
@@ -333,11 +338,11 @@ class FlightProcesses:
             self._pause(POLL_PERIOD)
 
     def ended(self) -> Outcome | None:
-        """The outcome by the first process that has ended, or by simulated time; None while all
-        run. In real time the law flies on without a learner.
+        """The outcome by the first process that has ended, or by simulated time.
 
-        On a busy host several may have ended since the last call. A landing is then the cause, and
-        a process that lost contact with another is not.
+        None while all run. In real time the law flies on without a learner. On a busy host several
+        may have ended since the last call. A landing is then the cause, and a process that lost
+        contact with another is not.
         """
         processes = [
             process for process in self.processes if self.lockstep or process.node is not LEARNER
@@ -371,9 +376,7 @@ class FlightProcesses:
         )
 
     def is_completed(self) -> bool:
-        """Whether the aircraft has completed a lockstep flight, the u of its last instant
-        included.
-        """
+        """Whether the aircraft has completed a lockstep flight, with the u of its last instant."""
         return any(
             self.monitor.is_completed(name, pid)
             for name, pid in self._nodes()
@@ -381,8 +384,9 @@ class FlightProcesses:
         )
 
     def last_words(self, node: NodeSpec) -> str:
-        """The last line of a node on a topic that it waits for, or on a refused sample; empty
-        without one.
+        """The last line of a node on a topic that it waits for, or on a refused sample.
+
+        Empty without one.
         """
         lines: list[str] = []
         for process in self.processes:
@@ -394,10 +398,10 @@ class FlightProcesses:
         return re.sub(r"^(\[[^]]*\] ?)*(: )?", "", line)
 
     def stop(self) -> None:
-        """Stop all processes, the recorder last; SIGKILL after STOP_TIMEOUT, and for the recorder
-        CLOSE_TIMEOUT.
+        """Stop all processes, the recorder last.
 
-        At the end of a lockstep flight a learner completes its search first.
+        SIGKILL follows after STOP_TIMEOUT, and for the recorder after CLOSE_TIMEOUT. At the end of
+        a lockstep flight a learner completes its search first.
         """
         # a second Ctrl-C must not interrupt this: it would truncate the log
         with handle_signals(signal.SIG_IGN):

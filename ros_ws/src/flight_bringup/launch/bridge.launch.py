@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fly an autopilot through a channel map on a full ROS 2: ros2 launch flight_bringup
-bridge.launch.py map:=ardupilot.
+"""Fly an autopilot through a channel map on a full ROS 2.
+
+ros2 launch flight_bringup bridge.launch.py map:=ardupilot
 
 The graph of fly.launch.py with the bridge in the aircraft's place. The bridge sends to the
 autopilot only with dry_run:=false and once it is engaged (docs/autopilots.md). Refuses a map whose

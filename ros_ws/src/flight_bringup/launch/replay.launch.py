@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Play a recorded flight on a full ROS 2, with nodes against it: ros2 launch flight_bringup
-replay.launch.py run:=runs/latest.
+"""Play a recorded flight on a full ROS 2, with nodes against it.
+
+ros2 launch flight_bringup replay.launch.py run:=runs/latest
 
 As `rise-di play`: the topics of the log with their timing, and /clock with the time of the log. It
 plays the topics that none of the nodes publishes, so a controller answers the recorded y and y_m

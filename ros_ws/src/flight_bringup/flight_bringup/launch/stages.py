@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Start the nodes of a launch in stages: a stage waits for the `node_state` "ready" of the stage
-before.
+"""Start the nodes of a launch in stages.
+
+A stage waits for the `node_state` "ready" of the stage before.
 """
 
 import math
@@ -137,8 +138,9 @@ def watch_argument() -> DeclareLaunchArgument:
 
 
 def watch_page(context: LaunchContext, run: Path) -> list[Action]:
-    """The process of the live page of a run, on demand. The flight does not depend on this
-    process.
+    """The process of the live page of a run, on demand.
+
+    The flight does not depend on this process.
     """
     if argument(context, "watch") != "true":
         return []
@@ -163,8 +165,9 @@ def sim_time_argument() -> DeclareLaunchArgument:
 
 
 def by_rise_di(context: LaunchContext, file: str) -> list[Action]:
-    """`rise-di fly` of a scenario or of a fleet, with the arguments of the launch; the launch ends
-    with it, with exit status 1 where a flight was not completed.
+    """`rise-di fly` of a scenario or of a fleet, with the arguments of the launch.
+
+    The launch ends with it, with exit status 1 where a flight was not completed.
     """
 
     def end(event: ProcessExited, context: LaunchContext) -> Sequence[Action]:
@@ -190,8 +193,9 @@ def argument(context: LaunchContext, name: str) -> str:
 
 
 def end_with_launch(context: LaunchContext) -> None:
-    """Let every process end with this process. Launch leaves processes running after an end by
-    anything but SIGINT.
+    """Let every process end with this process.
+
+    Launch leaves processes running after an end by anything but SIGINT.
     """
     context.launch_configurations.setdefault("launch-prefix", shlex.join(end_with_parent()))
 
@@ -199,8 +203,9 @@ def end_with_launch(context: LaunchContext) -> None:
 def flight_node(
     spec: NodeSpec, scenario: Scenario, overrides: ParameterOverrides, run: Path
 ) -> Node:
-    """A node of a flight into the folder `run`, with a section of the scenario and parameter
-    overrides.
+    """A node of a flight into the folder `run`.
+
+    It has a section of the scenario and parameter overrides.
     """
     return Node(
         package=spec.package,
@@ -216,10 +221,10 @@ def flight_node(
 def rosbag2(
     context: LaunchContext, scenario: Scenario, overrides: ParameterOverrides
 ) -> ExecuteProcess:
-    """`ros2 bag record` in the place of the stack's recorder, with the same topics. `overrides`
-    belong to the recorder.
+    """`ros2 bag record` in the place of the stack's recorder, with the same topics.
 
-    The attachments of the recorder become a separate log in the folder of the run.
+    `overrides` belong to the recorder. The attachments of the recorder become a separate log in the
+    folder of the run.
     """
     run = Path(overrides["directory"])
     with BagWriter(run) as bag:
@@ -253,8 +258,9 @@ def rosbag2(
 def fail_on_exit(
     event: ProcessExited, context: LaunchContext, run: Path
 ) -> Sequence[Action] | None:
-    """End the launch when a process ends before the flight, with the outcome in the folder `run`:
-    of a landing with exit status 0, else with 1.
+    """End the launch when a process ends before the flight.
+
+    The outcome goes to the folder `run`. The exit status of a landing is 0, else it is 1.
     """
     if context.is_shutdown:
         return None
@@ -281,8 +287,9 @@ def say_on_exit(event: ProcessExited, context: LaunchContext) -> list[Action]:
 def on_state(
     context: LaunchContext, spec: NodeSpec, state: NodeState, then: Callable[[], Sequence[Action]]
 ) -> RegisterEventHandler:
-    """Run the actions of `then` once, when a node of this launch publishes a state, or a later
-    one.
+    """Run the actions of `then` once, when a node of this launch publishes a state.
+
+    A later state counts, too.
     """
     node = f"{_namespace(context)}/{spec.executable}"
     states = [*NodeState]
@@ -309,12 +316,12 @@ def start_in_stages(
     beside: Sequence[Action] = (),
     publishes: Collection[str] = LOOP_INPUTS,
 ) -> list[Action]:
-    """Start the first stage of a flight into the folder `run`, and `beside`. Once the nodes are
-    ready, run the actions of `second`.
+    """Start the first stage of a flight into the folder `run`, and `beside`.
 
-    The arguments of `second` are the time until t = 0 and the system time of t = 0, s. A node that
-    is not ready after READY_TIMEOUT ends the launch with exit status 1, and so does another flight:
-    a publisher of a topic among `publishes`, before any node starts.
+    Once the nodes are ready, run the actions of `second`. Its arguments are the time until t = 0
+    and the system time of t = 0, s. A node that is not ready after READY_TIMEOUT ends the launch
+    with exit status 1, and so does another flight: a publisher of a topic among `publishes`, before
+    any node starts.
     """
     _subscribe_states(context)
     leave_outcome(run, INTERRUPTED)  # until another outcome replaces it
@@ -355,12 +362,11 @@ def begin_when_matched(
     *,
     by_rosbag2: bool,
 ) -> list[Action]:
-    """Begin the flight once each node is ready and each input has a publisher: t = 0 on the topic
-    `start`.
+    """Begin the flight once each node is ready and each input has a publisher.
 
-    End the flight once the log holds y, y_m and u to the end; with rosbag2 once u has the stamp of
-    the end. A node that does not get so far, and an aircraft that takes no u, end the launch with
-    exit status 1.
+    t = 0 goes to the topic `start`. End the flight once the log holds y, y_m and u to the end; with
+    rosbag2 once u has the stamp of the end. A node that does not get so far, and an aircraft that
+    takes no u, end the launch with exit status 1.
     """
     begin = _Begin(context, run, nodes, duration)
     return [
@@ -445,11 +451,10 @@ def end_with_log(
     *,
     by_rosbag2: bool,
 ) -> list[Action]:
-    """End a flight of `duration`, which began with `lead`, once the log holds y, y_m and u to the
-    system time `end_time`, s.
+    """End a flight once the log holds y, y_m and u to the system time `end_time`, s.
 
-    A log without u, as of a bridge that is not engaged, ends it after the duration; one that has
-    stopped, LOG_TIMEOUT later.
+    The flight of `duration` began with `lead`. A log without u, as of a bridge that is not engaged,
+    ends it after the duration; one that has stopped, LOG_TIMEOUT later.
     """
     last = [-math.inf]  # monotonic time of the last change of the log, s
 
@@ -469,8 +474,9 @@ def end_with_log(
 def _complete_at(
     context: LaunchContext, run: Path, held: Callable[[int], bool], *, by_rosbag2: bool
 ) -> RegisterEventHandler:
-    """Complete the flight once the stamp up to which the log holds y, y_m and u satisfies `held`;
-    with rosbag2 that of u.
+    """Complete the flight once the stamp up to which the log is whole satisfies `held`.
+
+    The log holds y, y_m and u up to it; with rosbag2 the stamp is that of u.
     """
 
     def receive(message: Any) -> None:
@@ -493,8 +499,9 @@ def _complete_at(
 def complete(
     run: Path, reason: str = "flight completed", outcome: Outcome = COMPLETED
 ) -> list[Action]:
-    """The actions at the end of a flight that reached its end. The recorder closes the log with
-    the outcome.
+    """The actions at the end of a flight that reached its end.
+
+    The recorder closes the log with the outcome.
     """
     leave = OpaqueFunction(function=lambda context: leave_outcome(run, outcome))
     return [
@@ -505,8 +512,9 @@ def complete(
 
 
 def _subscribe_states(context: LaunchContext) -> None:
-    """Emit a NodeStateEvent for every published state of a node of this launch; see
-    launch_ros.actions.LifecycleNode.
+    """Emit a NodeStateEvent for every published state of a node of this launch.
+
+    See launch_ros.actions.LifecycleNode.
     """
 
     def receive(message: KeyValue) -> None:
@@ -535,8 +543,9 @@ def _namespace(context: LaunchContext) -> str:
 
 
 def _is_descendant(pid: int) -> bool:
-    """Whether a process belongs to this launch, directly or behind a launch prefix, not to a second
-    flight.
+    """Whether a process belongs to this launch, not to a second flight.
+
+    It belongs to it directly or behind a launch prefix.
     """
     with suppress(psutil.Error):
         return os.getpid() in {parent.pid for parent in psutil.Process(pid).parents()}
