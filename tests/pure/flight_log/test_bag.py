@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Writing and reading bags: with independent readers, truncated and damaged files, bags of other
-recorders.
+"""Writing and reading bags.
+
+Independent readers read them. Truncated and damaged files and bags of other recorders are read.
 """
 
 import math
@@ -253,8 +254,9 @@ def record(
     topics: dict[str, list[bytes]],
     compression: CompressionMode = CompressionMode.NONE,
 ) -> None:
-    """Write a bag with rosbags: the messages of each topic 1 ms apart, and a topic of another
-    type.
+    """Write a bag with rosbags: the messages of each topic 1 ms apart.
+
+    A further topic has another type.
     """
     writer = Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP)
     if compression is not CompressionMode.NONE:
@@ -420,9 +422,7 @@ def first_chunk(log: bytes) -> tuple[bytes, list[int]]:
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_wrong_message_index_changes_no_message(data: st.DataObject, recorded: Path) -> None:
-    """The index saves the steps from message to message: it must agree with them, or they are
-    taken.
-    """
+    """The index saves the steps from message to message: it is used where it agrees with them."""
     chunk, places = first_chunk((recorded / "run_0.mcap").read_bytes())
     by_steps = messages_of(chunk, b"")
     assert messages_of(chunk, index_of(places)) == by_steps
@@ -457,8 +457,9 @@ def test_other_types_have_no_decoder_and_malformed_messages_counted() -> None:
 
 
 def test_engagements_of_log_begin_with_phase_engaged_and_end_with_reason(tmp_path: Path) -> None:
-    """Reports come at each change and once a second. The messages are written by the library
-    rosbags.
+    """Reports come at each change and once a second.
+
+    The messages are written by the library rosbags.
     """
     kind = "diagnostic_msgs/msg/KeyValue"
     bag = BagWriter(tmp_path / "run")

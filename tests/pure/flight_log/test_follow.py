@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Following a log that grows: the same values as reading it whole, in pieces of any size, also when
-it is hostile.
+"""Following a log that grows: the same values as reading it whole.
+
+The pieces have any size, and the log may be hostile.
 """
 
 import math
@@ -205,8 +206,9 @@ def test_index_that_points_outside_messages_changes_nothing(recorded: Path, tmp_
 def test_follower_reads_past_damage_what_a_scan_of_the_file_reads(
     offset: int, size: int, run: Path
 ) -> None:
-    """Bytes inverted in the head and in the content of a chunk, beside an intact index of the
-    file; then these bytes cut out, and the file cut there.
+    """Bytes are inverted in the head and in the content of a chunk, beside an intact index.
+
+    Then these bytes are cut out, and the file is cut there.
     """
     path = run / "run_0.mcap"
     content = path.read_bytes()

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A full disk: the log is finished from the reserve, or stays readable up to its last complete
-chunk.
+"""A full disk: the log is finished from the reserve.
+
+Else it stays readable up to its last complete chunk.
 """
 
 import errno
@@ -37,8 +38,9 @@ RANDOM = np.random.default_rng(1)
 
 
 def write(bag: BagWriter, channel: BagChannel, count: int) -> None:
-    """Write messages of 40 noisy channels, which do not compress; every tenth ends a chunk, as at 1
-    kHz and 0.1 s.
+    """Write messages of 40 noisy channels, which do not compress.
+
+    Every tenth ends a chunk, as at 1 kHz and 0.1 s.
     """
     for _ in range(count):
         stamp_ns = 1_000_000 * (channel.messages + 1)

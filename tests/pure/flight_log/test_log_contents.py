@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The attachments, metadata and provenance of a log: they suffice to repeat the flight from the
-file alone.
+"""The attachments, metadata and provenance of a log.
+
+They suffice to repeat the flight from the file alone.
 """
 
 import math

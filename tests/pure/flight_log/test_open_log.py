@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Logs of all kinds under every command: read with the figures of the flight, or refused with what
-is there.
+"""Logs of all kinds under every command.
+
+Each is read with the figures of the flight, or refused with what is there.
 """
 
 from pathlib import Path
@@ -72,8 +73,9 @@ def whole(request: pytest.FixtureRequest, messages: list[Recorded], tmp_path: Pa
 def test_whole_flight_is_read_replayed_shown_and_played(
     whole: Path, messages: list[Recorded], figures: dict[str, Any], osprey_gust: Scenario
 ) -> None:
-    """The scenario comes from its file, as `--scenario` gives it: the bag has none, like those of
-    `ros2 bag record`.
+    """The scenario comes from its file, as `--scenario` gives it.
+
+    The bag has none, like those of `ros2 bag record`.
     """
     with refusing(r"a log without its scenario, expected .* --scenario FILE"):
         read_flight(whole)

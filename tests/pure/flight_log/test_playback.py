@@ -22,8 +22,9 @@ from flight_log.tape_writer import write_run
 
 @pytest.fixture(scope="module")
 def run(osprey_gust: Scenario, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """One second in one process: y, y_m and truth at 500 Hz, u and internals at 100 Hz, pose at 50
-    Hz, from t = 0 to 1 s.
+    """One second in one process, from t = 0 to 1 s.
+
+    y, y_m and truth come at 500 Hz, u and internals at 100 Hz, pose at 50 Hz.
     """
     tape = simulate(osprey_gust.vary(flight={"duration": 1.0}))
     return write_run(
@@ -78,8 +79,9 @@ def test_a_log_without_messages_is_rejected(tmp_path: Path) -> None:
 
 
 def bag_of(folder: Path, sent: list[tuple[str, int, int, float]]) -> Path:
-    """A log of (topic, time of sending, stamp, value) in the order of receipt. `truth` has the
-    channel t.
+    """A log of (topic, time of sending, stamp, value) in the order of receipt.
+
+    `truth` has the channel t.
     """
     with BagWriter(folder) as bag:
         channels = {

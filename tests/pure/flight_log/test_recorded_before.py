@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A log of an earlier revision in tests/recorded: every sample is read, and every bit of u is
-computed again.
+"""A log of an earlier revision in tests/recorded.
+
+Every sample is read, and every bit of u is computed again.
 """
 
 import shutil

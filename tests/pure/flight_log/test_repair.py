@@ -168,8 +168,9 @@ def test_changed_bytes_never_cause_traceback_or_false_messages(recorded: Path, r
 
 
 def test_link_in_folder_is_not_followed(run: Path, tmp_path: Path) -> None:
-    """A folder from elsewhere may hold links: also to nothing, in the place of the copy of the
-    damaged file.
+    """A folder from elsewhere may hold links, also to nothing.
+
+    Such a link may stand in the place of the copy of the damaged file.
     """
     target = tmp_path / "target"
     precious = tmp_path / "precious"

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The age of u at the aircraft, from the diagnostics: the delay of the whole loop, from the instant
-of y to u.
+"""The age of u at the aircraft, from the diagnostics.
+
+It is the delay of the whole loop, from the instant of y to the action of u.
 """
 
 from collections.abc import Iterable
@@ -23,8 +24,9 @@ CHANNELS = ("mean", "max")
 
 
 def age_of_u(messages: Iterable[bytes], namespace: str) -> Signal | None:
-    """Mean and largest age of u between two reports of the aircraft of a namespace, s; None without
-    any.
+    """Mean and largest age of u between two reports of an aircraft, s; None without any.
+
+    `namespace` is that of the aircraft.
     """
     rows: dict[int, tuple[float, float]] = {}
     for data in messages:

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Writes a bag in the layout of rosbag2: an MCAP file of CDR messages, and metadata.yaml. Needs no
-ROS.
+"""Writes a bag in the layout of rosbag2: an MCAP file of CDR messages, and metadata.yaml.
+
+Needs no ROS.
 """
 
 import struct
@@ -90,8 +91,9 @@ class _MessageIndex(MessageIndex):
 
 
 class _ChunkBuilder(ChunkBuilder):
-    """The bytes of mcap's builder in half the time. The builder of mcap writes field by field, and
-    the length afterwards.
+    """Writes the bytes of mcap's builder in half the time.
+
+    The builder of mcap writes a message field by field, and the length afterwards.
     """
 
     def add_message(self, message: Message) -> None:
@@ -115,10 +117,10 @@ class _ChunkBuilder(ChunkBuilder):
 
 
 class _ChunkIndexes:
-    """Chunk indexes as records on disk, in place of mcap's list, which grows by 1 kB a chunk, 36 MB
-    an hour.
+    """Chunk indexes as records on disk, in place of mcap's list in memory.
 
-    The reserve for the end of the file grows with the number of chunks.
+    The list of mcap grows by 1 kB a chunk, 36 MB an hour. The reserve for the end of the file grows
+    with the number of chunks.
     """
 
     def __init__(self, file: ReservedFile, channels: Sequence[BagChannel]) -> None:
@@ -148,16 +150,17 @@ def full_names(remaps: Mapping[str, str]) -> dict[str, str]:
 
 
 def stack_topic(channel: Channel, remaps: Mapping[str, str] = {}) -> str:
-    """The full name that a topic of a log has in the stack: `remaps`, by topics of the log, come
-    before those of the log.
+    """The full name in the stack of a topic of a log.
+
+    The names in `remaps`, by topics of the log, come before those that the log itself has.
     """
     return remaps.get(channel.topic) or channel.metadata.get(BEFORE_REMAP) or channel.topic
 
 
 class BagWriter:
-    """Writes a bag into a folder. `flush` closes the chunk: closed chunks stay readable after a
-    kill of the process.
+    """Writes a bag into a folder.
 
+    `flush` closes the chunk in progress: closed chunks stay readable after a kill of the process.
     Disk space for the end of the file is reserved. Once a write has used the reserve, `full` is
     true and the bag has to be closed. Raises OSError when a write fails for any further reason, or
     when the reserve does not suffice.
@@ -195,9 +198,7 @@ class BagWriter:
         return self._file.full
 
     def add_attachments(self, attachments: LogAttachments, now_ns: int) -> None:
-        """Store the scenario and further files as attachments, and the named sets of strings as
-        metadata records.
-        """
+        """Store files as attachments, and named sets of strings as metadata records."""
         typed = [(path, FILE_MEDIA_TYPE) for path in attachments.files]
         if attachments.scenario is not None:
             typed.insert(0, (attachments.scenario, SCENARIO_MEDIA_TYPE))
@@ -212,9 +213,9 @@ class BagWriter:
         self._writer.add_metadata(name, dict(values))
 
     def add_topic(self, topic: str, type_name: str, qos: str, before_remap: str = "") -> BagChannel:
-        """Add a topic by the full name. `qos` is rosbag2's YAML list of offered profiles,
-        `before_remap` the name in the stack.
+        """Add a topic by the full name.
 
+        `qos` is rosbag2's YAML list of offered profiles, `before_remap` the name in the stack.
         Raises ParameterError when the definition of the type is unknown.
         """
         known = definition(type_name)

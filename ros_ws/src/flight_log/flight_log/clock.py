@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The clock of the stamps of a topic, followed in the order of the recording: steps, damaged
-stamps, equal stamps.
+"""The clock of the stamps of a topic, followed in the order of the recording.
+
+It finds steps of the clock, damaged stamps and equal stamps.
 """
 
 from collections.abc import Iterator, Mapping
@@ -26,10 +27,10 @@ SINCE_EPOCH_NS = 10**15  # larger stamps count from 1970, not from the start of 
 
 
 class StampClock:
-    """Follows the stamps of a topic. A step of the clock ends the usable part of the topic; a
-    damaged stamp is left out.
+    """Follows the stamps of a topic, up to a step of their clock.
 
-    The samples after a step forth stay: `without_leaps` knows all topics and decides on the
+    A step of the clock ends the usable part of the topic. A sample with a damaged stamp is left
+    out. The samples after a step forth stay: `without_leaps` knows all topics and decides on these
     samples.
     """
 
@@ -106,8 +107,9 @@ class StampClock:
         return self._taken(stamp_ns, keep, len(stamp_ns))
 
     def _jump_to(self, stamp_ns: int, offset_ns: int, *, has_time: bool) -> tuple[int, bool]:
-        """From the usable part to a stamp, ns, 0 without one; and whether the stamp is ahead of the
-        clock.
+        """The time from the usable part to a stamp, ns; and whether the stamp leads its clock.
+
+        The time is 0 without a usable part.
         """
         if not self._last_ns:  # none, or a stamp that was not set
             return 0, False
@@ -116,8 +118,9 @@ class StampClock:
         return jump_ns, is_ahead and has_time and not self._is_history
 
     def _after_step(self, stamp_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Mask of the samples that stay after the step: behind a step forth those later than the
-        step.
+        """Mask of the samples that stay after the step.
+
+        Behind a step forth they are those later than the step; behind a step back there are none.
         """
         return (stamp_ns > self._step_at_ns) & (self._step_ns > 0)
 
@@ -148,8 +151,11 @@ class StampClock:
 
 
 def _in_burst(stamp_ns: NDArray[np.int64], offset_ns: NDArray[np.int64]) -> bool:
-    """Whether the last samples, over LEAP_NS of stamps, were recorded in less than half of that
-    time, as the history of a publisher for a late recorder is: a pause in it is no step of a clock.
+    """Whether the last samples were recorded in a burst, as a publisher's history is.
+
+    The last samples span LEAP_NS of stamps. In a burst they were recorded in less than half of that
+    time: a recorder that starts late receives the history of the publisher at once. A pause in such
+    a history is no step of the clock.
     """
     recent = stamp_ns >= stamp_ns[-1] - LEAP_NS
     span_ns = stamp_ns[-1] - stamp_ns[recent][0]
@@ -227,8 +233,10 @@ def without_leaps(
 def _candidates(
     signals: Mapping[str, Signal], recording: Mapping[str, Recording]
 ) -> Iterator[Leap]:
-    """Leaps of the stamps: beside the flight times of `truth`, else beside numbers of messages
-    without a gap.
+    """Leaps of the stamps against a second measure of time.
+
+    The measure is the flight time in `truth`. Without one it is a constant period, where the
+    numbers of the messages have no gap.
     """
     name = next((name for name in ("truth", "y_m", "y") if name in signals), "")
     if not name:

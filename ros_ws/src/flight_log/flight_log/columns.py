@@ -23,11 +23,10 @@ IN_MEMORY = 32_000_000
 
 
 class Columns:
-    """Samples in order of arrival: stamps, and rows of equal length that are read as columns,
-    contiguous in memory.
+    """Samples in order of arrival: stamps, and rows of equal length.
 
-    `expected` samples are expected, more are taken. Raises ParameterError where no temporary file
-    can hold a long topic.
+    The rows are read as columns, contiguous in memory. `expected` samples are expected, more are
+    taken. Raises ParameterError where no temporary file can hold a long topic.
     """
 
     def __init__(self, width: int, expected: int) -> None:
@@ -79,8 +78,9 @@ class _Memory:
 
 
 class _File:
-    """Columns in a temporary file without a name, written past memory and mapped as long as an
-    array of them is used.
+    """Columns in a temporary file without a name.
+
+    They are written past memory, and mapped as long as an array of them is used.
     """
 
     def __init__(self, width: int, capacity: int) -> None:

@@ -20,10 +20,10 @@ def free_bytes(folder: Path) -> int:
 
 
 def try_lock(stream: IO[bytes] | int, kind: int = fcntl.LOCK_EX) -> bool:
-    """Lock a file until the stream is closed. False when a second process, such as a recorder,
-    holds the lock.
+    """Lock a file until the stream is closed.
 
-    A file system without locks always grants the lock.
+    False when a second process, such as a recorder, holds the lock. A file system without locks
+    always grants the lock.
     """
     try:
         fcntl.flock(stream, kind | fcntl.LOCK_NB)
@@ -35,8 +35,9 @@ def try_lock(stream: IO[bytes] | int, kind: int = fcntl.LOCK_EX) -> bool:
 
 
 def is_locked(path: Path) -> bool:
-    """Whether a second process, such as a recorder, holds the lock of a file. Raises OSError when
-    the file cannot be opened.
+    """Whether a second process, such as a recorder, holds the lock of a file.
+
+    Raises OSError when the file cannot be opened.
     """
     with path.open("rb") as stream:
         return not try_lock(stream, fcntl.LOCK_SH)
@@ -69,10 +70,10 @@ class ReservedFile:
         self.full = False  # the reserve was needed
 
     def reserve(self, size: int) -> None:
-        """Reserve this many bytes in total. Without enough space `full` is set and the earlier
-        reserve stays.
+        """Reserve this many bytes in total.
 
-        A call after `release` has no effect: the last chunk is written then.
+        Without enough space `full` is set and the earlier reserve stays. A call after `release` has
+        no effect: the last chunk is written then.
         """
         if self.full or self._reserve.closed or size <= self._reserved_bytes:
             return
@@ -83,9 +84,7 @@ class ReservedFile:
             self.full = error.errno in NO_SPACE
 
     def keep(self, data: bytes) -> None:
-        """Keep data for the end of the file: in the reserve while a reserve exists, then in
-        memory.
-        """
+        """Keep data for the end of the file: in the reserve while there is one, then in memory."""
         if not self._reserve.closed:
             try:
                 if os.pwrite(self._reserve.fileno(), data, self._kept_bytes) == len(data):
@@ -109,8 +108,9 @@ class ReservedFile:
             self._reserve.close()
 
     def write(self, data: bytes | memoryview) -> int:
-        """Write the data. Raises OSError when the reserve does not suffice, or for any further
-        reason.
+        """Write the data.
+
+        Raises OSError when the reserve does not suffice, or for any further reason.
         """
         unwritten = memoryview(data)
         size = unwritten.nbytes

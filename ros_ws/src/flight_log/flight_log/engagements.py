@@ -23,8 +23,9 @@ class Engagement(NamedTuple):
 
 
 def engagements(reports: Iterable[tuple[int, bytes]]) -> list[Engagement] | None:
-    """The engagements, in order, from the times of sending and the messages of the reports; None
-    without a report.
+    """The engagements, in order, from the reports of a bridge; None without a report.
+
+    A report is the time of sending and the message.
     """
     spans: list[Engagement] | None = None
     for sent_ns, data in reports:

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Names the kind of a file by the first bytes: a log, a packed log, or a file of another
-program.
+"""Names the kind of a file by the first bytes.
+
+A file is a log, a packed log, or a file of another program.
 """
 
 import struct
@@ -81,8 +82,9 @@ def file_kind(path: Path) -> str:
 
 
 def kind_of(head: bytes) -> str:
-    """The kind of a file by the first HEAD_BYTES bytes, or the kind of a text or of unknown
-    bytes.
+    """The kind of a file by the first HEAD_BYTES bytes.
+
+    Bytes of no kind in the table are a text or unknown bytes.
     """
     if MCAP0_MAGIC.startswith(head):  # also of a recorder that was killed at its start
         return BEGUN if head else EMPTY

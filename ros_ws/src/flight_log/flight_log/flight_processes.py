@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The processes of a flight in a log: when ready, by the line on /rosout, and the span of the
-samples.
+"""The processes of a flight in a log.
+
+When a process is ready is read from its line on /rosout, how long it lives from its samples.
 """
 
 import re
@@ -117,8 +118,7 @@ RESTART = 10  # a number of a tick that is less by more is of another controller
 
 
 def controller_starts(number: FloatArray) -> list[int]:
-    """The places where a new controller begins in the numbers of ticks, shape (N,), in order of the
-    time.
+    """The places where a new controller begins in the numbers of ticks (N,), in order of time.
 
     Two ticks of one instant may be stored in either order: a number a little less, new to the
     controller, begins no controller.

@@ -90,8 +90,9 @@ def moved(motions: Mapping[int, float], least: float = STILL) -> list[int]:
 
 
 def _motion(table: Table, fields: Set[str]) -> float:
-    """The deviations of the fields, or the typical value of an airspeed: a dead sensor has no
-    airspeed.
+    """The sum of the deviations of the fields, or the typical value of an airspeed.
+
+    A dead sensor has no airspeed.
     """
     for field in fields & AIRSPEEDS & table.fields.keys():
         finite = table.fields[field][np.isfinite(table.fields[field])]
@@ -145,7 +146,8 @@ def _share(table: Table, field: str) -> float:
 
 def _airspeed(numbered: Mapping[int, Table]) -> tuple[Table, str]:
     """The primary airspeed sensor at every instant where healthy, else a healthy sensor in use.
-    NaN: not healthy.
+
+    NaN stands for a sensor that is not healthy.
     """
     tables = {number: _healthy(table) for number, table in numbered.items()}
     live = {
@@ -183,8 +185,9 @@ def _healthy(table: Table) -> Table:
 
 
 def _primary(tables: Mapping[int, Table]) -> tuple[list[int], Table] | None:
-    """The samples of the primary sensor at every instant, and the numbers of the sensors; None for
-    a log without `Pri`.
+    """The samples of the primary sensor at every instant, and the numbers of the sensors.
+
+    None for a log without `Pri`.
     """
     if not all("Pri" in table.fields for table in tables.values()):
         return None

@@ -1,10 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Reads a growing log by `Scan`: a call continues at the end of the last call. A finished log is
-read in the same way.
+"""Reads a growing log by `Scan`: a call continues at the end of the last call.
 
-A packed log is finished: `open_log` reads it. A record is read once
-the record is whole: a chunk in progress is never read.
+A finished log is read in the same way. A packed log is finished: `open_log` reads it. A record is
+read once the record is whole: a chunk in progress is never read.
 """
 
 import math
@@ -94,8 +93,9 @@ class Follower:
 
     @property
     def path(self) -> Path | None:
-        """The present file; None before the first file. Raises ParameterError for a folder with
-        several bags.
+        """The present file; None before the first file.
+
+        Raises ParameterError for a folder with several bags.
         """
         if self._path is None:
             files = bag_files(self.run)
@@ -122,10 +122,10 @@ class Follower:
                 channel.rate = 0.0
 
     def read(self) -> Iterator[Messages | Attachment | Metadata]:
-        """The records since the last call. A caller may stop the iteration: the next call
-        continues.
+        """The records since the last call.
 
-        Raises OSError when the file cannot be read, ParameterError for a folder with several bags.
+        A caller may stop the iteration: the next call continues. Raises OSError when the file
+        cannot be read, ParameterError for a folder with several bags.
         """
         yield from self._pending_records()
         while not self.fault and (path := self.path) is not None:

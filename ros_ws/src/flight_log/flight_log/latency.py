@@ -23,11 +23,11 @@ class Times(NamedTuple):
 
 
 def latency(sent: Mapping[str, Sequence[Times]]) -> Signal | None:
-    """Time from the sending of y to the sending of u with the stamp of y, s: a channel by the
-    stamps of u.
+    """Time from the sending of y to the sending of the u with the stamp of y, s.
 
-    `sent` holds the times by the full names of the topics y and u. None for a log without y or u,
-    with several aircraft, or with equal times, as of a flight in one process.
+    The signal has one channel, by the stamps of u. `sent` holds the times by the full names of the
+    topics y and u. None for a log without y or u, with several aircraft, or with equal times, as of
+    a flight in one process.
     """
     topics = {topic.rpartition("/")[2]: topic for topic in sent}
     if len(sent) != len(TOPICS) or len(topics) != len(TOPICS) or not all(sent.values()):

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What became of the proposals of a learner: messages of the topic `learning`, written and read
-without ROS.
+"""What became of the proposals of a learner: the messages of the topic `learning`.
+
+They are written and read without ROS.
 """
 
 import json

@@ -165,8 +165,9 @@ class TopicSamples:
     def _ordered(
         self, names: tuple[str, ...], values: NDArray[np.float64]
     ) -> tuple[tuple[str, ...], NDArray[np.float64]]:
-        """Names and values in the order of the first sample with these names: values are matched by
-        name.
+        """Names and values in the order of the first sample with these names.
+
+        Values are matched by name.
         """
         for known in self._samples:
             if known != names and sorted(known) == sorted(names):
@@ -174,10 +175,9 @@ class TopicSamples:
         return names, values
 
     def signal(self, name: str) -> Signal | None:
-        """The samples of a topic in the order of the stamps; None without samples that have a
-        stamp.
+        """The samples of a topic in the order of the stamps; None without a stamped sample.
 
-        Equal stamps may follow on another in RESTING topics, so that a stamp of 0 may be flight
+        Equal stamps may follow one another in RESTING topics, so that a stamp of 0 may be flight
         time. A plan needs no stamp.
         """
         self._decode_batch(end=True)
@@ -212,9 +212,7 @@ class TopicSamples:
         return signal
 
     def _names(self) -> tuple[str, ...]:
-        """The names of the first sample, or of the majority of samples with further names
-        beside.
-        """
+        """The names of the first sample, or of the majority where samples have further names."""
         first = next(iter(self._samples))
         return max((names for names in self._samples if set(first) <= set(names)), key=self._count)
 
@@ -222,8 +220,9 @@ class TopicSamples:
         return self._samples[names].count
 
     def conflict(self, name: str) -> str:
-        """The note on simultaneous publishers, of which the nodes accept the first; empty for
-        successive publishers.
+        """The note on simultaneous publishers, of which the nodes accept the first.
+
+        Empty for successive publishers.
         """
         spans = sorted(self.spans.items(), key=itemgetter(1))
         if all(before[1][1] < after[1][0] for before, after in pairwise(spans)):
@@ -302,8 +301,9 @@ class LogContent:
         return None
 
     def _time_of_stamps(self, sent_ns: np.int64) -> int:
-        """A time of sending by the clock of the stamps: the nodes keep their time when the system
-        clock is set.
+        """A time of sending by the clock of the stamps.
+
+        The nodes keep their time when the system clock is set.
         """
         if self.times is not None:
             nearest = np.argmin(np.abs(self.times.sent_ns - sent_ns))
@@ -372,8 +372,9 @@ def read_content(run: Path, remaps: Mapping[str, str]) -> LogContent:
 
 
 def _add_metadata(folder: Path, log: LogContent) -> None:
-    """Add what metadata.yaml tells of a bag; for an unreadable file a note names the repair
-    command.
+    """Add what metadata.yaml tells of a bag.
+
+    For an unreadable file a note names the repair command.
     """
     information: Mapping[str, Any] = {}
     try:

@@ -47,8 +47,9 @@ class Samples(NamedTuple):
 
 
 class Decoded(NamedTuple):
-    """The content of some messages. A vector without channels stands for a missing sample and is
-    left out.
+    """The content of some messages.
+
+    A vector without channels stands for a missing sample and is left out.
     """
 
     samples: list[Samples]
@@ -112,18 +113,18 @@ def stamps_of(table: Table) -> NDArray[np.int64]:
 
 
 def flight_start_ns(stamp_ns: int, t: float) -> int | None:
-    """Stamp of flight time 0, from a sample of `truth` with t in s: stamp - t. None when t is not a
-    flight time.
+    """Stamp of flight time 0, from a sample of `truth` with t in s: stamp - t.
+
+    None when t is not a flight time.
     """
     return stamp_ns - nanoseconds(t) if abs(t) <= MAX_FLIGHT_TIME else None
 
 
 def encoded(samples: Samples) -> NDArray[np.uint8]:
-    """The samples as serialised sensor_msgs/JointState, a row a message, with empty velocity and
-    effort.
+    """The samples as serialised sensor_msgs/JointState, a row a message.
 
-    The first message is serialised by its definition. The further messages differ in stamp and
-    values only.
+    Velocity and effort are empty. The first message is serialised by its definition. The further
+    messages differ in stamp and values only.
     """
     store = joint_state_types()
     types: dict[str, Any] = store.types
@@ -156,8 +157,9 @@ def _position(marked: bytes, marks: FloatArray) -> slice:
 
 
 def decode_routes(table: Table) -> Decoded:
-    """Routes of nav_msgs/Path in the frame map (east, north, up): a sample with the channels
-    WAYPOINT a waypoint.
+    """Routes of nav_msgs/Path in the frame map (east, north, up).
+
+    A waypoint becomes a sample with the channels WAYPOINT.
     """
     samples = []
     unreadable = 0
@@ -223,8 +225,10 @@ class _JointStateDecoder:
         return np.asarray(different.max(axis=1) == 0)
 
     def _learn(self, message: bytes) -> None:
-        """Learn the layout: serialise marked values with the same strings, and find the position of
-        the marks.
+        """Learn the byte layout of a message.
+
+        Marked values are serialised with the same strings. The place of the marks is that of the
+        values.
         """
         try:
             vector: Any = self._store.deserialize_cdr(message, JOINT_STATE)

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Opens the files of a log for every reader: packed files, compressed messages, several files of a
-bag.
+"""Opens the files of a log for every reader.
 
-A path that is no log is refused in one sentence with what is there.
+It unpacks packed files and compressed messages, and orders the files of a bag. A path that is no
+log is refused in one sentence with what is there.
 """
 
 import re
@@ -130,10 +130,10 @@ def missing_parts(files: Sequence[Path], information: Mapping[str, Any]) -> list
 
 @contextmanager
 def open_scan(file: Path) -> Iterator[Scan]:
-    """The reader of a file of a log, by the first bytes; a packed file is unpacked into a temporary
-    folder.
+    """The reader of a file of a log, by the first bytes.
 
-    Raises ParameterError for a file that cannot be read.
+    A packed file is unpacked into a temporary folder. Raises ParameterError for a file that cannot
+    be read.
     """
     kind = file_kind(file)
     if kind not in PACKED:
@@ -175,11 +175,10 @@ def _unpack(file: Path, plain: Path, kind: str) -> None:
 
 
 def log_topics(run: Path, remaps: Mapping[str, str] = {}) -> dict[str, str]:
-    """The types of the topics of a log by full name; with "in ENCODING" of messages that are no
-    CDR.
+    """The types of the topics of a log by full name.
 
-    By the index of a file alone where the file has an index. Raises ParameterError for a path
-    without a log.
+    A type of messages that are no CDR ends with "in ENCODING". Where the file has an index, the
+    index alone is read. Raises ParameterError for a path without a log.
     """
     topics: dict[str, str] = {}
     for file in log_files(run):
@@ -201,10 +200,10 @@ def log_topics(run: Path, remaps: Mapping[str, str] = {}) -> dict[str, str]:
 
 
 def plain_message(data: bytes) -> bytes:
-    """A message that `ros2 bag record` may have compressed: the beginning of a compressed message
-    is that of no CDR.
+    """A message that `ros2 bag record` may have compressed, without the compression.
 
-    A damaged message stays as it is: no decoder takes it.
+    A compressed message begins as no CDR does. A damaged message stays as it is: no decoder takes
+    it.
     """
     if data[:4] != ZSTD_MAGIC:
         return data

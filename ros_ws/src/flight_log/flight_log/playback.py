@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Playback schedule of a log: the messages and the times to send. Needs no ROS;
-`flight_bringup.player` sends.
+"""Playback schedule of a log: the messages and the times to send them.
+
+Needs no ROS; `flight_bringup.player` sends.
 """
 
 import re
@@ -58,11 +59,10 @@ class Playback(NamedTuple):
 def read_playback(
     run: Path, topics: Sequence[str] = (), start: float = 0.0, namespace: str | None = None
 ) -> Playback:
-    """The messages of a log from flight time `start` in s. `topics`: full or last names; empty for
-    every topic except SHARED.
+    """The messages of a log from flight time `start` in s.
 
-    `namespace` selects an aircraft; None plays every aircraft. Topics without CDR, e.g. with JSON,
-    are skipped.
+    `topics` are full or last names; empty for every topic except SHARED. `namespace` selects an
+    aircraft; None plays every aircraft. Topics without CDR, e.g. with JSON, are skipped.
 
     A message is due at the time of sending. In a log of a lockstep flight the host's clock has no
     meaning: there a message is due at the stamp, but not before the messages sent earlier. Raises
@@ -146,8 +146,9 @@ def _scheduled(
 def _latched(
     messages: Sequence[ScheduledMessage], known: Mapping[str, StoredMessage], begin_ns: int
 ) -> Iterator[ScheduledMessage]:
-    """The last messages of latched topics before the begin, as of /robot_description, for late
-    subscribers.
+    """The last messages of latched topics before the begin, for late subscribers.
+
+    /robot_description is such a topic.
     """
     kept = {
         topic: deque[ScheduledMessage](maxlen=latched_depth(message.qos))
@@ -160,8 +161,9 @@ def _latched(
 
 
 def latched_depth(qos: str) -> int:
-    """The number of messages for a late subscriber, by the offered profiles of rosbag2 as YAML; 0
-    of a volatile topic.
+    """The number of messages for a late subscriber; 0 of a volatile topic.
+
+    `qos` is the YAML list of the offered profiles of rosbag2.
     """
     try:
         profiles = yaml.safe_load(qos)
@@ -192,8 +194,9 @@ def _definition(message: StoredMessage) -> str:
 
 
 def begins_with_stamp(text: str) -> bool:
-    """Whether the first field of a message type is a header or a time, by the definition as text,
-    ros2msg or ros2idl.
+    """Whether the first field of a message type is a header or a time.
+
+    `text` is the definition, ros2msg or ros2idl.
     """
     if struct := IDL_STRUCT.search(text):
         text = text[struct.end() :]
@@ -216,8 +219,9 @@ def _is_flight_time(stored: StoredMessage) -> bool:
 
 
 def _start_ns(stored: Iterable[StoredMessage], otherwise: int) -> int:
-    """Stamp of flight time 0, by the first `truth` or else the first `y_m`; `otherwise` without
-    both.
+    """Stamp of flight time 0, by the first `truth` or else the first `y_m`.
+
+    It is `otherwise` without both.
     """
     first: dict[str, StoredMessage] = {}
     for message in stored:

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Provenance of a flight for the metadata of a log: versions, revision, host, command, as named
-sets of strings.
+"""Provenance of a flight for the metadata of a log, as named sets of strings.
+
+It holds versions, revision, host and command.
 """
 
 import os
@@ -78,8 +79,9 @@ def recorded_arithmetic(metadata: Mapping[str, Mapping[str, str]]) -> str:
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python, the arithmetic of u, the installed packages of the stack and the
-    installed main dependencies.
+    """Versions of Python, the arithmetic of u, the stack and its main dependencies.
+
+    The packages are those that are installed.
     """
     installed = {"python": platform.python_version(), "arithmetic": ARITHMETIC}
     for name in (*STACK, *DEPENDENCIES):
@@ -93,8 +95,9 @@ def versions() -> dict[str, str]:
 
 
 def revision(source: Path) -> dict[str, str]:
-    """The git commit of a source file, and `dirty`, "true" when a tracked file was changed. Empty
-    without a commit.
+    """The git commit of a source file, and `dirty`, "true" when a tracked file was changed.
+
+    Empty without a commit.
     """
     git = shutil.which("git")
     if git is None:

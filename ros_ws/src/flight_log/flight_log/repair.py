@@ -1,9 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Repairs a truncated or damaged bag, as a killed recorder leaves behind: every rosbag2 reader
-accepts the result.
+"""Repairs a truncated or damaged bag, as a killed recorder leaves behind.
 
-Needs no ROS.
+Every rosbag2 reader accepts the result. Needs no ROS.
 """
 
 import os
@@ -54,15 +53,14 @@ class Repair(NamedTuple):
 
 
 def repair(run: Path) -> Repair:
-    """Rebuild the damaged files in the folder of a bag: truncated files, files with damaged parts,
-    and metadata.yaml.
+    """Rebuild the damaged files in the folder of a bag, and metadata.yaml.
 
-    A rebuilt file holds every readable record and has an index. The rebuilt file replaces the
-    damaged file atomically; the damaged file stays as *.damaged. An intact bag does not change.
-    metadata.yaml keeps the names of missing files. The file of a bag is repaired alone, without
-    metadata.yaml. Raises ParameterError without a bag, while a recorder writes the bag, for a bag
-    without a readable message, for a metadata.yaml of another program, and for a folder that cannot
-    be written.
+    A damaged file is truncated or has damaged parts. A rebuilt file holds every readable record and
+    has an index. The rebuilt file replaces the damaged file atomically; the damaged file stays as
+    *.damaged. An intact bag does not change. metadata.yaml keeps the names of missing files. The
+    file of a bag is repaired alone, without metadata.yaml. Raises ParameterError without a bag,
+    while a recorder writes the bag, for a bag without a readable message, for a metadata.yaml of
+    another program, and for a folder that cannot be written.
     """
     files = bag_files(run) or log_files(run)  # the latter says what is there
     for file in files:
@@ -99,10 +97,10 @@ def repair(run: Path) -> Repair:
 
 
 def _previous_metadata(path: Path) -> tuple[Mapping[str, Any], int]:
-    """The content of metadata.yaml and the log time of the last message; empty and 0 for a missing
-    or damaged file.
+    """The content of metadata.yaml and the log time of the last message.
 
-    Raises ParameterError for a file of another program, which must not be replaced.
+    Empty and 0 for a missing or damaged file. Raises ParameterError for a file of another program,
+    which must not be replaced.
     """
     try:
         return read_bag_metadata(path.parent)
@@ -194,8 +192,9 @@ class _FileScan:
         )
 
     def _copy(self, writer: Writer) -> None:
-        """Copy the records. Schemas and channels come first, because the index also holds the
-        channels of a damaged chunk.
+        """Copy the records, schemas and channels first.
+
+        The index also holds the channels of a damaged chunk.
         """
         writer.start(profile="ros2", library="rise-di repair")
         schemas = {
@@ -231,8 +230,9 @@ class _FileScan:
 
 
 def _keep_damaged(path: Path) -> Path:
-    """Give the damaged file a second name for the time after the replacement; a copy on a file
-    system without hard links.
+    """Give the damaged file a second name for the time after the replacement.
+
+    On a file system without hard links it is a copy.
     """
     number = 1
     # A link to nothing also has the name.

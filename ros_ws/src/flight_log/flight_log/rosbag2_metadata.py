@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""metadata.yaml of a bag, version 9 of rosbag2: reading, writing as text, finding the MCAP files of
-a bag. Needs no ROS.
+"""metadata.yaml of a bag, version 9 of rosbag2, and the files of a bag.
+
+Reads the file, makes its text, and finds the MCAP files of a bag. Needs no ROS.
 """
 
 import re
@@ -60,11 +61,11 @@ def part_number(name: str) -> int | None:
 
 
 def bag_files(run: Path) -> list[Path]:
-    """The files of a bag in the order of their numbers; the file itself when a file is given; empty
-    without a file.
+    """The files of a bag in the order of their numbers; empty without a file.
 
-    A file that is unpacked beside the packed file comes in place of the latter. Raises
-    ParameterError when the files in the folder are not parts of a single bag.
+    The path of a file is the file itself. A file that is unpacked beside the packed file comes in
+    place of the latter. Raises ParameterError when the files in the folder are not parts of a
+    single bag.
     """
     if is_file(run):
         return [run]
@@ -116,10 +117,10 @@ def bag_metadata_yaml(
     previous: Mapping[str, Any] | None = None,
     missing: Sequence[str] = (),
 ) -> str:
-    """The text of metadata.yaml. Compression, custom data and distribution come from the `previous`
-    content.
+    """The text of metadata.yaml.
 
-    `missing` files of the previous content stay in the lists of files.
+    Compression, custom data and distribution come from the `previous` content. `missing` files of
+    the previous content stay in the lists of files.
     """
     counts: dict[str, TopicCount] = {}
     for count in chain.from_iterable(file.counts for file in files):

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Reads the records of an intact, truncated, damaged or growing MCAP file: up to its end, without
-the damaged parts.
+"""Reads the records of an MCAP file that may be truncated, damaged or growing.
+
+It reads up to the end of the file, without the damaged parts.
 """
 
 import os
@@ -142,8 +143,9 @@ T = TypeVar("T")
 
 
 class Scan:
-    """A file. `records`, `batches` and `groups` read on where the call before ended, as a growing
-    file needs. The attributes are valid afterwards.
+    """A file, read from where the last reading ended, as a growing file needs.
+
+    `records`, `batches` and `groups` read. The attributes are valid afterwards.
     """
 
     def __init__(self, path: Path) -> None:
@@ -175,9 +177,7 @@ class Scan:
         return chain.from_iterable(self._read(decode_parts, 0, map))
 
     def batches(self) -> Iterator[McapRecord | MessageBatch]:
-        """As `records`, many times faster: the messages of a channel in some chunks come
-        together.
-        """
+        """As `records`, many times faster: the messages of a channel in some chunks together."""
         return chain.from_iterable(self._read(decode_batches, JOINED_BYTES, map_ahead))
 
     def groups(self) -> Iterator[Sequence[McapRecord | MessageBatch]]:
@@ -206,8 +206,9 @@ class Scan:
                 self.damaged += 1  # a changed opcode makes a record unrecognisable
 
     def _index(self, stream: IO[bytes], size: int) -> list[McapRecord]:
-        """The records of the index (the MCAP summary); empty when the file is truncated or the
-        index damaged.
+        """The records of the index, the MCAP summary.
+
+        Empty when the file is truncated or the index damaged.
         """
         position = size - FOOTER.size - len(MCAP0_MAGIC)
         if position < len(MCAP0_MAGIC):
@@ -310,8 +311,9 @@ def whole_parts(stream: IO[bytes], position: int, known: Sequence[int]) -> Itera
 
 
 def _joined(parts: Iterator[Part], most: int) -> Iterator[Sequence[Part]]:
-    """Successive chunks with up to `most` bytes of records together, or a larger chunk alone; every
-    further record alone.
+    """Successive chunks with up to `most` bytes of records together; every further record alone.
+
+    A chunk of more bytes is alone too.
     """
     chunks: list[Part] = []
     size = 0
@@ -351,8 +353,9 @@ def _decoded(
 
 
 def map_ahead(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
-    """As `map`, with the next results from a thread: decompression and NumPy leave the interpreter
-    to the caller meanwhile.
+    """As `map`, with the next results from a thread.
+
+    Decompression and NumPy leave the interpreter to the caller meanwhile.
     """
     with ThreadPoolExecutor(1) as pool:
         ahead: deque[Future[R]] = deque()
@@ -387,10 +390,10 @@ def _messages_in(record: object) -> int:
 
 
 def decode_batches(parts: Sequence[Part]) -> Iterator[McapRecord | MessageBatch]:
-    """As `decode` of chunks or of a single record, with the messages of a channel together. Raises
-    DECODE_ERRORS.
+    """As `decode` of chunks or of a single record, with the messages of a channel together.
 
-    The message indexes of a chunk save most of the time. A wrong index changes nothing.
+    The message indexes of a chunk save most of the time. A wrong index changes nothing. Raises
+    DECODE_ERRORS.
     """
     yield from _split_batches([(_plain(part), _places(part.message_indexes)) for part in parts])
 
@@ -509,8 +512,9 @@ def decode(opcode: int, content: bytes) -> Iterator[McapRecord]:
 
 
 def decompress(chunk: bytes) -> bytes:
-    """The bytes of the records in the content of a chunk, limited to the stated size. Raises
-    DECODE_ERRORS.
+    """The bytes of the records in the content of a chunk, limited to the stated size.
+
+    Raises DECODE_ERRORS.
     """
     _, _, size, crc, name_length = CHUNK.unpack_from(chunk)
     (length,), start = (

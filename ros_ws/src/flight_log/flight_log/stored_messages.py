@@ -38,10 +38,10 @@ NO_SCHEMA = Schema(id=0, data=b"", encoding="", name="")
 
 
 def stored_messages(run: Path) -> Iterator[StoredMessage]:
-    """The messages of a log in the order of writing; of a truncated or damaged file the readable
-    messages.
+    """The messages of a log in the order of writing.
 
-    Raises ParameterError for a missing or unreadable log.
+    Of a truncated or damaged file they are the readable messages. Raises ParameterError for a
+    missing or unreadable log.
     """
     for file in log_files(run):
         schemas: dict[int, Schema] = {}
@@ -102,8 +102,9 @@ def parameter_changes(run: Path, node: str, known: Mapping[str, object]) -> list
 
 
 def parameter_event(stamp_ns: int, node: str, changes: Mapping[str, Any]) -> bytes:
-    """A message of PARAMETER_EVENTS with changes by dotted name, the inverse of
-    `parameter_changes`; None deletes one.
+    """A message of PARAMETER_EVENTS with changes by dotted name; None deletes a parameter.
+
+    It is the inverse of `parameter_changes`.
     """
     store = typestore()
     types = {

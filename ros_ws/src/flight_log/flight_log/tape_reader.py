@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Reads a bag as a Tape, without ROS: bags of this stack and of `ros2 bag record`, also truncated
-ones.
+"""Reads a bag as a Tape, without ROS.
+
+It reads the bags of this stack and of `ros2 bag record`, also truncated ones.
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -53,13 +54,13 @@ AIRCRAFT_TOPICS = ("y", "y_m", "u", "u_m", "internals", "truth")
 
 
 class RecordedRun(NamedTuple):
-    """The content of a log. `metadata` holds the named sets of strings, `attachments` the files
-    except the scenario.
+    """The content of a log, of the aircraft in `namespace`, "" for the root.
 
+    `metadata` holds the named sets of strings, `attachments` the files except the scenario.
     `latency` is that of the loop from y to u, `age_of_u` the age of u at the aircraft,
     `engagements` are the engagements of a bridge; None for a log without samples of the kind, or
-    without times of sending. The content is of the aircraft in `namespace`, "" for the root. `path`
-    is where the log was read, `topics` are the types of all topics of the log by full name.
+    without times of sending. `path` is where the log was read, `topics` are the types of all topics
+    of the log by full name.
     """
 
     tape: Tape
@@ -75,14 +76,14 @@ class RecordedRun(NamedTuple):
 
     @property
     def account(self) -> Any:
-        """The share of each topic, and what the log lacks, as `rise_di.read_run` finds them; else
-        None.
+        """The share of each topic, and what the log lacks.
+
+        `rise_di.read_run` finds them; None without it.
         """
         return self.tape.account
 
     def require(self, *names: str) -> None:
-        """Raise ParameterError with the topics of the log where a topic of a flight has no sample,
-        or every topic.
+        """Raise ParameterError where the log has no sample of a topic, with the topics that it has.
 
         Args:
             names: Topics that need a sample; none: at least a topic of a flight.
@@ -181,8 +182,9 @@ def _require_samples(log: LogContent, filled: Mapping[str, Signal], run: Path) -
 def _tape(
     log: LogContent, aircraft: str, names: Mapping[str, str], filled: Mapping[str, Signal]
 ) -> Tape:
-    """The tape of an aircraft, without the duration; `names` within the namespace by topic, signals
-    by name.
+    """The tape of an aircraft, without the duration.
+
+    `names` are the names within the namespace by topic, `filled` the signals by name.
     """
     stamped = {
         name: log.topics[topic] for topic, name in names_within(aircraft, log.topics).items()
@@ -221,15 +223,17 @@ def _tape(
 
 
 def _is_before_epoch(start_ns: int, spans: Mapping[str, Span]) -> bool:
-    """Whether processes stamped by /clock: by the host's time stamps are since the epoch, and in
-    lockstep a node leaves out its process id.
+    """Whether processes stamped by /clock.
+
+    Stamps by the host's time are since the epoch, and in lockstep a node leaves out its process id.
     """
     return start_ns <= SINCE_EPOCH_NS and any(INSTANCE.fullmatch(sender) for sender in spans)
 
 
 def _spans(topics: Iterable[tuple[str, Mapping[str, Span]]]) -> dict[str, Span]:
-    """The span of each publisher over its topics, which are names with spans; of other programs on
-    those of aircraft alone.
+    """The span of each publisher over its topics, which are names with spans.
+
+    Of other programs only the topics of aircraft count.
     """
     spans: dict[str, Span] = {}
     for name, senders in topics:
@@ -240,15 +244,17 @@ def _spans(topics: Iterable[tuple[str, Mapping[str, Span]]]) -> dict[str, Span]:
 
 
 def stored_scenario(path: Path) -> StoredFile:
-    """A scenario file as a file inside a log. Raises ParameterError for a file that cannot be
-    read.
+    """A scenario file as a file inside a log.
+
+    Raises ParameterError for a file that cannot be read.
     """
     return StoredFile(path.name, read_file(path, str(path), A_SCENARIO))
 
 
 def files_beside(run: Path) -> list[StoredFile]:
-    """The scenario and the parameters beside a log without attachments: a single scenario by the
-    content.
+    """The scenario and the parameters beside a log without attachments.
+
+    The content tells a scenario. Several scenarios are as none.
     """
     folder = run if is_folder(run) else run.parent
     files = []
@@ -277,8 +283,9 @@ def aircraft_namespaces(topics: Collection[str]) -> list[str]:
 
 
 def chosen_namespace(topics: Collection[str], namespace: str | None, where: str) -> str:
-    """The namespace of an aircraft, "" for the root and without an aircraft; `namespace` is the
-    choice of the caller.
+    """The namespace of an aircraft, "" for the root and without an aircraft.
+
+    `namespace` is the choice of the caller.
     """
     aircraft = aircraft_namespaces(topics)
     known = ", ".join(name or "/" for name in aircraft) or "none"
@@ -308,9 +315,7 @@ def names_within(chosen: str, topics: Collection[str]) -> dict[str, str]:
 
 
 def _duration(attachments: Sequence[StoredFile]) -> float | None:
-    """The duration of the whole flight by the attached parameters, s; None for a log without
-    them.
-    """
+    """The duration of the whole flight by the attached parameters, s; None without them."""
     for stored in attachments:
         if stored.name == PARAMETERS:
             with suppress(ParameterError, LookupError, OverflowError, TypeError, ValueError):
@@ -320,8 +325,9 @@ def _duration(attachments: Sequence[StoredFile]) -> float | None:
 
 
 def _start_ns(signals: Mapping[str, Signal]) -> int:
-    """Stamp of flight time 0: by `truth`, else the first y_m, where commands begin; else the
-    earliest stamp.
+    """Stamp of flight time 0.
+
+    It is known by `truth`, else it is the first y_m, where commands begin, else the earliest stamp.
     """
     truth = signals.get("truth")
     if truth is not None and "t" in truth.names:

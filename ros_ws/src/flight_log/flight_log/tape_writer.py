@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Writes a Tape as an MCAP bag, without ROS. A flight in one process and a flight over topics leave
-the same kind of log.
+"""Writes a Tape as an MCAP bag, without ROS.
+
+A flight in one process and a flight over topics leave the same kind of log.
 """
 
 from collections.abc import Mapping

@@ -53,8 +53,9 @@ def read_vehicle_log(path: Path, choice: Choice = ANY) -> VehicleLog:
 
 @contextmanager
 def _silent() -> Iterator[None]:
-    """Discard what pymavlink and pyulog print of a damaged file, a line for each byte without a
-    message, from C too.
+    """Discard what pymavlink and pyulog print of a damaged file, from C too.
+
+    They print a line for each byte without a message.
     """
     with (
         redirect_stdout(StringIO()) as text,
@@ -83,8 +84,9 @@ MEMORY = (1 << 30, 100)
 
 
 def read_foreign_log(path: Path, choice: Choice = ANY) -> VehicleLog:
-    """`read_vehicle_log` in an isolated process: a log of a few bytes may claim billions of values.
-    Raises ParameterError.
+    """`read_vehicle_log` in an isolated process, which a hostile log cannot harm.
+
+    A log of a few bytes may claim billions of values. Raises ParameterError.
     """
     require(path.is_file(), str(path), "no such file", EXPECTED)
     size = path.stat().st_size

@@ -184,8 +184,9 @@ def _read_tlog(path: Path, kind: str, choice: Choice) -> VehicleLog:
 def _flown_system(
     received: Mapping[int, list[Received]], chosen: int | None
 ) -> tuple[int, tuple[tuple[str, str], ...]]:
-    """The flying system of a tlog, and a row on the choice. Raises ParameterError where two systems
-    moved.
+    """The flying system of a tlog, and a row on the choice.
+
+    Raises ParameterError where two systems moved.
     """
     numbers = " and ".join(map(str, received)) or "none with a heartbeat"
     if chosen is not None:
@@ -218,12 +219,12 @@ AGAIN_NS = 30 * NANOSECONDS
 
 
 def _dated(received: list[Received]) -> Iterator[Sample]:
-    """The samples by the clock of the autopilot: a radio may bunch messages, a second link repeats
-    messages later.
+    """The samples by the clock of the autopilot.
 
-    A message without a time gets the time of the message before on the same link, the nearest by
-    the sequence. Stamps count from the first arrival. Without a clock in the messages the arrival
-    is the time.
+    The times of arrival do not serve: a radio may bunch messages, and a second link repeats
+    messages later. A message without a time gets the time of the message before on the same link,
+    the nearest by the sequence. Stamps count from the first arrival. Without a clock in the
+    messages the arrival is the time.
     """
     timed = [message for message in received if hasattr(message.content, "time_boot_ms")]
     times = {message.content.time_boot_ms for message in timed}
@@ -314,9 +315,7 @@ def _angles(attitude: Table) -> dict[str, FloatArray]:
 
 
 def _vehicle(instances: Instances) -> tuple[str, bool]:
-    """The kind of vehicle by `vehicle_status`, "" where unknown, and whether the vehicle is a
-    VTOL.
-    """
+    """The kind of vehicle by `vehicle_status`, "" where unknown, and whether it is a VTOL."""
     table = instances.get("vehicle_status", {}).get(0)
     if table is None:
         return "", False
@@ -354,8 +353,9 @@ ULOG_VALUES = 65535
 
 
 def _require_short(formats: Mapping[str, Any]) -> None:
-    """Raise ValueError for a format with more values than a message holds: pyulog makes a field of
-    each value.
+    """Raise ValueError for a format with more values than a message holds.
+
+    pyulog would make a field of each value.
     """
     counts: dict[str, int] = {}
 

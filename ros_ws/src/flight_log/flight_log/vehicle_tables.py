@@ -25,17 +25,16 @@ SERVOS = 16
 
 
 class Table(NamedTuple):
-    """The samples of a message: stamps, ns, shape (N,), ascending, and the fields by name, each of
-    shape (N,).
+    """The samples of a message.
+
+    The stamps, ns, have the shape (N,) and ascend. The fields, by name, have the shape (N,) each.
     """
 
     stamp_ns: NDArray[np.int64]
     fields: Mapping[str, FloatArray]
 
     def at(self, field: str, stamp_ns: NDArray[np.int64]) -> FloatArray:
-        """The newest value of a field at each of some instants, shape (n,); NaN before the
-        first.
-        """
+        """The newest value of a field at each of some instants, (n,); NaN before the first."""
         places = np.searchsorted(self.stamp_ns, stamp_ns, side="right") - 1
         return np.where(places < 0, np.nan, self.fields[field][places])
 
@@ -67,8 +66,10 @@ Sources = Mapping[str, tuple[Source, ...]]
 
 
 class Format(NamedTuple):
-    """A format of logs: what has y and pose in SI (body FRD; north, east, up), the transmitter's
-    channels, the servos.
+    """A format of logs: where it has each quantity.
+
+    The quantities are y and pose in SI (body FRD; north, east, up), the channels of the
+    transmitter, the servos.
     """
 
     sources: Sources
@@ -133,8 +134,9 @@ ANY = Choice()
 
 
 class VehicleLog(NamedTuple):
-    """A log of an autopilot. `format` is None for a ULog, whose messages have the names of PX4's
-    topics.
+    """A log of an autopilot.
+
+    `format` is None for a ULog, whose messages have the names of PX4's topics.
     """
 
     kind: str
@@ -159,8 +161,9 @@ class VehicleLog(NamedTuple):
         return 0 if source is None else int(self.tables[source.message].stamp_ns[0])
 
     def parameters_at(self, stamp_ns: int) -> dict[str, float]:
-        """The values of the parameters at an instant, without parameters whose first record comes
-        later.
+        """The values of the parameters at an instant.
+
+        A parameter whose first record comes later is missing.
         """
         values: dict[str, float] = {}
         for name, records in self.parameters.items():
@@ -174,7 +177,5 @@ class VehicleLog(NamedTuple):
         return source.message in self.tables and source.field in self.tables[source.message].fields
 
     def at(self, source: Source, stamp_ns: NDArray[np.int64]) -> FloatArray:
-        """The newest value of a place at each of some instants, shape (n,); NaN before the
-        first.
-        """
+        """The newest value of a place at each of some instants, (n,); NaN before the first."""
         return source.scale * self.tables[source.message].at(source.field, stamp_ns)
