@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The live page without a browser: a followed flight, what the server answers, and clients that it
-refuses.
+"""The live page without a browser.
+
+A flight is followed, the server answers, and it refuses some clients.
 """
 
 import asyncio
@@ -457,8 +458,9 @@ async def test_foreign_host_another_path_and_another_method_refused(
 async def test_no_sample_served_without_token(
     path: str, headers: dict[str, str], recorded: Path
 ) -> None:
-    """Neither the query, which a log of addresses may keep, nor a cookie, which goes to all ports
-    of a host, has the token.
+    """Neither the query nor a cookie has the token.
+
+    A log of addresses may keep the query, and a cookie goes to all ports of a host.
     """
     async with serving(recorded) as server:
         response = await get(server, path, token="", **headers)
@@ -486,8 +488,9 @@ def end(*connections: Connection) -> None:
 
 
 async def test_connections_without_token_leave_place(recorded: Path) -> None:
-    """A new connection takes the place of the oldest connection without the token; the page is
-    served throughout.
+    """A new connection takes the place of the oldest connection without the token.
+
+    The page is served throughout.
     """
     async with serving(recorded) as server:
         idle = await connect(server, count=1000)
@@ -500,8 +503,9 @@ async def test_connections_without_token_leave_place(recorded: Path) -> None:
 
 
 async def rest_of(reader: asyncio.StreamReader) -> bytes:
-    """What arrives until the server closes; it resets a connection of which it leaves bytes
-    unread.
+    """What arrives until the server closes.
+
+    The server resets a connection of which it leaves bytes unread.
     """
     try:
         return await reader.read()
@@ -659,8 +663,9 @@ async def test_idle_or_surplus_websockets_closed(
 async def test_websocket_without_reader_gets_few_answers(
     recorded: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """A WebSocket asks and reads no answer: the server makes few answers, ends the WebSocket, and
-    ends quietly.
+    """A WebSocket asks and reads no answer.
+
+    The server makes few answers, ends the WebSocket, and ends quietly.
     """
     made: list[bytes] = []
 
@@ -726,8 +731,9 @@ def test_recording_run_is_chosen_first(recorded: Path, tmp_path: Path) -> None:
 
 
 def test_aircraft_of_one_log_are_a_fleet(tmp_path: Path) -> None:
-    """The places of both are topics of one answer; the page of the second shows its samples alone,
-    without a note.
+    """The places of both are topics of one answer.
+
+    The page of the second shows its samples alone, without a note.
     """
     with BagWriter(tmp_path) as bag:
         for name, east in (("uav1", 1.0), ("uav2", 2.0)):

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Control from the page without ROS: who is refused, what is bounded, compare and set, undo, the
-lease.
+"""Control from the page without ROS.
+
+Tested are who is refused, what is bounded, compare and set, undo, and the lease.
 """
 
 import asyncio

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The log of a flight over the Foxglove protocol, against a client of another library; the extra
-may be missing.
+"""The log of a flight over the Foxglove protocol, against a client of another library.
+
+The extra may be missing.
 """
 
 import asyncio

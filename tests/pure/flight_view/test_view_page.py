@@ -1,7 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The live page in a browser: a flight that grows, replay, signs of the scene, states, hostile
-names, phone and dark scheme.
+"""The live page in a browser.
+
+A flight grows and is replayed. The signs of the scene, the states, hostile names, a phone and the
+dark scheme are tested.
 """
 
 import math
@@ -72,8 +74,9 @@ PIXELS = """((selector, name) => {
 
 
 def pixels_of(browser: Browser, selector: str, name: str) -> int:
-    """Number of pixels of a canvas that have nearly the colour of that name, as the middle of a
-    line has.
+    """Number of pixels of a canvas that have nearly the colour of that name.
+
+    The middle of a line has it.
     """
     return int(browser.run(f"{PIXELS}('{selector}', '{name}')"))
 
@@ -187,8 +190,9 @@ def test_names_that_are_html_shown_as_text(browser: Browser, tmp_path: Path) -> 
 
 
 def seen(browser: Browser, expression: str) -> Any:
-    """An expression with scene.js as `m`, and `at`: the place on the screen of a body point of a
-    pose, seen from behind.
+    """An expression with scene.js as `m`, and `at`.
+
+    `at` is the place on the screen of a body point of a pose, seen from behind.
     """
     at = """const at = (point, phi, theta, psi) => m.project(m.camera([-10, 0, -3], [10, 0, 3]),
         m.toWorld(m.rotation(phi, theta, psi), point), 500, 400, 400).slice(0, 2);"""
@@ -249,8 +253,9 @@ def test_horizon_moves_against_aircraft(page: Browser) -> None:
     """The horizon falls when the nose rises, and turns left in a roll to the right."""
 
     def sky(pose: str, x: float, y: float) -> bool:
-        """Whether a point of the instrument shows the sky; x and y in fractions of its radius from
-        its centre.
+        """Whether a point of the instrument shows the sky.
+
+        x and y are in fractions of its radius from its centre.
         """
         script = f"""import('./scene.js').then(m => {{
             const canvas = document.createElement('canvas');

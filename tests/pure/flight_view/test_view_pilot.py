@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What a pilot does on the live page: the header, the map that takes targets, and the choice of
-charts.
+"""What a pilot does on the live page.
+
+The header, the map that takes targets, and the choice of charts are tested.
 """
 
 from collections.abc import Iterator

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A flight on a page, live or recorded. The page follows the growing log and joins no ROS graph,
-except for control.
+"""A flight on a page, live or recorded.
+
+The page follows the growing log and joins no ROS graph, except for control.
 
 | module | does |
 |---|---|

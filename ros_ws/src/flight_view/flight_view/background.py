@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The background of the map: lines and points of a GeoJSON of the user, in the plane of the
-flight.
+"""The background of the map: lines and points of a GeoJSON of the user.
+
+They are in the plane of the flight.
 """
 
 from pathlib import Path

@@ -46,8 +46,9 @@ Assess = Callable[[Scenario, ControllerConfig], dict[str, Any]]
 
 
 class Link(Protocol):
-    """What reaches the nodes of a flight. Methods return why something is refused, or "", and may
-    raise ParameterError.
+    """What reaches the nodes of a flight.
+
+    Methods return why something is refused, or "", and may raise ParameterError.
     """
 
     def nodes(self) -> list[str]:
@@ -239,8 +240,9 @@ class Control:
     def _carry_out(
         self, action: str, request: Mapping[str, Any], cancellations: int
     ) -> dict[str, Any]:
-        """Carry out a request and write a line in the log. Refused after a cancellation later than
-        `cancellations`.
+        """Carry out a request and write a line in the log.
+
+        It is refused after a cancellation later than `cancellations`.
         """
         self._link.resume()
         self._link.keep_link()
@@ -267,7 +269,9 @@ class Control:
             return self.state()
 
     def state(self) -> dict[str, Any]:
-        """State for the page: lease, nodes, gains with their ranges, digests, faults, the
+        """State for the page.
+
+        It has the lease, the nodes, the gains with their ranges, the digests, the faults and the
         bridge.
         """
         nodes = self._link.nodes()
@@ -329,8 +333,9 @@ class Control:
         return gains
 
     def _refresh(self, request: Mapping[str, Any]) -> str:
-        """Read the faults; at first, and where the digest in the log differs, also the controller's
-        parameters.
+        """Read the faults.
+
+        At first, and where the digest in the log differs, also read the controller's parameters.
         """
         # the digest is 0 before the first tick
         stale = not self._digest or self._flight.digest not in {0, self._digest}
@@ -418,8 +423,9 @@ class Control:
             )
 
     def _activate(self, *, active: bool) -> str:
-        """Activate or deactivate the controller. With a bridge this is refused: the bridge does so
-        with engagement.
+        """Activate or deactivate the controller.
+
+        With a bridge this is refused: the bridge does so with engagement.
         """
         if "bridge" in self._link.nodes():
             return "the bridge activates and deactivates the controller: engage or disengage it"
@@ -488,8 +494,9 @@ class Control:
 
 
 def gains_of(controller: ControllerConfig) -> dict[str, Any]:
-    """The numeric parameters of a law tunable in flight, by name: a number, or a number per
-    channel.
+    """The numeric parameters of a law tunable in flight, by name.
+
+    A value is a number, or a number per channel.
     """
     fields = type(controller).model_fields
     tunable = [
@@ -502,8 +509,10 @@ def gains_of(controller: ControllerConfig) -> dict[str, Any]:
 
 
 def _channels_of(count: int, controller: ControllerConfig) -> list[str]:
-    """The names of the values of a gain: none of a single value, of several the outputs, the
-    outputs but the last as for `k_d`, or the inputs, else numbers from 1 on.
+    """The names of the values of a gain.
+
+    A single value has no name. Several values have those of the outputs, of the outputs but the
+    last as for `k_d`, or of the inputs, else numbers from 1 on.
     """
     if count == 1:
         return [""]

@@ -18,11 +18,10 @@ STRINGS = Parameter.Type.STRING_ARRAY
 
 
 class ControlClient(Client):
-    """Changes a running flight for `rise-di watch --control`. Each method but `cancel` may wait,
-    and is called by one thread.
+    """Changes a running flight for `rise-di watch --control`.
 
-    Methods return why something is refused, or "". They raise ParameterError where a node or its
-    answer is missing.
+    Each method but `cancel` may wait, and is called by one thread. Methods return why something is
+    refused, or "". They raise ParameterError where a node or its answer is missing.
     """
 
     NODES = ("aircraft", "bridge", "controller", "guidance")
@@ -92,7 +91,8 @@ class ControlClient(Client):
         return self._operator().send_route(points)
 
     def keep_link(self) -> None:
-        """Tell guidance, where there is one, that an operator is there:
+        """Tell guidance, where there is one, that an operator is there.
+
         `guidance.home.link_timeout` counts from now.
         """
         if "guidance" in self.nodes():

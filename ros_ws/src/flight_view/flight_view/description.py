@@ -42,8 +42,9 @@ class Flown(NamedTuple):
 def rms_by_model(
     flown: Sequence[Flown], start_ns: int, scenario: Scenario | None, proposed_ns: Sequence[int]
 ) -> dict[str, Any]:
-    """Headings and rows of the rms of the measured error by model, from the ticks of a flight and
-    the stamps of proposed models.
+    """Headings and rows of the rms of the measured error by model.
+
+    They come from the ticks of a flight and the stamps of proposed models.
     """
     first_ns: dict[float, int] = {}
     for span in flown:
@@ -91,10 +92,9 @@ def described(scenario: Scenario) -> dict[str, Any]:
 
 
 def mission(guided: GuidanceConfig, waypoints: Sequence[Waypoint]) -> dict[str, Any]:
-    """What the map shows of guidance with a route, `mission_drawing` and the waypoints: north,
-    east, altitude, m.
+    """What the map shows of guidance with a route: `mission_drawing` and the waypoints.
 
-    Raises ParameterError for a route with no way to fly.
+    A waypoint is north, east, altitude, m. Raises ParameterError for a route with no way to fly.
     """
     drawing = mission_drawing(guided, [guided.plan(waypoints)] if waypoints else [])
     return drawing | {"waypoints": [[*waypoint.point, waypoint.altitude] for waypoint in waypoints]}

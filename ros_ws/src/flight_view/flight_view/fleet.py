@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The places of all aircraft of a fleet, for the map of a page with the flight of a single
-aircraft.
+"""The places of all aircraft of a fleet, for the map of a page.
+
+The page has the flight of a single aircraft.
 """
 
 from collections.abc import Mapping, Sequence
@@ -32,8 +33,9 @@ class Fleet:
 
     @property
     def start_ns(self) -> int:
-        """Stamp of flight time 0 of the first aircraft that has begun: the clock of the stamps is
-        common.
+        """Stamp of flight time 0 of the first aircraft that has begun.
+
+        The clock of the stamps is common.
         """
         return min((flight.start_ns for flight in self.flights if flight.samples), default=0)
 

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Follows the log of a run, live or recorded: samples by topic, events, and the state of the
-recording.
+"""Follows the log of a run, live or recorded.
+
+It has the samples by topic, the events, and the state of the recording.
 """
 
 import math
@@ -181,8 +182,10 @@ class Flight:
 
     @property
     def start_ns(self) -> int:
-        """Stamp of flight time 0: by `truth`, else the first y_m, the origin of commands; else the
-        earliest stamp.
+        """Stamp of flight time 0.
+
+        It is known by `truth`, else it is the first y_m, the origin of commands, else the earliest
+        stamp.
         """
         return next(
             (
@@ -205,8 +208,9 @@ class Flight:
         return (max(newest) - self.start_ns) / NANOSECONDS if newest else 0.0
 
     def state(self) -> str:
-        """What the recording does: "waiting", "reading" what is there, "recording", "no data",
-        "interrupted" or "ended".
+        """What the recording does, in a word.
+
+        "waiting", "reading" what is there, "recording", "no data", "interrupted" or "ended".
         """
         if self._behind:
             return "reading"
@@ -224,8 +228,9 @@ class Flight:
 
     @property
     def models(self) -> dict[str, Any]:
-        """Headings and rows of the rms of the measured error by model, as in the report; empty
-        without a learner.
+        """Headings and rows of the rms of the measured error by model, as in the report.
+
+        Empty without a learner.
         """
         if LEARNED not in self.samples or not self._flown:
             return {}
@@ -267,10 +272,10 @@ class Flight:
         ]
 
     def update(self, budget: float = math.inf) -> bool:
-        """Read for at most about `budget` s. Whether there was anything to read; the next call
-        reads on.
+        """Read for at most about `budget` s.
 
-        Raises ParameterError where the log cannot be read, or for a folder with several bags.
+        Returns whether there was anything to read; the next call reads on. Raises ParameterError
+        where the log cannot be read, or for a folder with several bags.
         """
         deadline = time.monotonic() + budget
         news = False
@@ -305,8 +310,9 @@ class Flight:
             self._account.join()
 
     def _count(self) -> None:
-        """What an ended log lacks. The page reads a part of the samples; this reads the whole
-        log.
+        """Find what an ended log lacks.
+
+        The page reads a part of the samples; this reads the whole log.
         """
         with suppress(ParameterError, OSError):
             recorded = read_run(self.run, self._namespace, None, self._remaps)
@@ -340,9 +346,7 @@ class Flight:
         return RATES[name]
 
     def _shows(self, namespace: str) -> bool:
-        """Whether a namespace belongs to the aircraft on the page, or the aircraft is not known
-        yet.
-        """
+        """Whether a namespace belongs to the aircraft on the page, or that is not known yet."""
         return self._namespace in {None, namespace}
 
     def _note(self, sentence: str) -> None:
@@ -543,8 +547,9 @@ class Flight:
                 )
 
     def _take_route(self, sent_ns: int, waypoints: Sequence[Waypoint]) -> None:
-        """A route received in flight replaces the route before, unless guidance refuses the new
-        route.
+        """A route received in flight replaces the route before.
+
+        It does not where guidance refuses the new route.
         """
         guided = None if self.scenario is None else self.scenario.guidance
         if guided is None:

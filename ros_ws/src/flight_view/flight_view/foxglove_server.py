@@ -1,10 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Serves a flight in progress to viewers of the Foxglove protocol: Foxglove, Lichtblick,
-PlotJuggler.
+"""Serves a flight in progress to viewers of the Foxglove protocol.
 
-The messages are copies from the log, byte for byte, from the connection on. A viewer can send
-nothing.
+Foxglove, Lichtblick and PlotJuggler are such viewers. The messages are copies from the log, byte
+for byte, from the connection on. A viewer can send nothing.
 """
 
 import math
@@ -24,10 +23,10 @@ BACKLOG = 4096  # messages that wait for a slow viewer; the oldest is dropped
 
 
 def serve(run: Path, port: int, announce: Callable[[str], None]) -> None:
-    """Serve a run until the end of the recording, SIGINT or SIGTERM. `announce` gets a line for the
-    user.
+    """Serve a run until the end of the recording, SIGINT or SIGTERM.
 
-    Raises ParameterError where the port is taken, or the recording has ended before.
+    `announce` gets a line for the user. Raises ParameterError where the port is taken, or the
+    recording has ended before.
     """
     ended = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -81,8 +80,9 @@ def _channel(
     channels: dict[str, foxglove.Channel],
     context: foxglove.Context,
 ) -> foxglove.Channel | None:
-    """The channel of a topic, advertised with the first messages; None for a record without
-    messages.
+    """The channel of a topic, advertised with the first messages.
+
+    None for a record without messages.
     """
     if not isinstance(record, Messages):
         return None

@@ -41,8 +41,10 @@ class Series:
         return self._values[: self.count]
 
     def append(self, stamp_ns: NDArray[np.int64], values: FloatArray) -> None:
-        """Append rows. A row up to DISORDER_NS older than an earlier row takes the newer stamp; an
-        older row is refused.
+        """Append rows.
+
+        A row up to DISORDER_NS older than an earlier row takes the newer stamp; an older row is
+        refused.
         """
         earliest = (
             self._stamp_ns[self.count - 1] if self.count else np.iinfo(np.int64).min + DISORDER_NS
@@ -74,8 +76,9 @@ class Series:
         self.count = end
 
     def _thin(self) -> None:
-        """Replace groups of four rows by two, the minima and the maxima per channel: a plot keeps
-        the peaks.
+        """Replace groups of four rows by two, the minima and the maxima per channel.
+
+        A plot keeps the peaks.
         """
         grouped = self.count - self.count % 4
         k = len(self.names)

@@ -122,8 +122,9 @@ class Server:
         )
 
     def listen(self, port: int) -> None:
-        """Listen on this host alone; port 0 takes any free port. Raises OSError where the port is
-        taken.
+        """Listen on this host alone; port 0 takes any free port.
+
+        Raises OSError where the port is taken.
         """
         listener = socket.create_server((ADDRESS, port), backlog=MAX_CONNECTIONS)
         listener.setblocking(False)
@@ -148,8 +149,9 @@ class Server:
         return host in {f"{name}:{self.port}" for name in (ADDRESS, "localhost", "[::1]")}
 
     async def follow(self) -> None:
-        """Read the logs, and answer the WebSockets, until cancelled. Raises as `Flight.update`
-        does.
+        """Read the logs, and answer the WebSockets, until cancelled.
+
+        Raises as `Flight.update` does.
         """
         looked = -math.inf
         while True:
@@ -168,8 +170,9 @@ class Server:
             await asyncio.sleep(pause)
 
     async def news(self, flight: Flight | Fleet, known: Mapping[str, str]) -> bytes:
-        """The answer to a browser with the `known` numbers of rows by topic; waits up to MAX_WAIT s
-        for news.
+        """The answer to a browser with the `known` numbers of rows by topic.
+
+        It waits up to MAX_WAIT s for news.
         """
         deadline = time.monotonic() + MAX_WAIT
         while not has_news(flight, known) and (remaining := deadline - time.monotonic()) > 0.0:
@@ -178,8 +181,9 @@ class Server:
         return self.answer(flight, known)
 
     def answer(self, flight: Flight | Fleet, known: Mapping[str, str]) -> bytes:
-        """The answer to a browser with the `known` numbers of rows by topic. Raises HTTPError for
-        too long a number.
+        """The answer to a browser with the `known` numbers of rows by topic.
+
+        Raises HTTPError for too long a number.
         """
         several = len(self.followed) > 1
         fleet = len(self.followed) if self.fleet else 0
@@ -193,8 +197,9 @@ class Server:
 
 
 def _epoch(flight: Flight | Fleet) -> str:
-    """Changes when rows known to a browser have changed: by thinning, or with the instant of flight
-    time 0.
+    """A text that changes when rows known to a browser have changed.
+
+    They change by thinning, or with the instant of flight time 0.
     """
     return f"{flight.start_ns}.{sum(samples.thinned for samples in flight.samples.values())}"
 
@@ -231,14 +236,13 @@ def answer(
     fleet: int = 0,
     control: bool = False,
 ) -> bytes:
-    """Data unknown to a browser: the length of a head as uint32, the head as JSON, then columns per
-    topic of the head.
+    """Data unknown to a browser: a head, then the columns of each topic of the head.
 
     `fleet`: the number of the places of all aircraft; 0 without a fleet.
 
-    Little endian; the head ends at a multiple of 8 bytes. Columns of a topic with `count` rows:
-    flight time in s as float64, then the channels as float32, filled up to a multiple of 8 bytes.
-    At most MAX_ROWS rows of a topic.
+    The head is its length as uint32, then JSON. Little endian; the head ends at a multiple of 8
+    bytes. Columns of a topic with `count` rows: flight time in s as float64, then the channels as
+    float32, filled up to a multiple of 8 bytes. At most MAX_ROWS rows of a topic.
     """
     first = _first_rows(flight, known)
     topics = []
@@ -279,10 +283,10 @@ def answer(
 
 
 class _LimitedServer(HTTPServer):
-    """Holds at most MAX_CONNECTIONS connections with the token, WebSockets included, and RESERVED
-    further connections.
+    """Holds at most MAX_CONNECTIONS connections with the token, and RESERVED further ones.
 
-    A new connection takes the place of the oldest connection that has not shown the token.
+    WebSockets are included. A new connection takes the place of the oldest connection that has not
+    shown the token.
     """
 
     def initialize(self, *args: Any, **kwargs: Any) -> None:
@@ -298,8 +302,9 @@ class _LimitedServer(HTTPServer):
         super().handle_stream(stream, address)
 
     def admit(self, stream: IOStream) -> bool:
-        """Keep a connection that has shown the token. False where MAX_CONNECTIONS connections are
-        kept already.
+        """Keep a connection that has shown the token.
+
+        False where MAX_CONNECTIONS connections are kept already.
         """
         self._leave_out_closed()
         if sum(self._admitted.values()) < MAX_CONNECTIONS:
@@ -313,11 +318,11 @@ class _LimitedServer(HTTPServer):
 
 
 class _Handler(RequestHandler):
-    """Checks the Host header and the token of a request. Answers 404, not found, where no subclass
-    answers.
+    """Checks the Host header and the token of a request.
 
-    A connection without the token, or beyond MAX_CONNECTIONS, is closed after the answer. A
-    connection whose peer does not take the answer within REQUEST_TIMEOUT is closed, too.
+    Answers 404, not found, where no subclass answers. A connection without the token, or beyond
+    MAX_CONNECTIONS, is closed after the answer. A connection whose peer does not take the answer
+    within REQUEST_TIMEOUT is closed, too.
     """
 
     _kept = False
@@ -400,8 +405,9 @@ class _File(_Handler):
 
 
 class _Data(_Handler):
-    """The samples of a flight; the query holds the numbers of rows known to the browser, by
-    topic.
+    """The samples of a flight.
+
+    The query holds the numbers of rows known to the browser, by topic.
     """
 
     async def get(self, *names: str) -> None:
@@ -419,10 +425,10 @@ class _Data(_Handler):
 
 
 class _News(_Handler, WebSocketHandler):
-    """The samples of a flight, again and again: a message holds a query as for `_Data` and gets the
-    same answer.
+    """The samples of a flight, again and again.
 
-    The first message is the token: a page sets no header of a WebSocket.
+    A message holds a query as for `_Data` and gets the same answer. The first message is the token:
+    a page sets no header of a WebSocket.
     """
 
     def require_token(self) -> None:
@@ -496,8 +502,9 @@ class _News(_Handler, WebSocketHandler):
 
 
 class _Control(_Handler):
-    """Requests of a page to command the flight: JSON, from the page's own origin, with the key
-    typed by the user.
+    """Requests of a page to command the flight.
+
+    They are JSON, from the page's own origin, with the key typed by the user.
     """
 
     def get(self, *_: str) -> None:

@@ -1,7 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A flight in the terminal: state, mode, outputs over their references, inputs, attitude, the last
-events.
+"""A flight in the terminal.
+
+It shows the state, the mode, the outputs over their references, the inputs, the attitude and the
+last events.
 """
 
 import math
@@ -30,8 +32,9 @@ STYLES = {
 
 
 def show(flight: Flight) -> None:
-    """Show a flight until the recording ends or is interrupted, or Ctrl-C. Raises as
-    `Flight.update`.
+    """Show a flight until the recording ends or is interrupted, or Ctrl-C.
+
+    Raises as `Flight.update`.
     """
     with Live(picture(flight), refresh_per_second=REFRESH, transient=False) as live:
         while True:

@@ -46,8 +46,9 @@ def runs_in_recording(runs: Path, namespace: str | None = None) -> list[Path]:
 
 
 def newest_run(runs: Path, namespace: str | None = None) -> Path:
-    """The newest run in recording, with a namespace of that aircraft, else the last run flown.
-    Raises ParameterError.
+    """The newest run in recording, else the last run in the folder.
+
+    With a namespace it is one of that aircraft. Raises ParameterError.
     """
     if recording := runs_in_recording(runs, namespace):
         return recording[0]
@@ -59,8 +60,9 @@ def newest_run(runs: Path, namespace: str | None = None) -> Path:
 
 
 def namespaces(run: Path) -> list[str | None]:
-    """The namespaces of the aircraft in the log of a run; of a log without aircraft None alone, the
-    first aircraft to come.
+    """The namespaces of the aircraft in the log of a run.
+
+    Of a log without aircraft it is None alone, the first aircraft to come.
     """
     with suppress(ParameterError, OSError):
         return [*aircraft_namespaces(log_topics(run))] or [None]
@@ -68,8 +70,9 @@ def namespaces(run: Path) -> list[str | None]:
 
 
 def require_log(run: Path, namespace: str | None = None, remaps: Mapping[str, str] = {}) -> None:
-    """Raise ParameterError unless a run has the log of a flight, or a log in recording, of an
-    aircraft in the namespace.
+    """Raise ParameterError unless a run has the log of a flight, or a log in recording.
+
+    The flight is that of an aircraft in the namespace.
     """
     with suppress(OSError):
         if any(is_locked(file) for file in log_files(run)):
