@@ -388,8 +388,10 @@ cli.main()
 def test_interrupt_in_a_module_in_c_ends_command_without_traceback(
     error: str, cause: str, status: int, words: str
 ) -> None:
-    """pybind11, and with it rclpy, makes an ImportError of it while it loads, and a TypeError in a
-    callback; an error with another cause is told.
+    """pybind11, and with it rclpy, makes other errors of a KeyboardInterrupt.
+
+    It makes an ImportError of it while it loads, and a TypeError in a callback. An error with
+    another cause is told.
     """
     code = f"""
 from flight_cli import cli

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di import --scenario`: a log of the exported module, recorded in PX4 SITL, replays to
-the bit.
+"""`rise-di import --scenario`: a log of the exported module replays to the bit.
+
+The log was recorded in PX4 SITL.
 """
 
 import json

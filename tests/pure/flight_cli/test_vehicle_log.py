@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di import`: a flight in each format of logs gives its y and u, and Omega of the
-aircraft.
+"""`rise-di import`: a flight in each format of logs gives its y and u.
+
+It also gives Omega of the aircraft.
 """
 
 import json
@@ -63,8 +64,9 @@ def _in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module")
 def flight() -> Flight:
-    """First-order channels y_dot = -damping y + Omega v, with servos v_dot = (u - v) / lag, behind
-    held random inputs.
+    """First-order channels y_dot = -damping y + Omega v behind held random inputs.
+
+    The servos are v_dot = (u - v) / lag.
     """
     random = np.random.default_rng(1)
     steps = round(DURATION * RATE)
@@ -81,8 +83,9 @@ def flight() -> Flight:
 
 
 def sticks(u: FloatArray) -> FloatArray:
-    """Pulses of roll, pitch, throttle and yaw, us, between RCn_MIN 1000 and RCn_MAX 2000, those of
-    the map ardupilot.
+    """Pulses of roll, pitch, throttle and yaw, us, those of the map ardupilot.
+
+    They are between RCn_MIN 1000 and RCn_MAX 2000.
     """
     elevator, thrust, aileron, rudder = u.T
     surfaces = (1500.0 + 500.0 * surface / FULL for surface in (aileron, elevator, rudder))
@@ -126,8 +129,9 @@ def dataflash(
     parameters: Mapping[str, float] = PARAMETERS,
     changes: Changes = (),
 ) -> Path:
-    """A log of ArduPlane. The servos follow the sticks as RCn_REVERSED and SERVOn_REVERSED of the
-    first parameters say.
+    """A log of ArduPlane.
+
+    The servos follow the sticks as RCn_REVERSED and SERVOn_REVERSED of the first parameters say.
     """
     parts = (on_ground(flight), flight)
     stamps = [stamp for part in parts for stamp in part.stamp_us]
@@ -158,8 +162,9 @@ def dataflash(
 
 
 def multicopter(path: Path, flight: Flight, firmware: str = "ArduCopter V4.5.7 (2a3dc4b7)") -> Path:
-    """The channels of the flight as those of a multicopter, in STABILIZE, which has the number of
-    MANUAL of a plane.
+    """The channels of the flight as those of a multicopter, in STABILIZE.
+
+    This mode has the number of MANUAL of a plane.
     """
     parts = (on_ground(flight), flight)
     stamps = [stamp for part in parts for stamp in part.stamp_us]
@@ -216,8 +221,10 @@ def stamped(flight: Flight, values: FloatArray) -> list[tuple[int, FloatArray]]:
 
 
 def ulog(path: Path, flight: Flight, changes: Changes = (), *, vtol: bool = False) -> Path:
-    """A log of PX4. A VTOL flies the first half on its rotors, whose torques in instance 0 oppose
-    the rates to the end.
+    """A log of PX4.
+
+    A VTOL flies the first half on its rotors, whose torques in instance 0 oppose the rates to the
+    end.
     """
     elevator, thrust, aileron, rudder = flight.u.T
     still = np.zeros(len(thrust))
@@ -345,8 +352,9 @@ def test_sticks_outside_of_manual_are_no_commands(flight: Flight, tmp_path: Path
 def test_servos_give_u_of_the_stick_that_moved_them(
     stick_reversed: float, servo_reversed: float, flight: Flight, tmp_path: Path
 ) -> None:
-    """With RC2_REVERSED a larger pulse is nose down, and so it is in the map of such an aircraft. u
-    follows the pulse.
+    """With RC2_REVERSED a larger pulse is nose down, and so it is in the map of such an aircraft.
+
+    u follows the pulse.
     """
     content = named_map("ardupilot").model_dump(mode="json", exclude_unset=True)
     content["inputs"]["elevator"]["positive"] = "nose down" if stick_reversed else "nose up"
@@ -409,8 +417,9 @@ def test_tlog_is_compared_with_the_map_too_and_says_what_it_lacks(
 def test_parameters_of_the_samples_count_and_not_the_last_ones(
     flight: Flight, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A servo that was reversed in flight and is not after it, as on an aircraft that is built
-    otherwise on the ground.
+    """A servo was reversed in flight and is not after it.
+
+    So it is on an aircraft that is built otherwise on the ground.
     """
     bag = tmp_path / "bag"
     end = flight.stamp_us[-1]
@@ -458,8 +467,9 @@ def test_log_without_the_mode_is_not_taken_for_manual(flight: Flight, tmp_path: 
 def test_imported_log_is_read_with_the_map_of_its_import_alone(
     flight: Flight, tmp_path: Path
 ) -> None:
-    """The bag has the u of the map of the import: signs and effects by another map would be those
-    of another u.
+    """The bag has the u of the map of the import.
+
+    Signs and effects by another map would be those of another u.
     """
     bag = imported_bag(tmp_path, flight)
     content = named_map("ardupilot").model_dump(mode="json", exclude_unset=True)
@@ -497,8 +507,9 @@ def test_gains_from_imported_log_state_for_which_link_they_are(
 def test_multicopter_gives_outputs_of_its_rate_controllers_in_any_mode(
     flight: Flight, tmp_path: Path
 ) -> None:
-    """Mode 0 of ArduCopter is STABILIZE, whose sticks command angles. In the air is more than half
-    of the usual thrust.
+    """Mode 0 of ArduCopter is STABILIZE, whose sticks command angles.
+
+    In the air is more than half of the usual thrust.
     """
     quadrotor = str(REPOSITORY / "examples" / "px4_quadrotor" / "map.yaml")
     bag = tmp_path / "bag"
@@ -682,8 +693,9 @@ def test_two_systems_that_flew_are_refused_but_for_the_one_that_the_user_names(
 def arrivals(
     path: Path, arrival: Callable[[int], int], *, copies: Callable[[int], int] | None = None
 ) -> Path:
-    """A tlog with other times of arrival, us; with `copies` a second link brings each message again
-    at its own time.
+    """A tlog with other times of arrival, us.
+
+    With `copies` a second link brings each message again at its own time.
     """
     clocks = [clock for clock in (arrival, copies) if clock is not None]
     packets = packets_of(path.read_bytes())
@@ -733,8 +745,9 @@ def sensors(
     *instances: FloatArray,
     **flags: Any,
 ) -> Path:
-    """A log of ArduPlane with several sensors: values by instance, shape (N, fields), and flags by
-    field, a value for each.
+    """A log of ArduPlane with several sensors.
+
+    The values are by instance, shape (N, fields), the flags by field, a value for each.
     """
     fields = {"ARSP": ("Airspeed",), "IMU": ("GyrX", "GyrY", "GyrZ")}[name]
     rows = []

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di airframes`: the assumptions of the theorem, on the airframes of the library or your own;
-a new airframe.
+"""`rise-di airframes`: the assumptions of the theorem, on any airframe.
+
+The airframe is one of the library or your own; a new one can be written.
 """
 
 from collections.abc import Sequence

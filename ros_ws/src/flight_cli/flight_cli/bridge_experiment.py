@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The part of `rise-di identify` that excites the aircraft behind a channel map, and writes a
-scenario that flies it.
+"""The part of `rise-di identify` that excites the aircraft behind a channel map.
+
+It writes a scenario that flies the aircraft.
 """
 
 import shlex
@@ -64,11 +65,10 @@ GUIDED = 600.0  # s, of a flight under guidance
 
 @dataclass(frozen=True, kw_only=True)
 class BridgeExperiment:
-    """An experiment behind a channel map, or a recorded one, and the folder for what flies the
-    aircraft.
+    """An experiment behind a channel map, or a recorded one.
 
-    Gains from an imported log are for `link_delay`, s, beyond the delay in the log; None for that
-    of the map.
+    It has the folder for what flies the aircraft. Gains from an imported log are for `link_delay`,
+    s, beyond the delay in the log; None for that of the map.
     """
 
     map_name: str
@@ -196,8 +196,9 @@ def _identified(
     spans: list[tuple[int, int]],
     speed: float | None,
 ) -> tuple[dict[str, float], Response, Channels]:
-    """Trims, step responses and channels of an experiment, shown. Raises ParameterError for a
-    channel that is not certain.
+    """Trims, step responses and channels of an experiment, shown.
+
+    Raises ParameterError for a channel that is not certain.
     """
     pairing, _ = channel_pairs(channel_map)
     trims = (
@@ -252,12 +253,11 @@ def _announce(console: Console, planned: Experiment, duration: float, *, hovers:
 
 
 def _engaged(run: Path, channel_map: ChannelMap) -> tuple[Tape, list[tuple[int, int]], str]:
-    """The tape of an experiment, the engaged spans, ns, and a sentence on an early end by the
-    bridge, else empty.
+    """The tape of an experiment, the engaged spans, ns, and a sentence on its end.
 
-    A flight of `rise-di import` is a single span.
-    Raises ParameterError for a log without an engagement, and for a flight under feedback: u
-    follows y.
+    The sentence is on an early end by the bridge, else empty. A flight of `rise-di import` is a
+    single span. Raises ParameterError for a log without an engagement, and for a flight under
+    feedback: u follows y.
     """
     recorded = read_run(run)
     warn_of_lacks(recorded)
@@ -293,8 +293,9 @@ def _engaged(run: Path, channel_map: ChannelMap) -> tuple[Tape, list[tuple[int, 
 
 
 def _digits(value: float, digits: int) -> str:
-    """A value by its leading digits, without an exponent up to 1e6: a narrow column would cut it
-    off.
+    """A value by its leading digits, without an exponent up to 1e6.
+
+    A narrow column would cut an exponent off.
     """
     return f"{float(f'{value:.{digits}g}'):g}"
 

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di campaign`: a Monte Carlo campaign, a scenario flown by thousands of uncertain
-aircraft.
+"""`rise-di campaign`: a Monte Carlo campaign.
+
+A scenario is flown by thousands of uncertain aircraft.
 """
 
 import math
@@ -75,11 +76,10 @@ class EngineName(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class Campaign:
-    """Fly a Monte Carlo campaign: thousands of uncertain aircraft around the airframe of a
-    scenario, many at once.
+    """Fly a Monte Carlo campaign: thousands of uncertain aircraft around an airframe.
 
-    Aircraft with a route or a learner fly one by one: 7 s of a core a minute of flight, and up to
-    20 s with a learner.
+    The airframe is that of a scenario, and many fly at once. Aircraft with a route or a learner fly
+    one by one: 7 s of a core a minute of flight, and up to 20 s with a learner.
 
     Exit status: 0 all flown, 2 bad input, 130 interrupted; its folder continues it.
     """
@@ -248,8 +248,9 @@ def _parse_sweep(text: str) -> Sweep:
 def _fly_missing(
     monte_carlo: MonteCarlo, engine: engines.Engine, place: str, *, quiet: bool
 ) -> float | None:
-    """Fly the chunks that are missing; aircraft-seconds per second, None if none is. `place` says
-    where, as " on NVIDIA H200".
+    """Fly the chunks that are missing; aircraft-seconds per second, None if none is.
+
+    `place` says where, as " on NVIDIA H200".
     """
     definition = monte_carlo.definition
     total = definition.aircraft * definition.cases

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The `rise-di` command: what it can do. A command's module is imported when it runs, so that
---help is quick.
+"""The `rise-di` command: what it can do.
+
+A command's module is imported when it runs, so that --help is quick.
 """
 
 import signal
@@ -100,8 +101,9 @@ def _options(
 
 
 def application(words: Collection[str]) -> typer.Typer:
-    """The command line with the commands among the words; further commands have name and help
-    alone.
+    """The command line with the commands among the words.
+
+    Further commands have name and help alone.
     """
     app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
     app.callback()(_options)
@@ -117,8 +119,9 @@ def application(words: Collection[str]) -> typer.Typer:
 
 
 def _repeat_interrupt(ignored: "sys.UnraisableHookArgs") -> None:
-    """Repeat a Ctrl-C that came inside a destructor or a callback of a weak reference: Python
-    prints and ignores it there.
+    """Repeat a Ctrl-C that came inside a destructor or a callback of a weak reference.
+
+    Python prints and ignores it there.
     """
     if issubclass(ignored.exc_type, KeyboardInterrupt):
         signal.signal(signal.SIGALRM, signal.default_int_handler)

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di compare`: RISE-DI and further control laws on the same aircraft, tuned by the same
-procedure.
+"""`rise-di compare`: RISE-DI and further control laws on the same aircraft.
+
+All are tuned by the same procedure.
 """
 
 import json
@@ -113,8 +114,9 @@ class Contest(NamedTuple):
         return registered_laws.with_courses(build, self.controllers)
 
     def tuned(self) -> Gains:
-        """The gains by law and objective: those of a search, else those of a controller. Raises
-        ParameterError without any.
+        """The gains by law and objective: those of a search, else those of a controller.
+
+        Raises ParameterError without any.
         """
         stored = tuned_gains.load(self.path)
         gains: Gains = {}
@@ -131,10 +133,10 @@ class Contest(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Compare:
-    """Fly RISE-DI and further laws side by side: same aircraft, reference, winds, noise, limits,
-    uncertainty, tuning.
+    """Fly RISE-DI and further laws side by side.
 
-    Exit status: 0, or 2 bad input.
+    Aircraft, reference, winds, noise, limits, uncertainty and tuning are the same for all. Exit
+    status: 0, or 2 bad input.
     """
 
     scenario: str = argument(
@@ -392,8 +394,9 @@ def _notes(
 
 
 def _as_json(result: LawResult, law: Law, scenario: Scenario) -> dict[str, Any]:
-    """Figures of a law for JSON: SI, null for an infinite figure, and for the cost of gains that no
-    search found.
+    """Figures of a law for JSON, in SI.
+
+    null stands for an infinite figure, and for the cost of gains that no search found.
     """
     controller = scenario.controller
     levels = []

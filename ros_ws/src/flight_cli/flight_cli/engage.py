@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di engage`: bumpless engagement of the autopilot behind a running bridge, and
-disengagement.
+"""`rise-di engage`: bumpless engagement of the autopilot behind a running bridge.
+
+It also disengages.
 """
 
 from dataclasses import dataclass

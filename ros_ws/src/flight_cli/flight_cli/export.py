@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di export`: the controller of a scenario as C99, with a proof that C and Python give the
-same bits.
+"""`rise-di export`: the controller of a scenario as C99.
+
+A proof shows that C and Python give the same bits.
 """
 
 from dataclasses import dataclass
@@ -32,12 +33,11 @@ PROOF = ("duration", "drawn", "seed", "runner")
 
 @dataclass(frozen=True, kw_only=True)
 class Export:
-    """Write the controller of a scenario as C99, compile it, and prove that C and Python give the
-    same bits.
+    """Write the controller of a scenario as C99, and prove that C and Python give the same bits.
 
-    The proof feeds the code with flights in one process (with lost samples, faults, new parameters,
-    engagement, limits), with drawn calls and with drawn steps. It compares every u and every state.
-    Exit status: 0 proved, 1 a bit differs, 2 bad input.
+    The code is compiled. The proof feeds it with flights in one process (with lost samples, faults,
+    new parameters, engagement, limits), with drawn calls and with drawn steps. It compares every u
+    and every state. Exit status: 0 proved, 1 a bit differs, 2 bad input.
     """
 
     scenario: str = argument(

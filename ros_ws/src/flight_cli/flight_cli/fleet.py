@@ -36,8 +36,9 @@ def open_fleet(file: str, duration: float | None, *, use_sim_time: bool) -> Flee
 
 
 def fly_fleet_file(chosen: Fleet, runs: Sequence[Path], *, as_json: bool) -> int:
-    """Fly a fleet: every aircraft in a namespace, with nodes, a log and a report. Returns the
-    severest exit status.
+    """Fly a fleet: every aircraft in a namespace, with nodes, a log and a report.
+
+    Returns the severest exit status.
     """
     totals = {member.name: member.scenario.flight.duration for member in chosen.members}
     with progress_bar(NAME_COLUMN, *CLOCK_COLUMNS, quiet=as_json) as bar:
@@ -67,8 +68,9 @@ def fly_fleet_file(chosen: Fleet, runs: Sequence[Path], *, as_json: bool) -> int
 
 
 class _Result(NamedTuple):
-    """The summary of an aircraft, and the fraction of its ticks with the controller ENGAGED; None
-    without ticks.
+    """The summary of an aircraft, and the fraction of its ticks with the controller ENGAGED.
+
+    None without ticks.
     """
 
     summary: dict[str, Any]

@@ -60,13 +60,12 @@ OF_AIRCRAFT = (
 
 @dataclass(frozen=True, kw_only=True)
 class Fly(RouteWords):
-    """Fly a scenario or a fleet: the nodes of each aircraft as processes over ROS 2 topics, in real
-    time.
+    """Fly a scenario or a fleet over ROS 2 topics, in real time.
 
-    Exit status: 0 completed or landed, 2 bad input, 3 ended early or never flew, 4 completed or
-    landed and short of something, which the outcome names with its figure: the errors, the law
-    engaged, speed, height, fence, route, touch-down zone, log; 130 interrupted. Of a fleet it is
-    the severest of its aircraft.
+    The nodes of each aircraft are processes. Exit status: 0 completed or landed, 2 bad input, 3
+    ended early or never flew, 4 completed or landed and short of something, which the outcome names
+    with its figure: the errors, the law engaged, speed, height, fence, route, touch-down zone, log;
+    130 interrupted. Of a fleet it is the severest of its aircraft.
     """
 
     context: typer.Context
@@ -152,8 +151,9 @@ class Fly(RouteWords):
         raise typer.Exit(_report(chosen, run, outcome, as_json=self.as_json))
 
     def _scenario(self) -> Scenario:
-        """The scenario with settings, route and fence. Raises ParameterError for contradictory
-        words.
+        """The scenario with settings, route and fence.
+
+        Raises ParameterError for contradictory words.
         """
         found = find_scenario(self.scenario, self.duration, with_route=self.route is None)
         chosen = with_settings(found, self.settings)
@@ -278,8 +278,9 @@ def _that_learns(scenario: Scenario) -> Scenario:
 
 
 def _learner(scenario: Scenario) -> Learn | None:
-    """The learner of a scenario, for a flight in one process. Raises ParameterError for one that
-    cannot learn.
+    """The learner of a scenario, for a flight in one process.
+
+    Raises ParameterError for one that cannot learn.
     """
     if not scenario.learns():
         return None

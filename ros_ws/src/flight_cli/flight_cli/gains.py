@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di gains`: select gains by Theorem 1 and by the engineering procedure, or check those of a
-scenario.
+"""`rise-di gains`: select gains by Theorem 1 and by the engineering procedure.
+
+It also checks the gains of a scenario.
 """
 
 import math
@@ -112,11 +113,10 @@ class _Result(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Gains:
-    """Select gains for an airframe by Theorem 1 and by the engineering procedure, and show every
-    condition on both.
+    """Select gains by Theorem 1 and by the engineering procedure.
 
-    With --check, show the conditions and margins of the scenario's controller instead: of any law,
-    with the law's own gains.
+    Every condition on both is shown. With --check, show the conditions and margins of the
+    scenario's controller instead: of any law, with the law's own gains.
 
     Exit status: 0; 1 if a condition of the loop fails with --check, or an aircraft within
     --uncertainty may be unstable with --guarantee; 2 bad input.
@@ -306,8 +306,9 @@ def _loop_of_px4(
 
 
 def _write_page(path: Path, answer: Assessment) -> None:
-    """The margins of a gain set on a page. Raises ParameterError for the literal sign, which has no
-    linear loop.
+    """Write the margins of a gain set on a page.
+
+    Raises ParameterError for the literal sign, which has no linear loop.
     """
     loop = answer.loop_with_box()
     with writing("--page", path, "a page that can"):

@@ -33,8 +33,9 @@ def require_guarantee(*, check: bool, guaranteed: bool, worst: Path | None, late
 
 
 def write_unstable(folder: Path | None, promise: Guarantee, airframe: str, scenario: str) -> None:
-    """Write the first unstable aircraft as an airframe and the scenario that flies it, if a folder
-    is named.
+    """Write the first unstable aircraft as an airframe and the scenario that flies it.
+
+    Without a `folder` nothing is written.
     """
     if folder is None:
         return

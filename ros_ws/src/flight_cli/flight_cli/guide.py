@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di guide`: what a guided flight holds from now on, the services of guidance, the operator's
-link, a route.
+"""`rise-di guide`: what a guided flight holds from now on.
+
+It also calls the services of guidance, keeps the operator's link and sends a route.
 """
 
 import math
@@ -35,10 +36,9 @@ LINK = "link"
 
 @dataclass(frozen=True, kw_only=True)
 class Guide(RouteWords):
-    """Command a running guided flight, as in: rise-di guide heading=90 altitude=1300. What is not
-    named stays.
+    """Command a running guided flight, as in: rise-di guide heading=90 altitude=1300.
 
-    Exit status: 0 done, 1 refused, 2 bad input or no guidance.
+    What is not named stays. Exit status: 0 done, 1 refused, 2 bad input or no guidance.
     """
 
     commands: list[str] = argument(
@@ -97,8 +97,9 @@ class Guide(RouteWords):
             return client.send_route(points) if points else client.call(command)
 
     def _points(self, file: str) -> list[tuple[float, float, float]]:
-        """The waypoints of a route file for a flight: north, east, altitude in m. Raises
-        ParameterError.
+        """The waypoints of a route file for a flight: north, east, altitude in m.
+
+        Raises ParameterError.
         """
         expected = f"NAME=VALUE, {', '.join((*SERVICES, LINK))} or a route file"
         require(Path(file).suffix != "", "guide", repr(file), expected)

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di identify`: an aircraft of JSBSim by linearisation, with its scenario, or A and B of an
-airframe from a flight's log.
+"""`rise-di identify`: an aircraft of JSBSim by linearisation, with its scenario.
+
+From a flight's log it identifies A and B of an airframe.
 """
 
 import math
@@ -87,8 +88,7 @@ BESIDE_BRIDGE = "none beside --bridge"
 
 @dataclass(frozen=True, kw_only=True)
 class Identify:
-    """Identify an aircraft of JSBSim by linearisation, or A and B of an airframe from the log of a
-    flight.
+    """Identify an aircraft of JSBSim by linearisation, or A and B from the log of a flight.
 
     Of JSBSim it also selects gains, flies the aircraft and writes a scenario for `rise-di fly`. A
     model from a log is accepted if it predicts the part of the flight that it was not fitted to
@@ -282,8 +282,9 @@ class Identify:
             raise typer.Exit(CANNOT_FLY) from None
 
     def _identify_log(self, log: Path) -> None:
-        """Identify a model from a log, show it and write it. Raises ParameterError for a model that
-        is refused.
+        """Identify a model from a log, show it and write it.
+
+        Raises ParameterError for a model that is refused.
         """
         require_unused(self, ("speed", "altitude", *OF_JSBSIM, *OF_MARGINS), "none beside a log")
         require(
@@ -363,8 +364,9 @@ def _write_model(console: Console, identification: Identification, log: Path, pa
 
 
 class _Reflight(NamedTuple):
-    """Rms errors of a recorded flight and of the same one with feedforward and observer of a model,
-    SI, by output.
+    """Rms errors of a recorded flight and of the same one with another model, SI, by output.
+
+    The second flight has feedforward and observer of that model.
     """
 
     origin: str  # of the observer's gains
@@ -433,8 +435,9 @@ def _units(identification: Identification) -> dict[str, DisplayUnit]:
 
 
 def _innovation_page(identification: Identification, name: str) -> Page:
-    """Innovations of the nominal and of the identified model over the flight, the held-out seconds
-    shaded.
+    """Innovations of the nominal and of the identified model over the flight.
+
+    The held-out seconds are shaded.
     """
     t = identification.recorded.t - identification.recorded.t[0]
     before, after = (

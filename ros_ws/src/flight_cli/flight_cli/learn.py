@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di learn`: repeat the learner on the log of a flight, with other settings, and write the
-model.
+"""`rise-di learn`: repeat the learner on the log of a flight, and write the model.
+
+The learner may have other settings.
 """
 
 from dataclasses import dataclass
@@ -40,12 +41,12 @@ NOTHING_LEARNED = 1
 
 @dataclass(frozen=True, kw_only=True)
 class Learn:
-    """Repeat the learner on the log of a flight, with the settings of its scenario or, by --set
-    controller.learn.*, others.
+    """Repeat the learner on the log of a flight.
 
-    y and u are those of the log: a flight without a learner can be learned from too, if its
-    controller has an observer. With --write the model becomes an airframe file, from which
-    `controller.learn.prior` starts the next flight. Exit status: 0 a model, 1 none, 2 bad input.
+    The settings are those of its scenario or, by --set controller.learn.*, others. y and u are
+    those of the log: a flight without a learner can be learned from too, if its controller has an
+    observer. With --write the model becomes an airframe file, from which `controller.learn.prior`
+    starts the next flight. Exit status: 0 a model, 1 none, 2 bad input.
     """
 
     run: Path = argument("Folder of a run, or an MCAP file.", default=LATEST)

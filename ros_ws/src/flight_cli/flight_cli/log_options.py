@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the commands that read a log share: the scenario of a log without a scenario, the aircraft
-of several, what it lacks.
+"""What the commands that read a log share.
+
+The scenario of a log without one, the aircraft of several, and what the log lacks.
 """
 
 from contextlib import suppress
@@ -43,15 +44,17 @@ def remaps_of(words: list[str] | None) -> dict[str, str]:
 
 
 def scenario_file(name: str | None) -> Path | None:
-    """The file of a scenario by name or path; None without a name. Raises ParameterError for an
-    invalid scenario.
+    """The file of a scenario by name or path; None without a name.
+
+    Raises ParameterError for an invalid scenario.
     """
     return None if name is None else find_scenario(name).path
 
 
 def warn_of_lacks(recorded: RecordedRun) -> None:
-    """Print what a log lacks, a warning each on standard error, so that no result stands for more
-    than was recorded.
+    """Print what a log lacks, a warning each on standard error.
+
+    So no result stands for more than was recorded.
     """
     account = log_account(recorded)
     imported = recorded.metadata.get(IMPORTED, {}).get(COMPARED, "")

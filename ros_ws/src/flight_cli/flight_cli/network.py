@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di network`: the profile of the middleware for nodes on several hosts, and a check of the
-network between the hosts.
+"""`rise-di network`: the profile of the middleware for nodes on several hosts.
+
+It also checks the network between the hosts.
 """
 
 import os
@@ -20,11 +21,10 @@ FAILED = 1
 
 @dataclass(frozen=True, kw_only=True)
 class Network:
-    """Write the profile of the middleware for nodes on several hosts: unicast between their
-    addresses, without multicast.
+    """Write the profile of the middleware for nodes on several hosts.
 
-    Exit status: 0 written, and with --check every host receives and is received; 1 a host does not;
-    2 bad input.
+    They communicate by unicast between their addresses, without multicast. Exit status: 0 written,
+    and with --check every host receives and is received; 1 a host does not; 2 bad input.
     """
 
     peers: str = option(

@@ -95,8 +95,9 @@ def entry_table(title: str, entries: Iterable[Entry]) -> Table:
 
 
 def entries_as_json(entries: Iterable[Entry]) -> dict[str, dict[str, float]]:
-    """Entries of A and B by name, nominal and identified in SI; change and its deviation in units,
-    that of an entry in SI.
+    """Entries of A and B by name, nominal and identified in SI.
+
+    The change and its deviation are in units, the deviation of an entry in SI.
     """
     return {
         entry.name: {
@@ -116,8 +117,10 @@ def new_table(
     left_aligned: Container[str] | None = None,
     wrapped: Container[str] = (),
 ) -> Table:
-    """An empty table: columns outside `left_aligned`, by default the first, are aligned right,
-    columns outside `wrapped` keep to one line.
+    """An empty table.
+
+    Columns outside `left_aligned`, by default the first, are aligned right. Columns outside
+    `wrapped` keep to one line.
     """
     left = headings[:1] if left_aligned is None else left_aligned
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
@@ -128,8 +131,9 @@ def new_table(
 
 
 def print_table(console: Console, table: Table) -> None:
-    """Print a table at the width that its figures need: a narrow terminal folds the lines, and no
-    cell is cut.
+    """Print a table at the width that its figures need.
+
+    A narrow terminal folds the lines, and no cell is cut.
     """
     for column in table.columns:
         if column.no_wrap:
@@ -172,8 +176,9 @@ def clock(t: float, duration: float) -> str:
 def flight_progress(
     duration: float, *, quiet: bool
 ) -> Iterator[tuple[Callable[[float, str], None], Callable[[str], None]]]:
-    """The progress bar of a flight, s: a function for the flight time and the text beside it, and
-    one for a line above.
+    """The progress bar of a flight of `duration`, s.
+
+    Yields a function for the flight time and the text beside it, and one for a line above.
     """
     with progress_bar(*CLOCK_COLUMNS, quiet=quiet) as bar:
         task = bar.add_task("flight", total=duration, clock="", shown="")
@@ -228,8 +233,9 @@ def stdout_for(file: Path | None) -> AbstractContextManager[object]:
 
 
 def write_text(option: str, path: Path, text: str) -> None:
-    """Write a file that an option names, "-" for standard output. Raises ParameterError where it
-    cannot be written.
+    """Write a file that an option names, "-" for standard output.
+
+    Raises ParameterError where it cannot be written.
     """
     if path == STDOUT:
         print(text, end="")

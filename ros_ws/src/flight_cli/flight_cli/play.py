@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di play`: publish the topics of a recorded flight again with their timing, for a node under
-test.
+"""`rise-di play`: publish the topics of a recorded flight again with their timing.
+
+It plays for a node under test.
 """
 
 import math
@@ -28,12 +29,12 @@ class Stamps(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class Play:
-    """Publish the topics of a recorded flight again with their timing, and /clock with the time of
-    the log.
+    """Publish the topics of a recorded flight again with their timing.
 
-    The bytes of the log are sent, with new stamps. A domain with a publisher on a topic of the log
-    is refused. A warning names the skipped topics: without CDR, or of a message type that is not
-    installed. Exit status: 0 played to the end, 2 bad input, 130 interrupted.
+    /clock has the time of the log. The bytes of the log are sent, with new stamps. A domain with a
+    publisher on a topic of the log is refused. A warning names the skipped topics: without CDR, or
+    of a message type that is not installed. Exit status: 0 played to the end, 2 bad input, 130
+    interrupted.
     """
 
     run: Path = argument("Folder of a run, or an MCAP file.", default=REQUIRED)
@@ -77,8 +78,9 @@ class Play:
                     break
 
     def _sendable(self, playback: Playback, *, every: bool) -> dict[str, str]:
-        """Message types by topic for sending; a warning names the skipped topics. Raises
-        ParameterError without a topic.
+        """Message types by topic for sending; a warning names the skipped topics.
+
+        Raises ParameterError without a topic.
         """
         from flight_bringup.player import unsendable  # noqa: PLC0415 - as above
 

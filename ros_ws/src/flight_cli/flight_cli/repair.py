@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The repair of `rise-di report`: rebuild a log whose recorder was killed, so that every rosbag2
-reader accepts it.
+"""The repair of `rise-di report`: rebuild a log whose recorder was killed.
+
+Every rosbag2 reader accepts the result.
 """
 
 from pathlib import Path
@@ -17,8 +18,9 @@ from flight_log.tape_reader import read_run
 
 
 def repair_log(run: Path) -> None:
-    """Rebuild the log of a run whose recorder was killed, or that is damaged. An intact log stays
-    as it is.
+    """Rebuild the log of a run whose recorder was killed, or that is damaged.
+
+    An intact log stays as it is.
     """
     repaired = repair_bag(run)
     for file in repaired.files:
@@ -38,8 +40,9 @@ def repair_log(run: Path) -> None:
 
 
 def _missing_at_end(run: Path, last: FileRepair) -> str:
-    """Time missing at the end of the log: by what the files say of their end, else by the duration
-    of the scenario.
+    """Time missing at the end of the log, as a sentence.
+
+    It is known by what the files say of their end, else by the duration of the scenario.
     """
     if (missing := seconds(last.known_end_ns - last.last_ns)) > 0:
         return f"{missing:.3f} s are missing at its end"

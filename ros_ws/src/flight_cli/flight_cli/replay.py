@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di replay`: compute a recorded flight again and compare it bit by bit, or with other gains
-in open loop.
+"""`rise-di replay`: compute a recorded flight again and compare it bit by bit.
+
+With other gains it computes the flight in open loop.
 """
 
 import io
@@ -44,13 +45,12 @@ DIFFERS = 1
 
 @dataclass(frozen=True, kw_only=True)
 class Replay:
-    """Compute every tick of a recorded flight again, and every step of guidance, and compare it
-    with the log bit by bit.
+    """Compute every tick of a recorded flight again and compare it with the log bit by bit.
 
-    --set computes u from the recorded y and y_m with other parameters. That is an open loop: the
-    aircraft did not fly this u. Exit status: 0 every bit equal, 1 a tick differs or flew with other
-    parameters, 2 bad input, 4 every bit equal, and less than 99 % of the ticks are in the log with
-    y and u.
+    Every step of guidance is computed and compared, too. --set computes u from the recorded y and
+    y_m with other parameters. That is an open loop: the aircraft did not fly this u. Exit status: 0
+    every bit equal, 1 a tick differs or flew with other parameters, 2 bad input, 4 every bit equal,
+    and less than 99 % of the ticks are in the log with y and u.
     """
 
     run: Path = argument("Folder of a run, or an MCAP file.", default=LATEST)
@@ -200,8 +200,9 @@ def _count_by_group(result: ReplayResult) -> dict[str, int]:
 
 
 def _u_figures(result: ReplayResult, inputs: tuple[str, ...]) -> dict[str, dict[str, float]]:
-    """Difference of u by input, in its unit: rms, largest, its time, and the rms of the recorded u;
-    NaN without a u.
+    """Difference of u by input, in its unit.
+
+    The figures are the rms, the largest, its time, and the rms of the recorded u; NaN without a u.
     """
     known = np.isfinite(result.computed).all(axis=1)
     recorded = result.group(result.recorded[known], "u")
@@ -244,8 +245,9 @@ def _as_json(shown: Shown, notes: Sequence[str], settings: list[str]) -> dict[st
 
 
 def _write_csv(path: Path, result: ReplayResult, inputs: tuple[str, ...]) -> None:
-    """One row a tick: number, t, then each input as recorded and as computed, in digits that
-    restore every bit.
+    """Write a row a tick: number, t, then each input as recorded and as computed.
+
+    The digits restore every bit.
     """
     columns = [result.names.index(f"u.{name}") for name in inputs]
     text = io.StringIO(newline="")

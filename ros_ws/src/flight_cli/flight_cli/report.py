@@ -36,12 +36,12 @@ FILES = ("html", "output", "png", "parquet", "figure")
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """Write the report page of a recorded run again, or one that compares several, and print its
-    tables.
+    """Write the report page of a recorded run again, and print its tables.
 
-    A log of --repair holds every message that could be read, an index and, in the folder of a run,
-    metadata.yaml. The damaged file stays as *.damaged, an intact log as it is, and metadata.yaml of
-    another program is never replaced. Exit status: 0, 2 bad input, 4 a log is incomplete.
+    With several runs the page compares them. A log of --repair holds every message that could be
+    read, an index and, in the folder of a run, metadata.yaml. The damaged file stays as *.damaged,
+    an intact log as it is, and metadata.yaml of another program is never replaced. Exit status: 0,
+    2 bad input, 4 a log is incomplete.
     """
 
     runs: list[Path] | None = argument(

@@ -35,8 +35,9 @@ class RouteWords:
     )
 
     def read_waypoints(self, file: Path, *, above_sea: bool | None) -> tuple[Waypoint, ...]:
-        """The waypoints of a route file; notes on the rest of the file go to standard error. Raises
-        as `read_route_file`.
+        """The waypoints of a route file; notes on the rest of the file go to standard error.
+
+        Raises as `read_route_file`.
         """
         for key, value in (("altitude", self.altitude), ("simplify", self.simplify)):
             require(value is None or math.isfinite(value), f"--{key}", value, "a number")

@@ -19,8 +19,9 @@ def settings_option() -> Any:
 
 
 def parse_settings(settings: Sequence[str] | None, owner: str = "scenario") -> dict[str, Any]:
-    """The values by key, as controller.k_g; `owner` is the only section, or the scenario. Raises
-    ParameterError.
+    """The values by key, as controller.k_g.
+
+    `owner` is the only section, or the scenario. Raises ParameterError.
     """
     changes: dict[str, Any] = {}
     for text in settings or ():

@@ -33,11 +33,10 @@ from flight_view.watch import (
 
 @dataclass(frozen=True, kw_only=True)
 class Watch:
-    """See a flight on a page: charts, horizon, scene and timeline, live while it is recorded, or
-    again later.
+    """See a flight on a page, live while it is recorded, or again later.
 
-    The page is served on this host alone, until Ctrl-C. Exit status: 0 ended, 2 bad input, 130
-    interrupted in the terminal.
+    The page has charts, horizon, scene and timeline. It is served on this host alone, until Ctrl-C.
+    Exit status: 0 ended, 2 bad input, 130 interrupted in the terminal.
     """
 
     run: list[Path] | None = argument(
@@ -189,8 +188,9 @@ def _serve_with_control(
 
 @contextmanager
 def watched(*runs: Path, fleet: bool = False) -> Iterator[list[str]]:
-    """Serve the page of runs that will be recorded, by another process during the block. Yields its
-    lines for the user.
+    """Serve the page of runs that another process will record during the block.
+
+    Yields its lines for the user.
     """
     options = ["--wait", *(["--fleet"] if fleet else [])]
     command = [
