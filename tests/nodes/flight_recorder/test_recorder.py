@@ -1,7 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The recorder's node: its topics and their qualities, lost messages, silences, a full disk, and
-the end of the log.
+"""The recorder's node.
+
+Tested are its topics and their qualities, lost messages, silences, a full disk, and the end of the
+log.
 """
 
 import re

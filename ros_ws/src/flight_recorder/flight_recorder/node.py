@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The recorder's node: records the topics of a flight, as serialised messages, to a single MCAP
-bag.
+"""The recorder's node: records the topics of a flight to a single MCAP bag.
+
+The messages stay serialised.
 """
 
 import sys
@@ -167,8 +168,9 @@ class RecorderNode(FlightNode[RecorderConfig]):
         return bag
 
     def _free_folder(self, directory: Path) -> Path:
-        """The folder; another one beside it where it holds the log of a simulation that ended
-        before this one.
+        """The folder, or another one beside it.
+
+        It is another one where the folder holds the log of a simulation that ended before this one.
         """
         numbered = (directory.with_name(f"{directory.name}-{number}") for number in count(2))
         taken = self.simulated is not None and any(directory.glob("*.mcap"))
@@ -214,8 +216,9 @@ class RecorderNode(FlightNode[RecorderConfig]):
         return False
 
     def advance(self) -> bool:
-        """In a process with further nodes: write at ticks between the steps of the nodes, without
-        delay of a node.
+        """In a process with further nodes: write at ticks between the steps of the nodes.
+
+        No node is delayed.
         """
         if time.monotonic_ns() - self._drained_ns > self.period_ns():
             self._write()
@@ -225,8 +228,9 @@ class RecorderNode(FlightNode[RecorderConfig]):
         self._write()
 
     def _write(self) -> None:
-        """Drain the subscriptions. Every FLUSH_PERIOD_NS also flush, and check the graph and the
-        disk.
+        """Drain the subscriptions.
+
+        Every FLUSH_PERIOD_NS also flush, and check the graph and the disk.
         """
         now_ns = self._drained_ns = time.monotonic_ns()
         self._drain_subscriptions()
@@ -253,8 +257,9 @@ class RecorderNode(FlightNode[RecorderConfig]):
             self._end(f"min_free: {sentence}")
 
     def _drain_subscriptions(self) -> None:
-        """Write the received messages. In lockstep publish the stamp of the newest sample of
-        `truth` in the bag.
+        """Write the received messages.
+
+        In lockstep publish the stamp of the newest sample of `truth` in the bag.
         """
         if self.simulated is not None and (self.simulated.restarted or not self.simulated.known()):
             return
@@ -289,8 +294,9 @@ class RecorderNode(FlightNode[RecorderConfig]):
             )
 
     def _publish_span(self) -> None:
-        """In real time: the stamp up to which y, y_m and u are in the log. A flight ends once these
-        span it.
+        """In real time: publish the stamp up to which y, y_m and u are in the log.
+
+        A flight ends once these span it.
         """
         stamps = [topic.stamp_ns for topic in self._among(LOOP)]
         if not self.parameters.lockstep and min(stamps) >= 0:
@@ -319,8 +325,9 @@ class RecorderNode(FlightNode[RecorderConfig]):
             topic.next_sequence = sequence + 1
 
     def _write_or_end(self, write: Callable[[], None]) -> None:
-        """Write to the bag. On an error or a full disk end the bag; the node goes on, because a
-        flight waits for it.
+        """Write to the bag, and on an error or a full disk end it.
+
+        The node goes on, because a flight waits for it.
         """
         try:
             write()
@@ -404,19 +411,20 @@ class RecorderNode(FlightNode[RecorderConfig]):
             )
 
     def _warn_of_a_part(self) -> None:
-        """Warn of a log with some of y, y_m and u: a flight has y, y_m and u, but discovery may
-        fail on a busy domain.
+        """Warn of a log with some of y, y_m and u.
+
+        A flight has y, y_m and u, but discovery may fail on a busy domain.
         """
         silent = [topic for topic in self._among(LOOP) if not topic.channel.messages]
         for topic in silent if len(silent) < len(LOOP) else ():
             self.warn_no_publisher(topic.subscription)
 
     def _warn_of_silence(self, now_ns: int) -> None:
-        """Warn, once, when y, y_m and u have stopped: the publishers have ended, or this process
-        receives nothing.
+        """Warn, once, when y, y_m and u have stopped.
 
-        Fast DDS can block the receiving threads during the removal of a leaving participant
-        (eProsima/Fast-DDS, issue 6502).
+        The publishers have ended, or this process receives nothing: Fast DDS can block the
+        receiving threads during the removal of a leaving participant (eProsima/Fast-DDS, issue
+        6502).
         """
         heard = sum(topic.channel.messages for topic in self._among(LOOP))
         if heard != self._heard:
@@ -430,11 +438,10 @@ class RecorderNode(FlightNode[RecorderConfig]):
             )
 
     def _warn_of_topic_silence(self, now_ns: int) -> None:
-        """Warn of a steady topic without messages, while the publisher is there and further topics
-        go on.
+        """Warn of a steady topic without messages, while its publisher is there.
 
-        A reader may miss all of a topic: a full queue, or a message of the middleware that was
-        forged.
+        Further topics go on. A reader may miss all of a topic: a full queue, or a message of the
+        middleware that was forged.
         """
         steady = self._among(STEADY, heard=True)
         newest_ns = max((topic.heard_ns for topic in steady), default=0)
@@ -483,8 +490,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
         ]
 
     def _weaken_qos(self, topic: _RecordedTopic) -> None:
-        """Subscribe again with a weaker QoS where the publishers of a topic offer less than is
-        requested.
+        """Subscribe again with a weaker QoS where publishers offer less than is requested.
 
         A weaker publisher beside one of the stack does not lower the QoS: EndpointMonitor logs the
         mismatch.
@@ -528,8 +534,9 @@ class RecorderNode(FlightNode[RecorderConfig]):
         return level, f"recording to {self._bag.path}", figures
 
     def _drain(self) -> None:
-        """Write the messages that were sent before the end: this process may be seconds behind on a
-        busy host.
+        """Write the messages that were sent before the end.
+
+        This process may be seconds behind on a busy host.
         """
         end_ns = time.monotonic_ns()
         sent_ns = time.time_ns()
