@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A simulated autopilot with ArduPilot's DDS interface, as a process: python -m tests.ros.autopilot
-SCENARIO RELEASE_AFTER.
+"""A simulated autopilot with ArduPilot's DDS interface, as a process.
+
+python -m tests.ros.autopilot SCENARIO RELEASE_AFTER
 
 It simulates the aircraft section of the scenario at its rate and publishes y as AP_DDS does (ENU
 and FLU, best effort, depth five). It subscribes to Joy as AP_DDS does: axes are scaled to full
@@ -71,8 +72,9 @@ class Autopilot:
             )
 
     def _u(self) -> list[float]:
-        """Elevator, thrust, aileron, rudder from trim, in rad and as a fraction of full thrust;
-        half throttle is trim.
+        """Elevator, thrust, aileron, rudder from trim, in rad and as a fraction of full thrust.
+
+        Half throttle is trim.
         """
         if (
             any(math.isfinite(axis) for axis in self._axes)
@@ -132,8 +134,9 @@ class Autopilot:
 
 
 class Odometer(Autopilot):
-    """A simulator that publishes Imu and Odometry and takes commands of joints and of the
-    thrust.
+    """A simulator that publishes Imu and Odometry.
+
+    It takes commands of joints and of the thrust.
     """
 
     def __init__(self, scenario: Path, release_after: float, node: Any) -> None:

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fixtures for real processes over real DDS. Each test has its own domain; its processes are killed
-afterwards.
+"""Fixtures for real processes over real DDS.
+
+Each test has its own domain; its processes are killed afterwards.
 """
 
 import fcntl
@@ -45,8 +46,9 @@ T = TypeVar("T")
 
 
 class Process:
-    """A process under test and the lines of its output. It ends with pytest, also where no fixture
-    ends it.
+    """A process under test and the lines of its output.
+
+    It ends with pytest, also where no fixture ends it.
     """
 
     def __init__(
@@ -72,8 +74,9 @@ class Process:
         return "\n".join(self.lines)
 
     def has_logged(self, *parts: str) -> bool:
-        """Whether a line contains all parts. A process that has ended without one never will: its
-        output is the error.
+        """Whether a line contains all parts.
+
+        A process that has ended without one never will: its output is the error.
         """
         ended = not self._reader.is_alive()
         logged = any(all(part in line for part in parts) for line in list(self.lines))
@@ -160,11 +163,11 @@ INCONCLUSIVE = "inconclusive"  # key of the property of a report
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool | None:
-    """Run a test again where it failed beside a delay of the host beyond what it bears; a failure
-    without one is a failure.
+    """Run a test again where it failed beside a delay of the host beyond what it bears.
 
-    Where the host delayed each of three attempts, the test is skipped as inconclusive, but not
-    where all failed alike: then the host is not the cause. The summary names the test either way.
+    A failure without such a delay is a failure. Where the host delayed each of three attempts, the
+    test is skipped as inconclusive, but not where all failed alike: then the host is not the cause.
+    The summary names the test either way.
     """
     if not item.path.is_relative_to(IN_REAL_TIME):
         return None
@@ -222,17 +225,17 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 
 
 def is_closed(run: Path) -> bool:
-    """Whether the recorder of a run has closed its file, by the reader of mcap: the file has its
-    summary. Notes of a log say besides what a busy host left out, and do not serve.
+    """Whether the recorder of a run has closed its file, by the reader of mcap.
+
+    A closed file has its summary. Notes of a log say besides what a busy host left out, and do not
+    serve.
     """
     with next(run.glob("*.mcap")).open("rb") as stream:
         return make_reader(stream).get_summary() is not None
 
 
 def settable_clock(folder: Path) -> Path:
-    """A library, of faults/clock.c, that gives the processes that load it a system clock that can
-    be set.
-    """
+    """A library, of faults/clock.c, that gives processes a system clock that can be set."""
     compiler = shutil.which("cc")
     if compiler is None:
         pytest.skip("no C compiler for a clock that can be set")
@@ -247,10 +250,10 @@ def settable_clock(folder: Path) -> Path:
 
 @contextmanager
 def reserved_domain() -> Iterator[int]:
-    """A ROS domain that no other test of this host has until the block is left, also of another
-    worker or checkout.
+    """A ROS domain that no other test of this host has until the block is left.
 
-    The ports of domains 1 to 100 are below the ephemeral ports of Linux.
+    That includes tests of another worker or checkout. The ports of domains 1 to 100 are below the
+    ephemeral ports of Linux.
     """
     for number in (1 + next(_numbers) % 100 for _ in range(100)):
         with (Path(tempfile.gettempdir()) / f"ros_domain_{number}.lock").open("a") as lock:
@@ -298,8 +301,9 @@ def start(tmp_path: Path) -> Iterator[Start]:
 
 @pytest.fixture
 def start_node(start: Start, osprey_gust: Scenario) -> Start:
-    """Start the node of a package with the parameters of the default scenario, and with more ROS
-    arguments.
+    """Start the node of a package with the parameters of the default scenario.
+
+    More ROS arguments may follow.
     """
     return lambda package, *arguments, within=(): start(
         f"{package}.main",

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A simulated autopilot with ArduPilot's MAVLink interface, as a process: python -m
-tests.ros.mavlink_autopilot SCENARIO PORT.
+"""A simulated autopilot with ArduPilot's MAVLink interface, as a process.
+
+python -m tests.ros.mavlink_autopilot SCENARIO PORT
 
 It simulates the aircraft section of the scenario, sends ATTITUDE, VFR_HUD and more to a UDP port of
 this host at 50 Hz, and takes RC_CHANNELS_OVERRIDE of system 255: 0 releases a channel, 65535 leaves

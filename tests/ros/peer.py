@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A peer of a node under test: publishes y and y_m, subscribes to topics of the node, calls its
-services.
+"""A peer of a node under test.
+
+It publishes y and y_m, subscribes to topics of the node, and calls its services.
 """
 
 import time
@@ -39,8 +40,9 @@ def stamp_ns(message: Any) -> int:
 
 
 class Peer:
-    """A node that runs while `until` waits for a condition. `received` holds its messages by
-    topic.
+    """A node that runs while `until` waits for a condition.
+
+    `received` holds its messages by topic.
     """
 
     def __init__(self, context: Context, topics: tuple[str, ...], qos: QoSProfile) -> None:

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A network between the network namespaces of two processes, with delay and loss: python -m
-tests.ros.relay PID PID DELAY LOSS.
+"""A network between the network namespaces of two processes, with delay and loss.
+
+python -m tests.ros.relay PID PID DELAY LOSS
 
 It forwards the packets of two TUN devices, `net0` in each namespace, after DELAY s; a share LOSS is
 lost. It prints "up" once the devices exist. SIGUSR1 pulls the cable for a second.

@@ -1,10 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Measures the age of u on the host of the aircraft, by rclpy alone, beside what the aircraft
-tells.
+"""Measures the age of u on the host of the aircraft, beside what the aircraft tells.
 
-As a process, python -m tests.ros.stopwatch. It prints "told MEAN measured MEAN", s, for each report
-of the aircraft.
+It needs rclpy alone. As a process, python -m tests.ros.stopwatch. It prints "told MEAN measured
+MEAN", s, for each report of the aircraft.
 """
 
 import rclpy

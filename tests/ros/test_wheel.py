@@ -32,8 +32,9 @@ def write_package(folder: Path, name: str) -> None:
 
 @pytest.fixture
 def installed(tmp_path: Path) -> Path:
-    """The folder that holds the installed wheel, and a foreign package of the name guidance, as on
-    PyPI.
+    """The folder that holds the installed wheel, and a foreign package of the name guidance.
+
+    PyPI has one of that name.
     """
     built = tmp_path / "built"
     target = tmp_path / "installed"
@@ -59,8 +60,9 @@ def installed(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def run(installed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
-    """Runs Python with the wheel. Strangers of all names are in the working folder and behind the
-    wheel on the path.
+    """Runs Python with the wheel.
+
+    Strangers of all names are in the working folder and behind the wheel on the path.
     """
     behind = tmp_path / "behind"
     working = tmp_path / "working"
@@ -81,8 +83,9 @@ def run(installed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run
 
 
 def test_the_wheel_flies_beside_strangers(installed: Path, run: Run) -> None:
-    """Every package is that of the wheel. In one process, and as four processes over DDS, the
-    replay is equal to the bit.
+    """Every package is that of the wheel.
+
+    In one process, and as four processes over DDS, the replay is equal to the bit.
     """
     code = (
         f"import importlib\nfor name in {PACKAGES}: print(importlib.import_module(name).__file__)"

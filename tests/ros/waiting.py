@@ -16,11 +16,10 @@ LOOK = 0.005  # s, between two looks at a condition
 
 
 class HostDelays(threading.Thread):
-    """Delays of the host, as a thread sees them that is due every 10 ms: all processes of a test
-    have them.
+    """Delays of the host, as a thread sees them that is due every 10 ms.
 
-    What this process itself computes meanwhile is no delay of the host: another thread may have
-    held the interpreter.
+    All processes of a test have them. What this process itself computes meanwhile is no delay of
+    the host: another thread may have held the interpreter.
     """
 
     def __init__(self) -> None:
@@ -72,11 +71,11 @@ def until(
     each: Callable[[], object] = lambda: time.sleep(LOOK),
     timeout: float = HANG,
 ) -> T:
-    """Wait until a condition is true; what it returned. `each` is called between two looks and
-    takes some milliseconds.
+    """Wait until a condition is true; what it returned.
 
-    `because` says what the test waits for. The limit grows by the delays of the host. A wait that
-    ends without the condition fails with the output of all processes of the test.
+    `each` is called between two looks and takes some milliseconds. `because` says what the test
+    waits for. The limit grows by the delays of the host. A wait that ends without the condition
+    fails with the output of all processes of the test.
     """
     begin = time.monotonic()
     began = time.time()

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Tests with a real autopilot in software: `make test-sitl`. They are skipped, with the reason,
-where the kit cannot run.
+"""Tests with a real autopilot in software: `make test-sitl`.
+
+They are skipped, with the reason, where the kit cannot run.
 """
 
 import os
@@ -40,8 +41,9 @@ def plane(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ArduPlane]:
 
 @pytest.fixture(scope="module")
 def px4(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Px4]:
-    """PX4's airplane in flight. Without a stick it goes on, and without an offboard heartbeat it
-    changes to Hold.
+    """PX4's airplane in flight.
+
+    Without a stick it goes on, and without an offboard heartbeat it changes to Hold.
     """
     autopilot = Px4(tmp_path_factory.mktemp("run"))
     try:

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The kits of autopilots in software: one is started and stopped, commanded, and flown by commands
-of the stack beside it.
+"""The kits of autopilots in software.
 
-The kits are no part of this repository. RISE_DI_SITL names the folder of ArduPlane's, by default
-../shared/sitl beside the checkout; that of PX4 is its folder px4. Their READMEs say what they need.
-PILOT_PYTHON is an interpreter with pymavlink, by default python3.
+A kit is started and stopped, commanded, and flown by commands of the stack beside it. The kits are
+no part of this repository. RISE_DI_SITL names the folder of ArduPlane's, by default ../shared/sitl
+beside the checkout; that of PX4 is its folder px4. Their READMEs say what they need. PILOT_PYTHON
+is an interpreter with pymavlink, by default python3.
 """
 
 import csv
@@ -95,8 +95,9 @@ def missing() -> str:
 
 
 class Autopilot:
-    """An autopilot and its agent in a network of their own, and the flights of the stack beside
-    it.
+    """An autopilot and its agent in a network of their own.
+
+    It has the flights of the stack beside it.
     """
 
     script: Path
@@ -205,8 +206,9 @@ class Autopilot:
         raise NotImplementedError
 
     def hand_over(self) -> None:
-        """Change to the mode in which the stack is engaged, where the bridge does not ask for
-        it.
+        """Change to the mode in which the stack is engaged.
+
+        Needed where the bridge does not ask for it.
         """
 
     def patient_map(self, name: str, *changes: tuple[str, str]) -> str:
@@ -243,10 +245,10 @@ class Autopilot:
     def engaged(
         self, scenario: Path, channel_map: str, duration: float, *, transmitter: bool = False
     ) -> Iterator[Process]:
-        """A flight of the stack, engaged from level flight. Afterwards the autopilot flies level in
-        its own mode.
+        """A flight of the stack, engaged from level flight.
 
-        `transmitter`: whether the bridge watches the transmitter.
+        Afterwards the autopilot flies level in its own mode. `transmitter`: whether the bridge
+        watches the transmitter.
         """
         self.level()
         flight = self.fly(scenario, channel_map, duration, "--send")
@@ -262,8 +264,9 @@ class Autopilot:
             self.level()
 
     def requested(self, *options: str) -> Process:
-        """The end of `rise-di engage`, requested again until the rates of a MAVLink link are known,
-        2 s after its begin.
+        """The end of `rise-di engage`, requested again until the rates of a MAVLink link are known.
+
+        They are known 2 s after its begin.
         """
         for _ in range(ENGAGEMENTS):
             request = self.start("engage", *options)
@@ -272,8 +275,9 @@ class Autopilot:
         return request
 
     def _engage_level(self, *options: str) -> None:
-        """Engage, again from level flight where the aircraft climbs or sinks at the hand-over, as
-        after a jammed surface.
+        """Engage, again from level flight where the aircraft climbs or sinks at the hand-over.
+
+        It does so after a jammed surface.
         """
         for _ in range(ENGAGEMENTS):
             self.hand_over()
@@ -284,8 +288,9 @@ class Autopilot:
         engaged.succeed()
 
     def experiment(self, *command: str) -> Process:
-        """Fly the experiment of `identify --bridge`, with the arguments of the command, to its end
-        in the air.
+        """Fly the experiment of `identify --bridge` to its end in the air.
+
+        The arguments are those of the command.
         """
         self.level()
         excited = self.start(*command)
@@ -302,18 +307,18 @@ class Autopilot:
         return (self.folder / "runs" / "latest").resolve()
 
     def summary(self) -> dict[str, Any]:
-        """The summary of the last flight: its outcome, and its engagements with start, stop,
-        reason.
+        """The summary of the last flight.
+
+        Its outcome, and its engagements with start, stop, reason.
         """
         found: dict[str, Any] = json.loads((self.run / "summary.json").read_text())
         return found
 
 
 def guided_scenario(scenario: Path, program: Program, speed: float) -> str:
-    """The text of a scenario under guidance by rule in place of its commands; `program` has times,
-    s, and values by channel.
+    """The text of a scenario under guidance by rule in place of its commands.
 
-    The poses of a busy host may be MAX_AGE old.
+    `program` has times, s, and values by channel. The poses of a busy host may be MAX_AGE old.
     """
     content = yaml.safe_load(scenario.read_text())
     reference = content["/**/reference_model"]["ros__parameters"]
@@ -330,8 +335,9 @@ def guided_scenario(scenario: Path, program: Program, speed: float) -> str:
 
 
 def followed(tape: Tape, name: str, start: float, stop: float) -> float:
-    """The part of y that goes along with y_m from start to stop, s, over y_m: the largest at a
-    delay below 0.6 s.
+    """The part of y that goes along with y_m from start to stop, s, over y_m.
+
+    It is the largest at a delay below 0.6 s.
     """
     y = tape["y"]
     y_m = tape["y_m"]
@@ -347,8 +353,9 @@ def followed(tape: Tape, name: str, start: float, stop: float) -> float:
 
 
 class Agreement(NamedTuple):
-    """A signal of the stack over the autopilot's own, at the delay between both with the smallest
-    residual.
+    """A signal of the stack over the autopilot's own.
+
+    It is taken at the delay between both with the smallest residual.
     """
 
     # by orthogonal regression: the instants of both jitter, so an ordinary one, with noise in one
@@ -456,15 +463,17 @@ class ArduPlane(Autopilot):
             self.say("param", "SIM_RC_FAIL", "0")
 
     def hand_over(self) -> None:
-        """Change to MANUAL with the sticks where the servos are, so that the aircraft stays in
-        trim.
+        """Change to MANUAL with the sticks where the servos are.
+
+        So the aircraft stays in trim.
         """
         self.say("sticks_from_servos")
         assert "ok" in self.say("mode", "MANUAL")
 
     def restart(self) -> None:
-        """End the autopilot and start it again, on the ground. Its ground station notices no other
-        way.
+        """End the autopilot and start it again, on the ground.
+
+        Its ground station notices no other way.
         """
         again = self.kill("pilot.py", "arduplane")
         (self.folder / "pilot.sock").unlink()
@@ -475,8 +484,9 @@ class ArduPlane(Autopilot):
             time.sleep(POLL)
 
     def log(self, kind: str, *fields: str) -> tuple[FloatArray, FloatArray]:
-        """The autopilot's own log over MAVLink: the times of arrival, s of the system clock, and
-        the fields.
+        """The autopilot's own log over MAVLink.
+
+        The times of arrival, s of the system clock, and the fields.
         """
         with (self.folder / "mavlink.csv").open(encoding="utf-8", newline="") as file:
             rows = [
@@ -489,16 +499,18 @@ class ArduPlane(Autopilot):
         )
 
     def mavlink_map(self, *changes: tuple[str, str]) -> str:
-        """The map `ardupilot_mavlink` with longer ages, on the second serial port, beside the
-        ground station of the kit.
+        """The map `ardupilot_mavlink` with longer ages, on the second serial port.
+
+        The ground station of the kit is beside it.
         """
         return self.patient_map(
             "ardupilot_mavlink", ("url: udpin:127.0.0.1:14551", "url: tcp:127.0.0.1:5763"), *changes
         )
 
     def shared_map(self) -> str:
-        """The map `ardupilot_mavlink` with longer ages, on the link of `shared_link`, with the
-        number of its station.
+        """The map `ardupilot_mavlink` with longer ages, on the link of `shared_link`.
+
+        It has the number of its station.
         """
         return self.patient_map(
             "ardupilot_mavlink", ("source_system: 255", f"source_system: {STATION}")
@@ -506,8 +518,9 @@ class ArduPlane(Autopilot):
 
     @contextmanager
     def shared_link(self) -> Iterator[Callable[[str], None]]:
-        """Start `tests.sitl.shared_link`, whose station is the autopilot's; what is given sends it
-        a word.
+        """Start `tests.sitl.shared_link`, whose station is the autopilot's.
+
+        The function that is returned sends it a word.
         """
         path = str(self.folder / "link.sock")
         link = self._module("tests.sitl.shared_link", path)
@@ -531,11 +544,10 @@ class ArduPlane(Autopilot):
         return max((self.folder / "logs").glob("*.BIN"), key=lambda path: path.stat().st_mtime)
 
     def own_errors(self, ratio: float = 1.0) -> dict[str, tuple[float, float]]:
-        """The rms of the autopilot's own log less y_m, and of y_m, by channel, in the engaged time
-        in which it is commanded.
+        """The rms of the autopilot's own log less y_m, and of y_m, by channel.
 
-        V is the sensor's, as a deviation from its value at the engagement, times `ratio`, of true
-        over equivalent airspeed.
+        It covers the engaged time in which y_m is commanded. V is the sensor's, as a deviation from
+        its value at the engagement, times `ratio`, of true over equivalent airspeed.
         """
         log = read_run(self.run)
         (span,) = log.engagements or []
@@ -565,8 +577,9 @@ class ArduPlane(Autopilot):
     def turns(
         self, starts: Sequence[float], altitude: float, speed: float
     ) -> dict[str, tuple[Sequence[float], Sequence[float]]]:
-        """A program of guidance: at each start, s, a turn by TURN, a climb or sink of 15 m, and 1
-        m/s more or less.
+        """A program of guidance: at each start a turn, a climb or sink, and a change of airspeed.
+
+        A start is in s, the turn TURN, the climb or sink 15 m, the change 1 m/s more or less.
         """
         self.state()  # writes the log
         heading = float(self.log("ATTITUDE", "yaw")[1][-1, 0])
@@ -648,8 +661,9 @@ class Px4(Autopilot):
         return {**state, "alt": -height.get("z", 0.0), "climb": -height.get("vz", 0.0)}
 
     def take_off(self) -> None:
-        """Take off from the runway, into Hold. The airplane cannot hold its default speed of 15
-        m/s.
+        """Take off from the runway, into Hold.
+
+        The airplane cannot hold its default speed of 15 m/s.
         """
         deadline = time.monotonic() + 60.0
         armed = False
@@ -672,8 +686,9 @@ class Px4(Autopilot):
         self.say("param", "set", "FW_AIRSPD_TRIM", "11.2")
 
     def level(self) -> None:
-        """Fly straight ahead in Hold, towards a place 20 km to the north, 150 m above the
-        ground.
+        """Fly straight ahead in Hold.
+
+        The place ahead is 20 km to the north, 150 m above the ground.
         """
         # not before its agent is connected
         self.until(lambda _: self.tool("say", "away", "0", "20000", "150").end() == 0)
@@ -698,8 +713,9 @@ class Px4(Autopilot):
 
     @contextmanager
     def watching_truth(self) -> Iterator[Callable[[], Signal]]:
-        """Ask the simulator for its own p, q, r ten times a second. What is given returns them,
-        rad/s, by the system clock.
+        """Ask the simulator for its own p, q, r ten times a second.
+
+        The function that is returned gives them, rad/s, by the system clock.
         """
         asked: list[tuple[float, FloatArray]] = []  # s of the system clock; p, q, r
         ended = Event()

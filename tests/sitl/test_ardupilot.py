@@ -52,11 +52,10 @@ def engaged(plane: ArduPlane, duration: float) -> AbstractContextManager[Process
 
 
 def test_dry_run_measures_what_autopilot_logs(plane: ArduPlane) -> None:
-    """In turns and climbs rates and pose are those of its own log: slopes of 1 within 1 %, and V
-    its airspeed within 5 %.
+    """In turns and climbs rates and pose are those of its own log.
 
-    V is the airspeed of its estimator, VFR_HUD that of the sensor, an equivalent one. In the
-    autopilot they differ by 3 %.
+    Slopes of 1 within 1 %, and V its airspeed within 5 %. V is the airspeed of its estimator,
+    VFR_HUD that of the sensor, an equivalent one. In the autopilot they differ by 3 %.
     """
     plane.level()
     channel_map = map_of(plane, captured=False)  # V before an engagement too
@@ -95,11 +94,10 @@ def test_dry_run_measures_what_autopilot_logs(plane: ArduPlane) -> None:
 
 
 def test_an_engaged_flight_tracks_its_commands(plane: ArduPlane) -> None:
-    """While they are commanded the errors of q and p stay below y_m, and every tick of the log
-    replays.
+    """While they are commanded the errors of q and p stay below y_m.
 
-    An aircraft that does not follow has a ratio of 1 or more. Calm flights had 0.63, 0.49; with
-    identified gains 0.43, 0.17.
+    Every tick of the log replays. An aircraft that does not follow has a ratio of 1 or more. Calm
+    flights had 0.63, 0.49; with identified gains 0.43, 0.17.
     """
     with engaged(plane, SCENARIO.flight.duration) as flight:
         flight.succeed(SCENARIO.flight.duration + 30.0)
@@ -125,12 +123,11 @@ def test_an_engaged_flight_tracks_its_commands(plane: ArduPlane) -> None:
 
 
 def test_turbulence_moves_aircraft_as_much_as_under_autopilots_own_law(plane: ArduPlane) -> None:
-    """The rms of q while engaged is at most twice that in GUIDED just before, by the autopilot's
-    log; the envelope may end it.
+    """The rms of q while engaged is at most twice that in GUIDED just before.
 
-    SIM_WIND_TURB 2 moves q by 0.4 rad/s in GUIDED, far more than a command: an error would tell of
-    the wind. The rms of 8 s differs from one time to the next; a law at its limit of stability has
-    several times as much.
+    It is by the autopilot's log; the envelope may end the engagement. SIM_WIND_TURB 2 moves q by
+    0.4 rad/s in GUIDED, far more than a command: an error would tell of the wind. The rms of 8 s
+    differs from one time to the next; a law at its limit of stability has several times as much.
     """
     before = 8.0  # s in GUIDED
     with ExitStack() as afterwards:
@@ -157,13 +154,12 @@ def test_turbulence_moves_aircraft_as_much_as_under_autopilots_own_law(plane: Ar
     "turns", [1, pytest.param(10, marks=[pytest.mark.long, pytest.mark.timeout(1000)])]
 )
 def test_guidance_holds_heading_altitude_and_airspeed(plane: ArduPlane, turns: int) -> None:
-    """A minute for each turn, climb and change of airspeed: engaged to the end, and all are held
-    again after 45 s.
+    """A minute for each turn, climb and change of airspeed, engaged to the end.
 
-    Altitude and airspeed within the bands in which a guided flight counts as settled, 5 m and 1
-    m/s. The gyro of the simulator drifts by up to b = 4.4 mrad/s, SIM_DRIFT_SPEED 0.05 deg/s a
-    minute for 5 minutes, and heading is off by b g / (k_phi k_chi V): 2.6 deg for the bandwidth of
-    p in the example. 2 deg are those of a settled heading.
+    All are held again after 45 s, altitude and airspeed within the bands in which a guided flight
+    counts as settled, 5 m and 1 m/s. The gyro of the simulator drifts by up to b = 4.4 mrad/s,
+    SIM_DRIFT_SPEED 0.05 deg/s a minute for 5 minutes, and heading is off by b g / (k_phi k_chi V):
+    2.6 deg for the bandwidth of p in the example. 2 deg are those of a settled heading.
     """
     first, each = 15.0, 60.0  # s
     starts = (first + each * np.arange(turns)).tolist()
@@ -190,8 +186,9 @@ def test_guidance_holds_heading_altitude_and_airspeed(plane: ArduPlane, turns: i
 
 
 class Event(NamedTuple):
-    """What ends an engagement, the reason in the summary, and when the sticks act again, s after
-    the event.
+    """What ends an engagement, and the reason in the summary.
+
+    The third is when the sticks act again, s after the event.
     """
 
     act: Callable[[ArduPlane, Process], Callable[[], object] | None]
@@ -262,8 +259,9 @@ EVENTS = {
 def test_sticks_that_bridge_overrides_do_not_show_and_do_not_act_before_release(
     plane: ArduPlane,
 ) -> None:
-    """The autopilot shows Joy in channels 1 to 4, so that an override by a stick of these would act
-    on the law's own u.
+    """The autopilot shows Joy in channels 1 to 4.
+
+    An override by a stick of these would act on the law's own u.
     """
     with engaged(plane, 60.0) as flight:
         plane.say("stick", "4", str(MARK))
@@ -308,8 +306,9 @@ def test_the_pilot_has_the_aircraft_again(
 
 
 def sticks_act(plane: ArduPlane, since: float) -> float:
-    """The time from which on the rudder channel is where its stick is, for 0.5 s at least; s of the
-    system clock.
+    """The time from which on the rudder channel is where its stick is, s of the system clock.
+
+    It stays there for 0.5 s at least.
     """
     deadline = time.monotonic() + 10.0
     while time.monotonic() < deadline:
@@ -323,8 +322,9 @@ def sticks_act(plane: ArduPlane, since: float) -> float:
 
 
 def test_max_engaged_ends_an_engagement_without_transmitter(plane: ArduPlane) -> None:
-    """No field tells the loss, and Joy keeps the autopilot's own RC failsafe off: the failsafe acts
-    after the release.
+    """No field tells the loss, and Joy keeps the autopilot's own RC failsafe off.
+
+    The failsafe acts after the release.
     """
     bound = 20.0
     channel_map = plane.patient_map("ardupilot", ("max_engaged: 120.0", f"max_engaged: {bound}"))
@@ -343,8 +343,9 @@ def test_max_engaged_ends_an_engagement_without_transmitter(plane: ArduPlane) ->
 
 
 def test_overloaded_machine_leaves_aircraft_to_law_or_to_pilot(plane: ArduPlane) -> None:
-    """Four busy processes a core for 3 s: the bridge stays engaged, or says what was stale; then a
-    release acts at once.
+    """Four busy processes a core for 3 s: the bridge stays engaged, or says what was stale.
+
+    Then a release acts at once.
     """
     with engaged(plane, 60.0) as flight:
         plane.say("stick", "4", str(MARK))
@@ -361,8 +362,9 @@ def test_overloaded_machine_leaves_aircraft_to_law_or_to_pilot(plane: ArduPlane)
 
 @pytest.mark.parametrize("what", ["agent", "autopilot"])
 def test_the_stack_engages_again_after_a_restart(plane: ArduPlane, what: str) -> None:
-    """One flight of the stack goes on while agent or autopilot are away. The restarted aircraft
-    takes off again.
+    """One flight of the stack goes on while agent or autopilot are away.
+
+    The restarted aircraft takes off again.
     """
     with engaged(plane, 400.0) as flight:
         if what == "agent":

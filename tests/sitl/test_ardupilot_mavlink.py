@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The map `ardupilot_mavlink` against ArduPlane's MAVLink: what the bridge releases, refuses and
-flies through.
+"""The map `ardupilot_mavlink` against ArduPlane's MAVLink.
+
+What the bridge releases, refuses and flies through.
 """
 
 import re
@@ -44,8 +45,9 @@ def engaged(
 
 
 def test_engaged_flight_over_mavlink_tracks_its_commands(plane: ArduPlane) -> None:
-    """As over DDS: while they are commanded the errors of q and p stay below y_m, by the
-    autopilot's log, and ticks replay.
+    """As over DDS: while they are commanded the errors of q and p stay below y_m.
+
+    The errors are by the autopilot's log, and ticks replay.
     """
     with engaged(plane, SCENARIO.flight.duration) as flight:
         flight.succeed(SCENARIO.flight.duration + 30.0)
@@ -58,8 +60,9 @@ def test_engaged_flight_over_mavlink_tracks_its_commands(plane: ArduPlane) -> No
 
 
 class Trouble(NamedTuple):
-    """What fails, by parameters, a pattern of the reason, empty where the bridge flies on, and the
-    time for it, s.
+    """What fails, by parameters, and a pattern of the reason.
+
+    The pattern is empty where the bridge flies on. The time for it is in s.
     """
 
     parameters: Sequence[tuple[str, float]]
@@ -105,8 +108,9 @@ HEALTHY = {
 def test_bridge_releases_with_the_reason_of_a_trouble_or_flies_on(
     plane: ArduPlane, name: str, record_testsuite_property: Callable[[str, object], None]
 ) -> None:
-    """A surface that does not move, an engine or an airspeed sensor that fails end it; a spare
-    sensor takes over.
+    """A surface that does not move, an engine or an airspeed sensor that fails end it.
+
+    A spare sensor takes over.
     """
     trouble = TROUBLE[name]
     with ExitStack() as afterwards, engaged(plane, 100.0) as flight:
@@ -177,8 +181,9 @@ def test_transmitter_lost_before_an_engagement_refuses_it_by_the_mode(plane: Ard
 
 
 def test_transmitter_lost_while_engaged_is_bounded_by_max_engaged(plane: ArduPlane) -> None:
-    """No field tells the loss, and the override keeps the autopilot's own failsafe off: it acts
-    after the release.
+    """No field tells the loss, and the override keeps the autopilot's own failsafe off.
+
+    The failsafe acts after the release.
     """
     bound = 20.0
     with engaged(plane, 60.0, ("max_engaged: 120.0", f"max_engaged: {bound}")) as flight:
@@ -279,8 +284,9 @@ def test_cut_cable_leaves_the_last_u_for_the_timeout_of_overrides_alone(plane: A
 def test_silent_ground_station_ends_the_engagement_and_the_aircraft_loiters(
     plane: ArduPlane, failsafe: None
 ) -> None:
-    """The overrides hide the silence from the autopilot, whose failsafe acts FS_LONG_TIMEOUT after
-    the last of them.
+    """The overrides hide the silence from the autopilot.
+
+    Its failsafe acts FS_LONG_TIMEOUT after the last of them.
     """
     with (
         plane.shared_link() as link,

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The map of `examples/px4_airplane` against PX4's own uXRCE-DDS client: into offboard, and back
-into a mode of PX4's own.
+"""The map of `examples/px4_airplane` against PX4's own uXRCE-DDS client.
+
+Into offboard, and back into a mode of PX4's own.
 """
 
 import time
@@ -34,12 +35,11 @@ def engaged(px4: Px4, duration: float) -> AbstractContextManager[Process]:
 
 
 def test_engaged_flight_tracks_commands_in_offboard(px4: Px4) -> None:
-    """The part of y that goes along with y_m has half to one and a half of its size, thrust is off
-    its limits, ticks replay.
+    """The part of y that goes along with y_m has half to one and a half of its size.
 
-    The noise of its gyro is larger than the commands: rms 50 mrad/s in q and 104 in p, in Hold too.
-    The part is uncertain by 0.1, and in a flight it was 1.04 in q, 0.93 in p, 0.83 in V, 0.25 s
-    after y_m.
+    Thrust is off its limits, ticks replay. The noise of its gyro is larger than the commands: rms
+    50 mrad/s in q and 104 in p, in Hold too. The part is uncertain by 0.1, and in a flight it was
+    1.04 in q, 0.93 in p, 0.83 in V, 0.25 s after y_m.
     """
     with engaged(px4, SCENARIO.flight.duration) as flight:
         assert px4.state()["nav_state"] == OFFBOARD
@@ -57,8 +57,9 @@ def test_engaged_flight_tracks_commands_in_offboard(px4: Px4) -> None:
 
 
 class Event(NamedTuple):
-    """What ends an engagement, the reason in the summary, and the time until a mode of PX4's own
-    flies, s.
+    """What ends an engagement, and the reason in the summary.
+
+    The third is the time until a mode of PX4's own flies, s.
     """
 
     act: Callable[[Px4, Process], Callable[[], object] | None]
@@ -125,11 +126,10 @@ EVENTS = {
 def test_px4_flies_by_its_own_law_again(
     px4: Px4, name: str, record_testsuite_property: Callable[[str, object], None]
 ) -> None:
-    """Within the time of the event PX4 leaves offboard or is disarmed, and the log says why the
-    engagement ended.
+    """Within the time of the event PX4 leaves offboard or is disarmed.
 
-    The time of a release and of an override begins with the bridge's release in the log: their
-    commands take longer to start.
+    The log says why the engagement ended. The time of a release and of an override begins with the
+    bridge's release in the log: their commands take longer to start.
     """
     event = EVENTS[name]
     with ExitStack() as afterwards, engaged(px4, 90.0) as flight:
@@ -181,8 +181,9 @@ def test_lost_transmitter_releases_within_a_second(
 
 
 def test_overloaded_machine_leaves_airplane_to_law_or_to_px4(px4: Px4) -> None:
-    """Four busy processes a core for 3 s: the bridge stays engaged, or says what was stale, and PX4
-    flies in Hold.
+    """Four busy processes a core for 3 s: the bridge stays engaged, or says what was stale.
+
+    PX4 flies in Hold then.
     """
     with engaged(px4, 60.0) as flight:
         for process in burn(3.0):
@@ -200,8 +201,9 @@ def test_overloaded_machine_leaves_airplane_to_law_or_to_px4(px4: Px4) -> None:
 
 @pytest.mark.parametrize("what", ["agent", "autopilot"])
 def test_the_stack_engages_again_after_a_restart(px4: Px4, what: str) -> None:
-    """One flight of the stack goes on. PX4's client connects again where it has noticed that the
-    agent was away.
+    """One flight of the stack goes on.
+
+    PX4's client connects again where it has noticed that the agent was away.
     """
     with engaged(px4, 400.0) as flight:
         if what == "agent":

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The bridge, over DDS: the unchanged controller flies a simulated autopilot through the map
-examples/maps/ardupilot_2024.yaml.
+"""The bridge, over DDS: the unchanged controller flies a simulated autopilot.
 
-tests/nodes/autopilot_bridge/test_bridge.py has what a bridge does with its messages. These tests
-have the commands, the flight with a bridge, and the ends of its process.
+The map is examples/maps/ardupilot_2024.yaml. tests/nodes/autopilot_bridge/test_bridge.py has what a
+bridge does with its messages. These tests have the commands, the flight with a bridge, and the ends
+of its process.
 """
 
 import json

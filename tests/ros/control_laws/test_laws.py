@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A control law of another package over real DDS: lockstep equal to the loop in one process, and
-replayed.
+"""A control law of another package over real DDS.
+
+In lockstep it is equal to the loop in one process, and replayed.
 """
 
 import os
@@ -35,8 +36,9 @@ PULSES = {
 
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder into which pip installs a copy of the example; pip leaves build artefacts beside
-    the source.
+    """The folder into which pip installs a copy of the example.
+
+    Pip leaves build artefacts beside the source.
     """
     copy = tmp_path_factory.mktemp("source") / "pid_law"
     target = tmp_path_factory.mktemp("installed")
@@ -87,8 +89,9 @@ def scenario_file(path: Path, controller: dict[str, Any]) -> Path:
 def test_law_of_another_package_flies_in_lockstep_as_without_ros_and_replayed(
     start: Start, tmp_path: Path
 ) -> None:
-    """In four processes and in one. tests/nodes/flight_bringup/test_lockstep.py flies the other
-    laws.
+    """In four processes and in one.
+
+    tests/nodes/flight_bringup/test_lockstep.py flies the other laws.
     """
     scenario = scenario_file(tmp_path / "pid.yaml", SECTIONS["pid"])
     runs = []

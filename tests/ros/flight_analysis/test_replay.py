@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Replay of flights over real DDS from their logs: bit by bit, after faults of the controller and
-of the recorder too.
+"""Replay of flights over real DDS from their logs: bit by bit.
+
+Logs after faults of the controller and of the recorder are replayed too.
 """
 
 import json
@@ -26,8 +27,9 @@ PEER_TOPICS = ("internals", "/diagnostics")
 
 
 def replayed(start: Start, run: Path, *settings: str, equal: bool = True) -> dict[str, Any]:
-    """The JSON output of `rise-di replay`, whose exit status tells a log without 99 % of the
-    ticks.
+    """The JSON output of `rise-di replay`.
+
+    Its exit status tells a log without 99 % of the ticks.
     """
     process = start("flight_cli.cli", "replay", str(run), "--json", *settings)
     status = process.end()

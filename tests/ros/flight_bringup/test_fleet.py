@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fleets over topics: in lockstep as lone flights, in real time without an effect of one aircraft
-on another.
+"""Fleets over topics: in lockstep as lone flights.
+
+In real time no aircraft has an effect on another.
 """
 
 import re

@@ -39,8 +39,9 @@ def is_engaged(folder: Path) -> bool:
 def test_flights_in_two_namespaces_do_not_mix_and_end_by_interrupts(
     start: Start, engaged: Engaged, tmp_path: Path
 ) -> None:
-    """The first by one interrupt, the one beside it by three: the further ones do not interrupt its
-    shutdown.
+    """The first by one interrupt, the one beside it by three.
+
+    The further ones do not interrupt its shutdown.
     """
     flight, nodes = engaged
     assert len(nodes) == 4

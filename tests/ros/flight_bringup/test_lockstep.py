@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Lockstep over real DDS: repeatable to the byte, equal to the loop in one process, and free of
-deadlocks.
+"""Lockstep over real DDS: repeatable to the byte.
+
+It is equal to the loop in one process, and free of deadlocks.
 """
 
 import json

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The topic `node_state`: readiness and completion of nodes, for late subscribers and for the
-process runner.
+"""The topic `node_state`: readiness and completion of nodes.
+
+Late subscribers and the process runner read it.
 """
 
 import json
@@ -31,8 +32,9 @@ def received_states(peer_node: Peer, topic: str = NODE_STATE.name) -> dict[str, 
 def test_state_of_each_process_for_late_subscriber_and_monitor_and_aircraft_that_waits_for_start(
     start_node: Start, osprey_gust: Scenario
 ) -> None:
-    """The aircraft is matched with the publisher of u before t = 0, and its y have stamps from t =
-    0 on.
+    """The aircraft is matched with the publisher of u before t = 0.
+
+    Its y have stamps from t = 0 on.
     """
     in_namespace = ("-r", "__ns:=/one")
     nodes = {

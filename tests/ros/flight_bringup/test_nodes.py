@@ -98,8 +98,9 @@ def test_waiting_nodes_report_unfit_publishers_and_shut_down_cleanly(start_node:
 def test_start_has_early_participant_and_late_replies_leave_controller_ticks(
     start_node: Start, peer_node: Peer
 ) -> None:
-    """The middleware blocks for 0.1 s before a reply whose reader does not match: here one that
-    requires another durability.
+    """The middleware blocks for 0.1 s before a reply whose reader does not match.
+
+    Here the reader requires another durability.
     """
     stopped = start_node("rise_di_controller")
     early_participant = f"_start_{stopped.popen.pid}"

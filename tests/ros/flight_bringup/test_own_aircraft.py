@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The shells of docs/ros.md that start single nodes run as they stand, each in a shell of its own,
-to their last command.
+"""The shells of docs/ros.md that start single nodes run as they stand.
+
+Each is a shell of its own, to its last command.
 """
 
 import re
@@ -26,8 +27,9 @@ FIRST_CHUNKS = 100_000  # bytes of a log; the readers need a whole chunk
 
 
 def shells(section: str) -> tuple[list[str], list[str]]:
-    """The lines of a section that each shell begins with, and the commands, each of a shell of its
-    own.
+    """The lines of a section that each shell begins with, and the commands.
+
+    Each command has a shell of its own.
     """
     text = PAGE.partition(f"\n## {section}\n")[2].partition("\n## ")[0]
     text = re.sub(r"^```python\n.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL)
@@ -38,8 +40,9 @@ def shells(section: str) -> tuple[list[str], list[str]]:
 
 @pytest.fixture
 def checkout(tmp_path: Path) -> Path:
-    """A folder with what the commands of a page need of a checkout, and the programs of the
-    page.
+    """A folder with what the commands of a page need of a checkout.
+
+    It has the programs of the page too.
     """
     for name in (".venv", "ros_ws"):
         (tmp_path / name).symlink_to(REPOSITORY / name)

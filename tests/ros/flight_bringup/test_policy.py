@@ -45,8 +45,9 @@ class Access(NamedTuple):
 
 
 def in_full(name: str, node: str) -> str:
-    """The full name, resolved as in the policy format: "~" is the node's name; the namespace is the
-    root.
+    """The full name, resolved as in the policy format.
+
+    "~" is the node's name; the namespace is the root.
     """
     return f"/{node}/{name[1:]}" if name.startswith("~") else f"/{name.removeprefix('/')}"
 
@@ -78,8 +79,9 @@ def graph(peer_node: Peer, node: str) -> Access:
 
 
 def discovered(peer_node: Peer, nodes: tuple[str, ...]) -> dict[str, Access]:
-    """The topics and services of the nodes, once the discovery has settled: its endpoints are
-    discovered one by one.
+    """The topics and services of the nodes, once the discovery has settled.
+
+    Its endpoints are discovered one by one.
     """
     found: dict[str, Access] = {}
     changed = time.monotonic()

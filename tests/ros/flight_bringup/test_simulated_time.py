@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The example simulator with its own /clock over real DDS: slow, fast and in lockstep the aircraft
-tracks alike.
+"""The example simulator with its own /clock over real DDS.
+
+Slow, fast and in lockstep the aircraft tracks alike.
 """
 
 import shutil
@@ -31,8 +32,9 @@ def pitch_rate(message: JointState | None) -> float:
 
 
 def error(run: Path) -> float:
-    """The rms of the error of q from the first command on, rad/s, of a flight whose ticks are
-    computed again to the bit.
+    """The rms of the error of q from the first command on, rad/s.
+
+    The ticks of the flight are computed again to the bit.
     """
     internals = read_run(run).tape.signals["internals"]
     command = int(np.argmax(np.abs(internals["y_m.q"]) > 0.0))

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""rise-di play: subscribers get every byte of a recorded flight in time; a controller reproduces
-its u.
+"""rise-di play: subscribers get every byte of a recorded flight in time.
+
+A controller reproduces its u.
 """
 
 import time
@@ -28,8 +29,9 @@ MS = 1_000_000
 
 
 class Receiver:
-    """Subscribes to topics; holds the bytes of their messages and the instants at which they were
-    sent.
+    """Subscribes to topics.
+
+    Holds the bytes of their messages and the instants at which they were sent.
     """
 
     def __init__(self, node: Node, *topics: Topic) -> None:

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The learner's node beside the controller: lockstep, proposals of others, and a learner that is
-killed and started again.
+"""The learner's node beside the controller.
+
+Lockstep, proposals of others, and a learner that is killed and started again.
 """
 
 from pathlib import Path
@@ -25,8 +26,9 @@ from rise_di_controller.learning.proposals import Event
 
 
 def scenario(folder: Path, **learn: object) -> Scenario:
-    """osprey_learn at 100 Hz, with an aircraft that is that of the file: its search is the
-    shortest.
+    """osprey_learn at 100 Hz, with an aircraft that is that of the file.
+
+    Its search is the shortest.
     """
     chosen = find_scenario("osprey_learn").vary(
         flight={"duration": 11.0},

@@ -54,8 +54,9 @@ def test_lockstep_flight_repeats_bytes_of_one_process(start: Start, tmp_path: Pa
 
 
 def tools_read(run: Path, logged: Signal) -> None:
-    """Rosbags reads what tools get as guidance had it: frames of REP 103 by SciPy, the place on
-    WGS84 by pymap3d.
+    """Rosbags reads what tools get as guidance had it.
+
+    SciPy has the frames of REP 103, pymap3d the place on WGS84.
     """
     with AnyReader([run]) as reader:
         messages: dict[str, list[Any]] = {

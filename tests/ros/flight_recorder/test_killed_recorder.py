@@ -41,8 +41,9 @@ def stamps_and_sequences(folder: Path) -> dict[str, tuple[list[int], list[int]]]
 
 
 def missing_seconds(folder: Path, witness: PolledSubscription) -> float:
-    """Delay of a recorder's file behind the messages that another process received, of the topic
-    with the largest delay, s.
+    """Delay of a recorder's file behind the messages that another process received, s.
+
+    It is that of the topic with the largest delay.
     """
     by_topic = stamps_and_sequences(folder)
     received = [stamp_of(message.message) for message in witness.take()]

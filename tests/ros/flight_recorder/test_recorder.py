@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The recorder over DDS: topics of ROS 2 itself, any offered quality of service, lost messages, and
-a forged packet.
+"""The recorder over DDS.
 
+Topics of ROS 2 itself, any offered quality of service, lost messages, and a forged packet.
 tests/nodes/flight_recorder/test_recorder.py has what it does with its messages.
 """
 
@@ -152,10 +152,10 @@ def test_plain_publishers_of_any_rate_are_recorded(
 
 
 def forge_gap(domain: int, writer: bytes) -> None:
-    """Send a GAP of a writer to all participants of this host: its readers take 100,000 samples as
-    irrelevant.
+    """Send a GAP of a writer to all participants of this host.
 
-    DDSI-RTPS 2.3: header 8.3.3, GAP 9.4.5.5 with the sequence numbers from 1 on, ports 9.6.1.1.
+    Its readers take 100,000 samples as irrelevant. DDSI-RTPS 2.3: header 8.3.3, GAP 9.4.5.5 with
+    the sequence numbers from 1 on, ports 9.6.1.1.
     """
     # the first, the base of the set, and an empty set
     numbers = struct.pack("<iIiII", 0, 1, 0, 100_000, 0)

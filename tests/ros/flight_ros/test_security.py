@@ -146,8 +146,9 @@ def on_network(tmp_path: Path) -> tuple[str, ...]:
 def test_second_host_has_access_by_network_profile_alone(
     start: Start, start_node: Start, hosts: Hosts, on_network: tuple[str, ...]
 ) -> None:
-    """Without the profile the host neither receives y nor commands u. With it each of two hosts
-    says so of the other.
+    """Without the profile the host neither receives y nor commands u.
+
+    With it each of two hosts says so of the other.
     """
     node = aircraft(start_node, within=hosts.first)
     assert (

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Control of a real flight over the page's server: gains, faults, a gust, the controller; in the
-log, and replayed.
+"""Control of a real flight over the page's server.
+
+Gains, faults, a gust, the controller; in the log, and replayed.
 """
 
 import json

@@ -1,11 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The faults: injection, detection (by which node, how, within what time), response of u, and time
-of recovery.
+"""The faults: injection, detection, response of u, and time of recovery.
 
-Among them: nodes killed and stopped (failsafe, re-engagement), message storms and conflicting
-publishers (publisher lock), malformed samples, incompatible QoS, overruns, a full disk and steps of
-the clock.
+A detection has a node, a way and a time. Among the faults: nodes killed and stopped (failsafe,
+re-engagement), message storms and conflicting publishers (publisher lock), malformed samples,
+incompatible QoS, overruns, a full disk and steps of the clock.
 """
 
 import json
@@ -157,9 +156,7 @@ def conflicting(topic: str, publisher: str) -> Detection:
 
 
 def until_logged_again(flight: Flight, role: str, pattern: str, period: float) -> None:
-    """Wait until the rate limit of a log line is over, so that a node would log it again at
-    once.
-    """
+    """Wait until the rate limit of a log line is over: a node would log it again at once."""
     flight.until(
         lambda: flight.first_line(role, pattern, time.time() - period) is None,
         10.0,
@@ -250,8 +247,9 @@ LEVEL = 10.0  # s after the loss of u_m, until the wings have to be level
 
 
 def kill_in_a_roll_in(flight: Flight, random: Generator) -> None:
-    """Guidance killed at any bank of a roll-in to either side, and started again when the wings
-    have to be level.
+    """Guidance killed at any bank of a roll-in to either side.
+
+    It is started again when the wings have to be level.
     """
     bank = float(random.choice((-BANK, BANK)))
     fraction = random.uniform(0.0, 0.95)
@@ -288,8 +286,9 @@ def pose_fault(word: str, *back: str) -> Injection:
 
 
 def reboot(flight: Flight, random: Generator) -> None:
-    """The autopilot killed and started again. The bridge engages when it is requested to, not
-    before.
+    """The autopilot killed and started again.
+
+    The bridge engages when it is requested to, not before.
     """
     at_random(flight, random)
     begin = flight.begin_fault()
@@ -314,8 +313,9 @@ class Page(NamedTuple):
     address: str
 
     def state(self) -> str:
-        """What the page says of the recording, by one request of a browser that has just loaded it;
-        empty without an answer.
+        """What the page says of the recording, by one request of a browser that has just loaded it.
+
+        Empty without an answer.
         """
         base, _, token = self.address.partition("#token=")
         request = urllib.request.Request(f"{base}data/0", headers={TOKEN_HEADER: token})  # noqa: S310 - http of this host
@@ -349,8 +349,9 @@ CONNECTIONS, PAGE_STORM = 1000, 2.0  # s
 
 
 def storm_on_the_page(flight: Flight, random: Generator) -> None:
-    """A thousand connections to the live page that ask for all samples at once and read nothing; it
-    answers afterwards.
+    """A thousand connections to the live page that ask for all samples at once and read nothing.
+
+    The page answers afterwards.
     """
     with live_page(flight) as page:
         disturb(flight, "clients", page.address, str(CONNECTIONS), str(PAGE_STORM))
@@ -374,8 +375,9 @@ def recorder_killed_under_the_page(flight: Flight, random: Generator) -> None:
 
 
 def ready_stamp(flight: Flight, role: str, begin: float) -> float | None:
-    """The stamp of a node's line "ready". The line is received later, when the probe has discovered
-    the node.
+    """The stamp of a node's line "ready".
+
+    The line is received later, when the probe has discovered the node.
     """
     for arrival in flight.probe.since("/rosout", begin):
         if arrival.message.name == role and arrival.message.msg == "ready":
@@ -385,8 +387,9 @@ def ready_stamp(flight: Flight, role: str, begin: float) -> float | None:
 
 
 def full_traffic(flight: Flight, role: str, begin: float) -> float | None:
-    """When the last of a node's topics had its first message; of the recorder, when the log had a
-    message of every topic.
+    """When the last of a node's topics had its first message.
+
+    For the recorder: when the log had a message of every topic.
     """
     if role == "recorder":
         return recorded_since(flight.runs[-1], 0.0)
@@ -643,8 +646,9 @@ stronger_qos = incompatible_qos(
 
 
 def step_of_clock(by: float) -> Injection:
-    """The system clock of all processes of the flight, set by so many seconds, and corrected when
-    all nodes have logged it.
+    """The system clock of all processes of the flight, set by so many seconds.
+
+    It is corrected when all nodes have logged it.
     """
 
     def inject(flight: Flight, random: Generator) -> None:
@@ -735,8 +739,9 @@ CHANGES, IN_FLIGHT = 300, 8  # requests; a service queues ten
 
 
 def parameters(flight: Flight, random: Generator) -> None:
-    """Three hundred changes of the controller's gains, half of them invalid, also the first one;
-    eight requests at once.
+    """Three hundred changes of the controller's gains, half of them invalid, also the first one.
+
+    Eight requests at once.
     """
     valid = random.random(CHANGES) < 0.5
     valid[0] = False

@@ -77,8 +77,9 @@ def seeds(pytestconfig: pytest.Config) -> range:
 
 @pytest.fixture(scope="session")
 def draws(pytestconfig: pytest.Config) -> list[Draw]:
-    """Failures of the past and random faults, those of one kind of flight after one another; none
-    outside the campaign.
+    """Failures of the past and random faults, those of one kind of flight after one another.
+
+    None outside the campaign.
     """
     first, count = (
         int(pytestconfig.getoption(f"--faults-{name}", 0)) for name in ("seed", "random")
@@ -97,8 +98,9 @@ def lockstep_seeds(pytestconfig: pytest.Config) -> range:
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """The cases of the suite; all of them where benchmarks/faults.py runs the tests, with a
-    table.
+    """The cases of the suite.
+
+    All of them where benchmarks/faults.py runs the tests, with a table.
     """
     if "case" in metafunc.fixturenames:
         every = metafunc.config.getoption("--faults-table", None) is not None
@@ -147,8 +149,9 @@ class Flights:
         self.all: list[Flight] = []  # including those that have ended
 
     def steady(self, kind: Kind) -> Flight:
-        """A flight that is steady and near trim: the running one, or a new one where a fault has
-        upset that.
+        """A flight that is steady and near trim.
+
+        It is the running one, or a new one where a fault has upset that.
         """
         if kind in self._running:
             with suppress(AssertionError):

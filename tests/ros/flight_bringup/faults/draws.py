@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Random faults: any case at any instant, a tenth of them two at a time, repeatable by their
-seed.
+"""Random faults: any case at any instant, repeatable by their seed.
+
+A tenth of them come two at a time.
 """
 
 import threading
@@ -70,8 +71,9 @@ def found() -> list[Draw]:
 
 
 def inject(flight: Flight, draw: Draw) -> list[Flight]:
-    """Inject the faults of a draw. The flight as each of them sees it: with its own begin, end and
-    figures.
+    """Inject the faults of a draw.
+
+    The flight as each of them sees it: with its own begin, end and figures.
     """
     views = [copy(flight) for _ in draw.cases]
     errors: list[BaseException] = []

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A flight under test: processes that can be killed and stopped, and a probe that receives and
-times their messages.
+"""A flight under test: processes that can be killed and stopped, and a probe.
+
+The probe receives and times their messages.
 """
 
 import os
@@ -146,8 +147,9 @@ class Received(NamedTuple):
 
 
 class Probe:
-    """Receives the flight's topics in a thread of its own; `until` waits for a condition on
-    them.
+    """Receives the flight's topics in a thread of its own.
+
+    `until` waits for a condition on them.
     """
 
     def __init__(self) -> None:
@@ -251,8 +253,9 @@ def _waited_ns(process: int) -> int:
 
 
 def _scheduled_ns(path: Path) -> tuple[int, int]:
-    """How long a thread ran, and how long it was ready and waited for a processor
-    (proc_pid_schedstat).
+    """How long a thread ran, and how long it was ready and waited for a processor, ns.
+
+    Source: proc_pid_schedstat.
     """
     run, waited, _ = map(int, path.read_text(encoding="ascii").split())
     return run, waited
@@ -290,10 +293,10 @@ def tick_channels(inputs: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def steady_scenario(source: Path, folder: Path) -> Path:
-    """A scenario in a steady flight 0.1 m/s above trim, without an end: u is not 0, so that a
-    change of it shows.
+    """A scenario in a steady flight 0.1 m/s above trim, without an end.
 
-    Guidance, where the scenario has a section of it, commands this flight with level wings.
+    U is not 0, so that a change of it shows. Guidance, where the scenario has a section of it,
+    commands this flight with level wings.
     """
     tree = yaml.safe_load(source.read_text())
     sections = {
@@ -329,8 +332,9 @@ RELEASE_AFTER = 3.0  # s without a message: RC_OVERRIDE_TIME of ArduPilot
 
 
 def fast_map(folder: Path) -> Path:
-    """The map of the simulated autopilot with 200 messages a second, as an observer's loop with a
-    small delay needs them.
+    """The map of the simulated autopilot with 200 messages a second.
+
+    An observer's loop with a small delay needs them.
     """
     content = yaml.safe_load(MAP_FILES["ardupilot_2024"].read_text())
     content["messages"]["joy"]["rate"] = 200.0
@@ -460,8 +464,9 @@ class Flight:
         return at
 
     def spent(self, role: str) -> tuple[float, float]:
-        """Of the main thread of a role's process: processor time, and the time that it was ready
-        and waited for it, s.
+        """Processor time of the main thread of a role's process, and the time that it waited, s.
+
+        It waits where it is ready and has no processor.
         """
         run, waited = _scheduled_ns(Path(f"/proc/{self.processes[role].popen.pid}/schedstat"))
         return seconds(run), seconds(waited)
@@ -492,8 +497,9 @@ class Flight:
         self.probe.close()
 
     def engage(self) -> None:
-        """Engage through the bridge, as soon as it permits. The end of the fault is the last
-        request.
+        """Engage through the bridge, as soon as it permits.
+
+        The end of the fault is the last request.
         """
 
         def requested() -> bool:
@@ -523,8 +529,9 @@ class Flight:
         return _ticks(*self._values("internals", self._tick_channels, begin, end))
 
     def foreign_y(self, begin: float, end: float) -> list[StampedVector]:
-        """The engaged ticks with the y of another publisher: their stamp, that of y, is none of the
-        aircraft's instants.
+        """The engaged ticks with the y of another publisher.
+
+        Their stamp, that of y, is none of the aircraft's instants.
         """
         (instant, *_) = (sample.stamp_ns for _, sample in self._samples("truth", (), begin, end))
         ticks = [
@@ -535,8 +542,9 @@ class Flight:
         return [tick for tick in ticks if (tick.stamp_ns - instant) % period_ns(RATE, "rate")]
 
     def engaged_ticks(self, begin: float, until: float) -> Ticks | None:
-        """The engaged ticks with samples from `begin` on, from the log, which is complete; None
-        before it reaches `until`.
+        """The engaged ticks with samples from `begin` on, from the log, which is complete.
+
+        None before the log reaches `until`.
         """
         decoder = Decoder(self._tick_channels)
         found = []
@@ -591,14 +599,14 @@ class Flight:
         return float(np.diff(times).max())
 
     def host_delay(self, begin: float, end: float) -> float:
-        """The longest host scheduling delay of a process between two instants, s: it was ready, and
-        waited for a processor.
+        """The longest host scheduling delay of a process between two instants, s.
 
-        As Linux counts it (proc_pid_schedstat), for all threads of a process together. It is at
-        least the time without a sample of it, in which the probe itself waited. It is also at least
-        the time without a message of any node. The nodes are processes of their own: all pause at
-        once where the host of a virtual machine withholds its processors, which Linux in that
-        machine does not count, or where the middleware of the probe waits.
+        The process was ready, and waited for a processor. As Linux counts it (proc_pid_schedstat),
+        for all threads of a process together. It is at least the time without a sample of it, in
+        which the probe itself waited. It is also at least the time without a message of any node.
+        The nodes are processes of their own: all pause at once where the host of a virtual machine
+        withholds its processors, which Linux in that machine does not count, or where the
+        middleware of the probe waits.
         """
         end += 2.0 * DELAY_PERIOD
         samples = [
@@ -615,8 +623,9 @@ class Flight:
         return float(max([0.0, *gaps, *silences, *(delay for at, delay in samples if at >= begin)]))
 
     def waited(self, begin: float, end: float) -> float:
-        """At most so long did a process wait for a processor between two instants, all its delays
-        together, s.
+        """At most so long did a process wait for a processor between two instants, s.
+
+        All its delays count together.
         """
         return sum(
             delay for at, delay in list(self.probe.delays) if begin <= at <= end + DELAY_PERIOD
@@ -630,8 +639,9 @@ class Flight:
         return None
 
     def expect_in_log(self, case: str) -> None:
-        """Keep what was received since the fault's begin, and from HISTORY before the end of a
-        killed node on.
+        """Keep what was received since the fault's begin.
+
+        The end of a killed node counts from HISTORY before it on.
         """
         decoder = Decoder(())
         killed_nodes = [
@@ -700,8 +710,9 @@ class Flight:
         ]
 
     def count(self, role: str, key: str) -> float:
-        """The last value of a counter in the diagnostics of a role's present process, 0 where it
-        has none.
+        """The last value of a counter in the diagnostics of a role's present process.
+
+        0 where it has none.
         """
         instance = self.instance(role)
         reports = [
@@ -728,8 +739,9 @@ class Flight:
         return float(ticks.t[breaks.max() + 1] if len(breaks) else ticks.t[0])
 
     def is_steady(self) -> bool:
-        """Whether the law has been engaged and has tracked for 0.4 s, and the aircraft applies its
-        u.
+        """Whether the law has been engaged and has tracked for 0.4 s.
+
+        The aircraft applies its u.
         """
         now = time.time()
         ticks, (_, inputs) = self.ticks(now - 0.4), self.actuator_positions(now - 0.1)

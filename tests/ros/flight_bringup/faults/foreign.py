@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What disturbs a flight, as a process of its own: an unexpected publisher, a faulty relay, clients
-of a live page.
+"""What disturbs a flight, as a process of its own.
+
+An unexpected publisher, a faulty relay, clients of a live page.
 
 python -m tests.ros.flight_bringup.faults.foreign storm TOPIC RATE SECONDS SEED
     # valid vectors of random values
@@ -153,10 +154,10 @@ def gate(source: str, target: str) -> None:
 
 
 def clients(address: str, count: int, duration: float) -> None:
-    """So many connections to a page, within `duration` s or longer, of which the server closes all
-    beyond its limit.
+    """So many connections to a page, within `duration` s or longer.
 
-    Each sends its requests for all samples as fast as the server reads them, and reads no answer.
+    The server closes all beyond its limit. Each sends its requests for all samples as fast as the
+    server reads them, and reads no answer.
     """
     parts = urlsplit(address)
     token = parts.fragment.removeprefix("token=")

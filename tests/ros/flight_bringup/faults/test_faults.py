@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Each fault is detected in time, has no other effect on u than the failsafe, and leaves no effect
-after recovery.
+"""Each fault is detected in time, and has no other effect on u than the failsafe.
+
+After recovery no effect is left.
 """
 
 import math
@@ -69,8 +70,9 @@ def test_fault_is_detected_contained_and_recovered_from(
 def test_random_faults_detected_contained_and_recovered_from(
     flights: Flights, draws: Sequence[Draw], record: Callable[[Row], None]
 ) -> None:
-    """Of two at a time: each is detected by the node that should, no process ends, and the flight
-    is steady again.
+    """Of two at a time: each is detected by the node that should.
+
+    No process ends, and the flight is steady again.
     """
     failed = []
     for draw in draws:
@@ -109,11 +111,11 @@ def check_two(draw: Draw, views: Sequence[Flight]) -> None:
 
 
 def test_log_holds_every_received_message_of_each_fault(flights: Flights) -> None:
-    """To the byte, also of a time without a recorder: publishers keep their last samples for the
-    next one.
+    """To the byte, also of a time without a recorder.
 
-    Of a killed node, the last messages within NOT_RETRANSMITTED may be missing from the log,
-    because no process is left to retransmit them. Those that are in the log are without a gap.
+    Publishers keep their last samples for the next one. Of a killed node, the last messages within
+    NOT_RETRANSMITTED may be missing from the log, because no process is left to retransmit them.
+    Those that are in the log are without a gap.
     """
     flights.close()
     for flight in flights.all:
@@ -140,9 +142,7 @@ def contents(runs: list[Path]) -> tuple[set[bytes], set[tuple[str, str]]]:
 
 
 class Window(NamedTuple):
-    """Instant of the re-engagement after a fault, host scheduling delay, and the time allowed for
-    it, s.
-    """
+    """The re-engagement after a fault, host scheduling delay, and the time allowed, s."""
 
     engaged: float
     host_delay: float
@@ -150,8 +150,9 @@ class Window(NamedTuple):
 
 
 def check(case: Case, flight: Flight) -> tuple[float | None, float, float]:
-    """Check all that the case states; time of the detection, of the recovery, and host scheduling
-    delay, s.
+    """Check all that the case states.
+
+    Returns the time of the detection, of the recovery, and the host scheduling delay, s.
     """
     reaction = None
     if case.detection is not None:
@@ -198,8 +199,9 @@ def engaged_for(duration: float, flight: Flight) -> float | None:
 
 
 def check_unchanged(case: Case, flight: Flight, window: Window) -> None:
-    """The law and the aircraft used samples of the flight's own nodes only; no topic paused beyond
-    its age limit.
+    """The law and the aircraft used samples of the flight's own nodes only.
+
+    No topic paused beyond its age limit.
     """
     until = flight.end + SETTLING
     ticks, (_, applied) = (
@@ -251,8 +253,9 @@ def check_pauses(
 
 
 def check_controller_failsafe(case: Case, flight: Flight, window: Window) -> None:
-    """HOLD: u is constant to the last bit; RAMP: a straight line to trim; TRIM: 0; then a bumpless
-    re-engagement.
+    """HOLD: u is constant to the last bit; RAMP: a straight line to trim; TRIM: 0.
+
+    A bumpless re-engagement follows.
     """
     ticks = flight.ticks(flight.begin, window.engaged + SETTLING)
     # the controller does not publish a new tick until y or y_m is stale: well within the aircraft's
@@ -285,8 +288,9 @@ def check_controller_failsafe(case: Case, flight: Flight, window: Window) -> Non
 
 
 def check_aircraft_failsafe(case: Case, flight: Flight, window: Window) -> None:
-    """The aircraft holds its last input for the age limit and HOLD, then ramps it to trim; the next
-    u is applied bumpless.
+    """The aircraft holds its last input for the age limit and HOLD, then ramps it to trim.
+
+    The next u is applied bumpless.
     """
     t, applied = flight.actuator_positions(flight.begin, window.engaged + SETTLING)
     before = flight.actuator_positions(flight.begin - 0.5, flight.begin + 0.05)[1][-1]
@@ -329,8 +333,9 @@ def check_aircraft_failsafe(case: Case, flight: Flight, window: Window) -> None:
 
 
 def check_late(case: Case, flight: Flight, window: Window) -> None:
-    """The law is engaged, or u is held where samples came too late; u does not move more than in a
-    steady flight.
+    """The law is engaged, or u is held where samples came too late.
+
+    U does not move more than in a steady flight.
     """
     ticks = flight.ticks(flight.begin, flight.end + SETTLING)
     assert set(ticks.modes) <= {Mode.ENGAGED, Mode.HOLD, Mode.RAMP}
@@ -339,8 +344,9 @@ def check_late(case: Case, flight: Flight, window: Window) -> None:
 
 
 def check_released(case: Case, flight: Flight, window: Window) -> None:
-    """While disengaged the controller is at trim and computes nothing; it begins at trim. y_m
-    continues.
+    """While disengaged the controller is at trim and computes nothing.
+
+    It begins at trim. y_m continues.
     """
     ticks = flight.ticks(flight.begin, window.engaged + SETTLING)
     disengaged = (ticks.t > flight.begin + case.within + window.slack) & (ticks.t < flight.end)

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Random faults of lockstep flights: a killed node is named as the cause, and a stopped one changes
-no byte of the log.
+"""Random faults of lockstep flights.
 
+A killed node is named as the cause, and a stopped one changes no byte of the log.
 benchmarks/random_faults.py injects them; the tests of lockstep cover single cases.
 """
 
