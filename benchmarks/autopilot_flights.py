@@ -62,8 +62,10 @@ def on_the_ground(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 def tracking(autopilot: "Autopilot") -> dict[str, Any]:
-    """Of the last flight: errors while commanded, y behind y_m, the part of the time with u at a
-    limit, whether it replays.
+    """The figures of the last flight.
+
+    Errors while commanded, y behind y_m, the part of the time with u at a limit, whether it
+    replays.
     """
     summary = autopilot.summary()
     log = read_run(autopilot.run)

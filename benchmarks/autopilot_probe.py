@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Stuck surfaces of ArduPlane over MAVLink: when the probe of the inputs finds each, and false
-alarms.
+"""Stuck surfaces of ArduPlane over MAVLink: when the probe of the inputs finds each.
+
+False alarms are counted too.
 """
 
 import math
@@ -61,8 +62,9 @@ def probed(plane: "ArduPlane", program: Mapping[str, Any]) -> Path:
 
 
 def stuck(plane: "ArduPlane", channel_map: str, surface: str) -> float:
-    """The time from a surface that sticks where it is until the release that names it, s; infinite
-    for another release, or none.
+    """The time from a surface that sticks where it is until the release that names it, s.
+
+    Infinite for another release, or none.
     """
     number = SERVOS[surface]
     ends = {f"SERVO{number}_MIN": -1.0, f"SERVO{number}_MAX": 1.0, f"SERVO{number}_TRIM": 0.0}
@@ -86,8 +88,9 @@ def stuck(plane: "ArduPlane", channel_map: str, surface: str) -> float:
 
 
 def unfailed(plane: "ArduPlane", channel_map: str, name: str) -> dict[str, Any]:
-    """Minutes engaged without a fault: the least effect that any test told, and whether the ticks
-    replay.
+    """Minutes engaged without a fault.
+
+    The least effect that any test told, and whether the ticks replay.
     """
     speed, turbulence, turns = KINDS[name]
     plane.say("param", "SIM_WIND_SPD", f"{speed:g}")

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Experiments on signs with ArduPlane: whether `rise-di check` finds each sign, and each flipped
-one.
+"""Experiments on signs with ArduPlane.
+
+Whether `rise-di check` finds each sign, and each flipped one.
 """
 
 import time
@@ -36,11 +37,10 @@ MODERATE = 0.5  # SIM_WIND_TURB up to which one experiment has to show every sig
 
 
 def signs(experiments: int = 25) -> dict[str, Any]:
-    """Short experiments, open loop, each in other turbulence, and what `rise-di check` says of
-    each; earlier ones are kept.
+    """Short experiments, open loop, and what `rise-di check` says of each.
 
-    The simulator draws its turbulence from one stream of random numbers without a seed: each
-    experiment has another part of it.
+    Each is in other turbulence; earlier ones are kept. The simulator draws its turbulence from one stream of random numbers
+    without a seed: each experiment has another part of it.
     """
     with arduplane(0.03) as plane:
         channel_map = plane.patient_map("ardupilot")
@@ -85,12 +85,11 @@ def signs(experiments: int = 25) -> dict[str, Any]:
 def signs_of_logs(
     runs: Sequence[Path], wind_of: Callable[[int, Engagement], float]
 ) -> dict[str, Any]:
-    """The stored experiments on signs, and those of logs; `wind_of` is the turbulence of an
-    engagement.
+    """The stored experiments on signs, and those of logs.
 
-    An engagement shorter than EXCITED was ended by the bridge or with the flight: it is counted,
-    not judged. Those of a run in strong turbulence are also judged together, as `rise-di check`
-    judges a log with several.
+    `wind_of` is the turbulence of an engagement. An engagement shorter than EXCITED was ended by
+    the bridge or with the flight: it is counted, not judged. Those of a run in strong turbulence
+    are also judged together, as `rise-di check` judges a log with several.
     """
     earlier = stored("signs")
     channel_map = load_map("ardupilot")
@@ -117,8 +116,9 @@ def signs_of_logs(
 def judged(
     channel_map: ChannelMap, tape: Tape, engagements: Sequence[Engagement]
 ) -> dict[str, Any]:
-    """What `rise-di check` says of every sign, and of each flipped alone: its column of the
-    recorded u has the other sign.
+    """What `rise-di check` says of every sign, and of each flipped alone.
+
+    For a flipped one its column of the recorded u has the other sign.
     """
     pairing, expected = channel_pairs(channel_map)
     columns = [list(channel_map.inputs).index(name) for name in pairing.inputs]

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Flies real autopilots in software and writes docs/evidence/autopilots-*.csv: gains, engagements,
-signs, pose, releases.
+"""Flies real autopilots in software and writes docs/evidence/autopilots-*.csv.
+
+Gains, engagements, signs, pose, releases.
 
     python -m benchmarks.autopilots --sitl KIT                       # everything, about 80 minutes
     python -m benchmarks.autopilots --sitl KIT --only signs
@@ -128,10 +129,10 @@ def identified(
     speed: float,
     log: Path | None,
 ) -> dict[str, Any]:
-    """Experiment, gains, flight, replay: the commands of docs/autopilots.md. The log is read on the
-    ground.
+    """Experiment, gains, flight, replay: the commands of docs/autopilots.md.
 
-    With the log of an experiment that this command flew before, there is no new one.
+    The log is read on the ground. With the log of an experiment that this command flew before,
+    there is no new one.
     """
     found = place / "found"
     channel_map = place / f"{Path(map_name).stem}.yaml"
@@ -170,11 +171,10 @@ def identified(
 
 
 def own_log() -> dict[str, Any]:
-    """ArduPlane at a cruise 15 % faster, over DDS and over MAVLink, calm and in wind: errors by its
-    own log, and Omega by it.
+    """ArduPlane at a cruise 15 % faster, over DDS and over MAVLink, calm and in wind.
 
-    Each with gains of its own experiment. The autopilot's DataFlash log of the experiment is
-    imported and identified too.
+    The errors are by its own log, and so is Omega. Each flight has gains of its own experiment. The
+    autopilot's DataFlash log of the experiment is imported and identified too.
     """
     from tests.sitl.kit import OVERRIDE_TIME, ArduPlane  # noqa: PLC0415 - after the kit's place is known
 
@@ -215,8 +215,9 @@ def own_log() -> dict[str, Any]:
 
 
 def imported_beside(command: Sequence[str], log: Path, run: Path, place: Path) -> dict[str, Any]:
-    """Omega by channel from the autopilot's own log of an experiment, beside that from the log of
-    the stack.
+    """Omega by channel from the autopilot's own log of an experiment.
+
+    That from the log of the stack is beside it.
     """
     bag = place / "imported"
     shutil.rmtree(bag, ignore_errors=True)
@@ -246,8 +247,9 @@ def imported_beside(command: Sequence[str], log: Path, run: Path, place: Path) -
 
 
 def guided() -> dict[str, Any]:
-    """Minutes engaged under guidance by rule, with the gains of the last identification: turns,
-    climbs, changes of V.
+    """Minutes engaged under guidance by rule: turns, climbs, changes of V.
+
+    The gains are those of the last identification.
     """
     from tests.sitl.kit import ALTITUDE, guided_scenario  # noqa: PLC0415 - after the kit's place is known
 
@@ -263,8 +265,9 @@ def guided() -> dict[str, Any]:
 
 
 def held_figures(run: Path, starts: Sequence[float]) -> dict[str, Any]:
-    """How well a guided flight of turns at these times holds what it is commanded, and whether it
-    replays.
+    """How well a guided flight of turns at these times holds what it is commanded.
+
+    Whether it replays is beside it.
     """
     (one,) = json.loads((run / "summary.json").read_text())["engagements"]
     tape = read_run(run).tape
@@ -286,8 +289,9 @@ def held_figures(run: Path, starts: Sequence[float]) -> dict[str, Any]:
 
 
 def observed() -> dict[str, Any]:
-    """The last identified gains without and with an extended-state observer of the identified Omega
-    and lags, in turbulence.
+    """The last identified gains without and with an extended-state observer, in turbulence.
+
+    The observer has the identified Omega and lags.
     """
     found = FOLDER / "arduplane" / "found"
     results = []
@@ -319,8 +323,9 @@ def observed() -> dict[str, Any]:
 
 
 def bumpless() -> dict[str, Any]:
-    """Engagements and releases in one flight: the largest step of a setpoint around each, of its
-    range.
+    """Engagements and releases in one flight.
+
+    The largest step of a setpoint around each, of its range.
     """
     with arduplane(0.03) as plane:
         channel_map = plane.patient_map("ardupilot")
@@ -347,8 +352,9 @@ def bumpless() -> dict[str, Any]:
 
 
 def step(sent: Signal, ranges: dict[str, float], engaged_ns: int) -> float:
-    """The largest step from one setpoint to the next around an engagement, of its range. Before it,
-    that is the stick.
+    """The largest step from one setpoint to the next around an engagement, of its range.
+
+    Before it, that is the stick.
     """
     begin, end = (engaged_ns + int(edge * NANOSECONDS) for edge in WINDOW)
     around = sent.within([(begin, end)])
@@ -356,9 +362,7 @@ def step(sent: Signal, ranges: dict[str, float], engaged_ns: int) -> float:
 
 
 def pose() -> dict[str, Any]:
-    """Rates and pose of the map `ardupilot` against the autopilot's own log, in turns and
-    climbs.
-    """
+    """Rates and pose of the map `ardupilot` in turns and climbs, against the autopilot's log."""
     with arduplane(0.03) as plane:
         flown = plane.fly(EXAMPLE, plane.patient_map("ardupilot"), 60.0)
         flown.wait_for("DISENGAGED")
@@ -372,9 +376,7 @@ def pose() -> dict[str, Any]:
 
 
 def releases() -> dict[str, Any]:
-    """`make test-sitl`: what failed, and the times until the pilot or PX4's own law flies again,
-    s.
-    """
+    """`make test-sitl`: what failed, and the times until the pilot or PX4 flies again, s."""
     report = FOLDER / "releases.xml"
     python = sys.executable
     command = [python, "-m", "pytest", "tests/sitl", "-m", "not long", f"--junitxml={report}"]

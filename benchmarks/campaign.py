@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Monte Carlo campaign: seconds and their floor on the device of this host, ratio to its CPU and to
-the simulation in one process, integration error, memory.
+"""Monte Carlo campaign: seconds and their floor on the device of this host.
+
+Beside them the ratio to its CPU and to the simulation in one process, integration error, memory.
 
 python -m benchmarks.campaign  # 10,000 aircraft of osprey_servo, a minute on two cores
     # 1,000,000 on a GPU, and 10,000 on the CPU of its host
@@ -73,8 +74,10 @@ def speed(scenario: Scenario, aircraft: int, chunk: int | None, workers: int | N
 
 
 def floor(scenario: Scenario, aircraft: int) -> float:
-    """Least seconds of a campaign on the device: its matrices, which fit into no cache of a device,
-    are read at each tick, at the speed of a copy.
+    """Least seconds of a campaign on the device.
+
+    Its matrices, which fit into no cache of a device, are read at each tick, at the speed of a
+    copy.
     """
     course = build_course(scenario)
     airframe = load_airframe(scenario.aircraft.airframe)
@@ -125,8 +128,9 @@ def write_rows(label: str, figures: dict[str, tuple[float, str]], begun: Origin)
 
 
 def alone(scenario: Scenario) -> tuple[float, FloatArray]:
-    """One flight in one process: aircraft-seconds per second, and rms of the true error at the
-    ticks, (m,).
+    """One flight in one process.
+
+    Aircraft-seconds per second, and rms of the true error at the ticks, (m,).
     """
     begin = time.perf_counter()
     tape = simulate(scenario)
@@ -141,11 +145,10 @@ def alone(scenario: Scenario) -> tuple[float, FloatArray]:
 
 
 def integration_error(scenario: Scenario, count: int) -> tuple[float, FloatArray]:
-    """Largest relative difference of rms between a fleet and the same aircraft with the step FINE,
-    (m,).
+    """Largest relative difference of rms between a fleet and the same aircraft with the step FINE.
 
-    The first result is the speed of the simulation in one process at the scenario's own step,
-    aircraft-seconds per second.
+    The rms has the shape (m,). The first result is the speed of the simulation in one process at
+    the scenario's own step, aircraft-seconds per second.
     """
     definition = define(scenario, count, UNCERTAINTY, SEED, count)
     figures = fly_chunk_figures(definition.model_dump_json(), (0, 0)).figures

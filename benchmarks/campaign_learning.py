@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Campaign of aircraft that learn: processor seconds an aircraft, and the share within 10 % of the
-true model.
+"""Campaign of aircraft that learn.
+
+Processor seconds an aircraft, and the share within 10 % of the true model.
 
 python -m benchmarks.campaign_learning  # 10 aircraft of osprey_learn for 64 s, five minutes
 
@@ -73,8 +74,9 @@ def knowing(scenario: Scenario) -> Learn:
 
 
 def score_of(scenario: Scenario, learn: Learn) -> float:
-    """Score of an aircraft from LEARNED on; NaN for a flight that falls back to the law of the
-    start.
+    """Score of an aircraft from LEARNED on.
+
+    NaN for a flight that falls back to the law of the start.
     """
     events: list[Event] = []
     tape = simulate(scenario, learn=learn, announce=events.append)

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Counterexample to Theorem 1 as a rule for gains: plots docs/images/counterexample.png, prints the
-table of the theory page.
+"""Counterexample to Theorem 1 as a rule for gains.
+
+Plots docs/images/counterexample.png, prints the table of the theory page.
 
 python -m benchmarks.counterexample    # half a minute
 """
@@ -42,8 +43,9 @@ class Cycle(NamedTuple):
 
     @property
     def gamma_2(self) -> float:
-        """The smallest gamma_2 of (40) on this flight, 1/s: the ratio of the integrals of
-        abs(e_dot) and abs(e).
+        """The smallest gamma_2 of (40) on this flight, 1/s.
+
+        It is the ratio of the integrals of abs(e_dot) and abs(e).
         """
         return float(np.trapezoid(np.abs(self.e_dot), self.t) / np.trapezoid(self.e, self.t))
 
@@ -65,11 +67,10 @@ def formula(beta: float) -> float:
 
 
 def half_period(speed: float, beta: float, acts: float = 1.0) -> Any:
-    """Solution of e_ddot + K e_dot + K LAMBDA e + beta sgn(e) = f_dot from e = 0, e_dot = speed to
-    the next e = 0.
+    """Solution of e_ddot + K e_dot + K LAMBDA e + beta sgn(e) = f_dot over half a period.
 
-    f_dot = BOUND sat(SLOPE e_dot / BOUND), or 0 with acts = 0. By symmetry the half period with e <
-    0 is the negative of it.
+    It goes from e = 0, e_dot = speed to the next e = 0. f_dot = BOUND sat(SLOPE e_dot / BOUND), or
+    0 with acts = 0. By symmetry the half period with e < 0 is the negative of it.
     """
 
     def w_dot(_: float, w: FloatArray) -> list[float]:
@@ -96,8 +97,9 @@ def half_period(speed: float, beta: float, acts: float = 1.0) -> Any:
 
 
 def limit_cycle(beta: float) -> Cycle:
-    """The cycle: the speed at e = 0 that half a period reproduces. It exists for beta > BOUND and
-    SLOPE > K.
+    """The cycle: the speed at e = 0 that half a period reproduces.
+
+    It exists for beta > BOUND and SLOPE > K.
     """
     energy_balance = 1.5 * BOUND / K
     speed = brentq(
@@ -112,8 +114,9 @@ def limit_cycle(beta: float) -> Cycle:
 
 
 def peaks(beta: float, acts: float) -> tuple[FloatArray, FloatArray]:
-    """Times and sizes of the peaks of abs(e) of a flight from e = 0, e_dot = 1, in which f is
-    recorded.
+    """Times and sizes of the peaks of abs(e) of a flight from e = 0, e_dot = 1.
+
+    In the flight f is recorded.
     """
     t, speed, times, sizes = 0.0, 1.0, [], []
     while t < DURATION:
@@ -125,8 +128,9 @@ def peaks(beta: float, acts: float) -> tuple[FloatArray, FloatArray]:
 
 
 def plot(cycles: list[Cycle]) -> Figure:
-    """Two panels: peaks of abs(e) over time, with and without f, and their limit over beta beside
-    the formula.
+    """Two panels: peaks of abs(e) over time, with and without f, and their limit over beta.
+
+    The formula is beside the limit.
     """
     figure = Figure(figsize=(9.0, 3.4), layout="constrained")
     over_time, over_beta = figure.subplots(1, 2)

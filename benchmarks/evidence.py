@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Measures: each measurement writes its figures to docs/evidence/NAME.csv, and docs/evidence.md is
-the table of these files.
+"""Measures: each measurement writes its figures to docs/evidence/NAME.csv.
+
+docs/evidence.md is the table of these files.
 
     make evidence                              # what has no file yet
     make evidence ARGS="--again faults"
@@ -129,8 +130,9 @@ def split(name: str) -> tuple[str, str]:
 
 
 def rows(result: Any, goals: Mapping[str, str], name: str = "") -> Iterator[Row]:
-    """The rows of a JSON result: the path of keys is the name, and the first goal whose pattern
-    ends the name holds.
+    """The rows of a JSON result.
+
+    The path of keys is the name, and the first goal whose pattern ends the name holds.
     """
     if isinstance(result, dict):
         for key, value in result.items():
@@ -238,8 +240,9 @@ def origin(command: str) -> Origin:
 
 
 def revision(*paths: str) -> str:
-    """The commit, with DIRTY if any file but the evidence differs from the commit; of `paths` the
-    last that touched them.
+    """The commit, with DIRTY if any file but the evidence differs from the commit.
+
+    Of `paths` it is the last that touched them.
     """
     changed = _git(
         "status", "--porcelain", "--", *(paths or (".", ":(exclude)docs/evidence*"))

@@ -46,8 +46,9 @@ Row = dict[str, Any]
 
 
 def fly(times: int, seed: int, only: str, scenario: str, guided: str) -> tuple[list[Row], int]:
-    """Inject every case `times` times in a row; one row for each injection, and the exit status of
-    the tests.
+    """Inject every case `times` times in a row.
+
+    One row for each injection, and the exit status of the tests.
     """
     options = [f"--faults-times={times}", f"--faults-seed={seed}", f"--timeout={120 * times}"]
     words = only.replace(",", " ").split() or ["test"]
@@ -58,10 +59,10 @@ def fly(times: int, seed: int, only: str, scenario: str, guided: str) -> tuple[l
 
 
 def run_campaign(options: Sequence[str], total: int | None = None) -> tuple[list[Row], int]:
-    """Run the tests with options of pytest; their rows, and the exit status. Exits where no test
-    matches.
+    """Run the tests with options of pytest; their rows, and the exit status.
 
-    `total` is the number of injections, for the progress bar; None where it is unknown.
+    Exits where no test matches. `total` is the number of injections, for the progress bar; None
+    where it is unknown.
     """
     with tempfile.TemporaryDirectory() as folder:
         table = Path(folder) / "rows.jsonl"
@@ -160,8 +161,9 @@ def main(
     ] = "",
     file: Annotated[Path | None, typer.Option("--json", help="JSON file to write.")] = None,
 ) -> None:
-    """Run the fault campaign and print its table; exit status 1 if a case did not pass each time,
-    or a log lacks messages.
+    """Run the fault campaign and print its table.
+
+    Exit status 1 if a case did not pass each time, or a log lacks messages.
     """
     rows, status = fly(times, seed, only, scenario, guided)
     summaries = summarise(rows)

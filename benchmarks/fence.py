@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Aircraft that fly out of a fence, in wind and turbulence: five shapes, four winds; how many leave
-the fence, and how far.
+"""Aircraft that fly out of a fence, in wind and turbulence: five shapes, four winds.
+
+How many leave the fence, and how far.
 
     .venv/bin/python -m benchmarks.fence [--only osprey c172p f16 737] [--aircraft 20]
     .venv/bin/python -m benchmarks.fence --generated 60 [--seed 7]
@@ -120,10 +121,9 @@ def windy(
     home: tuple[float, float],
     radii: float = DURATION,
 ) -> tuple[Scenario, float]:
-    """A scenario in a wind, share of V0, without a route, that flies to the north; and the least
-    radius, m.
+    """A scenario in a wind, share of V0, without a route, that flies to the north.
 
-    `home` in radii; `radii`: the duration, at V0.
+    The second result is the least radius, m. `home` in radii; `radii`: the duration, at V0.
     """
     if scenario.guidance is None:
         raise ValueError(f"{scenario.name} has no guidance")
@@ -157,9 +157,7 @@ class Flight(NamedTuple):
 
 
 def fly_fleet(shape: str, wind: str, aircraft: int, seed: int) -> Row:
-    """The row of uncertain ospreys, which fly to the north one by one, on the cores of this
-    host.
-    """
+    """The row of uncertain ospreys, which fly to the north one by one on all cores."""
     scenario, radius = windy(find_scenario("osprey_route"), WINDS[wind], HOME)
     with ProcessPoolExecutor() as pool:
         underway = []
@@ -204,8 +202,9 @@ def fly(prepared: tuple[Scenario, float], shape: tuple[Zone, ...], course: float
 def polygon(
     rng: np.random.Generator, corners: int, radii: tuple[float, float], centre: float = 0.0
 ) -> Zone:
-    """A polygon round a place at the distance `centre`, radii, from the origin, with corners at
-    random angles and distances, radii.
+    """A polygon round a place at the distance `centre`, radii, from the origin.
+
+    Its corners are at random angles and distances, radii.
     """
     evenly = rng.uniform() + np.arange(corners) / corners
     angles = 2.0 * math.pi * (evenly + rng.uniform(-0.3, 0.3, corners) / corners)

@@ -93,8 +93,9 @@ def replay(target: str, files: list[Path]) -> None:
 
 
 def fuzz_all(seconds: int) -> None:
-    """Fuzz every target in a process of its own; print the statistics and the exit status of each
-    fuzzer.
+    """Fuzz every target in a process of its own.
+
+    Print the statistics and the exit status of each fuzzer.
     """
     from tests.fuzz.targets import TARGETS  # noqa: PLC0415 - as above
 
@@ -112,8 +113,9 @@ def fuzz_all(seconds: int) -> None:
 
 
 def fuzz(target: str, seconds: int) -> int:
-    """Fuzz for `seconds` in another process, whose files are removed afterwards. Returns its exit
-    status.
+    """Fuzz for `seconds` in another process, whose files are removed afterwards.
+
+    Returns its exit status.
     """
     memory = Path("/dev/shm")  # noqa: S108 - for speed
     with tempfile.TemporaryDirectory(

@@ -1,10 +1,12 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Guaranteed and found limits of the deviations of A and B, for scenarios that ship and for the
-F-4C of the tutorial (f4c), with the flight of an unstable aircraft: CSV on standard output.
+"""Guaranteed and found limits of the deviations of A and B: CSV on standard output.
 
-python -m benchmarks.guarantee osprey_servo osprey_observer f4c
-python -m benchmarks.guarantee osprey_servo --corners 20000  with corners and samples at the limit
+For scenarios that ship and for the F-4C of the tutorial (f4c), with the flight of an unstable
+aircraft.
+
+python -m benchmarks.guarantee osprey_servo osprey_observer f4c python -m benchmarks.guarantee
+osprey_servo --corners 20000  with corners and samples at the limit
 """
 
 import argparse
@@ -76,8 +78,10 @@ def loop_of(name: str) -> tuple[LinearLoop, Scenario | None]:
 
 
 def learned_loop(scenario: Scenario) -> LinearLoop:
-    """The loop of the last model of a flight that learns: around that model, with two of its
-    standard deviations a side for the box; those before a flight where the flight shows none.
+    """The loop of the last model of a flight that learns.
+
+    It is the loop around that model, with two of its standard deviations a side for the box; those
+    before a flight where the flight shows none.
     """
     tape = simulate(scenario, learn=learner(scenario))
     controller = scenario.controller
@@ -114,8 +118,9 @@ def flight(scenario: Scenario, first: Unstable) -> str:
 
 
 def beyond(linear: LinearLoop, stable: float, count: int) -> str:
-    """How many of `count` aircraft are unstable at a guaranteed limit: a half are corners, a half
-    uniform samples.
+    """How many of `count` aircraft are unstable at a guaranteed limit.
+
+    A half are corners, a half uniform samples.
     """
     box = linear.box
     assert box is not None  # noqa: S101 - for mypy

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Acceptance of guidance: holds, a rectangle and an orbit, by rule alone, in calm air and in
-turbulence of 1.5 m/s.
+"""Acceptance of guidance: holds, a rectangle and an orbit, by rule alone.
+
+In calm air and in turbulence of 1.5 m/s.
 
     .venv/bin/python -m benchmarks.guidance [--only osprey_servo c172p] [--manoeuvres heading orbit]
     [--seeds 5]
@@ -49,8 +50,9 @@ from flight_core.outcome import COMPLETED
 
 
 def prepared(scenario: Scenario) -> Scenario:
-    """A scenario with guidance by rule in calm air, without the commands and the gusts of its
-    own.
+    """A scenario with guidance by rule in calm air.
+
+    It is without the commands and the gusts of its own.
     """
     aircraft: dict[str, Any] = {"gusts": {}, "turbulence": None}
     if not scenario.aircraft.is_jsbsim:
@@ -62,8 +64,9 @@ def prepared(scenario: Scenario) -> Scenario:
 
 @cache
 def aircraft_of(name: str) -> Scenario:
-    """The scenario of an aircraft, with guidance, and the stall speed as `rise-di identify
-    --guidance` writes it.
+    """The scenario of an aircraft, with guidance.
+
+    The stall speed is the one that `rise-di identify --guidance` writes.
     """
     scenario = prepared(original_of(name))
     if name not in CONDITIONS:
@@ -206,8 +209,9 @@ def rows(
     seeds: int,
     over: Callable[..., Iterable[list[Figure]]] = map,
 ) -> Iterator[Row]:
-    """All rows of an aircraft, as they are flown by `over`, which is `map` or that of a pool of
-    processes.
+    """All rows of an aircraft, as they are flown by `over`.
+
+    `over` is `map` or that of a pool of processes.
     """
     several = list(jobs(manoeuvres, seeds))
     done = zip(several, over(partial(fly, aircraft_of(name)), several), strict=True)
@@ -224,8 +228,9 @@ def rows(
 
 
 def main() -> None:
-    """Fly, store the results and write the page; exit status 1 where a limit is not met or a point
-    is lost.
+    """Fly, store the results and write the page.
+
+    Exit status 1 where a limit is not met or a point is lost.
     """
     parser = parser_of(__doc__)
     parser.add_argument("--only", nargs="*", choices=AIRCRAFT, default=AIRCRAFT, help="aircraft")

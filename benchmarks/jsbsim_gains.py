@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Gains, margins and errors of the aircraft of JSBSim that trim, at two speeds each, as `rise-di
-identify` finds them, and whether a random search refutes refusals: CSV on standard output.
+"""Gains, margins and errors of the aircraft of JSBSim that trim: CSV on standard output.
+
+Two speeds each, as `rise-di identify` finds them, and whether a random search refutes refusals.
 
 python -m benchmarks.jsbsim_gains c172p t6texan2
 

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Time of one tick: the law, the law with anti-windup and the whole tick, relative to a NumPy
-multiply-add of the same size.
+"""Time of one tick: the law, the law with anti-windup and the whole tick.
+
+Relative to a NumPy multiply-add of the same size.
 
 python -m benchmarks.speed --only law
 """
@@ -58,8 +59,9 @@ def ticked(scenario: str, y: FloatArray, y_m: FloatArray) -> Callable[[int], obj
 
 
 def measure() -> dict[str, tuple[float, float, float]]:
-    """Median, 99.9th percentile and maximum in us of a law step, a step with anti-windup, a tick,
-    and the multiply-add.
+    """Median, 99.9th percentile and maximum, us.
+
+    Of a law step, a step with anti-windup, a tick, and the multiply-add.
     """
     controller = find_scenario("osprey_gust").controller
     law = controller.law_params()

@@ -42,8 +42,9 @@ FLOOR = "bare echo, to another process and back"
 
 
 def flight_steps_per_second(scenario: Scenario, run: Path, *, one_process: bool) -> float:
-    """Steps of the controller per second of a lockstep flight, between its first and its last u in
-    the log.
+    """Steps of the controller per second of a lockstep flight.
+
+    Between its first and its last u in the log.
     """
     outcome = fly_over_topics(
         scenario, run, lambda t, u: None, lockstep=True, one_process=one_process
@@ -86,8 +87,9 @@ def echo_steps_per_second() -> float:
 
 
 def measure(folder: Path, duration: float, repeat: int) -> dict[str, float]:
-    """Steps per second of the echo (FLOOR) and of each kind of flight: the median of `repeat` runs,
-    interleaved.
+    """Steps per second of the echo (FLOOR) and of each kind of flight.
+
+    The median of `repeat` runs, interleaved.
     """
     aircraft = {"rate": RATE, "step": 1.0 / RATE}
     model = {"rate": RATE}

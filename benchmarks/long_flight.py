@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A long guided flight over topics, round a triangle in turbulence, watched by a client of the live
-page.
+"""A long guided flight over topics, round a triangle in turbulence.
+
+A client of the live page watches it.
 
     .venv/bin/python -m benchmarks.long_flight  # the c172p of JSBSim, 60 min in lockstep
     .venv/bin/python -m benchmarks.long_flight --observer
@@ -68,8 +69,9 @@ MODES = {
 
 
 def triangle(minutes: float, *, observer: bool, rate: float | None = None) -> Scenario:
-    """The flight: laps round an equilateral triangle in turbulence, without wind; the scenario's
-    own rates without `rate`.
+    """The flight: laps round an equilateral triangle in turbulence, without wind.
+
+    The scenario's own rates without `rate`.
     """
     base = find_scenario("osprey_route" if observer else "jsbsim_c172p_route")
     if observer:
@@ -97,11 +99,10 @@ def triangle(minutes: float, *, observer: bool, rate: float | None = None) -> Sc
 
 
 def fly(scenario: Path, runs: Path, mode: str) -> tuple[dict[str, list[int]], int]:
-    """Fly, with a client of the page; the memory of each process by its command, until the nodes
-    end, bytes every PERIOD.
+    """Fly, with a client of the page; the memory of each process by its command.
 
-    The second result is the most memory of `rise-di fly` after that, while it writes the report,
-    bytes.
+    It is taken until the nodes end, bytes every PERIOD. The second result is the most memory of
+    `rise-di fly` after that, while it writes the report, bytes.
     """
     within = real_time() if mode == "in real time" else ()
     command = [*within, RISE_DI, "fly", str(scenario), *MODES[mode], "--runs", str(runs)]
@@ -209,11 +210,11 @@ def opened(report: Path) -> dict[str, float] | None:
 def figures(
     run: Path, memory: Mapping[str, list[int]], delays: Intervals | None, *, real_time: bool
 ) -> dict[str, Any]:
-    """The figures of a flight from its run, SI; memory in bytes in the middle and at the end, ticks
-    as `figures_of_ticks`.
+    """The figures of a flight from its run, SI.
 
-    `delays` are those of the host, by the clock of the stamps; None where unknown. Ticks are of
-    flights in real time alone: in lockstep they wait for their inputs.
+    Memory in bytes in the middle and at the end, ticks as `figures_of_ticks`. `delays` are those of
+    the host, by the clock of the stamps; None where unknown. Ticks are of flights in real time
+    alone: in lockstep they wait for their inputs.
     """
     begin = time.monotonic()
     write_report(run)

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Plots docs/images/lyapunov.png: V1, V2, e and r of the small example, for a beta that meets (29),
-(30) and one that does not.
+"""Plots docs/images/lyapunov.png: V1, V2, e and r of the small example.
+
+One beta meets (29), (30) and one does not.
 
 python -m benchmarks.lyapunov
 """
@@ -21,8 +22,9 @@ COLOURS = ("#1f6f8b", "#c8553d")
 
 
 def flights() -> dict[str, Evidence]:
-    """The same flight under beta and under 0.05 beta, both with the constant zeta_b of Lemma 2 for
-    the first.
+    """The same flight under beta and under 0.05 beta.
+
+    Both have the constant zeta_b of Lemma 2 for the first.
     """
     case = example(DT, DURATION)
     evidence_by_beta = {}
@@ -38,8 +40,9 @@ def flights() -> dict[str, Evidence]:
 
 
 def plot(evidence_by_beta: dict[str, Evidence]) -> Figure:
-    """Four panels over time, a line a gain set: V1 and the norms of e and r on log scales, V2 on a
-    linear one.
+    """Four panels over time, a line a gain set.
+
+    V1 and the norms of e and r on log scales, V2 on a linear one.
     """
     figure = Figure(figsize=(9.0, 5.6), layout="constrained")
     axes = figure.subplots(2, 2, sharex=True)

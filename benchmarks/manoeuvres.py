@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The manoeuvres of `benchmarks.guidance`: the commands of a flight, and its figures with their
-limits.
+"""The manoeuvres of `benchmarks.guidance`.
+
+The commands of a flight, and its figures with their limits.
 """
 
 import math
@@ -74,8 +75,9 @@ class Figure(NamedTuple):
 
 
 class Pose(NamedTuple):
-    """How guidance receives pose: `aircraft.pose` of the scenario, and a fault for `fault` s from
-    FAULT on.
+    """How guidance receives pose.
+
+    `aircraft.pose` of the scenario, and a fault for `fault` s from FAULT on.
     """
 
     measured: Mapping[str, Any] = MappingProxyType({})
@@ -86,8 +88,9 @@ class Pose(NamedTuple):
 
 
 class FaultyPose(Guidance):
-    """Guidance that receives pose with the fault. As the node does, it refuses a sample that is not
-    newer or stands still.
+    """Guidance that receives pose with the fault.
+
+    As the node does, it refuses a sample that is not newer or stands still.
     """
 
     def __init__(self, how: Pose, parameters: GuidanceConfig) -> None:
@@ -168,8 +171,9 @@ def of_heading(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figu
 
 
 def of_pose(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figure]:
-    """Heading and altitude as received over the last 10 s, the true bank then, and how long the
-    wings were levelled.
+    """Heading and altitude as received over the last 10 s, and the true bank then.
+
+    How long the wings were levelled is beside them.
     """
     end = tape.time("guidance")[-1] - 10.0
     psi, altitude, wanted, lateral = after(
@@ -207,8 +211,9 @@ def of_altitude(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Fig
 
 
 def of_speed(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figure]:
-    """Overshoot of an acceleration and what it costs in altitude; rms of V in turbulence over that
-    of the wind.
+    """Overshoot of an acceleration and what it costs in altitude.
+
+    The rms of V in turbulence is over that of the wind.
     """
     altitude, V = after(tape, START, "pose.altitude", "y.V")
     step = FASTER * section.speed
@@ -241,8 +246,9 @@ def of_orbit(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figure
 
 
 def of_switch(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figure]:
-    """Largest jump of u within 20 ms of a change of the mode, in percent of the range of each
-    input.
+    """Largest jump of u within 20 ms of a change of the mode.
+
+    In percent of the range of each input.
     """
     t = tape.time("u")
     u = tape["u"].values
@@ -262,8 +268,9 @@ RANGES: dict[str, float] = {}
 
 
 def of_limits(tape: Tape, section: GuidanceConfig, calm: bool, pose: Pose) -> Iterator[Figure]:
-    """How far the bank is beyond its limit, and the airspeed below nine tenths of the floor, in any
-    manoeuvre.
+    """How far the bank is beyond its limit, and the airspeed below nine tenths of the floor.
+
+    In any manoeuvre.
     """
     phi = tape["truth"]["x.phi"]
     V = tape["guidance"]["y.V"]
@@ -285,8 +292,9 @@ def lap(section: GuidanceConfig) -> float:
 def round_route(
     places: Sequence[tuple[float, float, float]], section: GuidanceConfig
 ) -> tuple[dict[str, Any], float]:
-    """A route over places: north and east in least radii, which the fillets have, and altitude over
-    that of trim, m.
+    """A route over places.
+
+    North and east in least radii, which the fillets have, and altitude over that of trim, m.
     """
     radius = float(math.ceil(least_radius(section.speed, section.wind, section.bank)))
     north, east, altitude = np.transpose(places) * [[radius], [radius], [1.0]]

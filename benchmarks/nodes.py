@@ -19,8 +19,9 @@ from flight_ros.ticker import Tick, Ticker
 
 @contextlib.contextmanager
 def open_node(name: str) -> Iterator[Node]:
-    """A plain node of rclpy on the stack's transport, in a context of its own and without signal
-    handlers.
+    """A plain node of rclpy on the stack's transport.
+
+    It has a context of its own and no signal handlers.
     """
     transport.prepare()
     context = Context()

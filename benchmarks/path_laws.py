@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Guidance with its path law, with L1, and with L1 behind the same lead of the curvature: the
-osprey on the same routes in the same loop.
+"""Guidance with its path law, with L1, and with L1 behind the same lead of the curvature.
+
+The osprey flies the same routes in the same loop.
 
     .venv/bin/python -m benchmarks.path_laws
 

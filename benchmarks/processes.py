@@ -21,8 +21,9 @@ PRIORITY = 50  # SCHED_FIFO, as that of ros2_control
 
 
 class Child:
-    """A role of benchmarks/speed_nodes.py, or a module (with a dot in its name), as a process; a
-    context manager.
+    """A role of benchmarks/speed_nodes.py, or a module (with a dot in its name), as a process.
+
+    A context manager.
     """
 
     def __init__(self, role: str, *arguments: str, within: Sequence[str] = ()) -> None:
@@ -67,8 +68,9 @@ class Child:
 
 
 def threads_ns(pid: int) -> int:
-    """Processor time of the threads of a process, ns, from the kernel's schedstat: psutil resolves
-    10 ms only.
+    """Processor time of the threads of a process, ns.
+
+    From the kernel's schedstat: psutil resolves 10 ms only.
     """
     total = 0
     for task in Path(f"/proc/{pid}/task").iterdir():
@@ -86,8 +88,9 @@ def real_time() -> tuple[str, ...]:
 
 @contextlib.contextmanager
 def delay_monitors(allowed: bool) -> Iterator[Callable[[], Intervals] | None]:
-    """Host delays, measured by a process of the highest priority on each core, monotonic ns; None
-    if not allowed.
+    """Host delays, measured by a process of the highest priority on each core, monotonic ns.
+
+    None if not allowed.
     """
     if not allowed:
         yield None

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Time of a receiver for one message of y that has arrived: a right one taken by the controller,
-and refused ones.
+"""Time of a receiver for one message of y that has arrived.
+
+A right one taken by the controller, and refused ones.
 
 python -m benchmarks.speed --only receiver
 """

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""CPU time and losses of the recorder at 1 kHz on six topics, and the size of its file compared
-with that of rosbags' Writer.
+"""CPU time and losses of the recorder at 1 kHz on six topics.
+
+The size of its file is compared with that of rosbags' Writer.
 
 Another process publishes y, y_m, u, u_m, internals and truth, as wide and as noisy as those of the
 scenario osprey_servo. Then the same messages, in the order recorded, go through
@@ -32,8 +33,9 @@ TOPICS = (Y, Y_M, U, U_M, INTERNALS, TRUTH)
 
 
 def publish(rate: float, duration: float) -> None:
-    """Publish on each topic for the duration or until SIGTERM. Print "matched" first and the number
-    sent at the end.
+    """Publish on each topic for the duration or until SIGTERM.
+
+    Print "matched" first and the number sent at the end.
     """
     tape = simulate(find_scenario("osprey_servo", 5.0))
     ended = termination()
@@ -71,8 +73,9 @@ def publish(rate: float, duration: float) -> None:
 
 
 def record(run: Path, rate: float, duration: float) -> tuple[dict[str, float], float]:
-    """The publisher's counts, and the processor time of the recorder from the first message to the
-    last, s.
+    """The publisher's counts, and the processor time of the recorder, s.
+
+    The time is from the first message to the last.
     """
     scenario = find_scenario("osprey_servo").path
     options = ("--ros-args", "--params-file", str(scenario), "-p", f"directory:={run}")
@@ -97,9 +100,7 @@ class Rewritten(NamedTuple):
 
 
 def rewrite(run: Path, folder: Path, compression: CompressionMode) -> Rewritten:
-    """Write the messages of a run on TOPICS, read into memory before, to a bag of rosbags'
-    Writer.
-    """
+    """Write the messages of a run on TOPICS, read before, to a bag of rosbags' Writer."""
     names = {f"/{topic.name}" for topic in TOPICS}
     with AnyReader([run]) as reader:
         connections = [connection for connection in reader.connections if connection.topic in names]

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Routes by rule from where they are hard to begin, in wind, steep, and crossing themselves: flown,
-missed or refused.
+"""Routes by rule from where they are hard to begin, in wind, steep, and crossing themselves.
+
+They are flown, missed or refused.
 
     .venv/bin/python -m benchmarks.routes [--only osprey_servo c172p 737 f16] [--cases behind helix]
 
@@ -45,8 +46,9 @@ SETTLE = 20.0
 
 
 class Case(NamedTuple):
-    """A route, by the least radius in m, and the air. The aircraft starts at the origin and heads
-    north.
+    """A route, by the least radius in m, and the air.
+
+    The aircraft starts at the origin and heads north.
     """
 
     waypoints: Callable[[float], list[Waypoint]]
@@ -77,8 +79,9 @@ class Row(NamedTuple):
 def of_radii(
     *places: tuple[float, float], altitudes: tuple[float, ...] = ()
 ) -> Callable[[float], list[Waypoint]]:
-    """A route of places in radii to the north and to the east, and altitudes over that of the start
-    in m.
+    """A route of places in radii to the north and to the east.
+
+    Its altitudes are over that of the start in m.
     """
 
     def waypoints(radius: float) -> list[Waypoint]:

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Speed of the stack, each figure compared with a baseline: the least program that does the same on
-this host in one run.
+"""Speed of the stack, each figure compared with a baseline.
+
+The baseline is the least program that does the same on this host in one run.
 
     python -m benchmarks.speed [--only node] [--seconds 10] [--json FILE]
 
@@ -96,8 +97,9 @@ def us(values: Sequence[float] | FloatArray) -> dict[str, float]:
 
 
 class Peer:
-    """Publishes y and y_m at a rate as aircraft and reference model do, and receives u and
-    internals.
+    """Publishes y and y_m at a rate as aircraft and reference model do.
+
+    It receives u and internals.
     """
 
     def __init__(self, node: Node) -> None:
@@ -114,8 +116,9 @@ class Peer:
         self._values = np.random.default_rng(1).normal(size=(1000, len(outputs))) * 1e-3
 
     def drive(self, hz: float, seconds: float, child: Child) -> "Driven":
-        """Publish to a process for `seconds` after its first answer and WARM_UP. Raises
-        RuntimeError without an answer.
+        """Publish to a process for `seconds` after its first answer and WARM_UP.
+
+        Raises RuntimeError without an answer.
         """
         begin = time.monotonic()
         first = 0.0
@@ -230,8 +233,9 @@ def receiver_rows() -> Iterator[Row]:
 
 
 def node_rows(seconds: float, folder: Path) -> Iterator[Row]:
-    """The controller's tick and an echo's callback, from a y that has arrived to the message
-    published.
+    """The controller's tick and an echo's callback.
+
+    From a y that has arrived to the message published.
     """
     length = min(seconds, 4.0)
     took: dict[str, list[dict[str, float]]] = {}
@@ -467,8 +471,9 @@ def seconds_to_first_u() -> float:
 
 
 def import_rows() -> Iterator[Row]:
-    """Processor time of an import, alone and with the start of Python, and of `rise-di --help`;
-    medians.
+    """Processor time of an import, alone and with the start of Python, and of `rise-di --help`.
+
+    Medians.
     """
     floor, ours, usage = "python, import numpy", "python, import rise_di", "rise-di --help"
     alone = (
@@ -508,8 +513,9 @@ def lockstep_rows(seconds: float, folder: Path) -> Iterator[Row]:
 
 
 def recorder_rows(seconds: float, folder: Path) -> Iterator[Row]:
-    """CPU time, losses and size of the recorder at 1 kHz on six topics, compared with rosbags'
-    writer fed from memory.
+    """CPU time, losses and size of the recorder at 1 kHz on six topics.
+
+    They are compared with rosbags' writer fed from memory.
     """
     run = folder / "recorded"
     floor = "rosbags' Writer, MCAP"

@@ -193,10 +193,10 @@ def ticker_node(hz: float, seconds: float) -> dict[str, Any]:
 
 
 def delay_monitor(core: int) -> dict[str, Any]:
-    """Host delays of one core: intervals in which a process of the highest priority did not run,
-    monotonic ns.
+    """Host delays of one core, monotonic ns.
 
-    The kernel delays it or, in a virtual machine, its host (steal time).
+    They are intervals in which a process of the highest priority did not run. The kernel delays it
+    or, in a virtual machine, its host (steal time).
     """
     os.sched_setaffinity(0, {core})
     os.sched_setscheduler(
@@ -217,8 +217,9 @@ def delay_monitor(core: int) -> dict[str, Any]:
 
 
 def controller() -> dict[str, float]:
-    """The controller's node: time from the beginning of a tick until u is published, and until its
-    end.
+    """The controller's node.
+
+    Time from the beginning of a tick until u is published, and until its end.
     """
     until_u: list[int] = []
     whole: list[int] = []

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The cost of watching a flight: opening a long log, the server beside a flight, delays to the
-screen, missed ticks.
+"""The cost of watching a flight.
+
+Opening a long log, the server beside a flight, delays to the screen, missed ticks.
 
 .venv/bin/python -m benchmarks.view                      # all
 .venv/bin/python -m benchmarks.view open --hours 1       # `rise-di watch` of a log of that length
@@ -67,8 +68,9 @@ STARTED = 7.0  # s, for the start of the server, until its client has the flight
 
 
 def write_long_log(run: Path, hours: float) -> None:
-    """Repeat a flight of PIECE s with moved stamps, with a chunk each 0.1 s as the recorder writes
-    them.
+    """Repeat a flight of PIECE s with moved stamps.
+
+    A chunk each 0.1 s, as the recorder writes them.
     """
     scenario = find_scenario(SCENARIO, PIECE)
     with tempfile.TemporaryDirectory() as folder:
@@ -95,8 +97,9 @@ def write_long_log(run: Path, hours: float) -> None:
 
 
 def moved(one: StoredMessage, now_ns: int) -> bytes:
-    """The message with another stamp. Its t, where it has one, stays, as in one flight the first
-    alone counts.
+    """The message with another stamp.
+
+    Its t, where it has one, stays, as in one flight the first alone counts.
     """
     seconds, rest = divmod(now_ns, NANOSECONDS)
     return (
@@ -108,11 +111,10 @@ def moved(one: StoredMessage, now_ns: int) -> bytes:
 
 
 def open_log(hours: float) -> dict[str, Any]:
-    """Times in s from the start of `rise-di watch` to answers about a long log, and the memory of
-    the server in MB.
+    """Times in s from the start of `rise-di watch` to answers about a long log.
 
-    "first samples" is the first answer that has some, "whole log" the first one with the state
-    "ended".
+    The memory of the server, in MB, is beside them. "first samples" is the first answer that has
+    some, "whole log" the first one with the state "ended".
     """
     with tempfile.TemporaryDirectory() as folder:
         run = Path(folder) / "run"
@@ -176,8 +178,9 @@ class Client(threading.Thread):
                 break
 
     def news(self) -> dict[str, Any]:
-        """The head of an answer with what the client lacks, which it knows then. Raises EOFError
-        where the server has ended.
+        """The head of an answer with what the client lacks, which it knows then.
+
+        Raises EOFError where the server has ended.
         """
         known = {
             name: self._head.get(name, "") for name in ("epoch", "state", "described")
@@ -262,8 +265,9 @@ MEASURE = """(start => {
 
 
 def live(seconds: float, *, browser: bool) -> dict[str, Any]:
-    """Processor share and memory (MB) of the server beside a flight, traffic, and delays to the
-    screen.
+    """Processor share and memory (MB) of the server beside a flight.
+
+    Traffic, and delays to the screen.
     """
     with (
         tempfile.TemporaryDirectory() as folder,
@@ -304,8 +308,9 @@ def live(seconds: float, *, browser: bool) -> dict[str, Any]:
 
 
 def frozen(seconds: float = FREEZE) -> dict[str, Any]:
-    """A page whose process stops for so long: the time from its going on until its delay is below
-    RECOVERED again, s.
+    """A page whose process stops for so long.
+
+    The time from its going on until its delay is below RECOVERED again, s.
     """
     with (
         tempfile.TemporaryDirectory() as folder,
@@ -351,13 +356,12 @@ def start_of(address: str) -> float:
 
 
 def flights(count: int, seconds: float) -> dict[str, Any]:
-    """Ticks of flights, for half of the time without and with a watching client: missed, and late
-    p99 in s.
+    """Ticks of flights, for half of the time without and with a watching client.
 
-    Client and server stop and go on in turns of TURN. So the phases of the nodes' timers, which
-    differ from flight to flight, are the same for both, and a drift of the host cancels. "start
-    included" counts also the start of the server, whose processor time is that of any program that
-    starts.
+    Missed, and late p99 in s. Client and server stop and go on in turns of TURN. So the phases of
+    the nodes' timers, which differ from flight to flight, are the same for both, and a drift of the
+    host cancels. "start included" counts also the start of the server, whose processor time is that
+    of any program that starts.
     """
     period_ns = nanoseconds(1.0 / find_scenario(SCENARIO).controller.rate)
     found: dict[str, list[dict[str, float]]] = {"without": [], "with": [], "start included": []}
@@ -420,8 +424,9 @@ def figures_of_ticks(
     period_ns: int,
     windows: Intervals = ((0, 2**63 - 1),),
 ) -> dict[str, float]:
-    """Missed ticks and late p99 of the deadlines inside windows, also excluding host delays where
-    they are known.
+    """Missed ticks and late p99 of the deadlines inside windows.
+
+    Also excluding host delays where they are known.
     """
     at = internals.stamp_ns + np.rint(internals["age"] * NANOSECONDS).astype(np.int64)
     due = at - np.rint(internals["late"] * NANOSECONDS).astype(np.int64)
@@ -445,18 +450,19 @@ def figures_of_ticks(
 
 
 def interval(differences: FloatArray) -> list[float]:
-    """The 95 % confidence interval of the median, by order statistics: of ten values from the
-    second to the ninth.
+    """The 95 % confidence interval of the median, by order statistics.
+
+    Of ten values from the second to the ninth.
     """
     ends: list[float] = np.array(quantile_test(differences).confidence_interval(0.95)).tolist()
     return ends
 
 
 def probability(differences: FloatArray) -> float:
-    """Of a mean difference this large or larger by chance, where watching has no effect: all signs
-    of the pairs are alike.
+    """Probability of a mean difference this large or larger by chance.
 
-    Exact permutation test of paired samples; Edgington, Randomization Tests, 4th edition, 5.
+    Where watching has no effect, all signs of the pairs are alike. Exact permutation test of paired
+    samples; Edgington, Randomization Tests, 4th edition, 5.
     """
     signs = np.array(list(itertools.product((1.0, -1.0), repeat=len(differences))))
     return float(np.mean(signs @ differences >= np.sum(differences) - 1e-12))

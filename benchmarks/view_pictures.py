@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The pictures of the live page in the documentation: a flight in the air, a replay with a ghost, a
-guided flight.
+"""The pictures of the live page in the documentation.
+
+A flight in the air, a replay with a ghost, a guided flight.
 
 .venv/bin/python -m benchmarks.view_pictures
 """
@@ -49,8 +50,9 @@ def save(
     at: str = "",
     clicks: Sequence[str] = (),
 ) -> None:
-    """Open the page of runs, at an instant, click on elements, and save its picture once a
-    condition holds.
+    """Open the page of runs, at an instant, click on elements, and save its picture.
+
+    It is saved once a condition holds.
     """
     with watching(*runs) as (_, address):
         browser.open(f"{address}{at}")

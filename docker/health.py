@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Health check of a container (a watchdog): whether the loops of its nodes still publish to
-/diagnostics, at 1 Hz.
+"""Health check of a container (a watchdog).
+
+Whether the loops of its nodes still publish to /diagnostics, at 1 Hz.
 
 health.py [NODE ...] waits for one report of each given node, or of any node without arguments. Exit
 status 0 when all reports arrived, 1 otherwise. A report of level WARN or ERROR is printed and

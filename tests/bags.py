@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Bags of one flight, as the recorders of ROS 2 and other programs leave them, and files that are
-no logs.
+"""Bags of one flight, as the recorders of ROS 2 and other programs leave them.
 
-The writers are the libraries mcap and rosbags, not the stack.
+Files that are no logs are beside them. The writers are the libraries mcap and rosbags, not the
+stack.
 """
 
 import gzip
@@ -61,8 +61,9 @@ def restamped(data: bytes, stamp_ns: int) -> bytes:
 
 
 def flight_messages(file: Path) -> list[Recorded]:
-    """The messages of a log in the order of recording, with stamps of today, received 1 ms and sent
-    0.5 ms later.
+    """The messages of a log in the order of recording, with stamps of today.
+
+    Received 1 ms and sent 0.5 ms later.
     """
     with file.open("rb") as stream:
         stored = [
@@ -207,8 +208,9 @@ def packed(
 def split(
     folder: Path, messages: Sequence[Recorded], names: Sequence[str], *, metadata: bool = True
 ) -> None:
-    """Write the messages in three files; a name "" leaves a file out. metadata.yaml names bag_0 to
-    bag_2.
+    """Write the messages in three files; a name "" leaves a file out.
+
+    metadata.yaml names bag_0 to bag_2.
     """
     for k, (name, part) in enumerate(zip(names, parts(messages), strict=True)):
         file = write_mcap(folder, part, name or f"bag_{k}.mcap")

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A headless Chromium, controlled over its DevTools pipe: JSON that ends with a zero byte, on
-descriptors 3 and 4.
+"""A headless Chromium, controlled over its DevTools pipe.
+
+The pipe carries JSON that ends with a zero byte, on descriptors 3 and 4.
 """
 
 import json
@@ -28,8 +29,9 @@ CONSOLE_EVENTS = {"Runtime.exceptionThrown", "Runtime.consoleAPICalled", "Log.en
 
 
 class Browser:
-    """One browser with one page. `console` holds the exceptions and console messages of the last
-    page that was opened.
+    """One browser with one page.
+
+    `console` holds the exceptions and console messages of the last page that was opened.
     """
 
     def __init__(
@@ -82,8 +84,9 @@ class Browser:
             os.close(end)
 
     def call(self, method: str, **params: Any) -> Any:
-        """The result of a command of the DevTools protocol. Raises RuntimeError with the error of
-        the browser.
+        """The result of a command of the DevTools protocol.
+
+        Raises RuntimeError with the error of the browser.
         """
         self._number += 1
         message = {"id": self._number, "method": method, "params": params} | self._session

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Builders that several tests share: parameters and truth of the simulated aircraft, errors of a
-flight.
+"""Builders that several tests share.
+
+Parameters and truth of the simulated aircraft, errors of a flight.
 """
 
 from typing import Any

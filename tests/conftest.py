@@ -55,8 +55,9 @@ def invoke(*words: object, **options: Any) -> Result:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Let all processes of a session share the programs that JAX has compiled; workers inherit the
-    environment.
+    """Let all processes of a session share the programs that JAX has compiled.
+
+    Workers inherit the environment.
     """
     if not hasattr(config, "workerinput"):
         folder = tempfile.TemporaryDirectory(prefix="jax", ignore_cleanup_errors=True)
@@ -119,8 +120,9 @@ def run(recorded: Path, tmp_path: Path) -> Path:
 
 
 def with_policy(*policy: str) -> list[str]:
-    """What runs a command with a scheduling policy, as options of chrt; skips the test where that
-    is not permitted.
+    """A function that runs a command with a scheduling policy, as options of chrt.
+
+    Skips the test where that is not permitted.
     """
     command = [shutil.which("chrt") or "", *policy]
     if (

@@ -52,8 +52,9 @@ DAMAGES: Mapping[str, Damage] = {
 
 
 def damage(log: Path, copy: Path, topic: str, change: Damage, *, from_ns: int = 0) -> Path:
-    """Write the copy of a log with a damaged topic; an empty `topic` damages each. The stamps count
-    from `from_ns`.
+    """Write the copy of a log with a damaged topic; an empty `topic` damages each.
+
+    The stamps count from `from_ns`.
     """
     copy.parent.mkdir(parents=True, exist_ok=True)
     with log.open("rb") as source, copy.open("wb") as target:

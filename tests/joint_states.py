@@ -56,8 +56,9 @@ def parameter_event(
     deleted: Mapping[str, object] = NONE,
     stamp_ns: int = 0,
 ) -> bytes:
-    """The ParameterEvent of a node: parameters that have changed, are new, or have no value any
-    more (None).
+    """The ParameterEvent of a node.
+
+    It has parameters that have changed, are new, or have no value any more (None).
     """
     types: dict[str, Any] = STORE.types
     kinds = {

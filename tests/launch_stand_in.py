@@ -20,8 +20,9 @@ class Event: ...
 
 
 class LaunchContext:
-    """The values of the arguments, the events, and the ROS node of the launch. It is its own
-    asyncio loop.
+    """The values of the arguments, the events, and the ROS node of the launch.
+
+    It is its own asyncio loop.
     """
 
     def __init__(self, **arguments: str) -> None:
@@ -40,8 +41,9 @@ class LaunchContext:
         self.events.append(event)
 
     def handle(self, actions: Sequence[Any]) -> list[Any]:
-        """The actions that follow from the kept events, given all actions so far. Unregisters
-        handlers that handle once.
+        """The actions that follow from the kept events, given all actions so far.
+
+        Unregisters handlers that handle once.
         """
         follow: list[Any] = []
         events = self.events

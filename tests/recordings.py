@@ -41,8 +41,9 @@ def scenario_file(path: Path, base: Path, **sections: Mapping[str, Any]) -> Path
 
 
 def truncate(run: Path, fraction: float) -> bytes:
-    """Leave what a killed recorder leaves: the beginning of the file, which is returned, and no
-    metadata.yaml.
+    """Leave what a killed recorder leaves.
+
+    The beginning of the file, which is returned, and no metadata.yaml.
     """
     file = run / "run_0.mcap"
     content = file.read_bytes()
@@ -61,8 +62,9 @@ def summary_of(file: Path) -> Summary:
 
 
 def messages(run: Path) -> list[tuple[str, int, bytes]]:
-    """Topic, log time and bytes of all messages, as rosbags reads them. Each can be
-    deserialised.
+    """Topic, log time and bytes of all messages, as rosbags reads them.
+
+    Each can be deserialised.
     """
     with AnyReader([run]) as reader:
         assert sum(connection.msgcount for connection in reader.connections) == reader.message_count

@@ -24,8 +24,9 @@ def write_dataflash(
     firmware: str,
     changes: Changes = (),
 ) -> None:
-    """A DataFlash log: every field a float. Messages are in the order of their stamps, firmware and
-    parameters before them.
+    """A DataFlash log: every field a float.
+
+    Messages are in the order of their stamps, firmware and parameters before them.
     """
 
     def format_of(identity: int, size: int, name: bytes, types: bytes, labels: bytes) -> None:
@@ -61,10 +62,10 @@ def write_ulog(
     changes: Changes = (),
     second: Mapping[str, Rows] = MappingProxyType({}),
 ) -> None:
-    """A ULog of topics by name: the fields as PX4 declares them, all float (PX4 guide, ULog file
-    format).
+    """A ULog of topics by name.
 
-    `second` has the samples of the instance 1 by topic.
+    The fields are as PX4 declares them, all float (PX4 guide, ULog file format). `second` has the
+    samples of the instance 1 by topic.
     """
 
     def message(kind: bytes, content: bytes) -> bytes:
@@ -106,8 +107,9 @@ def write_ulog(
 
 
 def write_tlog(path: Path, messages: Sequence[tuple[int, Any]], system: int = 1) -> None:
-    """A tlog: before each packet its time, us since 1970 (MAVLink guide). The messages are those of
-    pymavlink.
+    """A tlog: before each packet its time, us since 1970 (MAVLink guide).
+
+    The messages are those of pymavlink.
     """
     sender = mavlink.MAVLink(None, srcSystem=system, srcComponent=1)
     ordered = sorted(messages, key=lambda pair: pair[0])

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A flight in the air for the page's control: a log whose recording seems to go on, and nodes in
-memory behind the `Link`.
+"""A flight in the air for the page's control.
+
+It is a log whose recording seems to go on, and nodes in memory behind the `Link`.
 """
 
 import threading

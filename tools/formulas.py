@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A hook of MkDocs: the formulas of a page become MathML, which browsers draw without a script and
-without another host.
+"""A hook of MkDocs: the formulas of a page become MathML.
+
+Browsers draw it without a script and without another host.
 """
 
 import html
@@ -28,8 +29,9 @@ def mathml(tex: str, displayed: bool) -> str:
 
 
 def on_page_content(content: str, page: Any, **_: object) -> str:
-    """The HTML of a page with its formulas as MathML. Raises PluginError: the page and the formula
-    that is no LaTeX.
+    """The HTML of a page with its formulas as MathML.
+
+    Raises PluginError: the page and the formula that is no LaTeX.
     """
 
     def converted(match: re.Match[str]) -> str:

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Builds ROS 2 message packages for this interpreter from their sources; ROS 2 itself comes from
-PyPI.
+"""Builds ROS 2 message packages for this interpreter from their sources.
+
+ROS 2 itself comes from PyPI.
 
     make messages PACKAGE=px4_msgs SOURCE=../px4_msgs
     make messages PACKAGE=mavros_msgs SOURCE="../mavros ../geographic_info"
@@ -70,8 +71,9 @@ def find_sources(folders: Sequence[Path]) -> dict[str, Source]:
 
 
 def in_order(package: str, sources: Mapping[str, Source]) -> list[str]:
-    """The package and those of its dependencies that are among the sources, each after its
-    dependencies.
+    """The package and those of its dependencies that are among the sources.
+
+    Each comes after its dependencies.
     """
     if package not in sources:
         raise MessagesError(
@@ -146,8 +148,9 @@ def copy_of_part(package: str, source: Path, names: Sequence[str], target: Path)
 
 
 def point_at_this_python(prefix: Path) -> None:
-    """Replace, in the CMake files of the wheels, the headers of the Python that built them by those
-    of this one.
+    """Replace the headers of Python in the CMake files of the wheels.
+
+    Those of the Python that built them become those of this one.
     """
     include = sysconfig.get_path("include")
     if not Path(include, "Python.h").is_file():
@@ -164,8 +167,9 @@ def point_at_this_python(prefix: Path) -> None:
 
 
 def run(log: Path, prefix: Path, *command: str) -> None:
-    """Run a step of a build with the packages of this environment alone; its output goes to a
-    log.
+    """Run a step of a build with the packages of this environment alone.
+
+    Its output goes to a log.
     """
     # A ROS 2 that is sourced too would mix two.
     environment = {

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Writes docs/reference/parameters.md: every parameter of every node, from the classes that
-validate them.
+"""Writes docs/reference/parameters.md: every parameter of every node.
+
+They come from the classes that validate them.
 """
 
 from collections.abc import Iterator, Mapping, Set
@@ -91,8 +92,9 @@ def _section(title: str, schema: type[Config], known: Set[str] = frozenset()) ->
 
 
 def _rows(schema: type[Config], prefix: str = "") -> Iterator[tuple[str, str, str]]:
-    """Key, permitted value and meaning of each parameter of a set; those of a group under a dotted
-    key, once for each class.
+    """Key, permitted value and meaning of each parameter of a set.
+
+    Those of a group are under a dotted key, once for each class.
     """
     shown: dict[type[Config], str] = {}
     for name, field in schema.model_fields.items():
@@ -156,8 +158,9 @@ def _type(annotation: Any) -> str:
 
 
 def _bounds(rules: Mapping[str, Any]) -> str:
-    """The bounds of a number, without those of every number; a smallest size says that the number
-    is positive.
+    """The bounds of a number, without those of every number.
+
+    A smallest size says that the number is positive.
     """
     signs = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
     limits = {rule: rules[rule] for rule in signs if rule in rules and abs(rules[rule]) < UNBOUNDED}

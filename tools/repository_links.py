@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A hook of MkDocs: a link to a file of the repository that is no page of the site becomes the name
-of that file.
+"""A hook of MkDocs: a link to a file of the repository becomes the name of that file.
+
+Links to pages of the site stay.
 """
 
 import posixpath
@@ -12,8 +13,9 @@ LINK = re.compile(r"\[(?P<text>[^\]]+)\]\((?P<target>\.\./[^)#\s]+)[^)]*\)")
 
 
 def on_page_markdown(markdown: str, page: Any, **_: object) -> str:
-    """The Markdown of a page with the paths of such files, from the root of the repository, in the
-    place of the links.
+    """The Markdown of a page with the paths of such files in the place of the links.
+
+    The paths are from the root of the repository.
     """
     folder = posixpath.dirname(posixpath.join("docs", page.file.src_uri))
 

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Writes the table of topics in docs/topics.md, and the access control policy of DDS Security,
-from flight_core.topics.
+"""Writes the table of topics in docs/topics.md, and the access control policy of DDS Security.
+
+Both come from flight_core.topics.
 """
 
 from pathlib import Path
@@ -129,8 +130,9 @@ def _list(profile: ElementTree.Element, kind: str, verb: str, names: list[str]) 
 
 
 def _of_maps() -> tuple[list[str], list[str], list[str]]:
-    """Topics that the bridge sends and receives with each map of the library and of the examples,
-    and services.
+    """Topics that the bridge sends and receives, and services.
+
+    They are those of each map of the library and of the examples.
     """
     files = (
         path

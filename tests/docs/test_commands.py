@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Every command of every page exists: `rise-di` parses it, `make` has the target, ROS 2 the
-executable, Python the module.
+"""Every command of every page exists.
 
-The quick ones run as they stand. tests/docs/test_pages.py runs all of the tutorials.
+`rise-di` parses it, `make` has the target, ROS 2 the executable, Python the module. The quick ones
+run as they stand. tests/docs/test_pages.py runs all of the tutorials.
 """
 
 import re

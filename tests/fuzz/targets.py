@@ -99,8 +99,9 @@ def rejected(call: Callable[[], object]) -> bool:
 
 
 def mcap(data: bytes, folder: Path) -> None:
-    """A log: read as a flight, as messages and as a replay; then repaired. The repaired log is not
-    damaged.
+    """A log: read as a flight, as messages and as a replay; then repaired.
+
+    The repaired log is not damaged.
     """
     run = write_run(folder, data)
     file = run / "run_0.mcap"
@@ -153,11 +154,11 @@ NUMBER = re.compile(r"-?\b(0x)?[0-9a-f]+(\.[0-9a-f]*)?(p[+-]?\d+)?F?\b")
 
 
 def export(data: bytes, folder: Path) -> None:
-    """Names of channels, one a line, in the place of NAMED in an airframe and its scenario, up to
-    the C code and its FMU.
+    """Names of channels, one a line, in the place of NAMED in an airframe and its scenario.
 
-    Outside of strings and comments the code has the tokens that it has with NAMED. The names reach
-    the code from the files, and past the check of the files.
+    They go up to the C code and its FMU. Outside of strings and comments the code has the tokens
+    that it has with NAMED. The names reach the code from the files, and past the check of the
+    files.
     """
     given = data.decode("utf-8", "replace").split("\n")
     names = dict(zip(NAMED, given, strict=False))
@@ -190,8 +191,9 @@ def _renamed(tree: Any, names: Mapping[str, str]) -> Any:
 
 
 def _check_code(controller: RiseDiConfig) -> None:
-    """The code has the tokens of the shipped scenario's, but for the numbers, and the FMU the
-    variables of the channels.
+    """The code has the tokens of the shipped scenario's, but for the numbers.
+
+    The FMU has the variables of the channels.
     """
     text = header(controller, "fuzz", float32=False)
     assert "??" not in text  # a trigraph of C
@@ -262,8 +264,9 @@ def route(data: bytes, folder: Path) -> None:
 
 
 def vehicle_log(data: bytes, folder: Path) -> None:
-    """The log of an autopilot. It is decoded here: `rise-di import` does it in an isolated
-    process.
+    """The log of an autopilot.
+
+    It is decoded here: `rise-di import` does it in an isolated process.
     """
     path = folder / "vehicle.log"
     path.write_bytes(data)
@@ -273,11 +276,10 @@ def vehicle_log(data: bytes, folder: Path) -> None:
 
 
 def targets(data: bytes, folder: Path) -> None:
-    """Poses, y and targets of guidance, as 64 bit numbers. What a step commands is finite and
-    inside its slew limits.
+    """Poses, y and targets of guidance, as 64 bit numbers.
 
-    After a time without steps beyond the age limit of u_m, guidance starts again at what is
-    measured: no limit holds across it.
+    What a step commands is finite and inside its slew limits. After a time without steps beyond the
+    age limit of u_m, guidance starts again at what is measured: no limit holds across it.
     """
     guidance = Guidance(_guided())
     params = _guided().params()
@@ -361,8 +363,9 @@ def _guided() -> GuidanceConfig:
 
 @lru_cache(maxsize=1)
 def _page() -> tuple[asyncio.AbstractEventLoop, Server, Control, list[str]]:
-    """A server with control of nodes in memory, its event loop, and the exceptions that it has
-    logged.
+    """A server with control of nodes in memory, its event loop, and its exceptions.
+
+    They are those that it has logged.
     """
     folder = Path(tempfile.mkdtemp(prefix="fuzz"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
@@ -430,8 +433,9 @@ def log(
     chunked: bool = True,
     indexed: bool = True,
 ) -> bytes:
-    """An MCAP file of (topic, type, payload), 1 ms apart. By default it has no checksums, which
-    would reveal a changed byte.
+    """An MCAP file of (topic, type, payload), 1 ms apart.
+
+    By default it has no checksums, which would reveal a changed byte.
     """
     stream = BytesIO()
     index = IndexType.ALL if indexed else IndexType.NONE

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fuzzing of the command line: invalid input gives an exit status and one sentence, no traceback,
-no hang.
+"""Fuzzing of the command line.
+
+Invalid input gives an exit status and one sentence, no traceback, no hang.
 """
 
 import io

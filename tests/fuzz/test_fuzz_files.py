@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fuzzing of file readers: any content is read or rejected with one sentence, in bounded time and
-memory.
+"""Fuzzing of file readers.
+
+Any content is read or rejected with one sentence, in bounded time and memory.
 """
 
 import json

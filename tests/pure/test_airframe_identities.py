@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Units, output matrix and identities of an airframe file, against published factors,
-python-control and wrong files.
+"""Units, output matrix and identities of an airframe file.
+
+They are held against published factors, python-control and wrong files.
 """
 
 from collections.abc import Callable, Mapping
@@ -236,8 +237,9 @@ def test_text_with_a_unit_becomes_si() -> None:
 
 
 def body_axes(alpha: float = 0.16) -> tuple[dict[str, Any], Airframe]:
-    """The Navion turned by a trim angle of attack to u, w of body axes, with V = u cos + w sin; and
-    the same in V, w.
+    """The Navion turned by a trim angle of attack to u, w of body axes.
+
+    V = u cos + w sin; and the same in V, w.
     """
     sine = np.sin(alpha)
     cosine = np.cos(alpha)

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Airframes from python-control, SciPy, MATLAB, AVL and XFLR5, against the printed matrices of a
-book and the library.
+"""Airframes from python-control, SciPy, MATLAB, AVL and XFLR5.
+
+They are held against the printed matrices of a book and the library.
 """
 
 from pathlib import Path
@@ -122,8 +123,9 @@ def test_gusts_are_minus_the_columns_of_the_flow() -> None:
 
 
 def test_body_axes_give_the_airspeed_along_the_path() -> None:
-    """u_dot has -W0 q and w_dot has U0 q, so V = u cos(alpha_0) + w sin(alpha_0): 9.4 deg in Cook's
-    example 4.2.
+    """u_dot has -W0 q and w_dot has U0 q, so V = u cos(alpha_0) + w sin(alpha_0).
+
+    It is 9.4 deg in Cook's example 4.2.
     """
     f4c = np.array(
         [
@@ -180,8 +182,9 @@ def test_matlab_file_carries_names(tmp_path: Path) -> None:
 
 
 def test_avl_derivatives_give_the_printed_matrices(tmp_path: Path) -> None:
-    """Nelson prints the lateral matrix on p. 199 and the longitudinal derivatives on p. 153,
-    without alpha_dot: M_q = -2.05.
+    """Nelson prints the lateral matrix on p. 199 and the longitudinal derivatives on p. 153.
+
+    They are without alpha_dot: M_q = -2.05.
     """
     frame, note = import_airframe(
         tool_file(tmp_path, "navion.st", AVL_ST), speed="176 ft/s", thrust=True, **BODY
@@ -219,8 +222,9 @@ def test_avl_derivatives_give_the_printed_matrices(tmp_path: Path) -> None:
 
 
 def supra(axes: float) -> str:
-    """AVL's system matrix of the sailplane Supra as a user of AVL posted it, longitudinal, with an
-    elevator per deg.
+    """AVL's system matrix of the sailplane Supra as a user of AVL posted it.
+
+    It is longitudinal, with an elevator per deg.
     """
     longitudinal = [
         [-0.0486, 2.397, -0.6799, -9.81],
@@ -411,8 +415,9 @@ def test_command_writes_airframe_and_scenario(
 
 
 def test_f4c_of_tutorial_follows_from_the_derivatives_of_the_book() -> None:
-    """Cook, examples 4.2 and 4.3: the dimensionless derivatives in body axes, kg, m, s; mass matrix
-    with w_dot and Ixz.
+    """Cook, examples 4.2 and 4.3: the dimensionless derivatives in body axes, kg, m, s.
+
+    The mass matrix has w_dot and Ixz.
     """
     m, Ix, Iy, Iz, Ixz = 17642.0, 33898.0, 165669.0, 189496.0, 2952.0
     S = 49.239

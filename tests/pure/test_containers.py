@@ -69,8 +69,9 @@ def test_no_service_has_a_network() -> None:
 
 
 def test_only_link_of_autopilot_is_open() -> None:
-    """The agent's topics and the flight's are on one loopback interface, with the stack's own
-    profile.
+    """The agent's topics and the flight's are on one loopback interface.
+
+    It has the stack's own profile.
     """
     agent = AUTOPILOT["agent"]
     flight = AUTOPILOT["flight"]
@@ -102,8 +103,9 @@ def test_only_link_of_autopilot_is_open() -> None:
 
 
 def test_flight_of_autopilot_is_dry_unless_it_told_to_send(tmp_path: Path) -> None:
-    """The command as compose expands it without variables, but for the scenario. It ends at the
-    scenario, which is missing.
+    """The command as compose expands it without variables, but for the scenario.
+
+    It ends at the scenario, which is missing.
     """
     command = re.sub(
         r"\$\{SCENARIO:\?[^}]*\}", str(tmp_path / "absent.yaml"), AUTOPILOT["flight"]["command"]

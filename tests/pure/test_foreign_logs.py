@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Logs of autopilots from elsewhere: decoded in an isolated process, in time and memory that follow
-from their size.
+"""Logs of autopilots from elsewhere, decoded in an isolated process.
+
+Its time and memory follow from their size.
 """
 
 import struct

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Who may import whom: one table, held against the imports of every source file and against
-docs/architecture.md.
+"""Who may import whom, by one table.
+
+It is held against the imports of every source file and against docs/architecture.md.
 """
 
 import ast
@@ -29,8 +30,9 @@ IMPORTS: dict[str, set[str]] = {
 
 
 def imported_modules(path: Path) -> set[str]:
-    """Full names of all modules that a file imports, wherever in the file; for `from a import b`
-    both a and a.b.
+    """Full names of all modules that a file imports, wherever in the file.
+
+    For `from a import b` both a and a.b.
     """
     names: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text())):

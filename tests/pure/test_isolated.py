@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The isolated process: what foreign code or a foreign file can reach from it, and what comes
-back.
+"""The isolated process: what foreign code or a foreign file can reach from it.
+
+What comes back is checked too.
 """
 
 import ctypes

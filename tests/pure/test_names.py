@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Names of channels, states and inputs: one grammar at every file, and an escape in every text of
-another language.
+"""Names of channels, states and inputs.
+
+One grammar at every file, and an escape in every text of another language.
 """
 
 from collections.abc import Callable
@@ -40,8 +41,9 @@ HOSTILE = ("q*/", 'q"', "q\\", "??/", "<q>", "q: 1", "q\n", "1q", "", "q,p", "na
 
 
 def places(tree: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    """The paths of the names of channels, states and inputs in a file: entries of a list, and keys
-    of a mapping.
+    """The paths of the names of channels, states and inputs in a file.
+
+    Entries of a list, and keys of a mapping.
     """
     if not isinstance(tree, dict):
         return []

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The controller in a loop of the user's own and in python-control, and the aircraft as an
-environment of gymnasium.
+"""The controller in a loop of the user's own and in python-control.
+
+The aircraft as an environment of gymnasium is beside them.
 """
 
 from typing import Any
@@ -195,8 +196,9 @@ def test_diverged_aircraft_terminates_episode(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_environments_draw_entries_of_scenario() -> None:
-    """An entry at one of its limits: after the same thrust, V is that of 10 % or of 190 % of the
-    effect.
+    """An entry at one of its limits.
+
+    After the same thrust, V is that of 10 % or of 190 % of the effect.
     """
     own = SCENARIO.vary(
         aircraft={
@@ -220,8 +222,9 @@ def test_environments_draw_entries_of_scenario() -> None:
 
 
 def test_vector_environment_flies_as_environments_one_by_one() -> None:
-    """The fleet's linear steps against the simulator's integration: their difference is that of the
-    campaign's figures.
+    """The fleet's linear steps against the simulator's integration.
+
+    Their difference is that of the campaign's figures.
     """
     flights = rise_di.FlightVectorEnv(SCENARIO, 3, uncertainty=0.0)
     alone = rise_di.FlightEnv(SCENARIO)

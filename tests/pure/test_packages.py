@@ -162,8 +162,9 @@ def test_packages_install_their_data_files() -> None:
 
 
 def uninstalled_data(package: Path) -> set[Path]:
-    """Data files that setup.py does not name; a symlinked build has all files of the package
-    folder.
+    """Data files that setup.py does not name.
+
+    A symlinked build has all files of the package folder.
     """
     setup = (package / "setup.py").read_text()
     named = {

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the project takes from others: locked packages without an advisory, and releases that no
-package can change.
+"""What the project takes from others.
+
+Locked packages without an advisory, and releases that no package can change.
 """
 
 import re
@@ -77,8 +78,9 @@ def test_one_job_has_rights() -> None:
 
 @pytest.mark.parametrize("name, job", WITH_RIGHTS)
 def test_job_with_rights_runs_no_program_of_others(name: str, job: dict[str, Any]) -> None:
-    """A package that runs there could change what is published, or publish in the name of the
-    project.
+    """A package that runs there could change what is published.
+
+    It could publish in the name of the project too.
     """
     steps = job["steps"]
     actions = {step["uses"].partition("@")[0] for step in steps if "uses" in step}

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""docs/symbols.md against code and tests: each equation has a test, and a docstring that names it;
-each name exists.
+"""docs/symbols.md against code and tests.
+
+Each equation has a test, and a docstring that names it; each name exists.
 """
 
 import ast
@@ -44,8 +45,9 @@ def numbers(text: str) -> set[int]:
 
 
 def resolve(name: str) -> Any:
-    """The object of a name that begins with a module of the packages. A field without a default is
-    its annotation.
+    """The object of a name that begins with a module of the packages.
+
+    A field without a default is its annotation.
     """
     module, *parts = name.split(".")
     (path,) = SOURCES.glob(f"*/*/**/{module}.py")

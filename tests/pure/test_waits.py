@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How the tests over DDS wait: by tests/ros/waiting.py alone, never for a time, and for each
-message that they read.
+"""How the tests over DDS wait.
+
+By tests/ros/waiting.py alone, never for a time, and for each message that they read.
 """
 
 import ast
@@ -25,8 +26,9 @@ random instants."""
 
 
 def appended(tree: ast.AST) -> set[str]:
-    """The names of the lists to which a subscription appends: `create_subscription(...,
-    NAME.append, ...)`.
+    """The names of the lists to which a subscription appends.
+
+    `create_subscription(..., NAME.append, ...)`.
     """
     calls = (
         node
@@ -82,8 +84,9 @@ def is_end(node: ast.expr) -> bool:
 
 
 def faults(source: str) -> Iterator[str]:
-    """Each wait for a time, and each index into a list that a message must have filled, with its
-    line.
+    """Each wait for a time, and each index into a list that a message must have filled.
+
+    Its line is beside it.
     """
     tree = ast.parse(source)
     lists = appended(tree) | aliases(tree) | {"received"}
