@@ -99,7 +99,13 @@ def retune(state: PidState, old: PidParams, new: PidParams) -> PidState:
     )
 
 
-CONTROL_LAW = ControlLaw(PidState, engage, without_limits(limited), limited, retune)
+CONTROL_LAW = ControlLaw(
+    state=PidState,
+    engage=engage,
+    step=without_limits(limited),
+    limited=limited,
+    retune=retune,
+)
 
 
 class PidConfig(ControllerConfig):

@@ -159,7 +159,7 @@ def sizes(controller: RiseDiConfig) -> Sizes:
     n = 0 if controller.feedforward is None else len(controller.feedforward.states)
     s = 0 if controller.observer is None else len(controller.observer.states)
     p = 0 if controller.allocation is None else len(controller.allocation.effectors)
-    return Sizes(len(controller.outputs), p, n, s, controller.schedule is not None)
+    return Sizes(m=len(controller.outputs), p=p, n=n, s=s, schedule=controller.schedule is not None)
 
 
 def constants(controller: RiseDiConfig) -> list[Constant]:

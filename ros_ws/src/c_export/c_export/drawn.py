@@ -182,12 +182,12 @@ def drawn_steps(sets: Sequence[RiseDiConfig], index: int, steps: int, seed: int)
     reals = _rows(after, groups)
     loaded = _rows(before, groups)
     return Recording(
-        f"drawn steps, parameters {index}",
-        state_names(sets[index]),
-        events,
-        integers,
-        reals,
-        loaded,
+        name=f"drawn steps, parameters {index}",
+        names=state_names(sets[index]),
+        events=events,
+        integers=integers,
+        reals=reals,
+        loaded=loaded,
     )
 
 
@@ -226,7 +226,11 @@ def drawn_commands(reference: ReferenceModelConfig, steps: int, seed: int) -> Re
     names = ("refused", *numbered({"y_m": m, "x_m": len(model.x_m)}))
     integers = np.array(refused, dtype=np.int64)[:, None]
     return Recording(
-        "drawn commands", names, np.array(events, dtype=event_type(m)), integers, np.array(reals)
+        name="drawn commands",
+        names=names,
+        events=np.array(events, dtype=event_type(m)),
+        integers=integers,
+        reals=np.array(reals),
     )
 
 
@@ -294,14 +298,18 @@ def _stepped(
     state = restored(law.control_law, before)
     u_before = before["u"]
     held = Measurements(
-        before["y"], before["y_m"], zero, before["u_trim"] + before["u_ff"], u_before
+        y=before["y"],
+        y_m=before["y_m"],
+        y_m_dot=zero,
+        u_trim=before["u_trim"] + before["u_ff"],
+        u_before=u_before,
     )
     missed = np.round(dt / period) - 1.0
     for k in range(round(missed.max())):
         state = _chosen(k < missed, law.control_law.missed(state, held, params), state)
     u_ff, model_state = _fed_forward(guard.nominal, before, y_m, dt)
     u_trim = before["u_trim"] if guard.nominal is None else before["u_trim"] + u_ff
-    measured = Measurements(y, y_m, zero, u_trim, u_before)
+    measured = Measurements(y=y, y_m=y_m, y_m_dot=zero, u_trim=u_trim, u_before=u_before)
     stepped, u_free = law.control_law.step(state, measured, dt, params)
     last = before.get("effectors")
     u, _ = _given(saturate(u_free, u_before, dt, limits), last, dt, guard.allocation)
@@ -342,7 +350,10 @@ def _fed_forward(
         before[f"feedforward.{name}"] for name in FeedforwardState._fields
     )
     now, u_ff = feedforward.step(
-        FeedforwardState(x, u, dt_before[0], ticks[0], u_0), y_m, dt, _columns(nominal)
+        FeedforwardState(x=x, u=u, dt=dt_before[0], ticks=ticks[0], u_0=u_0),
+        y_m,
+        dt,
+        _columns(nominal),
     )
     states = now._asdict().items()
     return u_ff, {f"feedforward.{name}": np.atleast_2d(value) for name, value in states}

@@ -257,7 +257,9 @@ class Recorder(Controller):
         events = np.array(self._events, dtype=event_type(len(self._none)))
         integers = np.array(self._integers, dtype=np.int64).reshape(-1, len(INTEGERS))
         reals = np.array(self._reals).reshape(len(integers), -1)
-        return Recording(name, self._names, events, integers, reals)
+        return Recording(
+            name=name, names=self._names, events=events, integers=integers, reals=reals
+        )
 
 
 def parameter_sets(controller: RiseDiConfig) -> list[RiseDiConfig]:

@@ -221,13 +221,13 @@ class Program:
                 np.ptp(u, axis=0), np.finfo(float).tiny
             )
         return Comparison(
-            recording.name,
-            recording.ticks,
-            differ.size,
-            int(differ.sum()),
-            first,
-            float(parts.max()),
-            not modes_differ.any(),
+            name=recording.name,
+            ticks=recording.ticks,
+            values=differ.size,
+            differing=int(differ.sum()),
+            first=first,
+            deviation=float(parts.max()),
+            modes_equal=not modes_differ.any(),
         )
 
 

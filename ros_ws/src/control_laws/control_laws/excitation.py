@@ -105,7 +105,13 @@ def _retune(
     return state
 
 
-EXCITATION = ControlLaw(ExcitationState, _engage, without_limits(_limited), _limited, _retune)
+EXCITATION = ControlLaw(
+    state=ExcitationState,
+    engage=_engage,
+    step=without_limits(_limited),
+    limited=_limited,
+    retune=_retune,
+)
 
 
 class ExcitationConfig(ControllerConfig):

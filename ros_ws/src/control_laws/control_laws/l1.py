@@ -58,7 +58,13 @@ def _control_law(*, feedforward: bool) -> ControlLaw:
     def engage(measured: Measurements, params: L1Params) -> L1State:
         e = measured.y - measured.y_m
         zero = array_namespace(e).zeros_like(e)
-        return L1State(e, measured.y, params.Omega @ measured.u_before + zero, zero, -params.K * e)
+        return L1State(
+            e=e,
+            y_before=measured.y,
+            y_dot_u=params.Omega @ measured.u_before + zero,
+            sigma_hat=zero,
+            sigma_f=-params.K * e,
+        )
 
     def limited(
         state: L1State, measured: Measurements, dt: Array, params: L1Params, limits: Limits
@@ -77,14 +83,26 @@ def _control_law(*, feedforward: bool) -> ControlLaw:
         )
         u_free = u_r - params.inverse @ (params.K * e + sigma_f)
         u, _ = saturate(u_free, measured, dt, limits)
-        return L1State(e, measured.y, params.Omega @ u, sigma_hat, sigma_f), u_free, u
+        return (
+            L1State(
+                e=e,
+                y_before=measured.y,
+                y_dot_u=params.Omega @ u,
+                sigma_hat=sigma_hat,
+                sigma_f=sigma_f,
+            ),
+            u_free,
+            u,
+        )
 
     def retune(state: L1State, old: L1Params, new: L1Params) -> L1State:
         nu = old.inverse @ (old.K * state.e + state.sigma_f)
         y_dot_u = new.Omega @ (old.inverse @ state.y_dot_u)
         return state._replace(y_dot_u=y_dot_u, sigma_f=new.Omega @ nu - new.K * state.e)
 
-    return ControlLaw(L1State, engage, without_limits(limited), limited, retune)
+    return ControlLaw(
+        state=L1State, engage=engage, step=without_limits(limited), limited=limited, retune=retune
+    )
 
 
 CONTROL_LAWS = {feedforward: _control_law(feedforward=feedforward) for feedforward in (False, True)}

@@ -32,11 +32,11 @@ def _limited(
 
 
 CONTROL_LAW = ControlLaw(
-    LqgState,
-    lambda measured, params: LqgState(),
-    without_limits(_limited),
-    _limited,
-    lambda state, old, new: state,
+    state=LqgState,
+    engage=lambda measured, params: LqgState(),
+    step=without_limits(_limited),
+    limited=_limited,
+    retune=lambda state, old, new: state,
 )
 
 

@@ -59,7 +59,7 @@ def control_law(model: NominalModel, *, ideal: bool) -> ControlLaw:
     def engage(measured: Measurements, params: MacKunisParams) -> MacKunisState:
         e = measured.y - measured.y_m
         zero = array_namespace(e).zeros_like(e)
-        return MacKunisState(e, e, zero, zero, zero)
+        return MacKunisState(e_0=e, e=e, e_dot=zero, integral_e=zero, Pi=zero)
 
     def limited(
         state: MacKunisState,
@@ -83,7 +83,11 @@ def control_law(model: NominalModel, *, ideal: bool) -> ControlLaw:
         y_dot_excess = Omega @ excess
         integral_e = conditional_integration(state.integral_e, integral_e, -increment, y_dot_excess)
         Pi = conditional_integration(state.Pi, Pi, -Pi_step, y_dot_excess)
-        return MacKunisState(state.e_0, e, e_dot, integral_e, Pi), u_free, u
+        return (
+            MacKunisState(e_0=state.e_0, e=e, e_dot=e_dot, integral_e=integral_e, Pi=Pi),
+            u_free,
+            u,
+        )
 
     return campaign_law(MacKunisState, engage, limited)
 
@@ -103,4 +107,10 @@ def mackunis_params(gains: dict[str, FloatArray], model: NominalModel) -> MacKun
     K = gains["K"]
     beta = gains["beta"]
     eps = beta / K * gains["softening"]
-    return MacKunisParams(K, gains["Lambda"], beta, eps, gains.get("filter", 0.0) + 0.0 * K)
+    return MacKunisParams(
+        K=K,
+        Lambda=gains["Lambda"],
+        beta=beta,
+        eps=eps,
+        bandwidth=gains.get("filter", 0.0) + 0.0 * K,
+    )

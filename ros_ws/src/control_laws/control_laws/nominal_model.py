@@ -72,7 +72,9 @@ def campaign_law(
     def retune(state: Any, old: Any, new: Any) -> Any:
         raise NotImplementedError("a law that only campaigns fly has no retuning")
 
-    return ControlLaw(state, engage, without_limits(limited), limited, retune)
+    return ControlLaw(
+        state=state, engage=engage, step=without_limits(limited), limited=limited, retune=retune
+    )
 
 
 class ErrorIntegral(NamedTuple):

@@ -46,7 +46,16 @@ def observer_params(
     Phi, Gamma, H, L, F = (
         aircraft_last(matrix) for matrix in (design.Phi, design.Gamma, design.H, design.L, design.F)
     )
-    return ObserverParams(law_params, Phi, Gamma, H, L, F, limits, np.array(1.0 / FADE))
+    return ObserverParams(
+        law=law_params,
+        Phi=Phi,
+        Gamma=Gamma,
+        H=H,
+        L=L,
+        F=F,
+        limits=limits,
+        fade_rate=np.array(1.0 / FADE),
+    )
 
 
 def aircraft_design(

@@ -81,7 +81,9 @@ def _retune(state: PiState, old: PiParams, new: PiParams) -> PiState:
     return state._replace(e_0=state.e + new.Lambda * state.integral_e - asked)
 
 
-CONTROL_LAW = ControlLaw(PiState, _engage, without_limits(_limited), _limited, _retune)
+CONTROL_LAW = ControlLaw(
+    state=PiState, engage=_engage, step=without_limits(_limited), limited=_limited, retune=_retune
+)
 
 
 def params_of(gains: dict[str, FloatArray], model: NominalModel) -> PiParams:

@@ -24,12 +24,12 @@ def params_of(gains: dict[str, FloatArray], model: NominalModel) -> LawParams:
     )
     omega = gains.get("omega", 1.0) + 0.0 * K
     return LawParams(
-        K,
-        gains["Lambda"],
-        beta,
-        model.D[:, None],
-        model.input_scale[:, None],
-        omega,
-        eps,
+        K=K,
+        Lambda=gains["Lambda"],
+        beta=beta,
+        D=model.D[:, None],
+        input_scale=model.input_scale[:, None],
+        omega=omega,
+        eps=eps,
         sign=None,
     )

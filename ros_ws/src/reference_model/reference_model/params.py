@@ -260,14 +260,14 @@ class ReferenceModelConfig(NodeConfig):
             frequency = self.second_order.natural_frequency
             gain = (frequency[p] / 4.0, frequency[q] / 4.0)
         return LiveParams(
-            nanoseconds(section.max_age),
-            nanoseconds(section.levelling),
-            np.array([section.bounds.get(name, np.inf) for name in self.outputs]),
-            np.array([section.slew.get(name, np.inf) for name in self.outputs]) / self.rate,
-            speed,
-            channels,
-            gain,
-            section.roll_rate,
+            max_age_ns=nanoseconds(section.max_age),
+            levelling_ns=nanoseconds(section.levelling),
+            bounds=np.array([section.bounds.get(name, np.inf) for name in self.outputs]),
+            reach=np.array([section.slew.get(name, np.inf) for name in self.outputs]) / self.rate,
+            speed=speed,
+            channels=channels,
+            gain=gain,
+            roll_rate=section.roll_rate,
         )
 
     def profile(self) -> Profile:
@@ -291,12 +291,12 @@ class ReferenceModelConfig(NodeConfig):
             bank_rate[self.outputs.index(turn.bank_rate)] = 1.0
             turn_rate[self.outputs.index(turn.turn_rate)] = GRAVITY / turn.speed
         return Profile(
-            time,
-            change,
-            np.array(self.rise),
-            np.array([0.0 if sine is None else sine.amplitude for sine in sines]),
-            np.array([1.0 if sine is None else sine.frequency for sine in sines]),
-            np.array([0.0 if sine is None else sine.phase for sine in sines]),
-            bank_rate,
-            turn_rate,
+            time=time,
+            change=change,
+            rise=np.array(self.rise),
+            amplitude=np.array([0.0 if sine is None else sine.amplitude for sine in sines]),
+            frequency=np.array([1.0 if sine is None else sine.frequency for sine in sines]),
+            phase=np.array([0.0 if sine is None else sine.phase for sine in sines]),
+            bank_rate=bank_rate,
+            turn_rate=turn_rate,
         )

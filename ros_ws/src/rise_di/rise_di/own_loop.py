@@ -337,7 +337,9 @@ def as_control(
     law, params = tuned
     zero = np.zeros(m)
     p = 0 if guard.allocation is None else len(names)
-    start = fields(law.engage(Measurements(zero, zero, zero, zero, zero), params))
+    start = fields(
+        law.engage(Measurements(y=zero, y_m=zero, y_m_dot=zero, u_trim=zero, u_before=zero), params)
+    )
     sizes = [value.size for value in start.values()]
     # so that x = 0 is the engagement in trim
     offset = np.concatenate([value.ravel() for value in start.values()])
@@ -353,7 +355,9 @@ def as_control(
             },
         )
         u_before, y_m_before, effectors = np.split(x[ends[-1] :], [m, 2 * m])
-        sample = Measurements(v[:m], v[m:], (v[m:] - y_m_before) / dt, zero, u_before)
+        sample = Measurements(
+            y=v[:m], y_m=v[m:], y_m_dot=(v[m:] - y_m_before) / dt, u_trim=zero, u_before=u_before
+        )
         after, _, u, allocated = law_within_limits(
             state, sample, np.float64(dt), tuned, guard, effectors if p else None
         )

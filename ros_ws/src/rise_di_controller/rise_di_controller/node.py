@@ -100,11 +100,11 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         if self.parameters.lockstep:
             self._empty_encoder = self.encoder(())
             self._inputs = LockstepInputs(
-                period_ns(self.parameters.y_rate, "y_rate"),
-                self.period_ns(),
-                self._y.receive,
-                self._y_m.receive,
-                self._has_proposal,
+                y_period_ns=period_ns(self.parameters.y_rate, "y_rate"),
+                period_ns=self.period_ns(),
+                receive_y=self._y.receive,
+                receive_other=self._y_m.receive,
+                is_ready=self._has_proposal,
             )
         self._last_ns = 0  # of the last tick
         self._still_vanes: tuple[str, ...] = ()
@@ -368,7 +368,13 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
             raise ChannelError("malformed", "a proposal without the digests start and flown")
         assert self._learning is not None  # noqa: S101 - the receiver was made beside it
         self._learning.receive(
-            Proposal(report.stamp_ns, start, flown, change, report.sentence),
+            Proposal(
+                stamp_ns=report.stamp_ns,
+                start=start,
+                flown=flown,
+                change=change,
+                sentence=report.sentence,
+            ),
             self._controller,
             now_ns,
         )

@@ -227,7 +227,8 @@ class ControllerConfig(NodeConfig):
         """The log holds each array of the law's state by output, beside groups of its own."""
         zero = np.zeros(len(self.outputs))
         state = self.control_law().engage(
-            Measurements(zero, zero, zero, zero, zero), self.law_params()
+            Measurements(y=zero, y_m=zero, y_m_dot=zero, u_trim=zero, u_before=zero),
+            self.law_params(),
         )
         for name, value in fields(state).items():
             require(
@@ -405,7 +406,17 @@ class ControllerConfig(NodeConfig):
         vanes = None
         if section is not None:
             vanes = section.params(self.outputs, self._model_states(), len(Phi))
-        observed = ObserverParams(params, Phi, Gamma, H, L, F, limits, np.float64(fade_rate), vanes)
+        observed = ObserverParams(
+            law=params,
+            Phi=Phi,
+            Gamma=Gamma,
+            H=H,
+            L=L,
+            F=F,
+            limits=limits,
+            fade_rate=np.float64(fade_rate),
+            vanes=vanes,
+        )
         return TunedLaw(
             with_observer(law) if section is None else with_observer(law, vanes=True), observed
         )

@@ -408,7 +408,9 @@ class RiseDiConfig(ControllerConfig):
         time = np.float64(self.schedule.time)
         return TunedLaw(
             with_schedule(law.control_law),
-            ScheduleParams(law.params, speed, self._airspeed(), time, over),
+            ScheduleParams(
+                law=law.params, speed=speed, airspeed=self._airspeed(), time=time, observer=over
+            ),
         )
 
     def logged_groups(self, law: ControlLaw | None = None) -> dict[str, tuple[str, ...]]:

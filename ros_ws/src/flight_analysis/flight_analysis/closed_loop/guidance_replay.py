@@ -69,7 +69,13 @@ def replay_guidance(tape: Tape, parameters: GuidanceConfig | None) -> GuidanceRe
     steps = len(tape.time("guidance"))
     if tape["guidance"].names != guidance.names(parameters.outputs):
         why = "the log has other channels of guidance"
-        return GuidanceReplay(steps, 0, 0, None, (f"{steps} steps of guidance not checked: {why}",))
+        return GuidanceReplay(
+            steps=steps,
+            checked=0,
+            differing=0,
+            first=None,
+            notes=(f"{steps} steps of guidance not checked: {why}",),
+        )
     comparison = _Comparison(tape, parameters)
     differences = [*comparison.differences()]
     missing = steps - comparison.checked
@@ -78,7 +84,13 @@ def replay_guidance(tape: Tape, parameters: GuidanceConfig | None) -> GuidanceRe
     if comparison.failed:
         notes.append(f"{comparison.failed} steps of guidance failed: the last u_m went on")
     first = next(iter(differences), None)
-    return GuidanceReplay(steps, comparison.checked, len(differences), first, tuple(notes))
+    return GuidanceReplay(
+        steps=steps,
+        checked=comparison.checked,
+        differing=len(differences),
+        first=first,
+        notes=tuple(notes),
+    )
 
 
 class _Comparison:

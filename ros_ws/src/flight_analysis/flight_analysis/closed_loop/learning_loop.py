@@ -123,7 +123,13 @@ def as_received(proposal: LearnerResult, start: RiseDiConfig, end_ns: int, flown
     The proposal has the end of the window, and the digest of the parameters in force there.
     """
     change = {} if proposal.controller is None else designed(start, proposal.controller)
-    return Proposal(end_ns, start.digest(), flown, change, proposal.sentence)
+    return Proposal(
+        stamp_ns=end_ns,
+        start=start.digest(),
+        flown=flown,
+        change=change,
+        sentence=proposal.sentence,
+    )
 
 
 def proposed(

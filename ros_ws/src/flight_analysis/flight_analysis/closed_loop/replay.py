@@ -104,7 +104,11 @@ class ReplayResult(NamedTuple):
         recorded = float(self.recorded[row, column])
         computed = float(self.computed[row, column])
         return Difference(
-            int(self.number[row]), float(self.t[row]), self.names[column], recorded, computed
+            number=int(self.number[row]),
+            t=float(self.t[row]),
+            channel=self.names[column],
+            recorded=recorded,
+            computed=computed,
         )
 
     def group(self, values: FloatArray, prefix: str) -> Signal:
@@ -240,15 +244,15 @@ def _replay(
     missing = np.flatnonzero(~ticks.u_found)
     steps.computed[missing, -ticks.p :] = ticks.values[missing, -ticks.p :]
     return ReplayResult(
-        ticks.names,
-        ticks.number,
-        ticks.t,
-        ticks.values,
-        steps.computed,
-        steps.checked,
-        steps.other_parameters,
-        notes,
-        ticks.u_found & (ticks.y_found | ~ticks.flies),
+        names=ticks.names,
+        number=ticks.number,
+        t=ticks.t,
+        recorded=ticks.values,
+        computed=steps.computed,
+        checked=steps.checked,
+        other_parameters=steps.other_parameters,
+        notes=notes,
+        published=ticks.u_found & (ticks.y_found | ~ticks.flies),
     )
 
 

@@ -64,7 +64,7 @@ def boxes_until_proved(part: Channels, size: float, disk: float, most: int) -> i
     highest = np.pi / part.period
     half = np.r_[np.full(len(part.entries), size), np.ones(part.late)]
     disks = np.full(len(part.D) - part.real, disk)
-    regions = [Region(np.zeros(len(half)), half, 0.0, highest, None)]
+    regions = [Region(centre=np.zeros(len(half)), half=half, low=0.0, high=highest, scaling=None)]
     for tried in range(1, most + 1):
         region = regions.pop()
         w = _frequency(region, highest)

@@ -72,7 +72,15 @@ def guarantee(linear: LinearLoop, late: float = 0.0) -> Guarantee:
     assert box is not None  # noqa: S101 - for mypy
     largest = float(np.max(box.part))
     m = len(linear.inputs)
-    none = Guarantee(largest, 0.0, None, linear.inputs, np.zeros(m), 0.0, late)
+    none = Guarantee(
+        uncertainty=largest,
+        stable=0.0,
+        unstable=None,
+        inputs=linear.inputs,
+        disk=np.zeros(m),
+        disk_all=0.0,
+        late=late,
+    )
     if not is_stable(linear.nominal, linear.law, linear.loop, np.zeros(m)):
         return none
     whole = uncertain_loop(linear.nominal, linear.law, linear.loop, box, late)

@@ -324,16 +324,18 @@ def _margins(form: SchurForm, period: float, *, together: bool) -> Margins:
     decrease, increase = _gain_margins(form, w, L, period)
     each = stable[:, None]
     return Margins(
-        stable,
-        np.where(each, phase, 0.0),
-        np.where(each, crossover, 0.0),
-        np.where(each, decrease, 1.0),
-        np.where(each, increase, 1.0),
-        np.where(each, np.max(np.abs(diagonal), axis=1), np.inf),
-        np.where(each, disk, 0.0),
-        np.where(stable, norm, np.inf),
-        np.where(stable, disk_all, 0.0),
-        np.array([min([1.0, *_slow_modes(row, period).damping]) for row in form.eigenvalues]),
+        stable=stable,
+        phase=np.where(each, phase, 0.0),
+        crossover=np.where(each, crossover, 0.0),
+        gain_decrease=np.where(each, decrease, 1.0),
+        gain_increase=np.where(each, increase, 1.0),
+        sensitivity=np.where(each, np.max(np.abs(diagonal), axis=1), np.inf),
+        disk=np.where(each, disk, 0.0),
+        sensitivity_all=np.where(stable, norm, np.inf),
+        disk_all=np.where(stable, disk_all, 0.0),
+        damping=np.array(
+            [min([1.0, *_slow_modes(row, period).damping]) for row in form.eigenvalues]
+        ),
     )
 
 

@@ -121,7 +121,11 @@ def loop_margins(linear: LinearLoop) -> LoopMargins:
         for share in np.eye(len(linear.inputs))
     )
     result = LoopMargins(
-        linear.inputs, nominal, slow_modes(linear.nominal, linear.law, linear.loop), delay, each
+        inputs=linear.inputs,
+        nominal=nominal,
+        modes=slow_modes(linear.nominal, linear.law, linear.loop),
+        delay=delay,
+        channel_delay=each,
     )
     count = len(linear.plant.A) - 1
     if not count:
@@ -220,11 +224,11 @@ def linear_loop(
     plant = LinearPlant(A + airframe.matrix_gravity(), B[:, :, columns], C)
     model = f"model: {airframe.name}{'' if A.any() else BARE}"
     return LinearLoop(
-        model,
-        controller.inputs,
-        plant,
-        linear_law(controller.tuned_law(), len(rows), loop.period),
-        loop,
+        model=model,
+        inputs=controller.inputs,
+        plant=plant,
+        law=linear_law(controller.tuned_law(), len(rows), loop.period),
+        loop=loop,
     )
 
 
@@ -254,7 +258,7 @@ def box_of(
             F[entry, j] = size
         else:
             G[entry] = size * T[j]
-    return Box(tuple(places), part, E, F, G)
+    return Box(names=tuple(places), part=part, E=E, F=F, G=G)
 
 
 def _some(plant: LinearPlant, chosen: slice) -> LinearPlant:

@@ -132,14 +132,14 @@ def uncertain_loop(
     W = np.zeros((len(kept), TERMS * k))
     W[:n] = driven[:n]
     exact = UncertainLoop(
-        np.block([[P + Pu @ law.D @ C, Pu @ law.C], [law.B @ C, law.A]]),
-        np.vstack([W, none]),
-        np.hstack([Q + Qu @ law.D @ C, Qu @ law.C]),
-        _coefficients(driven, n, k),
-        np.vstack([Pu, np.zeros((states, m))]),
-        Qu,
-        np.hstack([law.D @ C, law.C]),
-        loop.period,
+        A=np.block([[P + Pu @ law.D @ C, Pu @ law.C], [law.B @ C, law.A]]),
+        W=np.vstack([W, none]),
+        Z=np.hstack([Q + Qu @ law.D @ C, Qu @ law.C]),
+        D=_coefficients(driven, n, k),
+        U=np.vstack([Pu, np.zeros((states, m))]),
+        V=Qu,
+        K=np.hstack([law.D @ C, law.C]),
+        period=loop.period,
     )
     if late == 0.0:
         return exact
@@ -281,13 +281,13 @@ def every_channel(loop: UncertainLoop, inputs: tuple[int, ...] = ()) -> Channels
     D[p : p + width, p + width :] = late.V[:, chosen]
     D[p + width :, p + width :] = np.eye(c) / 2.0
     return Channels(
-        loop.A,
-        np.hstack([loop.W, late.W, loop.U[:, chosen]]),
-        np.vstack([loop.Z, late.Z, loop.K[chosen]]),
-        D,
-        tuple(range(p // TERMS)),
-        loop.period,
-        width,
+        A=loop.A,
+        W=np.hstack([loop.W, late.W, loop.U[:, chosen]]),
+        Z=np.vstack([loop.Z, late.Z, loop.K[chosen]]),
+        D=D,
+        entries=tuple(range(p // TERMS)),
+        period=loop.period,
+        late=width,
     )
 
 

@@ -111,7 +111,13 @@ def plot_context(flights: Sequence[RecordedFlight]) -> PlotContext:
         intervals += gust_intervals(longest, gusts)
     if len(flights) == 1:
         intervals += mode_intervals(longest, end * MIN_VISIBLE_FRACTION)
-    return PlotContext(runs_of(flights), common_units(flights), intervals, end, SampleStore())
+    return PlotContext(
+        runs=runs_of(flights),
+        units=common_units(flights),
+        intervals=intervals,
+        end=end,
+        samples=SampleStore(),
+    )
 
 
 def runs_of(flights: Sequence[RecordedFlight]) -> dict[str, Run]:
@@ -135,7 +141,13 @@ def gust_intervals(tape: Tape, gusts: Windows) -> list[Interval]:
     """The gusts up to the end of the flight; a repeated gust has one label."""
     end = flight_end(tape)
     return [
-        Interval(f"{name.rstrip('0123456789 ')} gust", start, min(stop, end), GUST, True)
+        Interval(
+            label=f"{name.rstrip('0123456789 ')} gust",
+            start=start,
+            stop=min(stop, end),
+            colour=GUST,
+            labelled=True,
+        )
         for name, (start, stop) in gusts.items()
         if start < end
     ]
@@ -151,7 +163,8 @@ def mode_intervals(tape: Tape, min_length: float = 0.0) -> list[Interval]:
     for mode, colour in MODE_COLOURS.items():
         spans = mask_spans(t, modes == mode, min_length)
         intervals += [
-            Interval(mode.name.lower(), start, stop, colour, False) for start, stop in spans
+            Interval(label=mode.name.lower(), start=start, stop=stop, colour=colour, labelled=False)
+            for start, stop in spans
         ]
     return intervals
 

@@ -147,12 +147,12 @@ def flown_legs(tape: Tape) -> list[FlownLeg]:
         joined = float(t[first + on_leg[0]]) if len(on_leg) else None
         flown.append(
             FlownLeg(
-                int(legs[first]),
-                float(t[first]),
-                joined,
-                float(t[min(after, len(t) - 1)]),
-                result,
-                missed,
+                leg=int(legs[first]),
+                start=float(t[first]),
+                joined=joined,
+                stop=float(t[min(after, len(t) - 1)]),
+                result=result,
+                missed=missed,
             )
         )
     return flown
@@ -245,13 +245,13 @@ def landing_touch(tape: Tape, section: GuidanceConfig | None) -> Touch | None:
         low = float(speed[min(int(row), len(speed) - 1)])
     across = end["v_east"] * math.cos(end["psi"]) - end["v_north"] * math.sin(end["psi"])
     return Touch(
-        -end["climb"],
-        across,
-        math.remainder(end["psi"] - landing.course, 2.0 * math.pi),
-        float(line[0] * place[1] - line[1] * place[0]),
-        float(line @ place),
-        float(speed[-1]),
-        low,
+        sink=-end["climb"],
+        sideways=across,
+        crab=math.remainder(end["psi"] - landing.course, 2.0 * math.pi),
+        beside=float(line[0] * place[1] - line[1] * place[0]),
+        beyond=float(line @ place),
+        V=float(speed[-1]),
+        V_screen=low,
     )
 
 

@@ -57,7 +57,7 @@ def guided_context(context: PlotContext) -> PlotContext:
     for shaded, colour in MODE_SHADES.items():
         label = f"guidance: {shaded.name.lower().replace('_', ' ')}"
         stale += [
-            Interval(label, start, stop, colour, False)
+            Interval(label=label, start=start, stop=stop, colour=colour, labelled=False)
             for start, stop in mask_spans(t, mode == shaded)
         ]
     return context._replace(units=QUANTITY_UNITS, intervals=[*context.intervals, *stale])

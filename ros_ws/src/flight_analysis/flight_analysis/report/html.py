@@ -114,7 +114,16 @@ def write_loop_page(path: Path, title: str, loop: LinearLoop) -> None:
     """Write a page of a linear loop that need not have flown: margins, Bode and Nyquist plot."""
     table = margin_figures.margin_table(loop_margins(loop), kept(loop))
     sections = _loop_sections({"": loop})
-    _write(path, Page(title, [], [TableGroup([table])], sections, SampleStore()))
+    _write(
+        path,
+        Page(
+            title=title,
+            lines=[],
+            tables=[TableGroup([table])],
+            sections=sections,
+            samples=SampleStore(),
+        ),
+    )
 
 
 def _imported_page(flight: RecordedFlight) -> Page:
@@ -134,10 +143,10 @@ def _imported_page(flight: RecordedFlight) -> Page:
         f"by the map {source['map']}."
     )
     return Page(
-        f"Flight {flight.name}",
-        [Line(text)],
-        [TableGroup(flight_tables)],
-        [
+        title=f"Flight {flight.name}",
+        lines=[Line(text)],
+        tables=[TableGroup(flight_tables)],
+        sections=[
             Section(
                 "Output y",
                 "about trim",
@@ -152,9 +161,9 @@ def _imported_page(flight: RecordedFlight) -> Page:
                 over_time=False,
             ),
         ],
-        context.samples,
-        flight.summary["notes"],
-        replay(flight, context),
+        samples=context.samples,
+        notes=flight.summary["notes"],
+        replay=replay(flight, context),
     )
 
 
@@ -168,15 +177,15 @@ def _flight_page(flight: RecordedFlight, scenario: Scenario) -> Page:
     )
     description = filter(None, [_description(flight, scenario), command_results(flight.summary)])
     return Page(
-        f"Flight {flight.name}",
-        [_outcome_line(f"{'; '.join(description)}.", flight)],
-        [
+        title=f"Flight {flight.name}",
+        lines=[_outcome_line(f"{'; '.join(description)}.", flight)],
+        tables=[
             TableGroup([*flight_tables, *_margin_tables(loops)]),
         ],
-        [*_sections(flight, scenario, context), *_loop_sections(_drawn_loops(loops))],
-        context.samples,
-        flight.summary["notes"],
-        replay(flight, context),
+        sections=[*_sections(flight, scenario, context), *_loop_sections(_drawn_loops(loops))],
+        samples=context.samples,
+        notes=flight.summary["notes"],
+        replay=replay(flight, context),
     )
 
 
@@ -228,7 +237,13 @@ def _comparison_page(flights: Sequence[RecordedFlight]) -> Page:
                 "Ground track", "", guided_figures.tracks_figure(tracks, routes), over_time=False
             ),
         )
-    return Page(f"{len(flights)} flights compared", lines, groups, sections, context.samples)
+    return Page(
+        title=f"{len(flights)} flights compared",
+        lines=lines,
+        tables=groups,
+        sections=sections,
+        samples=context.samples,
+    )
 
 
 def _condition_group(flights: Sequence[RecordedFlight], labels: Sequence[str]) -> list[TableGroup]:

@@ -91,5 +91,13 @@ def errors_by_model(tape: Tape) -> list[ModelSpan]:
         in_span = (t >= span.start) & (t < stop) & engaged
         rms = {name: error_metrics(error[name][in_span]).rms for name in error.names}
         if in_span.any():
-            spans.append(ModelSpan(span.name, digests.index(span.digest), span.start, stop, rms))
+            spans.append(
+                ModelSpan(
+                    name=span.name,
+                    model=digests.index(span.digest),
+                    start=span.start,
+                    stop=stop,
+                    rms=rms,
+                )
+            )
     return spans

@@ -210,7 +210,11 @@ def _flight(recorded: RecordedRun, run: Path, outcome: Outcome | None) -> Record
         )
         summary = summarise_imported(recorded.tape, source)
         return RecordedFlight(
-            name, None, recorded.tape, summary, recorded.metadata.get(CHANNEL_UNITS, {})
+            name=name,
+            scenario=None,
+            tape=recorded.tape,
+            summary=summary,
+            si_units=recorded.metadata.get(CHANNEL_UNITS, {}),
         )
     scenario = _scenario_in(recorded, run)
     timed = {"latency": recorded.latency, "age_of_u": recorded.age_of_u}

@@ -379,15 +379,22 @@ def _topic(
     t = (signal.stamp_ns - tape.start_ns) / NANOSECONDS
     gaps = np.diff(t)
     longest = int(np.argmax(gaps)) if len(gaps) else None
+    repeated = int(np.count_nonzero(gaps == 0.0))
+    if recording.found and signal.sender is None:
+        repeated = recording.repeated
     return TopicAccount(
-        expected, count - early,
-        float(t[0]) if count else None, float(t[-1]) if count else None,
-        None if longest is None else float(gaps[longest]),
-        None if longest is None else float(t[longest]),
-        recording.repeated if recording.found and signal.sender is None
-        else int(np.count_nonzero(gaps == 0.0)),
-        recording.unset, seconds(recording.step_ns), recording.left_out, 0,
-    )  # fmt: skip
+        expected=expected,
+        found=count - early,
+        first=float(t[0]) if count else None,
+        last=float(t[-1]) if count else None,
+        gap=None if longest is None else float(gaps[longest]),
+        gap_at=None if longest is None else float(t[longest]),
+        repeated=repeated,
+        unset=recording.unset,
+        step=seconds(recording.step_ns),
+        left_out=recording.left_out,
+        unsent=0,
+    )
 
 
 def _latest(scenario: Scenario) -> dict[str, float]:

@@ -111,12 +111,21 @@ HELD_COLUMNS = (
 
 def _ms(group: str, topic: str, **heads: str) -> tuple[Column, ...]:
     """Times of a topic of the summary, by key with the heading."""
-    return tuple(Column(group, head, (topic, key), MILLISECONDS, 3) for key, head in heads.items())
+    return tuple(
+        Column(group=group, head=head, path=(topic, key), unit=MILLISECONDS, decimals=3)
+        for key, head in heads.items()
+    )
 
 
 TIMING_COLUMNS = (
-    Column("ticks", "", ("ticks", "ticks"), NO_UNIT, 0),
-    Column("periods without a new y", "", ("ticks", "without_new_y"), NO_UNIT, 0),
+    Column(group="ticks", head="", path=("ticks", "ticks"), unit=NO_UNIT, decimals=0),
+    Column(
+        group="periods without a new y",
+        head="",
+        path=("ticks", "without_new_y"),
+        unit=NO_UNIT,
+        decimals=0,
+    ),
     *_ms("period", "ticks", period_mean="mean", period_p99="p99", period_max="max"),
     *_ms("jitter", "ticks", jitter="rms"),
     *_ms("after the deadline", "ticks", late_p99="p99", late_max="max"),

@@ -85,7 +85,13 @@ def design_allocation(
         _alone(T, sides)
         for sides in ((effectors.upper, effectors.lower), (effectors.lower, effectors.upper))
     )
-    return config, LawInputs(law, -lower, upper, _alone(T, (effectors.rate, effectors.rate)), lag)
+    return config, LawInputs(
+        names=law,
+        lower=-lower,
+        upper=upper,
+        slew=_alone(T, (effectors.rate, effectors.rate)),
+        lag=lag,
+    )
 
 
 def _require_effectors(airframe: Airframe, effectors: Effectors) -> None:

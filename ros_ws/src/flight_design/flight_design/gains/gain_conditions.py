@@ -353,7 +353,10 @@ def check_loop(
     def add(name: str, values: FloatArray, bound: FloatArray, *, at_least: bool) -> None:
         pairs = enumerate(zip(values, bound, strict=True))
         finite = ((i, float(a), float(b)) for i, (a, b) in pairs if math.isfinite(b))
-        conditions.extend(Condition(name, i, a, b, at_least) for i, a, b in finite)
+        conditions.extend(
+            Condition(name=name, channel=i, value=a, bound=b, at_least=at_least)
+            for i, a, b in finite
+        )
 
     bandwidth = params.K * response
     most = np.full(len(total), MAX_CROSSOVER_LAG_PRODUCT)

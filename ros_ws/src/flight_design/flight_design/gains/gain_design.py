@@ -51,7 +51,7 @@ SLOWER = 1.8
 searched with 38 ms in q, the gains have the margins with 55 ms and miss the margins with 65 and 75
 ms. The gains of the rule have the margins from 75 ms on."""
 BY_RULE = "gains by a rule from the lags, a start"
-STABLE = Requirement(1e-3, 1.001, 1e3, 1e-3, 0.0)
+STABLE = Requirement(phase=1e-3, gain=1.001, sensitivity=1e3, damping=1e-3, worst_phase=0.0)
 """What gains from a file need: a stable loop."""
 DIAGONAL, FULL = MIXINGS = ("diagonal", "full")
 MESSAGES = 3.0  # of y: the age limit of the law, at least

@@ -277,13 +277,13 @@ def _paired(study: Study, setting: LoopSetting) -> _Paired:
     columns = [paired[i] for i in rows]
     responses = np.einsum("Nii->Ni", (study.C @ study.B)[:, rows][..., columns])
     return _Paired(
-        channels,
-        rows,
-        columns,
-        bandwidth[rows],
-        require_channels(Omega[np.ix_(rows, rows)], channels),
-        1.0 / np.abs(np.diag(Omega))[rows],
-        np.abs(responses).max(axis=0),
+        channels=channels,
+        rows=rows,
+        columns=columns,
+        bandwidth=bandwidth[rows],
+        D=require_channels(Omega[np.ix_(rows, rows)], channels),
+        unit=1.0 / np.abs(np.diag(Omega))[rows],
+        spread=np.abs(responses).max(axis=0),
     )
 
 
@@ -406,15 +406,15 @@ def loop_setting(scenario: Scenario, gamma_2: float = 0.0) -> LoopSetting:
     slew = dict(zip(controller.inputs, controller.slew or (), strict=bool(controller.slew)))
     limits = dict(zip(scenario.aircraft.channels().inputs, rates, strict=bool(rates)))
     return LoopSetting(
-        controller,
-        controller.rate,
-        dict(zip(controller.inputs, controller.lag, strict=True)),
-        controller.delay,
-        {
+        base=controller,
+        rate=controller.rate,
+        lag=dict(zip(controller.inputs, controller.lag, strict=True)),
+        delay=controller.delay,
+        rate_limit={
             name: min(slew.get(name, math.inf), limits.get(name, math.inf))
             for name in controller.inputs
         },
-        gamma_2,
+        gamma_2=gamma_2,
     )
 
 
@@ -442,7 +442,14 @@ def assess_gains(
     if isinstance(controller, RiseDiConfig):
         theorem, loop_conditions, bounds = _rise_di_conditions(study, controller, setting, D)
     if is_literal(controller):
-        return GainAssessment(controller, theorem, loop_conditions, bounds, None, study)
+        return GainAssessment(
+            controller=controller,
+            theorem=theorem,
+            loop=loop_conditions,
+            bounds=bounds,
+            margins=None,
+            study=study,
+        )
     loop = loop_with_box(study, controller)
     margins = loop_margins(loop)
     stable = (margins.stable + float(margins.nominal.stable)) / len(study.A)
@@ -460,7 +467,14 @@ def assess_gains(
             Condition("delay margin", None, margins.delay, least),
             *conditions(margins, needed),
         )
-    return GainAssessment(controller, theorem, loop_conditions, bounds, margins, study)
+    return GainAssessment(
+        controller=controller,
+        theorem=theorem,
+        loop=loop_conditions,
+        bounds=bounds,
+        margins=margins,
+        study=study,
+    )
 
 
 def _rise_di_conditions(

@@ -159,17 +159,17 @@ def study_airframe(
     u_dot = _ideal_rates(_ideal_plant(airframe, manoeuvre, A, B), _references(manoeuvre, airframe))
     undisturbed, slew = (np.max(np.abs(u_dot[:, column]), axis=0) for column in (-1, 0))
     return Study(
-        airframe,
-        A[:-1],
-        B[:-1],
-        airframe.matrix_c(),
-        airframe.matrix_gravity(),
-        u_dot[:, :-1],
-        slew,
-        undisturbed,
-        stable,
-        uncertainty,
-        effected,
+        airframe=airframe,
+        A=A[:-1],
+        B=B[:-1],
+        C=airframe.matrix_c(),
+        gravity=airframe.matrix_gravity(),
+        u_dot=u_dot[:, :-1],
+        slew=slew,
+        slew_undisturbed=undisturbed,
+        stable=stable,
+        uncertainty=uncertainty,
+        effected=effected,
     )
 
 
@@ -216,7 +216,9 @@ def _ideal_plant(
     project = np.asarray(H.T @ (np.eye(len(P)) - B @ inverse @ C), dtype=np.float64)
     follow = np.asarray(H.T @ B @ inverse)
     aircraft = _columns(airframe, manoeuvre.gusts, len(A))
-    return _IdealPlant(A, B, C, inverse, project, follow, aircraft, P, N)
+    return _IdealPlant(
+        A=A, B=B, C=C, inverse=inverse, project=project, follow=follow, aircraft=aircraft, P=P, N=N
+    )
 
 
 def _ideal_rates(
@@ -288,11 +290,11 @@ def _columns(airframe: Airframe, gusts: Mapping[str, Gust], columns: int) -> Air
     start, speed, length = np.split(profiles, 3, axis=1)
     directions = [airframe.gust_direction(name) for name in gusts]
     return Aircraft(
-        airframe.matrix_a(),
-        airframe.matrix_b(),
-        airframe.matrix_c(),
-        airframe.matrix_gravity(),
-        np.reshape(directions, (len(gusts), len(airframe.states))).T,
-        Gusts(start, speed * gust_on, length),
-        np.array(airframe.speed),
+        A=airframe.matrix_a(),
+        B=airframe.matrix_b(),
+        C=airframe.matrix_c(),
+        gravity=airframe.matrix_gravity(),
+        gust_direction=np.reshape(directions, (len(gusts), len(airframe.states))).T,
+        gusts=Gusts(start, speed * gust_on, length),
+        speed=np.array(airframe.speed),
     )

@@ -92,7 +92,9 @@ def from_tape(scenario: Scenario, tape: Tape) -> tuple[KnownPlant, FlightSamples
     internals = tape["internals"]
     y_m = np.column_stack([tape["y_m"][name][ticks["y_m"]] for name in controller.outputs])
     x, f = (truth.group(name).values[ticks["truth"]] for name in ("x", "f"))
-    return plant, FlightSamples(tape.time("internals"), x, f, y_m, internals.group("Pi").values)
+    return plant, FlightSamples(
+        t=tape.time("internals"), x=x, f=f, y_m=y_m, Pi=internals.group("Pi").values
+    )
 
 
 def fly(
@@ -120,7 +122,7 @@ def fly(
         xs.append(x)
         Pis.append(state.Pi)
     f = [plant.f(float(time), x) for time, x in zip(t, xs, strict=True)]
-    return FlightSamples(t, np.array(xs), np.array(f), y_m, np.array(Pis))
+    return FlightSamples(t=t, x=np.array(xs), f=np.array(f), y_m=y_m, Pi=np.array(Pis))
 
 
 def evidence(
@@ -155,7 +157,7 @@ def evidence(
     V1 = (np.sum(e * e, axis=1) + np.sum(r * (r @ M.T), axis=1)) / 2.0
     L = np.sum(r * (N_d - derivative(flight.Pi) @ (D[:, None] * U * D).T), axis=1)
     P = zeta_b - integral(L, t)
-    return Evidence(t, e, e_dot, r, N_d, L, V1, P, V1 + P)
+    return Evidence(t=t, e=e, e_dot=e_dot, r=r, N_d=N_d, L=L, V1=V1, P=P, V2=V1 + P)
 
 
 def decay_matrix(plant: KnownPlant, params: LawParams) -> FloatArray:

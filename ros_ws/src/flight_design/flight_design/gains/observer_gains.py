@@ -53,9 +53,17 @@ def gains_by_rule(model: NominalModel, axes: tuple[str, ...], speed: float) -> O
     length = spectrum.length[places]
     sigma = spectrum.sigma[places]
     gust = 0.12 * sigma * np.sqrt(2.0 * speed / length)
-    weights = Weights(0.38 * T, 0.4 * 0.035 / T, gust, 17.0 * length / speed, np.array([0.0036]))
+    weights = Weights(
+        effort=0.38 * T,
+        drift=0.4 * 0.035 / T,
+        gust=gust,
+        wind_time=17.0 * length / speed,
+        loose=np.array([0.0036]),
+    )
     K = 0.026 / T
-    return ObserverGains(K, K / 4.0, K / T, np.full(len(T), 3.0), weights)
+    return ObserverGains(
+        K=K, Lambda=K / 4.0, beta=K / T, softening=np.full(len(T), 3.0), weights=weights
+    )
 
 
 BESIDE_SKETCH = {"effort": (0.25, 4.0), "K": (16.0, 1.0)}
@@ -112,6 +120,16 @@ def gains_of_search(gains: Mapping[str, list[float]], T: FloatArray) -> Observer
     Lambda = values["Lambda"]
     if "beta" in values:
         return ObserverGains(
-            K, Lambda, values["beta"], np.broadcast_to(values["softening"], K.shape), weights
+            K=K,
+            Lambda=Lambda,
+            beta=values["beta"],
+            softening=np.broadcast_to(values["softening"], K.shape),
+            weights=weights,
         )
-    return ObserverGains(K, SHARE * Lambda, K / T, 1.0 / ((1.0 - SHARE) * Lambda * T), weights)
+    return ObserverGains(
+        K=K,
+        Lambda=SHARE * Lambda,
+        beta=K / T,
+        softening=1.0 / ((1.0 - SHARE) * Lambda * T),
+        weights=weights,
+    )

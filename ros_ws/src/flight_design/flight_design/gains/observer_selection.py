@@ -264,7 +264,13 @@ class _AircraftDesigns(NamedTuple):
         assert feedforward is not None  # noqa: S101 - it was added
         plant = LinearPlant(model.A + model.gravity, model.B, model.C)
         scale = np.array([1.0 if name == "V" else ratio**-2.0 for name in outputs])
-        return AtSpeed(ratio, plant, feedforward, scale, self.observer(model, gains))
+        return AtSpeed(
+            ratio=ratio,
+            plant=plant,
+            feedforward=feedforward,
+            scale=scale,
+            design=self.observer(model, gains),
+        )
 
 
 def _require_no_vanes(vanes: Mapping[str, float], outputs: Sequence[str]) -> None:
@@ -330,9 +336,21 @@ def with_extended_state_observer(
     weights = extended_state_weights(controller.outputs, model.total_lag)
     # y_dot by a unit of scaled input: the gains are those for a unit response
     response = np.abs(np.diag(Omega)) * law.input_scale
-    unused = Weights(weights.effort, weights.drift, np.zeros(0), np.zeros(0), np.zeros(1))
+    unused = Weights(
+        effort=weights.effort,
+        drift=weights.drift,
+        gust=np.zeros(0),
+        wind_time=np.zeros(0),
+        loose=np.zeros(1),
+    )
     softening = np.broadcast_to(controller.softening, (m,))
-    gains = ObserverGains(law.K * response, law.Lambda, law.beta * response, softening, unused)
+    gains = ObserverGains(
+        K=law.K * response,
+        Lambda=law.Lambda,
+        beta=law.beta * response,
+        softening=softening,
+        weights=unused,
+    )
 
     def design(slower: FloatArray) -> ObserverDesign:
         drift = weights.drift / slower

@@ -176,7 +176,8 @@ def nominal_conditions(nominal: Margins, needed: Requirement) -> tuple[Condition
     by_input: list[Condition] = []
     for name, values, bound, at_least in rows:
         by_input += [
-            Condition(name, i, float(value), bound, at_least) for i, value in enumerate(values)
+            Condition(name=name, channel=i, value=float(value), bound=bound, at_least=at_least)
+            for i, value in enumerate(values)
         ]
     return (*by_input, Condition(NAMES[3], None, float(nominal.damping), needed.damping))
 

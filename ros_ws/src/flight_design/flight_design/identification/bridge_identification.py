@@ -314,7 +314,16 @@ def join(
         )
     if refused:
         raise ParameterError("; ".join(refused))
-    return Channels(Omega, deviation, lag, delay, damping, stiffness, zero, misfit)
+    return Channels(
+        Omega=Omega,
+        Omega_deviation=deviation,
+        lag=lag,
+        delay=delay,
+        damping=damping,
+        stiffness=stiffness,
+        zero=zero,
+        misfit=misfit,
+    )
 
 
 def over_link(channels: Channels, link_delay: float) -> Channels:
@@ -467,7 +476,16 @@ def airframe_yaml(
 def signs_alone(sign: FloatArray) -> Channels:
     """Channels with a known sign alone."""
     none = 0.0 * sign
-    return Channels(np.diag(sign), none + np.nan, none, none, none, none, none, none + np.nan)
+    return Channels(
+        Omega=np.diag(sign),
+        Omega_deviation=none + np.nan,
+        lag=none,
+        delay=none,
+        damping=none,
+        stiffness=none,
+        zero=none,
+        misfit=none + np.nan,
+    )
 
 
 def bridge_sections(

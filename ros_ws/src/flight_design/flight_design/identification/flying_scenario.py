@@ -111,7 +111,13 @@ def flying_scenario(
     text = scenario_text(heading, bridge_sections(airframe_file, commands, flown))
     lacking = "" if margins is None else unmet(margins, needed, flown.outputs)
     delay = None if margins is None else margins.delay
-    return Flyable(flown, delay, lacking, identified.airframe_text(source), text)
+    return Flyable(
+        controller=flown,
+        delay_margin=delay,
+        lacking=lacking,
+        airframe=identified.airframe_text(source),
+        scenario=text,
+    )
 
 
 class _Identified(NamedTuple):
@@ -188,11 +194,11 @@ class _Identified(NamedTuple):
         base = RiseDiConfig.validate_mapping(channels | unit_gains(lag, loop.delay), "controller")
         lags = dict(zip(self.pairing.inputs, lag, strict=True))
         return LoopSetting(
-            base,
-            RATE,
-            lags,
-            loop.delay,
-            {},
+            base=base,
+            rate=RATE,
+            lag=lags,
+            delay=loop.delay,
+            rate_limit={},
             crossover_lag_products=self.products,
             requirement=needed,
         )

@@ -426,7 +426,13 @@ def filter_bank(
         each, names._replace(states=names.states + air.states, winds=()), np.zeros(0)
     )
     loose = air.noises(strength, levels)
-    weights = Weights(np.ones(m), np.full(m, drift), np.zeros(0), np.zeros(0), loose)
+    weights = Weights(
+        effort=np.ones(m),
+        drift=np.full(m, drift),
+        gust=np.zeros(0),
+        wind_time=np.zeros(0),
+        loose=loose,
+    )
     L = observer_design.aircraft_correction(
         sampled, each, weights, corrections_near if near else correction_of
     )
@@ -434,7 +440,13 @@ def filter_bank(
     covariance = np.linalg.solve(
         np.eye(m) - sampled.H @ L, np.broadcast_to(np.diag(model.noise**2), (*L.shape[:2], m, m))
     )
-    return FilterBank(sampled, L, np.asarray(covariance), each.gravity, model.period)
+    return FilterBank(
+        sampled=sampled,
+        L=L,
+        covariance=np.asarray(covariance),
+        gravity=each.gravity,
+        period=model.period,
+    )
 
 
 OF_INPUTS = ("input_scale", "D", "lag", "total_lag", "lower", "upper")  # vectors of a model

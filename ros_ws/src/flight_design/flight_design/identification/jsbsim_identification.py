@@ -181,7 +181,13 @@ def identify(
     Raises FlightEnded if the aircraft does not trim or does not respond, ParameterError if its
     outputs and inputs cannot be paired, or if the speed is below guidance's speed floor.
     """
-    condition = FlightCondition(require_aircraft(name), speed, altitude, nanoseconds(STEP), named)
+    condition = FlightCondition(
+        name=require_aircraft(name),
+        speed=speed,
+        altitude=altitude,
+        step_ns=nanoseconds(STEP),
+        named=named,
+    )
     linear = _linear(condition, progress)
     condition = linear.condition
     stall = slowest_trim(condition) if guided else None
@@ -420,11 +426,11 @@ def _setting(linear: Linearization, V_bandwidth: float) -> LoopSetting:
         "V": V_bandwidth * float(total[inputs.index("throttle")]),
     }
     return LoopSetting(
-        base,
-        CONTROL_RATE,
-        dict(zip(inputs, linear.lag.tolist(), strict=True)),
-        DELAY,
-        {},
+        base=base,
+        rate=CONTROL_RATE,
+        lag=dict(zip(inputs, linear.lag.tolist(), strict=True)),
+        delay=DELAY,
+        rate_limit={},
         crossover_lag_products=products,
     )
 

@@ -418,13 +418,13 @@ class Likelihood:
             values = self._model.A if matrix == "A" else self._model.B
             places += [
                 Entry(
-                    matrix,
-                    self.names.states[i],
-                    columns[j],
-                    float(values[i, j]),
-                    0.0,
-                    0.0,
-                    float(unit[i, j]),
+                    matrix=matrix,
+                    row=self.names.states[i],
+                    column=columns[j],
+                    nominal=float(values[i, j]),
+                    error=0.0,
+                    deviation=0.0,
+                    unit=float(unit[i, j]),
                 )
                 for i, j in np.argwhere(unit)
             ]

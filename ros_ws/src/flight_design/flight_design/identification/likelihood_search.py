@@ -122,7 +122,14 @@ class Search(Likelihood):
 
         after = self.predicted(theta, best.levels)
         by_flown = None if flown is None else beside(flown)
-        return Fit(theta, deviation, beside(0.0), after, best.levels, by_flown)
+        return Fit(
+            theta=theta,
+            deviation=deviation,
+            before=beside(0.0),
+            after=after,
+            levels=best.levels,
+            flown=by_flown,
+        )
 
     def _ends(self, flown: FloatArray | None, used: NDArray[np.bool_]) -> list[End]:
         """The ends of the search from the best starts."""

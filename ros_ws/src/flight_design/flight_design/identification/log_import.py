@@ -296,7 +296,7 @@ def _commands(
         f"no {source.message}.{source.field} in the log",
         expected,
     )
-    return _Reader(log, source, row.line, stick, servo)
+    return _Reader(log=log, source=source, line=row.line, stick=stick, servo=servo)
 
 
 def _torque(log: VehicleLog, name: str, row: InputRow, servos: bool) -> _Reader:

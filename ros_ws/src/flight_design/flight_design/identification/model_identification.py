@@ -126,7 +126,13 @@ class _Study(NamedTuple):
     def search(self, model: NominalModel, block: Block, *, coupled: bool = False) -> Search:
         """The search of a block."""
         search = Search(
-            self.recorded, model, block, self.airframe, self.delay, self.unknown, coupled=coupled
+            recorded=self.recorded,
+            model=model,
+            block=block,
+            airframe=self.airframe,
+            delay=self.delay,
+            unknown=self.unknown,
+            coupled=coupled,
         )
         search.progress = self.step
         return search
@@ -135,30 +141,29 @@ class _Study(NamedTuple):
         """The model of a block, with the reason why the model must not be used."""
         outputs = search.names.outputs
         entries = search.entries(fit)
-        predictions = (
-            prediction(fit.before, self.validating),
-            prediction(fit.after, self.validating),
-        )
+        before = prediction(fit.before, self.validating)
+        after = prediction(fit.after, self.validating)
         sentences = (
             another_airframe(entries, self.airframe.name, self.at_bound, self.unknown.factor),
             search.strange_air(fit),
             too_little_excitation(entries, outputs),
             other_signs(self.airframe, with_entries(self.airframe, entries), self.channels),
-            no_better(*predictions),
+            no_better(before, after),
         )
         refusal = next(filter(None, sentences), "")
         delays, deviations = search.delays(fit)
         gusts = bool(np.mean(LEVELS[fit.levels, 1] > 0.0) >= FEW)
         return Part(
-            search.names.inputs,
-            outputs,
-            tuple(entries),
-            *predictions,
-            refusal,
-            tuple((delays + 2.0 * deviations).tolist()),
-            gusts,
-            tuple(delays.tolist()),
-            0.0 if fit.flown is None else self.advantage(fit.flown, fit.before),
+            inputs=search.names.inputs,
+            outputs=outputs,
+            entries=tuple(entries),
+            before=before,
+            after=after,
+            refusal=refusal,
+            latest=tuple((delays + 2.0 * deviations).tolist()),
+            gusts=gusts,
+            delays=tuple(delays.tolist()),
+            advantage=0.0 if fit.flown is None else self.advantage(fit.flown, fit.before),
         )
 
     def fit(
@@ -226,7 +231,15 @@ def identify(
         progress(completed=next(step_count), total=total)
 
     study = _Study(
-        recorded, blown, actuation.delay, unknown, validating, later, paired, at_bound, step
+        recorded=recorded,
+        airframe=blown,
+        delay=actuation.delay,
+        unknown=unknown,
+        validating=validating,
+        later=later,
+        channels=paired,
+        at_bound=at_bound,
+        step=step,
     )
     searches = [study.search(model, block) for block in every]
     fitted = [study.fit(search, used, flown, quick=quick) for search in searches]
@@ -250,10 +263,15 @@ def identify(
             parts = [part]
             first = fit.before
             last = fit.after
-    identified = with_entries(airframe, chain.from_iterable(part.entries for part in parts))
-    predictions = (prediction(first, validating), prediction(last, validating))
-    both = (first.r, last.r)
-    return Identification(identified, recorded, validating, both, *predictions, tuple(parts))
+    return Identification(
+        airframe=with_entries(airframe, chain.from_iterable(part.entries for part in parts)),
+        recorded=recorded,
+        held_out=validating,
+        innovations=(first.r, last.r),
+        before=prediction(first, validating),
+        after=prediction(last, validating),
+        parts=tuple(parts),
+    )
 
 
 def _follows(

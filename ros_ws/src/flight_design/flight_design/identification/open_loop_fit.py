@@ -239,4 +239,13 @@ def _model(fit: Any, misfit: float, period: float) -> ChannelModel:
     delay, lag, Omega, damping, stiffness, slow = np.concatenate(
         [fit.x, np.zeros(6 - len(fit.x))]
     ).tolist()
-    return ChannelModel(delay, lag, Omega, damping, stiffness, slow, covariance, misfit)
+    return ChannelModel(
+        delay=delay,
+        lag=lag,
+        Omega=Omega,
+        damping=damping,
+        stiffness=stiffness,
+        slow=slow,
+        covariance=covariance,
+        misfit=misfit,
+    )

@@ -114,7 +114,11 @@ def stick_of(channel_map: ChannelMap, name: str) -> Stick:
     require(responds in AXES, f"inputs.{name}.positive", f"{row.positive!r}", motions)
     channel = int(match[1]) + 1 if match[1] else int(match[2])
     return Stick(
-        AXES[responds], channel, SAME_LINE if trim is None else trim.line, row.range, raw_sign
+        axis=AXES[responds],
+        channel=channel,
+        trim_line=SAME_LINE if trim is None else trim.line,
+        raw_range=row.range,
+        raw_sign=raw_sign,
     )
 
 
@@ -167,7 +171,13 @@ def servo_of(stick: Stick, name: str, values: Mapping[str, float]) -> Servo:
         ascending, f"SERVO{outputs[0]}_MIN, TRIM, MAX", ends, f"ascending values, {sticks_instead}"
     )
     require(is_reversed in {0.0, 1.0}, f"SERVO{outputs[0]}_REVERSED", f"{is_reversed:g}", "0 or 1")
-    return Servo(outputs[0], low, trim[0] if trim else low, high, is_reversed == 1.0)
+    return Servo(
+        output=outputs[0],
+        low=low,
+        trim=trim[0] if trim else low,
+        high=high,
+        is_reversed=is_reversed == 1.0,
+    )
 
 
 class Agreement(NamedTuple):
@@ -194,7 +204,15 @@ def compared(
         for name, (value, tolerance) in stick.parameters().items():
             differs = name in known and not abs(known[name] - value) <= tolerance
             logged = f"{known[name]:g}" if name in known else ""
-            rows.append(Agreement(name, logged, f"{value:g}", differs, name in values))
+            rows.append(
+                Agreement(
+                    what=name,
+                    logged=logged,
+                    mapped=f"{value:g}",
+                    differs=differs,
+                    is_known=name in values,
+                )
+            )
     return rows
 
 

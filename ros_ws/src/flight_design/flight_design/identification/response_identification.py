@@ -412,18 +412,18 @@ def _responses(
     counts = (share >= MIN_SHARE) & ~((share < 1.0) & (delay < LEAST_DELAY))
     counted = np.where(share < 1.0, counts / CLOSED_LOOP_ERRORS, counts)
     return Response(
-        outputs,
-        inputs,
-        np.stack([column.Omega for column in columns], axis=1),
-        np.stack([column.deviation for column in columns], axis=1),
-        lag,
-        lag_deviation,
-        delay,
-        delay_deviation,
-        tuple(refusal),
-        sum(len(part.y) for part in rows) * layout.period,
-        share,
-        sign_ratio * counted,
+        outputs=outputs,
+        inputs=inputs,
+        Omega=np.stack([column.Omega for column in columns], axis=1),
+        Omega_deviation=np.stack([column.deviation for column in columns], axis=1),
+        lag=lag,
+        lag_deviation=lag_deviation,
+        delay=delay,
+        delay_deviation=delay_deviation,
+        refusal=tuple(refusal),
+        seconds=sum(len(part.y) for part in rows) * layout.period,
+        share=share,
+        sign_ratio=sign_ratio * counted,
     )
 
 

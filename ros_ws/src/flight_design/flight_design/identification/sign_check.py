@@ -195,7 +195,15 @@ def check(
         effect = None if measured is None else float(measured.Omega[i, i])
         ratio = None if measured is None else float(measured.sign_ratio[i])
         channels.append(
-            Channel(output, name, float(mapped[i, i]), D_mapped[i], D[i], effect, ratio)
+            Channel(
+                output=output,
+                input=name,
+                effect=float(mapped[i, i]),
+                D=D_mapped[i],
+                D_controller=D[i],
+                measured=effect,
+                ratio=ratio,
+            )
         )
         if D_mapped[i] != D[i]:
             sentences.append(
@@ -246,7 +254,15 @@ def check_effectors(
         actual = int(np.sign(mapped[i, j]))
         expected = int(np.sign(effect[i, j]))
         channels.append(
-            Channel(outputs[i], name, float(mapped[i, j]), actual, expected, None, None)
+            Channel(
+                output=outputs[i],
+                input=name,
+                effect=float(mapped[i, j]),
+                D=actual,
+                D_controller=expected,
+                measured=None,
+                ratio=None,
+            )
         )
         if actual != expected:
             sentences.append(

@@ -48,7 +48,13 @@ class Column(NamedTuple):
 def no_column(m: int) -> Column:
     """A column of NaN, for an input without a result."""
     return Column(
-        np.full(m, np.nan), np.full(m, np.nan), math.nan, math.nan, math.nan, math.nan, 0.0
+        Omega=np.full(m, np.nan),
+        deviation=np.full(m, np.nan),
+        lag=math.nan,
+        lag_deviation=math.nan,
+        delay=math.nan,
+        delay_deviation=math.nan,
+        sign_ratio=0.0,
     )
 
 
@@ -110,7 +116,15 @@ def fitted_column(t: FloatArray, responses: FloatArray, j: int) -> Column:
         error[i] = np.linalg.norm(solve[0])
     Omega[j] = best.theta[2] * size
     error[j] = deviation[2] * size
-    return Column(Omega, error, lag, float(deviation[1]), delay, float(deviation[0]), sign)
+    return Column(
+        Omega=Omega,
+        deviation=error,
+        lag=lag,
+        lag_deviation=float(deviation[1]),
+        delay=delay,
+        delay_deviation=float(deviation[0]),
+        sign_ratio=sign,
+    )
 
 
 def begins_with_Omega(t: FloatArray, theta: FloatArray) -> bool:  # noqa: N802 - the symbol

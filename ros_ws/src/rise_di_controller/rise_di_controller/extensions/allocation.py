@@ -48,7 +48,13 @@ def allocation(
 ) -> Allocation:
     """The parameters with `exchange`."""
     columns = [product(T, column) for column in effect.T]
-    return Allocation(T, effect, np.eye(len(T)) - np.column_stack(columns), tuple(order), limits)
+    return Allocation(
+        T=T,
+        effect=effect,
+        exchange=np.eye(len(T)) - np.column_stack(columns),
+        order=tuple(order),
+        limits=limits,
+    )
 
 
 def allocate(

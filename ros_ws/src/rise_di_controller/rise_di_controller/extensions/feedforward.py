@@ -56,17 +56,17 @@ def nominal_model(
     path = np.eye(len(A)) - product(product(B, inverse), C)
     angles = tuple(np.flatnonzero(gravity.any(axis=0)).tolist())
     return Nominal(
-        A,
-        B,
-        C,
-        gravity,
-        inverse,
-        path,
-        product(path, A),
-        product(path, gravity),
-        lead,
-        angles,
-        acts,
+        A=A,
+        B=B,
+        C=C,
+        gravity=gravity,
+        inverse=inverse,
+        path=path,
+        path_A=product(path, A),
+        path_gravity=product(path, gravity),
+        lead=lead,
+        sine_states=angles,
+        acts=acts,
     )
 
 
@@ -85,7 +85,7 @@ def initial_state(y_m: Array, nominal: Nominal) -> FeedforwardState:
     xp = array_namespace(y_m)
     zeros = xp.zeros_like(y_m)
     zero = xp.zeros_like(y_m[0])
-    return FeedforwardState(product(nominal.C.T, y_m), zeros, zero, zero, zeros)
+    return FeedforwardState(x=product(nominal.C.T, y_m), u=zeros, dt=zero, ticks=zero, u_0=zeros)
 
 
 def continued(
@@ -171,7 +171,9 @@ def step(
     u = ideal((x + state.x) / 2.0, y_m_dot, nominal)
     u_ff = u + (dt + 2.0 * nominal.lead) * (u - state.u) / (dt + state.dt)
     u_0 = xp.where(state.ticks < 2.0, u_ff, state.u_0)
-    return FeedforwardState(x, u, dt, state.ticks + 1.0, u_0), acting(u_ff - u_0, nominal)
+    return FeedforwardState(x=x, u=u, dt=dt, ticks=state.ticks + 1.0, u_0=u_0), acting(
+        u_ff - u_0, nominal
+    )
 
 
 def acting(u: Array, nominal: Nominal) -> Array:

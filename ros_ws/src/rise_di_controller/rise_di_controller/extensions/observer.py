@@ -278,11 +278,11 @@ def with_observer(law: ControlLaw, *, vanes: bool = False) -> ControlLaw:
         return predicted(state, law_state, measured.u_before, measured, params)
 
     return ControlLaw(
-        VaneObserverState if vanes else ObserverState,
-        engage,
-        step,
-        limited,
-        retune,
-        missed,
+        state=VaneObserverState if vanes else ObserverState,
+        engage=engage,
+        step=step,
+        limited=limited,
+        retune=retune,
+        missed=missed,
         inner=law,
     )

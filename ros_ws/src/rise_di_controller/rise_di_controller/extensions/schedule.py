@@ -247,4 +247,12 @@ def with_schedule(law: ControlLaw) -> ControlLaw:
     ) -> ScheduleState:
         return state._replace(law=law.missed(state.law, measured, law_at(params, state.scale)))
 
-    return ControlLaw(ScheduleState, engage, step, limited, retune, missed, inner=law)
+    return ControlLaw(
+        state=ScheduleState,
+        engage=engage,
+        step=step,
+        limited=limited,
+        retune=retune,
+        missed=missed,
+        inner=law,
+    )

@@ -288,7 +288,7 @@ def _control_law(sign: Sign) -> ControlLaw:
         u_before = measured.u_before
         return step_with_anti_windup(state, y, y_m, dt, u_trim, u_before, with_sign(params), limits)
 
-    return ControlLaw(LawState, start, tick, limited, retune)
+    return ControlLaw(state=LawState, engage=start, step=tick, limited=limited, retune=retune)
 
 
 CONTROL_LAWS = {sign: _control_law(sign) for sign in Sign}

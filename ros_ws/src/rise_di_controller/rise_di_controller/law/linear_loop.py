@@ -93,7 +93,9 @@ def linear_law(law: TunedLaw, m: int, period: float, candidates: int | None = No
         params = params._replace(
             vanes=vanes._replace(least=np.where(np.isinf(vanes.least), np.inf, -1.0))
         )
-    still = Measurements(zero, zero, zero, zero, zero, vane=none, vane_m=none)
+    still = Measurements(
+        y=zero, y_m=zero, y_m_dot=zero, u_trim=zero, u_before=zero, vane=none, vane_m=none
+    )
     at_engagement = fields(control_law.engage(still, params))
     at_rest = {
         name: np.broadcast_to(value, (len(value), *sets)) for name, value in at_engagement.items()
