@@ -34,7 +34,7 @@ from flight_design.gains.observer_selection import model_for, with_aircraft_obse
 from rise_di_controller import laws
 from rise_di_controller.controller import Controller
 from rise_di_controller.extensions.observer import ObserverParams, ObserverState
-from rise_di_controller.guard import guard
+from rise_di_controller.guard import guard, retuning
 from rise_di_controller.guard.guard import ControllerState, GuardParams
 from rise_di_controller.law.control_law import Measurements, TunedLaw, field_names, fields, restored
 from rise_di_controller.law.law import gain
@@ -139,7 +139,9 @@ def random_flight(law: TunedLaw, size: float, ticks: int = 20) -> tuple[Any, Mea
     state = law.control_law.engage(measured, law.params)
     for _ in range(ticks):
         y, y_m, y_m_dot, u_trim = size * generator.standard_normal((4, 4))
-        measured = Measurements(y, y_m, y_m_dot, u_trim, measured.u_before)
+        measured = Measurements(
+            y=y, y_m=y_m, y_m_dot=y_m_dot, u_trim=u_trim, u_before=measured.u_before
+        )
         state, u = law.control_law.step(state, measured, np.float64(DT), law.params)
         measured = measured._replace(u_before=u)
     return state, measured
@@ -474,17 +476,29 @@ def test_observer_is_kalman_filter_with_linear_feedback() -> None:
     )
     H = np.eye(m, s)
     params = ObserverParams(
-        lqg.LqgParams(), Phi, Gamma, H, L, F, Limits(-wide, wide, wide), np.float64(2.0)
+        law=lqg.LqgParams(),
+        Phi=Phi,
+        Gamma=Gamma,
+        H=H,
+        L=L,
+        F=F,
+        limits=Limits(-wide, wide, wide),
+        fade_rate=np.float64(2.0),
     )
     law = controller("lqg, observer").tuned_law().control_law
     zero = np.zeros(m)
     e = generator.standard_normal((60, m))
-    state = law.engage(Measurements(e[0], zero, zero, zero, zero), params)
+    state = law.engage(
+        Measurements(y=e[0], y_m=zero, y_m_dot=zero, u_trim=zero, u_before=zero), params
+    )
     x = np.concatenate([e[0], np.zeros(s - m)])  # the outputs are the first states
     u = zero
     for k, error in enumerate(e):
         state, commanded = law.step(
-            state, Measurements(error, zero, zero, zero, u), np.float64(DT), params
+            state,
+            Measurements(y=error, y_m=zero, y_m_dot=zero, u_trim=zero, u_before=u),
+            np.float64(DT),
+            params,
         )
         x = x + L @ (error - H @ x)  # measurement update
         u = -min(1.0, (k + 1) * DT * 2.0) * (F @ x)
@@ -521,7 +535,7 @@ def test_observer_with_other_matrices_restarts_without_jump(name: str) -> None:
         state = tick(parameters, state, 10 * k, e)
     weaker = [0.9 * gain for gain in sections()[name]["observer"]["F"]]
     new = controller(name, observer=sections()[name]["observer"] | {"F": weaker})
-    after = guard.retune(state, parameters.tuned_law(), new.tuned_law())
+    after = retuning.retune(state, parameters.tuned_law(), new.tuned_law())
     assert state.law.u_o.any()
     assert_allclose(after.u_trim, state.u_trim + state.law.u_o, rtol=1e-12)
     assert after.law.z.tolist() == (matrices(new).H.T @ e).tolist()

@@ -22,7 +22,7 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_core.modes import Mode
 from flight_core.rates import seconds
 from flight_core.vectors import FloatArray, StampedVector
-from rise_di_controller.guard import guard
+from rise_di_controller.guard import guard, retuning
 from rise_di_controller.guard.guard import ControllerState
 from rise_di_controller.law.law import LawParams, control, retune
 from rise_di_controller.params import ControllerConfig
@@ -87,7 +87,7 @@ def fly(
 ) -> list[Tick]:
     """Simulate the scenario, or the reference y_m from the state x_0. Without latching e_0 is 0.
 
-    New parameters are taken between two ticks by `guard.retune`, as in the node.
+    New parameters are taken between two ticks by `retuning.retune`, as in the node.
     """
     hardware = SERVO.aircraft.plant()
     aircraft = plant.initial_state(hardware)
@@ -110,14 +110,23 @@ def fly(
         before = state
         law = now.parameters.tuned_law()
         if now.parameters != conditions(max(k - 1, 0)).parameters:
-            state = guard.retune(state, old, law)
+            state = retuning.retune(state, old, law)
         state, inputs = guard.tick(
             state, now_ns, y, samples, now.parameters.guard(), law, now.active
         )
         if k == 0 and not latched and state.law is not None:
             state = state._replace(law=state.law._replace(e_0=np.zeros(4)))
         dt = inputs.dt if inputs is not None else 0.0
-        records.append(Tick(before, state, old.params, law.params, dt, measured - reference))
+        records.append(
+            Tick(
+                before=before,
+                after=state,
+                old=old.params,
+                new=law.params,
+                dt=dt,
+                error=measured - reference,
+            )
+        )
         old = law
     return records
 

@@ -15,7 +15,8 @@ from rise_di_controller.extensions.observer import (
     estimates_after,
     with_observer,
 )
-from rise_di_controller.guard.guard import initial_state, retune
+from rise_di_controller.guard.guard import initial_state
+from rise_di_controller.guard.retuning import retune
 from rise_di_controller.law.control_law import ControlLaw, Measurements, TunedLaw
 from rise_di_controller.law.saturation import Limits
 
@@ -39,13 +40,26 @@ def params(bound: float = np.inf, rate: float = np.inf) -> ObserverParams:
     """Phi = 0.5, Gamma = 2, H = 1, L = 0.25, F = 3, full after 0.5 s."""
     Phi, Gamma, H, L, F = (np.array([[value]]) for value in (0.5, 2.0, 1.0, 0.25, 3.0))
     return ObserverParams(
-        (), Phi, Gamma, H, L, F, Limits(vector(-bound), vector(bound), vector(rate)), np.array(2.0)
+        law=(),
+        Phi=Phi,
+        Gamma=Gamma,
+        H=H,
+        L=L,
+        F=F,
+        limits=Limits(vector(-bound), vector(bound), vector(rate)),
+        fade_rate=np.array(2.0),
     )
 
 
 def measured(e: float, u_before: float = TRIM) -> Measurements:
     y_m = 7.0  # the observer takes the difference alone
-    return Measurements(vector(e + y_m), vector(y_m), vector(0.0), vector(TRIM), vector(u_before))
+    return Measurements(
+        y=vector(e + y_m),
+        y_m=vector(y_m),
+        y_m_dot=vector(0.0),
+        u_trim=vector(TRIM),
+        u_before=vector(u_before),
+    )
 
 
 def respond(errors: list[float], observer: ObserverParams) -> list[float]:

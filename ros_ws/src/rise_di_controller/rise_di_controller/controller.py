@@ -18,7 +18,7 @@ from flight_core.parameters import require
 from flight_core.rates import seconds
 from flight_core.vectors import FloatArray, StampedVector, require_newer, require_not_future
 from rise_di_controller import internals
-from rise_di_controller.guard import guard, samples
+from rise_di_controller.guard import guard, retuning, samples
 from rise_di_controller.guard.probe import EffectTest
 from rise_di_controller.law.control_law import TunedLaw
 from rise_di_controller.learning import divergence
@@ -63,11 +63,11 @@ def preparing(parameters: ControllerConfig) -> Generator[None, None, Prepared]:
     limits = parameters.guard()
     yield
     return Prepared(
-        parameters,
-        law,
-        limits,
-        parameters.digest(),
-        internals.names(parameters.logged_groups(law.control_law)),
+        parameters=parameters,
+        law=law,
+        guard=limits,
+        digest=parameters.digest(),
+        names=internals.names(parameters.logged_groups(law.control_law)),
     )
 
 
@@ -185,7 +185,7 @@ class Controller:
             "the law and the observer that fly: these change at a restart",
         )
         before = self._parameters
-        self._state = guard.retune(self._state, self._law, new.law, (self._guard, new.guard))
+        self._state = retuning.retune(self._state, self._law, new.law, (self._guard, new.guard))
         self._law = new.law
         self._guard = new.guard
         self._digest = new.digest
@@ -386,7 +386,9 @@ class Controller:
             digest,
             given_up,
         )
-        return ControlOutput(inputs.stamp_ns, self._state.command, inputs, log, effects)
+        return ControlOutput(
+            stamp_ns=inputs.stamp_ns, u=self._state.command, inputs=inputs, log=log, effects=effects
+        )
 
     def watch(self, e: FloatArray, dt: float) -> None:
         """Take the error of a tick, for `diverging` and `oscillations`.

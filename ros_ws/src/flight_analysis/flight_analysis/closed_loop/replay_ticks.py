@@ -16,7 +16,7 @@ from flight_core.vectors import FloatArray, StampedVector
 from flight_log.flight_processes import controller_starts
 from rise_di_controller import internals
 from rise_di_controller.extensions import feedforward
-from rise_di_controller.guard import guard
+from rise_di_controller.guard import guard, retuning
 from rise_di_controller.guard.guard import ControllerState, GuardParams, Vanes
 from rise_di_controller.law.control_law import TunedLaw, restored
 from rise_di_controller.laws import AnyLaw
@@ -89,7 +89,7 @@ class ParametersInForce:
             limits = self.limits
             self._apply(step)
             if state is not None:
-                state = guard.retune(state, law, self.law, (limits, self.limits))
+                state = retuning.retune(state, law, self.law, (limits, self.limits))
         return state
 
 
@@ -158,17 +158,17 @@ class Ticks:
             feedforward_state = feedforward.initial_state(y_m, limits.nominal)
         y = StampedVector(int(self.stamp_ns[k]), row["y"])
         logged = ControllerState(
-            mode,
-            law_state,
-            y,
-            y_m,
-            u,
-            row["u_free"],
-            row["u_trim"],
-            0,
-            u,
-            row["u_ff"],
-            feedforward_state,
+            mode=mode,
+            law=law_state,
+            y=y,
+            y_m=y_m,
+            u=u,
+            u_free=row["u_free"],
+            u_trim=row["u_trim"],
+            failsafe_start_ns=0,
+            u_failsafe=u,
+            u_ff=row["u_ff"],
+            feedforward=feedforward_state,
         )
         vanes = Vanes(row["vane"], row["vane_m"]) if limits.vanes else None
         return logged._replace(effectors=effectors, effectors_failsafe=effectors, vanes=vanes)

@@ -17,7 +17,7 @@ from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray, StampedVector
 from flight_log.vehicle_tables import Table, VehicleLog
 from rise_di_controller import internals
-from rise_di_controller.guard import guard
+from rise_di_controller.guard import guard, retuning
 from rise_di_controller.params import ControllerConfig
 
 STATUS = "rise_di_status"
@@ -138,7 +138,7 @@ class _Ticks:
                     changes.append(Change(int(self._stamp_ns[k]), change))
                     new_law = controller.tuned_law()
                     new_limits = controller.guard()
-                    state = guard.retune(state, law, new_law, (limits, new_limits))
+                    state = retuning.retune(state, law, new_law, (limits, new_limits))
                     law = new_law
                     limits = new_limits
                     digest = controller.digest()

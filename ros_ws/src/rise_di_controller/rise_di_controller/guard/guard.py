@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Guard of the control law: saturation, engagement, retuning and failsafe.
+"""Guard of the control law: saturation, engagement and failsafe.
 
 The guard is pure, like the law, and fits every control law.
 
@@ -25,15 +25,14 @@ from flight_core.failsafe import failsafe_scale
 from flight_core.modes import Mode
 from flight_core.rates import seconds
 from flight_core.vectors import Array, FloatArray, StampedVector
-from rise_di_controller.extensions import feedforward, observer
+from rise_di_controller.extensions import feedforward
 from rise_di_controller.extensions.allocation import Allocation, allocate, reached
 from rise_di_controller.extensions.feedforward import FeedforwardState, Nominal
-from rise_di_controller.extensions.observer import ObserverParams, ObserverState, PastTick
-from rise_di_controller.extensions.schedule import OverSpeed, ScheduleState, law_at, observers_of
+from rise_di_controller.extensions.observer import PastTick
+from rise_di_controller.extensions.schedule import OverSpeed
 from rise_di_controller.guard.probe import Probe
 from rise_di_controller.guard.samples import SampleLimits
 from rise_di_controller.law.control_law import Measurements, TunedLaw, fields
-from rise_di_controller.law.law import LawState, shifted
 from rise_di_controller.law.saturation import Limits, saturate
 
 # Least distance of two samples for a slope, as a fraction of the extrapolation. Closer samples are
@@ -137,7 +136,17 @@ def initial_state(m: int, allocation: Allocation | None = None) -> ControllerSta
     zero = np.zeros(m)
     effectors = None if allocation is None else np.zeros(len(allocation.T))
     return ControllerState(
-        Mode.WAITING, None, None, None, zero, zero, zero, 0, zero, zero, effectors=effectors
+        mode=Mode.WAITING,
+        law=None,
+        y=None,
+        y_m=None,
+        u=zero,
+        u_free=zero,
+        u_trim=zero,
+        failsafe_start_ns=0,
+        u_failsafe=zero,
+        u_ff=zero,
+        effectors=effectors,
     )
 
 
@@ -188,14 +197,16 @@ def _with_history(
     scale = getattr(stepped.law, "scale", None)
     nominal = np.float64(seconds(guard.period_ns))
     lost = (
-        PastTick(None, state.u - state.u_trim - state.u_ff, state.y_m, nominal, scale),
+        PastTick(
+            e=None, u=state.u - state.u_trim - state.u_ff, y_m=state.y_m, dt=nominal, scale=scale
+        ),
     ) * missed
     last = PastTick(
-        inputs.y - inputs.y_m,
-        stepped.u - state.u_trim - stepped.u_ff,
-        inputs.y_m,
-        np.float64(inputs.dt),
-        scale,
+        e=inputs.y - inputs.y_m,
+        u=stepped.u - state.u_trim - stepped.u_ff,
+        y_m=inputs.y_m,
+        dt=np.float64(inputs.dt),
+        scale=scale,
     )
     return stepped._replace(history=(*state.history, *lost, last)[-guard.history :])
 
@@ -239,10 +250,18 @@ def tick(
         and reference is not None
         and not state.u.any()
     ):
-        return state._replace(mode=Mode.INACTIVE), TickInputs(now_ns, y.value, reference, 0.0, 0.0)
+        return state._replace(mode=Mode.INACTIVE), TickInputs(
+            stamp_ns=now_ns, y=y.value, y_m=reference, y_m_offset=0.0, dt=0.0
+        )
     if not active or y is None or reference is None:
         return _failsafe(state, now_ns, guard, active)
-    inputs = TickInputs(y.stamp_ns, y.value, reference, seconds(y_m[-1].stamp_ns - y.stamp_ns), 0.0)
+    inputs = TickInputs(
+        stamp_ns=y.stamp_ns,
+        y=y.value,
+        y_m=reference,
+        y_m_offset=seconds(y_m[-1].stamp_ns - y.stamp_ns),
+        dt=0.0,
+    )
     return _with_sample(state, y, inputs, vane, guard, law, u_ff_recorded, vane_m_recorded)
 
 
@@ -272,9 +291,11 @@ def _with_sample(
     ff_state = state.feedforward
     missed = max(round(dt / period) - 1, 0)
     zero = np.zeros_like(u_ff)
-    held = Measurements(last.value, state.y_m, zero, u_trim + u_ff, state.u)
+    held = Measurements(
+        y=last.value, y_m=state.y_m, y_m_dot=zero, u_trim=u_trim + u_ff, u_before=state.u
+    )
     law_state = _predicted(state.law, held, missed, law)
-    model = _nominal(guard, law_state)
+    model = nominal_at_speed(guard, law_state)
     if model is not None and ff_state is not None:
         parts = feedforward.parts_of(span_ns, guard.period_ns)
         ff_state, u_ff = feedforward.step(ff_state, inputs.y_m, dt, model, parts)
@@ -285,7 +306,15 @@ def _with_sample(
     vanes = _vanes(vane, ff_state, guard, vane_m_recorded)
     slope = (inputs.y_m - state.y_m) / dt
     vane_m = None if vanes is None else vanes.reference
-    measured = Measurements(y.value, inputs.y_m, slope, u_trim, state.u, vane=vane, vane_m=vane_m)
+    measured = Measurements(
+        y=y.value,
+        y_m=inputs.y_m,
+        y_m_dot=slope,
+        u_trim=u_trim,
+        u_before=state.u,
+        vane=vane,
+        vane_m=vane_m,
+    )
     after, u_free, u, effectors = law_within_limits(
         law_state, measured, dt, law, guard, state.effectors
     )
@@ -348,7 +377,9 @@ def _engaged(
     ff_state = (
         None if guard.nominal is None else feedforward.initial_state(reference, guard.nominal)
     )
-    measured = Measurements(y.value, reference, zero, state.u, state.u, vane=vane)
+    measured = Measurements(
+        y=y.value, y_m=reference, y_m_dot=zero, u_trim=state.u, u_before=state.u, vane=vane
+    )
     u_trim = state.u
     if guard.probe is not None:
         u_trim = u_trim - guard.probe.at(y.stamp_ns)  # so that u goes on
@@ -385,7 +416,7 @@ def _readings(reading: FloatArray, before: Vanes | None) -> FloatArray:
     return np.where(np.abs(reading) <= LARGEST_VANE, reading, last)
 
 
-def _nominal(guard: GuardParams, law: Any) -> Nominal | None:
+def nominal_at_speed(guard: GuardParams, law: Any) -> Nominal | None:
     """The nominal model of the feedforward, at the speed of a schedule if any.
 
     None without a feedforward.
@@ -450,128 +481,6 @@ def _within_effectors(
     return u, effectors
 
 
-def retune(
-    state: ControllerState,
-    old: TunedLaw,
-    new: TunedLaw,
-    guards: tuple[GuardParams, GuardParams] | None = None,
-) -> ControllerState:
-    """State for new parameters of the law, without a jump of u (bumpless transfer).
-
-    An observer with the same matrices continues. With a history of the last ticks a new observer
-    and a new feedforward go on in the same motion: z comes from the new filter over these ticks,
-    and u_o goes on where an observer acts. Without a history the observer starts again from the
-    present error, and u_o and u_ff become part of u_trim. A schedule has the models of the present
-    speed, and over the record those of every tick. Arguments: `guards`, old and new, with the
-    models of the feedforward.
-    """
-    y = state.y
-    y_m = state.y_m
-    if state.law is None or y is None or y_m is None:
-        return state
-    law = new.control_law.retune(state.law, old.params, new.params)
-    before, after = (None, None) if guards is None else (_nominal(guard, law) for guard in guards)
-    other_nominal = not _same_arrays(before, after)
-    observing = law
-    observers = (old.params, new.params)
-    if isinstance(law, ScheduleState):
-        observing, observers = law.law, tuple(law_at(params, law.scale) for params in observers)
-    other_model = isinstance(
-        observing, (ObserverState, observer.VaneObserverState)
-    ) and _is_replaced(*observers)
-    if (
-        len(state.history) > 1
-        and isinstance(observing, ObserverState)
-        and isinstance(observing.law, LawState)
-    ):
-        change: Array = np.zeros_like(state.u)  # of u_ff
-        if other_nominal:
-            state, change = _with_nominal(state, y_m, after)
-        if other_model or other_nominal:
-            filters = observers_of(new.params, [tick.scale for tick in state.history])
-            z = observer.estimates_after(state.history, change, filters)
-            observing = _with_estimates(state, observing, z, change, observers)
-    else:
-        if other_model and not _same_model(*observers):
-            z = observer.initial_estimates(y.value - y_m, observers[1])
-            state = state._replace(u_trim=state.u_trim + observing.u_o)
-            observing = observing._replace(
-                z=z, u_o=np.zeros_like(observing.u_o), sigma=np.zeros_like(observing.sigma)
-            )
-        if other_nominal:
-            start = None if after is None else feedforward.initial_state(y_m, after)
-            state = state._replace(
-                u_trim=state.u_trim + state.u_ff, u_ff=np.zeros_like(state.u_ff), feedforward=start
-            )
-    if isinstance(law, ScheduleState):
-        observing = law._replace(law=observing)
-    return state._replace(law=observing)
-
-
-def _with_estimates(
-    state: ControllerState,
-    observing: ObserverState,
-    z: Array,
-    change: Array,
-    observers: tuple[ObserverParams, ...],
-) -> ObserverState:
-    """The observer of new parameters in the same motion.
-
-    The observer goes on from the estimates z and the change of u_ff, (m,).
-
-    u_o goes on to -F z at its own rate. Of a channel without an observer before it takes the part
-    of the law: what the law has integrated beside an observer stays there, which would take it long
-    to integrate again.
-    """
-    law_part = state.u - state.u_trim - state.u_ff
-    limits = observers[1].limits
-    acted, acts = ((params.limits.upper > 0.0) & np.any(params.F, axis=1) for params in observers)
-    goes_on = np.where(acted, observing.u_o - change, law_part)
-    u_o = np.where(acts, np.clip(goes_on, limits.lower, limits.upper), 0.0)
-    inner = shifted(
-        observing.law, law_part - u_o - (law_part + change - observing.u_o), observers[1].law
-    )
-    return ObserverState(inner, z, u_o, np.ones_like(observing.sigma))
-
-
-def _with_nominal(
-    state: ControllerState, y_m: FloatArray, nominal: Nominal | None
-) -> tuple[ControllerState, Array]:
-    """The state with the feedforward of another model in the same motion.
-
-    The second result is the change of u_ff, (m,).
-    """
-    u_ff = np.zeros_like(state.u)
-    goes_on = None
-    if nominal is not None:
-        earlier = state.history[-2]
-        last = state.history[-1]
-        goes_on = feedforward.continued(
-            state.feedforward, y_m, (last.y_m - earlier.y_m) / last.dt, last.dt, nominal
-        )
-        u_ff = feedforward.acting(goes_on.u - goes_on.u_0, nominal)
-    return state._replace(u_ff=u_ff, feedforward=goes_on), u_ff - state.u_ff
-
-
-def _is_replaced(old: ObserverParams, new: ObserverParams) -> bool:
-    """Whether the model of the observer changes, or the observer is added or removed."""
-    return not _same_model(old, new) or bool(np.any(old.limits.upper) != np.any(new.limits.upper))
-
-
-def _same_model(old: ObserverParams, new: ObserverParams) -> bool:
-    same = all(
-        np.array_equal(getattr(old, name), getattr(new, name))
-        for name in ("Phi", "Gamma", "H", "L", "F")
-    )
-    return same and _same_arrays(old.vanes, new.vanes)
-
-
-def _same_arrays(old: tuple[Any, ...] | None, new: tuple[Any, ...] | None) -> bool:
-    if old is None or new is None:
-        return old is new
-    return all(np.array_equal(before, after) for before, after in zip(old, new, strict=True))
-
-
 def _failsafe(
     state: ControllerState, now_ns: int, guard: GuardParams, active: bool
 ) -> tuple[ControllerState, TickInputs | None]:
@@ -604,5 +513,5 @@ def _failsafe(
     if effectors is not None and scale != 1.0:
         effectors = scale * effectors
     return state._replace(mode=mode, u=u, u_free=u, effectors=effectors), TickInputs(
-        now_ns, y.value, y_m, 0.0, 0.0
+        stamp_ns=now_ns, y=y.value, y_m=y_m, y_m_offset=0.0, dt=0.0
     )

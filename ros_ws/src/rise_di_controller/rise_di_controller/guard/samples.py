@@ -134,7 +134,14 @@ def standstill(state: SampleState, sample: StampedVector) -> str:
 def begun(sample: StampedVector) -> SampleState:
     """The state after the first sample."""
     stillness = Stillness(sample.stamp_ns)
-    return SampleState(sample.stamp_ns, sample, np.zeros_like(sample.value), sample, 0, stillness)
+    return SampleState(
+        begin_ns=sample.stamp_ns,
+        last=sample,
+        change=np.zeros_like(sample.value),
+        far=sample,
+        agreeing=0,
+        stillness=stillness,
+    )
 
 
 def step(

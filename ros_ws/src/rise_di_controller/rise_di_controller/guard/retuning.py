@@ -1,0 +1,140 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""New parameters of a law in flight, without a jump of u (bumpless transfer)."""
+
+from typing import Any
+
+import numpy as np
+
+from flight_core.vectors import Array, FloatArray
+from rise_di_controller.extensions import feedforward, observer
+from rise_di_controller.extensions.feedforward import Nominal
+from rise_di_controller.extensions.observer import ObserverParams, ObserverState
+from rise_di_controller.extensions.schedule import ScheduleState, law_at, observers_of
+from rise_di_controller.guard.guard import ControllerState, GuardParams, nominal_at_speed
+from rise_di_controller.law.control_law import TunedLaw
+from rise_di_controller.law.law import LawState, shifted
+
+
+def retune(
+    state: ControllerState,
+    old: TunedLaw,
+    new: TunedLaw,
+    guards: tuple[GuardParams, GuardParams] | None = None,
+) -> ControllerState:
+    """State for new parameters of the law, without a jump of u (bumpless transfer).
+
+    An observer with the same matrices continues. With a history of the last ticks a new observer
+    and a new feedforward go on in the same motion: z comes from the new filter over these ticks,
+    and u_o goes on where an observer acts. Without a history the observer starts again from the
+    present error, and u_o and u_ff become part of u_trim. A schedule has the models of the present
+    speed, and over the record those of every tick. Arguments: `guards`, old and new, with the
+    models of the feedforward.
+    """
+    y = state.y
+    y_m = state.y_m
+    if state.law is None or y is None or y_m is None:
+        return state
+    law = new.control_law.retune(state.law, old.params, new.params)
+    before, after = (
+        (None, None) if guards is None else (nominal_at_speed(guard, law) for guard in guards)
+    )
+    other_nominal = not _same_arrays(before, after)
+    observing = law
+    observers = (old.params, new.params)
+    if isinstance(law, ScheduleState):
+        observing, observers = law.law, tuple(law_at(params, law.scale) for params in observers)
+    other_model = isinstance(
+        observing, (ObserverState, observer.VaneObserverState)
+    ) and _is_replaced(*observers)
+    if (
+        len(state.history) > 1
+        and isinstance(observing, ObserverState)
+        and isinstance(observing.law, LawState)
+    ):
+        change: Array = np.zeros_like(state.u)  # of u_ff
+        if other_nominal:
+            state, change = _with_nominal(state, y_m, after)
+        if other_model or other_nominal:
+            filters = observers_of(new.params, [tick.scale for tick in state.history])
+            z = observer.estimates_after(state.history, change, filters)
+            observing = _with_estimates(state, observing, z, change, observers)
+    else:
+        if other_model and not _same_model(*observers):
+            z = observer.initial_estimates(y.value - y_m, observers[1])
+            state = state._replace(u_trim=state.u_trim + observing.u_o)
+            observing = observing._replace(
+                z=z, u_o=np.zeros_like(observing.u_o), sigma=np.zeros_like(observing.sigma)
+            )
+        if other_nominal:
+            start = None if after is None else feedforward.initial_state(y_m, after)
+            state = state._replace(
+                u_trim=state.u_trim + state.u_ff, u_ff=np.zeros_like(state.u_ff), feedforward=start
+            )
+    if isinstance(law, ScheduleState):
+        observing = law._replace(law=observing)
+    return state._replace(law=observing)
+
+
+def _with_estimates(
+    state: ControllerState,
+    observing: ObserverState,
+    z: Array,
+    change: Array,
+    observers: tuple[ObserverParams, ...],
+) -> ObserverState:
+    """The observer of new parameters in the same motion.
+
+    The observer goes on from the estimates z and the change of u_ff, (m,).
+
+    u_o goes on to -F z at its own rate. Of a channel without an observer before it takes the part
+    of the law: what the law has integrated beside an observer stays there, which would take it long
+    to integrate again.
+    """
+    law_part = state.u - state.u_trim - state.u_ff
+    limits = observers[1].limits
+    acted, acts = ((params.limits.upper > 0.0) & np.any(params.F, axis=1) for params in observers)
+    goes_on = np.where(acted, observing.u_o - change, law_part)
+    u_o = np.where(acts, np.clip(goes_on, limits.lower, limits.upper), 0.0)
+    inner = shifted(
+        observing.law, law_part - u_o - (law_part + change - observing.u_o), observers[1].law
+    )
+    return ObserverState(inner, z, u_o, np.ones_like(observing.sigma))
+
+
+def _with_nominal(
+    state: ControllerState, y_m: FloatArray, nominal: Nominal | None
+) -> tuple[ControllerState, Array]:
+    """The state with the feedforward of another model in the same motion.
+
+    The second result is the change of u_ff, (m,).
+    """
+    u_ff = np.zeros_like(state.u)
+    goes_on = None
+    if nominal is not None:
+        earlier = state.history[-2]
+        last = state.history[-1]
+        goes_on = feedforward.continued(
+            state.feedforward, y_m, (last.y_m - earlier.y_m) / last.dt, last.dt, nominal
+        )
+        u_ff = feedforward.acting(goes_on.u - goes_on.u_0, nominal)
+    return state._replace(u_ff=u_ff, feedforward=goes_on), u_ff - state.u_ff
+
+
+def _is_replaced(old: ObserverParams, new: ObserverParams) -> bool:
+    """Whether the model of the observer changes, or the observer is added or removed."""
+    return not _same_model(old, new) or bool(np.any(old.limits.upper) != np.any(new.limits.upper))
+
+
+def _same_model(old: ObserverParams, new: ObserverParams) -> bool:
+    same = all(
+        np.array_equal(getattr(old, name), getattr(new, name))
+        for name in ("Phi", "Gamma", "H", "L", "F")
+    )
+    return same and _same_arrays(old.vanes, new.vanes)
+
+
+def _same_arrays(old: tuple[Any, ...] | None, new: tuple[Any, ...] | None) -> bool:
+    if old is None or new is None:
+        return old is new
+    return all(np.array_equal(before, after) for before, after in zip(old, new, strict=True))
