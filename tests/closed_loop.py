@@ -98,7 +98,13 @@ def still_air(A: FloatArray, B: FloatArray, C: FloatArray, gravity: FloatArray) 
     """An aircraft without gusts."""
     empty = np.zeros(0)
     return Aircraft(
-        A, B, C, gravity, np.zeros((len(A), 0)), Gusts(empty, empty, empty), speed=np.array(1.0)
+        A=A,
+        B=B,
+        C=C,
+        gravity=gravity,
+        gust_direction=np.zeros((len(A), 0)),
+        gusts=Gusts(empty, empty, empty),
+        speed=np.array(1.0),
     )
 
 

@@ -61,7 +61,17 @@ def at(y: Any, y_m: Any = 0.0, **others: Any) -> Measurements:
     """Measurements of one aircraft; the others are 0, and x is y."""
     y = np.atleast_1d(np.asarray(y, dtype=float))[:, None]
     zero = np.zeros_like(y)
-    measured = Measurements(y, zero + y_m, zero, zero, zero, zero, y, y, zero)
+    measured = Measurements(
+        y=y,
+        y_m=zero + y_m,
+        y_m_dot=zero,
+        u_trim=zero,
+        u_before=zero,
+        position=zero,
+        x=y,
+        x_air=y,
+        y_dot=zero,
+    )
     return measured._replace(**{key: np.asarray(value) for key, value in others.items()})
 
 

@@ -331,7 +331,19 @@ def test_one_missing_sample_is_no_lack_of_short_topic(
     found: int, expected: int, whole: bool
 ) -> None:
     """99 %, or all but one: the last tick of a flight may come after its end."""
-    topic = TopicAccount(expected, found, 0.0, 0.97, 0.01, 0.5, 0, 0, 0.0, 0, 0)
+    topic = TopicAccount(
+        expected=expected,
+        found=found,
+        first=0.0,
+        last=0.97,
+        gap=0.01,
+        gap_at=0.5,
+        repeated=0,
+        unset=0,
+        step=0.0,
+        left_out=0,
+        unsent=0,
+    )
     assert topic.holds(found) == whole
     assert (Account(0.97, {"u": topic}, ()).over("u") == "") == whole
 

@@ -64,8 +64,16 @@ def integrator(k: float, part: float) -> LinearLoop:
     """U = -k y around y_dot = (1 + d) u."""
     plant = LinearPlant(np.zeros((1, 1, 1)), np.ones((1, 1, 1)), np.eye(1))
     law = LinearLaw(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.array([[-k]]))
-    box = Box(("B[y,u]",), np.array([part]), np.eye(1), np.zeros((1, 1)), np.array([[part]]))
-    return LinearLoop("", ("u",), plant, law, Loop(np.zeros(1), 0.0, PERIOD), box)
+    box = Box(
+        names=("B[y,u]",),
+        part=np.array([part]),
+        E=np.eye(1),
+        F=np.zeros((1, 1)),
+        G=np.array([[part]]),
+    )
+    return LinearLoop(
+        model="", inputs=("u",), plant=plant, law=law, loop=Loop(np.zeros(1), 0.0, PERIOD), box=box
+    )
 
 
 @pytest.mark.parametrize("k", [120.0, 150.0, 180.0])
@@ -251,11 +259,11 @@ def test_search_is_at_or_below_corners() -> None:
 def test_search_over_two_entries_is_brute_force() -> None:
     linear = integrator(100.0, 0.3)
     box = Box(
-        ("A[y,y]", "B[y,u]"),
-        np.array([0.3, 0.3]),
-        np.ones((1, 2)),
-        np.array([[-0.6], [0.0]]),
-        np.array([[0.0], [0.3]]),
+        names=("A[y,y]", "B[y,u]"),
+        part=np.array([0.3, 0.3]),
+        E=np.ones((1, 2)),
+        F=np.array([[-0.6], [0.0]]),
+        G=np.array([[0.0], [0.3]]),
     )
     plant = LinearPlant(np.array([[-2.0]]), np.ones((1, 1)), np.eye(1))
     search = worst_in_box(plant, linear.law, linear.loop, box)

@@ -137,7 +137,11 @@ def test_no_feedback_has_infinite_margins() -> None:
 def test_least_delay_margin_beside_a_nominal_loop_that_tolerates_every_delay() -> None:
     gains = np.array([[[2.0]], [[4.0]]])  # an integrator of gain k has the delay margin pi / 2 k
     plant = LinearPlant(np.zeros((2, 1, 1)), gains, np.eye(1))
-    found = loop_margins(LinearLoop("two", ("u",), plant, proportional(np.eye(1)), NO_LAG))
+    found = loop_margins(
+        LinearLoop(
+            model="two", inputs=("u",), plant=plant, law=proportional(np.eye(1)), loop=NO_LAG
+        )
+    )
     assert found.delay == math.inf  # beyond MAX_DELAY_MARGIN
     assert found.worst_delay == approx(math.pi / 8.0, rel=0.02)
 

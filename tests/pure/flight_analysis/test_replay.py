@@ -291,9 +291,15 @@ def test_differences_counted_in_units_in_last_place() -> None:
     )
     for recorded, computed, ulps in cases:
         yes = np.ones(1, dtype=bool)
-        pair = np.array([[recorded]]), np.array([[computed]])
         result = ReplayResult(
-            ("u.a",), np.ones(1, dtype=np.int64), np.zeros(1), *pair, yes, ~yes, ()
+            names=("u.a",),
+            number=np.ones(1, dtype=np.int64),
+            t=np.zeros(1),
+            recorded=np.array([[recorded]]),
+            computed=np.array([[computed]]),
+            checked=yes,
+            other_parameters=~yes,
+            notes=(),
         )
         first = result.first()
         assert first is not None  # zeros of different sign differ

@@ -95,7 +95,9 @@ def identified(tmp_path_factory: pytest.TempPathFactory) -> Identified:
     models = channel_models(MAP, tape, [(0, 10**18)], SPEED)
     channels = join(MAP, response, models)
     flying = flying_scenario(MAP, channels, SPEED, str(folder / "flight_airframe.yaml"))
-    return Identified(response, models, channels, flying, folder)
+    return Identified(
+        response=response, models=models, channels=channels, flying=flying, folder=folder
+    )
 
 
 def test_channels_of_unknown_aircraft_identified(identified: Identified) -> None:
@@ -162,7 +164,16 @@ def of_second_order(tmp_path_factory: pytest.TempPathFactory) -> tuple[Channels,
     )
     Omega = np.diag([5.0 if name == "V" else 80.0 for name in MAP.outputs])
     none = 0.0 * damping
-    found = Channels(Omega, none, none + 0.02, none + 0.1, damping, stiffness, zero, none)
+    found = Channels(
+        Omega=Omega,
+        Omega_deviation=none,
+        lag=none + 0.02,
+        delay=none + 0.1,
+        damping=damping,
+        stiffness=stiffness,
+        zero=zero,
+        misfit=none,
+    )
     return found, flying_scenario(
         MAP, found, SPEED, str(tmp_path_factory.mktemp("known") / "airframe.yaml")
     )

@@ -142,15 +142,15 @@ def test_constant_of_lemma_2_is_hand_worked_one() -> None:
     column = np.array([[2.0], [1.0], [0.0]])
     zero = np.zeros(3)
     flight = Evidence(
-        np.arange(3.0),
-        column,
-        -np.ones((3, 1)),
-        column,
-        np.full((3, 1), 0.5),
-        zero,
-        zero,
-        zero,
-        zero,
+        t=np.arange(3.0),
+        e=column,
+        e_dot=-np.ones((3, 1)),
+        r=column,
+        N_d=np.full((3, 1), 0.5),
+        L=zero,
+        V1=zero,
+        P=zero,
+        V2=zero,
     )
     assert lemma_2(plant, flight, law_params(1.0, 3.0, 2.0)) == pytest.approx(3.0)
 

@@ -210,7 +210,13 @@ def test_aircraft_that_no_gains_hold_do_not_count() -> None:
     C = airframe.matrix_c()
     held = A - B @ np.linalg.solve(C @ B, C @ A)
     diverging = int(np.sum(np.linalg.eigvals(held).real.max(axis=1)[1:] > FASTEST))
-    loose = Requirement(math.radians(20.0), 1.4, 3.0, 0.05, math.radians(5.0))
+    loose = Requirement(
+        phase=math.radians(20.0),
+        gain=1.4,
+        sensitivity=3.0,
+        damping=0.05,
+        worst_phase=math.radians(5.0),
+    )
     controller, origin = observed(scenario.rise_di(), scenario, airframe, 0.01, loose)
     assert controller.observer is not None
     assert f"{diverging} of {WORST_OF} uncertain aircraft do not count" in origin

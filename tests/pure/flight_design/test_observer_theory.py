@@ -98,12 +98,12 @@ def random_plant(seed: int, U_12: float = 0.0) -> Plant:
     A = np.vstack([top, np.hstack([left, zero_dynamics])])
     back = np.linalg.inv(change)
     return Plant(
-        back @ A @ change,
-        back @ np.vstack([(S * D) @ U, np.zeros((N - M, M))]),
-        np.eye(M, N) @ change,
-        S,
-        D,
-        U,
+        A=back @ A @ change,
+        B=back @ np.vstack([(S * D) @ U, np.zeros((N - M, M))]),
+        C=np.eye(M, N) @ change,
+        S=S,
+        D=D,
+        U=U,
     )
 
 
@@ -121,7 +121,9 @@ def linear_quadratic(
     A_z, B_z, H = model
     F = np.linalg.solve(R, B_z.T @ solve_continuous_are(A_z, B_z, Q, R))
     L = np.linalg.solve(noise, H @ solve_continuous_are(A_z.T, H.T, process, noise)).T
-    return Observer(A_z, B_z, H, np.asarray(F, dtype=np.float64), np.asarray(L, dtype=np.float64))
+    return Observer(
+        A_z=A_z, B_z=B_z, H=H, F=np.asarray(F, dtype=np.float64), L=np.asarray(L, dtype=np.float64)
+    )
 
 
 def observer_of(plant: Plant) -> Observer:
@@ -146,7 +148,7 @@ def osprey() -> tuple[Airframe, Plant]:
     A = airframe.matrix_a() + airframe.matrix_gravity()
     B = airframe.matrix_b()
     C = airframe.matrix_c()
-    return airframe, Plant(A, B, C, np.eye(4), np.ones(4), np.eye(4))
+    return airframe, Plant(A=A, B=B, C=C, S=np.eye(4), D=np.ones(4), U=np.eye(4))
 
 
 def osprey_observer() -> Observer:
@@ -187,7 +189,7 @@ def hidden(plant: Plant) -> Hidden:
     m = len(plant.C)
     T = np.vstack([plant.C, np.linalg.svd(plant.B.T)[2][m:]])
     A = T @ plant.A @ np.linalg.inv(T)
-    return Hidden(T[m:], A[:m, :m], A[:m, m:], A[m:, :m], A[m:, m:])
+    return Hidden(T=T[m:], yy=A[:m, :m], y_eta=A[:m, m:], eta_y=A[m:, :m], eta=A[m:, m:])
 
 
 # The Proposition
@@ -214,7 +216,9 @@ def arbitrary_observer(rng: np.random.Generator) -> Observer:
     A_z = rng.normal(size=(s, s))
     H = rng.normal(size=(M, s))
     L = place_poles(A_z.T, H.T, -rng.uniform(0.5, 5.0, size=s)).gain_matrix.T
-    return Observer(A_z, rng.normal(size=(s, M)), H, 10.0 * rng.normal(size=(M, s)), L)
+    return Observer(
+        A_z=A_z, B_z=rng.normal(size=(s, M)), H=H, F=10.0 * rng.normal(size=(M, s)), L=L
+    )
 
 
 def test_zeros_with_observer_are_those_of_aircraft_and_poles_of_filter() -> None:
@@ -398,7 +402,11 @@ def cross_terms(plant: Plant) -> CrossTerms:
     one = np.eye(len(plant.C))
     G = M_ @ (part.yy + one)
     return CrossTerms(
-        G, G - one - M_ @ part.y_eta @ part.eta_y, -M_ @ part.y_eta @ part.eta, part.eta, part.eta_y
+        G=G,
+        W_e=G - one - M_ @ part.y_eta @ part.eta_y,
+        W_eta=-M_ @ part.y_eta @ part.eta,
+        A_eta=part.eta,
+        B_eta=part.eta_y,
     )
 
 
@@ -644,7 +652,13 @@ def gain_set(
         name: [float(gain) for gain in text.split()]
         for name, text in (("K", K), ("Lambda", Lambda), ("beta", beta))
     }
-    return TuningResult(of_law | {"softening": [softening]} | (observer or {}), 1.0, 1, [1.0], 0)
+    return TuningResult(
+        gains=of_law | {"softening": [softening]} | (observer or {}),
+        cost=1.0,
+        seed=1,
+        costs=[1.0],
+        evaluations=0,
+    )
 
 
 GAINS = {

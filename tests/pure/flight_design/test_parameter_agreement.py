@@ -139,7 +139,7 @@ def test_deflection_of_a_surface_is_that_about_its_trim(is_reversed: float, sign
 def test_deflection_of_a_throttle_is_that_from_its_end(is_reversed: bool, part: float) -> None:
     """SRV_Channel::pwm_from_range: a reversed throttle is open at its lower end."""
     stick = stick_of(named_map("ardupilot"), "thrust")
-    servo = Servo(3, 1000.0, 1000.0, 2000.0, is_reversed)
+    servo = Servo(output=3, low=1000.0, trim=1000.0, high=2000.0, is_reversed=is_reversed)
     assert servo.deflection(np.array([1250.0]), stick) == pytest.approx([part])
 
 

@@ -245,7 +245,9 @@ def test_linear_error_of_a_ramp_is_the_closed_form() -> None:
     k, a, period, duration = 5.0, 2.0, 0.001, 4.0
     law = LinearLaw(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.array([[-k]]))
     plant = LinearPlant(np.zeros((1, 1, 1)), np.ones((1, 1, 1)), np.eye(1))
-    of = LinearLoop("", ("u",), plant, law, Loop(np.zeros(1), 0.0, period))
+    of = LinearLoop(
+        model="", inputs=("u",), plant=plant, law=law, loop=Loop(np.zeros(1), 0.0, period)
+    )
     u_dot = np.full((round(duration / ideal_control.STEP) + 1, 1), a)
     t = np.arange(0.0, duration, period)
     expected = a / k * (t - (1.0 - np.exp(-k * t)) / k)

@@ -88,7 +88,11 @@ def random_task(n: int, m: int, seed: int) -> Task:
         rng.uniform(0.2, 1.0, m), rng.uniform(0.5, 2.0, m), rng.uniform(0.0, 2.0 * np.pi, m)
     )
     return Task(
-        aircraft, D, rotation, reference, rng.choice([-1.0, 1.0], m) * rng.uniform(0.1, 0.3, m)
+        aircraft=aircraft,
+        D=D,
+        rotation=rotation,
+        reference=reference,
+        e_0=rng.choice([-1.0, 1.0], m) * rng.uniform(0.1, 0.3, m),
     )
 
 

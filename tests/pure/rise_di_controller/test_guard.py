@@ -361,7 +361,7 @@ def test_internals_hold_integrals_and_what_limited_each_input() -> None:
     )
     values = logged(
         state,
-        guard.TickInputs(0, np.ones(4), np.zeros(4), 0.0, 0.01),
+        guard.TickInputs(stamp_ns=0, y=np.ones(4), y_m=np.zeros(4), y_m_offset=0.0, dt=0.01),
         limits,
         0.0,
         0.0,

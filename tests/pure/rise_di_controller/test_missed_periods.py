@@ -56,13 +56,21 @@ def by_hand(state: ControllerState, y: FloatArray, lost: int, predicted: int) ->
     y_m = y_m_at(LAST + lost + 1)
     dt = np.float64((lost + 1) * 0.01)
     zero = np.zeros(4)
-    held = Measurements(state.y.value, state.y_m, zero, state.u_trim + state.u_ff, state.u)
+    held = Measurements(
+        y=state.y.value,
+        y_m=state.y_m,
+        y_m_dot=zero,
+        u_trim=state.u_trim + state.u_ff,
+        u_before=state.u,
+    )
     law_state = state.law
     for _ in range(predicted):
         law_state = law.control_law.missed(law_state, held, law.params)
     _, u_ff = feedforward.step(state.feedforward, y_m, dt, guard.nominal)
     u_trim = state.u_trim + u_ff
-    measured = Measurements(y, y_m, (y_m - state.y_m) / dt, u_trim, state.u)
+    measured = Measurements(
+        y=y, y_m=y_m, y_m_dot=(y_m - state.y_m) / dt, u_trim=u_trim, u_before=state.u
+    )
     after, _, u, _ = law_within_limits(law_state, measured, dt, law, guard, None)
     return state._replace(law=after, u=u)
 

@@ -791,7 +791,16 @@ def largest_y_m_ddot(model: Model, rise: float) -> float:
     """
     one = np.ones((1, 1))
     zero = np.zeros(1)
-    climb = Profile(0.0 * one, one, np.array(rise), zero, zero + 1.0, zero, zero, zero)
+    climb = Profile(
+        time=0.0 * one,
+        change=one,
+        rise=np.array(rise),
+        amplitude=zero,
+        frequency=zero + 1.0,
+        phase=zero,
+        bank_rate=zero,
+        turn_rate=zero,
+    )
     dt = rise / 5.0
     y_m = reference_outputs(model, climb, dt, round(0.5 / dt))
     return float(np.max(np.abs(np.diff(y_m, 2, axis=0)))) / dt**2

@@ -76,7 +76,11 @@ class Flight:
         """A proposal of now."""
         digest = self.controller.digest
         proposal = Proposal(
-            self.now_ns, START.digest(), digest, CHANGE if change is None else change, "model"
+            stamp_ns=self.now_ns,
+            start=START.digest(),
+            flown=digest,
+            change=CHANGE if change is None else change,
+            sentence="model",
         )
         self.learning.receive(proposal._replace(**replaced), self.controller, self.now_ns)
 

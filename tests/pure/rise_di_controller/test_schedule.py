@@ -83,17 +83,22 @@ def test_change_of_scale_leaves_u_as_it_is() -> None:
     control_law, params = law()
     rng = np.random.default_rng(1)
     zero = np.zeros(4)
-    state = control_law.engage(Measurements(zero, zero, zero, zero, zero), params)
+    state = control_law.engage(
+        Measurements(y=zero, y_m=zero, y_m_dot=zero, u_trim=zero, u_before=zero), params
+    )
     for _ in range(20):
         y = 0.01 * rng.normal(size=4)
         state, u = control_law.step(
-            state, Measurements(y, zero, zero, zero, zero), np.float64(0.01), params
+            state,
+            Measurements(y=y, y_m=zero, y_m_dot=zero, u_trim=zero, u_before=zero),
+            np.float64(0.01),
+            params,
         )
     instant = np.float64(1e-9)
     at_once = params._replace(time=np.float64(1e-9))
     y[3] += FASTER
     # the reference moved too: the same error
-    moved = Measurements(y, y_at(FASTER), zero, zero, zero)
+    moved = Measurements(y=y, y_m=y_at(FASTER), y_m_dot=zero, u_trim=zero, u_before=zero)
     state, after = control_law.step(state, moved, instant, at_once)
     assert state.scale[0] == approx((SPEED / (SPEED + y[3])) ** 2)
     assert after == approx(u, rel=1e-6)

@@ -132,10 +132,15 @@ def test_law_at_a_steady_speed_is_that_of_its_models(scheduled: RiseDiConfig) ->
     errors = rng.normal(size=(20, 4)) * np.array([0.01, 0.01, 0.01, 0.0])
     for controller in (scheduled, scheduled.at_speed(FASTER)):
         law, params = controller.tuned_law()
-        state = law.engage(Measurements(V, V, zero, zero, zero), params)
+        state = law.engage(
+            Measurements(y=V, y_m=V, y_m_dot=zero, u_trim=zero, u_before=zero), params
+        )
         for e in errors:
             state, u = law.step(
-                state, Measurements(V + e, V, zero, zero, zero), np.float64(0.01), params
+                state,
+                Measurements(y=V + e, y_m=V, y_m_dot=zero, u_trim=zero, u_before=zero),
+                np.float64(0.01),
+                params,
             )
         outputs.append(u)
     assert outputs[0] == approx(outputs[1], rel=1e-9)
@@ -240,7 +245,13 @@ class Learns:
 
     def propose(self, change: dict[str, Any]) -> str:
         """What becomes of a proposal."""
-        proposal = Proposal(self.now_ns, LEARNS.digest(), self.controller.digest, change, "model")
+        proposal = Proposal(
+            stamp_ns=self.now_ns,
+            start=LEARNS.digest(),
+            flown=self.controller.digest,
+            change=change,
+            sentence="model",
+        )
         self.learning.receive(proposal, self.controller, self.now_ns)
         said = len(self.events)
         while len(self.events) == said:
@@ -258,7 +269,11 @@ def test_learned_models_of_all_speeds_fly_and_go_back_at_once(
     state, (law, params) = flight.controller.state, flight.model.tuned_law()
     assert state.y is not None
     at_once = Measurements(
-        state.y.value, state.y_m, np.zeros(4), state.u_trim + state.u_ff, state.u
+        y=state.y.value,
+        y_m=state.y_m,
+        y_m_dot=np.zeros(4),
+        u_trim=state.u_trim + state.u_ff,
+        u_before=state.u,
     )
     _, u = law.step(state.law, at_once, np.float64(1e-9), params)
     assert u == approx(state.u, abs=1e-6)
