@@ -39,8 +39,8 @@ MODERATE = 0.5  # SIM_WIND_TURB up to which one experiment has to show every sig
 def signs(experiments: int = 25) -> dict[str, Any]:
     """Short experiments, open loop, and what `rise-di check` says of each.
 
-    Each is in other turbulence; earlier ones are kept. The simulator draws its turbulence from one stream of random numbers
-    without a seed: each experiment has another part of it.
+    Each is in other turbulence; earlier ones are kept. The simulator draws its turbulence from one
+    stream of random numbers without a seed: each experiment has another part of it.
     """
     with arduplane(0.03) as plane:
         channel_map = plane.patient_map("ardupilot")
