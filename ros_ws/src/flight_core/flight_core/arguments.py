@@ -48,9 +48,9 @@ def _bounded(
     number: type[float], value: object, key: str, least: float, most: float, expected: str
 ) -> float:
     problems = Problems()
-    read: float = kind_of(number, {"ge": least, "le": most}).read(value, key, problems)
+    number_in_bounds: float = kind_of(number, {"ge": least, "le": most}).read(value, key, problems)
     require(not problems.sentences(), key, short_repr(value), expected)
-    return read
+    return number_in_bounds
 
 
 def as_numbers(value: object, key: str, expected: str) -> tuple[float, ...]:
@@ -59,9 +59,9 @@ def as_numbers(value: object, key: str, expected: str) -> tuple[float, ...]:
     Raises ParameterError for a different value.
     """
     problems = Problems()
-    read = kind_of(float | tuple[float, ...]).read(value, key, problems)
+    numbers = kind_of(float | tuple[float, ...]).read(value, key, problems)
     require(not problems.sentences(), key, short_repr(value), expected)
-    return read if isinstance(read, tuple) else (float(read),)
+    return numbers if isinstance(numbers, tuple) else (float(numbers),)
 
 
 def as_names(value: object, key: str, expected: str) -> tuple[str, ...]:
@@ -72,9 +72,9 @@ def as_names(value: object, key: str, expected: str) -> tuple[str, ...]:
     if isinstance(value, str):
         value = value.split(",") if value else ()
     problems = Problems()
-    read: tuple[str, ...] = kind_of(tuple[str, ...]).read(value, key, problems)
+    names: tuple[str, ...] = kind_of(tuple[str, ...]).read(value, key, problems)
     require(not problems.sentences(), key, short_repr(value), expected)
-    return read
+    return names
 
 
 def as_instance(value: object, kind: type[T], key: str, expected: str) -> T:

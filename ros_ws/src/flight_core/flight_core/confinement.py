@@ -36,18 +36,18 @@ def confine(folder: Path) -> list[str]:
     The process must have one thread. Returns a sentence for a measure without support by the
     kernel.
     """
-    ways = []
+    sentences = []
     if _LIBC.unshare(CLONE_NEWUSER | CLONE_NEWNET):
-        ways.append(
+        sentences.append(
             "foreign files are read with access to the network: the kernel refuses a namespace "
             f"({_reason()})"
         )
     if not _write_beneath(folder):
-        ways.append(
+        sentences.append(
             "foreign files are read with the right to write files: the kernel refuses landlock "
             f"({_reason()})"
         )
-    return ways
+    return sentences
 
 
 def _write_beneath(folder: Path) -> bool:
@@ -62,18 +62,18 @@ def _write_beneath(folder: Path) -> bool:
     if ruleset < 0:
         return False
     for path, rights in ((folder, changes), (Path(os.devnull), changes & (WRITE_FILE | TRUNCATE))):
-        opened = os.open(path, os.O_PATH | os.O_CLOEXEC)
-        refused = _LIBC.syscall(
-            ADD_RULE, ruleset, PATH_BENEATH, struct.pack("=Qi", rights, opened), 0
+        descriptor = os.open(path, os.O_PATH | os.O_CLOEXEC)
+        has_failed = _LIBC.syscall(
+            ADD_RULE, ruleset, PATH_BENEATH, struct.pack("=Qi", rights, descriptor), 0
         )
-        os.close(opened)
-        if refused:
+        os.close(descriptor)
+        if has_failed:
             return False
-    restricted = not _LIBC.prctl(NO_NEW_PRIVS, 1, 0, 0, 0) and not _LIBC.syscall(
+    is_restricted = not _LIBC.prctl(NO_NEW_PRIVS, 1, 0, 0, 0) and not _LIBC.syscall(
         RESTRICT_SELF, ruleset, 0
     )
     os.close(ruleset)
-    return restricted
+    return is_restricted
 
 
 def _reason() -> str:

@@ -18,11 +18,8 @@ from typing import NoReturn
 
 PROFILE_VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
 MAX_PARTICIPANTS = 100  # of a domain, by `flight_ros/loopback.xml`
-# bytes; rclpy and a flight use 12 kB
-SHARED_MEMORY, LEAST_SHARED_MEMORY = (
-    Path("/dev/shm"),  # noqa: S108
-    1 << 16,
-)
+SHARED_MEMORY = Path("/dev/shm")  # noqa: S108 - its free space is read, no file is made
+LEAST_SHARED_MEMORY = 1 << 16  # bytes; rclpy and a flight use 12 kB
 LEAST_FILES = 128  # open at once in a process
 LAST_START = 2**31 - 86_400
 """s. A stamp of ROS 2 has seconds of 32 bits with a sign: the last is on 2038-01-19
@@ -50,23 +47,23 @@ def _require_clock() -> None:
     now = time.time()
     if not 0.0 <= now < LAST_START:
         date = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(now))
-        wanted = "1970 to 2038-01-18 03:14 UTC, which the stamps of ROS 2 can hold"
+        span = "1970 to 2038-01-18 03:14 UTC, which the stamps of ROS 2 can hold"
         _refuse(
-            f"system clock: found {date}, expected {wanted}: set the clock (date --set), or fly "
+            f"system clock: found {date}, expected {span}: set the clock (date --set), or fly "
             "with --in-process"
         )
 
 
 def _require_domain() -> None:
     domain = os.environ.get("ROS_DOMAIN_ID", "")
-    fits = not domain or (re.fullmatch(r"[0-9]{1,9}", domain) and int(domain) <= MAX_DOMAIN)
-    if not fits:
+    is_domain = not domain or (re.fullmatch(r"[0-9]{1,9}", domain) and int(domain) <= MAX_DOMAIN)
+    if not is_domain:
         _refuse(f"ROS_DOMAIN_ID: found {domain!r}, expected a number from 0 to {MAX_DOMAIN}")
 
 
 def _require_middleware() -> None:
     """By the index of the installed packages; an installation without an index passes."""
-    wanted = os.environ.get("RMW_IMPLEMENTATION", "")
+    name = os.environ.get("RMW_IMPLEMENTATION", "")
     prefixes = [
         *filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)),
         sys.prefix,
@@ -75,10 +72,10 @@ def _require_middleware() -> None:
         Path(prefix) / "share/ament_index/resource_index/rmw_typesupport" for prefix in prefixes
     ]
     folders = filter(Path.is_dir, indexes)
-    names = {path.name for path in chain.from_iterable(map(Path.iterdir, folders))}
-    known = sorted(names - {"rmw_implementation"})
-    if wanted and known and wanted not in known:
-        _refuse(f"RMW_IMPLEMENTATION: found {wanted!r}, expected one of {', '.join(known)}")
+    installed = {path.name for path in chain.from_iterable(map(Path.iterdir, folders))}
+    choices = sorted(installed - {"rmw_implementation"})
+    if name and choices and name not in choices:
+        _refuse(f"RMW_IMPLEMENTATION: found {name!r}, expected one of {', '.join(choices)}")
 
 
 def _require_shared_memory() -> None:

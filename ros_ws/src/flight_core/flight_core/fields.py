@@ -111,8 +111,8 @@ def _number(kind: type[float], *, allow_inf_nan: bool = False, **limits: float) 
         if kind is not float or set(map(type, values)) != {float}:
             return False
         ends = (min(values), max(values))
-        in_limits = all(holds(end, limit) for holds, _, limit in checks for end in ends)
-        return in_limits and all(map(math.isfinite, values))
+        is_in_limits = all(holds(end, limit) for holds, _, limit in checks for end in ends)
+        return is_in_limits and all(map(math.isfinite, values))
 
     types = (int, kind)
     expected = "an integer" if kind is int else "a number"
@@ -142,9 +142,9 @@ def _string(*, min_length: int = 0, pattern: str = "") -> Kind:
 
 def _choice(choices: Sequence[object], expected: str = "") -> Kind:
     """A value among choices, of the same type: 1 is neither True nor 1.0."""
-    named = expected or _either([repr(choice) for choice in choices])
+    words = expected or _either([repr(choice) for choice in choices])
     return Kind(
-        named,
+        words,
         lambda value: any(type(value) is type(choice) and value == choice for choice in choices),
         _same,
     )
@@ -163,15 +163,15 @@ def _check_count(count: int, key: str, problems: Problems, least: float, most: f
 
 def _values(parts: Sequence[Any], *, min_length: float = 0, max_length: float = math.inf) -> Kind:
     """A tuple: of any length with values of one kind, or with a value per kind."""
-    repeated = parts[-1] is Ellipsis
+    is_repeated = parts[-1] is Ellipsis
     kinds = [kind_of(part) for part in parts if part is not Ellipsis]
-    least, most = (min_length, max_length) if repeated else (len(kinds), len(kinds))
+    least, most = (min_length, max_length) if is_repeated else (len(kinds), len(kinds))
 
     def content(value: Sequence[Any], key: str, problems: Problems) -> tuple[Any, ...]:
         _check_count(len(value), key, problems, least, most)
-        if repeated and value and kinds[0].takes_all(value):
+        if is_repeated and value and kinds[0].takes_all(value):
             return tuple(value)
-        each = zip(kinds * len(value) if repeated else kinds, value, strict=False)
+        each = zip(kinds * len(value) if is_repeated else kinds, value, strict=False)
         return tuple(
             kind.read(item, f"{key}[{i}]", problems) for i, (kind, item) in enumerate(each)
         )
@@ -190,14 +190,12 @@ def _table(parts: Sequence[Any], *, min_length: float = 0, max_length: float = m
     def content(value: Mapping[Any, Any], key: str, problems: Problems) -> dict[Any, Any]:
         _check_count(len(value), key, problems, min_length, max_length)
         table = {}
-        for entered, item in value.items():
-            # a key of JSON
+        for label, item in value.items():
+            # JSON has texts alone as keys
             is_number = (
-                parts[0] is int
-                and isinstance(entered, str)
-                and re.fullmatch(r"-?\d{1,18}", entered)
+                parts[0] is int and isinstance(label, str) and re.fullmatch(r"-?\d{1,18}", label)
             )
-            name = int(entered) if is_number else entered
+            name = int(label) if is_number else label
             if keys.takes(name):
                 table[keys.content(name, key, problems)] = values.read(
                     item, f"{key}.{name}", problems

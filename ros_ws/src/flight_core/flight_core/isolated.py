@@ -77,8 +77,8 @@ def call(
                 stdin=subprocess.DEVNULL,
                 timeout=WAIT * timeout,
                 cwd=folder,
-                env=os.environ
-                | {"TMPDIR": folder, "OPENBLAS_NUM_THREADS": "1"},  # each thread takes memory
+                # each thread takes memory
+                env=os.environ | {"TMPDIR": folder, "OPENBLAS_NUM_THREADS": "1"},
                 check=False,
             )
         except subprocess.TimeoutExpired:
@@ -92,11 +92,11 @@ def call(
             last = (process.stderr.strip() or "no result").splitlines()[-1]
             raise IsolatedCallError(f"exited with status {process.returncode} ({last})")
         with file.open("rb") as stream:
-            kind, value, open_ways = _Reader(
+            kind, value, warnings = _Reader(
                 stream, records.__name__ if records else function.__module__
             ).load()
-    for way in open_ways if foreign else ():
-        note(way)
+    for sentence in warnings if foreign else ():
+        note(sentence)
     if kind in ERRORS:
         raise ERRORS[kind](value)
     return value
@@ -138,28 +138,24 @@ def main() -> None:
     The result goes into the file RESULT.
     """
     timeout, memory, module, name, arguments = json.loads(sys.argv[1])
-    # that of the user, which no process may raise
-    hard = resource.getrlimit(resource.RLIMIT_CPU)[1]
-    soft = math.ceil(float(timeout))
-    resource.setrlimit(
-        resource.RLIMIT_CPU, (soft if hard == resource.RLIM_INFINITY else min(soft, hard), hard)
-    )
     limit_memory(memory)
-    for limit, most in ((resource.RLIMIT_FSIZE, FILE_LIMIT), (resource.RLIMIT_CORE, 0)):
-        resource.setrlimit(
-            limit,
-            (
-                min(most, current) if (current := resource.getrlimit(limit)[1]) >= 0 else most,
-                current,
-            ),
-        )
-    open_ways = confinement.confine(Path.cwd())
+    limits = (
+        (resource.RLIMIT_CPU, math.ceil(float(timeout))),
+        (resource.RLIMIT_FSIZE, FILE_LIMIT),
+        (resource.RLIMIT_CORE, 0),
+    )
+    for limit, most in limits:
+        # the hard limit is that of the user, which no process may raise
+        hard = resource.getrlimit(limit)[1]
+        soft = most if hard == resource.RLIM_INFINITY else min(most, hard)
+        resource.setrlimit(limit, (soft, hard))
+    warnings = confinement.confine(Path.cwd())
     try:
-        result = ("value", getattr(import_module(module), name)(*arguments), open_ways)
+        result = ("value", getattr(import_module(module), name)(*arguments), warnings)
     except FlightEnded as error:
-        result = ("ended", str(error), open_ways)
+        result = ("ended", str(error), warnings)
     except ParameterError as error:
-        result = ("refused", str(error), open_ways)
+        result = ("refused", str(error), warnings)
     with Path(RESULT).open("wb") as stream:
         _Writer(stream).dump(result)
 

@@ -7,11 +7,9 @@ One packet to its middleware may not take the memory of the host.
 
 import resource
 
-DATA_LIMIT = (
-    2 << 30
-    # bytes; a node of a flight maps 0.2 GB of data (VmData of proc_pid_status(5)), half of it
-    # thread stacks
-)
+DATA_LIMIT = 2 << 30
+"""Bytes. A node of a flight maps 0.2 GB of data (VmData of proc_pid_status(5)), half of it thread
+stacks."""
 
 
 def limit_memory(limit: int = DATA_LIMIT) -> None:

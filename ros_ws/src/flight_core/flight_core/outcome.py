@@ -135,13 +135,13 @@ def ended_early(reason: str) -> Outcome:
     return Outcome(End.ENDED_EARLY, bounded(reason))
 
 
-def log_ends_at(held: float, duration: float) -> Outcome:
+def log_ends_at(end: float, duration: float) -> Outcome:
     """The outcome of a flight of `duration` s whose log ends early.
 
-    It holds y, y_m and u up to the flight time `held`, s; -inf: none.
+    It holds y, y_m and u up to the flight time `end`, s; -inf: none.
     """
-    part = f"up to t = {held:.3f} of" if held >= 0.0 else "of"
-    verb = "holds" if held >= 0.0 else "does not hold"
+    part = f"up to t = {end:.3f} of" if end >= 0.0 else "of"
+    verb = "holds" if end >= 0.0 else "does not hold"
     return ended_early(f"ended early: the log {verb} y, y_m and u {part} {duration:g} s")
 
 

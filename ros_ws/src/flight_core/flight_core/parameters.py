@@ -97,14 +97,14 @@ class Config:
         """
         problems = Problems()
         try:
-            built = cls.read(values, where, problems, check=check)
+            parameters = cls.read(values, where, problems, check=check)
         except ArithmeticError as error:  # of a check with several keys
-            too_far = f"numbers too large or too small ({error.args[-1]})"
-            raise ParameterError(f"{where}: found {too_far}, expected those of a flight") from None
-        if built is None:
+            numbers = f"numbers too large or too small ({error.args[-1]})"
+            raise ParameterError(f"{where}: found {numbers}, expected those of a flight") from None
+        if parameters is None:
             first, *others = problems.sentences()
             raise ParameterError(first + (f" (and {len(others)} more)" if others else ""))
-        return built
+        return parameters
 
     @classmethod
     def read(
@@ -114,7 +114,7 @@ class Config:
 
         None, and a sentence in `problems`, for a value not permitted.
         """
-        before = len(problems.sentences())
+        count_before = len(problems.sentences())
         content = {}
         for name, field in cls.model_fields.items():
             if name in values:
@@ -134,17 +134,17 @@ class Config:
                 problems.unknown.append(
                     f"{key}.{name}: unknown key, expected {one_of(sorted(cls.model_fields), name)}"
                 )
-        if len(problems.sentences()) > before:
+        if len(problems.sentences()) > count_before:
             return None
-        built = cls.__new__(cls)
-        vars(built).update(content, _given=frozenset(values))
+        parameters = cls.__new__(cls)
+        vars(parameters).update(content, _given=frozenset(values))
         try:
             if check:
-                built._check()
+                parameters._check()
         except ValueError as error:  # from `require`, with the rest of the key and the sentence
             problems.others.append(f"{key}.{error}")
             return None
-        return built
+        return parameters
 
     def changed(self, changes: Mapping[str, Any]) -> dict[str, Any]:
         """The values with changes by dotted name, not validated.
@@ -198,19 +198,18 @@ class Config:
                 return (list if mode == "json" else type(value))(map(plain, value))
             return value
 
-        dumped = {}
+        tree = {}
         for name, field in self.model_fields.items():
             value = getattr(self, name)
-            is_left_out = (exclude_none and value is None) or (
-                exclude_defaults and value == field.default
-            )
-            if not (
+            is_excluded = (
                 name in exclude
-                or is_left_out
+                or (exclude_none and value is None)
+                or (exclude_defaults and value == field.default)
                 or (exclude_unset and name not in vars(self)["_given"])
-            ):
-                dumped[name] = plain(value)
-        return dumped
+            )
+            if not is_excluded:
+                tree[name] = plain(value)
+        return tree
 
     def model_dump_json(self, *, indent: int | None = None) -> str:
         """The set as JSON."""

@@ -71,11 +71,13 @@ class PublisherLock:
         if sender == self.publisher:
             return
         max_age_ns, takeover_ns = self._timeouts_ns()
-        restarted = (
+        is_restarted = (
             self.publisher is not None
             and sender.partition("#")[0] == self.publisher.partition("#")[0]
         )
-        if not self.timed_out(now_ns - self._overrun_ns, max_age_ns if restarted else takeover_ns):
+        if not self.timed_out(
+            now_ns - self._overrun_ns, max_age_ns if is_restarted else takeover_ns
+        ):
             raise ChannelError(
                 SENDER,
                 f"conflicting publisher {sender} ignored: already receiving from {self.publisher}",
@@ -83,14 +85,14 @@ class PublisherLock:
 
     def refresh(self, sender: str, now_ns: int) -> bool:
         """Lock to the publisher of a valid sample. Returns whether the publisher has changed."""
-        changed = sender != self.publisher
-        if changed:
+        has_changed = sender != self.publisher
+        if has_changed:
             self._sequence = 0
             self._went_back_ns = None
         self.publisher = sender
         self._received_ns = now_ns
         self._overrun_ns = 0
-        return changed
+        return has_changed
 
     def require_alone(self, sender: str, sequence: int, now_ns: int) -> None:
         """Raise ChannelError, reason "sender", where two publishers send under the locked name.
@@ -103,9 +105,9 @@ class PublisherLock:
             return
         is_shared = self._went_back_ns is not None and 0 <= now_ns - self._went_back_ns < SHARED_NS
         if sequence > 0:
-            went_back = sequence <= self._sequence
+            has_gone_back = sequence <= self._sequence
             self._sequence = sequence
-            if went_back and (is_shared or self.holds(sender, now_ns)):
+            if has_gone_back and (is_shared or self.holds(sender, now_ns)):
                 self._went_back_ns = now_ns
                 is_shared = True
         if is_shared:

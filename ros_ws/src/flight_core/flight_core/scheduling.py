@@ -81,5 +81,7 @@ def request_short_slices() -> None:
             if os.sched_getscheduler(thread) == os.SCHED_OTHER:
                 nice = os.getpriority(os.PRIO_PROCESS, thread)
                 size = struct.calcsize(ATTRIBUTES)
-                wanted = struct.pack(ATTRIBUTES, size, os.SCHED_OTHER, 0, nice, 0, SLICE_NS, 0, 0)
-                ctypes.CDLL(None).syscall(number, thread, wanted, 0)
+                attributes = struct.pack(
+                    ATTRIBUTES, size, os.SCHED_OTHER, 0, nice, 0, SLICE_NS, 0, 0
+                )
+                ctypes.CDLL(None).syscall(number, thread, attributes, 0)

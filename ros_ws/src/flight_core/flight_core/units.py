@@ -85,8 +85,8 @@ def quantity(unit: str, key: str = "unit") -> Quantity:
     """
     total = Quantity(1.0)
     for part in re.findall(r"[*/]?[^*/]*", unit)[:-1] or [""]:
-        read = re.fullmatch(r"[*/]?([^^]*)(?:\^(-?[1-9]))?", part)
-        name, power = read.groups() if read else (part, None)
+        factor = re.fullmatch(r"[*/]?([^^]*)(?:\^(-?[1-9]))?", part)
+        name, power = factor.groups() if factor else (part, None)
         if name not in BASE_UNITS:
             known = f"{one_of(tuple(BASE_UNITS), name)}, or a product such as ft/s^2"
             raise ParameterError(f"{key}: found {unit!r}, expected {known}")
@@ -113,12 +113,12 @@ def in_si(value: str | float, key: str, like: str) -> float:
     `like` is an SI unit of the same dimension. Raises ParameterError for a text without a finite
     number, an unknown unit, and a unit of a different dimension.
     """
-    parsed = re.fullmatch(
+    match = re.fullmatch(
         r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)(?:\s*)(\D.*)?", str(value).strip()
     )
-    if parsed is None:
+    if match is None:
         raise ParameterError(f"{key}: found {value!r}, expected a number in {like}, or with a unit")
-    entered = quantity(parsed[2] or like, key)
-    if entered.dimension != quantity(like).dimension:
+    unit = quantity(match[2] or like, key)
+    if unit.dimension != quantity(like).dimension:
         raise ParameterError(f"{key}: found {value!r}, expected a unit like {like}")
-    return float(parsed[1]) * entered.si
+    return float(match[1]) * unit.si

@@ -159,43 +159,43 @@ def require_not_old(stamp_ns: int, now_ns: int, max_age_ns: int) -> None:
 
 
 def select(
-    wanted: Sequence[str], names: Sequence[str], values: Sequence[float] | FloatArray
+    channels: Sequence[str], names: Sequence[str], values: Sequence[float] | FloatArray
 ) -> FloatArray:
-    """Values of the wanted channels, in the wanted order, shape (len(wanted),).
+    """Values of the channels, in the order of `channels`, shape (len(channels),).
 
-    v_i = values[names.index(wanted_i)]. Raises ChannelError with reason "length" (names and values
-    differ in number), "name" (a wanted channel is missing or duplicated) or "finite" (a wanted
-    value is NaN or infinite).
+    v_i = values[names.index(channels[i])]. Raises ChannelError with reason "length" (names and
+    values differ in number), "name" (a channel is missing or duplicated) or "finite" (a value of
+    the channels is NaN or infinite).
     """
     if len(names) != len(values):
         raise ChannelError("length", f"{len(names)} names for {len(values)} values")
-    if names is wanted:
-        selected = np.array(values, dtype=np.float64)
+    if names is channels:
+        vector = np.array(values, dtype=np.float64)
     else:
-        selected = np.asarray(values, dtype=np.float64)[_places(tuple(wanted), tuple(names))]
+        vector = np.asarray(values, dtype=np.float64)[_places(tuple(channels), tuple(names))]
     # a third of the time of np.isfinite for a few channels
-    if not all(map(math.isfinite, selected.tolist())):
-        raise ChannelError("finite", f"{', '.join(wanted)} = {selected.tolist()} is not finite")
-    return selected
+    if not all(map(math.isfinite, vector.tolist())):
+        raise ChannelError("finite", f"{', '.join(channels)} = {vector.tolist()} is not finite")
+    return vector
 
 
-def selection_matrix(wanted: Sequence[str], names: Sequence[str]) -> FloatArray:
-    """The matrix that selects the wanted channels by its product with values.
+def selection_matrix(channels: Sequence[str], names: Sequence[str]) -> FloatArray:
+    """The matrix that selects the channels by its product with values.
 
-    1 where a row of `wanted` and a column of `names` are the same channel, else 0.
+    1 where a row of `channels` and a column of `names` are the same channel, else 0.
     """
-    matrix = np.zeros((len(wanted), len(names)))
-    for row, channel in zip(matrix, wanted, strict=True):
+    matrix = np.zeros((len(channels), len(names)))
+    for row, channel in zip(matrix, channels, strict=True):
         row[:] = [name == channel for name in names]
     return matrix
 
 
 @lru_cache(maxsize=256)
-def _places(wanted: tuple[str, ...], names: tuple[str, ...]) -> NDArray[np.intp]:
-    """Places of the wanted channels among the names. Raises ChannelError as `select` does."""
-    for name in wanted:
+def _places(channels: tuple[str, ...], names: tuple[str, ...]) -> NDArray[np.intp]:
+    """Places of the channels among the names. Raises ChannelError as `select` does."""
+    for name in channels:
         if names.count(name) != 1:
             raise ChannelError(
                 "name", f"channel {name} expected once among {', '.join(names) or 'no names'}"
             )
-    return np.array([names.index(name) for name in wanted], dtype=np.intp)
+    return np.array([names.index(name) for name in channels], dtype=np.intp)

@@ -82,10 +82,9 @@ class Peers:
         self, sender: str, sent_ns: int, received_ns: int, reported: Mapping[str, float]
     ) -> None:
         """Take a message of another node, with the instants on both clocks."""
-        for name in [
-            name for name, heard_ns in self._heard_ns.items() if received_ns - heard_ns > FORGET_NS
-        ]:
-            self.forget(name)
+        for name, heard_ns in list(self._heard_ns.items()):
+            if received_ns - heard_ns > FORGET_NS:
+                self.forget(name)
         if sender == self._own or (sender not in self._seen and len(self._seen) >= PEERS):
             return
         self._heard_ns[sender] = received_ns
@@ -99,8 +98,8 @@ class Peers:
 
     def forget(self, name: str) -> None:
         """Forget a node."""
-        for known in (self._seen, self._reported, self._heard_ns, self._on_host):
-            known.pop(name, None)
+        for table in (self._seen, self._reported, self._heard_ns, self._on_host):
+            table.pop(name, None)
 
     def differences(self) -> dict[str, float]:
         """The report of a node: the least difference of every peer.
@@ -131,7 +130,7 @@ class PeerClocks:
         self._refusals = refusals
         self._peers = Peers(instance, number_of_host())
         self._instance = instance
-        self._told: dict[str, float] = {}
+        self._logged: dict[str, float] = {}
         self._publish = node.create_publisher(CLOCKS.type, CLOCKS.name, offered(CLOCKS)).publish
         self._subscription = PolledSubscription(node, CLOCKS, offered(CLOCKS), raw=True)
         self._decoder = NamedDecoder()
@@ -160,7 +159,7 @@ class PeerClocks:
         """The clocks of the peers."""
         return self._peers.clocks()
 
-    def told_of(self, sender: str) -> str:
+    def sentence_on(self, sender: str) -> str:
         """The end of a sentence on a stamp of a node whose clock differs.
 
         Empty without a known difference.
@@ -187,8 +186,8 @@ class PeerClocks:
         sentences = []
         for name, clock in self.clocks().items():
             offset = clock.offset if abs(clock.offset) > DIFFERS else 0.0
-            if abs(offset - self._told.get(name, 0.0)) > DIFFERS:
-                self._told[name] = offset
+            if abs(offset - self._logged.get(name, 0.0)) > DIFFERS:
+                self._logged[name] = offset
                 agrees = "agrees with this one" if offset == 0.0 else f"is {clock}: {clock.advice}"
                 sentences.append(bounded(f"the clock of {name} {agrees}"))
         return sentences

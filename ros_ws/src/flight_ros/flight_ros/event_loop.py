@@ -72,10 +72,10 @@ class _Stop:
     The lock of an Event deadlocks when a second signal interrupts the first handler.
     """
 
-    requested = False
+    is_requested = False
 
     def request(self, number: int, frame: FrameType | None) -> None:
-        self.requested = True
+        self.is_requested = True
 
 
 def run(
@@ -175,9 +175,8 @@ def _serve(executor: SingleThreadedExecutor, node: FlightNode[Any], until_ns: in
             return
         try:
             execute()
-        except (
-            Exception
-        ) as error:  # rclpy cannot serve the request, e.g. an invalid lifecycle transition
+        except Exception as error:
+            # rclpy cannot serve the request, e.g. an invalid lifecycle transition
             node.get_logger().error(bounded(f"request rejected: {' '.join(str(error).split())}"))
         if time.monotonic_ns() >= until_ns:
             return
@@ -200,11 +199,12 @@ def _run_lockstep(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> None:
     subscriptions = chain.from_iterable(node.polled_subscriptions for node in nodes)
     wait_set = WaitSet([subscription.entity for subscription in subscriptions], nodes[0].context)
     now_ns = advance_ns = serve_ns = report_ns = time.monotonic_ns()
-    began = False
-    while not stop.requested:
-        advanced = [node.advance() for node in nodes]  # each of them, without a short circuit
-        if any(advanced):
-            began = True
+    has_begun = False
+    while not stop.is_requested:
+        # each of them, without a short circuit
+        advances = [node.advance() for node in nodes]
+        if any(advances):
+            has_begun = True
             advance_ns = now_ns
         elif not wait_set.wait(nanoseconds(IDLE_POLL_PERIOD)):
             serve_ns = 0  # no message: check the liveliness of the peers now
@@ -221,24 +221,24 @@ def _run_lockstep(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> None:
                 for check in node.graph_checks():
                     check()
             if now_ns - advance_ns > PEER_TIMEOUT_NS:
-                require_input(nodes, advance_ns, began)
+                require_input(nodes, advance_ns, has_begun)
 
 
-def require_input(nodes: Sequence[FlightNode[Any]], advance_ns: int, began: bool) -> None:
+def require_input(nodes: Sequence[FlightNode[Any]], advance_ns: int, has_begun: bool) -> None:
     """Raise FlightEnded where a lockstep flight waits for ever.
 
     It waits for a sample that was refused, or for its first one. `advance_ns`: when it last
     advanced. A flight that began waits for a peer that is stopped, for instance in a debugger.
     """
     for node in nodes:
-        awaited = node.awaited_topic()
-        refused_ns, sentence = node.refusals.last.get(awaited, (0, ""))
+        topic = node.awaited_topic()
+        refused_ns, sentence = node.refusals.last.get(topic, (0, ""))
         if refused_ns >= advance_ns:
-            raise FlightEnded(f"timed out waiting for {awaited}: a sample was refused: {sentence}")
-    if not began:
-        awaited = nodes[0].awaited_topic()
+            raise FlightEnded(f"timed out waiting for {topic}: a sample was refused: {sentence}")
+    if not has_begun:
+        topic = nodes[0].awaited_topic()
         raise FlightEnded(
-            f"timed out waiting for {awaited}: no message in {seconds(PEER_TIMEOUT_NS):g} s"
+            f"timed out waiting for {topic}: no message in {seconds(PEER_TIMEOUT_NS):g} s"
         )
 
 
@@ -293,17 +293,17 @@ def _start_instants(
     nodes: Sequence[FlightNode[Any]], executor: SingleThreadedExecutor, stop: _Stop
 ) -> list[int]:
     """The starts of the nodes, ns of the system clock, once known; none after a signal."""
-    known: dict[FlightNode[Any], int] = {}
-    awaiting = [node for node in nodes if node.waits_for_start()]
-    while not stop.requested:
+    starts: dict[FlightNode[Any], int] = {}
+    waiting = [node for node in nodes if node.waits_for_start()]
+    while not stop.is_requested:
         for node in nodes:
             node.warn_without_time()
         has_time = all(node.has_time() for node in nodes)
-        for node in awaiting:
-            if has_time and node not in known and (start_ns := node.start_ns()) is not None:
-                known[node] = start_ns
-        if has_time and len(known) == len(awaiting):
-            return [known[node] if node in known else node.start_ns() or 0 for node in nodes]
+        for node in waiting:
+            if has_time and node not in starts and (start_ns := node.start_ns()) is not None:
+                starts[node] = start_ns
+        if has_time and len(starts) == len(waiting):
+            return [starts[node] if node in starts else node.start_ns() or 0 for node in nodes]
         for node in nodes:
             node.match()
         _serve(executor, nodes[0])
@@ -318,7 +318,7 @@ def _run_real_time(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> None:
     """
     executor = _start(nodes)
     starts = _start_instants(nodes, executor, stop)
-    running = [
+    loops = [
         RealTime(node, start_ns, spin=len(nodes) == 1)
         for node, start_ns in zip(nodes, starts, strict=False)
     ]
@@ -326,21 +326,21 @@ def _run_real_time(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> None:
     period_ns = nanoseconds(IDLE_POLL_PERIOD if len(nodes) == 1 else SERVICE_POLL_PERIOD)
     disable_timer_slack()
     request_short_slices()
-    while not stop.requested:
-        upcoming = min(running, key=lambda each: each.ticker.remaining())
+    while not stop.is_requested:
+        upcoming = min(loops, key=lambda each: each.ticker.remaining())
         upcoming.ticker.wait(IDLE_POLL_PERIOD)
-        ran = next((each for each in running if each.run_due_tick()), upcoming)
+        last = next((each for each in loops if each.run_due_tick()), upcoming)
         now_ns = time.monotonic_ns()
         if now_ns >= serve_ns:
             # Requests may take half of the time to the next tick.
-            remaining = min(each.ticker.remaining() for each in running)
+            remaining = min(each.ticker.remaining() for each in loops)
             _serve(executor, nodes[0], now_ns + nanoseconds(max(remaining, 0.0) / 2.0))
             for node in nodes:
                 node.require_flight()
                 node.warn_without_time()
                 node.match()
             duration_ns = time.monotonic_ns() - now_ns
-            late = min(each.ticker.remaining() for each in running) <= 0.0
-            pause_ns = LATE_REQUEST_PAUSE * duration_ns if late else 0
+            is_late = min(each.ticker.remaining() for each in loops) <= 0.0
+            pause_ns = LATE_REQUEST_PAUSE * duration_ns if is_late else 0
             serve_ns = now_ns + max(period_ns, min(pause_ns, LONGEST_PAUSE_NS))
-        ran.report()
+        last.report()

@@ -78,13 +78,14 @@ class FlightNode(Node, Generic[P]):
         # Two equal lockstep flights give equal bytes, so the process number is left out.
         process = "" if self.parameters.lockstep else f"#{os.getpid()}"
         self.instance = self.get_fully_qualified_name() + process
-        self.refusals, self.endpoints = Refusals(self, self.clock_of), EndpointMonitor(self)
-        simulated = self.get_parameter(SIM_TIME).value and not self.parameters.lockstep
-        self.simulated = SimulatedTime(self, self.refusals) if simulated else None
+        self.refusals = Refusals(self, self.clock_of)
+        self.endpoints = EndpointMonitor(self)
+        is_simulated = self.get_parameter(SIM_TIME).value and not self.parameters.lockstep
+        self.simulated = SimulatedTime(self, self.refusals) if is_simulated else None
         self.host: HostTime = self.simulated or time  # the time of the ticks
         self.clocks = (
             None
-            if simulated or self.parameters.lockstep
+            if is_simulated or self.parameters.lockstep
             else PeerClocks(self, self.instance, self.refusals)
         )
         self.polled_subscriptions: list[PolledSubscription] = []
@@ -104,7 +105,7 @@ class FlightNode(Node, Generic[P]):
         self._start_subscription = (
             PolledSubscription(self, START, offered(START), raw=True) if is_start_awaited else None
         )
-        self._matched = False
+        self._is_matched = False
         self._adopted: P | None = None
         self._tick_times = TickTimes()
         self.time_offset_ns = 0  # of the time of the ticks from the monotonic clock
@@ -263,7 +264,7 @@ class FlightNode(Node, Generic[P]):
 
     def clock_of(self, sender: str) -> str:
         """The end of a sentence on the stamp of a node whose clock differs; else empty."""
-        return "" if self.clocks is None else self.clocks.told_of(sender)
+        return "" if self.clocks is None else self.clocks.sentence_on(sender)
 
     def warn_no_publisher(
         self, subscription: PolledSubscription, lack: str = "no publisher"
@@ -289,8 +290,8 @@ class FlightNode(Node, Generic[P]):
                 "; ".join(self.endpoints.mismatches(subscription))
                 or "no sample of its publisher arrives"
             )
-        if refused := self.refusals.since(subscription, now_ns - NO_PUBLISHER_WARNING_NS):
-            cause = refused
+        if refusal := self.refusals.since(subscription, now_ns - NO_PUBLISHER_WARNING_NS):
+            cause = refusal
         self.get_logger().warning(f"waiting for {subscription.name}: {cause}")
 
     def _change_parameters(self, changes: list[Parameter]) -> SetParametersResult:
@@ -304,8 +305,8 @@ class FlightNode(Node, Generic[P]):
             return SetParametersResult(successful=True)
         try:
             sim_time = self.get_parameter(SIM_TIME).value
-            same = all(change.value == sim_time for change in changes if change.name == SIM_TIME)
-            require(same, f"{self.get_name()}.{SIM_TIME}", not sim_time, AT_START)
+            is_same = all(change.value == sim_time for change in changes if change.name == SIM_TIME)
+            require(is_same, f"{self.get_name()}.{SIM_TIME}", not sim_time, AT_START)
             parameters = changed(self, self.parameters, changes)
             self.on_parameters(parameters)
         except ParameterError as error:
@@ -335,10 +336,10 @@ class FlightNode(Node, Generic[P]):
             *self.inputs(),
             *([self._start_subscription] if self._start_subscription is not None else []),
         ]
-        if not self._matched and all(
+        if not self._is_matched and all(
             subscription.entity.get_publisher_count() for subscription in awaited
         ):
-            self._matched = True
+            self._is_matched = True
             self.publish_state(NodeState.MATCHED)
 
     def run_tick(self, tick: Tick, now_ns: int) -> None:
@@ -357,10 +358,10 @@ class FlightNode(Node, Generic[P]):
         """
         step_ns = self.host.time_ns() - self.now_ns()
         if abs(step_ns - self._clock_step_ns) > CLOCK_STEP_NS:
-            restored = abs(step_ns) <= CLOCK_STEP_NS
+            is_restored = abs(step_ns) <= CLOCK_STEP_NS
             advice = (
                 "it is correct again"
-                if restored
+                if is_restored
                 else "this node keeps its own time; restart all nodes or none"
             )
             self.get_logger().error(

@@ -52,13 +52,13 @@ def to_message(
     return message
 
 
-def from_message(message: JointState, wanted: Sequence[str]) -> StampedVector:
-    """The wanted channels of a message.
+def from_message(message: JointState, channels: Sequence[str]) -> StampedVector:
+    """Some channels of a message, in the order of `channels`.
 
     Raises ChannelError for invalid names, lengths or values.
     """
     stamp = message.header.stamp
-    value = select(wanted, message.name, message.position)
+    value = select(channels, message.name, message.position)
     return StampedVector(stamp.sec * NANOSECONDS + stamp.nanosec, value, message.header.frame_id)
 
 
@@ -104,10 +104,10 @@ class Encoder:
 
 
 class Decoder:
-    """Decodes the wanted channels of the messages of a topic."""
+    """Decodes some channels of the messages of a topic."""
 
-    def __init__(self, wanted: Sequence[str]) -> None:
-        self._wanted = list(wanted)
+    def __init__(self, channels: Sequence[str]) -> None:
+        self._channels = list(channels)
         self._fixed = b""  # the constant bytes of the last publisher's messages
         self._names: list[str] = []
         self._order: list[int] = []
@@ -123,7 +123,7 @@ class Decoder:
             message = _message(raw)
             if not message.name and not message.position:
                 return None
-            sample = from_message(message, self._wanted)
+            sample = from_message(message, self._channels)
             self._learn_layout(message, raw)
             return sample
         seconds, nanoseconds = STAMP.unpack_from(raw, STAMP_PLACE)
@@ -131,7 +131,7 @@ class Decoder:
         # the sum of finite values can overflow
         if not math.isfinite(value.sum()) and not np.isfinite(value).all():
             raise ChannelError(
-                "finite", f"{', '.join(self._wanted)} = {value.tolist()} is not finite"
+                "finite", f"{', '.join(self._channels)} = {value.tolist()} is not finite"
             )
         return StampedVector(seconds * NANOSECONDS + nanoseconds, value, self._sender)
 
@@ -150,7 +150,7 @@ class Decoder:
         self._names = list(message.name)
         self._place = encoder.place
         self._sender = message.header.frame_id
-        self._order = [self._names.index(name) for name in self._wanted]
+        self._order = [self._names.index(name) for name in self._channels]
         self._fixed = self._fixed_part(raw)
 
 

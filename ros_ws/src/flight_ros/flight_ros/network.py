@@ -30,8 +30,8 @@ def addresses(text: str) -> tuple[str, ...]:
             raise ParameterError(
                 f"--peers: found {address!r}, expected IPv4 addresses, as in 10.0.0.1,10.0.0.2"
             ) from None
-        usable = not (host.is_unspecified or host.is_multicast or host.is_loopback)
-        require(usable, "--peers", repr(address), "the address of a host on the network")
+        is_usable = not (host.is_unspecified or host.is_multicast or host.is_loopback)
+        require(is_usable, "--peers", repr(address), "the address of a host on the network")
     require(
         len(set(hosts)) == len(hosts) >= 2,
         "--peers",
@@ -47,11 +47,11 @@ def own_address(peers: Sequence[str], local: Collection[str]) -> str:
     Raises ParameterError.
     """
     matches = [address for address in peers if address in local]
-    named = ", ".join(sorted(local)) or "none"
+    own = ", ".join(sorted(local)) or "none"
     require(
         len(matches) == 1,
         "--peers",
-        f"{len(matches)} addresses of this host ({named})",
+        f"{len(matches)} addresses of this host ({own})",
         "one of them, and those of the other hosts",
     )
     return matches[0]

@@ -50,11 +50,11 @@ def read_parameters(node: Node, schema: type[P]) -> P:
     }
     for name, value in flatten(parameters.model_dump()):
         group = name.split(".")[0]
-        read_only = group not in tunable | own and name not in tunable
+        is_read_only = group not in tunable | own and name not in tunable
         # dynamic_typing: the set validates the types and accepts an integer as a float
         descriptor = ParameterDescriptor(
             description=descriptions.get(group, ""),
-            read_only=read_only,
+            read_only=is_read_only,
             dynamic_typing=True,
             additional_constraints=AT_RESTART if group in own else "",
         )
