@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The guidance node: targets, routes, services, learned authority, and what it does without its
-inputs.
+"""The guidance node.
+
+Tested are targets, routes, services, learned authority, and what it does without its inputs.
 """
 
 import math

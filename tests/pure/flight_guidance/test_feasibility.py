@@ -81,8 +81,9 @@ def test_a_speed_below_the_floor_is_refused() -> None:
 
 @pytest.mark.parametrize("altitude, side, rate", [(1300.0, "above", 2.5), (700.0, "below", 4.0)])
 def test_altitude_beyond_climb_flown_on_circles(altitude: float, side: str, rate: float) -> None:
-    """A climb is flown before the leg, a descent after the leg: clear of what the higher waypoint
-    was meant to clear.
+    """A climb is flown before the leg, a descent after the leg.
+
+    So the aircraft is clear of what the higher waypoint was meant to clear.
     """
     route = (
         CORNER[0],
@@ -109,8 +110,9 @@ def test_altitude_beyond_climb_flown_on_circles(altitude: float, side: str, rate
 
 
 def test_waypoint_of_short_leg_left_out_where_route_passes_near() -> None:
-    """Two corners 300 m apart: the nearer one to the line of its neighbours goes, and the note
-    tells the distance.
+    """Two corners are 300 m apart: the nearer one to the line of its neighbours goes.
+
+    The note tells the distance.
     """
     near = (
         Waypoint(0, 0, 0),
@@ -137,8 +139,9 @@ def test_waypoint_of_short_leg_left_out_where_route_passes_near() -> None:
 
 
 def test_routes_of_tutorial_are_as_shown(tmp_path: Path) -> None:
-    """The triangle of the tutorial is planned, the short route refused with the sentence on the
-    page.
+    """The triangle of the tutorial is planned.
+
+    The short route is refused with the sentence on the page.
     """
     page = (REPOSITORY / "docs" / "fly-a-route.md").read_text()
     guidance = find_scenario("osprey_route").guidance

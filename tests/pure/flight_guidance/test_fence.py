@@ -67,8 +67,9 @@ def test_clearance_is_distance_from_border() -> None:
 
 
 def test_clearance_of_several_zones() -> None:
-    """An aircraft stays in one of the zones to stay in, and out of each excluded zone. An edge
-    inside the other is none.
+    """An aircraft stays in one of the zones to stay in, and out of each excluded zone.
+
+    An edge inside the other is none.
     """
     second = SQUARE._replace(north=tuple(value + 150.0 for value in SQUARE.north))
     assert at((SQUARE, second), (75.0, 0.0), (240.0, 0.0), (-90.0, 0.0)) == approx(
@@ -85,8 +86,9 @@ EDGE_EAST = Zone((-3000.0, 3000.0, 3000.0, -3000.0), (-2000.0, -2000.0, 500.0, 5
 @pytest.mark.parametrize("edge, course", [(EDGE_NORTH, 0.0), (EDGE_EAST, math.pi / 2.0)])
 @pytest.mark.parametrize("wind", [0.0, 7.5, -7.5])
 def test_predicted_turn_is_arc_with_drift(edge: Zone, course: float, wind: float) -> None:
-    """Head on to an edge, without roll time: the way to the edge is R sin(w t) + W t at w t =
-    acos(-W / V).
+    """Head on to an edge, without roll time.
+
+    The way to the edge is R sin(w t) + W t at w t = acos(-W / V).
     """
     speed = 25.0
     bank = math.radians(30.0)
@@ -107,8 +109,9 @@ def test_predicted_turn_is_arc_with_drift(edge: Zone, course: float, wind: float
 @pytest.mark.parametrize("side", [1.0, -1.0])
 @pytest.mark.parametrize("wind", [5.0, -5.0])
 def test_predicted_turn_drifts_with_wind_across(side: float, wind: float) -> None:
-    """Along an edge, a turn towards the edge: nearest is R (1 - cos(w t)) + W t, where V sin(w t) =
-    -W.
+    """Along an edge, a turn towards the edge.
+
+    Nearest is R (1 - cos(w t)) + W t, where V sin(w t) = -W.
     """
     speed = 25.0
     bank = math.radians(30.0)
@@ -131,11 +134,10 @@ def test_predicted_turn_drifts_with_wind_across(side: float, wind: float) -> Non
 @pytest.mark.parametrize("side", [1.0, -1.0])
 @pytest.mark.parametrize("phi", [0.0, -0.3])
 def test_predicted_turn_ends_after_lag_and_roll(side: float, phi: float) -> None:
-    """The course points home all the time, 15 deg to the side: the turn is flown until the bank is
-    there, no longer.
+    """The course points home all the time, 15 deg to the side.
 
-    That is the lag and the time of the roll, in which a level aircraft turns by 7 deg, within a
-    step of the prediction.
+    The turn is flown until the bank is there, no longer. That is the lag and the time of the roll,
+    in which a level aircraft turns by 7 deg, within a step of the prediction.
     """
     speed = 25.0
     bank = math.radians(30.0)
@@ -211,8 +213,9 @@ LEAST_RADIUS = 282.0
 
 @pytest.mark.parametrize("name", benchmark.OUTSIDE)
 def test_aircraft_outside_flies_home_in_wind(name: str) -> None:
-    """A point that banks at 0.35 rad/s and turns by g tan(phi) / V, in winds of 0.4 V from four
-    sides, heading four ways.
+    """A point banks at 0.35 rad/s and turns by g tan(phi) / V.
+
+    The winds are of 0.4 V from four sides, and it heads four ways.
     """
     scaled = benchmark.OUTSIDE[name]
     fence = Fence(
@@ -268,8 +271,9 @@ def test_aircraft_outside_flies_home_in_wind(name: str) -> None:
 
 
 def test_outside_is_a_state_of_its_own() -> None:
-    """Outside the aircraft flies the course of the shortest way inside, until it is half a second
-    of flight inside.
+    """Outside the aircraft flies the course of the shortest way inside.
+
+    It does so until it is half a second of flight inside.
     """
     fence = Fence((FIELD,), (0.0, 0.0))
 
@@ -287,8 +291,9 @@ def test_outside_is_a_state_of_its_own() -> None:
 
 
 def test_on_the_way_home_no_turn_begins_that_keeps_the_clearance_of_now() -> None:
-    """A quarter of a second of flight from the border, away from it and across the way home: the
-    margin of a first turn would begin one.
+    """A quarter of a second of flight from the border, away from it and across the way home.
+
+    The margin of a first turn would begin one.
     """
     fence = Fence((FIELD,), (0.0, 0.0))
     near = motion(1300.0 - 6.25, 0.0, math.radians(100.0))
@@ -300,8 +305,9 @@ def test_on_the_way_home_no_turn_begins_that_keeps_the_clearance_of_now() -> Non
 
 
 def test_no_turn_begins_that_is_worse_than_the_way_home() -> None:
-    """In a funnel of 80 to 18 m, home at its narrow end: the way keeps 9 m, less than 12.5 m, and a
-    turn leaves by 200 m.
+    """A funnel of 80 to 18 m has home at its narrow end.
+
+    The way keeps 9 m, less than 12.5 m, and a turn leaves by 200 m.
     """
     funnel = Zone((-1000.0, 1600.0, 1600.0, -1000.0), (-40.0, -9.0, 9.0, 40.0))
     escape = last_safe_turn(Fence((funnel,), (1500.0, 0.0)), HOME, motion(0.0, 0.0))
@@ -310,8 +316,9 @@ def test_no_turn_begins_that_is_worse_than_the_way_home() -> None:
 
 
 def test_way_home_leads_round_a_zone() -> None:
-    """A slot of a U between the aircraft and home: the way leads to the closed end, and has a
-    turn's room there.
+    """A slot of a U is between the aircraft and home.
+
+    The way leads to the closed end, and has a turn's room there.
     """
     arms = Zone(
         (-600.0, 2600.0, 2600.0, -600.0, -600.0, 1600.0, 1600.0, -600.0),
@@ -484,8 +491,9 @@ def test_start_outside_of_fence_refused() -> None:
 
 
 def test_lost_link_flies_home() -> None:
-    """Without a message of an operator the route ends after the limit, which log, replay, notice
-    and outcome know.
+    """Without a message of an operator the route ends after the limit.
+
+    Log, replay, notice and outcome know it.
     """
     route = {"north": [0.0, 900.0], "east": [0.0, 0.0], "altitude": [0.0, 0.0]}
     scenario = calm(5.0, route=route, home={"east": 300.0, "link_timeout": 3.0})
@@ -562,8 +570,10 @@ def square(half: float, wind: float = 0.0) -> dict[str, Any]:
 
 
 def test_fence_in_which_no_turn_onto_the_orbit_fits_is_refused_with_the_size() -> None:
-    """The turn from home leaves home by twice its radius, 137 m with the slip of the prediction,
-    and by what the aircraft flies meanwhile: the orbit of 144 m alone fits into the square.
+    """The turn from home leaves home by more than the square allows.
+
+    It leaves by twice its radius, 137 m with the slip of the prediction, and by what the aircraft
+    flies meanwhile: the orbit of 144 m alone fits into the square.
     """
     with pytest.raises(ParameterError) as refused:
         GuidanceConfig.validate_mapping(square(200.0), "guidance")

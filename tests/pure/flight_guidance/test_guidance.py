@@ -161,8 +161,9 @@ def test_course_approached_on_shorter_side() -> None:
 
 
 def cross_track(e_0: float, times: FloatArray) -> FloatArray:
-    """Cross-track error of a point with the acceleration of `path_acceleration` beside a line to
-    the north.
+    """Cross-track error of a point with the acceleration of `path_acceleration`.
+
+    It flies beside a line to the north.
     """
 
     def derivative(_: float, z: FloatArray) -> list[float]:
@@ -221,8 +222,9 @@ def test_acceleration_on_circle_is_centripetal(radius: float) -> None:
 
 
 def offset_from_a_circle(*, estimated: bool) -> float:
-    """Radius of the orbit in m beyond that asked for, of an aircraft that slips: a tenth of its
-    bank's turn is missing.
+    """Radius of the orbit beyond that of the command, m, of an aircraft that slips.
+
+    A tenth of its bank's turn is missing.
     """
     speed, radius, dt = 50.0, 800.0, 0.05
     north = 0.0
@@ -274,8 +276,9 @@ def test_gyro_bias_is_no_sideslip() -> None:
 
 
 def test_heading_is_smoothed_without_lag_across_180_deg() -> None:
-    """T = 2 s at 50 Hz. A low-pass leaves of white noise sigma sqrt(g / (2 - g)), g = 1 -
-    exp(-dt/T): 0.07 deg of 1.
+    """T = 2 s at 50 Hz.
+
+    A low-pass leaves of white noise sigma sqrt(g / (2 - g)), g = 1 - exp(-dt/T): 0.07 deg of 1.
     """
     dt = 0.02
     noise = np.random.default_rng(1).normal(0.0, math.radians(1.0), 5000)

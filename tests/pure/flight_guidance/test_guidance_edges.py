@@ -82,8 +82,9 @@ def test_fence_has_a_number_at_every_edge(asarray: Callable[[Any], Array]) -> No
 
 @pytest.mark.parametrize("wind", [0.0, 30.0])
 def test_turn_without_bank_is_the_straight_way(wind: float) -> None:
-    """Away from home to the north at 20 m/s with a wind from the west, over a square: the line ends
-    at the farthest.
+    """Away from home to the north at 20 m/s with a wind from the west, over a square.
+
+    The line ends at the farthest.
     """
     straight = motion(20.0, 0.0, (0.0, wind), np.float64(0.0))._replace(north=500.0)
     right, left = map(float, turn_clearance(FENCE, straight))

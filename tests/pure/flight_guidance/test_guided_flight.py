@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Guided flights in one process: holds, routes, protection, failsafe, refusals, and the log from
-which each step follows.
+"""Guided flights in one process.
+
+Tested are holds, routes, protection, failsafe, refusals, and the log from which each step follows.
 """
 
 import math

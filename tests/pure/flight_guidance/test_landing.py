@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A landing on a line of the route: what is refused, the flare, the nose along the line, and the
-go-around.
+"""A landing on a line of the route.
+
+Tested are what is refused, the flare, the nose along the line, and the go-around.
 """
 
 import dataclasses
@@ -131,8 +132,9 @@ def test_box_ahead_is_flown_to_and_a_missed_box_goes_around(across: Scenario) ->
 def test_no_go_around_below_the_height_of_the_decrab(
     height: float, around: bool, across: Scenario
 ) -> None:
-    """A metre above the ground a drift out of the box ends on the ground beside it, not in a climb
-    from there.
+    """A metre above the ground a drift out of the box ends on the ground beside it.
+
+    It does not end in a climb from there.
     """
     box = {"north": [700.0, 1000.0, 1000.0, 700.0], "east": [5.0, 5.0, 20.0, 20.0]}
     section = section_with(across, touchdown=box)

@@ -162,8 +162,9 @@ def test_authority_acts_from_the_next_step_on_and_is_logged() -> None:
 
 
 def rolled(share: float, test: RollTest) -> RollTest:
-    """The test after 60 s of steps of the bank to either side, of an aircraft that rolls with a
-    share of the command, 0.4 s behind it, and with gusts.
+    """The test after 60 s of steps of the bank to either side.
+
+    The aircraft rolls with a share of the command, 0.4 s behind it, and with gusts.
     """
     dt = 0.02
     # rad/s, of which 0.05 rms are left: ten times those of an osprey in moderate turbulence

@@ -168,8 +168,9 @@ def plan(
 
 
 def wpl(*rows: tuple[float, ...]) -> str:
-    """Rows of frame, command, latitude, longitude, altitude, perhaps the first two parameters,
-    after the home at 400 m.
+    """Rows of a QGC WPL 110, after the home at 400 m.
+
+    A row has frame, command, latitude, longitude, altitude, perhaps the first two parameters.
     """
     lines = [(*row, 0.0, 0.0)[:7] for row in [(0, 16, 47.4, 8.5, 400.0), *rows]]
     texts = [
@@ -575,8 +576,9 @@ def test_fence_of_file_is_zones_and_home(tmp_path: Path, ending: str) -> None:
 
 
 def test_inclusion_zones_of_an_autopilot_are_one_group(tmp_path: Path) -> None:
-    """MAVLink: inside all zones of a group. A plan has no groups; PX4 and ArduPilot stay inside all
-    of its zones.
+    """MAVLink: inside all zones of a group.
+
+    A plan has no groups; PX4 and ArduPilot stay inside all of its zones.
     """
     path = tmp_path / "fence.plan"
     polygon = PLAN_FENCE["geoFence"]["polygons"][0]

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Legs of a route are flown or said to be missed: joining circles, tangents, the wind, against
-closed forms of geometry.
+"""Legs of a route are flown or said to be missed.
+
+Joining circles, tangents and the wind are tested against closed forms of geometry.
 """
 
 import math
@@ -211,8 +212,9 @@ def test_first_waypoint_has_to_be_reached() -> None:
 
 
 def test_leg_after_sharp_corner_is_joined() -> None:
-    """A turn of 174 deg has no fillet: the aircraft passes the waypoint, and a circle leads it onto
-    the leg back.
+    """A turn of 174 deg has no fillet.
+
+    The aircraft passes the waypoint, and a circle leads it onto the leg back.
     """
     flown = Flown(
         (0.0, 0.0, 100.0), (1000.0, 0.0, 100.0), (-600.0, 160.0, 100.0), (-600.0, 2000.0, 100.0)
@@ -303,8 +305,9 @@ def test_altitude_changes_along_leg_or_at_its_begin(profile: str) -> None:
 def circling(
     flown: Flown, centre: path.Point, turns: float, altitude: float = 100.0, first: float = -90.0
 ) -> dict[str, float]:
-    """The log after steps of flight clockwise round a centre, from a bearing of the centre in
-    deg.
+    """The log after steps of flight clockwise round a centre.
+
+    The flight begins at a bearing of the centre in deg.
     """
     log: dict[str, float] = {}
     step = SPEED * 0.02 / R
@@ -319,8 +322,9 @@ def circling(
 
 @pytest.mark.parametrize("turns, wait", [(2.0, 0.0), (0.0, 60.0), (2.0, 1.0), (0.5, 60.0)])
 def test_loiter_ends_after_its_turns_or_wait(turns: float, wait: float) -> None:
-    """The route goes on to the north. A circle takes 2 pi R / V = 36 s; the aircraft leaves it in
-    the west.
+    """The route goes on to the north.
+
+    A circle takes 2 pi R / V = 36 s; the aircraft leaves it in the west.
     """
     centre = (2000.0, 0.0)
     flown = Flown((0.0, 0.0, 100.0), (*centre, 100.0, None, turns, wait), (5000.0, -R, 100.0))

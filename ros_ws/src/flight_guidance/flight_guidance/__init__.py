@@ -1,5 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Guidance of the RISE-DI flight stack: attitude, altitude, course and routes outside the control
-law.
+"""Guidance of the RISE-DI flight stack, outside the control law.
+
+Attitude, altitude, course and routes.
 """

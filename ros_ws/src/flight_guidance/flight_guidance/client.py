@@ -85,8 +85,9 @@ class GuidanceClient(Client):
             self._node.destroy_publisher(publisher)
 
     def _reaches_guidance(self, publisher: Publisher) -> bool:
-        """Whether guidance is among the subscribers in the graph, and each of them has been
-        matched.
+        """Whether guidance is among the subscribers in the graph.
+
+        Every subscriber has to be matched, too.
         """
         known = [
             endpoint.node_name
@@ -95,8 +96,9 @@ class GuidanceClient(Client):
         return NAME in known and len(known) <= publisher.get_subscription_count()
 
     def _reason(self, topic: Topic, is_taken: Callable[[], bool], unknown: str) -> str:
-        """Wait until guidance has taken a message, or has refused it. Returns the reason, `unknown`
-        after TARGET_TIMEOUT.
+        """Wait until guidance has taken a message, or has refused it.
+
+        Returns the reason, `unknown` after TARGET_TIMEOUT.
         """
         reasons: list[str] = []
 
@@ -116,8 +118,9 @@ class GuidanceClient(Client):
         return reasons[-1] if reasons else ""
 
     def _refusals(self, topic: Topic) -> list[str]:
-        """Why guidance has refused messages of a topic since the last call, from the log of the
-        nodes.
+        """Why guidance has refused messages of a topic since the last call.
+
+        The reasons come from the log of the nodes.
         """
         texts = [
             received.message.msg
@@ -161,8 +164,9 @@ class TargetClient(GuidanceClient):
         )
 
     def send(self, values: Mapping[str, float]) -> str:
-        """Publish commands by channel until guidance has them in force. Returns why they are not,
-        or "".
+        """Publish commands by channel until guidance has them in force.
+
+        Returns why they are not, or "".
         """
         self._spin_until(lambda: bool(self._received()), self._silent)
         self._log.take()
@@ -174,8 +178,9 @@ class TargetClient(GuidanceClient):
         self._publish({})
 
     def hold_link(self) -> NoReturn:
-        """Keep the link, a message each LINK_PERIOD. Raises ParameterError where no guidance flies
-        in the domain.
+        """Keep the link, a message each LINK_PERIOD.
+
+        Raises ParameterError where no guidance flies in the domain.
         """
         while True:
             self._spin_until(lambda: bool(self._received()), self._silent)

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Feasibility: refusal of a route beyond the aircraft's performance before the flight, with the
-nearest feasible value.
+"""Feasibility: refusal of a route beyond the aircraft's performance before the flight.
+
+The refusal has the nearest feasible value.
 """
 
 import math
@@ -40,8 +41,9 @@ class Performance(NamedTuple):
 
 
 def speeds(waypoints: Sequence[Waypoint], first: float) -> tuple[float, ...]:
-    """Airspeeds on the legs to the waypoints, m/s: of the waypoint, or of the leg before; `first`
-    where none is named yet.
+    """Airspeeds on the legs to the waypoints, m/s.
+
+    The airspeed is that of the waypoint, or of the leg before; `first` where none is named yet.
     """
     named = []
     for waypoint in waypoints:
@@ -51,8 +53,9 @@ def speeds(waypoints: Sequence[Waypoint], first: float) -> tuple[float, ...]:
 
 
 class FlyableRoute(NamedTuple):
-    """The legs of a route, and the waypoints that the legs fly: without those that are cut, with
-    the loiters of steep legs.
+    """The legs of a route, and the waypoints that the legs fly.
+
+    Waypoints that are cut are missing, and steep legs have loiters.
     """
 
     legs: tuple[Leg, ...]
@@ -138,10 +141,9 @@ def _legs(waypoints: Sequence[Waypoint], radius: float, least: float) -> tuple[L
 def _without_short_legs(
     waypoints: Sequence[Waypoint], radius: float, least: float
 ) -> tuple[list[tuple[int, Waypoint]], tuple[str, ...]]:
-    """The waypoints with their numbers, without those left out for short legs, and a note on each
-    of these.
+    """The waypoints with their numbers, without those left out for short legs.
 
-    Raises ShortLegError where none can go.
+    A note tells each of the latter. Raises ShortLegError where none can go.
     """
     remaining = list(enumerate(waypoints))
     refusal = None
@@ -197,8 +199,9 @@ def _with_circles(
     least: float,
     can: Performance,
 ) -> FlyableRoute:
-    """The route with a circle for each change of altitude beyond the climb or sink along the leg;
-    waypoints by number.
+    """The route with a circle for each change of altitude that the leg does not allow.
+
+    The change is beyond the climb or sink along the leg. Waypoints are by number.
     """
     numbers = list(numbered)
     waypoints = list(numbered.values())
@@ -278,8 +281,9 @@ def require_bounds(waypoints: Sequence[Waypoint], can: Performance) -> None:
 
 
 def require_inside(route: Route, fence: Fence, margin: float) -> None:
-    """Raise ParameterError for a leg nearer to the fence than `margin`, m, with the place that is
-    the farthest outside.
+    """Raise ParameterError for a leg nearer to the fence than `margin`, m.
+
+    The sentence has the place that is the farthest outside.
     """
     start: Point = (0.0, 0.0)
     for number, leg in enumerate(route.legs):

@@ -156,8 +156,9 @@ def require_channels(logged: Collection[str]) -> None:
 
 
 def u_m(state: GuidanceState) -> FloatArray:
-    """What is published as u_m: the commands in the order of the parameters' outputs, then
-    ATTITUDE.
+    """What is published as u_m.
+
+    The commands in the order of the parameters' outputs, then ATTITUDE.
     """
     return np.array([*state.u_m, state.phi, state.theta - state.alpha])
 
@@ -276,14 +277,16 @@ class Guidance:
         self._pose = newest
 
     def take_y(self, sample: StampedVector, now_ns: int) -> None:
-        """Take a y in the order of the parameters' outputs. Raises ChannelError as `take_pose`
-        does, but for equal values.
+        """Take a y in the order of the parameters' outputs.
+
+        Raises ChannelError as `take_pose` does, but for equal values.
         """
         self._y = self._newest(self._y, sample, now_ns)
 
     def take_authority(self, channels: Mapping[str, float]) -> None:
-        """Limit the steps from now on by what the inputs can do, from the channels of the topic
-        `authority`.
+        """Limit the steps from now on by what the inputs can do.
+
+        The channels are those of the topic `authority`.
         """
         self._authority = authority_of(channels)._replace(roll=self._authority.roll)
 
@@ -301,8 +304,9 @@ class Guidance:
         return sample
 
     def take_target(self, values: Mapping[str, float]) -> None:
-        """Take commands by channel of Target; commands of the same instant come in one call. Raises
-        ChannelError.
+        """Take commands by channel of Target; commands of the same instant come in one call.
+
+        Raises ChannelError.
         """
         targets.read_target(values, self._params, self.route, degrees=True)
         # A lateral or vertical command replaces the command of the mode before.
@@ -339,7 +343,8 @@ class Guidance:
         self._link_lost = False
 
     def hold(self) -> bool:
-        """Hold the heading, the altitude and the airspeed of now, or of a multicopter the place;
+        """Hold the heading, the altitude and the airspeed of now, or of a multicopter the place.
+
         False while guidance does not fly.
         """
         if self.mode is not Mode.ENGAGED or self._pose is None or self._y is None:
@@ -358,8 +363,9 @@ class Guidance:
         return True
 
     def skip(self) -> bool:
-        """Leave the waypoint ahead out and fly to the next waypoint; False while no route is flown,
-        and on the last leg.
+        """Leave the waypoint ahead out and fly to the next waypoint.
+
+        False while no route is flown, and on the last leg.
         """
         state = self._state
         route = self.route
@@ -380,8 +386,9 @@ class Guidance:
         return True
 
     def resume(self) -> bool:
-        """Fly the last leg again from the nearest point; False while the route is flown, and
-        without a route.
+        """Fly the last leg again from the nearest point.
+
+        False while the route is flown, and without a route.
         """
         state = self._state
         route = self.route
@@ -405,8 +412,9 @@ class Guidance:
         self._engaged = engaged
 
     def pause(self, *, paused: bool, forget: bool) -> None:
-        """Command nothing while the controller does not fly. `forget`: then hold what is measured,
-        else go on as before.
+        """Command nothing while the controller does not fly.
+
+        `forget`: then hold what is measured, else go on as before.
         """
         if forget:
             self._begin = Begin.HOLD
@@ -415,8 +423,9 @@ class Guidance:
         self._paused = paused
 
     def _forget_commands(self) -> None:
-        """Forget commands given while guidance did not fly, but a route. Before the first step
-        commands wait.
+        """Forget commands given while guidance did not fly, but a route.
+
+        Before the first step commands wait.
         """
         if self._state is not None:
             self._given = {
@@ -447,8 +456,9 @@ class Guidance:
         }
 
     def waits(self, now_ns: int) -> str:
-        """Why there is no u_m, once guidance has waited for STALE_TIME for a young pose or a step
-        without a failure; else "".
+        """Why there is no u_m; "" where there is one.
+
+        Guidance then has waited for STALE_TIME for a young pose or a step without a failure.
         """
         since = self._waits_from_ns
         pose = self._pose
@@ -498,12 +508,12 @@ class Guidance:
             self._given |= self._lander.commands(state, self.pose(), self.route)
 
     def step(self, now_ns: int, t_ns: int) -> GuidanceOutput | None:
-        """A step at an instant and flight time t; None without fresh y, before the first pose, and
-        while disengaged.
+        """A step at an instant and flight time t.
 
-        After steps of None the filters start again at the measured values. A step fails by an
-        exception or a value that is not finite: the state stays, commands wait for the next step,
-        and the last u_m goes on up to the age limit.
+        None without fresh y, before the first pose, and while disengaged. After steps of None the
+        filters start again at the measured values. A step fails by an exception or a value that is
+        not finite: the state stays, commands wait for the next step, and the last u_m goes on up to
+        the age limit.
         """
         try:
             return self._step(now_ns, t_ns)

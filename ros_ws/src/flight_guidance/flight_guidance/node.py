@@ -84,12 +84,12 @@ LEVELS = {Mode.ENGAGED: DiagnosticStatus.OK, Mode.POSE_LOST: DiagnosticStatus.ER
 
 
 class GuidanceNode(FlightNode[GuidanceConfig]):
-    """A tick takes the received y, pose, target and route, steps `guidance.Guidance` and publishes
-    u_m and guidance.
+    """A tick takes the inputs, steps `guidance.Guidance` and publishes u_m and guidance.
 
-    In real time guidance flies while the controller is ENGAGED. In lockstep the number of samples
-    of y gives the time. A step waits for the y and the pose of the instant and publishes exactly
-    one u_m, without channels where guidance has no command.
+    The inputs are the received y, pose, target and route. In real time guidance flies while the
+    controller is ENGAGED. In lockstep the number of samples of y gives the time. A step waits for
+    the y and the pose of the instant and publishes exactly one u_m, without channels where guidance
+    has no command.
     """
 
     def __init__(self) -> None:
@@ -199,8 +199,9 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         return (self._pose if self._inputs.has_y else self._y).name
 
     def _receives_authority(self, now_ns: int) -> bool:
-        """Lockstep: whether the last `authority` from before a step has arrived, of a controller
-        that learns.
+        """Lockstep: whether the last `authority` from before a step has arrived.
+
+        A controller that learns sends `authority`.
         """
         if self._authority is None or not now_ns:
             return True
@@ -308,8 +309,9 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
                 self._guidance.keep_link()
 
     def _receive_authority(self) -> Receiver[StampedVector] | None:
-        """The receiver of `authority`; None in a flight without a learner, where an unexpected
-        publisher alone would send.
+        """The receiver of `authority`; None in a flight without a learner.
+
+        There an unexpected publisher alone would send.
         """
         rate = self.parameters.authority_rate
         self._authority_period_ns = period_ns(rate, "authority_rate") if rate else 0
@@ -331,8 +333,9 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         return None if self._internals.lock is None else self._internals.lock.publisher
 
     def _poll_authority(self, now_ns: int) -> None:
-        """Real time: take `authority`. The last sample is void after FEWEST_AUTHORITIES periods and
-        the age limit.
+        """Real time: take `authority`.
+
+        The last sample is void after FEWEST_AUTHORITIES periods and the age limit.
         """
         if self._authority is None:
             return
@@ -360,8 +363,9 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         self._authority_ns = sample.stamp_ns
 
     def _take_mode(self, sample: StampedVector, now_ns: int) -> None:
-        """Fly while the controller is ENGAGED. After INACTIVE, hold what is measured; after a
-        failsafe, go on.
+        """Fly while the controller is ENGAGED.
+
+        After INACTIVE, hold what is measured; after a failsafe, go on.
         """
         try:
             mode = ControllerMode(int(sample.value[0]))
@@ -411,8 +415,9 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         return self.create_publisher(topic.type, topic.name, publisher_qos(period_ns))
 
     def _publish_sensors(self, odometry: Odometry) -> None:
-        """Attitude and rates, the place on the Earth where an origin is given, the estimated wind
-        by where the air moves to.
+        """Publish attitude and rates, the place on the Earth, and the estimated wind.
+
+        The place is published where an origin is given. The wind is by where the air moves to.
         """
         place = odometry.pose.pose
         twist = odometry.twist.twist
@@ -480,8 +485,9 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
 def _service(
     answer: Callable[[Any], bool | str], called: Callable[[], None]
 ) -> Callable[[Any, Any], Any]:
-    """A service callback: True, or a sentence of refusal, as the response. `called` knows of each
-    call.
+    """A service callback: True, or a sentence of refusal, as the response.
+
+    `called` knows of each call.
     """
 
     def callback(request: Any, response: Any) -> Any:

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Notices of guidance: a missed leg, a go-around, the fence, a flight carried back, a strong wind,
-a lost link, new limits.
+"""Notices of guidance.
 
-The node logs the sentences as warnings; the summary of a flight takes the same sentences from the
-log.
+They tell of a missed leg, a go-around, the fence, a flight carried back, a strong wind, a lost
+link, new limits. The node logs the sentences as warnings; the summary of a flight takes the same
+sentences from the log.
 """
 
 import math
@@ -50,10 +50,9 @@ class Notice(NamedTuple):
 
 
 def is_blown_back(log: Mapping[str, Scalar]) -> Scalar:
-    """Whether an aircraft that flies ahead along a path through the air goes back along the path
-    over ground.
+    """Whether an aircraft that flies ahead along a path goes back along it over ground.
 
-    `log`: channels of `guidance`, values or arrays.
+    The aircraft flies ahead through the air. `log`: channels of `guidance`, values or arrays.
     """
     track = log["track"]
     lateral = log["mode.lateral"]
@@ -67,8 +66,9 @@ def is_blown_back(log: Mapping[str, Scalar]) -> Scalar:
 
 
 class _Lasting:
-    """Whether a condition has lasted for `dwell`; due once, and again after the condition has been
-    away for `dwell`.
+    """Whether a condition has lasted for `dwell`.
+
+    Due once, and again after the condition has been away for `dwell`.
     """
 
     def __init__(self, dwell: float = DWELL) -> None:
@@ -200,8 +200,9 @@ class Notices:
         return [Notice(t, text) for text in texts]
 
     def _outside(self, t: float, clearance: float) -> list[str]:
-        """The sentence where the aircraft leaves the fence, or is back inside. While pose is lost,
-        neither is known.
+        """The sentence where the aircraft leaves the fence, or is back inside.
+
+        While pose is lost, neither is known.
         """
         if clearance >= LARGEST:
             return []

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Pose as odometry of REP 103: the map frame is east, north, up, the body frame forward, left,
-up.
+"""Pose as odometry of REP 103.
+
+The map frame is east, north, up, the body frame forward, left, up.
 """
 
 import math
@@ -14,8 +15,9 @@ ROUTE_FRAMES = (MAP, "")  # of a route that guidance takes
 
 
 def quaternion(phi: float, theta: float, psi: float) -> tuple[float, float, float, float]:
-    """Orientation x, y, z, w of forward-left-up in east-north-up: R_z(pi/2 - psi) R_y(-theta)
-    R_x(phi); angles in rad.
+    """Orientation x, y, z, w of forward-left-up in east-north-up.
+
+    R_z(pi/2 - psi) R_y(-theta) R_x(phi); angles in rad.
     """
     (cr, sr), (cp, sp), (cy, sy) = (
         (math.cos(angle / 2.0), math.sin(angle / 2.0))

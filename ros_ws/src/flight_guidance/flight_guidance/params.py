@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of guidance. What is left out follows by rule from the reference model, the throttle
-and the speeds.
+"""Parameters of guidance.
+
+What is left out follows by rule from the reference model, the throttle and the speeds.
 """
 
 import math
@@ -308,8 +309,9 @@ class GuidanceConfig(NodeConfig):
         )
 
     def fence_margin(self, speed: float) -> float:
-        """Least distance of a route from the fence at an airspeed, m: MARGIN of flight with the
-        wind from behind.
+        """Least distance of a route from the fence at an airspeed, m.
+
+        MARGIN of flight with the wind from behind.
         """
         return MARGIN * (speed + self.wind)
 
@@ -335,16 +337,19 @@ class GuidanceConfig(NodeConfig):
         )
 
     def largest_roll_rate(self) -> float:
-        """p_max, rad/s: 0.35, or less where 0.4 w p_max, the largest p_m_dot after a step, is a
-        third of the authority.
+        """Largest roll rate p_max, rad/s.
+
+        0.35, or less where 0.4 w p_max, the largest p_m_dot after a step, is a third of the
+        authority.
         """
         frequency = self._frequency()["p"]
         authority = math.inf if self.roll_authority is None else self.roll_authority
         return self.roll_rate or min(FASTEST_ROLL, reach.roll_rate(authority, frequency))
 
     def k_beta(self) -> float:
-        """k_beta = min(0.5, k_chi V0 d / s), 1/s: a lateral gust of s = 1.5 m/s turns a held
-        heading by d = 1 deg.
+        """k_beta = min(0.5, k_chi V0 d / s), 1/s.
+
+        A lateral gust of s = 1.5 m/s turns a held heading by d = 1 deg.
         """
         if self.sideslip_gain is not None:
             return self.sideslip_gain
@@ -380,11 +385,11 @@ class GuidanceConfig(NodeConfig):
         return Notices(self.wind, self.max_age, wind_of, link_timeout, reach_of, landing=landing)
 
     def climb_limits(self) -> tuple[float, float]:
-        """Largest climb and sink rate, m/s: 0.7 and 0.5 of what full throttle gives, a V0 / g, and
-        at most a tenth of V0.
+        """Largest climb and sink rate, m/s.
 
-        The rest of the throttle holds the airspeed. `protection.climb_range` takes the climb back
-        where the rest is too little.
+        They are 0.7 and 0.5 of what full throttle gives, a V0 / g, and at most a tenth of V0. The
+        rest of the throttle holds the airspeed. `protection.climb_range` takes the climb back where
+        the rest is too little.
         """
         steepest = STEEPEST * self.speed
         down, up = self.throttle_authority or (math.inf, math.inf)
@@ -482,11 +487,11 @@ class GuidanceConfig(NodeConfig):
         )
 
     def _vertical(self, climb: float, sink: float) -> VerticalParams:
-        """The altitude loop. Where the lag T_L of the flight path is known, T >= T_L and k_h <= 0.4
-        / T_L.
+        """The altitude loop.
 
-        The flight path then has a damping of 0.5 or more, and the altitude a gain margin of 2.5 by
-        Routh's criterion.
+        Where the lag T_L of the flight path is known, T >= T_L and k_h <= 0.4 / T_L. The flight
+        path then has a damping of 0.5 or more, and the altitude a gain margin of 2.5 by Routh's
+        criterion.
         """
         lag = path_lag(self.stall_speed, self.speed) if self.stall_speed else 0.0
         gain = min(ALTITUDE_GAIN, 0.4 / lag) if lag else ALTITUDE_GAIN

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Limits of commands by what the inputs can do: by rule at the start, and by a model that is
-learned in flight.
+"""Limits of commands by what the inputs can do.
+
+They are by rule at the start, and by a model that is learned in flight.
 """
 
 import math
@@ -47,8 +48,9 @@ the command."""
 
 
 class Authority(NamedTuple):
-    """Least change of an output by the input from trim, units/s: 0 without an effect, UNKNOWN
-    without a learned model.
+    """Least change of an output by the input from trim, units/s.
+
+    0 without an effect, UNKNOWN without a learned model.
     """
 
     q: float = UNKNOWN  # rad/s^2
@@ -71,8 +73,9 @@ class RollTest(NamedTuple):
     ignored: bool = False
 
     def after(self, dt: float, command: float, p: float, largest: float) -> "RollTest":
-        """The test after a step of a command, at most `largest`, and a measured p, rad/s. Without
-        ASKED of evidence the verdict stays.
+        """The test after a step of a command, at most `largest`, and a measured p, rad/s.
+
+        Without ASKED of evidence the verdict stays.
         """
         kept = math.exp(-dt / MEMORY)
         asked = kept * self.asked + dt * command**2
@@ -95,15 +98,17 @@ def authority_of(channels: Mapping[str, float]) -> Authority:
 
 
 def climb_rates(down: float, up: float, speed: float) -> tuple[float, float]:
-    """Climb and sink rate, m/s, that full throttle up and down gives, a V0 / g, by the parts CLIMB
-    and SINK.
+    """Climb and sink rate that full throttle up and down gives, m/s.
+
+    They are a V0 / g, by the parts CLIMB and SINK.
     """
     return CLIMB * up * speed / GRAVITY, SINK * down * speed / GRAVITY
 
 
 def roll_rate(authority: float, frequency: float) -> float:
-    """Roll rate p_max, rad/s: 0.4 w p_max, the largest p_m_dot of the reference after a step, is a
-    third of the authority.
+    """Roll rate p_max, rad/s.
+
+    0.4 w p_max, the largest p_m_dot of the reference after a step, is a third of the authority.
     """
     return authority / (3.0 * 0.4 * frequency)
 

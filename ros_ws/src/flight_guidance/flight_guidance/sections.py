@@ -123,8 +123,9 @@ class ZoneConfig(Config):
 
 
 class HomeConfig(Config):
-    """Where the aircraft goes at a fence, by `guidance/home`, and after a loss of pose or of the
-    operator's link by choice.
+    """Where the aircraft goes at a fence and by `guidance/home`.
+
+    By choice it also goes there after a loss of pose or of the operator's link.
     """
 
     north: Number = Field(default=0.0, description="m")

@@ -120,11 +120,11 @@ COURSES = 24
 
 
 def room_at_home(fence: Fence, motion: Motion, wind: float) -> float:
-    """Least clearance of the better turn from home onto the orbit, m, of COURSES courses in a wind,
-    m/s, from COURSES sides.
+    """Least clearance of the better turn from home onto the orbit, m.
 
-    `motion`: the aircraft at home. An aircraft comes over home on any course, and its turn onto the
-    orbit leaves the orbit by up to twice the radius of the turn.
+    The least of COURSES courses in a wind, m/s, from COURSES sides. `motion`: the aircraft at home.
+    An aircraft comes over home on any course, and its turn onto the orbit leaves the orbit by up to
+    twice the radius of the turn.
     """
     angles = np.linspace(0.0, 2.0 * math.pi, COURSES, endpoint=False)
     from_sides = angles if wind else angles[:1]
@@ -140,8 +140,9 @@ def room_at_home(fence: Fence, motion: Motion, wind: float) -> float:
 
 
 def _integral(rate: Array, longest: Array) -> Array:
-    """Integral from 0 over the axis 1 of a rate at POINTS equal times up to `longest`, by the
-    trapezoidal rule.
+    """Integral from 0 over the axis 1 of a rate at POINTS equal times up to `longest`.
+
+    The trapezoidal rule gives it.
     """
     xp = array_namespace(rate)
     steps = 0.5 * (rate[:, 1:] + rate[:, :-1]) * (longest / (POINTS - 1))

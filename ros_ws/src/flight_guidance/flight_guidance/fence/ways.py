@@ -1,11 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Ways home inside of a fence, and back inside from outside: a map of square cells, made once for a
-fence.
+"""Ways home inside of a fence, and back inside from outside.
 
-Dijkstra's shortest ways over cells that stay inside, with room for a turn where there is room. Each
-cell has an aim: a place on the way, about a radius ahead. An aircraft that flies the course to the
-aim of the cell it is in comes home.
+They are a map of square cells, made once for a fence. Dijkstra's shortest ways over cells that stay
+inside, with room for a turn where there is room. Each cell has an aim: a place on the way, about a
+radius ahead. An aircraft that flies the course to the aim of the cell it is in comes home.
 """
 
 import math
@@ -32,8 +31,9 @@ POINTS = 64
 
 
 class Ways(NamedTuple):
-    """The map: the aim of a cell, and whether the straight way onto the orbit round home is
-    free; shapes (rows, columns).
+    """The map: the aim of a cell, and whether the straight way home is free.
+
+    The straight way leads onto the orbit round home. Shapes (rows, columns).
     """
 
     corner: tuple[float, float]  # north, east of the first cell, m
@@ -43,8 +43,9 @@ class Ways(NamedTuple):
     straight: NDArray[np.bool_]
 
     def aim(self, fence: Fence, north: Array, east: Array) -> tuple[Array, Array, Array]:
-        """The aim of places, north and east, m, and whether the straight way home is free; beside
-        the map the nearest cell.
+        """The aim of places, north and east, m, and whether the straight way home is free.
+
+        Beside the map the nearest cell counts.
         """
         xp = array_namespace(north)
         rows, columns = self.straight.shape
@@ -67,8 +68,9 @@ class Ways(NamedTuple):
 
 
 def onto_orbit(fence: Fence, north: Array, east: Array) -> tuple[Array, Array]:
-    """Where the tangent from a place touches the clockwise orbit round home; within the orbit a
-    place 1 m on along it.
+    """Where the tangent from a place touches the clockwise orbit round home.
+
+    Within the orbit it is a place 1 m on along it.
     """
     xp = array_namespace(north)
     x = fence.home[0] - north
@@ -137,8 +139,9 @@ def ways(fence: Fence) -> Ways:
 
 
 def _cells(fence: Fence) -> tuple[FloatArray, FloatArray, float]:
-    """Centres of the cells, north and east, m, over all zones, home and the surroundings; and the
-    size of a cell, m.
+    """Centres of the cells, north and east, m, and the size of a cell, m.
+
+    The cells lie over all zones, home and the surroundings.
     """
     sides = list[tuple[float, float]]()
     for axis in ("north", "east"):
@@ -186,10 +189,10 @@ def _uphill(values: FloatArray) -> NDArray[np.intp]:
 def _shortest(
     seeds: NDArray[np.bool_], room: FloatArray, cost: FloatArray, cell: float
 ) -> tuple[FloatArray, NDArray[np.intp]]:
-    """Weighted length of the shortest way to a seed, and the following cell on the way, itself of a
-    seed or without a way.
+    """Weighted length of the shortest way to a seed, and the following cell on the way.
 
-    Bellman and Ford: the lengths of all cells at once, until none becomes shorter.
+    The following cell of a seed, or without a way, is the cell itself. Bellman and Ford: the
+    lengths of all cells at once, until none becomes shorter.
     """
     lengths = [cell * math.hypot(*step) for step in STEPS]
     costs = _neighbours(cost, math.inf)
@@ -227,8 +230,9 @@ def _nearest(
 def _is_straight(
     fence: Fence, north: FloatArray, east: FloatArray, room: FloatArray, cell: float
 ) -> NDArray[np.bool_]:
-    """Whether the line onto the orbit round home has a cell of clearance, or the clearance of the
-    ends where less.
+    """Whether the line onto the orbit round home has a cell of clearance.
+
+    Where the ends have less, it has the clearance of the ends.
     """
     to_north, to_east = onto_orbit(fence, north, east)
     at_end = clearance(fence.zones, to_north, to_east)

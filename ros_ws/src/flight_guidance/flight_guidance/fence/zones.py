@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Zones of a fence, and the distance from the fence. Functions take arrays, of NumPy or of JAX, of
-any shape.
+"""Zones of a fence, and the distance from the fence.
+
+Functions take arrays, of NumPy or of JAX, of any shape.
 """
 
 import math
@@ -104,8 +105,9 @@ def _groups(zones: tuple[Zone, ...]) -> tuple[tuple[Zone, ...], ...]:
 
 
 def _deepest(groups: tuple[tuple[Zone, ...], ...], north: Array, east: Array) -> Array:
-    """Distance from the border of the deepest group of a place, m, negative outside of the
-    groups.
+    """Distance from the border of the deepest group of a place, m.
+
+    Negative outside of the groups.
     """
     xp = array_namespace(north)
     depths = []
@@ -119,11 +121,10 @@ def _deepest(groups: tuple[tuple[Zone, ...], ...], north: Array, east: Array) ->
 def _border(
     groups: tuple[tuple[Zone, ...], ...],
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """The border of all groups together: starts and lengths of edges to the north and to the east,
-    m, shapes (M,).
+    """The border of all groups together: starts and lengths of edges, m, shapes (M,).
 
-    Each edge of a zone is cut where other edges cross or touch it. A piece belongs to the border
-    where one side is inside.
+    They are to the north and to the east. Each edge of a zone is cut where other edges cross or
+    touch it. A piece belongs to the border where one side is inside.
     """
     groups = tuple(tuple(map(_polygon, group)) for group in groups)
     corners = [np.column_stack([zone.north, zone.east]) for zone in chain.from_iterable(groups)]
@@ -156,8 +157,9 @@ def _polygon(zone: Zone) -> Zone:
 def _cut(
     start: FloatArray, end: FloatArray, starts: FloatArray, ends: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Starts and ends of the pieces of an edge, shapes (P, 2), cut where further edges cross or
-    begin.
+    """Starts and ends of the pieces of an edge, shapes (P, 2).
+
+    Further edges cross or begin at a cut.
     """
     edge = end - start
     edges = ends - starts

@@ -60,8 +60,9 @@ class Landing(NamedTuple):
 def landing_at(
     place: Point, route: Route, section: LandingConfig, box: Zone | None, params: GuidanceParams
 ) -> Landing:
-    """The landing at a place. Raises ParameterError where no line of the route descends to the
-    place and goes straight on.
+    """The landing at a place.
+
+    Raises ParameterError where no line of the route descends to the place and goes straight on.
     """
     key = f"landing.waypoint {section.waypoint}"
     lines = [k for k, leg in enumerate(route.legs) if isinstance(leg, Line)]
@@ -94,8 +95,9 @@ def landing_at(
 
 
 def flare_climb(height: float, path_sink: float, landing: Landing) -> float:
-    """Commanded climb rate, m/s, in the flare: from that of the glide path to -sink in proportion
-    to the height, m.
+    """Commanded climb rate in the flare, m/s.
+
+    From the rate of the glide path to -sink in proportion to the height, m.
     """
     share = min(max(height / landing.flare, 0.0), 1.0)
     return -(landing.sink + max(path_sink - landing.sink, 0.0) * share)

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The bank that a lateral mode asks for: a heading or a course, an orbit, a leg of a route, or the
-action of the fence.
+"""The bank of a lateral mode.
+
+The mode is a heading or a course, an orbit, a leg of a route, or the action of the fence.
 """
 
 import math
@@ -39,8 +40,9 @@ def lateral_bank(
     route: Route | None,
     params: GuidanceParams,
 ) -> tuple[float, PathError, float]:
-    """Bank asked for by the lateral mode, rad; error beside the path, and distance to the end of
-    the leg, m.
+    """Bank of the lateral mode, rad, with the error beside the path.
+
+    Returns further the distance to the end of the leg, m.
     """
     if state.mode is not Mode.ENGAGED:
         return 0.0, NOWHERE, 0.0
@@ -132,13 +134,12 @@ def follow(
     speed: Scalar,
     params: GuidanceParams,
 ) -> Scalar:
-    """Bank to follow a path, rad, before protection. `entry` is the curvature of the following leg
-    at the start, 1/m.
+    """Bank to follow a path, rad, before protection.
 
-    `entry` replaces the curvature of the leg early, by the lag of the bank: as soon as `entered`
-    holds for the position a mean lag ahead. The mean lag of a change of the bank d is abs(d) / (2
-    p_max) + 1 / (2 k_phi), a ramp, then the loop of the bank; without rudder and the lag of the
-    turn behind the bank.
+    `entry` is the curvature of the following leg at the start, 1/m. `entry` replaces the curvature
+    of the leg early, by the lag of the bank: as soon as `entered` holds for the position a mean lag
+    ahead. The mean lag of a change of the bank d is abs(d) / (2 p_max) + 1 / (2 k_phi), a ramp,
+    then the loop of the bank; without rudder and the lag of the turn behind the bank.
     """
     course, ground_speed = course_and_speed(pose)
     xp = array_namespace(ground_speed)
@@ -160,8 +161,9 @@ def escaping_bank(
     speed: Scalar,
     params: GuidanceParams,
 ) -> Scalar:
-    """Bank by the action of the fence, rad, in place of `wanted` by the lateral mode: that of a
-    turn, or of a course.
+    """Bank by the action of the fence, rad, in place of `wanted` by the lateral mode.
+
+    The bank of a turn, or of a course.
     """
     course, ground_speed = course_and_speed(pose)
     xp = array_namespace(ground_speed)

@@ -29,8 +29,9 @@ LEVEL = 5.0
 def along_route(
     state: GuidanceState, pose: Mapping[str, float], dt: float, route: Route
 ) -> tuple[GuidanceState, float]:
-    """The state on the leg once the leg is joined, or on the next leg once the leg is passed; and
-    the distance missed by, m.
+    """The state on the leg once the leg is joined, and the distance missed by, m.
+
+    The next leg begins once the leg is passed.
     """
     position = (pose["north"], pose["east"])
     leg = route.legs[state.leg]
@@ -55,8 +56,9 @@ def along_route(
 def _loitering(
     state: GuidanceState, leg: Arc, loiter: Loiter, pose: Mapping[str, float], dt: float
 ) -> GuidanceState:
-    """The state with the share of a loiter that is flown, from within 1 s of flight of the circle
-    on.
+    """The state with the share of a loiter that is flown.
+
+    The share counts from within 1 s of flight of the circle on.
     """
     error, (course, ground_speed) = (
         path.error(leg, (pose["north"], pose["east"])),
@@ -77,8 +79,9 @@ def has_loitered(state: GuidanceState, pose: Mapping[str, float], route: Route) 
 
 
 def leaves(leg: Leg, reach: float, pose: Mapping[str, float], position: Point) -> bool:
-    """Whether a position is beyond the end of a circle, within `reach`, m, by an aircraft that
-    flies the course there.
+    """Whether a position is beyond the end of a circle, and the aircraft flies the course there.
+
+    `reach`: largest distance from the end, m.
     """
     return leg.end is not None and bool(
         path.joined(leg.end, path.end_course(leg), reach, position, course_and_speed(pose)[0])
@@ -94,11 +97,12 @@ def with_commands(
     follow: Callable[[GuidanceState, Route], tuple[GuidanceState, float]],
     join: Callable[[GuidanceState, int, float, Route], GuidanceState],
 ) -> tuple[GuidanceState, float]:
-    """The modes and commands in force: of the next leg by `follow` once a leg is passed, then the
-    commands given. `join`: the state on the way to a leg, from a distance along the leg on.
+    """The modes and commands in force.
 
-    A lateral command ends the leg: the command may come with a new route, and so with new legs.
-    Returns further the distance from the end of a leg that ends here and is missed, m.
+    They are of the next leg by `follow` once a leg is passed, then the commands given. `join`: the
+    state on the way to a leg, from a distance along the leg on. A lateral command ends the leg: the
+    command may come with a new route, and so with new legs. Returns further the distance from the
+    end of a leg that ends here and is missed, m.
     """
     moved = channels.lateral.keys() & commands.keys()
     missed = 0.0
@@ -137,8 +141,9 @@ def on_leg(state: GuidanceState, leg: int, route: Route) -> GuidanceState:
 def on_profile(
     state: GuidanceState, pose: Mapping[str, float], route: Route | None
 ) -> GuidanceState:
-    """The state with the altitude and the climb rate of the leg at the nearest point, or where the
-    aircraft joins the leg.
+    """The state with the altitude and the climb rate of the leg.
+
+    Of the nearest point, or where the aircraft joins the leg.
     """
     flies = (
         state.mode is Mode.ENGAGED
@@ -162,8 +167,9 @@ def on_profile(
 def joining(
     state: GuidanceState, leg: int, along: float, pose: Mapping[str, float], route: Route
 ) -> GuidanceState:
-    """The state on the way to a point of a leg, at the altitude and the airspeed there; on the leg
-    where the point is near.
+    """The state on the way to a point of a leg, at the altitude and the airspeed there.
+
+    Where the point is near, the state is on the leg.
     """
     state = on_leg(state, leg, route)
     flown = route.legs[leg]

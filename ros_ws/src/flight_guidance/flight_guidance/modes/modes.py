@@ -58,8 +58,9 @@ second."""
 def holding(
     t_ns: int, pose: Mapping[str, Scalar], speed: Scalar, params: GuidanceParams
 ) -> GuidanceState:
-    """The state before the first step, at t: holds the heading, the altitude and the airspeed of
-    now.
+    """The state before the first step, at t.
+
+    Heading, altitude and airspeed of now are held.
     """
     alpha = pose["theta"] - path_angle(pose["climb"], speed)
     return GuidanceState(
@@ -169,8 +170,9 @@ def _wanted_rates(
     speed: Scalar,
     params: GuidanceParams,
 ) -> BodyRates:
-    """Body rates to the commanded attitude, rad/s; none after the loss of the pose, and none of a
-    dead output.
+    """Body rates to the commanded attitude, rad/s.
+
+    There are none after the loss of the pose, and none of a dead output.
     """
     flies = state.mode is Mode.ENGAGED
     attitude = params.attitude._replace(n_alpha=1.0 / (state.alpha_trim + 0.05))
@@ -197,11 +199,10 @@ def command(
     dt: float,
     params: GuidanceParams,
 ) -> tuple[GuidanceState, Commands]:
-    """Protection and u_m of `step`, from the bank asked for by the lateral mode, rad. `t_ns` of the
-    state stays.
+    """Protection and u_m of `step`, from the bank of the lateral mode, rad.
 
-    The values may be arrays with an element per aircraft of a fleet; the modes hold for the whole
-    fleet.
+    `t_ns` of the state stays. The values may be arrays with an element per aircraft of a fleet; the
+    modes hold for the whole fleet.
     """
     speed = true_airspeed(y["V"], params)
     limits = params.limits
@@ -310,8 +311,9 @@ def motion_of(
     speed: Scalar,
     params: GuidanceParams,
 ) -> Motion:
-    """What the fence predicts a turn from. A roll that has begun goes on for the lag of the bank, 1
-    / (2 k_phi).
+    """What the fence predicts a turn from.
+
+    A roll that has begun goes on for the lag of the bank, 1 / (2 k_phi).
     """
     bank = protection.bank_limit(params.limits.bank, params.limits.stall_speed, speed)
     lag = 0.5 / params.attitude.k_phi
@@ -407,8 +409,9 @@ def _climb(
 def _pitch_within(
     state: GuidanceState, altitude: Scalar, speed: Scalar, params: GuidanceParams
 ) -> Scalar:
-    """The commanded pitch, rad, within that of the climb rates to the least and the largest
-    altitude.
+    """The commanded pitch, rad, within the range that the altitudes allow.
+
+    The range is that of the climb rates to the least and the largest altitude.
     """
     if not any(map(math.isfinite, (params.limits.lowest, params.limits.highest))):
         return state.target.theta
@@ -420,8 +423,9 @@ def _pitch_within(
 
 
 def _climb_within(altitude: Scalar, params: GuidanceParams) -> tuple[Scalar, Scalar]:
-    """Least and largest climb rate by the least and the largest altitude, m/s: those of `climb_for`
-    to the bounds.
+    """Least and largest climb rate by the least and the largest altitude, m/s.
+
+    The rates of `climb_for` to the bounds.
     """
     vertical = params.vertical
     limits = params.limits

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The targets that an operator may command: the limits of the parameters and of a learned model, to
-hold and to fly home.
+"""The targets that an operator may command, to hold and to fly home.
+
+The limits are those of the parameters and of a learned model.
 """
 
 import math
@@ -61,8 +62,9 @@ def within_reach(params: GuidanceParams, authority: Authority) -> GuidanceParams
 
 
 def reach_sentence(params: GuidanceParams, authority: Authority) -> str:
-    """The limits by what is learned in flight, as a sentence; empty where the own limits are
-    less.
+    """The limits by what is learned in flight, as a sentence.
+
+    Empty where the own limits are less.
     """
     now = within_reach(params, authority)
     parts = [
@@ -108,10 +110,10 @@ def read_target(
     *,
     degrees: bool = False,
 ) -> None:
-    """Raise ChannelError for commands of no mode or two modes, of no leg of the route, or beyond
-    the limits.
+    """Raise ChannelError for commands that guidance cannot fly.
 
-    `degrees`: the sentence has angles in degrees, as an operator types angles; else in rad.
+    Commands of no mode or two modes, of no leg of the route, or beyond the limits. `degrees`: the
+    sentence has angles in degrees, as an operator types angles; else in rad.
     """
     channels = params.channels
     lateral_modes = {mode for name, mode in channels.lateral.items() if name in values}
@@ -196,8 +198,9 @@ def _read_leg(values: Mapping[str, float], route: Route | None, what: str) -> No
 
 
 def hold(pose: Mapping[str, Scalar], speed: Scalar, params: GuidanceParams) -> dict[str, Scalar]:
-    """Commands to hold the heading, the altitude and the airspeed of now, within the limits of the
-    airspeed.
+    """Commands to hold the heading, the altitude and the airspeed of now.
+
+    The airspeed is within its limits.
     """
     return {
         "heading": pose["psi"],
@@ -213,8 +216,9 @@ def permitted_speed(speed: Scalar, params: GuidanceParams) -> Scalar:
 
 
 def home(pose: Mapping[str, float], params: GuidanceParams) -> dict[str, float]:
-    """Commands to orbit home clockwise on the least radius, or of a multicopter to hover there, at
-    the altitude of home or of now.
+    """Commands to orbit home clockwise on the least radius, or of a multicopter to hover there.
+
+    The altitude is that of home or of now.
     """
     place = params.home
     altitude = pose["altitude"] if place.altitude is None else place.altitude

@@ -79,8 +79,9 @@ def _gains(params: GuidanceParams) -> MulticopterParams:
 def hold(
     pose: Mapping[str, float], _y: tuple[float, ...], params: GuidanceParams
 ) -> dict[str, float]:
-    """Commands to hover where the aircraft stops, v abs(v) / (2 a) ahead, with the heading and the
-    altitude of now.
+    """Commands to hover where the aircraft stops, v abs(v) / (2 a) ahead.
+
+    The heading and the altitude are those of now.
     """
     stop = _stop(pose, _gains(params))
     place = {"north": stop.real, "east": stop.imag}
@@ -180,8 +181,9 @@ def _begin(
     pose: Mapping[str, float],
     params: GuidanceParams,
 ) -> GuidanceState:
-    """The state before a step; where the filters begin, that of a hover where the aircraft
-    stops.
+    """The state before a step.
+
+    Where the filters begin, it is that of a hover where the aircraft stops.
     """
     if state is not None and inputs.begin is Begin.NO:
         return state
@@ -215,8 +217,9 @@ def _with_attitude(
     dt: float,
     params: GuidanceParams,
 ) -> GuidanceState:
-    """Mode, and attitude from pose or by dead reckoning. A pose that returns after a loss begins a
-    hover, or the way home.
+    """Mode, and attitude from pose or by dead reckoning.
+
+    A pose that returns after a loss begins a hover, or the way home.
     """
     age_ns = inputs.pose_age_ns
     since = dt
@@ -247,8 +250,9 @@ def _is_near(state: GuidanceState, pose: Mapping[str, float], place: Point) -> b
 
 
 def _stops(route: Route, number: int) -> bool:
-    """Whether an aircraft stops at the end of a leg: before a hover, and where a corner has no
-    fillet.
+    """Whether an aircraft stops at the end of a leg.
+
+    A stop comes before a hover, and where a corner has no fillet.
     """
     following = next(iter(route.legs[number + 1 :]), None)
     hovers = following is not None and path.is_orbit(following)
@@ -258,8 +262,9 @@ def _stops(route: Route, number: int) -> bool:
 def _along_route(
     state: GuidanceState, pose: Mapping[str, float], dt: float, route: Route
 ) -> tuple[GuidanceState, float]:
-    """The state on the leg once its start is reached, or on the next leg once the leg is passed or
-    its wait is over; and the distance missed by, m.
+    """The state on the leg once its start is reached, and the distance missed by, m.
+
+    The next leg begins once the leg is passed or the wait there is over.
     """
     position = (pose["north"], pose["east"])
     leg = route.legs[state.leg]
@@ -344,8 +349,9 @@ def _wanted(
 
 
 def _approach(distance: float, speed: float, gains: MulticopterParams) -> tuple[float, float]:
-    """Speed towards a place at a distance, m/s, and its slope over the distance, 1/s: `climb_for`
-    with `k_p`, which falls by `braking`.
+    """Speed towards a place at a distance, m/s, and its slope over the distance, 1/s.
+
+    `climb_for` with `k_p`, falling by `braking`.
     """
     params = VerticalParams(gains.k_p, 2.0 * gains.braking, speed, speed, 0.0)
     allowed = float(climb_for(distance, params))
@@ -475,8 +481,9 @@ def _with_climb(
 def _rates(
     state: GuidanceState, phi_c: float, theta_c: float, gains: MulticopterParams
 ) -> dict[str, float]:
-    """Body rates that turn the thrust into its direction by the shortest way, and the heading at
-    its rate, the inverse of `kinematics.heading_rate`, rad/s.
+    """Body rates that turn the thrust into its direction by the shortest way, rad/s.
+
+    They turn the heading at its rate, the inverse of `kinematics.heading_rate`:
 
         [p, q] = k_tilt angle [d_y, -d_x] / sqrt(d_x^2 + d_y^2),  angle = atan2(sqrt(..), -d_z)
 

@@ -55,12 +55,12 @@ def gains(
 def route_through(
     waypoints: Sequence[Waypoint], radius: float | None, braking: float, can: Performance
 ) -> Route:
-    """Lines with fillets through waypoints, and a hover at the last one and at each `wait`, which
-    the aircraft reaches by a line without a fillet: its leg is a circle of the radius of the
-    fillets within which the place counts as reached.
+    """Lines with fillets through waypoints, and a hover at the last one and at each `wait`.
 
-    Altitudes change along the lines. `braking`, m/s^2, bounds the curvature. Raises ParameterError
-    for a waypoint beyond the bounds, and for circles, which a multicopter does not fly.
+    The aircraft reaches a hover by a line without a fillet: its leg is a circle of the radius of
+    the fillets within which the place counts as reached. Altitudes change along the lines.
+    `braking`, m/s^2, bounds the curvature. Raises ParameterError for a waypoint beyond the bounds,
+    and for circles, which a multicopter does not fly.
     """
     require(len(waypoints) >= 2, "route", f"{len(waypoints)} waypoints", "two or more")
     require_bounds(waypoints, can)

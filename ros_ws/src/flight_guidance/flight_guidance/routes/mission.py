@@ -72,8 +72,9 @@ class Item(NamedTuple):
 
 
 def named(command: int, number: int) -> str:
-    """The name of a command, by pymavlink where COMMANDS lacks the command, and the number of the
-    item.
+    """The name of a command and the number of the item.
+
+    pymavlink has the name where COMMANDS lacks the command.
     """
     name = COMMANDS.get(command, f"MAV_CMD {command}")
     if command not in COMMANDS:
@@ -89,12 +90,12 @@ MOST_ITEMS = 20_000
 
 
 def _in_order(key: str, items: Sequence[Item]) -> list[int]:
-    """The positions of the items in the order of flight, with the jumps that are followed, up to an
-    item of LAST.
+    """The positions of the items in the order of flight, up to an item of LAST.
 
-    A DO_JUMP leads to an item as often as it says, with a negative number for good; a jump back for
-    good ends the order. Raises ParameterError for a jump to no item, for a loop inside of a loop,
-    which PX4 begins again and ArduPilot does not, and for more than MOST_ITEMS.
+    The jumps are followed. A DO_JUMP leads to an item as often as it says, with a negative number
+    for good; a jump back for good ends the order. Raises ParameterError for a jump to no item, for
+    a loop inside of a loop, which PX4 begins again and ArduPilot does not, and for more than
+    MOST_ITEMS.
     """
     places = {items[k].number: k for k in reversed(range(len(items)))}
     repetitions: dict[int, float] = {}  # repetitions of a jump
@@ -142,8 +143,9 @@ def _in_order(key: str, items: Sequence[Item]) -> list[int]:
 def mission_route(
     key: str, items: Sequence[Item], home: Home | None, notes: Sequence[str] = ()
 ) -> Places:
-    """The waypoints and loiters of a mission in the order of flight; the items that are not flown
-    in notes.
+    """The waypoints and loiters of a mission in the order of flight.
+
+    The notes tell the items that are not flown.
     """
     places: list[Place] = []
     flown: set[int] = set()

@@ -97,8 +97,9 @@ LANDINGS = ("fwLandingPattern", "vtolLandingPattern")  # as NAV_LAND, not flown
 
 
 def _plan_items(listed: Sequence[Any], key: str) -> Iterator[tuple[int, Any]]:
-    """The items of a plan with their numbers from 1 on, those inside of a survey with the number of
-    the survey.
+    """The items of a plan with their numbers from 1 on.
+
+    Items inside of a survey have the number of the survey.
     """
     for number, entry in enumerate(listed, start=1):
         if member(entry, "complexItemType") in TRANSECTS:
@@ -217,12 +218,11 @@ def plan_fence(tree: Any, key: str) -> FencePlaces:
 
 
 def _grouped(area: Area, group: Any = 0) -> Area:
-    """A zone of an autopilot, in its group where the aircraft stays in; a plan has the group 0
-    alone.
+    """A zone of an autopilot, in its group where the aircraft stays in.
 
-    MAVLink, MAV_CMD_NAV_FENCE_POLYGON_VERTEX_INCLUSION and MAV_CMD_NAV_FENCE_CIRCLE_INCLUSION,
-    parameter 2, Inclusion Group: "Vehicle must be inside ALL inclusion zones in a single group,
-    vehicle must be inside at least one group".
+    A plan has the group 0 alone. MAVLink, MAV_CMD_NAV_FENCE_POLYGON_VERTEX_INCLUSION and
+    MAV_CMD_NAV_FENCE_CIRCLE_INCLUSION, parameter 2, Inclusion Group: "Vehicle must be inside ALL
+    inclusion zones in a single group, vehicle must be inside at least one group".
     """
     return area if area.exclude else area._replace(group=group)
 
@@ -268,8 +268,9 @@ def json_fence(tree: Any, key: str) -> FencePlaces:
 
 
 def wpl_fence(content: bytes, key: str) -> FencePlaces:
-    """The polygons, circles, return point and rally points of MAVLink: MAV_CMD_NAV_FENCE_... and
-    MAV_CMD_NAV_RALLY_POINT.
+    """The polygons, circles, return point and rally points of MAVLink.
+
+    The commands are MAV_CMD_NAV_FENCE_... and MAV_CMD_NAV_RALLY_POINT.
     """
     items, home = wpl_items(content, key)
     zones: list[Area] = []

@@ -1,11 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Route files as waypoints in the local tangent plane; `route_formats` reads the formats with
-latitudes and longitudes.
+"""Route files as waypoints in the local tangent plane.
 
-A YAML file holds the list `route` of [north, east, altitude], [north, east, altitude, V] or a
-mapping: north and east, or latitude and longitude, altitude, and perhaps V, turns, wait and leave
-of `Waypoint`.
+`route_formats` reads the formats with latitudes and longitudes. A YAML file holds the list `route`
+of [north, east, altitude], [north, east, altitude, V] or a mapping: north and east, or latitude and
+longitude, altitude, and perhaps V, turns, wait and leave of `Waypoint`.
 """
 
 import math
@@ -83,8 +82,9 @@ FURTHER = ("V", "turns", "wait", "leave")
 
 
 def local(latitude: float, longitude: float, origin: Origin) -> Point:
-    """North and east of a position on the ellipsoid WGS84 in the tangent plane at the origin, m;
-    angles in deg.
+    """North and east of a position on the ellipsoid WGS84 in the tangent plane, m.
+
+    The plane touches the ellipsoid at the origin; angles in deg.
 
         [x, y, z] = N(lat) [cos(lat) cos(lon), cos(lat) sin(lon), (1 - e^2) sin(lat)],
             N = a / sqrt(1 - e^2 sin(lat)^2)
@@ -101,11 +101,10 @@ def local(latitude: float, longitude: float, origin: Origin) -> Point:
 
 
 def geographic(north: float, east: float, origin: Origin) -> Origin:
-    """Latitude and longitude, deg, of a position on the ellipsoid north and east of the origin, m:
-    the inverse of `local`.
+    """Latitude and longitude, deg, of a position north and east of the origin, m.
 
-    Each step of the iteration leaves a hundredth of the error within 50 km of an origin below 80
-    deg of latitude.
+    The position is on the ellipsoid: the inverse of `local`. Each step of the iteration leaves a
+    hundredth of the error within 50 km of an origin below 80 deg of latitude.
     """
     latitude, longitude = origin
     for _ in range(8):
@@ -117,8 +116,9 @@ def geographic(north: float, east: float, origin: Origin) -> Origin:
 
 
 def _is_above(latitude: float, longitude: float, origin: Origin) -> bool:
-    """Whether a position is on the half of the Earth around the origin; the antipodal half has the
-    same north and east.
+    """Whether a position is on the half of the Earth around the origin.
+
+    The antipodal half has the same north and east.
     """
     lat = math.radians(origin.latitude)
     turn = math.radians(longitude - origin.longitude)
@@ -127,9 +127,7 @@ def _is_above(latitude: float, longitude: float, origin: Origin) -> bool:
 
 
 def _meridian(latitude: float) -> tuple[float, float]:
-    """Distance of a position on the ellipsoid from the Earth's axis, and from the plane of the
-    equator, m.
-    """
+    """Distance of a position on the ellipsoid from the Earth's axis and the equator's plane, m."""
     e_squared = FLATTENING * (2.0 - FLATTENING)
     normal = SEMI_MAJOR / math.sqrt(1.0 - e_squared * math.sin(latitude) ** 2)
     return normal * math.cos(latitude), normal * (1.0 - e_squared) * math.sin(latitude)
@@ -201,10 +199,9 @@ def read_route_file(
 
 
 def _merged(waypoints: Sequence[Waypoint]) -> list[Waypoint]:
-    """The waypoints, successive ones at a place as a single waypoint with all circles, left at the
-    last altitude.
+    """The waypoints, successive ones at a place as a single waypoint with all circles.
 
-    The airspeed that the last of them names is that of the next leg.
+    The aircraft leaves at the last altitude. The airspeed of the last waypoint is for the next leg.
     """
     merged: list[Waypoint] = []
     speed: float | None = None
@@ -228,12 +225,12 @@ def read_fence_file(
     *,
     above_sea: bool = False,
 ) -> dict[str, Any]:
-    """The sections `fence` and `home` of guidance from a file, the arguments as of
-    `read_route_file`.
+    """The sections `fence` and `home` of guidance from a file.
 
-    Home is the rally point nearest to the origin, without rally points the return point of the
-    fence, without both the home in the file, else not in the result. Raises ParameterError for an
-    unreadable file, a file without a zone, and a number missing or out of range.
+    The arguments are as of `read_route_file`. Home is the rally point nearest to the origin,
+    without rally points the return point of the fence, without both the home in the file, else not
+    in the result. Raises ParameterError for an unreadable file, a file without a zone, and a number
+    missing or out of range.
     """
     suffix = path.suffix.lower()
     require(
@@ -335,8 +332,9 @@ class _Heights:
         self._above_sea = above_sea
 
     def altitude(self, place: Place) -> Any:
-        """The altitude in m, not validated yet. Raises ParameterError where the file does not
-        tell.
+        """The altitude in m, not validated yet.
+
+        Raises ParameterError where the file does not tell.
         """
         altitude = place.altitude
         above = place.above
@@ -388,8 +386,9 @@ def _home_of_fence(
 
 
 def _require_order(places: Sequence[Place], origin: Origin | None) -> None:
-    """Raise ParameterError where places are near the origin with latitude and longitude exchanged
-    alone.
+    """Raise ParameterError where latitude and longitude are exchanged.
+
+    The places are near the origin with latitude and longitude exchanged alone.
     """
     if origin is None:
         return

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Formats of routes with latitudes and longitudes of WGS84: GeoJSON, KML, KMZ, GPX, plans of
-QGroundControl, QGC WPL 110.
+"""Formats of routes with latitudes and longitudes of WGS84.
 
-A file holds one route: a line, or points in the order of the file. What else a file holds is
-refused, or named in a note. Sources: RFC 7946 (GeoJSON); OGC 12-007r2 (KML); GPX 1.1 schema;
-QGroundControl guide, Plan File Format; MAVLink guide, File Formats and MAV_FRAME.
+They are GeoJSON, KML, KMZ, GPX, plans of QGroundControl, QGC WPL 110. A file holds one route: a
+line, or points in the order of the file. What else a file holds is refused, or named in a note.
+Sources: RFC 7946 (GeoJSON); OGC 12-007r2 (KML); GPX 1.1 schema; QGroundControl guide, Plan File
+Format; MAVLink guide, File Formats and MAV_FRAME.
 """
 
 from collections.abc import Callable, Mapping
@@ -41,6 +41,7 @@ def read(content: bytes, key: str, suffix: str, line: str | None = None) -> Plac
 
 def read_fence(content: bytes, key: str, suffix: str) -> FencePlaces:
     """The zones and the rally points of a plan of QGroundControl, a QGC WPL 110 or a GeoJSON.
+
     Raises ParameterError.
     """
     if suffix in WPL_ENDINGS:

@@ -26,8 +26,9 @@ def parsed_json(content: bytes, key: str) -> Any:
 
 
 def _whole(digits: str) -> int | float:
-    """A whole number; one of more digits than a float holds is a float, infinite beyond its
-    range.
+    """A whole number; one of more digits than a float holds is a float.
+
+    Infinite beyond the range of a float.
     """
     return int(digits) if len(digits) < 16 else float(digits)
 
@@ -64,8 +65,9 @@ def json_route(tree: Any, key: str, line: str | None) -> Places:
 
 
 def read_lines(content: bytes, key: str) -> list[list[Place]]:
-    """The lines, rings and points of a GeoJSON, in the order of the file. Raises ParameterError as
-    `read`.
+    """The lines, rings and points of a GeoJSON, in the order of the file.
+
+    Raises ParameterError as `read`.
     """
     tree = parsed_json(content, key)
     require_wgs84(tree, key)
@@ -87,8 +89,9 @@ def read_lines(content: bytes, key: str) -> list[list[Place]]:
 
 
 def _ring(rings: list[Any]) -> list[list[Any]]:
-    """The outer ring of a Polygon, whose only line is a route; every ring of a Polygon with
-    holes.
+    """The outer ring of a Polygon, whose only line is a route.
+
+    Of a Polygon with holes, every ring.
     """
     return [ring for ring in rings if isinstance(ring, list)]
 
@@ -114,8 +117,9 @@ PARTS = {
 
 
 def nodes(tree: Any) -> Iterator[tuple[Any, Any]]:
-    """The geometries with the properties of their Feature, in the order of the file; None for a
-    Feature without geometry.
+    """The geometries with the properties of their Feature, in the order of the file.
+
+    None for a Feature without geometry.
     """
     pending: list[tuple[Any, Any]] = [(tree, None)]
     while pending:
@@ -131,8 +135,9 @@ def nodes(tree: Any) -> Iterator[tuple[Any, Any]]:
 
 
 def require_wgs84(tree: Any, key: str) -> None:
-    """Refuse a member `crs` of another system: RFC 7946 has WGS84 alone, and GDAL wrote others
-    before.
+    """Refuse a member `crs` of another system.
+
+    RFC 7946 has WGS84 alone, and GDAL wrote others before.
     """
     crs = member(tree, "crs")
     name = str(member(member(crs, "properties"), "name") or "")
@@ -160,8 +165,9 @@ def entries(tree: Any, name: str, key: str) -> list[Any]:
 
 
 def flag(tree: Any, name: str, absent: bool | None, key: str) -> bool:
-    """A member of a JSON object that is true or false, also as 1 or 0; `absent`: its value where
-    the object lacks it.
+    """A member of a JSON object that is true or false, also as 1 or 0.
+
+    `absent`: its value where the object lacks it.
     """
     value = absent if member(tree, name) is None else tree[name]
     require(value in (True, False), key, f"{name}: {short_repr(value)}", "true or false")

@@ -66,8 +66,9 @@ class Geometry(NamedTuple):
 def one_route(
     key: str, geometries: Sequence[Geometry], others: Sequence[str] = (), line: str | None = None
 ) -> Places:
-    """The only line, or that of `line`; the points where there is no line. Raises ParameterError
-    that names what is there.
+    """The only line, or that of `line`; the points where there is no line.
+
+    Raises ParameterError that names what is there.
     """
     joined_lines = _joined([geometry for geometry in geometries if geometry.kind not in POINTS])
     lines = [geometry for geometry in joined_lines if geometry.places]
@@ -133,8 +134,9 @@ def _counted(kinds: Sequence[str]) -> str:
 
 
 def _joined(lines: Sequence[Geometry]) -> list[Geometry]:
-    """The lines, with parts that were cut at the antimeridian as one line (RFC 7946, section
-    3.1.9).
+    """The lines, with parts that were cut at the antimeridian as one line.
+
+    Source: RFC 7946, section 3.1.9.
     """
     joined: list[Geometry] = []
     for line in lines:

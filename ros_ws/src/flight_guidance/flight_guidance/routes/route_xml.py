@@ -27,8 +27,9 @@ from flight_guidance.routes.route_places import (
 
 
 class _NoDoctype(TreeBuilder):
-    """Refuses a document type, the only place of entity declarations: no entity is ever expanded or
-    fetched.
+    """Refuses a document type, the only place of entity declarations.
+
+    No entity is ever expanded or fetched.
     """
 
     def doctype(self, name: str, pubid: str | None, system: str | None) -> None:
@@ -139,8 +140,9 @@ def _kml_places(key: str, kind: str, element: Element, polygon: Element | None) 
 
 
 def read_kmz(content: bytes, key: str, line: str | None = None) -> Places:
-    """The KML file of a KMZ archive: doc.kml, or the only one, at the root where there is one (OGC
-    12-007r2, Annex C).
+    """The KML file of a KMZ archive: doc.kml, or the only one.
+
+    Where the root has one, it is that (OGC 12-007r2, Annex C).
     """
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
@@ -182,8 +184,9 @@ lost its satellites."""
 
 
 def read_gpx(content: bytes, key: str, line: str | None = None) -> Places:
-    """A route (rte), without one a track (trk), without both the waypoints (wpt); with `line` one
-    of all routes and tracks.
+    """A route (rte), without one a track (trk), without both the waypoints (wpt).
+
+    With `line` it is one of all routes and tracks.
     """
     root = _parsed_xml(content, key, "a GPX file")
     marks = _gpx_places(root, "wpt")
@@ -240,8 +243,9 @@ def _gpx_segments(line: Element, kind: str) -> list[list[Place]]:
 
 
 def _gap(end: Place, begin: Place) -> float:
-    """Distance of two near positions on a sphere, m; 0 where one of them is no position, which is
-    refused later.
+    """Distance of two near positions on a sphere, m.
+
+    0 where one of them is no position, which is refused later.
     """
     values = (end.latitude, end.longitude, begin.latitude, begin.longitude)
     if not all(isinstance(value, float) and math.isfinite(value) for value in values):

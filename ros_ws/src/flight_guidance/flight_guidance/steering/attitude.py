@@ -54,8 +54,9 @@ def body_rates(
     speed: Scalar,
     params: AttitudeParams,
 ) -> BodyRates:
-    """Rates to bring phi and theta to their commands, by the inverse of Euler's equations in a
-    coordinated turn:
+    """Rates to bring phi and theta to their commands.
+
+    The inverse of Euler's equations in a coordinated turn gives them:
 
         phi_dot_c   = clip(k_phi (phi_c - phi), +-roll_rate),
             theta_dot_c = clip(k_theta (theta_c - theta), +-load g/V)
@@ -68,7 +69,7 @@ def body_rates(
     behind the bank, by the reference model of r and by the sideslip of a roll. The last term of q_m
     leads the angle of attack of the turn. Arguments: angles in rad, `speed` V in m/s. Source: R. W.
     Beard, T. W. McLain, Small Unmanned Aircraft (2012), chapters 2 and 9.
-    """  # noqa: D400, D415 - what follows is an equation
+    """
     speed = forward(speed)
     phi_dot = clip(params.k_phi * (phi_c - phi), params.roll_rate)
     theta_dot = clip(params.k_theta * (theta_c - theta), params.load * GRAVITY / speed)
@@ -79,8 +80,9 @@ def body_rates(
 
 
 def yaw_for_bank(phi_c: Scalar, phi: Scalar, speed: Scalar) -> Scalar:
-    """Yaw rate for a bank without an aileron, rad/s: of the turn, and more to roll there, within
-    +-g tan(LARGEST_YAW) / V.
+    """Yaw rate for a bank without an aileron, rad/s, within +-g tan(LARGEST_YAW) / V.
+
+    The rate of the turn, and more to roll there:
 
         r_m = g tan(phi_c) / V + k (SKIDDING phi_c - phi),  k = YAW_TO_BANK
 

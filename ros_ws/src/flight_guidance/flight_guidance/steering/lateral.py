@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Lateral: the acceleration to the right to hold a heading or course, or to follow a path, and the
-bank for it.
+"""Lateral: the acceleration to the right, and the bank for it.
+
+A heading or course is held, or a path followed.
 """
 
 import math
@@ -49,8 +50,9 @@ def turn_towards(difference: Scalar) -> Scalar:
 
 
 def heading_estimate(psi: float, measured: float | None, psi_dot: float, dt: float) -> float:
-    """Heading a step later, rad, from the heading rate of y, rad/s, and the heading of pose; None
-    where pose is stale.
+    """Heading a step later, rad, from the heading rate of y, rad/s, and the heading of pose.
+
+    The latter is None where pose is stale.
 
         psi+ = psi + dt psi_dot + (1 - exp(-dt/T)) (measured - psi - dt psi_dot),  T = HEADING_TIME
 
@@ -107,8 +109,9 @@ def path_acceleration(
 def slip_estimate(
     slip: Scalar, turn: Scalar, flown: Scalar, rolling: Scalar, dt: float, time: float
 ) -> Scalar:
-    """Loss of turn by a sideslip at a bank, a step later, m/s^2; `turn` = g tan(phi), `flown` = V
-    psi_dot:
+    """Loss of turn by a sideslip at a bank, a step later, m/s^2.
+
+    `turn` = g tan(phi), `flown` = V psi_dot:
 
         slip+ = slip + (1 - exp(-dt/T)) max(1 - rolling / 0.2, 0) (turn - flown - slip) within
         +-LARGEST_SLIP abs(turn)
@@ -117,7 +120,7 @@ def slip_estimate(
     like a sideslip. A bias of the gyro of r looks like a sideslip too; the bound is 0 in straight
     flight and keeps the bias out there. Added to the acceleration of a path, the estimate keeps an
     aircraft on an arc in a turn that is not coordinated.
-    """  # noqa: D400, D415 - what follows is an equation
+    """
     steady = array_namespace(slip).maximum(1.0 - rolling / 0.2, 0.0)
     return clip(
         slip + (1.0 - math.exp(-dt / time)) * steady * (turn - flown - slip),
@@ -140,8 +143,9 @@ def least_period(speed: float, bank: float, roll_rate: float) -> float:
 
 
 def largest_wind(speed: float, wind: float, bank: float) -> float:
-    """Wind in which a circle of `least_radius` for `wind` takes the whole bank, m/s: (V + W)
-    sqrt(tan(b) / tan(0.8 b)) - V.
+    """Wind in which a circle of `least_radius` for `wind` takes the whole bank, m/s.
+
+    (V + W) sqrt(tan(b) / tan(0.8 b)) - V.
     """
     return (speed + wind) * math.sqrt(math.tan(bank) / math.tan(0.8 * bank)) - speed
 

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Paths: lines and arcs in the local tangent plane, and routes of waypoints whose corners are
-fillets.
+"""Paths: lines and arcs in the local tangent plane, and routes of waypoints.
+
+The corners of a route are fillets.
 """
 
 import math
@@ -46,8 +47,9 @@ class Line(NamedTuple):
 
 
 class Loiter(NamedTuple):
-    """What an aircraft does on a circle before it flies on; at the end it is at the altitude of the
-    leg.
+    """What an aircraft does on a circle before it flies on.
+
+    At the end it is at the altitude of the leg.
     """
 
     turns: float = 0.0  # 1
@@ -55,8 +57,9 @@ class Loiter(NamedTuple):
 
 
 class Arc(NamedTuple):
-    """A leg on a circle, less than a full turn; without an end an orbit, with a loiter an orbit
-    until the loiter is flown.
+    """A leg on a circle, less than a full turn.
+
+    Without an end it is an orbit, with a loiter an orbit until the loiter is flown.
     """
 
     centre: Point
@@ -85,14 +88,16 @@ class Route(NamedTuple):
         return abs(self.legs[-1].radius) if isinstance(self.legs[-1], Arc) else 0.0
 
     def near(self, leg: int) -> float:
-        """Distance from the end of a leg within which the leg counts as flown, m: the radius, at
-        least 1 s of flight.
+        """Distance from the end of a leg within which the leg counts as flown, m.
+
+        The radius, at least 1 s of flight.
         """
         return max(self.radius, self.V[leg])
 
     def start(self, leg: int, along: float = 0.0) -> tuple[Point, float]:
-        """The start of a leg, of a line the point at a distance along, m, and the course there,
-        rad; the centre of an orbit.
+        """The start of a leg and the course there, rad; the centre of an orbit.
+
+        Of a line it is the point at a distance along, m.
         """
         flown = self.legs[leg]
         if isinstance(flown, Line):
@@ -104,8 +109,9 @@ class Route(NamedTuple):
         return before.end or flown.centre, end_course(before)
 
     def profile(self, leg: int, along: float) -> tuple[float, float]:
-        """The altitude at a distance along a leg, m, and its slope, 1: a straight line from
-        waypoint to waypoint, or a step.
+        """The altitude at a distance along a leg, m, and its slope, 1.
+
+        The altitude is a straight line from waypoint to waypoint, or a step.
         """
         altitude = self.altitude[leg]
         distance = length(self.legs[leg])
@@ -137,8 +143,9 @@ def along(start: Point, end: Point, share: float) -> Point:
 
 
 def nearest(leg: Leg, position: Point) -> float:
-    """Distance along a line from the start to the point nearest to a position, m, from 0 to the
-    length; 0 for an arc.
+    """Distance along a line from the start to the point nearest to a position, m.
+
+    From 0 to the length; 0 for an arc.
     """
     return (
         min(max(length(leg) - to_go(leg, position), 0.0), length(leg))
@@ -153,8 +160,9 @@ def course_of(start: Point, end: Point) -> float:
 
 
 def error(leg: Leg, position: Point) -> PathError:
-    """The cross-track error of a position, and course and curvature of the leg at the nearest
-    point.
+    """The cross-track error of a position.
+
+    Course and curvature are those of the leg at the nearest point.
     """
     if isinstance(leg, Line):
         return line_error(leg.start, course_of(leg.start, leg.end), position)
@@ -192,6 +200,7 @@ def end_course(leg: Leg) -> float:
 
 def passed(leg: Leg, position: Point) -> bool:
     """Whether a position lies beyond the half plane at the end of a leg, across the course there.
+
     Never for an orbit.
     """
     return (
@@ -235,8 +244,9 @@ def to_go(leg: Leg, position: Point) -> float:
 
 
 def joining_centre(point: Point, course: Scalar, radius: Scalar) -> Point:
-    """Centre of the circle that touches a course, rad, at a point; the radius is positive to the
-    right, m.
+    """Centre of the circle that touches a course, rad, at a point.
+
+    The radius is positive to the right, m.
     """
     xp = array_namespace(course)
     return point[0] - radius * xp.sin(course), point[1] + radius * xp.cos(course)
@@ -268,10 +278,10 @@ def joining_length(
 def joining(
     point: Point, course: Scalar, radius: Scalar, near: Scalar, position: Point, flown: Scalar
 ) -> Scalar:
-    """Side of the shorter joining circle onto a course at a point: 1 turns to the right, -1 to the
-    left, 0 needs none.
+    """Side of the shorter joining circle onto a course at a point.
 
-    None is needed within `near`, m, and within OPPOSITE of the course.
+    1 turns to the right, -1 to the left, 0 needs none. None is needed within `near`, m, and within
+    OPPOSITE of the course.
     """
     right_way, left_way = (
         joining_length(point, course, side * radius, position, flown) for side in (1.0, -1.0)
@@ -284,8 +294,9 @@ def joining(
 
 
 def joined(point: Point, course: Scalar, near: Scalar, position: Point, flown: Scalar) -> Any:
-    """Whether an aircraft is beyond a point of a leg, within `near`, m, and within JOINED of the
-    course of the leg.
+    """Whether an aircraft is beyond a point of a leg, and near the leg.
+
+    Near means within `near`, m, and within JOINED of the course of the leg.
     """
     xp = array_namespace(course)
     is_near = xp.hypot(position[0] - point[0], position[1] - point[1]) <= near
@@ -295,8 +306,9 @@ def joined(point: Point, course: Scalar, near: Scalar, position: Point, flown: S
 
 
 def outline(leg: Leg, start: Point) -> list[Point]:
-    """Points along a leg from the start, for drawing: at most 10 deg apart on an arc; an orbit is
-    at least a full turn.
+    """Points along a leg from the start, for drawing.
+
+    They are at most 10 deg apart on an arc; an orbit is at least a full turn.
     """
     if isinstance(leg, Line):
         return [leg.start, leg.end]
@@ -341,8 +353,9 @@ def lengths_after(route: Route) -> list[float]:
 
 
 def leg_places(route: Route) -> dict[int, Point]:
-    """Where the number of a leg is drawn: the middle of a line, the centre of a circle; the fillets
-    have none.
+    """Where the number of a leg is drawn.
+
+    The middle of a line, the centre of a circle; fillets have no number.
     """
     places: dict[int, Point] = {}
     for number, leg in enumerate(route.legs):
@@ -376,8 +389,9 @@ def turns_back(leg: Leg, following: Leg | None) -> bool:
 
 
 def leads(legs: Sequence[Leg]) -> list[int]:
-    """Numbers of the waypoints at the ends of the legs of a route; a fillet at a waypoint leads to
-    the next waypoint.
+    """Numbers of the waypoints at the ends of the legs of a route.
+
+    A fillet at a waypoint leads to the next waypoint.
     """
     numbers = []
     number = 0
@@ -401,16 +415,15 @@ def route(
     least: float,
     loiters: Mapping[int, Loiter] = MappingProxyType({}),
 ) -> tuple[Leg, ...]:
-    """Legs through waypoints with fillets of a radius in the corners, m, then an orbit round the
-    last waypoint, clockwise.
+    """Legs through waypoints, then a clockwise orbit round the last waypoint.
 
-    A corner of the turn tau begins and ends radius tan(tau / 2) from the waypoint; one beyond
-    SHARPEST has no fillet. At a waypoint of `loiters`, by the number, a clockwise circle round the
-    waypoint takes the place of the fillet. Lines touch circles and the orbit; a line too short for
-    a tangent leads to the waypoint. Raises ParameterError for fewer than two waypoints, a radius
-    below `least` (`lateral.least_radius`), and a waypoint within the circle of a loiter;
-    ShortLegError for a leg too short for the fillets. Source: R. W. Beard, T. W. McLain, Small
-    Unmanned Aircraft (2012), algorithm 8.
+    The corners have fillets of a radius, m. A corner of the turn tau begins and ends radius tan(tau
+    / 2) from the waypoint; one beyond SHARPEST has no fillet. At a waypoint of `loiters`, by the
+    number, a clockwise circle round the waypoint takes the place of the fillet. Lines touch circles
+    and the orbit; a line too short for a tangent leads to the waypoint. Raises ParameterError for
+    fewer than two waypoints, a radius below `least` (`lateral.least_radius`), and a waypoint within
+    the circle of a loiter; ShortLegError for a leg too short for the fillets. Source: R. W. Beard,
+    T. W. McLain, Small Unmanned Aircraft (2012), algorithm 8.
     """
     require(len(waypoints) >= 2, "route", f"{len(waypoints)} waypoints", "two or more")
     require(
@@ -438,11 +451,10 @@ def route(
 def _between_circles(
     waypoints: Sequence[Point], radius: float, first: int, *, leaves: bool
 ) -> list[Leg]:
-    """Lines and fillets onto a clockwise circle round the last waypoint, from a circle round the
-    first where `leaves`.
+    """Lines and fillets onto a clockwise circle round the last waypoint.
 
-    `first`: number of the first waypoint. The centre of a clockwise circle is on the right of the
-    tangent.
+    Where `leaves`, they begin at a circle round the first waypoint. `first`: number of the first
+    waypoint. The centre of a clockwise circle is on the right of the tangent.
     """
     points = list(waypoints)
     if leaves:
@@ -475,8 +487,9 @@ def _between_circles(
 
 
 def filleted(waypoints: Sequence[Point], radius: float, first: int = 0) -> list[Leg]:
-    """Lines through waypoints, and the fillets in the corners. Raises as `route`; `first`: number
-    of the first waypoint.
+    """Lines through waypoints, and the fillets in the corners.
+
+    `first`: number of the first waypoint. Raises as `route`.
     """
     turns = [0.0]
     for before, corner, after in zip(waypoints, waypoints[1:], waypoints[2:], strict=False):

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Protection: limits of bank, speed and climb, in this order, from the stall speed and the
-commanded airspeed.
+"""Protection: limits of bank, speed and climb, in this order.
+
+They follow from the stall speed and the commanded airspeed.
 """
 
 from flight_core.units import GRAVITY
@@ -31,10 +32,10 @@ def forward(speed: Scalar) -> Scalar:
 
 
 def bank_limit(limit: float, stall_speed: float, speed: Scalar) -> Scalar:
-    """Largest bank, rad: min(phi_max, acos((1.1 V_s / V)^2)), for the load factor of a level turn
-    is 1 / cos(phi).
+    """Largest bank, rad: min(phi_max, acos((1.1 V_s / V)^2)).
 
-    0 at a V of 1.1 V_s and below: the wings are level.
+    The load factor of a level turn is 1 / cos(phi). The bank is 0 at a V of 1.1 V_s and below: the
+    wings are level.
     """
     xp = array_namespace(speed)
     ratio = STALL_MARGIN * stall_speed / forward(speed)
@@ -52,21 +53,20 @@ def _share(value: Scalar) -> Scalar:
 
 
 def climb_limit(climb: float, sink: float, speed: Scalar, floor: float) -> Scalar:
-    """Largest climb rate, m/s: ratio climb - (1 - ratio) sink, ratio = clip((V - 0.9 V_floor) /
-    (0.1 V_floor), 0, 1).
+    """Largest climb rate, m/s: ratio climb - (1 - ratio) sink.
 
-    Below the floor pitch flies the speed: at nine tenths of the floor the aircraft sinks at the
-    largest rate.
+    ratio = clip((V - 0.9 V_floor) / (0.1 V_floor), 0, 1). Below the floor pitch flies the speed: at
+    nine tenths of the floor the aircraft sinks at the largest rate.
     """
     ratio = _share((speed - 0.9 * floor) / (0.1 * floor))
     return ratio * climb - (1.0 - ratio) * sink
 
 
 def sink_limit(climb: float, sink: float, speed: Scalar, largest: float) -> Scalar:
-    """Least climb rate, m/s: (1 - ratio) climb - ratio sink, ratio = clip((1.1 V_max - V) / (0.1
-    V_max), 0, 1).
+    """Least climb rate, m/s: (1 - ratio) climb - ratio sink.
 
-    The mirror of `climb_limit`: beyond the largest airspeed pitch flies the speed.
+    ratio = clip((1.1 V_max - V) / (0.1 V_max), 0, 1). The mirror of `climb_limit`: beyond the
+    largest airspeed pitch flies the speed.
     """
     ratio = _share((1.1 * largest - speed) / (0.1 * largest))
     return (1.0 - ratio) * climb - ratio * sink
@@ -75,15 +75,16 @@ def sink_limit(climb: float, sink: float, speed: Scalar, largest: float) -> Scal
 def climb_range(
     climb: float, sink: float, shortfall: Scalar, speed: float
 ) -> tuple[Scalar, Scalar]:
-    """Least and largest climb rate, m/s, by the shortfall V_c - V of the airspeed, m/s, since a
-    throttle at the stop leaves V:
+    """Least and largest climb rate, m/s, by the shortfall V_c - V of the airspeed, m/s.
+
+    There is a shortfall since a throttle at the stop leaves V:
 
         -sink clip(2 + shortfall / d, 0, 1),  climb clip(2 - shortfall / d, 0, 1),
             d = max(0.05 V0, g climb / (0.4 V0))
 
     `speed`: V0, m/s. With V_dot = -g climb / V the second term of d bounds the bandwidth of V by
     climb to 0.4 rad/s.
-    """  # noqa: D400, D415 - what follows is an equation
+    """
     margins = (max(SHORTFALL * speed, GRAVITY * rate / (0.4 * speed)) for rate in (sink, climb))
     ratios = (sign * shortfall / d for sign, d in zip((-1.0, 1.0), margins, strict=True))
     least, largest = (_share(2.0 - ratio) for ratio in ratios)

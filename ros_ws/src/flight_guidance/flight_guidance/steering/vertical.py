@@ -31,14 +31,15 @@ class VerticalParams(NamedTuple):
 
 
 def climb_for(error: Scalar, params: VerticalParams) -> Scalar:
-    """Climb rate for an error of altitude (command less altitude, m), in m/s, within -sink and
-    climb:
+    """Climb rate for an error of altitude (command less altitude, m), in m/s.
+
+    Within -sink and climb:
 
         k_h e  near,  sign(e) sqrt(a (abs(e) - e_l / 2))  from e_l = a / (2 k_h^2) on
 
     The two branches and the slopes agree at e_l. Far away the climb rate falls by a/2 a second:
     slow enough for the aircraft.
-    """  # noqa: D400, D415 - what follows is an equation
+    """
     k_h = params.k_h
     a = params.acceleration
     near = a / (2.0 * k_h * k_h)
@@ -74,11 +75,10 @@ def pitch_for(climb: Scalar, speed: Scalar, alpha: Scalar) -> Scalar:
 
 
 def climb_speed(error: Scalar, speed: Scalar) -> Scalar:
-    """Command of the airspeed, m/s, over the target, for an error of the climb rate without an
-    elevator: K V / (2 g) error.
+    """Command of the airspeed over the target, m/s, for an error of the climb rate.
 
-    At a constant angle of attack the lift goes with V^2, so h_ddot = 2 g dV / V, and the error
-    decays at K = CLIMB_BANDWIDTH.
+    K V / (2 g) error, of an aircraft without an elevator. At a constant angle of attack the lift
+    goes with V^2, so h_ddot = 2 g dV / V, and the error decays at K = CLIMB_BANDWIDTH.
     """
     return CLIMB_BANDWIDTH * speed / (2.0 * GRAVITY) * error
 

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Wind: the velocity over ground less the velocity through the air, to the north and to the
-east.
+"""Wind: the velocity over ground less the velocity through the air.
+
+To the north and to the east.
 """
 
 import math
@@ -16,10 +17,10 @@ Wind = tuple[Scalar, Scalar]  # where the air moves to: north, east, m/s
 
 
 def wind_of(v_north: Scalar, v_east: Scalar, climb: Scalar, heading: Scalar, speed: Scalar) -> Wind:
-    """Wind from the velocity over ground and the airspeed, m/s: v_g - sqrt(V^2 - climb^2) [cos,
-    sin](heading).
+    """Wind from the velocity over ground and the airspeed, m/s.
 
-    `heading`: psi + beta, rad, the direction of the flight through the air.
+    v_g - sqrt(V^2 - climb^2) [cos, sin](heading), with `heading` psi + beta, rad, the direction of
+    the flight through the air.
     """
     xp = array_namespace(speed)
     level = xp.sqrt(xp.maximum(speed**2 - climb**2, 0.0))
@@ -27,8 +28,9 @@ def wind_of(v_north: Scalar, v_east: Scalar, climb: Scalar, heading: Scalar, spe
 
 
 def wind_estimate(wind: Wind, measured: Wind, dt: float) -> Wind:
-    """Low-pass of the wind a step later: wind+ = wind + (1 - exp(-dt/T)) (measured - wind), T =
-    WIND_TIME.
+    """Low-pass of the wind a step later.
+
+    wind+ = wind + (1 - exp(-dt/T)) (measured - wind), T = WIND_TIME.
     """
     share = 1.0 - math.exp(-dt / WIND_TIME)
     north, east = (
