@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The watchdog and failsafe of the aircraft's node when u times out, its refusals, and when its
-flight begins.
+"""The aircraft's node when u times out: its watchdog and failsafe.
+
+Its refusals, and when its flight begins, are tested too.
 """
 
 from collections.abc import Iterator
@@ -90,8 +91,9 @@ def test_u_that_times_out_held_then_ramped_to_trim_and_may_return(osprey_gust: S
 
 
 def test_u_older_than_age_limit_does_not_end_failsafe(osprey_gust: Scenario) -> None:
-    """As of a controller that was stopped while its middleware sent: longer than the age limit,
-    newer than the last u.
+    """A controller was stopped while its middleware sent.
+
+    Its u is older than the age limit, and newer than the last u.
     """
     with flying(osprey_gust, max_age=MAX_AGE, hold=0.0, ramp=0.0) as flight:
         flight.fly(0.01)

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Actuators and their faults against closed forms, and flights with dead zones, lags, rate and
-position saturation.
+"""Actuators and their faults against closed forms.
+
+The flights have dead zones, lags, rate and position saturation.
 """
 
 import math
@@ -129,8 +130,9 @@ def test_dead_zone_has_no_jump_and_never_reverses_command(
 
 
 def position_history(times_ms: range, command: float, **actuators: Any) -> FloatArray:
-    """Positions of the four actuators 10 ms after each of the given instants, with one command for
-    all four.
+    """Positions of the four actuators 10 ms after each of the given instants.
+
+    One command is for all four.
     """
     params = osprey(10.0, **actuators)
     state = plant.initial_state(params)
@@ -212,8 +214,9 @@ def test_slow_surface_has_lag_of_fault_from_instant_on() -> None:
 
 
 def test_runaway_takes_travel_over_rate_to_its_stop_whatever_is_commanded() -> None:
-    """From 0.1 rad at 0.02 s to the lower stop of -0.3 rad at 2 rad/s: 0.4 / 2 = 0.2 s, behind any
-    lag. The mean of a step of this motion is that of its ends.
+    """From 0.1 rad at 0.02 s to the lower stop of -0.3 rad at 2 rad/s.
+
+    It takes 0.4 / 2 = 0.2 s, behind any lag. The mean of a step of this motion is that of its ends.
     """
     params = osprey(
         lag=[0.05] * 4,
@@ -305,8 +308,9 @@ def test_scenario_without_actuators_integrates_command_to_last_bit() -> None:
 
 @pytest.mark.parametrize("every", [1, 2])
 def test_late_command_acts_as_that_command_given_later(every: int) -> None:
-    """To the last bit, also where every second sample is left out: u is then held over two
-    periods.
+    """It does to the last bit, also where every second sample is left out.
+
+    u is then held over two periods.
     """
     scenario = find_scenario("osprey_servo")
     periods = 3
@@ -328,8 +332,9 @@ def test_late_command_acts_as_that_command_given_later(every: int) -> None:
 def continuous(
     commands: list[float], tick: float, lag: float, rate: float, stop: float
 ) -> FloatArray:
-    """Integral of the position of the continuous actuator at the ends of the ticks, by SciPy's
-    integrator.
+    """Integral of the position of the continuous actuator at the ends of the ticks.
+
+    SciPy's integrator gives it.
     """
 
     def rates(_: float, state: FloatArray, command: float) -> list[float]:

@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The simulated aircraft against exact solutions, independent integrators and its own
-definition.
-"""
+"""The simulated aircraft against exact solutions, independent integrators and its definition."""
 
 import math
 from functools import partial

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The airframe library against published modes, and Remark 1 ("D = I for every model tried") as a
-table.
+"""The airframe library against published modes.
+
+Remark 1 ("D = I for every model tried") is a table.
 """
 
 import math
@@ -152,8 +153,9 @@ def test_more_inputs_than_outputs_give_d_equal_to_one_through_the_pseudo_inverse
 
 
 def test_split_effectors_moved_together_are_those_of_the_osprey() -> None:
-    """Elevator, thrust, aileron and rudder of the twin and of the V-tail, from the geometry
-    alone.
+    """Elevator, thrust, aileron and rudder are those of the twin and of the V-tail.
+
+    The geometry alone gives them.
     """
     whole, twin, tail = (
         load_airframe(name).matrix_b() for name in ("osprey", "osprey_twin", "osprey_vtail")
@@ -169,8 +171,9 @@ def test_split_effectors_moved_together_are_those_of_the_osprey() -> None:
 
 
 def test_the_flying_wing_has_the_short_period_of_its_coefficients() -> None:
-    """Z_alpha, M_alpha and M_q by hand from the coefficients of Gryte et al. 2018 at 18 m/s: see
-    the source in the file.
+    """Z_alpha, M_alpha and M_q are by hand from the coefficients of Gryte et al. 2018 at 18 m/s.
+
+    See the source in the file.
     """
     q_S = 0.5 * 1.225 * 18.0**2 * 0.75
     Z_alpha = -(q_S * 4.0203 + 3.459) / (3.364 * 18.0)
@@ -255,8 +258,9 @@ FIRST_EDITION = (
 
 
 def lateral_state_space(c: Mapping[str, float]) -> tuple[FloatArray, FloatArray]:
-    """Beard and McLain, Table 5.1, states v, p, r, phi; trim from lift = weight and zero pitching
-    moment.
+    """Beard and McLain, Table 5.1, states v, p, r, phi.
+
+    The trim is from lift = weight and zero pitching moment.
     """
     pressure = 0.5 * c["rho"] * c["V"] ** 2 * c["S"]
     lift = c["mass"] * c["g"] / pressure - c["CL0"]
@@ -306,8 +310,9 @@ def test_the_aerosondes_follow_from_their_published_coefficients(
 
 
 def toy(k: float) -> Airframe:
-    """y_dot = -y + z + u, z_dot = z + k u: holding y at zero takes u = -z, so the zero is at 1 -
-    k.
+    """y_dot = -y + z + u, z_dot = z + k u.
+
+    Holding y at zero takes u = -z, so the zero is at 1 - k.
     """
     inputs = {"u": {"unit": "1", "positive": "more y"}}
     states = {"y": "1", "z": "1"}

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Gusts, biases, sines and inertial coupling: formulas, Assumption 2, and exactly no effect with
-amplitude 0.
+"""Gusts, biases, sines and inertial coupling: formulas, Assumption 2.
+
+With amplitude 0 they have exactly no effect.
 """
 
 import math
@@ -167,8 +168,9 @@ OUTSIDE: dict[str, dict[str, Any]] = {
 
 
 def largest(disturbed: dict[str, Any], rate: float, scenario: Scenario) -> FloatArray:
-    """The largest errors of q and r with the default law at a rate, in 6 s without commands and
-    gusts, mrad/s.
+    """The largest errors of q and r with the default law at a rate, mrad/s.
+
+    The flight takes 6 s without commands and gusts.
     """
     no_commands = scenario.vary(
         aircraft={"gusts": {}, "rate": 400.0, "step": 0.0025} | disturbed,
@@ -298,8 +300,9 @@ SECTIONS: dict[str, tuple[str, Any, Any]] = {  # section, off, on
 
 @pytest.fixture(scope="module")
 def baseline(osprey_gust: Scenario) -> Scenario:
-    """1.2 s of the default flight with servos, noise and two gusts, without the disturbances under
-    test.
+    """1.2 s of the default flight with servos, noise and two gusts.
+
+    It is without the disturbances under test.
     """
     slow = {"rate": 100.0, "step": 0.005}
     return osprey_gust.vary(

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Aircraft of JSBSim as flight dynamics models: trim, signs, wind, repeatability, process
-isolation, and every failure.
+"""Aircraft of JSBSim as flight dynamics models.
+
+Tested are trim, signs, wind, repeatability, process isolation, and every failure.
 """
 
 import ctypes
@@ -180,10 +181,10 @@ def thrusts(model: JsbsimModel) -> list[float]:
     ids=["a piston with a propeller", "two turbines"],
 )
 def test_lost_engines_give_no_thrust(condition: FlightCondition) -> None:
-    """JSBSim's own thrust. At throttle 0 alone an engine of the 737 idles, with 1.1 kN. A propeller
-    turned by the wind brakes.
+    """The thrust is JSBSim's own.
 
-    The flight goes on: an engine that stops for another reason ends it.
+    At throttle 0 alone an engine of the 737 idles, with 1.1 kN. A propeller turned by the wind
+    brakes. The flight goes on: an engine that stops for another reason ends it.
     """
     model = cessna(condition=condition)
     model.retune(0, with_lost_throttle(0.5))

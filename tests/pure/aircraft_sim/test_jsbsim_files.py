@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Foreign models of JSBSim: the files that they name as JSBSim finds them, and what they may not do
-to the user's host.
+"""Foreign models of JSBSim: the files that they name as JSBSim finds them.
+
+What they may not do to the user's host is tested too.
 """
 
 import io
@@ -132,8 +133,9 @@ def test_model_opens_no_socket(line: str, tmp_path: Path) -> None:
 def test_property_that_writes_a_file_is_refused(
     name: str, place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """JSBSim writes NAME_lin.sce and initfile.TIME.xml where a model sets them; NAME of the model
-    may be a path.
+    """JSBSim writes NAME_lin.sce and initfile.TIME.xml where a model sets them.
+
+    NAME of the model may be a path.
     """
     monkeypatch.chdir(tmp_path)
     switch = f'<property value="1">simulation/{name}</property>'

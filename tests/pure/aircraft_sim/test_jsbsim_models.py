@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Models of JSBSim of the user's own: found by path, with engines beside them or in a root,
-electric engines too.
+"""Models of JSBSim of the user's own.
+
+They are found by path, with engines beside them or in a root, electric engines too.
 """
 
 import shutil
@@ -64,8 +65,9 @@ def electric(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def external(tmp_path: Path) -> Path:
-    """A c172p whose flight control reads the elevator in rad, half of the opposite, and ailerons by
-    two properties.
+    """A c172p whose flight control reads the elevator in rad, half of the opposite.
+
+    It reads ailerons by two properties.
     """
     declared = "".join(
         f'<property value="0.0">fcs/cmd{name}</property>'
@@ -126,8 +128,9 @@ def test_command_without_effect_is_named_with_what_the_model_reads(external: Pat
 
 
 def test_aircraft_flies_by_the_properties_that_the_user_names(external: Path) -> None:
-    """The same command as that of the c172p: -2 rad^-1 x -0.5 rad, and half of the aileron to each
-    side.
+    """The same command as that of the c172p: -2 rad^-1 x -0.5 rad.
+
+    Half of the aileron goes to each side.
     """
     commands = {
         "elevator": "fcs/cmdElev_ext_rad=-0.5",
@@ -346,8 +349,9 @@ def test_missing_engine_named_with_folders_searched(electric: Path, tmp_path: Pa
 
 
 def test_nearest_trim_is_the_first_neighbour_that_trims(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of an aircraft that needs 27 m/s and flies up to 4,000 m: a tenth faster is nearer than a
-    third, and half of the altitude is tried where no speed helps.
+    """The aircraft needs 27 m/s and flies up to 4,000 m.
+
+    A tenth faster is nearer than a third, and half of the altitude is tried where no speed helps.
     """
     seconds = []
 

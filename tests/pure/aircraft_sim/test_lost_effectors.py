@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What a lost effector takes from an aircraft in trim: the thrust of an engine or a rotor, and
-nothing of a surface.
+"""What a lost effector takes from an aircraft in trim.
+
+It takes the thrust of an engine or a rotor, and nothing of a surface.
 """
 
 import math
@@ -39,8 +40,9 @@ def configured(airframe: str, lost: str, *others: str, **actuators: Any) -> Airc
 
 
 def accelerations(airframe: str, lost: str) -> dict[str, float]:
-    """x_dot of the aircraft in trim by state, SI, with all commands at trim and an effector
-    lost.
+    """x_dot of the aircraft in trim by state, SI, with an effector lost.
+
+    All commands are at trim.
     """
     params = configured(airframe, lost).plant()
     u = np.zeros(len(load_airframe(airframe).inputs))
@@ -52,8 +54,9 @@ def accelerations(airframe: str, lost: str) -> dict[str, float]:
 def test_twin_yaws_toward_its_dead_engine_by_the_arm_times_the_remaining_thrust(
     lost: str, toward: float
 ) -> None:
-    """By hand, of the sources of the file: 3 m/s^2 by 13.5 kg in trim, half of it an engine, at 0.2
-    m, J_z 1.759 kg m^2.
+    """The figures are by hand, of the sources of the file.
+
+    3 m/s^2 by 13.5 kg in trim, half of it an engine, at 0.2 m, J_z 1.759 kg m^2.
     """
     thrust = 0.5 * 0.06 * 100.0 * 13.5 / 2.0
     found = accelerations("osprey_twin", lost)
@@ -65,8 +68,9 @@ def test_twin_yaws_toward_its_dead_engine_by_the_arm_times_the_remaining_thrust(
 
 @pytest.mark.parametrize("name", ["osprey", "osprey_vtail"])
 def test_without_its_only_engine_the_osprey_slows_down_by_its_thrust(name: str) -> None:
-    """Half of 0.6 times the weight, as the airframe file says; 0.06 m/s^2 per % rounds it by 2
-    %.
+    """The thrust is half of 0.6 times the weight, as the airframe file says.
+
+    0.06 m/s^2 per % rounds it by 2 %.
     """
     found = accelerations(name, "thrust")
     assert found["V"] == approx(-0.5 * 0.6 * GRAVITY, rel=0.02)
@@ -74,8 +78,9 @@ def test_without_its_only_engine_the_osprey_slows_down_by_its_thrust(name: str) 
 
 
 def test_thrust_of_flying_wing_in_trim_is_its_drag() -> None:
-    """Drag of V^2 at constant alpha: m V0 abs(A[V,V]) / 2, of a column of the file that no thrust
-    has a part in.
+    """Drag of V^2 at constant alpha: m V0 abs(A[V,V]) / 2.
+
+    The column is that of the file in which no thrust has a part.
     """
     found = accelerations("x8_elevons", "thrust")
     assert found["V"] == approx(-0.1142 * 18.0 / 2.0, rel=2e-3)
@@ -83,10 +88,10 @@ def test_thrust_of_flying_wing_in_trim_is_its_drag() -> None:
 
 @pytest.mark.parametrize("number", range(1, 7))
 def test_hexarotor_loses_a_sixth_of_its_lift_and_the_moments_of_the_rotor(number: int) -> None:
-    """Newton and Euler with the geometry in the file: 1.5 kg, 0.275 m, 0.02, 0.02, 0.035 kg m^2,
-    0.016 m of torque a newton.
+    """Newton and Euler with the geometry in the file.
 
-    The trim thrust of the file has three figures, 2.45 of 2.4525 N.
+    It is 1.5 kg, 0.275 m, 0.02, 0.02, 0.035 kg m^2, 0.016 m of torque a newton. The trim thrust of
+    the file has three figures, 2.45 of 2.4525 N.
     """
     thrust = 1.5 * GRAVITY / 6.0
     angle = math.radians(30.0 + 60.0 * (number - 1))  # from the nose to the right
@@ -121,8 +126,9 @@ def positions(params: AircraftConfig, commands: list[float]) -> FloatArray:
 def test_no_command_and_no_other_fault_gives_a_lost_engine_thrust(
     airframe: str, effector: str
 ) -> None:
-    """Its position is that of no thrust in each step, behind lag, rate and stops, and beside the
-    other faults.
+    """Its position is that of no thrust in each step.
+
+    It is behind lag, rate and stops, and beside the other faults.
     """
     frame = load_airframe(airframe)
     place = list(frame.inputs).index(effector)

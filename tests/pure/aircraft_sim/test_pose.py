@@ -127,8 +127,9 @@ def test_kinematics_and_wind_that_aircraft_cannot_have_refused(
 
 
 def test_pose_of_airframe_agrees_with_another_integrator() -> None:
-    """From an aileron step on: heading and position by SciPy's integrator with the rotations of
-    SciPy.
+    """From an aileron step on, SciPy's integrator gives heading and position.
+
+    The rotations are SciPy's, too.
     """
     simulator = Simulator(aircraft_parameters(kinematics="euler"))
     airframe, aircraft = aircraft_parameters(kinematics="euler").load()
@@ -243,8 +244,9 @@ POOR = {
 
 
 def test_poor_pose_is_late_rare_and_off_as_specified() -> None:
-    """100 s: the noise of 500 samples has a standard deviation within 4 / sqrt(2 N) of that
-    specified.
+    """The flight takes 100 s.
+
+    The noise of 500 samples has a standard deviation within 4 / sqrt(2 N) of that specified.
     """
     simulator = Simulator(aircraft_parameters(pose=POOR, rate=100.0))
     truth = {}

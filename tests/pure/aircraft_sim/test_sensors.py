@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Sensor noise, bias, drift, quantisation, dropout and transport delay: statistics, repeatability,
-effect on a flight.
+"""Sensor noise, bias, drift, quantisation, dropout and transport delay.
+
+Tested are statistics, repeatability, effect on a flight.
 """
 
 from typing import Any

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Dryden turbulence against the published spectra: lengths, intensities, filters, ensemble
-statistics, repeatability.
+"""Dryden turbulence against the published spectra.
+
+Tested are lengths, intensities, filters, ensemble statistics, repeatability.
 """
 
 import math
@@ -37,8 +38,9 @@ TURBULENCE = {"altitude": 30.0, "wind": 7.7}
 
 
 def spectrum(omega: FloatArray, axis: int, model: Dryden) -> FloatArray:
-    """The published spectrum, one-sided in omega, m^2/s^2 per rad/s: MIL-F-8785C, 3.7.1.2, in Omega
-    = omega / V0.
+    """The published spectrum, one-sided in omega, m^2/s^2 per rad/s.
+
+    Source: MIL-F-8785C, 3.7.1.2, in Omega = omega / V0.
     """
     L = model.length[axis]
     sigma = model.sigma[axis]
@@ -51,8 +53,9 @@ def spectrum(omega: FloatArray, axis: int, model: Dryden) -> FloatArray:
 
 
 def correlation(lag: FloatArray, axis: int, model: Dryden) -> FloatArray:
-    """Dryden's correlation at a distance d = V0 lag: sigma^2 exp(-d/L) along the flight, (1 - d/2L)
-    times that across it.
+    """Dryden's correlation at a distance d = V0 lag.
+
+    It is sigma^2 exp(-d/L) along the flight, (1 - d/2L) times that across it.
     """
     d = V0 * np.abs(lag) / model.length[axis]
     return np.asarray(model.sigma[axis] ** 2 * np.exp(-d) * (1.0 if axis == 0 else 1.0 - d / 2.0))

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Uncertain aircraft of Monte Carlo campaigns: distribution around the published airframe,
-repeatability by seed.
+"""Uncertain aircraft of Monte Carlo campaigns.
+
+Tested are the distribution around the published airframe and repeatability by seed.
 """
 
 from pathlib import Path
@@ -46,8 +47,9 @@ def test_entries_are_uniform_and_independent() -> None:
 
 
 def test_normal_deviations_have_limit_at_three_standard_deviations() -> None:
-    """2000 samples: the standard deviation is known to 1/sqrt(4000) = 1.6 %, the limit is four of
-    these.
+    """Of 2000 samples the standard deviation is known to 1/sqrt(4000) = 1.6 %.
+
+    The limit is four of these.
     """
     A, _ = nominal_and_sampled(OSPREY, 0.3, 2000, seed=3, spread=Spread(distribution="normal"))
     q = OSPREY.index("q")

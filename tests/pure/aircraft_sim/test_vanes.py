@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Vanes: what they read, icing and loss, the filter with them, what a still vane leaves, flights,
-refusals.
+"""Vanes: what they read, icing and loss, and the filter with them.
+
+What a still vane leaves, flights and refusals are tested too.
 """
 
 from functools import cache

@@ -80,8 +80,9 @@ def flown(aircraft: AircraftConfig, samples: int, u: FloatArray) -> FloatArray:
 
 @pytest.mark.parametrize("base", [OSPREY, OSPREY | CESSNA | {"kinematics": "linear"}])
 def test_level_flight_in_a_shear_is_that_in_the_wind_of_its_height(base: dict[str, Any]) -> None:
-    """Trim holds the altitude for a second within centimetres; at 50 m above the ground the wind is
-    that of the log law, ln(500) / ln(100) of 4 m/s.
+    """Trim holds the altitude for a second within centimetres.
+
+    At 50 m above the ground the wind is that of the log law, ln(500) / ln(100) of 4 m/s.
     """
     above = (base.get("altitude") or 0.0) - 50.0
     shear = LOG | {"ground": above}
@@ -94,9 +95,10 @@ def test_level_flight_in_a_shear_is_that_in_the_wind_of_its_height(base: dict[st
 
 
 def test_aircraft_that_climbs_into_a_head_wind_gains_airspeed_and_keeps_its_ground_speed() -> None:
-    """Through a layer of a metre the head wind rises by 5 m/s. Over a short time the velocity over
-    ground stays: the airspeed gains the wind. The weight and the drag take a part meanwhile, which
-    the same flight without wind shows.
+    """Through a layer of a metre the head wind rises by 5 m/s.
+
+    Over a short time the velocity over ground stays: the airspeed gains the wind. The weight and
+    the drag take a part meanwhile, which the same flight without wind shows.
     """
     layer = {"law": "table", "ground": 0.0, "height": [0.2, 1.2], "east": [0.0, 0.0]}
     u = np.array([0.2, 0.0, 0.0, 0.0])  # nose up
@@ -117,8 +119,9 @@ def test_aircraft_that_climbs_into_a_head_wind_gains_airspeed_and_keeps_its_grou
 
 
 def test_start_heading_turns_the_flight_and_not_the_wind() -> None:
-    """Towards the centre of a microburst from the south and from the west, 1000 m away: by symmetry
-    the same outflow against the flight.
+    """Towards the centre of a microburst from the south and from the west, 1000 m away.
+
+    By symmetry the same outflow is against the flight.
     """
     burst = {"ground": -40.0, "north": 0.0, "east": 0.0, "radius": 600.0, "speed": 12.0}
     winds = []

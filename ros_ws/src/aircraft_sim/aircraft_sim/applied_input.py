@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""u that the aircraft applies: the received u, the failsafe of a u that times out, and a bumpless
-return.
+"""u that the aircraft applies.
+
+The received u, the failsafe of a u that times out, and a bumpless return.
 """
 
 import numpy as np

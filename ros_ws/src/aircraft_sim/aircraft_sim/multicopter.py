@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A multicopter: the linear model of an airframe for rates and climb, and the tilt of the thrust
-for the flight over ground.
+"""A multicopter: the linear model of an airframe for rates and climb.
+
+The tilt of the thrust makes the flight over ground.
 """
 
 from collections.abc import Sequence

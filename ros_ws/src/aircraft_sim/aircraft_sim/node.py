@@ -1,10 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The node of the simulated aircraft: subscribes u, publishes y, pose and truth, in real time
-or in lockstep.
+"""The node of the simulated aircraft, in real time or in lockstep.
 
-A watchdog measures the age of u. A timeout of u starts the failsafe: hold the last value, then
-ramp to trim.
+Subscribes u, and publishes y, pose and truth. A watchdog measures the age of u. A timeout of u
+starts the failsafe: hold the last value, then ramp to trim.
 """
 
 from collections.abc import Sequence
@@ -33,12 +32,12 @@ recorder that overruns."""
 
 
 class AircraftNode(FlightNode[AircraftConfig]):
-    """At tick k the node integrates from t(k-1) to t(k) with the last u held, publishes y and
-    truth, then takes the newest u.
+    """At tick k the node integrates from t(k-1) to t(k) with the last u held.
 
-    In lockstep the node sets the time: y, truth and pose come at their instants. At the
-    controller's instants the node waits for u, then publishes clock with the next instant. An
-    instant has exactly one y, without channels where no sample arrives.
+    Then the node publishes y and truth, and takes the newest u. In lockstep the node sets the time:
+    y, truth and pose come at their instants. At the controller's instants the node waits for u,
+    then publishes clock with the next instant. An instant has exactly one y, without channels where
+    no sample arrives.
     """
 
     def __init__(self) -> None:

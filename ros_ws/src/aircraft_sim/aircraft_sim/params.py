@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of the simulated aircraft, validated once, and their conversion to the arrays of the
-equations.
+"""Parameters of the simulated aircraft, validated once.
+
+They convert to the arrays of the equations.
 """
 
 from collections.abc import Sequence
@@ -167,8 +168,9 @@ class AircraftConfig(NodeConfig):
 
     @classmethod
     def tunable(cls) -> frozenset[str]:
-        """Faults that begin and end in flight: of effectors, of sensors, gusts, and the start of a
-        drift.
+        """Faults that begin and end in flight.
+
+        Faults of effectors and sensors, gusts, and the start of a drift.
         """
         gusts = {f"gusts.{axis}.{key}" for axis, key in product(AXES, Gust.model_fields)}
         sensors = {f"sensors.{key}" for key in ("bias", "noise", "dropout")} | {
@@ -309,8 +311,9 @@ class AircraftConfig(NodeConfig):
         return {end: getattr(self.actuators, end) for end in effector_faults.ENDS}
 
     def _no_thrust(self) -> FloatArray:
-        """The inputs without thrust, deviations from trim, SI: nan where unknown. Of JSBSim the
-        throttle is -1 until the model has its trim.
+        """The inputs without thrust, deviations from trim, SI: nan where unknown.
+
+        Of JSBSim the throttle is -1 until the model has its trim.
         """
         if self.is_jsbsim:
             inputs = self.flight_condition().inputs()
@@ -384,8 +387,9 @@ class AircraftConfig(NodeConfig):
         return airframe.with_rotary_gusts() if self.has_rotary_gusts else airframe
 
     def sampled_airframe(self) -> Airframe:
-        """The airframe in flight: the named airframe, or a sample of `uncertainty` around the named
-        airframe.
+        """The airframe in flight.
+
+        The named airframe, or a sample of `uncertainty` around the named airframe.
         """
         chosen = self.uncertainty
         return uncertainty.sample_airframe(
@@ -423,8 +427,9 @@ class AircraftConfig(NodeConfig):
         return Drift(self.drift.start, self.drift.duration, *factors)
 
     def load(self) -> tuple[Airframe, Aircraft]:
-        """The airframe in flight and the arrays of equation (1) with the disturbances, for the axes
-        of the airframe's gusts.
+        """The airframe in flight and the arrays of equation (1) with the disturbances.
+
+        The disturbances are for the axes of the airframe's gusts.
         """
         airframe = self.sampled_airframe()
         gain, first, second = airframe.products()
@@ -470,8 +475,9 @@ class AircraftConfig(NodeConfig):
         return Actuators(**columns, no_thrust=self._no_thrust() if known else None)
 
     def flight_condition(self) -> FlightCondition:
-        """The aircraft of JSBSim and the flight condition. Raises ParameterError for a linear
-        aircraft.
+        """The aircraft of JSBSim and the flight condition.
+
+        Raises ParameterError for a linear aircraft.
         """
         if self.speed is None or self.altitude is None:
             raise ParameterError(
@@ -547,7 +553,8 @@ class AircraftConfig(NodeConfig):
 
     def pose_sensors(self) -> Sensors | None:
         """The errors of pose as arrays, in the order of `channels.POSE`; None of an ideal pose.
-        Independent of those of y.
+
+        Independent of the errors of y.
         """
         pose = self.pose
         if not (

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Pose of the aircraft: attitude, position and velocity over ground as absolute values, for
-guidance and the log.
+"""Pose of the aircraft: attitude, position and velocity over ground as absolute values.
 
-Position is in a local tangent plane whose origin is below the aircraft at t = 0, unless it starts
-elsewhere. A steady wind moves the air mass as a whole: the flight relative to the air is as in
-still air, and the pose alone gets the wind (Galilean invariance).
+Guidance and the log take it. Position is in a local tangent plane whose origin is below the
+aircraft at t = 0, unless it starts elsewhere. A steady wind moves the air mass as a whole: the
+flight relative to the air is as in still air, and the pose alone gets the wind (Galilean
+invariance).
 """
 
 import math
@@ -35,8 +35,9 @@ def wrapped(angle: float) -> float:
 def velocity(
     speed: Scalar, alpha: Scalar, beta: Scalar, phi: Scalar, theta: Scalar, psi: Scalar
 ) -> tuple[Scalar, Scalar, Scalar]:
-    """Velocity to the north, to the east and up, m/s, of an aircraft with this airspeed, m/s, and
-    these angles, rad.
+    """Velocity to the north, to the east and up, m/s.
+
+    The aircraft has this airspeed, m/s, and these angles, rad.
 
         [v_north, v_east, -climb] = R_z(psi) R_y(theta) R_x(phi) V [cos(alpha) cos(beta), sin(beta),
         sin(alpha) cos(beta)]
@@ -68,11 +69,10 @@ class Start(NamedTuple):
 
 
 def over_ground(pose: FloatArray, t: float, wind: Sequence[float], start: Start) -> FloatArray:
-    """A pose relative to the air mass as a pose over ground after t s of a steady wind (m/s to the
-    north, to the east).
+    """A pose relative to the air mass as a pose over ground after t s of a steady wind.
 
-    The pose is that of a flight from the origin to the north. It is turned by the heading of the
-    start and moved there.
+    The wind is in m/s to the north and to the east. The pose is that of a flight from the origin to
+    the north. The heading of the start turns the pose, and its place moves it.
     """
     moved = pose.copy()
     if start.heading:

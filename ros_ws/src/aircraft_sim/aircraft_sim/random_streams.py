@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Counter-based random numbers (Philox): a draw depends on seed, stream and number alone, not on
-earlier draws.
+"""Counter-based random numbers (Philox).
 
-Two flights of a scenario therefore agree, even if samples are missing in the second flight. NumPy's
-generator stays outside the functions on further array types.
+A draw depends on seed, stream and number alone, not on earlier draws. Two flights of a scenario
+therefore agree, even if samples are missing in the second flight. NumPy's generator stays outside
+the functions on further array types.
 """
 
 import numpy as np

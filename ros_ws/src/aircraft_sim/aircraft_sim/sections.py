@@ -37,8 +37,9 @@ class Gust(Config):
 
 
 class TurbulenceConfig(Config):
-    """Dryden turbulence by MIL-F-8785C; `wind` gives the intensity at low altitude, `sigma` at high
-    altitude.
+    """Dryden turbulence by MIL-F-8785C.
+
+    `wind` gives the intensity at low altitude, `sigma` at high altitude.
     """
 
     altitude: Number = Field(ge=LOWEST, description="the altitude above the ground, m")
@@ -80,8 +81,9 @@ NEEDS = {
 
 
 class ShearConfig(Config):
-    """The steady wind over the height above the ground: `aircraft.wind` at `reference`, or a
-    table.
+    """The steady wind over the height above the ground.
+
+    `aircraft.wind` at `reference`, or a table.
     """
 
     law: Literal["log", "power", "table"] = Field(description="of the wind over the height")
@@ -143,8 +145,9 @@ class MicroburstConfig(Config):
 def require_one_wind(
     wind: Sequence[float], shear: ShearConfig | None, burst: MicroburstConfig | None
 ) -> None:
-    """Raise ParameterError for a wind beside a table of the wind, and for two altitudes of the
-    ground.
+    """Raise ParameterError for a wind beside a table of the wind.
+
+    Two altitudes of the ground are refused, too.
     """
     if shear is not None and shear.law == "table":
         expected = "0 beside shear.law table, which has the whole wind"
@@ -171,8 +174,9 @@ def wind_field_of(
 
 
 class BiasConfig(Config):
-    """A bias on x_dot of a state: a rise from 0 to the value along half a cosine, or a step with
-    rise 0.
+    """A bias on x_dot of a state.
+
+    A rise from 0 to the value along half a cosine, or a step with rise 0.
     """
 
     start: NonNegative = Field(description="the instant at which it begins, s")
@@ -198,8 +202,9 @@ class DrawConfig(Config):
 
 
 class UncertaintyConfig(DrawConfig):
-    """An aircraft sampled around the airframe: every entry times 1 + d, d independent; rows of
-    angles stay.
+    """An aircraft sampled around the airframe: every entry times 1 + d, d independent.
+
+    The rows of angles stay.
     """
 
     entries: tuple[str, ...] = Field(
@@ -232,8 +237,9 @@ class UncertaintyConfig(DrawConfig):
 
 
 class DriftConfig(DrawConfig):
-    """A and B change in flight, as by ice or by damage: every entry times 1 + d, d uniform and
-    independent.
+    """A and B change in flight, as by ice or by damage.
+
+    Every entry is multiplied by 1 + d, d uniform and independent.
     """
 
     start: Annotated[float, Field(ge=0, allow_inf_nan=True)] = Field(
@@ -268,8 +274,9 @@ Times = Upper  # from 0 on, .inf for never
 
 
 class ActuatorConfig(Config):
-    """The actuators, a value per input in the airframe's order. A missing list means ideal
-    actuators.
+    """The actuators, a value per input in the airframe's order.
+
+    A missing list means ideal actuators.
     """
 
     lag: NonNegativesOrNone = Field(
@@ -328,8 +335,9 @@ PerPose = dict[str, Number]
 
 
 class PoseConfig(Config):
-    """How `pose` is measured. The defaults are an ideal estimator: the true pose at once, at up to
-    50 Hz.
+    """How `pose` is measured.
+
+    The defaults are an ideal estimator: the true pose at once, at up to 50 Hz.
     """
 
     rate: Positive | None = Field(

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Sensors between the aircraft and y: bias, drift, noise and quantisation, then loss and delay of
-samples.
+"""Sensors between the aircraft and y.
+
+They have bias, drift, noise and quantisation, then loss and delay of samples.
 """
 
 from typing import NamedTuple
@@ -13,8 +14,9 @@ from flight_core.vectors import Array, FloatArray, StampedVector, array_namespac
 
 
 class Sensors(NamedTuple):
-    """Parameters of the sensors of m outputs. Ideal sensors have noise 0, delay 0 and dropout 0.
-    None: the error is absent.
+    """Parameters of the sensors of m outputs.
+
+    Ideal sensors have noise 0, delay 0 and dropout 0. None: the error is absent.
     """
 
     noise: FloatArray  # (m,) standard deviation per sample, SI
@@ -68,8 +70,9 @@ def measure(number: int, y: FloatArray, drift: Drift, params: Sensors) -> Measur
 
 
 def error(number: int, drift: Drift, params: Sensors) -> tuple[FloatArray, Drift]:
-    """Additive error at sample `number`, bias + walk(number) + noise(number), shape (m,), and the
-    walk; y plays no part.
+    """Additive error at sample `number`, bias + walk(number) + noise(number), shape (m,).
+
+    Returns further the walk; y plays no part.
     """
     drift = walk(number, drift, params)
     added = noise(number, params)
@@ -79,8 +82,9 @@ def error(number: int, drift: Drift, params: Sensors) -> tuple[FloatArray, Drift
 
 
 def quantised(measured: Array, quantum: Array) -> Array:
-    """Quantum round(measured / quantum), half to even; as measured where the quantum is 0. Works on
-    any array type.
+    """Quantum round(measured / quantum), half to even; as measured where the quantum is 0.
+
+    Works on any array type.
     """
     xp = array_namespace(measured)
     coarse = quantum > 0.0
@@ -92,8 +96,9 @@ def quantised(measured: Array, quantum: Array) -> Array:
 
 
 def noise(number: int, params: Sensors) -> FloatArray:
-    """Error of sample `number` >= 0: noise_i n_i with n_i standard normal, white over channels and
-    samples; shape (m,).
+    """Error of sample `number` >= 0, shape (m,): noise_i n_i.
+
+    n_i is standard normal, white over channels and samples.
     """
     if not any(params.noise.tolist()):  # a seventh of the time of .any() for a few channels
         return params.noise
@@ -103,10 +108,10 @@ def noise(number: int, params: Sensors) -> FloatArray:
 
 
 def walk(number: int, drift: Drift, params: Sensors) -> Drift:
-    """The random walk at sample `number`: w(0) = 0, w(k) = w(k-1) + drift_i n_i(k), with n standard
-    normal and independent.
+    """The random walk at sample `number`: w(0) = 0, w(k) = w(k-1) + drift_i n_i(k).
 
-    Steps of skipped samples are added too, so the walk does not depend on the measured samples.
+    n is standard normal and independent. Steps of skipped samples are added too, so the walk does
+    not depend on the measured samples.
     """
     if params.drift is None:
         return drift
@@ -118,8 +123,9 @@ def walk(number: int, drift: Drift, params: Sensors) -> Drift:
 
 
 def arrives(number: int, params: Sensors) -> bool:
-    """Whether sample `number` >= 0 is not dropped: v >= dropout with v uniform in [0, 1),
-    independent of the noise.
+    """Whether sample `number` >= 0 is not dropped: v >= dropout.
+
+    v is uniform in [0, 1), independent of the noise.
     """
     return (
         params.dropout == 0.0

@@ -48,8 +48,9 @@ class FlightDynamicsModel(Protocol):
         """Values in the order of `truth_names`."""
 
     def pose(self) -> FloatArray:
-        """The pose relative to the air mass, in the order of `channels.POSE`, absolute values,
-        SI.
+        """The pose relative to the air mass, absolute values, SI.
+
+        In the order of `channels.POSE`.
         """
 
     def diverged(self) -> bool:
@@ -112,8 +113,9 @@ class Simulator:
         self._require_above_ground(0)
 
     def retune(self, parameters: AircraftConfig) -> None:
-        """Take faults and gusts of these parameters from now on. Raises ParameterError where one
-        would change the past.
+        """Take faults and gusts of these parameters from now on.
+
+        Raises ParameterError where one would change the past.
         """
         now_ns = self._number * self.period_ns
         t = seconds(now_ns)
@@ -149,12 +151,11 @@ class Simulator:
         self._model.retune(now_ns, parameters)
 
     def sample(self, number: int, u: FloatArray) -> DelayLine:
-        """Advance to sample `number`, at number periods of flight time, with u held since the last
-        sample, and measure.
+        """Advance to sample `number` with u held since the last sample, and measure.
 
-        Returns the arriving y, the oldest first; their stamps are flight time. Raises FlightEnded
-        on the ground, and where the aircraft has diverged: its state, or an output beyond
-        `flight_core.plausible`.
+        The sample is at `number` periods of flight time. Returns the arriving y, the oldest first;
+        their stamps are flight time. Raises FlightEnded on the ground, and where the aircraft has
+        diverged: its state, or an output beyond `flight_core.plausible`.
         """
         t_ns = number * self.period_ns
         self._advance(number, u)
@@ -219,8 +220,9 @@ class Simulator:
         )
 
     def poses(self) -> DelayLine:
-        """The poses that arrive at the instant of the last sample, the oldest first, as measured;
-        stamps are flight time.
+        """The poses that arrive at the instant of the last sample, the oldest first.
+
+        They are as measured; stamps are flight time.
         """
         due = self._number % self._pose_every == 0
         t_ns = self._number * self.period_ns

@@ -109,11 +109,11 @@ class StateSpaceModel:
         return self._over_place.at(seconds(t_ns), *self._position)
 
     def _rate_by_wind(self) -> FloatArray:
-        """x_dot by the change of the wind along the flight, shape (n,): the states V, beta and
-        alpha are relative to the air.
+        """x_dot by the change of the wind along the flight, shape (n,).
 
-        V_dot -= W_dot forward, beta_dot -= W_dot right / V0, alpha_dot -= W_dot down / V0. W_dot is
-        that over the period before. Source: B. Etkin, Dynamics of Atmospheric Flight (1972), 5.5.
+        The states V, beta and alpha are relative to the air: V_dot -= W_dot forward, beta_dot -=
+        W_dot right / V0, alpha_dot -= W_dot down / V0. W_dot is that over the period before.
+        Source: B. Etkin, Dynamics of Atmospheric Flight (1972), 5.5.
         """
         _, _, _, phi, theta, *_ = self._states()
         return self._into @ (wind_field.body_axes(phi, theta, self._psi) @ self._wind_dot)
@@ -158,8 +158,9 @@ class StateSpaceModel:
         return y
 
     def air_angles(self, t_ns: int) -> FloatArray:
-        """See FlightDynamicsModel: x less the wind along the axis of the angle over V0,
-        `disturbance.AIR_STATE`.
+        """See FlightDynamicsModel.
+
+        x less the wind along the axis of the angle over V0, `disturbance.AIR_STATE`.
         """
         x = self._states()
         wind = self._block.wind[2 * ((t_ns - self._block_ns) // self._plant.step_ns)]

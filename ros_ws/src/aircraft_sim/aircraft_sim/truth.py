@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Ground truth for the log: the full state, f(x, t), the wind and the actuator positions. No
-controller receives it.
+"""Ground truth for the log: the full state, f(x, t), the wind and the actuator positions.
+
+No controller receives it.
 """
 
 import numpy as np

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Uncertain aircraft for Monte Carlo campaigns: A and B sampled around a published airframe,
-repeatable by seed.
+"""Uncertain aircraft for Monte Carlo campaigns, repeatable by seed.
+
+A and B are sampled around a published airframe.
 """
 
 from collections.abc import Mapping
@@ -46,10 +47,10 @@ UNIFORM = Spread()
 def nominal_and_sampled(
     airframe: Airframe, uncertainty: float, samples: int, seed: int, spread: Spread = UNIFORM
 ) -> tuple[FloatArray, FloatArray]:
-    """A and B, shapes (1 + samples, n, n) and (1 + samples, n, m), SI: as published, then numbers
-    0, 1, ... of the seed.
+    """A and B, shapes (1 + samples, n, n) and (1 + samples, n, m), SI.
 
-    Raises as `sampled_matrices`.
+    The first are as published, then come numbers 0, 1, ... of the seed. Raises as
+    `sampled_matrices`.
     """
     A, B = sampled_matrices(airframe, uncertainty, uncertainty, seed, 0, samples, spread)
     return np.concatenate([airframe.matrix_a()[None], A]), np.concatenate(
@@ -66,11 +67,10 @@ def sample_airframe(
     wind: WindEffect = AIR_RELATIVE,
     spread: Spread = UNIFORM,
 ) -> Airframe:
-    """Uncertain airframe `number` of a seed, with uncertainties of A and of B. 0, 0 and no entry
-    give the published airframe.
+    """Uncertain airframe `number` of a seed, with uncertainties of A and of B.
 
-    The effect of wind comes from `wind_factors`; the rest of f stays as published. Raises as
-    `sampled_matrices`.
+    0, 0 and no entry give the published airframe. The effect of wind comes from `wind_factors`; the
+    rest of f stays as published. Raises as `sampled_matrices`.
     """
     A, B = sampled_matrices(airframe, part_A, part_B, seed, number, 1, spread)
     return (
@@ -81,11 +81,10 @@ def sample_airframe(
 
 
 def wind_factors(airframe: Airframe, A: FloatArray, wind: WindEffect) -> FloatArray:
-    """Factors on the published effect of wind, shape (N, n, G), of N aircraft with the matrices A,
-    shape (N, n, n), SI.
+    """Factors on the published effect of wind, shape (N, n, G), of N aircraft.
 
-    Wind w along an axis changes the state j of AIR_STATE relative to the air, so the wind acts as
-    minus column j of A:
+    A, shape (N, n, n), SI, are their matrices. Wind w along an axis changes the state j of
+    AIR_STATE relative to the air, so the wind acts as minus column j of A:
 
         air_relative    factor_i = A_ij / published A_ij
             1 where the published A_ij is 0 or the airframe has no state j
@@ -106,8 +105,9 @@ def wind_factors(airframe: Airframe, A: FloatArray, wind: WindEffect) -> FloatAr
 
 
 def gust_directions(airframe: Airframe, A: FloatArray, wind: WindEffect) -> FloatArray:
-    """Change of x_dot for 1 m/s of wind along the axes, shape (N, n, G), of N aircraft with the
-    matrices A; `wind_factors`.
+    """Change of x_dot for 1 m/s of wind along the axes, shape (N, n, G), of N aircraft.
+
+    A are their matrices; see `wind_factors`.
     """
     return wind_factors(airframe, A, wind) * airframe.matrix_gusts()
 
@@ -121,12 +121,12 @@ def sampled_matrices(
     count: int,
     spread: Spread = UNIFORM,
 ) -> tuple[FloatArray, FloatArray]:
-    """A and B of the aircraft first, first + 1, ... of a seed, shapes (count, n, n) and (count, n,
-    m), SI.
+    """A and B of the aircraft first, first + 1, ... of a seed, SI.
 
-    Every entry is multiplied by 1 + d, d independent and within +-uncertainty, as `spread` says.
-    The rows of angles stay. An aircraft depends on seed and number alone, not on `count`. Raises
-    ParameterError for an uncertainty outside [0, 1), and for an unknown entry.
+    The shapes are (count, n, n) and (count, n, m). Every entry is multiplied by 1 + d, d
+    independent and within +-uncertainty, as `spread` says. The rows of angles stay. An aircraft
+    depends on seed and number alone, not on `count`. Raises ParameterError for an uncertainty
+    outside [0, 1), and for an unknown entry.
     """
     parts = {
         "A": np.full(airframe.matrix_a().shape, part_A),
@@ -170,11 +170,10 @@ def deviations(uniform: FloatArray, distribution: Distribution) -> FloatArray:
 
 
 def drawn_entries(airframe: Airframe, A: FloatArray, B: FloatArray) -> dict[str, FloatArray]:
-    """The entries that `sampled_matrices` draws, by name as A[q,alpha] and B[V,thrust], each of
-    shape (N,), SI.
+    """The entries that `sampled_matrices` draws, by name as A[q,alpha] and B[V,thrust].
 
-    A, of shape (N, n, n), and B, of shape (N, n, m), are those of N aircraft. Entries that are 0 as
-    published, and the rows of angles, are not drawn.
+    Shape (N,), SI. A, of shape (N, n, n), and B, of shape (N, n, m), are those of N aircraft.
+    Entries that are 0 as published, and the rows of angles, are not drawn.
     """
     matrices = {"A": A, "B": B}
     return {
@@ -200,8 +199,9 @@ def drawn_places(airframe: Airframe) -> dict[str, tuple[str, int, int]]:
 def with_entries(
     airframe: Airframe, deviations: Mapping[str, float], wind: WindEffect = AIR_RELATIVE
 ) -> Airframe:
-    """The airframe with entries multiplied by 1 + deviation, named as in `drawn_entries`; wind as
-    in `wind_factors`.
+    """The airframe with entries multiplied by 1 + deviation, named as in `drawn_entries`.
+
+    Wind as in `wind_factors`.
     """
     matrices = {"A": airframe.matrix_a().copy(), "B": airframe.matrix_b().copy()}
     places = drawn_places(airframe)
@@ -214,7 +214,8 @@ def with_entries(
 
 
 def as_yaml(airframe: Airframe) -> str:
-    """An airframe as the text of an airframe file, whose numbers read back as they are to the last
-    bit.
+    """An airframe as the text of an airframe file.
+
+    The numbers read back as they are to the last bit.
     """
     return dump_yaml(airframe.model_dump(mode="json", exclude_defaults=True))

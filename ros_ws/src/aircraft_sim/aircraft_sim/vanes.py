@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Vanes: angle of attack and sideslip relative to the air, with icing before the sensor and lost
-readings behind it.
+"""Vanes: angle of attack and sideslip relative to the air.
+
+Icing is before the sensor, lost readings are behind it.
 """
 
 from collections.abc import Sequence
@@ -30,8 +31,9 @@ class Vanes(NamedTuple):
 
 
 class VaneSensorsConfig(Config):
-    """Vanes: further channels of y, alpha and beta relative to the air, with errors of `sensors`
-    too.
+    """Vanes: further channels of y, alpha and beta relative to the air.
+
+    The errors of `sensors` apply, too.
     """
 
     channels: tuple[Literal["alpha", "beta"], ...] = Field(
@@ -92,8 +94,9 @@ def turned(t: float, angles: FloatArray, state: VaneState, params: Vanes) -> Van
 
 
 def read(number: int, measured: FloatArray, state: VaneState, params: Vanes) -> VaneState:
-    """The readings of sample `number`, (k,), from measured angles with errors: a lost reading
-    repeats the last.
+    """The readings of sample `number`, (k,), from measured angles with errors.
+
+    A lost reading repeats the last.
     """
     if params.dropout == 0.0:
         return state._replace(reading=measured)

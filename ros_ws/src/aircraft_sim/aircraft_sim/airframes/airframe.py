@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Airframe files: published matrices with their units and signs, converted to SI here and nowhere
-else.
+"""Airframe files: published matrices with their units and signs.
+
+They are converted to SI here and nowhere else.
 """
 
 import math
@@ -57,8 +58,9 @@ AIRPLANE_STATES = {
 
 
 class Input(Config):
-    """An input: the unit of the column of B, the effect of a positive value, and where an engine or
-    a rotor stands still.
+    """An input: the unit of the column of B, and the effect of a positive value.
+
+    Where an engine or a rotor stands still, too.
     """
 
     unit: Unit = Field(description="the unit of this column of B")
@@ -269,8 +271,9 @@ class Airframe(Config):
         return matrix * row[:, None] / column[None, :]
 
     def no_thrust(self) -> FloatArray:
-        """The inputs without thrust, deviations from trim, shape (p,), SI: 0 of a surface, nan
-        where the file has none.
+        """The inputs without thrust, deviations from trim, shape (p,), SI.
+
+        0 of a surface, nan where the file has none.
         """
         units = [quantity(channel.unit) for channel in self.inputs.values()]
         unsaid = [0.0 if unit.dimension == ANGLE else math.nan for unit in units]
@@ -298,8 +301,9 @@ class Airframe(Config):
         return matrix
 
     def products(self) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.int64]]:
-        """Inertial coupling, P terms: f = gain @ (x[first] * x[second]), shapes (n, P), (P,) and
-        (P,).
+        """Inertial coupling, P terms: f = gain @ (x[first] * x[second]).
+
+        The shapes of gain, first and second are (n, P), (P,) and (P,).
         """
         terms = self.inertial_coupling
         gain = np.zeros((len(self.states), len(terms)))
@@ -310,12 +314,11 @@ class Airframe(Config):
         return gain, first, second
 
     def with_matrices(self, A: FloatArray, B: FloatArray, wind_factor: FloatArray) -> Self:
-        """A copy with new A, shape (n, n), and B, shape (n, m), given in SI and stored in the units
-        of the file.
+        """A copy with new A, shape (n, n), and B, shape (n, m).
 
-        `wind_factor`, shape (n, G), multiplies the effect of wind along the axes of `gusts`.
-        Sampled and identified entries need not meet the identities of physics, so the copy is not
-        checked for these.
+        They are given in SI and stored in the units of the file. `wind_factor`, shape (n, G),
+        multiplies the effect of wind along the axes of `gusts`. Sampled and identified entries need
+        not meet the identities of physics, so the copy is not checked for these.
 
         Args:
             A: Shape (n, n), SI.
@@ -342,8 +345,9 @@ class Airframe(Config):
         )
 
     def through(self, T: FloatArray, inputs: Sequence[str]) -> Self:
-        """A copy with the m inputs v of u = T v, SI, for its p inputs u, T (p, m) in their order;
-        physics unchecked.
+        """A copy with the m inputs v of u = T v, SI, for its p inputs u, in their order.
+
+        Physics unchecked.
 
         Args:
             T: Matrix of u = T v, shape (p, m).
@@ -415,8 +419,9 @@ def _si(units: Iterable[Unit]) -> FloatArray:
 
 
 def check_identities(airframe: Airframe) -> None:
-    """Raise ParameterError for an airframe that contradicts what physics fixes, unless the file
-    says `identities: false`.
+    """Raise ParameterError for an airframe that contradicts what physics fixes.
+
+    Unless the file says `identities: false`.
     """
     if airframe.identities:
         effects = {name: channel.positive for name, channel in airframe.inputs.items()}
@@ -468,8 +473,9 @@ def load_airframe(name: FilePath | Airframe) -> Airframe:
 
 @lru_cache(maxsize=8)
 def _parsed(name: str, path: Path, content: bytes) -> Airframe:
-    """An airframe from the content of a file, cached: a node that checks a change in flight saves
-    15 ms.
+    """An airframe from the content of a file, cached.
+
+    A node that checks a change in flight saves 15 ms.
     """
     parsed = parse_yaml(content, f"airframe {path}", EXPECTED)
     require(isinstance(parsed, dict), f"airframe {path}", type(parsed).__name__, "a mapping")

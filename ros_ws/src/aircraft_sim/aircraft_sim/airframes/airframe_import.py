@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Airframes from the models of other tools: python-control, SciPy, MATLAB, AVL, XFLR5, and matrices
-with named states.
+"""Airframes from the models of other tools.
+
+The tools are python-control, SciPy, MATLAB, AVL, XFLR5, and matrices with named states.
 """
 
 import re
@@ -37,8 +38,9 @@ def import_airframe(
     text: str = "",
     **body: str | float,
 ) -> tuple[Airframe, str]:
-    """An airframe from the model of another tool, checked against physics, and a sentence on what
-    it was made of.
+    """An airframe from the model of another tool, and a sentence on what it was made of.
+
+    The airframe is checked against physics.
 
     Args:
         source: A state space of python-control or SciPy, or the path of a MATLAB file (.mat), of an
@@ -84,8 +86,9 @@ def import_airframe(
 
 
 def _of_file(source: str | Path, name: str, options: Mapping[str, Any]) -> Airframe:
-    """The airframe of an airframe file, with another name unless empty; no option fits beside
-    the file.
+    """The airframe of an airframe file, with another name unless empty.
+
+    No option fits beside the file.
     """
     for key, value in options.items():
         require(not value, key, f"{value!r} beside an airframe file", "none: the file has it")
@@ -116,8 +119,9 @@ def _check_identities(model: Model, name: str, speed: float) -> None:
 
 
 def _with_thrust(model: Model) -> Model:
-    """The model with an input thrust: V_dot, or u_dot, = g, in units of the weight along the flight
-    path.
+    """The model with an input thrust in units of the weight along the flight path.
+
+    V_dot, or u_dot, = g.
     """
     require(
         "thrust" not in model.inputs, "thrust", "an input thrust in the model", "none to add one"
@@ -182,8 +186,9 @@ def _airframe(
 def _rows_of_outputs(
     model: Model, wanted: Sequence[str], labels: Sequence[str]
 ) -> tuple[dict[str, FloatArray], dict[str, str]]:
-    """Rows of C by output, and units of the outputs that are no states; `labels` name the rows of
-    the model's own C.
+    """Rows of C by output, and units of the outputs that are no states.
+
+    `labels` name the rows of the model's own C.
     """
     names = list(model.states)
     identity = np.eye(len(names))
@@ -235,8 +240,9 @@ def _output(text: str, names: Sequence[str]) -> tuple[str, str, FloatArray | Non
 
 
 def _default_outputs(model: Model) -> list[str]:
-    """q, V, p, r by elevator, thrust, aileron, rudder; V = u cos(alpha_0) + w sin(alpha_0) of body
-    axes, by u_dot = -W0 q.
+    """q, V, p, r by elevator, thrust, aileron, rudder.
+
+    V = u cos(alpha_0) + w sin(alpha_0) of body axes, by u_dot = -W0 q.
     """
     outputs = []
     for name in model.inputs:
@@ -269,8 +275,9 @@ def _effect(model: Model, name: str) -> str:
 
 
 def _gusts(frame: Airframe) -> dict[str, dict[str, float]]:
-    """What wind adds to x_dot, per w / V0: minus the column of the state that moves relative to the
-    air; not to angles, h.
+    """What wind adds to x_dot, per w / V0.
+
+    Minus the column of the state that moves relative to the air; not to angles, h.
     """
     A = frame.matrix_a()
     names = list(frame.states)

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""An airframe away from the trim speed: A, B and trim in level flight at the same altitude, by
-powers of the airspeed.
+"""An airframe away from the trim speed.
+
+A, B and trim are those in level flight at the same altitude, by powers of the airspeed.
 """
 
 from collections.abc import Mapping
@@ -69,8 +70,9 @@ class Exponents(NamedTuple):
 
 
 def exponents(airframe: Airframe, thrust: str) -> Exponents:
-    """The exponents for the input `thrust`. Raises ParameterError for a state whose exponents are
-    not known.
+    """The exponents for the input `thrust`.
+
+    Raises ParameterError for a state whose exponents are not known.
     """
     unknown = [name for name in airframe.states if name not in STATES]
     require(
@@ -152,8 +154,9 @@ def level_flight(airframe: Airframe, ratio: float, thrust: str) -> tuple[FloatAr
 
 
 def over_airspeed(airframe: Airframe, thrust: str) -> OverAirspeed:
-    """How matrices and trim of an airframe follow the airspeed. Raises as `exponents`, and without
-    V or a speed.
+    """How matrices and trim of an airframe follow the airspeed.
+
+    Raises as `exponents`, and without V or a speed.
     """
     require(
         "V" in airframe.states and airframe.speed > 0.0,

@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What physics fixes in the matrices of an aircraft: kinematics, gravity, trim speed, the sign and
-the size of a control.
+"""What physics fixes in the matrices of an aircraft.
 
-The names of the states say what they are: V, u, v, w speeds, alpha, beta, theta, phi, psi angles,
-p, q, r angular rates, h a height; FRD axes. A state of a different name is not checked, but VT
-and further names of these are refused. Source of the identities: the linear equations of motion
-about straight flight, B. L. Stevens, F. L. Lewis, Aircraft Control and Simulation, 2nd ed. (2003),
-sec. 3.7; B. Etkin, L. D. Reid, Dynamics of Flight, 3rd ed. (1996), eq. (4.9,18).
+Kinematics, gravity, trim speed, the sign and the size of a control. The names of the states say
+what they are: V, u, v, w speeds, alpha, beta, theta, phi, psi angles, p, q, r angular rates, h a
+height; FRD axes. A state of a different name is not checked, but VT and further names of these are
+refused. Source of the identities: the linear equations of motion about straight flight, B. L.
+Stevens, F. L. Lewis, Aircraft Control and Simulation, 2nd ed. (2003), sec. 3.7; B. Etkin, L. D.
+Reid, Dynamics of Flight, 3rd ed. (1996), eq. (4.9,18).
 """
 
 from collections.abc import Iterator, Mapping
@@ -239,8 +239,9 @@ def _effects(model: Model) -> Iterator[Finding]:
 
 
 def _strengths(model: Model) -> Iterator[Finding]:
-    """Size of a control: angular acceleration per rad over stiffness + damping, |M_alpha| + |M_q|
-    (|M_q| + |Z_alpha|).
+    """Size of a control: angular acceleration per rad over stiffness + damping.
+
+    The latter is |M_alpha| + |M_q| (|M_q| + |Z_alpha|).
     """
     names = list(model.states)
     for k, name in enumerate(model.effects):

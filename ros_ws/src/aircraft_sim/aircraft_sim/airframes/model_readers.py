@@ -196,8 +196,9 @@ def _state_space(system: Any, states: Mapping[str, Any], inputs: Mapping[str, An
 
 
 def _matlab(path: Path, states: Mapping[str, Any], inputs: Mapping[str, Any]) -> Model:
-    """A, B, C, D of a .mat file, or of a structure in the file; names in StateName, InputName,
-    OutputName.
+    """A, B, C, D of a .mat file, or of a structure in the file.
+
+    The names are in StateName, InputName, OutputName.
     """
     from scipy.io import loadmat  # noqa: PLC0415 - for .mat alone
     from scipy.io.matlab import MatReadError  # noqa: PLC0415
@@ -263,8 +264,9 @@ def _rows(lines: Sequence[str], count: int, columns: int, key: str) -> FloatArra
 
 
 def _xflr5(text: str, states: Mapping[str, Any], inputs: Mapping[str, Any]) -> Model:
-    """Both 4 x 4 matrices of XFLR5's log, SI; the control matrices are per rad, a set of both a
-    control.
+    """Both 4 x 4 matrices of XFLR5's log, SI.
+
+    The control matrices are per rad, a set of both a control.
     """
     lines = text.splitlines()
 
@@ -328,8 +330,9 @@ def _avl_matrix(
     inputs: Mapping[str, Any],
     speed: float | None,
 ) -> Model:
-    """AVL's system matrix, SI: the axes are those that physics confirms, x forward and z down, or x
-    aft and z up.
+    """AVL's system matrix, SI.
+
+    The axes are those that physics confirms, x forward and z down, or x aft and z up.
     """
     line, names, controls = header
     require(
@@ -378,11 +381,10 @@ DERIVATIVES = "Sref Cref Bref Alpha CLtot CDtot CLa CYb Clb Cma Cnb CYp Clp Cnp 
 def _avl_derivatives(
     text: str, inputs: Mapping[str, Any], speed: float | None, body: Mapping[str, str | float]
 ) -> Model:
-    """Linear equations about level flight in stability axes from AVL's stability derivatives,
-    without those of alpha_dot.
+    """Linear equations about level flight in stability axes from AVL's stability derivatives.
 
-    Source: R. C. Nelson, Flight Stability and Automatic Control, 2nd ed. (1998), tables 3.5, 3.6,
-    eqs. (4.51), (5.33).
+    Derivatives by alpha_dot are left out. Source: R. C. Nelson, Flight Stability and Automatic
+    Control, 2nd ed. (1998), tables 3.5, 3.6, eqs. (4.51), (5.33).
     """
     if speed is None:
         raise ParameterError("speed: found none, expected the trim speed beside AVL's derivatives")

@@ -59,11 +59,11 @@ class Sines(NamedTuple):
 
 
 def one_minus_cosine(t: Array, gusts: Gusts, airspeed: Array) -> Array:
-    """Speeds of the gusts in m/s, shape (G,): w = U_ds/2 (1 - cos(pi s/H)), s = V0 ((t - start) mod
-    every) up to 2H.
+    """Speeds of the gusts in m/s, shape (G,): w = U_ds/2 (1 - cos(pi s/H)) up to s = 2H.
 
-    Zero before entry, and after 2H/V0 seconds until it comes again. The derivative is continuous
-    and at most U_ds/2 pi V0/H, which meets Assumption 2. Source of the form: FAR/CS 25.341(a).
+    s = V0 ((t - start) mod every). Zero before entry, and after 2H/V0 seconds until it comes again.
+    The derivative is continuous and at most U_ds/2 pi V0/H, which meets Assumption 2. Source of the
+    form: FAR/CS 25.341(a).
     """
     xp = array_namespace(gusts.speed)
     since = t - gusts.start
@@ -76,12 +76,11 @@ def one_minus_cosine(t: Array, gusts: Gusts, airspeed: Array) -> Array:
 
 
 def bias(t: Array, params: Bias) -> Array:
-    """Biases at t, shape (n,), [x]/s: value/2 (1 - cos(pi s)), s = (t - start)/rise clipped to [0,
-    1].
+    """Biases at t, shape (n,), [x]/s: value/2 (1 - cos(pi s)).
 
-    With rise > 0 the derivative is continuous and at most value/2 pi/rise. With rise = 0 the bias
-    is a step: zero up to start, `value` afterwards. Assumption 2 does not hold at the instant of
-    the step.
+    s = (t - start)/rise clipped to [0, 1]. With rise > 0 the derivative is continuous and at most
+    value/2 pi/rise. With rise = 0 the bias is a step: zero up to start, `value` afterwards.
+    Assumption 2 does not hold at the instant of the step.
     """
     xp = array_namespace(params.value)
     s = xp.minimum(xp.maximum((t - params.start) / xp.maximum(params.rise, MIN_RISE), 0.0), 1.0)
@@ -89,8 +88,9 @@ def bias(t: Array, params: Bias) -> Array:
 
 
 def sines(t: Array, params: Sines) -> Array:
-    """Sines at t, shape (n,), [x]/s: amplitude sin(frequency t + phase). The derivative is at most
-    amplitude frequency.
+    """Sines at t, shape (n,), [x]/s: amplitude sin(frequency t + phase).
+
+    The derivative is at most amplitude frequency.
     """
     return params.amplitude * array_namespace(params.amplitude).sin(
         params.frequency * t + params.phase

@@ -1,11 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Dryden turbulence of MIL-F-8785C, MIL-HDBK-1797: intensities, lengths, and shaping filters driven
-by white noise.
+"""Dryden turbulence of MIL-F-8785C, MIL-HDBK-1797.
 
-Turbulence lies outside the theorem. Assumption 2 requires a bounded f with a bounded derivative. A
-Gaussian process has no bound, and none of the three winds has a derivative: the filters have a pole
-more than zeros.
+Intensities, lengths, and shaping filters driven by white noise. Turbulence lies outside the
+theorem. Assumption 2 requires a bounded f with a bounded derivative. A Gaussian process has no
+bound, and none of the three winds has a derivative: the filters have a pole more than zeros.
 
 The rotary gusts p_g, q_g, r_g act where a scenario has `turbulence.rotary`: they depend on the
 span, which not all airframe files state. Their effect is not small: at 100 m, for a span of 3 m,
@@ -52,8 +51,9 @@ class Dryden(NamedTuple):
 
 
 class Turbulence(NamedTuple):
-    """Discretised turbulence filters of a step, for the winds of G axes. The state z is (s,), s =
-    5, or 8 with rotary gusts; the first five are of unit variance or less.
+    """Discretised turbulence filters of a step, for the winds of G axes.
+
+    The state z is (s,), s = 5, or 8 with rotary gusts; the first five are of unit variance or less.
     """
 
     transition: Array  # (s, s)
@@ -109,10 +109,10 @@ def filters(
     seed: int,
     span: float | None = None,
 ) -> Turbulence:
-    """The shaping filters, discretised exactly: at multiples of dt the winds are distributed as in
-    continuous time.
+    """The shaping filters, discretised exactly.
 
-    With a = V0/L by axis and white noise n of unit intensity,
+    At multiples of dt the winds are distributed as in continuous time. With a = V0/L by axis and
+    white noise n of unit intensity,
 
         u       z_dot = -a z + sqrt(2a) n,  u = sigma z
         v, w    z1_dot = -a z1 + sqrt(2a) n,  z2_dot = a (z1 - z2),
@@ -202,8 +202,10 @@ def initial_state(params: Turbulence) -> FloatArray:
 
 
 def normals(first: int, count: int, params: Turbulence) -> FloatArray:
-    """Standard normal numbers of the steps first, first + 1, ... of `count`, shape (count, k); step
-    k depends on seed and k. Those of the winds are the same with and without rotary gusts.
+    """Standard normal numbers of the steps first, first + 1, ... of `count`, shape (count, k).
+
+    Step k depends on seed and k. The numbers of the winds are the same with and without rotary
+    gusts.
     """
     skipped = first % BLOCK
     streams = [(random_streams.TURBULENCE, STATES)]
@@ -220,8 +222,9 @@ def normals(first: int, count: int, params: Turbulence) -> FloatArray:
 
 
 def step(z: Array, normal: Array, params: Turbulence) -> Array:
-    """State a step later, shape (s,): transition z + spread n, with n standard normal, shape
-    (k,).
+    """State a step later, shape (s,): transition z + spread n.
+
+    n is standard normal, shape (k,).
     """
     return params.transition @ z + params.spread @ normal
 
@@ -246,8 +249,9 @@ def _spread(h: float) -> FloatArray:
 
 
 def _axes(matrices: Sequence[FloatArray]) -> FloatArray:
-    """Block diagonal of the 2 x 2 matrices of the three axes, (5, 5). Of the first matrix the first
-    entry counts alone.
+    """Block diagonal of the 2 x 2 matrices of the three axes, (5, 5).
+
+    Of the first matrix the first entry counts alone.
     """
     block = np.zeros((STATES, STATES))
     block[0, 0] = matrices[0][0, 0]

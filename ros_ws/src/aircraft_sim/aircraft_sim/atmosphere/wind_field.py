@@ -91,8 +91,9 @@ class Microburst(NamedTuple):
 
 
 class WindField(NamedTuple):
-    """Wind over the place. `wind` is the steady wind, of `Log` and `Power` that at their reference
-    height.
+    """Wind over the place.
+
+    `wind` is the steady wind, of `Log` and `Power` that at their reference height.
     """
 
     wind: tuple[float, float]  # m/s to the north, to the east
@@ -119,10 +120,10 @@ class WindField(NamedTuple):
 
 
 class RelativeWind:
-    """Wind against that of the start, in the axes of a flight that begins at the origin, to the
-    north.
+    """Wind against that of the start, in the axes of a flight.
 
-    `carried`: the wind at the start to the north and to the east, m/s, which moves the air mass.
+    The flight begins at the origin, to the north. `carried`: the wind at the start to the north and
+    to the east, m/s, which moves the air mass.
     """
 
     def __init__(self, field: WindField, start: Start, altitude: float) -> None:
@@ -133,8 +134,9 @@ class RelativeWind:
         self._sin = math.sin(start.heading)
 
     def at(self, t: float, north: float, east: float, altitude: float) -> FloatArray:
-        """Wind at t and at a place of the flight, to the north, to the east and down, m/s, shape
-        (3,).
+        """Wind at t and at a place of the flight, m/s, shape (3,).
+
+        To the north, to the east and down.
         """
         cos = self._cos
         sin = self._sin

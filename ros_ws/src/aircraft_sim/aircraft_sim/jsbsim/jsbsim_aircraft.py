@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Aircraft of JSBSim: names, channel tables, flight condition, wind. The import of JSBSim waits for
-the first use.
+"""Aircraft of JSBSim: names, channel tables, flight condition, wind.
 
-JSBSim uses feet and normalised commands from stop to stop. u, y and truth are deviations from trim
-in SI. The tables INPUTS and STATES alone map between the two, with units and signs.
+The import of JSBSim waits for the first use. JSBSim uses feet and normalised commands from stop to
+stop. u, y and truth are deviations from trim in SI. The tables INPUTS and STATES alone map between
+the two, with units and signs.
 """
 
 import difflib
@@ -59,12 +59,12 @@ PROPERTY = re.compile(r"(?!simulation/)[A-Za-z][\w-]*(\[\d+\])?(/[A-Za-z][\w-]*(
 def named_properties(
     commands: Mapping[str, str], key: str
 ) -> tuple[tuple[str, NamedProperties], ...]:
-    """The user's own properties by input, of texts such as "fcs/cmdAilR_rad=0.5
-    fcs/cmdAilL_rad=-0.5".
+    """The user's own properties by input.
 
-    The number is the property's value at the command 1, which is the default; "none" of a rudder
-    is a model without rudder. Raises ParameterError for an unknown input, for what is no property
-    of an aircraft, and for the value 0.
+    They come from texts such as "fcs/cmdAilR_rad=0.5 fcs/cmdAilL_rad=-0.5". The number is the
+    property's value at the command 1, which is the default; "none" of a rudder is a model without
+    rudder. Raises ParameterError for an unknown input, for what is no property of an aircraft, and
+    for the value 0.
     """
     named = list[tuple[str, NamedProperties]]()
     for name, text in commands.items():
@@ -146,8 +146,9 @@ RESIDUALS: Mapping[str, float] = {
 
 
 class FlightCondition(NamedTuple):
-    """An aircraft of JSBSim in a flight condition: level, straight, gear up, engines running,
-    heading north, no wind.
+    """An aircraft of JSBSim in a flight condition.
+
+    Level, straight, gear up, engines running, heading north, no wind.
     """
 
     name: str  # of the aircraft, without PREFIX, or the absolute path of its model
@@ -211,11 +212,10 @@ def aircraft_names() -> tuple[str, ...]:
 
 
 def root() -> Path:
-    """The folder with JSBSim's folders aircraft, engine and systems: $JSBSIM_ROOT, or in the
-    package jsbsim.
+    """The folder with JSBSim's folders aircraft, engine and systems.
 
-    Raises ParameterError where JSBSim is not installed, and for a $JSBSIM_ROOT that is no such
-    folder.
+    $JSBSIM_ROOT, or in the package jsbsim. Raises ParameterError where JSBSim is not installed, and
+    for a $JSBSIM_ROOT that is no such folder.
     """
     try:
         import jsbsim  # noqa: PLC0415 - other aircraft fly without it
@@ -255,8 +255,9 @@ def require_aircraft(airframe: str) -> str:
 
 
 def foreign_model(name: str) -> Path | None:
-    """The file of an aircraft's model that is not one of the package jsbsim: the user's own, or of
-    $JSBSIM_ROOT; else None.
+    """The file of an aircraft's model that is not one of the package jsbsim.
+
+    The user's own, or of $JSBSIM_ROOT; else None.
     """
     if Path(name).is_absolute():
         return Path(name)
@@ -264,10 +265,10 @@ def foreign_model(name: str) -> Path | None:
 
 
 def root_of(model: Path) -> Path:
-    """The folder of the engines and systems of a model: $JSBSIM_ROOT, the ROOT of
-    ROOT/aircraft/NAME/NAME.xml, or the package.
+    """The folder of the engines and systems of a model.
 
-    JSBSim looks for the files of a model beside the model first.
+    $JSBSIM_ROOT, the ROOT of ROOT/aircraft/NAME/NAME.xml, or the package. JSBSim looks for the
+    files of a model beside the model first.
     """
     folder = model.parents[min(2, len(model.parents) - 1)]
     is_tree = (

@@ -61,8 +61,9 @@ def engine_count(fdm: jsbsim.FGFDMExec) -> int:
 
 
 def command_paths(command: Command, engines: int) -> list[tuple[str, float]]:
-    """The properties of a command with the value of each at the command 1, a property per engine
-    for one of the engines.
+    """The properties of a command with the value of each at the command 1.
+
+    For one of the engines it is a property per engine.
     """
     if command.named:
         return list(command.named)
@@ -87,8 +88,9 @@ def residuals(fdm: jsbsim.FGFDMExec) -> FloatArray:
 def commands_and_limits(
     fdm: jsbsim.FGFDMExec, inputs: Iterable[Command]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Whole commands, the trim's part included, and the distances to the lower and upper stops,
-    shapes (4,).
+    """Whole commands, the trim's part included, and the distances to their stops, shapes (4,).
+
+    The stops are the lower and the upper ones.
     """
     inputs = list(inputs)
     first = [command_paths(command, 1)[0] for command in inputs]
@@ -141,8 +143,9 @@ def _moves(fdm: jsbsim.FGFDMExec, paths: Iterable[tuple[str, float]], part: floa
 def sentence_without_effect(
     fdm: jsbsim.FGFDMExec, commands: Mapping[str, Command], names: Iterable[str], model: Path | None
 ) -> str:
-    """A sentence on inputs without effect: the properties that move nothing, and those that the
-    model reads.
+    """A sentence on inputs without effect.
+
+    Properties that move nothing, and properties that the model reads.
     """
     parts = [
         f"{name}: {' and '.join(path for path, _ in command_paths(commands[name], 1))}"
@@ -160,8 +163,9 @@ def sentence_without_effect(
 
 
 def hysteresis_of(model: Path | None) -> str:
-    """The end of a sentence on a trim that fails, where servos of a model hold their output while a
-    command moves little; empty without such.
+    """The end of a sentence on a trim that fails, where servos of a model have hysteresis.
+
+    They hold their output while a command moves little; empty without such.
     """
     members = {} if model is None else model_files(model).members
     if not any(b"<hysteresis_width>" in content for content in members.values()):
@@ -170,8 +174,9 @@ def hysteresis_of(model: Path | None) -> str:
 
 
 def _read_by_model(model: Path) -> list[str]:
-    """The properties that the control systems of a model read or declare, and no component
-    writes.
+    """The properties that the control systems of a model read or declare.
+
+    No component writes them.
     """
     read: set[str] = set()
     written: set[str] = set()

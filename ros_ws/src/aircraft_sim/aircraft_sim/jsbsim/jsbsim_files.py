@@ -1,12 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The files of a foreign model of JSBSim, found as JSBSim finds files, and what the model may not
-do.
+"""The files of a foreign model of JSBSim, and what the model may not do.
 
-JSBSim loads a copy of these files alone. Sources: JSBSim 1.3, FGModelLoader.cpp (a name without
-".xml" gets it), FindFullPathName of FGModel, FGFCS and FGPropulsion (the folders),
-FGFDMExec::LoadModel (input and output), FGPropagate.cpp and FGLinearization.cpp (properties that
-write a file), sg_path.cxx (a backslash is a slash).
+They are found as JSBSim finds files. JSBSim loads a copy of these files alone. Sources: JSBSim 1.3,
+FGModelLoader.cpp (a name without ".xml" gets it), FindFullPathName of FGModel, FGFCS and
+FGPropulsion (the folders), FGFDMExec::LoadModel (input and output), FGPropagate.cpp and
+FGLinearization.cpp (properties that write a file), sg_path.cxx (a backslash is a slash).
 """
 
 import io
@@ -76,8 +75,9 @@ class ModelFiles(NamedTuple):
         return root / self.model
 
     def archive(self) -> bytes:
-        """A zip file of the root, the same bytes for the same files. Unpacked,
-        jsbsim:FOLDER/aircraft/NAME flies the same.
+        """A zip file of the root, the same bytes for the same files.
+
+        Unpacked, jsbsim:FOLDER/aircraft/NAME flies the same.
         """
         content = io.BytesIO()
         with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -133,8 +133,9 @@ def model_files(model: Path) -> ModelFiles:
 
 
 def _places(model: Path, element: str, name: str) -> Iterator[_Place]:
-    """The files of a name in the folders of an element, in JSBSim's order. Raises ParameterError
-    for a link to elsewhere.
+    """The files of a name in the folders of an element, in JSBSim's order.
+
+    Raises ParameterError for a link to elsewhere.
     """
     root = root_of(model)
     folders = [
@@ -157,8 +158,9 @@ def _places(model: Path, element: str, name: str) -> Iterator[_Place]:
 
 
 def _relative(name: str, path: Path) -> str:
-    """The path of a named file with the suffix. Raises ParameterError where the path leaves the
-    folder.
+    """The path of a named file with the suffix.
+
+    Raises ParameterError where the path leaves the folder.
     """
     plain = PurePosixPath(name.replace("\\", "/"))
     inside = not plain.is_absolute() and ".." not in plain.parts
@@ -169,8 +171,9 @@ def _relative(name: str, path: Path) -> str:
 
 
 def _sentence(model: Path, missing: Mapping[str, str]) -> str:
-    """A sentence on missing files, by name with the element: the files of elements like the
-    first.
+    """A sentence on missing files, by name with the element.
+
+    The files are those of elements like the first.
     """
     element = next(iter(missing.values()))
     names = sorted(
@@ -201,8 +204,9 @@ def _content(path: Path) -> bytes:
 
 
 def _parsed(content: bytes, path: Path) -> ElementTree.Element:
-    """The elements as JSBSim reads them: names as they stand, without namespaces. Raises
-    ParameterError.
+    """The elements as JSBSim reads them: names as they stand, without namespaces.
+
+    Raises ParameterError.
     """
     builder = ElementTree.TreeBuilder()
     parser = expat.ParserCreate()
@@ -218,8 +222,9 @@ def _parsed(content: bytes, path: Path) -> ElementTree.Element:
 
 
 def _leave_out(tree: ElementTree.Element, model: Path) -> tuple[str, ...]:
-    """Remove the sections LEFT_OUT of a model; their texts. Raises ParameterError for a child
-    model.
+    """Remove the sections LEFT_OUT of a model; returns their texts.
+
+    Raises ParameterError for a child model.
     """
     require(
         tree.find(CHILD) is None,

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Flight dynamics model of JSBSim: a six-degree-of-freedom aircraft, flown around a trim point like
-the linear aircraft.
+"""Flight dynamics model of JSBSim: a six-degree-of-freedom aircraft.
+
+Flown around a trim point like the linear aircraft.
 """
 
 import math
@@ -47,10 +48,9 @@ LEAST_FUEL = 1.0
 
 
 class JsbsimModel:
-    """An aircraft of JSBSim behind its actuators, in trim at t = 0: a
-    `simulator.FlightDynamicsModel`.
+    """An aircraft of JSBSim behind its actuators, in trim at t = 0.
 
-    A step of the integration, from t_k to t_k + dt:
+    A `simulator.FlightDynamicsModel`. A step of the integration, from t_k to t_k + dt:
 
         position+ = actuators.apply_faults(t_k, position, actuators.step(position, u, dt))
         wind+     = gusts(t_k + dt) + turbulence.wind(z+), along the heading, to the right and down
@@ -189,8 +189,9 @@ class JsbsimModel:
         return self._x[: len(OUTPUTS)]
 
     def air_angles(self, t_ns: int) -> FloatArray:
-        """See `simulator.FlightDynamicsModel`; alpha and beta of JSBSim are those relative to the
-        air.
+        """See `simulator.FlightDynamicsModel`.
+
+        alpha and beta of JSBSim are those relative to the air.
         """
         return self._x[[list(STATES).index(name) for name in ANGLES]]
 
@@ -199,8 +200,9 @@ class JsbsimModel:
         return np.concatenate([self._x, self._wind(t_ns), self._position])
 
     def pose(self) -> FloatArray:
-        """See `simulator.FlightDynamicsModel`. Position is integrated from the velocity by the
-        trapezoidal rule.
+        """See `simulator.FlightDynamicsModel`.
+
+        Position is integrated from the velocity by the trapezoidal rule.
         """
         phi, theta, psi, altitude, *velocity, beta = (
             node.get_double_value() * si for node, si in self._pose_nodes
@@ -222,8 +224,9 @@ class JsbsimModel:
         self._wind_model = self._wind_model._replace(gusts=parameters.gust_arrays(AXES))
 
     def _cut_engines(self, cut: bool) -> None:
-        """Stop the engines with the begin of their loss, and start them with its end. Whether they
-        run is then no outcome.
+        """Stop the engines with the begin of their loss, and start them with its end.
+
+        Whether they run is then no outcome.
         """
         if cut == self._cut:
             return

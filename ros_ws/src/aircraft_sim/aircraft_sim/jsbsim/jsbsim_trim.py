@@ -100,8 +100,9 @@ where JSBSim's own trim succeeds. It gives the same bits everywhere."""
 
 
 class _Log(jsbsim.FGLogger):
-    """Keeps JSBSim's output off the console. `last` has the last two errors: the second often says
-    only where.
+    """Keeps JSBSim's output off the console.
+
+    `last` has the last two errors: the second often says only where.
     """
 
     def __init__(self) -> None:
@@ -130,10 +131,9 @@ class _Log(jsbsim.FGLogger):
 
 @cache
 def trim_solution(condition: FlightCondition, timeout: float = TIMEOUT) -> TrimSolution:
-    """Find the trim and make a short test flight in an isolated process, where JSBSim may crash or
-    hang.
+    """Find the trim and make a short test flight in an isolated process.
 
-    Raises FlightEnded.
+    JSBSim may crash or hang there. Raises FlightEnded.
     """
     try:
         foreign = foreign_model(condition.name) is not None
@@ -150,8 +150,9 @@ def solve_and_probe(
     step_ns: int,
     named: tuple[tuple[str, NamedProperties], ...] = (),
 ) -> TrimSolution:
-    """Find and apply the trim, and fly with one command after the next moved by PROBE_SIZE. Raises
-    FlightEnded.
+    """Find and apply the trim, and fly with one command after the next moved by PROBE_SIZE.
+
+    Raises FlightEnded.
     """
     condition = FlightCondition(name, speed, altitude, step_ns, named)
     solution = _solve_trim(condition)
@@ -173,8 +174,9 @@ def solve_and_probe(
 def trimmed_fdm(
     condition: FlightCondition, solution: TrimSolution
 ) -> tuple[jsbsim.FGFDMExec, Trim]:
-    """The aircraft in the trim of a solution. Raises FlightEnded where the aircraft cannot be
-    loaded.
+    """The aircraft in the trim of a solution.
+
+    Raises FlightEnded where the aircraft cannot be loaded.
     """
     fdm = _load(condition)
     if solution is None:
@@ -198,8 +200,9 @@ def structure_contacts(fdm: jsbsim.FGFDMExec) -> list[str]:
 
 
 def running_property(engine: int) -> str:
-    """The property with the value 1 while an engine runs. An electric engine of JSBSim never has
-    this value.
+    """The property with the value 1 while an engine runs.
+
+    An electric engine of JSBSim never has this value.
     """
     return f"propulsion/engine[{engine}]/set-running"
 
@@ -210,19 +213,19 @@ def thrust_property(engine: int) -> str:
 
 
 def cut_engines(fdm: jsbsim.FGFDMExec, cut: bool) -> None:
-    """Cut off the fuel of all turbines and turboprops and the ignition of all pistons, or switch
-    both on again.
+    """Cut off the fuel of all turbines and turboprops and the ignition of all pistons.
 
-    An electric engine and a rocket have no such switch: they stop at throttle 0, where a turbine
-    idles and gives thrust.
+    With `cut` false switch both on again. An electric engine and a rocket have no such switch: they
+    stop at throttle 0, where a turbine idles and gives thrust.
     """
     fdm["propulsion/cutoff_cmd"] = float(cut)
     fdm["propulsion/magneto_cmd"] = 0.0 if cut else BOTH_MAGNETOS
 
 
 def error_text(error: jsbsim.BaseError) -> str:
-    """JSBSim's message on a line. Most often a property of a flight simulator around JSBSim is
-    missing.
+    """JSBSim's message on a line.
+
+    Most often a property of a flight simulator around JSBSim is missing.
     """
     text = " ".join(str(error).split())
     missing = re.search(r"The property (\S+) does not exist", text)
@@ -382,8 +385,9 @@ def _jsbsim_trim(fdm: jsbsim.FGFDMExec, condition: FlightCondition) -> bool:
 def _solve_accelerations(
     fdm: jsbsim.FGFDMExec, condition: FlightCondition, settling: float, by_elevator: float
 ) -> tuple[float, ...]:
-    """The solver's root of the accelerations after `settling` s of frozen flight: unknowns x =
-    START + (scaled - 1) SCALE.
+    """The solver's root of the accelerations after `settling` s of frozen flight.
+
+    The unknowns are x = START + (scaled - 1) SCALE.
     """
     from scipy.optimize import fsolve, least_squares  # noqa: PLC0415 - a sixth of a second, which other aircraft do not need
 
@@ -485,8 +489,9 @@ def _engines_start(condition: FlightCondition) -> bool:
 
 
 def nearest_trim(condition: FlightCondition) -> str:
-    """The nearest speed and altitude of NEIGHBOURS at which an aircraft trims, in words; "" for
-    none.
+    """The nearest speed and altitude of NEIGHBOURS at which an aircraft trims, in words.
+
+    "" for none.
     """
     for speed, altitude in NEIGHBOURS:
         near = condition._replace(

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Actuators between the command u and the aircraft: dead zone, lag, rate and position saturation;
-faults of effectors.
+"""Actuators between the command u and the aircraft.
+
+They have dead zone, lag, rate and position saturation, and faults of effectors.
 """
 
 from typing import Any, NamedTuple
@@ -13,8 +14,9 @@ MIN_LAG = 1e-30
 
 
 class Actuators(NamedTuple):
-    """Parameters of m actuators, SI. An ideal actuator has lag 0 and infinite limits. None: no
-    actuator has this property.
+    """Parameters of m actuators, SI.
+
+    An ideal actuator has lag 0 and infinite limits. None: no actuator has this property.
     """
 
     lag: Array | None = None  # (m,) time constant of the first-order response, s, 0 = none
@@ -75,8 +77,9 @@ def step(position: Array, command: Array, dt: Any, params: Actuators) -> Array:
 
 
 def mean_position(position: Array, command: Array, new: Array, dt: Any, params: Actuators) -> Array:
-    """Mean of the actuator positions over a step from `position` to `new`, shape (m,): the input of
-    the aircraft in this step.
+    """Mean of the actuator positions over a step from `position` to `new`, shape (m,).
+
+    The input of the aircraft in this step:
 
         input                                                                     as in `step`
         lagged  = input - (input - position) lag / dt (1 - exp(-dt / lag))
@@ -108,8 +111,9 @@ def mean_position(position: Array, command: Array, new: Array, dt: Any, params: 
 def move(
     t: Any, position: Array, command: Array, dt: Any, params: Actuators
 ) -> tuple[Array, Array]:
-    """Positions at the end of a step from t on, and the mean input of the aircraft over the step,
-    with faults, shapes (m,).
+    """Positions at the end of a step from t on, and the mean input over the step.
+
+    The input is that of the aircraft; both are with faults, shapes (m,).
     """
     now = in_force(t, position, params)
     new = step(position, command, dt, now)
@@ -120,8 +124,10 @@ def move(
 
 
 def in_force(t: Any, position: Array, params: Actuators) -> Actuators:
-    """Parameters of a step from t on: a slow actuator has at least `slow_lag`, a loose one the
-    backlash `loose_play`, and a runaway goes to `hard_over_to` at the rate limit, without a lag.
+    """Parameters of a step from t on.
+
+    A slow actuator has at least `slow_lag`, a loose one the backlash `loose_play`, and a runaway
+    goes to `hard_over_to` at the rate limit, without a lag.
     """
     xp = array_namespace(position)
     if params.slow_at is not None:
@@ -172,8 +178,9 @@ def _input(position: Array, command: Array, params: Actuators) -> Array:
 
 
 def apply_faults(t: Any, position: Array, new: Array, params: Actuators) -> Array:
-    """Actuator positions at the end of a step from t on, or means over the step, with faults
-    applied, shape (m,).
+    """Actuator positions at the end of a step from t on, with faults applied, shape (m,).
+
+    They may be means over the step.
 
         t >= stuck_at    position    the actuator keeps the position
         t >= lost_at     no_thrust

@@ -21,8 +21,9 @@ class Coupling(NamedTuple):
 
 
 class EulerKinematics(NamedTuple):
-    """Nonlinear kinematics in place of the linear kinematics of A. Angles belong to the stability
-    axes: 0 in trim.
+    """Nonlinear kinematics in place of the linear kinematics of A.
+
+    Angles belong to the stability axes: 0 in trim.
     """
 
     select: Array  # (5, n), picks phi, theta, p, q, r
@@ -34,8 +35,9 @@ class EulerKinematics(NamedTuple):
 
 
 class Aircraft(NamedTuple):
-    """Matrices of equation (1) and the terms of f as arrays, SI and radians. None: the term is
-    absent.
+    """Matrices of equation (1) and the terms of f as arrays, SI and radians.
+
+    None: the term is absent.
     """
 
     A: Array  # (n, n)
@@ -78,8 +80,9 @@ def x_dot_forced(x: Array, forced: Array, params: Aircraft) -> Array:
 
 
 def f_state(x: Array, params: Aircraft) -> Array:
-    """The state-dependent part of f: gravity @ sin(x) + gain @ (x[first] x[second]) +
-    kinematics(x), shape (n,).
+    """The state-dependent part of f, shape (n,).
+
+    gravity @ sin(x) + gain @ (x[first] x[second]) + kinematics(x).
     """
     total = params.gravity.dot(array_namespace(x).sin(x))
     if params.coupling is not None:
@@ -111,8 +114,9 @@ def kinematics(x: Array, params: EulerKinematics) -> Array:
 
 
 def f_time(t: Any, wind: Array, params: Aircraft) -> Array:
-    """The time-dependent part of f: gust_direction @ wind + bias(t) + sines(t), shape (n,); wind of
-    shape (G,), m/s.
+    """The time-dependent part of f, shape (n,).
+
+    gust_direction @ wind + bias(t) + sines(t); wind of shape (G,), m/s.
     """
     total = params.gust_direction @ wind
     if params.bias is not None:

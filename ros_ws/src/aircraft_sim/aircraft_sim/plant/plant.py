@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The simulated plant: equation (1) behind actuators, integrated in fixed steps, with zero-order
-hold of u.
+"""The simulated plant: equation (1) behind actuators, with zero-order hold of u.
+
+Integrated in fixed steps.
 """
 
 from typing import Any, NamedTuple
@@ -24,8 +25,9 @@ SHORTEST_DRIFT = 1e-9  # s, for duration 0, which has no division by 0 then
 
 
 class Drift(NamedTuple):
-    """A change of A, B and the effect of wind in flight: factors of their entries after `duration`,
-    linear in time before.
+    """A change of A, B and the effect of wind in flight.
+
+    The factors of their entries are those after `duration`, linear in time before.
     """
 
     start: float  # s of flight time
@@ -43,8 +45,9 @@ def share(t: Array, start: Any, duration: Any) -> Array:
 
 
 class OverAirspeed(NamedTuple):
-    """How A, B and the trim follow the airspeed V0 + V: exponents of the ratio to V0, and trims at
-    K ratios.
+    """How A, B and the trim follow the airspeed V0 + V.
+
+    Exponents of the ratio to V0, and trims at K ratios.
     """
 
     speed: float  # V0, m/s
@@ -59,8 +62,9 @@ class OverAirspeed(NamedTuple):
 
 
 class PlantParams(NamedTuple):
-    """Parameters of the plant: aircraft, actuators, integration step, turbulence, drift, and what
-    follows the airspeed.
+    """Parameters of the plant.
+
+    Aircraft, actuators, integration step, turbulence, drift, and what follows the airspeed.
     """
 
     aircraft: Aircraft
@@ -72,11 +76,10 @@ class PlantParams(NamedTuple):
 
 
 def aircraft_at(t_ns: int, plant: PlantParams, x: Array | None = None) -> Aircraft:
-    """The aircraft at t in the state x, (n,), at the trim without x: its A, B and effect of wind
-    times 1 + share (factor - 1).
+    """The aircraft at t in the state x, (n,), at the trim without x.
 
-    Over the airspeed the entries are times powers of r = 1 + V / V0, and about the trim of r, (x_r,
-    u_r):
+    A, B and effect of wind are multiplied by 1 + share (factor - 1). Over the airspeed the entries
+    are times powers of r = 1 + V / V0, and about the trim of r, (x_r, u_r):
 
         x_dot = A x + gravity sin(x) + B u + trim,  trim = -(A x_r + gravity sin(x_r) + B u_r)
     """
@@ -121,8 +124,9 @@ class AircraftState(NamedTuple):
 
 
 def initial_state(plant: PlantParams) -> AircraftState:
-    """The state in trim: x = 0, actuators at 0, turbulence filters in a sample of their stationary
-    distribution.
+    """The state in trim: x = 0, actuators at 0.
+
+    The turbulence filters are in a sample of their stationary distribution.
     """
     xp = array_namespace(plant.aircraft.A)
     z = None if plant.turbulence is None else turbulence.initial_state(plant.turbulence)
@@ -132,8 +136,9 @@ def initial_state(plant: PlantParams) -> AircraftState:
 
 
 def forcing(t_ns: int, steps: int, plant: PlantParams, x: Array | None = None) -> Forcing:
-    """Forcing at the beginnings, middles and ends of some steps from t and x on: 2 steps + 1
-    instants; the aircraft of then.
+    """Forcing at the beginnings, middles and ends of some steps from t and x on.
+
+    These are 2 steps + 1 instants; the aircraft is that of then.
     """
     halves = array_namespace(plant.aircraft.A).arange(2 * steps + 1, dtype=plant.aircraft.A.dtype)
     return dynamics.at_times(
