@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Monte Carlo campaigns: statistics of constant size, chunks that do not depend on engine or order,
-kill and resume.
+"""Monte Carlo campaigns: statistics of constant size.
+
+Chunks do not depend on engine or order; kill and resume are tested too.
 """
 
 import io
@@ -144,8 +145,9 @@ def test_aircraft_of_campaign_has_same_score_in_single_process_simulation(tmp_pa
 
 
 def test_aircraft_with_entries_of_its_own_flies_again_with_same_score(tmp_path: Path) -> None:
-    """One entry at its own limits, lags, noise and u late too, the others at theirs, and a score
-    with a unit of its own.
+    """One entry has its own limits, the others theirs, and a score has a unit of its own.
+
+    Lags, noise and u late are among them.
     """
     units = {"V": 0.2}
     entries = {"B[V,thrust]": 0.6, "lag[thrust]": 0.2, "lag": 0.5, "noise[q]": 0.9, "delay": 0.035}
@@ -248,8 +250,9 @@ def test_figures_of_a_mission_are_those_of_its_flight_alone() -> None:
 
 
 def test_figures_of_a_mission_leave_out_what_is_no_leg() -> None:
-    """Of the last orbit the aircraft begins at the centre, a radius beside its path; beyond a fence
-    the aircraft flies home, away from its leg.
+    """The last orbit begins at the centre, a radius beside its path.
+
+    Beyond a fence the aircraft flies home, away from its leg.
     """
     route = {"north": [0.0, 100.0], "east": [0.0, 0.0], "altitude": [0.0, 0.0]}
     section = {"route": route, "home": {"north": -30.0}}
@@ -723,8 +726,9 @@ def test_campaign_goes_on_with_scheduler_that_is_back() -> None:
 def test_chunk_beyond_memory_flies_in_halves_with_the_same_draws(
     error: Exception, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """The second is the text of an error of JAX. Figures may differ by the order of sums, which
-    depends on the vector width of the CPU.
+    """The second text is that of an error of JAX.
+
+    Figures may differ by the order of sums, which depends on the vector width of the CPU.
     """
     part = define(SHORT.vary(flight={"duration": 0.5}), 30, 0.3, 7, 20).model_dump_json()
     fits = campaign.fly_chunk_figures(part, (0, 0))

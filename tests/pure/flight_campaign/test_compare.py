@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Comparison of control laws: cost and score, repeatable tuning, delayed inputs, the shipped gains,
-the command.
+"""Comparison of control laws.
+
+Tested are cost and score, repeatable tuning, delayed inputs, the shipped gains, the command.
 """
 
 import json

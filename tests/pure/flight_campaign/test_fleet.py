@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Vectorised flights of N aircraft: each is the single-process simulation, independent of the
-others.
+"""Vectorised flights of N aircraft.
+
+Each is the single-process simulation, independent of the others.
 """
 
 from dataclasses import replace
@@ -71,8 +72,9 @@ def fly(
 
 
 def alone(scenario: Scenario, number: int) -> dict[str, FloatArray]:
-    """One of them in the single-process simulation, evaluated at the ticks: figures of
-    `FleetResult`, (m,).
+    """One of them in the single-process simulation, evaluated at the ticks.
+
+    The figures are those of `FleetResult`, (m,).
     """
     effect = scenario.aircraft.uncertainty.wind
     uncertainty = {"A": 0.3, "B": 0.3, "wind": effect, "seed": 5, "number": number}
@@ -181,8 +183,9 @@ def test_each_aircraft_with_column_limits_flies_as_in_single_process_simulation(
 
 
 def test_an_allocation_at_its_stops_flies_as_in_single_process_simulation() -> None:
-    """Limits bind in a tenth of the ticks (p, r) to two fifths (V). The bound is that of the
-    flights above.
+    """Limits bind in a tenth of the ticks (p, r) to two fifths (V).
+
+    The bound is that of the flights above.
     """
     twin = find_scenario("osprey_twin")
     stop = [0.01 if "aileron" in name else 0.5 for name in twin.controller.effectors]

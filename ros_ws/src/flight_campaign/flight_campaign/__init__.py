@@ -1,5 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Monte Carlo campaigns over thousands of uncertain aircraft, tuning and comparison of control
-laws.
+"""Monte Carlo campaigns over thousands of uncertain aircraft.
+
+Control laws are tuned and compared, too.
 """

@@ -1,10 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Monte Carlo campaign: thousands of uncertain aircraft in one scenario, in chunks; an interrupted
-campaign can be resumed.
+"""Monte Carlo campaign: thousands of uncertain aircraft in one scenario, in chunks.
 
-The folder of a campaign holds its definition, a table for each completed chunk, and at the end its
-figures and its report.
+An interrupted campaign can be resumed. The folder of a campaign holds its definition, a table for
+each completed chunk, and at the end its figures and its report.
 """
 
 import logging
@@ -152,11 +151,10 @@ def _default_chunk(scenario: Scenario, aircraft: int) -> int:
 
 
 def fly_chunk(text: str, job: Job, learner: MakeLearner | None = None) -> bytes:
-    """Fly a chunk of a campaign: its definition as JSON, the job -> its rows as Parquet. It has no
-    other inputs.
+    """Fly a chunk of a campaign: its definition as JSON, the job -> its rows as Parquet.
 
-    `learner` makes the learner of a scenario. Raises ParameterError for an aircraft that does not
-    fit into memory.
+    Definition and job are the only inputs. `learner` makes the learner of a scenario. Raises
+    ParameterError for an aircraft that does not fit into memory.
     """
     definition = Definition.model_validate_json(text)
     if single_flights.flies_alone(definition.scenario()):
@@ -294,8 +292,9 @@ class Campaign:
             yield self.definition.size(job)
 
     def tally(self, case: int) -> Tally:
-        """Statistics of a case, summed in the order of the chunks. Raises ParameterError for a
-        damaged file.
+        """Statistics of a case, summed in the order of the chunks.
+
+        Raises ParameterError for a damaged file.
         """
         total = Tally()
         for job in self._flown():
@@ -304,7 +303,8 @@ class Campaign:
         return total
 
     def rows(self, case: int | None = None) -> "pl.LazyFrame":
-        """The table of the completed chunks of a case or of all, ordered by case, then number;
+        """The table of the completed chunks of a case or of all, ordered by case, then number.
+
         `rows` has the columns.
         """
         import polars as pl  # noqa: PLC0415 - some tenths of a second
@@ -319,8 +319,9 @@ class Campaign:
             self.rows().sink_parquet(stream)
 
     def margins(self, case: int) -> LoopMargins | None:
-        """Margins of the nominal aircraft and the worst found in the box of a case; None without a
-        linear loop.
+        """Margins of the nominal aircraft and the worst found in the box of a case.
+
+        None without a linear loop.
         """
         definition = self.definition
         scenario = self.definition.scenario(case)
@@ -350,8 +351,9 @@ class Campaign:
         return [job for job in self.definition.jobs() if self._path(job).exists()]
 
     def influence(self, case: int, worst: int) -> dict[str, Any]:
-        """Rank correlations of the drawn entries with the score of a case; `worst` is the number of
-        its worst aircraft.
+        """Rank correlations of the drawn entries with the score of a case.
+
+        `worst` is the number of its worst aircraft.
         """
         import polars as pl  # noqa: PLC0415 - as above
 

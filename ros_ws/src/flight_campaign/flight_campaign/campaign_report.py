@@ -93,10 +93,9 @@ LEARNER_LEGEND = (
 
 
 def write_results(campaign: Campaign) -> tuple[dict[str, Any], Table]:
-    """Write the summary, the report and the scenarios of the worst aircraft; returns the summary
-    and the overview.
+    """Write the summary, the report and the scenarios of the worst aircraft.
 
-    Raises ParameterError.
+    Returns the summary and the overview. Raises ParameterError.
     """
     definition = campaign.definition
     tallies = [campaign.tally(case) for case in range(definition.cases)]
@@ -138,8 +137,9 @@ def _write_worst(campaign: Campaign, case: int, tally: Tally) -> list[dict[str, 
 
 
 def _influence(campaign: Campaign, case: int, tally: Tally) -> dict[str, Any]:
-    """Rank correlations of a case; writes the airframe and the scenario of the worst corner where
-    there is one.
+    """Rank correlations of a case.
+
+    Writes the airframe and the scenario of the worst corner where there is one.
     """
     definition = campaign.definition
     ranked = campaign.influence(case, tally.worst[0].number)
@@ -197,8 +197,9 @@ def write_page(
     cases: Sequence[Mapping[str, Any]],
     margins: Sequence[LoopMargins | None],
 ) -> None:
-    """Write the report of a campaign: for each case a tally, the figures of the summary, and the
-    margins of the loop.
+    """Write the report of a campaign.
+
+    For each case it has a tally, the figures of the summary, and the margins of the loop.
     """
     scenario = definition.scenario()
     units = QUANTITY_UNITS | display_units(scenario)

@@ -34,8 +34,9 @@ def swept_parameters(controller: ControllerConfig) -> list[str]:
 
 
 class Sweep(Config):
-    """Factors of one parameter of the controller, or of its value in a channel; every aircraft
-    flies with each of them.
+    """Factors of one parameter of the controller, or of its value in a channel.
+
+    Every aircraft flies with each of them.
     """
 
     parameter: str = Field(description="its name, as beta, or with a channel of y or u, as beta[V]")
@@ -87,8 +88,9 @@ class Sweep(Config):
 
 
 class Definition(Config):
-    """All inputs of a campaign's figures, except the version of the stack and the arithmetic of the
-    CPU.
+    """All inputs of a campaign's figures.
+
+    The version of the stack and the arithmetic of the CPU are not among them.
     """
 
     name: str  # of the scenario

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Engines for the chunks of a campaign: threads of this process, or dask workers, with equal
-results.
+"""Engines for the chunks of a campaign, with equal results.
+
+They are threads of this process, or dask workers.
 """
 
 import logging
@@ -38,10 +39,10 @@ Devices = Sequence[Mapping[str, str]]
 
 
 def require_jax(*, shared: bool = False) -> None:
-    """Raise ParameterError where JAX is not installed or finds no device, as with JAX_PLATFORMS of
-    another host.
+    """Raise ParameterError where JAX is not installed or finds no device.
 
-    With `shared` the process leaves the memory of its device to other processes.
+    As with JAX_PLATFORMS of another host. With `shared` the process leaves the memory of its device
+    to other processes.
     """
     require_package("jax")
     if shared:
@@ -59,8 +60,9 @@ def require_jax(*, shared: bool = False) -> None:
 
 
 def threads(workers: int | None = None) -> Engine:
-    """Threads of this process, None: as many as keep the device busy. The loop is compiled once
-    and releases the interpreter lock, so threads run in parallel.
+    """Threads of this process, None: as many as keep the device busy.
+
+    The loop is compiled once and releases the interpreter lock, so threads run in parallel.
     """
 
     def fly(work: Work, jobs: Iterable[Job]) -> Iterator[tuple[Job, Any]]:
@@ -91,12 +93,11 @@ def threads(workers: int | None = None) -> Engine:
 def dask(
     workers: int | None = None, scheduler: str | None = None, *, on_devices: bool = True
 ) -> Engine:
-    """Processes of this machine, or the workers of a scheduler. The chunks of a dead worker run
-    again.
+    """Processes of this machine, or the workers of a scheduler.
 
-    A scheduler gets the lost chunks again when the scheduler is back within RECONNECT. On a host
-    with GPUs each process has a GPU of its own, unless `on_devices` is False: single flights need
-    cores.
+    The chunks of a dead worker run again. A scheduler gets the lost chunks again when the scheduler
+    is back within RECONNECT. On a host with GPUs each process has a GPU of its own, unless
+    `on_devices` is False: single flights need cores.
     """
 
     def fly(work: Work, jobs: Iterable[Job]) -> Iterator[tuple[Job, Any]]:
@@ -139,8 +140,9 @@ def dask(
 def _connected(
     stack: ExitStack, scheduler: str | None, count: int, devices: Devices, patience: float
 ) -> tuple[Any, int]:
-    """A client of the scheduler, or of `count` processes of this machine, and the number of their
-    threads.
+    """A client of the scheduler, or of `count` processes of this machine.
+
+    Returns further the number of their threads.
     """
     from distributed import Client  # noqa: PLC0415 - half a second
 

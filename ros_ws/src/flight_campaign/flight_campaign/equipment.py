@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Lags of the actuators, noise of the sensors and delay of u of the aircraft of a campaign, drawn
-as the entries of A and B.
+"""Lags of the actuators, noise of the sensors and delay of u of the aircraft of a campaign.
 
-An entry is lag[INPUT], a time constant in s, noise[OUTPUT], a standard deviation in SI, or delay,
-s; lag and noise alone mean all. The entry delay is the largest delay of u beyond that of the
-scenario, drawn in whole periods of the controller.
+They are drawn as the entries of A and B. An entry is lag[INPUT], a time constant in s,
+noise[OUTPUT], a standard deviation in SI, or delay, s; lag and noise alone mean all. The entry
+delay is the largest delay of u beyond that of the scenario, drawn in whole periods of the
+controller.
 """
 
 import math
@@ -53,10 +53,10 @@ def published(scenario: Scenario) -> dict[str, float]:
 
 
 def expanded(entries: Mapping[str, float], scenario: Scenario) -> dict[str, float]:
-    """The entries, with each channel in place of lag and noise, whose own entry counts, and the
-    delay in whole periods.
+    """The entries, with each channel in place of lag and noise.
 
-    Raises ParameterError for an unknown entry.
+    A channel's own entry counts, and the delay is in whole periods. Raises ParameterError for an
+    unknown entry.
     """
     known = published(scenario)
     every = dict[str, float]()
@@ -83,12 +83,11 @@ def expanded(entries: Mapping[str, float], scenario: Scenario) -> dict[str, floa
 def drawn(
     scenario: Scenario, spread: Spread, seed: int, first: int, count: int
 ) -> dict[str, FloatArray]:
-    """Drawn lags, noise and delays of the aircraft first, first + 1, ... of a seed by entry,
-    (count,) each.
+    """Drawn lags, noise and delays of aircraft of a seed by entry, (count,) each.
 
-    A lag and a noise are multiplied by 1 + d, as an entry of A. A delay is (1 + d) / 2 of the
-    largest one, in whole periods. A value depends on seed and number alone. The entries of `spread`
-    are those of `expanded`.
+    The aircraft are first, first + 1, ... A lag and a noise are multiplied by 1 + d, as an entry of
+    A. A delay is (1 + d) / 2 of the largest one, in whole periods. A value depends on seed and
+    number alone. The entries of `spread` are those of `expanded`.
     """
     known = published(scenario)
     rate = scenario.controller.rate
@@ -106,8 +105,9 @@ def drawn(
 
 
 def references(scenario: Scenario, entries: Mapping[str, float]) -> dict[str, float]:
-    """Values of which a deviation is a part: `published`, and half of the largest delay, which is
-    drawn within +-100 %.
+    """Values of which a deviation is a part.
+
+    They are `published`, and half of the largest delay, which is drawn within +-100 %.
     """
     return published(scenario) | ({DELAY: entries[DELAY] / 2.0} if DELAY in entries else {})
 
@@ -115,8 +115,9 @@ def references(scenario: Scenario, entries: Mapping[str, float]) -> dict[str, fl
 def in_order(
     values: Mapping[str, Any], kind: str, names: tuple[str, ...], otherwise: tuple[float, ...]
 ) -> list[Any]:
-    """The values of a kind in the order of the channels, `otherwise` where a channel has no
-    value.
+    """The values of a kind in the order of the channels.
+
+    `otherwise` where a channel has no value.
     """
     return [
         values.get(f"{kind}[{name}]", value) for name, value in zip(names, otherwise, strict=True)

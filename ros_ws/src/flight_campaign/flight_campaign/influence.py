@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Which drawn entries of A and B decide the score of a campaign: rank correlations, and the corner
-that they point to.
+"""Which drawn entries of A and B decide the score of a campaign.
+
+They are told by rank correlations, and the corner that these point to.
 """
 
 import math
@@ -21,11 +22,11 @@ CHANCE = 0.05  # part of the campaigns in which an entry without effect exceeds 
 
 
 def rank_correlations(table: "pl.DataFrame", published: Mapping[str, float]) -> dict[str, float]:
-    """Rank correlation (Spearman) of the size of each entry over its published value with the
-    score, the strongest first.
+    """Rank correlation (Spearman) of the size of each entry with the score.
 
-    +1: the score grows (the aircraft flies worse) with the size of the entry. A diverged aircraft
-    has the worst rank. Empty for fewer than LEAST_RANKED aircraft, or equal ones.
+    The size is over its published value; the strongest comes first. +1: the score grows (the
+    aircraft flies worse) with the size of the entry. A diverged aircraft has the worst rank. Empty
+    for fewer than LEAST_RANKED aircraft, or equal ones.
     """
     from scipy.stats import rankdata  # noqa: PLC0415 - half a second, only for this
 
@@ -42,12 +43,11 @@ def rank_correlations(table: "pl.DataFrame", published: Mapping[str, float]) -> 
 
 
 def chance_level(aircraft: int, entries: int) -> float:
-    """The rank correlation that none of so many entries without effect exceeds, in 95 % of
-    campaigns.
+    """The rank correlation that none of so many entries without effect exceeds.
 
-    Of independent values it has mean 0 and variance 1 / (N - 1), normal for large N. Source:
-    Kendall, Rank Correlation Methods,
-    1948. The level counts the number of entries (Bonferroni).
+    This holds in 95 % of campaigns. Of independent values it has mean 0 and variance 1 / (N - 1),
+    normal for large N. Source: Kendall, Rank Correlation Methods, 1948. The level counts the number
+    of entries (Bonferroni).
     """
     from scipy.stats import norm  # noqa: PLC0415 - as above
 
@@ -60,12 +60,12 @@ def influence(
     published: Mapping[str, float],
     uncertainty: Mapping[str, float],
 ) -> dict[str, Any]:
-    """Rank correlations of a case as figures of a file: of `table`, beside the entries of the row
-    `worst`, the worst aircraft.
+    """Rank correlations of a case as figures of a file.
 
-    `uncertainty` is the largest part by entry. "worst_aircraft" and "worst_corner" are parts of the
-    published entry: of the worst aircraft, and the limit of the uncertainty on the side of the
-    higher score, 0 for an entry within chance.
+    They are of `table`, beside the entries of the row `worst`, the worst aircraft. `uncertainty` is
+    the largest part by entry. "worst_aircraft" and "worst_corner" are parts of the published entry:
+    of the worst aircraft, and the limit of the uncertainty on the side of the higher score, 0 for
+    an entry within chance.
     """
     correlations = rank_correlations(table, published)
     level = chance_level(table.height, len(correlations)) if correlations else None

@@ -44,8 +44,9 @@ def joined(parts: Sequence[Chunk]) -> Chunk:
 
 
 def encode(chunk: Chunk, seed: int, factor: float) -> bytes:
-    """The table of a chunk as Parquet (zstd), SI; figures of a diverged aircraft, and NaN, are
-    null.
+    """The table of a chunk as Parquet (zstd), SI.
+
+    Figures of a diverged aircraft, and NaN, are null.
     """
     import polars as pl  # noqa: PLC0415
 

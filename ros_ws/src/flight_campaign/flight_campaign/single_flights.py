@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Flights of a campaign one by one, as those of `rise-di fly --in-process`: of aircraft that learn,
-and of aircraft on a route.
+"""Flights of a campaign one by one, as those of `rise-di fly --in-process`.
+
+Aircraft that learn, and aircraft on a route.
 """
 
 import math
@@ -121,12 +122,12 @@ def _tracking_figures(tape: Tape, scenario: Scenario) -> dict[str, float]:
 
 
 def mission_figures(tape: Tape, guidance: GuidanceConfig) -> dict[str, float]:
-    """Score, cross-track error and altitude error on the route, largest bank, legs missed; with a
-    fence the distance flown beyond it and the last distance from home. SI.
+    """Score, cross-track and altitude error on the route, largest bank, legs missed, SI.
 
-    The score is the largest cross-track error in half seconds of flight at V0. The orbit round the
-    last waypoint, which begins at the centre, and the ways onto a leg are left out. NaN where no
-    leg was flown.
+    With a fence it has the distance flown beyond it and the last distance from home. The score is
+    the largest cross-track error in half seconds of flight at V0. The orbit round the last
+    waypoint, which begins at the centre, and the ways onto a leg are left out. NaN where no leg was
+    flown.
     """
     log = tape["guidance"]
     last_leg = len(guidance.plan(guidance.waypoints()).legs) - 1

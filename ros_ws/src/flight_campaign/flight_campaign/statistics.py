@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Monte Carlo statistics of constant size: moments, histograms and the worst flights, summed chunk
-by chunk.
+"""Monte Carlo statistics of constant size.
+
+Moments, histograms and the worst flights are summed chunk by chunk.
 """
 
 import math
@@ -64,8 +65,9 @@ class Figure(Config):
         return cls(count=len(values), mean=mean, squares=squares, largest=largest, bins=bins)
 
     def __add__(self, added: Self) -> Self:
-        """The figures together. Source: Chan, Golub, LeVeque, Updating formulae and a pairwise
-        algorithm, 1979.
+        """The figures together.
+
+        Source: Chan, Golub, LeVeque, Updating formulae and a pairwise algorithm, 1979.
         """
         count = self.count + added.count
         if not count:
@@ -120,8 +122,9 @@ class Tally(Config):
     def from_flights(
         cls, first: int, diverged: FloatArray, figures: Mapping[str, FloatArray]
     ) -> Self:
-        """The tally of the aircraft first, first + 1, ...; every figure of shape (N,), the "score"
-        included.
+        """The tally of the aircraft first, first + 1, ...
+
+        Every figure is of shape (N,), the "score" included.
         """
         bounded = ~np.asarray(diverged, dtype=bool)
         score = np.asarray(figures["score"])
@@ -189,8 +192,9 @@ class Tally(Config):
         }
 
     def share(self, count: int) -> tuple[float, float, float]:
-        """A number of flights as a share, and the 95 % confidence interval (Clopper-Pearson), 0 to
-        1.
+        """A number of flights as a share, and the 95 % confidence interval, 0 to 1.
+
+        The interval is that of Clopper and Pearson.
         """
         from scipy.stats import binomtest  # noqa: PLC0415 - half a second, only for this
 
@@ -199,8 +203,9 @@ class Tally(Config):
 
 
 def lost_track(diverged: FloatArray, score: FloatArray) -> NDArray[np.bool_]:
-    """Which flights lost track, shape (N,): those that did not diverge with a score above
-    LOSS_OF_TRACK_SCORE.
+    """Which flights lost track, shape (N,).
+
+    Flights that did not diverge with a score above LOSS_OF_TRACK_SCORE.
     """
     return np.asarray(~np.asarray(diverged, dtype=bool) & (score > LOSS_OF_TRACK_SCORE))
 
@@ -208,10 +213,10 @@ def lost_track(diverged: FloatArray, score: FloatArray) -> NDArray[np.bool_]:
 def score_units(
     outputs: Sequence[str], units: Mapping[str, str], stated: Mapping[str, float] | None = None
 ) -> FloatArray:
-    """Units of the rms errors of the channels in the score, SI, shape (m,); `stated` replaces usual
-    units by output.
+    """Units of the rms errors of the channels in the score, SI, shape (m,).
 
-    Raises ParameterError for an output without a unit in the score.
+    `stated` replaces usual units by output. Raises ParameterError for an output without a unit in
+    the score.
     """
     known = SCORE_UNIT_OF | dict(stated or {})
     for name in outputs:
@@ -231,7 +236,8 @@ def score_units(
 
 
 def score(rms: FloatArray, unit: FloatArray) -> FloatArray:
-    """Sum over the channels of rms / unit, shape (N,), from (m, N) and (m,): 1 a channel is 10
-    mrad/s or 0.1 m/s, 20 in p.
+    """Sum over the channels of rms / unit, shape (N,), from (m, N) and (m,).
+
+    1 a channel is 10 mrad/s or 0.1 m/s, 20 in p.
     """
     return np.asarray(np.sum(rms / unit[:, None], axis=0))

@@ -1,10 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Vectorised Monte Carlo simulation: N uncertain aircraft through one course under any law, as in
-the single-process loop.
+"""Vectorised Monte Carlo simulation: N uncertain aircraft through one course under any law.
 
-The last axis of every array is the aircraft, so that one line of a law or of the actuators acts on
-all of them.
+The loop is that of a single process. The last axis of every array is the aircraft, so that one line
+of a law or of the actuators acts on all of them.
 """
 
 from collections.abc import Mapping, Sequence
@@ -75,8 +74,9 @@ def vehicle(scenario: Scenario) -> Vehicle:
 
 
 def shared(params: Any) -> Any:
-    """Parameters of a law for one aircraft, (m,), as those of a fleet, (m, 1); matrices stay, which
-    all aircraft share.
+    """Parameters of a law for one aircraft, (m,), as those of a fleet, (m, 1).
+
+    Matrices stay, which all aircraft share.
     """
     return jax.tree.map(
         lambda value: np.asarray(value)[:, None] if np.ndim(value) == 1 else np.asarray(value),
@@ -112,8 +112,9 @@ def _rows(values: Sequence[Any]) -> Array:
 
 
 def _reduced(aircraft: Aircraft) -> tuple[NDArray[np.int64], Aircraft]:
-    """Indices of the states in the remainder, and the aircraft reduced to them and to
-    `remainder_rows`.
+    """Indices of the states in the remainder, and the aircraft reduced to them.
+
+    Reduced to `remainder_rows`, too.
     """
     rows = remainder_rows(aircraft)
     coupling = aircraft.coupling
@@ -182,8 +183,9 @@ def _timing(fleet: Fleet, course: Course) -> Timing:
 
 
 class Stepper:
-    """The flights of `fly` tick by tick, with u from outside: `sense`, then `advance`, for each
-    tick of the course.
+    """The flights of `fly` tick by tick, with u from outside.
+
+    `sense`, then `advance`, for each tick of the course.
     """
 
     def __init__(self, fleet: Fleet, vehicle: Vehicle, course: Course) -> None:
@@ -213,8 +215,9 @@ class Stepper:
         return y, np.broadcast_to(np.asarray(sample.y_m), y.shape)
 
     def advance(self, u: FloatArray) -> None:
-        """To the next tick with the command u, (p, N), in the order of the controller's
-        effectors.
+        """To the next tick with the command u, (p, N).
+
+        u is in the order of the controller's effectors.
         """
         self._state = _advance_once(
             self._state,

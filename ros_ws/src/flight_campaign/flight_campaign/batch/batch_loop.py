@@ -59,8 +59,9 @@ class Vehicle:
 
 
 class FleetResult(NamedTuple):
-    """Metrics of N flights, by channel in the law's order, over the controller's ticks. Errors are
-    the true ones, C x - y_m.
+    """Metrics of N flights, by channel in the law's order, over the controller's ticks.
+
+    Errors are the true ones, C x - y_m.
     """
 
     rms: Array  # (m, N)
@@ -77,8 +78,9 @@ def rows_of(array: Array, places: Sequence[int] | NDArray[np.int64]) -> Array:
 
 
 def remainder_of(states: Array, aircraft: Aircraft) -> Array:
-    """Nonlinear remainder of f_state, (q, N): gravity @ (sin(x) - x) + gain @ (x[first] x[second])
-    + kinematics(x).
+    """Nonlinear remainder of f_state, (q, N).
+
+    gravity @ (sin(x) - x) + gain @ (x[first] x[second]) + kinematics(x).
     """
     return dynamics.f_state(states, aircraft) - aircraft.gravity @ states
 
@@ -372,8 +374,9 @@ def in_trim(fleet: Fleet, vehicle: Vehicle, timing: Timing) -> LoopState:
 
 
 def _product(matrices: Array, vector: Any) -> Array:
-    """The matrix-vector product of each aircraft, compiled to one loop; 0 for matrices without a
-    column.
+    """The matrix-vector product of each aircraft, compiled to one loop.
+
+    0 for matrices without a column.
     """
     return (
         product(matrices, vector)

@@ -22,8 +22,9 @@ from flight_core.vectors import Array, FloatArray, array_namespace
 
 
 class StateBlock(NamedTuple):
-    """Coupled states and the signals that act on them, as indices in x and in [x, p_1, ..., p_K,
-    s]. Hashable.
+    """Coupled states and the signals that act on them.
+
+    They are indices in x and in [x, p_1, ..., p_K, s]. Hashable.
     """
 
     rows: tuple[int, ...]
@@ -31,8 +32,9 @@ class StateBlock(NamedTuple):
 
 
 class Change(NamedTuple):
-    """A drift of N aircraft: differences of the matrices of Fleet after `duration`, linear in time
-    before.
+    """A drift of N aircraft: differences of the matrices of Fleet.
+
+    Differences after `duration`, linear in time before.
     """
 
     start: float  # s
@@ -44,11 +46,10 @@ class Change(NamedTuple):
 
 
 class Fleet(NamedTuple):
-    """N aircraft over one tick of the controller, in K steps of the integration; q rows of the
-    remainder, r of the forcing.
+    """N aircraft over one tick of the controller, in K steps of the integration.
 
-    With p_k the actuators' mean positions over step k, the remainder s and the course's forcing w_k
-    in step k, one tick is
+    q rows of the remainder, r of the forcing. With p_k the actuators' mean positions over step k,
+    the remainder s and the course's forcing w_k in step k, one tick is
 
         x+ = tick @ [x, p_1, ..., p_K, s] + wind forced @ [w_1, ..., w_K]
     """
@@ -192,8 +193,9 @@ def remainder_rows(aircraft: Aircraft) -> NDArray[np.int64]:
 
 
 def _blocks(moves: NDArray[np.bool_]) -> tuple[StateBlock, ...]:
-    """Connected components of the states, `moves` of shape (n, columns): in general longitudinal
-    and lateral motion.
+    """Connected components of the states, `moves` of shape (n, columns).
+
+    They are in general longitudinal and lateral motion.
     """
     number, part = connected_components(moves[:, : len(moves)], directed=False)
     rows = [np.flatnonzero(part == k) for k in range(number)]

@@ -1,10 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The course of the aircraft of a campaign, tick by tick: reference, wind, errors of the sensors,
-feedforward.
+"""The course of the aircraft of a campaign, tick by tick.
 
-The course does not depend on the aircraft and is computed once, with the functions of the
-simulation in one process.
+Reference, wind, errors of the sensors, feedforward. The course does not depend on the aircraft and
+is computed once, with the functions of the simulation in one process.
 """
 
 from typing import NamedTuple
@@ -56,8 +55,9 @@ class Segments(NamedTuple):
 
 
 class Course(NamedTuple):
-    """T ticks of the controller, the last at the end of the flight; channels in the law's order,
-    states in the airframe's.
+    """T ticks of the controller, the last at the end of the flight.
+
+    Channels are in the law's order, states in the airframe's.
     """
 
     segments: Segments
@@ -231,8 +231,9 @@ def _feedforward(
     y_m: FloatArray,
     period: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """u_ff at the ticks, (T, m), and the state of the nominal model, (T, n); n = 0 without a
-    model.
+    """u_ff at the ticks, (T, m), and the state of the nominal model, (T, n).
+
+    n = 0 without a model.
     """
     u_ff = np.zeros_like(y_m)
     if nominal is None:
@@ -309,8 +310,9 @@ def _forcing(ticks: int, steps: int, plant: PlantParams) -> tuple[_Forcing, _For
 
 
 def _air_angles(wind: FloatArray, airframe: Airframe) -> FloatArray:
-    """Contribution of the wind at the ticks, shape (T, G), to alpha and beta, rad, in the order of
-    the states, shape (T, n).
+    """Contribution of the wind at the ticks, shape (T, G), to alpha and beta, rad.
+
+    In the order of the states, shape (T, n).
     """
     angles = np.zeros((len(wind), len(airframe.states)))
     for place, axis in enumerate(airframe.gusts):

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Comparison of tuned laws on the same aircraft, winds, noise and limits: nominal, uncertain, and
-with delayed inputs.
+"""Comparison of tuned laws on the same aircraft, winds, noise and limits.
+
+The aircraft are nominal, uncertain, and with delayed inputs.
 """
 
 import os
@@ -164,8 +165,9 @@ def _nominal_once(matrices: Sequence[FloatArray]) -> FloatArray:
 
 
 def score_cells(result: LawResult) -> list[str]:
-    """The scores of a law as cells of a table: by wind the score of the nominal aircraft, then mean
-    (worst) by level.
+    """The scores of a law as cells of a table.
+
+    By wind it is the score of the nominal aircraft, then mean (worst) by level.
     """
     cells = []
     for wind, nominal in result.scores.items():

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Registered laws beside the laws of the catalogue: the controller of a scenario and the gains in
-the scenario.
+"""Registered laws beside the laws of the catalogue.
+
+They are the controller of a scenario and the gains in the scenario.
 """
 
 from collections.abc import Iterable, Mapping
@@ -39,8 +40,9 @@ def own_gains(controller: ControllerConfig) -> dict[str, list[float]]:
 
 
 def registered_law(controller: ControllerConfig, name: str) -> Law:
-    """The law of a controller, with the gains as the start of a search; the rest of the controller
-    stays.
+    """The law of a controller, with the gains as the start of a search.
+
+    The rest of the controller stays.
     """
     start = own_gains(controller)
     scalars = {key for key in start if not isinstance(getattr(controller, key), tuple)}
@@ -78,8 +80,9 @@ def _value(gain: FloatArray, scalar: bool) -> float | list[float]:
 
 
 def _last(*leaves: Any) -> FloatArray:
-    """A parameter of N candidates, with the candidates in the last axis; (m, 1) for equal
-    values.
+    """A parameter of N candidates, with the candidates in the last axis.
+
+    (m, 1) for equal values.
     """
     first = np.asarray(leaves[0], dtype=np.float64)
     if all(np.array_equal(first, leaf) for leaf in leaves):

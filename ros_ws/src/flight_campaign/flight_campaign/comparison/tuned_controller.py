@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Tuned gains of a comparison as the controller of a scenario, under the registered law of the same
-equations.
+"""Tuned gains of a comparison as the controller of a scenario.
+
+The registered law has the same equations.
 """
 
 from typing import Any
@@ -43,11 +44,10 @@ def require_registered(name: str) -> None:
 
 
 def tuned_controller(name: str, tuned: TuningResult, benchmark: Benchmark) -> ControllerConfig:
-    """The controller that flies as a law of the catalogue with tuned gains, in the inputs of the
-    benchmark: 1 / abs(Omega_ii).
+    """The controller that flies as a law of the catalogue with tuned gains.
 
-    Topics have no delay, as in the benchmark. Raises ParameterError for a law that no scenario
-    flies.
+    The inputs of the benchmark: 1 / abs(Omega_ii). Topics have no delay, as in the benchmark.
+    Raises ParameterError for a law that no scenario flies.
     """
     require_registered(name)
     model = benchmark.model
@@ -84,8 +84,9 @@ def tuned_controller(name: str, tuned: TuningResult, benchmark: Benchmark) -> Co
 
 
 def _rise_di(gains: dict[str, FloatArray], input_scale: FloatArray) -> dict[str, Any]:
-    """Parameters of RISE-DI: a K that (22) does not have is a larger one with a smaller input
-    scale, the same loop.
+    """Parameters of RISE-DI.
+
+    A K that (22) does not have is a larger one with a smaller input scale, the same loop.
     """
     K = gains["K"]
     least = max(MIN_K, float(K[-1]))
@@ -117,8 +118,9 @@ def _feedforward(name: str, benchmark: Benchmark) -> FeedforwardConfig | None:
 
 
 def _observer(name: str, tuned: TuningResult, benchmark: Benchmark) -> ObserverConfig:
-    """The observer of a law, with its bound of u_o; the margin is that of the search, so none is
-    required of it.
+    """The observer of a law, with its bound of u_o.
+
+    The margin is that of the search, so none is required of it.
     """
     controller = benchmark.scenario.controller
     airframe = benchmark.scenario.aircraft.load()[0]

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""One tuning procedure for every law: CMA-ES over the logarithms of its gains, on the nominal
-aircraft and around it.
+"""One tuning procedure for every law: CMA-ES over the logarithms of its gains.
+
+On the nominal aircraft and around.
 """
 
 import os
@@ -101,8 +102,9 @@ STEP = 0.005
 
 
 class Benchmark(NamedTuple):
-    """The setting in which laws are tuned and compared: one scenario in two winds, channels in the
-    law's order.
+    """The setting in which laws are tuned and compared: one scenario in two winds.
+
+    Channels are in the law's order.
     """
 
     scenario: Scenario
@@ -117,12 +119,11 @@ class Benchmark(NamedTuple):
 
 
 def build_benchmark(scenario: Scenario, turbulence_seed: int = TUNING_TURBULENCE_SEED) -> Benchmark:
-    """The benchmark of a scenario: its manoeuvre, actuators and noise; y, y_m and law at one rate,
-    topics without delay.
+    """The benchmark of a scenario: its manoeuvre, actuators and noise.
 
-    Its winds are those of the scenario, and turbulence of `turbulence_seed` alone, `turbulence_of`.
-    Raises ParameterError for a scenario that a campaign cannot fly, and for outputs whose unit has
-    no score.
+    y, y_m and law are at one rate, topics without delay. The winds of the scenario, and turbulence
+    of `turbulence_seed` alone, `turbulence_of`. Raises ParameterError for a scenario that a
+    campaign cannot fly, and for outputs whose unit has no score.
     """
     require_flyable(scenario)
     scenario = scenario.vary(
@@ -175,8 +176,9 @@ def build_benchmark(scenario: Scenario, turbulence_seed: int = TUNING_TURBULENCE
 
 
 def turbulence_of(scenario: Scenario) -> dict[str, float]:
-    """The turbulence of a benchmark: altitude and intensity of that of the scenario; moderate at
-    100 m where it has none.
+    """The turbulence of a benchmark: altitude and intensity of that of the scenario.
+
+    Moderate at 100 m where the scenario has none.
     """
     turbulence = scenario.aircraft.turbulence
     return (
@@ -187,8 +189,9 @@ def turbulence_of(scenario: Scenario) -> dict[str, float]:
 
 
 def _courses(scenario: Scenario) -> dict[str, Course]:
-    """The course of a scenario whose controller has the aircraft as the model of its feedforward,
-    by the model of that.
+    """The course of a scenario, by the model of its feedforward.
+
+    The controller has the aircraft as that model.
     """
     course, controller, (airframe, _) = (
         build_course(scenario),
@@ -209,16 +212,18 @@ def _courses(scenario: Scenario) -> dict[str, Course]:
 
 
 def score(result: FleetResult, unit: FloatArray) -> FloatArray:
-    """Sum over the channels of rms of the true error / unit, shape (N,); infinite if a flight
-    diverged.
+    """Sum over the channels of rms of the true error / unit, shape (N,).
+
+    Infinite if a flight diverged.
     """
     total = statistics.score(np.asarray(result.rms), unit)
     return np.where(np.asarray(result.diverged) | ~np.isfinite(total), np.inf, total)
 
 
 def cost(result: FleetResult, benchmark: Benchmark) -> FloatArray:
-    """Score + sum over the channels of mean abs(u_dot) / activity_unit, shape (N,), at most
-    MAX_COST.
+    """Score + sum over the channels of mean abs(u_dot) / activity_unit, shape (N,).
+
+    At most MAX_COST.
     """
     activity = np.sum(np.asarray(result.slew) / benchmark.activity_unit[:, None], axis=0)
     total = score(result, benchmark.unit) + activity
@@ -245,8 +250,9 @@ class Evaluation(NamedTuple):
 
 
 def evaluations(objective: Objective, benchmark: Benchmark) -> list[Evaluation]:
-    """Flights of one evaluation of the cost, by wind: all aircraft with u in time, and the late
-    ones.
+    """Flights of one evaluation of the cost, by wind.
+
+    Aircraft with u in time, and late aircraft.
 
         cost = sum over the winds of weight (mean over the aircraft with u in time + mean over the
         late ones)
@@ -278,11 +284,10 @@ def repeat_flights(flights: Fleet, times: int) -> Fleet:
 
 
 def spread_over(params: Any, single: Any, flights: int) -> Any:
-    """Parameters of several candidates, each for all of its flights: (.., candidates) -> (..,
-    candidates flights).
+    """Parameters of several candidates, each for all of its flights.
 
-    `single` are the parameters of one candidate. What has the same shape in both is common to all
-    candidates, and stays.
+    (.., candidates) -> (.., candidates flights). `single` are the parameters of one candidate. What
+    has the same shape in both is common to all candidates, and stays.
     """
 
     def spread(leaf: FloatArray, single_leaf: FloatArray) -> FloatArray:
@@ -307,14 +312,13 @@ def tune(
     generations: int | None = None,
     progress: Callable[[int, float], None] | None = None,
 ) -> TuningResult:
-    """Gains of the smallest cost that CMA-ES finds from the initial ones, the best of several
-    seeds; all seeds run together.
+    """Gains of the smallest cost that CMA-ES finds from the initial ones.
 
-    The cost of a candidate is the weighted sum over the flights of `evaluations`. A loop with a
-    part of the margins that the objective requires costs MAX_COST times the rest. Threads fly a
-    part of the candidates in one wind each. `progress` receives the generation and the smallest
-    cost so far. Source: N. Hansen, A. Ostermeier, Evolutionary Computation 9(2), 2001; the package
-    `cma`.
+    They are the best of several seeds; all seeds run together. The cost of a candidate is the
+    weighted sum over the flights of `evaluations`. A loop with a part of the margins that the
+    objective requires costs MAX_COST times the rest. Threads fly a part of the candidates in one
+    wind each. `progress` receives the generation and the smallest cost so far. Source: N. Hansen,
+    A. Ostermeier, Evolutionary Computation 9(2), 2001; the package `cma`.
     """
     import cma  # noqa: PLC0415 - it imports matplotlib, which nothing here uses
 
@@ -370,10 +374,10 @@ def tune(
 
 
 def nominal_margins(law: Law, gains: Gains, model: NominalModel) -> Margins:
-    """Margins of a law around the nominal aircraft for N sets of gains, (m, N) or (1, N), shapes
-    (N, m) and (N,), without those of all inputs at once.
+    """Margins of a law around the nominal aircraft for N sets of gains, (m, N) or (1, N).
 
-    u has no delay, as in a benchmark.
+    Their shapes are (N, m) and (N,), without those of all inputs at once. u has no delay, as in a
+    benchmark.
     """
     tuned = TunedLaw(law.control_law(model), law.params(gains, model))
     count = max((gain.shape[-1] for gain in gains.values()), default=1)
