@@ -91,7 +91,7 @@ class AutopilotLock:
     def _start(self, since_boot_ns: int, now_ns: int) -> str:
         """The name of the start to which a time since boot belongs.
 
-        It is the locked start, or a new name by the instant of boot.
+        The locked start, or a new name by the instant of boot.
         """
         boot_ns = now_ns - since_boot_ns
         advances = (

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bridge to an autopilot, without ROS: y from its messages, setpoints for u to it.
 
-It has the engagement, the pilot override and the failsafe. It reads no clock: every instant is an
-argument, in ns of one clock. The watchdogs of y and u end an engagement.
+Engagement, pilot override and failsafe are here. No clock is read: every instant is an argument, in
+ns of a single clock. The watchdogs of y and u end an engagement.
 """
 
 import math
@@ -201,7 +201,7 @@ class Bridge:
     def _outside(self, section: str = "envelope") -> str:
         """The channels that are outside the limits of a section of the map, as a sentence.
 
-        All of them were received.
+        Every channel was received.
         """
         what = "the envelope" if section == "envelope" else section
         values = (

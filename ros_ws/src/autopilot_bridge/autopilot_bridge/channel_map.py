@@ -112,7 +112,7 @@ def _airspeed_of_pressure(pressure: Any) -> float:
 def _quaternion(field: Any) -> tuple[float, float, float, float]:
     """(w, x, y, z), of length 1, of a quaternion.
 
-    It has members w, x, y, z, or four elements in this order, as PX4 publishes it.
+    The field has members w, x, y, z, or four elements in this order, as PX4 publishes them.
     """
     w, x, y, z = (field.w, field.x, field.y, field.z) if hasattr(field, "w") else field
     w, x, y, z = float(w), float(x), float(y), float(z)
@@ -125,7 +125,7 @@ def _quaternion(field: Any) -> tuple[float, float, float, float]:
 def _roll(field: Any) -> float:
     """Roll angle of a quaternion, rad.
 
-    It is the last of the rotations about z, y, x from the world to the body.
+    Roll is the last of the rotations about z, y, x from the world to the body.
     """
     w, x, y, z = _quaternion(field)
     return math.atan2(2.0 * (w * x + y * z), w * w - x * x - y * y + z * z)

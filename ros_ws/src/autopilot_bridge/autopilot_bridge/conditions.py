@@ -51,7 +51,7 @@ class Conditions:
     def unmet(self, now_ns: int, *, awaited: bool) -> str:
         """The conditions that do not hold, as a sentence.
 
-        They are those that an engagement awaits, or the others.
+        `awaited`: those of an engagement; else the rest.
         """
         rows = (
             (name, row)
@@ -85,7 +85,7 @@ class Conditions:
     def is_active(self, name: str, now_ns: int, *, engaged: bool) -> bool:
         """Whether a pilot override is active.
 
-        It ends with its topic: an old one does not block an engagement.
+        An override ends with the topic: an old override does not block an engagement.
         """
         row = self._map.overrides[name]
         reading = self._overrides.get(name)
@@ -150,7 +150,7 @@ def staleness(topic: str, reading: Reading | None, max_age: float, now_ns: int) 
 def joined(faults: Mapping[str, str]) -> str:
     """What is wrong with some channels, by name, as a sentence.
 
-    Channels with the same fault stand together in it.
+    Channels with the same fault stand together.
     """
     names: dict[str, list[str]] = {}
     for name, fault in faults.items():

@@ -208,7 +208,7 @@ class Link:
     def send(self, message: Any) -> None:
         """Send a message of `message_type` to the autopilot.
 
-        It has the number of the ground station.
+        The sender has the number of the ground station.
         """
         fields = message.packed.fieldnames
         values = {field: getattr(message, field) for field in fields}
@@ -275,7 +275,7 @@ class Link:
     def lost(self) -> str:
         """What ends an engagement, as a sentence.
 
-        It is a rate that stays slow, or the silence of the ground station.
+        A rate stays slow, or the ground station is silent.
         """
         now = time.monotonic()
         limit = self._config.station_silence
@@ -292,7 +292,7 @@ class Link:
     def station(self) -> str:
         """What the autopilot's failsafe FS_GCS_ENABL watches, as a sentence.
 
-        It watches while RC overrides are sent.
+        The failsafe watches while RC overrides are sent.
         """
         system = self._stations_text()
         limit = self._config.station_silence

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whether the messages of a link come at their requested rates.
 
-It reads no clock: every instant is an argument, in s.
+No clock is read: every instant is an argument, in s.
 """
 
 from collections import deque

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The bridge node, in place of the aircraft node.
 
-It makes y from the messages of an autopilot and setpoints for u to it, by a channel map.
+A channel map makes y of the messages of an autopilot, and its setpoints of u.
 """
 
 import os
@@ -74,7 +74,7 @@ NamedRow = tuple[str, MeasuredRow | WatchedRow]
 class BridgeNode(FlightNode[BridgeConfig]):
     """The node of `Bridge`: at each tick it polls the topics, publishes y and sends setpoints.
 
-    It polls the autopilot's topics, publishes a new y, takes the newest u and sends the due
+    A tick polls the autopilot's topics, publishes a new y, takes the newest u and sends the due
     messages.
     """
 
@@ -254,7 +254,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
     def _pause_ns(self) -> int:
         """Time since the tick before began.
 
-        It includes the time of a suspended host, in which the clock of the ticks stands still.
+        The time of a suspended host counts, in which the clock of the ticks stands still.
         """
         return self._boot_ns() - self._began_ns
 
@@ -367,7 +367,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
     def _activate(self, active: bool) -> None:
         """Request that the controller is active.
 
-        It is so only while engaged, so that its integrals do not wind up.
+        Active only while engaged: the integrals do not wind up.
         """
         self._awaits_controller = active and not self._controller.service_is_ready()
         if not self._controller.service_is_ready():

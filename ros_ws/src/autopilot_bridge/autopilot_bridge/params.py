@@ -142,7 +142,7 @@ class ChannelMap(Config):
     def _check_inputs(self) -> None:
         """Check the fields of the inputs, and their values against the range of the field.
 
-        The values are those in trim and at the limits.
+        In trim and at the limits.
         """
         owners: dict[tuple[str, str], str] = {}
         for name, row in self.inputs.items():
@@ -321,7 +321,7 @@ class ChannelMap(Config):
     def recorded_topics(self) -> list[str]:
         """The topics that the log has.
 
-        They are those with a quality of service, and what comes over MAVLink.
+        Topics with a quality of service, and what comes over MAVLink.
         """
         rows = chain.from_iterable(named.values() for named in self._readers().values())
         read = [row.topic for row in rows if row.topic.startswith(f"{MAVLINK}/")]
@@ -343,8 +343,7 @@ class ChannelMap(Config):
     def used_fields(self) -> list[tuple[str, str, str, str, str | None]]:
         """Each field that is read or set, as (key of the row, topic, type, path, components).
 
-        The path is that of the field. The components are those of `COMPONENTS` for a field that a
-        function reads, None for another one.
+        The components are those of `COMPONENTS` for a field that a function reads, else None.
         """
         fields: list[tuple[str, str, str, str, str | None]] = []
         for kind, named in self._readers().items():

@@ -132,9 +132,9 @@ def require_limits(autopilot: Autopilot, scenario: Scenario) -> None:
 def second_stage(scenario: Scenario, *, bridge: bool = False) -> tuple[NodeSpec, ...]:
     """The second stage of a scenario.
 
-    It has the aircraft or the bridge, the reference model, and guidance and the learner where the
-    scenario has them. Raises ParameterError where guidance cannot fly the simulated aircraft, and
-    for a bridge beside a learner.
+    Aircraft or bridge, reference model, and guidance and learner where the scenario has them.
+    Raises ParameterError where guidance cannot fly the simulated aircraft, and for a bridge beside
+    a learner.
     """
     if not bridge:
         require_guidable(scenario)
@@ -170,7 +170,7 @@ def start_lead(startup: float) -> float:
 def start_instant(lead: float, now: float) -> float:
     """Time of t = 0, s, `lead` from `now`.
 
-    It is a whole 0.01 s, so nodes with and without `start_time` tick together.
+    A whole 0.01 s, so nodes with and without `start_time` tick together.
     """
     return round(now + lead, 2)
 

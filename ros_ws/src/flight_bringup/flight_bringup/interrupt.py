@@ -48,9 +48,9 @@ def interrupt(number: int, frame: FrameType | None) -> None:
 class DeferredInterrupt:
     """A signal handler that interrupts outside the blocks of `deferred`.
 
-    Such a block is a write of the log. With `only_in_pauses` it interrupts in `pause` alone: an
-    exception in Python that a module in C has called, such as a message that rclpy makes, becomes
-    an error of that module.
+    A write of the log is a block of `deferred`. With `only_in_pauses` it interrupts in `pause`
+    alone: an exception in Python that a module in C has called, such as a message that rclpy makes,
+    becomes an error of that module.
     """
 
     def __init__(self, *, only_in_pauses: bool = False) -> None:

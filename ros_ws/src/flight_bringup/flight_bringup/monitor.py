@@ -148,7 +148,7 @@ class FlightMonitor(Client):
     def learned(self) -> list[tuple[float, str]]:
         """What became of proposals of a learner since the last call.
 
-        Each is an instant by the clock of the stamps, s, and a sentence.
+        Instants by the clock of the stamps, s, and sentences.
         """
         return [
             (seconds(report.stamp_ns), bounded(report.sentence))
@@ -166,7 +166,7 @@ class FlightMonitor(Client):
     def require_free_domain(self) -> None:
         """Raise ParameterError where the namespace already has an aircraft or a reference model.
 
-        It looks in this domain. It waits until the publishers are known, DISCOVERY_TIME after the
+        Looks in this domain, and waits until the publishers are known, DISCOVERY_TIME after the
         start.
         """
         remaining = self._created + DISCOVERY_TIME - time.monotonic()

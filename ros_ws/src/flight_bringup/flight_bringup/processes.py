@@ -71,7 +71,7 @@ POLL_PERIOD = 0.005  # s, while nodes start
 def end_with_parent() -> list[str]:
     """Prefix of a command: SIGTERM when this process dies.
 
-    It needs setpriv of util-linux, and is empty without it.
+    Empty without setpriv of util-linux.
     """
     setpriv = shutil.which("setpriv")
     return [setpriv, "--pdeathsig", "TERM"] if setpriv else []

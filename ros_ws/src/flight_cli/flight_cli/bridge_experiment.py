@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The part of `rise-di identify` that excites the aircraft behind a channel map.
 
-It writes a scenario that flies the aircraft.
+A scenario that flies the aircraft is written.
 """
 
 import shlex
@@ -67,8 +67,8 @@ GUIDED = 600.0  # s, of a flight under guidance
 class BridgeExperiment:
     """An experiment behind a channel map, or a recorded one.
 
-    It has the folder for what flies the aircraft. Gains from an imported log are for `link_delay`,
-    s, beyond the delay in the log; None for that of the map.
+    `folder` takes what flies the aircraft. Gains from an imported log are for `link_delay`, s,
+    beyond the delay in the log; None for that of the map.
     """
 
     map_name: str

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`rise-di check`: a channel map beside the D of the controller.
 
-It also checks a map against a recorded flight, and against releases of an autopilot.
+A map is also checked against a recorded flight, and against releases of an autopilot.
 """
 
 from collections.abc import Sequence
@@ -157,7 +157,7 @@ def _format_field(row: OutputRow | InputRow) -> str:
 def _check_rows(channel_map: ChannelMap, definitions: Sequence[Path], as_json: bool) -> None:
     """Compare the rows of a map with the message definitions of releases.
 
-    Each row that does not hold is shown.
+    Rows that do not hold are shown.
     """
     kinds = list(dict.fromkeys(kind for _, _, kind, *_ in channel_map.used_fields()))
     installed = installed_definitions(kinds)

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`rise-di compare`: RISE-DI and further control laws on the same aircraft.
 
-All are tuned by the same procedure.
+The same procedure tunes every law.
 """
 
 import json

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`rise-di engage`: bumpless engagement of the autopilot behind a running bridge.
 
-It also disengages.
+Disengagement, too.
 """
 
 from dataclasses import dataclass

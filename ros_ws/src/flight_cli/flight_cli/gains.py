@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`rise-di gains`: select gains by Theorem 1 and by the engineering procedure.
 
-It also checks the gains of a scenario.
+The gains of a scenario are checked, too.
 """
 
 import math

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`rise-di guide`: what a guided flight holds from now on.
 
-It also calls the services of guidance, keeps the operator's link and sends a route.
+Services of guidance, the operator's link and a route, too.
 """
 
 import math

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`rise-di network`: the profile of the middleware for nodes on several hosts.
 
-It also checks the network between the hosts.
+The network between the hosts is checked, too.
 """
 
 import os

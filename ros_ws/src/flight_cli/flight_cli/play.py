@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`rise-di play`: publish the topics of a recorded flight again with their timing.
 
-It plays for a node under test.
+For a node under test.
 """
 
 import math

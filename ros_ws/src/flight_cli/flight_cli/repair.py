@@ -42,7 +42,7 @@ def repair_log(run: Path) -> None:
 def _missing_at_end(run: Path, last: FileRepair) -> str:
     """Time missing at the end of the log, as a sentence.
 
-    It is known by what the files say of their end, else by the duration of the scenario.
+    The files say their end, else the duration of the scenario does.
     """
     if (missing := seconds(last.known_end_ns - last.last_ns)) > 0:
         return f"{missing:.3f} s are missing at its end"

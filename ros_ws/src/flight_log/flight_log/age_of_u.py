@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The age of u at the aircraft, from the diagnostics.
 
-It is the delay of the whole loop, from the instant of y to the action of u.
+The age is the delay of the whole loop, from the instant of y to the action of u.
 """
 
 from collections.abc import Iterable

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The clock of the stamps of a topic, followed in the order of the recording.
 
-It finds steps of the clock, damaged stamps and equal stamps.
+Steps of the clock, damaged stamps and equal stamps are found.
 """
 
 from collections.abc import Iterator, Mapping

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Opens the files of a log for every reader.
 
-It unpacks packed files and compressed messages, and orders the files of a bag. A path that is no
+Packed files and compressed messages are unpacked, and the files of a bag ordered. A path that is no
 log is refused in one sentence with what is there.
 """
 

@@ -221,7 +221,7 @@ def _is_flight_time(stored: StoredMessage) -> bool:
 def _start_ns(stored: Iterable[StoredMessage], otherwise: int) -> int:
     """Stamp of flight time 0, by the first `truth` or else the first `y_m`.
 
-    It is `otherwise` without both.
+    `otherwise` without both.
     """
     first: dict[str, StoredMessage] = {}
     for message in stored:

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Provenance of a flight for the metadata of a log, as named sets of strings.
 
-It holds versions, revision, host and command.
+Versions, revision, host and command are collected.
 """
 
 import os

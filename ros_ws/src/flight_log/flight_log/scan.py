@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reads the records of an MCAP file that may be truncated, damaged or growing.
 
-It reads up to the end of the file, without the damaged parts.
+Reading goes to the end of the file, without the damaged parts.
 """
 
 import os

@@ -104,7 +104,7 @@ def parameter_changes(run: Path, node: str, known: Mapping[str, object]) -> list
 def parameter_event(stamp_ns: int, node: str, changes: Mapping[str, Any]) -> bytes:
     """A message of PARAMETER_EVENTS with changes by dotted name; None deletes a parameter.
 
-    It is the inverse of `parameter_changes`.
+    The inverse of `parameter_changes`.
     """
     store = typestore()
     types = {

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reads a bag as a Tape, without ROS.
 
-It reads the bags of this stack and of `ros2 bag record`, also truncated ones.
+Bags of this stack and of `ros2 bag record` are read, also truncated.
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -327,7 +327,7 @@ def _duration(attachments: Sequence[StoredFile]) -> float | None:
 def _start_ns(signals: Mapping[str, Signal]) -> int:
     """Stamp of flight time 0.
 
-    It is known by `truth`, else it is the first y_m, where commands begin, else the earliest stamp.
+    `truth` tells the stamp, else the first y_m, where commands begin, else the earliest stamp.
     """
     truth = signals.get("truth")
     if truth is not None and "t" in truth.names:

@@ -170,7 +170,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
     def _free_folder(self, directory: Path) -> Path:
         """The folder, or another one beside it.
 
-        It is another one where the folder holds the log of a simulation that ended before this one.
+        A new folder where this folder holds the log of a simulation that ended before.
         """
         numbered = (directory.with_name(f"{directory.name}-{number}") for number in count(2))
         taken = self.simulated is not None and any(directory.glob("*.mcap"))

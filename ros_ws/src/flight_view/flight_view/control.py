@@ -242,7 +242,7 @@ class Control:
     ) -> dict[str, Any]:
         """Carry out a request and write a line in the log.
 
-        It is refused after a cancellation later than `cancellations`.
+        A cancellation later than `cancellations` refuses the request.
         """
         self._link.resume()
         self._link.keep_link()
@@ -271,8 +271,7 @@ class Control:
     def state(self) -> dict[str, Any]:
         """State for the page.
 
-        It has the lease, the nodes, the gains with their ranges, the digests, the faults and the
-        bridge.
+        Lease, nodes, gains with their ranges, digests, faults and bridge.
         """
         nodes = self._link.nodes()
         scenario = self._flight.scenario

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Follows the log of a run, live or recorded.
 
-It has the samples by topic, the events, and the state of the recording.
+Samples by topic, events and the state of the recording are kept.
 """
 
 import math
@@ -184,7 +184,7 @@ class Flight:
     def start_ns(self) -> int:
         """Stamp of flight time 0.
 
-        It is known by `truth`, else it is the first y_m, the origin of commands, else the earliest
+        `truth` tells the stamp, else the first y_m, the origin of commands, else the earliest
         stamp.
         """
         return next(
@@ -549,7 +549,7 @@ class Flight:
     def _take_route(self, sent_ns: int, waypoints: Sequence[Waypoint]) -> None:
         """A route received in flight replaces the route before.
 
-        It does not where guidance refuses the new route.
+        Where guidance refuses the new route, the route before stays.
         """
         guided = None if self.scenario is None else self.scenario.guidance
         if guided is None:

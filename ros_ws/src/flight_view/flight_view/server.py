@@ -172,7 +172,7 @@ class Server:
     async def news(self, flight: Flight | Fleet, known: Mapping[str, str]) -> bytes:
         """The answer to a browser with the `known` numbers of rows by topic.
 
-        It waits up to MAX_WAIT s for news.
+        Waits up to MAX_WAIT s for news.
         """
         deadline = time.monotonic() + MAX_WAIT
         while not has_news(flight, known) and (remaining := deadline - time.monotonic()) > 0.0:

@@ -2,8 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A flight in the terminal.
 
-It shows the state, the mode, the outputs over their references, the inputs, the attitude and the
-last events.
+The picture has state, mode, outputs over their references, inputs, attitude and the last events.
 """
 
 import math

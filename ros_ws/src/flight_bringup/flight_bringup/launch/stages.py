@@ -205,7 +205,7 @@ def flight_node(
 ) -> Node:
     """A node of a flight into the folder `run`.
 
-    It has a section of the scenario and parameter overrides.
+    The node gets a section of the scenario and parameter overrides.
     """
     return Node(
         package=spec.package,
@@ -318,10 +318,10 @@ def start_in_stages(
 ) -> list[Action]:
     """Start the first stage of a flight into the folder `run`, and `beside`.
 
-    Once the nodes are ready, run the actions of `second`. Its arguments are the time until t = 0
-    and the system time of t = 0, s. A node that is not ready after READY_TIMEOUT ends the launch
-    with exit status 1, and so does another flight: a publisher of a topic among `publishes`, before
-    any node starts.
+    Once the nodes are ready, run the actions of `second`. The arguments of `second` are the time
+    until t = 0 and the system time of t = 0, s. A node that is not ready after READY_TIMEOUT ends
+    the launch with exit status 1, and so does another flight: a publisher of a topic among
+    `publishes`, before any node starts.
     """
     _subscribe_states(context)
     leave_outcome(run, INTERRUPTED)  # until another outcome replaces it
@@ -545,7 +545,7 @@ def _namespace(context: LaunchContext) -> str:
 def _is_descendant(pid: int) -> bool:
     """Whether a process belongs to this launch, not to a second flight.
 
-    It belongs to it directly or behind a launch prefix.
+    Directly or behind a launch prefix.
     """
     with suppress(psutil.Error):
         return os.getpid() in {parent.pid for parent in psutil.Process(pid).parents()}
