@@ -67,8 +67,9 @@ from flight_log.rosbag2_metadata import (
 from flight_log.stored_messages import PARAMETER_EVENT, PARAMETER_EVENTS, parameter_changes
 from flight_log.tape_reader import read_run
 from flight_log.vehicle_log import read_vehicle_log
-from flight_view.control import Control, RefusedError
+from flight_view.control import Control
 from flight_view.flight import Flight
+from flight_view.request_values import RefusedError
 from flight_view.server import ADDRESS, Server, answer
 from rise_di_controller.controller import Controller
 from rise_di_controller.rise_di_config import RiseDiConfig

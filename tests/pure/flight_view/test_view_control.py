@@ -19,7 +19,8 @@ from tornado.httpclient import AsyncHTTPClient, HTTPResponse
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.linear_loop.loop_margins import delay_margins
-from flight_view.control import BURST, KEY_PERIOD, LEASE, Control, RefusedError, gains_of, new_key
+from flight_view.control import BURST, KEY_PERIOD, LEASE, Control, gains_of, new_key
+from flight_view.request_values import RefusedError
 from flight_view.server import TOKEN_HEADER, Server
 from rise_di_controller.params import ControllerConfig
 

@@ -10,6 +10,7 @@ The page follows the growing log and joins no ROS graph, except for control.
 | `flight` | follows the log of a run: samples, events, state |
 | `server` | serves the page and the samples to browsers on this host |
 | `control` | checks and carries out commands of the page, over a link to the nodes |
+| `request_values` | refuses values of a request that are not well formed or in range |
 | `foxglove_server` | serves a log to viewers of the Foxglove protocol, an extra |
 | `watch` | finds the run and serves the run until Ctrl-C |
 | `text` | shows a flight in a terminal |

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Control of a flight from the page: permission, range and order of commands, without ROS.
 
-A `Link` reaches the nodes. A single page at a time holds the lease. Requests run in sequence on a
-separate thread; to deactivate the controller or disengage the bridge ends the running request.
+A `FlightLink` reaches the nodes. A single page at a time holds the lease. Requests run in sequence
+on a separate thread; to deactivate the controller or disengage the bridge ends the running request.
 """
 
 import asyncio
@@ -11,7 +11,7 @@ import hmac
 import math
 import secrets
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
@@ -25,27 +25,39 @@ from flight_core.parameters import ParameterError, flatten, nest
 from flight_core.rates import NANOSECONDS
 from flight_guidance.guidance_state import TARGETS
 from flight_view.flight import Flight
+from flight_view.request_values import (
+    RefusedError,
+    as_list,
+    finite_number,
+    finite_numbers,
+    is_sentences,
+    like_parameter,
+    permitted_range,
+    require_form,
+    require_known,
+    require_range,
+    values_by_name,
+)
 from rise_di_controller.params import ControllerConfig
 
-RANGE = (0.5, 2.0)  # of a gain in the scenario: what the page may set
 LEASE = 5.0  # s that a page controls after its last request
 RATE = 5.0  # requests a second
-BURST = 10.0  # and at once
+BURST = 10.0  # requests at once
 KEY_PERIOD = 1.0  # s between two wrong keys
 MAX_WAYPOINTS = 200
 AXES = ("north", "east", "altitude")  # of a waypoint
 GUIDED = ("hold", "skip", "resume", "home")  # services of guidance without arguments
 AT_ONCE = ("deactivate", "disengage")  # actions that do not queue
 OVER = ("ended", "interrupted")  # states of a recording: the flight can be commanded no more
-# s from the request to the begin of a gust; the second where a busy host sets the first late
+# s, from the request to the begin of a gust. A busy host may set the first late: then the second.
 GUST_LEADS = (0.2, 1.0)
-# stamps above are of the system clock, stamps of a lockstep flight begin at 0
+# Larger stamps are of the system clock; stamps of a lockstep flight begin at 0.
 SYSTEM_TIME_NS = 10**17
 
 Assess = Callable[[Scenario, ControllerConfig], dict[str, Any]]
 
 
-class Link(Protocol):
+class FlightLink(Protocol):
     """What reaches the nodes of a flight.
 
     Methods return why something is refused, or "", and may raise ParameterError.
@@ -91,15 +103,6 @@ class Link(Protocol):
         """Write a line to the log of the flight."""
 
 
-class RefusedError(Exception):
-    """A refused request: the status and a sentence."""
-
-    def __init__(self, status: HTTPStatus, sentence: str) -> None:
-        super().__init__(sentence)
-        self.status = status
-        self.sentence = sentence
-
-
 @contextmanager
 def _refusing() -> Iterator[None]:
     """A ParameterError of the block as a refusal."""
@@ -121,7 +124,7 @@ class Control:
     def __init__(
         self,
         flight: Flight,
-        link: Link,
+        link: FlightLink,
         key: str,
         *,
         real: bool = False,
@@ -183,9 +186,11 @@ class Control:
             )
         self._take_lease(lease)
         loop = asyncio.get_running_loop()
-        if action == "check":  # takes a while, and reaches no node
+        # A check takes a while, and reaches no node.
+        if action == "check":
             return await loop.run_in_executor(self._assessor, self._check, request)
-        if action in AT_ONCE:  # also while a request waits, or waits for its turn
+        # A request of AT_ONCE goes first while another one runs, or waits for its turn.
+        if action in AT_ONCE:
             self._cancellations += 1
             self._link.cancel()
         return await loop.run_in_executor(
@@ -281,9 +286,9 @@ class Control:
             "undo": len(self._undo),
             "targets": list(TARGETS),
         }
-        # the digest is that of a refresh
-        known = scenario is not None and self._digest and "controller" in nodes
-        if scenario is not None and known and gains_of(scenario.controller):
+        # Before the first refresh the digest is 0 and no gain is known.
+        are_gains_known = self._digest and "controller" in nodes
+        if scenario is not None and are_gains_known and gains_of(scenario.controller):
             shown |= {
                 "gains": self._gains(scenario),
                 "digest": f"{self._digest:012x}",
@@ -292,11 +297,8 @@ class Control:
         if scenario is not None and "aircraft" in nodes:
             channels = scenario.aircraft.channels()
             truth = self._flight.samples.get("truth")
-            axes = (
-                []
-                if truth is None
-                else [name.partition(".")[2] for name in truth.names if name.startswith("gust.")]
-            )
+            names = () if truth is None else truth.names
+            axes = [name.partition(".")[2] for name in names if name.startswith("gust.")]
             shown["aircraft"] = {
                 "outputs": list(channels.outputs),
                 "inputs": list(channels.inputs),
@@ -320,12 +322,12 @@ class Control:
     def _gains(self, scenario: Scenario) -> list[dict[str, Any]]:
         gains = []
         for name, base in gains_of(scenario.controller).items():
-            values = list(_as_list(self._values.get(name, base)))
+            values = list(as_list(self._values.get(name, base)))
             gains.append(
                 {
                     "name": name,
                     "values": values,
-                    "ranges": [*map(_range, _as_list(base))],
+                    "ranges": [*map(permitted_range, as_list(base))],
                     "channels": _channels_of(len(values), scenario.controller),
                 }
             )
@@ -336,11 +338,11 @@ class Control:
 
         At first, and where the digest in the log differs, also read the controller's parameters.
         """
-        # the digest is 0 before the first tick
-        stale = not self._digest or self._flight.digest not in {0, self._digest}
+        # The digest of the flight is 0 before the first tick.
+        is_stale = not self._digest or self._flight.digest not in {0, self._digest}
         scenario = self._flight.scenario
         nodes = self._link.nodes()
-        if scenario is not None and "controller" in nodes and stale:
+        if scenario is not None and "controller" in nodes and is_stale:
             self._read()
         if scenario is not None and "aircraft" in nodes:
             self._faults = self._link.parameters("aircraft", _faults_of(scenario))
@@ -358,14 +360,14 @@ class Control:
         return type(base).validate_mapping(nest(content), "controller")
 
     def _set_gains(self, request: Mapping[str, Any]) -> str:
-        values = _mapping(request, "values")
+        values = values_by_name(request, "values")
         gains = gains_of(self._controller())
-        chosen = {}
+        changes = {}
         for name, value in values.items():
-            _require_known(name, gains, "gain")
-            chosen[name] = _like(name, gains[name], value)
-            _require_range(name, chosen[name], gains[name])
-        return self._apply(request, chosen, undo=True)
+            require_known(name, gains, "gain")
+            changes[name] = like_parameter(name, gains[name], value)
+            require_range(name, changes[name], gains[name])
+        return self._apply(request, changes, undo=True)
 
     def _undo_gains(self, request: Mapping[str, Any]) -> str:
         if not self._undo:
@@ -398,13 +400,15 @@ class Control:
         """Margins of the gains in flight with some changed."""
         if self._assess is None or self._flight.scenario is None:
             return {}
-        values = _mapping(request, "values")
+        values = values_by_name(request, "values")
         gains = gains_of(self._controller())
-        chosen = {
-            name: _like(name, gains[name], value) for name, value in values.items() if name in gains
+        changes = {
+            name: like_parameter(name, gains[name], value)
+            for name, value in values.items()
+            if name in gains
         }
         with _refusing():
-            return self._assess(self._flight.scenario, self._with(self._values | chosen))
+            return self._assess(self._flight.scenario, self._with(self._values | changes))
 
     def _map(self) -> str:
         """The name of the channel map of the bridge."""
@@ -434,25 +438,25 @@ class Control:
         if self._flight.scenario is None:
             return "the log has no scenario"
         known = _faults_of(self._flight.scenario)
-        values = _mapping(request, "values")
+        values = values_by_name(request, "values")
         for name in values:
-            _require_known(name, known, "fault")
-        chosen = {
-            name: value if _is_sentences(value) else _numbers(name, value)
+            require_known(name, known, "fault")
+        changes = {
+            name: value if is_sentences(value) else finite_numbers(name, value)
             for name, value in values.items()
         }
-        if not (refusal := self._link.set_parameters("aircraft", chosen)):
-            self._faults |= chosen
+        if not (refusal := self._link.set_parameters("aircraft", changes)):
+            self._faults |= changes
         return refusal
 
     def _begin_gust(self, request: Mapping[str, Any]) -> str:
         axis = request.get("axis")
-        # ROS has no name for half a surrogate pair
-        _require(
+        # ROS has no name for half a surrogate pair.
+        require_form(
             isinstance(axis, str) and axis.isidentifier(),
             f"axis: found {short_repr(axis)}, expected the name of an axis",
         )
-        speed, length = (_number(key, request.get(key)) for key in ("speed", "length"))
+        speed, length = (finite_number(key, request.get(key)) for key in ("speed", "length"))
         flight = self._flight
         real = flight.start_ns > SYSTEM_TIME_NS
         refusal = ""
@@ -466,11 +470,11 @@ class Control:
         return refusal
 
     def _send_target(self, request: Mapping[str, Any]) -> str:
-        values = _mapping(request, "values")
+        values = values_by_name(request, "values")
         for name in values:
-            _require_known(name, TARGETS, "target")
+            require_known(name, TARGETS, "target")
         return self._link.send_target(
-            {name: _number(name, value) for name, value in values.items()}
+            {name: finite_number(name, value) for name, value in values.items()}
         )
 
     def _send_route(self, request: Mapping[str, Any]) -> str:
@@ -479,13 +483,13 @@ class Control:
         if not isinstance(points, list) or not 2 <= len(points) <= MAX_WAYPOINTS:
             raise RefusedError(HTTPStatus.BAD_REQUEST, expected)
         for point in points:
-            _require(isinstance(point, list) and len(point) == len(AXES), expected)
-        coordinate = partial(_number, "points")
+            require_form(isinstance(point, list) and len(point) == len(AXES), expected)
+        coordinate = partial(finite_number, "points")
         return self._link.send_route([[*map(coordinate, point)] for point in points])
 
     def _engage(self, request: Mapping[str, Any]) -> str:
         name = self._map()
-        _require(
+        require_form(
             request.get("map") == name,
             f"map: found {short_repr(request.get('map'))}, expected {name}, that of the bridge",
         )
@@ -522,7 +526,7 @@ def _channels_of(count: int, controller: ControllerConfig) -> list[str]:
 
 
 def _is_numeric(value: object) -> bool:
-    return all(isinstance(number, float) for number in _as_list(value))
+    return all(isinstance(number, float) for number in as_list(value))
 
 
 def _faults_of(scenario: Scenario) -> list[str]:
@@ -532,74 +536,5 @@ def _faults_of(scenario: Scenario) -> list[str]:
     )
 
 
-def _require(holds: bool, sentence: str) -> None:
-    """Refuse a request that is not well formed."""
-    if not holds:
-        raise RefusedError(HTTPStatus.BAD_REQUEST, sentence)
-
-
-def _require_known(name: str, known: Collection[str], kind: str) -> None:
-    _require(name in known, f"{short_repr(name)}: no {kind}, expected one of {', '.join(known)}")
-
-
 def _plain(key: str) -> bytes:
     return key.replace("-", "").strip().upper().encode()
-
-
-def _as_list(value: Any) -> Sequence[Any]:
-    return value if isinstance(value, list | tuple) else [value]
-
-
-def _range(value: float) -> list[float]:
-    return sorted(factor * value for factor in RANGE)
-
-
-def _require_range(name: str, value: Any, base: Any) -> None:
-    for number, middle in zip(_as_list(value), _as_list(base), strict=True):
-        low, high = _range(middle)
-        _require(
-            low <= number <= high,
-            f"{name}: found {number:g}, expected {low:g} to {high:g}, {RANGE[0]:g} to "
-            f"{RANGE[1]:g} times the scenario's",
-        )
-
-
-def _like(name: str, base: Any, value: Any) -> Any:
-    """A value as a float or a list, by the type of the parameter."""
-    values = _as_list(_numbers(name, value))
-    expected = len(_as_list(base))
-    _require(len(values) == expected, f"{name}: found {len(values)} values, expected {expected}")
-    return values if isinstance(base, tuple) else values[0]
-
-
-def _mapping(request: Mapping[str, Any], key: str) -> dict[str, Any]:
-    values = request.get(key)
-    if not isinstance(values, dict) or not values:
-        raise RefusedError(HTTPStatus.BAD_REQUEST, f"{key}: expected values by name")
-    return values
-
-
-def _number(name: str, value: Any) -> float:
-    try:
-        number = (
-            float(value)
-            if isinstance(value, int | float) and not isinstance(value, bool)
-            else math.nan
-        )
-    except OverflowError:  # an integer of hundreds of digits
-        number = math.inf
-    _require(
-        math.isfinite(number), f"{short_repr(name)}: found {short_repr(value)}, expected a number"
-    )
-    return number
-
-
-def _is_sentences(value: Any) -> bool:
-    return isinstance(value, list) and all(isinstance(fault, str) for fault in value)
-
-
-def _numbers(name: str, value: Any) -> Any:
-    """A number, or a list of numbers; null in a list stands for never, infinity."""
-    if not isinstance(value, list):
-        return _number(name, value)
-    return [math.inf if number is None else _number(name, number) for number in value]

@@ -36,9 +36,10 @@ from tornado.websocket import WebSocketClosedError, WebSocketHandler, WebSocketP
 
 from flight_analysis.report.summary import finite_or_null
 from flight_core.rates import NANOSECONDS
-from flight_view.control import Control, RefusedError
+from flight_view.control import Control
 from flight_view.fleet import Fleet
 from flight_view.flight import Flight
+from flight_view.request_values import RefusedError
 
 ADDRESS = "127.0.0.1"
 PAGE = Path(__file__).parent / "page"

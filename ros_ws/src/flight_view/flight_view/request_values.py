@@ -1,0 +1,101 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Values of a request of the controlling page: refused unless well formed and in range."""
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from http import HTTPStatus
+from typing import Any
+
+from flight_core.fields import short_repr
+
+RANGE = (0.5, 2.0)
+"""Factors on a gain of the scenario: what the page may set."""
+
+
+class RefusedError(Exception):
+    """A refused request: the status and a sentence."""
+
+    def __init__(self, status: HTTPStatus, sentence: str) -> None:
+        super().__init__(sentence)
+        self.status = status
+        self.sentence = sentence
+
+
+def require_form(holds: bool, sentence: str) -> None:
+    """Refuse a request that is not well formed."""
+    if not holds:
+        raise RefusedError(HTTPStatus.BAD_REQUEST, sentence)
+
+
+def require_known(name: str, known: Collection[str], kind: str) -> None:
+    """Refuse a name that is not among the known names of a kind."""
+    require_form(
+        name in known, f"{short_repr(name)}: no {kind}, expected one of {', '.join(known)}"
+    )
+
+
+def as_list(value: Any) -> Sequence[Any]:
+    """A value of a parameter as a sequence."""
+    return value if isinstance(value, list | tuple) else [value]
+
+
+def permitted_range(value: float) -> list[float]:
+    """The least and the largest value of a gain, by the value in the scenario."""
+    return sorted(factor * value for factor in RANGE)
+
+
+def require_range(name: str, value: Any, base: Any) -> None:
+    """Refuse a gain outside of `permitted_range` of `base`, the gain in the scenario."""
+    for number, middle in zip(as_list(value), as_list(base), strict=True):
+        low, high = permitted_range(middle)
+        require_form(
+            low <= number <= high,
+            f"{name}: found {number:g}, expected {low:g} to {high:g}, {RANGE[0]:g} to "
+            f"{RANGE[1]:g} times the scenario's",
+        )
+
+
+def like_parameter(name: str, base: Any, value: Any) -> Any:
+    """A value as a float or a list, by the type of the parameter."""
+    values = as_list(finite_numbers(name, value))
+    expected = len(as_list(base))
+    require_form(
+        len(values) == expected, f"{name}: found {len(values)} values, expected {expected}"
+    )
+    return values if isinstance(base, tuple) else values[0]
+
+
+def values_by_name(request: Mapping[str, Any], key: str) -> dict[str, Any]:
+    """The mapping under a key of a request."""
+    values = request.get(key)
+    if not isinstance(values, dict) or not values:
+        raise RefusedError(HTTPStatus.BAD_REQUEST, f"{key}: expected values by name")
+    return values
+
+
+def finite_number(name: str, value: Any) -> float:
+    """A finite number of a request."""
+    number = math.nan
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        # An integer of hundreds of digits is beyond a float.
+        try:
+            number = float(value)
+        except OverflowError:
+            number = math.inf
+    require_form(
+        math.isfinite(number), f"{short_repr(name)}: found {short_repr(value)}, expected a number"
+    )
+    return number
+
+
+def is_sentences(value: Any) -> bool:
+    """Whether a value is a list of sentences, as of faults."""
+    return isinstance(value, list) and all(isinstance(fault, str) for fault in value)
+
+
+def finite_numbers(name: str, value: Any) -> Any:
+    """A number, or a list of numbers; null in a list stands for never, infinity."""
+    if not isinstance(value, list):
+        return finite_number(name, value)
+    return [math.inf if number is None else finite_number(name, number) for number in value]
