@@ -310,7 +310,14 @@ def test_condition_without_trim_refused_in_one_sentence(
 def test_property_that_does_not_exist_refused_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     cessna()  # caches the trim found with the real table
     wrong = dict(INPUTS) | {
-        "rudder": Command("fcs/ruder-cmd-norm", None, -1.0, 1.0, False, "nose left")
+        "rudder": Command(
+            property="fcs/ruder-cmd-norm",
+            trim_property=None,
+            lower=-1.0,
+            upper=1.0,
+            each_engine=False,
+            positive="nose left",
+        )
     }
     monkeypatch.setattr(jsbsim_aircraft, "INPUTS", wrong)
     with pytest.raises(

@@ -206,7 +206,11 @@ def test_named_property_that_is_none_is_refused(commands: dict[str, str], senten
 
 def test_named_property_that_the_model_lacks_is_refused(external: Path) -> None:
     condition = FlightCondition(
-        str(external), 46.3, 1219.2, STEP_NS, (("elevator", (("fcs/absent", 1.0),)),)
+        name=str(external),
+        speed=46.3,
+        altitude=1219.2,
+        step_ns=STEP_NS,
+        named=(("elevator", (("fcs/absent", 1.0),)),),
     )
     with pytest.raises(FlightEnded, match="it has no property fcs/absent"):
         trim_solution(condition)

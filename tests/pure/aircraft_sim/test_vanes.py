@@ -144,7 +144,13 @@ def test_gain_with_vane_is_that_of_the_stationary_filter() -> None:
         tuple(airframe.states), controller.inputs, controller.outputs, tuple(airframe.gusts)
     )
     T = model.total_lag
-    weights = Weights(T, 0.4 * T, np.full(3, 0.5), np.full(3, 4.0), np.array([0.01]))
+    weights = Weights(
+        effort=T,
+        drift=0.4 * T,
+        gust=np.full(3, 0.5),
+        wind_time=np.full(3, 4.0),
+        loose=np.array([0.01]),
+    )
     sampled = aircraft_model(model, names, weights.wind_time)
     row = np.array(
         [1.0 * (name == "x.alpha") - 0.04 * (name == "wind.vertical") for name in sampled.states]
@@ -175,11 +181,21 @@ def test_still_vane_is_left_out_and_moving_vane_corrects() -> None:
     e = generator.standard_normal(4)
     reading = np.array([0.1, -0.2])
     zero = np.zeros(4)
-    measured = Measurements(e, zero, zero, zero, zero, vane=reading, vane_m=np.zeros(2))
+    measured = Measurements(
+        y=e, y_m=zero, y_m_dot=zero, u_trim=zero, u_before=zero, vane=reading, vane_m=np.zeros(2)
+    )
     none = np.zeros(2)
 
     def corrected(square: FloatArray, frozen: list[bool]) -> FloatArray:
-        state = VaneObserverState(None, z, np.zeros(4), np.zeros(1), reading, square, none)
+        state = VaneObserverState(
+            law=None,
+            z=z,
+            u_o=np.zeros(4),
+            sigma=np.zeros(1),
+            vane_mean=reading,
+            vane_square=square,
+            vane_measures=none,
+        )
         return np.asarray(
             correct(state, measured, np.float64(0.01), without_frozen(params, frozen)).z
         )

@@ -19,7 +19,7 @@ from flight_core.vectors import FloatArray
 OSPREY = {"airframe": "osprey", "rate": 100.0, "step": 0.01, "kinematics": "euler"}
 CESSNA = {"airframe": "jsbsim:c172p", "speed": 50.0, "altitude": 500.0}
 LOG = {"law": "log", "ground": -50.0, "reference": 10.0, "roughness": 0.1}
-BURST = Microburst(100.0, -50.0, 600.0, 12.0, 40.0)
+BURST = Microburst(north=100.0, east=-50.0, radius=600.0, speed=12.0, height=40.0)
 
 
 def config(**values: Any) -> AircraftConfig:

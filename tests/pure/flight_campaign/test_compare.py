@@ -64,7 +64,11 @@ def brief(scenario: Scenario) -> Scenario:
 def as_tuned(gains: Gains, **changes: Any) -> TuningResult:
     """A tuning result with these gains."""
     return TuningResult(
-        {name: value[:, 0].tolist() for name, value in gains.items()}, 1.0, 1, [1.0], 0
+        gains={name: value[:, 0].tolist() for name, value in gains.items()},
+        cost=1.0,
+        seed=1,
+        costs=[1.0],
+        evaluations=0,
     )._replace(**changes)
 
 
@@ -151,7 +155,7 @@ def test_share_of_lost_aircraft_is_that_of_first_level_by_delay_of_u(short: Benc
 
 def test_tuned_gains_written_to_new_folder_or_refused_in_sentence(tmp_path: Path) -> None:
     path = tmp_path / "one" / "two" / "gains.yaml"
-    found = TuningResult({"K": [1.0]}, 2.0, 1, [2.0, 3.0], 100)
+    found = TuningResult(gains={"K": [1.0]}, cost=2.0, seed=1, costs=[2.0, 3.0], evaluations=100)
     tuned_gains.save(path, {"pi": {"gust": found}}, ["gust"], "a command")
     assert tuned_gains.load(path) == {"pi": {"gust": found}}
     with refusing(r"cannot be written \(.*\), expected a file of tuned gains that can$"):
@@ -342,13 +346,25 @@ def test_written_controller_is_the_law_that_was_tuned(name: str, short: Benchmar
     y = np.cumsum(0.002 * generator.standard_normal((60, 4)), axis=0)
     zero = np.zeros(4)
     none = np.zeros((4, 1))
-    state = law.engage(Measurements(y[0], zero, zero, zero, zero), params)
-    wide = of_catalogue.engage(Measurements(y[0][:, None], none, none, none, none), sets)
+    state = law.engage(
+        Measurements(y=y[0], y_m=zero, y_m_dot=zero, u_trim=zero, u_before=zero), params
+    )
+    wide = of_catalogue.engage(
+        Measurements(y=y[0][:, None], y_m=none, y_m_dot=none, u_trim=none, u_before=none), sets
+    )
     u = zero
     found = none
     for sample in y[1:]:
-        state, u = law.step(state, Measurements(sample, zero, zero, zero, u), dt, params)
+        state, u = law.step(
+            state,
+            Measurements(y=sample, y_m=zero, y_m_dot=zero, u_trim=zero, u_before=u),
+            dt,
+            params,
+        )
         wide, found = of_catalogue.step(
-            wide, Measurements(sample[:, None], none, none, none, found), dt, sets
+            wide,
+            Measurements(y=sample[:, None], y_m=none, y_m_dot=none, u_trim=none, u_before=found),
+            dt,
+            sets,
         )
     assert_allclose(u, found[:, 0], rtol=2e-4, atol=1e-7)  # a file has six digits

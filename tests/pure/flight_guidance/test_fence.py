@@ -100,7 +100,17 @@ def test_predicted_turn_is_arc_with_drift(edge: Zone, course: float, wind: float
     for side, name in ((1.0, 0), (-1.0, 1)):
         phi = np.float64(side * bank)
         air = (wind * north, wind * east)
-        motion = Motion(np.float64(0.0), np.float64(0.0), phi, course, speed, air, bank, 1e9, 0.0)
+        motion = Motion(
+            north=np.float64(0.0),
+            east=np.float64(0.0),
+            phi=phi,
+            heading=course,
+            speed=speed,
+            wind=air,
+            bank=bank,
+            roll_rate=1e9,
+            lag=0.0,
+        )
         # Home is far behind. 64 points of the trapezoidal rule: 0.3 m.
         turns = turn_clearance(Fence((edge,), (-1900.0 * north, -1900.0 * east)), motion)
         assert float(turns[name]) == approx(500.0 - ahead, abs=0.3)
@@ -124,7 +134,15 @@ def test_predicted_turn_drifts_with_wind_across(side: float, wind: float) -> Non
     )
     phi = np.float64(side * bank)
     motion = Motion(
-        np.float64(0.0), np.float64(0.0), phi, 0.0, speed, (0.0, side * wind), bank, 1e9, 0.0
+        north=np.float64(0.0),
+        east=np.float64(0.0),
+        phi=phi,
+        heading=0.0,
+        speed=speed,
+        wind=(0.0, side * wind),
+        bank=bank,
+        roll_rate=1e9,
+        lag=0.0,
     )
     # home is beyond the nearest point
     right, left = turn_clearance(Fence((edge,), (-3000.0, -side * 5500.0)), motion)
@@ -148,15 +166,15 @@ def test_predicted_turn_ends_after_lag_and_roll(side: float, phi: float) -> None
     bearing = math.radians(15.0) if phi == 0.0 else math.radians(4.0)
     home = (900.0, side * 900.0 * math.tan(bearing))
     motion = Motion(
-        np.float64(0.0),
-        np.float64(0.0),
-        np.float64(side * phi),
-        0.0,
-        speed,
-        (0.0, 0.0),
-        bank,
-        roll_rate,
-        lag,
+        north=np.float64(0.0),
+        east=np.float64(0.0),
+        phi=np.float64(side * phi),
+        heading=0.0,
+        speed=speed,
+        wind=(0.0, 0.0),
+        bank=bank,
+        roll_rate=roll_rate,
+        lag=lag,
     )
     right, left = turn_clearance(Fence((edge,), home), motion)
     rolled = lag + (bank - phi) / roll_rate
@@ -173,7 +191,17 @@ def test_predicted_turn_ends_after_lag_and_roll(side: float, phi: float) -> None
 def motion(north: float, east: float, course: float = 0.0) -> Motion:
     """Of an osprey with level wings in calm air."""
     x, y, phi = np.array([north, east, 0.0])
-    return Motion(x, y, phi, course, 25.0, (0.0, 0.0), math.radians(30.0), 0.35, 0.4)
+    return Motion(
+        north=x,
+        east=y,
+        phi=phi,
+        heading=course,
+        speed=25.0,
+        wind=(0.0, 0.0),
+        bank=math.radians(30.0),
+        roll_rate=0.35,
+        lag=0.4,
+    )
 
 
 def test_turn_begins_at_last_moment() -> None:
@@ -241,15 +269,15 @@ def test_aircraft_outside_flies_home_in_wind(name: str) -> None:
         course = np.arctan2(v_east, v_north)
         ground_speed = np.hypot(v_north, v_east)
         motion = Motion(
-            north,
-            east,
-            phi,
-            psi,
-            np.full(4, speed),
-            (wind[0], wind[1]),
-            np.full(4, bank),
-            0.35,
-            0.4,
+            north=north,
+            east=east,
+            phi=phi,
+            heading=psi,
+            speed=np.full(4, speed),
+            wind=(wind[0], wind[1]),
+            bank=np.full(4, bank),
+            roll_rate=0.35,
+            lag=0.4,
         )
         escape = last_safe_turn(fence, action, motion)
         action = np.asarray(escape.action)

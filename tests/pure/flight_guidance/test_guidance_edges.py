@@ -64,7 +64,17 @@ def test_wings_are_level_at_a_speed_without_room_for_a_bank(
 def motion(speed: Any, bank: Any, wind: tuple[float, float], phi: Any) -> Motion:
     """An aircraft on the way to the north, 1,300 m before the border."""
     zero = 0.0 * phi
-    return Motion(zero, zero, phi, zero, speed, wind, bank, 0.6, 1.0)
+    return Motion(
+        north=zero,
+        east=zero,
+        phi=phi,
+        heading=zero,
+        speed=speed,
+        wind=wind,
+        bank=bank,
+        roll_rate=0.6,
+        lag=1.0,
+    )
 
 
 @NAMESPACES
@@ -97,7 +107,9 @@ def test_turn_without_bank_is_the_straight_way(wind: float) -> None:
 
 
 def test_speeds_that_divide_have_numbers() -> None:
-    attitude = AttitudeParams(1.0, 1.0, 0.6, 1.0, 5.0, 0.5)
+    attitude = AttitudeParams(
+        k_phi=1.0, k_theta=1.0, roll_rate=0.6, load=1.0, n_alpha=5.0, k_beta=0.5
+    )
     path = PathParams(14.0, 0.7, 0.5)
     for speed, climb, e in product(SPEEDS, (-5.0, 0.0, 5.0), (-10.0, 0.0, 10.0)):
         rates = body_rates(0.5, 0.1, 0.2, 0.0, 0.0, 0.1, speed, attitude)

@@ -156,7 +156,14 @@ def test_each_step_follows_from_log_to_last_bit() -> None:
             stamp_ns, dict(zip(signal.names, values.tolist(), strict=True)), params.outputs
         )
         state, commands = modes.step(state, inputs, None, params)
-        sample = guidance.Sample(inputs, state, commands, guidance.digest(None), 0.0, 0)
+        sample = guidance.Sample(
+            inputs=inputs,
+            state=state,
+            commands=commands,
+            route=guidance.digest(None),
+            link_age=0.0,
+            failed=0,
+        )
         assert guidance.row(sample, params.outputs).tobytes() == values.tobytes()
         assert state == logged
         state = logged

@@ -79,7 +79,9 @@ def pose_of(attitude: tuple[float, float, float], **values: float) -> dict[str, 
 
 def inputs_of(attitude: tuple[float, float, float]) -> guidance_state.Inputs:
     pose = tuple(pose_of(attitude).values())
-    return guidance_state.Inputs(0, guidance_state.Begin.HOLD, pose, 0, (0.0,) * 4, {})
+    return guidance_state.Inputs(
+        t_ns=0, begin=guidance_state.Begin.HOLD, pose=pose, pose_age_ns=0, y=(0.0,) * 4, commands={}
+    )
 
 
 def test_square_at_3_m_per_s_stays_on_its_lines_and_replays_to_the_bit(

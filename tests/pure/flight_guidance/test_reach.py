@@ -46,13 +46,13 @@ def flown(
     for k in range(500):
         begin, given = (Begin.HOLD, target) if k == 0 else (Begin.NO, {})
         inputs = Inputs(
-            k * OWN.period_ns,
-            begin,
-            tuple(values[name] for name in POSE),
-            0,
-            (0.0,) * 4,
-            given,
-            authority,
+            t_ns=k * OWN.period_ns,
+            begin=begin,
+            pose=tuple(values[name] for name in POSE),
+            pose_age_ns=0,
+            y=(0.0,) * 4,
+            commands=given,
+            authority=authority,
         )
         state, commands = modes.step(state, inputs, None, OWN)
     assert state is not None

@@ -416,7 +416,9 @@ def test_waypoints_at_one_place_are_one(tmp_path: Path) -> None:
         "route:\n- [0, 0, 0]\n- [900, 0, 0]\n- {north: 900, east: 0, altitude: 80, turns: 2}\n- "
         "[1800, 0, 80]\n",
     )
-    assert read_route(path)[1] == Waypoint(900.0, 0.0, 0.0, None, 2.0, 0.0, 80.0)
+    assert read_route(path)[1] == Waypoint(
+        north=900.0, east=0.0, altitude=0.0, speed=None, turns=2.0, wait=0.0, leave=80.0
+    )
     path.write_text(
         "route: [[0, 0, 0], [900, 0, 0, 26], [900, 0, 0, 27], [900, 900, 0], [0, 900, 0]]",
     )

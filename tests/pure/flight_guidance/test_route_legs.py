@@ -393,9 +393,9 @@ def test_summary_says_which_legs_were_flown() -> None:
         missed=[0] * 5 + [321.0] + [0] * 4,
     )
     assert flown_legs(tape) == [
-        FlownLeg(0, 0.0, 2.0, 3.0, "flown", 0.0),
-        FlownLeg(1, 3.0, 3.0, 5.0, "missed", 321.0),
-        FlownLeg(2, 5.0, 5.0, 9.0, "not ended", 0.0),
+        FlownLeg(leg=0, start=0.0, joined=2.0, stop=3.0, result="flown", missed=0.0),
+        FlownLeg(leg=1, start=3.0, joined=3.0, stop=5.0, result="missed", missed=321.0),
+        FlownLeg(leg=2, start=5.0, joined=5.0, stop=9.0, result="not ended", missed=0.0),
     ]
     assert guidance_notices(tape, CONFIG) == ["guidance at t = 5.0 s: leg 1 missed by 321 m"]
     assert (

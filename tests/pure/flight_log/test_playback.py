@@ -170,7 +170,15 @@ def test_start_in_the_middle_sends_latched_messages_first(
 ) -> None:
     qos = f"- history: keep_last\n  depth: {depth}\n  durability: {durability}\n"
     stored = [
-        StoredMessage(topic, "x/msg/X", "", t, t, b"", qos=qos if topic == "/a" else "")
+        StoredMessage(
+            topic=topic,
+            type_name="x/msg/X",
+            definition="",
+            received_ns=t,
+            sent_ns=t,
+            data=b"",
+            qos=qos if topic == "/a" else "",
+        )
         for topic, t in LATCHED
     ]
     monkeypatch.setattr(playback, "stored_messages", lambda run: iter(stored))

@@ -436,19 +436,19 @@ class AircraftConfig(NodeConfig):
         biases = {name: bias for name, bias in self.bias.items() if bias.value != 0.0}
         sines = {name: sine for name, sine in self.sines.items() if sine.amplitude != 0.0}
         return airframe, Aircraft(
-            airframe.matrix_a(),
-            airframe.matrix_b(),
-            airframe.matrix_c(),
-            airframe.matrix_gravity(),
-            airframe.matrix_gusts(),
-            self.gust_arrays(list(airframe.gusts)),
-            np.array(airframe.speed),
-            Coupling(self.inertial_coupling * gain, first, second)
+            A=airframe.matrix_a(),
+            B=airframe.matrix_b(),
+            C=airframe.matrix_c(),
+            gravity=airframe.matrix_gravity(),
+            gust_direction=airframe.matrix_gusts(),
+            gusts=self.gust_arrays(list(airframe.gusts)),
+            speed=np.array(airframe.speed),
+            coupling=Coupling(self.inertial_coupling * gain, first, second)
             if self.inertial_coupling > 0.0
             else None,
-            Bias(*by_state(biases, Bias._fields, airframe.states)) if biases else None,
-            Sines(*by_state(sines, Sines._fields, airframe.states)) if sines else None,
-            euler_kinematics(airframe) if self.kinematics == "euler" else None,
+            bias=Bias(*by_state(biases, Bias._fields, airframe.states)) if biases else None,
+            sines=Sines(*by_state(sines, Sines._fields, airframe.states)) if sines else None,
+            kinematics=euler_kinematics(airframe) if self.kinematics == "euler" else None,
         )
 
     def plant(self) -> PlantParams:
@@ -458,7 +458,12 @@ class AircraftConfig(NodeConfig):
         turbulence = self._turbulence(airframe.speed, list(airframe.gusts), span)
         over = None if self.over_airspeed is None else over_airspeed(airframe, self.over_airspeed)
         return PlantParams(
-            aircraft, self.actuator_model(), self.step_ns, turbulence, self.drift_factors(), over
+            aircraft=aircraft,
+            actuators=self.actuator_model(),
+            step_ns=self.step_ns,
+            turbulence=turbulence,
+            drift=self.drift_factors(),
+            over_airspeed=over,
         )
 
     def actuator_model(self) -> Actuators:
@@ -486,7 +491,11 @@ class AircraftConfig(NodeConfig):
             )
         named = named_properties(self.commands, "commands")
         return FlightCondition(
-            require_aircraft(self.airframe), self.speed, self.altitude, self.step_ns, named
+            name=require_aircraft(self.airframe),
+            speed=self.speed,
+            altitude=self.altitude,
+            step_ns=self.step_ns,
+            named=named,
         )
 
     def wind_model(self) -> WindModel:
@@ -568,7 +577,14 @@ class AircraftConfig(NodeConfig):
         drift = np.array([pose.drift.get(name, 0.0) for name in POSE])
         noise = np.array([pose.noise.get(name, 0.0) for name in POSE])
         walk = drift * np.sqrt(self.pose_every() / self.rate) if drift.any() else None
-        return Sensors(noise, nanoseconds(pose.delay), 0.0, pose.seed + 2**64, bias, walk)
+        return Sensors(
+            noise=noise,
+            delay_ns=nanoseconds(pose.delay),
+            dropout=0.0,
+            seed=pose.seed + 2**64,
+            bias=bias,
+            drift=walk,
+        )
 
 
 STILL_AIR = Gust(start=0.0, speed=0.0, length=1.0)

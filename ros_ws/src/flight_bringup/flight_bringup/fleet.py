@@ -163,7 +163,13 @@ def read_fleet(
         "true in lockstep, which has no clock",
         "one of the two",
     )
-    fleet = Fleet(path.stem, tuple(members), config.lockstep, config.composed, by_clock)
+    fleet = Fleet(
+        name=path.stem,
+        members=tuple(members),
+        lockstep=config.lockstep,
+        composed=config.composed,
+        use_sim_time=by_clock,
+    )
     cheaper = "" if config.composed else "; composed: true takes one an aircraft"
     participants = f"{fleet.participants()} participants of the middleware"
     require(

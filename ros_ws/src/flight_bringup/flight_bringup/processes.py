@@ -317,7 +317,13 @@ class FlightProcesses:
             first_y = min(FIRST_Y, BEFORE_END * self.scenario.flight.duration)
             overrides = {**overrides, "first_y": first_y}
         self.processes.append(
-            NodeProcess(node, self.scenario.path, overrides, log, self._namespace)
+            NodeProcess(
+                node=node,
+                scenario_file=self.scenario.path,
+                overrides=overrides,
+                log=log,
+                namespace=self._namespace,
+            )
         )
 
     def _wait_until_ready(self, deadline: float) -> None:

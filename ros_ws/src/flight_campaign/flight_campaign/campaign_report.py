@@ -245,7 +245,13 @@ def write_page(
         ),
         Section("Sweep", "score over the factor", _sweep(definition, tallies), over_time=False),
     ]
-    page = Page(title, [Line(text)], [TableGroup(tables)], sections, SampleStore())
+    page = Page(
+        title=title,
+        lines=[Line(text)],
+        tables=[TableGroup(tables)],
+        sections=sections,
+        samples=SampleStore(),
+    )
     write_file(path, page_html(page))
 
 

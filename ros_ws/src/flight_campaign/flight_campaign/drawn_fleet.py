@@ -52,4 +52,4 @@ def drawn_fleet(definition: Definition, scenario: Scenario, first: int, count: i
     A, B = sampled_matrices(airframe, part, part, definition.seed, first, count, definition.spread)
     directions = gust_directions(airframe, A, definition.wind)
     equipped = definition.drawn_equipment(scenario, first, count)
-    return DrawnFleet(scenario, A, B, directions, equipped)
+    return DrawnFleet(scenario=scenario, A=A, B=B, gust_directions=directions, equipment=equipped)

@@ -220,7 +220,14 @@ class Compare:
         controllers = registered_laws.find_laws(laws, chosen, others)
         entries = registered_laws.entries(controllers)
         path = self.gains or tuned_gains.tuned_file(chosen)
-        return Contest(chosen, laws, aims, controllers, entries, path)
+        return Contest(
+            scenario=chosen,
+            names=laws,
+            aims=aims,
+            controllers=controllers,
+            entries=entries,
+            path=path,
+        )
 
     def _command(self) -> str:
         """The command of another tuning, for the file of gains."""

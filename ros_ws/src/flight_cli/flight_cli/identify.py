@@ -445,10 +445,16 @@ def _innovation_page(identification: Identification, name: str) -> Page:
         for r in identification.innovations
     )
     held_out = [
-        Interval("held out", start, stop, GUST, False)
+        Interval(label="held out", start=start, stop=stop, colour=GUST, labelled=False)
         for start, stop in mask_spans(t, identification.held_out)
     ]
-    context = PlotContext({}, _units(identification), held_out, float(t[-1]), SampleStore())
+    context = PlotContext(
+        runs={},
+        units=_units(identification),
+        intervals=held_out,
+        end=float(t[-1]),
+        samples=SampleStore(),
+    )
     curves = {
         "nominal": Curve(before, ERROR, start_ns=0),
         "identified": Curve(after, PLANT, start_ns=0),
@@ -465,11 +471,11 @@ def _innovation_page(identification: Identification, name: str) -> Page:
     )
     line = Line(f"log-likelihood of a held-out sample: {likelihoods}")
     return Page(
-        f"Model of {identification.airframe.name} from {name}",
-        [line],
-        [],
-        [section],
-        context.samples,
+        title=f"Model of {identification.airframe.name} from {name}",
+        lines=[line],
+        tables=[],
+        sections=[section],
+        samples=context.samples,
     )
 
 

@@ -119,13 +119,13 @@ def as_route(
         is_fillet = not isinstance(leg, Line) and not orbit
         altitude.append(departures[-1] if is_fillet and slopes else end)
     return Route(
-        legs,
-        tuple(altitude),
-        tuple(flown[k] for k in numbers),
-        tuple(departures),
-        tuple(flown[k] for k in before),
-        slopes,
-        notes,
+        legs=legs,
+        altitude=tuple(altitude),
+        V=tuple(flown[k] for k in numbers),
+        from_altitude=tuple(departures),
+        from_V=tuple(flown[k] for k in before),
+        slopes=slopes,
+        notes=notes,
     )
 
 

@@ -119,7 +119,13 @@ class ZoneConfig(Config):
 
     def zone(self) -> Zone:
         """The zone of the equations."""
-        return Zone(self.north, self.east, self.radius or 0.0, self.exclude, self.group)
+        return Zone(
+            north=self.north,
+            east=self.east,
+            radius=self.radius or 0.0,
+            exclude=self.exclude,
+            group=self.group,
+        )
 
 
 class HomeConfig(Config):

@@ -247,11 +247,11 @@ class BagWriter:
         """What the file holds so far."""
         counts = (
             TopicCount(
-                channel.topic,
-                channel.type.name,
-                channel.type.type_hash,
-                channel.qos,
-                channel.messages,
+                topic=channel.topic,
+                type_name=channel.type.name,
+                type_hash=channel.type.type_hash,
+                qos=channel.qos,
+                messages=channel.messages,
             )
             for channel in self.channels
         )

@@ -141,12 +141,12 @@ class StampClock:
     def recording(self, unset: int = 0) -> Recording:
         """The result; `unset`: further messages without a usable stamp."""
         return Recording(
-            self._found,
-            self._unset + unset,
-            self._repeated,
-            self._step_ns,
-            self._step_at_ns,
-            self._left_out,
+            found=self._found,
+            unset=self._unset + unset,
+            repeated=self._repeated,
+            step_ns=self._step_ns,
+            step_at_ns=self._step_at_ns,
+            left_out=self._left_out,
         )
 
 

@@ -62,7 +62,9 @@ class Columns:
         stamp_ns = self._stamp_ns[: self.count]
         sender = np.concatenate(self._sender) if len(self._senders) > 1 else None
         if isinstance(self._store, _File):
-            return _StoredSignal(stamp_ns, names, sender, self._store, 0)
+            return _StoredSignal(
+                stamp_ns=stamp_ns, names=names, sender=sender, store=self._store, first=0
+            )
         return Signal(stamp_ns, names, self._store.read(0, self._width, self.count), sender)
 
 
@@ -152,7 +154,13 @@ class _StoredSignal(Signal):
     def until(self, end_ns: int) -> Signal:
         count = int(np.searchsorted(self.stamp_ns, end_ns, side="right"))
         sender = None if self.sender is None else self.sender[:count]
-        return _StoredSignal(self.stamp_ns[:count], self.names, sender, self._store, self._first)
+        return _StoredSignal(
+            stamp_ns=self.stamp_ns[:count],
+            names=self.names,
+            sender=sender,
+            store=self._store,
+            first=self._first,
+        )
 
     def group(self, prefix: str) -> Signal:
         names = [name for name in self.names if name.startswith(f"{prefix}.")]
@@ -160,9 +168,9 @@ class _StoredSignal(Signal):
         if tuple(names) != self.names[first : first + len(names)]:
             return super().group(prefix)
         return _StoredSignal(
-            self.stamp_ns,
-            tuple(name.removeprefix(f"{prefix}.") for name in names),
-            self.sender,
-            self._store,
-            self._first + first,
+            stamp_ns=self.stamp_ns,
+            names=tuple(name.removeprefix(f"{prefix}.") for name in names),
+            sender=self.sender,
+            store=self._store,
+            first=self._first + first,
         )

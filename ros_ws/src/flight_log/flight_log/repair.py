@@ -157,11 +157,11 @@ class _FileScan:
             )
             counts.append(
                 TopicCount(
-                    channel.topic,
-                    schema.name if schema else "",
-                    type_hash,
-                    qos,
-                    self.messages[identity],
+                    topic=channel.topic,
+                    type_name=schema.name if schema else "",
+                    type_hash=type_hash,
+                    qos=qos,
+                    messages=self.messages[identity],
                 )
             )
         return FileContents(
@@ -170,7 +170,12 @@ class _FileScan:
 
     def unchanged(self) -> FileRepair:
         return FileRepair(
-            self.path, self.messages.total(), self.last_ns, self.known_end_ns, "", None
+            path=self.path,
+            messages=self.messages.total(),
+            last_ns=self.last_ns,
+            known_end_ns=self.known_end_ns,
+            faults="",
+            damaged=None,
         )
 
     def rebuild(self) -> FileRepair:
@@ -188,7 +193,12 @@ class _FileScan:
             os.fsync(stream.fileno())
             damaged = _keep_damaged(self.path)
         return FileRepair(
-            self.path, sum(known.values()), self.last_ns, self.known_end_ns, self.faults, damaged
+            path=self.path,
+            messages=sum(known.values()),
+            last_ns=self.last_ns,
+            known_end_ns=self.known_end_ns,
+            faults=self.faults,
+            damaged=damaged,
         )
 
     def _copy(self, writer: Writer) -> None:

@@ -446,11 +446,11 @@ def _split_batches(
         log_ns, publish_ns = (heads[name][first:end].copy() for name in ("log_ns", "publish_ns"))
         rows = windows[places[first:end] + HEAD.itemsize]
         yield MessageBatch(
-            int(heads["channel"][first]),
-            rows,
-            log_ns,
-            publish_ns,
-            heads["sequence"][first:end].astype(np.int64),
+            channel_id=int(heads["channel"][first]),
+            data=rows,
+            log_ns=log_ns,
+            publish_ns=publish_ns,
+            sequence=heads["sequence"][first:end].astype(np.int64),
         )
 
 

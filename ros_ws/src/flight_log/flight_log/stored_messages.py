@@ -53,14 +53,14 @@ def stored_messages(run: Path) -> Iterator[StoredMessage]:
                         channel = channels[record.channel_id]
                         schema = schemas.get(channel.schema_id, NO_SCHEMA)
                         yield StoredMessage(
-                            channel.topic,
-                            full_name(schema.name),
-                            schema.data.decode(errors="replace"),
-                            record.log_time,
-                            record.publish_time,
-                            plain_message(record.data),
-                            channel.message_encoding,
-                            channel.metadata.get("offered_qos_profiles", ""),
+                            topic=channel.topic,
+                            type_name=full_name(schema.name),
+                            definition=schema.data.decode(errors="replace"),
+                            received_ns=record.log_time,
+                            sent_ns=record.publish_time,
+                            data=plain_message(record.data),
+                            encoding=channel.message_encoding,
+                            qos=channel.metadata.get("offered_qos_profiles", ""),
                         )
                     elif isinstance(record, Schema):
                         schemas[record.id] = record

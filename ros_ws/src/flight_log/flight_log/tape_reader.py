@@ -154,16 +154,16 @@ def read_run(
     sent = {topic: times for topic, times in log.sent.items() if names.get(topic) in TIMED_TOPICS}
     other_files = (file for file in beside if file.name != PARAMETERS)
     return RecordedRun(
-        tape,
-        replacement or log.scenario or next(other_files, None),
-        log.metadata,
-        tuple(log.attachments),
-        None if stepped else latency(sent),
-        engagements(log.reports.get(f"{aircraft}{ENGAGEMENT}", [])),
-        aircraft,
-        run,
-        log.kinds,
-        age_of_u(log.diagnostics, aircraft),
+        tape=tape,
+        scenario=replacement or log.scenario or next(other_files, None),
+        metadata=log.metadata,
+        attachments=tuple(log.attachments),
+        latency=None if stepped else latency(sent),
+        engagements=engagements(log.reports.get(f"{aircraft}{ENGAGEMENT}", [])),
+        namespace=aircraft,
+        path=run,
+        topics=log.kinds,
+        age_of_u=age_of_u(log.diagnostics, aircraft),
     )
 
 

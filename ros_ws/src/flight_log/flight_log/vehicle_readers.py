@@ -127,7 +127,14 @@ def _read_dataflash(path: Path, kind: str, choice: Choice) -> VehicleLog:
     vehicle = FIRMWARES.get(next(iter(firmwares), ""), "")
     if (attitude := tables.get("ATT")) is not None:
         attitude.fields["Yaw"][:] = np.remainder(attitude.fields["Yaw"] + 180.0, 360.0) - 180.0
-    return VehicleLog(kind + parts, tables, parameters, DATAFLASH, vehicle, taken=tuple(taken))
+    return VehicleLog(
+        kind=kind + parts,
+        tables=tables,
+        parameters=parameters,
+        format=DATAFLASH,
+        vehicle=vehicle,
+        taken=tuple(taken),
+    )
 
 
 def _true_airspeed(tables: Mapping[str, Table]) -> None:
@@ -178,7 +185,15 @@ def _read_tlog(path: Path, kind: str, choice: Choice) -> VehicleLog:
     autopilot, mav_type = autopilots.get(system, (0, -1))
     vehicle = "" if mav_type < 0 else MAV_TYPES.get(mav_type, f"vehicle of MAV_TYPE {mav_type}")
     manual = PX4_MANUAL if autopilot == PX4 else 0
-    return VehicleLog(kind + parts, tables, parameters, TLOG, vehicle, manual, taken)
+    return VehicleLog(
+        kind=kind + parts,
+        tables=tables,
+        parameters=parameters,
+        format=TLOG,
+        vehicle=vehicle,
+        manual=manual,
+        taken=taken,
+    )
 
 
 def _flown_system(
@@ -301,7 +316,14 @@ def _read_ulog(path: Path, kind: str, choice: Choice) -> VehicleLog:
         tables["vehicle_attitude"] = Table(
             attitude.stamp_ns, {**attitude.fields, **_angles(attitude)}
         )
-    return VehicleLog(kind, tables, parameters, None, vehicle, taken=tuple(taken))
+    return VehicleLog(
+        kind=kind,
+        tables=tables,
+        parameters=parameters,
+        format=None,
+        vehicle=vehicle,
+        taken=tuple(taken),
+    )
 
 
 def _angles(attitude: Table) -> dict[str, FloatArray]:

@@ -58,7 +58,9 @@ def rms_by_model(
         if span.ticks:
             rms = {name: math.sqrt(square / span.ticks) for name, square in span.squares.items()}
             model = digests.index(span.digest)
-            spans.append(ModelSpan(names[model], model, start, stop, rms)._asdict())
+            spans.append(
+                ModelSpan(name=names[model], model=model, start=start, stop=stop, rms=rms)._asdict()
+            )
     known = {} if scenario is None else display_units(scenario)
     headings, rows = model_rows(spans, dict.fromkeys(flown[0].squares, NO_UNIT) | known)
     return {"headings": ["", *headings], "rows": rows}

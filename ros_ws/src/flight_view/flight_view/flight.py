@@ -475,7 +475,13 @@ class Flight:
             stop_ns = int(stamp_ns[rows[-1]])
             counted = rows[engaged[rows]]
             squares = {name: float(np.sum(e[counted] ** 2)) for name, e in errors.items()}
-            span = Flown(digest, start_ns, stop_ns, len(counted), squares)
+            span = Flown(
+                digest=digest,
+                start_ns=start_ns,
+                stop_ns=stop_ns,
+                ticks=len(counted),
+                squares=squares,
+            )
             if self._flown and (before := self._flown[-1]).digest == digest:
                 self._flown.pop()
                 total = {name: square + before.squares[name] for name, square in squares.items()}

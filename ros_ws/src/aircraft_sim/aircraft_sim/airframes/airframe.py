@@ -431,7 +431,14 @@ def check_identities(airframe: Airframe) -> None:
         gravity = airframe.matrix_gravity()
         identities.check(
             identities.Model(
-                airframe.name, airframe.states, effects, units, airframe.speed, A, B, gravity
+                name=airframe.name,
+                states=airframe.states,
+                effects=effects,
+                inputs=units,
+                speed=airframe.speed,
+                file_A=A,
+                file_B=B,
+                gravity=gravity,
             )
         )
 

@@ -114,7 +114,16 @@ def _check_identities(model: Model, name: str, speed: float) -> None:
     units = tuple(channel["unit"] for channel in model.inputs.values())
     none = np.zeros_like(model.A)
     identities.check(
-        identities.Model(name, model.states, effects, units, speed, model.A, model.B, none)
+        identities.Model(
+            name=name,
+            states=model.states,
+            effects=effects,
+            inputs=units,
+            speed=speed,
+            file_A=model.A,
+            file_B=model.B,
+            gravity=none,
+        )
     )
 
 

@@ -141,11 +141,11 @@ def filters(
         * spectrum.sigma[:, None]
     )
     winds = Turbulence(
-        _axes([np.exp(-h) * np.array([[1.0, 0.0], [h, 1.0]]) for h in steps]),
-        _axes([_spread(h) for h in steps]),
-        _axes([_spread(np.inf)] * len(steps)),
-        np.vstack([output, np.zeros((ROTARY_STATES, STATES))]),  # no rotary gusts yet
-        seed,
+        transition=_axes([np.exp(-h) * np.array([[1.0, 0.0], [h, 1.0]]) for h in steps]),
+        spread=_axes([_spread(h) for h in steps]),
+        stationary=_axes([_spread(np.inf)] * len(steps)),
+        output=np.vstack([output, np.zeros((ROTARY_STATES, STATES))]),  # no rotary gusts yet
+        seed=seed,
     )
     every = winds if span is None else _with_rotary(winds, spectrum, airspeed, dt, span)
     return every._replace(output=every.output[list(axes)])
@@ -186,7 +186,13 @@ def _with_rotary(
         output[row, :STATES] = sign / (airspeed * constant) * winds.output[wind]
         output[row, state] = -sign / (airspeed * constant)
     covariance = solve_discrete_lyapunov(transition, spread @ spread.T)
-    return Turbulence(transition, spread, np.linalg.cholesky(covariance), output, winds.seed)
+    return Turbulence(
+        transition=transition,
+        spread=spread,
+        stationary=np.linalg.cholesky(covariance),
+        output=output,
+        seed=winds.seed,
+    )
 
 
 def initial_state(params: Turbulence) -> FloatArray:

@@ -106,14 +106,36 @@ class Quantity(NamedTuple):
 
 INPUTS: Mapping[str, Command] = {
     "elevator": Command(
-        "fcs/elevator-cmd-norm", "fcs/pitch-trim-cmd-norm", -1.0, 1.0, False, "nose down"
+        property="fcs/elevator-cmd-norm",
+        trim_property="fcs/pitch-trim-cmd-norm",
+        lower=-1.0,
+        upper=1.0,
+        each_engine=False,
+        positive="nose down",
     ),
-    "throttle": Command("fcs/throttle-cmd-norm", None, 0.0, 1.0, True, "more thrust"),
+    "throttle": Command(
+        property="fcs/throttle-cmd-norm",
+        trim_property=None,
+        lower=0.0,
+        upper=1.0,
+        each_engine=True,
+        positive="more thrust",
+    ),
     "aileron": Command(
-        "fcs/aileron-cmd-norm", "fcs/roll-trim-cmd-norm", -1.0, 1.0, False, "roll right"
+        property="fcs/aileron-cmd-norm",
+        trim_property="fcs/roll-trim-cmd-norm",
+        lower=-1.0,
+        upper=1.0,
+        each_engine=False,
+        positive="roll right",
     ),
     "rudder": Command(
-        "fcs/rudder-cmd-norm", "fcs/yaw-trim-cmd-norm", -1.0, 1.0, False, "nose left"
+        property="fcs/rudder-cmd-norm",
+        trim_property="fcs/yaw-trim-cmd-norm",
+        lower=-1.0,
+        upper=1.0,
+        each_engine=False,
+        positive="nose left",
     ),
 }
 

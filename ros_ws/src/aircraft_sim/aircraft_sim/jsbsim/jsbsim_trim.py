@@ -154,7 +154,9 @@ def solve_and_probe(
 
     Raises FlightEnded.
     """
-    condition = FlightCondition(name, speed, altitude, step_ns, named)
+    condition = FlightCondition(
+        name=name, speed=speed, altitude=altitude, step_ns=step_ns, named=named
+    )
     solution = _solve_trim(condition)
     fdm, _ = trimmed_fdm(condition, solution)
     try:

@@ -36,7 +36,7 @@ KINDS = {
     "lost": Kind("lost_at"),
     "failed": Kind("lost_at"),
     HARD_OVER: Kind("hard_over_at", "hard_over_to"),
-    "weak": Kind("weak_at", "weak_effect", 0.5, -2.0, 2.0),
+    "weak": Kind(begin="weak_at", strength="weak_effect", default=0.5, least=-2.0, most=2.0),
     "slow": Kind("slow_at", "slow_lag", 0.2),
     "loose": Kind("loose_at", "loose_play", 0.01),
 }

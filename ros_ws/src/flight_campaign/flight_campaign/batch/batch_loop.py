@@ -252,7 +252,19 @@ def _measured(
     position = rows_of(now.position, vehicle.inputs)
     if vehicle.allocation is not None:
         position = product(vehicle.allocation.effect, position)
-    return Measurements(y, y_m, y_m_dot, u_trim, now.u, position, x, x_air, moving, vane, vane_m)
+    return Measurements(
+        y=y,
+        y_m=y_m,
+        y_m_dot=y_m_dot,
+        u_trim=u_trim,
+        u_before=now.u,
+        position=position,
+        x=x,
+        x_air=x_air,
+        y_dot=moving,
+        vane=vane,
+        vane_m=vane_m,
+    )
 
 
 def sense(now: LoopState, segment: Segments, vehicle: Vehicle) -> tuple[LoopState, Sample]:
@@ -358,18 +370,18 @@ def in_trim(fleet: Fleet, vehicle: Vehicle, timing: Timing) -> LoopState:
     none = jnp.zeros((m, count))
     command = jnp.zeros((p, count))
     return LoopState(
-        jnp.zeros((n, count)),
-        command,
-        jnp.zeros((len(vehicle.remainder.gravity), count)),
-        None,
-        none,
-        command,
-        jnp.zeros((timing.y_late, m, count)),
-        jnp.zeros((timing.u_late, p, count)),
-        none,
-        none,
-        command,
-        jnp.ones(count, dtype=bool),
+        x=jnp.zeros((n, count)),
+        position=command,
+        remainder=jnp.zeros((len(vehicle.remainder.gravity), count)),
+        law=None,
+        u=none,
+        command=command,
+        y_before=jnp.zeros((timing.y_late, m, count)),
+        command_before=jnp.zeros((timing.u_late, p, count)),
+        squares=none,
+        max=none,
+        travel=command,
+        bounded=jnp.ones(count, dtype=bool),
     )
 
 

@@ -117,14 +117,14 @@ def assemble(
         moved, *others = (after - before for before, after in zip(begin, end, strict=True))
         change = Change(drift.start, drift.duration, by_block(moved), *map(_last, others))
     return Fleet(
-        blocks,
-        by_block(tick),
-        _last(forced),
-        _last(rate),
-        _last(forced_rate),
-        jnp.broadcast_to(jnp.asarray(wind, dtype=np.float64), (count,)),
-        jnp.broadcast_to(jnp.asarray(late) + course.u_late, (count,)),
-        change,
+        blocks=blocks,
+        tick=by_block(tick),
+        forced=_last(forced),
+        rate=_last(rate),
+        forced_rate=_last(forced_rate),
+        wind=jnp.broadcast_to(jnp.asarray(wind, dtype=np.float64), (count,)),
+        late=jnp.broadcast_to(jnp.asarray(late) + course.u_late, (count,)),
+        change=change,
     )
 
 

@@ -161,22 +161,31 @@ def build_course(scenario: Scenario) -> Course:
     guard = controller.guard()
     u_ff, x_m = _feedforward(guard.nominal, phase, dt, y_m[used], seconds(tick_ns))
     segments = Segments(
-        np.arange(ticks) * np.float64(seconds(tick_ns)),
-        phase,
-        dt,
-        y_m,
-        y_m[used],
-        y_m_dot[used],
-        u_ff,
-        error[:, order],
-        noise[:, order],
-        over_step.reshape(ticks, -1),
-        now,
-        _air_angles(wind.at_tick, airframe),
-        x_m[:, guard.vanes],
-        error[:, vanes],
+        t=np.arange(ticks) * np.float64(seconds(tick_ns)),
+        phase=phase,
+        dt=dt,
+        y_m=y_m,
+        sampled_y_m=y_m[used],
+        sampled_y_m_dot=y_m_dot[used],
+        u_ff=u_ff,
+        error=error[:, order],
+        noise=noise[:, order],
+        forcing=over_step.reshape(ticks, -1),
+        forcing_now=now,
+        air=_air_angles(wind.at_tick, airframe),
+        vane_m=x_m[:, guard.vanes],
+        vane_error=error[:, vanes],
     )
-    return Course(segments, axes, basis, order, late, u_late, seconds(tick_ns), steps)
+    return Course(
+        segments=segments,
+        axes=axes,
+        basis=basis,
+        order=order,
+        late=late,
+        u_late=u_late,
+        period=seconds(tick_ns),
+        steps=steps,
+    )
 
 
 def _phases(

@@ -98,7 +98,7 @@ def compare(
         TURBULENCE: benchmark_fleet(A, B, 0 * in_time, TURBULENCE, benchmark),
     }
 
-    study = _Study(benchmark, flights, levels, parts, delays)
+    study = _Study(benchmark=benchmark, flights=flights, levels=levels, parts=parts, delays=delays)
 
     def results(name: str) -> list[LawResult]:
         control_law = laws[name].control_law(benchmark.model)  # of all gain sets: compiled once
@@ -147,15 +147,15 @@ class _Study(NamedTuple):
         for ticks, costs_late in zip(self.delays, delayed, strict=True):
             lost[ticks * benchmark.model.period] = _lost(costs_late)
         return LawResult(
-            name,
-            objective,
-            gains.costs,
-            {wind: float(costs[0]) for wind, costs in scores.items()},
-            tuple(by_level),
-            lost,
-            np.asarray(flown[GUST].rms)[:, 0],
-            np.asarray(flown[GUST].slew)[:, 0],
-            _margins(law, gains, benchmark),
+            law=name,
+            objective=objective,
+            costs=gains.costs,
+            scores={wind: float(costs[0]) for wind, costs in scores.items()},
+            levels=tuple(by_level),
+            lost_late=lost,
+            rms=np.asarray(flown[GUST].rms)[:, 0],
+            slew=np.asarray(flown[GUST].slew)[:, 0],
+            margins=_margins(law, gains, benchmark),
         )
 
 

@@ -62,16 +62,17 @@ def registered_law(controller: ControllerConfig, name: str) -> Law:
         return jax.tree.map(_last, *each)
 
     return Law(
-        f"law {controller.law}, gains of the scenario",
-        controller.law,
-        "y",
-        "own parameters",
-        lambda model: controller.tuned_law().control_law,
-        params,
-        tuple(start),
-        NONE if controller.feedforward is None else name,
-        {key: np.array(value)[:, None] for key, value in start.items()},
-        not isinstance(controller, RiseDiConfig) or controller.sampled_sign()[0] is Sign.SOFT,
+        title=f"law {controller.law}, gains of the scenario",
+        law=controller.law,
+        measurements="y",
+        model_data="own parameters",
+        control_law=lambda model: controller.tuned_law().control_law,
+        params=params,
+        tuned=tuple(start),
+        feedforward=NONE if controller.feedforward is None else name,
+        initial={key: np.array(value)[:, None] for key, value in start.items()},
+        linear=not isinstance(controller, RiseDiConfig)
+        or controller.sampled_sign()[0] is Sign.SOFT,
     )
 
 
@@ -154,4 +155,6 @@ def with_courses(
 
 def as_tuned(controller: ControllerConfig) -> TuningResult:
     """The gains of a controller in place of the result of a search: without a cost."""
-    return TuningResult(own_gains(controller), float("nan"), 0, [], 0)
+    return TuningResult(
+        gains=own_gains(controller), cost=float("nan"), seed=0, costs=[], evaluations=0
+    )

@@ -65,11 +65,11 @@ OBJECTIVES = {
         "gusts and turbulence with a large delay", {GUST: 1.0, TURBULENCE: 0.5}, 2, all_late=True
     ),
     "margins": Objective(
-        "gusts and turbulence within margins of 45 deg and 6 dB",
-        {GUST: 1.0, TURBULENCE: 0.5},
-        1,
-        False,
-        REQUIREMENT,
+        title="gusts and turbulence within margins of 45 deg and 6 dB",
+        weights={GUST: 1.0, TURBULENCE: 0.5},
+        delay=1,
+        all_late=False,
+        requirement=REQUIREMENT,
     ),
 }
 
@@ -163,15 +163,17 @@ def build_benchmark(scenario: Scenario, turbulence_seed: int = TUNING_TURBULENCE
         upper=in_law_order(actuators.upper, np.inf),
     )
     return Benchmark(
-        scenario,
-        model,
-        unit,
-        np.array([ACTIVITY_UNIT[airframe.inputs[name].unit] for name in controller.inputs]),
-        scenario.aircraft.plant(),
-        batch.vehicle(scenario),
-        {GUST: with_model, TURBULENCE: turbulent},
-        {GUST: _courses(with_model), TURBULENCE: _courses(turbulent)},
-        DELAY_TICKS if any(controller.lag) else 1,
+        scenario=scenario,
+        model=model,
+        unit=unit,
+        activity_unit=np.array(
+            [ACTIVITY_UNIT[airframe.inputs[name].unit] for name in controller.inputs]
+        ),
+        plant=scenario.aircraft.plant(),
+        vehicle=batch.vehicle(scenario),
+        scenarios={GUST: with_model, TURBULENCE: turbulent},
+        courses={GUST: _courses(with_model), TURBULENCE: _courses(turbulent)},
+        delay=DELAY_TICKS if any(controller.lag) else 1,
     )
 
 
@@ -370,7 +372,13 @@ def tune(
     winner = int(np.argmin([value for value, _ in best]))
     gains = _rounded(gains_of(best[winner][1][None]))
     lowest = [round(value, 4) for value, _ in best]
-    return TuningResult(gains, lowest[winner], seeds[winner], lowest, generations * POPULATION)
+    return TuningResult(
+        gains=gains,
+        cost=lowest[winner],
+        seed=seeds[winner],
+        costs=lowest,
+        evaluations=generations * POPULATION,
+    )
 
 
 def nominal_margins(law: Law, gains: Gains, model: NominalModel) -> Margins:

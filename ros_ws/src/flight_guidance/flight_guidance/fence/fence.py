@@ -212,4 +212,10 @@ def last_safe_turn(fence: Fence, action: Scalar, motion: Motion) -> Escape:
         xp.where(flies_home, homeward, 0.0),
     )
     after = xp.where(turns, action, xp.where(is_outside, BACK, after))
-    return Escape(after, (action == 0.0) & (after != 0.0), now, predicted, bearing)
+    return Escape(
+        action=after,
+        begins=(action == 0.0) & (after != 0.0),
+        clearance=now,
+        predicted=predicted,
+        course=bearing,
+    )

@@ -135,7 +135,13 @@ def ways(fence: Fence) -> Ways:
         aim_north[outside] = north[leads_home][nearest]
         aim_east[outside] = east[leads_home][nearest]
     corner = (float(north[0, 0]), float(east[0, 0]))
-    return Ways(corner, cell, aim_north, aim_east, _is_straight(fence, north, east, room, cell))
+    return Ways(
+        corner=corner,
+        cell=cell,
+        north=aim_north,
+        east=aim_east,
+        straight=_is_straight(fence, north, east, room, cell),
+    )
 
 
 def _cells(fence: Fence) -> tuple[FloatArray, FloatArray, float]:

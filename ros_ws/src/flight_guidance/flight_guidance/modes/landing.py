@@ -80,17 +80,17 @@ def landing_at(
     require(slope < 0.0, key, f"a line with the slope {slope:g}", "one that descends")
     speed = route.V[leg]
     return Landing(
-        leg,
-        around,
-        place,
-        ground,
-        path.end_course(line),
-        slope,
-        section.flare or FLARE * -slope * speed,
-        section.sink,
-        section.decrab,
-        section.V or speed,
-        box,
+        leg=leg,
+        around=around,
+        place=place,
+        ground=ground,
+        course=path.end_course(line),
+        slope=slope,
+        flare=section.flare or FLARE * -slope * speed,
+        sink=section.sink,
+        decrab=section.decrab,
+        V=section.V or speed,
+        box=box,
     )
 
 

@@ -320,15 +320,15 @@ def motion_of(
     r = yaw_rate(y, state.phi, state.theta, speed)
     phi_dot, _ = euler_rates(state.phi, state.theta, y["p"], y["q"], r)
     return Motion(
-        pose["north"],
-        pose["east"],
-        clip(state.phi + lag * phi_dot, bank),
-        pose["psi"] + pose["beta"],
-        speed,
-        state.wind,
-        bank,
-        params.attitude.roll_rate,
-        lag + params.turn_lag,
+        north=pose["north"],
+        east=pose["east"],
+        phi=clip(state.phi + lag * phi_dot, bank),
+        heading=pose["psi"] + pose["beta"],
+        speed=speed,
+        wind=state.wind,
+        bank=bank,
+        roll_rate=params.attitude.roll_rate,
+        lag=lag + params.turn_lag,
     )
 
 
@@ -344,7 +344,9 @@ def _within_fence(
     A lateral command during a turn is flown after the turn, unless the aircraft is outside.
     """
     if params.fence is None or state.mode is not Mode.ENGAGED:
-        return state, Escape(state.fence, False, LARGEST, LARGEST, 0.0)
+        return state, Escape(
+            action=state.fence, begins=False, clearance=LARGEST, predicted=LARGEST, course=0.0
+        )
     escape = Escape(
         *map(
             float,

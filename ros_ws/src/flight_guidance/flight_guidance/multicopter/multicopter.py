@@ -156,14 +156,14 @@ def step(
         for channel, before, rate in zip(params.outputs, state.u_m, params.slew, strict=True)
     )
     commands = Commands(
-        phi_c,
-        theta_c,
-        wanted.error.e,
-        wanted.to_go,
-        wanted.error.track,
-        missed,
-        escape.clearance,
-        escape.predicted,
+        phi_c=phi_c,
+        theta_c=theta_c,
+        xtrack=wanted.error.e,
+        to_go=wanted.to_go,
+        track=wanted.error.track,
+        missed=missed,
+        clearance=escape.clearance,
+        predicted=escape.predicted,
         bank_limited=limited,
         theta_limited=limited,
         climb_limited=climb_limited,
@@ -297,7 +297,9 @@ def _within_fence(
     """
     fence = params.fence
     if fence is None or state.mode is not Mode.ENGAGED:
-        return state, Escape(state.fence, False, LARGEST, LARGEST, 0.0)
+        return state, Escape(
+            action=state.fence, begins=False, clearance=LARGEST, predicted=LARGEST, course=0.0
+        )
     position = (np.float64(pose["north"]), np.float64(pose["east"]))
     margin = MARGIN * max(abs(_velocity(pose)), 1.0)
     now = float(clearance(fence.zones, *position))
@@ -310,7 +312,9 @@ def _within_fence(
             lateral=Lateral.PLACE, vertical=Vertical.ALTITUDE, target=target, joining=0.0
         )
     flown = action if begins or state.fence != 0.0 else 0.0
-    return state._replace(fence=flown), Escape(flown, begins, now, predicted, 0.0)
+    return state._replace(fence=flown), Escape(
+        action=flown, begins=begins, clearance=now, predicted=predicted, course=0.0
+    )
 
 
 def _action(fence: Fence, position: tuple[Any, Any], now: float) -> float:
@@ -353,7 +357,9 @@ def _approach(distance: float, speed: float, gains: MulticopterParams) -> tuple[
 
     `climb_for` with `k_p`, falling by `braking`.
     """
-    params = VerticalParams(gains.k_p, 2.0 * gains.braking, speed, speed, 0.0)
+    params = VerticalParams(
+        k_h=gains.k_p, acceleration=2.0 * gains.braking, climb=speed, sink=speed, alpha_time=0.0
+    )
     allowed = float(climb_for(distance, params))
     slope = min(gains.k_p, gains.braking / max(allowed, 1e-6))
     return allowed, 0.0 if allowed >= speed else slope
@@ -368,7 +374,13 @@ def _to_place(
     velocity = cmath.rect(speed, course)
     closing = (_velocity(pose) * cmath.rect(1.0, -course)).real
     brake = cmath.rect(-slope * closing, course)
-    return Wanted(velocity, velocity, brake, PathError(distance, course, 0.0), distance)
+    return Wanted(
+        velocity=velocity,
+        ahead=velocity,
+        acceleration=brake,
+        error=PathError(distance, course, 0.0),
+        to_go=distance,
+    )
 
 
 def _on_path(
@@ -393,7 +405,9 @@ def _on_path(
     track = cmath.rect(1.0, error_later.track)
     bend = complex(-slope * speed, speed**2 * error_later.curvature)
     now = velocity * cmath.rect(1.0, error.track)
-    return Wanted(now, velocity * track, bend * track, error, to_go)
+    return Wanted(
+        velocity=now, ahead=velocity * track, acceleration=bend * track, error=error, to_go=to_go
+    )
 
 
 def _by_tilt(

@@ -202,4 +202,11 @@ def _mission_place(key: str, item: Item, speed: Any, before: Place | None) -> Pl
     frame_text = f"the frame {item.frame}{', above the ground' if item.frame in TERRAIN else ''}"
     expected = "0 or 3: above the sea or the home, for the height of the ground is not known"
     require(item.frame in FRAMES, f"{key}: {item.name}", frame_text, expected)
-    return Place("route", latitude, longitude, altitude, speed, FRAMES[item.frame])
+    return Place(
+        key="route",
+        latitude=latitude,
+        longitude=longitude,
+        altitude=altitude,
+        speed=speed,
+        above=FRAMES[item.frame],
+    )

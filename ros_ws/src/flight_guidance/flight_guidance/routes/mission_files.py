@@ -60,7 +60,9 @@ def _plan_item(entry: Any, number: int, key: str) -> Item:
     jump = number if (jump_id := member(entry, "doJumpId")) is None else jump_id
     require(isinstance(jump, int | float), key, f"doJumpId: {short_repr(jump)}", "a number")
     if kind in LANDINGS:
-        return Item(f"{kind} (item {number})", 0, LAND, [None] * 7, jump)
+        return Item(
+            name=f"{kind} (item {number})", frame=0, command=LAND, params=[None] * 7, number=jump
+        )
     expected = f"waypoints, {' or '.join(TRANSECTS)} with their items, {' or '.join(LANDINGS)}"
     require(kind == "SimpleItem", key, f"a {short_repr(kind)}", expected)
     params = member(entry, "params")
@@ -72,7 +74,12 @@ def _plan_item(entry: Any, number: int, key: str) -> Item:
     fits = numbers and len(params) == 7 and isinstance(frame, int) and isinstance(command, int)
     require(fits, key, short_repr(entry), "frame, command and seven params")
     return Item(
-        named(command, number), frame, command, params, jump, flag(entry, "autoContinue", True, key)
+        name=named(command, number),
+        frame=frame,
+        command=command,
+        params=params,
+        number=jump,
+        goes_on=flag(entry, "autoContinue", True, key),
     )
 
 
@@ -165,12 +172,12 @@ def wpl_items(content: bytes, key: str) -> tuple[list[Item], Home | None]:
             continue
         items.append(
             Item(
-                named(int(command), int(index)),
-                int(frame),
-                int(command),
-                params,
-                index,
-                numbers[-1] != 0.0,
+                name=named(int(command), int(index)),
+                frame=int(frame),
+                command=int(command),
+                params=params,
+                number=index,
+                goes_on=numbers[-1] != 0.0,
             )
         )
     return items, home

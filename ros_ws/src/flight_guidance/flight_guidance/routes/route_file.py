@@ -448,7 +448,13 @@ def _read_yaml(content: bytes, key: str, origin: Origin | None) -> Iterator[Wayp
                     speed,
                 )
             else:
-                placed = _placed(Place(name, first, second, altitude, speed), origin, _Heights())
+                placed = _placed(
+                    Place(
+                        key=name, latitude=first, longitude=second, altitude=altitude, speed=speed
+                    ),
+                    origin,
+                    _Heights(),
+                )
             circles = {
                 key: _loiter(name, value, key)
                 for key, value in (("turns", turns), ("wait", wait))

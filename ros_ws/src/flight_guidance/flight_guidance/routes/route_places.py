@@ -180,11 +180,11 @@ def lon_lat(
     require(is_position(position), "route", short_repr(position), "longitude, latitude, altitude")
     longitude, latitude, *altitude = position
     return Place(
-        "route",
-        latitude,
-        longitude,
-        altitude[0] if altitude else None,
-        speed,
-        above,
-        altitude_text or short_repr(position),
+        key="route",
+        latitude=latitude,
+        longitude=longitude,
+        altitude=altitude[0] if altitude else None,
+        speed=speed,
+        above=above,
+        altitude_text=altitude_text or short_repr(position),
     )
