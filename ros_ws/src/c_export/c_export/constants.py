@@ -280,6 +280,9 @@ def header(
 
     members = constants(controller)
     rows = _rows(members, numbers)
+    reference_lines = []
+    if reference is not None:
+        reference_lines = _macro("RISE_DI_REFERENCE", struct(reference_constants(reference)))
     lines = [
         "/* SPDX-FileCopyrightText: RISE-DI contributors",
         " * SPDX-License-Identifier: Apache-2.0",
@@ -308,11 +311,7 @@ def header(
         f"#define RISE_DI_SINE_COEFFICIENTS {{{numbers(np.array(SINE_COEFFICIENTS))}}}",
         "",
         *_macro("RISE_DI_PARAMETERS", struct(members)),
-        *(
-            []
-            if reference is None
-            else _macro("RISE_DI_REFERENCE", struct(reference_constants(reference)))
-        ),
+        *reference_lines,
         f"#define RISE_DI_ROWS {len(rows)} /* of the table of parameters */",
         *_macro("RISE_DI_TABLE", rows, braces=False),
         "#endif",
@@ -323,10 +322,11 @@ def header(
 def _names_and_sizes(controller: RiseDiConfig, r: int, samples: int, *, float32: bool) -> list[str]:
     """Lines of the header: names of the channels, dimensions, and what is compiled."""
     m, p, n, s, schedule = sizes(controller)
+    effectors = [f"#define RISE_DI_EFFECTORS {_strings(controller.effectors)}"] if p else []
     return [
         f"#define RISE_DI_OUTPUTS {_strings(controller.outputs)}",
         f"#define RISE_DI_INPUTS {_strings(controller.inputs)}",
-        *([f"#define RISE_DI_EFFECTORS {_strings(controller.effectors)}"] if p else []),
+        *effectors,
         f"#define RISE_DI_M {m} /* channels */",
         f"#define RISE_DI_P {p} /* effectors of the allocation, 0: no allocation */",
         f"#define RISE_DI_N {n} /* states of the feedforward's model, 0: no feedforward */",

@@ -70,7 +70,7 @@ class Law(NamedTuple):
     params: Callable[[Gains, NominalModel], Any]
     tuned: tuple[str, ...]  # names of the gains
     feedforward: str = NONE  # model of the feedforward
-    # of a search; None: by the lag of the loop and the constants above
+    # gains at which a search begins; None: by the lag of the loop and the constants above
     initial: Gains | None = None
     linear: bool = True  # near e = 0
 

@@ -32,7 +32,7 @@ MIN_BAND_NOISE_FLOORS = 4.0
 """Least half-width of the settling band of a measured error, in noise floors. 500 samples of normal
 noise stay within 4 with a probability of 97 %."""
 
-# of the value of an entry that the flight shows: half of the deviation before it
+# share of the value of an entry that the flight shows: half of the deviation before the flight
 MAX_DEVIATION = 0.15
 
 LONGEST_INTERVAL = 1.0

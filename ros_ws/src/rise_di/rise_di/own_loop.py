@@ -69,7 +69,7 @@ class Loop:
         self.measured = self.config.measured
         self.period = seconds(self._controller.period_ns)
         self._now_ns = -1  # of the last tick
-        # of the last tick; None where nothing is to be sent
+        # output of the last tick; None where nothing is to be sent
         self.output: ControlOutput | None = None
         self.lost = ""  # why a sample of the last tick is lost; empty where none is
 
@@ -341,7 +341,7 @@ def as_control(
         law.engage(Measurements(y=zero, y_m=zero, y_m_dot=zero, u_trim=zero, u_before=zero), params)
     )
     sizes = [value.size for value in start.values()]
-    # so that x = 0 is the engagement in trim
+    # an offset, so that x = 0 is the engagement in trim
     offset = np.concatenate([value.ravel() for value in start.values()])
     ends = np.cumsum(sizes)
 

@@ -64,7 +64,7 @@ from rise_di_controller.law.linear_loop import (
 )
 from rise_di_controller.law.saturation import Limits
 
-# of the delay margin, where the nominal loop with an observer has to be stable
+# parts of the delay margin at which the nominal loop with an observer has to be stable
 MARGIN_PARTS = (0.0, 0.5, 1.0)
 
 MAX_DELAY_PERIODS = 100

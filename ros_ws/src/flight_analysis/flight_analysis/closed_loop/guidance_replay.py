@@ -141,16 +141,16 @@ class _Comparison:
         goes_on: bool,
     ) -> FloatArray:
         """The channels of a step after a state, then u_m. `goes_on`: a failed step."""
-        flown = int(channels["route"])
+        route = int(channels["route"])
         if goes_on and previous is not None:
             state, commands = previous, Commands()
         else:
-            state, commands = guidance.step(previous, inputs, self._legs[flown], self._params)
+            state, commands = guidance.step(previous, inputs, self._legs[route], self._params)
         sample = guidance.Sample(
             inputs=inputs,
             state=state,
             commands=commands,
-            route=flown,
+            route=route,
             link_age=channels[LINK_AGE],
             failed=int(channels[FAILED]),
         )

@@ -200,15 +200,15 @@ def replay(
     """
     if isinstance(run, Tape):
         return _replay(run, parameters, others, changes)
-    read = _as_run(run)
-    recorded = recorded_arithmetic(read.metadata)
+    log = _as_run(run)
+    arithmetic = recorded_arithmetic(log.metadata)
     require(
-        recorded == ARITHMETIC,
+        arithmetic == ARITHMETIC,
         "arithmetic",
-        recorded,
+        arithmetic,
         f"{ARITHMETIC}: a later version recorded the log",
     )
-    return _replay(read, parameters, others, changes)
+    return _replay(log, parameters, others, changes)
 
 
 def _replay(
@@ -259,13 +259,13 @@ def _replay(
 def _require_same_channels(recorded: ControllerConfig, others: ControllerConfig) -> None:
     """Raise ParameterError for parameters with other channels than the recorded ones."""
     for key, names in (("outputs", "measured"), ("inputs", "inputs"), ("effectors", "effectors")):
-        wanted = getattr(recorded, names)
-        declared = getattr(others, names)
+        before = getattr(recorded, names)
+        after = getattr(others, names)
         require(
-            declared == wanted,
+            after == before,
             f"controller.{key}",
-            ", ".join(declared),
-            f"{', '.join(wanted)}, as recorded",
+            ", ".join(after),
+            f"{', '.join(before)}, as recorded",
         )
 
 
@@ -318,23 +318,18 @@ def _recorded(
     Raises ParameterError.
     """
     if isinstance(run, Tape):
-        scenario = run.scenario
-        controller = (
-            scenario.controller
-            if parameters is None and isinstance(scenario, Scenario)
-            else parameters
-        )
-        return (
-            run,
-            as_controller(controller, "parameters"),
-            run.changes if changes is None else changes,
-        )
-    controller = (
-        recorded_parameters(run.scenario_file())
-        if parameters is None
-        else as_controller(parameters, "parameters")
-    )
-    return run.tape, controller, recorded_changes(run, controller) if changes is None else changes
+        if parameters is None and isinstance(run.scenario, Scenario):
+            parameters = run.scenario.controller
+        if changes is None:
+            changes = run.changes
+        return run, as_controller(parameters, "parameters"), changes
+    if parameters is None:
+        controller = recorded_parameters(run.scenario_file())
+    else:
+        controller = as_controller(parameters, "parameters")
+    if changes is None:
+        changes = recorded_changes(run, controller)
+    return run.tape, controller, changes
 
 
 def recorded_changes(run: RecordedRun, parameters: ControllerConfig) -> Sequence[Change]:

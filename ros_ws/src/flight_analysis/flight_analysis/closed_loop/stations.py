@@ -98,12 +98,10 @@ class Topics:
             self._stamps[topic].append(sample.stamp_ns)
             self._rows[topic].append(sample.value)
         for channels, take in self._subscriptions.get(topic, ()):
-            wanted = (
-                sample.value
-                if channels is None
-                else select(channels, self._names[topic], sample.value)
-            )
-            take(StampedVector(sample.stamp_ns, wanted), t_ns)
+            values = sample.value
+            if channels is not None:
+                values = select(channels, self._names[topic], values)
+            take(StampedVector(sample.stamp_ns, values), t_ns)
 
     def pop_signals(self) -> dict[str, Signal]:
         """The recorded samples since the last call, by topic."""

@@ -83,19 +83,22 @@ def guarantee(linear: LinearLoop, late: float = 0.0) -> Guarantee:
     )
     if not is_stable(linear.nominal, linear.law, linear.loop, np.zeros(m)):
         return none
-    whole = uncertain_loop(linear.nominal, linear.law, linear.loop, box, late)
+    uncertain = uncertain_loop(linear.nominal, linear.law, linear.loop, box, late)
     first = _first_unstable(linear, late)
     size = (1.0 if first is None else first.deviation) / largest
-    stable = largest * _proved(parts_of(whole), size, disks=False, exact=first is None)
+    stable = largest * _proved(parts_of(uncertain), size, disks=False, exact=first is None)
     promise = none._replace(stable=stable, unstable=first)
     if not promise.holds:
         return promise
     loops = _loops(linear, late)
     worst = [worst_in_box(linear.nominal, linear.law, loop, box).worst for loop in loops]
     every = tuple(range(m))
-    disk_all = _disk(whole, every, min(float(least.disk_all) for least in worst))
+    disk_all = _disk(uncertain, every, min(float(least.disk_all) for least in worst))
     # disks in all inputs at once cover a disk in one
-    disks = [_disk(whole, (i,), min(float(least.disk[i]) for least in worst)) for i in every]
+    disks = []
+    for i in every:
+        least_found = min(float(least.disk[i]) for least in worst)
+        disks.append(_disk(uncertain, (i,), least_found))
     return promise._replace(disk=np.maximum(disks, disk_all), disk_all=disk_all)
 
 
@@ -121,9 +124,9 @@ def _first_unstable(linear: LinearLoop, late: float) -> Unstable | None:
     return least
 
 
-def _disk(whole: UncertainLoop, inputs: tuple[int, ...], least: float) -> float:
+def _disk(loop: UncertainLoop, inputs: tuple[int, ...], least: float) -> float:
     """The disk margin of every aircraft of the box, with the least one found."""
-    return _proved(parts_of(whole, inputs), min(least, WIDEST_DISK), disks=True)
+    return _proved(parts_of(loop, inputs), min(least, WIDEST_DISK), disks=True)
 
 
 def _proved(parts: list[Channels], least: float, *, disks: bool, exact: bool = False) -> float:
@@ -154,7 +157,8 @@ def _boxes(parts: list[Channels], size: float, most: int, *, disks: bool) -> int
     """The number of boxes with which each part is proved; None if `most` are not enough."""
     remaining = most
     for part in parts:
-        used = boxes_until_proved(part, *((1.0, size) if disks else (size, 0.0)), remaining)
+        deviation, disk = (1.0, size) if disks else (size, 0.0)
+        used = boxes_until_proved(part, deviation, disk, remaining)
         if used is None:
             return None
         remaining -= used

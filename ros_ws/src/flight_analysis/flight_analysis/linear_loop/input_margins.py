@@ -45,14 +45,14 @@ gain margin and S."""
 NO_MODE = 1e-6
 # magnitude of an eigenvalue of a motion ended within a period: a delayed input, or rounding
 VANISHED = 1e-9
-# of the vectors of the modes, Frobenius: S is exact to 1e-9 below it
+# largest condition of the vectors of the modes, Frobenius: S is exact to 1e-9 below
 MOST_CONDITION = 1e6
 BATCH = 16  # aircraft computed together: larger arrays leave the cache
 # entries of a complex matrix below which OpenBLAS starts no threads: threads would only wait
 SERIAL_SIZE = 4000
 # rad, phase of -L at the lowest frequency below which L is taken as real there
 PHASE_AT_ZERO = 0.01
-# of `scaled_norm`, and of the search for the peak
+# rounds of `scaled_norm`, and of the search for the peak
 BALANCED_ROUNDS = 6
 DESCENT_STEPS = 40
 MAX_REFINED = 40
@@ -411,7 +411,7 @@ def _refined(
     The method is regula falsi, Illinois.
     """
     aircraft, place, channel = places
-    # of the input of each crossing alone
+    # the rows and columns of the input of the crossing alone
     forms = SchurForm(
         form.T[aircraft], form.R[aircraft, :, channel, None], form.L[aircraft, None, channel]
     )

@@ -61,7 +61,7 @@ class LoopMargins(NamedTuple):
     modes: SlowModes  # of the nominal aircraft
     delay: float  # s, delay margin of the nominal aircraft, u late in all inputs
     channel_delay: tuple[float, ...]  # s, u late in one input alone
-    # of the uncertain aircraft, each figure by itself; None without any
+    # least of the uncertain aircraft, figure by figure; None without any
     worst: Margins | None = None
     worst_delay: float | None = None  # s
     aircraft: int = 0  # number of uncertain aircraft

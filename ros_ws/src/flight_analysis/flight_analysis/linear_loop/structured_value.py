@@ -21,7 +21,7 @@ from rise_di_controller.law.linear_loop import SPECTRAL_RADIUS_TOLERANCE
 
 RADIUS = 1.0 + SPECTRAL_RADIUS_TOLERANCE  # abs(z) of the limit of stability
 
-# of the search for D and G
+# rounds of the search for D and G
 BALANCE_ROUNDS = 6
 LARGEST_G = 1e3
 LEVELS = 40

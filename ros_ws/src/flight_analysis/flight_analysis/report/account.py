@@ -63,19 +63,20 @@ class Account(NamedTuple):
 
     def over(self, *topics: str) -> str:
         """The part of these topics that a figure is taken over; empty for whole topics."""
-        named = {name: self.topics[name] for name in topics if name in self.topics}
+        accounts = {name: self.topics[name] for name in topics if name in self.topics}
         parts = [
             f"{math.floor(100.0 * topic.share)} % of {name}"
-            for name, topic in named.items()
+            for name, topic in accounts.items()
             if topic.share is not None and not topic.holds(topic.found)
         ]
         return f"over {', '.join(parts)}" if parts else ""
 
     def notes(self) -> tuple[str, ...]:
         """Sentences for the user of a log."""
-        # which notes tell of
+        # notes tell of these
         lacks = [lack for lack in self.lacks if not any(part in lack for part in PARTS)]
-        return (*([self.busy] if self.busy else []), *(f"the log lacks {lack}" for lack in lacks))
+        busy = (self.busy,) if self.busy else ()
+        return (*busy, *(f"the log lacks {lack}" for lack in lacks))
 
     def as_json(self) -> dict[str, Any]:
         """The account for `summary.json`."""
@@ -116,10 +117,10 @@ def best_error_over(tape: Tape) -> tuple[str, Signal]:
 
 def planned_end_ns(tape: Tape) -> int | None:
     """Stamp of the planned end; None where the log does not have it."""
-    planned = (
-        tape.scenario.flight.duration if isinstance(tape.scenario, Scenario) else tape.duration
-    )
-    return None if planned is None else tape.start_ns + nanoseconds(planned)
+    duration = tape.duration
+    if isinstance(tape.scenario, Scenario):
+        duration = tape.scenario.flight.duration
+    return None if duration is None else tape.start_ns + nanoseconds(duration)
 
 
 def account(
@@ -300,14 +301,13 @@ def account_of_json(summary: Mapping[str, Any]) -> Account | None:
     content = summary.get("account")
     if content is None:
         return None
+    topics = {}
+    for name, topic in content["topics"].items():
+        topics[name] = TopicAccount(**{key: topic[key] for key in TopicAccount._fields})
+    processes = {name: ProcessAccount(**each) for name, each in content["processes"].items()}
     values: dict[str, Any] = content | {
-        "topics": {
-            name: TopicAccount(**{key: topic[key] for key in TopicAccount._fields})
-            for name, topic in content["topics"].items()
-        },
-        "processes": {
-            name: ProcessAccount(**process) for name, process in content["processes"].items()
-        },
+        "topics": topics,
+        "processes": processes,
         "commands": content["commands"] and Commands(**content["commands"]),
     }
     lists = {name: tuple(value) for name, value in values.items() if isinstance(value, list)}

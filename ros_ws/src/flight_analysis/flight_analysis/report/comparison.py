@@ -83,7 +83,7 @@ def conditions(flights: Sequence[RecordedFlight]) -> list[Condition]:
     """The parameters with unlike values, wind first, and whether a flight was in real time."""
     values = [_parameters(flight) for flight in flights]
     keys = sorted(
-        {key for each in values for key in each if not key.startswith(NO_CONDITION)},
+        {key for key in chain.from_iterable(values) if not key.startswith(NO_CONDITION)},
         key=lambda key: (not key.startswith(WINDS), key.startswith(COMPARED), key),
     )
     rows = [(key, [each.get(key, "none") for each in values]) for key in keys]

@@ -87,7 +87,7 @@ MIN_SPECTRUM_SAMPLES = 64
 HISTOGRAM_BINS = 80
 # Hz, ticks of a spectrum
 FREQUENCIES = [digit * 10.0**power for power, digit in product(range(-4, 4), (1, 2, 5))]
-# of the axis, about two pixels: shorter intervals are lengthened to it
+# share of the axis, about two pixels: shorter intervals are lengthened
 MIN_VISIBLE_FRACTION = 1 / 500
 LIMIT_VIEW_RATIO = 3.0  # a limit is in view where it is at most this many times the largest u
 

@@ -26,17 +26,16 @@ def outcome_of_log(tape: Tape, scenario: Scenario, *, simulated: bool) -> Outcom
     )
     if simulated and not {*TICKS} & {*tape.signals}:
         return UNKNOWN if is_part else NEVER_ENGAGED
-    loop = [
-        tape[name].stamp_ns for name in ("y", "y_m", *(["u"] if simulated else [])) if name in tape
-    ]
-    held = min(
-        (int(stamp_ns[-1]) if len(stamp_ns) else tape.start_ns for stamp_ns in loop),
+    names = ("y", "y_m", "u") if simulated else ("y", "y_m")
+    stamps = [tape[name].stamp_ns for name in names if name in tape]
+    last_ns = min(
+        (int(stamp_ns[-1]) if len(stamp_ns) else tape.start_ns for stamp_ns in stamps),
         default=tape.start_ns,
     )
-    planned = scenario.flight.duration if tape.duration is None else tape.duration
-    if held >= tape.start_ns + nanoseconds(planned) - LATE_TICK_NS:
+    duration = scenario.flight.duration if tape.duration is None else tape.duration
+    if last_ns >= tape.start_ns + nanoseconds(duration) - LATE_TICK_NS:
         return COMPLETED
-    return UNKNOWN if is_part else log_ends_at(seconds(held - tape.start_ns), planned)
+    return UNKNOWN if is_part else log_ends_at(seconds(last_ns - tape.start_ns), duration)
 
 
 def flown(tape: Tape) -> Tape:

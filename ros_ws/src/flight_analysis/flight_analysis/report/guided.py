@@ -52,7 +52,7 @@ PATHS = (Lateral.ORBIT, Lateral.ROUTE, Lateral.PLACE)
 """Modes with an error in m: beside a path, or from a place."""
 
 
-class Held(NamedTuple):
+class HoldErrors(NamedTuple):
     """Errors of a held quantity over a segment, in SI.
 
     A segment with a begin outside the band has overshoot and settling.
@@ -83,9 +83,9 @@ class Segment(NamedTuple):
     start: float  # s
     stop: float  # s
     leg: int | None  # number of the leg of a route, from 0 as in `target`
-    lateral: Held
-    vertical: Held
-    V: Held
+    lateral: HoldErrors
+    vertical: HoldErrors
+    V: HoldErrors
 
 
 def segments(tape: Tape) -> list[Segment]:
@@ -98,19 +98,20 @@ def segments(tape: Tape) -> list[Segment]:
     times = sample_times(tape["guidance"].stamp_ns)
     log = tape["guidance"]
     targets = [f"target.{name}" for name in TARGETS]
-    named = ["mode.lateral", "mode.vertical", "leg", *targets, "joining"]
-    columns = np.column_stack([log[name] for name in named])
-    follows = [k for k, name in enumerate(named) if name in {"target.altitude", "target.climb"}]
-    # they change along the leg
+    names = ["mode.lateral", "mode.vertical", "leg", *targets, "joining"]
+    columns = np.column_stack([log[name] for name in names])
+    # The altitude and the climb of a profile change along the leg.
+    follows = [k for k, name in enumerate(names) if name in {"target.altitude", "target.climb"}]
     columns[np.ix_(log["mode.vertical"] == Vertical.PROFILE, follows)] = 0.0
     changes = np.any(np.diff(columns, axis=0) != 0.0, axis=1)
     starts = [0]
     for k in np.flatnonzero(changes) + 1:
         if t[k] - t[starts[-1]] >= SETTLING_DWELL:
             starts.append(int(k))
-    flown = []
+    result = []
     for first, after in zip(starts, [*starts[1:], len(t)], strict=True):
-        last = after - 1  # its modes and commands are those that the segment ends with
+        # The segment ends with the modes and the commands of its last sample.
+        last = after - 1
         lateral = Lateral(int(log["mode.lateral"][last]))
         vertical = Vertical(int(log["mode.vertical"][last]))
         on_path = "xtrack" if lateral in PATHS else lateral.name.lower()
@@ -119,13 +120,23 @@ def segments(tape: Tape) -> list[Segment]:
             "altitude" if vertical is Vertical.PROFILE else vertical.name.lower(),
             "V",
         )
-        held = [
-            _held(name, t[first:after], errors[name][first:after], times[first:after])
+        errors_of_segment = [
+            _hold_errors(name, t[first:after], errors[name][first:after], times[first:after])
             for name in quantities
         ]
         leg = int(log["leg"][last]) if lateral is Lateral.ROUTE else None
-        flown.append(Segment(float(t[first]), float(t[min(after, len(t) - 1)]), leg, *held))
-    return flown
+        lateral_errors, vertical_errors, speed_errors = errors_of_segment
+        result.append(
+            Segment(
+                start=float(t[first]),
+                stop=float(t[min(after, len(t) - 1)]),
+                leg=leg,
+                lateral=lateral_errors,
+                vertical=vertical_errors,
+                V=speed_errors,
+            )
+        )
+    return result
 
 
 def flown_legs(tape: Tape) -> list[FlownLeg]:
@@ -133,29 +144,29 @@ def flown_legs(tape: Tape) -> list[FlownLeg]:
     t = tape.time("guidance")
     log = tape["guidance"]
     legs = np.where(log["mode.lateral"] == Lateral.ROUTE, log["leg"], -1.0)
-    chosen = log["given"].astype(np.int64) & bits(("leg",))  # a leg chosen again begins again
-    edges = np.flatnonzero((np.diff(legs) != 0.0) | (chosen[1:] != 0)) + 1
-    flown = []
+    # A leg that is commanded again begins again.
+    commands = log["given"].astype(np.int64) & bits(("leg",))
+    edges = np.flatnonzero((np.diff(legs) != 0.0) | (commands[1:] != 0)) + 1
+    result = []
     for first, after in zip([0, *edges], [*edges, len(t)], strict=True):
         if legs[first] < 0.0 or first == after:
             continue
         on_leg = np.flatnonzero(log["joining"][first:after] == 0.0)
-        ends = after < len(t) and not chosen[after]
+        ends = after < len(t) and not commands[after]
         ends = ends and legs[after] == legs[first] + 1.0
-        missed = float(log["missed"][after]) if ends else 0.0
-        result = "not ended" if not ends else "missed" if missed else "flown"
-        joined = float(t[first + on_leg[0]]) if len(on_leg) else None
-        flown.append(
+        distance = float(log["missed"][after]) if ends else 0.0
+        outcome = "missed" if distance else "flown"
+        result.append(
             FlownLeg(
                 leg=int(legs[first]),
                 start=float(t[first]),
-                joined=joined,
+                joined=float(t[first + on_leg[0]]) if len(on_leg) else None,
                 stop=float(t[min(after, len(t) - 1)]),
-                result=result,
-                missed=missed,
+                result=outcome if ends else "not ended",
+                missed=distance,
             )
         )
-    return flown
+    return result
 
 
 def unflown_legs(tape: Tape, section: GuidanceConfig) -> range:
@@ -391,13 +402,15 @@ def flown_speed(tape: Tape, trim: float) -> FloatArray:
     return trim + log["y.V"] if "y.V" in log.names else over_ground
 
 
-def _held(quantity: str, t: FloatArray, error: FloatArray, times: FloatArray) -> Held:
+def _hold_errors(quantity: str, t: FloatArray, error: FloatArray, times: FloatArray) -> HoldErrors:
     metrics = error_metrics(error, times)
     first = float(error[0])
     if abs(first) <= BANDS[quantity]:
-        return Held(quantity, *metrics, None, None)
+        return HoldErrors(quantity, *metrics, None, None)
     overshoot = float(np.max(-error * math.copysign(1.0, first), initial=0.0))
-    return Held(quantity, *metrics, overshoot, settling_time(t, error, BANDS[quantity], math.inf))
+    return HoldErrors(
+        quantity, *metrics, overshoot, settling_time(t, error, BANDS[quantity], math.inf)
+    )
 
 
 def guidance_notices(tape: Tape, section: GuidanceConfig | None) -> list[str]:

@@ -132,7 +132,9 @@ def _airframes(tape: Tape, aircraft: AircraftConfig | None) -> list[Airframe]:
     names = {f"{group}.{state}" for group in "xf" for state in aircraft.sampled_airframe().states}
     if not names <= set(tape["truth"].names):
         return []
-    return [aircraft.sampled_airframe(), *([aircraft.drifted_airframe()] if aircraft.drift else [])]
+    if aircraft.drift:
+        return [aircraft.sampled_airframe(), aircraft.drifted_airframe()]
+    return [aircraft.sampled_airframe()]
 
 
 def _has_wind(tape: Tape, aircraft: AircraftConfig | None) -> bool:

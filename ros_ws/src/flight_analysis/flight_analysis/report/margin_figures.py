@@ -98,16 +98,13 @@ def _cell(value: float, worst: float | None, form: str) -> str:
     """A value, and the value of the worst aircraft in parentheses."""
 
     def text(number: float) -> str:
-        return (
-            NO_VALUE
-            if math.isnan(number)
-            else "none"
-            if math.isinf(number)
-            else format(number, form)
-        )
+        if math.isnan(number):
+            return NO_VALUE
+        return "none" if math.isinf(number) else format(number, form)
 
-    alone = worst is None or math.isnan(worst) or form == ALONE
-    return text(value) if worst is None or alone else f"{text(value)} ({text(worst)})"
+    if worst is None or math.isnan(worst) or form == ALONE:
+        return text(value)
+    return f"{text(value)} ({text(worst)})"
 
 
 LEAST_MARGINS = {

@@ -78,17 +78,17 @@ def write_figure(
         NARROWEST <= metres <= WIDEST, "width", f"{width}", "30 mm to 1 m, with a unit as in 88mm"
     )
     outputs, errors, inputs = channels_by_title(flights).values()
-    known = [*outputs, *inputs, *errors]
-    wanted = as_names(channels, "channels", "names of channels: q,V,elevator") or tuple(outputs)
-    for name in wanted:
-        require(name in known, "channels", f"{name!r}", one_of(known, name))
+    names = [*outputs, *inputs, *errors]
+    rows = as_names(channels, "channels", "names of channels: q,V,elevator") or tuple(outputs)
+    for name in rows:
+        require(name in names, "channels", f"{name!r}", one_of(names, name))
     inches = metres / (FOOT / 12.0)
     with mpl.rc_context(STYLE):
         figure = Figure(
-            figsize=(inches, ROW_RATIO * inches * len(wanted) + LEGEND_HEIGHT), layout="constrained"
+            figsize=(inches, ROW_RATIO * inches * len(rows) + LEGEND_HEIGHT), layout="constrained"
         )
-        grid = figure.subplots(len(wanted), 1, sharex=True, squeeze=False)[:, 0]
-        for axes, name in zip(grid, wanted, strict=True):
+        grid = figure.subplots(len(rows), 1, sharex=True, squeeze=False)[:, 0]
+        for axes, name in zip(grid, rows, strict=True):
             draw_channel(axes, flights, name)
         grid[-1].set_xlabel("t (s)")
         grid[-1].set_xlim(0.0, last_instant(flights))
@@ -140,11 +140,18 @@ def draw_channel(
             first.tape, first.tape["y_m"], color=REFERENCE, linewidth=3.0 * line_width, label="y_m"
         )
     for label, (tape, _, colour) in runs_of(flights).items():
-        signal = best_error(tape)[1] if is_error else tape.signals.get("y" if is_output else "u")
-        if signal is not None and plain in signal.names:
-            drawn = {} if is_output else {"drawstyle": "steps-post"}
-            shown = label if len(flights) > 1 else ("y" if is_output and not is_error else "")
-            plot(tape, signal, color=colour, linewidth=line_width, label=shown, **drawn)
+        if is_error:
+            signal: Signal | None = best_error(tape)[1]
+        else:
+            signal = tape.signals.get("y" if is_output else "u")
+        if signal is None or plain not in signal.names:
+            continue
+        style = {} if is_output else {"drawstyle": "steps-post"}
+        # A single flight needs no name; its y is told from y_m.
+        legend = label
+        if len(flights) == 1:
+            legend = "y" if is_output and not is_error else ""
+        plot(tape, signal, color=colour, linewidth=line_width, label=legend, **style)
     axes.set_ylabel(("e of " if is_error else "") + channel_label(plain, units))
     axes.grid(alpha=0.3, linewidth=0.4)
     axes.spines[["top", "right"]].set_visible(False)

@@ -25,7 +25,7 @@ from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 
 T = TypeVar("T", bound=np.generic)
-# of a curve over the page's width: above the smallest and the largest value of each pixel
+# points of a curve over the page's width; above, a pixel has the smallest and the largest value
 MAX_POINTS = 2400
 LEVEL = 4  # of zlib: of the samples of a flight 1 % larger than with 6, in 60 % of the time
 PACKERS = 2  # threads that pack: each holds a channel twice
@@ -67,7 +67,7 @@ class SampleStore:
         # compression leaves the interpreter to the other threads
         self._pool = ThreadPoolExecutor(PACKERS)
         self._instants: dict[tuple[str, int, bool], Instants] = {}
-        # of stamps by their id, which the stamps keep
+        # digests of stamps by id, with the stamps, so that no id comes twice
         self._digests: dict[int, tuple[str, NDArray[np.int64]]] = {}
         self._times: dict[int, tuple[str, NDArray[np.int64]]] = {}
 

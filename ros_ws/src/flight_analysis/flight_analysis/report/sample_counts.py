@@ -168,7 +168,9 @@ def _periods(tape: Tape, scenario: Scenario, *, simulated: bool) -> dict[str, in
         return {"y_m": _period(tape, "y_m", y_m_ns)}
     y_ns = period_ns(scenario.aircraft.rate, "aircraft.rate")
     has_truth = _is_of_stack(tape, "truth")
-    recorded = {"y", "y_m", *tape.signals, *tape.recording, *(["truth"] if has_truth else [])}
+    recorded = {"y", "y_m", *tape.signals, *tape.recording}
+    if has_truth:
+        recorded.add("truth")
     nominal_ns = {"y": y_ns, "truth": y_ns, "pose": scenario.aircraft.pose_every() * y_ns}
     if not _is_of_stack(tape, "u"):
         nominal_ns["u"] = period_ns(scenario.controller.rate, "controller.rate")

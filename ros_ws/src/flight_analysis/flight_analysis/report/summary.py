@@ -188,9 +188,11 @@ def summarise(
     if "internals" in tape:
         ticks = tick_metrics(tape, period_ns(scenario.controller.rate, "controller.rate"))
     age = age_metrics(tape)
-    if tape.start_ns > SINCE_EPOCH_NS and not ends_last(tape, "internals"):  # in real time
+    is_real_time = tape.start_ns > SINCE_EPOCH_NS
+    if is_real_time and not ends_last(tape, "internals"):
         flight_account = _with_late_ticks(flight_account, ticks, scenario)
     busy = flight_account.busy
+    busy_notes = [busy] if busy else []
     summary = empty_summary(scenario, judged(outcome, tape, scenario, flight_account)) | {
         "duration": _duration(tape, flight_account),
         "error": best_error(tape)[0],
@@ -211,7 +213,7 @@ def summarise(
         ],
         "account": flight_account.as_json(),
         "notes": [
-            *([busy] if busy else []),
+            *busy_notes,
             *late_u(scenario, age),
             *(note for note in tape.notes if note != busy),
             *saturation_notes(tape),
@@ -225,14 +227,14 @@ def summarise(
 
 def _flown_scenario(tape: Tape, scenario: Scenario | None) -> Scenario:
     """The scenario of a flight, else the scenario on the tape. Raises ParameterError without."""
-    flown = as_tape(tape).scenario if scenario is None else scenario
+    of_flight = as_tape(tape).scenario if scenario is None else scenario
     require(
-        flown is not None,
+        of_flight is not None,
         "scenario",
         "none on the tape of a log",
         "summarise(run.tape, recorded_scenario(run))",
     )
-    return as_scenario(flown)
+    return as_scenario(of_flight)
 
 
 def _require_topics(tape: Tape) -> None:

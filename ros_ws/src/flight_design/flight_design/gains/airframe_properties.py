@@ -223,12 +223,11 @@ def marginal_sentence(facts: Sequence[AirframeFacts]) -> str:
     names = [airframe.name for airframe in facts if airframe.zero_dynamics is ZeroDynamics.MARGINAL]
     if not names:
         return ""
-    integrate = (
-        f": {', '.join(states)} integrate{'s' if len(states) == 1 else ''} the outputs"
-        if states
-        else ""
-    )
-    where = f"{integrate} ({', '.join(names)})"
+    integrals = ""
+    if states:
+        verb = "integrates" if len(states) == 1 else "integrate"
+        integrals = f": {', '.join(states)} {verb} the outputs"
+    where = f"{integrals} ({', '.join(names)})"
     return (
         "Zeros at the origin are outside Assumption 3, an outer loop has to bound their "
         f"states{where}."

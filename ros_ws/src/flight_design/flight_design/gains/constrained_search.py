@@ -75,9 +75,13 @@ def descend(
     while best.shortage:
         if reach > REACH:
             return best
-        moved = [*channels, *([list(channels)] if moves.is_joint else [])]
+        directions: list[int | list[int]] = [*channels]
+        if moves.is_joint:
+            directions.append([*channels])
         places = [
-            place for i in moved for place in _moved(best.place, i, reach, moves.mending, bounds)
+            place
+            for i in directions
+            for place in _moved(best.place, i, reach, moves.mending, bounds)
         ]
         trials = assess(places)
         nearest = min(trials, key=lambda trial: (trial.shortage, trial.cost), default=best)

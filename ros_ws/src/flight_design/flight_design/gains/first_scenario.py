@@ -218,11 +218,13 @@ def scenario_text(heading: Iterable[str], sections: Sections) -> str:
     `gain_yaml.as_yaml` writes a whole section. Empty lines of the heading, and keys without a
     value, None or {}, are left out.
     """
-    kept = {
-        name: rows
-        if isinstance(rows, str)
-        else {key: value for key, value in rows.items() if value is not None and value != {}}
-        for name, rows in sections.items()
-    }
+    rows = {name: _with_values(section) for name, section in sections.items()}
     lines = LICENCE + "#\n" + comment(filter(None, heading))
-    return SCENARIO_YAML.render(heading=lines.rstrip("\n"), sections=kept, comments=COMMENTS)
+    return SCENARIO_YAML.render(heading=lines.rstrip("\n"), sections=rows, comments=COMMENTS)
+
+
+def _with_values(section: Mapping[str, Any] | str) -> Mapping[str, Any] | str:
+    """A section without the keys that have no value; a text as it is."""
+    if isinstance(section, str):
+        return section
+    return {key: value for key, value in section.items() if value is not None and value != {}}

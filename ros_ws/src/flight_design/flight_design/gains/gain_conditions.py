@@ -99,7 +99,9 @@ class Condition(NamedTuple):
     @property
     def side(self) -> str:
         """The relation in words: the value is "at least", "at most" or "above" the bound."""
-        return "above" if self.strict else "at least" if self.at_least else "at most"
+        if self.strict:
+            return "above"
+        return "at least" if self.at_least else "at most"
 
     @property
     def holds(self) -> bool:

@@ -79,7 +79,7 @@ on the `osprey`."""
 INPUT_LIMITS = ("lower", "upper", "slew")
 
 
-# of the search for the speed up to which the delay margin lasts
+# step of the search for the speed up to which the delay margin lasts
 SPEED_STEP = 0.05
 MAX_SPEED_RATIO = 3.0
 

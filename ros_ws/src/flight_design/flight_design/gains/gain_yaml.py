@@ -243,12 +243,10 @@ def margins_sentence(controller: ControllerConfig, margins: LoopMargins | None) 
     phases = ", ".join(f"{name} {phase:.0f}" for name, phase in each)
     largest = float(margins.nominal.sensitivity.max())
     damping = float(margins.nominal.damping)
-    worst = (
-        ""
-        if margins.worst is None
-        else f"; worst {'found' if margins.by_search else f'of {margins.aircraft}'} "
-        f"{np.degrees(margins.worst.phase.min()):.0f} deg"
-    )
+    worst = ""
+    if margins.worst is not None:
+        origin = "found" if margins.by_search else f"of {margins.aircraft}"
+        worst = f"; worst {origin} {np.degrees(margins.worst.phase.min()):.0f} deg"
     return (
         f"Phase margins {phases} deg{worst}; largest sensitivity {largest:.2f}, damping "
         f"{damping:.2f}."

@@ -86,7 +86,7 @@ def air_response(plant: LinearPlant, law: LinearLaw, loop: Loop, air: Air) -> Ai
     noise = measured * air.noise
     covariance, transition = _turbulent(matrix, blown, noise, loop.period, air)
     variance = np.einsum("ij,jk,ik->i", C, covariance[:n, :n], C)
-    # of u = K z + D v, and of its value a tick later
+    # rows of u = K z + D v, and of its value a tick later
     K = np.hstack([law.D @ C_sampled, law.C, law.D @ air.reading])
     direct = law.D * air.noise
     after = transition @ covariance @ K.T

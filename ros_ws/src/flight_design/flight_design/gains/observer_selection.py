@@ -54,7 +54,7 @@ from rise_di_controller.law.linear_loop import LinearPlant
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di_config import RiseDiConfig
 
-# of the uncertain aircraft whose least phase margin counts
+# deviation of the uncertain aircraft whose least phase margin counts
 WORST_UNCERTAINTY = 0.3
 # 1/s, of a zero on the right: the aircraft diverges so fast while its outputs are held
 FASTEST = 1e-3

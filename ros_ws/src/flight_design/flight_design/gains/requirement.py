@@ -59,7 +59,7 @@ MOVES = Moves(mending=(*CHEAPER, (-1, 1), (1, 0), (0, 1)), cheaper=CHEAPER)
 slow disturbance grows with slower lower^2: only moves with a + 2 b <= 0 can lower the cost."""
 
 NO_ERROR = 1e-12  # SI: an error below it costs nothing
-# by which the nominal phase margin rises while the worst aircraft has too little
+# step of the nominal phase margin while the worst aircraft has too little
 WORST_STEP = math.radians(2.5)
 MAX_WORST_STEPS = 8
 

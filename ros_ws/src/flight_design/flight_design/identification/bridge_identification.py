@@ -50,16 +50,17 @@ class Excitation(NamedTuple):
 
 
 EXCITATIONS: Mapping[str, Excitation] = {
-    "V": Excitation(1.0, 12.0, 0.1, 0.8),  # engines take longer
-    "climb": Excitation(
-        0.8, 10.0, 0.1, 1.5
-    ),  # the climb is an integral: slow commands move it more than its noise
+    # Engines take longer.
+    "V": Excitation(width=1.0, period=12.0, lowest=0.1, highest=0.8),
+    # The climb is an integral: slow commands move it more than its noise.
+    "climb": Excitation(width=0.8, period=10.0, lowest=0.1, highest=1.5),
 }
 """By the motion that the input causes; another input turns the aircraft."""
 PAUSE = 1.5  # s, between the inputs
 
-AGE = 1.5  # failsafe of the controller: its age limit per largest one of the bridge
-HOLD = 0.5  # which acts first; s
+# Failsafe of the controller: its age limit over the largest one of the bridge, which acts first.
+AGE = 1.5
+HOLD = 0.5  # s
 RAMP = 2.0  # s
 WAIT = 30.0  # s before the first command of the flight: the time to engage
 
@@ -143,7 +144,10 @@ def experiment(
     pairing, sign = channel_pairs(channel_map)
     rows = [channel_map.inputs[name] for name in pairing.inputs]
     m = len(rows)
-    chosen = [EXCITATIONS.get(motion, Excitation()) for motion in motions(channel_map).values()]
+    excitations = [
+        EXCITATIONS.get(motion, Excitation()) for motion in motions(channel_map).values()
+    ]
+    values_by_key = zip(Excitation._fields, zip(*excitations, strict=True), strict=True)
     controller = ExcitationConfig.validate_mapping(
         controller_values(channel_map, pairing)
         | {
@@ -155,10 +159,7 @@ def experiment(
             "amplitude": [amplitude * min(-row.lower, row.upper) for row in rows],
             "pause": PAUSE,
         }
-        | {
-            key: list(values)
-            for key, values in zip(Excitation._fields, zip(*chosen, strict=True), strict=True)
-        },
+        | {key: list(values) for key, values in values_by_key},
         "controller",
     )
     second_order = {"natural_frequency": [1.0] * m, "damping": [1.0] * m}
@@ -218,38 +219,34 @@ def channel_models(
     pairing, sign = channel_pairs(channel_map)
     y = tape["y"].within(spans)
     u = tape["u"].within(spans)
-    gravity = (
-        gravity_along_path(tape["pose"], speed) if "pose" in tape and speed is not None else None
-    )
-    moved = motions(channel_map)
-    return [
-        None
-        if moved[output] == "V" and gravity is None
-        else fit_channel(
-            y,
-            u,
-            output,
-            name,
-            direction,
-            gravity if moved[output] == "V" else None,
-            first_order=moved[output] == "climb",
+    gravity = None
+    if "pose" in tape and speed is not None:
+        gravity = gravity_along_path(tape["pose"], speed)
+    motion_by_output = motions(channel_map)
+    models: list[ChannelModel | None] = []
+    for output, name, direction in zip(pairing.outputs, pairing.inputs, sign.tolist(), strict=True):
+        motion = motion_by_output[output]
+        # Without gravity along the path V shows the phugoid in place of the thrust.
+        if motion == "V" and gravity is None:
+            models.append(None)
+            continue
+        along_path = gravity if motion == "V" else None
+        is_first_order = motion == "climb"
+        models.append(
+            fit_channel(y, u, output, name, direction, along_path, first_order=is_first_order)
         )
-        for output, name, direction in zip(
-            pairing.outputs, pairing.inputs, sign.tolist(), strict=True
-        )
-    ]
+    return models
 
 
 def gravity_along_path(pose: Signal, speed: float) -> Signal | None:
     """V_dot by gravity, -g climb / speed, m/s^2, at the stamps of a pose; None without a climb."""
     if "climb" not in pose.names:
         return None
-    known = np.isfinite(pose["climb"])
-    return (
-        Signal(pose.stamp_ns[known], ("V",), -GRAVITY / speed * pose["climb"][known, None])
-        if known.any()
-        else None
-    )
+    is_finite = np.isfinite(pose["climb"])
+    if not is_finite.any():
+        return None
+    gravity = -GRAVITY / speed * pose["climb"][is_finite, None]
+    return Signal(pose.stamp_ns[is_finite], ("V",), gravity)
 
 
 class Channels(NamedTuple):

@@ -52,10 +52,10 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 
 # s: u may cross from trim to its limit in that time, which bounds beta from below
 FULL_RANGE_TIME = 1.0
-# of the uncertain aircraft whose phase margin counts
+# deviation of the uncertain aircraft whose phase margin counts
 UNCERTAINTY = 0.3
 SAMPLES = 20
-# of a channel's loop with its integral: a gain margin of 2, a phase margin of 29 deg
+# of the loop of a channel with its integral: a gain margin of 2, a phase margin of 29 deg
 MAX_SENSITIVITY = 2.0
 INTEGRALS = np.append(np.geomspace(1.0, 0.01, 40), 0.0)  # of the wanted one, those that are tried
 

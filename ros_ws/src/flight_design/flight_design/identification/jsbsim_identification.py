@@ -73,7 +73,7 @@ DELAY = 0.006
 
 THROTTLE = list(INPUTS).index("throttle")
 
-# of the unit of an output to the noise that an observer expects: 1 mrad/s, 0.01 m/s
+# unit of an output over the noise that an observer expects: 1 mrad/s, 0.01 m/s
 NOISE_SHARE = 100.0
 
 # s, least delay margin: without A the model of an observer has no damping, and less margin than the
@@ -477,14 +477,12 @@ def _text(
         }
         guidance["guidance"] = {"rate": 50.0, "stall_speed": stall, "program": program}
     gust = {"start": commands.gust, "speed": GUST_SPEED, "length": GUST_LENGTH}
-    air = (
-        {
+    air: dict[str, Any] = {"gusts": {"vertical": gust}}
+    if learns:
+        air = {
             "turbulence": moderate_turbulence(condition.altitude),
             "sensors": {"noise": [NOISE[name] for name in OUTPUTS], "seed": 1},
         }
-        if learns
-        else {"gusts": {"vertical": gust}}
-    )
     count = len(condition.inputs())
     stops = {"lower": linear.trim.lower, "upper": linear.trim.upper}
     aircraft = {

@@ -41,9 +41,9 @@ MAX_DELAY_ERROR = 4.0
 # 1, of a value over the nominal one: 1 / (1 - MAX_ERROR), for a rough model errs by a factor either
 # way
 MAX_FACTOR = 2.5
-# of the largest effect on a row, unit of an entry that is 0: a deviation of 10 % before the flight
+# unit of an entry that is 0, over the largest effect on the row: a deviation of 10 % before the
+# flight
 COUPLING = 0.34
-# of the steps that are tried side by side
 CHANGE = 3.0  # of log-likelihood that a span has to gain by a stronger wind: odds of 20 to 1
 # 1, mean square of the innovations of a span in parts of the median one: no level explains it
 UNEXPLAINED = 5.0

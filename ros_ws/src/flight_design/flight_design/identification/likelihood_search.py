@@ -15,8 +15,10 @@ from flight_core.vectors import FloatArray
 from flight_design.identification.likelihood import Fit, Innovations, Likelihood
 
 DIFFERENCE = 1e-4  # 1, of a parameter, for the derivatives
-# of the decrease by the quadratic model: the undamped step is taken, and no damped one is tried
+# share of the decrease by the quadratic model: the undamped step is taken, and no damped one is
+# tried
 GOOD = 0.7
+# dampings of the steps that are tried side by side
 DAMPINGS = (0.0, 0.01, 0.1, 1.0, 10.0)
 FRACTIONS = (0.5, 0.25)
 # levels with which the search begins: calm air, light and moderate turbulence, gusts
@@ -24,13 +26,12 @@ STARTS = (0, 3, 4, 13)
 TURBULENT = STARTS[2]
 ALIKE = 0.8  # of the spans: so many have the same level where `fit_alike` takes it for all
 SIGNS = (-1.0, 1.0)  # of the effect of the slope of the vertical wind on q, in two further starts
-# at most, of each start, and of the search from one of the best
+# most steps of a start, and of the search from one of the best
 START_STEPS = 8
 STEPS = 12
-# starts from which the search goes on, at most, and of cost above that of the best one
-REFINED = 2
-CLOSE = 100.0
-# of the cost, a log-likelihood, in a step: a start ends, or the search
+REFINED = 2  # most starts from which the search goes on
+CLOSE = 100.0  # most cost of such a start above the cost of the best one
+# decrease of the cost, a log-likelihood, in a step below which a start ends, or the search
 START_PROGRESS = 5.0
 PROGRESS = 0.3
 

@@ -32,7 +32,8 @@ from flight_log.tape_reader import RecordedRun
 from flight_log.vehicle_tables import COPTER, PLANE, ULOG_TORQUES, Source, VehicleLog
 
 COMMANDS = "commands"  # the topic with trim + u, by input
-# of the typical airspeed, of a multicopter the typical thrust: below, the aircraft is on the ground
+# share of the typical airspeed, of a multicopter the typical thrust: below, the aircraft is on the
+# ground
 AIRBORNE = 0.5
 # percentile of either in a log, which may have more time on the ground than in the air
 TYPICAL = 90.0

@@ -68,7 +68,7 @@ from flight_design.identification.model_quality import (
 # 1, of innovations that follow the u of another part, see `correlation`: uncoupled aircraft have up
 # to 3
 FOLLOWS = 10.0
-# of log-likelihood of held-out samples by coupling: uncoupled aircraft have -20
+# gain in log-likelihood of held-out samples by coupling: uncoupled aircraft have -20
 COUPLED_GAIN = 20.0
 
 

@@ -24,8 +24,8 @@ from flight_design.identification.likelihood import (
     largest_error,
 )
 
-# of the best known effect of an input on each output: two deviations are then a fifth of the loop
-# gain
+# deviation of the best known effect of an input on each output: two deviations are then a fifth of
+# the loop gain
 MAX_DEVIATION = 0.1
 # 1 for white innovations, with a deviation of 0.3: a model with more leaves out what the aircraft
 # does

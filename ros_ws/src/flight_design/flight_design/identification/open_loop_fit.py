@@ -38,7 +38,7 @@ LOOP_FREQUENCY = 0.5  # of 1 / (delay + lag): about where the loops of `rise-di 
 MAX_ZERO_LAG = 0.5  # zero times lag; at 1 they cancel
 # 1/s: a feedforward of 100 Hz follows no faster one (rise_di_controller.params, _check_nominal)
 FASTEST_ZERO = 25.0
-# of the misfit, by which a second order has to lower it: noise alone does not in 10 s
+# factor by which a second order has to lower the misfit: noise alone does not in 10 s
 MIN_GAIN = 0.85
 # Delay s, lag s, damping 1/s, stiffness 1/s^2, zero 1/s: a slow response to slow servos, a
 # short-period or Dutch roll mode of a transport and that of a model aircraft

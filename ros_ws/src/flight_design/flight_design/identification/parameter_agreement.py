@@ -22,17 +22,18 @@ from flight_core.rates import seconds
 from flight_core.vectors import FloatArray
 from flight_log.vehicle_tables import SERVOS, Parameters
 
-# of a transmitter: Rc.msg from 0, MAVLink from 1
+# channel of a transmitter: Rc.msg from 0, MAVLink from 1
 CHANNEL = re.compile(r"channels\[(\d+)\]|chan(\d+)_raw")
-# of RCMAP, by what responds
+# axis of RCMAP, by what responds
 AXES: Mapping[str, str] = {"p": "ROLL", "q": "PITCH", "V": "THROTTLE", "r": "YAW"}
 # SERVOn_FUNCTION: aileron, elevator, throttle, rudder
 FUNCTIONS = {"ROLL": 4, "PITCH": 19, "THROTTLE": 70, "YAW": 21}
 SAME_LINE = Line(1, 1.0, 0.0)
 
-# of half the range: the effect differs by as much, below the standard errors of `identify`
+# share of half the range: the effect differs by as much, below the standard errors of `identify`
 END_TOLERANCE = 0.01
-# of half the range: the effects on the two sides of the trim differ from their mean by as much
+# share of half the range: the effects on the two sides of the trim differ from their mean by as
+# much
 TRIM_TOLERANCE = 0.05
 
 DECISIVE = re.compile(r"RCMAP_\w+|(RC|SERVO)\d+_(FUNCTION|MIN|MAX|TRIM|REVERSED)|(CA|PWM)_\w+")
@@ -155,7 +156,7 @@ def servo_of(stick: Stick, name: str, values: Mapping[str, float]) -> Servo:
     if not outputs:
         missing = f"found no servo with SERVOn_FUNCTION {function} in the log"
         raise ParameterError(f"inputs.{name}: {missing}, expected one, {sticks_instead}")
-    keys = ["MIN", *(["TRIM"] if stick.is_centred else []), "MAX", "REVERSED"]
+    keys = ["MIN", "TRIM", "MAX", "REVERSED"] if stick.is_centred else ["MIN", "MAX", "REVERSED"]
     names = [f"SERVO{outputs[0]}_{key}" for key in keys]
     absent = [key for key in names if key not in values]
     require(

@@ -43,12 +43,12 @@ FINE_U = 0.45
 FAR = 2.0
 HORIZON = 0.8  # s of the step response
 DRAWS = 200  # of the predictor's coefficients, for the covariance of the step response
-# of a coefficient: it turns a typical y or u into so many typical changes of y within a window
+# size of a coefficient: it turns a typical y or u into so many typical changes of y within a window
 PRIOR = 10.0
 MEMORY = 0.2  # s, decay of the coefficients of the predictor before the fit
 MIN_ROWS_PER_COEFFICIENT = 5.0
-# of the motion in a closed loop: then feedback of disturbances is too little to be taken for a
-# response
+# share of the motion in a closed loop: then feedback of disturbances is too little to be taken for
+# a response
 MIN_SHARE = 0.9
 # times as large as estimated: up to a tenth of the motion is feedback, a bias as large as the
 # errors

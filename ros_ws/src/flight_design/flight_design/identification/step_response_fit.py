@@ -26,8 +26,8 @@ SPREAD = np.array([1.0, 0.2, 1e3, 50.0, 2500.0, 5000.0])  # before the fit
 # an integrator, first order, second order
 ORDERS = ((1, 1, 1, 0, 0, 0), (1, 1, 1, 1, 0, 0), (1, 1, 1, 1, 1, 1))
 MIN_GAIN = 6.0  # of chi squared per parameter that a higher order has to gain
-# of chi squared, relative, at which a search ends: far below what MIN_GAIN or a standard error can
-# show
+# relative change of chi squared at which a search ends: far below what MIN_GAIN or a standard error
+# can show
 TOLERANCE = 1e-6
 EARLY = 0.3  # s after delay and lag in which the sign of a response shows
 COUPLING_SPAN = 0.25  # s after delay and lag in which other outputs respond by Omega

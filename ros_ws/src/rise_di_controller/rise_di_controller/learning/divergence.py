@@ -27,7 +27,8 @@ STEP = 0.02
 TEST = 50  # means between two tests for an oscillation, 1 s
 # correlation of e with e a period later: 0.9 in a limit cycle, at most 0.5 in turbulence and gusts
 LIKENESS = 0.7
-# of the largest rms error over WINDOW before: below this the law of the start is not clearly better
+# factor on the largest rms error over WINDOW before: below this the law of the start is not clearly
+# better
 GROWN = 1.5
 HARMLESS = 0.2  # of the rms errors that do not count as a divergence
 
@@ -77,7 +78,7 @@ class Oscillations:
 
     def __init__(self, least: FloatArray) -> None:
         """`least`: mean squares below a divergence, (m,)."""
-        # s, of the oscillations at the last test, (m,); 0 for none
+        # s, periods of the oscillations at the last test, (m,); 0 for none
         self.periods = np.zeros_like(least)
         self._least = HARMLESS**2 * least
         self._largest = np.zeros_like(least)

@@ -507,15 +507,15 @@ def designed(old: ControllerConfig, new: ControllerConfig) -> dict[str, Any]:
 
     None for what an old set, or what flies meanwhile, may have besides.
     """
-    before, after = (
-        {
-            name: value
-            for name, value in flatten(parameters.model_dump())
-            if name.split(".")[0] in DESIGNED
-        }
-        for parameters in (old, new)
-    )
+    before = _designed_values(old)
+    after = _designed_values(new)
     return dict.fromkeys([*before, *OPTIONAL]) | after
+
+
+def _designed_values(parameters: ControllerConfig) -> dict[str, Any]:
+    """The values of DESIGNED by dotted name."""
+    values = flatten(parameters.model_dump())
+    return {name: value for name, value in values if name.split(".")[0] in DESIGNED}
 
 
 def changes(old: ControllerConfig, new: ControllerConfig) -> dict[str, Any]:
