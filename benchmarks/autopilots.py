@@ -55,7 +55,7 @@ from flight_analysis.report.guided import control_errors
 from flight_analysis.report.summary import transients
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal
-from flight_design.gains.nominal import sizes
+from flight_design.gains.nominal import unit_sizes
 from flight_design.gains.observer_selection import with_extended_state_observer
 from flight_design.identification.jsbsim_identification import NOISE_SHARE
 from flight_log.tape_reader import read_run
@@ -302,7 +302,7 @@ def observed() -> dict[str, Any]:
         sys.exit(f"error: {found}: found no feedforward, expected a scenario of identify --bridge")
     rows = [model.states.index(name) for name in controller.outputs]
     Omega = np.reshape(model.B, (len(model.states), -1))[rows]
-    size = sizes("m/s" if name == "V" else "rad/s" for name in controller.outputs)
+    size = unit_sizes("m/s" if name == "V" else "rad/s" for name in controller.outputs)
     observer = with_extended_state_observer(
         controller, Omega, size / NOISE_SHARE, size, controller.delay + OBSERVER_MARGIN
     )

@@ -86,10 +86,10 @@ def original_of(name: str) -> Scenario:
         return find_scenario(name).vary(aircraft=slower, reference_model={"rate": 100.0})
     if name in {"c172p", "f16"}:
         return find_scenario(f"jsbsim_{name}")
-    from flight_design.identification.jsbsim_identification import identify  # noqa: PLC0415 - for this aircraft alone
+    from flight_design.identification.jsbsim_identification import identify_jsbsim  # noqa: PLC0415 - for this aircraft alone
 
     return parse_scenario(
-        identify(name, *CONDITIONS[name]).text.encode(), Path(f"jsbsim_{name}.yaml")
+        identify_jsbsim(name, *CONDITIONS[name]).text.encode(), Path(f"jsbsim_{name}.yaml")
     )
 
 

@@ -25,10 +25,10 @@ from aircraft_sim.jsbsim.jsbsim_aircraft import OUTPUTS
 from flight_analysis.linear_loop.input_margins import input_margins
 from flight_core.outcome import FlightEnded
 from flight_core.parameters import ParameterError
-from flight_design.gains.gain_selection import Selection, gain_candidates, select_gains
+from flight_design.gains.gain_selection import Selection, gain_candidates, gain_sets
 from flight_design.gains.relaxation import binding
 from flight_design.gains.requirement import least_fraction
-from flight_design.identification.jsbsim_identification import IdentifiedAircraft, identify
+from flight_design.identification.jsbsim_identification import IdentifiedAircraft, identify_jsbsim
 
 CONDITIONS = yaml.safe_load(Path(__file__).with_suffix(".yaml").read_text(encoding="utf-8"))
 FIVE = 5
@@ -120,7 +120,7 @@ def main() -> None:
             row = [name, f"{speed:g}", f"{altitude:g}"]
             rows.append(row)
             try:
-                identified = identify(name, speed, altitude)
+                identified = identify_jsbsim(name, speed, altitude)
             except (FlightEnded, ParameterError) as error:
                 row.append(f"{error}")
                 continue
@@ -128,7 +128,7 @@ def main() -> None:
             needed = selection.setting.requirement._replace(
                 phase=math.radians(options.phase_margin)
             )
-            more = select_gains(selection.study, selection.setting._replace(requirement=needed))
+            more = gain_sets(selection.study, selection.setting._replace(requirement=needed))
             row += [
                 verdict(selection),
                 *figures(identified),

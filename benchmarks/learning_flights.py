@@ -33,7 +33,7 @@ from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
 from flight_design.gains.gain_design import observed
 from flight_design.learning.scenario_learner import learner
-from rise_di_controller.law.linear_loop import LinearPlant, Loop, is_stable, linear_law
+from rise_di_controller.law.linear_loop import LinearPlant, LoopTiming, is_stable, linear_law
 from rise_di_controller.learning.proposals import Event
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di_config import RiseDiConfig
@@ -257,7 +257,7 @@ def is_unstable(controller: ControllerConfig, aircraft: Airframe) -> int:
         aircraft.matrix_b()[:, columns],
         aircraft.matrix_c()[rows],
     )
-    loop = Loop(np.array(controller.lag), 0.0, 1.0 / controller.rate)
+    loop = LoopTiming(np.array(controller.lag), 0.0, 1.0 / controller.rate)
     m = len(columns)
     return int(
         not is_stable(
@@ -278,9 +278,9 @@ def margin_left(controller: RiseDiConfig, chosen: Scenario) -> float:
     period = 1.0 / controller.rate
     late = aircraft.actuators.delay + aircraft.sensors.delay
     plant = linear.plant._replace(A=linear.plant.A[0], B=linear.plant.B[0])
-    if not is_stable(plant, linear.law, Loop(lag, 0.0, period), np.full(len(lag), late)):
+    if not is_stable(plant, linear.law, LoopTiming(lag, 0.0, period), np.full(len(lag), late)):
         return -1.0
-    return loop_margins(linear._replace(loop=Loop(lag, 0.0, period))).delay - late
+    return loop_margins(linear._replace(loop=LoopTiming(lag, 0.0, period))).delay - late
 
 
 class Learned(NamedTuple):

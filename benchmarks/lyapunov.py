@@ -13,7 +13,7 @@ import numpy as np
 from benchmarks.tables import plain, save_picture
 from matplotlib.figure import Figure
 
-from flight_design.gains.lyapunov import Evidence, evidence, example, fly, lemma_2
+from flight_design.gains.lyapunov import Evidence, evidence, example, fly_known_plant, lemma_2
 
 IMAGE = Path(__file__).resolve().parents[1] / "docs" / "images" / "lyapunov.png"
 DT, DURATION = 0.01, 60.0  # s
@@ -31,7 +31,7 @@ def flights() -> dict[str, Evidence]:
     zeta_b = 0.0
     for factor in (1.0, TOO_SMALL):
         params = case.params._replace(beta=factor * case.params.beta)
-        flight = fly(case.plant, case.y_m, DT, params, case.x_0)
+        flight = fly_known_plant(case.plant, case.y_m, DT, params, case.x_0)
         zeta_b = zeta_b or lemma_2(case.plant, evidence(case.plant, flight, params), params)
         evidence_by_beta[f"beta = ({', '.join(f'{b:g}' for b in params.beta)})"] = evidence(
             case.plant, flight, params, zeta_b

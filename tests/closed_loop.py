@@ -108,7 +108,9 @@ def still_air(A: FloatArray, B: FloatArray, C: FloatArray, gravity: FloatArray) 
     )
 
 
-def reference_outputs(params: model.Model, profile: Profile, dt: float, steps: int) -> FloatArray:
+def reference_outputs(
+    params: model.ReferenceMatrices, profile: Profile, dt: float, steps: int
+) -> FloatArray:
     """y_m at 0, dt, 2 dt, ..., shape (steps + 1, m), from rest."""
     x_m = np.zeros(len(params.A_m))
     matrices = model.stepper(dt, params)

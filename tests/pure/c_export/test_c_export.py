@@ -45,8 +45,8 @@ from c_export.proof import (
     Program,
     build,
     compilers,
+    proof_report,
     prove,
-    report,
     write_code,
 )
 from flight_analysis.closed_loop.replay_ticks import vary
@@ -182,7 +182,7 @@ def case(request: pytest.FixtureRequest, exported: Callable[[str], Case]) -> Cas
 
 def test_every_bit_is_equal(case: Case) -> None:
     proof = prove(case.code, compilers(), case.sets, case.recordings, float32=False)
-    assert proof.holds, report(proof, "the case")
+    assert proof.holds, proof_report(proof, "the case")
     assert proof.figures["data_bytes"] == 0  # no global
     assert proof.figures["multiply"] > 0 or shutil.which("g++") is None
     ticks = [recording for recording in case.recordings if recording.name != "drawn commands"]
@@ -249,7 +249,7 @@ def test_proof_of_another_machine(case: Case) -> None:
     proof = prove(
         case.code, commands, case.sets, case.recordings, float32=False, runner=["qemu-aarch64"]
     )
-    assert proof.holds, report(proof, "the case")
+    assert proof.holds, proof_report(proof, "the case")
     assert "aarch64-linux-gnu-gcc" in proof.compilers[0]
     with refusing("runner: found no program 'qemu-of-nothing', expected a command such as"):
         export("osprey_servo", case.code, runner="qemu-of-nothing")
@@ -387,7 +387,7 @@ def test_float32_is_within_its_bound(tmp_path: Path) -> None:
         write_code(sets[0], name, tmp_path / name, float32=True)
         recordings = flight_recordings(scenario.vary(flight={"duration": 6.0}), sets)
         proof = prove(tmp_path / name, [["gcc"]], sets, recordings, float32=True)
-        assert proof.holds, report(proof, name)
+        assert proof.holds, proof_report(proof, name)
         assert all(0.0 < comparison.deviation < FLOAT32_BOUND for comparison in proof.comparisons)
 
 

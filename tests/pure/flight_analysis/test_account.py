@@ -39,7 +39,7 @@ from flight_analysis.report.summary import (
     summarise,
     taken_over,
 )
-from flight_analysis.report.tables import Interval, flight_tables
+from flight_analysis.report.tables import EventInterval, flight_tables
 from flight_bringup.fleet import Flown, Member
 from flight_bringup.fly import fly_and_report
 from flight_cli.fleet import _Result as FleetResult
@@ -544,7 +544,7 @@ def half(whole: Path, tmp_path_factory: pytest.TempPathFactory) -> RecordedFligh
 
 def test_every_table_of_the_page_says_its_share(half: RecordedFlight) -> None:
     """The samples of a process and the margins are no figures of the flight."""
-    events = [Interval("gust", 0.0, 1.0, "1 s")]
+    events = [EventInterval("gust", 0.0, 1.0, "1 s")]
     tables = flight_tables(half.summary, half.units, events)
     captions = [table.caption for table in tables]
     assert len(captions) >= 5

@@ -20,7 +20,7 @@ from flight_analysis.linear_loop import branch_and_bound
 from flight_analysis.linear_loop import guarantee as guarantee_module
 from flight_analysis.linear_loop.guarantee import guarantee
 from flight_analysis.linear_loop.input_margins import input_margins
-from flight_analysis.linear_loop.kept_guarantee import keep, kept
+from flight_analysis.linear_loop.kept_guarantee import keep, kept_guarantee
 from flight_analysis.linear_loop.loop_margins import LinearLoop, box_of, margins, scenario_loop
 from flight_analysis.linear_loop.structured_value import (
     Scaling,
@@ -38,7 +38,7 @@ from flight_analysis.linear_loop.worst_case import worst_in_box
 from flight_analysis.report.html import write_loop_page
 from flight_analysis.report.margin_figures import guarantee_text
 from flight_core.vectors import FloatArray
-from rise_di_controller.law.linear_loop import LinearLaw, LinearPlant, Loop, closed_loop
+from rise_di_controller.law.linear_loop import LinearLaw, LinearPlant, LoopTiming, closed_loop
 
 LIMIT = 1.0 + 1e-6  # abs(z) of the limit of stability
 PERIOD = 0.01
@@ -72,7 +72,12 @@ def integrator(k: float, part: float) -> LinearLoop:
         G=np.array([[part]]),
     )
     return LinearLoop(
-        model="", inputs=("u",), plant=plant, law=law, loop=Loop(np.zeros(1), 0.0, PERIOD), box=box
+        model="",
+        inputs=("u",),
+        plant=plant,
+        law=law,
+        loop=LoopTiming(np.zeros(1), 0.0, PERIOD),
+        box=box,
     )
 
 
@@ -281,27 +286,27 @@ def _caches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_report_shows_the_guarantee_that_was_computed_for_its_loop(tmp_path: Path) -> None:
     linear = integrator(150.0, 0.1)
-    assert kept(linear) is None
+    assert kept_guarantee(linear) is None
     promise = guarantee(linear)
     keep(linear, promise._replace(late=0.01))  # a report speaks of u in time
-    assert kept(linear) is None
+    assert kept_guarantee(linear) is None
     keep(linear, promise)
-    again = kept(linear)
+    again = kept_guarantee(linear)
     assert again is not None
     assert guarantee_text(again) == guarantee_text(promise)
     write_loop_page(tmp_path / "loop.html", "loop", linear)
     assert guarantee_text(promise)[0] in (tmp_path / "loop.html").read_text()
-    assert kept(integrator(151.0, 0.1)) is None  # another gain
+    assert kept_guarantee(integrator(151.0, 0.1)) is None  # another gain
     box = linear.box
     assert box is not None
     half = box._replace(part=0.5 * box.part, F=0.5 * box.F, G=0.5 * box.G)
-    assert kept(linear._replace(box=half)) is not None  # the guarantee says its size
+    assert kept_guarantee(linear._replace(box=half)) is not None  # the guarantee says its size
     skewed = box._replace(G=box.G * np.linspace(1.0, 2.0, len(box.G))[:, None] + 1.0)
-    assert kept(linear._replace(box=skewed)) is None  # other aircraft
-    assert kept(linear._replace(box=None)) is None
+    assert kept_guarantee(linear._replace(box=skewed)) is None  # other aircraft
+    assert kept_guarantee(linear._replace(box=None)) is None
     (file,) = (tmp_path / "caches" / "rise-di" / "guarantees").iterdir()
     file.write_text("{")
-    assert kept(linear) is None
+    assert kept_guarantee(linear) is None
 
 
 def test_command_fails_below_uncertainty_and_writes_an_unstable_aircraft(tmp_path: Path) -> None:
@@ -337,6 +342,6 @@ def test_command_bounds_the_effectors_behind_an_allocation() -> None:
     words = ["gains", "x8_elevons", "--scenario", "x8_elevons", "--check", "--guarantee", "--json"]
     done = invoke(*words, "--samples", "2")
     assert done.exit_code == 1
-    promise = kept(boxed("x8_elevons"))  # of the same loop and box
+    promise = kept_guarantee(boxed("x8_elevons"))  # of the same loop and box
     assert promise is not None
     assert json.loads(done.output)["guarantee"]["stable"] == approx(promise.stable)

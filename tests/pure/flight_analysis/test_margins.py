@@ -38,9 +38,9 @@ from flight_analysis.linear_loop.loop_margins import (
 )
 from flight_core.vectors import FloatArray
 from rise_di_controller.law import linear_loop
-from rise_di_controller.law.linear_loop import LinearLaw, LinearPlant, Loop, linear_law
+from rise_di_controller.law.linear_loop import LinearLaw, LinearPlant, LoopTiming, linear_law
 
-NO_LAG = Loop(np.zeros(1), 0.0, 0.01)
+NO_LAG = LoopTiming(np.zeros(1), 0.0, 0.01)
 INTEGRATOR = LinearPlant(np.zeros((1, 1)), np.eye(1), np.eye(1))
 
 
@@ -150,7 +150,7 @@ def test_second_order_loop_has_its_damping() -> None:
     # y_dot = u through a lag tau under u = -k y: tau s^2 + s + k. 0.1 ms a tick: the hold costs 1 %
     # of the damping
     tau, k = 0.2, 20.0
-    loop = Loop(np.array([tau]), 0.0, 1e-4)
+    loop = LoopTiming(np.array([tau]), 0.0, 1e-4)
     modes = slow_modes(INTEGRATOR, proportional(np.array([[k]])), loop)
     natural = math.sqrt(k / tau)
     assert modes.frequency == approx([natural], rel=1e-2)
@@ -168,7 +168,7 @@ def test_disk_margin_of_the_spinning_satellite() -> None:
     A = np.array([[0.0, a], [-a, 0.0]])
     C = np.array([[1.0, a], [-a, 1.0]])
     found = input_margins(
-        LinearPlant(A, np.eye(2), C), proportional(np.eye(2)), Loop(np.zeros(2), 0.0, 1e-3)
+        LinearPlant(A, np.eye(2), C), proportional(np.eye(2)), LoopTiming(np.zeros(2), 0.0, 1e-3)
     )
     expected = 1.0 / math.sqrt(np.linalg.eigvalsh([[0.25, a / 2.0], [a / 2.0, a**2 + 0.25]])[-1])
     assert expected == approx(0.0997, abs=1e-4)

@@ -410,8 +410,8 @@ def test_ticks_of_another_time_are_neither_better_nor_worse(unlike: list[Recorde
     first = unlike[0]
     later = replace(first.tape, start_ns=EPOCH)
     pair = [first._replace(tape=later), first._replace(name="in one process")]
-    assert comparison.alike(pair) == (True, True)
-    assert comparison.alike(pair, timed=True) == (True, False)
+    assert comparison.has_same_conditions(pair) == (True, True)
+    assert comparison.has_same_conditions(pair, timed=True) == (True, False)
     assert [each.key for each in comparison.conditions(pair)] == ["flown"]
 
 

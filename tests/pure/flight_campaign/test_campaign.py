@@ -53,7 +53,7 @@ from flight_campaign.rows import Chunk, encode, entry_names, tally_of
 from flight_campaign.statistics import WORST_KEPT, Figure, Tally, score, score_units
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
-from flight_design.identification.model_identification import identify
+from flight_design.identification.model_identification import identify_model
 from flight_design.learning import scenario_learner
 from rise_di import CampaignResult
 from rise_di_controller.rise_di_config import RiseDiConfig
@@ -363,7 +363,7 @@ def test_quick_learner_of_campaign_finds_what_learner_of_node_finds(
     identified: list[Any] = []
 
     def kept(*arguments: Any, **options: Any) -> Any:
-        identified.append(identify(*arguments, **options))
+        identified.append(identify_model(*arguments, **options))
         return identified[-1]
 
     monkeypatch.setattr("flight_design.learning.learner.identify", kept)

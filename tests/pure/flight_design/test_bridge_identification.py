@@ -31,7 +31,7 @@ from flight_core.tape import Signal, Tape
 from flight_core.units import GRAVITY
 from flight_design.identification import open_loop_fit
 from flight_design.identification.bridge_identification import (
-    Channels,
+    IdentifiedChannels,
     channel_models,
     channel_pairs,
     experiment,
@@ -80,7 +80,7 @@ class Identified(NamedTuple):
 
     response: Response
     models: list[ChannelModel | None]
-    channels: Channels
+    channels: IdentifiedChannels
     flying: Flyable
     folder: Path
 
@@ -149,7 +149,7 @@ def test_gains_from_log_of_the_board_are_for_the_delay_of_the_link_too(
 
 
 @pytest.fixture(scope="module")
-def of_second_order(tmp_path_factory: pytest.TempPathFactory) -> tuple[Channels, Flyable]:
+def of_second_order(tmp_path_factory: pytest.TempPathFactory) -> tuple[IdentifiedChannels, Flyable]:
     """Channels that are known, and their flight.
 
     q is stiff, r and V are damped, and p has y_dot = Omega u.
@@ -164,7 +164,7 @@ def of_second_order(tmp_path_factory: pytest.TempPathFactory) -> tuple[Channels,
     )
     Omega = np.diag([5.0 if name == "V" else 80.0 for name in MAP.outputs])
     none = 0.0 * damping
-    found = Channels(
+    found = IdentifiedChannels(
         Omega=Omega,
         Omega_deviation=none,
         lag=none + 0.02,
@@ -180,7 +180,7 @@ def of_second_order(tmp_path_factory: pytest.TempPathFactory) -> tuple[Channels,
 
 
 def test_stiff_channel_gets_integral_by_which_loop_crosses_one_at_bandwidth(
-    of_second_order: tuple[Channels, Flyable],
+    of_second_order: tuple[IdentifiedChannels, Flyable],
 ) -> None:
     # a light airplane: below 30 rad/s it answers the elevator with a pitch rate, not with its
     # derivative

@@ -11,7 +11,7 @@ import pytest
 from aircraft_sim.airframes.airframe import Airframe
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_design.identification.innovation_filters import Actuation, Recording, recording
+from flight_design.identification.innovation_filters import Actuation, FlightData, recording
 from flight_design.learning.change_test import LOSS, change_test
 from flight_design.learning.part_checks import changed
 from rise_di_controller.learning.learned_channels import with_channels_of
@@ -25,7 +25,7 @@ FAULTS = ["elevator lost 0", "aileron weak 0"]
 
 
 @pytest.fixture(scope="module")
-def damaged() -> tuple[Recording, Airframe]:
+def damaged() -> tuple[FlightData, Airframe]:
     """8 s in light turbulence with a bank, and the aircraft before.
 
     The elevator is lost, and half of the aileron.
@@ -49,7 +49,7 @@ def damaged() -> tuple[Recording, Airframe]:
 
 
 def test_lost_elevator_is_dead_and_weak_aileron_changed(
-    damaged: tuple[Recording, Airframe],
+    damaged: tuple[FlightData, Airframe],
 ) -> None:
     lon, lat = change_test(*damaged, ACTUATION)
     assert (lon.outputs, lon.found, lon.dead) == (("q", "V"), True, "elevator")
@@ -63,7 +63,7 @@ def test_lost_elevator_is_dead_and_weak_aileron_changed(
 
 @pytest.mark.parametrize("model, found", [(0.6, False), (0.72, True)])
 def test_loss_within_what_a_model_may_err_is_no_change(
-    damaged: tuple[Recording, Airframe], model: float, *, found: bool
+    damaged: tuple[FlightData, Airframe], model: float, *, found: bool
 ) -> None:
     """Half of the effect is lost beside a model that has already most of the loss.
 

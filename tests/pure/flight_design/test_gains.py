@@ -31,13 +31,13 @@ from flight_core.vectors import FloatArray
 from flight_design.gains import gain_conditions, ideal_control
 from flight_design.gains import gain_selection as selection
 from flight_design.gains.channel_signs import require_channels
-from flight_design.gains.gain_conditions import Bounds, Condition, GainSet
+from flight_design.gains.gain_conditions import Bounds, GainCondition, GainSet
 from flight_design.gains.gain_design import select_gains
 from flight_design.gains.gain_selection import GainAssessment, LoopSetting
 from flight_design.gains.ideal_control import ChannelPairing, Study
 from rise_di_controller.law.decomposition import decompose
 from rise_di_controller.law.law import LawParams, Sign, engage, step, tuned
-from rise_di_controller.law.linear_loop import LinearLaw, LinearPlant, Loop, linear_law
+from rise_di_controller.law.linear_loop import LinearLaw, LinearPlant, LoopTiming, linear_law
 from rise_di_controller.laws import AnyLaw
 
 pytestmark = pytest.mark.slow
@@ -69,10 +69,10 @@ def osprey() -> Study:
 @pytest.fixture(scope="module")
 def selected(osprey: Study) -> selection.Selection:
     """Both gain sets for the osprey behind servos."""
-    return selection.select_gains(osprey, SERVOS)
+    return selection.gain_sets(osprey, SERVOS)
 
 
-def names(conditions: tuple[Condition, ...], channels: tuple[str, ...]) -> list[str]:
+def names(conditions: tuple[GainCondition, ...], channels: tuple[str, ...]) -> list[str]:
     return [
         condition.name
         if condition.channel is None
@@ -106,7 +106,9 @@ def test_k_g_and_k_d_follow_steps_2_and_3_from_last_channel_up() -> None:
 
 @pytest.mark.equation("Step 3")
 def test_gains_of_theorem_1_meet_conditions() -> None:
-    conditions = gain_conditions.check(gain_conditions.theorem_gains(HAND, np.ones(3)), HAND)
+    conditions = gain_conditions.check_theorem(
+        gain_conditions.theorem_gains(HAND, np.ones(3)), HAND
+    )
     assert not gain_conditions.failing(conditions)
     # the least beta
     assert [condition.margin for condition in conditions[:3]] == approx([1.0, 1.0, 1.0])
@@ -130,14 +132,15 @@ def test_a_condition_that_fails_is_named(
     good = gain_conditions.theorem_gains(bounds, np.ones(3))
     # with Lambda = 1 the gamma_2 of the second channel is 1
     assert good.beta.tolist() == [36.0, 7.0, 3.0]
-    conditions = gain_conditions.failing(gain_conditions.check(good._replace(**change), bounds))  # type: ignore[arg-type]
+    gains = good._replace(**change)  # type: ignore[arg-type]
+    conditions = gain_conditions.failing(gain_conditions.check_theorem(gains, bounds))
     assert names(conditions, ("a", "b", "c")) == failing
 
 
 @pytest.mark.equation(22)
 def test_gain_that_22_does_not_allow_refused() -> None:
     with refusing(r"^k_d: found \[0\.\], expected values above 0$"):
-        gain_conditions.check(GainSet(1.0, np.zeros(1), np.ones(2), np.ones(2)), HAND)
+        gain_conditions.check_theorem(GainSet(1.0, np.zeros(1), np.ones(2), np.ones(2)), HAND)
     with refusing("the smallest in the last channel"):
         gain_conditions.split_gain(np.array([2.0, 3.0]))
     with refusing(r"^K\[1\]: found 0\.9, expected above 1"):
@@ -212,9 +215,7 @@ def test_gains_of_theorem_1_are_unstable_on_osprey_with_servos(
 
 
 def test_beta_stays_below_rate_of_actuators(osprey: Study) -> None:
-    limited = selection.select_gains(
-        osprey, SERVOS._replace(rate_limit={"thrust": 1.2})
-    ).engineering
+    limited = selection.gain_sets(osprey, SERVOS._replace(rate_limit={"thrust": 1.2})).engineering
     params = limited.controller.law_params()
     # the slew of the ideal thrust is 1.14 1/s
     assert params.beta[3] * params.input_scale[3] == approx(0.7 * 1.2)
@@ -268,7 +269,7 @@ def test_pairing_without_decomposition_or_with_strong_coupling_refused(
         require_channels(*osprey_channels(inputs))
 
 
-OSPREY_LOOP = Loop(np.array([0.02, 0.1, 0.02, 0.02]), 0.0, 0.01)
+OSPREY_LOOP = LoopTiming(np.array([0.02, 0.1, 0.02, 0.02]), 0.0, 0.01)
 
 
 def linear(params: LawParams) -> LinearLaw:
@@ -360,7 +361,7 @@ def test_predicted_delay_margin_is_where_simulated_loop_begins_to_grow(
     omega, period = 0.98, 0.01
     params = scalar(omega, factor * (lag + 1.5 * period))
     plant = LinearPlant(np.zeros((1, 1)), np.array([[omega]]), np.eye(1))
-    margin = delay_margin(plant, linear(params), Loop(np.array([lag]), 0.0, period))
+    margin = delay_margin(plant, linear(params), LoopTiming(np.array([lag]), 0.0, period))
     # 0.75 ms: the simulated delay comes in steps of 0.25 ms, the predicted one in 0.1 ms, and
     # growth has to show in 9 s
     assert 0.003 < margin < 0.1
@@ -369,7 +370,7 @@ def test_predicted_delay_margin_is_where_simulated_loop_begins_to_grow(
 
 
 def test_softened_sign_narrower_than_lag_of_loop_is_unstable() -> None:
-    loop = Loop(np.array([0.02]), 0.0, 0.01)
+    loop = LoopTiming(np.array([0.02]), 0.0, 0.01)
     plant = LinearPlant(np.zeros((1, 1)), np.eye(1), np.eye(1))
     wide, narrow = (scalar(1.0, factor * 0.035) for factor in (1.7, 0.5))
     assert delay_margin(plant, linear(wide), loop) > 0.0
@@ -397,7 +398,7 @@ def test_delay_margin_lasts_up_to_speed_at_which_loop_with_responses_turns_unsta
 
 def test_the_literal_sign_has_no_linear_loop(osprey: Study) -> None:
     literal = find_scenario("osprey_servo").vary(controller={"sign": "literal"})
-    answer: GainAssessment[Any] = selection.check_gains(literal, osprey)
+    answer: GainAssessment[Any] = selection.assess_scenario(literal, osprey)
     assert answer.delay_margin is None
     with refusing(r"^sign: found literal, expected soft or implicit"):
         linear_law(literal.controller.tuned_law(), 4, 0.01)

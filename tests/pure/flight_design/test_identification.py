@@ -20,11 +20,11 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_core.outcome import FlightEnded
 from flight_core.parameters import ParameterError
-from flight_design.gains.first_scenario import Commands
+from flight_design.gains.first_scenario import FirstCommands
 from flight_design.identification import jsbsim_identification
 from flight_design.identification.jsbsim_identification import (
     IdentifiedAircraft,
-    identify,
+    identify_jsbsim,
     sideslip_zero,
     slowest_trim,
     with_sideslip_held,
@@ -36,7 +36,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def cessna() -> IdentifiedAircraft:
-    return identify("c172p", 46.3, 1219.2)
+    return identify_jsbsim("c172p", 46.3, 1219.2)
 
 
 def test_signs_and_pairing_of_aircraft_found(cessna: IdentifiedAircraft) -> None:
@@ -70,7 +70,7 @@ def test_aircraft_whose_sideslip_diverges_has_gains(monkeypatch: pytest.MonkeyPa
         return {"calm": manoeuvre_result(simulate(scenario.vary(aircraft={"gusts": {}})))}
 
     monkeypatch.setattr(jsbsim_identification, "fly_all", calm)
-    found = identify("f15", 180.0, 3000.0, guided=True)
+    found = identify_jsbsim("f15", 180.0, 3000.0, guided=True)
     assert found.sideslip_zero > 0.0
     assert found.flights["calm"].outcome == "completed"
 
@@ -108,7 +108,7 @@ def test_slowest_trim_is_found_within_one_percent(
 
 
 def test_guidance_turns_and_climbs(cessna: IdentifiedAircraft) -> None:
-    commands = Commands(cessna.scenario().reference_model.model_dump(exclude_none=True), 60.0)
+    commands = FirstCommands(cessna.scenario().reference_model.model_dump(exclude_none=True), 60.0)
     text = jsbsim_identification._text(cessna.linear, commands, cessna.selection, stall=30.0)
     log = simulate(jsbsim_identification._load(text).vary(aircraft={"gusts": {}}))["guidance"]
     # the band of a settled heading

@@ -49,7 +49,7 @@ from flight_design.learning.learner import Known, Learner
 from flight_design.learning.scenario_learner import learn_again, learner, with_last_model
 from flight_log.stored_messages import parameter_changes
 from flight_log.tape_reader import read_run
-from rise_di_controller.law.linear_loop import LinearPlant, Loop, is_stable, linear_law
+from rise_di_controller.law.linear_loop import LinearPlant, LoopTiming, is_stable, linear_law
 from rise_di_controller.learning.learned_channels import (
     acting_inputs,
     authority,
@@ -649,7 +649,7 @@ def test_learned_part_keeps_the_margin_of_the_file_and_the_other_part_its_gains(
     )
     assert (design.relaxation[1:3] == file.relaxation[1:3]).all()
     law = linear_law(design.controller.tuned_law(), 4, 0.01)
-    loop = Loop(np.array(plain.lag), 0.0, 0.01)
+    loop = LoopTiming(np.array(plain.lag), 0.0, 0.01)
     assert is_stable(plant_of(model, design.controller), law, loop, aim.margin)
     slow = selected_observer(plain, flight, model, 0.03, uncertain=False, beside=file)
     assert design.cost < slow.cost
@@ -704,7 +704,7 @@ def test_late_thrust_costs_the_elevator_no_margin(
     behind = dict(zip(part.inputs, np.add(latest, 0.01), strict=True))
     late = np.array([max(behind.get(name, 0.0), 0.03) for name in flown.inputs])
     law = linear_law(flown.tuned_law(), 4, 0.01)
-    loop = Loop(np.array(flown.lag), 0.0, 0.01)
+    loop = LoopTiming(np.array(flown.lag), 0.0, 0.01)
     assert is_stable(plant_of(made.model, flown), law, loop, late)
 
 
@@ -724,7 +724,7 @@ def test_model_of_a_late_u_has_margin_behind_its_delay_and_errs_less_than_the_la
     # a delay within 5 ms, and its deviations
     assert flown.observer.margin == approx(0.04 + 0.01, abs=0.01)
     true = late.aircraft.sampled_airframe()
-    loop = Loop(np.array(flown.lag), 0.04, 0.01)
+    loop = LoopTiming(np.array(flown.lag), 0.04, 0.01)
     assert is_stable(
         plant_of(true, flown), linear_law(flown.tuned_law(), 4, 0.01), loop, np.zeros(4)
     )

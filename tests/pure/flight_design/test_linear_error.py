@@ -16,7 +16,7 @@ from flight_design.gains.linear_error import (
     air_response,
     discrete_gust,
 )
-from rise_di_controller.law.linear_loop import LinearLaw, LinearPlant, Loop
+from rise_di_controller.law.linear_loop import LinearLaw, LinearPlant, LoopTiming
 
 PERIOD = 0.001  # s: a sampled loop is then nearly the continuous one
 GAIN = 4.0  # 1/s
@@ -26,7 +26,7 @@ ONE = np.ones((1, 1))
 def response(sigma: float = 0.0, noise: float = 0.0, gust: float = 0.0) -> AirResponse:
     """y_dot = u + w, u = -GAIN (y + v), with turbulence of 2 s and a gust of 5 s."""
     law = LinearLaw(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), -GAIN * ONE)
-    loop = Loop(np.zeros(1), 0.0, PERIOD)
+    loop = LoopTiming(np.zeros(1), 0.0, PERIOD)
     air = Air(
         wind=ONE,
         reading=0.0 * ONE,

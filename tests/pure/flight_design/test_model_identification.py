@@ -30,9 +30,13 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 from flight_design.identification import innovation_filters
-from flight_design.identification.innovation_filters import Actuation, Recording
+from flight_design.identification.innovation_filters import Actuation, FlightData
 from flight_design.identification.likelihood_search import Search
-from flight_design.identification.model_identification import Identification, identify, model_yaml
+from flight_design.identification.model_identification import (
+    Identification,
+    identify_model,
+    model_yaml,
+)
 from flight_design.identification.model_quality import MAX_WHITENESS, correlation, whiteness
 from flight_log.bag import LogAttachments
 from flight_log.tape_writer import write_run
@@ -76,7 +80,7 @@ def flight(air: str, uncertainty: float) -> Tape:
 
 @cache
 def identified(air: str, uncertainty: float) -> Identification:
-    return identify(
+    return identify_model(
         innovation_filters.recording(flight(air, uncertainty), OSPREY), OSPREY, ACTUATORS
     )
 
@@ -186,7 +190,9 @@ def test_the_deviations_are_those_of_the_errors() -> None:
 
 def test_flight_without_excitation_refused_with_channel_and_factor() -> None:
     scenario = servo("calm", 0.3, duration=20.0, pulses={}, coordinated_turn=None)
-    found = identify(innovation_filters.recording(simulate(scenario), OSPREY), OSPREY, ACTUATORS)
+    found = identify_model(
+        innovation_filters.recording(simulate(scenario), OSPREY), OSPREY, ACTUATORS
+    )
     pattern = (
         r"excitation of \w: found B\[\w, \w+\] known to [\d.]+ %, expected 10 %: \w needs "
         r"[\d.]+ times the amplitude"
@@ -197,7 +203,7 @@ def test_flight_without_excitation_refused_with_channel_and_factor() -> None:
 def test_flight_without_noise_that_is_mostly_at_rest_has_deviations() -> None:
     """At rest the innovations are 0. The seconds that move are then no outliers."""
     scenario = find_scenario("osprey_gust").vary(flight={"duration": 20.0})  # p moves from 11 s on
-    found = identify(
+    found = identify_model(
         innovation_filters.recording(simulate(scenario), OSPREY),
         OSPREY,
         Actuation(np.zeros(4), 0.0),
@@ -223,7 +229,9 @@ def test_coupled_parts_are_identified_together(tmp_path: Path) -> None:
     airframe = tmp_path / "coupled.yaml"
     airframe.write_text(as_yaml(OSPREY.with_matrices(A, B, np.ones((8, 3)))))
     scenario = servo("turbulence", 0.0, duration=20.0).vary(aircraft={"airframe": str(airframe)})
-    found = identify(innovation_filters.recording(simulate(scenario), OSPREY), OSPREY, ACTUATORS)
+    found = identify_model(
+        innovation_filters.recording(simulate(scenario), OSPREY), OSPREY, ACTUATORS
+    )
     assert found.refusal == ""
     assert [part.outputs for part in found.parts] == [OSPREY.outputs]
     entries = {entry.name: entry for entry in found.entries}
@@ -245,7 +253,7 @@ def test_lost_samples_are_predicted_over() -> None:
     )
     recorded = innovation_filters.recording(lossy, OSPREY)
     assert np.isnan(recorded.y[:, 0]).mean() == approx(0.2, abs=0.02)
-    found = identify(recorded, OSPREY, ACTUATORS)
+    found = identify_model(recorded, OSPREY, ACTUATORS)
     true = true_errors(servo("gust", 0.5).aircraft.sampled_airframe(), found.entries)
     assert found.refusal == ""
     assert all(
@@ -286,7 +294,7 @@ def test_log_that_shows_no_model_is_refused() -> None:
     with refusing("^record: found a constant p, expected outputs that move"):
         signals = {"y": still, "u": u}
         recorded = innovation_filters.recording(replace(tape, signals=signals), OSPREY)
-        identify(recorded, OSPREY, ACTUATORS)
+        identify_model(recorded, OSPREY, ACTUATORS)
     late = [
         Signal(of.stamp_ns + 10**15 * (of.stamp_ns > of.stamp_ns.mean()), of.names, of.values)
         for of in (y, u)
@@ -302,7 +310,7 @@ def test_late_input_is_mean_that_acts_in_period() -> None:
 
 
 def osprey_model(noise: Any = (0.0017, 0.03, 0.0017, 0.0017)) -> NominalModel:
-    none = Recording(0.01, np.zeros(10), np.zeros((10, 4)), np.zeros((10, 4)))
+    none = FlightData(0.01, np.zeros(10), np.zeros((10, 4)), np.zeros((10, 4)))
     return innovation_filters.filter_model(OSPREY, ACTUATORS, none)._replace(noise=np.array(noise))
 
 

@@ -38,7 +38,7 @@ from flight_design.gains.observer_selection import (
     with_extended_state_observer,
 )
 from flight_design.gains.requirement import Requirement
-from rise_di_controller.law.linear_loop import LinearPlant, Loop, is_stable, linear_law
+from rise_di_controller.law.linear_loop import LinearPlant, LoopTiming, is_stable, linear_law
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 pytestmark = pytest.mark.slow
@@ -102,7 +102,7 @@ def test_margin_of_selected_observer_holds_and_is_one_that_was_asked_for() -> No
         selected = by_rule(margin)
         controller = selected.controller
         plant = LinearPlant(*_plant(controller))
-        loop = Loop(np.array(controller.lag), 0.0, 0.01)
+        loop = LoopTiming(np.array(controller.lag), 0.0, 0.01)
         law = linear_law(controller.tuned_law(), 4, 0.01)
         assert selected.delay_margin >= margin
         assert is_stable(plant, law, loop, np.full(4, margin))

@@ -6,8 +6,9 @@
 The tests are of the Proposition, Lemma A, Lemma B and the error inside the softened sign.
 
 Observers here are designed with the Riccati solver of scipy, in this file. Plants are random, with
-stable zero dynamics, or the osprey. Loops are those of `flight_design.gains.lyapunov.fly`: the
-extended plant is a plant (1), so it flies like one.
+stable zero dynamics, or the osprey. Loops are those of
+`flight_design.gains.lyapunov.fly_known_plant`: the extended plant is a plant (1), so it flies like
+one.
 """
 
 from typing import NamedTuple
@@ -26,7 +27,7 @@ from flight_campaign.comparison import law_comparison, tuning
 from flight_core.vectors import FloatArray
 from flight_design.gains.airframe_properties import invariant_zeros
 from flight_design.gains.ideal_control import manoeuvre, study_airframe
-from flight_design.gains.lyapunov import KnownPlant, fly
+from flight_design.gains.lyapunov import KnownPlant, fly_known_plant
 from flight_design.gains.tuned_gains import TuningResult
 from rise_di_controller.law.law import LawParams, Sign
 
@@ -501,7 +502,7 @@ def flown_error(
     flown = plant if observer is None else extended(plant, observer)
     x_0 = np.zeros(len(flown.A))
     x_0[:N] = 0.3
-    flight = fly(KnownPlant(flown.A, flown.B, flown.C, f), y_m, dt, params, x_0)
+    flight = fly_known_plant(KnownPlant(flown.A, flown.B, flown.C, f), y_m, dt, params, x_0)
     settled = t > 12.0
     e = np.asarray(flight.x @ flown.C.T - y_m)
     return t[settled], e[settled]

@@ -30,7 +30,7 @@ from flight_design.gains import gain_selection, ideal_control
 from flight_design.gains import requirement as requirement_module
 from flight_design.gains.constrained_search import Place, Trial, descend
 from flight_design.gains.gain_design import select_gains
-from flight_design.gains.gain_yaml import as_yaml
+from flight_design.gains.gain_yaml import selection_yaml
 from flight_design.gains.ideal_control import Manoeuvre
 from flight_design.gains.linear_error import linear_error
 from flight_design.gains.relaxation import lacking
@@ -39,13 +39,13 @@ from flight_design.gains.requirement import (
     NAMES,
     Requirement,
     above_zeros,
-    conditions,
     least_fraction,
+    margin_conditions,
     requirement,
 )
 from flight_design.gains.trade import trade
 from reference_model.params import ReferenceModelConfig
-from rise_di_controller.law.linear_loop import LinearLaw, LinearPlant, Loop
+from rise_di_controller.law.linear_loop import LinearLaw, LinearPlant, LoopTiming
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 pytestmark = pytest.mark.slow
@@ -96,7 +96,7 @@ def selected(phase_margin: float, V_product: float = 0.46) -> RiseDiConfig:
     setting = setting._replace(
         crossover_lag_products={**gain_selection.CROSSOVER_LAG_PRODUCTS, "V": V_product}
     )
-    return gain_selection.select_gains(studied, setting).chosen
+    return gain_selection.gain_sets(studied, setting).chosen
 
 
 def of_python_control(controller: RiseDiConfig, channel: int) -> tuple[float, float]:
@@ -222,7 +222,7 @@ def test_conditions_say_what_is_missing() -> None:
     of = margins(SERVO.vary(controller={"softening": 2.75, "Lambda": [5.0, 5.0, 3.0, 0.5]}))
     failing = [
         condition.name
-        for condition in conditions(of, Requirement(phase=math.radians(80.0)))
+        for condition in margin_conditions(of, Requirement(phase=math.radians(80.0)))
         if not condition.holds
     ]
     assert failing[:1] == ["phase margin (deg)"]
@@ -246,7 +246,7 @@ def test_linear_error_of_a_ramp_is_the_closed_form() -> None:
     law = LinearLaw(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.array([[-k]]))
     plant = LinearPlant(np.zeros((1, 1, 1)), np.ones((1, 1, 1)), np.eye(1))
     of = LinearLoop(
-        model="", inputs=("u",), plant=plant, law=law, loop=Loop(np.zeros(1), 0.0, period)
+        model="", inputs=("u",), plant=plant, law=law, loop=LoopTiming(np.zeros(1), 0.0, period)
     )
     u_dot = np.full((round(duration / ideal_control.STEP) + 1, 1), a)
     t = np.arange(0.0, duration, period)
@@ -280,8 +280,10 @@ def test_a_refusal_names_bound_and_change_and_the_file_is_marked(
     eased = select_gains("osprey", "osprey_servo", samples=0, phase_margin=41.0)
     assert not eased.engineering.unmet
     assert lacking(eased) == ""
-    assert as_yaml(selection).startswith("# Margins below the requirement: phase margin (deg) of V")
-    assert "Margins below" not in as_yaml(eased)
+    assert selection_yaml(selection).startswith(
+        "# Margins below the requirement: phase margin (deg) of V"
+    )
+    assert "Margins below" not in selection_yaml(eased)
 
 
 def test_damping_of_a_zero_bounds_what_is_asked_for() -> None:

@@ -10,7 +10,7 @@ from tests.conftest import refusing
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_design.identification.innovation_filters import (
     Actuation,
-    Recording,
+    FlightData,
     blocks,
     filter_model,
 )
@@ -46,7 +46,7 @@ def test_sketch_has_the_modes_of_an_aircraft(name: str) -> None:
 def test_parts_of_sketch_do_not_couple() -> None:
     Omega, speed = STEPS["c172p"]
     frame = sketch("c172p", np.diag(Omega) + 0.01, OUTPUTS, INPUTS, speed)
-    still = Recording(0.01, np.linspace(0.0, 0.09, 10), np.zeros((10, 4)), np.zeros((10, 4)))
+    still = FlightData(0.01, np.linspace(0.0, 0.09, 10), np.zeros((10, 4)), np.zeros((10, 4)))
     parts = blocks(filter_model(frame, Actuation(np.full(4, 0.02), 0.0), still))
     assert sorted([frame.outputs[i] for i in part.outputs] for part in parts) == [
         ["V"],

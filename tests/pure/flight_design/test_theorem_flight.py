@@ -45,7 +45,7 @@ def selection(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, gain_sele
 
 def flown(folder: Path, selected: gain_selection.Selection, rate: float) -> FloatArray:
     """The largest errors, law's order, under the gains of Theorem 1 as written, at a rate in Hz."""
-    written = gain_yaml.as_yaml(selected, theorem=True).replace(
+    written = gain_yaml.selection_yaml(selected, theorem=True).replace(
         "rate: 100.0  # Hz", f"rate: {rate}  # Hz"
     )
     path = folder / f"ideal_{rate:g}.yaml"
@@ -70,7 +70,7 @@ def test_written_gains_are_those_of_the_theorem(
     selection: tuple[Path, gain_selection.Selection],
 ) -> None:
     _, selected = selection
-    text = gain_yaml.as_yaml(selected, theorem=True)
+    text = gain_yaml.selection_yaml(selected, theorem=True)
     section = yaml.safe_load(text)["/**/controller"]["ros__parameters"]
     assert "by Theorem 1" in text
     np.testing.assert_allclose(section["beta"], selected.literal.beta, rtol=1e-5)

@@ -86,7 +86,7 @@ def test_step_is_one_runge_kutta_step_of_equation_2() -> None:
     dt = 0.05
     x_m = np.linspace(-0.2, 0.3, 6)
 
-    def x_dot(t: float, x: FloatArray, _: None, params: model.Model) -> FloatArray:
+    def x_dot(t: float, x: FloatArray, _: None, params: model.ReferenceMatrices) -> FloatArray:
         return np.asarray(model.x_m_dot(t, x, command(t, profile), params))
 
     # PULSES change u_m within this step; the two differ by rounding only.

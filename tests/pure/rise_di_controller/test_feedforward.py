@@ -144,8 +144,8 @@ def test_input_extrapolated_linearly_from_last_two() -> None:
 
 def test_zero_dynamics_are_zeros_of_model() -> None:
     # With y = x_1 at 0, x_2_dot = -3 x_2; in the small aircraft c_dot = -2 c and d_dot = 0
-    assert feedforward.zero_dynamics(BY_HAND) == approx([-3.0])
-    assert sorted(feedforward.zero_dynamics(nominal_of(small_aircraft())).real) == approx(
+    assert feedforward.nominal_zeros(BY_HAND) == approx([-3.0])
+    assert sorted(feedforward.nominal_zeros(nominal_of(small_aircraft())).real) == approx(
         [-2.0, 0.0]
     )
 

@@ -28,9 +28,15 @@ from aircraft_sim.plant import dynamics
 from aircraft_sim.sections import Gust
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray
-from flight_design.gains.lyapunov import KnownPlant, decay_matrix, evidence, example, fly
+from flight_design.gains.lyapunov import (
+    KnownPlant,
+    decay_matrix,
+    evidence,
+    example,
+    fly_known_plant,
+)
 from reference_model.command import Profile
-from reference_model.model import Model, second_order
+from reference_model.model import ReferenceMatrices, second_order
 from rise_di_controller.law.decomposition import DecompositionError, decompose
 from rise_di_controller.law.law import LawParams, Sign, engage, gain, step
 
@@ -415,7 +421,7 @@ def test_sampled_law_converges_to_20_with_period(loop: Loop, sign: Sign) -> None
     for ticks in (60, 120, 240):
         dt = DURATION / ticks
         y_m = np.array([loop.p.C @ loop.unpack(k * dt)[1] for k in range(ticks + 1)])
-        flight = fly(loop.p.plant(), y_m, dt, loop.p.law(sign), X_0)
+        flight = fly_known_plant(loop.p.plant(), y_m, dt, loop.p.law(sign), X_0)
         distance.append(float(np.max(np.abs(flight.x[-1] - loop.unpack(DURATION)[0]))))
     assert all(1.7 < before / after < 2.3 for before, after in pairwise(distance))
 
@@ -512,7 +518,7 @@ def coupled_flight(beta: FloatArray) -> float:
         K=np.array([60.0, 4.0]), omega=2.0 * np.abs(np.diag(S * D @ U)), beta=beta
     )
     assert np.linalg.eigvalsh(decay_matrix(plant, params)).min() > 0.0
-    signals = evidence(plant, fly(plant, case.y_m, 0.0025, params, case.x_0), params)
+    signals = evidence(plant, fly_known_plant(plant, case.y_m, 0.0025, params, case.x_0), params)
     assert np.all(np.max(np.abs(signals.N_d), axis=0) < [2.0, 2.0])
     return float(np.max(np.abs(signals.e[signals.t > 6.0])))
 
@@ -562,7 +568,9 @@ def test_gamma_2_grows_as_period_falls() -> None:
     for dt in (0.02, 0.01, 0.005, 0.0025):
         case = example(dt, 10.0)
         params = case.params._replace(sign=Sign.LITERAL)
-        signals = evidence(case.plant, fly(case.plant, case.y_m, dt, params, case.x_0), params)
+        signals = evidence(
+            case.plant, fly_known_plant(case.plant, case.y_m, dt, params, case.x_0), params
+        )
         late = signals.t > 5.0
         ratios.append(
             np.sum(np.abs(signals.e_dot[late]), axis=0) / np.sum(np.abs(signals.e[late]), axis=0)
@@ -641,7 +649,7 @@ def test_classical_condition_replaces_lemma_1() -> None:
     S, D = decompose(case.plant.C @ case.plant.B)[:2]
     plant = case.plant._replace(B=np.vstack([S * D, 0.1 * np.eye(2)]))
     params = case.params._replace(beta=np.array([6.0, 6.0]))
-    signals = evidence(plant, fly(plant, case.y_m, 0.005, params, case.x_0), params)
+    signals = evidence(plant, fly_known_plant(plant, case.y_m, 0.005, params, case.x_0), params)
     settled = signals.t > 0.02  # the ends of a second difference have a lower order
     N_d_dot = np.gradient(signals.N_d[settled], signals.t[settled], axis=0)
     required = (
@@ -673,7 +681,7 @@ def hidden_state(pole: float) -> tuple[float, float]:
     )
     params = law_params(8.0, 1.0, 5.0, omega=2.0)
     t = 0.01 * np.arange(1501)
-    flight = fly(plant, np.sin(t)[:, None], 0.01, params, np.zeros(2))
+    flight = fly_known_plant(plant, np.sin(t)[:, None], 0.01, params, np.zeros(2))
     return float(np.max(np.abs(flight.x[:, 1]))), float(abs(flight.x[-1, 0] - np.sin(t[-1])))
 
 
@@ -716,7 +724,7 @@ def behind_a_servo(T_eps: float) -> float:
     )
     eps = beta / K * T_eps
     params = law_params(K, 1.0, beta, sign=Sign.SOFT, eps=eps)
-    flight = fly(plant, np.zeros((20001, 1)), dt, params, np.array([eps / 2.0, 0.0]))
+    flight = fly_known_plant(plant, np.zeros((20001, 1)), dt, params, np.array([eps / 2.0, 0.0]))
     return float(np.max(np.abs(flight.x[-2000:, 0])) / eps)
 
 
@@ -784,7 +792,7 @@ def test_bound_7_fails_in_gust() -> None:
     assert np.degrees(np.max(np.abs(x[ALPHA]))) == approx(21.1, abs=0.1)
 
 
-def largest_y_m_ddot(model: Model, rise: float) -> float:
+def largest_y_m_ddot(model: ReferenceMatrices, rise: float) -> float:
     """The peak of abs(y_m_ddot) for a command that rises to one within `rise` seconds.
 
     It is by second differences.
@@ -810,7 +818,7 @@ def test_first_order_model_unbounds_N_d() -> None:
     """A step command through a model of first order makes N_d unbounded."""
     # y_m_ddot contains C B_m u_m_dot = 4 / rise: a tenth of the rise needs ten times the beta, and
     # no beta suffices for a step.
-    first_order = Model(np.array([[-4.0]]), np.array([[4.0]]), np.array([[1.0]]))
+    first_order = ReferenceMatrices(np.array([[-4.0]]), np.array([[4.0]]), np.array([[1.0]]))
     peaks = [largest_y_m_ddot(first_order, rise) for rise in (0.1, 0.01, 0.001)]
     assert peaks == approx([40.0, 400.0, 4000.0], rel=0.1)  # measured 37, 396, 3997
 

@@ -16,7 +16,7 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_core.modes import Mode
 from flight_core.vectors import ChannelError, FloatArray, StampedVector
 from rise_di_controller.controller import Controller
-from rise_di_controller.extensions.feedforward import parts_of
+from rise_di_controller.extensions.feedforward import step_count
 from rise_di_controller.guard.samples import MOVING, STILL
 from rise_di_controller.laws import AnyLaw
 from rise_di_controller.params import ControllerConfig
@@ -213,11 +213,11 @@ def test_gap_within_the_age_limit_counts_in_full_at_any_rate(rate: float) -> Non
 def test_steps_of_the_model_are_at_most_ten_periods_long() -> None:
     """So that a gap of 100 periods of a fast model is as stable as one of ten."""
     period_ns = MS
-    assert [parts_of(span * period_ns, period_ns) for span in (1, 10, 11, 20, 21, 101)] == [
+    assert [step_count(span * period_ns, period_ns) for span in (1, 10, 11, 20, 21, 101)] == [
         1, 1, 2, 2, 3, 11,
     ]  # fmt: skip
-    assert parts_of(10 * period_ns + 1, period_ns) == 2
-    assert parts_of(1, period_ns) == 1
+    assert step_count(10 * period_ns + 1, period_ns) == 2
+    assert step_count(1, period_ns) == 1
 
 
 def test_gap_beyond_the_age_limit_engages_again_and_says_so() -> None:

@@ -33,7 +33,7 @@ from flight_design.learning.designs import Goal
 from flight_design.learning.learner import Learner
 from rise_di_controller.controller import Controller
 from rise_di_controller.law.control_law import Measurements
-from rise_di_controller.law.linear_loop import LinearPlant, Loop, linear_law
+from rise_di_controller.law.linear_loop import LinearPlant, LoopTiming, linear_law
 from rise_di_controller.learning.proposals import Event, Learning, Proposal, designed
 from rise_di_controller.rise_di_config import RiseDiConfig
 
@@ -66,7 +66,7 @@ def margin(controller: RiseDiConfig, ratio: float) -> float:
     return delay_margin(
         plant,
         linear_law(controller.tuned_law(), 4, 0.01),
-        Loop(np.array(controller.lag), 0.0, 0.01),
+        LoopTiming(np.array(controller.lag), 0.0, 0.01),
     )
 
 

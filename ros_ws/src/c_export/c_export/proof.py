@@ -297,7 +297,7 @@ FIGURES = {
 }
 
 
-def report(proof: Proof, scenario: str) -> str:
+def proof_report(proof: Proof, scenario: str) -> str:
     """The proof as text."""
     precision = "float32" if proof.float32 else "float64"
     lines = [

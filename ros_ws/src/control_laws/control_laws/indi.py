@@ -11,7 +11,7 @@ from control_laws.nominal_model import (
     NominalModel,
     campaign_law,
     filter_gain,
-    saturate,
+    saturate_with_excess,
 )
 from flight_core.vectors import Array, FloatArray, array_namespace
 from rise_di_controller.law.control_law import ControlLaw, Measurements
@@ -61,7 +61,7 @@ def control_law(model: NominalModel) -> ControlLaw:
         position = state.position + a * (measured.position - state.position)
         nu = measured.y_m_dot - params.K * (measured.y - measured.y_m) - y_dot
         u_free = position + params.share * (inverse @ nu)
-        u, _ = saturate(u_free, measured, dt, limits)
+        u, _ = saturate_with_excess(u_free, measured, dt, limits)
         return IndiState(measured.y, y_dot, position), u_free, u
 
     return campaign_law(IndiState, engage, limited)

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from control_laws.nominal_model import NominalModel, filter_gain, saturate
+from control_laws.nominal_model import NominalModel, filter_gain, saturate_with_excess
 from flight_core.fields import Field
 from flight_core.parameters import Numbers, ParameterError, Positives, require, require_length
 from flight_core.vectors import Array, FloatArray, array_namespace
@@ -82,7 +82,7 @@ def _control_law(*, feedforward: bool) -> ControlLaw:
             sigma_hat - sigma_r - state.sigma_f
         )
         u_free = u_r - params.inverse @ (params.K * e + sigma_f)
-        u, _ = saturate(u_free, measured, dt, limits)
+        u, _ = saturate_with_excess(u_free, measured, dt, limits)
         return (
             L1State(
                 e=e,

@@ -7,7 +7,7 @@ The observer corrects the trim, and there is no further feedback.
 
 from typing import NamedTuple
 
-from control_laws.nominal_model import NominalModel, saturate
+from control_laws.nominal_model import NominalModel, saturate_with_excess
 from flight_core.parameters import require
 from flight_core.vectors import Array, FloatArray
 from rise_di_controller.law.control_law import ControlLaw, Measurements, without_limits
@@ -27,7 +27,7 @@ def _limited(
     state: LqgState, measured: Measurements, dt: Array, params: LqgParams, limits: Limits
 ) -> tuple[LqgState, Array, Array]:
     """U = u_trim, shape (m,), saturated. u_trim contains u_o of the observer."""
-    u, _ = saturate(measured.u_trim, measured, dt, limits)
+    u, _ = saturate_with_excess(measured.u_trim, measured, dt, limits)
     return state, measured.u_trim, u
 
 

@@ -14,7 +14,7 @@ from control_laws.nominal_model import (
     NominalModel,
     campaign_law,
     conditional_integration,
-    saturate,
+    saturate_with_excess,
     start_integral,
     state_of,
 )
@@ -61,7 +61,7 @@ def control_law(_: NominalModel, *, vanes: bool) -> ControlLaw:
             ]
         )
         u_free = measured.u_trim - xp.sum(params.gain * z[None, :, :], axis=1)
-        u, excess = saturate(u_free, measured, dt, limits)
+        u, excess = saturate_with_excess(u_free, measured, dt, limits)
         m = e.shape[0]
         integral_gain = xp.stack(
             [params.gain[i, params.gain.shape[1] - m + i, :] for i in range(m)]

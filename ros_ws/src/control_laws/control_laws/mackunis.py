@@ -12,7 +12,7 @@ from control_laws.nominal_model import (
     campaign_law,
     conditional_integration,
     filter_gain,
-    saturate,
+    saturate_with_excess,
 )
 from flight_core.vectors import Array, FloatArray, array_namespace
 from rise_di_controller.law.control_law import ControlLaw, Measurements
@@ -79,7 +79,7 @@ def control_law(model: NominalModel, *, ideal: bool) -> ControlLaw:
         Pi = state.Pi + Pi_step
         nu = -params.K * (e - state.e_0 + params.Lambda * integral_e) - Pi
         u_free = measured.u_trim + inverse @ nu
-        u, excess = saturate(u_free, measured, dt, limits)
+        u, excess = saturate_with_excess(u_free, measured, dt, limits)
         y_dot_excess = Omega @ excess
         integral_e = conditional_integration(state.integral_e, integral_e, -increment, y_dot_excess)
         Pi = conditional_integration(state.Pi, Pi, -Pi_step, y_dot_excess)

@@ -101,7 +101,9 @@ def state_of(measured: Measurements, *, vanes: bool = False) -> Array:
     return x
 
 
-def saturate(u: Array, measured: Measurements, dt: Array, limits: Limits) -> tuple[Array, Array]:
+def saturate_with_excess(
+    u: Array, measured: Measurements, dt: Array, limits: Limits
+) -> tuple[Array, Array]:
     """Saturation of u, shape (m,).
 
     The results are the commanded u inside the limits, and the excess of the requested u.

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from control_laws.nominal_model import NominalModel, saturate
+from control_laws.nominal_model import NominalModel, saturate_with_excess
 from flight_core.fields import Field
 from flight_core.parameters import NonNegatives, Positives, require_length
 from flight_core.vectors import Array, FloatArray, array_namespace
@@ -56,7 +56,7 @@ def _limited(
     """
     e = measured.y - measured.y_m
     after = PiState(state.e_0, e, state.integral_e + dt * (e + state.e) / 2.0)
-    _, excess = saturate(measured.u_trim + _u(after, params), measured, dt, limits)
+    _, excess = saturate_with_excess(measured.u_trim + _u(after, params), measured, dt, limits)
     change = (
         -params.input_scale
         * params.D
@@ -68,7 +68,7 @@ def _limited(
         integral_e=limited_integral(state.integral_e, after.integral_e, change, excess)
     )
     u_free = measured.u_trim + _u(after, params)
-    u, _ = saturate(u_free, measured, dt, limits)
+    u, _ = saturate_with_excess(u_free, measured, dt, limits)
     return after, u_free, u
 
 

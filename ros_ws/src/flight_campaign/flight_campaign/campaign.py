@@ -22,7 +22,7 @@ from aircraft_sim.uncertainty import (
 )
 from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario
 from flight_analysis.linear_loop.guarantee import Guarantee
-from flight_analysis.linear_loop.kept_guarantee import kept
+from flight_analysis.linear_loop.kept_guarantee import kept_guarantee
 from flight_analysis.linear_loop.loop_margins import LoopMargins, margins, scenario_loop
 from flight_campaign import equipment, single_flights
 from flight_campaign.batch.campaign_course import Course, build_course
@@ -343,7 +343,9 @@ class Campaign:
         part = definition.uncertainty
         spread = definition.spread
         try:
-            return kept(scenario_loop(scenario, scenario.controller, 0, part, spread=spread))
+            return kept_guarantee(
+                scenario_loop(scenario, scenario.controller, 0, part, spread=spread)
+            )
         except ParameterError:
             return None
 

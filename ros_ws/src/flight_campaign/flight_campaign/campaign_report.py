@@ -25,7 +25,7 @@ from flight_analysis.report.display_units import (
     display_units,
 )
 from flight_analysis.report.figures import COLOURS
-from flight_analysis.report.html import Line, Page, Section, TableGroup, page_html
+from flight_analysis.report.html import Page, Section, TableGroup, TitleLine, page_html
 from flight_analysis.report.margin_figures import (
     LEAST_MARGINS,
     guarantee_as_json,
@@ -36,7 +36,7 @@ from flight_analysis.report.plotting import SampleStore, set_layout
 from flight_analysis.report.run_folder import REPORT, SUMMARY
 from flight_analysis.report.summary import finite_or_null
 from flight_analysis.report.summary_rows import Column
-from flight_analysis.report.tables import Table
+from flight_analysis.report.tables import MetricTable
 from flight_campaign import equipment
 from flight_campaign.campaign import Campaign
 from flight_campaign.definition import Definition
@@ -92,7 +92,7 @@ LEARNER_LEGEND = (
 )
 
 
-def write_results(campaign: Campaign) -> tuple[dict[str, Any], Table]:
+def write_results(campaign: Campaign) -> tuple[dict[str, Any], MetricTable]:
     """Write the summary, the report and the scenarios of the worst aircraft.
 
     Returns the summary and the overview. Raises ParameterError.
@@ -247,7 +247,7 @@ def write_page(
     ]
     page = Page(
         title=title,
-        lines=[Line(text)],
+        lines=[TitleLine(text)],
         tables=[TableGroup(tables)],
         sections=sections,
         samples=SampleStore(),
@@ -255,7 +255,7 @@ def write_page(
     write_file(path, page_html(page))
 
 
-def _guarantees(labels: Sequence[str], cases: Sequence[Mapping[str, Any]]) -> Table:
+def _guarantees(labels: Sequence[str], cases: Sequence[Mapping[str, Any]]) -> MetricTable:
     """The guarantees that were computed for the loops of the cases."""
     rows = []
     for label, case in zip(labels, cases, strict=True):
@@ -266,12 +266,12 @@ def _guarantees(labels: Sequence[str], cases: Sequence[Mapping[str, Any]]) -> Ta
         rows.append([label, *(NO_VALUE if x is None else f"{100.0 * x:.1f}" for x in shown)])
     heads = ("stable for every aircraft within, %", "first unstable aircraft found, %")
     columns = [Column("", head) for head in heads]
-    return Table("Guarantee of the linear loop", columns, rows, GUARANTEE_LEGEND)
+    return MetricTable("Guarantee of the linear loop", columns, rows, GUARANTEE_LEGEND)
 
 
 def overview(
     definition: Definition, tallies: Sequence[Tally], margins: Sequence[LoopMargins | None]
-) -> Table:
+) -> MetricTable:
     """Scores, lost aircraft and margins, a column for each case."""
     columns = []
     for tally, loop_margins in zip(tallies, margins, strict=True):
@@ -288,7 +288,7 @@ def overview(
         )
     names = ("score, mean", "score, worst", "lost or diverged, %", *LEAST_MARGINS)
     rows = [[name, *cells] for name, *cells in zip(names, *columns, strict=True)]
-    return Table(
+    return MetricTable(
         "Score and margins",
         [Column("", label) for label in _labels(definition)],
         rows,
@@ -327,7 +327,7 @@ def _labels(definition: Definition) -> list[str]:
     return [definition.label(case) for case in range(definition.cases)]
 
 
-def _ends(labels: Sequence[str], cases: Sequence[Mapping[str, Any]]) -> Table:
+def _ends(labels: Sequence[str], cases: Sequence[Mapping[str, Any]]) -> MetricTable:
     columns = [
         Column(*pair)
         for pair in product(("diverged", "loss of track"), ("aircraft", "%", "95 % interval"))
@@ -343,15 +343,15 @@ def _ends(labels: Sequence[str], cases: Sequence[Mapping[str, Any]]) -> Table:
                 f"{100 * outcome['low']:.2g} to {100 * outcome['high']:.2g}",
             ]
         rows.append(row)
-    return Table("Outcomes", columns, rows)
+    return MetricTable("Outcomes", columns, rows)
 
 
-def _without_model(labels: Sequence[str], tallies: Sequence[Tally]) -> Table:
+def _without_model(labels: Sequence[str], tallies: Sequence[Tally]) -> MetricTable:
     rows = [
         [label, str(tally.without_model()), str(tally.flights)]
         for label, tally in zip(labels, tallies, strict=True)
     ]
-    return Table(
+    return MetricTable(
         "Aircraft that learn",
         [Column("", "without a model"), Column("", "of")],
         rows,
@@ -359,9 +359,9 @@ def _without_model(labels: Sequence[str], tallies: Sequence[Tally]) -> Table:
     )
 
 
-def _figures(label: str, tally: Tally, units: Mapping[str, DisplayUnit]) -> Table:
+def _figures(label: str, tally: Tally, units: Mapping[str, DisplayUnit]) -> MetricTable:
     columns = [Column("", head) for head in FIGURE_HEADINGS]
-    return Table(
+    return MetricTable(
         label,
         columns,
         figure_rows(tally, units),
@@ -394,14 +394,14 @@ def _label(name: str, units: Mapping[str, DisplayUnit]) -> tuple[str, float]:
     return f"{kind} {channel} ({shown.unit}{'/s' * (kind == 'slew')})", shown.factor
 
 
-def _worst(labels: Sequence[str], cases: Sequence[Mapping[str, Any]]) -> Table:
+def _worst(labels: Sequence[str], cases: Sequence[Mapping[str, Any]]) -> MetricTable:
     columns = [Column("", head) for head in ("aircraft", "score", "fly it again")]
     rows = []
     for label, case in zip(labels, cases, strict=True):
         for flight in case["fly_again"]:
             score = "diverged" if flight["score"] is None else f"{flight['score']:.3g}"
             rows.append([label, str(flight["number"]), score, flight["command"]])
-    return Table(
+    return MetricTable(
         "Worst flights",
         columns,
         rows,
@@ -409,7 +409,7 @@ def _worst(labels: Sequence[str], cases: Sequence[Mapping[str, Any]]) -> Table:
     )
 
 
-def influence_table(label: str, case: Mapping[str, Any]) -> Table:
+def influence_table(label: str, case: Mapping[str, Any]) -> MetricTable:
     """The drawn entries whose size goes most with the score, of a case of the summary."""
     ranked = case["influence"]
     rows = [
@@ -431,7 +431,7 @@ def influence_table(label: str, case: Mapping[str, Any]) -> Table:
     if ranked["command"] is not None:
         legend += f". The worst corner flies by {ranked['command']}"
     columns = [Column("", head) for head in ("rank correlation", "worst aircraft", "worst corner")]
-    return Table(f"Drawn entries: {label}", columns, rows, legend)
+    return MetricTable(f"Drawn entries: {label}", columns, rows, legend)
 
 
 def _corner(value: float) -> str:

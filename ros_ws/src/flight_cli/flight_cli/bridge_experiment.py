@@ -39,8 +39,8 @@ from flight_core.tape import Tape
 from flight_core.text import sentences
 from flight_design.gains.requirement import Requirement
 from flight_design.identification.bridge_identification import (
-    Channels,
     Experiment,
+    IdentifiedChannels,
     channel_models,
     channel_pairs,
     cut_short,
@@ -150,8 +150,13 @@ class BridgeExperiment:
         return run
 
     def _with_link(
-        self, console: Console, channel_map: ChannelMap, channels: Channels, *, imported: bool
-    ) -> Channels:
+        self,
+        console: Console,
+        channel_map: ChannelMap,
+        channels: IdentifiedChannels,
+        *,
+        imported: bool,
+    ) -> IdentifiedChannels:
         """The channels of an imported log with the delay of the link."""
         expected = "a log of rise-di import: an experiment over the link contains its delay"
         require(imported or self.link_delay is None, "link_delay", self.link_delay, expected)
@@ -161,7 +166,7 @@ class BridgeExperiment:
         _show_link(console, channel_map, later)
         return over_link(channels, later or 0.0)
 
-    def _flyable(self, channel_map: ChannelMap, channels: Channels) -> Flyable:
+    def _flyable(self, channel_map: ChannelMap, channels: IdentifiedChannels) -> Flyable:
         """Airframe and scenario with gains. Raises ParameterError for short margins."""
         airframe = str((self.folder / "airframe.yaml").resolve())
         flyable = flying_scenario(channel_map, channels, self.speed, airframe, self.needed)
@@ -195,7 +200,7 @@ def _identified(
     tape: Tape,
     spans: list[tuple[int, int]],
     speed: float | None,
-) -> tuple[dict[str, float], Response, Channels]:
+) -> tuple[dict[str, float], Response, IdentifiedChannels]:
     """Trims, step responses and channels of an experiment, shown.
 
     Raises ParameterError for a channel that is not certain.
@@ -385,7 +390,9 @@ def _show_link(console: Console, channel_map: ChannelMap, link_delay: float | No
     say(console, sentence)
 
 
-def _show_gains(console: Console, channels: Channels, response: Response, flyable: Flyable) -> None:
+def _show_gains(
+    console: Console, channels: IdentifiedChannels, response: Response, flyable: Flyable
+) -> None:
     controller = flyable.controller
     params = flyable.controller.law_params()
     table = new_table("Gains by lag and delay", ("channel", "bandwidth, rad/s", "Lambda, 1/s"))
@@ -402,7 +409,11 @@ def _show_gains(console: Console, channels: Channels, response: Response, flyabl
 
 
 def _as_json(
-    response: Response, channels: Channels, flyable: Flyable, trims: dict[str, float], folder: Path
+    response: Response,
+    channels: IdentifiedChannels,
+    flyable: Flyable,
+    trims: dict[str, float],
+    folder: Path,
 ) -> dict[str, object]:
     def numbers(values: Any) -> dict[str, Any]:
         arrays = {

@@ -22,7 +22,7 @@ from aircraft_sim.uncertainty import Distribution, WindEffect
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.report.display_units import QUANTITY_UNITS, display_units
 from flight_analysis.report.run_folder import REPORT, new_run
-from flight_analysis.report.tables import Table
+from flight_analysis.report.tables import MetricTable
 from flight_campaign import engines
 from flight_campaign.campaign import Campaign as MonteCarlo
 from flight_campaign.campaign import define
@@ -203,7 +203,7 @@ class Campaign:
 
 
 def _show_cases(
-    console: Console, monte_carlo: MonteCarlo, cases: Sequence[dict[str, Any]], results: Table
+    console: Console, monte_carlo: MonteCarlo, cases: Sequence[dict[str, Any]], results: MetricTable
 ) -> None:
     """Print the figures and the influences of every case, and the table of all."""
     definition = monte_carlo.definition

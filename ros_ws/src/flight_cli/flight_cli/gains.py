@@ -60,7 +60,7 @@ from flight_core.parameters import ParameterError, require
 from flight_core.units import quantity
 from flight_design.gains import gain_selection, gain_yaml
 from flight_design.gains.airframe_properties import airframe_facts, marginal_sentence
-from flight_design.gains.gain_conditions import Condition, failing
+from flight_design.gains.gain_conditions import GainCondition, failing
 from flight_design.gains.gain_design import check_gains, select_gains
 from flight_design.gains.gain_selection import GainAssessment, Selection
 from flight_design.gains.ideal_control import Study
@@ -272,7 +272,7 @@ class Gains:
         if self.write is not None:
             if not self.accept:
                 _require_margins(selection, theorem=self.theorem)
-            text = LICENCE + gain_yaml.as_yaml(selection, theorem=self.theorem)
+            text = LICENCE + gain_yaml.selection_yaml(selection, theorem=self.theorem)
             write_text("--write", self.write, text)
         if self.observer:
             return _Result({"observer": selection.engineering}, selection)
@@ -458,7 +458,7 @@ def _own_gains(controller: ControllerConfig, aircraft: str) -> Table:
     return table
 
 
-def _condition_name(row: tuple[Condition, ...], outputs: tuple[str, ...]) -> str:
+def _condition_name(row: tuple[GainCondition, ...], outputs: tuple[str, ...]) -> str:
     """Name of a row, with the channel if it is the same in every gain set."""
     where = {None if condition.channel is None else outputs[condition.channel] for condition in row}
     channel = where.pop() if len(where) == 1 else None
@@ -504,7 +504,7 @@ def _milliseconds(margin: float) -> str:
     return f"{1e3 * margin:.0f} ms" if math.isfinite(margin) else "over 500 ms"
 
 
-def _cells(condition: Condition) -> tuple[str, str]:
+def _cells(condition: GainCondition) -> tuple[str, str]:
     margin = "" if math.isnan(condition.margin) else f"{condition.margin:.2g}"
     side = SIDES[condition.side]
     return (
@@ -549,7 +549,9 @@ def _assessment_as_json(study: Study, answer: Assessment) -> dict[str, Any]:
     }
 
 
-def _condition_as_json(part: str, condition: Condition, outputs: tuple[str, ...]) -> dict[str, Any]:
+def _condition_as_json(
+    part: str, condition: GainCondition, outputs: tuple[str, ...]
+) -> dict[str, Any]:
     return {
         "name": condition.name,
         "part": part,

@@ -24,7 +24,7 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import mask_spans
 from flight_analysis.report.display_units import DisplayUnit, display_unit
 from flight_analysis.report.figures import ERROR, GUST, PLANT
-from flight_analysis.report.html import Line, Page, Section, page_html
+from flight_analysis.report.html import Page, Section, TitleLine, page_html
 from flight_analysis.report.plotting import (
     Curve,
     Interval,
@@ -69,10 +69,13 @@ from flight_design.gains.requirement import PHASE_MARGIN, Requirement, requireme
 from flight_design.identification.bridge_identification import AMPLITUDE
 from flight_design.identification.innovation_filters import Actuation, recording
 from flight_design.identification.jsbsim_identification import STEP_MARGIN, IdentifiedAircraft
-from flight_design.identification.jsbsim_identification import identify as identify_aircraft
+from flight_design.identification.jsbsim_identification import identify_jsbsim as identify_aircraft
 from flight_design.identification.manoeuvre import manoeuvre_result
-from flight_design.identification.model_identification import Identification, model_yaml
-from flight_design.identification.model_identification import identify as identify_model
+from flight_design.identification.model_identification import (
+    Identification,
+    identify_model,
+    model_yaml,
+)
 from flight_log.log_content import StoredFile
 from flight_log.tape_reader import RecordedRun, read_run
 from rise_di_controller.params import ControllerConfig
@@ -469,7 +472,7 @@ def _innovation_page(identification: Identification, name: str) -> Page:
         f"{identification.before.log_likelihood:.4g} nominal, "
         f"{identification.after.log_likelihood:.4g} identified"
     )
-    line = Line(f"log-likelihood of a held-out sample: {likelihoods}")
+    line = TitleLine(f"log-likelihood of a held-out sample: {likelihoods}")
     return Page(
         title=f"Model of {identification.airframe.name} from {name}",
         lines=[line],

@@ -33,7 +33,7 @@ from flight_core.files import write_file, writing
 from flight_core.parameters import require
 
 if TYPE_CHECKING:
-    from flight_analysis.report.tables import Table as PageTable
+    from flight_analysis.report.tables import MetricTable as PageTable
 
 # exit status; bad input is 2 (`flight_cli.cli`)
 INTERRUPTED = 130

@@ -21,7 +21,7 @@ from rich.console import Console
 
 from flight_analysis.closed_loop.guidance_replay import GuidanceReplay, replay_guidance
 from flight_analysis.closed_loop.replay import (
-    Difference,
+    ReplayDifference,
     ReplayResult,
     recorded_parameters,
     recorded_scenario,
@@ -137,7 +137,7 @@ def _show_guidance(guided: GuidanceReplay) -> None:
         )
 
 
-def _difference(first: Difference) -> str:
+def _difference(first: ReplayDifference) -> str:
     """A difference as a text."""
     distance = (
         "which is not a number"

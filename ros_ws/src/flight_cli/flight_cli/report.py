@@ -120,13 +120,15 @@ def show_comparison(console: Console, flights: Sequence[RecordedFlight]) -> None
         say(console, f"{k}: {label}, {result}")
     for condition in comparison.conditions(flights):
         say(console, f"{condition.key}: {'; '.join(condition.texts)}")
-    if not all(comparison.alike(flights)):
+    if not all(comparison.has_same_conditions(flights)):
         say(console, comparison.UNLIKE, style="bold")
     headings = ("channel", "", *(str(k + 1) for k in range(len(flights))))
     table = new_table(
         "Tracking error, and its ratio to the first", headings, left_aligned=("channel", "")
     )
-    for channel in comparison.metric_tables(flights, "errors", ERROR_COLUMNS, lower_is_better=True):
+    for channel in comparison.comparison_tables(
+        flights, "errors", ERROR_COLUMNS, lower_is_better=True
+    ):
         for k, row in enumerate(channel.rows):
             ratios = (
                 "" if j == 0 or ratio is None else f" x{ratio:.3g}"

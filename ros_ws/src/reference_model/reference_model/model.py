@@ -11,7 +11,7 @@ from flight_core.integrators import rk4
 from flight_core.vectors import Array, FloatArray
 
 
-class Model(NamedTuple):
+class ReferenceMatrices(NamedTuple):
     """Matrices of equation (2): A_m (n, n) Hurwitz, B_m (n, m), C (m, n)."""
 
     A_m: Array
@@ -19,12 +19,12 @@ class Model(NamedTuple):
     C: Array
 
 
-def x_m_dot(t: Any, x_m: Array, u_m: Array, params: Model) -> Array:
+def x_m_dot(t: Any, x_m: Array, u_m: Array, params: ReferenceMatrices) -> Array:
     """Equation (2): A_m x_m + B_m u_m, shape (n,)."""
     return params.A_m @ x_m + params.B_m @ u_m
 
 
-def output(x_m: Array, params: Model) -> Array:
+def output(x_m: Array, params: ReferenceMatrices) -> Array:
     """Reference output y_m = C x_m, shape (m,)."""
     return product(params.C, x_m)
 
@@ -36,7 +36,7 @@ class Stepper(NamedTuple):
     Gamma: Array  # (n, 3m), for u_m at t, t + dt/2 and t + dt
 
 
-def stepper(dt: float, params: Model) -> Stepper:
+def stepper(dt: float, params: ReferenceMatrices) -> Stepper:
     """Matrices of x_m(t + dt) = Phi x_m(t) + Gamma [u_m(t), u_m(t + dt/2), u_m(t + dt)].
 
     Their columns are Runge-Kutta steps of the unit vectors. The product is the same step to
@@ -46,7 +46,7 @@ def stepper(dt: float, params: Model) -> Stepper:
     x = np.eye(n, n + 3 * m)
     u: FloatArray = np.eye(3 * m, n + 3 * m, n).reshape(3, m, n + 3 * m)
 
-    def driven(t: Any, x: Array, u: Array, params: Model) -> Array:
+    def driven(t: Any, x: Array, u: Array, params: ReferenceMatrices) -> Array:
         return dt * x_m_dot(t, x, u[round(2.0 * t)], params)  # t = 0, 1/2, 1 of a step of length 1
 
     columns = rk4(driven, 0.0, x, u, params, 1.0)
@@ -62,14 +62,14 @@ def step(x_m: Array, u_m: Array, matrices: Stepper) -> Array:
     return product(matrices.Phi, x_m) + product(matrices.Gamma, u_m)
 
 
-def second_order(natural_frequency: FloatArray, damping: FloatArray) -> Model:
+def second_order(natural_frequency: FloatArray, damping: FloatArray) -> ReferenceMatrices:
     """A filter of second order per channel, n = 2m.
 
     y_m,i'' + 2 damping_i w_i y_m,i' + w_i^2 y_m,i = w_i^2 u_m,i. The states are [y_m,1, y_m,1',
     y_m,2, ...]. C selects the outputs, as (2) requires. Arguments: shape (m,), rad/s and 1.
     """
     m = len(natural_frequency)
-    model = Model(np.zeros((2 * m, 2 * m)), np.zeros((2 * m, m)), np.zeros((m, 2 * m)))
+    model = ReferenceMatrices(np.zeros((2 * m, 2 * m)), np.zeros((2 * m, m)), np.zeros((m, 2 * m)))
     for i, (omega, zeta) in enumerate(zip(natural_frequency, damping, strict=True)):
         block = slice(2 * i, 2 * i + 2)
         model.A_m[block, block] = [[0.0, 1.0], [-(omega**2), -2.0 * zeta * omega]]

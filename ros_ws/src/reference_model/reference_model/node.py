@@ -19,7 +19,7 @@ from reference_model.params import ReferenceModelConfig
 from reference_model.reference import Reference
 
 
-class Command(NamedTuple):
+class LiveCommand(NamedTuple):
     """A received u_m."""
 
     stamp_ns: int
@@ -58,7 +58,7 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
             self._u_m = self.receive(
                 U_M, self._decode_u_m, self._take_u_m, lock=lock, max_age_ns=self._max_age_ns
             )
-            self._u_m_due: deque[Command | None] = deque()
+            self._u_m_due: deque[LiveCommand | None] = deque()
 
     def period_ns(self) -> int:
         return self._reference.period_ns
@@ -85,12 +85,12 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
         live = self.parameters.live
         return nanoseconds(live.max_age), nanoseconds(live.max_age + live.levelling)
 
-    def _decode_u_m(self, raw: bytes) -> Command | None:
+    def _decode_u_m(self, raw: bytes) -> LiveCommand | None:
         sample = self._decoder.decode(raw)
         return (
             None
             if sample is None
-            else Command(sample.stamp_ns, sample.value, self._attitude(raw), sample.sender)
+            else LiveCommand(sample.stamp_ns, sample.value, self._attitude(raw), sample.sender)
         )
 
     def _attitude(self, raw: bytes) -> FloatArray | None:
@@ -103,7 +103,7 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
             return None
         return None if sample is None else sample.value
 
-    def _take_u_m(self, command: Command, now_ns: int) -> None:
+    def _take_u_m(self, command: LiveCommand, now_ns: int) -> None:
         self._reference.take(command.stamp_ns - self._start_ns, command.u_m, command.attitude)
 
     def _log_source(self, source: str) -> None:

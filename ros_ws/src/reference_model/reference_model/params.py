@@ -29,7 +29,7 @@ from flight_core.units import GRAVITY
 from flight_core.vectors import selection_matrix
 from reference_model.command import Profile
 from reference_model.live import LiveParams
-from reference_model.model import Model, second_order, stepper
+from reference_model.model import ReferenceMatrices, second_order, stepper
 
 
 class Pulses(Config):
@@ -227,7 +227,7 @@ class ReferenceModelConfig(NodeConfig):
             "a higher one: the Runge-Kutta steps of the model diverge",
         )
 
-    def model(self) -> Model:
+    def model(self) -> ReferenceMatrices:
         """The matrices of equation (2)."""
         if self.second_order is not None:
             return second_order(
@@ -238,7 +238,9 @@ class ReferenceModelConfig(NodeConfig):
         n = len(self.linear.states)
         m = len(self.outputs)
         C = selection_matrix(self.outputs, self.linear.states)
-        return Model(np.reshape(self.linear.A_m, (n, n)), np.reshape(self.linear.B_m, (n, m)), C)
+        return ReferenceMatrices(
+            np.reshape(self.linear.A_m, (n, n)), np.reshape(self.linear.B_m, (n, m)), C
+        )
 
     def live_params(self) -> LiveParams:
         """Limits of u_m and the gains of the ending.

@@ -23,7 +23,7 @@ from flight_core.vectors import Array, StampedVector, array_namespace
 from flight_design.gains.airframe_properties import airframe_facts
 from flight_design.gains.gain_design import check_gains, select_gains
 from flight_design.gains.gain_selection import GainAssessment, Selection
-from flight_design.gains.gain_yaml import as_yaml as gains_yaml
+from flight_design.gains.gain_yaml import selection_yaml as gains_yaml
 from flight_design.learning.scenario_learner import learner
 from flight_log.tape_reader import RecordedRun
 from rise_di.c_code import Exported, export

@@ -12,7 +12,7 @@ from c_export.constants import exportable
 from c_export.drawn import drawn_calls, drawn_commands, drawn_standstill, drawn_steps
 from c_export.events import Recording, flight_recordings, parameter_sets, run_recording
 from c_export.library import Units, build_fmu, si_units
-from c_export.proof import FMU, REPORT, Proof, compilers, prove, report, words, write_code
+from c_export.proof import FMU, REPORT, Proof, compilers, proof_report, prove, words, write_code
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.arguments import FilePath, as_number, as_path
@@ -130,7 +130,7 @@ def export(
     proved = prove(
         code, commands, material.sets, material.recordings, float32=float32, runner=starter
     )
-    text = report(proved, title) + material.line
+    text = proof_report(proved, title) + material.line
     with writing("c", folder, "a folder that can"):
         write_file(folder / REPORT, text)
     return Exported([*files, folder / REPORT], proved, text)

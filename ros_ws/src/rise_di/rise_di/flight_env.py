@@ -12,7 +12,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from aircraft_sim.uncertainty import gust_directions, sampled_matrices
 from flight_analysis.closed_loop.scenario import Scenario, as_scenario
-from flight_analysis.closed_loop.stations import AircraftStation, Loop, ReferenceStation, Topics
+from flight_analysis.closed_loop.stations import (
+    AircraftStation,
+    FlightLoop,
+    ReferenceStation,
+    Topics,
+)
 from flight_campaign.batch.campaign_course import HOLD, build_course
 from flight_campaign.statistics import LOSS_OF_TRACK_SCORE, score_units
 from flight_core.arguments import as_count, as_number
@@ -176,7 +181,7 @@ class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
         reference = ReferenceStation(self.scenario.reference_model, self._topics, self._period_ns)
         every_ns = self._period_ns if _is_newest_last(self.scenario) else None
         aircraft = AircraftStation(self._drawn().aircraft, self._topics, every_ns)
-        self._loop = Loop([reference, aircraft])
+        self._loop = FlightLoop([reference, aircraft])
         self._k = 0
         self._loop.run(0)
         return self._observed(), {}

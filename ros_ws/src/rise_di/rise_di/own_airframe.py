@@ -191,7 +191,7 @@ def _flying(
             )
 
         selection = select_gains(trial, _parsed(text(trial, controller), files[1]), samples=SAMPLES)
-        section = gain_yaml.as_yaml(selection)
+        section = gain_yaml.selection_yaml(selection)
         flown = _parsed(text(trial, section), files[1])
         tape = simulate(flown)
         used = _used(flown, tape)

@@ -215,7 +215,7 @@ def fly_plant(
     length_ns = nanoseconds(as_number(duration, "duration", loop.period, unit="s"))
     outcome = COMPLETED
     try:
-        stations.Loop([plant_station, reference, _LoopStation(loop, topics)]).run(length_ns)
+        stations.FlightLoop([plant_station, reference, _LoopStation(loop, topics)]).run(length_ns)
     except FlightEnded as error:
         outcome = error.outcome
     signals = topics.pop_signals()

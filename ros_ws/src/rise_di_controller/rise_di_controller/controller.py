@@ -291,11 +291,11 @@ class Controller:
         else:
             last = self._samples.last
             self._samples, change = samples.step(self._samples, outputs, self._guard.samples)
-            if change is samples.Change.FROZEN:
+            if change is samples.SampleChange.FROZEN:
                 return samples.standstill(self._samples, outputs)
-            if change is not samples.Change.NEAR:
+            if change is not samples.SampleChange.NEAR:
                 jump = samples.jump(last, outputs, self._parameters.outputs)
-                if change is samples.Change.FAR:
+                if change is samples.SampleChange.FAR:
                     return jump
                 self._restarted = f"{jump}, and stays there"
                 self.restart()

@@ -38,7 +38,7 @@ from rise_di_controller.extensions.feedforward import (
     LONGEST_PART,
     ZERO_REAL_PART,
     Nominal,
-    zero_dynamics,
+    nominal_zeros,
 )
 from rise_di_controller.extensions.model_sections import (
     AllocationConfig,
@@ -57,7 +57,7 @@ from rise_di_controller.guard.probe import LARGEST, Probe, ProbeConfig
 from rise_di_controller.law.control_law import ControlLaw, Measurements, TunedLaw, fields
 from rise_di_controller.law.linear_loop import (
     LinearPlant,
-    Loop,
+    LoopTiming,
     is_stable,
     linear_law,
     spectral_radius,
@@ -269,7 +269,7 @@ class ControllerConfig(NodeConfig):
         )
 
     def _check_nominal(self, nominal: Nominal) -> None:
-        zeros = zero_dynamics(nominal)
+        zeros = nominal_zeros(nominal)
         rightmost = float(np.max(zeros.real, initial=-np.inf))
         fastest = float(np.max(np.abs(zeros), initial=0.0))
         require(
@@ -326,7 +326,7 @@ class ControllerConfig(NodeConfig):
         (law, params), period, m = self.tuned_law(), 1.0 / self.rate, len(self.inputs)
         read = selection_matrix(self.vanes, self._model_states())
         plant = LinearPlant(nominal.A + nominal.gravity, nominal.B, np.vstack([nominal.C, read]))
-        loop = Loop(np.array(self.lag), 0.0, period)
+        loop = LoopTiming(np.array(self.lag), 0.0, period)
         for frozen in _subsets(self.vanes):
             flown = without_frozen(params, [name in frozen for name in self.vanes])
             frozen_text = f" without {' and '.join(frozen)}" if frozen else ""
@@ -558,7 +558,7 @@ class ControllerConfig(NodeConfig):
             ramp_ns=nanoseconds(self.ramp),
             deactivation_holds=self.on_deactivate == "hold",
             limits=self._limits(),
-            samples=samples.bounds(
+            samples=samples.sample_limits(
                 self.outputs, self._authority(), self.y_max, period_ns(self.rate, "rate")
             ),
             history=self.history_ticks(),

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flight_analysis.closed_loop.replay import Difference
+from flight_analysis.closed_loop.replay import ReplayDifference
 from flight_core.channels import ATTITUDE
 from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
@@ -30,7 +30,7 @@ class GuidanceReplay(NamedTuple):
     steps: int
     checked: int
     differing: int
-    first: Difference | None
+    first: ReplayDifference | None
     notes: tuple[str, ...]
 
     def equal(self) -> bool:
@@ -110,7 +110,7 @@ class _Comparison:
             {} if u_m is None else dict(zip(u_m.stamp_ns.tolist(), u_m.values, strict=True))
         )
 
-    def differences(self) -> Iterator[Difference]:
+    def differences(self) -> Iterator[ReplayDifference]:
         """The first different channel of each different step, in the order of the steps."""
         previous: GuidanceState | None = None
         failed_before = 0.0
@@ -156,7 +156,9 @@ class _Comparison:
         )
         return np.append(guidance.row(sample, self._outputs), guidance.u_m(state))
 
-    def _difference(self, k: int, recorded: FloatArray, computed: FloatArray) -> Difference | None:
+    def _difference(
+        self, k: int, recorded: FloatArray, computed: FloatArray
+    ) -> ReplayDifference | None:
         """The first channel of step k with a different bit."""
         columns = np.flatnonzero(recorded.view(np.int64) != computed.view(np.int64))
         if len(columns) == 0:
@@ -165,4 +167,4 @@ class _Comparison:
         published = (f"published.{name}" for name in (*self._outputs, *ATTITUDE))
         channel = (*self._names, *published)[column]
         values = float(recorded[column]), float(computed[column])
-        return Difference(k + 1, float(self._t[k]), channel, *values)
+        return ReplayDifference(k + 1, float(self._t[k]), channel, *values)

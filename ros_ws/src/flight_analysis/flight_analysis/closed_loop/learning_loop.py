@@ -72,7 +72,7 @@ class Entry(NamedTuple):
 
 
 class Learned(NamedTuple):
-    """Channels of the topic `learned`.
+    """Channels of the topic `learned_sample`.
 
     They are `proposed`, and the value and the deviation of entries of A and B in the rows of the
     outputs.
@@ -82,7 +82,9 @@ class Learned(NamedTuple):
     values: FloatArray
 
 
-def learned(entries: Iterable[Entry], outputs: tuple[str, ...], *, proposed: bool) -> Learned:
+def learned_sample(
+    entries: Iterable[Entry], outputs: tuple[str, ...], *, proposed: bool
+) -> Learned:
     """What an identification found, and whether it became a proposal."""
     output_entries = [entry for entry in entries if entry.row in outputs]
     channels = {f"value.{entry.name}": entry.value for entry in output_entries}
@@ -110,7 +112,7 @@ class Identifications:
         entries = {entry.name: entry for entry in identification.entries if entry.nominal}
         # a topic keeps its channels: those of the rough airframe
         self._names = self._names or tuple(entries)
-        return learned(
+        return learned_sample(
             (entries[name] for name in self._names),
             self._outputs,
             proposed=proposal.controller is not None,

@@ -36,7 +36,7 @@ U_PREFIXES = ("u.", "published.")
 OPEN_LOOP = "open loop: the recorded aircraft did not fly this u"
 
 
-class Difference(NamedTuple):
+class ReplayDifference(NamedTuple):
     """A channel of a tick whose recorded and computed values differ."""
 
     number: int  # of the tick's sample in `internals`
@@ -87,7 +87,7 @@ class ReplayResult(NamedTuple):
         """Whether every checked bit is equal, and recorded with these parameters."""
         return not self.different().any() and not self.other_parameters.any()
 
-    def first(self) -> Difference | None:
+    def first(self) -> ReplayDifference | None:
         """The first difference in the first different tick; None without a difference.
 
         A channel of u goes before a channel of `internals`.
@@ -103,7 +103,7 @@ class ReplayResult(NamedTuple):
         )
         recorded = float(self.recorded[row, column])
         computed = float(self.computed[row, column])
-        return Difference(
+        return ReplayDifference(
             number=int(self.number[row]),
             t=float(self.t[row]),
             channel=self.names[column],

@@ -17,7 +17,7 @@ from flight_log.flight_processes import controller_starts
 from rise_di_controller import internals
 from rise_di_controller.extensions import feedforward
 from rise_di_controller.guard import guard, retuning
-from rise_di_controller.guard.guard import ControllerState, GuardParams, Vanes
+from rise_di_controller.guard.guard import ControllerState, GuardParams, VaneReadings
 from rise_di_controller.law.control_law import TunedLaw, restored
 from rise_di_controller.laws import AnyLaw
 from rise_di_controller.params import ControllerConfig
@@ -170,7 +170,7 @@ class Ticks:
             u_ff=row["u_ff"],
             feedforward=feedforward_state,
         )
-        vanes = Vanes(row["vane"], row["vane_m"]) if limits.vanes else None
+        vanes = VaneReadings(row["vane"], row["vane_m"]) if limits.vanes else None
         return logged._replace(effectors=effectors, effectors_failsafe=effectors, vanes=vanes)
 
     def tick(

@@ -14,8 +14,8 @@ from flight_analysis.closed_loop.scenario import Scenario, as_scenario, require_
 from flight_analysis.closed_loop.stations import (
     AircraftStation,
     ControllerStation,
+    FlightLoop,
     GuidanceStation,
-    Loop,
     ReferenceStation,
     Station,
     Topics,
@@ -139,7 +139,7 @@ def fly(
         stations += [ProposalStation(controller, learning, topics), control_station, learner]
     else:
         stations.append(control_station)
-    loop = Loop([*stations, _Recorder(topics, record, progress)])
+    loop = FlightLoop([*stations, _Recorder(topics, record, progress)])
     outcome = COMPLETED
     try:
         loop.run(nanoseconds(scenario.flight.duration))

@@ -42,7 +42,7 @@ class Station(Protocol):
         """Act at flight time t. Raises FlightEnded or ChannelError where the flight ends."""
 
 
-class Loop:
+class FlightLoop:
     """Steps the due stations of each instant in simulated time, in the order of the list."""
 
     def __init__(self, stations: Sequence[Station]) -> None:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from flight_core.vectors import FloatArray
-from rise_di_controller.law.linear_loop import LinearLaw, LinearPlant, Loop, is_stable
+from rise_di_controller.law.linear_loop import LinearLaw, LinearPlant, LoopTiming, is_stable
 
 MAX_DELAY_MARGIN = 0.5
 """s, upper end of the search for a delay margin. A loop that tolerates more is slower than any loop
@@ -19,7 +19,7 @@ NEAR = 4  # of the resolution, first step of the search about the delay margin o
 def delay_margin(
     plant: LinearPlant,
     law: LinearLaw,
-    loop: Loop,
+    loop: LoopTiming,
     share: FloatArray | float = 1.0,
     longest: float = MAX_DELAY_MARGIN,
     near: float | None = None,

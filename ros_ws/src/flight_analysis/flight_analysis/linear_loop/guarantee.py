@@ -22,7 +22,7 @@ from flight_analysis.linear_loop.uncertain_loop import (
 from flight_analysis.linear_loop.worst_case import first_unstable, worst_in_box
 from flight_core.parameters import require
 from flight_core.vectors import FloatArray
-from rise_di_controller.law.linear_loop import Loop, closed_loop, is_stable
+from rise_di_controller.law.linear_loop import LoopTiming, closed_loop, is_stable
 
 LARGEST = 0.99  # part of an entry up to which an unstable aircraft is sought
 WIDEST_DISK = 2.0  # a disk of 2 leaves 180 deg
@@ -102,7 +102,7 @@ def guarantee(linear: LinearLoop, late: float = 0.0) -> Guarantee:
     return promise._replace(disk=np.maximum(disks, disk_all), disk_all=disk_all)
 
 
-def _loops(linear: LinearLoop, late: float) -> list[Loop]:
+def _loops(linear: LinearLoop, late: float) -> list[LoopTiming]:
     """The loop with u in time, and with u late by the whole time."""
     loop = linear.loop
     return [loop._replace(delay=loop.delay + extra) for extra in sorted({0.0, late})]

@@ -24,7 +24,7 @@ from rise_di_controller.law.linear_loop import (
     SPECTRAL_RADIUS_TOLERANCE,
     LinearLaw,
     LinearPlant,
-    Loop,
+    LoopTiming,
     closed_loop,
     sampled_plant,
 )
@@ -118,7 +118,7 @@ class SlowModes(NamedTuple):
     damping: FloatArray  # (k,) ratio
 
 
-def slow_modes(plant: LinearPlant, law: LinearLaw, loop: Loop) -> SlowModes:
+def slow_modes(plant: LinearPlant, law: LinearLaw, loop: LoopTiming) -> SlowModes:
     """The slow modes of an aircraft: frequency abs(p) and damping -Re p / abs(p).
 
     p = log(eigenvalue) / T.
@@ -134,7 +134,9 @@ def _slow_modes(eigenvalues: ComplexArray, period: float) -> SlowModes:
     return SlowModes(np.abs(slow) / period, -slow.real / np.abs(slow))
 
 
-def loop_transfer(plant: LinearPlant, law: LinearLaw, loop: Loop, w: FloatArray) -> ComplexArray:
+def loop_transfer(
+    plant: LinearPlant, law: LinearLaw, loop: LoopTiming, w: FloatArray
+) -> ComplexArray:
     """L_i of an aircraft at the frequencies w, (F,) rad/s up to pi / T, shape (F, m)."""
     form = schur_form(LinearPlant(plant.A[None], plant.B[None], plant.C), law, loop)
     S = _sensitivity(form, np.exp(1j * w * loop.period)[None])[0]
@@ -142,7 +144,7 @@ def loop_transfer(plant: LinearPlant, law: LinearLaw, loop: Loop, w: FloatArray)
 
 
 def input_margins(
-    plant: LinearPlant, law: LinearLaw, loop: Loop, *, together: bool = True
+    plant: LinearPlant, law: LinearLaw, loop: LoopTiming, *, together: bool = True
 ) -> Margins:
     """Margins of an aircraft, or of N aircraft.
 
@@ -170,7 +172,7 @@ def input_margins(
     )
 
 
-def phase_margins(plant: LinearPlant, law: LinearLaw, loop: Loop) -> FloatArray:
+def phase_margins(plant: LinearPlant, law: LinearLaw, loop: LoopTiming) -> FloatArray:
     """The `phase` of `input_margins` alone, (..., m), to 1e-8.
 
     There is no search for gain margins and peaks. A loop with independent modes is a sum over the
@@ -236,7 +238,7 @@ def _batches(plant: LinearPlant, law: LinearLaw) -> Iterator[tuple[LinearPlant, 
         yield LinearPlant(A[batch], B[batch], plant.C), its_law
 
 
-def schur_form(plant: LinearPlant, law: LinearLaw, loop: Loop) -> SchurForm:
+def schur_form(plant: LinearPlant, law: LinearLaw, loop: LoopTiming) -> SchurForm:
     """The closed loops of N aircraft: A (N, n, n), B (N, n, m) under one law or N laws."""
     from scipy.linalg import schur  # noqa: PLC0415 - a controller without an observer starts without it
 
@@ -247,7 +249,7 @@ def schur_form(plant: LinearPlant, law: LinearLaw, loop: Loop) -> SchurForm:
 
 
 def _modal_form(
-    plant: LinearPlant, law: LinearLaw, loop: Loop
+    plant: LinearPlant, law: LinearLaw, loop: LoopTiming
 ) -> tuple[SchurForm, NDArray[np.bool_]]:
     """As `schur_form` with a diagonal T, and whether the modes of a loop are independent.
 
@@ -267,7 +269,7 @@ def _modal_form(
 
 
 def _from_inputs_to_inputs(
-    plant: LinearPlant, law: LinearLaw, loop: Loop
+    plant: LinearPlant, law: LinearLaw, loop: LoopTiming
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """The closed loops of N aircraft from a disturbance d of the inputs to u.
 

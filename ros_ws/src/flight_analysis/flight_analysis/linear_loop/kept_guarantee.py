@@ -39,7 +39,7 @@ def keep(linear: LinearLoop, promise: Guarantee) -> None:
         return
 
 
-def kept(linear: LinearLoop) -> Guarantee | None:
+def kept_guarantee(linear: LinearLoop) -> Guarantee | None:
     """The guarantee that was computed for a loop; None without one, or for a damaged file."""
     try:
         content: dict[str, Any] = json.loads(_path(linear).read_bytes())

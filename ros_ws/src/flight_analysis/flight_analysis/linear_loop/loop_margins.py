@@ -24,7 +24,7 @@ from rise_di_controller.law.linear_loop import (
     SPECTRAL_RADIUS_TOLERANCE,
     LinearLaw,
     LinearPlant,
-    Loop,
+    LoopTiming,
     closed_loop,
     is_stable,
     linear_law,
@@ -44,7 +44,7 @@ class LinearLoop(NamedTuple):
     inputs: tuple[str, ...]
     plant: LinearPlant  # of N aircraft, the nominal one first: A (N, n, n), B (N, n, m)
     law: LinearLaw
-    loop: Loop
+    loop: LoopTiming
     box: Box | None = None  # of the uncertain aircraft; None without any
 
     @property
@@ -321,9 +321,11 @@ def is_literal(controller: ControllerConfig) -> bool:
     return isinstance(controller, RiseDiConfig) and controller.sampled_sign()[0] is Sign.LITERAL
 
 
-def loop_of(controller: ControllerConfig) -> Loop:
+def loop_of(controller: ControllerConfig) -> LoopTiming:
     """The loop of a controller."""
-    return Loop(np.array(controller.lag, dtype=np.float64), controller.delay, 1.0 / controller.rate)
+    return LoopTiming(
+        np.array(controller.lag, dtype=np.float64), controller.delay, 1.0 / controller.rate
+    )
 
 
 def law_order(airframe: Airframe, controller: ControllerConfig) -> tuple[list[int], list[int]]:

@@ -28,7 +28,7 @@ from rise_di_controller.law.linear_loop import (
     ROOT,
     LinearLaw,
     LinearPlant,
-    Loop,
+    LoopTiming,
     SampledPlant,
     sampled_plant,
     zero_order_hold,
@@ -91,7 +91,7 @@ class UncertainLoop(NamedTuple):
 
 
 def uncertain_loop(
-    plant: LinearPlant, law: LinearLaw, loop: Loop, box: Box, late: float = 0.0
+    plant: LinearPlant, law: LinearLaw, loop: LoopTiming, box: Box, late: float = 0.0
 ) -> UncertainLoop:
     """The loop of a plant, A (n, n), with the entries of a box pulled out.
 

@@ -37,7 +37,7 @@ from rise_di_controller.law.linear_loop import (
     SPECTRAL_RADIUS_TOLERANCE,
     LinearLaw,
     LinearPlant,
-    Loop,
+    LoopTiming,
 )
 
 SEED = 1  # of the corners at which a search starts
@@ -204,7 +204,7 @@ class WorstCase(NamedTuple):
     least_phase: FloatArray  # (k,) deviations with the smallest phase margin
 
 
-def worst_in_box(plant: LinearPlant, law: LinearLaw, loop: Loop, box: Box) -> WorstCase:
+def worst_in_box(plant: LinearPlant, law: LinearLaw, loop: LoopTiming, box: Box) -> WorstCase:
     """The least margins over the corners of a box around a plant, A (n, n), by search.
 
     Each figure goes from the corner at which it is least to the corner to which its slope points,
@@ -263,7 +263,7 @@ def _figures(margins: Margins) -> FloatArray:
 def _slopes(
     plant: LinearPlant,
     law: LinearLaw,
-    loop: Loop,
+    loop: LoopTiming,
     box: Box,
     uncertain: UncertainLoop,
     d: FloatArray,

@@ -123,7 +123,9 @@ def _text(value: object) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def alike(flights: Sequence[RecordedFlight], *, timed: bool = False) -> tuple[bool, ...]:
+def has_same_conditions(
+    flights: Sequence[RecordedFlight], *, timed: bool = False
+) -> tuple[bool, ...]:
     """Whether each flight had the conditions of the first, but for the controller.
 
     `timed`: with the same time.
@@ -139,7 +141,7 @@ def alike(flights: Sequence[RecordedFlight], *, timed: bool = False) -> tuple[bo
 # ---- Tables
 
 
-def metric_tables(
+def comparison_tables(
     flights: Sequence[RecordedFlight], key: str, columns: Sequence[Column], *, lower_is_better: bool
 ) -> list[ComparisonTable]:
     """Metrics of "errors" or "inputs" of the summaries: a table per channel.
@@ -147,7 +149,7 @@ def metric_tables(
     A table has a row per column with a value.
     """
     display = common_units(flights)
-    same = alike(flights)
+    same = has_same_conditions(flights)
     tables = []
     for channel in dict.fromkeys(chain.from_iterable(flight.summary[key] for flight in flights)):
         unit = display.get(channel, NO_UNIT)
@@ -165,7 +167,7 @@ def error_tables(flights: Sequence[RecordedFlight]) -> list[ComparisonTable]:
     """Metrics of the error and settling times, by channel."""
     return [
         table._replace(rows=(*table.rows, *_settling_rows(flights, table.channel)))
-        for table in metric_tables(
+        for table in comparison_tables(
             flights, "errors", (*ERROR_COLUMNS, SWITCH_COLUMN), lower_is_better=True
         )
     ]
@@ -183,7 +185,7 @@ def _settling_rows(flights: Sequence[RecordedFlight], channel: str) -> list[Comp
 
 def tick_tables(flights: Sequence[RecordedFlight]) -> list[ComparisonTable]:
     """Timing metrics of the controllers as a table; none for zeros alone."""
-    same = alike(flights, timed=True)
+    same = has_same_conditions(flights, timed=True)
     summaries = [flight.summary for flight in flights]
     rows = []
     for column in TIMING_COLUMNS:

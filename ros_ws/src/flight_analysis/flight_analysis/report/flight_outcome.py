@@ -38,7 +38,7 @@ def outcome_of_log(tape: Tape, scenario: Scenario, *, simulated: bool) -> Outcom
     return UNKNOWN if is_part else log_ends_at(seconds(last_ns - tape.start_ns), duration)
 
 
-def flown(tape: Tape) -> Tape:
+def until_last_tick(tape: Tape) -> Tape:
     """The tape up to the controller's last tick.
 
     Later samples belong to the shutdown of the processes. A u that ends much earlier than y and

@@ -17,7 +17,7 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.linear_loop.kept_guarantee import kept
+from flight_analysis.linear_loop.kept_guarantee import kept_guarantee
 from flight_analysis.linear_loop.loop_margins import LinearLoop, loop_margins
 from flight_analysis.report import (
     comparison,
@@ -35,12 +35,12 @@ from flight_analysis.report.display_units import (
 )
 from flight_analysis.report.flown_models import FILE, TRUE, FlownLoop, flown_loops, learned_lines
 from flight_analysis.report.plotting import Curve, Figure, SampleStore, pack, time_series_figure
-from flight_analysis.report.replay_scene import Replay, replay
+from flight_analysis.report.replay_scene import Replay, replay_of
 from flight_analysis.report.summary import (
     RecordedFlight,
     command_results,
     finite_or_null,
-    parts_legend,
+    summary_legend,
     time_flown,
 )
 from flight_analysis.report.summary_rows import INPUT_COLUMNS, Column
@@ -50,7 +50,7 @@ from flight_core.vectors import FloatArray
 HERE = Path(__file__).parent
 
 
-class Line(NamedTuple):
+class TitleLine(NamedTuple):
     """A line under the title: colour, label and outcome of a flight, and text.
 
     Any part may be empty.
@@ -66,7 +66,7 @@ class Line(NamedTuple):
 class TableGroup(NamedTuple):
     """Adjacent tables. With `colours` of the flights: comparison tables."""
 
-    tables: Sequence[tables.Table] | Sequence[comparison.ComparisonTable]
+    tables: Sequence[tables.MetricTable] | Sequence[comparison.ComparisonTable]
     title: str = ""
     legend: str = ""
     colours: Sequence[str] = ()
@@ -86,7 +86,7 @@ class Page(NamedTuple):
     """Content of a page."""
 
     title: str
-    lines: Sequence[Line]
+    lines: Sequence[TitleLine]
     tables: Sequence[TableGroup]
     sections: Sequence[Section]
     samples: SampleStore
@@ -112,7 +112,7 @@ def _write(path: Path, page: Page) -> None:
 
 def write_loop_page(path: Path, title: str, loop: LinearLoop) -> None:
     """Write a page of a linear loop that need not have flown: margins, Bode and Nyquist plot."""
-    table = margin_figures.margin_table(loop_margins(loop), kept(loop))
+    table = margin_figures.margin_table(loop_margins(loop), kept_guarantee(loop))
     sections = _loop_sections({"": loop})
     _write(
         path,
@@ -144,7 +144,7 @@ def _imported_page(flight: RecordedFlight) -> Page:
     )
     return Page(
         title=f"Flight {flight.name}",
-        lines=[Line(text)],
+        lines=[TitleLine(text)],
         tables=[TableGroup(flight_tables)],
         sections=[
             Section(
@@ -163,7 +163,7 @@ def _imported_page(flight: RecordedFlight) -> Page:
         ],
         samples=context.samples,
         notes=flight.summary["notes"],
-        replay=replay(flight, context),
+        replay=replay_of(flight, context),
     )
 
 
@@ -185,14 +185,14 @@ def _flight_page(flight: RecordedFlight, scenario: Scenario) -> Page:
         sections=[*_sections(flight, scenario, context), *_loop_sections(_drawn_loops(loops))],
         samples=context.samples,
         notes=flight.summary["notes"],
-        replay=replay(flight, context),
+        replay=replay_of(flight, context),
     )
 
 
-def _outcome_line(text: str, flight: RecordedFlight) -> Line:
+def _outcome_line(text: str, flight: RecordedFlight) -> TitleLine:
     """A line with the outcome of a flight."""
     outcome = flight.summary["outcome"]
-    return Line(text, outcome["sentence"], is_success=outcome["status"] == 0)
+    return TitleLine(text, outcome["sentence"], is_success=outcome["status"] == 0)
 
 
 def _comparison_page(flights: Sequence[RecordedFlight]) -> Page:
@@ -206,9 +206,11 @@ def _comparison_page(flights: Sequence[RecordedFlight]) -> Page:
         lines.append(line._replace(label=label, colour=colour))
     palette = list(colours.values())
     legend = ". ".join(
-        dict.fromkeys([*(parts_legend(flight.summary) for flight in flights), tables.ERROR_LEGEND])
+        dict.fromkeys(
+            [*(summary_legend(flight.summary) for flight in flights), tables.ERROR_LEGEND]
+        )
     )
-    inputs = comparison.metric_tables(flights, "inputs", INPUT_COLUMNS, lower_is_better=False)
+    inputs = comparison.comparison_tables(flights, "inputs", INPUT_COLUMNS, lower_is_better=False)
     groups = [
         *_condition_group(flights, list(colours)),
         TableGroup(comparison.error_tables(flights), "Tracking error", legend, palette),
@@ -252,8 +254,8 @@ def _condition_group(flights: Sequence[RecordedFlight], labels: Sequence[str]) -
     if not rows:
         return []
     columns = [Column("", label) for label in labels]
-    table = tables.Table("", columns, [(row.key, *row.texts) for row in rows])
-    legend = "" if all(comparison.alike(flights)) else comparison.UNLIKE
+    table = tables.MetricTable("", columns, [(row.key, *row.texts) for row in rows])
+    legend = "" if all(comparison.has_same_conditions(flights)) else comparison.UNLIKE
     return [TableGroup([table], "What differs", legend)]
 
 
@@ -321,14 +323,14 @@ def _sections(
     ]
 
 
-def _margin_tables(loops: Sequence[FlownLoop]) -> list[tables.Table]:
+def _margin_tables(loops: Sequence[FlownLoop]) -> list[tables.MetricTable]:
     """The margins of a single loop by input, the least margins of several loops."""
     if not loops:
         return []
     if len(loops) > 1:
         return [margin_figures.flown_margin_table(loops)]
     loop = loops[0].loop
-    return [margin_figures.margin_table(loop_margins(loop), kept(loop))]
+    return [margin_figures.margin_table(loop_margins(loop), kept_guarantee(loop))]
 
 
 def _drawn_loops(loops: Sequence[FlownLoop]) -> dict[str, LinearLoop]:

@@ -34,7 +34,7 @@ from rise_di_controller.law.linear_loop import (
     SPECTRAL_RADIUS_TOLERANCE,
     LinearLaw,
     LinearPlant,
-    Loop,
+    LoopTiming,
     closed_loop,
     linear_law,
     sampled_plant,
@@ -180,7 +180,7 @@ def _linear_error(
 
 def _known_loop(
     controller: ControllerConfig, airframe: Airframe
-) -> tuple[LinearPlant, LinearLaw, Loop]:
+) -> tuple[LinearPlant, LinearLaw, LoopTiming]:
     """The loop around the airframe of a simulation."""
     A = airframe.matrix_a()[None]
     B = airframe.matrix_b()[None] @ distribution(airframe, controller)
@@ -188,7 +188,7 @@ def _known_loop(
     return linear.nominal, linear.law, linear.loop
 
 
-def _bare_loop(controller: ControllerConfig) -> tuple[LinearPlant, LinearLaw, Loop]:
+def _bare_loop(controller: ControllerConfig) -> tuple[LinearPlant, LinearLaw, LoopTiming]:
     """The loop around y_dot = Omega u, abs(Omega_ii) = omega / input_scale, of the controller."""
     if controller.vanes:
         controller = controller.without_vanes()
@@ -204,7 +204,7 @@ def _bare_loop(controller: ControllerConfig) -> tuple[LinearPlant, LinearLaw, Lo
 def _flight(
     tape: Tape,
     controller: ControllerConfig,
-    parts: tuple[LinearPlant, LinearLaw, Loop],
+    parts: tuple[LinearPlant, LinearLaw, LoopTiming],
     ticks: FloatArray,
     d: FloatArray,
     y_m: FloatArray,

@@ -19,7 +19,7 @@ from flight_analysis.report.figures import COLOURS
 from flight_analysis.report.flown_models import FlownLoop
 from flight_analysis.report.plotting import Figure, add_line, axis, first_in_legend, set_layout
 from flight_analysis.report.summary_rows import Column
-from flight_analysis.report.tables import Table
+from flight_analysis.report.tables import MetricTable
 from flight_core.vectors import FloatArray
 
 MARGIN_COLUMNS = (
@@ -157,11 +157,11 @@ def modes_text(margins: LoopMargins) -> str:
     return f"slow modes and their damping: {modes or f'all above {SHOWN_DAMPING:g}'}{least}"
 
 
-def margin_table(margins: LoopMargins, promise: Guarantee | None = None) -> Table:
+def margin_table(margins: LoopMargins, promise: Guarantee | None = None) -> MetricTable:
     """The margins of a flight's loop, and the guarantee that was computed for it."""
     sentences = [MARGIN_LEGEND, modes_text(margins)]
     sentences += [] if promise is None else guarantee_text(promise)
-    return Table(
+    return MetricTable(
         "Margins of the linear loop",
         MARGIN_COLUMNS,
         margin_rows(margins),
@@ -169,7 +169,7 @@ def margin_table(margins: LoopMargins, promise: Guarantee | None = None) -> Tabl
     )
 
 
-def flown_margin_table(loops: Sequence[FlownLoop]) -> Table:
+def flown_margin_table(loops: Sequence[FlownLoop]) -> MetricTable:
     """The least margins of the loops of a flight, a row each."""
     columns = [
         Column("flown", "from to (s)"),
@@ -190,7 +190,9 @@ def flown_margin_table(loops: Sequence[FlownLoop]) -> Table:
         "inputs at once; damping: of slow modes. aircraft: that of the file, and the true one as "
         "simulated before a drift"
     )
-    return Table("Margins of the linear loop, by the parameters that flew", columns, rows, legend)
+    return MetricTable(
+        "Margins of the linear loop, by the parameters that flew", columns, rows, legend
+    )
 
 
 def margins_as_json(margins: LoopMargins) -> dict[str, Any]:

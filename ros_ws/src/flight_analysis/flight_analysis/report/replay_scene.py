@@ -36,7 +36,7 @@ class Replay(NamedTuple):
     style: str
 
 
-def replay(flight: RecordedFlight, context: PlotContext) -> Replay | None:
+def replay_of(flight: RecordedFlight, context: PlotContext) -> Replay | None:
     """The replay of a flight with a logged attitude, else None.
 
     Adds the poses to the samples of the page.

@@ -24,7 +24,7 @@ from flight_analysis.closed_loop.scenario import (
     scenario_yaml,
 )
 from flight_analysis.report.account import Account, account
-from flight_analysis.report.flight_outcome import NEVER_ENGAGED, flown, outcome_of_log
+from flight_analysis.report.flight_outcome import NEVER_ENGAGED, outcome_of_log, until_last_tick
 from flight_analysis.report.flown_models import FlownController, flown_controllers
 from flight_analysis.report.model_spans import flown_parameters
 from flight_analysis.report.summary import (
@@ -226,7 +226,7 @@ def _flight(recorded: RecordedRun, run: Path, outcome: Outcome | None) -> Record
         outcome = NEVER_ENGAGED
     if "guidance" in log:
         require_channels(log["guidance"].names)
-    tape = flown(log)
+    tape = until_last_tick(log)
     flight_account = account(log, scenario, outcome, simulated=engagements is None)
     engaged = _engaged(tape, engagements or [])
     has_figures = {"y", "y_m"} <= set(engaged.signals)  # an engagement may be shorter than a sample

@@ -535,7 +535,7 @@ def finite_or_null(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def parts_legend(summary: Mapping[str, Any]) -> str:
+def summary_legend(summary: Mapping[str, Any]) -> str:
     """Legend of the parts of a flight."""
     is_guided = any("turn" in parts for parts in summary["errors"].values())
     air = summary["air"] or UNKNOWN_AIR

@@ -20,7 +20,7 @@ from flight_analysis.report.display_units import (
     format_value,
 )
 from flight_analysis.report.guided import BANDS, landing_results, leg_results
-from flight_analysis.report.summary import parts_legend, taken_over, time_flown
+from flight_analysis.report.summary import summary_legend, taken_over, time_flown
 from flight_analysis.report.summary_rows import (
     ERROR_COLUMNS,
     INPUT_COLUMNS,
@@ -68,7 +68,7 @@ MODEL_LEGEND = "start: the law of the start. Commands and wind of the spans diff
 SATURATION_LEGEND = "; saturated: ticks with saturation by magnitude / by rate"
 
 
-class Table(NamedTuple):
+class MetricTable(NamedTuple):
     """A table with the names of the rows in the first column; `columns` follow."""
 
     caption: str
@@ -94,7 +94,7 @@ class Table(NamedTuple):
         ]
 
 
-class Interval(NamedTuple):
+class EventInterval(NamedTuple):
     """A gust, a fault, a failsafe mode, a saturation or a still vane.
 
     The span is from the first to the last instant in s.
@@ -121,7 +121,7 @@ def _stands_still(measures: FloatArray, tape: Tape, time: float) -> NDArray[np.b
     return still
 
 
-def events(tape: Tape, gusts: Windows, scenario: Scenario | None = None) -> list[Interval]:
+def events(tape: Tape, gusts: Windows, scenario: Scenario | None = None) -> list[EventInterval]:
     """Gusts, faults of effectors, modes but ENGAGED, saturations, and still vanes.
 
     The order is that of the start. The saturations are of the inputs. The scenario comes from the
@@ -134,7 +134,7 @@ def events(tape: Tape, gusts: Windows, scenario: Scenario | None = None) -> list
         spans = [(interval.start, interval.stop) for interval in group]
         times = f", {len(spans)} times" if len(spans) > 1 else ""
         listed.append(
-            Interval(
+            EventInterval(
                 label,
                 spans[0][0],
                 spans[-1][1],
@@ -144,7 +144,7 @@ def events(tape: Tape, gusts: Windows, scenario: Scenario | None = None) -> list
     end = figures.flight_end(tape)
     faults = flown.aircraft.actuators.read_faults() if isinstance(flown, Scenario) else ()
     listed += [
-        Interval(f"fault: {fault.subject}", fault.at, end, fault.extent)
+        EventInterval(f"fault: {fault.subject}", fault.at, end, fault.extent)
         for fault in faults
         if fault.at < end
     ]
@@ -157,7 +157,7 @@ def events(tape: Tape, gusts: Windows, scenario: Scenario | None = None) -> list
                 first, last = t[saturated][[0, -1]]
                 extent = f"{saturated.sum()} of {len(saturated)} ticks"
                 listed.append(
-                    Interval(f"{name} saturated: {kind.name.lower()}", first, last, extent)
+                    EventInterval(f"{name} saturated: {kind.name.lower()}", first, last, extent)
                 )
         measures = tape["internals"].group("vane_measures")
         observer = flown.controller.observer if isinstance(flown, Scenario) else None
@@ -166,7 +166,7 @@ def events(tape: Tape, gusts: Windows, scenario: Scenario | None = None) -> list
             if (still := _stands_still(measures[name], tape, time)).any():
                 first, last = t[still][[0, -1]]
                 listed.append(
-                    Interval(
+                    EventInterval(
                         f"vane {name} stands still: left out",
                         first,
                         last,
@@ -176,7 +176,9 @@ def events(tape: Tape, gusts: Windows, scenario: Scenario | None = None) -> list
     return sorted(listed, key=lambda event: event.start)
 
 
-def metric_tables(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -> list[Table]:
+def metric_tables(
+    summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]
+) -> list[MetricTable]:
     """Tables of the error, the inputs, guidance, the models and the ticks.
 
     Page and terminal have these tables. A table without rows is left out.
@@ -184,7 +186,7 @@ def metric_tables(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) 
     inputs = (*columns_of(INPUT_COLUMNS, summary["inputs"]), SATURATION_COLUMN)
     tables = (
         _error_table(summary, units),
-        Table(
+        MetricTable(
             f"Inputs{taken_over(summary, 'inputs')}",
             inputs,
             input_rows(summary, units),
@@ -198,8 +200,10 @@ def metric_tables(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) 
 
 
 def flight_tables(
-    summary: Mapping[str, Any], units: Mapping[str, DisplayUnit], event_list: Sequence[Interval]
-) -> list[Table]:
+    summary: Mapping[str, Any],
+    units: Mapping[str, DisplayUnit],
+    event_list: Sequence[EventInterval],
+) -> list[MetricTable]:
     """The tables of metrics, and those of the events and the processes."""
     times = [Column("", head) for head in ("from (s)", "to (s)", "")]
     rows = [
@@ -207,20 +211,22 @@ def flight_tables(
         for event in event_list
     ]
     others = (
-        Table(f"Events{taken_over(summary, 'ticks')}", times, rows),
+        MetricTable(f"Events{taken_over(summary, 'ticks')}", times, rows),
         _process_table(summary),
     )
     return [*metric_tables(summary, units), *(table for table in others if table.rows)]
 
 
-def imported_tables(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -> list[Table]:
+def imported_tables(
+    summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]
+) -> list[MetricTable]:
     """Tables of y and u, and of the topics, of an imported flight."""
     tables = []
     for title, key in (("Outputs", "outputs"), ("Inputs", "inputs")):
         columns = columns_of(INPUT_COLUMNS, summary[key])
         caption = f"{title} about trim, {format_seconds(summary['duration'])}"
         tables.append(
-            Table(caption, columns, table_rows(summary[key], columns, units), IMPORTED_LEGEND)
+            MetricTable(caption, columns, table_rows(summary[key], columns, units), IMPORTED_LEGEND)
         )
     flight_account = account_of_json(summary)
     rows = []
@@ -230,11 +236,13 @@ def imported_tables(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]
         rows.append([name, f"{topic.found}", format_value(rate), format_value(topic.gap)])
     return [
         *tables,
-        Table("Topics", [Column("", head) for head in ("samples", "Hz", "longest gap (s)")], rows),
+        MetricTable(
+            "Topics", [Column("", head) for head in ("samples", "Hz", "longest gap (s)")], rows
+        ),
     ]
 
 
-def _error_table(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -> Table:
+def _error_table(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -> MetricTable:
     columns = columns_of((*ERROR_COLUMNS, NOISE_FLOOR_COLUMN, SWITCH_COLUMN), summary["errors"])
     kinds = {transient["kind"] for transient in summary["transients"]}
     settling = [kind for kind in SETTLING_COLUMNS if kind in kinds]
@@ -242,40 +250,44 @@ def _error_table(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -
     for channel, row in zip(summary["errors"], rows, strict=True):
         row.extend(slowest_settling(summary, channel, kind) for kind in settling)
     caption = f"Tracking error ({summary['error']}), {time_flown(summary)}"
-    legend = f"{parts_legend(summary)}. {ERROR_LEGEND}{NOISE_FLOOR_LEGEND}"
-    return Table(caption, (*columns, *(SETTLING_COLUMNS[kind] for kind in settling)), rows, legend)
+    legend = f"{summary_legend(summary)}. {ERROR_LEGEND}{NOISE_FLOOR_LEGEND}"
+    return MetricTable(
+        caption, (*columns, *(SETTLING_COLUMNS[kind] for kind in settling)), rows, legend
+    )
 
 
-def _guidance_table(summary: Mapping[str, Any]) -> Table:
+def _guidance_table(summary: Mapping[str, Any]) -> MetricTable:
     guidance = summary["guidance"] or {"segments": (), "legs": ()}
     columns, rows = segment_table(guidance["segments"])
     results = (landing_results(guidance.get("landing")), leg_results(guidance["legs"]))
     legend = sentences(*results, GUIDANCE_LEGEND) if rows else ""
-    return Table(f"Guidance by segment{taken_over(summary, 'guidance')}", columns, rows, legend)
+    return MetricTable(
+        f"Guidance by segment{taken_over(summary, 'guidance')}", columns, rows, legend
+    )
 
 
 def model_table(
     models: Sequence[Mapping[str, Any]], units: Mapping[str, DisplayUnit], part: str
-) -> Table:
+) -> MetricTable:
     """The rms of the error before the first learned model and under every model.
 
     `part`: what the log has of the flight, after a comma.
     """
     headings, rows = model_rows(models, units)
     columns = [Column("", head) for head in headings]
-    return Table(f"Rms of the error by model{part}", columns, rows, MODEL_LEGEND)
+    return MetricTable(f"Rms of the error by model{part}", columns, rows, MODEL_LEGEND)
 
 
-def _tick_table(summary: Mapping[str, Any]) -> Table:
+def _tick_table(summary: Mapping[str, Any]) -> MetricTable:
     caption = f"Ticks of the controller{taken_over(summary, 'ticks')}"
     rows = []
     for topic, label, text in timing_rows(summary):
         part = "" if topic == "ticks" else taken_over(summary, topic)
         rows.append((f"{label}{part}", text))
-    return Table(caption, [Column("", "")], rows)
+    return MetricTable(caption, [Column("", "")], rows)
 
 
-def _process_table(summary: Mapping[str, Any]) -> Table:
+def _process_table(summary: Mapping[str, Any]) -> MetricTable:
     flight_account = account_of_json(summary)
     processes = {} if flight_account is None else flight_account.processes
     columns = [
@@ -286,4 +298,4 @@ def _process_table(summary: Mapping[str, Any]) -> Table:
     for name, (*times, samples) in processes.items():
         cells = ["" if time is None else f"{time:.3f}" for time in times]
         rows.append([name, *cells, f"{samples}"])
-    return Table("Processes", columns, rows)
+    return MetricTable("Processes", columns, rows)

@@ -253,7 +253,7 @@ def _feedforward(
         if action == ENGAGE:
             state = feedforward.initial_state(y_m[k], nominal)
         elif action == STEP:
-            parts = feedforward.parts_of(round(dt[k] / period), 1)
+            parts = feedforward.step_count(round(dt[k] / period), 1)
             state, u_ff[k] = feedforward.step(state, y_m[k], dt[k], nominal, parts)
         elif k:
             u_ff[k] = u_ff[k - 1]

@@ -32,11 +32,11 @@ from flight_campaign.statistics import score_units
 from flight_core.vectors import Array, FloatArray
 from flight_design.gains.extended_state import integrator_model
 from flight_design.gains.gain_selection import with_feedforward
-from flight_design.gains.nominal import ACTIVITY_UNIT, nominal_model
+from flight_design.gains.nominal import ACTIVITY_UNIT, airframe_model
 from flight_design.gains.requirement import REQUIREMENT, Requirement, least_fractions
 from flight_design.gains.tuned_gains import TuningResult
 from rise_di_controller.law.control_law import TunedLaw
-from rise_di_controller.law.linear_loop import LinearPlant, Loop, linear_law
+from rise_di_controller.law.linear_loop import LinearPlant, LoopTiming, linear_law
 
 GUST = "gust"
 TURBULENCE = "turbulence"
@@ -149,8 +149,8 @@ def build_benchmark(scenario: Scenario, turbulence_seed: int = TUNING_TURBULENCE
 
     unit = score_units(controller.outputs, airframe.units_of_outputs())
     noise = scenario.aircraft.sensor_arrays().noise[rows]
-    loop = Loop(np.array(controller.lag), 0.0, 1.0 / controller.rate)
-    model = nominal_model(
+    loop = LoopTiming(np.array(controller.lag), 0.0, 1.0 / controller.rate)
+    model = airframe_model(
         airframe,
         controller.outputs,
         controller.inputs,
@@ -391,7 +391,7 @@ def nominal_margins(law: Law, gains: Gains, model: NominalModel) -> Margins:
     count = max((gain.shape[-1] for gain in gains.values()), default=1)
     plant = LinearPlant(model.A + model.gravity, model.B, model.C)
     candidates = linear_law(tuned, len(model.lag), model.period, count)
-    loop = Loop(model.lag, 0.0, model.period)
+    loop = LoopTiming(model.lag, 0.0, model.period)
     return input_margins(plant, candidates, loop, together=False)
 
 

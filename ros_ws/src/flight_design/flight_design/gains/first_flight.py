@@ -30,7 +30,7 @@ from flight_design.gains.gain_selection import (
 )
 from rise_di_controller.extensions.model_sections import AllocationConfig
 from rise_di_controller.law.decomposition import search
-from rise_di_controller.law.linear_loop import Loop
+from rise_di_controller.law.linear_loop import LoopTiming
 
 # s, servos and engine of a light aircraft, assumed
 SURFACE_LAG = 0.05
@@ -121,7 +121,7 @@ def _channels(airframe: Airframe, lag: Sequence[float]) -> dict[str, Channel]:
         authority = response * np.array(_stops(airframe))[paired]
         lags = np.array(lag)[paired]
     products = [CROSSOVER_LAG_PRODUCTS.get(name, DEFAULT_CROSSOVER_LAG_PRODUCT) for name in outputs]
-    bandwidth = bandwidths(Loop(lags, DELAY, 1.0 / CONTROL_RATE), np.array(products))
+    bandwidth = bandwidths(LoopTiming(lags, DELAY, 1.0 / CONTROL_RATE), np.array(products))
     rows = airframe.matrix_c()
     damping = -np.diag(rows @ airframe.matrix_a() @ np.linalg.pinv(rows))
     return {

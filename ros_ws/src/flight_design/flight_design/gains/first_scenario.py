@@ -78,7 +78,7 @@ def _largest(motion: str, speed: float | None) -> float:
     return min(OF_SPEED * speed, LARGEST_SPEED) if motion in SPEEDS and speed else math.inf
 
 
-class Commands(NamedTuple):
+class FirstCommands(NamedTuple):
     """The commands of a first flight."""
 
     reference: dict[str, Any]  # the section reference_model
@@ -98,7 +98,7 @@ def first_commands(
     banks: bool,
     wait: float = 0.0,
     part: float = 1.0,
-) -> Commands:
+) -> FirstCommands:
     """The commands of a first flight by output: rates one after another, then the speeds.
 
     Frequency and height of each are those of its `Channel`; `part` multiplies the heights. Where
@@ -138,7 +138,7 @@ def first_commands(
     if turn:
         rates = {"bank_rate": names["p"], "turn_rate": names["r"]}
         reference["coordinated_turn"] = rates | {"speed": speed}
-    return Commands(reference, t + LAST)
+    return FirstCommands(reference, t + LAST)
 
 
 def unit_gains(lag: Sequence[float], delay: float) -> dict[str, Any]:
@@ -215,8 +215,8 @@ Sections = Mapping[str, Mapping[str, Any] | str]
 def scenario_text(heading: Iterable[str], sections: Sections) -> str:
     """The text of a scenario file: a heading, a comment a line, then the sections.
 
-    `gain_yaml.as_yaml` writes a whole section. Empty lines of the heading, and keys without a
-    value, None or {}, are left out.
+    `gain_yaml.selection_yaml` writes a whole section. Empty lines of the heading, and keys without
+    a value, None or {}, are left out.
     """
     rows = {name: _with_values(section) for name, section in sections.items()}
     lines = LICENCE + "#\n" + comment(filter(None, heading))

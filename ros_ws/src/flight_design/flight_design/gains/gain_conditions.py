@@ -7,8 +7,9 @@ The procedures are Theorem 1 and the engineering procedure.
 
 The theorem's conditions are sufficient, not necessary, and they contain no actuator.
 `theorem_gains` meets them all; behind servos its result is unstable. `engineering_gains` starts
-from the lag of the loop. `check` evaluates the theorem's conditions on a gain set, `check_loop`
-those of the loop. `rise_di_controller.law.linear_loop` has the linear loop and its delay margin.
+from the lag of the loop. `check_theorem` evaluates the theorem's conditions on a gain set,
+`check_loop` those of the loop. `rise_di_controller.law.linear_loop` has the linear loop and its
+delay margin.
 
 The crossover lag product of a channel is its bandwidth times the lag of its loop, in rad. It is the
 phase that the lag costs at the crossover: 57.3 degrees times the product. A loop that integrates
@@ -30,7 +31,7 @@ from flight_core.vectors import FloatArray
 from rise_di_controller.law import law
 from rise_di_controller.law.decomposition import decompose
 from rise_di_controller.law.law import MIN_GAIN, LawParams, Sign
-from rise_di_controller.law.linear_loop import Loop
+from rise_di_controller.law.linear_loop import LoopTiming
 
 MIN_K = 1.5
 """1/s, lower bound of K, since (22) requires K > 1. A slower channel gets this K and a smaller
@@ -82,7 +83,7 @@ class Bounds(NamedTuple):
     gamma_2: FloatArray  # (m,) of Lemma 1, 1/s: an assumption, nothing bounds it
 
 
-class Condition(NamedTuple):
+class GainCondition(NamedTuple):
     """A condition on a gain set: value >= bound or value <= bound.
 
     A strict bound means value > bound.
@@ -134,7 +135,7 @@ class Condition(NamedTuple):
         return f"{where}: found {self.value:.4g}, expected {self.side} {self.bound:.4g}"
 
 
-def failing(conditions: Sequence[Condition]) -> tuple[Condition, ...]:
+def failing(conditions: Sequence[GainCondition]) -> tuple[GainCondition, ...]:
     """The conditions that the gain set does not meet."""
     return tuple(condition for condition in conditions if not condition.holds)
 
@@ -210,7 +211,7 @@ def theorem_gains(bounds: Bounds, Lambda: FloatArray) -> GainSet:
     return GainSet(k_g, k_d, Lambda, np.maximum(least_beta(Lambda, bounds), MIN_GAIN))
 
 
-def check(gains: GainSet, bounds: Bounds) -> tuple[Condition, ...]:
+def check_theorem(gains: GainSet, bounds: Bounds) -> tuple[GainCondition, ...]:
     """Conditions of Theorem 1 on a gain set.
 
     They are (29), (30) from the last channel up, then steps 2 and 3.
@@ -232,7 +233,7 @@ def check(gains: GainSet, bounds: Bounds) -> tuple[Condition, ...]:
     m = len(gains.Lambda)
     smallest = (bounds.N_d + bounds.U @ gains.beta) * (1.0 + bounds.gamma_2 / gains.Lambda)
     conditions = [
-        Condition(
+        GainCondition(
             "beta (29)" if i == m - 1 else "beta (30)",
             i,
             float(gains.beta[i]),
@@ -242,7 +243,7 @@ def check(gains: GainSet, bounds: Bounds) -> tuple[Condition, ...]:
         for i in reversed(range(m))
     ]
     least = min(float(gains.Lambda.min()), 1.0)
-    conditions.append(Condition("k_g, step 2", None, gains.k_g, bounds.rho**2 / (4.0 * least)))
+    conditions.append(GainCondition("k_g, step 2", None, gains.k_g, bounds.rho**2 / (4.0 * least)))
     terms = np.array(
         [zeta_Phi(i, gains.K, bounds.U) ** 2 / (4.0 * gains.k_d[i]) for i in range(m - 1)]
     )
@@ -250,7 +251,7 @@ def check(gains: GainSet, bounds: Bounds) -> tuple[Condition, ...]:
         remaining = least - bounds.rho**2 / (4.0 * gains.k_g)
         largest = int(np.argmax(terms))
         conditions.append(
-            Condition("k_d, step 3", largest, float(terms.sum()), remaining, at_least=False)
+            GainCondition("k_d, step 3", largest, float(terms.sum()), remaining, at_least=False)
         )
     return tuple(conditions)
 
@@ -258,7 +259,7 @@ def check(gains: GainSet, bounds: Bounds) -> tuple[Condition, ...]:
 # The engineering procedure
 
 
-def bandwidths(loop: Loop, crossover_lag_product: FloatArray) -> FloatArray:
+def bandwidths(loop: LoopTiming, crossover_lag_product: FloatArray) -> FloatArray:
     """Bandwidths of the channels, shape (m,), rad/s.
 
     Bandwidth i is crossover_lag_product_i / (lag_i + 1.5 period + delay). A product of 0.63 rad
@@ -327,12 +328,12 @@ def N_d(Omega: FloatArray, v_dot: FloatArray) -> FloatArray:
 
 def check_loop(
     params: LawParams,
-    loop: Loop,
+    loop: LoopTiming,
     response: FloatArray,
     largest: FloatArray,
     slew: FloatArray,
     rate_limit: FloatArray,
-) -> tuple[Condition, ...]:
+) -> tuple[GainCondition, ...]:
     """Conditions of the loop on a gain set, channel by channel.
 
         lag product:      K_i response_i total_i <= 0.8
@@ -349,14 +350,14 @@ def check_loop(
     bound; slew and rate_limit in those same inputs, units of y / s^2, infinite without a limit; all
     of shape (m,).
     """
-    conditions: list[Condition] = []
+    conditions: list[GainCondition] = []
     total = loop.total
 
     def add(name: str, values: FloatArray, bound: FloatArray, *, at_least: bool) -> None:
         pairs = enumerate(zip(values, bound, strict=True))
         finite = ((i, float(a), float(b)) for i, (a, b) in pairs if math.isfinite(b))
         conditions.extend(
-            Condition(name=name, channel=i, value=a, bound=b, at_least=at_least)
+            GainCondition(name=name, channel=i, value=a, bound=b, at_least=at_least)
             for i, a, b in finite
         )
 

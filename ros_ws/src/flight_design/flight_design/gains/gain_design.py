@@ -23,7 +23,7 @@ from flight_design.gains import gain_selection, ideal_control, tuned_gains
 from flight_design.gains.effectors import LAW_INPUT, Effectors, design_allocation
 from flight_design.gains.gain_selection import GainAssessment, LoopSetting, Selection
 from flight_design.gains.ideal_control import Effected, Study
-from flight_design.gains.nominal import sizes
+from flight_design.gains.nominal import unit_sizes
 from flight_design.gains.observer_gains import (
     ObserverGains,
     gains_beside_sketch,
@@ -158,7 +158,7 @@ def select_gains(
     pair = _two_speeds(speeds, observer=observer)
     known_model = frame if model is None else load_airframe(model)
     studied = study(frame, chosen, setting.base, uncertainty, samples, seed)
-    selection = gain_selection.select_gains(studied, setting)
+    selection = gain_selection.gain_sets(studied, setting)
     if not observer:
         return selection
     needed = _beside_observer(setting.requirement, as_read=weights is not None and accept)
@@ -237,7 +237,7 @@ def check_gains(
     frame = load_airframe(airframe)
     gamma_2 = as_number(gamma_2, "gamma_2", 0.0, unit="1/s")
     studied = study(frame, chosen, chosen.controller, uncertainty, samples, seed)
-    return gain_selection.check_gains(chosen, studied, gamma_2)
+    return gain_selection.assess_scenario(chosen, studied, gamma_2)
 
 
 def study(
@@ -524,7 +524,7 @@ def _noise(
     channels = scenario.aircraft.channels().outputs
     measured = scenario.aircraft.sensors.noise or (0.0,) * len(channels)
     by_name = dict(zip(channels, measured, strict=True))
-    perfect = sizes(model.units_of_outputs()[name] for name in controller.outputs) / 100.0
+    perfect = unit_sizes(model.units_of_outputs()[name] for name in controller.outputs) / 100.0
     noise = np.array(
         [by_name[name] or least for name, least in zip(controller.outputs, perfect, strict=True)]
     )

@@ -5,9 +5,9 @@
 The gain sets come from the ideal control of the airframe along a manoeuvre.
 
 `study_airframe` finds the rates of the ideal control, on the airframe as published and on uncertain
-ones around it. `select_gains` derives two gain sets, of Theorem 1 and of the engineering procedure.
-`check_gains` assesses the gain set of a scenario: conditions, stability and delay margin. `as_yaml`
-writes a gain set as the section of a scenario file.
+ones around it. `gain_sets` derives two gain sets, of Theorem 1 and of the engineering procedure.
+`assess_scenario` assesses the gain set of a scenario: conditions, stability and delay margin.
+`gain_yaml.selection_yaml` writes a gain set as the section of a scenario file.
 """
 
 import math
@@ -35,7 +35,7 @@ from flight_core.parameters import LARGEST, require
 from flight_core.vectors import FloatArray
 from flight_design.gains import gain_conditions
 from flight_design.gains.channel_signs import require_channels
-from flight_design.gains.gain_conditions import Bounds, Condition, GainSet
+from flight_design.gains.gain_conditions import Bounds, GainCondition, GainSet
 from flight_design.gains.ideal_control import ChannelPairing, Study
 from flight_design.gains.lyapunov import KnownPlant, decay_matrix
 from flight_design.gains.requirement import NAMES as REQUIRED
@@ -44,13 +44,13 @@ from flight_design.gains.requirement import (
     Candidate,
     Requirement,
     above_zeros,
-    conditions,
+    margin_conditions,
     within_requirement,
 )
 from rise_di_controller.extensions.model_sections import FeedforwardConfig
 from rise_di_controller.law.decomposition import DecompositionError, signs
 from rise_di_controller.law.law import Sign
-from rise_di_controller.law.linear_loop import Loop, is_stable
+from rise_di_controller.law.linear_loop import LoopTiming, is_stable
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di_config import RiseDiConfig
 
@@ -108,8 +108,8 @@ class GainAssessment(NamedTuple, Generic[Controller]):
     """A controller, every condition on its gains, and the margins of its loop."""
 
     controller: Controller
-    theorem: tuple[Condition, ...]  # empty for a law other than RISE-DI
-    loop: tuple[Condition, ...]
+    theorem: tuple[GainCondition, ...]  # empty for a law other than RISE-DI
+    loop: tuple[GainCondition, ...]
     bounds: Bounds | None  # None for a law other than RISE-DI
     margins: LoopMargins | None  # None for the literal sign
     study: Study  # of the airframe
@@ -143,7 +143,7 @@ class GainAssessment(NamedTuple, Generic[Controller]):
         return any(condition.name in REQUIRED for condition in self.loop)
 
     @property
-    def unmet(self) -> tuple[Condition, ...]:
+    def unmet(self) -> tuple[GainCondition, ...]:
         """The margins of the requirement that the loop does not have."""
         return tuple(
             condition
@@ -152,7 +152,7 @@ class GainAssessment(NamedTuple, Generic[Controller]):
         )
 
     @property
-    def failing(self) -> tuple[Condition, ...]:
+    def failing(self) -> tuple[GainCondition, ...]:
         """Every condition that does not hold."""
         return gain_conditions.failing((*self.theorem, *self.loop))
 
@@ -190,7 +190,7 @@ class Selection:
         return assess_gains(self.study, self.chosen, self.setting)
 
 
-def select_gains(study: Study, setting: LoopSetting) -> Selection:
+def gain_sets(study: Study, setting: LoopSetting) -> Selection:
     """Two gain sets for an airframe: by Theorem 1 and by the engineering procedure.
 
     The set by Theorem 1 is literal.
@@ -220,7 +220,7 @@ def gain_candidates(
     """A function of `slower` and `lower`, (m,), to the engineering gains and the loop.
 
     The bandwidth is lower by `lower`, and the integral slower by `slower` and `lower`. Raises
-    ParameterError as `select_gains`.
+    ParameterError as `gain_sets`.
     """
     paired = _paired(study, setting)
     limits = (
@@ -268,7 +268,7 @@ def _paired(study: Study, setting: LoopSetting) -> _Paired:
         setting.crossover_lag_products.get(name, DEFAULT_CROSSOVER_LAG_PRODUCT)
         for name in pairing.outputs
     ]
-    loop = Loop(_by_name(setting.lag, pairing.inputs, 0.0), setting.delay, 1.0 / setting.rate)
+    loop = LoopTiming(_by_name(setting.lag, pairing.inputs, 0.0), setting.delay, 1.0 / setting.rate)
     bandwidth = gain_conditions.bandwidths(loop, np.array(products))
     rows = np.argsort(-bandwidth, kind="stable").tolist()
     channels = ChannelPairing(
@@ -379,7 +379,7 @@ def with_feedforward(controller: Controller, airframe: Airframe) -> Controller:
     )
 
 
-def check_gains(
+def assess_scenario(
     scenario: Scenario, study: Study, gamma_2: float = 0.0
 ) -> GainAssessment[ControllerConfig]:
     """Every condition on the gain set of a scenario's controller.
@@ -436,8 +436,8 @@ def assess_gains(
     rows, columns = law_order(study.airframe, controller)
     channels = ChannelPairing(controller.outputs, controller.inputs)
     D = require_channels(study.Omega[np.ix_(rows, columns)], channels, controller.D)
-    theorem: tuple[Condition, ...] = ()
-    loop_conditions: tuple[Condition, ...] = ()
+    theorem: tuple[GainCondition, ...] = ()
+    loop_conditions: tuple[GainCondition, ...] = ()
     bounds = None
     if isinstance(controller, RiseDiConfig):
         theorem, loop_conditions, bounds = _rise_di_conditions(study, controller, setting, D)
@@ -453,7 +453,7 @@ def assess_gains(
     loop = loop_with_box(study, controller)
     margins = loop_margins(loop)
     stable = (margins.stable + float(margins.nominal.stable)) / len(study.A)
-    loop_conditions += (Condition("linear stability", None, stable, 1.0),)
+    loop_conditions += (GainCondition("linear stability", None, stable, 1.0),)
     if not (isinstance(controller, RiseDiConfig) and controller.sampled_sign()[0] is Sign.IMPLICIT):
         observer = controller.observer
         needed = above_zeros(setting.requirement, loop.nominal)
@@ -464,8 +464,8 @@ def assess_gains(
             else needed._replace(phase=min(needed.phase, OBSERVER_REQUIREMENT.phase))
         )
         loop_conditions += (
-            Condition("delay margin", None, margins.delay, least),
-            *conditions(margins, needed),
+            GainCondition("delay margin", None, margins.delay, least),
+            *margin_conditions(margins, needed),
         )
     return GainAssessment(
         controller=controller,
@@ -479,7 +479,7 @@ def assess_gains(
 
 def _rise_di_conditions(
     study: Study, controller: RiseDiConfig, setting: LoopSetting, D: FloatArray
-) -> tuple[tuple[Condition, ...], tuple[Condition, ...], Bounds]:
+) -> tuple[tuple[GainCondition, ...], tuple[GainCondition, ...], Bounds]:
     """The conditions of Theorem 1, those of `check_loop`, and the bounds of the theorem.
 
     "D" and "zero dynamics" are the fractions of the samples for which they hold. The bounds of
@@ -503,10 +503,10 @@ def _rise_di_conditions(
         float(np.linalg.eigvalsh(decay_matrix(plant, params)).min()) for plant in known
     )
     theorem = (
-        Condition("D (11)", None, float(np.mean(holds)), 1.0),
-        Condition("zero dynamics", None, float(np.mean(study.stable)), 1.0),
-        *gain_conditions.check(gains, bounds),
-        Condition("V2_dot", None, decay_rate, 0.0, strict=True),
+        GainCondition("D (11)", None, float(np.mean(holds)), 1.0),
+        GainCondition("zero dynamics", None, float(np.mean(study.stable)), 1.0),
+        *gain_conditions.check_theorem(gains, bounds),
+        GainCondition("V2_dot", None, decay_rate, 0.0, strict=True),
     )
     # the engineering rules are those of a law that has no other feedback beside it
     if controller.observer is not None:

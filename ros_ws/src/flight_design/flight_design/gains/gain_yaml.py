@@ -16,7 +16,7 @@ from flight_core.arguments import as_instance
 from flight_core.files import parse_yaml
 from flight_core.text import printable
 from flight_core.vectors import FloatArray
-from flight_design.gains.gain_conditions import Condition
+from flight_design.gains.gain_conditions import GainCondition
 from flight_design.gains.gain_selection import Selection, response
 from rise_di_controller.extensions.model_sections import (
     AllocationConfig,
@@ -112,7 +112,7 @@ def _listed(values: FloatArray) -> str:
     return ", ".join(f"{value:.3g}" for value in values)
 
 
-def as_yaml(selection: Selection, *, theorem: bool = False) -> str:
+def selection_yaml(selection: Selection, *, theorem: bool = False) -> str:
     """The engineering gain set as the section `/**/controller` of a scenario file.
 
     Comments have units and reasons.
@@ -199,7 +199,7 @@ def section_yaml(
     margins: LoopMargins | None,
     origin: str,
     comments: Mapping[str, str],
-    unmet: Sequence[Condition] = (),
+    unmet: Sequence[GainCondition] = (),
 ) -> str:
     """A controller as the section `/**/controller` of a scenario file.
 
@@ -223,7 +223,7 @@ def section_yaml(
     )
 
 
-def below_requirement(unmet: Sequence[Condition], outputs: Sequence[str]) -> str:
+def below_requirement(unmet: Sequence[GainCondition], outputs: Sequence[str]) -> str:
     """The first line of a file whose margins fall short; "" where none does."""
     lacking = "; ".join(condition.sentence(outputs) for condition in unmet)
     return f"Margins below the requirement: {lacking}." if lacking else ""

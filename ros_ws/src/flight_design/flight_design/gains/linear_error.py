@@ -13,7 +13,7 @@ from flight_design.gains.ideal_control import STEP
 from rise_di_controller.law.linear_loop import (
     LinearLaw,
     LinearPlant,
-    Loop,
+    LoopTiming,
     closed_loop,
     sampled_plant,
     zero_order_hold,
@@ -65,7 +65,7 @@ class AirResponse(NamedTuple):
     activity: FloatArray  # (m,) mean abs(u_dot) in turbulence, SI
 
 
-def air_response(plant: LinearPlant, law: LinearLaw, loop: Loop, air: Air) -> AirResponse:
+def air_response(plant: LinearPlant, law: LinearLaw, loop: LoopTiming, air: Air) -> AirResponse:
     """What a stable loop does in the gusts, and in turbulence with noise for HORIZON from rest.
 
         z+ = A z + N n,  P+ = A P A' + N N',  n white with unit variance

@@ -97,7 +97,7 @@ def from_tape(scenario: Scenario, tape: Tape) -> tuple[KnownPlant, FlightSamples
     )
 
 
-def fly(
+def fly_known_plant(
     plant: KnownPlant, y_m: FloatArray, dt: float, params: LawParams, x_0: FloatArray
 ) -> FlightSamples:
     """The plant under the law from x_0, engaged at t = 0.
@@ -216,7 +216,7 @@ def integral(signal: FloatArray, t: FloatArray) -> FloatArray:
 
 
 class Example(NamedTuple):
-    """A flight for `fly`."""
+    """A flight for `fly_known_plant`."""
 
     plant: KnownPlant
     y_m: FloatArray  # (N, m) at the ticks

@@ -11,7 +11,7 @@ from aircraft_sim.uncertainty import KINEMATIC
 from control_laws.nominal_model import NominalModel
 from flight_core.units import LENGTH, SPEED, quantity
 from flight_core.vectors import FloatArray
-from rise_di_controller.law.linear_loop import Loop
+from rise_di_controller.law.linear_loop import LoopTiming
 
 SIZES = {SPEED: 1.0, LENGTH: 1.0}  # m/s, m: the units of states in weights, "sizes"
 ANGLE_SIZE = 0.1  # rad (/s), and of states without a dimension
@@ -22,13 +22,17 @@ ACTIVITY_UNIT = {"deg": np.deg2rad(60.0), "rad": np.deg2rad(60.0), "%": 6.0, "1"
 60 deg/s and 600 %/s."""
 
 
-def sizes(units: Iterable[str]) -> FloatArray:
+def unit_sizes(units: Iterable[str]) -> FloatArray:
     """Sizes of values with these units."""
     return np.array([SIZES.get(quantity(unit).dimension, ANGLE_SIZE) for unit in units])
 
 
-def nominal_model(
-    airframe: Airframe, outputs: Sequence[str], inputs: Sequence[str], noise: FloatArray, loop: Loop
+def airframe_model(
+    airframe: Airframe,
+    outputs: Sequence[str],
+    inputs: Sequence[str],
+    noise: FloatArray,
+    loop: LoopTiming,
 ) -> NominalModel:
     """The model of an airframe with channels in this order, without limits.
 
@@ -48,7 +52,7 @@ def nominal_model(
         wind=airframe.matrix_gusts(),
         noise=noise,
         kinematic=np.array([float(state in KINEMATIC) for state in airframe.states]),
-        size=sizes(airframe.states.values()),
+        size=unit_sizes(airframe.states.values()),
         input_scale=1.0 / np.abs(np.diag(C @ B)),
         D=np.ones(len(columns)),
         lag=loop.lag,

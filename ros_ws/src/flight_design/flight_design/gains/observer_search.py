@@ -30,7 +30,7 @@ from flight_design.gains.constrained_search import (
     descend,
     exponent,
 )
-from flight_design.gains.gain_conditions import MIN_K, Condition, failing
+from flight_design.gains.gain_conditions import MIN_K, GainCondition, failing
 from flight_design.gains.linear_error import Air, air_response
 from flight_design.gains.nominal import ERROR_SHARE
 from flight_design.gains.observer_gains import ObserverGains
@@ -51,7 +51,7 @@ from rise_di_controller.law.law import MIN_GAIN, gain
 from rise_di_controller.law.linear_loop import (
     LinearLaw,
     LinearPlant,
-    Loop,
+    LoopTiming,
     is_stable,
     linear_law,
     spectral_radius,
@@ -153,9 +153,9 @@ class ObserverSearch(NamedTuple):
         return LinearPlant(self.plant.A[0], self.plant.B[0], self.plant.C)
 
     @property
-    def loop(self) -> Loop:
+    def loop(self) -> LoopTiming:
         """The loop without its delay: the delay margin counts the declared delay too."""
-        return Loop(self.model.lag, 0.0, self.model.period)
+        return LoopTiming(self.model.lag, 0.0, self.model.period)
 
     def best(self, progress: Callable[[str], None] = lambda _: None) -> Trial[_Loops]:
         """The trial with the least error that has the margins, or that lacks least of them.
@@ -304,7 +304,7 @@ class ObserverSearch(NamedTuple):
             margins = input_margins(self.nominal, law, loop_of(loops.controller), together=False)
             share = self.margin / longest if longest else 1.0
             delay = 1e3 * delay_margin(self.nominal, law, self.loop, share)
-            late = Condition("delay margin (ms)", None, delay, 1e3 * (longest + RESOLUTION))
+            late = GainCondition("delay margin (ms)", None, delay, 1e3 * (longest + RESOLUTION))
             failed = failing((late, *nominal_conditions(margins, needed)))
             lacking += [condition.sentence(loops.controller.outputs) for condition in failed]
         return "; ".join(dict.fromkeys(lacking))

@@ -39,7 +39,7 @@ from flight_design.gains.airframe_properties import fastest_zero
 from flight_design.gains.extended_state import extended_state_weights, integrator_model
 from flight_design.gains.gain_selection import with_feedforward
 from flight_design.gains.linear_error import Air, discrete_gust
-from flight_design.gains.nominal import ACTIVITY_UNIT, nominal_model
+from flight_design.gains.nominal import ACTIVITY_UNIT, airframe_model
 from flight_design.gains.observer_gains import ObserverGains
 from flight_design.gains.observer_search import (
     WORST_OF,
@@ -49,7 +49,7 @@ from flight_design.gains.observer_search import (
     least_error,
 )
 from flight_design.gains.requirement import OBSERVER_REQUIREMENT, Requirement
-from rise_di_controller.extensions.model_sections import VanesConfig, require_signs
+from rise_di_controller.extensions.model_sections import VanesConfig, require_same_signs
 from rise_di_controller.law.linear_loop import LinearPlant
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di_config import RiseDiConfig
@@ -71,7 +71,7 @@ def model_for(airframe: Airframe, controller: ControllerConfig, noise: FloatArra
 
     `noise` of the measured outputs, (m,), rms per sample.
     """
-    model = nominal_model(
+    model = airframe_model(
         airframe, controller.outputs, controller.inputs, noise, loop_of(controller)
     )
     return _limited(model, controller)
@@ -222,7 +222,7 @@ class _AircraftDesigns(NamedTuple):
         )
         rows, columns = law_order(airframe, controller)
         Omega = airframe.matrix_c()[rows] @ airframe.matrix_b()[:, columns]
-        require_signs(Omega, controller.D, f"airframe {airframe.name}")
+        require_same_signs(Omega, controller.D, f"airframe {airframe.name}")
         bare = controller.model_copy(update={"observer": None, "schedule": None})
         states = tuple(airframe.states)
         names = Names(states, controller.inputs, controller.outputs, tuple(airframe.gusts))
@@ -324,7 +324,7 @@ def with_extended_state_observer(
     units, 1 m/s or 0.1 rad/s. Raises ParameterError as `with_aircraft_observer`.
     """
     m = len(controller.outputs)
-    require_signs(Omega, controller.D, "Omega")
+    require_same_signs(Omega, controller.D, "Omega")
     values = controller.model_dump() | {
         "observer": None,
         "feedforward": integrator_model(controller, Omega).model_dump(),

@@ -7,12 +7,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from flight_design.gains.gain_conditions import Condition
-from flight_design.gains.gain_selection import LoopSetting, Selection, select_gains
+from flight_design.gains.gain_conditions import GainCondition
+from flight_design.gains.gain_selection import LoopSetting, Selection, gain_sets
 from flight_design.gains.requirement import ACCEPTED_PHASE_MARGIN, PHASE_MARGINS
 
 
-def binding(selection: Selection) -> Condition:
+def binding(selection: Selection) -> GainCondition:
     """The condition of the requirement that the engineering gains are farthest from."""
     return min(selection.engineering.unmet, key=lambda condition: condition.margin)
 
@@ -35,7 +35,7 @@ def lacking(selection: Selection, *, options: Sequence[str] = ()) -> str:
     relaxed = [
         text
         for text, setting in _relaxed(selection, options).items()
-        if not select_gains(selection.study, setting).engineering.unmet
+        if not gain_sets(selection.study, setting).engineering.unmet
     ]
     mend = f"met with {' or with '.join(relaxed)}" if relaxed else "met with no single change"
     bound = binding(selection)

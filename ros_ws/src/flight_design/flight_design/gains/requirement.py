@@ -32,7 +32,7 @@ from flight_design.gains.constrained_search import (
     descend,
     exponent,
 )
-from flight_design.gains.gain_conditions import Condition, failing
+from flight_design.gains.gain_conditions import GainCondition, failing
 from flight_design.gains.linear_error import linear_error
 from rise_di_controller.law.linear_loop import LinearLaw, LinearPlant
 from rise_di_controller.params import ControllerConfig
@@ -94,7 +94,7 @@ NAMES = (
     "damping of slow modes",
     "phase margin of the worst aircraft (deg)",
 )
-"""Names of the `conditions` of a requirement."""
+"""Names of the `margin_conditions` of a requirement."""
 
 REQUIREMENT = Requirement()
 
@@ -152,7 +152,7 @@ def least_fraction(margins: Margins, needed: Requirement) -> float:
     return float(least_fractions(margins, needed))
 
 
-def conditions(margins: LoopMargins, needed: Requirement) -> tuple[Condition, ...]:
+def margin_conditions(margins: LoopMargins, needed: Requirement) -> tuple[GainCondition, ...]:
     """The requirement as conditions, input by input, the nominal aircraft first."""
     nominal = nominal_conditions(margins.nominal, needed)
     if margins.worst is None:
@@ -161,10 +161,10 @@ def conditions(margins: LoopMargins, needed: Requirement) -> tuple[Condition, ..
     least = needed.uncertain_phase
     if margins.by_search:
         least = min(least, needed.searched_phase)
-    return (*nominal, Condition(NAMES[4], None, worst, math.degrees(least)))
+    return (*nominal, GainCondition(NAMES[4], None, worst, math.degrees(least)))
 
 
-def nominal_conditions(nominal: Margins, needed: Requirement) -> tuple[Condition, ...]:
+def nominal_conditions(nominal: Margins, needed: Requirement) -> tuple[GainCondition, ...]:
     """The requirement on the margins of the nominal aircraft as conditions, input by input."""
     with np.errstate(divide="ignore"):
         decibels = 20.0 * np.log10(nominal.gain)
@@ -173,19 +173,19 @@ def nominal_conditions(nominal: Margins, needed: Requirement) -> tuple[Condition
         (NAMES[1], decibels, 20.0 * math.log10(needed.gain), True),
         (NAMES[2], nominal.sensitivity, needed.sensitivity, False),
     ]
-    by_input: list[Condition] = []
+    by_input: list[GainCondition] = []
     for name, values, bound, at_least in rows:
         by_input += [
-            Condition(name=name, channel=i, value=float(value), bound=bound, at_least=at_least)
+            GainCondition(name=name, channel=i, value=float(value), bound=bound, at_least=at_least)
             for i, value in enumerate(values)
         ]
-    return (*by_input, Condition(NAMES[3], None, float(nominal.damping), needed.damping))
+    return (*by_input, GainCondition(NAMES[3], None, float(nominal.damping), needed.damping))
 
 
 def unmet(margins: LoopMargins, needed: Requirement, outputs: Sequence[str]) -> str:
     """What a loop lacks, in sentences; "" for nothing. `outputs` of the law."""
     return "; ".join(
-        condition.sentence(outputs) for condition in failing(conditions(margins, needed))
+        condition.sentence(outputs) for condition in failing(margin_conditions(margins, needed))
     )
 
 

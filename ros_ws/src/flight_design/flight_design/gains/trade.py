@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from flight_analysis.linear_loop.loop_margins import law_order, linear_loop
 from flight_core.vectors import FloatArray
-from flight_design.gains.gain_selection import Selection, select_gains
+from flight_design.gains.gain_selection import Selection, gain_sets
 from flight_design.gains.ideal_control import Study
 from flight_design.gains.linear_error import linear_error
 
@@ -39,7 +39,7 @@ def trade(
     rows = []
     for phase_margin in phase_margins:
         needed = selection.setting.requirement._replace(phase=math.radians(phase_margin))
-        assessed = select_gains(nominal, selection.setting._replace(requirement=needed)).engineering
+        assessed = gain_sets(nominal, selection.setting._replace(requirement=needed)).engineering
         if assessed.margins is None:
             continue
         loop = linear_loop(assessed.controller, nominal.airframe, nominal.A, nominal.B)

@@ -27,7 +27,7 @@ from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray
-from flight_design.gains.first_scenario import RISE, Commands, scenario_text
+from flight_design.gains.first_scenario import RISE, FirstCommands, scenario_text
 from flight_design.gains.ideal_control import ChannelPairing
 from flight_design.identification.open_loop_fit import ChannelModel, fit_channel
 from flight_design.identification.response_identification import MIN_RATIO, Response, Spans
@@ -164,7 +164,7 @@ def experiment(
     )
     second_order = {"natural_frequency": [1.0] * m, "damping": [1.0] * m}
     reference = {"rate": RATE, "outputs": list(pairing.outputs), "second_order": second_order}
-    still = Commands(reference | {"rise": RISE}, wait + controller.duration)
+    still = FirstCommands(reference | {"rise": RISE}, wait + controller.duration)
     heading = (
         f"Experiment on the aircraft behind the map {channel_map.name}: each input is "
         "excited by itself, open loop."
@@ -249,7 +249,7 @@ def gravity_along_path(pose: Signal, speed: float) -> Signal | None:
     return Signal(pose.stamp_ns[is_finite], ("V",), gravity)
 
 
-class Channels(NamedTuple):
+class IdentifiedChannels(NamedTuple):
     """What is known of m channels, output i driven by input i; SI."""
 
     Omega: FloatArray  # (m, m)
@@ -265,7 +265,7 @@ class Channels(NamedTuple):
 
 def join(
     channel_map: ChannelMap, response: Response, models: Sequence[ChannelModel | None]
-) -> Channels:
+) -> IdentifiedChannels:
     """The models of the channels with a model, the step responses of the rest.
 
     Raises ParameterError for a channel without a certain result, and for signs in contradiction to
@@ -311,7 +311,7 @@ def join(
         )
     if refused:
         raise ParameterError("; ".join(refused))
-    return Channels(
+    return IdentifiedChannels(
         Omega=Omega,
         Omega_deviation=deviation,
         lag=lag,
@@ -323,7 +323,7 @@ def join(
     )
 
 
-def over_link(channels: Channels, link_delay: float) -> Channels:
+def over_link(channels: IdentifiedChannels, link_delay: float) -> IdentifiedChannels:
     """Channels identified from a log of the autopilot's board, as met by the law over the link.
 
     Their delay is delay + link_delay, s.
@@ -427,7 +427,7 @@ def _rounded(row: FloatArray) -> list[float]:
 def airframe_yaml(
     channel_map: ChannelMap,
     pairing: ChannelPairing,
-    channels: Channels,
+    channels: IdentifiedChannels,
     speed: float | None,
     source: str,
 ) -> str:
@@ -470,10 +470,10 @@ def airframe_yaml(
     return dump_yaml(values)
 
 
-def signs_alone(sign: FloatArray) -> Channels:
+def signs_alone(sign: FloatArray) -> IdentifiedChannels:
     """Channels with a known sign alone."""
     none = 0.0 * sign
-    return Channels(
+    return IdentifiedChannels(
         Omega=np.diag(sign),
         Omega_deviation=none + np.nan,
         lag=none,
@@ -486,7 +486,7 @@ def signs_alone(sign: FloatArray) -> Channels:
 
 
 def bridge_sections(
-    airframe_file: str, commands: Commands, controller: ControllerConfig
+    airframe_file: str, commands: FirstCommands, controller: ControllerConfig
 ) -> dict[str, Mapping[str, Any]]:
     """The sections of a scenario for the aircraft behind a bridge."""
     return {

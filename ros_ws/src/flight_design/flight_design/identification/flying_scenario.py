@@ -20,7 +20,7 @@ from flight_core.vectors import FloatArray
 from flight_design.gains import gain_selection, gain_yaml, ideal_control
 from flight_design.gains.first_scenario import (
     Channel,
-    Commands,
+    FirstCommands,
     first_commands,
     scenario_text,
     unit_gains,
@@ -38,7 +38,7 @@ from flight_design.gains.requirement import (
 from flight_design.identification.bridge_identification import (
     RATE,
     WAIT,
-    Channels,
+    IdentifiedChannels,
     airframe_yaml,
     bridge_sections,
     channel_pairs,
@@ -47,7 +47,7 @@ from flight_design.identification.bridge_identification import (
 )
 from reference_model.params import ReferenceModelConfig
 from rise_di_controller.law.law import Sign
-from rise_di_controller.law.linear_loop import Loop
+from rise_di_controller.law.linear_loop import LoopTiming
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 # s: u may cross from trim to its limit in that time, which bounds beta from below
@@ -73,7 +73,7 @@ class Flyable(NamedTuple):
 
 def flying_scenario(
     channel_map: ChannelMap,
-    channels: Channels,
+    channels: IdentifiedChannels,
     speed: float | None,
     airframe_file: str,
     needed: Requirement = REQUIREMENT,
@@ -93,7 +93,7 @@ def flying_scenario(
     flying = ideal_control.study_airframe(identified.airframe(source), manoeuvre, samples=1)
     studied = identified.of_integrators(manoeuvre)
     studied = studied._replace(slew=np.maximum(flying.slew, identified.reach / FULL_RANGE_TIME))
-    selection = gain_selection.select_gains(studied, identified.setting(needed))
+    selection = gain_selection.gain_sets(studied, identified.setting(needed))
     flown, margins = _within_margins(
         _with_integrals(selection.chosen, identified.pairing, channels, identified.loop),
         flying,
@@ -124,7 +124,7 @@ class _Identified(NamedTuple):
     """The identified channels of a map, and the trim speed, m/s, None in hover."""
 
     channel_map: ChannelMap
-    channels: Channels
+    channels: IdentifiedChannels
     speed: float | None
 
     @property
@@ -133,11 +133,11 @@ class _Identified(NamedTuple):
         return channel_pairs(self.channel_map)[0]
 
     @property
-    def loop(self) -> Loop:
+    def loop(self) -> LoopTiming:
         """The loop with one delay: what a channel has beyond it counts as its lag."""
         channels = self.channels
         delay = float(np.min(channels.delay))
-        return Loop(channels.lag + channels.delay - delay, delay, 1.0 / RATE)
+        return LoopTiming(channels.lag + channels.delay - delay, delay, 1.0 / RATE)
 
     @property
     def products(self) -> dict[str, float]:
@@ -151,7 +151,7 @@ class _Identified(NamedTuple):
         rows = [self.channel_map.inputs[name] for name in self.pairing.inputs]
         return np.array([min(-row.lower, row.upper) for row in rows])
 
-    def commands(self) -> Commands:
+    def commands(self) -> FirstCommands:
         """Commands within reach of the loop, after WAIT: `first_commands`."""
         crossover = bandwidths(self.loop, np.array(list(self.products.values())))
         authority = np.abs(np.diag(self.channels.Omega)) * self.reach
@@ -235,7 +235,7 @@ def _within_margins(
     return chosen.controller, loop_margins(chosen.loop)
 
 
-def _without_sideslip(channels: Channels, pairing: ChannelPairing) -> Channels:
+def _without_sideslip(channels: IdentifiedChannels, pairing: ChannelPairing) -> IdentifiedChannels:
     """Channels of r with damping alone.
 
     The stiffness of a straight flight would skid in a coordinated turn.
@@ -253,7 +253,10 @@ def _without_sideslip(channels: Channels, pairing: ChannelPairing) -> Channels:
 
 
 def _with_integrals(
-    controller: RiseDiConfig, pairing: ChannelPairing, channels: Channels, loop: Loop
+    controller: RiseDiConfig,
+    pairing: ChannelPairing,
+    channels: IdentifiedChannels,
+    loop: LoopTiming,
 ) -> RiseDiConfig:
     """The controller with integrals for a crossover of the modelled loops as of y_dot = Omega u.
 
@@ -274,7 +277,7 @@ def _with_integrals(
     return RiseDiConfig.validate_mapping(controller.model_dump() | {"Lambda": Lambda}, "controller")
 
 
-def _integral(channels: Channels, i: int, crossover: float, total_lag: float) -> float:
+def _integral(channels: IdentifiedChannels, i: int, crossover: float, total_lag: float) -> float:
     """The integral of a channel, 1/s, for a crossover of the loop at `crossover`, rad/s.
 
     The largest safe integral is the upper bound.

@@ -24,8 +24,8 @@ from flight_core.parameters import require, require_channels
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
-from flight_design.gains.nominal import nominal_model, sizes
-from rise_di_controller.law.linear_loop import Loop
+from flight_design.gains.nominal import airframe_model, unit_sizes
+from rise_di_controller.law.linear_loop import LoopTiming
 
 # s at the begin of a recording whose innovations do not count: the filter starts from y alone
 TRANSIENT = 0.5
@@ -56,7 +56,7 @@ SHEARED = ("alpha", "q")
 """States that the slope of the vertical wind moves."""
 
 
-class Recording(NamedTuple):
+class FlightData(NamedTuple):
     """A flight in T equal periods, channels in the airframe's order, deviations from trim."""
 
     period: float  # s
@@ -65,7 +65,7 @@ class Recording(NamedTuple):
     u: FloatArray  # (T, m) as the actuators received it
 
 
-def coarser(recorded: Recording, factor: int) -> Recording:
+def coarser(recorded: FlightData, factor: int) -> FlightData:
     """The means over `factor` periods; u between the middles of two means of y."""
     count = len(recorded.t) // factor
     ahead = [
@@ -76,7 +76,7 @@ def coarser(recorded: Recording, factor: int) -> Recording:
         values[: count * factor].reshape(count, factor, *values.shape[1:]).mean(axis=1)
         for values in (recorded.t, recorded.y, (ahead[0] + ahead[1]) / 2.0)
     )
-    return Recording(factor * recorded.period, t, y, u)
+    return FlightData(factor * recorded.period, t, y, u)
 
 
 class Actuation(NamedTuple):
@@ -86,7 +86,7 @@ class Actuation(NamedTuple):
     delay: float  # s
 
 
-def recording(tape: Tape, airframe: Airframe) -> Recording:
+def recording(tape: Tape, airframe: Airframe) -> FlightData:
     """Y and u of a tape at the rate of u, from the first u on.
 
     y is the sample nearest to the instant, within half a period; u is the last one. Raises
@@ -134,16 +134,16 @@ def recording(tape: Tape, airframe: Airframe) -> Recording:
     measured[lost] = np.nan
     places = np.searchsorted(u.stamp_ns, instants + period_ns // 2, side="right") - 1
     commanded = np.stack([u[name] for name in airframe.inputs], axis=1)[places]
-    return Recording(
+    return FlightData(
         period_ns / NANOSECONDS, (instants - tape.start_ns) / NANOSECONDS, measured, commanded
     )
 
 
-def filter_model(airframe: Airframe, actuation: Actuation, recorded: Recording) -> NominalModel:
+def filter_model(airframe: Airframe, actuation: Actuation, recorded: FlightData) -> NominalModel:
     """The model of an airframe for its filter, channels in the airframe's order."""
-    noise = measured_noise(recorded.y, airframe.matrix_c() @ sizes(airframe.states.values()))
-    loop = Loop(actuation.lag, actuation.delay, recorded.period)
-    return nominal_model(airframe, airframe.outputs, tuple(airframe.inputs), noise, loop)
+    noise = measured_noise(recorded.y, airframe.matrix_c() @ unit_sizes(airframe.states.values()))
+    loop = LoopTiming(actuation.lag, actuation.delay, recorded.period)
+    return airframe_model(airframe, airframe.outputs, tuple(airframe.inputs), noise, loop)
 
 
 def delayed(u: FloatArray, periods: float) -> FloatArray:
@@ -319,7 +319,7 @@ def wind_model(
     return np.array([constants[axis] for axis in axes]), np.array([noises[axis] for axis in axes])
 
 
-class Air:
+class FilterAir:
     """The winds of a filter and how the winds move the aircraft, see `filter_bank`."""
 
     def __init__(
@@ -419,7 +419,7 @@ def filter_bank(
     G); `drift` as in `observer_design.Weights`. Models `near` the first one have gains exact to
     first order.
     """
-    air = Air(names, speed, span, shear)
+    air = FilterAir(names, speed, span, shear)
     m = model.B.shape[-1]
     each = air.around(model)
     sampled = observer_design.aircraft_model(

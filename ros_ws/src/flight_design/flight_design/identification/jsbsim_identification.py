@@ -35,7 +35,7 @@ from flight_design.gains import gain_selection, gain_yaml, ideal_control
 from flight_design.gains.airframe_properties import invariant_zeros
 from flight_design.gains.first_scenario import (
     Channel,
-    Commands,
+    FirstCommands,
     Sections,
     first_commands,
     scenario_text,
@@ -43,7 +43,7 @@ from flight_design.gains.first_scenario import (
 )
 from flight_design.gains.gain_selection import LoopSetting, Selection
 from flight_design.gains.ideal_control import Manoeuvre, Study
-from flight_design.gains.nominal import sizes
+from flight_design.gains.nominal import unit_sizes
 from flight_design.gains.observer_selection import with_extended_state_observer
 from flight_design.gains.requirement import OBSERVER_REQUIREMENT, REQUIREMENT, Requirement
 from flight_design.identification.manoeuvre import (
@@ -149,7 +149,7 @@ class IdentifiedAircraft(NamedTuple):
         )
 
 
-def identify(
+def identify_jsbsim(
     name: str,
     speed: float,
     altitude: float,
@@ -167,7 +167,7 @@ def identify(
 
     1. Trim, first in another process, and the airframe: `linearize`. 2. The pairing, with outputs
     in units of the manoeuvre, and D from the minors. 3. Gains by the engineering procedure for the
-    airframe behind the lags, along the commands and gusts: `gain_selection.select_gains`. The
+    airframe behind the lags, along the commands and gusts: `gain_selection.gain_sets`. The
     sign of V is that of `airspeed_slew`. With `observer_margin`, the delay margin in s of the
     loop on y_dot = Omega u, the gains are those for y_dot = Omega u with an extended-state observer
     beside them. The margins of that loop meet `needed`, with 35 degrees of phase. 4. Simulations
@@ -206,16 +206,16 @@ def identify(
         studied = _study(_integrators(linear), commands)
     slew[THROTTLE] = airspeed_slew(V_bandwidth, abs(float(Omega[THROTTLE, THROTTLE])))
     try:
-        chosen = gain_selection.select_gains(studied._replace(slew=slew), setting)
+        chosen = gain_selection.gain_sets(studied._replace(slew=slew), setting)
     except ParameterError as error:
         raise ParameterError(f"{error}{_too_weak(linear)}") from None
     if observer_margin is not None and has_observer:
-        chosen = with_observer(chosen, Omega, observer_margin)
+        chosen = with_extended_state(chosen, Omega, observer_margin)
     text = _text(linear, commands, chosen, stall)
     flights = fly_all(_load(text), progress)
     if observer_margin is not None and learns:
         text = _text(
-            linear, commands, that_learns(chosen, condition, Omega, observer_margin), stall
+            linear, commands, learning_selection(chosen, condition, Omega, observer_margin), stall
         )
     return IdentifiedAircraft(
         linear=linear,
@@ -321,13 +321,13 @@ def slowest_trim(condition: FlightCondition) -> float:
     return fast
 
 
-def with_observer(selection: Selection, Omega: FloatArray, margin: float) -> Selection:
+def with_extended_state(selection: Selection, Omega: FloatArray, margin: float) -> Selection:
     """The selection with an extended-state observer in its engineering gains.
 
     Omega is in the aircraft's order.
     """
     controller = selection.chosen
-    size = sizes(OUTPUTS[name] for name in controller.outputs)
+    size = unit_sizes(OUTPUTS[name] for name in controller.outputs)
     needed = selection.setting.requirement
     needed = needed._replace(phase=min(needed.phase, OBSERVER_REQUIREMENT.phase))
     observed = with_extended_state_observer(
@@ -342,7 +342,7 @@ def _in_law_order(Omega: FloatArray, controller: RiseDiConfig) -> FloatArray:
     return Omega[np.ix_(rows, columns)]
 
 
-def that_learns(
+def learning_selection(
     selection: Selection, condition: FlightCondition, Omega: FloatArray, margin: float
 ) -> Selection:
     """A selection with feedforward and observer of a sketch, not yet flying, and `learn`.
@@ -358,7 +358,7 @@ def that_learns(
     return replace(selection, chosen=sketched.model_copy(update={"learn": learn}))
 
 
-def _study(airframe: Airframe, commands: Commands) -> Study:
+def _study(airframe: Airframe, commands: FirstCommands) -> Study:
     """The study of an airframe along the commands and gusts, without uncertain ones beside it.
 
     The equations are those that fly. Aircraft 30 % off besides, entry by entry, may have a zero of
@@ -439,7 +439,7 @@ def _load(text: str) -> Scenario:
     return parse_scenario(text.encode(), Path("identified.yaml"))
 
 
-def _commands(linear: Linearization, setting: LoopSetting) -> Commands:
+def _commands(linear: Linearization, setting: LoopSetting) -> FirstCommands:
     """The commands of a linear aircraft in the loop of its gains."""
     condition = linear.condition
     products = setting.crossover_lag_products
@@ -460,7 +460,7 @@ def _commands(linear: Linearization, setting: LoopSetting) -> Commands:
 
 
 def _text(
-    linear: Linearization, commands: Commands, selection: Selection, stall: float | None
+    linear: Linearization, commands: FirstCommands, selection: Selection, stall: float | None
 ) -> str:
     """The scenario file. `stall`: V_s, m/s; guided where it is not None."""
     condition = linear.condition
@@ -502,7 +502,7 @@ def _text(
         "flight": {"duration": commands.duration},
         "aircraft": aircraft,
         "reference_model": reference,
-        "controller": gain_yaml.as_yaml(selection),
+        "controller": gain_yaml.selection_yaml(selection),
         **guidance,
         "recorder": {"rate": 100.0},
     }

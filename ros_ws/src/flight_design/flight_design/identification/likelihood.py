@@ -25,8 +25,8 @@ from flight_design.identification.innovation_filters import (
     TRANSIENT,
     Block,
     FilterBank,
+    FlightData,
     Passage,
-    Recording,
     coarser,
     delayed,
     filter_bank,
@@ -55,7 +55,7 @@ SPAN = 1.0  # s, within which the level is constant
 HELD_OUT = 3
 
 
-def span_length(recorded: Recording) -> int:
+def span_length(recorded: FlightData) -> int:
     """Periods of a span: whole blocks of the filters."""
     return HOLD * max(round(SPAN / recorded.period / HOLD), 1)
 
@@ -179,7 +179,7 @@ class Likelihood:
 
     def __init__(
         self,
-        recorded: Recording,
+        recorded: FlightData,
         model: NominalModel,
         block: Block,
         airframe: Airframe,

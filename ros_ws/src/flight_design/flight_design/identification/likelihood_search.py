@@ -36,7 +36,7 @@ START_PROGRESS = 5.0
 PROGRESS = 0.3
 
 
-class End(NamedTuple):
+class SearchEnd(NamedTuple):
     """Where a search ends."""
 
     cost: float
@@ -102,7 +102,7 @@ class Search(Likelihood):
 
     def _fit_at(
         self,
-        best: End,
+        best: SearchEnd,
         same: NDArray[np.int64] | None,
         used: NDArray[np.bool_],
         flown: FloatArray | None,
@@ -132,7 +132,7 @@ class Search(Likelihood):
             flown=by_flown,
         )
 
-    def _ends(self, flown: FloatArray | None, used: NDArray[np.bool_]) -> list[End]:
+    def _ends(self, flown: FloatArray | None, used: NDArray[np.bool_]) -> list[SearchEnd]:
         """The ends of the search from the best starts."""
         coarse = self.coarse
         fitted = coarse.fitted()
@@ -182,7 +182,7 @@ class Search(Likelihood):
         levels: NDArray[np.int64] | None,
         used: NDArray[np.bool_],
         unsettled: int = 1,
-    ) -> End:
+    ) -> SearchEnd:
         """The end of the search from a start.
 
         The level of a span is by theta, or from `levels`. Every span counts in the first step and
@@ -198,7 +198,7 @@ class Search(Likelihood):
             if iteration > unsettled and progressed < PROGRESS:
                 break
         winds = self.levels(theta) if levels is None else levels
-        return End(self.cost(theta, used, winds), theta, hessian, winds)
+        return SearchEnd(self.cost(theta, used, winds), theta, hessian, winds)
 
     def _step(
         self,

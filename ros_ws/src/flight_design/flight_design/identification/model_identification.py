@@ -29,7 +29,7 @@ from flight_design.identification.innovation_filters import (
     TRANSIENT,
     Actuation,
     Block,
-    Recording,
+    FlightData,
     blocks,
     filter_model,
     in_rolling_air,
@@ -84,14 +84,14 @@ class Part(NamedTuple):
     latest: tuple[float, ...]  # s, of each input, its delay and two standard deviations
     gusts: bool  # whether FEW of its seconds, or more, are of gusts
     delays: tuple[float, ...] = ()  # s, of each input
-    advantage: float = 0.0  # of the model `flown` over the nominal one, see `identify`
+    advantage: float = 0.0  # of the model `flown` over the nominal one, see `identify_model`
 
 
 class Identification(NamedTuple):
     """The identified model of one flight."""
 
     airframe: Airframe
-    recorded: Recording
+    recorded: FlightData
     held_out: NDArray[np.bool_]  # (T,)
     # (T, m) each, of the nominal model and of this one, units of y
     innovations: tuple[FloatArray, FloatArray]
@@ -113,7 +113,7 @@ class Identification(NamedTuple):
 class _Study(NamedTuple):
     """What the searches of all parts share."""
 
-    recorded: Recording
+    recorded: FlightData
     airframe: Airframe
     delay: float  # s, of u
     unknown: Unknown
@@ -189,8 +189,8 @@ class _Study(NamedTuple):
         return advantage(flown, nominal, span_length(self.recorded), self.later)
 
 
-def identify(
-    recorded: Recording,
+def identify_model(
+    recorded: FlightData,
     airframe: Airframe,
     actuation: Actuation,
     channels: ChannelPairing | None = None,

@@ -26,7 +26,7 @@ CHANNELS = ("y", "y_m", "e", "u", "u_end")
 EXPECTED = "a ULog of the module of `rise-di export --px4`, with rise_di_status in its topics"
 
 
-class Change(NamedTuple):
+class ModuleChange(NamedTuple):
     """Parameters of the controller that the module changed before a tick."""
 
     stamp_ns: int
@@ -40,7 +40,7 @@ class ModuleFlight(NamedTuple):
     """
 
     tape: Tape
-    changes: tuple[Change, ...]
+    changes: tuple[ModuleChange, ...]
     equal: int
     lost: int
 
@@ -123,7 +123,7 @@ class _Ticks:
         law = controller.tuned_law()
         limits = controller.guard()
         digest = controller.digest()
-        changes: list[Change] = []
+        changes: list[ModuleChange] = []
         rows: list[FloatArray] = []
         equal = 0
         number = 1  # the first tick of a stretch cannot be checked: its number leaves a gap
@@ -135,7 +135,7 @@ class _Ticks:
                 change = self._limits(k)
                 if any(getattr(controller, key) != value for key, value in change.items()):
                     controller = vary(controller, change)
-                    changes.append(Change(int(self._stamp_ns[k]), change))
+                    changes.append(ModuleChange(int(self._stamp_ns[k]), change))
                     new_law = controller.tuned_law()
                     new_limits = controller.guard()
                     state = retuning.retune(state, law, new_law, (limits, new_limits))
@@ -174,7 +174,7 @@ class _Ticks:
         self,
         stretches: list[list[int]],
         rows: list[FloatArray],
-        changes: list[Change],
+        changes: list[ModuleChange],
         equal: int,
     ) -> ModuleFlight:
         controller = self._controller

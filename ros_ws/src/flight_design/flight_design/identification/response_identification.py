@@ -27,7 +27,7 @@ from flight_core.tape import Signal
 from flight_core.vectors import FloatArray
 from flight_design.identification.step_response_fit import (
     RESOLUTION,
-    Column,
+    ResponseColumn,
     fitted_column,
     no_column,
 )
@@ -407,7 +407,8 @@ def _responses(
         )
         refusal.append(_refusal(outputs[j], inputs[j], columns[-1], j, still, float(share[j])))
     lag, lag_deviation, delay, delay_deviation, sign_ratio = (
-        np.array([getattr(column, name) for column in columns]) for name in Column._fields[2:]
+        np.array([getattr(column, name) for column in columns])
+        for name in ResponseColumn._fields[2:]
     )
     counts = (share >= MIN_SHARE) & ~((share < 1.0) & (delay < LEAST_DELAY))
     counted = np.where(share < 1.0, counts / CLOSED_LOOP_ERRORS, counts)
@@ -427,7 +428,9 @@ def _responses(
     )
 
 
-def _refusal(output: str, name: str, column: Column, j: int, still: str, share: float) -> str:
+def _refusal(
+    output: str, name: str, column: ResponseColumn, j: int, still: str, share: float
+) -> str:
     if still:
         return f"{output} by {name}: found {still} constant, expected it to move"
     if not np.isfinite(column.Omega[j]):

@@ -31,7 +31,7 @@ from rise_di_controller.law.decomposition import signs
 OPEN_LOOP = "excitation"  # the law that does not use y
 
 
-class Channel(NamedTuple):
+class ChannelSign(NamedTuple):
     """A channel of the law, through the map."""
 
     output: str
@@ -47,7 +47,7 @@ class Channel(NamedTuple):
 class SignCheck(NamedTuple):
     """Result of the check."""
 
-    channels: tuple[Channel, ...]
+    channels: tuple[ChannelSign, ...]
     contradictions: tuple[str, ...]  # sentences
     # sentences on the channels whose sign the recorded flight does not show
     uncertain: tuple[str, ...]
@@ -106,7 +106,7 @@ def check_scenario(
     measured = (
         None if bag is None else recorded_response(bag, outputs, inputs, namespace, channel_map)
     )
-    return check(channel_map, in_map, outputs, inputs, controller.D, measured)
+    return check_map(channel_map, in_map, outputs, inputs, controller.D, measured)
 
 
 def recorded_response(
@@ -166,7 +166,7 @@ def recorded_response(
     )
 
 
-def check(
+def check_map(
     channel_map: ChannelMap,
     Omega: FloatArray,
     outputs: tuple[str, ...],
@@ -195,7 +195,7 @@ def check(
         effect = None if measured is None else float(measured.Omega[i, i])
         ratio = None if measured is None else float(measured.sign_ratio[i])
         channels.append(
-            Channel(
+            ChannelSign(
                 output=output,
                 input=name,
                 effect=float(mapped[i, i]),
@@ -243,8 +243,8 @@ def check_effectors(
 
     The output with the largest motion by an effector decides.
 
-    `Omega` as in `check`, (m, p). An output counts by the largest effect on it. D of a channel is
-    the sign of its effect.
+    `Omega` as in `check_map`, (m, p). An output counts by the largest effect on it. D of a channel
+    is the sign of its effect.
     """
     mapped = _through(channel_map, Omega, outputs, effectors)
     largest = np.argmax(np.abs(effect) / np.abs(effect).max(axis=1, keepdims=True), axis=0).tolist()
@@ -254,7 +254,7 @@ def check_effectors(
         actual = int(np.sign(mapped[i, j]))
         expected = int(np.sign(effect[i, j]))
         channels.append(
-            Channel(
+            ChannelSign(
                 output=outputs[i],
                 input=name,
                 effect=float(mapped[i, j]),

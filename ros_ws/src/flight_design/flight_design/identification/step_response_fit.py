@@ -33,7 +33,7 @@ EARLY = 0.3  # s after delay and lag in which the sign of a response shows
 COUPLING_SPAN = 0.25  # s after delay and lag in which other outputs respond by Omega
 
 
-class Column(NamedTuple):
+class ResponseColumn(NamedTuple):
     """The responses of m outputs to one input, and the lag and delay of the input, s."""
 
     Omega: FloatArray  # (m,)
@@ -45,9 +45,9 @@ class Column(NamedTuple):
     sign_ratio: float
 
 
-def no_column(m: int) -> Column:
+def no_column(m: int) -> ResponseColumn:
     """A column of NaN, for an input without a result."""
-    return Column(
+    return ResponseColumn(
         Omega=np.full(m, np.nan),
         deviation=np.full(m, np.nan),
         lag=math.nan,
@@ -58,7 +58,7 @@ def no_column(m: int) -> Column:
     )
 
 
-def second_order(
+def second_order_response(
     t: FloatArray, delay: float, lag: float, damping: float, stiffness: float
 ) -> tuple[FloatArray, FloatArray]:
     """Step responses y of y'' + damping y' + stiffness y = v' and = v, from rest.
@@ -79,7 +79,7 @@ def second_order(
     return z[1], z[0]
 
 
-def fitted_column(t: FloatArray, responses: FloatArray, j: int) -> Column:
+def fitted_column(t: FloatArray, responses: FloatArray, j: int) -> ResponseColumn:
     """Delay, lag and Omega_jj of input j from output j, then Omega_ij of the further outputs.
 
     These have the same delay and lag.
@@ -106,7 +106,7 @@ def fitted_column(t: FloatArray, responses: FloatArray, j: int) -> Column:
     lag = float(best.theta[1])
     sign = math.sqrt(_significance(t, responses[:, :, j], best.theta, size) / misfit)
     early = (t > delay) & (t <= delay + lag + COUPLING_SPAN)
-    basis = np.stack(second_order(t[early], delay, lag, 0.0, 0.0), axis=1)
+    basis = np.stack(second_order_response(t[early], delay, lag, 0.0, 0.0), axis=1)
     Omega = np.zeros(step.shape[1])
     error = np.zeros(step.shape[1])
     for i in range(step.shape[1]):
@@ -116,7 +116,7 @@ def fitted_column(t: FloatArray, responses: FloatArray, j: int) -> Column:
         error[i] = np.linalg.norm(solve[0])
     Omega[j] = best.theta[2] * size
     error[j] = deviation[2] * size
-    return Column(
+    return ResponseColumn(
         Omega=Omega,
         deviation=error,
         lag=lag,
@@ -134,7 +134,9 @@ def begins_with_Omega(t: FloatArray, theta: FloatArray) -> bool:  # noqa: N802 -
     and Omega is about 0.
     """
     delay, lag, Omega, damping, stiffness, slow = theta
-    first, second = second_order(t[t <= delay + lag + EARLY], delay, lag, damping, stiffness)
+    first, second = second_order_response(
+        t[t <= delay + lag + EARLY], delay, lag, damping, stiffness
+    )
     return bool(np.sum(Omega * first + slow * second) * Omega > 0.0)
 
 
@@ -144,7 +146,7 @@ def _significance(t: FloatArray, responses: FloatArray, theta: FloatArray, size:
     Time counts up to EARLY after delay and lag.
     """
     early = t <= theta[0] + theta[1] + EARLY
-    first, second = second_order(t[early], *theta[[0, 1, 3, 4]])
+    first, second = second_order_response(t[early], *theta[[0, 1, 3, 4]])
     fitted = size * (theta[2] * first + theta[5] * second)
     whiten = _whitener(responses[:, early])
     none = whiten @ responses[0, early]
@@ -194,7 +196,7 @@ def _search(
 
     def residuals(theta: FloatArray) -> FloatArray:
         delay, lag, Omega, damping, stiffness, slow = expanded(theta)
-        first, second = second_order(t, delay, lag, damping, stiffness)
+        first, second = second_order_response(t, delay, lag, damping, stiffness)
         return np.concatenate(
             [size * (whiten @ (Omega * first + slow * second - step)), theta / SPREAD[fitted]]
         )
@@ -202,7 +204,7 @@ def _search(
     starts = [] if start is None else [start]
     for delay in STARTS_DELAY:
         for lag in STARTS_LAG:
-            first, _ = second_order(t, delay, lag, 2.0, 0.0)
+            first, _ = second_order_response(t, delay, lag, 2.0, 0.0)
             seen = whiten @ first
             slope = float(seen @ whiten @ step) / max(float(seen @ seen), np.finfo(float).tiny)
             starts.append(np.array([delay, lag, slope, 2.0, 0.0, 0.0]))

@@ -16,7 +16,7 @@ from flight_core.vectors import FloatArray
 from flight_design.identification.innovation_filters import (
     Actuation,
     Block,
-    Recording,
+    FlightData,
     blocks,
     filter_model,
     in_rolling_air,
@@ -90,7 +90,7 @@ def believed(
 
 
 def change_test(
-    recorded: Recording,
+    recorded: FlightData,
     flown: Airframe,
     actuation: Actuation,
     delays: Mapping[tuple[str, ...], FloatArray] | None = None,
@@ -155,7 +155,7 @@ class Effects(Search):
 
     def __init__(
         self,
-        recorded: Recording,
+        recorded: FlightData,
         flown: Airframe,
         actuation: Actuation,
         block: Block,

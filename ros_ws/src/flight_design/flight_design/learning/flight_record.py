@@ -12,7 +12,7 @@ import numpy as np
 from aircraft_sim.airframes.airframe import Airframe
 from flight_core.rates import nanoseconds, seconds
 from flight_core.vectors import FloatArray
-from flight_design.identification.innovation_filters import Recording
+from flight_design.identification.innovation_filters import FlightData
 from rise_di_controller.learning import divergence
 from rise_di_controller.rise_di_config import RiseDiConfig
 
@@ -77,7 +77,7 @@ class FlightRecord:
         """Keep what is later than an instant alone."""
         self._samples = deque(self._after(stamp_ns))
 
-    def recording(self, after_ns: int = -1) -> Recording:
+    def recording(self, after_ns: int = -1) -> FlightData:
         """The record after an instant in equal periods, in the airframe's order; y of a lost tick
         is NaN, u is held.
         """
@@ -91,7 +91,7 @@ class FlightRecord:
         padded_y = np.full((len(t), y.shape[1]), np.nan)
         padded_y[place] = y
         held = u[np.searchsorted(place, np.arange(len(t)), side="right") - 1]
-        return Recording(self.period, t, padded_y[:, self._rows], held[:, self._columns])
+        return FlightData(self.period, t, padded_y[:, self._rows], held[:, self._columns])
 
     def fell_back(self, after_ns: int, proposals: Collection[int]) -> bool:
         """Whether the law fell back after an instant: other parameters than one of the proposals,
@@ -109,7 +109,7 @@ class FlightRecord:
         return [sample for sample in self._samples if sample.stamp_ns > stamp_ns]
 
 
-def steady_end(recorded: Recording, airframe: Airframe) -> tuple[Recording, float]:
+def steady_end(recorded: FlightData, airframe: Airframe) -> tuple[FlightData, float]:
     """The longest end of a record over which a linear model holds, and the mean airspeed over V0.
 
     The airspeed differs from the mean by SPREAD of the mean, rms, at most: effects of surfaces then
@@ -128,6 +128,6 @@ def steady_end(recorded: Recording, airframe: Airframe) -> tuple[Recording, floa
     ), float(mean[length - 1])
 
 
-def about(recorded: Recording, airframe: Airframe, x: FloatArray, u: FloatArray) -> Recording:
+def about(recorded: FlightData, airframe: Airframe, x: FloatArray, u: FloatArray) -> FlightData:
     """A record as deviations from a trim, x (n,) and u (m,) in the airframe's order."""
     return recorded._replace(y=recorded.y - airframe.matrix_c() @ x, u=recorded.u - u)

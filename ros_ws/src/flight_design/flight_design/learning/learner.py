@@ -3,9 +3,9 @@
 """Learning in the air: A and B from the last seconds of a flight, checked, and the observer and
 feedforward of that model.
 
-The identification is that of a log (`model_identification.identify`), about a rough airframe. A
-model that fails a check is refused with a sentence. The controller refuses parameters that fail its
-own checks at load.
+The identification is that of a log (`model_identification.identify_model`), about a rough
+airframe. A model that fails a check is refused with a sentence. The controller refuses parameters
+that fail its own checks at load.
 """
 
 from collections import deque
@@ -24,11 +24,11 @@ from flight_core.rates import nanoseconds, seconds
 from flight_core.vectors import FloatArray
 from flight_design.gains.ideal_control import ChannelPairing
 from flight_design.gains.observer_search import SelectedObserver
-from flight_design.identification.innovation_filters import DRIFT, TRANSIENT, Actuation, Recording
+from flight_design.identification.innovation_filters import DRIFT, TRANSIENT, Actuation, FlightData
 from flight_design.identification.likelihood import HELD_OUT, KNOWN, Unknown
 from flight_design.identification.model_identification import (
     Identification,
-    identify,
+    identify_model,
     with_entries,
 )
 from flight_design.identification.model_quality import another_airframe
@@ -438,7 +438,7 @@ class Learner:
         channels = ChannelPairing(self._controller.outputs, self._controller.inputs)
         unknown = self._believed._replace(delay=DELAY_DEVIATION, angle=ANGLE)
         identified = partial(
-            identify,
+            identify_model,
             actuation=self._actuation,
             channels=channels,
             at_bound=AT_BOUND,
@@ -472,7 +472,7 @@ class Learner:
         )
         return reduced._replace(parts=tuple(parts))
 
-    def _steady(self, recorded: Recording) -> tuple[Recording, float]:
+    def _steady(self, recorded: FlightData) -> tuple[FlightData, float]:
         """Beside models at several speeds: the steady end of a record, about the trim there, and
         the speed over V0.
         """

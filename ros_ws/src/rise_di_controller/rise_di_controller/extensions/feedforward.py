@@ -133,7 +133,7 @@ def sines(x: Array, nominal: Nominal) -> Array:
     return values
 
 
-def parts_of(span_ns: int, period_ns: int) -> int:
+def step_count(span_ns: int, period_ns: int) -> int:
     """Number of Runge-Kutta steps over the time between two ticks.
 
     A step has at most LONGEST_PART periods.
@@ -181,7 +181,7 @@ def acting(u: Array, nominal: Nominal) -> Array:
     return u if nominal.acts is None else u * nominal.acts
 
 
-def zero_dynamics(nominal: Nominal) -> NDArray[np.complex128]:
+def nominal_zeros(nominal: Nominal) -> NDArray[np.complex128]:
     """Eigenvalues of the zero dynamics, shape (n - m,), 1/s: the zeros of the nominal model.
 
     Eigenvalues of H' (I - B Omega^-1 C) (A + gravity) H, with H the columns of I for states not

@@ -43,7 +43,7 @@ def _require_sizes(section: Config, key: str, sizes: Mapping[str, tuple[int, int
         )
 
 
-def require_signs(Omega: FloatArray, D: Sequence[int], where: str) -> None:
+def require_same_signs(Omega: FloatArray, D: Sequence[int], where: str) -> None:
     """Raise ParameterError for a C B without a D, or with another one."""
     try:
         signs_of_model = [int(sign) for sign in signs(Omega)]
@@ -102,7 +102,7 @@ class FeedforwardConfig(Config):
         B = np.reshape(self.B, (n, m))
         gravity = np.zeros((n, n)) if self.gravity is None else np.reshape(self.gravity, (n, n))
         C = selection_matrix(outputs, self.states)
-        require_signs(C @ B, D, "feedforward.B")
+        require_same_signs(C @ B, D, "feedforward.B")
         unknown = [name for name in self.inputs or () if name not in inputs]
         require(
             not unknown, "feedforward.inputs", ", ".join(unknown), f"some of {', '.join(inputs)}"

@@ -81,7 +81,7 @@ class GuardParams(NamedTuple):
 LEAST_DT = 0.2
 
 
-class Vanes(NamedTuple):
+class VaneReadings(NamedTuple):
     """Readings of the k vanes at the last step."""
 
     reading: FloatArray  # (k,)
@@ -110,7 +110,7 @@ class ControllerState(NamedTuple):
     # (p,) commanded, with an allocation; u is the input of the law that they give
     effectors: FloatArray | None = None
     effectors_failsafe: FloatArray | None = None  # at the start of the failsafe
-    vanes: Vanes | None = None  # None without vanes
+    vanes: VaneReadings | None = None  # None without vanes
 
     @property
     def command(self) -> FloatArray:
@@ -297,7 +297,7 @@ def _with_sample(
     law_state = _predicted(state.law, held, missed, law)
     model = nominal_at_speed(guard, law_state)
     if model is not None and ff_state is not None:
-        parts = feedforward.parts_of(span_ns, guard.period_ns)
+        parts = feedforward.step_count(span_ns, guard.period_ns)
         ff_state, u_ff = feedforward.step(ff_state, inputs.y_m, dt, model, parts)
         u_trim = u_trim + u_ff
     elif u_ff_recorded is not None:
@@ -407,7 +407,7 @@ def _is_finite(state: ControllerState) -> bool:
     return bool(np.isfinite(np.concatenate(arrays)).all())
 
 
-def _readings(reading: FloatArray, before: Vanes | None) -> FloatArray:
+def _readings(reading: FloatArray, before: VaneReadings | None) -> FloatArray:
     """The readings of the vanes, (k,).
 
     A missing reading repeats the tick before, so the vane counts as still.
@@ -432,14 +432,14 @@ def _vanes(
     state: FeedforwardState | None,
     guard: GuardParams,
     recorded: FloatArray | None,
-) -> Vanes | None:
+) -> VaneReadings | None:
     """The readings, and the states of the nominal model along y_m; None without vanes.
 
     The states are the readings of the reference motion.
     """
     if reading is None:
         return None
-    return Vanes(reading, recorded if state is None else state.x[list(guard.vanes)])  # type: ignore[arg-type]
+    return VaneReadings(reading, recorded if state is None else state.x[list(guard.vanes)])  # type: ignore[arg-type]
 
 
 def law_within_limits(

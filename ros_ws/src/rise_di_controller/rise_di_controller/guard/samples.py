@@ -59,7 +59,7 @@ class SampleLimits(NamedTuple):
     period_ns: int  # of the ticks
 
 
-class Change(IntEnum):
+class SampleChange(IntEnum):
     """What a sample of y is beside the samples before."""
 
     NEAR = 0  # taken
@@ -90,7 +90,7 @@ class SampleState(NamedTuple):
     stillness: Stillness
 
 
-def bounds(
+def sample_limits(
     names: Sequence[str], authority: FloatArray, largest: Sequence[float] | None, period_ns: int
 ) -> SampleLimits:
     """The limits of outputs by name.
@@ -146,7 +146,7 @@ def begun(sample: StampedVector) -> SampleState:
 
 def step(
     state: SampleState, sample: StampedVector, limits: SampleLimits
-) -> tuple[SampleState, Change]:
+) -> tuple[SampleState, SampleChange]:
     """The state after a sample of y with a later stamp, and what the sample is.
 
         change = abs(y - last) / periods,  periods = max(stamp - last stamp, period) / period
@@ -165,7 +165,7 @@ def step(
     stillness = _after(state.stillness, sample, state.last, limits)
     state = state._replace(stillness=stillness)
     if stillness.is_frozen:
-        return state._replace(far=sample, agreeing=0), Change.FROZEN
+        return state._replace(far=sample, agreeing=0), SampleChange.FROZEN
     near, change = _compared(state.last, sample, state.change, limits)
     is_first = sample.stamp_ns - state.begin_ns < FIRST_NS
     if near or is_first:
@@ -175,12 +175,14 @@ def step(
             change = np.abs(sample.value - state.last.value)
         fading = 1.0 - min(seconds(sample.stamp_ns - state.last.stamp_ns) / MEMORY, 1.0)
         largest = np.maximum(change, fading * state.change)
-        return state._replace(last=sample, change=largest, far=sample, agreeing=0), Change.NEAR
+        return state._replace(
+            last=sample, change=largest, far=sample, agreeing=0
+        ), SampleChange.NEAR
     agrees = state.agreeing > 0 and _compared(state.far, sample, state.change, limits)[0]
     agreeing = state.agreeing + 1 if agrees else 1
     if agreeing < AGREEING:
-        return state._replace(far=sample, agreeing=agreeing), Change.FAR
-    return state._replace(last=sample, far=sample, agreeing=0), Change.JUMPED
+        return state._replace(far=sample, agreeing=agreeing), SampleChange.FAR
+    return state._replace(last=sample, far=sample, agreeing=0), SampleChange.JUMPED
 
 
 def _after(

@@ -40,7 +40,7 @@ class LinearPlant(NamedTuple):
     C: FloatArray  # (m, n), with k vanes (m + k, n)
 
 
-class Loop(NamedTuple):
+class LoopTiming(NamedTuple):
     """Actuators, delay and sampling between y and the response of the aircraft, over m channels."""
 
     lag: FloatArray  # (m,) time constants of the actuators, s; 0 without an actuator
@@ -181,7 +181,7 @@ class SampledPlant(NamedTuple):
 
 
 def sampled_plant(
-    plant: LinearPlant, loop: Loop, extra: FloatArray, *, rising: bool = False
+    plant: LinearPlant, loop: LoopTiming, extra: FloatArray, *, rising: bool = False
 ) -> SampledPlant:
     """The exact motion over a period, with k = n + m + held m states.
 
@@ -250,7 +250,9 @@ def _driven(
     return transition, ROOT * (2.0 * (begin * held + risen) - held)
 
 
-def closed_loop(plant: LinearPlant, law: LinearLaw, loop: Loop, extra: FloatArray) -> FloatArray:
+def closed_loop(
+    plant: LinearPlant, law: LinearLaw, loop: LoopTiming, extra: FloatArray
+) -> FloatArray:
     """A period of the sampled loop as a matrix, exact.
 
     The loop is stable if no eigenvalue lies outside the unit circle.
@@ -274,6 +276,6 @@ def spectral_radius(matrix: FloatArray) -> float:
     return float(np.max(np.abs(np.linalg.eigvals(matrix)), initial=0.0))
 
 
-def is_stable(plant: LinearPlant, law: LinearLaw, loop: Loop, extra: FloatArray) -> bool:
+def is_stable(plant: LinearPlant, law: LinearLaw, loop: LoopTiming, extra: FloatArray) -> bool:
     """Whether no eigenvalue of `closed_loop` lies outside the unit circle, up to rounding."""
     return spectral_radius(closed_loop(plant, law, loop, extra)) <= 1.0 + SPECTRAL_RADIUS_TOLERANCE
