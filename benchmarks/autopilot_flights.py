@@ -93,9 +93,9 @@ def behind(tape: Tape, name: str, engaged: Engagement) -> float:
     t = np.arange(
         engaged.start_ns + NANOSECONDS, engaged.stop_ns or int(y.stamp_ns[-1]), NANOSECONDS // 100
     )
-    measured = np.interp(t, y.stamp_ns, y[name])
+    y_at_ticks = np.interp(t, y.stamp_ns, y[name])
     errors = [
-        float(np.var(measured - np.interp(t - delay * NANOSECONDS, y_m.stamp_ns, y_m[name])))
+        float(np.var(y_at_ticks - np.interp(t - delay * NANOSECONDS, y_m.stamp_ns, y_m[name])))
         for delay in DELAYS
     ]
     return float(DELAYS[int(np.argmin(errors))])

@@ -47,9 +47,9 @@ def signs(experiments: int = 25) -> dict[str, Any]:
         loaded = load_map(channel_map)
         airframe = plane.folder / "signs_airframe.yaml"
         scenario = plane.folder / "signs.yaml"
-        planned = experiment(loaded, 24.0, 0.2, str(airframe))
-        airframe.write_text(planned.airframe)
-        content = yaml.safe_load(planned.scenario)
+        plan = experiment(loaded, 24.0, 0.2, str(airframe))
+        airframe.write_text(plan.airframe)
+        content = yaml.safe_load(plan.scenario)
         controller = content["/**/controller"]["ros__parameters"]
         controller["pause"] = 1.0
         controller["period"] = [PERIODS[name] for name in controller["inputs"]]
@@ -58,16 +58,16 @@ def signs(experiments: int = 25) -> dict[str, Any]:
         scenario.write_text(yaml.safe_dump(content))
         duration = ExcitationConfig.validate_mapping(controller, "controller").duration
         plane.say("param", "SIM_WIND_SPD", "5")
-        flown = plane.fly(scenario, channel_map, EXPERIMENT * experiments, "--send")
-        flown.wait_for("DISENGAGED")
-        begun = []
+        run = plane.fly(scenario, channel_map, EXPERIMENT * experiments, "--send")
+        run.wait_for("DISENGAGED")
+        starts = []
         earlier = len(stored("signs").get("experiments", []))
         winds = [
             TURBULENCE[number % len(TURBULENCE)] for number in range(earlier, earlier + experiments)
         ]
         for wind in winds:
             plane.say("param", "SIM_WIND_TURB", f"{wind:g}")
-            begun.append(time.time_ns())
+            starts.append(time.time_ns())
             plane.level()
             plane.hand_over()
             while plane.engage().end() != 0:  # outside of the envelope, by a gust
@@ -77,9 +77,11 @@ def signs(experiments: int = 25) -> dict[str, Any]:
             plane.engage("--off").succeed()
         plane.say("param", "SIM_WIND_TURB", "0")
         plane.level()
-        flown.interrupt()
-        flown.end(60.0)
-    return signs_of_logs([plane.run], lambda _, engaged: winds[bisect(begun, engaged.start_ns) - 1])
+        run.interrupt()
+        run.end(60.0)
+    return signs_of_logs(
+        [plane.run], lambda _, engaged: winds[bisect(starts, engaged.start_ns) - 1]
+    )
 
 
 def signs_of_logs(
@@ -130,21 +132,21 @@ def judged(
     spans = [(engaged.start_ns, engaged.stop_ns or end_ns) for engaged in engagements]
 
     def verdicts(flipped: str) -> dict[str, str]:
-        turned = Signal(
+        flipped_u = Signal(
             u.stamp_ns, u.names, u.values * [-1.0 if name == flipped else 1.0 for name in u.names]
         )
         response = identify_response(
-            tape["y"], turned, pairing.outputs, pairing.inputs, engaged=spans
+            tape["y"], flipped_u, pairing.outputs, pairing.inputs, engaged=spans
         )
         D = tuple(int(sign) for sign in expected)
-        checked = check_map(channel_map, Omega, pairing.outputs, pairing.inputs, D, response)
-        shown = (
+        check = check_map(channel_map, Omega, pairing.outputs, pairing.inputs, D, response)
+        fraction = (
             (channel.input, channel.ratio or 0.0, (channel.measured or 0.0) * channel.effect)
-            for channel in checked.channels
+            for channel in check.channels
         )
         return {
             name: "unsure" if ratio < MIN_RATIO else "right" if agrees > 0.0 else "wrong"
-            for name, ratio, agrees in shown
+            for name, ratio, agrees in fraction
         }
 
     return {
@@ -166,15 +168,15 @@ def finds_each(experiment: dict[str, Any]) -> bool:
 
 def counted(result: dict[str, Any]) -> dict[str, Any]:
     """The counts of the experiments on signs."""
-    flown = result["experiments"]
-    moderate = [each for each in flown if each["turbulence"] <= MODERATE]
+    experiments = result["experiments"]
+    moderate = [each for each in experiments if each["turbulence"] <= MODERATE]
     return {
-        "experiments": len(flown),
+        "experiments": len(experiments),
         "experiments that ended early": len(result["ended"]),
-        "experiments that show every sign, right": sum(map(shows_all, flown)),
-        "experiments that find each flipped sign": sum(map(finds_each, flown)),
+        "experiments that show every sign, right": sum(map(shows_all, experiments)),
+        "experiments that find each flipped sign": sum(map(finds_each, experiments)),
         "experiments that call a right sign wrong": sum(
-            "wrong" in each["as flown"].values() for each in flown
+            "wrong" in each["as flown"].values() for each in experiments
         ),
         "moderate experiments that miss a sign": sum(
             not (shows_all(each) and finds_each(each)) for each in moderate

@@ -95,18 +95,18 @@ def gains_of_slow_servos(log: Path | None = None) -> dict[str, Any]:
 
 def gains_of_px4(log: Path | None = None) -> dict[str, Any]:
     """PX4's airplane, by its own identification."""
-    flown: list[tuple[Any, Callable[[], Signal]]] = []
+    flights: list[tuple[Any, Callable[[], Signal]]] = []
 
     @contextmanager
     def watched() -> Iterator[Any]:
         with px4() as airplane, airplane.watching_truth() as truth:
-            flown.append((airplane, truth))
+            flights.append((airplane, truth))
             yield airplane
 
     result = identified(watched, FOLDER / "px4", str(PX4_MAP), 11.5, log)
     if "refused" in result:
         return result
-    airplane, truth = flown[-1]
+    airplane, truth = flights[-1]
     return result | {"true_rms": true_errors(airplane, truth())}
 
 
@@ -134,7 +134,7 @@ def identified(
     The log is read on the ground. With the log of an experiment that this command flew before,
     there is no new one.
     """
-    found = place / "found"
+    results = place / "found"
     channel_map = place / f"{Path(map_name).stem}.yaml"
     command = (
         "identify",
@@ -143,27 +143,29 @@ def identified(
         "--speed",
         f"{speed:g}",
         "--write",
-        str(found),
+        str(results),
     )
     if log is None:
         with flying() as autopilot:
             autopilot.patient_map(map_name)
             autopilot.experiment(*command)
-    read = on_the_ground(*command, str((log or REPOSITORY / "runs" / "latest").resolve()), "--json")
-    if read.returncode:
-        return {"refused": read.stderr}
-    result = json.loads(read.stdout)
+    gain_result = on_the_ground(
+        *command, str((log or REPOSITORY / "runs" / "latest").resolve()), "--json"
+    )
+    if gain_result.returncode:
+        return {"refused": gain_result.stderr}
+    result = json.loads(gain_result.stdout)
     with (
         flying() as autopilot,
-        autopilot.engaged(found / "scenario.yaml", str(found / "map.yaml"), 75.0) as flight,
+        autopilot.engaged(results / "scenario.yaml", str(results / "map.yaml"), 75.0) as flight,
     ):
         flight.end(150.0)
-    kept = {
+    others = {
         key: result["controller"][key]
         for key in ("outputs", "k_g", "k_d", "Lambda", "delay", "lag")
     }
     return {
-        "controller": kept,
+        "controller": others,
         "channels": result["channels"],
         "delay_margin": result["delay_margin"],
         **tracking(autopilot),
@@ -192,9 +194,9 @@ def own_log() -> dict[str, Any]:
                 if name == "ardupilot"
                 else plane.mavlink_map(narrower)
             )
-            found = plane.folder / "found"
+            folder = plane.folder / "found"
             command = ("identify", "--bridge", channel_map, "--speed", f"{FASTER * TRUE:g}")
-            plane.experiment(*command, "--write", str(found)).succeed(300.0)
+            plane.experiment(*command, "--write", str(folder)).succeed(300.0)
             run = (REPOSITORY / "runs" / "latest").resolve()
             log = plane.folder / "experiment.BIN"
             shutil.copy(plane.dataflash(), log)
@@ -203,12 +205,12 @@ def own_log() -> dict[str, Any]:
                 plane.say("param", "SIM_WIND_SPD", f"{speed:g}")
                 plane.say("param", "SIM_WIND_TURB", f"{turbulence:g}")
                 with plane.engaged(
-                    found / "scenario.yaml", str(found / "map.yaml"), 90.0
+                    folder / "scenario.yaml", str(folder / "map.yaml"), 90.0
                 ) as flight:
                     flight.end(150.0)
-                own = plane.own_errors(TRUE if name == "ardupilot" else 1.0)
+                errors = plane.own_errors(TRUE if name == "ardupilot" else 1.0)
                 results[name]["flights"][wind] = tracking(plane) | {
-                    "own": {channel: rms for channel, (rms, _) in own.items()}
+                    "own": {channel: rms for channel, (rms, _) in errors.items()}
                 }
         results[name] |= imported_beside(command, log, run, plane.folder)
     return results
@@ -221,17 +223,17 @@ def imported_beside(command: Sequence[str], log: Path, run: Path, place: Path) -
     """
     bag = place / "imported"
     shutil.rmtree(bag, ignore_errors=True)
-    done = on_the_ground("import", str(log), "--map", command[2], "--output", str(bag))
-    if done.returncode:
-        return {"refused": done.stderr}
+    imported = on_the_ground("import", str(log), "--map", command[2], "--output", str(bag))
+    if imported.returncode:
+        return {"refused": imported.stderr}
     omega: dict[str, dict[str, float]] = {}
     for name, source in (("stack", run), ("imported", bag)):
-        read = on_the_ground(
+        identification = on_the_ground(
             *command, str(source), "--write", str(place / f"of_{name}"), "--accept", "--json"
         )
-        if read.returncode:
-            return {"refused": f"{name}: {read.stderr}"}
-        result = json.loads(read.stdout)
+        if identification.returncode:
+            return {"refused": f"{name}: {identification.stderr}"}
+        result = json.loads(identification.stdout)
         Omega = np.array(result["channels"]["Omega"])
         omega[name] = dict(
             zip(
@@ -255,11 +257,11 @@ def guided() -> dict[str, Any]:
 
     starts = np.arange(15.0, GUIDED, EACH).tolist()
     with arduplane(0.03) as plane:
-        found = plane.folder / "found"
+        results = plane.folder / "found"
         scenario = plane.folder / "guided.yaml"
         program = plane.turns(starts, ALTITUDE + 20.0, 24.0)
-        scenario.write_text(guided_scenario(found / "scenario.yaml", program, 24.0))
-        with plane.engaged(scenario, str(found / "map.yaml"), GUIDED) as flight:
+        scenario.write_text(guided_scenario(results / "scenario.yaml", program, 24.0))
+        with plane.engaged(scenario, str(results / "map.yaml"), GUIDED) as flight:
             flight.end(GUIDED + 100.0)
     return held_figures(plane.run, starts)
 
@@ -274,7 +276,7 @@ def held_figures(run: Path, starts: Sequence[float]) -> dict[str, Any]:
     t = tape.time("guidance")
     errors = control_errors(tape)
     stop = one["stop"] or GUIDED
-    held = in_spans(
+    is_held = in_spans(
         t,
         [(start + SETTLED, min(start + EACH, stop)) for start in starts if start + SETTLED < stop],
     )
@@ -282,8 +284,8 @@ def held_figures(run: Path, starts: Sequence[float]) -> dict[str, Any]:
         "seconds": stop - one["start"],
         "reason": one["reason"],
         "turns": len(starts),
-        "rms": {name: float(np.sqrt(np.mean(errors[name][held] ** 2))) for name in HELD},
-        "max": {name: float(np.max(np.abs(errors[name][held]))) for name in HELD},
+        "rms": {name: float(np.sqrt(np.mean(errors[name][is_held] ** 2))) for name in HELD},
+        "max": {name: float(np.max(np.abs(errors[name][is_held]))) for name in HELD},
         "replayed": on_the_ground("replay", str(run)).returncode == 0,
     }
 
@@ -293,27 +295,27 @@ def observed() -> dict[str, Any]:
 
     The observer has the identified Omega and lags.
     """
-    found = FOLDER / "arduplane" / "found"
+    folder = FOLDER / "arduplane" / "found"
     results = []
-    alone = load_scenario(found / "scenario.yaml")
-    controller = alone.rise_di()
+    plain = load_scenario(folder / "scenario.yaml")
+    controller = plain.rise_di()
     model = controller.feedforward
     if model is None:
-        sys.exit(f"error: {found}: found no feedforward, expected a scenario of identify --bridge")
+        sys.exit(f"error: {folder}: found no feedforward, expected a scenario of identify --bridge")
     rows = [model.states.index(name) for name in controller.outputs]
     Omega = np.reshape(model.B, (len(model.states), -1))[rows]
     size = unit_sizes("m/s" if name == "V" else "rad/s" for name in controller.outputs)
     observer = with_extended_state_observer(
         controller, Omega, size / NOISE_SHARE, size, controller.delay + OBSERVER_MARGIN
     )
-    scenarios = {"without": alone, "with": replace(alone, controller=observer.controller)}
+    scenarios = {"without": plain, "with": replace(plain, controller=observer.controller)}
     with arduplane(0.03) as plane:
         plane.say("param", "SIM_WIND_SPD", "5")
         plane.say("param", "SIM_WIND_TURB", f"{OBSERVED_TURBULENCE:g}")
         for name in [*scenarios] * OBSERVED_PAIRS:
             scenario = plane.folder / f"{name}_observer.yaml"
             scenario.write_text(scenario_yaml(scenarios[name]))
-            with plane.engaged(scenario, str(found / "map.yaml"), 75.0) as flight:
+            with plane.engaged(scenario, str(folder / "map.yaml"), 75.0) as flight:
                 flight.end(150.0)
             results.append({"observer": name, **tracking(plane)})
     return {
@@ -329,8 +331,8 @@ def bumpless() -> dict[str, Any]:
     """
     with arduplane(0.03) as plane:
         channel_map = plane.patient_map("ardupilot")
-        flown = plane.fly(EXAMPLE, channel_map, 1000.0, "--send")
-        flown.wait_for("DISENGAGED")
+        run = plane.fly(EXAMPLE, channel_map, 1000.0, "--send")
+        run.wait_for("DISENGAGED")
         for _ in range(ENGAGEMENTS):
             plane.level()
             plane.hand_over()
@@ -338,8 +340,8 @@ def bumpless() -> dict[str, Any]:
             time.sleep(WINDOW[1] + 0.5)
             plane.engage("--off").succeed()
         plane.level()
-        flown.interrupt()
-        flown.end(60.0)
+        run.interrupt()
+        run.end(60.0)
         log = read_run(plane.run)
         inputs = load_map(channel_map).inputs.values()
         ranges = {f"{row.message}.{row.field}": row.range[1] - row.range[0] for row in inputs}
@@ -364,9 +366,9 @@ def step(sent: Signal, ranges: dict[str, float], engaged_ns: int) -> float:
 def pose() -> dict[str, Any]:
     """Rates and pose of the map `ardupilot` in turns and climbs, against the autopilot's log."""
     with arduplane(0.03) as plane:
-        flown = plane.fly(EXAMPLE, plane.patient_map("ardupilot"), 60.0)
-        flown.wait_for("DISENGAGED")
-        plane.wander(flown)
+        run = plane.fly(EXAMPLE, plane.patient_map("ardupilot"), 60.0)
+        run.wait_for("DISENGAGED")
+        plane.wander(run)
         fits = {name: fit._asdict() for name, fit in plane.compare().items()}
     return fits | {
         "slopes of the rates, largest difference from 1": max(
@@ -440,7 +442,7 @@ def main() -> None:
     if reason := missing():
         sys.exit(f"error: {reason}")
     for name in arguments.only or MEASUREMENTS:
-        begun = evidence.origin(f"python -m benchmarks.autopilots --only {name}")
+        start = evidence.origin(f"python -m benchmarks.autopilots --only {name}")
         if name == "signs":
             result = (
                 signs_of_logs(arguments.log, lambda number, _: TURBULENCE[number % len(TURBULENCE)])
@@ -457,7 +459,7 @@ def main() -> None:
         evidence.write(
             f"autopilots-{name}",
             evidence.rows(figures, evidence.goals_of(f"autopilots-{name}")),
-            begun,
+            start,
         )
 
 

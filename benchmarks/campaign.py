@@ -116,7 +116,9 @@ def write_rows(label: str, figures: dict[str, tuple[float, str]], begun: Origin)
     """Write the rows of a device, value and unit by name, in place of its former rows."""
     DEVICES.touch()
     with DEVICES.open(newline="") as stream:
-        kept = [line for line in list(csv.reader(stream))[1:] if not line[0].startswith(label)]
+        other_rows = [
+            line for line in list(csv.reader(stream))[1:] if not line[0].startswith(label)
+        ]
     new = [
         [*Row(f"{label}{name}", f"{value:.4g}", unit), *begun]
         for name, (value, unit) in figures.items()
@@ -124,7 +126,7 @@ def write_rows(label: str, figures: dict[str, tuple[float, str]], begun: Origin)
     with DEVICES.open("w", newline="") as stream:
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(Row._fields + Origin._fields)
-        writer.writerows(sorted(kept + new))
+        writer.writerows(sorted(other_rows + new))
 
 
 def alone(scenario: Scenario) -> tuple[float, FloatArray]:
@@ -156,9 +158,9 @@ def integration_error(scenario: Scenario, count: int) -> tuple[float, FloatArray
     worst = np.zeros(len(outputs))
     single_speed = 0.0
     for number in range(count):
-        sampled = definition.aircraft_scenario(number)
-        single_speed = max(single_speed, alone(sampled)[0])
-        _, rms = alone(sampled.vary(aircraft={"step": FINE}))
+        aircraft = definition.aircraft_scenario(number)
+        single_speed = max(single_speed, alone(aircraft)[0])
+        _, rms = alone(aircraft.vary(aircraft={"step": FINE}))
         worst = np.maximum(
             worst, np.abs([figures[f"rms.{name}"][number] for name in outputs] / rms - 1.0)
         )
@@ -181,32 +183,32 @@ def main(
     ] = None,
 ) -> None:
     """Print and write speed, floor, ratios, memory, and integration error."""
-    begun = origin("python -m benchmarks.campaign")
-    chosen = find_scenario(scenario)
-    seconds = chosen.flight.duration
+    start = origin("python -m benchmarks.campaign")
+    definition_scenario = find_scenario(scenario)
+    seconds = definition_scenario.flight.duration
     count = aircraft or (10_000 if device.is_cpu() else MILLION)
-    many = speed(chosen, count, chunk, workers)
-    flown = count * seconds / many.took
+    many = speed(definition_scenario, count, chunk, workers)
+    aircraft_seconds = count * seconds / many.took
     rows = {
         "seconds": (many.took, "s"),
         "first chunk, with compilation": (many.compiled, "s"),
-        "speed": (flown, "aircraft-s/s"),
+        "speed": (aircraft_seconds, "aircraft-s/s"),
     }
     figures: dict[str, Any] = {
         **many._asdict(),
-        "flown": flown,
+        "flown": aircraft_seconds,
         "whole": count * seconds / (many.took + many.compiled),
         "memory_growth": many.memory / many.memory_early,
         "aircraft": count,
     }
     if not device.is_cpu():
-        figures["of_cpu"] = flown / on_cpu(scenario, 10_000)["flown"]
+        figures["of_cpu"] = aircraft_seconds / on_cpu(scenario, 10_000)["flown"]
         rows["ratio to the CPU of its host"] = (figures["of_cpu"], "")
-        rows["floor"] = (floor(chosen, count), "s")
+        rows["floor"] = (floor(definition_scenario, count), "s")
     if exact:
-        plain, errors = integration_error(chosen, exact)
-        shares = dict(zip(chosen.controller.outputs, errors.tolist(), strict=True))
-        rows["ratio to a simulation in one process"] = (flown / plain, "")
+        plain, errors = integration_error(definition_scenario, exact)
+        shares = dict(zip(definition_scenario.controller.outputs, errors.tolist(), strict=True))
+        rows["ratio to a simulation in one process"] = (aircraft_seconds / plain, "")
         rows |= {f"{name}: integration error": (share, "") for name, share in shares.items()}
         figures |= {"plain": plain, "exact": exact, "integration": shares}
     is_goal = not device.is_cpu() and (scenario, count) == ("osprey_servo", MILLION)
@@ -218,7 +220,7 @@ def main(
     Console().print(table)
     if json_file is not None:
         json_file.write_text(json.dumps(figures, indent=1))
-    write_rows(label, rows, begun)
+    write_rows(label, rows, start)
 
 
 if __name__ == "__main__":

@@ -215,22 +215,22 @@ def _line(path: Path, title: str) -> str:
         ((used(figure, figures), figure) for figure in figures.values() if figure.goal),
         reverse=True,
     )
-    met = sum(share <= 1.0 for share, _ in judged)
-    missed: dict[str, str] = {}  # of figures that differ by the subject alone the worst
-    for _, figure in judged[: len(judged) - met]:
+    met_count = sum(share <= 1.0 for share, _ in judged)
+    misses: dict[str, str] = {}  # of figures that differ by the subject alone the worst
+    for _, figure in judged[: len(judged) - met_count]:
         value = compared(figure, figures)
         text = (
             figure.value
             if math.isnan(value)
             else f"{value:.3g}{'' if figure.baseline else ' ' + figure.unit}".strip()
         )
-        missed.setdefault(
+        misses.setdefault(
             figure.name.rpartition(": ")[2] + figure.goal,
             f"{figure.name} **{text}** ({figure.goal})",
         )
-    passed = f"{met} of {len(judged)}" if judged else "-"
+    verdict = f"{met_count} of {len(judged)}" if judged else "-"
     busy = ["busy host"] if BUSY in origin.host else []
-    goals = "; ".join([passed, *missed.values(), *busy])
+    goals = "; ".join([verdict, *misses.values(), *busy])
     return f"| [{title}](evidence/{path.name}) | {goals} |"
 
 
@@ -244,13 +244,13 @@ def revision(*paths: str) -> str:
 
     Of `paths` it is the last that touched them.
     """
-    changed = _git(
+    status = _git(
         "status", "--porcelain", "--", *(paths or (".", ":(exclude)docs/evidence*"))
     ).strip()
     commit = (
         _git("log", "-1", "--format=%h", "--", *paths) if paths else _git("describe", "--always")
     )
-    return commit.strip() + (DIRTY if changed else "")
+    return commit.strip() + (DIRTY if status else "")
 
 
 def _git(*arguments: str) -> str:
@@ -275,37 +275,45 @@ def host() -> str:
 def measure(name: str) -> int:
     """Run a measurement and write its rows; the exit status, which is a goal where it is not 0."""
     busy = psutil.cpu_percent(interval=2.0) / 100.0
-    planned = COMMANDS[name]
-    begun = origin(planned)  # before the run: a commit meanwhile is not what runs
+    template = COMMANDS[name]
+    start = origin(template)  # before the run: a commit meanwhile is not what runs
     with tempfile.TemporaryDirectory() as folder, (BUILD / f"{name}.log").open("w") as log:
         file = Path(folder) / "result.json"
-        command = planned.replace("FILE", str(file)).replace("FOLDER", folder).split()
+        command = template.replace("FILE", str(file)).replace("FOLDER", folder).split()
         command[0] = str(Path(sys.executable).parent / command[0])
-        done = subprocess.run(  # noqa: S603
+        process = subprocess.run(  # noqa: S603
             command, cwd=REPOSITORY, stdout=subprocess.PIPE, stderr=log, text=True, check=False
         )
-        log.write(done.stdout)
-        text = file.read_text() if file.exists() else done.stdout
-    if planned.startswith("pytest"):
-        ended = re.findall(r"(\d+) (passed|failed|skipped|error)", text.strip().rpartition("\n")[2])
-        result: Any = {"failed": 0} | {kind: int(count) for count, kind in ended}
+        log.write(process.stdout)
+        text = file.read_text() if file.exists() else process.stdout
+    if template.startswith("pytest"):
+        counts = re.findall(
+            r"(\d+) (passed|failed|skipped|error)", text.strip().rpartition("\n")[2]
+        )
+        result: Any = {"failed": 0} | {kind: int(count) for count, kind in counts}
     else:
         result = json.loads(text) if text.lstrip().startswith(("{", "[")) else {}
     if busy > BUSY_SHARE:
-        begun = begun._replace(host=f"{begun.host}, {100 * busy:.0f} % {BUSY}")
+        start = start._replace(host=f"{start.host}, {100 * busy:.0f} % {BUSY}")
     failed = (
-        [row("exit status", done.returncode, at_most=0)] if done.returncode or not result else []
+        [row("exit status", process.returncode, at_most=0)]
+        if process.returncode or not result
+        else []
     )
-    found = result["evidence"] if isinstance(result, dict) and "evidence" in result else None
+    figures = result["evidence"] if isinstance(result, dict) and "evidence" in result else None
     write(
         name,
         [
             *failed,
-            *(rows(result, goals_of(name)) if found is None else (Row(*each) for each in found)),
+            *(
+                rows(result, goals_of(name))
+                if figures is None
+                else (Row(*each) for each in figures)
+            ),
         ],
-        begun,
+        start,
     )
-    return done.returncode
+    return process.returncode
 
 
 def main() -> int:

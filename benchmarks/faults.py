@@ -99,16 +99,16 @@ def summarise(rows: Sequence[Row]) -> list[Row]:
 
 
 def _summary(case: str, rows: Sequence[Row]) -> Row:
-    passed = [row for row in rows if row["passed"]]
+    passed_rows = [row for row in rows if row["passed"]]
     summary: Row = {
         "case": case,
         "u": rows[0]["does"],
         "injected": len(rows),
-        "passed": len(passed),
+        "passed": len(passed_rows),
     }
-    summary["any_delay"] = sum(row["any_delay"] for row in passed)
+    summary["any_delay"] = sum(row["any_delay"] for row in passed_rows)
     for key in (*TIMES, *BANKS):
-        values = [row[key] for row in passed if row.get(key) is not None]
+        values = [row[key] for row in passed_rows if row.get(key) is not None]
         summary[key] = (
             {"median": statistics.median(values), "worst": max(values)} if values else None
         )

@@ -162,8 +162,8 @@ def fly_fleet(shape: str, wind: str, aircraft: int, seed: int) -> Row:
     with ProcessPoolExecutor() as pool:
         underway = []
         for number in range(aircraft):
-            drawn = {"A": UNCERTAINTY, "B": UNCERTAINTY, "seed": seed, "number": number}
-            uncertain = scenario.vary(aircraft={"uncertainty": drawn})
+            uncertainty = {"A": UNCERTAINTY, "B": UNCERTAINTY, "seed": seed, "number": number}
+            uncertain = scenario.vary(aircraft={"uncertainty": uncertainty})
             underway.append(pool.submit(fly, (uncertain, radius), SHAPES[shape], 0.0))
         flights = [future.result() for future in underway]
     return row_of(OSPREY, shape, wind, flights)
@@ -191,12 +191,12 @@ def fly(prepared: tuple[Scenario, float], shape: tuple[Zone, ...], course: float
             aircraft={"start": {"heading": course}},
         )
     )
-    beyond = max(-float(tape["guidance"]["fence.clearance"].min()), 0.0)
+    distance = max(-float(tape["guidance"]["fence.clearance"].min()), 0.0)
     pose = tape["pose"]
     assert scenario.guidance is not None  # noqa: S101 - `windy` has made the section
     home = scenario.guidance.home
     to_home = math.hypot(pose["north"][-1] - home.north, pose["east"][-1] - home.east)
-    return Flight(beyond, tape.outcome != COMPLETED, to_home <= HOME_RADII * radius)
+    return Flight(distance, tape.outcome != COMPLETED, to_home <= HOME_RADII * radius)
 
 
 def polygon(
@@ -221,9 +221,9 @@ def generated(kind: str, rng: np.random.Generator) -> tuple[Zone, ...]:
         return (polygon(rng, int(rng.integers(3, 7)), (0.5, 2.5)),)
     width = rng.uniform(1.5, 3.5)
     length = rng.uniform(3.0, 15.0)
-    beside = rng.uniform(-0.3, 0.3) * width
+    offset = rng.uniform(-0.3, 0.3) * width
     ring = (length, length, -length, -length)
-    slot = Zone(ring, (beside + width, beside - width, beside - width, beside + width))
+    slot = Zone(ring, (offset + width, offset - width, offset - width, offset + width))
     if kind == "slot":
         return (slot,)
     field = slot._replace(east=(length, -length, -length, length))
@@ -236,7 +236,7 @@ GENERATED = ("triangle", "slot", "hole near home", "smaller than a turn")
 
 def fly_generated(accepted: int, seed: int, show: Callable[[Row], Any]) -> bool:
     """Fly in generated fences until so many are accepted; whether all flights stayed inside."""
-    flown = list[Row]()
+    rows_flown = list[Row]()
     refusals = dict.fromkeys(GENERATED, 0)
     for number, kind in enumerate(cycle(GENERATED)):
         rng = np.random.default_rng([seed, number])
@@ -249,13 +249,13 @@ def fly_generated(accepted: int, seed: int, show: Callable[[Row], Any]) -> bool:
             refusals[kind] += 1
             print(f"fence {number}, {kind}, {wind}: {refused}")
         else:
-            flown.append(row)
+            rows_flown.append(row)
             show(row)
         sys.stdout.flush()
-        if len(flown) == accepted:
+        if len(rows_flown) == accepted:
             break
     print(f"refused: {refusals}")
-    return not any(row.outside or row.lost for row in flown)
+    return not any(row.outside or row.lost for row in rows_flown)
 
 
 def row_of(name: str, shape: str, wind: str, flights: Sequence[Flight]) -> Row:
@@ -281,29 +281,31 @@ def main() -> int:
     parser.add_argument(
         "--generated", type=int, metavar="N", help="fly in N generated fences; not stored"
     )
-    chosen = parser.parse_args()
+    arguments = parser.parse_args()
     writer = csv.writer(sys.stdout)
     failed = False
     writer.writerow(Row._fields)
-    if chosen.generated:
-        return int(not fly_generated(chosen.generated, chosen.seed, writer.writerow))
-    for name in chosen.only:
-        options = f" --aircraft {chosen.aircraft} --seed {chosen.seed}" * (name == OSPREY)
-        begun = evidence.origin(f"python -m benchmarks.fence --only {name}{options}")
-        flown = list[Row]()
+    if arguments.generated:
+        return int(not fly_generated(arguments.generated, arguments.seed, writer.writerow))
+    for name in arguments.only:
+        options = f" --aircraft {arguments.aircraft} --seed {arguments.seed}" * (name == OSPREY)
+        start = evidence.origin(f"python -m benchmarks.fence --only {name}{options}")
+        rows_flown = list[Row]()
         for shape, wind in product(SHAPES, WINDS):
             of_fleet = name == OSPREY
             row = (
-                fly_fleet(shape, wind, chosen.aircraft, chosen.seed)
+                fly_fleet(shape, wind, arguments.aircraft, arguments.seed)
                 if of_fleet
                 else fly_alone(name, shape, wind)
             )
-            flown.append(row)
+            rows_flown.append(row)
             writer.writerow(row)
             sys.stdout.flush()
             failed |= bool(row.outside or row.lost)
         evidence.write(
-            f"guidance-fence-{name}", chain.from_iterable(row.figures() for row in flown), begun
+            f"guidance-fence-{name}",
+            chain.from_iterable(row.figures() for row in rows_flown),
+            start,
         )
     return int(failed)
 

@@ -101,12 +101,14 @@ def fuzz_all(seconds: int) -> None:
 
     def statistics(target: str) -> dict[str, int]:
         command = [sys.executable, "-m", "benchmarks.fuzz", target, "--seconds", str(seconds)]
-        done = subprocess.run(command, cwd=REPOSITORY, check=False, capture_output=True, text=True)  # noqa: S603 - ours
-        if done.returncode:
-            print(done.stderr[-10_000:], file=sys.stderr)
-        counts = re.findall(r"^stat::(\w+):\s+(\d+)", done.stderr, re.MULTILINE)
-        counts += [("covered", count) for count in re.findall(r"cov: (\d+)", done.stderr)]
-        return {"status": done.returncode} | {name: int(count) for name, count in counts}
+        process = subprocess.run(  # noqa: S603 - ours
+            command, cwd=REPOSITORY, check=False, capture_output=True, text=True
+        )
+        if process.returncode:
+            print(process.stderr[-10_000:], file=sys.stderr)
+        counts = re.findall(r"^stat::(\w+):\s+(\d+)", process.stderr, re.MULTILINE)
+        counts += [("covered", count) for count in re.findall(r"cov: (\d+)", process.stderr)]
+        return {"status": process.returncode} | {name: int(count) for name, count in counts}
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         print(json.dumps(dict(zip(TARGETS, pool.map(statistics, TARGETS), strict=True)), indent=1))

@@ -112,9 +112,9 @@ def flight(scenario: Scenario, first: Unstable) -> str:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "airframe.yaml"
         path.write_text(as_yaml(frame))
-        flown = scenario.vary(aircraft={"airframe": str(path)})
-        tape = simulate(flown)
-        return str(judged(tape.outcome, tape, flown, account(tape, flown)))
+        unstable = scenario.vary(aircraft={"airframe": str(path)})
+        tape = simulate(unstable)
+        return str(judged(tape.outcome, tape, unstable, account(tape, unstable)))
 
 
 def beyond(linear: LinearLoop, stable: float, count: int) -> str:

@@ -214,13 +214,13 @@ def rows(
     `over` is `map` or that of a pool of processes.
     """
     several = list(jobs(manoeuvres, seeds))
-    done = zip(several, over(partial(fly, aircraft_of(name)), several), strict=True)
-    for (title, shown), those in groupby(done, key=lambda flight: flight[0][:2]):
+    flights = zip(several, over(partial(fly, aircraft_of(name)), several), strict=True)
+    for (title, shown), those in groupby(flights, key=lambda flight: flight[0][:2]):
         worst: dict[str, Figure] = {}
         for figure in (figure for _, figures in those for figure in figures):
-            own = max(figure.limit, EXEMPT.get((name, title, figure.name), figure.limit))
+            limit = max(figure.limit, EXEMPT.get((name, title, figure.name), figure.limit))
             worst[figure.name] = max(
-                figure._replace(limit=own),
+                figure._replace(limit=limit),
                 worst.get(figure.name, figure),
                 key=lambda same: same.value,
             )
@@ -247,21 +247,21 @@ def main() -> None:
     )
     options = parser.parse_args()
     if options.route:
-        begun = origin(f"--route --seeds {options.seeds}")
-        flown = [
-            kept for name in OTHERS for kept in fly_manoeuvres(name, OTHER_ROUTE, options.seeds)
+        start = origin(f"--route --seeds {options.seeds}")
+        rows_flown = [
+            row for name in OTHERS for row in fly_manoeuvres(name, OTHER_ROUTE, options.seeds)
         ]
-        store("route", (figure_row(kept.aircraft, kept) for kept in flown), begun)
-        sys.exit(any(kept.figure.missed for kept in flown))
+        store("route", (figure_row(row.aircraft, row) for row in rows_flown), start)
+        sys.exit(any(row.figure.missed for row in rows_flown))
     failed = 0
     for name in options.only:
-        begun = origin(f"--only {name} --seeds {options.seeds}")
-        flown = fly_manoeuvres(
+        start = origin(f"--only {name} --seeds {options.seeds}")
+        rows_flown = fly_manoeuvres(
             name, {title: MANOEUVRES[title] for title in options.manoeuvres}, options.seeds
         )
         if len(options.manoeuvres) == len(MANOEUVRES):
-            store(name, (figure_row(kept.manoeuvre, kept) for kept in flown), begun)
-        failed += any(kept.figure.missed for kept in flown)
+            store(name, (figure_row(row.manoeuvre, row) for row in rows_flown), start)
+        failed += any(row.figure.missed for row in rows_flown)
     sys.exit(failed > 0)
 
 
@@ -287,14 +287,14 @@ def fly_manoeuvres(name: str, manoeuvres: Mapping[str, Manoeuvre], seeds: int) -
     table = new_table(
         f"Guidance by rule, {name}", ("manoeuvre", "air", "figure", "worst", "limit", ""), texts=3
     )
-    kept = []
+    kept_rows = []
     with ProcessPoolExecutor() as pool:
-        for flown in rows(name, manoeuvres, seeds, pool.map):
-            figure = flown.figure
+        for row in rows(name, manoeuvres, seeds, pool.map):
+            figure = row.figure
             verdict = "missed" if figure.missed else ""
             cells = (
-                flown.manoeuvre,
-                flown.air,
+                row.manoeuvre,
+                row.air,
                 figure.name,
                 f"{figure.value:.3g}",
                 f"{figure.limit:.3g}",
@@ -302,9 +302,9 @@ def fly_manoeuvres(name: str, manoeuvres: Mapping[str, Manoeuvre], seeds: int) -
             )
             print(name, *cells, sep="\t", file=sys.stderr, flush=True)
             table.add_row(*cells)
-            kept.append(flown)
+            kept_rows.append(row)
     Console().print(table)
-    return kept
+    return kept_rows
 
 
 if __name__ == "__main__":

@@ -93,14 +93,14 @@ def searched(selection: Selection) -> str:
         tries += 1
         step = SPREAD * generator.standard_normal((2, m))
         fresh = best < 0.0 or generator.random() < FRESH
-        tried = generator.random((2, m)) * WIDEST if fresh else np.clip(place + step, 0.0, WIDEST)
-        loop = build(*np.exp(tried)).loop
+        trial = generator.random((2, m)) * WIDEST if fresh else np.clip(place + step, 0.0, WIDEST)
+        loop = build(*np.exp(trial)).loop
         margins = input_margins(loop.nominal, loop.law, loop.loop, together=False)
         if np.isfinite(margins.phase).all():
             fraction = least_fraction(margins, selection.setting.requirement)
             if fraction > best:
                 best = fraction
-                place = tried
+                place = trial
     if best < 1.0:
         return f"none in {tries} tries, at most {best:.0%} of the goals"
     return f"REFUTED in {tries} tries by {np.exp(place).round(2).tolist()}"
@@ -113,7 +113,7 @@ def main() -> None:
     parser.add_argument("--phase-margin", type=float, default=60.0)
     options = parser.parse_args()
     rows: list[list[str]] = []
-    refused: list[tuple[list[str], Selection]] = []
+    refusals: list[tuple[list[str], Selection]] = []
     for name in options.aircraft:
         for speed, altitude in CONDITIONS[name]:
             print(f"{name} at {speed} m/s", file=sys.stderr)
@@ -125,10 +125,10 @@ def main() -> None:
                 row.append(f"{error}")
                 continue
             selection = identified.selection
-            needed = selection.setting.requirement._replace(
+            requirement = selection.setting.requirement._replace(
                 phase=math.radians(options.phase_margin)
             )
-            more = gain_sets(selection.study, selection.setting._replace(requirement=needed))
+            more = gain_sets(selection.study, selection.setting._replace(requirement=requirement))
             row += [
                 verdict(selection),
                 *figures(identified),
@@ -136,9 +136,9 @@ def main() -> None:
                 verdict(more),
             ]
             print(", ".join(row), file=sys.stderr)
-            refused += [(row, each) for each in (selection, more) if each.engineering.unmet]
-    for k in np.random.default_rng(1).permutation(len(refused))[:FIVE]:
-        row, selection = refused[k]
+            refusals += [(row, each) for each in (selection, more) if each.engineering.unmet]
+    for k in np.random.default_rng(1).permutation(len(refusals))[:FIVE]:
+        row, selection = refusals[k]
         phase = math.degrees(selection.setting.requirement.phase)
         row.append(f"{phase:g} deg: {searched(selection)}")
     writer = csv.writer(sys.stdout, lineterminator="\n")

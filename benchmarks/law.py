@@ -45,15 +45,11 @@ def ticked(scenario: str, y: FloatArray, y_m: FloatArray) -> Callable[[int], obj
     limits = controller.guard()
     first = StampedVector(0, y_m[0])
     stamp_ns = limits.period_ns
-    engaged, _ = guard.tick(
-        guard.initial_state(4), 0, StampedVector(0, y[0]), [first], limits, tuned
-    )
+    state, _ = guard.tick(guard.initial_state(4), 0, StampedVector(0, y[0]), [first], limits, tuned)
 
     def tick(k: int) -> object:
         references = [first, StampedVector(stamp_ns, y_m[k])]
-        return guard.tick(
-            engaged, stamp_ns, StampedVector(stamp_ns, y[k]), references, limits, tuned
-        )
+        return guard.tick(state, stamp_ns, StampedVector(stamp_ns, y[k]), references, limits, tuned)
 
     return tick
 

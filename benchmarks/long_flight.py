@@ -104,8 +104,8 @@ def fly(scenario: Path, runs: Path, mode: str) -> tuple[dict[str, list[int]], in
     It is taken until the nodes end, bytes every PERIOD. The second result is the most memory of
     `rise-di fly` after that, while it writes the report, bytes.
     """
-    within = real_time() if mode == "in real time" else ()
-    command = [*within, RISE_DI, "fly", str(scenario), *MODES[mode], "--runs", str(runs)]
+    prefix = real_time() if mode == "in real time" else ()
+    command = [*prefix, RISE_DI, "fly", str(scenario), *MODES[mode], "--runs", str(runs)]
     memory: dict[str, list[int]] = {}
     with ExitStack() as stack:
         flight = stack.enter_context(psutil.Popen(command, stdout=subprocess.DEVNULL))
@@ -158,15 +158,15 @@ def skips(
     rates = {"y": scenario.aircraft.rate, "y_m": scenario.reference_model.rate}
     rates |= {} if real_time else {"u": scenario.controller.rate}
     rates |= dict.fromkeys(("u_m", "guidance"), guidance.rate)
-    found = {}
+    figures_found = {}
     end_ns = tape.start_ns + nanoseconds(scenario.flight.duration)
     for name, rate in rates.items():
         stamps = tape[name].until(end_ns).stamp_ns
         period = period_ns(rate, name)
         lateness = period // 2 if real_time else 0
         ends = np.column_stack((stamps[:-1] + period, stamps[1:] + lateness))
-        found[name] = (ends[np.diff(stamps) > 1.5 * period], period)
-    return found
+        figures_found[name] = (ends[np.diff(stamps) > 1.5 * period], period)
+    return figures_found
 
 
 def missing(
@@ -176,14 +176,14 @@ def missing(
     skipped = skips(tape, scenario, real_time=real_time)
     return {
         words: {
-            name: missed_excluding_delays(ends, known, period)
+            name: missed_excluding_delays(ends, delays_known, period)
             for name, (ends, period) in skipped.items()
         }
-        for words, known in (
+        for words, delays_known in (
             ("missing samples", ()),
             ("missing samples, excluding host delays", delays),
         )
-        if known is not None
+        if delays_known is not None
     }
 
 
@@ -218,9 +218,9 @@ def figures(
     """
     begin = time.monotonic()
     write_report(run)
-    written = time.monotonic() - begin
-    read = read_run(run)
-    tape = read.tape
+    write_time = time.monotonic() - begin
+    run_read = read_run(run)
+    tape = run_read.tape
     scenario = load_scenario(run.parent / "flown.yaml")
     log = tape["guidance"]
     xtrack = log["xtrack"][tape.time("guidance") > 30.0]
@@ -230,7 +230,7 @@ def figures(
         "minutes": (tape["y"].stamp_ns[-1] - tape.start_ns) / NANOSECONDS / 60.0,
         "legs": int(log["leg"].max()),
         "missing": missing(tape, scenario, delays, real_time=real_time),
-        "lost": sum(int(count) for count in read.metadata.get(LOST_MESSAGES, {}).values()),
+        "lost": sum(int(count) for count in run_read.metadata.get(LOST_MESSAGES, {}).values()),
         "ticks": figures_of_ticks(
             tape["internals"], delays, period_ns(scenario.controller.rate, "rate")
         )
@@ -250,7 +250,7 @@ def figures(
         },
         "report": {
             "size": (run / "report.html").stat().st_size,
-            "written": written,
+            "written": write_time,
             "opened": opened(run / "report.html"),
         },
     }
@@ -294,13 +294,13 @@ def main() -> None:
         host = [(since + clock, until + clock) for since, until in delays()] if delays else None
         aircraft = "osprey with an observer" if options.observer else "c172p"
         priority = "" if host is None else f" at FIFO {PRIORITY}"
-        found = {
+        result = {
             "flight": f"the {aircraft}, {options.mode}{priority}",
             "took": took,
             **figures((runs / "latest").resolve(), memory, host, real_time=timed),
         }
-        found["report"]["memory"] = report_memory
-        text = json.dumps(found, indent=1)
+        result["report"]["memory"] = report_memory
+        text = json.dumps(result, indent=1)
         print(text)
         if options.json is not None:
             options.json.write_text(text + "\n")

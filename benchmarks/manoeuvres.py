@@ -229,10 +229,10 @@ def of_speed(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figure
 def of_route(waypoints: int, tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figure]:
     """Largest cross-track error from 30 s on and before the last orbit, in s of flight."""
     leg, xtrack = after(tape, 30.0, "leg", "xtrack")
-    flown = np.abs(xtrack[leg < leg.max()])
+    leg_errors = np.abs(xtrack[leg < leg.max()])
     if leg.max() < 2.0 * waypoints - 3.0:  # lines, fillets between them, and the orbit
         yield Figure("legs flown", leg.max(), -math.inf)
-    yield Figure("cross-track (s)", flown.max() / section.speed, 0.35 if calm else 0.5)
+    yield Figure("cross-track (s)", leg_errors.max() / section.speed, 0.35 if calm else 0.5)
 
 
 def of_orbit(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figure]:

@@ -46,7 +46,7 @@ def ticks(hz: float) -> Iterator[Tick]:
 
 def termination() -> threading.Event:
     """An event that SIGTERM and SIGINT set."""
-    ended = threading.Event()
+    has_ended = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: ended.set())
-    return ended
+        signal.signal(number, lambda *_: has_ended.set())
+    return has_ended

@@ -90,8 +90,8 @@ def without_lead(
     error: PathError, entry: Any, entered: Any, slip: Any, pose: Any, speed: Any, params: Any
 ) -> Any:
     """`lateral_modes.follow` with L1, without the lead and without the estimate of the slip."""
-    wanted = l1(error, *course_and_speed(pose), params.path)
-    return bank_for(wanted, path_angle(pose["climb"], speed), lateral_modes.STEEPEST)
+    acceleration = l1(error, *course_and_speed(pose), params.path)
+    return bank_for(acceleration, path_angle(pose["climb"], speed), lateral_modes.STEEPEST)
 
 
 @contextmanager
@@ -117,9 +117,9 @@ def osprey(wind: float, places: list[tuple[float, float]], start: float = 0.0) -
     speed = wind * base.guidance.speed
     section = base.guidance.model_copy(update={"wind": speed})
     radius = float(math.ceil(section.least_radius()))
-    moved = {"wind": [0.0, speed], "start": {"north": 5.0, "east": start * radius}}
+    changes = {"wind": [0.0, speed], "start": {"north": 5.0, "east": start * radius}}
     waypoints = [Waypoint(north * radius, east * radius, 0.0) for north, east in places]
-    return with_route(base.vary(aircraft=moved, guidance={"wind": speed}), waypoints)
+    return with_route(base.vary(aircraft=changes, guidance={"wind": speed}), waypoints)
 
 
 def rectangle(law: str, wind: float) -> float:
@@ -141,17 +141,17 @@ def capture(law: str, offset: float) -> tuple[float, float]:
         tape = simulate(scenario)
     assert scenario.guidance is not None  # noqa: S101 - of osprey
     error = tape["guidance"]["xtrack"]
-    beside = np.flatnonzero(np.abs(error) > WITHIN * scenario.guidance.speed)
-    return float(tape.time("guidance")[beside[-1]]), max(-float(np.min(error)), 0.0)
+    places = np.flatnonzero(np.abs(error) > WITHIN * scenario.guidance.speed)
+    return float(tape.time("guidance")[places[-1]]), max(-float(np.min(error)), 0.0)
 
 
 def cells() -> Iterator[Cell]:
     """The figures, flight by flight."""
     for offset in OFFSETS:
-        flown = {law: capture(law, offset) for law in LAWS}
+        captures = {law: capture(law, offset) for law in LAWS}
         title = f"capture from {offset:g} radii"
-        yield Cell(f"{title}: time", "s", {law: time for law, (time, _) in flown.items()})
-        yield Cell(f"{title}: overshoot", "m", {law: over for law, (_, over) in flown.items()})
+        yield Cell(f"{title}: time", "s", {law: time for law, (time, _) in captures.items()})
+        yield Cell(f"{title}: overshoot", "m", {law: over for law, (_, over) in captures.items()})
     for wind in WINDS:
         title = f"rectangle, wind {wind:g} V0: cross-track, largest"
         yield Cell(title, "m", {law: rectangle(law, wind) for law in LAWS})
@@ -159,12 +159,12 @@ def cells() -> Iterator[Cell]:
 
 def main() -> None:
     """Fly, print the rows and store them."""
-    begun = evidence.origin("python -m benchmarks.path_laws")
+    start = evidence.origin("python -m benchmarks.path_laws")
     figures = list[evidence.Row]()
     for cell in cells():
         print(cell.name, dict(cell.values), flush=True)
         figures += cell.figures
-    evidence.write("guidance-laws", figures, begun)
+    evidence.write("guidance-laws", figures, start)
 
 
 if __name__ == "__main__":

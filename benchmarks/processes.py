@@ -81,9 +81,9 @@ def threads_ns(pid: int) -> int:
 
 def real_time() -> tuple[str, ...]:
     """What runs a command at real-time priority; empty where that is not permitted."""
-    within = (shutil.which("chrt") or "", "-f", str(PRIORITY))
-    permitted = within[0] and not subprocess.run([*within, "true"], check=False).returncode  # noqa: S603
-    return within if permitted else ()
+    prefix = (shutil.which("chrt") or "", "-f", str(PRIORITY))
+    permitted = prefix[0] and not subprocess.run([*prefix, "true"], check=False).returncode  # noqa: S603
+    return prefix if permitted else ()
 
 
 @contextlib.contextmanager

@@ -37,26 +37,26 @@ def main(
     """Inject random faults and print what failed; exit status 1 if any did."""
     options = [f"--faults-random={count}", f"--faults-lockstep={lockstep}", f"--faults-seed={seed}"]
     options += [f"--timeout={30 * (count + lockstep) + 300}", "-k", "random or log_holds"]
-    planned = len(FOUND) * bool(count) + count + lockstep
-    rows, status = run_campaign(options, planned)
+    total = len(FOUND) * bool(count) + count + lockstep
+    rows, status = run_campaign(options, total)
     failed = [row for row in rows if not row["passed"]]
     two = sum("," in row["case"] for row in rows)
     cases = Counter(name for row in rows for name in row["case"].split(", "))
     result: Row = {
         "seed": seed,
-        "draws": planned,
+        "draws": total,
         "two": two,
         "lockstep": lockstep,
         "passed": len(rows) - len(failed),
-        "draws that fail": planned - len(rows) + len(failed),
+        "draws that fail": total - len(rows) + len(failed),
     }
     result |= {"status": status, "cases": cases, "failed": failed}
     if file is not None:
         file.write_text(json.dumps(result, indent=2) + "\n")
     for row in failed:
         print(f"seed {row['seed']}, {row['case']}: {row['error']}")
-    print(f"{result['passed']} of {planned} draws passed, {two} of them with two faults at a time")
-    sys.exit(int(result["passed"] < planned or bool(status)))
+    print(f"{result['passed']} of {total} draws passed, {two} of them with two faults at a time")
+    sys.exit(int(result["passed"] < total or bool(status)))
 
 
 if __name__ == "__main__":

@@ -44,7 +44,7 @@ def measure() -> dict[str, FloatArray]:
     controller = Controller(parameters)
     encoder = Encoder(parameters.outputs, OWN)
     right = encoder.encode(0, np.zeros(4))
-    refused = {
+    refusals = {
         DECODED: right + bytes(len(right)),
         "message of a conflicting publisher, refused": Encoder(parameters.outputs, FOREIGN).encode(
             0, np.zeros(4)
@@ -58,7 +58,7 @@ def measure() -> dict[str, FloatArray]:
             OWN, MAX_SIZE
         ),
     }
-    took = {name: np.empty(REPEATS) for name in (RIGHT, *refused)}
+    took = {name: np.empty(REPEATS) for name in (RIGHT, *refusals)}
 
     def take(sample: StampedVector, now_ns: int) -> None:
         controller.take_y(sample, now_ns)  # none is lost: y moves slowly
@@ -75,7 +75,7 @@ def measure() -> dict[str, FloatArray]:
         for k in range(REPEATS):  # in turn, since the speed of the host drifts
             for name, message in {
                 RIGHT: encoder.encode(k, np.full(4, 1e-6 * k)),
-                **refused,
+                **refusals,
             }.items():
                 begin_ns = time.perf_counter_ns()
                 receiver.take_message(message, REPEATS)

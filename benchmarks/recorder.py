@@ -38,9 +38,9 @@ def publish(rate: float, duration: float) -> None:
     Print "matched" first and the number sent at the end.
     """
     tape = simulate(find_scenario("osprey_servo", 5.0))
-    ended = termination()
-    sent = 0
-    missed = 0
+    has_ended = termination()
+    sent_count = 0
+    missed_count = 0
     with open_node("publisher") as node:
         publishers = [node.create_publisher(topic.type, topic.name, PUBLISH) for topic in TOPICS]
         signals = [tape["y_m" if topic is U_M else topic.name] for topic in TOPICS]
@@ -48,25 +48,29 @@ def publish(rate: float, duration: float) -> None:
         sources = list(
             zip(publishers, encoders, (list(signal.values) for signal in signals), strict=True)
         )
-        while not ended.is_set() and not all(
+        while not has_ended.is_set() and not all(
             publisher.get_subscription_count() for publisher in publishers
         ):
             time.sleep(0.01)
         print("matched", flush=True)
         begin = time.monotonic()
         for tick in ticks(rate):
-            if ended.is_set() or time.monotonic() - begin >= duration:
+            if has_ended.is_set() or time.monotonic() - begin >= duration:
                 break
             now_ns = time.time_ns()
             for publisher, encoder, rows in sources:
-                publisher.publish(encoder.encode(now_ns, rows[sent % len(rows)]))
-            sent += 1
-            missed += tick.missed
+                publisher.publish(encoder.encode(now_ns, rows[sent_count % len(rows)]))
+            sent_count += 1
+            missed_count += tick.missed
         for publisher in publishers:
             publisher.wait_for_all_acked(Duration(seconds=5.0))
         print(
             json.dumps(
-                {"sent": sent * len(TOPICS), "missed": missed, "seconds": time.monotonic() - begin}
+                {
+                    "sent": sent_count * len(TOPICS),
+                    "missed": missed_count,
+                    "seconds": time.monotonic() - begin,
+                }
             ),
             flush=True,
         )
@@ -86,9 +90,9 @@ def record(run: Path, rate: float, duration: float) -> tuple[dict[str, float], f
         if publisher.popen.stdout.readline() != "matched\n":
             sys.exit("error: the publisher did not find the recorder")
         before = recorder.popen.cpu_times()
-        sent = json.loads(publisher.popen.stdout.readline())
+        counts = json.loads(publisher.popen.stdout.readline())
         after = recorder.popen.cpu_times()
-    return sent, after.user + after.system - before.user - before.system
+    return counts, after.user + after.system - before.user - before.system
 
 
 class Rewritten(NamedTuple):
@@ -110,14 +114,14 @@ def rewrite(run: Path, folder: Path, compression: CompressionMode) -> Rewritten:
         if compression is not CompressionMode.NONE:
             writer.set_compression(compression, CompressionFormat.ZSTD)
         with writer:
-            made = {
+            copies = {
                 connection.id: writer.add_connection(
                     connection.topic, connection.msgtype, typestore=reader.typestore
                 )
                 for connection in connections
             }
             for connection, stamp_ns, data in messages:
-                writer.write(made[connection.id], stamp_ns, data)
+                writer.write(copies[connection.id], stamp_ns, data)
         took_us = (time.process_time_ns() - begin_ns) / 1e3
     counts = Counter(connection.topic.lstrip("/") for connection, *_ in messages)
     return Rewritten(counts, took_us / len(messages), mcap_size(folder) / len(messages))

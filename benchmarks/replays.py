@@ -17,13 +17,13 @@ from flight_analysis.closed_loop.scenario_library import scenarios
 
 def _run(*command: str) -> dict[str, Any]:
     """The JSON that a command prints; without any, the figure that misses the goal."""
-    done = subprocess.run(  # noqa: S603 - ours
+    process = subprocess.run(  # noqa: S603 - ours
         (RISE_DI, *command, "--json"), check=False, capture_output=True, text=True
     )
     return (
-        json.loads(done.stdout)
-        if done.stdout.startswith("{")
-        else {"differing": None, "error": done.stderr.strip()}
+        json.loads(process.stdout)
+        if process.stdout.startswith("{")
+        else {"differing": None, "error": process.stderr.strip()}
     )
 
 

@@ -162,12 +162,12 @@ def fly(name: str, title: str, case: Case) -> Row:
         raise ValueError(f"{name} has no guidance")
     route = varied.guidance.plan(varied.guidance.waypoints())
     result = "flown"
-    flown = flown_legs(tape)
-    missed = [leg for leg in flown if leg.result == "missed"]
-    if missed:
-        result = f"missed leg {missed[0].leg} by {missed[0].missed:.0f} m"
-    elif flown[-1].leg < len(route.legs) - 1:
-        result = f"missed: on leg {flown[-1].leg} of {len(route.legs) - 1} at the end"
+    legs = flown_legs(tape)
+    misses = [leg for leg in legs if leg.result == "missed"]
+    if misses:
+        result = f"missed leg {misses[0].leg} by {misses[0].missed:.0f} m"
+    elif legs[-1].leg < len(route.legs) - 1:
+        result = f"missed: on leg {legs[-1].leg} of {len(route.legs) - 1} at the end"
     xtrack, altitude = errors(tape, route)
     return Row(
         name, title, result, round(xtrack / varied.guidance.speed, 3), limit, round(altitude, 2)
@@ -226,20 +226,20 @@ def main() -> int:
     parser.add_argument(
         "--cases", nargs="*", choices=[*CASES], default=[*CASES], help="routes; not stored"
     )
-    chosen = parser.parse_args()
+    options = parser.parse_args()
     writer = csv.writer(sys.stdout)
     failed = False
     writer.writerow(Row._fields)
-    for name in chosen.only:
-        begun = evidence.origin(f"python -m benchmarks.routes --only {name}")
-        flown = list[Row]()
-        for title in chosen.cases:
-            flown.append(row := fly(name, title, CASES[title]))
+    for name in options.only:
+        start = evidence.origin(f"python -m benchmarks.routes --only {name}")
+        rows_flown = list[Row]()
+        for title in options.cases:
+            rows_flown.append(row := fly(name, title, CASES[title]))
             writer.writerow(row)
             sys.stdout.flush()
             failed |= row.xtrack > row.limit or row.result.startswith(("missed", "lost"))
-        if len(flown) == len(CASES):
-            evidence.write(f"guidance-routes-{name}", (row.figure for row in flown), begun)
+        if len(rows_flown) == len(CASES):
+            evidence.write(f"guidance-routes-{name}", (row.figure for row in rows_flown), start)
     return int(failed)
 
 

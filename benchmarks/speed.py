@@ -123,7 +123,7 @@ class Peer:
         begin = time.monotonic()
         first = 0.0
         since_ns = time.time_ns()
-        driven = Driven()
+        total = Driven()
         zero = np.zeros(self._values.shape[1])
         for tick in ticks(hz):
             if first and time.monotonic() >= first + WARM_UP + seconds:
@@ -133,27 +133,25 @@ class Peer:
             self._y.publish(
                 self._y_encoder.encode(now_ns, self._values[tick.number % len(self._values)])
             )
-            driven.sent += 1
+            total.sent += 1
             for received in self._u.take():
                 # else of an earlier process, or warm-up
                 if (stamp_ns := stamp_of(received.message)) >= since_ns:
-                    driven.start = driven.start or received.received_ns / NANOSECONDS
-                    driven.received[stamp_ns] = received.received_ns
+                    total.start = total.start or received.received_ns / NANOSECONDS
+                    total.received[stamp_ns] = received.received_ns
             for received in self._internals.take():
                 sample = self._decoder.decode(received.message)
                 if sample is not None:
-                    driven.age[sample.stamp_ns], driven.late[sample.stamp_ns] = (
-                        sample.value.tolist()
-                    )
-            if not first and driven.received and time.time() > driven.start + WARM_UP:
+                    total.age[sample.stamp_ns], total.late[sample.stamp_ns] = sample.value.tolist()
+            if not first and total.received and time.time() > total.start + WARM_UP:
                 first = time.monotonic() - WARM_UP
-                driven = Driven(driven.start)
+                total = Driven(total.start)
                 cpu_ns = child.cpu_ns()
                 since_ns = time.time_ns()
-            if not driven.received and not first and time.monotonic() > begin + MATCHED_WITHIN:
+            if not total.received and not first and time.monotonic() > begin + MATCHED_WITHIN:
                 raise RuntimeError(f"no answer within {MATCHED_WITHIN:g} s")
-        driven.cpu_ns = child.cpu_ns() - cpu_ns
-        return driven
+        total.cpu_ns = child.cpu_ns() - cpu_ns
+        return total
 
 
 @dataclass
@@ -219,8 +217,8 @@ def controller_at(
 
 def law_rows() -> Iterator[Row]:
     """One step of the law, one inside its limits, one whole tick."""
-    measured = law.measure() | {"guard.tick of osprey_observer": law.measure_observer()}
-    for name, (median, high, most) in measured.items():
+    times = law.measure() | {"guard.tick of osprey_observer": law.measure_observer()}
+    for name, (median, high, most) in times.items():
         yield Row(name, {"p50 (us)": median, "p99.9 (us)": high, "max (us)": most}, law.FLOOR)
 
 
@@ -255,18 +253,18 @@ def node_rows(seconds: float, folder: Path) -> Iterator[Row]:
                 with controller_at(OBSERVER_RATE, folder, scenario_name=scenario) as child:
                     peer.drive(OBSERVER_RATE, length, child)
                     took.setdefault(name, []).append(_whole(child.stop()))
-    without, observed = OBSERVED.values()
+    plain, observed = OBSERVED.values()
     for name, runs in took.items():
         figures = {
             f"{column} (us)": float(np.median([run[column] for run in runs]))
             for column in ("p50", "p99")
         }
         goals = () if name.startswith("bare") else (Goal("p50 (us)", 2.0, of_floor=True),)
-        if name in {without, observed}:
+        if name in {plain, observed}:
             yield Row(
                 name,
                 figures,
-                without,
+                plain,
                 (Goal("p50 (us)", 1.5, of_floor=True),) if name == observed else (),
             )
         else:
@@ -282,27 +280,27 @@ def latency_rows(seconds: float, folder: Path) -> Iterator[Row]:
     with open_node("peer") as node:
         peer = Peer(node)
         for hz in RATES:
-            driven = Driven()
+            total = Driven()
             echoed = dict.fromkeys(EXECUTORS, Driven())
             for _ in range(ROUNDS):
                 for executor in EXECUTORS:
                     with Child("echo", "--executor", executor) as child:
                         echoed[executor] += peer.drive(hz, seconds / ROUNDS, child)
                 with controller_at(hz, folder) as child:
-                    driven += peer.drive(hz, seconds / ROUNDS, child)
+                    total += peer.drive(hz, seconds / ROUNDS, child)
             floor = f"bare echo, single, {hz} Hz"
             for executor, of in echoed.items():
                 yield Row(f"bare echo, {executor}, {hz} Hz", _latency(of, of.round_trips), floor)
             goals = (Goal("CPU (us each)", 2.0, of_floor=True),)
             yield Row(
-                f"controller, tick to u, {hz} Hz", _latency(driven, driven.answers), floor, goals
+                f"controller, tick to u, {hz} Hz", _latency(total, total.answers), floor, goals
             )
             yield Row(
                 f"controller, y to u with the wait for the tick, {hz} Hz",
-                us(driven.round_trips),
+                us(total.round_trips),
                 floor,
             )
-            late = [1e9 * seconds_late for seconds_late in driven.late.values()]
+            late = [1e9 * seconds_late for seconds_late in total.late.values()]
             yield Row(f"controller, lateness of the tick, {hz} Hz", us(late))
 
 
@@ -317,7 +315,7 @@ def _latency(driven: Driven, values: Sequence[float]) -> dict[str, float]:
 def tick_rows(seconds: float) -> Iterator[Row]:
     """Lateness of the ticks of an empty node of the stack, compared with rclpy's own timers."""
     short = min(seconds, FLOOR_SECONDS)
-    within = real_time()
+    prefix = real_time()
     for hz in RATES:
         options = ("--hz", str(hz), "--seconds")
         floor = f"empty timer, single, {hz} Hz"
@@ -327,21 +325,21 @@ def tick_rows(seconds: float) -> Iterator[Row]:
         with Child("bare_loop", *options, str(short)) as child:
             yield Row(f"loop that only sleeps, {hz} Hz", _ticks(child, short), floor)
         goals = {
-            500: [Goal(OWN_MISSES if within else "missed", 0)],
+            500: [Goal(OWN_MISSES if prefix else "missed", 0)],
             1000: [Goal("p99 (us)", 100.0)],
         }.get(hz, [])
         with (
-            delay_monitors(bool(within)) as delays,
+            delay_monitors(bool(prefix)) as delays,
             Child("ticker", *options, str(seconds)) as child,
         ):
             figures = _ticks(child, seconds, delays)
         yield Row(f"the stack's loop, {hz} Hz", figures, floor, goals)
-    if not within:
+    if not prefix:
         return
     with full_load():
         for name, role in (("empty timer, single", "timer"), ("the stack's loop", "ticker")):
             length = short if role == "timer" else seconds
-            with Child(role, "--hz", "100", "--seconds", str(length), within=within) as child:
+            with Child(role, "--hz", "100", "--seconds", str(length), within=prefix) as child:
                 goals = [Goal("p99 (us)", 50.0)] if role == "ticker" else []
                 what, floor = (
                     f"{label}, 100 Hz, FIFO {PRIORITY}, full load"
@@ -476,27 +474,27 @@ def import_rows() -> Iterator[Row]:
     Medians.
     """
     floor, ours, usage = "python, import numpy", "python, import rise_di", "rise-di --help"
-    alone = (
+    imports = (
         "import time; begin = time.process_time(); import {}; print(1e3 * "
         "(time.process_time() - begin))"
     )
     commands = {
-        name: [sys.executable, "-c", alone.format(name.split()[-1])] for name in (floor, ours)
+        name: [sys.executable, "-c", imports.format(name.split()[-1])] for name in (floor, ours)
     }
     commands[usage] = [RISE_DI, "--help"]
-    whole = defaultdict(list)
+    time_series = defaultdict(list)
     imported = defaultdict(list)
     for _ in range(IMPORTS):  # in turns, since the speed of the host drifts
         for name, command in commands.items():
             before = resource.getrusage(resource.RUSAGE_CHILDREN)
             output = subprocess.run(command, check=True, capture_output=True, text=True).stdout  # noqa: S603 - this stack
             after = resource.getrusage(resource.RUSAGE_CHILDREN)
-            whole[name].append(
+            time_series[name].append(
                 1e3 * (after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime)
             )
             if name != usage:
                 imported[name].append(float(output))
-    figures = {name: {PROCESS: float(np.median(times))} for name, times in whole.items()}
+    figures = {name: {PROCESS: float(np.median(times))} for name, times in time_series.items()}
     figures |= {
         name: figures[name] | {IMPORT: float(np.median(times))} for name, times in imported.items()
     }
@@ -519,7 +517,7 @@ def recorder_rows(seconds: float, folder: Path) -> Iterator[Row]:
     """
     run = folder / "recorded"
     floor = "rosbags' Writer, MCAP"
-    sent, processor = recorder.record(run, 1000.0, seconds)
+    sent_count, processor = recorder.record(run, 1000.0, seconds)
     rewritten = recorder.rewrite(run, folder / "rosbags", CompressionMode.NONE)
     count = rewritten.counts.total()
     yield Row(floor, {"CPU (us each)": rewritten.cpu, "bytes each": rewritten.size}, floor)
@@ -529,7 +527,7 @@ def recorder_rows(seconds: float, folder: Path) -> Iterator[Row]:
     }
     yield Row(
         "recorder, from topics to disk",
-        figures | {"lost": sent["sent"] - count},
+        figures | {"lost": sent_count["sent"] - count},
         floor,
         (Goal("lost", 0),),
     )
@@ -606,14 +604,14 @@ def main() -> None:
     os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
     os.environ.update(transport.environment())
     console = Console(width=None if sys.stdout.isatty() else 160)
-    measured: list[evidence.Row] = []
+    rows_measured: list[evidence.Row] = []
     for name in [options.only] if options.only else GROUPS:
         with tempfile.TemporaryDirectory() as folder:
             rows = list(GROUPS[name](options.seconds, Path(folder)))
         show(console, name, rows)
-        measured += evidence_rows(rows)
+        rows_measured += evidence_rows(rows)
     if options.json is not None:
-        options.json.write_text(json.dumps({"evidence": measured}, indent=1) + "\n")
+        options.json.write_text(json.dumps({"evidence": rows_measured}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

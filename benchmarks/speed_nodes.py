@@ -79,7 +79,7 @@ def echo(kind: str, hz: float, *, timed: bool) -> dict[str, float]:
     Timed: the executor spins once at a fixed rate, when a message has arrived, and the time to the
     end of the callback is measured. Otherwise the executor spins as usual.
     """
-    ended = termination()
+    has_ended = termination()
     took: list[int] = []
     sent_ns = 0
 
@@ -92,11 +92,11 @@ def echo(kind: str, hz: float, *, timed: bool) -> dict[str, float]:
         publisher = node.create_publisher(U.type, U.name, PUBLISH)
         node.create_subscription(Y.type, Y.name, answer, NEWEST_SAMPLES)
         executor = executor_of(node, kind)
-        while not timed and not ended.is_set():
+        while not timed and not has_ended.is_set():
             executor.spin_once(timeout_sec=PAUSE)
         begin_ns = time.perf_counter_ns()
         for _ in ticks(hz):
-            if ended.is_set():
+            if has_ended.is_set():
                 break
             # a message had arrived; checked late, since an executor may have threads
             if sent_ns > begin_ns:
@@ -108,12 +108,12 @@ def echo(kind: str, hz: float, *, timed: bool) -> dict[str, float]:
 
 def polled_echo() -> dict[str, float]:
     """Publishes each message of y on u, by the stack's publisher and subscription."""
-    ended = termination()
+    has_ended = termination()
     with open_node("echo") as node:
         subscription = PolledSubscription(node, Y, LOCKSTEP, raw=True)
         publisher = node.create_publisher(U.type, U.name, PUBLISH)
         waiter = WaitSet([subscription.entity], node.context)
-        while not ended.is_set():
+        while not has_ended.is_set():
             waiter.wait(20_000_000)
             for received in subscription.take():
                 publisher.publish(received.message)
@@ -122,31 +122,33 @@ def polled_echo() -> dict[str, float]:
 
 def idle() -> dict[str, float]:
     """A node that only spins."""
-    ended = termination()
+    has_ended = termination()
     with open_node("idle") as node:
         executor = executor_of(node, "single")
-        while not ended.is_set():
+        while not has_ended.is_set():
             executor.spin_once(timeout_sec=PAUSE)
     return {}
 
 
 def timer(kind: str, hz: float, seconds: float) -> dict[str, float]:
     """Lateness of the callback of an empty timer of rclpy on the steady clock."""
-    ended = termination()
+    has_ended = termination()
     period_ns = round(NANOSECONDS / hz)
     late: list[int] = []
     at: list[int] = []
 
     def tick() -> None:
-        left_ns = made.time_until_next_call()
+        left_ns = node_timer.time_until_next_call()
         at.append(time.monotonic_ns())
         late.append(period_ns - left_ns)
 
     with open_node("timer") as node:
-        made = node.create_timer(1.0 / hz, tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        node_timer = node.create_timer(
+            1.0 / hz, tick, clock=Clock(clock_type=ClockType.STEADY_TIME)
+        )
         executor = executor_of(node, kind)
         end = time.monotonic() + seconds
-        while time.monotonic() < end and not ended.is_set():
+        while time.monotonic() < end and not has_ended.is_set():
             executor.spin_once(timeout_sec=PAUSE)
     due = round((at[-1] - at[0]) / period_ns) + 1
     return lateness(late, max(due - len(at), 0))
@@ -155,14 +157,14 @@ def timer(kind: str, hz: float, seconds: float) -> dict[str, float]:
 def bare_loop(hz: float, seconds: float) -> dict[str, float]:
     """A loop that only sleeps until the next deadline."""
     late = []
-    missed = 0
+    missed_count = 0
     end = time.monotonic() + seconds
     for tick in ticks(hz):
         late.append(tick.late_ns)
-        missed += tick.missed
+        missed_count += tick.missed
         if time.monotonic() >= end:
             break
-    return lateness(late, missed)
+    return lateness(late, missed_count)
 
 
 def ticker_node(hz: float, seconds: float) -> dict[str, Any]:
@@ -188,8 +190,8 @@ def ticker_node(hz: float, seconds: float) -> dict[str, Any]:
     signal.signal(signal.SIGALRM, lambda *_: signal.raise_signal(signal.SIGTERM))
     signal.setitimer(signal.ITIMER_REAL, seconds + 1.0)
     run(Empty)
-    missed = sum((until - since) // period for since, until in skipped)
-    return lateness(late, missed) | {"skipped": skipped, "period_ns": period}
+    missed_count = sum((until - since) // period for since, until in skipped)
+    return lateness(late, missed_count) | {"skipped": skipped, "period_ns": period}
 
 
 def delay_monitor(core: int) -> dict[str, Any]:
@@ -202,10 +204,10 @@ def delay_monitor(core: int) -> dict[str, Any]:
     os.sched_setscheduler(
         0, os.SCHED_FIFO, os.sched_param(os.sched_get_priority_max(os.SCHED_FIFO))
     )
-    ended = termination()
+    has_ended = termination()
     delays = []
     last_ns = time.monotonic_ns()
-    while not ended.is_set():
+    while not has_ended.is_set():
         time.sleep(MONITOR_PERIOD)
         now_ns = time.monotonic_ns()
         # a wake-up takes a twentieth to a fifth of a period
@@ -222,7 +224,7 @@ def controller() -> dict[str, float]:
     Time from the beginning of a tick until u is published, and until its end.
     """
     until_u: list[int] = []
-    whole: list[int] = []
+    tick_times: list[int] = []
 
     class Timed(ControllerNode):
         def __init__(self) -> None:
@@ -240,12 +242,12 @@ def controller() -> dict[str, float]:
             self._begin_ns, answers = time.perf_counter_ns(), len(until_u)
             super().tick(tick, now_ns)
             if len(until_u) > answers:
-                whole.append(time.perf_counter_ns() - self._begin_ns)
+                tick_times.append(time.perf_counter_ns() - self._begin_ns)
 
     run(Timed)
-    if not whole:
+    if not tick_times:
         return {}
-    return times(until_u) | {f"whole {name}": value for name, value in times(whole).items()}
+    return times(until_u) | {f"whole {name}": value for name, value in times(tick_times).items()}
 
 
 ROLES: dict[str, Callable[[argparse.Namespace], dict[str, Any]]] = {

@@ -182,10 +182,10 @@ class Client(threading.Thread):
 
         Raises EOFError where the server has ended.
         """
-        known = {
+        client_state = {
             name: self._head.get(name, "") for name in ("epoch", "state", "described")
         } | self._rows
-        content = self.ask(urllib.parse.urlencode(known))
+        content = self.ask(urllib.parse.urlencode(client_state))
         self.bytes += len(content)
         size = int.from_bytes(content[:4], "little")
         head: dict[str, Any] = json.loads(content[4 : 4 + size])
@@ -229,11 +229,11 @@ def flying(runs: Path, seconds: float) -> Iterator[tuple["subprocess.Popen[str]"
         str(runs),
         "--json",
     ]
-    known = set(runs.iterdir())
+    runs_before = set(runs.iterdir())
     with subprocess.Popen(  # noqa: S603
         command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
     ) as flight:
-        while not (new := set(runs.iterdir()) - known):
+        while not (new := set(runs.iterdir()) - runs_before):
             time.sleep(0.02)
         yield flight, new.pop()
 
@@ -275,7 +275,7 @@ def live(seconds: float, *, browser: bool) -> dict[str, Any]:
         watching(run) as (server, address),
     ):
         client = Client(address)
-        drawn = []
+        delays = []
         client.start()
         time.sleep(BEGUN)
         before = threads_ns(server.pid)
@@ -286,7 +286,7 @@ def live(seconds: float, *, browser: bool) -> dict[str, Any]:
                 page.wait_for("document.getElementById('state')?.textContent === 'LIVE'")
                 page.run(f"{MEASURE}({start_of(address)})")
                 time.sleep(seconds - 8.0)
-                drawn = page.run("delays")
+                delays = page.run("delays")
         else:
             time.sleep(seconds - 6.0)
         share = (threads_ns(server.pid) - before) / (time.monotonic() - begin) / NANOSECONDS
@@ -294,14 +294,14 @@ def live(seconds: float, *, browser: bool) -> dict[str, Any]:
         flight.communicate()
         client.stop()
         traffic = client.bytes / seconds
-    shown: dict[str, Any] = {
+    figures: dict[str, Any] = {
         "flight": seconds,
         "processor": share,
         "memory": memory,
         "traffic": traffic,
     }
-    return shown | (
-        {"to the screen": {f"p{k}": float(np.percentile(drawn, k)) for k in (50, 99)}}
+    return figures | (
+        {"to the screen": {f"p{k}": float(np.percentile(delays, k)) for k in (50, 99)}}
         if browser
         else {}
     )
@@ -364,7 +364,7 @@ def flights(count: int, seconds: float) -> dict[str, Any]:
     of any program that starts.
     """
     period_ns = nanoseconds(1.0 / find_scenario(SCENARIO).controller.rate)
-    found: dict[str, list[dict[str, float]]] = {"without": [], "with": [], "start included": []}
+    tables: dict[str, list[dict[str, float]]] = {"without": [], "with": [], "start included": []}
     starting: list[float] = []  # s
     for number in range(count):
         # system time, ns; without and with a client
@@ -403,19 +403,21 @@ def flights(count: int, seconds: float) -> dict[str, Any]:
             "with": turns[True],
             "start included": [(starts, joins), *turns[True]],
         }.items():
-            found[kind].append(figures_of_ticks(internals, host_delays, period_ns, windows))
+            tables[kind].append(figures_of_ticks(internals, host_delays, period_ns, windows))
         starting.append((joins - starts) / NANOSECONDS)
-    names = found["with"][0]
-    shown: dict[str, Any] = {
+    names = tables["with"][0]
+    by_kind: dict[str, Any] = {
         kind: {name: [figure[name] for figure in figures] for name in names}
-        for kind, figures in found.items()
+        for kind, figures in tables.items()
     }
     for kind in ("with", "start included"):
-        more = {name: np.subtract(shown[kind][name], shown["without"][name]) for name in names}
-        shown[f"more {kind}"] = {name: float(np.median(values)) for name, values in more.items()}
-        shown[f"interval {kind}"] = {name: interval(values) for name, values in more.items()}
-        shown[f"probability {kind}"] = {name: probability(values) for name, values in more.items()}
-    return shown | {"starting": starting}
+        more = {name: np.subtract(by_kind[kind][name], by_kind["without"][name]) for name in names}
+        by_kind[f"more {kind}"] = {name: float(np.median(values)) for name, values in more.items()}
+        by_kind[f"interval {kind}"] = {name: interval(values) for name, values in more.items()}
+        by_kind[f"probability {kind}"] = {
+            name: probability(values) for name, values in more.items()
+        }
+    return by_kind | {"starting": starting}
 
 
 def figures_of_ticks(
@@ -432,13 +434,15 @@ def figures_of_ticks(
     due = at - np.rint(internals["late"] * NANOSECONDS).astype(np.int64)
 
     def inside(instants: NDArray[np.int64]) -> NDArray[np.bool_]:
-        found: NDArray[np.bool_] = np.any(
+        is_inside: NDArray[np.bool_] = np.any(
             [(instants >= first) & (instants <= last) for first, last in windows], axis=0
         )
-        return found
+        return is_inside
 
-    missed = due[:-1] + period_ns  # unless the next tick has this deadline
-    skipped = np.column_stack((missed, at[1:]))[(np.diff(due) > 1.5 * period_ns) & inside(missed)]
+    deadlines = due[:-1] + period_ns  # unless the next tick has this deadline
+    skipped = np.column_stack((deadlines, at[1:]))[
+        (np.diff(due) > 1.5 * period_ns) & inside(deadlines)
+    ]
     ticks = np.column_stack((due, at))[inside(due)]
     figures: dict[str, float] = {}
     for words, known in (("", ()), (", excluding host delays", delays)):
@@ -485,20 +489,20 @@ def main() -> None:
     os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
     parts = arguments.parts or ["open", "live", "frozen", "flights"]
     browser = CHROMIUM is not None and not arguments.no_browser
-    found: dict[str, Any] = (
+    figures: dict[str, Any] = (
         {} if browser else {"to the screen": {"p50": None, "p99": None}, "recovered after": None}
     )
     if "open" in parts:
-        found["opened"] = open_log(arguments.hours)
+        figures["opened"] = open_log(arguments.hours)
     if "live" in parts:
-        found["live"] = live(arguments.seconds, browser=False)
+        figures["live"] = live(arguments.seconds, browser=False)
         if browser:
-            found["live with a browser"] = live(arguments.seconds, browser=True)
+            figures["live with a browser"] = live(arguments.seconds, browser=True)
     if "frozen" in parts and browser:
-        found["frozen"] = frozen()
+        figures["frozen"] = frozen()
     if "flights" in parts:
-        found["flights"] = flights(arguments.count, FLIGHT_SECONDS)
-    text = json.dumps(found, indent=2)
+        figures["flights"] = flights(arguments.count, FLIGHT_SECONDS)
+    text = json.dumps(figures, indent=2)
     print(text)
     if arguments.json is not None:
         arguments.json.write_text(text)

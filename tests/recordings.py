@@ -68,12 +68,12 @@ def messages(run: Path) -> list[tuple[str, int, bytes]]:
     """
     with AnyReader([run]) as reader:
         assert sum(connection.msgcount for connection in reader.connections) == reader.message_count
-        read = [
+        messages_read = [
             (connection.topic, stamp_ns, data) for connection, stamp_ns, data in reader.messages()
         ]
         for connection, _, data in reader.messages():
             reader.deserialize(data, connection.msgtype)
-    return read
+    return messages_read
 
 
 def count_messages(run: Path) -> Counter[str]:

@@ -35,11 +35,11 @@ def small_disk(folder: Path, size: int) -> Iterator[Path]:
 def fill(path: Path) -> None:
     """Allocate all free space once. Space that another process frees later stays free."""
     with path.open("ab", buffering=0) as stream:
-        taken = 0
+        taken_bytes = 0
         while free := free_bytes(path.parent):
             try:
-                os.posix_fallocate(stream.fileno(), taken, free)
-                taken += free
+                os.posix_fallocate(stream.fileno(), taken_bytes, free)
+                taken_bytes += free
             except OSError as error:  # another process has allocated a part of it
                 if error.errno != errno.ENOSPC:
                     raise

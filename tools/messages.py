@@ -116,21 +116,21 @@ def closure(package: str, source: Path, names: Sequence[str]) -> set[str]:
             f"MESSAGES: found {', '.join(unknown)}, expected interfaces of {package}, as in "
             f"{source}"
         )
-    waiting, chosen = list(names), set[str]()
+    waiting, order = list(names), set[str]()
     while waiting:
         name = waiting.pop()
-        if name not in chosen:
-            chosen.add(name)
+        if name not in order:
+            order.add(name)
             fields = [
                 field.type for spec in specifications(package, files[name]) for field in spec.fields
             ]
             waiting += [kind.type for kind in fields if kind.pkg_name == package]
-    return chosen
+    return order
 
 
 def copy_of_part(package: str, source: Path, names: Sequence[str], target: Path) -> Path:
     """A copy of a package with the named interfaces and what they contain, alone."""
-    chosen = closure(package, source, names)
+    packages = closure(package, source, names)
     shutil.rmtree(target, ignore_errors=True)
     shutil.copytree(source, target, ignore=shutil.ignore_patterns(".*"))
     lists = target / "CMakeLists.txt"
@@ -139,7 +139,7 @@ def copy_of_part(package: str, source: Path, names: Sequence[str], target: Path)
         path
         for kind in KINDS
         for path in (target / kind).glob(f"*.{kind}")
-        if path.stem not in chosen
+        if path.stem not in packages
     ]:
         path.unlink()
         text = re.sub(rf'"?\b{path.parent.name}/{re.escape(path.name)}"?', "", text)
@@ -179,10 +179,10 @@ def run(log: Path, prefix: Path, *command: str) -> None:
     }
     environment["AMENT_PREFIX_PATH"] = f"{prefix}{os.pathsep}{sys.prefix}"
     with log.open("a", encoding="utf-8") as file:
-        done = subprocess.run(
+        process = subprocess.run(
             command, env=environment, stdout=file, stderr=subprocess.STDOUT, check=False
         )
-    if done.returncode == 0:
+    if process.returncode == 0:
         return
     text = log.read_text(encoding="utf-8")
     if missing := MISSING.search(text):

@@ -66,9 +66,9 @@ HEAD = ("| parameter | value | meaning |", "|---|---|---|")
 
 def page() -> str:
     """The text of the page."""
-    known = {key: value for key, value, _ in _rows(AircraftConfig)}
+    keys = {key: value for key, value, _ in _rows(AircraftConfig)}
     parts = [LEAD, "## Keys of several sections", "", *HEAD]
-    parts += [f"| `{key}` | {known[key]} | {text} |" for key, text in SHARED.items()]
+    parts += [f"| `{key}` | {keys[key]} | {text} |" for key, text in SHARED.items()]
     parts += [""]
     parts += [_section(f"`{name}`", schema) for name, schema in SECTIONS.items()]
     for name in laws.names():
@@ -96,22 +96,22 @@ def _rows(schema: type[Config], prefix: str = "") -> Iterator[tuple[str, str, st
 
     Those of a group are under a dotted key, once for each class.
     """
-    shown: dict[type[Config], str] = {}
+    places: dict[type[Config], str] = {}
     for name, field in schema.model_fields.items():
         annotation, rules = _resolved(field.annotation, field.rules)
-        named = get_origin(annotation) is dict
-        group = _resolved(get_args(annotation)[1])[0] if named else annotation
+        is_table = get_origin(annotation) is dict
+        group = _resolved(get_args(annotation)[1])[0] if is_table else annotation
         key = f"{prefix}{name}"
         if isinstance(group, type) and issubclass(group, Config):
-            meaning = _text(field.description or ("" if named else group.__doc__ or ""))
-            like = shown.setdefault(group, key)
+            meaning = _text(field.description or ("" if is_table else group.__doc__ or ""))
+            like = places.setdefault(group, key)
             yield (
                 key,
-                "groups" if named else "group",
+                "groups" if is_table else "group",
                 meaning if like == key else f"{meaning}; keys as in `{like}`",
             )
             if like == key:
-                yield from _rows(group, f"{key}.NAME." if named else f"{key}.")
+                yield from _rows(group, f"{key}.NAME." if is_table else f"{key}.")
         else:
             item_rules = (
                 _resolved(get_args(annotation)[0])[1] if get_origin(annotation) is tuple else rules

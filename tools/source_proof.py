@@ -119,9 +119,11 @@ class Result(NamedTuple):
 
 def exported(scenario: str, folder: Path) -> None:
     """Write the code of a scenario without its self-test."""
-    chosen = find_scenario(scenario)
-    controller = exportable(chosen.controller)
-    write_code(controller, chosen.name, folder, chosen.reference_model, float32=False)
+    scenario_flown = find_scenario(scenario)
+    controller = exportable(scenario_flown.controller)
+    write_code(
+        controller, scenario_flown.name, folder, scenario_flown.reference_model, float32=False
+    )
     path = folder / "rise_di.c"
     text = path.read_text(encoding="utf-8")
     if text.count(SELF_TEST) != 1:
@@ -144,18 +146,18 @@ def eva(folder: Path, ticks: int) -> Result:
     if functions is None or count is None:
         raise SystemExit(f"frama-c: {text[-2000:]}")
     alarms = re.findall(r"\[eva:alarm\] (.*?) Warning: *\n *(.*)", text)
-    found = tuple(f"{place} {what}" for place, what in alarms)
-    if len(found) < int(count[1]):
-        found = (*found, *["an alarm"] * (int(count[1]) - len(found)))
-    return Result(int(functions[1]), found)
+    alarms_found = tuple(f"{place} {what}" for place, what in alarms)
+    if len(alarms_found) < int(count[1]):
+        alarms_found = (*alarms_found, *["an alarm"] * (int(count[1]) - len(alarms_found)))
+    return Result(int(functions[1]), alarms_found)
 
 
 def broken_rules(folder: Path) -> set[str]:
     """The rules of MISRA C:2012 that cppcheck finds broken; further findings by their id."""
     command = ["cppcheck", "--enable=warning,performance,portability,style", "--std=c99"]
     command += ["--addon=misra", "--quiet", "--template={id}", "rise_di.c", "rise_di_table.c"]
-    found = _output(command, folder).split()
-    return {name.removeprefix("misra-c2012-") for name in found}
+    words = _output(command, folder).split()
+    return {name.removeprefix("misra-c2012-") for name in words}
 
 
 def _output(command: list[str], folder: Path) -> str:

@@ -93,14 +93,14 @@ def policy() -> str:
         profile = ElementTree.SubElement(
             ElementTree.SubElement(enclave, "profiles"), "profile", ns="/", node=node
         )
-        sent, received, requested = _of_maps() if node == "bridge" else ([], [], [])
+        sent_topics, received, requested = _of_maps() if node == "bridge" else ([], [], [])
         alive = [f"alive/{role}" for role in IN_LOCKSTEP if node in IN_LOCKSTEP]
-        own = f"alive/{node}"
+        liveliness = f"alive/{node}"
         publishes = [
             *published_by(node),
             *FURTHER.get(node, []),
-            *(name for name in alive if name == own),
-            *sent,
+            *(name for name in alive if name == liveliness),
+            *sent_topics,
         ]
         subscribes = [
             topic.name
@@ -112,7 +112,7 @@ def policy() -> str:
             profile,
             "topics",
             "subscribe",
-            [*subscribes, *(name for name in alive if name != own), *received],
+            [*subscribes, *(name for name in alive if name != liveliness), *received],
         )
         _list(profile, "services", "request", requested)
         replies = [f"~{name}" for name in (*SERVICES.get(node, ()), *PARAMETER_SERVICES)]
@@ -139,20 +139,20 @@ def _of_maps() -> tuple[list[str], list[str], list[str]]:
         for folder in (LIBRARY, REPOSITORY / "examples" / "maps")
         for path in sorted(folder.glob("*.yaml"))
     )
-    used = {row for path in files for row in load_map(str(path)).used_topics()}
-    sent: set[str] = set()
+    rows = {row for path in files for row in load_map(str(path)).used_topics()}
+    sent_topics: set[str] = set()
     received: set[str] = set()
     requested = {"controller/change_state", "controller/get_state"}
-    for key, topic, kind in used:
+    for key, topic, kind in rows:
         is_sent = key.startswith("messages.")
         is_mavlink = kind.startswith(f"{MAVLINK}/")
         if "/srv/" in kind:
             requested.add(topic)
         elif is_mavlink and not is_sent:  # published for the recorder
-            sent.add(topic)
+            sent_topics.add(topic)
         elif not is_mavlink:
-            (sent if is_sent else received).add(topic)
-    return sorted(sent), sorted(received), sorted(requested)
+            (sent_topics if is_sent else received).add(topic)
+    return sorted(sent_topics), sorted(received), sorted(requested)
 
 
 if __name__ == "__main__":

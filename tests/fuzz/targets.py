@@ -140,11 +140,11 @@ def scenario(data: bytes, folder: Path) -> None:
     path.write_bytes(data)
 
     def fly() -> None:
-        chosen = load_scenario(path)
+        scenario = load_scenario(path)
         with np.errstate(all="ignore"):  # divergence is tested elsewhere
-            Controller(chosen.controller)
-            if not chosen.aircraft.is_jsbsim:  # which loads a model in a process of its own
-                Simulator(chosen.aircraft).sample(0, np.zeros(len(chosen.controller.inputs)))
+            Controller(scenario.controller)
+            if not scenario.aircraft.is_jsbsim:  # which loads a model in a process of its own
+                Simulator(scenario.aircraft).sample(0, np.zeros(len(scenario.controller.inputs)))
 
     rejected(fly)
 
@@ -161,23 +161,23 @@ def export(data: bytes, folder: Path) -> None:
     that it has with NAMED. The names reach the code from the files, and past the check of the
     files.
     """
-    given = data.decode("utf-8", "replace").split("\n")
-    names = dict(zip(NAMED, given, strict=False))
-    flown = find_scenario("osprey_gust")
+    lines = data.decode("utf-8", "replace").split("\n")
+    names = dict(zip(NAMED, lines, strict=False))
+    gust = find_scenario("osprey_gust")
     frame = folder / "frame.yaml"
     frame.write_text(
         dump_yaml(_renamed(yaml.safe_load((AIRFRAMES / "osprey.yaml").read_text()), names))
     )
-    sections = _renamed(yaml.safe_load(flown.path.read_text()), names)
+    sections = _renamed(yaml.safe_load(gust.path.read_text()), names)
     sections["/**/aircraft"]["ros__parameters"]["airframe"] = str(frame)
     path = folder / "scenario.yaml"
     path.write_text(dump_yaml(sections))
     rejected(lambda: _check_code(exportable(load_scenario(path).controller)))
-    changed = {
-        key: tuple(names.get(name, name) for name in getattr(flown.controller, key))
+    channels = {
+        key: tuple(names.get(name, name) for name in getattr(gust.controller, key))
         for key in ("outputs", "inputs")
     }
-    _check_code(exportable(flown.controller.model_copy(update=changed)))
+    _check_code(exportable(gust.controller.model_copy(update=channels)))
 
 
 def _renamed(tree: Any, names: Mapping[str, str]) -> Any:
@@ -234,8 +234,8 @@ def channel_map(data: bytes, folder: Path) -> None:
     path.write_bytes(data)
 
     def bridge() -> None:
-        made = Bridge(load_map(str(path)), dry_run=False)
-        made.engage(0), made.raw(), made.raw_u()
+        new_bridge = Bridge(load_map(str(path)), dry_run=False)
+        new_bridge.engage(0), new_bridge.raw(), new_bridge.raw_u()
 
     rejected(bridge)
 
@@ -306,11 +306,11 @@ def targets(data: bytes, folder: Path) -> None:
         assert np.isfinite(output.u_m).all(), output.u_m
         if before is not None and now_ns - before_ns <= params.max_age_ns:
             V = params.outputs.index("V")
-            moved = np.delete(np.abs(output.u_m - before)[:4], V)
+            steps = np.delete(np.abs(output.u_m - before)[:4], V)
             assert (
-                moved
+                steps
                 <= np.delete(params.slew, V) * (now_ns - before_ns) / 1e9 * (1.0 + 1e-9) + 1e-12
-            ).all(), moved
+            ).all(), steps
         before = output.u_m
         before_ns = now_ns
 
@@ -490,10 +490,10 @@ def _flight() -> list[tuple[str, str, bytes]]:
 def _mcaps() -> list[bytes]:
     flight = _flight()
     file = {"osprey.yaml": b"/**/flight:\n  ros__parameters: {duration: 1.0}\n"}
-    whole = log(flight, attached=file)
+    content = log(flight, attached=file)
     return [
-        whole,
-        whole[: len(whole) // 2],
+        content,
+        content[: len(content) // 2],
         log(flight, CompressionType.ZSTD, checked=True),
         log(flight, CompressionType.LZ4),
         log(flight, chunked=False),

@@ -36,11 +36,11 @@ def test_corpus_read_or_rejected_in_bounded_time_and_memory(target: str) -> None
     files = sorted(str(path) for path in (CORPUS / target).iterdir())
     assert files
     command = [sys.executable, "-m", "benchmarks.fuzz", target, "--replay", *files]
-    done = subprocess.run(
+    process = subprocess.run(
         command, cwd=REPOSITORY, capture_output=True, text=True, timeout=300, check=False
     )
-    assert done.returncode == 0, done.stderr
-    assert f"{len(files)} inputs read or refused" in done.stdout
+    assert process.returncode == 0, process.stderr
+    assert f"{len(files)} inputs read or refused" in process.stdout
 
 
 def test_the_corpus_is_small() -> None:
@@ -59,7 +59,7 @@ def damaged(draw: st.DrawFn, name: str) -> bytes:
     """A valid input that is truncated, or with changed, removed or duplicated bytes."""
     data = bytearray(draw(st.sampled_from(BINARY[name])))
     for _ in range(draw(st.integers(1, 4))):
-        place, other = sorted((draw(st.integers(0, len(data))), draw(st.integers(0, len(data)))))
+        place, end = sorted((draw(st.integers(0, len(data))), draw(st.integers(0, len(data)))))
         match draw(st.sampled_from(("cut", "change", "number", "take", "twice"))):
             case "cut":
                 del data[place:]
@@ -68,9 +68,9 @@ def damaged(draw: st.DrawFn, name: str) -> bytes:
             case "number":
                 data[place : place + 8] = draw(st.sampled_from(NUMBERS)).to_bytes(8, "little")
             case "take":
-                del data[place:other]
+                del data[place:end]
             case "twice":
-                data[other:other] = data[place : place + 200]
+                data[end:end] = data[place : place + 200]
     return bytes(data)
 
 

@@ -79,10 +79,10 @@ def test_a_chunk_inside_a_chunk_is_damaged(
 
 
 def test_lz4_chunk_with_changed_bytes_skipped(tmp_path: Path) -> None:
-    changed = bytearray(log(Y, CompressionType.LZ4))
-    frame = changed.index(b"\x04\x22\x4d\x18")  # the magic number of LZ4 frames
-    changed[frame + 4] ^= 0xFF  # the flags of the first of several chunks
-    scan = Scan(write_run(tmp_path, bytes(changed)) / "run_0.mcap")
+    message = bytearray(log(Y, CompressionType.LZ4))
+    frame = message.index(b"\x04\x22\x4d\x18")  # the magic number of LZ4 frames
+    message[frame + 4] ^= 0xFF  # the flags of the first of several chunks
+    scan = Scan(write_run(tmp_path, bytes(message)) / "run_0.mcap")
     assert any(isinstance(record, Message) for record in scan.records())
     assert scan.damaged == 1
 
@@ -107,9 +107,9 @@ def test_scenario_in_log_extracted_without_overwriting_log(
     run = write_run(tmp_path, log_before)
     recorded_scenario(run)
     assert (run / "run_0.mcap").read_bytes() == log_before
-    kept = "x.yaml" if name == "../../x.yaml" else "scenario.yaml"
-    assert {path.name for path in run.iterdir()} == {"run_0.mcap", kept}
-    assert (run / kept).read_bytes() == osprey_gust.path.read_bytes()
+    name_kept = "x.yaml" if name == "../../x.yaml" else "scenario.yaml"
+    assert {path.name for path in run.iterdir()} == {"run_0.mcap", name_kept}
+    assert (run / name_kept).read_bytes() == osprey_gust.path.read_bytes()
 
 
 @pytest.mark.parametrize("t", [float("nan"), float("inf"), -1e300])
@@ -142,8 +142,8 @@ def test_metadata_with_an_invalid_end_is_rejected(last: str, tmp_path: Path) -> 
     "content", [b"", b"[: x", b"5", b"/**/flight: {ros__parameters: {duration: [1]}}"]
 )
 def test_a_log_with_any_parameters_is_repaired(content: bytes, tmp_path: Path) -> None:
-    whole = log(Y).replace(b"rise_di_lost", b"rise_di_more")
-    run = write_run(tmp_path, whole[: len(whole) // 2])
+    bag = log(Y).replace(b"rise_di_lost", b"rise_di_more")
+    run = write_run(tmp_path, bag[: len(bag) // 2])
     stored = log(Y[:1], attached={"parameters.yaml": content})
     (run / "run_1.mcap").write_bytes(stored.replace(b"application/yaml", b"text/yaml_______"))
     assert repair(run).wrote_metadata

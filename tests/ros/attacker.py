@@ -34,12 +34,12 @@ def main() -> None:
     subscription = PolledSubscription(node, Y, NEWEST_SAMPLES, raw=True)
     publisher = node.create_publisher(U.type, U.name, SEND)
     encoder = Encoder(INPUTS, "/controller#1")
-    received = sent = 0
+    received = sent_count = 0
     deadline = time.monotonic() + float(seconds)
-    while time.monotonic() < deadline and not (received >= ENOUGH and sent >= ENOUGH):
+    while time.monotonic() < deadline and not (received >= ENOUGH and sent_count >= ENOUGH):
         received += len(subscription.take())
         publisher.publish(encoder.encode(time.time_ns(), np.array([0.0, 0.0, 0.02, 0.0])))
-        sent += received > 0
+        sent_count += received > 0
         time.sleep(0.02)
     print(json.dumps({"received": received}), flush=True)
     node.destroy_node()

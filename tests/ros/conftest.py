@@ -78,9 +78,9 @@ class Process:
 
         A process that has ended without one never will: its output is the error.
         """
-        ended = not self._reader.is_alive()
+        has_ended = not self._reader.is_alive()
         logged = any(all(part in line for part in parts) for line in list(self.lines))
-        assert logged or not ended, f"ended without {parts}; output:\n{self.output}"
+        assert logged or not has_ended, f"ended without {parts}; output:\n{self.output}"
         return logged
 
     def wait_for(self, text: str, timeout: float = HANG) -> Self:
@@ -341,8 +341,8 @@ def publisher(domain: int) -> Iterator[subprocess.Popen[str]]:
 @pytest.fixture
 def peer_node(request: pytest.FixtureRequest) -> Iterator[Peer]:
     """A peer with subscriptions to the topics that the module names in PEER_TOPICS."""
-    with peer(getattr(request.module, "PEER_TOPICS", ())) as made:
-        yield made
+    with peer(getattr(request.module, "PEER_TOPICS", ())) as node:
+        yield node
 
 
 def logged(run: Path) -> Iterator[tuple[str, Message]]:

@@ -152,9 +152,9 @@ def peer(
     transport.prepare()
     context = Context()
     rclpy.init(context=context)
-    made = Peer(context, topics, qos or QoSProfile(depth=100))
+    node = Peer(context, topics, qos or QoSProfile(depth=100))
     try:
-        yield made
+        yield node
     finally:
-        made.node.destroy_node()
+        node.node.destroy_node()
         context.try_shutdown()

@@ -30,14 +30,14 @@ def device(pid: int) -> int:
     """A TUN device in the network namespace of a process. Raises OSError without the permission."""
     libc = ctypes.CDLL(None, use_errno=True)
     with (
-        Path("/proc/self/ns/net").open("rb") as own,
-        Path(f"/proc/{pid}/ns/net").open("rb") as there,
+        Path("/proc/self/ns/net").open("rb") as own_namespace,
+        Path(f"/proc/{pid}/ns/net").open("rb") as peer_namespace,
     ):
-        if libc.setns(there.fileno(), CLONE_NEWNET):
+        if libc.setns(peer_namespace.fileno(), CLONE_NEWNET):
             raise OSError(ctypes.get_errno(), "setns")
         tun = os.open("/dev/net/tun", os.O_RDWR | os.O_NONBLOCK)
         fcntl.ioctl(tun, TUNSETIFF, struct.pack("16sH", NAME.encode(), IFF_TUN | IFF_NO_PI))
-        libc.setns(own.fileno(), CLONE_NEWNET)
+        libc.setns(own_namespace.fileno(), CLONE_NEWNET)
     return tun
 
 

@@ -31,15 +31,16 @@ class Stopwatch(Node):  # type: ignore[misc]
         )
 
     def _compare(self, message: DiagnosticArray) -> None:
-        told = [
+        ages_told = [
             float(value.value)
             for status in message.status
             for value in status.values
             if value.key == KEY
         ]
-        if told and self._ages:
+        if ages_told and self._ages:
             print(
-                f"told {told[0]:.4f} measured {sum(self._ages) / len(self._ages):.4f}", flush=True
+                f"told {ages_told[0]:.4f} measured {sum(self._ages) / len(self._ages):.4f}",
+                flush=True,
             )
         if any(status.name == "/aircraft" for status in message.status):
             self._ages.clear()

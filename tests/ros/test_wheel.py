@@ -73,11 +73,11 @@ def run(installed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run
 
     def run_python(*arguments: str) -> str:
         command = [sys.executable, *arguments]
-        done = subprocess.run(
+        process = subprocess.run(
             command, cwd=working, capture_output=True, text=True, timeout=HANG, check=False
         )
-        assert done.returncode == 0, done.stdout + done.stderr
-        return done.stdout
+        assert process.returncode == 0, process.stdout + process.stderr
+        return process.stdout
 
     return run_python
 

@@ -30,12 +30,12 @@ class HostDelays(threading.Thread):
         """Measure until the process ends."""
         period = 0.01
         begin = time.time()
-        computed = time.process_time()
+        processor_time = time.process_time()
         while True:
             time.sleep(period)
             begin, before = time.time(), begin
-            computed, computed_before = time.process_time(), computed
-            if (delay := begin - before - period - (computed - computed_before)) > period:
+            processor_time, computed_before = time.process_time(), processor_time
+            if (delay := begin - before - period - (processor_time - computed_before)) > period:
                 self._delays.append((begin, delay))
 
     def since(self, t: float) -> float:

@@ -15,9 +15,9 @@ from tests.sitl.kit import ArduPlane, Px4, missing
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Skip where something is missing. The hook of a folder gets the tests of the whole session."""
-    here = [item for item in items if Path(__file__).parent in item.path.parents]
-    if here and (reason := missing()):
-        for item in here:
+    items_here = [item for item in items if Path(__file__).parent in item.path.parents]
+    if items_here and (reason := missing()):
+        for item in items_here:
             item.add_marker(pytest.mark.skip(reason=reason))
 
 

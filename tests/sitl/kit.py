@@ -127,13 +127,13 @@ class Autopilot:
         # Files, not pipes: what `up` starts would hold a pipe open.
         output = self.folder / f"{action}.txt"
         with output.open("w") as file:
-            done = subprocess.run(
+            process = subprocess.run(
                 command, env={**os.environ, "PILOT_PYTHON": PILOT_PYTHON, **environment},
                 stdin=subprocess.DEVNULL,
                 stdout=file, stderr=subprocess.STDOUT, timeout=timeout, check=False,
             )  # fmt: skip
         text = output.read_text()
-        assert done.returncode == 0, f"{' '.join(command)}: {text}"
+        assert process.returncode == 0, f"{' '.join(command)}: {text}"
         return text.strip()
 
     def kill(self, *programs: str) -> Callable[[], None]:
@@ -148,19 +148,19 @@ class Autopilot:
                 for word in member.cmdline()
             )
 
-        chosen = [
+        options = [
             next(parent for parent in parents if is_one(parent, program)) for program in programs
         ]
         again = [
             (["ip", "netns", "exec", self.namespace, *process.cmdline()], process.environ())
-            for process in chosen
+            for process in options
         ]
-        for parent in chosen:
+        for parent in options:
             for process in (*parent.children(), parent):
                 process.kill()
 
         def start() -> None:
-            psutil.wait_procs(chosen)
+            psutil.wait_procs(options)
             for program, (command, environment) in zip(programs, again, strict=True):
                 with (self.folder / f"{program}_again.log").open("w") as log:
                     started = subprocess.Popen(
@@ -183,8 +183,8 @@ class Autopilot:
 
     def _module(self, *arguments: str, path: str = "") -> Process:
         """Start a Python module, with its arguments, in the autopilot's network."""
-        within = ("env", f"PYTHONPATH={path}", str(self.script), "in", str(self.folder))
-        self._processes.append(Process(*arguments, cwd=REPOSITORY, within=within))
+        prefix = ("env", f"PYTHONPATH={path}", str(self.script), "in", str(self.folder))
+        self._processes.append(Process(*arguments, cwd=REPOSITORY, within=prefix))
         return self._processes[-1]
 
     def state(self) -> dict[str, Any]:
@@ -281,11 +281,11 @@ class Autopilot:
         """
         for _ in range(ENGAGEMENTS):
             self.hand_over()
-            engaged = self.requested(*options)
-            if engaged.end() == 0 or "engage_if" not in engaged.output:
+            request = self.requested(*options)
+            if request.end() == 0 or "engage_if" not in request.output:
                 break
             self.level()
-        engaged.succeed()
+        request.succeed()
 
     def experiment(self, *command: str) -> Process:
         """Fly the experiment of `identify --bridge` to its end in the air.
@@ -311,8 +311,8 @@ class Autopilot:
 
         Its outcome, and its engagements with start, stop, reason.
         """
-        found: dict[str, Any] = json.loads((self.run / "summary.json").read_text())
-        return found
+        figures: dict[str, Any] = json.loads((self.run / "summary.json").read_text())
+        return figures
 
 
 def guided_scenario(scenario: Path, program: Program, speed: float) -> str:
@@ -322,10 +322,10 @@ def guided_scenario(scenario: Path, program: Program, speed: float) -> str:
     """
     content = yaml.safe_load(scenario.read_text())
     reference = content["/**/reference_model"]["ros__parameters"]
-    kept = {
+    nodes = {
         key: value for key, value in reference.items() if key not in {"pulses", "coordinated_turn"}
     }
-    content["/**/reference_model"]["ros__parameters"] = kept | {"live": {"speed": speed}}
+    content["/**/reference_model"]["ros__parameters"] = nodes | {"live": {"speed": speed}}
     steps = {
         name: {"start": list(start), "value": list(value)}
         for name, (start, value) in program.items()
@@ -347,8 +347,8 @@ def followed(tape: Tape, name: str, start: float, stop: float) -> float:
     parts = []
     for delay in np.arange(0.0, 0.6, 0.05):
         reference = np.interp(t[inside] - delay, t_m, y_m[name])
-        moved = reference - reference.mean()
-        parts.append(float(y[name][inside] @ moved / (moved @ moved)))
+        deviation = reference - reference.mean()
+        parts.append(float(y[name][inside] @ deviation / (deviation @ deviation)))
     return max(parts)
 
 
@@ -371,12 +371,12 @@ def agreement(t: FloatArray, logged: FloatArray, t_y: FloatArray, y: FloatArray)
     for delay in np.arange(-0.3, 0.3, 0.005):
         delayed = np.interp(t + delay, t_y, y)
         variances, directions = np.linalg.eigh(np.cov(logged, delayed))
-        found = Agreement(
+        best = Agreement(
             float(directions[1, 1] / directions[0, 1]),
             float(np.mean(delayed - logged)),
             float(delay),
         )
-        fits.append((float(variances[0]), found))
+        fits.append((float(variances[0]), best))
     return min(fits)[1]
 
 
@@ -557,9 +557,9 @@ class ArduPlane(Autopilot):
         errors = {}
         for name, (kind, field) in OWN_SIGNALS.items():
             t, values = self.log(kind, field)
-            own = values[:, 0]
+            speed = values[:, 0]
             if name == "V":
-                own = ratio * (own - np.interp(span.start_ns / 1e9, t, own))
+                speed = ratio * (speed - np.interp(span.start_ns / 1e9, t, speed))
             # r follows p in coordinated turns
             pulse = pulses.get(name, pulses["p"]) if name == "r" else pulses[name]
             edges = zip(pulse.start, pulse.stop, strict=True)
@@ -569,7 +569,7 @@ class ArduPlane(Autopilot):
             reference = np.interp(t[commanded], y_m.stamp_ns / 1e9, y_m[name])
             if commanded.any():
                 errors[name] = (
-                    float(np.sqrt(np.mean((own[commanded] - reference) ** 2))),
+                    float(np.sqrt(np.mean((speed[commanded] - reference) ** 2))),
                     float(np.sqrt(np.mean(reference**2))),
                 )
         return errors
@@ -613,14 +613,14 @@ class ArduPlane(Autopilot):
             t_y = signal.stamp_ns / 1e9
             inside = (t > t_y[0] + 0.5) & (t < t_y[-1] - 0.5)
             for name, values in zip(rows, logged[inside].T, strict=True):
-                measured = signal[name]
+                series = signal[name]
                 if name == "psi":
-                    measured = np.unwrap(measured)
+                    series = np.unwrap(series)
                     values = np.unwrap(values)  # noqa: PLW2901 - the same angle
                 elif name in IN_METRES:
                     scale, begin = IN_METRES[name]
                     values = scale * (values - begin)  # noqa: PLW2901 - the same position
-                compared[name] = agreement(t[inside], values, t_y, measured)
+                compared[name] = agreement(t[inside], values, t_y, series)
         return compared
 
 
@@ -648,10 +648,14 @@ class Px4(Autopilot):
             line.strip().partition(":")
             for line in self.say("listener", topic, "-n", "1").splitlines()
         ]
-        found = {name: value.split() for name, _, value in lines if name in names and value.strip()}
-        numbers = {name: float(words[0].removesuffix(",")) for name, words in found.items()}
-        if "timestamp" in found:  # "308080000 (0.320000 seconds ago)"
-            numbers["ago"] = float(found["timestamp"][1].removeprefix("("))
+        numbers_as_text = {
+            name: value.split() for name, _, value in lines if name in names and value.strip()
+        }
+        numbers = {
+            name: float(words[0].removesuffix(",")) for name, words in numbers_as_text.items()
+        }
+        if "timestamp" in numbers_as_text:  # "308080000 (0.320000 seconds ago)"
+            numbers["ago"] = float(numbers_as_text["timestamp"][1].removeprefix("("))
         return numbers
 
     def state(self) -> dict[str, Any]:
@@ -717,8 +721,8 @@ class Px4(Autopilot):
 
         The function that is returned gives them, rad/s, by the system clock.
         """
-        asked: list[tuple[float, FloatArray]] = []  # s of the system clock; p, q, r
-        ended = Event()
+        samples: list[tuple[float, FloatArray]] = []  # s of the system clock; p, q, r
+        has_ended = Event()
 
         def ask() -> None:
             command = (
@@ -730,31 +734,31 @@ class Px4(Autopilot):
                 "-n",
                 "1",
             )
-            while not ended.wait(POLL):
+            while not has_ended.wait(POLL):
                 answer = subprocess.run(
                     command, capture_output=True, text=True, timeout=30.0, check=False
                 ).stdout
                 # the client ends with the answer; most of its time goes by before the question
                 now = time.time()
-                found = re.search(r"timestamp: \d+ \(([\d.]+) .*xyz: \[(.*?)\]", answer, re.DOTALL)
-                if found is not None:
-                    asked.append(
+                match = re.search(r"timestamp: \d+ \(([\d.]+) .*xyz: \[(.*?)\]", answer, re.DOTALL)
+                if match is not None:
+                    samples.append(
                         (
-                            now - float(found[1]),
-                            np.array([float(coordinate) for coordinate in found[2].split(",")]),
+                            now - float(match[1]),
+                            np.array([float(coordinate) for coordinate in match[2].split(",")]),
                         )
                     )
 
         def truth() -> Signal:
-            stamps = np.round(np.array([t for t, _ in asked]) * 1e9).astype(np.int64)
-            return Signal(stamps, ("p", "q", "r"), np.array([rates for _, rates in asked]))
+            stamps = np.round(np.array([t for t, _ in samples]) * 1e9).astype(np.int64)
+            return Signal(stamps, ("p", "q", "r"), np.array([rates for _, rates in samples]))
 
         asking = Thread(target=ask)
         asking.start()
         try:
             yield truth
         finally:
-            ended.set()
+            has_ended.set()
             asking.join()
 
     def mode_changed(self) -> float:

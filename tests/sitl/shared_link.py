@@ -40,25 +40,25 @@ def main(path: str) -> None:
     take: Any = mavlink.MAVLink_request_data_stream_message(
         1, 1, mavlink.MAV_DATA_STREAM_ALL, TAKEN, 1
     )
-    joined = speaks = True
-    sent = 0.0
+    is_joined = speaks = True
+    sent_at = 0.0
     print("ready", flush=True)
     while True:
         readable, _, _ = select.select([control, autopilot, bridge], [], [], 0.1)
         if control in readable:
             word = control.recv(100).decode()
-            joined = {"cut": False, "join": True}.get(word, joined)
+            is_joined = {"cut": False, "join": True}.get(word, is_joined)
             speaks = {"silence": False, "speak": True}.get(word, speaks)
             if word == "take":
                 autopilot.sendall(take.pack(station))
-        if autopilot in readable and (received := autopilot.recv(4096)) and joined:
+        if autopilot in readable and (received := autopilot.recv(4096)) and is_joined:
             bridge.sendto(received, BRIDGE)
-        if bridge in readable and (answered := bridge.recv(4096)) and joined:
+        if bridge in readable and (answered := bridge.recv(4096)) and is_joined:
             autopilot.sendall(answered)
-        if speaks and time.monotonic() - sent > BEAT:
-            sent = time.monotonic()
+        if speaks and time.monotonic() - sent_at > BEAT:
+            sent_at = time.monotonic()
             autopilot.sendall(beat.pack(station))
-            if joined:
+            if is_joined:
                 bridge.sendto(beat.pack(station), BRIDGE)
 
 

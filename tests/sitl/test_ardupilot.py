@@ -139,14 +139,14 @@ def test_turbulence_moves_aircraft_as_much_as_under_autopilots_own_law(plane: Ar
             began = time.time()
             flight.succeed(SCENARIO.flight.duration + 30.0)
     (one,) = plane.summary()["engagements"]
-    ended = began + (one["stop"] or SCENARIO.flight.duration) - one["start"]
+    ended_at = began + (one["stop"] or SCENARIO.flight.duration) - one["start"]
     t, q = plane.log("ATTITUDE", "pitchspeed")
-    own, law = (
+    gyro, law = (
         np.std(q[(t > start) & (t < stop)])
-        for start, stop in ((began - before, began), (began, ended))
+        for start, stop in ((began - before, began), (began, ended_at))
     )
-    assert ended - began > before / 2.0, f"too short for an rms: {one['reason']}"
-    assert law < 2.0 * own
+    assert ended_at - began > before / 2.0, f"too short for an rms: {one['reason']}"
+    assert law < 2.0 * gyro
     assert one["stop"] is None or "outside the envelope" in one["reason"]
 
 
@@ -174,9 +174,9 @@ def test_guidance_holds_heading_altitude_and_airspeed(plane: ArduPlane, turns: i
     tape = read_run(plane.run).tape
     t = tape.time("guidance")
     errors = control_errors(tape)
-    held = in_spans(t, [(start + 45.0, start + each) for start in starts])
+    is_held = in_spans(t, [(start + 45.0, start + each) for start in starts])
     largest = {
-        name: float(np.max(np.abs(errors[name][held]))) for name in ("heading", "altitude", "V")
+        name: float(np.max(np.abs(errors[name][is_held]))) for name in ("heading", "altitude", "V")
     }
     bands = {name: BANDS[name] for name in largest} | {
         "heading": BANDS["heading"] + np.radians(2.6)
@@ -296,13 +296,13 @@ def test_the_pilot_has_the_aircraft_again(
             flight.interrupt()
         flight.end()
         afterwards.close()
-    flown, (engagement,) = plane.summary(), read_run(plane.run).engagements or []
+    summary, (engagement,) = plane.summary(), read_run(plane.run).engagements or []
     if event.act is release:
         began = (engagement.stop_ns or 0) / 1e9
     record_testsuite_property(f"ArduPlane, {name}", f"{sticks_at - began:.3f}")
     assert event.sticks_act[0] <= sticks_at - began <= event.sticks_act[1]
-    (one,) = flown["engagements"]
-    assert event.reason in f"{one['reason']}; {flown['outcome']['sentence']}"
+    (one,) = summary["engagements"]
+    assert event.reason in f"{one['reason']}; {summary['outcome']['sentence']}"
 
 
 def sticks_act(plane: ArduPlane, since: float) -> float:

@@ -157,9 +157,9 @@ def waiting(
 
 
 def require_refusal(plane: ArduPlane, reason: str) -> None:
-    refused = plane.requested()
-    assert refused.end() != 0
-    assert reason in refused.output
+    request = plane.requested()
+    assert request.end() != 0
+    assert reason in request.output
 
 
 def test_engagement_in_a_climb_is_refused(plane: ArduPlane) -> None:
@@ -271,11 +271,11 @@ def test_cut_cable_leaves_the_last_u_for_the_timeout_of_overrides_alone(plane: A
     ):
         plane.say("stick", "4", "1550")
         time.sleep(1.0)
-        cut = time.time()
+        cut_at = time.time()
         modes = mode_after(plane, lambda: link("cut"), 4.0)
         assert re.search(r"RELEASE: .* old \(mavlink/", flight.output)
         t, pulses = plane.log("RC_CHANNELS", "chan4_raw")
-        acted = t[(t > cut) & (pulses[:, 0] == 1550.0)][0] - cut
+        acted = t[(t > cut_at) & (pulses[:, 0] == 1550.0)][0] - cut_at
         # RC_CHANNELS comes each 0.1 s
         assert OVERRIDE_TIME - 0.1 < acted < OVERRIDE_TIME + 0.1 + LATE
         assert modes == {"MANUAL"}

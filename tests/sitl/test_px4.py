@@ -141,7 +141,7 @@ def test_px4_flies_by_its_own_law_again(
         if (undo := event.act(px4, flight)) is not None:
             afterwards.callback(undo)
         px4.until(lambda state: state["nav_state"] != OFFBOARD, timeout=10.0)
-        changed = px4.mode_changed() + time.time() - time.monotonic()
+        changed_at = px4.mode_changed() + time.time() - time.monotonic()
         # without one of its nodes the flight ends by itself
         if "killed" not in name or event.act is kill_agent:
             flight.wait_for("RELEASE").interrupt()
@@ -150,8 +150,8 @@ def test_px4_flies_by_its_own_law_again(
     summary, (engagement,) = px4.summary(), read_run(px4.run).engagements or []
     if event.act in (release, override):
         began = (engagement.stop_ns or 0) / 1e9
-    record_testsuite_property(f"PX4, {name}", f"{changed - began:.3f}")
-    assert changed - began <= limit + LATE
+    record_testsuite_property(f"PX4, {name}", f"{changed_at - began:.3f}")
+    assert changed_at - began <= limit + LATE
     (one,) = summary["engagements"]
     assert event.reason in f"{one['reason']}; {summary['outcome']['sentence']}"
 
@@ -166,7 +166,7 @@ def test_lost_transmitter_releases_within_a_second(
         channel_map = OWN_MAP or px4.patient_map(str(EXAMPLE / "map.yaml"))
         with px4.engaged(SCENARIO.path, channel_map, 90.0, transmitter=True) as flight:
             stick.popen.kill()
-            lost = time.time()
+            lost_at = time.time()
             px4.until(lambda state: state["nav_state"] != OFFBOARD, timeout=10.0)
             flight.wait_for("RELEASE").interrupt()
             flight.end()
@@ -174,7 +174,7 @@ def test_lost_transmitter_releases_within_a_second(
         stick.popen.kill()
         px4.say("param", "set", "COM_RC_IN_MODE", "4")
     (engagement,) = read_run(px4.run).engagements or []
-    released = (engagement.stop_ns or 0) / 1e9 - lost
+    released = (engagement.stop_ns or 0) / 1e9 - lost_at
     record_testsuite_property("PX4, transmitter lost", f"{released:.3f}")
     assert released <= 1.0
     assert "transmitter" in (engagement.reason or "")

@@ -150,11 +150,11 @@ def test_command_engages_withdraws_and_says_what_still_releases(
         "y and u",
         each=manual,
     )
-    refused = setup.command(manual)
-    assert refused.end() == 1
+    command = setup.command(manual)
+    assert command.end() == 1
     assert (
         "not engaged: the loss of the transmitter cannot be seen over this link: set max_engaged"
-        in refused.output
+        in command.output
     )
     client = start("flight_cli.cli", "engage", "--blind")
     waiting = "waiting: the mode is not guided (data is 10)"
@@ -204,10 +204,10 @@ def test_rise_di_fly_starts_bridge_and_logs_autopilot_topics(
         "flight_cli.cli", "fly", str(SCENARIO), "--bridge", setup.map, "--duration", "9", "--json"
     )
     setup.peer.until(lambda: setup.peer.received["bridge/would_send"], "a u through the bridge")
-    refused = start("flight_cli.cli", "engage")
+    request = start("flight_cli.cli", "engage")
     setup.peer.until(lambda: flight.popen.poll() is not None, "the end of the flight")
-    assert refused.end() == 1
-    assert "error: not engaged: dry_run is true: nothing is sent" in refused.output
+    assert request.end() == 1
+    assert "error: not engaged: dry_run is true: nothing is sent" in request.output
     assert flight.end() in {0, STATUS_SHORTFALL}, flight.output  # incomplete: the host paused
     assert "request rejected" not in flight.output
     run = tmp_path / "runs" / "latest"
@@ -248,9 +248,9 @@ def test_controller_is_active_only_while_engaged_and_summary_says_when_and_why(
     )
     # A busy host may start the bridge later than the 10 s for which the command waits for one.
     setup.peer.until(lambda: setup.peer.node.count_publishers("bridge/engagement"), "the bridge")
-    engaged = start("flight_cli.cli", "engage")  # before all nodes run: it waits for the first u
-    setup.peer.until(lambda: engaged.popen.poll() is not None, "the end of the command")
-    engaged.succeed()
+    request = start("flight_cli.cli", "engage")  # before all nodes run: it waits for the first u
+    setup.peer.until(lambda: request.popen.poll() is not None, "the end of the command")
+    request.succeed()
     setup.peer.until(
         lambda: any(any(u.position) for u in setup.peer.received["u"]), "a u away from trim"
     )
@@ -311,9 +311,9 @@ def test_identify_excites_autopilot_and_writes_what_flies_it(
     setup.command(None).succeed()
     setup.peer.until(lambda: identify.popen.poll() is not None, "the end of the command")
     identify.succeed()
-    found = json.loads(identify.lines[-1])
-    assert found["inputs"] == ["aileron"]
-    channels = {name: np.squeeze(values) for name, values in found["channels"].items()}
+    identification = json.loads(identify.lines[-1])
+    assert identification["inputs"] == ["aileron"]
+    channels = {name: np.squeeze(values) for name, values in identification["channels"].items()}
     airframe = load_airframe("osprey")
     p = list(airframe.states).index("p")
     aileron = list(airframe.inputs).index("aileron")

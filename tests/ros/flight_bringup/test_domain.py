@@ -45,14 +45,14 @@ def test_second_flight_refused_before_its_controller_publishes_u(
     """An aircraft of one's own, without a lock, would fly the u of the second controller."""
     (tmp_path / "fleet.yaml").write_text(FLEET)
     y, y_m, u = topics
-    with peer(topics=(u,)) as made:
+    with peer(topics=(u,)) as peer_node:
         second = start("flight_cli.cli", *words, "--duration", "2")
-        made.until(
+        peer_node.until(
             lambda: second.popen.poll() is not None,
             "the second flight is refused",
-            each=lambda: publish(made, y, y_m),
+            each=lambda: publish(peer_node, y, y_m),
         )
-        assert made.received[u] == []
+        assert peer_node.received[u] == []
     assert second.end() == status
     assert "publishers of" in second.output
     assert not list(tmp_path.glob("runs/*/log")), "a log a node that has started"

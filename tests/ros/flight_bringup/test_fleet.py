@@ -27,20 +27,20 @@ def test_lockstep_fleet_flies_as_each_aircraft_alone(tmp_path: Path) -> None:
         "{east: 90.0, heading: 1.0}}}}",
     )
     fleet = read_fleet(file)
-    for flown in fly_fleet(fleet, new_runs(fleet, tmp_path / "runs"), lambda name, t, shown: None):
-        assert str(flown.outcome) == "completed"
-        recorded = read_run(flown.run)
-        alone = simulate(flown.member.scenario)
+    for flight in fly_fleet(fleet, new_runs(fleet, tmp_path / "runs"), lambda name, t, shown: None):
+        assert str(flight.outcome) == "completed"
+        recorded = read_run(flight.run)
+        tape = simulate(flight.member.scenario)
         assert {
             topic.split("/")[1] for topic in recorded.topics if topic.endswith(("/y", "/u"))
-        } == {flown.member.name}
+        } == {flight.member.name}
         for name in ("y", "y_m", "u_m", "u", "pose"):
             of_log = recorded.tape[name]
-            of_simulation = alone[name]
+            of_simulation = tape[name]
             assert len(of_log.stamp_ns) > 20
             assert of_log.stamp_ns.tobytes() == of_simulation.stamp_ns.tobytes()
             values = np.column_stack([of_log[channel] for channel in of_simulation.names])
-            assert values.tobytes() == of_simulation.values.tobytes(), (flown.member.name, name)
+            assert values.tobytes() == of_simulation.values.tobytes(), (flight.member.name, name)
 
 
 def test_killed_aircraft_leaves_other_untouched_and_interrupt_ends_all(
@@ -70,6 +70,6 @@ def test_killed_aircraft_leaves_other_untouched_and_interrupt_ends_all(
     assert not psutil.wait_procs(nodes, timeout=10.0)[1]
     assert f"one_process was killed by {signal.SIGKILL.name}" in fleet.output
     assert "Traceback" not in fleet.output
-    left = next(tmp_path.glob("runs/*-two-*"))
-    assert is_closed(left)
-    assert str(read_run(left).tape.outcome) == "interrupted"
+    run = next(tmp_path.glob("runs/*-two-*"))
+    assert is_closed(run)
+    assert str(read_run(run).tape.outcome) == "interrupted"

@@ -45,20 +45,22 @@ def test_flights_in_two_namespaces_do_not_mix_and_end_by_interrupts(
     """
     flight, nodes = engaged
     assert len(nodes) == 4
-    beside = start(
+    second_flight = start(
         "flight_cli.cli", "fly", "osprey_gust", "--namespace", "uav2", "--runs", "beside/runs"
     )
-    beside.until(lambda: is_engaged(tmp_path / "beside"), "a flight beside it that has engaged")
-    nodes_beside = beside.children()
+    second_flight.until(
+        lambda: is_engaged(tmp_path / "beside"), "a flight beside it that has engaged"
+    )
+    nodes_beside = second_flight.children()
     flight.interrupt()
-    beside.interrupt()
-    beside.interrupt()
+    second_flight.interrupt()
+    second_flight.interrupt()
     psutil.wait_procs(nodes_beside[:1], timeout=ENDED)
-    beside.interrupt()
+    second_flight.interrupt()
     assert not psutil.wait_procs(nodes + nodes_beside, timeout=ENDED)[1]
     assert flight.end() == 130, flight.output
-    beside.end()
-    assert "Traceback" not in flight.output + beside.output
+    second_flight.end()
+    assert "Traceback" not in flight.output + second_flight.output
     assert "outcome: interrupted" in flight.output
     assert "q (deg/s)" in flight.output
     run = (tmp_path / "runs" / "latest").resolve()
@@ -106,10 +108,10 @@ def test_an_early_interrupt_causes_no_traceback(start: Start) -> None:
     # Seconds of processor time; an earlier interrupt stops the interpreter itself.
     for seconds in (0.3, 0.6):
         flight = start("flight_cli.cli", "fly", "osprey_gust")
-        used = psutil.Process(flight.popen.pid).cpu_times
+        processor_times = psutil.Process(flight.popen.pid).cpu_times
 
-        def is_due(used: Any = used, seconds: float = seconds) -> bool:
-            return bool(used().user + used().system >= seconds)
+        def is_due(processor_times: Any = processor_times, seconds: float = seconds) -> bool:
+            return bool(processor_times().user + processor_times().system >= seconds)
 
         flight.until(is_due, "the processor time of the interrupt")
         nodes = flight.children()
@@ -123,19 +125,21 @@ def test_second_flight_is_refused_and_killed_node_ends_flight_and_killed_command
     start: Start, engaged: Engaged, tmp_path: Path
 ) -> None:
     flight, nodes = engaged
-    beside = start(
+    second_flight = start(
         "flight_cli.cli", "fly", "osprey_gust", "--namespace", "uav2", "--runs", "beside/runs"
     )
-    beside.until(lambda: is_engaged(tmp_path / "beside"), "a flight beside it that has engaged")
-    nodes_beside = beside.children()
-    refused = start("flight_cli.cli", "fly", "osprey_gust")
-    assert refused.end() == 2
+    second_flight.until(
+        lambda: is_engaged(tmp_path / "beside"), "a flight beside it that has engaged"
+    )
+    nodes_beside = second_flight.children()
+    third_flight = start("flight_cli.cli", "fly", "osprey_gust")
+    assert third_flight.end() == 2
     assert (
         "a domain of its own for each flight: set ROS_DOMAIN_ID, or a namespace of its own"
-        in refused.output
+        in third_flight.output
     )
     flight.child("rise_di_controller.main").kill()
-    beside.popen.kill()
+    second_flight.popen.kill()
     assert not psutil.wait_procs(nodes + nodes_beside, timeout=ENDED)[1]
     assert flight.end() == 3
     assert "controller was killed by SIGKILL" in flight.output

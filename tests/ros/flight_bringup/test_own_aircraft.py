@@ -112,7 +112,7 @@ def test_shells_of_page_run_to_the_last_command(
     # of the recorder
     assert "[ERROR]" not in (checkout / f"{len(nodes) - 1}.txt").read_text(encoding="utf-8")
     for command in after:
-        done = subprocess.run(
+        command_process = subprocess.run(
             ["/bin/bash", "-c", "\n".join([*common, command])],
             cwd=checkout,
             capture_output=True,
@@ -122,7 +122,9 @@ def test_shells_of_page_run_to_the_last_command(
         )
         # this test ends the flight early; the recorder began after the controller
         statuses = {0, STATUS_ENDED_EARLY, STATUS_SHORTFALL}
-        assert done.returncode in statuses, done.stdout + done.stderr
+        assert command_process.returncode in statuses, (
+            command_process.stdout + command_process.stderr
+        )
     samples, q, reference = largest()
     assert samples > SAMPLES
     assert q > 0.5 * reference > 0.0  # without control q of the page's aircraft would stay 0

@@ -54,7 +54,7 @@ def in_full(name: str, node: str) -> str:
 
 def allowed() -> dict[str, Access]:
     """What the policy allows each node, by node name."""
-    found = {}
+    accesses = {}
     for enclave in ElementTree.parse(POLICY).getroot().findall("enclaves/enclave"):
         profiles = enclave.findall("profiles/profile")
         node = profiles[0].attrib["node"]
@@ -67,8 +67,8 @@ def allowed() -> dict[str, Access]:
             texts = [element.text or "" for part in lists for element in part]
             assert len(texts) == len(set(texts))
             names.append(frozenset(in_full(text, node) for text in texts))
-        found[node] = Access(*names)
-    return found
+        accesses[node] = Access(*names)
+    return accesses
 
 
 def graph(peer_node: Peer, node: str) -> Access:
@@ -83,22 +83,24 @@ def discovered(peer_node: Peer, nodes: tuple[str, ...]) -> dict[str, Access]:
 
     Its endpoints are discovered one by one.
     """
-    found: dict[str, Access] = {}
-    changed = time.monotonic()
+    accesses: dict[str, Access] = {}
+    changed_at = time.monotonic()
 
     def settled() -> bool:
         present = {name for name, _ in peer_node.node.get_node_names_and_namespaces()}
         if not present >= set(nodes):
             return False
-        nonlocal changed
-        before = dict(found)
-        found.update({node: graph(peer_node, node) for node in nodes})
-        if found != before or not all(access.publish and access.reply for access in found.values()):
-            changed = time.monotonic()
-        return time.monotonic() - changed > SETTLED
+        nonlocal changed_at
+        before = dict(accesses)
+        accesses.update({node: graph(peer_node, node) for node in nodes})
+        if accesses != before or not all(
+            access.publish and access.reply for access in accesses.values()
+        ):
+            changed_at = time.monotonic()
+        return time.monotonic() - changed_at > SETTLED
 
     peer_node.until(settled, "a graph that does not change")
-    return found
+    return accesses
 
 
 ROLES = ("aircraft", "reference_model", "controller", "recorder")
@@ -184,22 +186,26 @@ def test_policy_allows_exactly_topics_and_services_of_nodes(
 
 def check_bridge(own: Access, policy: Access) -> None:
     """Check the policy of the bridge: what it has with one map, and what the other maps add."""
-    used = [row for name in MAP_FILES for row in named_map(name).used_topics()]
-    sent, received = (
-        [row for row in used if row[0].startswith("messages.") is is_sent]
+    rows = [row for name in MAP_FILES for row in named_map(name).used_topics()]
+    sent_topics, received_topics = (
+        [row for row in rows if row[0].startswith("messages.") is is_sent]
         for is_sent in (True, False)
     )
     # what comes over MAVLink is published for the recorder, and what goes over MAVLink is no topic
-    requested = {topic for _, topic, kind in sent if "/srv/" in kind}
+    requested = {topic for _, topic, kind in sent_topics if "/srv/" in kind}
     published = {
-        in_full(topic, "bridge") for _, topic, kind in sent if not kind.startswith(f"{MAVLINK}/")
+        in_full(topic, "bridge")
+        for _, topic, kind in sent_topics
+        if not kind.startswith(f"{MAVLINK}/")
     } - requested
     published |= {
-        in_full(topic, "bridge") for _, topic, kind in received if kind.startswith(f"{MAVLINK}/")
+        in_full(topic, "bridge")
+        for _, topic, kind in received_topics
+        if kind.startswith(f"{MAVLINK}/")
     }
     subscribed = {
         in_full(topic, "bridge")
-        for _, topic, kind in received
+        for _, topic, kind in received_topics
         if not kind.startswith(f"{MAVLINK}/")
     }
     assert own.publish | published == policy.publish

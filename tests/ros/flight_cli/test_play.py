@@ -88,9 +88,9 @@ def test_flight_played_byte_by_byte_with_timing_and_clock_and_in_a_loop(
         k * 10 * MS for k in range(201)
     ]
     # 2 s at twice the rate, on absolute deadlines: host delays do not accumulate
-    sent = np.array(receiving.sent["y"])
-    late = (sent - sent[0]) / NANOSECONDS - np.arange(1001) * 0.001
-    assert np.median(np.abs(late)) < 0.02 + host_delays.since(sent[0] / NANOSECONDS)
+    instants = np.array(receiving.sent["y"])
+    late = (instants - instants[0]) / NANOSECONDS - np.arange(1001) * 0.001
+    assert np.median(np.abs(late)) < 0.02 + host_delays.since(instants[0] / NANOSECONDS)
 
     looped = Receiver(peer_node.node, Y)
     loop = start("flight_cli.cli", "play", str(run), "--topics", "y", "--start", "1.9", "--loop")
@@ -137,9 +137,9 @@ def test_topics_that_cannot_be_sent_are_skipped_and_those_with_a_publisher_refus
     ]
 
     peer_node.publish("y", to_message(0, ("q",), np.zeros(1), "peer"))
-    refused = start("flight_cli.cli", "play", str(log))
-    assert refused.end() == 2
-    (message,) = [line for line in refused.lines if line.startswith("error:")]
+    second_player = start("flight_cli.cli", "play", str(log))
+    assert second_player.end() == 2
+    (message,) = [line for line in second_player.lines if line.startswith("error:")]
     sentence = "found 1 publishers of /y already, expected no publisher: set ROS_DOMAIN"
     assert message.startswith(f"error: ROS_DOMAIN_ID {domain}: {sentence}")
 

@@ -30,13 +30,13 @@ def scenario(folder: Path, **learn: object) -> Scenario:
 
     Its search is the shortest.
     """
-    chosen = find_scenario("osprey_learn").vary(
+    learning = find_scenario("osprey_learn").vary(
         flight={"duration": 11.0},
         aircraft={"rate": 100.0, "step": 0.005, "uncertainty": {"A": 0.0, "B": 0.0}},
         reference_model={"rate": 100.0},
         controller={"learn": {"updates": [10.0], "latency": 0.5} | learn},
     )
-    return written(chosen, folder / "learn.yaml")
+    return written(learning, folder / "learn.yaml")
 
 
 def test_lockstep_with_a_learner_is_equal_to_the_byte_to_one_process_and_replays_to_the_bit(
@@ -54,13 +54,15 @@ def test_lockstep_with_a_learner_is_equal_to_the_byte_to_one_process_and_replays
             }
         },
     )
-    chosen = written(guided, tmp_path / "learn.yaml")
+    flight_scenario = written(guided, tmp_path / "learn.yaml")
     events = list[Event]()
     lines = list[str]()
     run = tmp_path / "run"
-    flown = fly_over_topics(chosen, run, lambda t, text: None, lockstep=True, announce=lines.append)
-    assert flown == COMPLETED
-    tape = simulate(chosen, learn=learner(chosen), announce=events.append)
+    outcome = fly_over_topics(
+        flight_scenario, run, lambda t, text: None, lockstep=True, announce=lines.append
+    )
+    assert outcome == COMPLETED
+    tape = simulate(flight_scenario, learn=learner(flight_scenario), announce=events.append)
     assert [event.stamp_ns for event in events] == [nanoseconds(t) for t in (0.5, 10.5, 11.0)]
     assert events[0].change  # the airframe file, before there is a record
     assert events[1].change
@@ -70,7 +72,7 @@ def test_lockstep_with_a_learner_is_equal_to_the_byte_to_one_process_and_replays
     result = replay(run)
     assert result.equal()
     assert result.compared.all()
-    steps = replay_guidance(recorded, chosen.guidance)
+    steps = replay_guidance(recorded, flight_scenario.guidance)
     assert steps.equal()
     assert steps.checked == steps.steps
     assert recorded["guidance"]["authority.p"].min() < UNKNOWN  # guidance knows what was learned
@@ -78,9 +80,9 @@ def test_lockstep_with_a_learner_is_equal_to_the_byte_to_one_process_and_replays
 
 def test_law_flies_on_without_its_learner_and_takes_another(start: Start, tmp_path: Path) -> None:
     # on a busy host the design of the airframe file, 2 s of a core at low priority, takes a minute
-    chosen = scenario(tmp_path, updates=[1.0, 2.5], window=600.0)
+    killed_scenario = scenario(tmp_path, updates=[1.0, 2.5], window=600.0)
     command = start(
-        "flight_cli.cli", "fly", str(chosen.path), "--duration", "240", "--runs", "runs"
+        "flight_cli.cli", "fly", str(killed_scenario.path), "--duration", "240", "--runs", "runs"
     )
     command.wait_for("flies the airframe osprey as it is, until a model is learned")
     learning = command.child("flight_design.main")
@@ -91,9 +93,9 @@ def test_law_flies_on_without_its_learner_and_takes_another(start: Start, tmp_pa
     learning.kill()
     command.wait_for("learner was killed by SIGKILL: the law flies on with the model that it has")
     said = command.output.count("no model: record")
-    start("flight_design.main", "--ros-args", "-p", f"scenario_file:={chosen.path}").wait_for(
-        "no model: record"
-    )
+    start(
+        "flight_design.main", "--ros-args", "-p", f"scenario_file:={killed_scenario.path}"
+    ).wait_for("no model: record")
     command.until(
         lambda: command.output.count("no model: record") > said,
         "an identification of another learner",

@@ -163,9 +163,9 @@ class Flight:
 @pytest.fixture
 def flight(start: Start, peer_node: Peer, calm: Path) -> Flight:
     """Guidance that has engaged."""
-    made = Flight(start, peer_node, calm)
-    made.until(lambda: peer_node.received["u_m"], "a u_m")
-    return made
+    flight_over_topics = Flight(start, peer_node, calm)
+    flight_over_topics.until(lambda: peer_node.received["u_m"], "a u_m")
+    return flight_over_topics
 
 
 def test_command_and_page_say_what_guidance_took_and_refused(
@@ -197,9 +197,9 @@ def test_command_and_page_say_what_guidance_took_and_refused(
         assert answer(client.send_target, {"phi": 0.2}) == ""
         flight.until(lambda: flight.last("target.phi") == 0.2, "the target in force")
         # The log has these values already; guidance refuses two lateral commands at once.
-        refused = answer(client.send_target, {"theta": 0.0, "leg": 0.0, "phi": 0.2})
+        refusal = answer(client.send_target, {"theta": 0.0, "leg": 0.0, "phi": 0.2})
         assert (
-            refused
+            refusal
             == "target: found theta, leg, phi, expected one lateral and one vertical command at "
             "most"
         )

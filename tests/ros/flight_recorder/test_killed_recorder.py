@@ -126,5 +126,5 @@ def test_log_of_killed_recorder_reported_and_repairable(
     after = read_run(run)
     assert after.tape.notes == ()
     assert after.tape["y"].values.tobytes() == before.tape["y"].values.tobytes()
-    told = json.loads((run / "summary.json").read_text())["outcome"]
-    assert told["sentence"] == "recorder was killed by SIGKILL"
+    outcome = json.loads((run / "summary.json").read_text())["outcome"]
+    assert outcome["sentence"] == "recorder was killed by SIGKILL"

@@ -127,27 +127,33 @@ def test_plain_publishers_of_any_rate_are_recorded(
         lambda: all(publisher.get_subscription_count() for publisher in publishers.values()),
         "the subscriptions of the recorder",
     )
-    sent = dict.fromkeys(PLAIN, 0)
+    sent_counts = dict.fromkeys(PLAIN, 0)
     begin = time.monotonic()
 
     def publish_due() -> None:
         elapsed = time.monotonic() - begin
         for topic, (rate, _) in PLAIN.items():
-            while sent[topic] <= elapsed * rate:
-                sent[topic] += 1
+            while sent_counts[topic] <= elapsed * rate:
+                sent_counts[topic] += 1
                 publishers[topic].publish(to_message(time.time_ns(), OUTPUTS, np.zeros(4), ""))
 
-    peer_node.until(lambda: sent["truth"] > 40, "two seconds of samples", each=publish_due)
+    peer_node.until(lambda: sent_counts["truth"] > 40, "two seconds of samples", each=publish_due)
     process.interrupt().succeed()
     run = read_run(tmp_path / "run")
     stored = {topic: len(run.tape[topic].stamp_ns) for topic in PLAIN}
-    lost = {topic: int(run.metadata.get("rise_di_lost", {}).get(f"/{topic}", 0)) for topic in PLAIN}
-    assert all(stored[topic] + lost[topic] >= sent[topic] - 1 for topic in PLAIN), (
-        sent,
+    lost_counts = {
+        topic: int(run.metadata.get("rise_di_lost", {}).get(f"/{topic}", 0)) for topic in PLAIN
+    }
+    assert all(stored[topic] + lost_counts[topic] >= sent_counts[topic] - 1 for topic in PLAIN), (
+        sent_counts,
         stored,
-        lost,
+        lost_counts,
     )
-    assert all(stored[topic] > 0.9 * sent[topic] for topic in PLAIN), (sent, stored, lost)
+    assert all(stored[topic] > 0.9 * sent_counts[topic] for topic in PLAIN), (
+        sent_counts,
+        stored,
+        lost_counts,
+    )
     assert [line for line in process.lines if "[ERROR]" in line or "waiting for" in line] == []
 
 
@@ -206,21 +212,25 @@ def test_lost_messages_are_counted_and_reported(
     process = recorder("run")
     process.wait_for("ready")
     names = [f"x.{k}" for k in range(100)]
-    sent = 0
+    sent_count = 0
     publisher = peer_node.node.create_publisher(JointState, "truth", PUBLISH)
     peer_node.until(
         lambda: publisher.get_subscription_count() == 1, "the subscription of the recorder"
     )
 
     def send(count: int) -> None:
-        nonlocal sent
+        nonlocal sent_count
         for _ in range(count):
-            sent += 1
-            publisher.publish(to_message(sent, names, np.full(100, float(sent)), "peer"))
+            sent_count += 1
+            publisher.publish(
+                to_message(sent_count, names, np.full(100, float(sent_count)), "peer")
+            )
 
     with process.stopped():
         send(1500)  # a publisher keeps a history of 2000
-    peer_node.until(lambda: recorded(peer_node, "/truth") == sent, "each message of the history")
+    peer_node.until(
+        lambda: recorded(peer_node, "/truth") == sent_count, "each message of the history"
+    )
     assert "lost /truth" not in diagnostics(peer_node)[2]
     with process.stopped():
         send(8000)  # more than that history and the socket buffer hold
@@ -229,13 +239,14 @@ def test_lost_messages_are_counted_and_reported(
     )
     peer_node.until(
         lambda: (
-            sent == recorded(peer_node, "/truth") + int(diagnostics(peer_node)[2]["lost /truth"])
+            sent_count
+            == recorded(peer_node, "/truth") + int(diagnostics(peer_node)[2]["lost /truth"])
         ),
         "each message recorded or lost",
     )
     process.interrupt().succeed()
     run = read_run(tmp_path / "run")
-    lost = int(run.metadata["rise_di_lost"]["/truth"])
-    assert lost > 0
-    assert len(run.tape["truth"].stamp_ns) + lost == sent
-    assert f"/truth: the recorder lost {lost} messages" in run.tape.notes
+    lost_count = int(run.metadata["rise_di_lost"]["/truth"])
+    assert lost_count > 0
+    assert len(run.tape["truth"].stamp_ns) + lost_count == sent_count
+    assert f"/truth: the recorder lost {lost_count} messages" in run.tape.notes

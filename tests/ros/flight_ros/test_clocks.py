@@ -40,16 +40,16 @@ def test_refusal_names_clock_of_the_other_node(start_node: Start, tmp_path: Path
         partial(told, f"old: {estimate}"), "the refusal, with the difference of the clocks"
     )
     with peer(topics=()) as peer_node:
-        found: list[float] = []
+        offsets: list[float] = []
 
         def take(message: DiagnosticArray) -> None:
             values = {
                 value.key: value.value for status in message.status for value in status.values
             }
-            found.extend(float(values[key]) for key in [f"clock of {name} (s)"] if key in values)
+            offsets.extend(float(values[key]) for key in [f"clock of {name} (s)"] if key in values)
 
         peer_node.node.create_subscription(DIAGNOSTICS.type, DIAGNOSTICS.name, take, 10)
         peer_node.until(
-            lambda: any(offset == pytest.approx(-0.15, abs=0.002) for offset in found),
+            lambda: any(offset == pytest.approx(-0.15, abs=0.002) for offset in offsets),
             "the difference of the clocks in the diagnostics",
         )

@@ -69,9 +69,9 @@ class Hosts(NamedTuple):
 
 def is_separate(holder: subprocess.Popen[bytes]) -> bool:
     """Whether the process has left this network namespace, or has ended."""
-    own = Path("/proc/self/ns/net")
-    other = Path(f"/proc/{holder.pid}/ns/net")
-    return holder.poll() is not None or other.readlink() != own.readlink()
+    own_namespace = Path("/proc/self/ns/net")
+    holder_namespace = Path(f"/proc/{holder.pid}/ns/net")
+    return holder.poll() is not None or holder_namespace.readlink() != own_namespace.readlink()
 
 
 def is_up(show_link: list[str]) -> bool:
@@ -100,9 +100,9 @@ def hosts() -> Iterator[Hosts]:
         name = f"rd{holders[0].pid % 100_000}"
         first, second = (holder.pid for holder in holders)
         pair = f"link add {name} netns {first} type veth peer name {name} netns {second}"
-        made = subprocess.run([ip, *pair.split()], capture_output=True, text=True, check=False)
-        if made.returncode:
-            pytest.skip(f"no virtual Ethernet devices for this user: {made.stderr.strip()}")
+        result = subprocess.run([ip, *pair.split()], capture_output=True, text=True, check=False)
+        if result.returncode:
+            pytest.skip(f"no virtual Ethernet devices for this user: {result.stderr.strip()}")
         for number, place in enumerate(places, start=1):
             for command in (
                 f"addr add 10.77.0.{number}/24 dev {name}",

@@ -51,8 +51,8 @@ class Page:
     def _answer(self, do: str, **request: Any) -> tuple[int, dict[str, Any]] | None:
         body = json.dumps({"do": do, **request}).encode()
         try:
-            sent = urllib.request.Request(f"{self._base}control", body, self._headers)  # noqa: S310 - http of this host
-            with urllib.request.urlopen(sent) as response:  # noqa: S310 - as above
+            http_request = urllib.request.Request(f"{self._base}control", body, self._headers)  # noqa: S310 - http of this host
+            with urllib.request.urlopen(http_request) as response:  # noqa: S310 - as above
                 return response.status, json.loads(response.read())
         except HTTPError as error:
             answer = error.code, json.loads(error.read())
@@ -71,15 +71,15 @@ class Page:
     def _until(
         self, flight: Process, is_expected: Callable[[dict[str, Any]], bool]
     ) -> dict[str, Any]:
-        found: dict[str, Any] = {}
+        state: dict[str, Any] = {}
 
         def as_expected() -> bool:
-            nonlocal found
-            found = self.post("state")[1]
-            return is_expected(found)
+            nonlocal state
+            state = self.post("state")[1]
+            return is_expected(state)
 
         flight.until(as_expected, "the state that the page expects")
-        return found
+        return state
 
 
 def test_flight_commanded_from_page_recorded_and_replayed(
@@ -100,14 +100,14 @@ def test_flight_commanded_from_page_recorded_and_replayed(
     state = page.until_flown(flight)
     k_g = next(gain["values"][0] for gain in state["gains"] if gain["name"] == "k_g")
 
-    status, changed = page.post(
+    status, reply = page.post(
         "gains", digest=state["digest"], values={"k_g": [1.2 * k_g], "softening": [2.5]}
     )
-    assert (status, changed["undo"]) == (200, 1), changed
-    page.until(flight, logged=changed["digest"])  # the controller flies them
+    assert (status, reply["undo"]) == (200, 1), reply
+    page.until(flight, logged=reply["digest"])  # the controller flies them
     assert page.post("gains", digest=state["digest"], values={"k_g": [k_g]})[0] == 409
-    assert page.post("gains", digest=changed["digest"], values={"k_g": [3.0 * k_g]})[0] == 400
-    status, undone = page.post("undo", digest=changed["digest"])
+    assert page.post("gains", digest=reply["digest"], values={"k_g": [3.0 * k_g]})[0] == 400
+    status, undone = page.post("undo", digest=reply["digest"])
     assert (status, undone["digest"]) == (200, state["digest"])
     page.until(flight, logged=state["digest"])
 
@@ -122,8 +122,8 @@ def test_flight_commanded_from_page_recorded_and_replayed(
         ),
         "a gust in the truth",
     )
-    status, refused = page.post("fault", values={"sensors.dropout": 2.0})
-    assert (status, "sensors.dropout" in refused["refused"]) == (422, True)
+    status, reply = page.post("fault", values={"sensors.dropout": 2.0})
+    assert (status, "sensors.dropout" in reply["refused"]) == (422, True)
     assert page.post("deactivate")[0] == 200
     assert page.post("activate")[0] == 200
     flight.interrupt()

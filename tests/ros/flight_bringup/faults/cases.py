@@ -431,8 +431,10 @@ def storm(topic: str, reason: str = "conflicting publisher") -> Injection:
         seed = int(random.integers(2**31))
         for _ in range(STORM_ATTEMPTS):
             until_refusal_logged_again(flight, topic, reason)
-            sent = disturb(flight, "storm", topic, str(STORM_RATE), str(STORM_DURATION), str(seed))
-            if sent >= 0.5 * STORM_RATE * STORM_DURATION:
+            message_count = disturb(
+                flight, "storm", topic, str(STORM_RATE), str(STORM_DURATION), str(seed)
+            )
+            if message_count >= 0.5 * STORM_RATE * STORM_DURATION:
                 return
         pytest.fail("the host is too busy for a storm")
 
@@ -760,19 +762,19 @@ def parameters(flight: Flight, random: Generator) -> None:
         peer_node.until(first.done, "the first answer")
         flight.begin_fault()
         futures: list[Any] = []
-        done = 0
+        count = 0
 
         def feed() -> None:
-            nonlocal done
-            while done < len(futures) and futures[done].done():
-                done += 1
-            while len(futures) < CHANGES and len(futures) - done < IN_FLIGHT:
+            nonlocal count
+            while count < len(futures) and futures[count].done():
+                count += 1
+            while len(futures) < CHANGES and len(futures) - count < IN_FLIGHT:
                 # a larger one may cost an observer's loop its margin
                 lower = ("k_g", k_g * float(random.uniform(0.8, 1.0)))
                 futures.append(request(*(lower if valid[len(futures)] else invalid_change(random))))
 
         feed()
-        peer_node.until(lambda: done == CHANGES, "an answer to each request", each=feed)
+        peer_node.until(lambda: count == CHANGES, "an answer to each request", each=feed)
         flight.end_fault()
         accepted = [future.result().results[0].successful for future in futures]
         assert accepted == valid.tolist()

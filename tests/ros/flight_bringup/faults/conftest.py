@@ -84,8 +84,8 @@ def draws(pytestconfig: pytest.Config) -> list[Draw]:
     first, count = (
         int(pytestconfig.getoption(f"--faults-{name}", 0)) for name in ("seed", "random")
     )
-    drawn = [*found(), *map(draw, range(first, first + count))] if count else []
-    return sorted(drawn, key=lambda fault: fault.cases[0].kind.name)
+    injections = [*found(), *map(draw, range(first, first + count))] if count else []
+    return sorted(injections, key=lambda fault: fault.cases[0].kind.name)
 
 
 @pytest.fixture(scope="session")
@@ -104,8 +104,8 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     """
     if "case" in metafunc.fixturenames:
         every = metafunc.config.getoption("--faults-table", None) is not None
-        chosen = [case for case in CASES if every or case.name in IN_SUITE]
-        metafunc.parametrize("case", chosen, ids=[case.name for case in chosen])
+        suite = [case for case in CASES if every or case.name in IN_SUITE]
+        metafunc.parametrize("case", suite, ids=[case.name for case in suite])
 
 
 CAMPAIGNS = {
@@ -117,13 +117,13 @@ CAMPAIGNS = {
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Leave out the random faults where no option asks for them."""
-    left = [
+    alive = [
         item
         for item in items
         if item.name in CAMPAIGNS and not config.getoption(CAMPAIGNS[item.name], 0)
     ]
-    config.hook.pytest_deselected(items=left)
-    items[:] = [item for item in items if item not in left]
+    config.hook.pytest_deselected(items=alive)
+    items[:] = [item for item in items if item not in alive]
 
 
 @pytest.fixture(scope="session")
@@ -206,6 +206,6 @@ def flights(
         Kind.BRIDGED: bridged,
         Kind.LEARNING: learning,
     }
-    made = Flights(tmp_path_factory.mktemp("faults"), scenarios)
-    yield made
-    made.close()
+    flights_of_suite = Flights(tmp_path_factory.mktemp("faults"), scenarios)
+    yield flights_of_suite
+    flights_of_suite.close()

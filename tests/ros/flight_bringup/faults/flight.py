@@ -547,16 +547,16 @@ class Flight:
         None before the log reaches `until`.
         """
         decoder = Decoder(self._tick_channels)
-        found = []
+        tables = []
         for topic, record in logged(self.runs[-1]):
             sample = self._decode(decoder, record.data) if topic == "/internals" else None
             if sample is not None and seconds(sample.stamp_ns) >= begin - MAX_AGE:
-                found.append(sample)
-        if not found or seconds(found[-1].stamp_ns) < until:
+                tables.append(sample)
+        if not tables or seconds(tables[-1].stamp_ns) < until:
             return None
         ticks = _ticks(
-            np.array([seconds(sample.stamp_ns) for sample in found]),
-            np.array([sample.value for sample in found]),
+            np.array([seconds(sample.stamp_ns) for sample in tables]),
+            np.array([sample.value for sample in tables]),
         )
         return Ticks(*(column[ticks.mode == Mode.ENGAGED] for column in ticks))
 
@@ -574,10 +574,10 @@ class Flight:
     def _values(
         self, topic: str, names: tuple[str, ...], begin: float, end: float
     ) -> tuple[FloatArray, FloatArray]:
-        found = [(at, sample.value) for at, sample in self._samples(topic, names, begin, end)]
-        return np.array([at for at, _ in found]), np.array([value for _, value in found]).reshape(
-            -1, len(names)
-        )
+        samples = [(at, sample.value) for at, sample in self._samples(topic, names, begin, end)]
+        return np.array([at for at, _ in samples]), np.array(
+            [value for _, value in samples]
+        ).reshape(-1, len(names))
 
     def _samples(
         self, topic: str, names: tuple[str, ...], begin: float, end: float
@@ -681,16 +681,16 @@ class Flight:
         for killed in (
             node for node in self._killed if node.role == "recorder" and node.dead >= self.begin
         ):
-            joined = min(
+            joined_at = min(
                 seconds(record.log_time)
                 for topic, record in logged(self.runs[-1])
                 if topic == "/internals"
             )
-            kept = joined - seconds(HISTORY_NS) + self.host_delay(killed.alive, joined)
+            kept_from = joined_at - seconds(HISTORY_NS) + self.host_delay(killed.alive, joined_at)
             received = [
                 (arrival, sender)
                 for arrival, sender in received
-                if not killed.alive - HISTORY < arrival.sent < kept
+                if not killed.alive - HISTORY < arrival.sent < kept_from
             ]
         internals = {arrival.message for arrival, _ in received}
         logged_lines = {(line.message.name, line.message.msg) for line in lines}
@@ -785,12 +785,12 @@ class Flight:
             ticks = self.ticks(time.time() - 2.0)
             delay = self.host_delay(begin, time.time())
             e = np.abs(ticks.e).max(axis=0, initial=0.0)
-            ended = [
+            dead = [
                 f"\n{role}: {process.output}"
                 for role, process in self.processes.items()
                 if process.popen.poll() is not None
             ]
             raise AssertionError(
                 f"{error}: {ticks.modes}, e {e}, host scheduling delay up to {delay:.2f} "
-                f"s{''.join(ended)}"
+                f"s{''.join(dead)}"
             ) from None

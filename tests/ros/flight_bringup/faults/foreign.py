@@ -68,13 +68,13 @@ def matched_publisher(topic: str) -> Iterator[Publisher]:
         time.sleep(0.005)
         if time.monotonic() > report:
             report += REPORT_PERIOD
-            known = sorted(
+            fault_names = sorted(
                 subscription.node_name
                 for subscription in node.get_subscriptions_info_by_topic(topic)
             )
             print(
                 f"{publisher.get_subscription_count()} of {subscribers} subscribers matched, "
-                f"known: {known}",
+                f"known: {fault_names}",
                 flush=True,
             )
     print(f"begins at {time.time():.6f}", flush=True)
@@ -89,17 +89,17 @@ def storm(topic: str, rate: float, duration: float, seed: int) -> None:
     encoder = Encoder(NAMES[topic], "/foreign")
     with matched_publisher(topic) as publisher:
         ticker = Ticker(BURST_NS, time.monotonic_ns())
-        sent = 0
+        count = 0
         begin = time.monotonic()
         while time.monotonic() - begin < duration:
             if (pause := ticker.remaining()) > 0:
                 time.sleep(pause)
             # On a busy host the rate is not reached: the storm ends nevertheless.
-            while sent < rate * (since := time.monotonic() - begin) and since < duration:
-                publisher.publish(encoder.encode(time.time_ns(), values[sent % len(values)]))
-                sent += 1
+            while count < rate * (since := time.monotonic() - begin) and since < duration:
+                publisher.publish(encoder.encode(time.time_ns(), values[count % len(values)]))
+                count += 1
             ticker.due()
-        print(f"sent {sent} in {(time.monotonic() - begin):.3f} s", flush=True)
+        print(f"sent {count} in {(time.monotonic() - begin):.3f} s", flush=True)
 
 
 def relay(topic: str) -> None:
@@ -166,7 +166,7 @@ def clients(address: str, count: int, duration: float) -> None:
     )
     print(f"begins at {time.time():.6f}", flush=True)
     until = time.monotonic() + duration
-    sent = 0
+    request_count = 0
     opened = 0
     connections: list[socket.socket] = []
     while opened < count or time.monotonic() < until:
@@ -180,13 +180,15 @@ def clients(address: str, count: int, duration: float) -> None:
         for place in reversed(range(len(connections))):
             try:
                 connections[place].send(request)
-                sent += 1
+                request_count += 1
             except BlockingIOError:
                 continue
             except OSError:  # the server has closed it
                 connections.pop(place).close()
         time.sleep(0.001)
-    print(f"sent {sent} on {opened} connections, {len(connections)} at the end", flush=True)
+    print(
+        f"sent {request_count} on {opened} connections, {len(connections)} at the end", flush=True
+    )
 
 
 if __name__ == "__main__":

@@ -159,16 +159,16 @@ def check(case: Case, flight: Flight) -> tuple[float | None, float, float]:
         detected = flight.until(lambda: case.detection(flight), case.within + 3.0, "detected")  # type: ignore[misc]
         # the message of the detection may overtake that of the fault
         reaction = max(detected - flight.begin, 0.0)
-    engaged = flight.until(lambda: engaged_for(SETTLING, flight), 10.0, "engaged again")
-    host_delay = flight.host_delay(flight.begin - 0.1, engaged + SETTLING)
+    engagement = flight.until(lambda: engaged_for(SETTLING, flight), 10.0, "engaged again")
+    host_delay = flight.host_delay(flight.begin - 0.1, engagement + SETTLING)
     # there the delay is the fault
     slack = SLACK + case.host_delays * host_delay * (case.response is not Response.LATE)
-    recovery = max(engaged - flight.end, 0.0)
+    recovery = max(engagement - flight.end, 0.0)
     if reaction is not None:
         allowed = case.within + slack
         assert reaction <= allowed, f"detected after {reaction:.3f} s, allowed {allowed:.3f} s"
     # A node starts again, and catches up, in many shares of a busy processor: their delays add up.
-    allowed = case.recovery + max(slack, SLACK + flight.waited(flight.end, engaged))
+    allowed = case.recovery + max(slack, SLACK + flight.waited(flight.end, engagement))
     # by the host, during the fault or later
     disturbed = case.response is Response.UNCHANGED and host_delay > QUIET
     assert recovery <= allowed or disturbed, (
@@ -179,7 +179,7 @@ def check(case: Case, flight: Flight) -> tuple[float | None, float, float]:
         assert duration <= RESTART + slack, (
             f"{key} {duration:.3f} s, allowed {RESTART + slack:.3f} s"
         )
-    CHECKS[case.response](case, flight, Window(engaged, host_delay, slack))
+    CHECKS[case.response](case, flight, Window(engagement, host_delay, slack))
     check_processes(flight)
     flight.until_steady()
     return reaction, recovery, host_delay
@@ -272,19 +272,19 @@ def check_controller_failsafe(case: Case, flight: Flight, window: Window) -> Non
     ], ticks.modes
     mode = ticks.mode
     u = ticks.u
-    held = u[mode == Mode.HOLD]
+    u_held = u[mode == Mode.HOLD]
     ramp = u[mode == Mode.RAMP]
-    assert (held == held[0]).all()
-    assert np.abs(held[0]).max() > 1e-4  # u = 0 would prove nothing
+    assert (u_held == u_held[0]).all()
+    assert np.abs(u_held[0]).max() > 1e-4  # u = 0 would prove nothing
     stale = ticks.t[mode == Mode.HOLD][0]
-    scale = ramp @ held[0] / (held[0] @ held[0])
-    assert np.abs(ramp - np.outer(scale, held[0])).max() <= EXACT
+    scale = ramp @ u_held[0] / (u_held[0] @ u_held[0])
+    assert np.abs(ramp - np.outer(scale, u_held[0])).max() <= EXACT
     expected = 1.0 - (ticks.t[mode == Mode.RAMP] - stale - HOLD) / RAMP
     assert np.abs(scale - expected).max() <= window.slack / RAMP
     assert (np.diff(scale) < 0).all()
     assert (u[mode == Mode.TRIM] == 0.0).all()
-    engaged = np.flatnonzero((mode[1:] == Mode.ENGAGED) & (mode[:-1] != Mode.ENGAGED)) + 1
-    assert (u[engaged] == u[engaged - 1]).all()
+    engagements = np.flatnonzero((mode[1:] == Mode.ENGAGED) & (mode[:-1] != Mode.ENGAGED)) + 1
+    assert (u[engagements] == u[engagements - 1]).all()
 
 
 def check_aircraft_failsafe(case: Case, flight: Flight, window: Window) -> None:
