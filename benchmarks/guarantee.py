@@ -34,7 +34,7 @@ from flight_analysis.linear_loop.loop_margins import (
 from flight_analysis.linear_loop.uncertain_loop import aircraft_at
 from flight_analysis.linear_loop.worst_case import worst_in_box
 from flight_analysis.report.account import account
-from flight_analysis.report.shortfalls import judged
+from flight_analysis.report.shortfalls import judge
 from flight_design.gains.gain_design import select_gains
 from flight_design.identification.likelihood import PRIOR
 from flight_design.learning.scenario_learner import learner
@@ -114,7 +114,7 @@ def flight(scenario: Scenario, first: Unstable) -> str:
         path.write_text(as_yaml(frame))
         unstable = scenario.vary(aircraft={"airframe": str(path)})
         tape = simulate(unstable)
-        return str(judged(tape.outcome, tape, unstable, account(tape, unstable)))
+        return str(judge(tape.outcome, tape, unstable, account(tape, unstable)))
 
 
 def beyond(linear: LinearLoop, stable: float, count: int) -> str:

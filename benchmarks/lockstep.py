@@ -27,7 +27,7 @@ from mcap.records import Channel, Message
 from mcap.stream_reader import StreamReader
 
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.closed_loop.scenario_library import find_scenario, written
+from flight_analysis.closed_loop.scenario_library import find_scenario, save_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.fly import fly_over_topics
 from flight_core.outcome import End
@@ -94,7 +94,7 @@ def measure(folder: Path, duration: float, repeat: int) -> dict[str, float]:
     aircraft = {"rate": RATE, "step": 1.0 / RATE}
     model = {"rate": RATE}
     scenario = find_scenario("osprey_gust", duration).vary(aircraft=aircraft, reference_model=model)
-    scenario = written(scenario, folder / "at_100_hz.yaml")
+    scenario = save_scenario(scenario, folder / "at_100_hz.yaml")
     measurements: dict[str, Callable[[Path], float]] = {
         FLOOR: lambda run: echo_steps_per_second(),
         "lockstep, four processes": lambda run: flight_steps_per_second(

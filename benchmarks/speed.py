@@ -37,7 +37,7 @@ from rclpy.node import Node
 from rich.console import Console
 from rosbags.rosbag2 import CompressionMode
 
-from flight_analysis.closed_loop.scenario_library import find_scenario, written
+from flight_analysis.closed_loop.scenario_library import find_scenario, save_scenario
 from flight_bringup.graph import CONTROLLER
 from flight_bringup.monitor import FlightMonitor
 from flight_bringup.processes import FlightProcesses
@@ -208,7 +208,7 @@ def controller_at(
         "reference_model": others,
         "controller": {"rate": hz},
     }
-    scenario = written(
+    scenario = save_scenario(
         find_scenario(scenario_name).vary(**rates), folder / f"{scenario_name}_at_{hz:g}_hz.yaml"
     )
     with Child(role, "--ros-args", "--params-file", str(scenario.path)) as child:
@@ -390,7 +390,7 @@ def flight_rows(seconds: float, folder: Path) -> Iterator[Row]:
     with Child("idle") as child:
         time.sleep(WARM_UP + 1.0)
         yield Row("node that only spins", _use([child.popen.pid], 3.0)[0], "node that only spins")
-    scenario = written(scenario, folder / "scenario.yaml")
+    scenario = save_scenario(scenario, folder / "scenario.yaml")
     with (
         FlightMonitor(
             scenario.controller.outputs, lockstep=True

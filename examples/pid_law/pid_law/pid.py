@@ -55,15 +55,15 @@ def u_from_trim(state: PidState, params: PidParams) -> Array:
     return -params.input_scale * params.D * params.K * terms
 
 
-def engage(measured: Measurements, params: PidParams) -> PidState:
+def engage(measurements: Measurements, params: PidParams) -> PidState:
     """The state at engagement: u = u_trim, however large the error is (bumpless transfer)."""
-    e = measured.y - measured.y_m
+    e = measurements.y - measurements.y_m
     zero = array_namespace(e).zeros_like(e)
     return PidState(e, e, zero, zero)
 
 
 def limited(
-    state: PidState, measured: Measurements, dt: Array, params: PidParams, limits: Limits
+    state: PidState, measurements: Measurements, dt: Array, params: PidParams, limits: Limits
 ) -> tuple[PidState, Array, Array]:
     """One tick inside the limits: u = u_trim + u_from_trim.
 
@@ -71,12 +71,12 @@ def limited(
     integral_e += dt (e + e_p) / 2, or less of it where u is saturated and would move further
     outwards (anti-windup)
     """
-    e = measured.y - measured.y_m
+    e = measurements.y - measurements.y_m
     share = -array_namespace(e).expm1(-dt / params.filter_time)
     e_dot = state.e_dot + share * ((e - state.e) / dt - state.e_dot)
     after = PidState(state.e_0, e, e_dot, state.integral_e + dt * (e + state.e) / 2.0)
-    u_free = measured.u_trim + u_from_trim(after, params)
-    beyond = u_free - saturate(u_free, measured.u_before, dt, limits)
+    u_free = measurements.u_trim + u_from_trim(after, params)
+    beyond = u_free - saturate(u_free, measurements.u_before, dt, limits)
     change = (
         -params.input_scale
         * params.D
@@ -87,8 +87,8 @@ def limited(
     after = after._replace(
         integral_e=limited_integral(state.integral_e, after.integral_e, change, beyond)
     )
-    u_free = measured.u_trim + u_from_trim(after, params)
-    return after, u_free, saturate(u_free, measured.u_before, dt, limits)
+    u_free = measurements.u_trim + u_from_trim(after, params)
+    return after, u_free, saturate(u_free, measurements.u_before, dt, limits)
 
 
 def retune(state: PidState, old: PidParams, new: PidParams) -> PidState:

@@ -16,7 +16,7 @@ from tests.conftest import refusing
 from tests.nodes.rise_di_controller.test_controller import Flight, missed
 from tests.nodes.world import diagnostics, world_of
 
-from flight_analysis.closed_loop.scenario_library import find_scenario, written
+from flight_analysis.closed_loop.scenario_library import find_scenario, save_scenario
 from flight_core.modes import Mode
 from flight_core.rates import nanoseconds
 from flight_design.learning.node import LearnerNode
@@ -66,7 +66,7 @@ def proposer(tmp_path: Path) -> Iterator[Proposer]:
     shipped = find_scenario("osprey_learn")
     # a parameter that only the proposal has
     model = shipped.rise_di().model_dump()["feedforward"] | {"gravity": None}
-    varied = written(shipped.vary(controller={"feedforward": model}), tmp_path / "learn.yaml")
+    varied = save_scenario(shipped.vary(controller={"feedforward": model}), tmp_path / "learn.yaml")
     with world_of("--params-file", str(varied.path)) as world:
         flight = Flight(world)
         flight.y = 0.0
@@ -125,7 +125,7 @@ def test_deactivated_law_ends_the_record(tmp_path: Path) -> None:
 
     The record before is forgotten.
     """
-    chosen = written(
+    chosen = save_scenario(
         find_scenario("osprey_learn").vary(
             controller={"learn": {"updates": [3.0], "latency": 0.5}}
         ),

@@ -25,7 +25,7 @@ from aircraft_sim.node import AircraftNode
 from autopilot_bridge.client import EngagementClient
 from autopilot_bridge.node import BridgeNode
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.closed_loop.scenario_library import find_scenario, written
+from flight_analysis.closed_loop.scenario_library import find_scenario, save_scenario
 from flight_bringup.graph import ON_START, ONE_PROCESS, parameter_overrides
 from flight_bringup.monitor import FlightMonitor
 from flight_core.vectors import ChannelError
@@ -51,7 +51,7 @@ def learning_and_guided(folder: Path) -> Scenario:
     scenario = find_scenario("osprey_learn").vary(
         guidance=guided.guidance, reference_model=guided.reference_model
     )
-    return written(scenario, folder / "learn_and_guide.yaml")
+    return save_scenario(scenario, folder / "learn_and_guide.yaml")
 
 
 def arguments(scenario: Scenario, folder: Path, **options: Any) -> list[str]:

@@ -31,7 +31,7 @@ from flight_analysis.report.account import Account, account
 from flight_analysis.report.html import write_page
 from flight_analysis.report.run_folder import read_flight
 from flight_analysis.report.sample_counts import TopicAccount
-from flight_analysis.report.shortfalls import judged
+from flight_analysis.report.shortfalls import judge
 from flight_analysis.report.summary import (
     RecordedFlight,
     command_results,
@@ -189,7 +189,7 @@ def test_flight_counts_from_its_first_u(
     }
     flight = Tape(late, duration=2.0)
     held = account(flight, osprey_gust)
-    assert str(judged(COMPLETED, flight, osprey_gust, held)).startswith(outcome)
+    assert str(judge(COMPLETED, flight, osprey_gust, held)).startswith(outcome)
 
 
 @pytest.mark.parametrize("share, named", [(0.005, False), (0.02, True), (0.1, True), (0.5, True)])

@@ -19,7 +19,7 @@ from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.metrics import best_error
 from flight_analysis.report.account import Account
 from flight_analysis.report.linear_flight import error_pair
-from flight_analysis.report.shortfalls import judged
+from flight_analysis.report.shortfalls import judge
 from flight_analysis.report.tracking import saturation_notes
 from flight_core.modes import Mode
 from flight_core.outcome import COMPLETED, Aim, End, Outcome
@@ -185,7 +185,7 @@ def test_law_that_was_not_asked_to_fly_is_no_shortfall() -> None:
     """A dry run behind an autopilot: the controller is inactive."""
     ticks = Signal(np.arange(3, dtype=np.int64), ("mode",), np.full((3, 1), float(Mode.INACTIVE)))
     tape = replace(healthy(), signals=dict(healthy().signals) | {"internals": ticks})
-    assert judged(COMPLETED, tape, servo(), WHOLE) == COMPLETED
+    assert judge(COMPLETED, tape, servo(), WHOLE) == COMPLETED
 
 
 def test_late_loop_is_told_with_its_cycle() -> None:
@@ -221,7 +221,7 @@ def test_landing_does_not_swallow_what_else_was_short() -> None:
     scenario = calm_osprey(5.0, route=route, landing={"waypoint": 2}, touchdown=box)
     tape = rise_di.simulate(scenario)
     half = WHOLE._replace(lacks=("u 250 of 501 samples",))
-    outcome = judged(Outcome(End.LANDED, "osprey landed at t = 5 s"), tape, scenario, half)
+    outcome = judge(Outcome(End.LANDED, "osprey landed at t = 5 s"), tape, scenario, half)
     aims = [shortfall.aim for shortfall in outcome.shortfalls]
     assert aims == [Aim.ROUTE, Aim.TOUCHDOWN, Aim.LOG]
     assert outcome.status == 4
@@ -300,9 +300,9 @@ def test_error_of_an_inactive_controller_is_no_shortfall() -> None:
     off[800:1200, truth.names.index("x.p")] += 1.0
     signals = dict(healthy().signals)
     signals["truth"] = Signal(truth.stamp_ns, truth.names, off)
-    assert judged(COMPLETED, replace(healthy(), signals=signals), servo(), WHOLE).status == 4
+    assert judge(COMPLETED, replace(healthy(), signals=signals), servo(), WHOLE).status == 4
     signals["internals"] = Signal(internals.stamp_ns, internals.names, values)
-    outcome = judged(COMPLETED, replace(healthy(), signals=signals), servo(), WHOLE)
+    outcome = judge(COMPLETED, replace(healthy(), signals=signals), servo(), WHOLE)
     assert outcome == COMPLETED
 
 
@@ -313,7 +313,7 @@ def test_truth_of_another_simulator_tells_no_wind() -> None:
     values = np.stack([truth[name] for name in names], axis=1)
     signals = dict(healthy().signals) | {"truth": Signal(truth.stamp_ns, names, values)}
     flight = replace(healthy(), signals=signals)
-    assert judged(COMPLETED, flight, servo(), WHOLE) == COMPLETED
+    assert judge(COMPLETED, flight, servo(), WHOLE) == COMPLETED
     pair = error_pair(flight, servo().controller, servo().aircraft)
     assert pair is not None
     assert pair.knowledge == (False, False)
@@ -324,10 +324,10 @@ def test_error_that_is_not_a_number_is_told() -> None:
     values = truth.values.copy()
     values[500:503] = np.nan
     signals = dict(healthy().signals) | {"truth": Signal(truth.stamp_ns, truth.names, values)}
-    (lack,) = judged(COMPLETED, replace(healthy(), signals=signals), servo(), WHOLE).shortfalls
+    (lack,) = judge(COMPLETED, replace(healthy(), signals=signals), servo(), WHOLE).shortfalls
     assert (lack.aim, "not a number" in lack.sentence) == (Aim.LOG, True)
     values[1200:, truth.names.index("x.p")] += 1.0  # what comes later is told as well
-    told = judged(COMPLETED, replace(healthy(), signals=signals), servo(), WHOLE)
+    told = judge(COMPLETED, replace(healthy(), signals=signals), servo(), WHOLE)
     assert [each.aim for each in told.shortfalls] == [Aim.LOG, Aim.ERROR]
 
 

@@ -27,7 +27,7 @@ from flight_analysis.closed_loop.learning_loop import Entry, LearnerResult
 from flight_analysis.closed_loop.replay import replay
 from flight_analysis.closed_loop.replay_ticks import vary
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.closed_loop.scenario_library import find_scenario, written
+from flight_analysis.closed_loop.scenario_library import find_scenario, save_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.fly import fly_in_process
 from flight_core.modes import Mode
@@ -88,7 +88,7 @@ class Flown(NamedTuple):
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
     run = tmp_path_factory.mktemp("learn")
     lines = list[str]()
-    chosen = written(scenario(), run / "learn.yaml")
+    chosen = save_scenario(scenario(), run / "learn.yaml")
     learned = made_learner(chosen)
     assert (
         fly_in_process(chosen, run, lambda t, text: None, lambda _: learned, lines.append)
@@ -644,14 +644,14 @@ def test_learned_part_keeps_the_margin_of_the_file_and_the_other_part_its_gains(
         aim.margin,
         aim.needed,
         uncertain=False,
-        beside=file,
+        earlier_design=file,
         is_free=aim.is_free,
     )
     assert (design.relaxation[1:3] == file.relaxation[1:3]).all()
     law = linear_law(design.controller.tuned_law(), 4, 0.01)
     loop = LoopTiming(np.array(plain.lag), 0.0, 0.01)
     assert is_stable(plant_of(model, design.controller), law, loop, aim.margin)
-    slow = selected_observer(plain, flight, model, 0.03, uncertain=False, beside=file)
+    slow = selected_observer(plain, flight, model, 0.03, uncertain=False, earlier_design=file)
     assert design.cost < slow.cost
 
 

@@ -22,7 +22,7 @@ from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.account import account
 from flight_analysis.report.guided import guidance_notices
-from flight_analysis.report.shortfalls import judged
+from flight_analysis.report.shortfalls import judge
 from flight_analysis.report.summary import summarise
 from flight_core.channels import POSE, SIDES, UNKNOWN
 from flight_core.outcome import COMPLETED
@@ -211,7 +211,7 @@ def test_lost_speed_in_a_fence_ends_with_an_outcome_and_a_report(fault: str) -> 
     stall = section.params().limits.stall_speed
     assert (section.speed + log["y.V"]).min() < 1.1 * stall
     assert tape.outcome == COMPLETED
-    told = judged(tape.outcome, tape, flight, account(tape, flight, tape.outcome))
+    told = judge(tape.outcome, tape, flight, account(tape, flight, tape.outcome))
     assert told.status == 4, "the airspeed is far below its command"
     assert log["failed"].max() == 0
     assert summarise(tape)["guidance"]["failed"] == 0

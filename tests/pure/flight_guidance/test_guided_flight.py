@@ -20,7 +20,7 @@ from tests.joint_states import path
 
 from flight_analysis.closed_loop.guidance_replay import replay_guidance
 from flight_analysis.closed_loop.scenario import load_scenario
-from flight_analysis.closed_loop.scenario_library import find_scenario, with_route, written
+from flight_analysis.closed_loop.scenario_library import find_scenario, save_scenario, with_route
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.guided_figures import flown_routes
 from flight_bringup.graph import GUIDANCE, second_stage
@@ -496,7 +496,7 @@ def test_route_received_in_flight_is_logged(tmp_path: Path) -> None:
 def test_route_file_flown_and_stays_with_flight(tmp_path: Path) -> None:
     file = tmp_path / "line.yaml"
     file.write_text("route: [[0, 0, 0], [800, 0, 10, 26.5], [800, 900, 10]]")
-    scenario = written(with_route(ROUTE, read_route(file)), tmp_path / "osprey_route.yaml")
+    scenario = save_scenario(with_route(ROUTE, read_route(file)), tmp_path / "osprey_route.yaml")
     section = load_scenario(scenario.path).guidance
     assert section is not None
     assert section.waypoints() == (

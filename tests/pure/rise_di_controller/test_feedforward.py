@@ -238,7 +238,9 @@ def test_engagement_and_re_engagement_during_manoeuvre_bumpless() -> None:
         assert 0.005 < np.abs(np.diff(u[2:], axis=0)).max() < 0.1
         t = 0.5 + first / 100
         rate = (reference(t + 0.01) - reference(t)) / 0.01
-        whole = feedforward.ideal(feedforward.initial_state(reference(t), nominal).x, rate, nominal)
+        whole = feedforward.ideal_input(
+            feedforward.initial_state(reference(t), nominal).x, rate, nominal
+        )
         assert np.abs(whole).max() > 0.5
 
 

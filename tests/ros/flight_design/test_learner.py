@@ -14,7 +14,7 @@ from tests.ros.conftest import Start
 from flight_analysis.closed_loop.guidance_replay import replay_guidance
 from flight_analysis.closed_loop.replay import replay
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.closed_loop.scenario_library import find_scenario, written
+from flight_analysis.closed_loop.scenario_library import find_scenario, save_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.fly import fly_over_topics
 from flight_core.channels import UNKNOWN
@@ -36,7 +36,7 @@ def scenario(folder: Path, **learn: object) -> Scenario:
         reference_model={"rate": 100.0},
         controller={"learn": {"updates": [10.0], "latency": 0.5} | learn},
     )
-    return written(learning, folder / "learn.yaml")
+    return save_scenario(learning, folder / "learn.yaml")
 
 
 def test_lockstep_with_a_learner_is_equal_to_the_byte_to_one_process_and_replays_to_the_bit(
@@ -54,7 +54,7 @@ def test_lockstep_with_a_learner_is_equal_to_the_byte_to_one_process_and_replays
             }
         },
     )
-    flight_scenario = written(guided, tmp_path / "learn.yaml")
+    flight_scenario = save_scenario(guided, tmp_path / "learn.yaml")
     events = list[Event]()
     lines = list[str]()
     run = tmp_path / "run"

@@ -31,7 +31,7 @@ from flight_core.vectors import ChannelError, FloatArray, StampedVector
 from reference_model.params import ReferenceModelConfig
 from reference_model.reference import Reference
 from rise_di_controller.extensions import feedforward
-from rise_di_controller.extensions.allocation import Allocation, allocate, reached
+from rise_di_controller.extensions.allocation import Allocation, allocate, limits_of_effectors
 from rise_di_controller.extensions.feedforward import FeedforwardState, Nominal
 from rise_di_controller.guard.guard import LEAST_DT, SAMPLE_BUFFER_SIZE
 from rise_di_controller.law.control_law import Measurements, fields, restored
@@ -111,13 +111,13 @@ def _jumps(unit: FloatArray, rng: np.random.Generator) -> Iterator[FloatArray]:
     One sample of 50, and some samples after, get up to 10^5 units, and are lost.
     """
     m = len(unit)
-    off = np.zeros_like(unit)
+    offset = np.zeros_like(unit)
     while True:
         if rng.random() < 0.02:
-            off = np.where(rng.random(m) < 0.3, unit * 10.0 ** rng.uniform(0.0, 5.0, m), 0.0)
+            offset = np.where(rng.random(m) < 0.3, unit * 10.0 ** rng.uniform(0.0, 5.0, m), 0.0)
         elif rng.random() < 0.4:
-            off = np.zeros(m)
-        yield off
+            offset = np.zeros(m)
+        yield offset
 
 
 def drawn_standstill(
@@ -205,14 +205,14 @@ def drawn_commands(reference: ReferenceModelConfig, steps: int, seed: int) -> Re
     size = np.where(np.isfinite(bounds), bounds, 1.0)
     none = np.zeros(m)
     events: list[tuple[Any, ...]] = [(START, 0, 0, 0, 0, none, none)]
-    refused = []
+    refusals = []
     reals = []
     silence = 0
     for k in range(steps):
         silence -= 1
         if rng.random() < 0.02:
             silence = int(rng.exponential(2.0 * reference.live.max_age * reference.rate))
-        refused.append(0)
+        refusals.append(0)
         if silence <= 0:
             stamp_ns = max(k + round(rng.uniform(-1.5, 0.5)), 0) * model.period_ns
             u_m = rng.uniform(-1.1, 1.1) * size * rng.uniform(0.2, 1.0, m)
@@ -220,11 +220,11 @@ def drawn_commands(reference: ReferenceModelConfig, steps: int, seed: int) -> Re
             try:
                 model.take(stamp_ns, u_m)
             except ChannelError:
-                refused[-1] = 1
+                refusals[-1] = 1
         events.append((STEP_REFERENCE, 0, 0, 0, 0, none, none))
         reals.append(np.concatenate([model.sample(k + 1), model.x_m]))
     names = ("refused", *numbered({"y_m": m, "x_m": len(model.x_m)}))
-    integers = np.array(refused, dtype=np.int64)[:, None]
+    integers = np.array(refusals, dtype=np.int64)[:, None]
     return Recording(
         name="drawn commands",
         names=names,
@@ -263,21 +263,21 @@ def _drawn_states(
     if controller.allocation is not None:
         stops = controller.effector_limits()
         sizes["effectors"] = 0.3 * (stops.upper - stops.lower)[:, None]
-    drawn = {
+    states = {
         name: sizes.get(name, 0.0) * rng.normal(size=(count, steps))
         for name, count in real_groups(controller).items()
     }
-    drawn |= {"sigma": rng.random((1, steps)), "scale": rng.uniform(0.3, 3.0, (m, steps))}
-    drawn |= {"feedforward.dt": dt_ns[None] / NANOSECONDS * rng.random((1, steps))}
-    drawn |= {"feedforward.ticks": rng.integers(0, 5, (1, steps)).astype(np.float64)}
-    drawn["y"] = drawn["y_m"] + drawn["e"]
-    y_m = drawn["y_m"] + 0.1 * size * rng.normal(size=(m, steps))
-    y = y_m + drawn["e"] + 0.1 * size * rng.normal(size=(m, steps))
+    states |= {"sigma": rng.random((1, steps)), "scale": rng.uniform(0.3, 3.0, (m, steps))}
+    states |= {"feedforward.dt": dt_ns[None] / NANOSECONDS * rng.random((1, steps))}
+    states |= {"feedforward.ticks": rng.integers(0, 5, (1, steps)).astype(np.float64)}
+    states["y"] = states["y_m"] + states["e"]
+    y_m = states["y_m"] + 0.1 * size * rng.normal(size=(m, steps))
+    y = y_m + states["e"] + 0.1 * size * rng.normal(size=(m, steps))
     if controller.schedule is not None:
         y[list(controller.outputs).index("V")] += controller.schedule.speed * rng.uniform(
             -1.0, 1.0, steps
         )
-    return drawn, y, y_m
+    return states, y, y_m
 
 
 def _stepped(
@@ -297,35 +297,35 @@ def _stepped(
     zero = np.zeros_like(y)
     state = restored(law.control_law, before)
     u_before = before["u"]
-    held = Measurements(
+    at_last_y = Measurements(
         y=before["y"],
         y_m=before["y_m"],
         y_m_dot=zero,
         u_trim=before["u_trim"] + before["u_ff"],
         u_before=u_before,
     )
-    missed = np.round(dt / period) - 1.0
-    for k in range(round(missed.max())):
-        state = _chosen(k < missed, law.control_law.missed(state, held, params), state)
+    lost_periods = np.round(dt / period) - 1.0
+    for k in range(round(lost_periods.max())):
+        state = _where(k < lost_periods, law.control_law.missed(state, at_last_y, params), state)
     u_ff, model_state = _fed_forward(guard.nominal, before, y_m, dt)
     u_trim = before["u_trim"] if guard.nominal is None else before["u_trim"] + u_ff
-    measured = Measurements(y=y, y_m=y_m, y_m_dot=zero, u_trim=u_trim, u_before=u_before)
-    stepped, u_free = law.control_law.step(state, measured, dt, params)
+    measurements = Measurements(y=y, y_m=y_m, y_m_dot=zero, u_trim=u_trim, u_before=u_before)
+    stepped, u_free = law.control_law.step(state, measurements, dt, params)
     last = before.get("effectors")
-    u, _ = _given(saturate(u_free, u_before, dt, limits), last, dt, guard.allocation)
-    limited = (u != u_free).any(axis=0)
-    limits = limits if guard.allocation is None else reached(u_free, u)
+    u, _ = _effector_values(saturate(u_free, u_before, dt, limits), last, dt, guard.allocation)
+    is_limited = (u != u_free).any(axis=0)
+    limits = limits if guard.allocation is None else limits_of_effectors(u_free, u)
     stepped_limited, u_free_limited, u_limited = law.control_law.limited(
-        state, measured, dt, params, limits
+        state, measurements, dt, params, limits
     )
-    u, effectors = _given(np.where(limited, u_limited, u), last, dt, guard.allocation)
+    u, effectors = _effector_values(np.where(is_limited, u_limited, u), last, dt, guard.allocation)
     after = {
         **before,
         "u": u,
-        "u_free": np.where(limited, u_free_limited, u_free),
+        "u_free": np.where(is_limited, u_free_limited, u_free),
         "u_ff": u_ff,
         **({} if effectors is None else {"effectors": effectors}),
-        **fields(_chosen(limited, stepped_limited, stepped)),
+        **fields(_where(is_limited, stepped_limited, stepped)),
         **model_state,
     }
     output = {
@@ -359,7 +359,7 @@ def _fed_forward(
     return u_ff, {f"feedforward.{name}": np.atleast_2d(value) for name, value in states}
 
 
-def _given(
+def _effector_values(
     u: FloatArray, before: FloatArray | None, dt: FloatArray, params: Allocation | None
 ) -> tuple[FloatArray, FloatArray | None]:
     """The u of the effectors for a u, and the effectors, by column.
@@ -381,8 +381,8 @@ def _columns(params: Any) -> Any:
     return params[:, None] if isinstance(params, np.ndarray) and params.ndim == 1 else params
 
 
-def _chosen(mask: NDArray[np.bool_], chosen: Any, otherwise: Any) -> Any:
-    """The state `chosen` where the mask is true, by step."""
-    if hasattr(chosen, "_asdict"):
-        return type(chosen)(*(_chosen(mask, *pair) for pair in zip(chosen, otherwise, strict=True)))
-    return np.where(mask, chosen, otherwise)
+def _where(mask: NDArray[np.bool_], here: Any, otherwise: Any) -> Any:
+    """The state `here` where the mask is true, by step."""
+    if hasattr(here, "_asdict"):
+        return type(here)(*(_where(mask, *pair) for pair in zip(here, otherwise, strict=True)))
+    return np.where(mask, here, otherwise)

@@ -174,12 +174,12 @@ class Recorder(Controller):
     ) -> str:
         self._refused = 2 * self._refused % REFUSALS
         try:
-            lost = take(sample, now_ns)
+            reason = take(sample, now_ns)
         except ChannelError:
             self._refused += 1
             raise
-        self._refused += bool(lost)
-        return lost
+        self._refused += bool(reason)
+        return reason
 
     def retune_to(self, index: int) -> None:
         """Take the parameters of an index of `sets`."""
@@ -311,14 +311,14 @@ def flight_recordings(
     engagement, tight limits.
     """
     sensors = scenario.aircraft.sensors.model_dump() | {"dropout": 0.1}
-    yield _flown("the flight", scenario, Recorder(sets, samples=samples))
+    yield _flight("the flight", scenario, Recorder(sets, samples=samples))
     lossy = scenario.vary(aircraft={"sensors": sensors})
-    yield _flown("a tenth of y lost", lossy, Recorder(sets, samples=samples))
+    yield _flight("a tenth of y lost", lossy, Recorder(sets, samples=samples))
     faults = _faults(scenario.flight.duration, sets)
-    yield _flown("faults", scenario, Recorder(sets, faults, samples))
+    yield _flight("faults", scenario, Recorder(sets, faults, samples))
 
 
-def _flown(name: str, scenario: Scenario, recorder: Recorder) -> Recording:
+def _flight(name: str, scenario: Scenario, recorder: Recorder) -> Recording:
     simulate(scenario, control=lambda _: recorder)
     return recorder.recording(name)
 
@@ -329,7 +329,7 @@ def _faults(duration: float, sets: Sequence[RiseDiConfig]) -> Callable[[Recorder
     within_hold = controller.max_age + 0.5 * controller.hold
     in_ramp = controller.max_age + controller.hold + 0.5 * controller.ramp
     past_ramp = controller.max_age + controller.hold + controller.ramp + 0.2
-    lost = {
+    losses = {
         0.25: ({"y"}, within_hold),
         0.35: ({"y_m"}, in_ramp),
         0.5: ({"y"}, past_ramp),
@@ -342,7 +342,7 @@ def _faults(duration: float, sets: Sequence[RiseDiConfig]) -> Callable[[Recorder
         t = now_ns / NANOSECONDS
         silent = [
             names
-            for part, (names, length) in lost.items()
+            for part, (names, length) in losses.items()
             if part * duration <= t < part * duration + length
         ]
         recorder.silent = frozenset().union(*silent)

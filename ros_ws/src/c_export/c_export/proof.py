@@ -97,12 +97,12 @@ def write_code(
     return [folder / name for name in (*CODE, PARAMETERS)]
 
 
-def compilers(named: Sequence[str] = ()) -> list[list[str]]:
+def compilers(names: Sequence[str] = ()) -> list[list[str]]:
     """Commands of the C compilers: `names`, or the COMPILERS on the PATH.
 
     Raises ParameterError for none.
     """
-    commands = [words(command) for command in named] or [
+    commands = [words(command) for command in names] or [
         [name] for name in COMPILERS if shutil.which(name)
     ]
     if not commands:
@@ -311,8 +311,8 @@ def proof_report(proof: Proof, scenario: str) -> str:
         compiler = f", {proof.compilers[k % len(proof.compilers)]}" if several else ""
         difference = f", {comparison.differing} differ"
         if proof.float32:
-            reached = f"{comparison.deviation:.2g} of its range, bound {FLOAT32_BOUND:.2g}"
-            difference = f"; u within {reached}"
+            part_of_range = f"{comparison.deviation:.2g} of its range, bound {FLOAT32_BOUND:.2g}"
+            difference = f"; u within {part_of_range}"
         ticks = f"{comparison.ticks} ticks, {comparison.values} values"
         lines.append(f"{comparison.name}{compiler}: {ticks}{difference}")
         if comparison.first is not None and not comparison.holds(float32=proof.float32):
@@ -357,16 +357,16 @@ def footprint(code: Path, compiler: Sequence[str], folder: Path) -> dict[str, in
         build([*compiler, *FLAGS, "-fstack-usage", "-c", "-o", "rise_di.o", "rise_di.c"], folder)
     except ParameterError:  # a compiler without -fstack-usage
         build([*compiler, *FLAGS, "-c", "-o", "rise_di.o", "rise_di.c"], folder)
-    known = {}
+    sizes = {}
     usage = folder / "rise_di.su"
     if usage.is_file():
         lines = [line.split("\t") for line in usage.read_text(encoding="utf-8").splitlines()]
-        known["stack_bytes"] = sum(int(line[1]) for line in lines)
+        sizes["stack_bytes"] = sum(int(line[1]) for line in lines)
     if (size := shutil.which("size")) is not None:
         process = subprocess.run(  # noqa: S603 - of binutils
             [size, "rise_di.o"], cwd=folder, capture_output=True, text=True, check=False
         )
         if not process.returncode:  # not of a file for a different machine
             text, data, bss = (int(word) for word in process.stdout.splitlines()[1].split()[:3])
-            known |= {"code_bytes": text, "data_bytes": data + bss}
-    return known
+            sizes |= {"code_bytes": text, "data_bytes": data + bss}
+    return sizes

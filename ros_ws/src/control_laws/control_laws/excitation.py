@@ -81,22 +81,22 @@ def multisine(
     return harmonic, phase, np.full(len(k), 1.0 / peak)
 
 
-def _engage(measured: Measurements, params: ExcitationParams) -> ExcitationState:
-    e = measured.y - measured.y_m
+def _engage(measurements: Measurements, params: ExcitationParams) -> ExcitationState:
+    e = measurements.y - measurements.y_m
     return ExcitationState(e, 0.0 * e)
 
 
 def _limited(
     state: ExcitationState,
-    measured: Measurements,
+    measurements: Measurements,
     dt: Array,
     params: ExcitationParams,
     limits: Limits,
 ) -> tuple[ExcitationState, Array, Array]:
     elapsed = state.elapsed + dt
-    u = measured.u_trim + params.amplitude * signal(elapsed, params)
-    after = ExcitationState(measured.y - measured.y_m, elapsed)
-    return after, u, saturate(u, measured.u_before, dt, limits)
+    u = measurements.u_trim + params.amplitude * signal(elapsed, params)
+    after = ExcitationState(measurements.y - measurements.y_m, elapsed)
+    return after, u, saturate(u, measurements.u_before, dt, limits)
 
 
 def _retune(

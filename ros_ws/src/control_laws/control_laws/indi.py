@@ -48,21 +48,23 @@ def control_law(model: NominalModel) -> ControlLaw:
     """
     inverse = model.inverse
 
-    def engage(measured: Measurements, params: IndiParams) -> IndiState:
+    def engage(measurements: Measurements, params: IndiParams) -> IndiState:
         return IndiState(
-            measured.y, array_namespace(measured.y).zeros_like(measured.y), measured.position
+            measurements.y,
+            array_namespace(measurements.y).zeros_like(measurements.y),
+            measurements.position,
         )
 
     def limited(
-        state: IndiState, measured: Measurements, dt: Array, params: IndiParams, limits: Limits
+        state: IndiState, measurements: Measurements, dt: Array, params: IndiParams, limits: Limits
     ) -> tuple[IndiState, Array, Array]:
         a = filter_gain(params.bandwidth, dt)
-        y_dot = state.y_dot + a * ((measured.y - state.y) / dt - state.y_dot)
-        position = state.position + a * (measured.position - state.position)
-        nu = measured.y_m_dot - params.K * (measured.y - measured.y_m) - y_dot
+        y_dot = state.y_dot + a * ((measurements.y - state.y) / dt - state.y_dot)
+        position = state.position + a * (measurements.position - state.position)
+        nu = measurements.y_m_dot - params.K * (measurements.y - measurements.y_m) - y_dot
         u_free = position + params.share * (inverse @ nu)
-        u, _ = saturate_with_excess(u_free, measured, dt, limits)
-        return IndiState(measured.y, y_dot, position), u_free, u
+        u, _ = saturate_with_excess(u_free, measurements, dt, limits)
+        return IndiState(measurements.y, y_dot, position), u_free, u
 
     return campaign_law(IndiState, engage, limited)
 

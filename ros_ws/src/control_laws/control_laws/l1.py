@@ -55,38 +55,40 @@ def _control_law(*, feedforward: bool) -> ControlLaw:
     saturation. Source: N. Hovakimyan, C. Cao, "L1 Adaptive Control Theory", SIAM 2010, section 3.3.
     """
 
-    def engage(measured: Measurements, params: L1Params) -> L1State:
-        e = measured.y - measured.y_m
+    def engage(measurements: Measurements, params: L1Params) -> L1State:
+        e = measurements.y - measurements.y_m
         zero = array_namespace(e).zeros_like(e)
         return L1State(
             e=e,
-            y_before=measured.y,
-            y_dot_u=params.Omega @ measured.u_before + zero,
+            y_before=measurements.y,
+            y_dot_u=params.Omega @ measurements.u_before + zero,
             sigma_hat=zero,
             sigma_f=-params.K * e,
         )
 
     def limited(
-        state: L1State, measured: Measurements, dt: Array, params: L1Params, limits: Limits
+        state: L1State, measurements: Measurements, dt: Array, params: L1Params, limits: Limits
     ) -> tuple[L1State, Array, Array]:
-        xp = array_namespace(measured.y)
-        e = measured.y - measured.y_m
-        error = state.y_before + dt * state.y_dot_u - measured.y
+        xp = array_namespace(measurements.y)
+        e = measurements.y - measurements.y_m
+        error = state.y_before + dt * state.y_dot_u - measurements.y
         a = ADAPTATION_POLE + xp.zeros_like(params.K)
         sigma_hat = -a * xp.exp(-a * dt) / filter_gain(a, dt) * error
         u_r = (
-            measured.u_trim if feedforward else measured.u_trim + params.inverse @ measured.y_m_dot
+            measurements.u_trim
+            if feedforward
+            else measurements.u_trim + params.inverse @ measurements.y_m_dot
         )
-        sigma_r = measured.y_m_dot - params.Omega @ u_r
+        sigma_r = measurements.y_m_dot - params.Omega @ u_r
         sigma_f = state.sigma_f + filter_gain(params.bandwidth, dt) * (
             sigma_hat - sigma_r - state.sigma_f
         )
         u_free = u_r - params.inverse @ (params.K * e + sigma_f)
-        u, _ = saturate_with_excess(u_free, measured, dt, limits)
+        u, _ = saturate_with_excess(u_free, measurements, dt, limits)
         return (
             L1State(
                 e=e,
-                y_before=measured.y,
+                y_before=measurements.y,
                 y_dot_u=params.Omega @ u,
                 sigma_hat=sigma_hat,
                 sigma_f=sigma_f,

@@ -24,11 +24,11 @@ class LqgState(NamedTuple):
 
 
 def _limited(
-    state: LqgState, measured: Measurements, dt: Array, params: LqgParams, limits: Limits
+    state: LqgState, measurements: Measurements, dt: Array, params: LqgParams, limits: Limits
 ) -> tuple[LqgState, Array, Array]:
     """U = u_trim, shape (m,), saturated. u_trim contains u_o of the observer."""
-    u, _ = saturate_with_excess(measured.u_trim, measured, dt, limits)
-    return state, measured.u_trim, u
+    u, _ = saturate_with_excess(measurements.u_trim, measurements, dt, limits)
+    return state, measurements.u_trim, u
 
 
 CONTROL_LAW = ControlLaw(

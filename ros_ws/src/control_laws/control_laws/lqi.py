@@ -45,23 +45,27 @@ def control_law(_: NominalModel, *, vanes: bool) -> ControlLaw:
     """
 
     def limited(
-        state: ErrorIntegral, measured: Measurements, dt: Array, params: LqiParams, limits: Limits
+        state: ErrorIntegral,
+        measurements: Measurements,
+        dt: Array,
+        params: LqiParams,
+        limits: Limits,
     ) -> tuple[ErrorIntegral, Array, Array]:
-        xp = array_namespace(measured.y)
-        e = measured.y - measured.y_m
+        xp = array_namespace(measurements.y)
+        e = measurements.y - measurements.y_m
         increment = dt * (e + state.e) / 2.0
         integral_e = state.integral_e + increment
         none = xp.zeros_like(e)
         z = xp.concat(
             [
-                state_of(measured, vanes=vanes),
-                measured.y_m + none,
-                measured.y_m_dot + none,
+                state_of(measurements, vanes=vanes),
+                measurements.y_m + none,
+                measurements.y_m_dot + none,
                 integral_e,
             ]
         )
-        u_free = measured.u_trim - xp.sum(params.gain * z[None, :, :], axis=1)
-        u, excess = saturate_with_excess(u_free, measured, dt, limits)
+        u_free = measurements.u_trim - xp.sum(params.gain * z[None, :, :], axis=1)
+        u, excess = saturate_with_excess(u_free, measurements, dt, limits)
         m = e.shape[0]
         integral_gain = xp.stack(
             [params.gain[i, params.gain.shape[1] - m + i, :] for i in range(m)]

@@ -56,30 +56,30 @@ def control_law(model: NominalModel, *, ideal: bool) -> ControlLaw:
     Omega = model.Omega
     inverse = model.inverse
 
-    def engage(measured: Measurements, params: MacKunisParams) -> MacKunisState:
-        e = measured.y - measured.y_m
+    def engage(measurements: Measurements, params: MacKunisParams) -> MacKunisState:
+        e = measurements.y - measurements.y_m
         zero = array_namespace(e).zeros_like(e)
         return MacKunisState(e_0=e, e=e, e_dot=zero, integral_e=zero, Pi=zero)
 
     def limited(
         state: MacKunisState,
-        measured: Measurements,
+        measurements: Measurements,
         dt: Array,
         params: MacKunisParams,
         limits: Limits,
     ) -> tuple[MacKunisState, Array, Array]:
-        xp = array_namespace(measured.y)
-        e = measured.y - measured.y_m
+        xp = array_namespace(measurements.y)
+        e = measurements.y - measurements.y_m
         e_dot = state.e_dot + filter_gain(params.bandwidth, dt) * ((e - state.e) / dt - state.e_dot)
-        r = (measured.y_dot - measured.y_m_dot if ideal else e_dot) + params.Lambda * e
+        r = (measurements.y_dot - measurements.y_m_dot if ideal else e_dot) + params.Lambda * e
         unit = xp.ones_like(e)
         Pi_step = dt * params.beta * xp.minimum(xp.maximum(r / params.eps, -unit), unit)
         increment = dt * (e + state.e) / 2.0
         integral_e = state.integral_e + increment
         Pi = state.Pi + Pi_step
         nu = -params.K * (e - state.e_0 + params.Lambda * integral_e) - Pi
-        u_free = measured.u_trim + inverse @ nu
-        u, excess = saturate_with_excess(u_free, measured, dt, limits)
+        u_free = measurements.u_trim + inverse @ nu
+        u, excess = saturate_with_excess(u_free, measurements, dt, limits)
         y_dot_excess = Omega @ excess
         integral_e = conditional_integration(state.integral_e, integral_e, -increment, y_dot_excess)
         Pi = conditional_integration(state.Pi, Pi, -Pi_step, y_dot_excess)

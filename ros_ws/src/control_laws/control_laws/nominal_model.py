@@ -84,31 +84,31 @@ class ErrorIntegral(NamedTuple):
     integral_e: Array
 
 
-def start_integral(measured: Measurements, _: Any) -> ErrorIntegral:
+def start_integral(measurements: Measurements, _: Any) -> ErrorIntegral:
     """The state at engagement."""
-    e = measured.y - measured.y_m
+    e = measurements.y - measurements.y_m
     return ErrorIntegral(e, array_namespace(e).zeros_like(e))
 
 
-def state_of(measured: Measurements, *, vanes: bool = False) -> Array:
+def state_of(measurements: Measurements, *, vanes: bool = False) -> Array:
     """The full state, shape (n, N), with `vanes` relative to the air.
 
     Raises ValueError where x is not measured.
     """
-    x = measured.x_air if vanes else measured.x
+    x = measurements.x_air if vanes else measurements.x
     if x is None:
         raise ValueError("measurements: found no state, expected the full state")
     return x
 
 
 def saturate_with_excess(
-    u: Array, measured: Measurements, dt: Array, limits: Limits
+    u: Array, measurements: Measurements, dt: Array, limits: Limits
 ) -> tuple[Array, Array]:
     """Saturation of u, shape (m,).
 
     The results are the commanded u inside the limits, and the excess of the requested u.
     """
-    commanded = saturation.saturate(u, measured.u_before, dt, limits)
+    commanded = saturation.saturate(u, measurements.u_before, dt, limits)
     return commanded, u - commanded
 
 

@@ -189,16 +189,16 @@ def aircraft_observer(model: NominalModel, names: Names, weights: Weights) -> Ob
     `loose` the states, and e has the noise of the model. Source: H. Kwakernaak, R. Sivan, "Linear
     Optimal Control Systems", ch. 5 and 6.
     """
-    sampled = aircraft_model(model, names, weights.wind_time)
+    model_by_tick = aircraft_model(model, names, weights.wind_time)
     return ObserverDesign(
-        *sampled,
-        aircraft_correction(sampled, model, weights),
-        feedback_gain(sampled, model, weights.effort),
+        *model_by_tick,
+        aircraft_correction(model_by_tick, model, weights),
+        feedback_gain(model_by_tick, model, weights.effort),
     )
 
 
 def aircraft_correction(
-    sampled: ObserverModel,
+    model_by_tick: ObserverModel,
     model: NominalModel,
     weights: Weights,
     correction: Correction = correction_of,
@@ -211,11 +211,11 @@ def aircraft_correction(
         weights.gust,
         weights.drift * (model.C @ model.size),
     ]
-    return _correction(sampled, model, intensities, correction)
+    return _correction(model_by_tick, model, intensities, correction)
 
 
 def vane_correction(
-    sampled: ObserverModel,
+    model_by_tick: ObserverModel,
     model: NominalModel,
     weights: tuple[Weights, Weights],
     row: FloatArray,
@@ -227,19 +227,19 @@ def vane_correction(
     reading beyond the reference motion is `row` z, (s,), with white `noise`, rms. `weights` without
     and with the vane.
     """
-    alone = aircraft_correction(sampled, model, weights[0])
-    with_vane = sampled._replace(H=np.vstack([sampled.H, row]))
+    without_vane = aircraft_correction(model_by_tick, model, weights[0])
+    with_vane = model_by_tick._replace(H=np.vstack([model_by_tick.H, row]))
     both = aircraft_correction(
         with_vane, model._replace(noise=np.append(model.noise, noise)), weights[1]
     )
-    return np.asarray(both - np.column_stack([alone, np.zeros(len(alone))]))
+    return np.asarray(both - np.column_stack([without_vane, np.zeros(len(without_vane))]))
 
 
 def extended_state_observer(
     model: NominalModel, names: Names, weights: ExtendedStateWeights
 ) -> ObserverDesign:
     """The observer over `extended_state_model`, with gains as in `aircraft_observer`."""
-    sampled = extended_state_model(model, names, weights.decay)
+    model_by_tick = extended_state_model(model, names, weights.decay)
     size = model.C @ model.size
     intensities = [
         0.0 * size,
@@ -247,21 +247,26 @@ def extended_state_observer(
         weights.drift * size,
         weights.rate_drift * size,
     ]
-    L = _correction(sampled, model, intensities)
-    return ObserverDesign(*sampled, L, feedback_gain(sampled, model, weights.effort))
+    L = _correction(model_by_tick, model, intensities)
+    return ObserverDesign(*model_by_tick, L, feedback_gain(model_by_tick, model, weights.effort))
 
 
-def feedback_gain(sampled: ObserverModel, model: NominalModel, effort: FloatArray) -> FloatArray:
+def feedback_gain(
+    model_by_tick: ObserverModel, model: NominalModel, effort: FloatArray
+) -> FloatArray:
     """F of `aircraft_observer`, shape (.., m, s), for `effort` (.., m), s."""
     size = model.C @ model.size
-    Q = transpose(sampled.H) @ np.diag(1.0 / size**2) @ sampled.H
+    Q = transpose(model_by_tick.H) @ np.diag(1.0 / size**2) @ model_by_tick.H
     return gain_of(
-        sampled.Phi, sampled.Gamma, Q, diagonal((effort / model.input_scale / size) ** 2)
+        model_by_tick.Phi,
+        model_by_tick.Gamma,
+        Q,
+        diagonal((effort / model.input_scale / size) ** 2),
     )
 
 
 def _correction(
-    sampled: ObserverModel,
+    model_by_tick: ObserverModel,
     model: NominalModel,
     intensities: list[FloatArray],
     correction: Correction = correction_of,
@@ -276,5 +281,8 @@ def _correction(
         axis=-1,
     )
     return correction(
-        sampled.Phi, sampled.H, diagonal(process**2 * model.period), np.diag(model.noise**2)
+        model_by_tick.Phi,
+        model_by_tick.H,
+        diagonal(process**2 * model.period),
+        np.diag(model.noise**2),
     )

@@ -42,21 +42,23 @@ def _u(state: PiState, params: PiParams) -> Array:
     )
 
 
-def _engage(measured: Measurements, params: PiParams) -> PiState:
-    e = measured.y - measured.y_m
+def _engage(measurements: Measurements, params: PiParams) -> PiState:
+    e = measurements.y - measurements.y_m
     return PiState(e, e, array_namespace(e).zeros_like(e))
 
 
 def _limited(
-    state: PiState, measured: Measurements, dt: Array, params: PiParams, limits: Limits
+    state: PiState, measurements: Measurements, dt: Array, params: PiParams, limits: Limits
 ) -> tuple[PiState, Array, Array]:
     """PI: u = u_trim - input_scale D K (e - e_0 + Lambda integral of e).
 
     The integral is a trapezoid with anti-windup (`limited_integral`).
     """
-    e = measured.y - measured.y_m
+    e = measurements.y - measurements.y_m
     after = PiState(state.e_0, e, state.integral_e + dt * (e + state.e) / 2.0)
-    _, excess = saturate_with_excess(measured.u_trim + _u(after, params), measured, dt, limits)
+    _, excess = saturate_with_excess(
+        measurements.u_trim + _u(after, params), measurements, dt, limits
+    )
     change = (
         -params.input_scale
         * params.D
@@ -67,8 +69,8 @@ def _limited(
     after = after._replace(
         integral_e=limited_integral(state.integral_e, after.integral_e, change, excess)
     )
-    u_free = measured.u_trim + _u(after, params)
-    u, _ = saturate_with_excess(u_free, measured, dt, limits)
+    u_free = measurements.u_trim + _u(after, params)
+    u, _ = saturate_with_excess(u_free, measurements, dt, limits)
     return after, u_free, u
 
 
@@ -77,8 +79,8 @@ def _retune(state: PiState, old: PiParams, new: PiParams) -> PiState:
 
     e_0 takes the difference, so Lambda may be 0.
     """
-    asked = -new.D * _u(state, old) / (new.input_scale * new.K)
-    return state._replace(e_0=state.e + new.Lambda * state.integral_e - asked)
+    start_error = -new.D * _u(state, old) / (new.input_scale * new.K)
+    return state._replace(e_0=state.e + new.Lambda * state.integral_e - start_error)
 
 
 CONTROL_LAW = ControlLaw(

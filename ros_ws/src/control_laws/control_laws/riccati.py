@@ -33,11 +33,11 @@ def riccati(F: FloatArray, G: FloatArray, Q: FloatArray, R: FloatArray) -> Float
     gramian = G @ np.linalg.solve(R, transpose(G))
     for _ in range(MAX_DOUBLINGS):
         solved = np.linalg.solve(eye + gramian @ P, np.concatenate([transition, gramian], axis=-1))
-        moved = solved[..., :s]
-        reached = solved[..., s:]
-        more = transpose(transition) @ P @ moved
-        gramian = gramian + transition @ reached @ transpose(transition)
-        transition = transition @ moved
+        step = solved[..., :s]
+        reach = solved[..., s:]
+        more = transpose(transition) @ P @ step
+        gramian = gramian + transition @ reach @ transpose(transition)
+        transition = transition @ step
         P = P + (more + transpose(more)) / 2.0
         if (np.abs(more) <= 1e-13 * np.abs(P).max(axis=(-1, -2), keepdims=True)).all():
             break

@@ -213,8 +213,8 @@ def engagements(tape: Tape) -> list[Transient]:
     """Instants of engagement of the controller, from the modes in `internals`."""
     if "internals" not in tape:
         return []
-    engaged = tape["internals"]["mode"] == Mode.ENGAGED
-    begins = engaged & ~np.concatenate([[False], engaged[:-1]])
+    is_engaged = tape["internals"]["mode"] == Mode.ENGAGED
+    begins = is_engaged & ~np.concatenate([[False], is_engaged[:-1]])
     return [Transient("engagement", "", float(t), float(t)) for t in tape.time("internals")[begins]]
 
 
@@ -231,8 +231,8 @@ def live_commands(tape: Tape) -> list[Transient]:
     # the attitude, which never rests
     attitude = () if "y_m" not in tape else set(u_m.names) - set(tape["y_m"].names)
     for name in [name for name in u_m.names if name not in attitude]:
-        moved = np.concatenate([u_m[name][:1] != 0.0, np.diff(u_m[name]) != 0.0])
-        instants = t[moved]
+        is_change = np.concatenate([u_m[name][:1] != 0.0, np.diff(u_m[name]) != 0.0])
+        instants = t[is_change]
         groups = np.split(instants, np.flatnonzero(np.diff(instants) > SETTLING_DWELL) + 1)
         commands += [
             Transient("command", name, float(group[0]), float(group[-1]))
@@ -465,12 +465,12 @@ def settling_times(tape: Tape, transients: Sequence[Transient]) -> list[Settling
     bands = settling_bands(tape)
     end = float(t[-1]) if len(t) else 0.0
     results = []
-    judged = [
+    events = [
         transient
         for transient in transients
         if transient.start <= end and transient.kind not in {"turn", "capture"}
     ]
-    for transient in sorted(judged, key=attrgetter("start")):
+    for transient in sorted(events, key=attrgetter("start")):
         start = transient.start
         leaves = transient.stop + SETTLING_DWELL - transient.start
         until = {}

@@ -13,7 +13,7 @@ from rich.console import Console
 
 from flight_analysis.closed_loop.learning_loop import Learn
 from flight_analysis.closed_loop.scenario import Scenario, limits_beyond_stops, opposite_signs
-from flight_analysis.closed_loop.scenario_library import find_scenario, with_route, written
+from flight_analysis.closed_loop.scenario_library import find_scenario, save_scenario, with_route
 from flight_analysis.report.run_folder import (
     UnwrittenReportError,
     new_run,
@@ -129,7 +129,7 @@ class Fly(RouteWords):
         run = new_run(chosen, self.runs)
         self.context.call_on_close(partial(remove_empty, run))
         if self.route or self.fence or self.settings or self.learn:
-            chosen = written(chosen, run / f"{chosen.name}.yaml")
+            chosen = save_scenario(chosen, run / f"{chosen.name}.yaml")
         self._watch(run)
         with flight_progress(chosen.flight.duration, quiet=self.as_json) as (progress, announce):
             if self.in_process:

@@ -277,7 +277,7 @@ class Identify:
                     margin if self.observer or self.learn else None,
                     guided=self.guidance,
                     learns=self.learn,
-                    needed=self._needed(),
+                    requirement=self._needed(),
                     named=named_properties(texts, "--command"),
                 )
         except FlightEnded as error:

@@ -146,17 +146,17 @@ class ReferenceModelConfig(NodeConfig):
                 f"a whole fraction of rate ({self.rate:g} Hz)",
             )
         turn = self.coordinated_turn
-        named = {f"pulses.{name}": name for name in self.pulses} | {
+        names = {f"pulses.{name}": name for name in self.pulses} | {
             f"sines.{name}": name for name in self.sines
         }
         if turn is not None:
-            named |= {
+            names |= {
                 "coordinated_turn.bank_rate": turn.bank_rate,
                 "coordinated_turn.turn_rate": turn.turn_rate,
             }
-        named |= {f"live.bounds.{name}": name for name in self.live.bounds}
-        named |= {f"live.slew.{name}": name for name in self.live.slew}
-        for key, name in named.items():
+        names |= {f"live.bounds.{name}": name for name in self.live.bounds}
+        names |= {f"live.slew.{name}": name for name in self.live.slew}
+        for key, name in names.items():
             require(
                 name in self.outputs, key, f"channel {name!r}", f"one of {', '.join(self.outputs)}"
             )

@@ -104,27 +104,27 @@ def export(
         >>> exported.files[0].name
         'rise_di.h'
     """
-    chosen = find_scenario(scenario)
-    if run is not None and chosen.learns():
-        chosen = with_last_model(chosen, run if isinstance(run, RecordedRun) else read_run(run))
+    source = find_scenario(scenario)
+    if run is not None and source.learns():
+        source = with_last_model(source, run if isinstance(run, RecordedRun) else read_run(run))
         run = None  # several models flew in its ticks: the proof flies the last one
     if rate is not None:
-        chosen = at_rate(chosen, rate)
+        source = at_rate(source, rate)
     folder = as_path(folder, "c", "the path of a folder")
-    title = printable(chosen.name)  # of a file, whose name may hold any character
-    controller = exportable(chosen.controller)
+    title = printable(source.name)  # of a file, whose name may hold any character
+    controller = exportable(source.controller)
     commands = compilers(compiler) if proof or fmu else []
     starter = words(runner, "runner", "a command such as qemu-aarch64") if runner else []
-    code, files, kept = _write(chosen, folder, autopilot, samples, float32=float32)
+    code, files, buffer_size = _write(source, folder, autopilot, samples, float32=float32)
     if fmu:
-        units = _units(chosen, controller)
+        units = _units(source, controller)
         files.append(build_fmu(code, commands[0], controller, title, folder / FMU, units))
     if not proof:
         return Exported(files, None, "")
     if run is None:
-        length = min(chosen.flight.duration, LONGEST) if duration is None else duration
-        flight = chosen.vary(flight={"duration": length})
-        material = _flown(flight, 0 if float32 else drawn, seed, kept)
+        length = min(source.flight.duration, LONGEST) if duration is None else duration
+        flight = source.vary(flight={"duration": length})
+        material = _flights(flight, 0 if float32 else drawn, seed, buffer_size)
     else:
         material = _logged(run, controller, title)
     proved = prove(
@@ -163,16 +163,16 @@ def _write(
 ) -> tuple[Path, list[Path], int]:
     """Write the code, alone or for an autopilot: its folder, all files, and the samples kept."""
     if autopilot is None:
-        kept = samples or SAMPLE_BUFFER_SIZE
+        buffer_size = samples or SAMPLE_BUFFER_SIZE
         controller = exportable(scenario.controller)
         title = printable(scenario.name)
         model = scenario.reference_model
-        files = write_code(controller, title, folder, model, float32=float32, samples=kept)
-        return folder, files, kept
+        files = write_code(controller, title, folder, model, float32=float32, samples=buffer_size)
+        return folder, files, buffer_size
     require(autopilot in SHELLS, "autopilot", autopilot, f"one of {', '.join(SHELLS)}")
-    kept = samples or SAMPLES
-    files = write_module(autopilot, scenario, folder, float32=float32, samples=kept)
-    return folder / SHELLS[autopilot].place, files, kept
+    buffer_size = samples or SAMPLES
+    files = write_module(autopilot, scenario, folder, float32=float32, samples=buffer_size)
+    return folder / SHELLS[autopilot].place, files, buffer_size
 
 
 def _units(scenario: Scenario, controller: RiseDiConfig) -> Units:
@@ -195,7 +195,7 @@ def _logged(run: FilePath | RecordedRun, controller: RiseDiConfig, title: str) -
     return Material(sets, iter([recording]), line)
 
 
-def _flown(scenario: Scenario, drawn: int, seed: int, samples: int) -> Material:
+def _flights(scenario: Scenario, drawn: int, seed: int, samples: int) -> Material:
     """Flights of a scenario and drawn inputs, with changes of the parameters."""
     sets = parameter_sets(exportable(scenario.controller))
     return Material(sets, _recordings(scenario, sets, drawn, seed, samples), "")

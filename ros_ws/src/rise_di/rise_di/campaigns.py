@@ -111,20 +111,20 @@ def fly_campaign(
         2
     """
     engines.require_jax()
-    chosen = find_scenario(scenario, duration)
-    spread = chosen.aircraft.uncertainty.spread()
+    source = find_scenario(scenario, duration)
+    spread = source.aircraft.uncertainty.spread()
     if entries is not None:
         spread = spread._replace(entries=_numbers(entries, "entries", '{"A[q,alpha]": 0.6}'))
     if distribution is not None:
         spread = spread._replace(distribution=distribution)
     units = None if score is None else _numbers(score, "score", '{"q": 0.02}')
     definition = define(
-        chosen, aircraft, uncertainty, seed, chunk, _sweep(sweep), wind, spread, units
+        source, aircraft, uncertainty, seed, chunk, _sweep(sweep), wind, spread, units
     )
-    quick_learner(chosen)  # refuses what the aircraft could not learn with
+    quick_learner(source)  # refuses what the aircraft could not learn with
     flies = _engine(definition, workers)
     report = _progress(progress)
-    folder = new_run(chosen, as_path(runs, "runs", "the path of a folder"), "campaign-")
+    folder = new_run(source, as_path(runs, "runs", "the path of a folder"), "campaign-")
     return _fly(Campaign.begin(folder, definition), flies, report)
 
 
@@ -158,8 +158,8 @@ def resume_campaign(
 def _engine(definition: Definition, workers: int | None) -> engines.Engine:
     """Threads of this process; with a learner or a route, processes of this machine."""
     count = None if workers is None else as_count(workers, "workers", 1)
-    alone = flies_alone(definition.scenario())
-    return engines.dask(count, on_devices=False) if alone else engines.threads(count)
+    is_single = flies_alone(definition.scenario())
+    return engines.dask(count, on_devices=False) if is_single else engines.threads(count)
 
 
 def _progress(progress: Progress | None) -> Progress:
@@ -197,9 +197,9 @@ def _fly(campaign: Campaign, engine: engines.Engine, progress: Progress) -> Camp
     definition = campaign.definition
     missing = campaign.missing()
     total = definition.aircraft * definition.cases
-    flown = total - sum(definition.size(job) for job in missing)
+    count = total - sum(definition.size(job) for job in missing)
     for flights in campaign.fly(engine, quick_learner):
-        flown += flights
-        progress(flown, total)
+        count += flights
+        progress(count, total)
     figures, _ = write_results(campaign)
     return CampaignResult(campaign.folder, campaign.folder / REPORT, figures)

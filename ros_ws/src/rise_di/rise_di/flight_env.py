@@ -241,8 +241,8 @@ class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
             "sensors": self.scenario.aircraft.sensors.model_dump() | {"seed": seed}
         }
         if not self.scenario.aircraft.is_jsbsim:
-            drawn = {"A": self._uncertainty, "B": self._uncertainty, "number": number}
-            aircraft["uncertainty"] = self.scenario.aircraft.uncertainty.model_dump() | drawn
+            uncertainty = {"A": self._uncertainty, "B": self._uncertainty, "number": number}
+            aircraft["uncertainty"] = self.scenario.aircraft.uncertainty.model_dump() | uncertainty
         if self.scenario.aircraft.turbulence is not None:
             aircraft["turbulence"] = self.scenario.aircraft.turbulence.model_dump() | {"seed": seed}
         return self.scenario.vary(aircraft=aircraft)
@@ -375,8 +375,8 @@ class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray
             airframe, part, part, seed, 0, self.num_envs, aircraft.uncertainty.spread()
         )
         directions = gust_directions(airframe, A, aircraft.uncertainty.wind)
-        drawn = self._assemble(A, B, aircraft.plant(), self._course, gust_directions=directions)
-        self._flights = self._stepper(drawn, self._vehicle, self._course)
+        vehicle = self._assemble(A, B, aircraft.plant(), self._course, gust_directions=directions)
+        self._flights = self._stepper(vehicle, self._vehicle, self._course)
         self._k = 0
         self._last = self._flights.ticks - 1
         self._y, self._ended = np.zeros_like(self._y), np.zeros_like(self._ended)

@@ -9,7 +9,7 @@ from flight_analysis.closed_loop.learning_loop import Learn
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate as fly_in_memory
 from flight_analysis.report.account import account
-from flight_analysis.report.shortfalls import judged
+from flight_analysis.report.shortfalls import judge
 from flight_core.tape import Tape
 from flight_guidance.guidance import Guidance
 from flight_guidance.params import GuidanceConfig
@@ -49,5 +49,5 @@ def simulate(
         ('completed', (51,))
     """
     tape = fly_in_memory(scenario, progress, guide, control, learn, announce)
-    held = account(tape, scenario, tape.outcome)
-    return replace(tape, outcome=judged(tape.outcome, tape, scenario, held))
+    flight_account = account(tape, scenario, tape.outcome)
+    return replace(tape, outcome=judge(tape.outcome, tape, scenario, flight_account))

@@ -192,26 +192,26 @@ def _flying(
 
         selection = select_gains(trial, _parsed(text(trial, controller), files[1]), samples=SAMPLES)
         section = gain_yaml.selection_yaml(selection)
-        flown = _parsed(text(trial, section), files[1])
-        tape = simulate(flown)
-        used = _used(flown, tape)
+        flight = _parsed(text(trial, section), files[1])
+        tape = simulate(flight)
+        shares = _stop_shares(flight, tape)
         scenario = text(files[0], section)
-        if tape.outcome.end is End.COMPLETED and max(used.values()) <= CLEAR:
+        if tape.outcome.end is End.COMPLETED and max(shares.values()) <= CLEAR:
             return scenario, ""
-        hardest = max(used, key=lambda key: used[key])
+        hardest = max(shares, key=lambda key: shares[key])
         if size == SIZES[-1]:
-            shortfall = _shortfall(flown, tape, hardest)
+            shortfall = _shortfall(flight, tape, hardest)
             scenario = text(files[0], section, shortfall=shortfall)
     return scenario, shortfall
 
 
-def _used(flown: Scenario, tape: Tape) -> dict[str, float]:
+def _stop_shares(flight: Scenario, tape: Tape) -> dict[str, float]:
     """The largest command of each input over its end stop."""
-    stops = zip(flown.aircraft.channels().inputs, flown.aircraft.actuators.upper, strict=True)
+    stops = zip(flight.aircraft.channels().inputs, flight.aircraft.actuators.upper, strict=True)
     return {key: float(abs(tape["u"][key]).max()) / stop for key, stop in stops}
 
 
-def _shortfall(flown: Scenario, tape: Tape, hardest: str) -> str:
+def _shortfall(flight: Scenario, tape: Tape, hardest: str) -> str:
     """What the flight of a scenario lacks.
 
     The sentence names the input at a stop, whether commands or gusts ask for the travel, the state
@@ -219,33 +219,34 @@ def _shortfall(flown: Scenario, tape: Tape, hardest: str) -> str:
 
     The input that holds y is u = -Omega^+ C (A x + f), f with the gusts.
     """
-    airframe = flown.aircraft.load()[0]
-    calm = simulate(flown.vary(aircraft={"gusts": {}}))
-    cause = "the commands" if _used(flown, calm)[hardest] > CLEAR else "the gusts"
+    airframe = flight.aircraft.load()[0]
+    calm = simulate(flight.vary(aircraft={"gusts": {}}))
+    cause = "the commands" if _stop_shares(flight, calm)[hardest] > CLEAR else "the gusts"
     C = airframe.matrix_c()
     inverse = np.linalg.pinv(C @ airframe.matrix_b())[list(airframe.inputs).index(hardest)] @ C
     truth = tape["truth"]
-    asked = dict(zip(airframe.states, np.abs(inverse @ airframe.matrix_a()).tolist(), strict=True))
-    reached = {name: float(np.abs(truth[f"x.{name}"]).max()) for name in asked}
+    gains = dict(zip(airframe.states, np.abs(inverse @ airframe.matrix_a()).tolist(), strict=True))
+    largest = {name: float(np.abs(truth[f"x.{name}"]).max()) for name in gains}
     units = dict(airframe.states)
     for axis, state in AIR_STATE.items():
-        if axis in flown.aircraft.gusts:
+        if axis in flight.aircraft.gusts:
             name = ANGLE_OF_GUST.get(axis, state)
             speed = airframe.speed if axis in ANGLE_OF_GUST else 1.0
-            asked[name] = float(abs(inverse @ airframe.gust_direction(axis))) * speed
-            reached[name] = float(np.abs(truth[f"gust.{axis}"]).max()) / speed
+            gains[name] = float(abs(inverse @ airframe.gust_direction(axis))) * speed
+            largest[name] = float(np.abs(truth[f"gust.{axis}"]).max()) / speed
             units[name] = "rad" if axis in ANGLE_OF_GUST else "m/s"
-    most = max(asked, key=lambda name: asked[name] * reached[name])
+    most = max(gains, key=lambda name: gains[name] * largest[name])
     input_unit = airframe.inputs[hardest].unit
-    each = f"1 {units[most]} of {most} asks {asked[most]:.3g} {input_unit} of {hardest}"
-    size = f"{reached[most]:.2g} {units[most]}"
+    each = f"1 {units[most]} of {most} asks {gains[most]:.3g} {input_unit} of {hardest}"
+    size = f"{largest[most]:.2g} {units[most]}"
     if {units[most], input_unit} == {"rad"}:
-        each = f"a degree of {most} asks {asked[most]:.3g} degrees of {hardest}"
-        size = f"{np.degrees(reached[most]):.2g} degrees"
-    ended = "" if tape.outcome.end is End.COMPLETED else f", and ends: {tape.outcome}"
+        each = f"a degree of {most} asks {gains[most]:.3g} degrees of {hardest}"
+        size = f"{np.degrees(largest[most]):.2g} degrees"
+    end = "" if tape.outcome.end is End.COMPLETED else f", and ends: {tape.outcome}"
+    percent = 100.0 * _stop_shares(flight, tape)[hardest]
     return (
-        f"The first flight has {hardest} at {100.0 * _used(flown, tape)[hardest]:.0f} % of its end "
-        f"stop{ended}: {cause} ask for it; {each}, and {most} reaches {size}."
+        f"The first flight has {hardest} at {percent:.0f} % of its end "
+        f"stop{end}: {cause} ask for it; {each}, and {most} reaches {size}."
     )
 
 

@@ -231,10 +231,10 @@ class Controller:
         if self.mode is Mode.ENGAGED and inputs.dt == 0.0:
             self._engaged_ns, self._vanes_moved = inputs.stamp_ns, np.zeros_like(self._vanes_moved)
         self._vanes_moved = self._vanes_moved | (measures > 0.0)
-        known = self._vanes_moved | (
+        counts = self._vanes_moved | (
             seconds(inputs.stamp_ns - self._engaged_ns) >= observer.vanes.time
         )
-        self._vanes_still = np.where(known, measures == 0.0, self._vanes_still)
+        self._vanes_still = np.where(counts, measures == 0.0, self._vanes_still)
 
     def diverging(self) -> tuple[str, ...]:
         """The outputs that diverge under a model learned in flight."""
@@ -284,10 +284,10 @@ class Controller:
         """
         m = len(self._parameters.outputs)
         outputs = sample._replace(value=sample.value[:m])
-        if lost := self._lost(self._samples and self._samples.far, outputs, now_ns):
-            return lost
+        if reason := self._lost(self._samples and self._samples.far, outputs, now_ns):
+            return reason
         if self._samples is None:
-            self._samples = samples.begun(outputs)
+            self._samples = samples.first_state(outputs)
         else:
             last = self._samples.last
             self._samples, change = samples.step(self._samples, outputs, self._guard.samples)
@@ -316,8 +316,8 @@ class Controller:
             ChannelError: Reason "future": the stamp is more than the age limit ahead of the clock.
                 Reason "order": the stamp is not later than the stamp of the sample taken before.
         """
-        if lost := self._lost(self._y_m[-1] if self._y_m else None, sample, now_ns):
-            return lost
+        if reason := self._lost(self._y_m[-1] if self._y_m else None, sample, now_ns):
+            return reason
         self._y_m.append(sample)
         return ""
 

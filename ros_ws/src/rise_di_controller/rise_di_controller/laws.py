@@ -98,13 +98,13 @@ class AnyLaw(ControllerConfig):
         """Build the parameters of the law. Raises ParameterError."""
         name = values.get("law", DEFAULT)
         try:
-            chosen = schema(name)
+            config = schema(name)
         except ParameterError as error:
             raise ParameterError(f"{where}.{error}") from None
         default_fields = {} if name == DEFAULT else schema(DEFAULT).model_fields
-        names = [key for key in chosen.model_fields if key not in ControllerConfig.model_fields]
+        names = [key for key in config.model_fields if key not in ControllerConfig.model_fields]
         expected = f"those of {name}: {', '.join(names) or 'none'}"
         for key in values:
-            foreign = key in default_fields and key not in chosen.model_fields
+            foreign = key in default_fields and key not in config.model_fields
             require(not foreign, f"{where}.{key}", f"a parameter of {DEFAULT}", expected)
-        return chosen.validate_mapping(values, where)
+        return config.validate_mapping(values, where)

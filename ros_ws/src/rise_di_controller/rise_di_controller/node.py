@@ -196,8 +196,8 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         """
 
         def taking(sample: StampedVector, now_ns: int) -> None:
-            if lost := take(sample, now_ns):
-                raise ChannelError("implausible", lost)
+            if reason := take(sample, now_ns):
+                raise ChannelError("implausible", reason)
 
         return taking
 

@@ -324,16 +324,18 @@ class ControllerConfig(NodeConfig):
         require(flies, "observer.vanes", "part 0 beside it", "a part above 0: the observer flies")
         yield
         (law, params), period, m = self.tuned_law(), 1.0 / self.rate, len(self.inputs)
-        read = selection_matrix(self.vanes, self._model_states())
-        plant = LinearPlant(nominal.A + nominal.gravity, nominal.B, np.vstack([nominal.C, read]))
+        readings = selection_matrix(self.vanes, self._model_states())
+        plant = LinearPlant(
+            nominal.A + nominal.gravity, nominal.B, np.vstack([nominal.C, readings])
+        )
         loop = LoopTiming(np.array(self.lag), 0.0, period)
         for frozen in _subsets(self.vanes):
-            flown = without_frozen(params, [name in frozen for name in self.vanes])
+            law_params = without_frozen(params, [name in frozen for name in self.vanes])
             frozen_text = f" without {' and '.join(frozen)}" if frozen else ""
-            radius = spectral_radius(filter_matrix(flown))
+            radius = spectral_radius(filter_matrix(law_params))
             unstable = f"a spectral radius of {radius:.6g}{frozen_text}"
             require(radius < 1.0, "observer.vanes.L", unstable, "less than 1: it is unstable")
-            linear = linear_law(TunedLaw(law, flown), m, period)
+            linear = linear_law(TunedLaw(law, law_params), m, period)
             for part in MARGIN_PARTS:
                 late = part * max(observer.margin, self.delay)
                 stable = is_stable(plant, linear, loop, np.full(m, late))
@@ -396,10 +398,10 @@ class ControllerConfig(NodeConfig):
         nominal = self.nominal()
         if self.observer is None or nominal is None:
             return TunedLaw(law, params)
-        bound = self._limits()
+        limits_of_u = self._limits()
         part = self.observer.part
-        rate = part / self.observer.within * (bound.upper - bound.lower) / 2.0
-        limits = Limits(part * bound.lower, part * bound.upper, rate)
+        rate = part / self.observer.within * (limits_of_u.upper - limits_of_u.lower) / 2.0
+        limits = Limits(part * limits_of_u.lower, part * limits_of_u.upper, rate)
         fade_rate = 1.0 / self.observer.fade if self.observer.fade else np.inf
         Phi, Gamma, H, L, F = self.observer.matrices(nominal)
         section = self.observer.vanes

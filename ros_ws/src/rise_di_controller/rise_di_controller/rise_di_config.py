@@ -218,9 +218,9 @@ class RiseDiConfig(ControllerConfig):
             )
             rising = list(self.learn.updates) == sorted(set(self.learn.updates))
             require(rising, "learn.updates", self.learn.updates, "rising times")
-            known = set(self.learn.without or ()) <= set(self.outputs)
+            are_outputs = set(self.learn.without or ()) <= set(self.outputs)
             require(
-                known,
+                are_outputs,
                 "learn.without",
                 self.learn.without,
                 f"outputs among {', '.join(self.outputs)}",

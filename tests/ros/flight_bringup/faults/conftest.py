@@ -14,7 +14,7 @@ from tests.ros.flight_bringup.faults.draws import Draw, draw, found
 from tests.ros.flight_bringup.faults.flight import Flight, Kind
 
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.closed_loop.scenario_library import find_scenario, written
+from flight_analysis.closed_loop.scenario_library import find_scenario, save_scenario
 
 Row = dict[str, str | int | float | bool | None]
 # of an error in a row: what failed, and the first output of a process that did not answer
@@ -198,7 +198,7 @@ def flights(
     learning = find_scenario("osprey_learn").vary(
         controller={"learn": {"updates": [3.0], "check": 1.0, "latency": 1.0}}
     )
-    learning = written(learning, tmp_path_factory.mktemp("learning") / "learn.yaml")
+    learning = save_scenario(learning, tmp_path_factory.mktemp("learning") / "learn.yaml")
     scenarios = {
         Kind.PLAIN: plain,
         Kind.OWN_CLOCK: plain,

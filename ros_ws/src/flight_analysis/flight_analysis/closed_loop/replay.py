@@ -339,10 +339,10 @@ def recorded_changes(run: RecordedRun, parameters: ControllerConfig) -> Sequence
     """
     if run.path is None:
         return run.tape.changes
-    known = {
+    fields = {
         name: field for name, field in type(parameters).model_fields.items() if name not in OF_NODE
     }
-    return parameter_changes(run.path, f"{run.namespace}/controller", known)
+    return parameter_changes(run.path, f"{run.namespace}/controller", fields)
 
 
 def _coverage_notes(ticks: Ticks, checked: NDArray[np.bool_]) -> Iterator[str]:
@@ -372,8 +372,8 @@ def _coverage_notes(ticks: Ticks, checked: NDArray[np.bool_]) -> Iterator[str]:
 def _few(notes: Sequence[str]) -> tuple[str, ...]:
     """The first notes on changes of the parameters, and how many more there are."""
     more = len(notes) - SHOWN_CHANGES
-    rest = (f"parameters changed {more} more times",) if more > 0 else ()
-    return (*notes[:SHOWN_CHANGES], *rest)
+    remainder = (f"parameters changed {more} more times",) if more > 0 else ()
+    return (*notes[:SHOWN_CHANGES], *remainder)
 
 
 def _controller_at(processes: Mapping[str, Process], stamp_ns: int) -> str:
@@ -381,12 +381,12 @@ def _controller_at(processes: Mapping[str, Process], stamp_ns: int) -> str:
 
     Empty where the log has no name.
     """
-    known = [
+    begins = [
         (process.first_ns, name)
         for name, process in processes.items()
         if "/controller#" in name and process.first_ns is not None and process.first_ns <= stamp_ns
     ]
-    return f", {max(known)[1]}," if known else ""
+    return f", {max(begins)[1]}," if begins else ""
 
 
 def _bits(values: FloatArray) -> NDArray[np.int64]:

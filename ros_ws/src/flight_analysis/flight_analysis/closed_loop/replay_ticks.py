@@ -77,11 +77,11 @@ class ParametersInForce:
             return state
         applied = self._changes[: len(steps) - 1]
         self._changes = self._changes[len(steps) - 1 :]
-        changed: set[str] = set()
+        names: set[str] = set()
         for change, old, new in zip(applied, steps, steps[1:], strict=False):
             if new != old:
-                changed.update(change)
-        self.notes.append(f"parameters changed before tick {number}: {', '.join(sorted(changed))}")
+                names.update(change)
+        self.notes.append(f"parameters changed before tick {number}: {', '.join(sorted(names))}")
         for step in steps[1:]:
             if step.digest() == self.digest:
                 continue
@@ -198,10 +198,10 @@ class Ticks:
         )
         u_ff = self._groups["u_ff"][k] if only_law else None
         vane_m = self._groups["vane_m"][k] if only_law and limits.vanes else None
-        after, used = guard.tick(
+        after, inputs = guard.tick(
             state, int(self.now_ns[k]), y, y_m, limits, law, bool(self._active[k]), u_ff, vane_m
         )
-        if used is None:
+        if inputs is None:
             return after, np.full(len(self.names), np.nan)
         late = float(self._signal["late"][k])
         age = float(self._signal["age"][k])
@@ -210,7 +210,7 @@ class Ticks:
             if internals.GIVEN_UP in self._groups
             else np.zeros(0)
         )
-        row = internals.values(after, used, limits, late, age, 0, 0, given_up)
+        row = internals.values(after, inputs, limits, late, age, 0, 0, given_up)
         row[self._copied] = self.values[k, self._copied]
         return after, np.concatenate([row, after.command])
 

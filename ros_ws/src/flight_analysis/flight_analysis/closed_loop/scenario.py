@@ -84,12 +84,12 @@ class Scenario:
         Raises:
             ParameterError: A section or a value is invalid.
         """
-        needed = [key for key in SCHEMAS if key not in OPTIONAL and key != "recorder"]
-        missing = [key for key in needed if key not in sections]
+        required = [key for key in SCHEMAS if key not in OPTIONAL and key != "recorder"]
+        missing = [key for key in required if key not in sections]
         unknown = [key for key in sections if key not in SCHEMAS]
         expected = (
-            f"the sections {', '.join(needed)}, and "
-            f"{' or '.join(key for key in SCHEMAS if key not in needed)}"
+            f"the sections {', '.join(required)}, and "
+            f"{' or '.join(key for key in SCHEMAS if key not in required)}"
         )
         require(not missing, name, f"no section {', '.join(missing)}", expected)
         require(not unknown, name, f"a section {', '.join(unknown)}", expected)
@@ -244,12 +244,12 @@ def parse_scenario(content: bytes, path: Path) -> Scenario:
 
 def scenario_of(name: str, path: Path, sections: Mapping[str, Mapping[str, Any]]) -> Scenario:
     """The scenario of these sections, validated. Raises ParameterError."""
-    checked: dict[str, Any] = {
+    parameters: dict[str, Any] = {
         key: schema.validate_mapping(sections[key], key)
         for key, schema in SCHEMAS.items()
         if key not in OPTIONAL
     }
-    scenario = Scenario(name=name, path=path, **checked)
+    scenario = Scenario(name=name, path=path, **parameters)
     check_together(scenario)
     return scenario.vary(**{key: sections[key] for key in OPTIONAL if key in sections})
 
@@ -265,8 +265,8 @@ def parse_scenario_sections(content: bytes, path: Path) -> Sections:
     )
     airframe = sections["aircraft"].get("airframe")
     if isinstance(airframe, str) and airframe.endswith(".yaml") and not is_file(Path(airframe)):
-        beside = (path.parent.absolute() / name for name in (airframe, Path(airframe).name))
-        sections["aircraft"]["airframe"] = str(next(filter(is_file, beside), airframe))
+        candidates = (path.parent.absolute() / name for name in (airframe, Path(airframe).name))
+        sections["aircraft"]["airframe"] = str(next(filter(is_file, candidates), airframe))
     return sections
 
 
@@ -286,8 +286,8 @@ def guidance_by_rule(
             f"{key}: found linear, expected second_order: guidance needs its bounds on y_m_ddot"
         )
     climbs = vertical(reference.outputs)
-    needed = [name for name in RATES_AND_SPEED if name != "V"] if climbs else WITHOUT_RUDDER
-    missing = [name for name in needed if name not in reference.outputs]
+    required = [name for name in RATES_AND_SPEED if name != "V"] if climbs else WITHOUT_RUDDER
+    missing = [name for name in required if name not in reference.outputs]
     require(
         not missing,
         "guidance",
@@ -377,8 +377,8 @@ def check_together(scenario: Scenario) -> None:
         effectors, controller.effectors, tuple(channels.inputs), f"the channels of {airframe}"
     )
     unknown = [name for name in controller.outputs if name not in channels.outputs]
-    measured = f"some of the outputs of {airframe}: {', '.join(channels.outputs)}"
-    require(not unknown, "controller.outputs", ", ".join(controller.outputs), measured)
+    expected = f"some of the outputs of {airframe}: {', '.join(channels.outputs)}"
+    require(not unknown, "controller.outputs", ", ".join(controller.outputs), expected)
     missing = [name for name in controller.vanes if name not in channels.outputs]
     require(
         not missing,
@@ -452,13 +452,13 @@ def require_guidable(scenario: Scenario) -> None:
     guidance = scenario.guidance
     if guidance is None:
         return
-    needed = "euler" if guidance.drag is None else "thrust"
+    kinematics = "euler" if guidance.drag is None else "thrust"
     turns = {"euler": "a bank turns the aircraft", "thrust": "a tilt accelerates the multicopter"}
     require(
-        aircraft.is_jsbsim or aircraft.kinematics == needed,
+        aircraft.is_jsbsim or aircraft.kinematics == kinematics,
         "aircraft.kinematics",
         f"{aircraft.kinematics!r} beside guidance",
-        f"{needed}: {turns[needed]}",
+        f"{kinematics}: {turns[kinematics]}",
     )
     start = aircraft.start
     inside = guidance.fence_clearance(start.north, start.east)

@@ -71,12 +71,12 @@ def with_route(
 
     Raises ParameterError where it cannot be flown.
     """
-    flown = speeds(waypoints, scenario.aircraft.channels().speed)
+    leg_speeds = speeds(waypoints, scenario.aircraft.channels().speed)
     route: dict[str, list[Any]] = {
         "north": [waypoint.north for waypoint in waypoints],
         "east": [waypoint.east for waypoint in waypoints],
         "altitude": [waypoint.altitude for waypoint in waypoints],
-        "V": list(flown),
+        "V": list(leg_speeds),
         "turns": [waypoint.turns for waypoint in waypoints],
         "wait": [waypoint.wait for waypoint in waypoints],
         "leave": [waypoint.departure for waypoint in waypoints],
@@ -89,7 +89,7 @@ def with_route(
     return scenario.vary(guidance={"route": route, "program": {}, **fence})
 
 
-def written(scenario: Scenario, path: Path) -> Scenario:
+def save_scenario(scenario: Scenario, path: Path) -> Scenario:
     """A scenario that differs from its file, as a file of its own.
 
     Raises ParameterError where it cannot be written.

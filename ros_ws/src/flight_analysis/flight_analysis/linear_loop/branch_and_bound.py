@@ -65,7 +65,7 @@ def boxes_until_proved(part: Channels, size: float, disk: float, most: int) -> i
     half = np.r_[np.full(len(part.entries), size), np.ones(part.late)]
     disks = np.full(len(part.D) - part.real, disk)
     regions = [Region(centre=np.zeros(len(half)), half=half, low=0.0, high=highest, scaling=None)]
-    for tried in range(1, most + 1):
+    for count in range(1, most + 1):
         region = regions.pop()
         w = _frequency(region, highest)
         around = part.centred(np.r_[region.centre[part.parameters], np.zeros(len(disks))])
@@ -80,7 +80,7 @@ def boxes_until_proved(part: Channels, size: float, disk: float, most: int) -> i
         else:
             regions += region.outside(*interval, scaling, NARROWEST * highest)
         if not regions:
-            return tried
+            return count
     return None
 
 

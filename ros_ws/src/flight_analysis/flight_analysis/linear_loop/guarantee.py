@@ -118,9 +118,11 @@ def _first_unstable(linear: LinearLoop, late: float) -> Unstable | None:
         delayed = linear._replace(loop=loop)
         for part in parts_of(uncertain_loop(linear.nominal, linear.law, loop, box)):
             for d in first_unstable(part, len(box.names), largest):
-                reached = _confirmed(delayed, d)
-                if reached is not None and (least is None or reached.deviation < least.deviation):
-                    least = reached
+                candidate = _confirmed(delayed, d)
+                if candidate is not None and (
+                    least is None or candidate.deviation < least.deviation
+                ):
+                    least = candidate
     return least
 
 
@@ -139,17 +141,17 @@ def _proved(parts: list[Channels], least: float, *, disks: bool, exact: bool = F
         return least
     for place, gap in enumerate(GAPS[FIRST_GAP:], FIRST_GAP):
         most = FEWER_BOXES if disks or place > FIRST_GAP else BOXES
-        used = _boxes(parts, least / (1.0 + gap), most, disks=disks)
-        if used is not None:
+        count = _boxes(parts, least / (1.0 + gap), most, disks=disks)
+        if count is not None:
             break
     else:
         return 0.0
     proved = gap
     for finer in reversed(GAPS[:place] if place == FIRST_GAP else ()):
-        if used is None or used > FEWER_BOXES:
+        if count is None or count > FEWER_BOXES:
             break
-        used = _boxes(parts, least / (1.0 + finer), FEWER_BOXES, disks=disks)
-        proved = proved if used is None else finer
+        count = _boxes(parts, least / (1.0 + finer), FEWER_BOXES, disks=disks)
+        proved = proved if count is None else finer
     return least / (1.0 + proved)
 
 
@@ -158,10 +160,10 @@ def _boxes(parts: list[Channels], size: float, most: int, *, disks: bool) -> int
     remaining = most
     for part in parts:
         deviation, disk = (1.0, size) if disks else (size, 0.0)
-        used = boxes_until_proved(part, deviation, disk, remaining)
-        if used is None:
+        count = boxes_until_proved(part, deviation, disk, remaining)
+        if count is None:
             return None
-        remaining -= used
+        remaining -= count
     return most - remaining
 
 

@@ -183,10 +183,10 @@ def phase_margins(plant: LinearPlant, law: LinearLaw, loop: LoopTiming) -> Float
         form, independent = _modal_form(aircraft, its_law, loop)
         phase = _phases(form, loop.period)
         if not independent.all():
-            rest = np.flatnonzero(~independent)
-            few = aircraft._replace(A=aircraft.A[rest], B=aircraft.B[rest])
-            few_laws = LinearLaw(*(matrix[rest] for matrix in its_law))
-            phase[rest] = _phases(schur_form(few, few_laws, loop), loop.period)
+            remainder = np.flatnonzero(~independent)
+            few = aircraft._replace(A=aircraft.A[remainder], B=aircraft.B[remainder])
+            few_laws = LinearLaw(*(matrix[remainder] for matrix in its_law))
+            phase[remainder] = _phases(schur_form(few, few_laws, loop), loop.period)
         parts.append(phase)
     return np.concatenate(parts).reshape(*_batch_shape(plant, law), -1)
 
@@ -510,10 +510,10 @@ def _balanced(matrices: ComplexArray) -> ComplexArray:
     The method is Osborne's iteration.
     """
     M = matrices.copy()
-    off = ~np.eye(matrices.shape[-1], dtype=bool)
+    off_diagonal = ~np.eye(matrices.shape[-1], dtype=bool)
     least = 1e-9 * np.linalg.norm(M, axis=(-2, -1)) + 1e-300
-    for _ in range(BALANCED_ROUNDS if len(off) > 1 else 0):
-        for i, places in enumerate(off):
+    for _ in range(BALANCED_ROUNDS if len(off_diagonal) > 1 else 0):
+        for i, places in enumerate(off_diagonal):
             row, column = (
                 np.sqrt(np.sum(part.real**2 + part.imag**2, axis=-1))
                 for part in (M[..., i, places], M[..., places, i])

@@ -61,7 +61,7 @@ def _path(linear: LinearLoop) -> Path:
         arrays += [box.part / size, box.E, box.F / size, box.G / size]
     digest = hashlib.sha256()
     for array in arrays:
-        rounded = (f"{value + 0.0:.{DIGITS - 1}e}" for value in np.ravel(array).tolist())
-        digest.update(f"{np.shape(array)} {' '.join(rounded)}".encode())
+        digits = (f"{value + 0.0:.{DIGITS - 1}e}" for value in np.ravel(array).tolist())
+        digest.update(f"{np.shape(array)} {' '.join(digits)}".encode())
     caches = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(caches) / "rise-di" / "guarantees" / f"{digest.hexdigest()}.json"

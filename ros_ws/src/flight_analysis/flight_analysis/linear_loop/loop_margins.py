@@ -101,11 +101,13 @@ def margins(
         >>> rise_di.margins(rise_di.find_scenario("osprey_servo")).delay > 0.03
         True
     """
-    flown = as_scenario(scenario)
+    flight = as_scenario(scenario)
     count = as_count(aircraft, "aircraft", 0)
     numbered = as_count(seed, "seed", 0)
     deviation = as_number(uncertainty, "uncertainty", 0.0, 1.0)
-    return loop_margins(scenario_loop(flown, flown.controller, count, deviation, numbered, spread))
+    return loop_margins(
+        scenario_loop(flight, flight.controller, count, deviation, numbered, spread)
+    )
 
 
 def loop_margins(linear: LinearLoop) -> LoopMargins:
@@ -200,8 +202,8 @@ def scenario_loop(
     airframe = _model(scenario, controller)
     A, B = nominal_and_sampled(airframe, uncertainty, aircraft, seed, spread)
     T = distribution(airframe, controller)  # B of each effector is drawn
-    seen = through_allocation(airframe, controller)
-    linear = linear_loop(controller, seen, A, B @ T)
+    airframe_of_law = through_allocation(airframe, controller)
+    linear = linear_loop(controller, airframe_of_law, A, B @ T)
     box = box_of(airframe, controller, uncertainty, spread)
     return linear._replace(box=box) if box.part.any() else linear
 
@@ -242,8 +244,8 @@ def box_of(
 
     The channels are in the law's order. Behind an allocation B of every effector is uncertain.
     """
-    seen = through_allocation(airframe, controller)
-    T = distribution(airframe, controller)[:, law_order(seen, controller)[1]]
+    airframe_of_law = through_allocation(airframe, controller)
+    T = distribution(airframe, controller)[:, law_order(airframe_of_law, controller)[1]]
     places = drawn_places(airframe)
     part = np.array([spread.entries.get(name, uncertainty) for name in places])
     n = len(airframe.states)
@@ -261,8 +263,8 @@ def box_of(
     return Box(names=tuple(places), part=part, E=E, F=F, G=G)
 
 
-def _some(plant: LinearPlant, chosen: slice) -> LinearPlant:
-    return LinearPlant(plant.A[chosen], plant.B[chosen], plant.C)
+def _some(plant: LinearPlant, names: slice) -> LinearPlant:
+    return LinearPlant(plant.A[names], plant.B[names], plant.C)
 
 
 def through_allocation(airframe: Airframe, controller: ControllerConfig) -> Airframe:

@@ -87,19 +87,19 @@ def tightened(M: ComplexArray, real: int, start: Scaling, target: float) -> tupl
     """
     N = np.exp(start.t)[:, None] * M * np.exp(-start.t)
     centre = Centre(np.ones(len(M)), np.clip(start.g[:real], -LARGEST_G / 2.0, LARGEST_G / 2.0))
-    wanted = target**2
+    goal = target**2
     least = centre.bound(N)
-    level = max(1.1 * least, wanted)
+    level = max(1.1 * least, goal)
     for _ in range(LEVELS):
-        reached = level <= wanted
+        is_low_enough = level <= goal
         for _ in range(CENTRING):
             centre, decrement = centre.stepped(N, level)
             if decrement < CENTRED:
                 break
         least = min(centre.bound(N), level)
-        if reached or level - least < STALLED * least:
+        if is_low_enough or level - least < STALLED * least:
             break
-        level = max(least + FALL * (level - least), wanted)
+        level = max(least + FALL * (level - least), goal)
     g = np.r_[centre.g / centre.d[:real], np.zeros(len(M) - real)]
     return float(np.sqrt(max(least, 0.0))), Scaling(start.t + 0.5 * np.log(centre.d), g)
 
@@ -113,16 +113,16 @@ def tightened_at(
     coefficients then balances rows and columns.
     """
     k = len(part.entries)
-    kept = np.r_[0:k, part.uncertain : len(scaled)]
-    few = Scaling(start.t[kept], start.g[kept])
-    _, means = tightened(scaled[np.ix_(kept, kept)], part.real - k, few, 1.0)
+    rows = np.r_[0:k, part.uncertain : len(scaled)]
+    few = Scaling(start.t[rows], start.g[rows])
+    _, means = tightened(scaled[np.ix_(rows, rows)], part.real - k, few, 1.0)
     second = slice(k, part.uncertain)
     sizes = np.abs(scaled) ** 2 + TINY
-    row = sizes[second, kept] @ np.exp(-2.0 * means.t)
-    column = np.exp(2.0 * means.t) @ sizes[kept, second]
+    row = sizes[second, rows] @ np.exp(-2.0 * means.t)
+    column = np.exp(2.0 * means.t) @ sizes[rows, second]
     scaling = Scaling(np.zeros(len(scaled)), np.zeros(len(scaled)))
-    scaling.t[kept] = means.t
-    scaling.g[kept] = means.g
+    scaling.t[rows] = means.t
+    scaling.g[rows] = means.g
     scaling.t[second] = np.log(column / row) / 4.0
     bound = float(bound_at(scaled, scaling))
     if bound < 1.0 or w * part.period < MEANS_UP_TO:

@@ -108,7 +108,7 @@ def uncertain_loop(
     C = np.hstack([plant.C, np.zeros((len(plant.C), TERMS * k))])
     still = np.zeros(m)
     pulled = LinearPlant(A, B, C)
-    sampled = sampled_plant(pulled, loop, still)
+    by_tick = sampled_plant(pulled, loop, still)
 
     steps = np.zeros((size + k, size + k))  # the states, then s from 0 to 1 over the period
     steps[:size, :size] = A
@@ -116,26 +116,26 @@ def uncertain_loop(
     drive = np.zeros((size + k, 2 * k))
     drive[:n, :k] = box.E
     drive[size:, k:] = np.eye(k) / loop.period
-    _, moved = zero_order_hold(steps, drive, loop.period)
-    held = moved[:size, :k]
-    rising = moved[:size, k:]
-    driven = np.hstack([held, ROOT * (2.0 * rising - held)])
+    _, motion = zero_order_hold(steps, drive, loop.period)
+    constant = motion[:size, :k]
+    rising = motion[:size, k:]
+    drives = np.hstack([constant, ROOT * (2.0 * rising - constant)])
 
-    kept = np.r_[0:n, size : len(sampled.A)]
-    P = sampled.A[np.ix_(kept, kept)]
-    Pu = sampled.B[kept]
-    Q = _coefficients(sampled.A, n, k)[:, kept]
-    Qu = _coefficients(sampled.B, n, k)
-    C = sampled.C[:, kept]
+    rows = np.r_[0:n, size : len(by_tick.A)]
+    P = by_tick.A[np.ix_(rows, rows)]
+    Pu = by_tick.B[rows]
+    Q = _coefficients(by_tick.A, n, k)[:, rows]
+    Qu = _coefficients(by_tick.B, n, k)
+    C = by_tick.C[:, rows]
     states = len(law.A)
     none = np.zeros((states, TERMS * k))
-    W = np.zeros((len(kept), TERMS * k))
-    W[:n] = driven[:n]
+    W = np.zeros((len(rows), TERMS * k))
+    W[:n] = drives[:n]
     exact = UncertainLoop(
         A=np.block([[P + Pu @ law.D @ C, Pu @ law.C], [law.B @ C, law.A]]),
         W=np.vstack([W, none]),
         Z=np.hstack([Q + Qu @ law.D @ C, Qu @ law.C]),
-        D=_coefficients(driven, n, k),
+        D=_coefficients(drives, n, k),
         U=np.vstack([Pu, np.zeros((states, m))]),
         V=Qu,
         K=np.hstack([law.D @ C, law.C]),
@@ -167,37 +167,37 @@ def _with_late(
     """
     m, q = exact.K.shape
     size = n + TERMS * k
-    moved = np.r_[0:n, size : len(ramps.A)]
+    rows = np.r_[0:n, size : len(ramps.A)]
     effect = ramps.A[: size + m, size + m :]
     c = effect.shape[1]
     ticks = int(np.ceil(late / exact.period - 1e-9))
     parts = np.minimum(late / exact.period - np.arange(ticks), 1.0)
-    kept = ticks * m  # u of earlier ticks, the newest first
-    now = np.hstack([exact.K, np.zeros((m, c + kept))])
-    before = np.eye(kept, q + c + kept, q + c)
+    width = ticks * m  # u of earlier ticks, the newest first
+    now = np.hstack([exact.K, np.zeros((m, c + width))])
+    before = np.eye(width, q + c + width, q + c)
     shifted = np.vstack([now, before[:-m]])
     halves = np.minimum(parts, 0.5)
     sizes = np.repeat([parts / 2.0, ROOT / 2.0 * halves * (1.0 - halves)], m, axis=1)
     Z = np.vstack([size[:, None] * (shifted - before) for size in sizes])
-    V = np.zeros((2 * kept, m))
+    V = np.zeros((2 * width, m))
     V[:m] = np.diag(sizes[0, :m])
-    V[kept : kept + m] = np.diag(sizes[1, :m])
-    held = np.vstack([exact.U, np.zeros((c + kept, m))])
-    ramp = np.zeros((q + c + kept, m))
-    ramp[np.r_[0 : n + m, q : q + c]] = ramps.B[moved]
+    V[width : width + m] = np.diag(sizes[1, :m])
+    held = np.vstack([exact.U, np.zeros((c + width, m))])
+    ramp = np.zeros((q + c + width, m))
+    ramp[np.r_[0 : n + m, q : q + c]] = ramps.B[rows]
     W = np.hstack([-held] * ticks + [ramp] * ticks)
     D = np.hstack([-exact.V] * ticks + [_coefficients(ramps.B, n, k)] * ticks)
-    A = np.zeros((q + c + kept, q + c + kept))
+    A = np.zeros((q + c + width, q + c + width))
     A[:q, :q] = exact.A
-    A[: n + m, q : q + c] = effect[moved[: n + m]]
+    A[: n + m, q : q + c] = effect[rows[: n + m]]
     A[q : q + c, q : q + c] = ramps.A[size + m :, size + m :]
     A[q + c :] = shifted
     U = held + W @ V
     U[q + c : q + c + m] += np.eye(m)
-    reach = np.hstack([exact.Z, _coefficients(effect, n, k), np.zeros((len(exact.Z), kept))])
+    reach = np.hstack([exact.Z, _coefficients(effect, n, k), np.zeros((len(exact.Z), width))])
     return exact._replace(
         A=A + W @ Z,
-        W=np.vstack([exact.W, np.zeros((c + kept, exact.W.shape[1]))]),
+        W=np.vstack([exact.W, np.zeros((c + width, exact.W.shape[1]))]),
         Z=reach + D @ Z,
         U=U,
         V=exact.V + D @ V,
@@ -268,22 +268,22 @@ def every_channel(loop: UncertainLoop, inputs: tuple[int, ...] = ()) -> Channels
 
     v is added to u and u + v / 2: S - I / 2.
     """
-    chosen = list(inputs)
+    channels = list(inputs)
     q, p = loop.W.shape
     m = len(loop.K)
-    c = len(chosen)
+    c = len(channels)
     late = loop.late or Late(np.zeros((q, 0)), np.zeros((p, 0)), np.zeros((0, q)), np.zeros((0, m)))
     width = late.W.shape[1]
     D = np.zeros((p + width + c, p + width + c))
     D[:p, :p] = loop.D
     D[:p, p : p + width] = late.D
-    D[:p, p + width :] = loop.V[:, chosen]
-    D[p : p + width, p + width :] = late.V[:, chosen]
+    D[:p, p + width :] = loop.V[:, channels]
+    D[p : p + width, p + width :] = late.V[:, channels]
     D[p + width :, p + width :] = np.eye(c) / 2.0
     return Channels(
         A=loop.A,
-        W=np.hstack([loop.W, late.W, loop.U[:, chosen]]),
-        Z=np.vstack([loop.Z, late.Z, loop.K[chosen]]),
+        W=np.hstack([loop.W, late.W, loop.U[:, channels]]),
+        Z=np.vstack([loop.Z, late.Z, loop.K[channels]]),
         D=D,
         entries=tuple(range(p // TERMS)),
         period=loop.period,
@@ -355,33 +355,33 @@ def _reduced(every: Channels, channels: IntArray) -> Channels:
     W = every.W[:, channels]
     Z = every.Z[channels]
     coupled = np.abs(A) > NO_COUPLING
-    moved = (np.abs(W) > NO_COUPLING).any(axis=1)
-    shown = (np.abs(Z) > NO_COUPLING).any(axis=0)
+    is_moved = (np.abs(W) > NO_COUPLING).any(axis=1)
+    is_shown = (np.abs(Z) > NO_COUPLING).any(axis=0)
     for _ in range(len(A)):
-        moved |= coupled[:, moved].any(axis=1)
-        shown |= coupled[shown].any(axis=0)
-    both = moved & shown
+        is_moved |= coupled[:, is_moved].any(axis=1)
+        is_shown |= coupled[is_shown].any(axis=0)
+    both = is_moved & is_shown
     A = A[np.ix_(both, both)]
     W = W[both]
     Z = Z[:, both]
     for _ in range(2):
         Q = _reached(A, W)
-        turned = (Q.T @ W).T
+        W_turned = (Q.T @ W).T
         A = (Q.T @ A @ Q).T
         W = (Z @ Q).T
-        Z = turned
+        Z = W_turned
     return every._replace(A=A, W=W, Z=Z, D=every.D[np.ix_(channels, channels)])
 
 
 def _reached(A: FloatArray, W: FloatArray) -> FloatArray:
     """An orthonormal basis of the states that W reaches through A."""
     Q = np.zeros((len(A), 0))
-    added = W / np.maximum(np.linalg.norm(W, axis=0), 1e-300)
-    while added.shape[1]:
+    directions = W / np.maximum(np.linalg.norm(W, axis=0), 1e-300)
+    while directions.shape[1]:
         for _ in range(2):  # twice: rounding
-            added = added - Q @ (Q.T @ added)
-        left, values, _ = np.linalg.svd(added, full_matrices=False)
-        added = left[:, values > NO_DIRECTION]
-        Q = np.hstack([Q, added])
-        added = A @ added
+            directions = directions - Q @ (Q.T @ directions)
+        left, values, _ = np.linalg.svd(directions, full_matrices=False)
+        directions = left[:, values > NO_DIRECTION]
+        Q = np.hstack([Q, directions])
+        directions = A @ directions
     return Q

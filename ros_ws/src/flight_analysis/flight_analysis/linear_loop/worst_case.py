@@ -58,16 +58,16 @@ def first_unstable(part: Channels, entries: int, largest: float) -> list[FloatAr
     highest = np.pi / part.period
     count = int(np.ceil(np.log(highest / SLOWEST) / (2.0 * np.log(NEAR))))
     windows = highest / NEAR ** (1.0 + 2.0 * np.arange(count))
-    reached = []
+    deviations = []
     least = largest
     for w in (0.0, *windows):
         size, corner = _oscillation(part, w, least) if w else _divergence(part)
         if size <= least:
             d = np.zeros(entries)
             d[list(part.entries)] = size * corner
-            reached.append(d)
+            deviations.append(d)
             least = size
-    return reached
+    return deviations
 
 
 def _divergence(part: Channels) -> tuple[float, FloatArray]:
@@ -81,7 +81,7 @@ def _divergence(part: Channels) -> tuple[float, FloatArray]:
     M = part.response(0.0, 1.0 + SPECTRAL_RADIUS_TOLERANCE)[:k, :k].real
     corners = np.where(np.random.default_rng(SEED).random((STARTS, k)) < 0.5, -1.0, 1.0)
     best = np.zeros(STARTS)
-    kept = corners
+    best_corners = corners
     for _ in range(ROUNDS):
         values, X = np.linalg.eig(M * corners[:, None, :])
         sizes = np.abs(values)
@@ -89,14 +89,14 @@ def _divergence(part: Channels) -> tuple[float, FloatArray]:
         most = np.argmax(upward, axis=1)
         rows = np.arange(STARTS)
         rises = upward[rows, most] > best
-        kept = np.where(rises[:, None], corners, kept)
+        best_corners = np.where(rises[:, None], corners, best_corners)
         best = np.where(rises, upward[rows, most], best)
         if not rises.any():
             break
         slopes = np.linalg.pinv(X)[rows, most] * X[rows, :, most]  # of log, up to the factor s
         corners = np.where((slopes.real < 0.0) & rises[:, None], -corners, corners)
     first = int(np.argmax(best))
-    return (1.0 / best[first] if best[first] > 0.0 else np.inf), kept[first]
+    return (1.0 / best[first] if best[first] > 0.0 else np.inf), best_corners[first]
 
 
 def _oscillation(part: Channels, frequency: float, largest: float) -> tuple[float, FloatArray]:
@@ -111,18 +111,18 @@ def _oscillation(part: Channels, frequency: float, largest: float) -> tuple[floa
     corners = np.where(rng.random((STARTS, k)) < 0.5, -1.0, 1.0)
     begin = np.sign(_growth(part, np.zeros((1, k)), frequency))
     corners = np.concatenate([np.where(begin == 0.0, 1.0, begin), corners])
-    tried: dict[tuple[float, ...], float] = {}
+    size_by_corner: dict[tuple[float, ...], float] = {}
     for _ in range(ROUNDS):
         sizes = np.array([_limit(part, corner, frequency, largest) for corner in corners])
-        tried.update(zip(map(tuple, corners), sizes, strict=True))
+        size_by_corner.update(zip(map(tuple, corners), sizes, strict=True))
         at = np.minimum(sizes, largest)[:, None] * corners
-        turned = np.where(_growth(part, at, frequency) < 0.0, -1.0, 1.0)
-        fresh = [corner for corner in set(map(tuple, turned)) if corner not in tried]
+        next_corners = np.where(_growth(part, at, frequency) < 0.0, -1.0, 1.0)
+        fresh = [corner for corner in set(map(tuple, next_corners)) if corner not in size_by_corner]
         if not fresh:
             break
         corners = np.array(sorted(fresh))
-    ranked = sorted(tried, key=lambda corner: (tried[corner], corner))
-    if not np.isfinite(tried[ranked[0]]):
+    ranked = sorted(size_by_corner, key=lambda corner: (size_by_corner[corner], corner))
+    if not np.isfinite(size_by_corner[ranked[0]]):
         return np.inf, np.array(ranked[0])
     flipped = [_flipped(part, np.array(c), frequency, largest) for c in ranked[:POLISHED]]
     best = min(flipped, key=lambda corner: _limit(part, corner, frequency, largest))
@@ -213,9 +213,9 @@ def worst_in_box(plant: LinearPlant, law: LinearLaw, loop: LoopTiming, box: Box)
     rng = np.random.default_rng(SEED)
     k = len(box.names)
     uncertain = uncertain_loop(plant, law, loop, box)
-    drawn = np.where(rng.random((BEGUN, k)) < 0.5, -1.0, 1.0)
+    random_corners = np.where(rng.random((BEGUN, k)) < 0.5, -1.0, 1.0)
     slopes = _slopes(plant, law, loop, box, uncertain, np.zeros(k))
-    corners = np.unique(np.concatenate([_corners(slopes), drawn]), axis=0)
+    corners = np.unique(np.concatenate([_corners(slopes), random_corners]), axis=0)
     margins = input_margins(aircraft_at(plant, box, corners), law, loop)
     walked: set[tuple[int, int]] = set()
     for _ in range(WALKED):
@@ -223,12 +223,12 @@ def worst_in_box(plant: LinearPlant, law: LinearLaw, loop: LoopTiming, box: Box)
         steps = [(f, at) for row in least.tolist() for f, at in enumerate(row)]
         steps = [pair for pair in steps if pair not in walked]
         walked.update(steps)
-        added = []
+        candidates = []
         for place in sorted({place for _, place in steps}):
             if margins.stable[place]:
                 slopes = _slopes(plant, law, loop, box, uncertain, corners[place])
-                added += [_corners(slopes[f]) for f, at in steps if at == place]
-        fresh = [c for c in map(tuple, added) if not (corners == c).all(axis=1).any()]
+                candidates += [_corners(slopes[f]) for f, at in steps if at == place]
+        fresh = [c for c in map(tuple, candidates) if not (corners == c).all(axis=1).any()]
         if not fresh:
             break
         fresh_corners = np.unique(fresh, axis=0)
@@ -281,9 +281,9 @@ def _slopes(
     diagonal = np.einsum("Fii->Fi", S)
     L = 1.0 / diagonal - 1.0
     log_gain = np.log(np.abs(L))
-    off = np.abs(np.angle(-L))
+    phase_distance = np.abs(np.angle(-L))
     half = S - np.eye(m) / 2.0
-    phase_at, phase_rate = _crossed(w, L, log_gain, off[:-1])
+    phase_at, phase_rate = _crossed(w, L, log_gain, phase_distance[:-1])
     gain_at, gain_rate = _crossed(
         w, L, L.imag, np.where(L.real < 0.0, np.abs(log_gain), np.inf)[:-1]
     )

@@ -226,9 +226,9 @@ def _absent(tape: Tape, scenario: Scenario | None) -> list[str]:
     if scenario is None:
         return []
     outputs = scenario.controller.outputs
-    wanted = {"y": outputs, "y_m": outputs, "u": scenario.controller.effectors}
+    channels_by_topic = {"y": outputs, "y_m": outputs, "u": scenario.controller.effectors}
     sentences = []
-    for topic, channels in wanted.items():
+    for topic, channels in channels_by_topic.items():
         absent = [name for name in channels if topic in tape and name not in tape[topic].names]
         if absent:
             sentences.append(f"{', '.join(absent)} of {topic}")
@@ -281,8 +281,8 @@ def _lack(name: str, topic: TopicAccount, end: float, late: float, *, late_u: bo
         tail = 0.0 if topic.last is None or topic.expected is None else end - topic.last
         if tail > min((1.0 - WHOLE) * end, SILENCE) + late:
             facts.append(f"ends at t = {topic.last:.3f} of {end:.3f} s")
-        lost = end * (1.0 - topic.share) if missing and topic.share is not None else math.inf
-        least = min(SILENCE, lost / 2.0)  # a shorter gap is named where it is most of the lack
+        silence = end * (1.0 - topic.share) if missing and topic.share is not None else math.inf
+        least = min(SILENCE, silence / 2.0)  # a shorter gap is named where it is most of the lack
         if topic.gap is not None and topic.gap_at is not None and topic.gap > least:
             facts.append(
                 f"no sample from t = {topic.gap_at:.3f} to {topic.gap_at + topic.gap:.3f} s"

@@ -175,8 +175,8 @@ def _curves(
     """A curve of each flight with a signal, under its `name`; of several under their labels."""
     curves = {}
     for label, run in context.runs.items():
-        if (found := signal(run.tape)) is not None:
-            curve = Curve(found, run.colour, **style)
+        if (samples := signal(run.tape)) is not None:
+            curve = Curve(samples, run.colour, **style)
             curves[label if context.is_comparison else name] = curve._replace(
                 start_ns=run.tape.start_ns
             )
@@ -191,9 +191,9 @@ def _references(context: PlotContext) -> dict[str, Curve]:
             (name for name, reference in references.items() if _is_same_curve(reference, curve)),
             label,
         )
-        shown = references.setdefault(equal, curve)
-        if len(curve.signal.stamp_ns) > len(shown.signal.stamp_ns):
-            references[equal] = curve._replace(colour=shown.colour)
+        earlier = references.setdefault(equal, curve)
+        if len(curve.signal.stamp_ns) > len(earlier.signal.stamp_ns):
+            references[equal] = curve._replace(colour=earlier.colour)
     if len(references) == 1:
         (curve,) = references.values()
         return {"y_m": curve._replace(colour=REFERENCE, width=6.0)}
@@ -367,16 +367,16 @@ def learned_figure(context: PlotContext, lines: Mapping[str, Mapping[str, float]
     if "learned" not in context.tape:
         return None
     t = context.tape.time("learned")
-    learned = context.tape["learned"]
-    known = known_entries(learned)
-    values = learned.group("value")
-    deviations = learned.group("deviation")
-    if not known:
+    identification = context.tape["learned"]
+    entries = known_entries(identification)
+    values = identification.group("value")
+    deviations = identification.group("deviation")
+    if not entries:
         return None
-    columns = min(len(known), 3)
-    symbols = np.where(learned["proposed"] > 0.0, "circle", "circle-open").tolist()
-    figure = Figure(len(known), columns, 110, spacing=0.06)
-    for index, name in enumerate(known):
+    columns = min(len(entries), 3)
+    symbols = np.where(identification["proposed"] > 0.0, "circle", "circle-open").tolist()
+    figure = Figure(len(entries), columns, 110, spacing=0.06)
+    for index, name in enumerate(entries):
         bars = {"type": "data", "array": 2.0 * deviations[name], "thickness": 1.2, "width": 3}
         style: dict[str, Any] = {
             "error_y": bars,
@@ -392,9 +392,9 @@ def learned_figure(context: PlotContext, lines: Mapping[str, Mapping[str, float]
         figure.add_scatter(name, t, values[name], index, "markers", **style)
         figure.x[index] |= {
             "range": [0.0, BEYOND_END * context.end],
-            "showticklabels": index + columns >= len(known),
+            "showticklabels": index + columns >= len(entries),
         }
-        figure.x[index] |= {"title": {"text": "t (s)"}} if index + columns >= len(known) else {}
+        figure.x[index] |= {"title": {"text": "t (s)"}} if index + columns >= len(entries) else {}
         figure.y[index]["title"] = {"text": name}
     return set_layout(figure)
 

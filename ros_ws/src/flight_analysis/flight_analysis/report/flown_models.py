@@ -61,18 +61,18 @@ def flown_controllers(
 
     The digests of the ticks tell them.
     """
-    known = {start.digest(): start}
+    by_digest = {start.digest(): start}
     latest = start
     for change in changes:
         latest = vary(latest, change)
-        known[latest.digest()] = latest
+        by_digest[latest.digest()] = latest
     spans: dict[tuple[str, int], list[tuple[float, float]]] = {}
     for span in flown_parameters(tape):
         spans.setdefault((span.name, span.digest), []).append((span.start, span.stop))
     return tuple(
-        FlownController(name, tuple(times), known[digest])
+        FlownController(name, tuple(times), by_digest[digest])
         for (name, digest), times in spans.items()
-        if digest in known
+        if digest in by_digest
     )
 
 
@@ -82,8 +82,8 @@ def flown_loops(
     """The linear loops of a flight; none without a linear model."""
     loops = []
     airframe = true_airframe(tape, scenario)
-    flown = [(each.name, each.times, each.controller) for each in controllers]
-    for name, times, controller in flown or [("", "", scenario.controller)]:
+    parameter_sets = [(each.name, each.times, each.controller) for each in controllers]
+    for name, times, controller in parameter_sets or [("", "", scenario.controller)]:
         try:
             around_file = scenario_loop(scenario, controller)
             loops.append(FlownLoop(name, times, FILE, around_file))
@@ -105,9 +105,9 @@ def true_airframe(tape: Tape, scenario: Scenario) -> Airframe | None:
 
 
 def _loop_around(airframe: Airframe, controller: ControllerConfig) -> LinearLoop:
-    seen = through_allocation(airframe, controller)
+    airframe_of_law = through_allocation(airframe, controller)
     B = airframe.matrix_b() @ distribution(airframe, controller)
-    return linear_loop(controller, seen, airframe.matrix_a()[None], B[None])
+    return linear_loop(controller, airframe_of_law, airframe.matrix_a()[None], B[None])
 
 
 def learned_lines(tape: Tape, scenario: Scenario) -> dict[str, dict[str, float]]:

@@ -182,9 +182,11 @@ def unflown_legs(tape: Tape, section: GuidanceConfig) -> range:
         return range(0)
     last = int(on_route[-1])
     limit = section.home.link_timeout or math.inf
-    lost = last + 1 < len(log.stamp_ns) and log[LINK_AGE][last + 1] > limit
+    is_link_lost = last + 1 < len(log.stamp_ns) and log[LINK_AGE][last + 1] > limit
     replaced = (
-        last + 1 < len(log.stamp_ns) and int(log["given"][last + 1]) & bits(LATERAL) and not lost
+        last + 1 < len(log.stamp_ns)
+        and int(log["given"][last + 1]) & bits(LATERAL)
+        and not is_link_lost
     )
     route = None if replaced else known_routes(tape, section).get(int(log["route"][last]))
     return range(0) if route is None else range(int(log["leg"][last]), len(route.legs) - 1)
@@ -305,8 +307,12 @@ def _guided_pose(tape: Tape) -> Signal | None:
     if "pose" not in tape or "guidance" not in tape or not len(tape["guidance"].stamp_ns):
         return None
     pose = tape["pose"]
-    begun = pose.stamp_ns >= tape["guidance"].stamp_ns[0]
-    return Signal(pose.stamp_ns[begun], pose.names, pose.values[begun]) if begun.any() else None
+    is_guided = pose.stamp_ns >= tape["guidance"].stamp_ns[0]
+    return (
+        Signal(pose.stamp_ns[is_guided], pose.names, pose.values[is_guided])
+        if is_guided.any()
+        else None
+    )
 
 
 def _outside(tape: Tape, pose: Signal, inside: FloatArray) -> Outside:
@@ -419,12 +425,12 @@ def guidance_notices(tape: Tape, section: GuidanceConfig | None) -> list[str]:
         return []
     log = tape["guidance"]
     t = tape.time("guidance")
-    flown = known_routes(tape, section)
+    routes = known_routes(tape, section)
     notes = []
     for number, k in zip(*np.unique(log["route"], return_index=True), strict=True):
         notes += [
             Notice(float(t[k]), text)
-            for text in (flown[int(number)].notes if int(number) in flown else ())
+            for text in (routes[int(number)].notes if int(number) in routes else ())
         ]
     notices = notes + section.notices().read_log(t, {name: log[name] for name in log.names})
     return [f"guidance at t = {notice.t:.1f} s: {notice.text}" for notice in notices]
@@ -445,7 +451,7 @@ def guidance_summary(tape: Tape, section: GuidanceConfig | None = None) -> dict[
     if "guidance" not in tape or len(tape["guidance"].stamp_ns) == 0:
         return None
     log = tape["guidance"]
-    limited = log.group("limited")
+    limits = log.group("limited")
     outside = time_outside(tape, section)
     altitude = altitude_excess(tape, section)
     touch = landing_touch(tape, section)
@@ -459,7 +465,7 @@ def guidance_summary(tape: Tape, section: GuidanceConfig | None = None) -> dict[
         "bank": _largest(log["pose.phi"]),
         "age_pose": _largest(log["age.pose"]),
         "failed": int(log[FAILED][-1]),
-        "limited": {name: float(np.mean(limited[name] != 0.0)) for name in limited.names},
+        "limited": {name: float(np.mean(limits[name] != 0.0)) for name in limits.names},
     }
 
 

@@ -80,9 +80,11 @@ def flown_routes(scenario: Scenario | None, tape: Tape) -> list[Route]:
     """The flown routes by the log: of the scenario and of the topic `route`."""
     if scenario is None or scenario.guidance is None:
         return []
-    flown = set(tape["guidance"]["route"].tolist())
+    numbers = set(tape["guidance"]["route"].tolist())
     return [
-        route for digest, route in known_routes(tape, scenario.guidance).items() if digest in flown
+        route
+        for digest, route in known_routes(tape, scenario.guidance).items()
+        if digest in numbers
     ]
 
 
@@ -219,10 +221,10 @@ def vertical_figure(context: PlotContext, speed: float, bounds: Bounds) -> Figur
         np.nan,
     )
     commands = {"altitude": commanded, AIRSPEED: log["V_c"]}
-    flown = {"altitude": log["pose.altitude"], AIRSPEED: flown_speed(context.tape, speed)}
+    values = {"altitude": log["pose.altitude"], AIRSPEED: flown_speed(context.tape, speed)}
     units = {**context.units, AIRSPEED: DisplayUnit("m/s", 1.0)}
     limits = {**bounds, AIRSPEED: bounds["V"]} if "V" in bounds else bounds
-    return _over_commands(context._replace(units=units), commands, flown, limits)
+    return _over_commands(context._replace(units=units), commands, values, limits)
 
 
 def attitude_figure(context: PlotContext, bounds: Bounds) -> Figure:
@@ -269,17 +271,17 @@ def _signal(context: PlotContext, channels: Mapping[str, FloatArray]) -> Signal:
 def _over_commands(
     context: PlotContext,
     commands: Mapping[str, FloatArray],
-    flown: Mapping[str, FloatArray],
+    samples: Mapping[str, FloatArray],
     bounds: Bounds,
 ) -> Figure:
     curves = {
         "command": Curve(_signal(context, commands), REFERENCE, 5.0),
-        "flown": Curve(_signal(context, flown), PLANT),
+        "flown": Curve(_signal(context, samples), PLANT),
     }
     figure = time_series_figure(context, curves)
-    for index, name in enumerate(flown):
+    for index, name in enumerate(samples):
         factor = context.units[name].factor
-        values = np.concatenate([flown[name], commands[name]]) * factor
+        values = np.concatenate([samples[name], commands[name]]) * factor
         low = float(np.nanmin(values))
         high = float(np.nanmax(values))
         lower, upper = (bound * factor for bound in bounds.get(name, (-math.inf, math.inf)))

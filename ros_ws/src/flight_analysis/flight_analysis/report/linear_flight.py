@@ -213,28 +213,28 @@ def _flight(
     """The error e of the linear loop at the ticks, (N, m), x_dot = A x + B u + d; d: (N, n)."""
     plant, law, loop = parts
     n, m = plant.B.shape
-    sampled = sampled_plant(plant, loop, np.zeros(m))
-    _, held = zero_order_hold(plant.A, np.eye(n), loop.period)
-    drive = np.zeros((len(ticks), len(sampled.A)))
-    drive[:, :n] = d @ held.T
+    by_tick = sampled_plant(plant, loop, np.zeros(m))
+    _, step = zero_order_hold(plant.A, np.eye(n), loop.period)
+    drive = np.zeros((len(ticks), len(by_tick.A)))
+    drive[:, :n] = d @ step.T
     # vanes add columns to y, which see the motion alone
-    vanes = len(sampled.C) - m
+    vanes = len(by_tick.C) - m
     noise = _noise(tape, controller, ticks)
     shift = np.concatenate([noise - y_m, np.zeros((len(ticks), vanes))], axis=1)
     probe = controller.guard().probe
-    x = np.zeros(len(sampled.A))
+    x = np.zeros(len(by_tick.A))
     x[:n] = np.linalg.pinv(plant.C[:m]) @ (e_0 + y_m[0])
     z = np.zeros(law.A.shape[-1])
     e = np.zeros((len(ticks), m))
     for k, t in enumerate(ticks):
-        y = sampled.C @ x
+        y = by_tick.C @ x
         e[k] = y[:m] - y_m[k]
         measured = y + shift[k]
         u = law.C @ z + law.D @ measured
         z = law.A @ z + law.B @ measured
         if probe is not None:
             u = u + probe.at(tape.start_ns + round(t * NANOSECONDS))
-        x = sampled.A @ x + sampled.B @ u + drive[k]
+        x = by_tick.A @ x + by_tick.B @ u + drive[k]
     return e
 
 
@@ -321,12 +321,12 @@ def _active(tape: Tape, ticks: FloatArray) -> NDArray[np.bool_]:
         return np.zeros(len(ticks), dtype=bool)
     mode = tape["internals"]["mode"]
     t = tape.time("internals")
-    engaged = mode == Mode.ENGAGED
-    if not engaged.any():
+    is_engaged = mode == Mode.ENGAGED
+    if not is_engaged.any():
         return np.zeros(len(ticks), dtype=bool)
     before = np.maximum(np.searchsorted(t, ticks, side="right") - 1, 0)
     is_active: NDArray[np.bool_] = mode[before] != Mode.INACTIVE
-    return is_active & (ticks >= float(t[np.argmax(engaged)]))
+    return is_active & (ticks >= float(t[np.argmax(is_engaged)]))
 
 
 def _sampled(t: FloatArray, ticks: FloatArray) -> NDArray[np.bool_]:

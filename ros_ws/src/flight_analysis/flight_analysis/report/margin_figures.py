@@ -147,8 +147,8 @@ def _least(margins: Margins, delay: float) -> list[float]:
 
 def modes_text(margins: LoopMargins) -> str:
     """The slow modes with little damping as a sentence."""
-    shown = [(w, zeta) for w, zeta in zip(*margins.modes, strict=True) if zeta < SHOWN_DAMPING]
-    modes = ", ".join(f"{w:.3g} rad/s {zeta:.2f}" for w, zeta in shown)
+    slow_modes = [(w, zeta) for w, zeta in zip(*margins.modes, strict=True) if zeta < SHOWN_DAMPING]
+    modes = ", ".join(f"{w:.3g} rad/s {zeta:.2f}" for w, zeta in slow_modes)
     least = (
         f"; least of the uncertain aircraft {float(margins.worst.damping):.2f}"
         if margins.worst is not None
@@ -239,9 +239,9 @@ def guarantee_text(promise: Guarantee) -> list[str]:
             f"the first unstable aircraft found: at {deviation:.1f} % ({first.frequency:.2g} rad/s)"
         )
     if not promise.holds:
-        asked = 100.0 * promise.uncertainty
+        percent = 100.0 * promise.uncertainty
         lines.append(
-            f"an aircraft within {asked:g} % may be unstable: no disk margin is guaranteed"
+            f"an aircraft within {percent:g} % may be unstable: no disk margin is guaranteed"
         )
     return lines
 
@@ -249,11 +249,11 @@ def guarantee_text(promise: Guarantee) -> list[str]:
 def guarantee_rows(promise: Guarantee, margins: LoopMargins) -> list[tuple[str, float, float]]:
     """Input, guaranteed disk margin, and the least disk margin found, ALL_INPUTS last."""
     worst = margins.worst
-    found = [math.nan] * (len(promise.inputs) + 1)
+    least_disks = [math.nan] * (len(promise.inputs) + 1)
     if worst is not None:
-        found = [*worst.disk.tolist(), float(worst.disk_all)]
+        least_disks = [*worst.disk.tolist(), float(worst.disk_all)]
     disks = [*promise.disk.tolist(), promise.disk_all]
-    return list(zip((*promise.inputs, ALL_INPUTS), disks, found, strict=True))
+    return list(zip((*promise.inputs, ALL_INPUTS), disks, least_disks, strict=True))
 
 
 def guarantee_as_json(promise: Guarantee) -> dict[str, Any]:

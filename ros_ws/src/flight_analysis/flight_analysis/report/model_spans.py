@@ -79,16 +79,16 @@ def errors_by_model(tape: Tape) -> list[ModelSpan]:
     _, error = best_error(tape)
     t = (error.stamp_ns - tape.start_ns) / 1e9
     ticks = tape.time("internals")
-    engaged = (
+    is_engaged = (
         tape["internals"]["mode"][np.maximum(np.searchsorted(ticks, t, side="right") - 1, 0)]
         == Mode.ENGAGED
     )
     spans = []
-    flown = flown_parameters(tape)
-    digests = list(dict.fromkeys(span.digest for span in flown))
-    for span in flown:
-        stop = float(t[-1]) if span is flown[-1] else span.stop
-        in_span = (t >= span.start) & (t < stop) & engaged
+    names = flown_parameters(tape)
+    digests = list(dict.fromkeys(span.digest for span in names))
+    for span in names:
+        stop = float(t[-1]) if span is names[-1] else span.stop
+        in_span = (t >= span.start) & (t < stop) & is_engaged
         rms = {name: error_metrics(error[name][in_span]).rms for name in error.names}
         if in_span.any():
             spans.append(

@@ -240,11 +240,11 @@ def time_series_figure(
         for label, curve in curves.items():
             if channel in curve.signal.names:
                 trace = _trace(context, curve, channel, factor, MAX_POINTS // columns)
-                shown = len(curves) > 1 and first_in_legend(figure, label)
+                in_legend = len(curves) > 1 and first_in_legend(figure, label)
                 trace |= {
                     "name": label,
                     "legendgroup": label,
-                    "showlegend": shown,
+                    "showlegend": in_legend,
                     "hovertemplate": f"%{{y:.4g}} {unit}",
                 }
                 figure.add(trace, index)
@@ -312,9 +312,9 @@ def add_line(
     """Add a line to a subplot, with an entry in the legend. None in x breaks the line."""
     if not x:
         return
-    shown = first_in_legend(figure, label)
+    in_legend = first_in_legend(figure, label)
     figure.add_scatter(
-        label, x, y, index, legendgroup=label, line=style, hoverinfo="skip", showlegend=shown
+        label, x, y, index, legendgroup=label, line=style, hoverinfo="skip", showlegend=in_legend
     )
 
 
@@ -371,9 +371,9 @@ def _extremes_of_bins(values: FloatArray, width: int) -> FloatArray:
     low = np.where(gaps, np.inf, bins).argmin(axis=1)
     high = np.where(gaps, -np.inf, bins).argmax(axis=1)
     columns = np.sort(np.column_stack([low, high]), axis=1)
-    drawn = np.take_along_axis(bins, columns, axis=1)
-    drawn[gaps.any(axis=1), 1] = np.nan
-    return drawn.ravel()
+    extremes = np.take_along_axis(bins, columns, axis=1)
+    extremes[gaps.any(axis=1), 1] = np.nan
+    return extremes.ravel()
 
 
 def _bins(values: NDArray[T], width: int) -> NDArray[T]:
@@ -388,8 +388,8 @@ def _instants(t_ns: NDArray[np.int64], steps: bool) -> Instants:
         before = np.flatnonzero(periods > MIN_GAP_PERIODS * np.median(periods))
         t_ns = np.insert(t_ns, before + 1, t_ns[before]) if len(before) else t_ns
     width = -(-len(t_ns) // (MAX_STORED // 2)) if len(t_ns) > MAX_STORED else 1
-    drawn = t_ns if width == 1 else _bins(t_ns, width)[:, [0, width // 2]].ravel()
-    return Instants(drawn, before + 1, width)
+    stamps = t_ns if width == 1 else _bins(t_ns, width)[:, [0, width // 2]].ravel()
+    return Instants(stamps, before + 1, width)
 
 
 def _shade_intervals(

@@ -107,10 +107,10 @@ def report(
         )
         if path is not None
     ]
-    alone = len(folders) == 1 and html is None
-    require(output is None or alone, "output", "a comparison", "one run; html for several")
-    read = partial(read_flight, namespace=namespace, scenario=scenario, remaps=remaps)
-    if alone:
+    is_single = len(folders) == 1 and html is None
+    require(output is None or is_single, "output", "a comparison", "one run; html for several")
+    read_one = partial(read_flight, namespace=namespace, scenario=scenario, remaps=remaps)
+    if is_single:
         folder = None if output is None else as_path(output, "output", "the path of a folder")
         result = write_report(
             folders[0], output=folder, namespace=namespace, scenario=scenario, remaps=remaps
@@ -118,7 +118,7 @@ def report(
         page = result.report
         flights = [result.flight]
     else:
-        flights = [read(folder) for folder in folders]
+        flights = [read_one(folder) for folder in folders]
         _require_comparable(folders, flights)
         if html is None:
             comparison = folders[0].absolute().parent / "comparison.html"

@@ -228,9 +228,11 @@ def _flight(recorded: RecordedRun, run: Path, outcome: Outcome | None) -> Record
         require_channels(log["guidance"].names)
     tape = until_last_tick(log)
     flight_account = account(log, scenario, outcome, simulated=engagements is None)
-    engaged = _engaged(tape, engagements or [])
-    has_figures = {"y", "y_m"} <= set(engaged.signals)  # an engagement may be shorter than a sample
-    summary = summarise(engaged if has_figures else tape, scenario, outcome, flight_account)
+    engaged_part = _engaged(tape, engagements or [])
+    has_figures = {"y", "y_m"} <= set(
+        engaged_part.signals
+    )  # an engagement may be shorter than a sample
+    summary = summarise(engaged_part if has_figures else tape, scenario, outcome, flight_account)
     summary["flight"] = _identity(recorded)
     if engagements is not None:
         summary["engagements"] = [_engagement(tape, engagement) for engagement in engagements]
@@ -272,7 +274,7 @@ def log_account(recorded: RecordedRun) -> Account | None:
     return account(recorded.tape, scenario, outcome, simulated=recorded.engagements is None)
 
 
-def _engaged(tape: Tape, flown: Sequence[Engagement]) -> Tape:
+def _engaged(tape: Tape, engagements: Sequence[Engagement]) -> Tape:
     """The engaged part of a flight with a bridge, for the figures.
 
     Without an engagement the whole tape counts, for the duration.
@@ -281,7 +283,7 @@ def _engaged(tape: Tape, flown: Sequence[Engagement]) -> Tape:
         (int(signal.stamp_ns[-1]) for signal in tape.signals.values() if len(signal.stamp_ns)),
         default=0,
     )
-    windows = [(engagement.start_ns, engagement.stop_ns or end_ns) for engagement in flown]
+    windows = [(engagement.start_ns, engagement.stop_ns or end_ns) for engagement in engagements]
     signals = (
         {name: signal.within(windows) for name, signal in tape.signals.items()}
         if windows
@@ -292,13 +294,13 @@ def _engaged(tape: Tape, flown: Sequence[Engagement]) -> Tape:
     )
 
 
-def _engagement(tape: Tape, flown: Engagement) -> dict[str, Any]:
+def _engagement(tape: Tape, engagement: Engagement) -> dict[str, Any]:
     """Start and end of an engagement in flight time, s, and the reason of the end."""
     start, stop = (
         (time_ns - tape.start_ns) / NANOSECONDS if time_ns else None
-        for time_ns in (flown.start_ns, flown.stop_ns)
+        for time_ns in (engagement.start_ns, engagement.stop_ns)
     )
-    return {"start": start, "stop": stop, "reason": flown.reason}
+    return {"start": start, "stop": stop, "reason": engagement.reason}
 
 
 def recorded_scenario(run: Path, namespace: str | None = None) -> Scenario:

@@ -144,9 +144,9 @@ def _expected(
         expected[name] = count
     if not span.simulated:  # the controller is inactive until the bridge engages
         return expected
-    engaged = seconds(span.end_ns - tape.start_ns)
+    engaged_time = seconds(span.end_ns - tape.start_ns)
     if _is_of_stack(tape, "u"):
-        ticks, engaged = _ticks(tape, scenario, span.end_ns)
+        ticks, engaged_time = _ticks(tape, scenario, span.end_ns)
         expected |= dict.fromkeys(TICKS, ticks)
     if scenario.guidance is not None:
         step_ns = period_ns(scenario.guidance.rate, "guidance.rate")
@@ -154,7 +154,7 @@ def _expected(
             if name not in tape or _is_of_stack(tape, name):
                 rate = NANOSECONDS / _period(tape, name, step_ns)
                 before_pose = math.ceil(pose.delay * rate)
-                expected[name] = max(math.floor(engaged * rate) - 2 - before_pose, 0)
+                expected[name] = max(math.floor(engaged_time * rate) - 2 - before_pose, 0)
     return expected
 
 
@@ -350,8 +350,8 @@ def _ticks(tape: Tape, scenario: Scenario, end_ns: int) -> tuple[int, float]:
     after = 0 if goes_on else max((end_ns - last_ns) // step_ns, 0) * count // instants
     ticks = int(len(log.stamp_ns) + max(missing, 0.0) + before + after)
     ticks = count if ticks < LEAST * count else ticks
-    engaged = float(np.mean(log["mode"] == Mode.ENGAGED))
-    return ticks, engaged * ticks * instants / count * seconds(step_ns)
+    engaged_share = float(np.mean(log["mode"] == Mode.ENGAGED))
+    return ticks, engaged_share * ticks * instants / count * seconds(step_ns)
 
 
 def _instants_with_y(tape: Tape, internals: Signal, step_ns: int) -> int:

@@ -42,7 +42,7 @@ ENGAGED = 0.9
 figure is of the law."""
 
 
-def judged(
+def judge(
     outcome: Outcome,
     tape: Tape,
     scenario: Scenario | None,
@@ -84,10 +84,10 @@ def _engagement(tape: Tape) -> list[Shortfall]:
     if "internals" not in tape or "mode" not in tape["internals"].names:
         return []
     mode = tape["internals"]["mode"]
-    asked = mode[mode != Mode.INACTIVE]
-    if not len(asked):
+    active_modes = mode[mode != Mode.INACTIVE]
+    if not len(active_modes):
         return []
-    share = float(np.mean(asked == Mode.ENGAGED))
+    share = float(np.mean(active_modes == Mode.ENGAGED))
     if share >= ENGAGED:
         return []
     sentence = f"the law engaged in {100.0 * share:.0f} % of the ticks"
@@ -134,10 +134,10 @@ def _guided(tape: Tape, section: GuidanceConfig, *, has_landed: bool) -> list[Sh
     if "guidance" in tape and len(tape["guidance"].stamp_ns):
         shortfalls += _failed_steps(tape)
         shortfalls += _route(tape, section, has_landed=has_landed)
-    beside = touched_beside(tape, section) if has_landed else 0.0
-    if beside:
-        sentence = f"outside of the touch-down zone by {beside:.0f} m"
-        figures = {"beside_m": beside}
+    touch_distance = touched_beside(tape, section) if has_landed else 0.0
+    if touch_distance:
+        sentence = f"outside of the touch-down zone by {touch_distance:.0f} m"
+        figures = {"beside_m": touch_distance}
         shortfalls.append(Shortfall(aim=Aim.TOUCHDOWN, sentence=sentence, figures=figures))
     return shortfalls
 

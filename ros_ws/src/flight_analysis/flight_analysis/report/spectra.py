@@ -26,9 +26,9 @@ def spectra(signal: Signal, period_ns: int) -> tuple[FloatArray, dict[str, Float
     longest = max(round(LONGEST_INTERVAL * NANOSECONDS / period_ns), 1)
     places = np.cumsum(np.minimum(np.diff(places, prepend=0), longest))
     grid = np.arange(places[-1] + 1)
-    held = signal.values[np.searchsorted(places, grid, side="right") - 1]
+    values = signal.values[np.searchsorted(places, grid, side="right") - 1]
     window = max(min(len(grid) // 10, MAX_WINDOW), min(len(grid), 256))
-    frequency, power = _welch(held, 1e9 / period_ns, window)
+    frequency, power = _welch(values, 1e9 / period_ns, window)
     return frequency[1:], dict(zip(signal.names, np.sqrt(power[1:]).T, strict=True))
 
 

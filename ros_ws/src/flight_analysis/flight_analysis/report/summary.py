@@ -48,7 +48,7 @@ from flight_analysis.report.flown_models import FlownController
 from flight_analysis.report.guided import guidance_notices, guidance_summary
 from flight_analysis.report.model_spans import errors_by_model
 from flight_analysis.report.sample_counts import WHOLE, ends_last, is_simulated
-from flight_analysis.report.shortfalls import judged
+from flight_analysis.report.shortfalls import judge
 from flight_analysis.report.timing import (
     AgeMetrics,
     LatencyMetrics,
@@ -193,7 +193,7 @@ def summarise(
         flight_account = _with_late_ticks(flight_account, ticks, scenario)
     busy = flight_account.busy
     busy_notes = [busy] if busy else []
-    summary = empty_summary(scenario, judged(outcome, tape, scenario, flight_account)) | {
+    summary = empty_summary(scenario, judge(outcome, tape, scenario, flight_account)) | {
         "duration": _duration(tape, flight_account),
         "error": best_error(tape)[0],
         "air": air,
@@ -241,9 +241,9 @@ def _require_topics(tape: Tape) -> None:
     """Raise ParameterError for a tape without y or y_m."""
     for topic in ("y", "y_m"):
         unset = " with a stamp" if topic in tape.recording and tape.recording[topic].unset else ""
-        refused = f" ({refusal_note(topic, tape.refused[topic])})" if topic in tape.refused else ""
-        found = f"no sample of {topic}{unset}{refused}"
-        require(topic in tape, "the log", found, "a flight with y and y_m")
+        refusal = f" ({refusal_note(topic, tape.refused[topic])})" if topic in tape.refused else ""
+        lack = f"no sample of {topic}{unset}{refusal}"
+        require(topic in tape, "the log", lack, "a flight with y and y_m")
 
 
 def _finite(metrics: TickMetrics | LatencyMetrics | AgeMetrics | None) -> dict[str, Any] | None:
@@ -408,15 +408,15 @@ def time_flown(summary: Mapping[str, Any]) -> str:
     return f"{format_seconds(summary['duration'])} flown{taken_over(summary, 'errors')}"
 
 
-def engagement_notes(flown: Sequence[Mapping[str, Any]], *, has_figures: bool) -> list[str]:
+def engagement_notes(engagements: Sequence[Mapping[str, Any]], *, has_figures: bool) -> list[str]:
     """Sentences on the engagements of a flight with a bridge.
 
     They have figures unless shorter than a sample.
     """
-    if not flown:
+    if not engagements:
         return ["never engaged: the figures are of an aircraft that this controller did not fly"]
     sentences = []
-    for engagement in flown:
+    for engagement in engagements:
         end = (
             "the end of the log"
             if engagement["stop"] is None
@@ -439,9 +439,9 @@ def mode_notes(tape: Tape, part: str) -> list[str]:
     """
     if "internals" not in tape:
         return []
-    engaged = (mode := tape["internals"]["mode"]) == Mode.ENGAGED
-    ticks = mode[np.argmax(engaged) :]
-    if not engaged.any() or np.mean(ticks == Mode.ENGAGED) >= WHOLE:
+    is_engaged = (mode := tape["internals"]["mode"]) == Mode.ENGAGED
+    ticks = mode[np.argmax(is_engaged) :]
+    if not is_engaged.any() or np.mean(ticks == Mode.ENGAGED) >= WHOLE:
         return []
     absent = [state for state in Mode if state is not Mode.ENGAGED and state in ticks]
     modes = ", ".join(f"{state.name} in {np.mean(ticks == state):.0%}" for state in absent)
@@ -462,8 +462,8 @@ def vane_notes(tape: Tape) -> list[str]:
     t = tape.time("internals")
     notes = []
     for name in measures.names:
-        moved = np.flatnonzero(measures[name] != 0.0)
-        since = float(t[moved[-1]] if len(moved) else t[0])
+        changes = np.flatnonzero(measures[name] != 0.0)
+        since = float(t[changes[-1]] if len(changes) else t[0])
         if t[-1] - since > STANDS_STILL:
             notes.append(
                 f"vane {name} stands still from t = {since:.1f} s on and is left out: frozen, "
@@ -539,5 +539,5 @@ def summary_legend(summary: Mapping[str, Any]) -> str:
     """Legend of the parts of a flight."""
     is_guided = any("turn" in parts for parts in summary["errors"].values())
     air = summary["air"] or UNKNOWN_AIR
-    bound = ". ultimate bound: the largest error in calm" if air == CALM else ""
-    return f"{metrics.parts_legend(air, is_guided=is_guided)}{bound}"
+    meaning = ". ultimate bound: the largest error in calm" if air == CALM else ""
+    return f"{metrics.parts_legend(air, is_guided=is_guided)}{meaning}"

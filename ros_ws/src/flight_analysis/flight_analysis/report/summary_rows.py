@@ -232,14 +232,14 @@ def slowest_settling(summary: Mapping[str, Any], channel: str, kind: str) -> str
     "> x" where the error did not settle after a transient; x is then the longest time, settled or
     not.
     """
-    settled: list[float] = []
+    times: list[float] = []
     unsettled: list[float] = []
     for transient in summary["transients"]:
         if transient["kind"] == kind and channel in transient["settling"]:
             if (time := transient["settling"][channel]) is None:
                 unsettled.append(transient["until"][channel] - transient["start"])
             else:
-                settled.append(time)
+                times.append(time)
     if unsettled:
-        return f"> {max(unsettled + settled):.2f}"
-    return f"{max(settled):.2f}" if settled else NO_VALUE
+        return f"> {max(unsettled + times):.2f}"
+    return f"{max(times):.2f}" if times else NO_VALUE

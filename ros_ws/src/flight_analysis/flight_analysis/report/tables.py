@@ -115,9 +115,9 @@ def _stands_still(measures: FloatArray, tape: Tape, time: float) -> NDArray[np.b
     t = tape.time("internals")
     tick = np.arange(len(measures))
     engages = (internals["mode"] == Mode.ENGAGED) & (internals["dt"] == 0.0)
-    engaged = np.maximum.accumulate(np.where(engages, tick, 0))
-    has_moved = np.maximum.accumulate(np.where(measures > 0.0, tick, -1)) >= engaged
-    still: NDArray[np.bool_] = (measures == 0.0) & (has_moved | (t - t[engaged] >= time))
+    engagement = np.maximum.accumulate(np.where(engages, tick, 0))
+    has_moved = np.maximum.accumulate(np.where(measures > 0.0, tick, -1)) >= engagement
+    still: NDArray[np.bool_] = (measures == 0.0) & (has_moved | (t - t[engagement] >= time))
     return still
 
 
@@ -127,7 +127,7 @@ def events(tape: Tape, gusts: Windows, scenario: Scenario | None = None) -> list
     The order is that of the start. The saturations are of the inputs. The scenario comes from the
     tape; the tape of a log has no scenario and needs the argument.
     """
-    flown = scenario if scenario is not None else tape.scenario
+    of_flight = scenario if scenario is not None else tape.scenario
     listed = []
     intervals = figures.gust_intervals(tape, gusts) + figures.mode_intervals(tape)
     for label, group in groupby(intervals, key=lambda interval: interval.label):
@@ -142,17 +142,17 @@ def events(tape: Tape, gusts: Windows, scenario: Scenario | None = None) -> list
             )
         )
     end = figures.flight_end(tape)
-    faults = flown.aircraft.actuators.read_faults() if isinstance(flown, Scenario) else ()
+    faults = of_flight.aircraft.actuators.read_faults() if isinstance(of_flight, Scenario) else ()
     listed += [
         EventInterval(f"fault: {fault.subject}", fault.at, end, fault.extent)
         for fault in faults
         if fault.at < end
     ]
     if "internals" in tape:
-        limited = tape["internals"].group("limited")
+        limits = tape["internals"].group("limited")
         t = tape.time("internals")
-        for name, kind in product(limited.names, (Saturation.MAGNITUDE, Saturation.RATE)):
-            saturated = limited[name] == kind
+        for name, kind in product(limits.names, (Saturation.MAGNITUDE, Saturation.RATE)):
+            saturated = limits[name] == kind
             if saturated.any():
                 first, last = t[saturated][[0, -1]]
                 extent = f"{saturated.sum()} of {len(saturated)} ticks"
@@ -160,7 +160,7 @@ def events(tape: Tape, gusts: Windows, scenario: Scenario | None = None) -> list
                     EventInterval(f"{name} saturated: {kind.name.lower()}", first, last, extent)
                 )
         measures = tape["internals"].group("vane_measures")
-        observer = flown.controller.observer if isinstance(flown, Scenario) else None
+        observer = of_flight.controller.observer if isinstance(of_flight, Scenario) else None
         time = 0.0 if observer is None or observer.vanes is None else observer.vanes.time
         for name in measures.names:
             if (still := _stands_still(measures[name], tape, time)).any():

@@ -124,8 +124,8 @@ def _worst(pair: ErrorPair, i: int, group: list[int], floor: float) -> Excess | 
     start, stop = spans[-1]
     end = (max(start, stop - _ticks(pair, END)), stop)
     excesses.append(_largest_excess(pair, i, group, floor, end))
-    beyond = [excess for excess in excesses if excess.rms > excess.allowed]
-    return max(beyond, key=lambda excess: excess.rms / excess.allowed, default=None)
+    violations = [excess for excess in excesses if excess.rms > excess.allowed]
+    return max(violations, key=lambda excess: excess.rms / excess.allowed, default=None)
 
 
 def _largest_excess(
@@ -193,14 +193,14 @@ def saturation_notes(tape: Tape) -> list[str]:
     """
     if "internals" not in tape:
         return []
-    limited = tape["internals"].group("limited")
+    limits = tape["internals"].group("limited")
     u = tape["internals"].group("u")
     u_free = tape["internals"].group("u_free")
     notes = []
-    for name in sorted({*limited.names} & {*u.names} & {*u_free.names}, key=limited.names.index):
-        at_limit = limited[name] == Saturation.MAGNITUDE
-        share_above = _windowed(limited, at_limit & (u_free[name] > u[name]))
-        share_below = _windowed(limited, at_limit & (u_free[name] < u[name]))
+    for name in sorted({*limits.names} & {*u.names} & {*u_free.names}, key=limits.names.index):
+        at_limit = limits[name] == Saturation.MAGNITUDE
+        share_above = _windowed(limits, at_limit & (u_free[name] > u[name]))
+        share_below = _windowed(limits, at_limit & (u_free[name] < u[name]))
         alternates = np.minimum(share_above, share_below) >= SIDE
         worst = np.where(alternates, share_above + share_below, 0.0).max(initial=0.0)
         if worst >= SATURATED:

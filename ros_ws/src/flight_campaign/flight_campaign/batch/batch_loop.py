@@ -28,7 +28,7 @@ from flight_campaign.batch.batch_schedule import ASKED, Kind, Run
 from flight_campaign.batch.campaign_course import Segments
 from flight_core.arithmetic import product
 from flight_core.vectors import Array
-from rise_di_controller.extensions.allocation import Allocation, reached
+from rise_di_controller.extensions.allocation import Allocation, limits_of_effectors
 from rise_di_controller.law.control_law import ControlLaw, Measurements
 from rise_di_controller.law.saturation import Limits, saturate
 
@@ -217,7 +217,7 @@ def tick(
             saturate(u_free, now.u, segment.dt, limits), now.command, segment.dt, allocation
         )
         law, _, u = control_law.limited(
-            now.law, measured, segment.dt, params, reached(u_free, reachable)
+            now.law, measured, segment.dt, params, limits_of_effectors(u_free, reachable)
         )
         command, u = allocate(u, now.command, segment.dt, allocation)
         return law, u, command

@@ -107,8 +107,8 @@ def _moved(
     bounds: tuple[IntArray, IntArray],
 ) -> list[Place]:
     """The places that moves of a channel, or of some, lead to, other than the place itself."""
-    moved = np.repeat(np.reshape(place, (1, *bounds[0].shape)), len(moves), axis=0)
+    places = np.repeat(np.reshape(place, (1, *bounds[0].shape)), len(moves), axis=0)
     for channel in np.atleast_1d(channels):
-        moved[:, :, channel] += reach * np.array(moves)
-    rows = np.clip(moved, *bounds).reshape(len(moves), -1).tolist()
+        places[:, :, channel] += reach * np.array(moves)
+    rows = np.clip(places, *bounds).reshape(len(moves), -1).tolist()
     return [row for row in dict.fromkeys(map(tuple, rows)) if row != place]

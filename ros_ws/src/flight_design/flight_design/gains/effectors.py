@@ -122,16 +122,16 @@ def _pseudo_inverse(airframe: Airframe, Omega: FloatArray, effectors: Effectors)
     Raises ParameterError for dependent rows of Omega.
     """
     reach = (effectors.upper - effectors.lower) / 2.0 / (effectors.lag + SERVO)
-    scaled = Omega * reach
-    size = np.abs(scaled).max(axis=1, keepdims=True)
-    rank = np.linalg.matrix_rank(scaled / np.where(size > 0.0, size, 1.0), 1e-6)
+    scaled_Omega = Omega * reach
+    size = np.abs(scaled_Omega).max(axis=1, keepdims=True)
+    rank = np.linalg.matrix_rank(scaled_Omega / np.where(size > 0.0, size, 1.0), 1e-6)
     require(
         bool((size > 0.0).all()) and rank == len(Omega),
         f"airframe {airframe.name}: C B",
         "rows that depend on each other",
         "inputs that move each output",
     )
-    return np.asarray(reach[:, None] * np.linalg.pinv(scaled))
+    return np.asarray(reach[:, None] * np.linalg.pinv(scaled_Omega))
 
 
 def _alone(T: FloatArray, sides: tuple[FloatArray, FloatArray]) -> FloatArray:

@@ -116,10 +116,10 @@ def _channels(airframe: Airframe, lag: Sequence[float]) -> dict[str, Channel]:
         authority = law.upper
         lags = law.lag
     else:
-        paired = list(pairing(airframe))
-        response = np.abs(airframe.matrix_c() @ airframe.matrix_b())[range(len(outputs)), paired]
-        authority = response * np.array(_stops(airframe))[paired]
-        lags = np.array(lag)[paired]
+        inputs = list(pairing(airframe))
+        response = np.abs(airframe.matrix_c() @ airframe.matrix_b())[range(len(outputs)), inputs]
+        authority = response * np.array(_stops(airframe))[inputs]
+        lags = np.array(lag)[inputs]
     products = [CROSSOVER_LAG_PRODUCTS.get(name, DEFAULT_CROSSOVER_LAG_PRODUCT) for name in outputs]
     bandwidth = bandwidths(LoopTiming(lags, DELAY, 1.0 / CONTROL_RATE), np.array(products))
     rows = airframe.matrix_c()
@@ -152,13 +152,13 @@ def _stops(airframe: Airframe) -> list[float]:
             for unit in airframe.units_of_outputs().values()
         ]
     )
-    moved = np.argmax(Omega / authorities[:, None], axis=0).tolist()
+    outputs = np.argmax(Omega / authorities[:, None], axis=0).tolist()
     if len(airframe.inputs) == len(airframe.outputs):
         for i, j in enumerate(pairing(airframe)):
-            moved[j] = i
+            outputs[j] = i
     return [
         STOP if surface else float(f"{authorities[i] / max(Omega[i, j], 1e-9):.3g}")
-        for j, (surface, i) in enumerate(zip(_surfaces(airframe), moved, strict=True))
+        for j, (surface, i) in enumerate(zip(_surfaces(airframe), outputs, strict=True))
     ]
 
 

@@ -137,15 +137,15 @@ def select_gains(
         >>> len(selection.chosen.beta)
         4
     """
-    chosen = find_scenario(scenario)
+    flight = find_scenario(scenario)
     frame = load_airframe(airframe)
-    chosen.rise_di()
+    flight.rise_di()
     require(callable(progress), "progress", progress, "a function of a text")
     require(mixing in MIXINGS, "mixing", mixing, " or ".join(MIXINGS))
-    loop = _mixed(_loop(chosen, frame, rate, y_rate, lag, delay), chosen, frame, mixing)
-    seen = through_allocation(frame, loop.base)
+    loop = _mixed(_loop(flight, frame, rate, y_rate, lag, delay), flight, frame, mixing)
+    airframe_of_law = through_allocation(frame, loop.base)
     setting = loop._replace(
-        inputs=_pairing(inputs, chosen.controller, seen),
+        inputs=_pairing(inputs, flight.controller, airframe_of_law),
         gamma_2=as_number(gamma_2, "gamma_2", 0.0, unit="1/s"),
         feedforward=feedforward,
         requirement=requirement(phase_margin, accept=accept),
@@ -157,14 +157,14 @@ def select_gains(
     margin = as_number(margin, "margin", 0.0, MAX_DELAY_MARGIN, "s")
     pair = _two_speeds(speeds, observer=observer)
     known_model = frame if model is None else load_airframe(model)
-    studied = study(frame, chosen, setting.base, uncertainty, samples, seed)
+    studied = study(frame, flight, setting.base, uncertainty, samples, seed)
     selection = gain_selection.gain_sets(studied, setting)
     if not observer:
         return selection
     needed = _beside_observer(setting.requirement, as_read=weights is not None and accept)
     controller, origin = observed(
         selection.chosen,
-        chosen,
+        flight,
         through_allocation(known_model, setting.base),
         margin,
         needed,
@@ -233,11 +233,11 @@ def check_gains(
         >>> rise_di.check_gains("osprey", samples=1).delay_margin > 0.03
         True
     """
-    chosen = find_scenario(scenario)
+    flight = find_scenario(scenario)
     frame = load_airframe(airframe)
     gamma_2 = as_number(gamma_2, "gamma_2", 0.0, unit="1/s")
-    studied = study(frame, chosen, chosen.controller, uncertainty, samples, seed)
-    return gain_selection.assess_scenario(chosen, studied, gamma_2)
+    studied = study(frame, flight, flight.controller, uncertainty, samples, seed)
+    return gain_selection.assess_scenario(flight, studied, gamma_2)
 
 
 def study(
@@ -252,11 +252,13 @@ def study(
 
     They fly along the commands and gusts of a scenario. Raises ParameterError.
     """
-    seen = through_allocation(airframe, controller)
-    behind = None if seen is airframe else Effected(airframe, distribution(airframe, controller))
+    effective = through_allocation(airframe, controller)
+    behind = None
+    if effective is not airframe:
+        behind = Effected(airframe, distribution(airframe, controller))
     return ideal_control.study_airframe(
-        seen,
-        ideal_control.manoeuvre(scenario, seen),
+        effective,
+        ideal_control.manoeuvre(scenario, effective),
         as_number(uncertainty, "uncertainty", 0.0, 1.0),
         as_count(samples, "samples", 0, MAX_SAMPLES),
         as_count(seed, "seed", 0),
@@ -328,16 +330,16 @@ def _with_limits(loop: LoopSetting, scenario: Scenario, airframe: Airframe) -> L
 
 
 def _pairing(
-    inputs: str | Sequence[str], controller: ControllerConfig, seen: Airframe
+    inputs: str | Sequence[str], controller: ControllerConfig, airframe: Airframe
 ) -> tuple[str, ...]:
     """Inputs as asked for, else of each output by a controller of the same names, else ()."""
-    asked = as_names(inputs, "inputs", f"the inputs {', '.join(seen.inputs)} in any order")
-    if asked:
-        return asked
+    names = as_names(inputs, "inputs", f"the inputs {', '.join(airframe.inputs)} in any order")
+    if names:
+        return names
     pairs = dict(zip(controller.outputs, controller.inputs, strict=True))
-    paired = tuple(pairs.get(name, "") for name in seen.outputs)
-    same = controller.allocation is None and sorted(paired) == sorted(seen.inputs)
-    return paired if same else ()
+    drivers = tuple(pairs.get(name, "") for name in airframe.outputs)
+    same = controller.allocation is None and sorted(drivers) == sorted(airframe.inputs)
+    return drivers if same else ()
 
 
 def _without_allocation(loop: LoopSetting, scenario: Scenario) -> LoopSetting:
@@ -427,7 +429,7 @@ def observed(
     scenario: Scenario,
     model: Airframe,
     margin: float,
-    needed: Requirement = OBSERVER_REQUIREMENT,
+    requirement: Requirement = OBSERVER_REQUIREMENT,
     *,
     uncertain: bool = True,
     speeds: tuple[float, float] | None = None,
@@ -440,7 +442,7 @@ def observed(
         scenario,
         model,
         margin,
-        needed,
+        requirement,
         uncertain=uncertain,
         speeds=speeds,
         weights=weights,
@@ -454,13 +456,13 @@ def selected_observer(
     scenario: Scenario,
     model: Airframe,
     margin: float | FloatArray,
-    needed: Requirement = OBSERVER_REQUIREMENT,
+    requirement: Requirement = OBSERVER_REQUIREMENT,
     *,
     uncertain: bool = True,
     sketched: bool = False,
     speeds: tuple[float, float] | None = None,
     weights: FilePath | None = None,
-    beside: SelectedObserver | None = None,
+    earlier_design: SelectedObserver | None = None,
     is_free: Sequence[bool] | None = None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> SelectedObserver:
@@ -474,17 +476,17 @@ def selected_observer(
     `uncertain` counts the phase margin of uncertain aircraft too, `sketched` takes the gains for a
     model from a sketch, and `speeds` are two ratios to the trim speed, with models there. `margin`,
     `is_free` and `progress` as for `with_aircraft_observer`; the search begins at the gains and the
-    relaxation of the design `beside`.
+    relaxation of the design `earlier_design`.
     """
     noise, vanes = _noise(controller, scenario, model)
     nominal = model_for(model, controller, noise)
     if weights is None:
         candidates = _gain_sets(controller, scenario, model, nominal, sketched=sketched)
     else:
-        read = read_gains(Path(weights), nominal.total_lag, len(model.gusts), len(model.states))
-        candidates = [(read, f"gains of {Path(weights).name}")]
-    if beside is not None:
-        candidates = [candidates[beside.place]]
+        gains = read_gains(Path(weights), nominal.total_lag, len(model.gusts), len(model.states))
+        candidates = [(gains, f"gains of {Path(weights).name}")]
+    if earlier_design is not None:
+        candidates = [candidates[earlier_design.place]]
     sets, origins = zip(*candidates, strict=True)
     selected = with_aircraft_observer(
         controller,
@@ -492,19 +494,19 @@ def selected_observer(
         sets,
         noise,
         margin,
-        needed,
+        requirement,
         vanes,
         uncertain=uncertain,
         speeds=speeds,
         keeps_gains=sketched or weights is not None,
-        begin=None if beside is None else beside.relaxation,
+        begin=None if earlier_design is None else earlier_design.relaxation,
         is_free=is_free,
         progress=progress,
     )
     origin = origins[selected.place]
     factors = zip(selected.controller.outputs, selected.relaxation.tolist(), strict=True)
-    changed = ", ".join(f"{output} {factor:.2f}" for output, factor in factors if factor != 1.0)
-    changes = f"; K and integral /, effort x {changed}" if changed else ""
+    listing = ", ".join(f"{output} {factor:.2f}" for output, factor in factors if factor != 1.0)
+    changes = f"; K and integral /, effort x {listing}" if listing else ""
     margins = (
         f"delay margin {1e3 * selected.delay_margin:.0f} ms, phase margin "
         f"{np.degrees(selected.phase_margin):.0f} deg"
@@ -545,13 +547,13 @@ def _gain_sets(
     if sketched:
         gains = gains_beside_sketch(nominal, controller.outputs, axes, model.speed)
         return [(gains, BY_RULE)]
-    tuned = _tuned_scenario(scenario)
-    results = {law: tuned_gains.find(tuned, law, OBJECTIVE) for law in OBSERVER_LAWS}
+    flight = _tuned_scenario(scenario)
+    results = {law: tuned_gains.find(flight, law, OBJECTIVE) for law in OBSERVER_LAWS}
     searched = sorted(
         ((result.cost, law, result) for law, result in results.items() if result is not None),
         key=lambda row: row[0],
     )
-    tuned_lag = dict(zip(tuned.controller.outputs, loop_of(tuned.controller).total, strict=True))
+    tuned_lag = dict(zip(flight.controller.outputs, loop_of(flight.controller).total, strict=True))
     ratios = [
         lag / tuned_lag.get(name, np.inf)
         for name, lag in zip(controller.outputs, nominal.total_lag, strict=True)
@@ -562,7 +564,7 @@ def _gain_sets(
     return [
         (
             gains_of_search(result.gains, nominal.total_lag),
-            f"gains of a search in {tuned.name}, law {law} on {OBJECTIVE}",
+            f"gains of a search in {flight.name}, law {law} on {OBJECTIVE}",
         )
         for _, law, result in searched
     ]

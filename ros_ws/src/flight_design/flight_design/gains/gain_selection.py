@@ -162,8 +162,8 @@ def loop_with_box(study: Study, controller: ControllerConfig) -> LinearLoop:
     loop = linear_loop(controller, study.airframe, study.A, study.B)
     if study.uncertainty == 0.0:
         return loop
-    drawn = study.airframe if study.effected is None else study.effected.airframe
-    return loop._replace(box=box_of(drawn, controller, study.uncertainty))
+    airframe = study.airframe if study.effected is None else study.effected.airframe
+    return loop._replace(box=box_of(airframe, controller, study.uncertainty))
 
 
 @dataclass(frozen=True)
@@ -203,15 +203,15 @@ def gain_sets(study: Study, setting: LoopSetting) -> Selection:
     the largest abs(Omega_ii) of the samples. Raises ParameterError as `require_channels` does, and
     for parameters that the controller does not accept.
     """
-    paired = _paired(study, setting)
+    pairs = _paired(study, setting)
     engineering = gain_candidates(study, setting)
-    first = engineering(np.ones(len(paired.rows)), np.ones(len(paired.rows))).controller
-    chosen = first
+    first = engineering(np.ones(len(pairs.rows)), np.ones(len(pairs.rows))).controller
+    gains = first
     if first.sampled_sign()[0] is Sign.SOFT:  # behind servos
-        rates = study.u_dot[:, 0][:, paired.columns]
-        chosen = within_requirement(engineering, setting.requirement, rates).controller
-    chosen = with_feedforward(chosen, study.airframe) if setting.feedforward else chosen
-    return Selection(study, setting, _literal(study, setting, paired), chosen)
+        rates = study.u_dot[:, 0][:, pairs.columns]
+        gains = within_requirement(engineering, setting.requirement, rates).controller
+    gains = with_feedforward(gains, study.airframe) if setting.feedforward else gains
+    return Selection(study, setting, _literal(study, setting, pairs), gains)
 
 
 def gain_candidates(
@@ -222,19 +222,19 @@ def gain_candidates(
     The bandwidth is lower by `lower`, and the integral slower by `slower` and `lower`. Raises
     ParameterError as `gain_sets`.
     """
-    paired = _paired(study, setting)
+    pairs = _paired(study, setting)
     limits = (
-        study.slew[paired.columns] / paired.unit,
+        study.slew[pairs.columns] / pairs.unit,
         setting.factor,
-        _by_name(setting.rate_limit, paired.channels.inputs, math.inf) / paired.unit,
+        _by_name(setting.rate_limit, pairs.channels.inputs, math.inf) / pairs.unit,
     )
-    controller = partial(_controller, setting, paired)
+    controller = partial(_controller, setting, pairs)
 
     def engineering(slower: FloatArray, lower: FloatArray) -> Candidate[RiseDiConfig]:
-        selected = gain_conditions.engineering_gains(paired.bandwidth / lower, *limits, slower)
+        selected = gain_conditions.engineering_gains(pairs.bandwidth / lower, *limits, slower)
         # both parts of the integral fall with the bandwidth
-        chosen = controller(*selected, slower * lower)
-        return Candidate(chosen, linear_loop(chosen, study.airframe, study.A, study.B))
+        config = controller(*selected, slower * lower)
+        return Candidate(config, linear_loop(config, study.airframe, study.A, study.B))
 
     return engineering
 
@@ -287,11 +287,11 @@ def _paired(study: Study, setting: LoopSetting) -> _Paired:
     )
 
 
-def _literal(study: Study, setting: LoopSetting, paired: _Paired) -> RiseDiConfig:
+def _literal(study: Study, setting: LoopSetting, pairs: _Paired) -> RiseDiConfig:
     """The gain set of Theorem 1."""
-    ones = np.ones(len(paired.rows))
+    ones = np.ones(len(pairs.rows))
     bounds, *_ = _bounds(
-        study, paired.rows, paired.columns, paired.unit, paired.D, ones, setting.gamma_2
+        study, pairs.rows, pairs.columns, pairs.unit, pairs.D, ones, setting.gamma_2
     )
     sufficient = gain_conditions.theorem_gains(bounds, ones)
     # The theorem may ask for gains beyond those that a controller takes, as k_d of 2e17 1/s for the
@@ -301,14 +301,14 @@ def _literal(study: Study, setting: LoopSetting, paired: _Paired) -> RiseDiConfi
         min(sufficient.k_g, LARGEST), *(np.minimum(values, LARGEST) for values in rows)
     )
     exact = {name: tuple(getattr(sufficient, name).tolist()) for name in GainSet._fields[1:]}
-    return _controller(setting, paired, accepted, ones, ones).model_copy(
+    return _controller(setting, pairs, accepted, ones, ones).model_copy(
         update={"k_g": float(sufficient.k_g)} | exact
     )
 
 
 def _controller(
     setting: LoopSetting,
-    paired: _Paired,
+    pairs: _Paired,
     gains: GainSet,
     response: FloatArray,
     slower: FloatArray,
@@ -317,8 +317,8 @@ def _controller(
 
     The integral is `slower`, and abs(Omega_ii) is `response` in the scaled inputs.
     """
-    channels = paired.channels
-    scale = paired.unit * response
+    channels = pairs.channels
+    scale = pairs.unit * response
     base_inputs = setting.base.inputs
     softening = (SOFTENING * np.broadcast_to(slower, response.shape)).tolist()
     has_limits = set(channels.inputs) <= set(base_inputs)
@@ -331,9 +331,9 @@ def _controller(
         "k_d": gains.k_d.tolist(),
         "Lambda": gains.Lambda.tolist(),
         "beta": gains.beta.tolist(),
-        "D": paired.D.astype(int).tolist(),
+        "D": pairs.D.astype(int).tolist(),
         "input_scale": scale.tolist(),
-        "omega": (paired.spread * scale).tolist(),
+        "omega": (pairs.spread * scale).tolist(),
         "sign": "auto",
         "lag": _by_name(setting.lag, channels.inputs, 0.0).tolist(),
         "delay": setting.delay,
@@ -387,11 +387,11 @@ def assess_scenario(
     The airframe is studied along the scenario's manoeuvre. Raises ParameterError for other outputs
     than those of the airframe, and if D or the pairing contradict the airframe.
     """
-    known = scenario.controller.outputs
+    names = scenario.controller.outputs
     frame = study.airframe
-    fits = f"the outputs {', '.join(known)}"
+    fits = f"the outputs {', '.join(names)}"
     require(
-        sorted(known) == sorted(frame.outputs),
+        sorted(names) == sorted(frame.outputs),
         f"airframe {frame.name}",
         ", ".join(frame.outputs),
         fits,
@@ -456,16 +456,16 @@ def assess_gains(
     loop_conditions += (GainCondition("linear stability", None, stable, 1.0),)
     if not (isinstance(controller, RiseDiConfig) and controller.sampled_sign()[0] is Sign.IMPLICIT):
         observer = controller.observer
-        needed = above_zeros(setting.requirement, loop.nominal)
+        requirement = above_zeros(setting.requirement, loop.nominal)
         least = 1.0 / controller.rate if observer is None else observer.margin - controller.delay
-        needed = (
-            needed
+        requirement = (
+            requirement
             if observer is None
-            else needed._replace(phase=min(needed.phase, OBSERVER_REQUIREMENT.phase))
+            else requirement._replace(phase=min(requirement.phase, OBSERVER_REQUIREMENT.phase))
         )
         loop_conditions += (
             GainCondition("delay margin", None, margins.delay, least),
-            *margin_conditions(margins, needed),
+            *margin_conditions(margins, requirement),
         )
     return GainAssessment(
         controller=controller,
@@ -495,12 +495,12 @@ def _rise_di_conditions(
     gains = GainSet(controller.k_g, np.array(controller.k_d), params.Lambda, params.beta)
     C = study.C[rows]
     Bs = study.B[:, :, columns]
-    known = [
+    plants = [
         KnownPlant(A, B * params.input_scale, C, lambda _, x: 0.0 * x)
         for A, B in zip(study.A[counts], Bs[counts], strict=True)
     ]
     decay_rate = min(
-        float(np.linalg.eigvalsh(decay_matrix(plant, params)).min()) for plant in known
+        float(np.linalg.eigvalsh(decay_matrix(plant, params)).min()) for plant in plants
     )
     theorem = (
         GainCondition("D (11)", None, float(np.mean(holds)), 1.0),

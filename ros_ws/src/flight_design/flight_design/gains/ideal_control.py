@@ -141,8 +141,8 @@ def study_airframe(
     `effected` are drawn, if any. Raises ParameterError if Omega is singular or if the nominal
     airframe has a zero in the right half plane: then Assumption 3 does not hold.
     """
-    drawn = airframe if effected is None else effected.airframe
-    A, B = nominal_and_sampled(drawn, uncertainty, samples, seed)
+    drawn_airframe = airframe if effected is None else effected.airframe
+    A, B = nominal_and_sampled(drawn_airframe, uncertainty, samples, seed)
     if effected is not None:
         B = np.asarray(B @ effected.T)
     zeros = [fastest_zero(*pair, airframe.matrix_c()) for pair in zip(A, B, strict=True)]
@@ -229,8 +229,8 @@ def _ideal_rates(
 
     def eta_dot(t: float, eta: Array, _: None, __: None) -> Array:
         k = round(2.0 * t / STEP)
-        moved = plant.drift(t, plant.state(y_m[k], eta))
-        return _times(plant.project, moved) + (plant.follow @ y_m_dot[k]).T
+        drift = plant.drift(t, plant.state(y_m[k], eta))
+        return _times(plant.project, drift) + (plant.follow @ y_m_dot[k]).T
 
     steps = (len(y_m) - 1) // 2
     hidden = plant.N.shape[1]
@@ -241,12 +241,12 @@ def _ideal_rates(
         t = k * STEP
         x = plant.state(y_m[2 * k], eta)
         free = plant.drift(t, x)
-        driven = np.asarray(y_m_dot[2 * k][:, None] - plant.C @ free, dtype=np.float64)
-        x_dot = free + _times(plant.B, _times(plant.inverse, driven))
-        ahead, behind = (
+        rate = np.asarray(y_m_dot[2 * k][:, None] - plant.C @ free, dtype=np.float64)
+        x_dot = free + _times(plant.B, _times(plant.inverse, rate))
+        later, behind = (
             dynamics.f(t + step, x + step * x_dot, plant.aircraft) for step in (near, -near)
         )
-        drift_dot: FloatArray = _times(plant.A, x_dot) + (ahead - behind) / (2.0 * near)
+        drift_dot: FloatArray = _times(plant.A, x_dot) + (later - behind) / (2.0 * near)
         u_dot[k] = _times(plant.inverse, y_m_ddot[2 * k][:, None] - plant.C @ drift_dot).T
         if k < steps and hidden:
             eta = rk4(eta_dot, t, eta, None, None, STEP)

@@ -80,10 +80,10 @@ def air_response(plant: LinearPlant, law: LinearLaw, loop: LoopTiming, air: Air)
     n = len(plant.A)
     size = len(matrix)
     C = plant.C[: len(loop.lag)]
-    measured = np.vstack([B @ law.D, law.B])
-    blown = measured @ air.reading
+    noise_input = np.vstack([B @ law.D, law.B])
+    blown = noise_input @ air.reading
     blown[:n] += drive
-    noise = measured * air.noise
+    noise = noise_input * air.noise
     covariance, transition = _turbulent(matrix, blown, noise, loop.period, air)
     variance = np.einsum("ij,jk,ik->i", C, covariance[:n, :n], C)
     # rows of u = K z + D v, and of its value a tick later
@@ -98,16 +98,16 @@ def air_response(plant: LinearPlant, law: LinearLaw, loop: LoopTiming, air: Air)
 
 
 def _gust_energy(
-    matrix: FloatArray, driven: FloatArray, C: FloatArray, period: float, air: Air
+    matrix: FloatArray, response: FloatArray, C: FloatArray, period: float, air: Air
 ) -> FloatArray:
     """Integral of the squares of the outputs in a gust of each axis, (m,)."""
-    state = np.zeros(driven.shape)
+    state = np.zeros(response.shape)
     energy = np.zeros(len(C))
     for k in range(round(GUST_HORIZON / period)):
         turn = 2.0 * np.pi * (k + 0.5) * period / air.gust_duration
         state = matrix @ state
         if turn < 2.0 * np.pi:
-            state += driven * (0.5 * (1.0 - math.cos(turn)))
+            state += response * (0.5 * (1.0 - math.cos(turn)))
         energy += ((C @ state[: C.shape[1]]) ** 2).sum(axis=1)
     return energy * period
 
@@ -120,14 +120,14 @@ def _turbulent(
     In the state the wind stands below the loop.
     """
     size, G = blown.shape
-    kept = np.exp(-period / air.time)
+    decay = np.exp(-period / air.time)
     transition = np.zeros((size + G, size + G))
     transition[:size, :size] = matrix
     transition[:size, size:] = blown
-    transition[size:, size:] = np.diag(kept)
+    transition[size:, size:] = np.diag(decay)
     drive = np.zeros((size + G, noise.shape[1] + G))
     drive[:size, : noise.shape[1]] = noise
-    drive[size:, noise.shape[1] :] = np.diag(air.sigma * np.sqrt(1.0 - kept**2))
+    drive[size:, noise.shape[1] :] = np.diag(air.sigma * np.sqrt(1.0 - decay**2))
     covariance = drive @ drive.T
     power = transition
     for _ in range(round(math.log2(HORIZON / period))):
@@ -148,13 +148,13 @@ def linear_error(loop: LinearLoop, u_dot: FloatArray) -> FloatArray:
         [np.zeros((1, u_dot.shape[1])), np.cumsum((u_dot[1:] + u_dot[:-1]) / 2.0 * STEP, axis=0)]
     )
     t = period * (np.arange(int((len(u) - 1) * STEP / period)) + 0.5)
-    held = np.array([np.interp(t, STEP * np.arange(len(u)), column) for column in u.T]).T
+    u_by_tick = np.array([np.interp(t, STEP * np.arange(len(u)), column) for column in u.T]).T
     step = closed_loop(loop.nominal, loop.law, loop.loop, np.zeros(u.shape[1]))
     _, drive = zero_order_hold(loop.nominal.A, loop.nominal.B, period)
     n = len(loop.nominal.A)
     state = np.zeros((*step.shape[:-1], 1))
     x = np.empty((len(t), *step.shape[:-2], n))
-    for k, disturbance in enumerate(-(held @ drive.T)):
+    for k, disturbance in enumerate(-(u_by_tick @ drive.T)):
         state = step @ state
         state[..., :n, 0] += disturbance
         x[k] = state[..., :n, 0]

@@ -96,8 +96,8 @@ def read_gains(path: Path, T: FloatArray, axes: int, states: int) -> ObserverGai
     lengths = dict.fromkeys(("K", "Lambda", "beta", "effort", "drift"), (m,))
     lengths |= {"softening": (1, m), "gust": (axes,), "wind_time": (axes,), "loose": (1, states)}
     content = read_yaml(path, "weights", expected := f"a file of {', '.join(lengths)}")
-    named = isinstance(content, dict) and set(content) == set(lengths)
-    require(named, "weights", path, expected)
+    has_names = isinstance(content, dict) and set(content) == set(lengths)
+    require(has_names, "weights", path, expected)
     gains: dict[str, list[float]] = {}
     for name, allowed in lengths.items():
         row = as_numbers(content[name], f"weights.{name}", "numbers above 0")

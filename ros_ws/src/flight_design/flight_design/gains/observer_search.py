@@ -113,12 +113,12 @@ class AtSpeed(NamedTuple):
     def flown(self, controller: RiseDiConfig, slower: FloatArray) -> RiseDiConfig:
         """What flies at this speed; not checked."""
         assert controller.observer is not None  # noqa: S101 - it was designed
-        changed = {
+        values = {
             "observer": controller.observer.model_copy(update=_matrices(self.design(slower))),
             "feedforward": self.feedforward,
             "input_scale": tuple((np.array(controller.input_scale) * self.scale).tolist()),
         }
-        return controller.model_copy(update=changed)
+        return controller.model_copy(update=values)
 
 
 class _Loops(NamedTuple):
@@ -169,7 +169,7 @@ class ObserverSearch(NamedTuple):
         lowest = 0 if self.air is None else -exponent(MAX_QUICKENING)
         lowest_of = (free * lowest).astype(np.int64)
         highest_of = (free * exponent(MAX_RELAXATION)).astype(np.int64)
-        needed = above_zeros(self.needed, self.nominal)
+        requirement = above_zeros(self.needed, self.nominal)
         trials: dict[Place, Trial[_Loops]] = {}
         least = math.inf  # cost of a trial with the margins
 
@@ -178,14 +178,14 @@ class ObserverSearch(NamedTuple):
             for place in places:
                 if place not in trials:
                     progress(f"observer: {len(trials) + 1} loops")
-                    trials[place] = self._trial(place, needed, least)
+                    trials[place] = self._trial(place, requirement, least)
                     least = min(least, trials[place].cost)
             return [trials[place] for place in places]
 
         (start,) = assess([(0,) * m])
         return descend(assess, start, moves, lowest_of, highest_of)
 
-    def _trial(self, place: Place, needed: Requirement, least: float) -> Trial[_Loops]:
+    def _trial(self, place: Place, requirement: Requirement, least: float) -> Trial[_Loops]:
         """The trial at a place.
 
         Beside one with the margins and the cost `least`, the margins of a trial that is late or
@@ -198,9 +198,9 @@ class ObserverSearch(NamedTuple):
             cost = self._cost(loops)
             if not cost < least - GAIN:
                 return Trial(place, 0.0, math.inf, loops)
-        shortage = self._shortage(loops, needed)
+        shortage = self._shortage(loops, requirement)
         if not shortage:
-            shortage = max(needed.uncertain_phase - self._worst_phase(loops), 0.0)  # rad
+            shortage = max(requirement.uncertain_phase - self._worst_phase(loops), 0.0)  # rad
         cost = math.inf if shortage else self._cost(loops)
         return Trial(place, shortage, cost, loops)
 
@@ -247,16 +247,16 @@ class ObserverSearch(NamedTuple):
         longest = float(self.margin.max())
         if longest == 0.0 or is_stable(plant, law, self.loop, self.margin + RESOLUTION):
             return 1.0
-        found = delay_margin(plant, law, self.loop, self.margin / longest)
-        return min(found / (longest + RESOLUTION), 1.0)
+        margin = delay_margin(plant, law, self.loop, self.margin / longest)
+        return min(margin / (longest + RESOLUTION), 1.0)
 
-    def _shortage(self, loops: _Loops, needed: Requirement) -> float:
+    def _shortage(self, loops: _Loops, requirement: Requirement) -> float:
         """The sum over the goals of 1 - found / needed, where this is above 0."""
         loop = loop_of(loops.controller)
         goals = [np.array([self._delay_fraction(plant, law) for plant, law in loops.around])]
         for plant, law in loops.around:
             margins = input_margins(plant, law, loop, together=False)
-            phase, gain_fraction, damping = fractions(margins, needed)
+            phase, gain_fraction, damping = fractions(margins, requirement)
             each = np.append(np.minimum(phase, gain_fraction), damping)
             goals.append(np.where(margins.stable, each, 0.0))
         return float(np.maximum(1.0 - np.concatenate(goals), 0.0).sum())
@@ -297,7 +297,7 @@ class ObserverSearch(NamedTuple):
 
     def _lacking(self, loops: _Loops) -> str:
         """The margins missing around the nominal aircraft, in sentences."""
-        needed = above_zeros(self.needed, self.nominal)
+        requirement = above_zeros(self.needed, self.nominal)
         longest = float(self.margin.max())
         lacking = []
         for law in _laws(loops.controller):
@@ -305,7 +305,7 @@ class ObserverSearch(NamedTuple):
             share = self.margin / longest if longest else 1.0
             delay = 1e3 * delay_margin(self.nominal, law, self.loop, share)
             late = GainCondition("delay margin (ms)", None, delay, 1e3 * (longest + RESOLUTION))
-            failed = failing((late, *nominal_conditions(margins, needed)))
+            failed = failing((late, *nominal_conditions(margins, requirement)))
             lacking += [condition.sentence(loops.controller.outputs) for condition in failed]
         return "; ".join(dict.fromkeys(lacking))
 
@@ -328,10 +328,10 @@ def _laws(controller: RiseDiConfig) -> list[LinearLaw]:
     """The linear laws of a controller, for every set of vanes in use."""
     (law, params), period = controller.tuned_law(), 1.0 / controller.rate
     sets = product((False, True), repeat=len(controller.vanes))
-    flown = (without_frozen(params, frozen) for frozen in sets)
+    laws = (without_frozen(params, frozen) for frozen in sets)
     return [
         linear_law(TunedLaw(law, law_params), len(controller.outputs), period)
-        for law_params in flown
+        for law_params in laws
     ]
 
 

@@ -91,7 +91,7 @@ def with_aircraft_observer(
     sets: Sequence[ObserverGains],
     noise: FloatArray,
     margin: float | FloatArray,
-    needed: Requirement = OBSERVER_REQUIREMENT,
+    requirement: Requirement = OBSERVER_REQUIREMENT,
     vanes: Mapping[str, float] = MappingProxyType({}),
     *,
     uncertain: bool = True,
@@ -138,7 +138,7 @@ def with_aircraft_observer(
             gains=gains,
             design=designs.observer(model, gains),
             margin=np.broadcast_to(margin, model.lag.shape),
-            needed=needed,
+            needed=requirement,
             vanes=section,
             others=[designs.at_speed(ratio, gains) for ratio in speeds or ()],
             air=None if keeps_gains else _air(airframe, model, vanes),
@@ -241,18 +241,18 @@ class _AircraftDesigns(NamedTuple):
         A = A + self.model.gravity
         B = B[:, :, columns]
         zeros = [fastest_zero(*pair, self.model.C) for pair in zip(A, B, strict=True)]
-        held = np.array(zeros) < FASTEST
-        held[0] = True  # the nominal aircraft: its margins say more
-        return LinearPlant(A[held], B[held], np.vstack([self.model.C, *vane_rows]))
+        is_stable = np.array(zeros) < FASTEST
+        is_stable[0] = True  # the nominal aircraft: its margins say more
+        return LinearPlant(A[is_stable], B[is_stable], np.vstack([self.model.C, *vane_rows]))
 
     def observer(
         self, model: NominalModel, gains: ObserverGains
     ) -> Callable[[FloatArray], ObserverDesign]:
         """The observer of a model by relaxation, (m,): u_o alone changes."""
         observer = aircraft_observer(model, self.names, gains.weights)
-        sampled = ObserverModel(observer.states, observer.Phi, observer.Gamma, observer.H)
+        model_by_tick = ObserverModel(observer.states, observer.Phi, observer.Gamma, observer.H)
         return lambda slower: observer._replace(
-            F=feedback_gain(sampled, model, slower * gains.weights.effort)
+            F=feedback_gain(model_by_tick, model, slower * gains.weights.effort)
         )
 
     def at_speed(self, ratio: float, gains: ObserverGains) -> AtSpeed:
@@ -292,16 +292,18 @@ def _vanes(
     vanes: Mapping[str, float],
 ) -> VanesConfig:
     """The section of the vanes: alpha and beta less the wind along their axes over V0."""
-    sampled = aircraft_model(model, names, weights.wind_time)
+    model_by_tick = aircraft_model(model, names, weights.wind_time)
     H = []
     L = []
     blowing = {AIR_STATE[axis]: f"wind.{axis}" for axis in airframe.gusts}
     for name, noise in vanes.items():
         parts = {f"x.{name}": 1.0, blowing.get(name, ""): -1.0 / airframe.speed}
-        row = np.array([parts.get(state, 0.0) for state in sampled.states])
+        row = np.array([parts.get(state, 0.0) for state in model_by_tick.states])
         with_vane = weights._replace(gust=GUST_WITH_VANE * weights.gust)
         H += row.tolist()
-        L += vane_correction(sampled, model, (weights, with_vane), row, noise).ravel().tolist()
+        L += (
+            vane_correction(model_by_tick, model, (weights, with_vane), row, noise).ravel().tolist()
+        )
     least = [STILL * noise for noise in vanes.values()]
     return VanesConfig(channels=tuple(vanes), H=tuple(H), L=tuple(L), least=tuple(least))
 
@@ -312,7 +314,7 @@ def with_extended_state_observer(
     noise: FloatArray,
     size: FloatArray,
     margin: float,
-    needed: Requirement = OBSERVER_REQUIREMENT,
+    requirement: Requirement = OBSERVER_REQUIREMENT,
 ) -> SelectedObserver:
     """The controller with an observer from Omega and lags alone: no A, no f, no wind.
 
@@ -355,10 +357,10 @@ def with_extended_state_observer(
     def design(slower: FloatArray) -> ObserverDesign:
         drift = weights.drift / slower
         rate_drift = weights.rate_drift / slower**2
-        changed = weights._replace(
+        new_weights = weights._replace(
             effort=slower * weights.effort, drift=drift, rate_drift=rate_drift
         )
-        return extended_state_observer(model, names, changed)
+        return extended_state_observer(model, names, new_weights)
 
     plant = LinearPlant(np.zeros((1, m, m)), Omega[None], np.eye(m))
     search = ObserverSearch(
@@ -368,7 +370,7 @@ def with_extended_state_observer(
         gains=gains,
         design=design,
         margin=np.full(m, margin),
-        needed=needed,
+        needed=requirement,
     )
     return least_error([search])
 

@@ -38,9 +38,9 @@ def lacking(selection: Selection, *, options: Sequence[str] = ()) -> str:
         if not gain_sets(selection.study, setting).engineering.unmet
     ]
     mend = f"met with {' or with '.join(relaxed)}" if relaxed else "met with no single change"
-    bound = binding(selection)
-    where = "the loop" if bound.channel is None else outputs[bound.channel]
-    return f"{rows}: the best of the search, bound by {bound.name} of {where}; {mend}"
+    limit = binding(selection)
+    where = "the loop" if limit.channel is None else outputs[limit.channel]
+    return f"{rows}: the best of the search, bound by {limit.name} of {where}; {mend}"
 
 
 def _relaxed(selection: Selection, options: Sequence[str]) -> dict[str, LoopSetting]:
@@ -53,8 +53,8 @@ def _relaxed(selection: Selection, options: Sequence[str]) -> dict[str, LoopSett
         phase = math.floor(np.degrees(least) + 1e-6)
         if PHASE_MARGINS[0] <= phase < np.degrees(setting.requirement.phase) - 1e-6:
             accept = " --accept" if phase < ACCEPTED_PHASE_MARGIN else ""
-            needed = setting.requirement._replace(phase=math.radians(phase))
-            changes[f"--phase-margin {phase}{accept}"] = setting._replace(requirement=needed)
+            requirement = setting.requirement._replace(phase=math.radians(phase))
+            changes[f"--phase-margin {phase}{accept}"] = setting._replace(requirement=requirement)
     halved = {name: lag / 2.0 for name, lag in setting.lag.items()}
     lags = ",".join(f"{halved.get(name, 0.0):.4g}" for name in selection.study.airframe.inputs)
     words = {

@@ -114,7 +114,7 @@ def requirement(phase_margin: float, *, accept: bool = False) -> Requirement:
     return Requirement(math.radians(phase_margin))
 
 
-def above_zeros(needed: Requirement, plant: LinearPlant) -> Requirement:
+def above_zeros(requirement: Requirement, plant: LinearPlant) -> Requirement:
     """A requirement with a damping within reach of a loop around an aircraft.
 
     The damping is at most about that of the zeros. No feedback moves a zero, and a loop with small
@@ -123,55 +123,63 @@ def above_zeros(needed: Requirement, plant: LinearPlant) -> Requirement:
     zeros = invariant_zeros(plant.A, plant.B, plant.C[: plant.B.shape[-1]])  # without vanes
     modes = zeros[(np.abs(zeros.imag) > NO_MOTION) & (np.abs(zeros) > NO_MOTION)]
     least = float(np.min(-modes.real / np.abs(modes), initial=1.0))
-    return needed._replace(damping=min(needed.damping, OF_ZERO * max(least, 0.0)))
+    return requirement._replace(damping=min(requirement.damping, OF_ZERO * max(least, 0.0)))
 
 
-def fractions(margins: Margins, needed: Requirement) -> tuple[FloatArray, FloatArray, FloatArray]:
+def fractions(
+    margins: Margins, requirement: Requirement
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """What is found over what is needed, for m inputs, (..., m), (..., m), (...).
 
     A fraction is at least 1 where the requirement holds. The first is the lesser of phase and
     sensitivity, the second that of the gain, in dB, the third that of the damping.
     """
     with np.errstate(divide="ignore"):
-        phase = np.minimum(margins.phase / needed.phase, needed.sensitivity / margins.sensitivity)
-        return phase, np.log(margins.gain) / math.log(needed.gain), margins.damping / needed.damping
+        phase = np.minimum(
+            margins.phase / requirement.phase, requirement.sensitivity / margins.sensitivity
+        )
+        return (
+            phase,
+            np.log(margins.gain) / math.log(requirement.gain),
+            margins.damping / requirement.damping,
+        )
 
 
-def least_fractions(margins: Margins, needed: Requirement) -> FloatArray:
+def least_fractions(margins: Margins, requirement: Requirement) -> FloatArray:
     """The least of `fractions` of a loop, (...).
 
     A fraction is at least 1 where the requirement holds, 0 for an unstable loop.
     """
-    phase, gain, damping = fractions(margins, needed)
+    phase, gain, damping = fractions(margins, requirement)
     least = np.minimum(np.minimum(phase.min(axis=-1), gain.min(axis=-1)), damping)
     return np.asarray(np.where(margins.stable, least, 0.0))
 
 
-def least_fraction(margins: Margins, needed: Requirement) -> float:
+def least_fraction(margins: Margins, requirement: Requirement) -> float:
     """The `least_fractions` of one loop."""
-    return float(least_fractions(margins, needed))
+    return float(least_fractions(margins, requirement))
 
 
-def margin_conditions(margins: LoopMargins, needed: Requirement) -> tuple[GainCondition, ...]:
+def margin_conditions(margins: LoopMargins, requirement: Requirement) -> tuple[GainCondition, ...]:
     """The requirement as conditions, input by input, the nominal aircraft first."""
-    nominal = nominal_conditions(margins.nominal, needed)
+    nominal = nominal_conditions(margins.nominal, requirement)
     if margins.worst is None:
         return nominal
     worst = math.degrees(float(margins.worst.phase.min()))
-    least = needed.uncertain_phase
+    least = requirement.uncertain_phase
     if margins.by_search:
-        least = min(least, needed.searched_phase)
+        least = min(least, requirement.searched_phase)
     return (*nominal, GainCondition(NAMES[4], None, worst, math.degrees(least)))
 
 
-def nominal_conditions(nominal: Margins, needed: Requirement) -> tuple[GainCondition, ...]:
+def nominal_conditions(nominal: Margins, requirement: Requirement) -> tuple[GainCondition, ...]:
     """The requirement on the margins of the nominal aircraft as conditions, input by input."""
     with np.errstate(divide="ignore"):
         decibels = 20.0 * np.log10(nominal.gain)
     rows: list[tuple[str, FloatArray, float, bool]] = [
-        (NAMES[0], np.degrees(nominal.phase), math.degrees(needed.phase), True),
-        (NAMES[1], decibels, 20.0 * math.log10(needed.gain), True),
-        (NAMES[2], nominal.sensitivity, needed.sensitivity, False),
+        (NAMES[0], np.degrees(nominal.phase), math.degrees(requirement.phase), True),
+        (NAMES[1], decibels, 20.0 * math.log10(requirement.gain), True),
+        (NAMES[2], nominal.sensitivity, requirement.sensitivity, False),
     ]
     by_input: list[GainCondition] = []
     for name, values, bound, at_least in rows:
@@ -179,13 +187,14 @@ def nominal_conditions(nominal: Margins, needed: Requirement) -> tuple[GainCondi
             GainCondition(name=name, channel=i, value=float(value), bound=bound, at_least=at_least)
             for i, value in enumerate(values)
         ]
-    return (*by_input, GainCondition(NAMES[3], None, float(nominal.damping), needed.damping))
+    return (*by_input, GainCondition(NAMES[3], None, float(nominal.damping), requirement.damping))
 
 
-def unmet(margins: LoopMargins, needed: Requirement, outputs: Sequence[str]) -> str:
+def unmet(margins: LoopMargins, requirement: Requirement, outputs: Sequence[str]) -> str:
     """What a loop lacks, in sentences; "" for nothing. `outputs` of the law."""
     return "; ".join(
-        condition.sentence(outputs) for condition in failing(margin_conditions(margins, needed))
+        condition.sentence(outputs)
+        for condition in failing(margin_conditions(margins, requirement))
     )
 
 
@@ -198,7 +207,7 @@ class Candidate(NamedTuple, Generic[Controller]):
 
 def within_requirement(
     build: Callable[[FloatArray, FloatArray], Candidate[Controller]],
-    needed: Requirement,
+    requirement: Requirement,
     u_dot: FloatArray,
 ) -> Candidate[Controller]:
     """The candidate of the least error whose measured margins meet a requirement.
@@ -214,10 +223,13 @@ def within_requirement(
     `worst_phase`, the nominal loop has to have 2.5 degrees more.
     """
     loops = _Loops(build, u_dot)
-    target = above_zeros(needed, loops.start.loop.nominal)
+    target = above_zeros(requirement, loops.start.loop.nominal)
     best = loops.search(target)
     for _ in range(MAX_WORST_STEPS):
-        if best.shortage or _worst_phase(best.content.candidate.loop) >= needed.uncertain_phase:
+        if (
+            best.shortage
+            or _worst_phase(best.content.candidate.loop) >= requirement.uncertain_phase
+        ):
             break
         target = target._replace(phase=target.phase + WORST_STEP)
         following = loops.search(target)
@@ -249,9 +261,9 @@ class _Loops(Generic[Controller]):
         self.m = self.start.loop.law.D.shape[-2]
         self.highest = np.repeat([[exponent(MAX_SLOWER)], [exponent(MAX_LOWER)]], self.m, axis=1)
 
-    def search(self, needed: Requirement) -> Trial[_Measured[Controller]]:
+    def search(self, requirement: Requirement) -> Trial[_Measured[Controller]]:
         """The trial with the least cost that meets a requirement, or the least shortage."""
-        assess = partial(self.assess, needed)
+        assess = partial(self.assess, requirement)
         lowest = np.zeros_like(self.highest)
         best = descend(assess, self._fastest_integrals(assess), MOVES, lowest, self.highest)
         for slower, lower in FURTHER_STARTS:
@@ -259,31 +271,35 @@ class _Loops(Generic[Controller]):
                 break
             place = np.minimum([[slower], [lower]], self.highest)
             (start,) = assess([tuple(place.ravel().tolist())])
-            reached = descend(assess, start, MOVES, lowest, self.highest)
-            best = reached if reached.is_better(best) else best
+            end = descend(assess, start, MOVES, lowest, self.highest)
+            best = end if end.is_better(best) else best
         return best
 
     def assess(
-        self, needed: Requirement, places: Sequence[Place]
+        self, requirement: Requirement, places: Sequence[Place]
     ) -> list[Trial[_Measured[Controller]]]:
         """The trials at some places."""
         self._measure([place for place in dict.fromkeys(places) if place not in self._measured])
-        measured = []
+        candidates = []
         shortages = []
         for place in places:
             candidate, margins = self._measured[place]
-            phase, gain, damping = fractions(margins, needed)
+            phase, gain, damping = fractions(margins, requirement)
             # each channel integrates: a phase without a crossover lies below the frequencies seen
-            seen = margins.stable & np.isfinite(margins.phase)
-            reached = np.where(seen, np.minimum(phase, gain), 0.0)
-            goals = np.append(reached, damping if margins.stable else 0.0)
-            measured.append(_Measured(candidate, reached))
+            is_certain = margins.stable & np.isfinite(margins.phase)
+            fraction = np.where(is_certain, np.minimum(phase, gain), 0.0)
+            goals = np.append(fraction, damping if margins.stable else 0.0)
+            candidates.append(_Measured(candidate, fraction))
             shortages.append(float(np.maximum(1.0 - goals, 0.0).sum()))
-        met = [place for place, shortage in zip(places, shortages, strict=True) if not shortage]
-        self._count_costs([place for place in dict.fromkeys(met) if place not in self._costs])
+        places_within = [
+            place for place, shortage in zip(places, shortages, strict=True) if not shortage
+        ]
+        self._count_costs(
+            [place for place in dict.fromkeys(places_within) if place not in self._costs]
+        )
         return [
             Trial(place, shortage, math.inf if shortage else self._costs[place], row)
-            for place, shortage, row in zip(places, shortages, measured, strict=True)
+            for place, shortage, row in zip(places, shortages, candidates, strict=True)
         ]
 
     def _measure(self, places: Sequence[Place]) -> None:
@@ -315,22 +331,22 @@ class _Loops(Generic[Controller]):
         highest = self.highest[0]
         rule = np.zeros(self.m, dtype=np.int64)
         short = rule - 1  # the largest exponents that lack a margin
-        met = highest + 1  # the least that have all
+        enough = highest + 1  # the least that have all
         tried = rule
         while True:
             (trial,) = assess([(*tried.tolist(), *rule.tolist())])
             has = trial.content.reached >= 1.0
-            met = np.where(has, np.minimum(met, tried), met)
+            enough = np.where(has, np.minimum(enough, tried), enough)
             short = np.where(has, short, np.maximum(short, tried))
-            unknown = met - short > 1
+            unknown = enough - short > 1
             if not unknown.any():
                 break
             doubled = np.minimum(2 * np.maximum(short, 0) + 1, highest)
-            bisected = np.where(unknown, (short + met) // 2, met)
-            tried = np.where(met > highest, doubled, bisected)
-        slower = np.where(met > highest, 0, met)
+            bisected = np.where(unknown, (short + enough) // 2, enough)
+            tried = np.where(enough > highest, doubled, bisected)
+        slower = np.where(enough > highest, 0, enough)
         (best,) = assess([(*slower.tolist(), *rule.tolist())])
-        while (lacking := (best.content.reached < 1.0) & (met <= highest)).any():
+        while (lacking := (best.content.reached < 1.0) & (enough <= highest)).any():
             slower = np.minimum(slower + lacking, highest)
             (following,) = assess([(*slower.tolist(), *rule.tolist())])
             if not following.is_better(best):

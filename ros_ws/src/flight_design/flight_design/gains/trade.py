@@ -38,8 +38,10 @@ def trade(
     nominal = _nominal(selection.study)
     rows = []
     for phase_margin in phase_margins:
-        needed = selection.setting.requirement._replace(phase=math.radians(phase_margin))
-        assessed = gain_sets(nominal, selection.setting._replace(requirement=needed)).engineering
+        requirement = selection.setting.requirement._replace(phase=math.radians(phase_margin))
+        assessed = gain_sets(
+            nominal, selection.setting._replace(requirement=requirement)
+        ).engineering
         if assessed.margins is None:
             continue
         loop = linear_loop(assessed.controller, nominal.airframe, nominal.A, nominal.B)

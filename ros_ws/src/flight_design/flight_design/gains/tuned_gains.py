@@ -60,14 +60,14 @@ def _load(path: Path, _changed_ns: int) -> dict[str, dict[str, TuningResult]]:
     content = read_yaml(path, path.name, "a file of tuned gains")
     try:
         laws = content["laws"].items()
-        tuned = {}
+        results = {}
         for law, sets in laws:
-            tuned[law] = {objective: TuningResult(**entry) for objective, entry in sets.items()}
+            results[law] = {objective: TuningResult(**entry) for objective, entry in sets.items()}
     except (TypeError, KeyError, AttributeError) as error:
         raise ParameterError(
             f"{path.name}: found {error}, expected laws, each with gains by objective"
         ) from None
-    return tuned
+    return results
 
 
 def find(scenario: Scenario, law: str, objective: str) -> TuningResult | None:
@@ -79,14 +79,17 @@ def find(scenario: Scenario, law: str, objective: str) -> TuningResult | None:
 
 
 def save(
-    path: Path, tuned: Mapping[str, Mapping[str, TuningResult]], order: Sequence[str], command: str
+    path: Path,
+    results: Mapping[str, Mapping[str, TuningResult]],
+    order: Sequence[str],
+    command: str,
 ) -> None:
     """Write tuned gains, costs and the tuning command.
 
     Laws are in the order of the catalogue first, objectives as given. Raises ParameterError where
     the file cannot be written.
     """
-    known = set().union(*tuned.values())
+    known = set().union(*results.values())
     objectives = [name for name in order if name in known]
     head = (
         "# SPDX-FileCopyrightText: RISE-DI contributors\n# SPDX-License-Identifier: Apache-2.0\n#\n"
@@ -94,10 +97,10 @@ def save(
         "seed, evaluations of a search.\n"
         + comment([f"Made by: {command} --tuning {','.join(objectives)}"])
     )
-    names = [*(law for law in LAWS if law in tuned), *(law for law in tuned if law not in LAWS)]
+    names = [*(law for law in LAWS if law in results), *(law for law in results if law not in LAWS)]
     laws = {}
     for law in names:
-        laws[law] = {name: tuned[law][name] for name in objectives if name in tuned[law]}
+        laws[law] = {name: results[law][name] for name in objectives if name in results[law]}
     text = yaml.dump(
         {"laws": laws}, Dumper=_Dumper, sort_keys=False, default_flow_style=False, width=160
     )

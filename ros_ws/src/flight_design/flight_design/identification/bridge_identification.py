@@ -70,16 +70,18 @@ def channel_pairs(channel_map: ChannelMap) -> tuple[ChannelPairing, FloatArray]:
 
     Raises ParameterError for an output without an input, and for one with the opposite sign.
     """
-    driven: dict[str, tuple[str, int]] = {}
+    drivers: dict[str, tuple[str, int]] = {}
     for name, row in channel_map.inputs.items():
         output, sign = row.motion
-        driver = driven.setdefault(output, (name, sign))
+        driver = drivers.setdefault(output, (name, sign))
         both = f"{driver[0]} and {name} both for {output}"
         require(driver[0] == name, f"map {channel_map.name}: inputs", both, "one of them")
-    moved = motions(channel_map)
-    for (name, motion), sign in zip(moved.items(), output_signs(channel_map), strict=True):
+    motion_by_output = motions(channel_map)
+    for (name, motion), sign in zip(
+        motion_by_output.items(), output_signs(channel_map), strict=True
+    ):
         require(
-            motion in driven,
+            motion in drivers,
             f"map {channel_map.name}: inputs",
             f"none that moves {name}",
             "one input for each output",
@@ -90,8 +92,8 @@ def channel_pairs(channel_map: ChannelMap) -> tuple[ChannelPairing, FloatArray]:
             "the opposite sign",
             "the stack's signs",
         )
-    inputs, signs = zip(*(driven[motion] for motion in moved.values()), strict=True)
-    return ChannelPairing(tuple(moved), inputs), np.array(signs, dtype=np.float64)
+    inputs, signs = zip(*(drivers[motion] for motion in motion_by_output.values()), strict=True)
+    return ChannelPairing(tuple(motion_by_output), inputs), np.array(signs, dtype=np.float64)
 
 
 def motions(channel_map: ChannelMap) -> dict[str, str]:
@@ -185,7 +187,7 @@ def experiment(
 WHOLE = 0.95  # of the planned duration: reports of the engagement are late by less than the rest
 
 
-def cut_short(flown: Sequence[Engagement], duration: float) -> str:
+def cut_short(engagements: Sequence[Engagement], duration: float) -> str:
     """When and why the bridge released before the end of an experiment, as a sentence.
 
     Empty for a whole experiment.
@@ -194,14 +196,14 @@ def cut_short(flown: Sequence[Engagement], duration: float) -> str:
     """
     lengths = [
         math.inf if part.stop_ns is None else (part.stop_ns - part.start_ns) / NANOSECONDS
-        for part in flown
+        for part in engagements
     ]
-    engaged = max(lengths)
-    if engaged > WHOLE * duration:
+    length = max(lengths)
+    if length > WHOLE * duration:
         return ""
     return (
-        f"the bridge released after {engaged:.0f} of {duration:.0f} s: "
-        f"{flown[lengths.index(engaged)].reason}"
+        f"the bridge released after {length:.0f} of {duration:.0f} s: "
+        f"{engagements[lengths.index(length)].reason}"
     )
 
 
@@ -284,7 +286,7 @@ def join(
     stiffness = np.zeros(m)
     zero = np.zeros(m)
     misfit = np.full(m, np.nan)
-    refused = []
+    refusals = []
     for i, (name, output, model) in enumerate(
         zip(pairing.inputs, pairing.outputs, models, strict=True)
     ):
@@ -298,7 +300,7 @@ def join(
             zero[i] = model.slow / model.Omega
             misfit[i] = model.misfit
         elif response.refusal[i] or response.sign_ratio[i] < MIN_RATIO:
-            refused.append(response.refusal[i] or response.sign_refusal(i))
+            refusals.append(response.refusal[i] or response.sign_refusal(i))
             continue
         else:
             Omega[i, i] = response.Omega[i, i]
@@ -309,8 +311,8 @@ def join(
             opposite,
             "the opposite: change `sign`",
         )
-    if refused:
-        raise ParameterError("; ".join(refused))
+    if refusals:
+        raise ParameterError("; ".join(refusals))
     return IdentifiedChannels(
         Omega=Omega,
         Omega_deviation=deviation,

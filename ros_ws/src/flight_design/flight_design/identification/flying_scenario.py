@@ -76,14 +76,14 @@ def flying_scenario(
     channels: IdentifiedChannels,
     speed: float | None,
     airframe_file: str,
-    needed: Requirement = REQUIREMENT,
+    requirement: Requirement = REQUIREMENT,
 ) -> Flyable:
     """Gains for identified channels, and the texts of airframe and scenario.
 
     The bandwidths follow from lag, delay and rate by the engineering procedure, for y_dot = Omega
     u. The integrals follow from damping and stiffness. Integrals and bandwidths fall until the loop
-    around the identified channels has the margins `needed`. The feedforward has the airframe as
-    model, in coordinated turns without sideslip.
+    around the identified channels meets `requirement`. The feedforward has the airframe as model,
+    in coordinated turns without sideslip.
     """
     identified = _Identified(channel_map, channels, speed)
     commands = identified.commands()
@@ -93,26 +93,26 @@ def flying_scenario(
     flying = ideal_control.study_airframe(identified.airframe(source), manoeuvre, samples=1)
     studied = identified.of_integrators(manoeuvre)
     studied = studied._replace(slew=np.maximum(flying.slew, identified.reach / FULL_RANGE_TIME))
-    selection = gain_selection.gain_sets(studied, identified.setting(needed))
-    flown, margins = _within_margins(
+    selection = gain_selection.gain_sets(studied, identified.setting(requirement))
+    controller, margins = _within_margins(
         _with_integrals(selection.chosen, identified.pairing, channels, identified.loop),
         flying,
-        needed,
+        requirement,
     )
     turning = identified
     if reference.coordinated_turn is not None:
         turning = identified._replace(channels=_without_sideslip(channels, identified.pairing))
     model = turning.airframe("identified in flight, without sideslip")
-    flown = gain_selection.with_feedforward(flown, model)
+    controller = gain_selection.with_feedforward(controller, model)
     heading = [
         f"The aircraft behind the map {channel_map.name}, with gains from its identified response.",
-        gain_yaml.margins_sentence(flown, margins),
+        gain_yaml.margins_sentence(controller, margins),
     ]
-    text = scenario_text(heading, bridge_sections(airframe_file, commands, flown))
-    lacking = "" if margins is None else unmet(margins, needed, flown.outputs)
+    text = scenario_text(heading, bridge_sections(airframe_file, commands, controller))
+    lacking = "" if margins is None else unmet(margins, requirement, controller.outputs)
     delay = None if margins is None else margins.delay
     return Flyable(
-        controller=flown,
+        controller=controller,
         delay_margin=delay,
         lacking=lacking,
         airframe=identified.airframe_text(source),
@@ -142,8 +142,10 @@ class _Identified(NamedTuple):
     @property
     def products(self) -> dict[str, float]:
         """Crossover times lag, by output."""
-        moved = motions(self.channel_map).items()
-        return {name: gain_selection.CROSSOVER_LAG_PRODUCTS[motion] for name, motion in moved}
+        motion_by_output = motions(self.channel_map).items()
+        return {
+            name: gain_selection.CROSSOVER_LAG_PRODUCTS[motion] for name, motion in motion_by_output
+        }
 
     @property
     def reach(self) -> FloatArray:
@@ -186,7 +188,7 @@ class _Identified(NamedTuple):
         short = manoeuvre._replace(duration=1.0)
         return ideal_control.study_airframe(integrators, short, samples=1)
 
-    def setting(self, needed: Requirement) -> LoopSetting:
+    def setting(self, requirement: Requirement) -> LoopSetting:
         """What the gains are selected for; each gain is 1 before."""
         loop = self.loop
         lag = loop.lag.tolist()
@@ -200,12 +202,12 @@ class _Identified(NamedTuple):
             delay=loop.delay,
             rate_limit={},
             crossover_lag_products=self.products,
-            requirement=needed,
+            requirement=requirement,
         )
 
 
 def _within_margins(
-    controller: RiseDiConfig, study: Study, needed: Requirement
+    controller: RiseDiConfig, study: Study, requirement: Requirement
 ) -> tuple[RiseDiConfig, LoopMargins | None]:
     """The controller with slower integrals and lower bandwidths where the loop lacks margins.
 
@@ -228,11 +230,11 @@ def _within_margins(
             "beta": np.array(controller.beta) * lower * ones,  # the same rate of u
         }
         values = controller.model_dump() | {key: value.tolist() for key, value in changes.items()}
-        chosen = RiseDiConfig.validate_mapping(values, "controller")
-        return Candidate(chosen, linear_loop(chosen, airframe, A, B))
+        config = RiseDiConfig.validate_mapping(values, "controller")
+        return Candidate(config, linear_loop(config, airframe, A, B))
 
-    chosen = within_requirement(build, needed, study.u_dot[:, 0][:, columns])
-    return chosen.controller, loop_margins(chosen.loop)
+    candidate = within_requirement(build, requirement, study.u_dot[:, 0][:, columns])
+    return candidate.controller, loop_margins(candidate.loop)
 
 
 def _without_sideslip(channels: IdentifiedChannels, pairing: ChannelPairing) -> IdentifiedChannels:
@@ -293,11 +295,11 @@ def _integral(channels: IdentifiedChannels, i: int, crossover: float, total_lag:
             / (s**2 + channels.damping[i] * s + channels.stiffness[i])
         )
 
-    wanted = crossover * np.sqrt(max(0.0, abs(response(crossover)) ** -2 - 1.0))
+    gain = crossover * np.sqrt(max(0.0, abs(response(crossover)) ** -2 - 1.0))
     delayed = response(omega) * np.exp(-1j * omega * total_lag)
     safe = (
         integral
-        for integral in wanted * INTEGRALS
+        for integral in gain * INTEGRALS
         if np.min(np.abs(1.0 + delayed * (1.0 - 1j * integral / omega))) > 1.0 / MAX_SENSITIVITY
     )
     return float(next(safe, 0.0))

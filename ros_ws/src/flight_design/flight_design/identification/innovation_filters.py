@@ -68,13 +68,13 @@ class FlightData(NamedTuple):
 def coarser(recorded: FlightData, factor: int) -> FlightData:
     """The means over `factor` periods; u between the middles of two means of y."""
     count = len(recorded.t) // factor
-    ahead = [
+    leads = [
         np.concatenate([recorded.u[k:], np.repeat(recorded.u[-1:], k, axis=0)])
         for k in ((factor - 1) // 2, factor // 2)
     ]
     t, y, u = (
         values[: count * factor].reshape(count, factor, *values.shape[1:]).mean(axis=1)
-        for values in (recorded.t, recorded.y, (ahead[0] + ahead[1]) / 2.0)
+        for values in (recorded.t, recorded.y, (leads[0] + leads[1]) / 2.0)
     )
     return FlightData(factor * recorded.period, t, y, u)
 
@@ -112,11 +112,11 @@ def recording(tape: Tape, airframe: Airframe) -> FlightData:
     require(period_ns > 0, "topic u", "samples with equal stamps", "one a period")
     end_ns = min(u.stamp_ns[-1], y.stamp_ns[-1])
     seconds = (end_ns - u.stamp_ns[0]) / NANOSECONDS
-    held = len(u.stamp_ns) * period_ns / NANOSECONDS
+    length = len(u.stamp_ns) * period_ns / NANOSECONDS
     require(
-        seconds < MOST_GAPS * held,
+        seconds < MOST_GAPS * length,
         "the log",
-        f"{held:.3g} s of u in {seconds:.3g} s",
+        f"{length:.3g} s of u in {seconds:.3g} s",
         "a log without long gaps",
     )
     instants = np.arange(u.stamp_ns[0], end_ns + 1, period_ns)
@@ -129,13 +129,13 @@ def recording(tape: Tape, airframe: Airframe) -> FlightData:
     )
     after = np.clip(np.searchsorted(y.stamp_ns, instants), 1, len(y.stamp_ns) - 1)
     nearest = after - (instants - y.stamp_ns[after - 1] <= y.stamp_ns[after] - instants)
-    lost = 2 * np.abs(y.stamp_ns[nearest] - instants) > period_ns
-    measured = np.stack([y[name] for name in airframe.outputs], axis=1)[nearest]
-    measured[lost] = np.nan
+    is_lost = 2 * np.abs(y.stamp_ns[nearest] - instants) > period_ns
+    y_rows = np.stack([y[name] for name in airframe.outputs], axis=1)[nearest]
+    y_rows[is_lost] = np.nan
     places = np.searchsorted(u.stamp_ns, instants + period_ns // 2, side="right") - 1
     commanded = np.stack([u[name] for name in airframe.inputs], axis=1)[places]
     return FlightData(
-        period_ns / NANOSECONDS, (instants - tape.start_ns) / NANOSECONDS, measured, commanded
+        period_ns / NANOSECONDS, (instants - tape.start_ns) / NANOSECONDS, y_rows, commanded
     )
 
 
@@ -238,8 +238,8 @@ class Passage:
         kinds, self._kind = np.unique(code, return_inverse=True)
         lifted = []
         for kind in kinds.tolist():
-            seen = [bool(kind >> j & 1) for j in range(HOLD)]
-            lifted.append(bank.lifted(kind >> HOLD, seen))
+            is_seen = [bool(kind >> j & 1) for j in range(HOLD)]
+            lifted.append(bank.lifted(kind >> HOLD, is_seen))
         self._forced, self._states = (
             np.empty((N, HOLD * m, blocks)),
             np.zeros((blocks + 1, N, s + len(self._angles), 1)),
@@ -270,13 +270,13 @@ class Passage:
         states = self._states[first : first + len(kind) + 1]
         states[0, ..., 0] = np.concatenate([z, z[:, self._angles]], axis=1)
         sine = np.empty(states[0, :, s:].shape)
-        moved = np.empty(states[0].shape)
+        next_state = np.empty(states[0].shape)
         # the loop is half of a search: no array is made in it
         for k, now, turned, following in zip(
             kind.tolist(), states[:-1], states[:-1, :, s:], states[1:], strict=True
         ):
             np.subtract(np.sin(turned, sine), turned, turned)
-            np.add(following, np.matmul(steps[k], now, moved), following)
+            np.add(following, np.matmul(steps[k], now, next_state), following)
         r = self._forced[..., first : first + len(kind)].copy()
         x = np.moveaxis(states[:-1, ..., 0], 0, -1)
         for k in np.unique(kind).tolist():

@@ -158,7 +158,7 @@ def identify_jsbsim(
     *,
     guided: bool = False,
     learns: bool = False,
-    needed: Requirement = REQUIREMENT,
+    requirement: Requirement = REQUIREMENT,
     named: tuple[tuple[str, NamedProperties], ...] = (),
 ) -> IdentifiedAircraft:
     """Identify an aircraft of JSBSim in a flight condition and select gains.
@@ -167,14 +167,14 @@ def identify_jsbsim(
 
     1. Trim, first in another process, and the airframe: `linearize`. 2. The pairing, with outputs
     in units of the manoeuvre, and D from the minors. 3. Gains by the engineering procedure for the
-    airframe behind the lags, along the commands and gusts: `gain_selection.gain_sets`. The
-    sign of V is that of `airspeed_slew`. With `observer_margin`, the delay margin in s of the
-    loop on y_dot = Omega u, the gains are those for y_dot = Omega u with an extended-state observer
-    beside them. The margins of that loop meet `needed`, with 35 degrees of phase. 4. Simulations
-    of the result: in calm air, with a gust, in turbulence. With `guided` the scenario has guidance
-    by rule in place of the pulses: a turn by 90 degrees and a climb by 100 m. Its stall speed is
-    that of `slowest_trim`, and its sideslip feedback flies an aircraft whose `sideslip_zero` is
-    positive, too. With `learns` the scenario learns in moderate turbulence: the gains begin alone,
+    airframe behind the lags, along the commands and gusts: `gain_selection.gain_sets`. The sign of
+    V is that of `airspeed_slew`. With `observer_margin`, the delay margin in s of the loop on y_dot
+    = Omega u, the gains are those for y_dot = Omega u with an extended-state observer beside them.
+    The margins of that loop meet `requirement`, with 35 degrees of phase. 4. Simulations of the
+    result: in calm air, with a gust, in turbulence. With `guided` the scenario has guidance by rule
+    in place of the pulses: a turn by 90 degrees and a climb by 100 m. Its stall speed is that of
+    `slowest_trim`, and its sideslip feedback flies an aircraft whose `sideslip_zero` is positive,
+    too. With `learns` the scenario learns in moderate turbulence: the gains begin alone,
     `observer_margin` is the margin of the designs, and the rough model is the `sketch` of Omega and
     speed.
 
@@ -197,7 +197,7 @@ def identify_jsbsim(
     V_bandwidth = airspeed_bandwidth(authority, float(linear.lag[THROTTLE]))
     zero = sideslip_zero(linear.airframe)
     progress("gains")
-    setting = _setting(linear, V_bandwidth)._replace(requirement=needed)
+    setting = _setting(linear, V_bandwidth)._replace(requirement=requirement)
     commands = _commands(linear, setting)
     studied = _study(with_sideslip_held(linear.airframe, zero), commands)
     slew = studied.slew.copy()
@@ -206,21 +206,24 @@ def identify_jsbsim(
         studied = _study(_integrators(linear), commands)
     slew[THROTTLE] = airspeed_slew(V_bandwidth, abs(float(Omega[THROTTLE, THROTTLE])))
     try:
-        chosen = gain_selection.gain_sets(studied._replace(slew=slew), setting)
+        selection = gain_selection.gain_sets(studied._replace(slew=slew), setting)
     except ParameterError as error:
         raise ParameterError(f"{error}{_too_weak(linear)}") from None
     if observer_margin is not None and has_observer:
-        chosen = with_extended_state(chosen, Omega, observer_margin)
-    text = _text(linear, commands, chosen, stall)
+        selection = with_extended_state(selection, Omega, observer_margin)
+    text = _text(linear, commands, selection, stall)
     flights = fly_all(_load(text), progress)
     if observer_margin is not None and learns:
         text = _text(
-            linear, commands, learning_selection(chosen, condition, Omega, observer_margin), stall
+            linear,
+            commands,
+            learning_selection(selection, condition, Omega, observer_margin),
+            stall,
         )
     return IdentifiedAircraft(
         linear=linear,
         coupling=coupling(Omega / heights[:, None]),
-        selection=chosen,
+        selection=selection,
         text=text,
         sideslip_zero=zero,
         flights=flights,
@@ -328,10 +331,10 @@ def with_extended_state(selection: Selection, Omega: FloatArray, margin: float) 
     """
     controller = selection.chosen
     size = unit_sizes(OUTPUTS[name] for name in controller.outputs)
-    needed = selection.setting.requirement
-    needed = needed._replace(phase=min(needed.phase, OBSERVER_REQUIREMENT.phase))
+    requirement = selection.setting.requirement
+    requirement = requirement._replace(phase=min(requirement.phase, OBSERVER_REQUIREMENT.phase))
     observed = with_extended_state_observer(
-        controller, _in_law_order(Omega, controller), size / NOISE_SHARE, size, margin, needed
+        controller, _in_law_order(Omega, controller), size / NOISE_SHARE, size, margin, requirement
     )
     return replace(selection, chosen=observed.controller)
 

@@ -152,12 +152,12 @@ def units(model: NominalModel, *, coupled: bool = False) -> tuple[FloatArray, Fl
     units of motion; the columns of angles stay 0.
     """
     free = model.kinematic[:, None] == 0.0
-    turned = model.kinematic == 0.0
+    is_dynamic = model.kinematic == 0.0
     units_A = np.where(free, model.A, 0.0)
     units_B = np.where(free, model.B, 0.0)
     if coupled:
         largest_A = (
-            np.max(np.abs(units_A) * model.size, axis=1, keepdims=True) / model.size * turned
+            np.max(np.abs(units_A) * model.size, axis=1, keepdims=True) / model.size * is_dynamic
         )
         largest_B = np.max(np.abs(units_B), axis=1, keepdims=True)
         units_A, units_B = (
@@ -356,9 +356,9 @@ class Likelihood:
             models.bank.covariance,
             self._of_span(calmest),
         )
-        chosen = self._usable[calmest]
-        self._passed = theta.tobytes(), chosen, passed
-        return chosen
+        levels = self._usable[calmest]
+        self._passed = theta.tobytes(), levels, passed
+        return levels
 
     def _of_span(self, values: Sequence[int] | NDArray[np.int64]) -> NDArray[np.int64]:
         """Values of the spans for the samples, (T,)."""

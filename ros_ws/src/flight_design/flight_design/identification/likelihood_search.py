@@ -190,10 +190,10 @@ class Search(Likelihood):
         """
         for iteration in range(STEPS):
             self.progress()
-            flown = self.levels(theta) if levels is None else levels
-            counted = used & self._counted(theta, flown) if iteration > unsettled else used
+            span_levels = self.levels(theta) if levels is None else levels
+            mask = used & self._counted(theta, span_levels) if iteration > unsettled else used
             theta, hessian, progressed = self._step(
-                theta, flown, counted, np.ones(len(theta), dtype=bool)
+                theta, span_levels, mask, np.ones(len(theta), dtype=bool)
             )
             if iteration > unsettled and progressed < PROGRESS:
                 break
@@ -216,26 +216,26 @@ class Search(Likelihood):
         Identification", 7.4 and 10.2.
         """
         size = len(theta)
-        moving = np.flatnonzero(free)
+        indices = np.flatnonzero(free)
         models = self.models(
-            theta + DIFFERENCE * np.vstack([np.zeros(size), np.eye(size)[moving]]),
+            theta + DIFFERENCE * np.vstack([np.zeros(size), np.eye(size)[indices]]),
             levels,
             near=True,
         )
         costs, e, half_log_det = self._costs(self.innovations(models, levels), used, theta[None])
         rms = np.sqrt(np.mean(e[0] ** 2, axis=0))
         J = np.zeros((size, e[0].size))
-        J[moving] = ((e[1:] - e[0]) / DIFFERENCE / rms).reshape(len(moving), -1)
+        J[indices] = ((e[1:] - e[0]) / DIFFERENCE / rms).reshape(len(indices), -1)
         hessian = J @ J.T + np.diag(self.prior**-2)
         slope = J @ (e[0] / rms).ravel() + theta / self.prior**2
-        slope[moving] += (half_log_det[1:] - half_log_det[0]) / DIFFERENCE
-        tried = np.clip(
+        slope[indices] += (half_log_det[1:] - half_log_det[0]) / DIFFERENCE
+        trials = np.clip(
             theta + damped_steps(theta, slope, hessian, self._lower, self._upper, free),
             self._lower,
             self._upper,
         )
-        expected = -float(slope @ (tried[0] - theta)) / 2.0
-        for several in (tried[:1], tried[1:]):
+        expected = -float(slope @ (trials[0] - theta)) / 2.0
+        for several in (trials[:1], trials[1:]):
             innovations = self.innovations(self.models(several, levels), levels)
             lower, _, _ = self._costs(innovations, used, several)
             progressed = float(costs[0] - lower.min())
@@ -261,13 +261,13 @@ class Search(Likelihood):
 
         A part that is searched apart from the parts with which it couples has wrong errors.
         """
-        known: dict[str, list[float]] = {}
+        values: dict[str, list[float]] = {}
         for part, fit in parts:
             for name, value in list(zip(part.named(), fit.theta.tolist(), strict=True))[
                 part.count :
             ]:
-                known.setdefault(name, []).append(value)
-        return np.array([np.mean(known.get(name, [0.0])) for name in self.named()])
+                values.setdefault(name, []).append(value)
+        return np.array([np.mean(values.get(name, [0.0])) for name in self.named()])
 
 
 def damped_steps(

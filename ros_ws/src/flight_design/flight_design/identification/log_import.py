@@ -104,10 +104,10 @@ def imported(
     first, last = _flight(log, stamps, speed, window, needs_manual=has_sticks and not servos)
     parameters = log.parameters_at(first)
     notes = parameter_changes(log.parameters, int(stamps[0]), first, last)
-    if speed is not None and (lost := ~np.isfinite(speed) & (stamps >= first)).any():
-        instant = seconds(int(stamps[lost.argmax()] - stamps[0]))
+    if speed is not None and (is_lost := ~np.isfinite(speed) & (stamps >= first)).any():
+        instant = seconds(int(stamps[is_lost.argmax()] - stamps[0]))
         notes.append(
-            f"no airspeed or thrust at {lost.sum()} of {len(stamps)} samples, from "
+            f"no airspeed or thrust at {is_lost.sum()} of {len(stamps)} samples, from "
             f"{instant:.1f} s of the log on"
         )
     sticks = [stick_of(channel_map, name) for name in channel_map.inputs if has_sticks]
@@ -395,8 +395,8 @@ def _longest_run(stamps: Stamps, keep: NDArray[np.bool_]) -> tuple[int, int]:
 
 def _complete(stamp_ns: Stamps, values: FloatArray) -> tuple[Stamps, FloatArray]:
     """The samples in which every channel is known."""
-    known = np.isfinite(values).all(axis=1)
-    return stamp_ns[known], values[known]
+    is_finite = np.isfinite(values).all(axis=1)
+    return stamp_ns[is_finite], values[is_finite]
 
 
 def _pose(channel_map: ChannelMap, log: VehicleLog, first: int, last: int) -> Signal | None:

@@ -78,7 +78,7 @@ def correlation(e: FloatArray, before: FloatArray, used: NDArray[np.bool_]) -> F
 
 
 def advantage(
-    first: Innovations, second: Innovations, span: int, counted: NDArray[np.bool_]
+    first: Innovations, second: Innovations, span: int, counts: NDArray[np.bool_]
 ) -> float:
     """By how many standard deviations one model predicts a record better than another one.
 
@@ -88,12 +88,12 @@ def advantage(
     Where both models are equally far from the aircraft, z has a standard normal distribution,
     whichever is simpler, and even if both are wrong. Source: Q. H. Vuong, Econometrica 57(2), 1989,
     here with spans of `span` samples, whose d_k are nearly independent. K is small, hence Student's
-    t. Only samples of the mask `counted`, (T,), count; z is 0 for less than two spans.
+    t. Only samples of the mask `counts`, (T,), count; z is 0 for less than two spans.
     """
-    end = len(counted) // span * span
-    d = np.where(counted, first.log_likelihood - second.log_likelihood, 0.0)[:end]
-    seen = counted[:end].reshape(-1, span).any(axis=1)
-    sums = d.reshape(-1, span).sum(axis=1)[seen]
+    end = len(counts) // span * span
+    d = np.where(counts, first.log_likelihood - second.log_likelihood, 0.0)[:end]
+    is_counted = counts[:end].reshape(-1, span).any(axis=1)
+    sums = d.reshape(-1, span).sum(axis=1)[is_counted]
     if len(sums) < 2 or np.ptp(sums) == 0.0:
         return 0.0
     t = np.sum(sums) / (np.sqrt(len(sums)) * np.std(sums, ddof=1))

@@ -56,9 +56,9 @@ def module_flight(log: VehicleLog, controller: ControllerConfig) -> ModuleFlight
     require(STATUS in log.tables, "the log", f"no {STATUS}", EXPECTED)
     table = log.tables[STATUS]
     ticks = _Ticks(table, controller)
-    flown = ticks.flown()
-    require(len(flown) > 0, "the log", "no tick of RISE-DI", "a flight with RDI_EN 1")
-    return ticks.computed(flown)
+    indices = ticks.flown()
+    require(len(indices) > 0, "the log", "no tick of RISE-DI", "a flight with RDI_EN 1")
+    return ticks.computed(indices)
 
 
 class _Ticks:
@@ -148,15 +148,15 @@ class _Ticks:
                     y_m.append(y_m[0]._replace(stamp_ns=stamp_ns + int(self._offset_ns[k])))
                 sample = StampedVector(stamp_ns, self._values["y"][k])
                 now_ns = int(self._now_ns[k])
-                state, used = guard.tick(state, now_ns, sample, y_m, limits, law, True)
-                if used is None:
+                state, inputs = guard.tick(state, now_ns, sample, y_m, limits, law, True)
+                if inputs is None:
                     raise ParameterError(f"{STATUS}: found a tick in row {k} that the law refuses")
                 u = self._values["u"][k]
                 equal += state.u.tobytes() == u.tobytes()
                 age = seconds(now_ns - stamp_ns)
                 logged = state._replace(u=u)
                 rows.append(
-                    internals.values(logged, used, limits, 0.0, age, number, digest, np.zeros(0))
+                    internals.values(logged, inputs, limits, 0.0, age, number, digest, np.zeros(0))
                 )
                 number += 1
         return self._flight(stretches, rows, changes, equal)

@@ -135,10 +135,10 @@ def fit_channel(
         return None
     first = int(u.stamp_ns[excited[0]] - BEFORE * NANOSECONDS)
     last = int(u.stamp_ns[excited[-1]] + AFTER * NANOSECONDS)
-    measured = y.within([(first, last)])
-    if not len(measured.stamp_ns) or not np.ptp(measured[output]):
+    y_of_channel = y.within([(first, last)])
+    if not len(y_of_channel.stamp_ns) or not np.ptp(y_of_channel[output]):
         return None
-    t = (measured.stamp_ns - first) / NANOSECONDS
+    t = (y_of_channel.stamp_ns - first) / NANOSECONDS
     t_u = (u.stamp_ns - first) / NANOSECONDS
     impulse = np.concatenate([[0.0], np.cumsum(u[name][:-1] * np.diff(t_u))])
     trend = [np.ones(len(t)), t]
@@ -156,7 +156,7 @@ def fit_channel(
     def residuals(theta: FloatArray) -> FloatArray:
         decay = [] if gravity is None else [_decay(t, theta[3])]
         q, _ = np.linalg.qr(np.stack(trend + decay, axis=1))
-        e = measured[output] - response(theta)
+        e = y_of_channel[output] - response(theta)
         return np.asarray(e - q @ (q.T @ e))
 
     orders = ORDERS[:1] if first_order or gravity is not None else ORDERS

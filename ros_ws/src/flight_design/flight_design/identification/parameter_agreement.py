@@ -199,12 +199,12 @@ def compared(
     A parameter without a value at the samples is compared by the first record after the samples,
     without a default.
     """
-    known = {name: records[0].value for name, records in recorded.items()} | dict(values)
+    parameters = {name: records[0].value for name, records in recorded.items()} | dict(values)
     rows = []
     for stick in sticks:
         for name, (value, tolerance) in stick.parameters().items():
-            differs = name in known and not abs(known[name] - value) <= tolerance
-            logged = f"{known[name]:g}" if name in known else ""
+            differs = name in parameters and not abs(parameters[name] - value) <= tolerance
+            logged = f"{parameters[name]:g}" if name in parameters else ""
             rows.append(
                 Agreement(
                     what=name,

@@ -238,20 +238,24 @@ def _rows(
     span: tuple[int, int],
 ) -> _Rows:
     """Regressors and predicted samples of a span."""
-    (t, values), (t_u, held), m = _within(y, outputs, span), _within(u, inputs, span), len(outputs)
+    (t, values), (t_u, u_values), m = (
+        _within(y, outputs, span),
+        _within(u, inputs, span),
+        len(outputs),
+    )
     k = np.arange(layout.past, len(t))
     if len(t_u) > 1:
         k = k[(t[k] - layout.u_windows[-1][1] * layout.period >= t_u[0]) & (t[k] <= t_u[-1])]
     if len(t_u) < 2 or not len(k):
-        return _Rows(np.zeros((0, 0)), np.zeros((0, m)), held)
+        return _Rows(np.zeros((0, 0)), np.zeros((0, m)), u_values)
     sums = np.concatenate([np.zeros((1, m)), np.cumsum(values, axis=0)])
     columns = [values[k - lag] for lag in range(1, layout.recent + 1)]
     columns += [(sums[k - a] - sums[k - b]) / (b - a) for a, b in layout.y_windows]
     edges = [0, *(b for _, b in layout.u_windows)]
-    ends = [_integral(t_u, held[:-1], t[k] - edge * layout.period) for edge in edges]
+    ends = [_integral(t_u, u_values[:-1], t[k] - edge * layout.period) for edge in edges]
     for (new, old), (a, b) in zip(pairwise(ends), layout.u_windows, strict=True):
         columns.append((new - old) / ((b - a) * layout.period))
-    return _Rows(np.concatenate(columns, axis=1), values[k], held)
+    return _Rows(np.concatenate(columns, axis=1), values[k], u_values)
 
 
 class _Predictor(NamedTuple):
@@ -269,8 +273,8 @@ class _Predictor(NamedTuple):
         m = self.coefficients.shape[1]
         layout = self.layout
         normal = np.random.default_rng(0).standard_normal((DRAWS, *self.coefficients.shape))
-        drawn = self.coefficients + np.einsum("ikl,dli->dki", self.roots, normal)
-        every = np.concatenate([self.coefficients[None], drawn])
+        draws = self.coefficients + np.einsum("ikl,dli->dki", self.roots, normal)
+        every = np.concatenate([self.coefficients[None], draws])
         blocks = np.swapaxes(every.reshape(len(every), -1, m, m), -1, -2)
         windows = len(layout.y_windows)
         steps = round(HORIZON / layout.period)
@@ -288,14 +292,14 @@ class _Predictor(NamedTuple):
 
 def _fit(rows: Sequence[_Rows], layout: Layout, m: int) -> _Predictor:
     """Least squares over the spans, with a constant per span."""
-    used = [part for part in rows if len(part.y)]
-    samples = sum(len(part.y) for part in used)
+    parts = [part for part in rows if len(part.y)]
+    samples = sum(len(part.y) for part in parts)
     coefficients = m * (layout.recent + len(layout.y_windows) + len(layout.u_windows))
     least = MIN_ROWS_PER_COEFFICIENT * coefficients
-    known = f"{samples * layout.period:.3g} s in which u acts and {FAR:g} s before are known"
-    require(samples >= least, "the log", known, f"{least * layout.period:.3g} s or more")
-    X = np.concatenate([part.regressors - part.regressors.mean(axis=0) for part in used])
-    Y = np.concatenate([part.y - part.y.mean(axis=0) for part in used])
+    length = f"{samples * layout.period:.3g} s in which u acts and {FAR:g} s before are known"
+    require(samples >= least, "the log", length, f"{least * layout.period:.3g} s or more")
+    X = np.concatenate([part.regressors - part.regressors.mean(axis=0) for part in parts])
+    Y = np.concatenate([part.y - part.y.mean(axis=0) for part in parts])
     first_u = m * (layout.recent + len(layout.y_windows))
     moves = np.std(np.diff(Y, axis=0), axis=0) * max(WINDOW / layout.period, 1.0) ** 0.5
     spread = np.std(X[:, first_u : first_u + m], axis=0)
@@ -303,8 +307,8 @@ def _fit(rows: Sequence[_Rows], layout: Layout, m: int) -> _Predictor:
     prior = PRIOR * block_diag(
         np.diag(np.kron(layout.y_decay(), per_y)), np.kron(layout.u_root(), np.diag(per_u))
     )
-    scaled = X @ prior
-    normal = scaled.T @ scaled
+    X_scaled = X @ prior
+    normal = X_scaled.T @ X_scaled
     fits = []
     roots = []
     for i in range(m):
@@ -316,7 +320,7 @@ def _fit(rows: Sequence[_Rows], layout: Layout, m: int) -> _Predictor:
             root = moves[i] * prior @ (vectors / np.sqrt(np.maximum(values, 1.0)))
             fit = root @ (root.T @ (X.T @ Y[:, i])) / variance
             e = Y[:, i] - X @ fit
-            variance = float(e @ e) / (len(e) - coefficients - len(used)) or 1.0
+            variance = float(e @ e) / (len(e) - coefficients - len(parts)) or 1.0
         fits.append(fit)
         roots.append(root)
     return _Predictor(layout, np.stack(fits, axis=1), np.stack(roots))
@@ -411,7 +415,7 @@ def _responses(
         for name in ResponseColumn._fields[2:]
     )
     counts = (share >= MIN_SHARE) & ~((share < 1.0) & (delay < LEAST_DELAY))
-    counted = np.where(share < 1.0, counts / CLOSED_LOOP_ERRORS, counts)
+    weights = np.where(share < 1.0, counts / CLOSED_LOOP_ERRORS, counts)
     return Response(
         outputs=outputs,
         inputs=inputs,
@@ -424,7 +428,7 @@ def _responses(
         refusal=tuple(refusal),
         seconds=sum(len(part.y) for part in rows) * layout.period,
         share=share,
-        sign_ratio=sign_ratio * counted,
+        sign_ratio=sign_ratio * weights,
     )
 
 

@@ -103,10 +103,10 @@ def check_scenario(
         )
         effect = np.reshape(controller.allocation.effect, (len(outputs), -1))
         return check_effectors(channel_map, in_map, outputs, inputs, effect)
-    measured = (
+    response = (
         None if bag is None else recorded_response(bag, outputs, inputs, namespace, channel_map)
     )
-    return check_map(channel_map, in_map, outputs, inputs, controller.D, measured)
+    return check_map(channel_map, in_map, outputs, inputs, controller.D, response)
 
 
 def recorded_response(
@@ -130,8 +130,8 @@ def recorded_response(
     recorded.require("y", "u")
     if channel_map is not None:
         require_map_of_import(channel_map, recorded)
-    flown = recorded.engagements
-    if flown is None:
+    engagements = recorded.engagements
+    if engagements is None:
         require(
             "bridge/would_send" not in tape,
             str(bag),
@@ -141,14 +141,14 @@ def recorded_response(
         spans = None
     else:
         require(
-            bool(flown),
+            bool(engagements),
             str(bag),
             "a bridge that was never engaged",
             "a flight with an engaged bridge",
         )
         spans = [
             (engagement.start_ns, engagement.stop_ns or int(tape["u"].stamp_ns[-1]))
-            for engagement in flown
+            for engagement in engagements
         ]
     open_loop = (
         recorded.scenario is not None and recorded_parameters(recorded.scenario).law == OPEN_LOOP

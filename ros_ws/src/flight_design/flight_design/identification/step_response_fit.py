@@ -72,10 +72,10 @@ def second_order_response(
     parts = np.linalg.solve(vectors, np.array([0.0, 0.0, 1.0 / lag]))
     product = values[:, None] * begin
     small = np.abs(product) < 1e-6
-    grown = np.where(
+    growth = np.where(
         small, begin, np.expm1(product) / np.where(values == 0.0, 1.0, values)[:, None]
     )
-    z = (vectors @ (parts[:, None] * grown)).real
+    z = (vectors @ (parts[:, None] * growth)).real
     return z[1], z[0]
 
 
@@ -91,11 +91,11 @@ def fitted_column(t: FloatArray, responses: FloatArray, j: int) -> ResponseColum
     whiten = _whitener(responses[:, :, j])
     best = _search(t, whiten, step[:, j] / size, size, ORDERS[0], None)
     for free in ORDERS[1:]:
-        tried = _search(t, whiten, step[:, j] / size, size, free, best.theta)
-        if best.chi_squared - tried.chi_squared > MIN_GAIN * (
+        trial = _search(t, whiten, step[:, j] / size, size, free, best.theta)
+        if best.chi_squared - trial.chi_squared > MIN_GAIN * (
             sum(free) - sum(best.free)
-        ) and begins_with_Omega(t, tried.theta):
-            best = tried
+        ) and begins_with_Omega(t, trial.theta):
+            best = trial
     inside = (np.array(best.free) > 0) & (best.theta > LOWER + 1e-6) & (best.theta < UPPER - 1e-6)
     # R. T. Birge, Phys. Rev. 40, 1932
     misfit = max(best.chi_squared / max(len(t) - sum(best.free), 1), 1.0)
@@ -205,8 +205,10 @@ def _search(
     for delay in STARTS_DELAY:
         for lag in STARTS_LAG:
             first, _ = second_order_response(t, delay, lag, 2.0, 0.0)
-            seen = whiten @ first
-            slope = float(seen @ whiten @ step) / max(float(seen @ seen), np.finfo(float).tiny)
+            weighted = whiten @ first
+            slope = float(weighted @ whiten @ step) / max(
+                float(weighted @ weighted), np.finfo(float).tiny
+            )
             starts.append(np.array([delay, lag, slope, 2.0, 0.0, 0.0]))
     bounds = LOWER[fitted], UPPER[fitted]
     best: Any = min(

@@ -92,7 +92,7 @@ def learner(scenario: Scenario, *, real_time: bool = False, quick: bool = False)
             uncertain=False,
             sketched=sketch,
             speeds=speeds,
-            beside=goal.beside,
+            earlier_design=goal.beside,
             is_free=goal.is_free,
         )
 

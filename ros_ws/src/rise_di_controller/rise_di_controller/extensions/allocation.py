@@ -99,7 +99,7 @@ def allocate(
     return u, product(params.effect, u)
 
 
-def reached(v_free: Array, v: Array) -> Limits:
+def limits_of_effectors(v_free: Array, v: Array) -> Limits:
     """The limits from v_free to the v of the effectors.
 
     The anti-windup of a law takes these limits.
@@ -143,9 +143,9 @@ def _towards(
                 target = halfway
         step = target - u
         room = np.where(step > 0.0, high - u, low - u)
-        limited = np.abs(step) > np.maximum(np.abs(room), LEAST_DIVISOR)
+        is_limited = np.abs(step) > np.maximum(np.abs(room), LEAST_DIVISOR)
         last = float(
-            np.min(np.where(limited, room, 1.0) / np.where(limited, step, 1.0), initial=1.0)
+            np.min(np.where(is_limited, room, 1.0) / np.where(is_limited, step, 1.0), initial=1.0)
         )
         u = np.minimum(np.maximum(u + last * step, low), high)
     return u
@@ -157,15 +157,17 @@ def _exchanged(
     """U with the same effect, inside its limits where the sweeps find such a u."""
     columns = exchange.T.tolist()
     ends = list(enumerate(zip(low.tolist(), high.tolist(), strict=True)))
-    moved = u.tolist()
+    values_of_u = u.tolist()
     for _ in range(SWEEPS):
         inside = True
         for j, (least, largest) in ends:
-            excess = moved[j] - min(max(moved[j], least), largest)
+            excess = values_of_u[j] - min(max(values_of_u[j], least), largest)
             if excess != 0.0 and abs(columns[j][j]) > SMALL:
                 inside = False
                 part = RELAXATION * excess / columns[j][j]
-                moved = [value - part * move for value, move in zip(moved, columns[j], strict=True)]
+                values_of_u = [
+                    value - part * move for value, move in zip(values_of_u, columns[j], strict=True)
+                ]
         if inside:
             break
-    return np.array(moved)
+    return np.array(values_of_u)

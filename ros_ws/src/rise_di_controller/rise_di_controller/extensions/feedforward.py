@@ -88,7 +88,7 @@ def initial_state(y_m: Array, nominal: Nominal) -> FeedforwardState:
     return FeedforwardState(x=product(nominal.C.T, y_m), u=zeros, dt=zero, ticks=zero, u_0=zeros)
 
 
-def continued(
+def with_new_model(
     state: FeedforwardState | None, y_m: Array, y_m_dot: Array, dt: Array, nominal: Nominal
 ) -> FeedforwardState:
     """State for a new model in the same motion.
@@ -99,10 +99,10 @@ def continued(
     start = initial_state(y_m, nominal)
     if state is not None and state.x.shape == start.x.shape:
         start = start._replace(x=state.x, u_0=state.u_0)
-    return start._replace(u=ideal(start.x, y_m_dot, nominal), dt=dt, ticks=start.ticks + 2.0)
+    return start._replace(u=ideal_input(start.x, y_m_dot, nominal), dt=dt, ticks=start.ticks + 2.0)
 
 
-def ideal(x: Array, y_m_dot: Array, nominal: Nominal) -> Array:
+def ideal_input(x: Array, y_m_dot: Array, nominal: Nominal) -> Array:
     """Input for the motion y_m_dot of the outputs of the nominal model, shape (m,).
 
     u = Omega^-1 (y_m_dot - C (A x + f(x))).
@@ -168,15 +168,15 @@ def step(
     x = state.x
     for _ in range(parts):
         x = rk4(x_dot, 0.0, x, forced, nominal, dt / parts)
-    u = ideal((x + state.x) / 2.0, y_m_dot, nominal)
+    u = ideal_input((x + state.x) / 2.0, y_m_dot, nominal)
     u_ff = u + (dt + 2.0 * nominal.lead) * (u - state.u) / (dt + state.dt)
     u_0 = xp.where(state.ticks < 2.0, u_ff, state.u_0)
-    return FeedforwardState(x=x, u=u, dt=dt, ticks=state.ticks + 1.0, u_0=u_0), acting(
+    return FeedforwardState(x=x, u=u, dt=dt, ticks=state.ticks + 1.0, u_0=u_0), of_active_inputs(
         u_ff - u_0, nominal
     )
 
 
-def acting(u: Array, nominal: Nominal) -> Array:
+def of_active_inputs(u: Array, nominal: Nominal) -> Array:
     """The input u of the inputs with a feedforward, 0 for the others, (m,)."""
     return u if nominal.acts is None else u * nominal.acts
 

@@ -140,8 +140,8 @@ class VanesConfig(Config):
         m = len(outputs)
         others = [name for name in states if name not in outputs]
         expected = f"states of the feedforward that are no outputs: {', '.join(others)}"
-        known = set(self.channels) <= set(others) and len(set(self.channels)) == k
-        require(known, "observer.vanes.channels", ", ".join(self.channels), expected)
+        are_states = set(self.channels) <= set(others) and len(set(self.channels)) == k
+        require(are_states, "observer.vanes.channels", ", ".join(self.channels), expected)
         for key, size in (("H", k * s), ("L", k * s * (m + 1)), ("least", k)):
             entries = len(getattr(self, key))
             require(
@@ -202,15 +202,15 @@ class ObserverConfig(Config):
         Phi, Gamma, H, L, _ = self.matrices(nominal)
         s, m = Gamma.shape
         periods = self.rate / rate
-        moved = np.eye(s + m)
-        moved[:s] = np.hstack([Phi, Gamma])
-        moved = fractional_matrix_power(moved, periods).real
-        seen = H @ L
-        kept = fractional_matrix_power(np.eye(m) - seen, periods).real
+        transition = np.eye(s + m)
+        transition[:s] = np.hstack([Phi, Gamma])
+        transition = fractional_matrix_power(transition, periods).real
+        correction = H @ L
+        remainder = fractional_matrix_power(np.eye(m) - correction, periods).real
         matrices = {
-            "Phi": moved[:s, :s],
-            "Gamma": moved[:s, s:],
-            "L": L @ (np.eye(m) - kept) @ np.linalg.inv(seen),
+            "Phi": transition[:s, :s],
+            "Gamma": transition[:s, s:],
+            "L": L @ (np.eye(m) - remainder) @ np.linalg.inv(correction),
         }
         changes = {name: tuple(values.ravel().tolist()) for name, values in matrices.items()}
         return self.model_copy(update={"rate": rate, **changes})
@@ -235,9 +235,9 @@ class AllocationConfig(Config):
         description="the inputs by how long they keep their effect; none: in order",
     )
 
-    def ordered(self, inputs: Sequence[str], wanted: Sequence[str]) -> "AllocationConfig":
+    def ordered(self, inputs: Sequence[str], order: Sequence[str]) -> "AllocationConfig":
         """The allocation of `inputs` for the same inputs in another order."""
-        places = [list(inputs).index(name) for name in wanted]
+        places = [list(inputs).index(name) for name in order]
         p = len(self.effectors)
         T = np.reshape(self.T, (p, -1))[:, places]
         effect = np.reshape(self.effect, (-1, p))[places]

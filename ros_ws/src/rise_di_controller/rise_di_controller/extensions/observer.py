@@ -194,7 +194,7 @@ def filter_matrix(params: ObserverParams) -> FloatArray:
     return np.asarray(params.Phi @ (np.eye(len(params.Phi)) - corrected))
 
 
-def correct(state: Any, measured: Measurements, dt: Array, params: ObserverParams) -> Any:
+def correct(state: Any, measurements: Measurements, dt: Array, params: ObserverParams) -> Any:
     """Correction by the measured error, and the contribution to the trim.
 
         z     = z + L (e - H z) + by_vanes
@@ -203,13 +203,17 @@ def correct(state: Any, measured: Measurements, dt: Array, params: ObserverParam
 
     The limits bound u_o and u_o_dot for any measurement. The fade-in makes the engagement bumpless.
     """
-    e = measured.y - measured.y_m
+    e = measurements.y - measurements.y_m
     innovation = e - product(params.H, state.z)
     z = state.z + product(params.L, innovation)
-    if params.vanes is not None and measured.vane is not None:
-        state = moving(state, measured.vane, dt, params.vanes)
+    if params.vanes is not None and measurements.vane is not None:
+        state = moving(state, measurements.vane, dt, params.vanes)
         z = z + by_vanes(
-            state.z, innovation, measured.vane - measured.vane_m, state.vane_measures, params.vanes
+            state.z,
+            innovation,
+            measurements.vane - measurements.vane_m,
+            state.vane_measures,
+            params.vanes,
         )
     sigma = array_namespace(e).minimum(state.sigma + dt * params.fade_rate, 1.0 + 0.0 * state.sigma)
     u_o = saturate(-sigma * product(params.F, z), state.u_o, dt, params.limits)
@@ -217,16 +221,16 @@ def correct(state: Any, measured: Measurements, dt: Array, params: ObserverParam
 
 
 def _at_engagement(
-    law_state: Any, measured: Measurements, params: ObserverParams, *, vanes: bool
+    law_state: Any, measurements: Measurements, params: ObserverParams, *, vanes: bool
 ) -> Any:
     """The state at engagement: estimates from the first e, u_o = 0."""
-    e = measured.y - measured.y_m
+    e = measurements.y - measurements.y_m
     zero = array_namespace(e).zeros_like(e)
     state = ObserverState(law_state, initial_estimates(e, params), zero, zero[:1])
-    if not vanes or measured.vane is None:
+    if not vanes or measurements.vane is None:
         return state
-    none = 0.0 * measured.vane
-    return VaneObserverState(*state, measured.vane, none, none)
+    none = 0.0 * measurements.vane
+    return VaneObserverState(*state, measurements.vane, none, none)
 
 
 @lru_cache(maxsize=64)
@@ -243,39 +247,41 @@ def with_observer(law: ControlLaw, *, vanes: bool = False) -> ControlLaw:
     """
 
     def corrected(
-        state: Any, measured: Measurements, dt: Array, params: ObserverParams
+        state: Any, measurements: Measurements, dt: Array, params: ObserverParams
     ) -> tuple[Any, Measurements]:
-        state = correct(state, measured, dt, params)
-        return state, measured._replace(u_trim=measured.u_trim + state.u_o)
+        state = correct(state, measurements, dt, params)
+        return state, measurements._replace(u_trim=measurements.u_trim + state.u_o)
 
     def predicted(
-        state: Any, law_state: Any, u: Array, measured: Measurements, params: ObserverParams
+        state: Any, law_state: Any, u: Array, measurements: Measurements, params: ObserverParams
     ) -> Any:
-        return state._replace(law=law_state, z=predict(state.z, u - measured.u_trim, params))
+        return state._replace(law=law_state, z=predict(state.z, u - measurements.u_trim, params))
 
-    def engage(measured: Measurements, params: ObserverParams) -> Any:
-        return _at_engagement(law.engage(measured, params.law), measured, params, vanes=vanes)
+    def engage(measurements: Measurements, params: ObserverParams) -> Any:
+        return _at_engagement(
+            law.engage(measurements, params.law), measurements, params, vanes=vanes
+        )
 
     def step(
-        state: Any, measured: Measurements, dt: Array, params: ObserverParams
+        state: Any, measurements: Measurements, dt: Array, params: ObserverParams
     ) -> tuple[Any, Array]:
-        state, inner = corrected(state, measured, dt, params)
+        state, inner = corrected(state, measurements, dt, params)
         law_state, u = law.step(state.law, inner, dt, params.law)
-        return predicted(state, law_state, u, measured, params), u
+        return predicted(state, law_state, u, measurements, params), u
 
     def limited(
-        state: Any, measured: Measurements, dt: Array, params: ObserverParams, limits: Limits
+        state: Any, measurements: Measurements, dt: Array, params: ObserverParams, limits: Limits
     ) -> tuple[Any, Array, Array]:
-        state, inner = corrected(state, measured, dt, params)
+        state, inner = corrected(state, measurements, dt, params)
         law_state, u_free, u = law.limited(state.law, inner, dt, params.law, limits)
-        return predicted(state, law_state, u, measured, params), u_free, u
+        return predicted(state, law_state, u, measurements, params), u_free, u
 
     def retune(state: Any, old: ObserverParams, new: ObserverParams) -> Any:
         return state._replace(law=law.retune(state.law, old.law, new.law))
 
-    def missed(state: Any, measured: Measurements, params: ObserverParams) -> Any:
-        law_state = law.missed(state.law, measured, params.law)
-        return predicted(state, law_state, measured.u_before, measured, params)
+    def missed(state: Any, measurements: Measurements, params: ObserverParams) -> Any:
+        law_state = law.missed(state.law, measurements, params.law)
+        return predicted(state, law_state, measurements.u_before, measurements, params)
 
     return ControlLaw(
         state=VaneObserverState if vanes else ObserverState,

@@ -213,27 +213,27 @@ def with_schedule(law: ControlLaw) -> ControlLaw:
             scale,
         )
 
-    def engage(measured: Measurements, params: ScheduleParams) -> ScheduleState:
-        scale = target_scale(measured.y, params)
-        return ScheduleState(law.engage(measured, law_at(params, scale)), scale)
+    def engage(measurements: Measurements, params: ScheduleParams) -> ScheduleState:
+        scale = target_scale(measurements.y, params)
+        return ScheduleState(law.engage(measurements, law_at(params, scale)), scale)
 
     def step(
-        state: ScheduleState, measured: Measurements, dt: Array, params: ScheduleParams
+        state: ScheduleState, measurements: Measurements, dt: Array, params: ScheduleParams
     ) -> tuple[ScheduleState, Array]:
-        state = followed(state, measured.y, dt, params)
-        law_state, u = law.step(state.law, measured, dt, law_at(params, state.scale))
+        state = followed(state, measurements.y, dt, params)
+        law_state, u = law.step(state.law, measurements, dt, law_at(params, state.scale))
         return state._replace(law=law_state), u
 
     def limited(
         state: ScheduleState,
-        measured: Measurements,
+        measurements: Measurements,
         dt: Array,
         params: ScheduleParams,
         limits: Limits,
     ) -> tuple[ScheduleState, Array, Array]:
-        state = followed(state, measured.y, dt, params)
+        state = followed(state, measurements.y, dt, params)
         law_state, u_free, u = law.limited(
-            state.law, measured, dt, law_at(params, state.scale), limits
+            state.law, measurements, dt, law_at(params, state.scale), limits
         )
         return state._replace(law=law_state), u_free, u
 
@@ -243,9 +243,9 @@ def with_schedule(law: ControlLaw) -> ControlLaw:
         )
 
     def missed(
-        state: ScheduleState, measured: Measurements, params: ScheduleParams
+        state: ScheduleState, measurements: Measurements, params: ScheduleParams
     ) -> ScheduleState:
-        return state._replace(law=law.missed(state.law, measured, law_at(params, state.scale)))
+        return state._replace(law=law.missed(state.law, measurements, law_at(params, state.scale)))
 
     return ControlLaw(
         state=ScheduleState,

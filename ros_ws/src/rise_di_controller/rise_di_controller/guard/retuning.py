@@ -114,10 +114,10 @@ def _with_nominal(
     if nominal is not None:
         earlier = state.history[-2]
         last = state.history[-1]
-        goes_on = feedforward.continued(
+        goes_on = feedforward.with_new_model(
             state.feedforward, y_m, (last.y_m - earlier.y_m) / last.dt, last.dt, nominal
         )
-        u_ff = feedforward.acting(goes_on.u - goes_on.u_0, nominal)
+        u_ff = feedforward.of_active_inputs(goes_on.u - goes_on.u_0, nominal)
     return state._replace(u_ff=u_ff, feedforward=goes_on), u_ff - state.u_ff
 
 

@@ -99,8 +99,8 @@ def sample_limits(
     """
     least = [LEAST.get(name, LEAST_RATE) for name in names]
     reach = np.maximum(AUTHORITY * authority * seconds(period_ns), least)
-    bound = plausible.largest(names) if largest is None else np.array(largest, dtype=np.float64)
-    return SampleLimits(bound, reach, period_ns)
+    bounds = plausible.largest(names) if largest is None else np.array(largest, dtype=np.float64)
+    return SampleLimits(bounds, reach, period_ns)
 
 
 def bound_violation(value: FloatArray, names: Sequence[str], limits: SampleLimits) -> str:
@@ -131,7 +131,7 @@ def standstill(state: SampleState, sample: StampedVector) -> str:
     return f"y: found every value as before for {span:g} s, expected an aircraft that moves"
 
 
-def begun(sample: StampedVector) -> SampleState:
+def first_state(sample: StampedVector) -> SampleState:
     """The state after the first sample."""
     stillness = Stillness(sample.stamp_ns)
     return SampleState(

@@ -39,7 +39,7 @@ class Measurements(NamedTuple):
     vane_m: Array | None = None
 
 
-def _no_prediction(state: Any, measured: Measurements, params: Any) -> Any:
+def _no_prediction(state: Any, measurements: Measurements, params: Any) -> Any:
     return state
 
 
@@ -102,9 +102,11 @@ def without_limits(
         True
     """
 
-    def step(state: Any, measured: Measurements, dt: Array, params: Any) -> tuple[Any, Array]:
-        infinite = array_namespace(measured.y).inf + 0.0 * measured.y
-        after, u, _ = limited(state, measured, dt, params, Limits(-infinite, infinite, infinite))
+    def step(state: Any, measurements: Measurements, dt: Array, params: Any) -> tuple[Any, Array]:
+        infinite = array_namespace(measurements.y).inf + 0.0 * measurements.y
+        after, u, _ = limited(
+            state, measurements, dt, params, Limits(-infinite, infinite, infinite)
+        )
         return after, u
 
     return step

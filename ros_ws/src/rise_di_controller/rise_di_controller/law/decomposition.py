@@ -256,9 +256,9 @@ def _sizes(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
     rows = np.ones(len(matrix))
     columns = np.ones(len(matrix))
     for _ in range(_EQUILIBRATIONS):
-        scaled = np.abs(matrix) / rows[:, None] / columns
-        row = scaled.max(axis=1)
-        column = scaled.max(axis=0)
+        sizes = np.abs(matrix) / rows[:, None] / columns
+        row = sizes.max(axis=1)
+        column = sizes.max(axis=0)
         rows *= np.sqrt(np.where(row > 0.0, row, 1.0))
         columns *= np.sqrt(np.where(column > 0.0, column, 1.0))
     return rows, columns

@@ -236,10 +236,10 @@ def step_with_anti_windup(
     excess = xp.maximum(xp.abs(beyond) - xp.where(outward, xp.abs(change), zero), zero)
     size_Pi = xp.where(outward_Pi, xp.abs(change_Pi), zero)
     divisor = xp.where(size_Pi > LEAST_DIVISOR, size_Pi, zero + 1.0)
-    kept = xp.maximum(size_Pi - excess, zero) / divisor
+    share = xp.maximum(size_Pi - excess, zero) / divisor
     after = after._replace(
         integral_e=xp.where(outward, state.integral_e, after.integral_e),
-        Pi=xp.where(outward_Pi, state.Pi + kept * increment_Pi, after.Pi),
+        Pi=xp.where(outward_Pi, state.Pi + share * increment_Pi, after.Pi),
     )
     u_free = u_trim + control(state, after, params)
     return after, u_free, saturate(u_free, u_before, dt, limits)
@@ -270,22 +270,22 @@ def _control_law(sign: Sign) -> ControlLaw:
     def with_sign(params: LawParams) -> LawParams:
         return params if params.sign is sign else params._replace(sign=sign)
 
-    def start(measured: Measurements, params: LawParams) -> LawState:
-        return engage(measured.y, measured.y_m)
+    def start(measurements: Measurements, params: LawParams) -> LawState:
+        return engage(measurements.y, measurements.y_m)
 
     def tick(
-        state: LawState, measured: Measurements, dt: Array, params: LawParams
+        state: LawState, measurements: Measurements, dt: Array, params: LawParams
     ) -> tuple[LawState, Array]:
-        after, u = step(state, measured.y, measured.y_m, dt, with_sign(params))
-        return after, measured.u_trim + u
+        after, u = step(state, measurements.y, measurements.y_m, dt, with_sign(params))
+        return after, measurements.u_trim + u
 
     def limited(
-        state: LawState, measured: Measurements, dt: Array, params: LawParams, limits: Limits
+        state: LawState, measurements: Measurements, dt: Array, params: LawParams, limits: Limits
     ) -> tuple[LawState, Array, Array]:
-        y = measured.y
-        y_m = measured.y_m
-        u_trim = measured.u_trim
-        u_before = measured.u_before
+        y = measurements.y
+        y_m = measurements.y_m
+        u_trim = measurements.u_trim
+        u_before = measurements.u_before
         return step_with_anti_windup(state, y, y_m, dt, u_trim, u_before, with_sign(params), limits)
 
     return ControlLaw(state=LawState, engage=start, step=tick, limited=limited, retune=retune)

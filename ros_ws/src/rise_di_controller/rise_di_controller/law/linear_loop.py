@@ -114,8 +114,8 @@ def linear_law(law: TunedLaw, m: int, period: float, candidates: int | None = No
     begin = np.concatenate([*at_rest.values(), np.zeros((wide, *sets))])
     equilibrium = step(begin[:size], begin[size:])
     if at_once:
-        moved = begin + SMALL * np.eye(size + wide)
-        matrix = (step(moved[:size], moved[size:]) - equilibrium) / SMALL
+        states = begin + SMALL * np.eye(size + wide)
+        matrix = (step(states[:size], states[size:]) - equilibrium) / SMALL
     else:
         units = SMALL * np.eye(size + wide).reshape(size + wide, size + wide, *(1 for _ in sets))
         columns = [
@@ -207,16 +207,16 @@ def sampled_plant(
     drive[..., n:, :] = np.diag(rate * has_lag)
     ticks = np.floor((loop.delay + extra) / loop.period + 1e-9).astype(int)
     part = np.maximum(loop.delay + extra - ticks * loop.period, 0.0)
-    held = int(ticks.max()) + 1  # earlier ticks whose u still acts, the newest first
+    kept_ticks = int(ticks.max()) + 1  # earlier ticks whose u still acts, the newest first
 
-    size = n + m + held * m
+    size = n + m + kept_ticks * m
     A = np.zeros((*batch, size, size))
     B = np.zeros((*batch, size, m))
     C = np.zeros((*batch, len(plant.C), size))
     C[..., :n] = plant.C
     A[..., : n + m, : n + m], _ = zero_order_hold(motion, drive, loop.period)
     # effect of u of this tick, then of earlier ticks
-    inputs = np.zeros((*batch, n + m, m + held * m))
+    inputs = np.zeros((*batch, n + m, m + kept_ticks * m))
     for i in range(m):
         split = loop.period - part[i]
         transition, new = _driven(motion, drive, split, 0.0, loop.period if rising else None)
@@ -227,7 +227,7 @@ def sampled_plant(
     B[..., : n + m, :] = inputs[..., :m]
     A[..., : n + m, n + m :] = inputs[..., m:]
     B[..., n + m : n + 2 * m, :] = np.eye(m)
-    A[..., n + 2 * m :, n + m : -m] = np.eye((held - 1) * m)
+    A[..., n + 2 * m :, n + m : -m] = np.eye((kept_ticks - 1) * m)
     return SampledPlant(A, B, C)
 
 
@@ -238,16 +238,16 @@ def _driven(
 
     With a period the input is ROOT (2 s - 1), s rising from `begin` by time / period.
     """
-    transition, held = zero_order_hold(motion, drive, time)
+    transition, step = zero_order_hold(motion, drive, time)
     if period is None:
-        return transition, held
+        return transition, step
     k, m = drive.shape
     ramp = np.zeros((k + m, k + m))
     ramp[:k, :k] = motion
     ramp[:k, k:] = drive
     slope = np.vstack([np.zeros((k, m)), np.eye(m) / period])
     risen = zero_order_hold(ramp, slope, time)[1][:k]
-    return transition, ROOT * (2.0 * (begin * held + risen) - held)
+    return transition, ROOT * (2.0 * (begin * step + risen) - step)
 
 
 def closed_loop(

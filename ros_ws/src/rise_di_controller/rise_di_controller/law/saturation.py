@@ -92,7 +92,7 @@ def limited_integral(before: Array, after: Array, change: Array, beyond: Array) 
     """
     xp = array_namespace(before)
     outward = change * beyond > 0.0
-    kept = xp.maximum(
+    share = xp.maximum(
         1.0 - beyond / xp.where(outward, change, xp.ones_like(change)), xp.zeros_like(change)
     )
-    return xp.where(outward, before + kept * (after - before), after)
+    return xp.where(outward, before + share * (after - before), after)

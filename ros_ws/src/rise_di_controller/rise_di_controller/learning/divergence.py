@@ -57,14 +57,16 @@ def step(errors: Errors, e: FloatArray, dt: float, *, first_law: bool) -> Errors
     return Errors(now, np.maximum(errors.largest, now) if first_law else errors.largest)
 
 
-def diverging(errors: Errors, least: FloatArray, learned: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def diverging(
+    errors: Errors, least: FloatArray, is_learned: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
     """Outputs, (m,), that diverge under a learned model.
 
     Their rms error is above FACTOR times its largest under the first law, and above `least`.
 
     Only outputs with a learned model count, mask (m,): further outputs fly the first law.
     """
-    return learned & (errors.now > np.maximum(FACTOR**2 * errors.largest, least))
+    return is_learned & (errors.now > np.maximum(FACTOR**2 * errors.largest, least))
 
 
 class Oscillations:
@@ -89,13 +91,13 @@ class Oscillations:
         self._means = 0
         self._first_law = True
 
-    def take(self, e: FloatArray, dt: float, learned: NDArray[np.bool_] | None) -> None:
+    def take(self, e: FloatArray, dt: float, is_learned: NDArray[np.bool_] | None) -> None:
         """Record a tick, and test once a second.
 
-        `learned`: outputs with a learned model, (m,); None under the first law.
+        `is_learned`: outputs with a learned model, (m,); None under the first law.
         """
-        if (learned is None) is not self._first_law:
-            self._first_law = learned is None
+        if (is_learned is None) is not self._first_law:
+            self._first_law = is_learned is None
             self._record.clear()
             self.periods = 0.0 * self.periods
         self._sum = self._sum + e
@@ -113,14 +115,14 @@ class Oscillations:
             return
         record = np.array(self._record)
         square = np.mean(record**2, axis=0)
-        if learned is None:
+        if is_learned is None:
             self._largest = np.maximum(self._largest, square)
         elif len(record) == self._record.maxlen:
-            grown = square > np.maximum(GROWN**2 * self._largest, self._least)
+            has_grown = square > np.maximum(GROWN**2 * self._largest, self._least)
             self.periods = np.array(
                 [
-                    spacing * period(x) * tested
-                    for x, tested in zip(record.T, learned & grown, strict=True)
+                    spacing * period(x) * is_tested
+                    for x, is_tested in zip(record.T, is_learned & has_grown, strict=True)
                 ]
             )
 
@@ -130,8 +132,10 @@ def oscillating(y: FloatArray, least: FloatArray) -> NDArray[np.bool_]:
 
     They move by more than HARMLESS of `least`. Repeated commands count too.
     """
-    moving = np.var(y, axis=0) > HARMLESS**2 * least
-    return np.array([bool(moves) and period(x) > 0 for x, moves in zip(y.T, moving, strict=True)])
+    is_moving = np.var(y, axis=0) > HARMLESS**2 * least
+    return np.array(
+        [bool(moves) and period(x) > 0 for x, moves in zip(y.T, is_moving, strict=True)]
+    )
 
 
 def period(x: FloatArray) -> int:

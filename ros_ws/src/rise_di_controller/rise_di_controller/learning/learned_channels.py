@@ -34,7 +34,7 @@ def with_channels_of(
     share = np.where(channels, law.K / K, 1.0)
     scale = np.where(channels, law.input_scale * share, design.input_scale)
     factors = {"beta": 1.0 / share, "Lambda": 1.0, "omega": share, "softening": 1.0}
-    changed: dict[str, Any] = {
+    values: dict[str, Any] = {
         name: tuple(
             np.where(
                 channels, np.array(getattr(start, name)) * factor, getattr(designed, name)
@@ -42,8 +42,8 @@ def with_channels_of(
         )
         for name, factor in factors.items()
     }
-    changed["k_d"] = tuple((K[:-1] - last).tolist())
-    changed["input_scale"] = tuple(np.where(dead, SMALLEST, scale).tolist())
+    values["k_d"] = tuple((K[:-1] - last).tolist())
+    values["input_scale"] = tuple(np.where(dead, SMALLEST, scale).tolist())
     observer = designed.observer
     feedforward = designed.feedforward
     schedule = designed.schedule
@@ -55,17 +55,17 @@ def with_channels_of(
             }
 
         acting = feedforward.inputs or start.inputs
-        flown = tuple(
+        inputs = tuple(
             name
             for name, is_bare in zip(start.inputs, bare, strict=True)
             if name in acting and not is_bare
         )
-        changed["observer"] = observer.model_copy(update=without(observer.F))
+        values["observer"] = observer.model_copy(update=without(observer.F))
         if schedule is not None and schedule.slow is not None and schedule.fast is not None:
             slow, fast = (model.model_copy(update=without(model.F)) for model in schedule.models)
-            changed["schedule"] = schedule.model_copy(update={"slow": slow, "fast": fast})
-        changed["feedforward"] = feedforward.model_copy(update={"inputs": flown or None})
-    return designed.model_copy(update=changed)
+            values["schedule"] = schedule.model_copy(update={"slow": slow, "fast": fast})
+        values["feedforward"] = feedforward.model_copy(update={"inputs": inputs or None})
+    return designed.model_copy(update=values)
 
 
 def acting_inputs(parameters: RiseDiConfig) -> tuple[str, ...]:
@@ -90,7 +90,7 @@ def authority_names(outputs: Sequence[str]) -> tuple[str, ...]:
     return tuple(f"{side}.{name}" for side in SIDES for name in outputs)
 
 
-def authority(flown: RiseDiConfig, start: RiseDiConfig) -> FloatArray:
+def authority(parameters: RiseDiConfig, start: RiseDiConfig) -> FloatArray:
     """Least change of the outputs by the paired inputs, (2m,), units/s.
 
     From trim to the lower and the upper limit:
@@ -103,42 +103,46 @@ def authority(flown: RiseDiConfig, start: RiseDiConfig) -> FloatArray:
     For an input without effect 0; UNKNOWN without a limit, and for an output under the law of the
     start.
     """
-    m = len(flown.outputs)
-    model = flown.feedforward
-    acting = acting_inputs(flown)
-    dead = np.array(flown.input_scale) <= SMALLEST
+    m = len(parameters.outputs)
+    model = parameters.feedforward
+    acting = acting_inputs(parameters)
+    dead = np.array(parameters.input_scale) <= SMALLEST
     bounds = np.where(dead, 0.0, np.full((2, m), UNKNOWN))
-    if model is None or flown.models() == start.models():
+    if model is None or parameters.models() == start.models():
         return bounds.ravel()
-    rows = [model.states.index(name) for name in flown.outputs]
+    rows = [model.states.index(name) for name in parameters.outputs]
     both = (model.B, model.deviation or (0.0,) * len(model.B))
     B, deviation = (np.reshape(values, (-1, m))[rows].diagonal() for values in both)
     least = np.abs(B) * np.exp(-2.0 * deviation / np.abs(B))
-    for scheduled in () if flown.schedule is None else flown.schedule.models:
+    for scheduled in () if parameters.schedule is None else parameters.schedule.models:
         least = least * np.minimum(
             np.abs(np.reshape(scheduled.B, (-1, m))[rows].diagonal() / B), 1.0
         )
-    for k, limits in enumerate((flown.lower, flown.upper)):
+    for k, limits in enumerate((parameters.lower, parameters.upper)):
         if limits is None:
             continue
         side = np.where(B > 0.0, k, 1 - k)
-        known = ~dead & [name in acting for name in flown.inputs]
-        bounds[side[known], np.flatnonzero(known)] = (least * np.abs(limits))[known]
+        is_known = ~dead & [name in acting for name in parameters.inputs]
+        bounds[side[is_known], np.flatnonzero(is_known)] = (least * np.abs(limits))[is_known]
     return bounds.ravel()
 
 
-def fallen_back(start: RiseDiConfig, flown: RiseDiConfig, bare: Sequence[bool]) -> RiseDiConfig:
+def fallen_back(
+    start: RiseDiConfig, parameters: RiseDiConfig, bare: Sequence[bool]
+) -> RiseDiConfig:
     """What flies, with the law of the start in further channels.
 
     The start itself where no channel keeps a model.
     """
-    acting = acting_inputs(flown)
-    is_first = flown.models() == start.models()
+    acting = acting_inputs(parameters)
+    is_first = parameters.models() == start.models()
     if is_first or all(
-        is_bare or name not in acting for name, is_bare in zip(flown.inputs, bare, strict=True)
+        is_bare or name not in acting for name, is_bare in zip(parameters.inputs, bare, strict=True)
     ):
         return start
-    mixed = with_channels_of(start, flown, bare, [scale <= SMALLEST for scale in flown.input_scale])
+    mixed = with_channels_of(
+        start, parameters, bare, [scale <= SMALLEST for scale in parameters.input_scale]
+    )
     return RiseDiConfig.validate_mapping(mixed.model_dump(), "controller", check=False)
 
 
@@ -149,16 +153,16 @@ def outputs_without(parameters: ControllerConfig) -> tuple[str, ...]:
 
 
 def without_models(
-    start: RiseDiConfig, flown: RiseDiConfig, outputs: Collection[str]
+    start: RiseDiConfig, parameters: RiseDiConfig, outputs: Collection[str]
 ) -> RiseDiConfig:
     """What flies, with the law of the start in some outputs.
 
     The outputs keep this law to the end of the engagement, and are added to `learn.without`.
     """
-    fallen = fallen_back(start, flown, [name in outputs for name in start.outputs])
+    fallen = fallen_back(start, parameters, [name in outputs for name in start.outputs])
     assert start.learn is not None  # noqa: S101 - a controller that learns
     bare_outputs = tuple(
-        name for name in start.outputs if name in {*outputs_without(flown), *outputs}
+        name for name in start.outputs if name in {*outputs_without(parameters), *outputs}
     )
     return fallen.model_copy(
         update={"learn": start.learn.model_copy(update={"without": bare_outputs or None})}
@@ -175,8 +179,9 @@ def coupled(parameters: RiseDiConfig, names: Collection[str]) -> list[bool]:
         for values in (model.A, model.gravity or np.zeros(n), model.B)
     )
     links = A | gravity | (B @ B.T) | np.eye(n, dtype=bool)
-    reached = np.linalg.matrix_power((links | links.T).astype(float), n) > 0.0
+    is_coupled = np.linalg.matrix_power((links | links.T).astype(float), n) > 0.0
     states = [model.states.index(name) for name in names]
     return [
-        bool(np.any(reached[model.states.index(output), states])) for output in parameters.outputs
+        bool(np.any(is_coupled[model.states.index(output), states]))
+        for output in parameters.outputs
     ]

@@ -101,13 +101,13 @@ class Fallback(NamedTuple):
     input_scale: tuple[float, ...]  # of these
     fallen: int  # digest of the parameters after
 
-    def outlived_by(self, proposal: Proposal, flown: int) -> bool:
+    def outlived_by(self, proposal: Proposal, digest: int) -> bool:
         """Whether a proposal beside the parameters before holds an input more.
 
         This input has no effect, and nothing else changed.
         """
         scale = proposal.change.get("input_scale")
-        if (proposal.flown, flown) != (self.flown, self.fallen) or not isinstance(scale, Sequence):
+        if (proposal.flown, digest) != (self.flown, self.fallen) or not isinstance(scale, Sequence):
             return False
         return any(new == SMALLEST < old for new, old in zip(scale, self.input_scale, strict=False))
 
@@ -194,9 +194,9 @@ class Learning:
 
     def authority(self, controller: Controller) -> FloatArray:
         """`authority` of what flies."""
-        flown = controller.parameters
-        assert isinstance(flown, RiseDiConfig)  # noqa: S101 - a proposal is of the law of the start
-        return authority(flown, self.start)
+        parameters = controller.parameters
+        assert isinstance(parameters, RiseDiConfig)  # noqa: S101 - a proposal is of the law of the start
+        return authority(parameters, self.start)
 
     def ticked(self, controller: Controller, now_ns: int) -> bool:
         """Note a tick; whether an identification begins there.
@@ -254,19 +254,21 @@ class Learning:
 
         A part with FALLBACKS fallbacks keeps this law to the end of the engagement.
         """
-        flown = controller.parameters
-        assert isinstance(flown, RiseDiConfig)  # noqa: S101 - for the type checker
+        parameters = controller.parameters
+        assert isinstance(parameters, RiseDiConfig)  # noqa: S101 - for the type checker
         part = [
             name
-            for name, diverges in zip(flown.outputs, coupled(flown, diverging), strict=True)
+            for name, diverges in zip(
+                parameters.outputs, coupled(parameters, diverging), strict=True
+            )
             if diverges
         ]
         self._fallbacks.update(part)
-        ended = [name for name in part if self._fallbacks[name] >= FALLBACKS]
-        fallen = without_models(self.start, self.start, {*outputs_without(flown), *ended})
-        lasting = f", in {', '.join(ended)} to the end of the engagement" * bool(ended)
-        reason = " and ".join(f"{name} diverges{' again' * bool(ended)}" for name in diverging)
-        self._fallback = Fallback(controller.digest, flown.input_scale, fallen.digest())
+        ends = [name for name in part if self._fallbacks[name] >= FALLBACKS]
+        fallen = without_models(self.start, self.start, {*outputs_without(parameters), *ends})
+        lasting = f", in {', '.join(ends)} to the end of the engagement" * bool(ends)
+        reason = " and ".join(f"{name} diverges{' again' * bool(ends)}" for name in diverging)
+        self._fallback = Fallback(controller.digest, parameters.input_scale, fallen.digest())
         self._updates.fell_back(now_ns)
         self._diverged.add(controller.digest)
         what = f"falls back to the law of the start{lasting}: {reason}"
@@ -280,19 +282,19 @@ class Learning:
 
         These parts keep the law to the end of the engagement.
         """
-        flown = controller.parameters
-        assert isinstance(flown, RiseDiConfig)  # noqa: S101 - for the type checker
-        bare = coupled(flown, periods)
+        parameters = controller.parameters
+        assert isinstance(parameters, RiseDiConfig)  # noqa: S101 - for the type checker
+        bare = coupled(parameters, periods)
         fallen = without_models(
             self.start,
-            flown,
-            [name for name, is_bare in zip(flown.outputs, bare, strict=True) if is_bare],
+            parameters,
+            [name for name, is_bare in zip(parameters.outputs, bare, strict=True) if is_bare],
         )
         rates = " and ".join(
             f"{name} oscillates at {1.0 / period:.2g} Hz" for name, period in periods.items()
         )
         outputs = ", ".join(
-            name for name, is_bare in zip(flown.outputs, bare, strict=True) if is_bare
+            name for name, is_bare in zip(parameters.outputs, bare, strict=True) if is_bare
         )
         what = (
             f"falls back to the law of the start in {outputs}, to the end of the engagement: "
@@ -334,10 +336,10 @@ class Learning:
                 f"{self._digest}, those of the start"
             )
         if self._simulated:
-            known = proposal.stamp_ns in self._due and proposal.stamp_ns not in self._received
+            is_due = proposal.stamp_ns in self._due and proposal.stamp_ns not in self._received
             return (
                 ""
-                if known
+                if is_due
                 else f"found {window}, expected that of an identification that is due, once"
             )
         longest = nanoseconds(self._settings.window)
@@ -383,8 +385,8 @@ class Learning:
                 refusal = "found parameters that diverged in this engagement, expected others"
             if not refusal:
                 bare_outputs = ", ".join(outputs_without(end.value.parameters))
-                without = f", without {bare_outputs}" if bare_outputs else ""
-                what = f"flies {proposal.sentence}{without}"
+                exception = f", without {bare_outputs}" if bare_outputs else ""
+                what = f"flies {proposal.sentence}{exception}"
                 self._take(controller, now_ns, end.value, EventKind.FLIES, what)
                 return controller.parameters
         except ArithmeticError as error:
@@ -436,7 +438,7 @@ class Learning:
 
 
 def _certificate(
-    flown: ControllerConfig, change: Mapping[str, Any], start: RiseDiConfig
+    parameters: ControllerConfig, change: Mapping[str, Any], start: RiseDiConfig
 ) -> Generator[None, None, Prepared]:
     """The parameters in force with a change, checked as at load.
 
@@ -449,7 +451,7 @@ def _certificate(
         f"a change of {', '.join(foreign)}",
         f"changes of {', '.join(sorted(DESIGNED))} alone",
     )
-    proposed = RiseDiConfig.validate_mapping(flown.changed(change), "controller", check=False)
+    proposed = RiseDiConfig.validate_mapping(parameters.changed(change), "controller", check=False)
     yield
     require(proposed.observer is not None, "proposal", "no observer", "one")
     assert proposed.observer is not None  # noqa: S101 - for the type checker
@@ -477,7 +479,7 @@ def _certificate(
         f"{margin:g} s",
         f"at least {least:g} s",
     )
-    if bare_outputs := outputs_without(flown):
+    if bare_outputs := outputs_without(parameters):
         others = f"one of other outputs than {', '.join(bare_outputs)}, by learn.without"
         require(proposed.feedforward is not None, "proposal", "no feedforward", others)
         bare = coupled(proposed, bare_outputs)
