@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from flight_analysis.closed_loop import stations
 from flight_analysis.report.account import account
-from flight_analysis.report.shortfalls import judged
+from flight_analysis.report.shortfalls import judge
 from flight_core.arguments import as_number
 from flight_core.installation import require_package
 from flight_core.modes import Mode
@@ -209,9 +209,9 @@ def fly_plant(
     topics = stations.Topics()
     plant_station = _PlantStation(plant, loop, topics)
     reference = stations.ReferenceStation(config, topics, plant_station.period_ns)
-    rest = plant_station.period_ns % period_ns(config.rate, "reference_model.rate")
+    remainder = plant_station.period_ns % period_ns(config.rate, "reference_model.rate")
     multiple = f"a whole multiple of controller.rate ({loop.config.rate:g} Hz)"
-    require(rest == 0, "reference_model.rate", f"{config.rate:g} Hz", multiple)
+    require(remainder == 0, "reference_model.rate", f"{config.rate:g} Hz", multiple)
     length_ns = nanoseconds(as_number(duration, "duration", loop.period, unit="s"))
     outcome = COMPLETED
     try:
@@ -223,8 +223,8 @@ def fly_plant(
     values = np.column_stack([y_m[name] for name in loop.outputs])
     signals["y_m"] = Signal(y_m.stamp_ns, loop.outputs, values)
     tape = Tape(signals, outcome=outcome)
-    held = account(tape, None, outcome)
-    return replace(tape, outcome=judged(outcome, tape, None, held, loop.config))
+    flight_account = account(tape, None, outcome)
+    return replace(tape, outcome=judge(outcome, tape, None, flight_account, loop.config))
 
 
 class _PlantStation:
@@ -329,17 +329,16 @@ def as_control(
     tuned = config.tuned_law()
     guard = config.guard()
     m = len(config.outputs)
-    measured = [f"y_{name}" for name in config.outputs]
+    channels = [f"y_{name}" for name in config.outputs]
     names = [f"u_{name}" for name in config.effectors]
     if linear:
         matrices = _linear_matrices(config)
-        return control.ss(*matrices, dt, inputs=measured, outputs=names, name=config.law)
+        return control.ss(*matrices, dt, inputs=channels, outputs=names, name=config.law)
     law, params = tuned
     zero = np.zeros(m)
     p = 0 if guard.allocation is None else len(names)
-    start = fields(
-        law.engage(Measurements(y=zero, y_m=zero, y_m_dot=zero, u_trim=zero, u_before=zero), params)
-    )
+    in_trim = Measurements(y=zero, y_m=zero, y_m_dot=zero, u_trim=zero, u_before=zero)
+    start = fields(law.engage(in_trim, params))
     sizes = [value.size for value in start.values()]
     # an offset, so that x = 0 is the engagement in trim
     offset = np.concatenate([value.ravel() for value in start.values()])
@@ -347,13 +346,8 @@ def as_control(
 
     def tick(x: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
         parts = np.split(offset + x[: ends[-1]], ends[:-1])
-        state = restored(
-            law,
-            {
-                name: part.reshape(start[name].shape)
-                for name, part in zip(start, parts, strict=True)
-            },
-        )
+        values = zip(start.items(), parts, strict=True)
+        state = restored(law, {name: part.reshape(first.shape) for (name, first), part in values})
         u_before, y_m_before, effectors = np.split(x[ends[-1] :], [m, 2 * m])
         sample = Measurements(
             y=v[:m], y_m=v[m:], y_m_dot=(v[m:] - y_m_before) / dt, u_trim=zero, u_before=u_before
@@ -370,7 +364,7 @@ def as_control(
         lambda t, x, v, _: tick(x, v)[1],
         dt=dt,
         states=int(ends[-1]) + 2 * m + p,
-        inputs=[*measured, *(f"y_m_{name}" for name in config.outputs)],
+        inputs=[*channels, *(f"y_m_{name}" for name in config.outputs)],
         outputs=names,
         name=config.law,
     )

@@ -166,6 +166,20 @@ class _Study(NamedTuple):
             advantage=0.0 if fit.flown is None else self.advantage(fit.flown, fit.before),
         )
 
+    def identification(
+        self, airframe: Airframe, parts: Sequence[Part], first: Innovations, last: Innovations
+    ) -> Identification:
+        """The parts as one model, with the innovations of the nominal model and of this one."""
+        return Identification(
+            airframe=with_entries(airframe, chain.from_iterable(part.entries for part in parts)),
+            recorded=self.recorded,
+            held_out=self.validating,
+            innovations=(first.r, last.r),
+            before=prediction(first, self.validating),
+            after=prediction(last, self.validating),
+            parts=tuple(parts),
+        )
+
     def fit(
         self,
         search: Search,
@@ -215,21 +229,16 @@ def identify_model(
     """
     blown = in_rolling_air(airframe)
     model = filter_model(blown, actuation, recorded)
-    known = np.isfinite(recorded.y).all(axis=1) & (recorded.t >= recorded.t[0] + TRANSIENT)
-    _require_motion(airframe.outputs, recorded.y[known])
-    validating = known & held_out(len(recorded.t), span_length(recorded))
-    used = known & ~validating
-    later = known & (recorded.t > after)
+    is_known = np.isfinite(recorded.y).all(axis=1) & (recorded.t >= recorded.t[0] + TRANSIENT)
+    _require_motion(airframe.outputs, recorded.y[is_known])
+    validating = is_known & held_out(len(recorded.t), span_length(recorded))
+    used = is_known & ~validating
+    later = is_known & (recorded.t > after)
     every = blocks(model)
-    step_count = count(1)
     starts = len(STARTS) + len(SIGNS) + (flown is not None)
     total = len(every) * (starts * START_STEPS + REFINED * STEPS)
     total += (len(every) > 1) * (START_STEPS + STEPS)
-    paired = channels or ChannelPairing(airframe.outputs, tuple(airframe.inputs))
-
-    def step() -> None:
-        progress(completed=next(step_count), total=total)
-
+    pairs = channels or ChannelPairing(airframe.outputs, tuple(airframe.inputs))
     study = _Study(
         recorded=recorded,
         airframe=blown,
@@ -237,9 +246,9 @@ def identify_model(
         unknown=unknown,
         validating=validating,
         later=later,
-        channels=paired,
+        channels=pairs,
         at_bound=at_bound,
-        step=step,
+        step=_counter(progress, total),
     )
     searches = [study.search(model, block) for block in every]
     fitted = [study.fit(search, used, flown, quick=quick) for search in searches]
@@ -253,7 +262,7 @@ def identify_model(
         by_flown = search.flying(search.model_errors(flown), fits)
         z = study.advantage(by_flown, first)
         parts = [part._replace(advantage=z) for part in parts]
-    if may_couple and len(every) > 1 and _follows(fits, every, recorded.u, known) > FOLLOWS:
+    if may_couple and len(every) > 1 and _follows(fits, every, recorded.u, is_known) > FOLLOWS:
         search = study.search(model, whole_aircraft(model), coupled=True)
         fit = search.fit(used, begin=search.joined(fits))
         part = study.part(search, fit)._replace(advantage=z)
@@ -263,15 +272,17 @@ def identify_model(
             parts = [part]
             first = fit.before
             last = fit.after
-    return Identification(
-        airframe=with_entries(airframe, chain.from_iterable(part.entries for part in parts)),
-        recorded=recorded,
-        held_out=validating,
-        innovations=(first.r, last.r),
-        before=prediction(first, validating),
-        after=prediction(last, validating),
-        parts=tuple(parts),
-    )
+    return study.identification(airframe, parts, first, last)
+
+
+def _counter(progress: Callable[..., None], total: int) -> Callable[[], None]:
+    """A function to call at each step, which tells how many of at most `total` are done."""
+    steps = count(1)
+
+    def step() -> None:
+        progress(completed=next(steps), total=total)
+
+    return step
 
 
 def _follows(

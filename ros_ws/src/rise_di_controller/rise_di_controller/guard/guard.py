@@ -26,7 +26,7 @@ from flight_core.modes import Mode
 from flight_core.rates import seconds
 from flight_core.vectors import Array, FloatArray, StampedVector
 from rise_di_controller.extensions import feedforward
-from rise_di_controller.extensions.allocation import Allocation, allocate, reached
+from rise_di_controller.extensions.allocation import Allocation, allocate, limits_of_effectors
 from rise_di_controller.extensions.feedforward import FeedforwardState, Nominal
 from rise_di_controller.extensions.observer import PastTick
 from rise_di_controller.extensions.schedule import OverSpeed
@@ -196,7 +196,7 @@ def _with_history(
     """The state after a step of the law with the past ticks, missed ticks included."""
     scale = getattr(stepped.law, "scale", None)
     nominal = np.float64(seconds(guard.period_ns))
-    lost = (
+    lost_ticks = (
         PastTick(
             e=None, u=state.u - state.u_trim - state.u_ff, y_m=state.y_m, dt=nominal, scale=scale
         ),
@@ -208,7 +208,7 @@ def _with_history(
         dt=np.float64(inputs.dt),
         scale=scale,
     )
-    return stepped._replace(history=(*state.history, *lost, last)[-guard.history :])
+    return stepped._replace(history=(*state.history, *lost_ticks, last)[-guard.history :])
 
 
 def tick(
@@ -286,16 +286,44 @@ def _with_sample(
         return _engaged(state, y, inputs, vane, guard, law, vane_m_recorded), inputs
     period = seconds(guard.period_ns)
     dt = max(seconds(span_ns), LEAST_DT * period)
+    missed = max(round(dt / period) - 1, 0)
+    u_trim = _probed_trim(state, y.stamp_ns, guard)
+    at_last_y = Measurements(
+        y=last.value,
+        y_m=state.y_m,
+        y_m_dot=np.zeros_like(state.u_ff),
+        u_trim=u_trim + state.u_ff,
+        u_before=state.u,
+    )
+    predicted = state._replace(law=_predicted(state.law, at_last_y, missed, law))
+    stepped = _stepped(predicted, y, inputs, vane, guard, law, u_ff_recorded, vane_m_recorded)
+    if not _is_finite(stepped):
+        return _engaged(state, y, inputs, vane, guard, law, vane_m_recorded), inputs
+    inputs = inputs._replace(dt=dt)
+    if guard.history:
+        stepped = _with_history(state, stepped, inputs, missed, guard)
+    return stepped, inputs
+
+
+def _stepped(
+    state: ControllerState,
+    y: StampedVector,
+    inputs: TickInputs,
+    vane: FloatArray | None,
+    guard: GuardParams,
+    law: TunedLaw,
+    u_ff_recorded: FloatArray | None,
+    vane_m_recorded: FloatArray | None,
+) -> ControllerState:
+    """The state after a step of the law from the predicted `state`, with the feedforward."""
+    assert state.y is not None  # noqa: S101 - for the type checker
+    assert state.y_m is not None  # noqa: S101 - for the type checker
+    span_ns = y.stamp_ns - state.y.stamp_ns
+    dt = max(seconds(span_ns), LEAST_DT * seconds(guard.period_ns))
     u_trim = _probed_trim(state, y.stamp_ns, guard)
     u_ff = state.u_ff
     ff_state = state.feedforward
-    missed = max(round(dt / period) - 1, 0)
-    zero = np.zeros_like(u_ff)
-    held = Measurements(
-        y=last.value, y_m=state.y_m, y_m_dot=zero, u_trim=u_trim + u_ff, u_before=state.u
-    )
-    law_state = _predicted(state.law, held, missed, law)
-    model = nominal_at_speed(guard, law_state)
+    model = nominal_at_speed(guard, state.law)
     if model is not None and ff_state is not None:
         parts = feedforward.step_count(span_ns, guard.period_ns)
         ff_state, u_ff = feedforward.step(ff_state, inputs.y_m, dt, model, parts)
@@ -306,7 +334,7 @@ def _with_sample(
     vanes = _vanes(vane, ff_state, guard, vane_m_recorded)
     slope = (inputs.y_m - state.y_m) / dt
     vane_m = None if vanes is None else vanes.reference
-    measured = Measurements(
+    measurements = Measurements(
         y=y.value,
         y_m=inputs.y_m,
         y_m_dot=slope,
@@ -316,9 +344,9 @@ def _with_sample(
         vane_m=vane_m,
     )
     after, u_free, u, effectors = law_within_limits(
-        law_state, measured, dt, law, guard, state.effectors
+        state.law, measurements, dt, law, guard, state.effectors
     )
-    stepped = state._replace(
+    return state._replace(
         law=after,
         y=y,
         y_m=inputs.y_m,
@@ -329,12 +357,6 @@ def _with_sample(
         effectors=effectors,
         vanes=vanes,
     )
-    if not _is_finite(stepped):
-        return _engaged(state, y, inputs, vane, guard, law, vane_m_recorded), inputs
-    inputs = inputs._replace(dt=dt)
-    if guard.history:
-        stepped = _with_history(state, stepped, inputs, missed, guard)
-    return stepped, inputs
 
 
 def _predicted(law_state: Any, held: Measurements, missed: int, law: TunedLaw) -> Any:
@@ -377,7 +399,7 @@ def _engaged(
     ff_state = (
         None if guard.nominal is None else feedforward.initial_state(reference, guard.nominal)
     )
-    measured = Measurements(
+    measurements = Measurements(
         y=y.value, y_m=reference, y_m_dot=zero, u_trim=state.u, u_before=state.u, vane=vane
     )
     u_trim = state.u
@@ -385,7 +407,7 @@ def _engaged(
         u_trim = u_trim - guard.probe.at(y.stamp_ns)  # so that u goes on
     return state._replace(
         mode=Mode.ENGAGED,
-        law=law.control_law.engage(measured, law.params),
+        law=law.control_law.engage(measurements, law.params),
         y=y,
         y_m=reference,
         u_trim=u_trim,
@@ -444,7 +466,7 @@ def _vanes(
 
 def law_within_limits(
     state: Any,
-    measured: Measurements,
+    measurements: Measurements,
     dt: Array,
     law: TunedLaw,
     guard: GuardParams,
@@ -456,14 +478,14 @@ def law_within_limits(
 
     Arguments: `effectors` (p,) of the last tick, None without an allocation.
     """
-    after, u_free = law.control_law.step(state, measured, dt, law.params)
+    after, u_free = law.control_law.step(state, measurements, dt, law.params)
     u, effector_values = _within_effectors(
-        saturate(u_free, measured.u_before, dt, guard.limits), effectors, dt, guard
+        saturate(u_free, measurements.u_before, dt, guard.limits), effectors, dt, guard
     )
     # otherwise `limited` gives the same and takes three times as long
     if not np.array_equal(u, u_free):
-        limits = guard.limits if guard.allocation is None else reached(u_free, u)
-        after, u_free, u = law.control_law.limited(state, measured, dt, law.params, limits)
+        limits = guard.limits if guard.allocation is None else limits_of_effectors(u_free, u)
+        after, u_free, u = law.control_law.limited(state, measurements, dt, law.params, limits)
         u, effector_values = _within_effectors(u, effectors, dt, guard)
     return after, u_free, u, effector_values
 
@@ -500,8 +522,8 @@ def _failsafe(
             ramp_ns=guard.ramp_ns,
         )
     elapsed_ns = now_ns - state.failsafe_start_ns
-    held = not active and guard.deactivation_holds
-    scale = 1.0 if held else failsafe_scale(elapsed_ns, state.hold_ns, state.ramp_ns)
+    is_held = not active and guard.deactivation_holds
+    scale = 1.0 if is_held else failsafe_scale(elapsed_ns, state.hold_ns, state.ramp_ns)
     if not active:
         mode = Mode.INACTIVE
     elif scale == 1.0:
