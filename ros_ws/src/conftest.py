@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Lets pytest in the folder of a package, as `colcon test` starts it, run the tests of the package
-in tests/.
+"""Lets pytest run the tests of a package, in tests/, from the folder of the package.
+
+`colcon test` starts it there.
 """
 
 from pathlib import Path

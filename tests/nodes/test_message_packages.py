@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`make messages`: two small packages, one of which contains messages of the other, built and
-imported.
+"""`make messages`: two small packages, built and imported.
+
+One of them contains messages of the other.
 """
 
 import os

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Nodes in the process of a test: their time is moved by the test, and their topics are queues.
-Nothing else differs.
+"""Nodes in the process of a test.
 
-A node is its class of the stack on a node of rclpy, with its parameters, its services and its
-ticks. Three things are replaced: the functions that make publishers, subscriptions and clients; the
-module `time`, as the modules of the stack see it; and the logger. A message is serialised where it
-is published, and waits in the queue of each subscription until the node takes it.
+Their time is moved by the test, and their topics are queues. Nothing else differs. A node is its
+class of the stack on a node of rclpy, with its parameters, its services and its ticks. Three things
+are replaced: the functions that make publishers, subscriptions and clients; the module `time`, as
+the modules of the stack see it; and the logger. A message is serialised where it is published, and
+waits in the queue of each subscription until the node takes it.
 """
 
 import sys
@@ -47,8 +47,9 @@ LIMIT = 60.0  # s of the time of the test, until a wait fails
 
 
 class Clock:
-    """The time of the host, in place of the module `time`; other functions of the module are
-    unchanged.
+    """The time of the host, in place of the module `time`.
+
+    Other functions of the module are unchanged.
     """
 
     def __init__(self) -> None:
@@ -203,8 +204,9 @@ class Log:
 
 
 class InWorld:
-    """Of a node before its class: publishers, subscriptions, clients and logger are those of the
-    world.
+    """Of a node before its class.
+
+    Publishers, subscriptions, clients and logger are those of the world.
     """
 
     world: "World"
@@ -263,8 +265,9 @@ class InWorld:
 
 
 class World:
-    """The nodes of a test, the graph between them, their time, and the messages that they have
-    published.
+    """The nodes of a test, the graph between them, and their time.
+
+    It keeps the messages that they have published.
     """
 
     def __init__(self, clock: Clock) -> None:
@@ -314,8 +317,9 @@ class World:
         node.destroy_node()
 
     def kill(self, node: AnyNode) -> None:
-        """SIGKILL. What the node published stays in the graph, as for the lease of a
-        participant.
+        """SIGKILL.
+
+        What the node published stays in the graph, as for the lease of a participant.
         """
         self.loops.pop(node, None)
         self.nodes.remove(node)
@@ -508,8 +512,9 @@ def clients_of(world: World) -> Iterator[None]:
 
 @contextmanager
 def world_of(*arguments: str) -> Iterator[World]:
-    """A world whose nodes have these arguments of ROS. Its time is that of the modules of the
-    stack.
+    """A world whose nodes have these arguments of ROS.
+
+    Its time is that of the modules of the stack.
     """
     clock = Clock()
     with pytest.MonkeyPatch.context() as patch:

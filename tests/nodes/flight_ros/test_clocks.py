@@ -14,8 +14,9 @@ from flight_ros.clocks import AHEAD, HOST, Peers
 def exchanged(
     offset: float, there: float, back: float, jitter: float, hosts: tuple[float, float] = (0.0, 0.0)
 ) -> Peers:
-    """What a knows of b after six exchanges; the clock of b is ahead by the offset, s, and messages
-    take there and back, s.
+    """What a knows of b after six exchanges.
+
+    The clock of b is ahead by the offset, s, and messages take there and back, s.
     """
     a = Peers("/a", hosts[0])
     b = Peers("/b", hosts[1])

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fuzzing of the decoders: any payload is decoded or rejected with a reason, and the next valid
-message is decoded.
+"""Fuzzing of the decoders.
+
+Any payload is decoded or rejected with a reason, and the next valid message is decoded.
 """
 
 from typing import Any

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Named vectors as bytes: against the independent serialisation of rosbags, and against the
-middleware.
+"""Named vectors as bytes.
+
+They are held against the independent serialisation of rosbags, and against the middleware.
 """
 
 import numpy as np

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A receiver looks at size and publisher before it decodes, and refuses, counts and logs what does
-not fit.
+"""A receiver looks at size and publisher before it decodes.
+
+It refuses, counts and logs what does not fit.
 """
 
 from typing import Any
@@ -135,8 +136,9 @@ def test_long_message_is_not_decoded(size: int, sender: str) -> None:
 
 
 def test_long_message_under_the_name_of_the_publisher_is_not_decoded() -> None:
-    """The longer, the dearer: 16 kB cost 22 times a right message. A publisher that timed out may
-    have other channels.
+    """The longer, the dearer: 16 kB cost 22 times a right message.
+
+    A publisher that timed out may have other channels.
     """
     setup = Setup()
     right = message()
@@ -159,8 +161,9 @@ def test_long_message_under_the_name_of_the_publisher_is_not_decoded() -> None:
 
 
 def test_report_may_be_much_longer_than_the_one_before() -> None:
-    """A learner without a model says so in 300 bytes, and proposes 10,000 bytes half a timeout
-    later.
+    """A learner without a model says so in 300 bytes.
+
+    It proposes 10,000 bytes half a timeout later.
     """
     right = message()
     long = message(names=(*NAMES, *(f"c{k}" for k in range(800))))

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Nodes by the /clock of a simulator, at any speed: the same flight, a pause, a restart, and the
-log.
+"""Nodes by the /clock of a simulator, at any speed.
+
+The same flight, a pause, a restart, and the log.
 """
 
 from collections.abc import Iterator
@@ -67,8 +68,9 @@ def simulation(scenario: Scenario, *arguments: str, speed: float = 1.0) -> Itera
 
 
 def flown(scenario: Scenario, speed: float) -> tuple[list[bytes], float]:
-    """What the controller sent in 2.5 s of simulated time, and how long that took on the host,
-    s.
+    """What the controller sent in 2.5 s of simulated time.
+
+    The second result is how long that took on the host, s.
     """
     with simulation(scenario, speed=speed) as simulator:
         simulator.start(AircraftNode, ReferenceModelNode, ControllerNode)

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A test in real time that fails beside a pause of the host is run again; one that fails without a
-pause fails.
+"""A test in real time that fails beside a pause of the host is run again.
+
+One that fails without a pause fails.
 """
 
 import subprocess
@@ -42,8 +43,9 @@ def test_bears_more(): assert False
 
 
 def printed(folder: Path, pause: float) -> str:
-    """What pytest prints of tests that pass at an attempt, and of one that bears a longer pause and
-    fails.
+    """What pytest prints of tests that pass at an attempt.
+
+    One of them bears a longer pause and fails.
     """
     (folder / "test_it.py").write_text(TESTS)
     (folder / "pytest.ini").write_text("[pytest]\nmarkers =\n  longest_pause(s): a test\n")

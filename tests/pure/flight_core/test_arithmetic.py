@@ -89,8 +89,9 @@ def test_inverse_pivots() -> None:
 
 
 def test_jax_is_near() -> None:
-    """XLA may contract products and sums, so the bound is a rounding per term, and not every
-    bit.
+    """XLA may contract products and sums.
+
+    So the bound is a rounding per term, and not every bit.
     """
     rng = np.random.default_rng(5)
     with jax.enable_x64(True):

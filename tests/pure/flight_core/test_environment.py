@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Environments in which no node can start: each is one sentence with the mend, from every command
-and from a node.
+"""Environments in which no node can start.
+
+Each is one sentence with the mend, from every command and from a node.
 """
 
 import resource

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the annotations of a parameter set permit, against pydantic's strict types, which were not
-written here.
+"""What the annotations of a parameter set permit.
+
+They are held against pydantic's strict types, which were not written here.
 """
 
 import math
@@ -177,8 +178,9 @@ def test_numbers_are_those_of_yaml_1_2(text: str, value: float) -> None:
 
 @pytest.mark.parametrize("text", ["060", "1:00", "1e"])
 def test_ambiguous_numbers_are_no_numbers(text: str) -> None:
-    """YAML 1.1 reads 060 as 48 and 1:00 as 60. Such text stays text, so a number field refuses
-    it.
+    """YAML 1.1 reads 060 as 48 and 1:00 as 60.
+
+    Such text stays text, so a number field refuses it.
     """
     assert parse_yaml(
         f"a: '{text}'\nb: {text if text != '-' else repr(text)}", "file", "a mapping"

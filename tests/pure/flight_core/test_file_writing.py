@@ -119,8 +119,9 @@ CALLS: dict[str, Callable[..., Any]] = {
 
 @pytest.mark.parametrize("name", CALLS)
 def test_dying_report_loses_no_file(run: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-    """A full disk at the n-th write of a report: each file has the old or the new content, and the
-    outcome survives.
+    """A full disk at the n-th write of a report.
+
+    Each file has the old or the new content, and the outcome survives.
     """
     write_report(run, COMPLETED)
     (run / REPORT).write_text("an older page")

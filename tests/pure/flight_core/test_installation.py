@@ -45,8 +45,9 @@ class Installed(NamedTuple):
 def test_installed_stack_names_what_it_came_from(
     origin: str | None, command: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """Not a package of an index from which it did not come: a foreign package may have that
-    name.
+    """Not a package of an index from which it did not come.
+
+    A foreign package may have that name.
     """
     monkeypatch.setattr(installation, "CHECKOUT", tmp_path)
     monkeypatch.setattr(installation, "distribution", lambda name: Installed(origin))

@@ -122,8 +122,9 @@ def test_a_change_of_publisher_is_returned_once() -> None:
 def test_delayed_reference_awaited_up_to_age_limit(
     late: float, modes: set[Mode], osprey_gust: Scenario
 ) -> None:
-    """Y and y_m at 100 Hz. From 1 s on y_m has a delay, once below the age limit of 0.1 s and once
-    above it.
+    """Y and y_m at 100 Hz, where y_m has a delay from 1 s on.
+
+    It is once below the age limit of 0.1 s and once above it.
     """
     controller = Controller(osprey_gust.controller)
     period_ns = 10_000_000

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""y and a second signal of a lockstep flight come together whatever the order in which they
-arrive.
+"""y and a second signal of a lockstep flight come together.
+
+The order in which they arrive does not matter.
 """
 
 import numpy as np
