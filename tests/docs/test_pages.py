@@ -29,6 +29,9 @@ BLOCK = re.compile(
     re.DOTALL,
 )
 EXECUTED = {"sh", "python"}
+BY_HAND = "by hand, "
+"""In a reason: no program runs the block. benchmarks/pages.py runs the others as they stand."""
+
 TIMEOUT = 600.0  # s, of a block: the longest takes about 30 s on an idle host
 pytestmark = pytest.mark.timeout(2.0 * TIMEOUT)
 
@@ -41,21 +44,25 @@ def blocks(page: Path) -> list[tuple[str, str, str]]:
     ]
 
 
-def run(command: list[str], folder: Path) -> None:
-    environment = os.environ | {
+def environment() -> dict[str, str]:
+    """The environment of a reader who has `rise-di` on the path, without a screen."""
+    return os.environ | {
         "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
         "MPLBACKEND": "agg",
     }
-    done = subprocess.run(
+
+
+def run(command: list[str], folder: Path) -> None:
+    process = subprocess.run(
         command,
         cwd=folder,
-        env=environment,
+        env=environment(),
         capture_output=True,
         text=True,
         timeout=TIMEOUT,
         check=False,
     )
-    assert done.returncode == 0, f"{' '.join(command)}\n{done.stdout}\n{done.stderr}"
+    assert process.returncode == 0, f"{' '.join(command)}\n{process.stdout}\n{process.stderr}"
 
 
 SHORTER = (
