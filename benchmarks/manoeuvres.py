@@ -20,7 +20,7 @@ from flight_core.tape import Tape
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray, StampedVector
 from flight_guidance.guidance import Guidance
-from flight_guidance.guidance_state import Lateral, Mode
+from flight_guidance.guidance_state import GuidanceMode, Lateral
 from flight_guidance.params import GuidanceConfig
 from flight_guidance.steering.lateral import least_radius
 from flight_guidance.steering.protection import FLOOR
@@ -191,7 +191,7 @@ def of_pose(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figure]
         math.degrees(np.abs(tape["truth"]["x.phi"][tape.time("truth") > end]).max()),
         5.0,
     )
-    stale = after(tape, 0.0, "mode")[0] != Mode.ENGAGED
+    stale = after(tape, 0.0, "mode")[0] != GuidanceMode.ENGAGED
     yield Figure(
         "pose stale (s)", float(stale.sum()) * seconds(section.params().period_ns), math.inf
     )

@@ -28,7 +28,7 @@ from tests.published_messages import FOREIGN_MAPS, PUBLISHED, blank, kind
 from autopilot_bridge.bridge import Bridge
 from autopilot_bridge.channel_map import (
     STEP,
-    Line,
+    LinearConversion,
     get_field,
     message_type,
     read_raw,
@@ -43,7 +43,9 @@ from flight_core import installation
 from flight_core.vectors import ChannelError
 
 MAPS = sorted(MAP_FILES)
-LINES = st.builds(Line, st.sampled_from((-1, 1)), st.floats(1e-3, 1e3), st.floats(-1e3, 1e3))
+LINES = st.builds(
+    LinearConversion, st.sampled_from((-1, 1)), st.floats(1e-3, 1e3), st.floats(-1e3, 1e3)
+)
 FLU = Message(x=0.3, y=-0.2, z=-0.1)  # roll right at 0.3 rad/s, nose up at 0.2, nose right at 0.1
 FRD = np.array([0.3, 0.2, 0.1], dtype=np.float32)  # the same motion as a fixed array of a message
 MOTION = {"p": 0.3, "q": 0.2, "r": 0.1}  # the expected channels for each map
@@ -405,7 +407,9 @@ def test_a_quaternion_without_an_attitude_is_refused(quaternion: list[float]) ->
 
 
 @given(LINES, st.floats(-1e4, 1e4))
-def test_sending_value_and_reading_it_back_gives_value(line: Line, channel: float) -> None:
+def test_sending_value_and_reading_it_back_gives_value(
+    line: LinearConversion, channel: float
+) -> None:
     assert to_channel(to_raw(channel, line), line) == approx(channel, rel=1e-12, abs=1e-9)
 
 

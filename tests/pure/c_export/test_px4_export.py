@@ -26,7 +26,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_cli.export import Export
 from flight_design.identification.module_log import STATUS, module_flight
-from flight_log.vehicle_tables import Table, VehicleLog
+from flight_log.vehicle_tables import MessageTable, VehicleLog
 from rise_di_controller.internals import Saturation
 from rise_di_controller.params import ControllerConfig
 
@@ -350,7 +350,7 @@ def test_refuses_what_no_rate_controller_is(tmp_path: Path) -> None:
     assert set(AXES) == set("pqr")
 
 
-def flown_table(shell: Shell, controller: ControllerConfig) -> Table:
+def flown_table(shell: Shell, controller: ControllerConfig) -> MessageTable:
     """rise_di_status of a flight.
 
     The rates come at twice the rate of the law with jitter, slow and fast, with a hand-back of 0.2
@@ -386,7 +386,7 @@ def flown_table(shell: Shell, controller: ControllerConfig) -> Table:
         "refusal": np.array([row["refusal"] for row in rows]),
     }
     fields |= {"parameters": np.full(len(rows), float(controller.digest()))}
-    return Table(1000 * now_us, fields)
+    return MessageTable(1000 * now_us, fields)
 
 
 def test_log_of_the_module_replays_to_the_bit(shell: Shell, folder: Path) -> None:
@@ -415,7 +415,7 @@ def test_log_of_the_module_replays_to_the_bit(shell: Shell, folder: Path) -> Non
     keep = np.ones(len(table.stamp_ns), dtype=bool)
     keep[700:710] = False
     fields = {name: values[keep] for name, values in table.fields.items()}
-    log = VehicleLog("a ULog", {STATUS: Table(table.stamp_ns[keep], fields)}, {}, None)
+    log = VehicleLog("a ULog", {STATUS: MessageTable(table.stamp_ns[keep], fields)}, {}, None)
     cut = module_flight(log, controller)
     assert cut.lost > 90  # of the 100 up to the engagement
     assert cut.equal == len(cut.tape["internals"].stamp_ns)
@@ -440,6 +440,6 @@ def test_log_of_another_module_is_refused(
             del fields[name]
         else:
             fields[name] = np.full(len(table.stamp_ns), value)
-    log = VehicleLog("a ULog", {STATUS: Table(table.stamp_ns, fields)}, {}, None)
+    log = VehicleLog("a ULog", {STATUS: MessageTable(table.stamp_ns, fields)}, {}, None)
     with refusing(words):
         module_flight(log, controller)

@@ -40,9 +40,9 @@ from flight_analysis.report.summary import (
     taken_over,
 )
 from flight_analysis.report.tables import EventInterval, flight_tables
-from flight_bringup.fleet import Flown, Member
+from flight_bringup.fleet import Member, MemberFlight
 from flight_bringup.fly import fly_and_report
-from flight_cli.fleet import _Result as FleetResult
+from flight_cli.fleet import _AircraftResult as FleetResult
 from flight_cli.fleet import _show as show_fleet
 from flight_cli.output import show_flight
 from flight_cli.replay import Replay
@@ -52,7 +52,7 @@ from flight_core.outcome import COMPLETED, STATUS_SHORTFALL
 from flight_core.rates import NANOSECONDS, nanoseconds
 from flight_core.tape import Process, Recording, Signal, Tape
 from flight_log.clock import StampClock
-from flight_log.flight_processes import Span, flight_processes
+from flight_log.flight_processes import SampleSpan, flight_processes
 from flight_log.rosbag2_metadata import METADATA, bag_files
 from flight_view.flight import Flight
 
@@ -472,9 +472,9 @@ def test_process_has_ready_time_of_its_own_start() -> None:
         ("/controller", 40 * second),
     ]
     spans = {
-        "/controller#9": Span(10 * second, 30 * second, 2000),
-        "/controller#4": Span(41 * second, 60 * second, 1900),
-        "": Span(0, 1, 2),  # of ros2 topic pub
+        "/controller#9": SampleSpan(10 * second, 30 * second, 2000),
+        "/controller#4": SampleSpan(41 * second, 60 * second, 1900),
+        "": SampleSpan(0, 1, 2),  # of ros2 topic pub
     }
     assert flight_processes(spans, ready, "") == {
         "/controller#9": Process(3 * second, 10 * second, 30 * second, 2000),
@@ -482,7 +482,7 @@ def test_process_has_ready_time_of_its_own_start() -> None:
         "/recorder": Process(1, None, None),
         "a publisher without a name": Process(None, 0, 1, 2),
     }
-    assert flight_processes({"": Span(0, 1, 2)}, [], "") == {}  # in one process
+    assert flight_processes({"": SampleSpan(0, 1, 2)}, [], "") == {}  # in one process
 
 
 def test_summary_counts_commands_of_flight(figures: dict[str, Any]) -> None:
@@ -578,7 +578,7 @@ def test_fleet_says_the_share_of_the_ticks_engaged(
 ) -> None:
     monkeypatch.setenv("COLUMNS", "200")
     assert half.scenario is not None
-    flown = Flown(Member("two", half.scenario), tmp_path, COMPLETED)
+    flown = MemberFlight(Member("two", half.scenario), tmp_path, COMPLETED)
     show_fleet("pair", [flown], {"two": FleetResult(half.summary, 0.9365)})
     assert "93.65 %, over 49 % of internals" in capsys.readouterr().out
 

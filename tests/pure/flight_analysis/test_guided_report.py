@@ -27,7 +27,7 @@ from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 from flight_guidance.fence.fence import Fence, Zone
 from flight_guidance.guidance import names
-from flight_guidance.guidance_state import Lateral, Mode, Vertical
+from flight_guidance.guidance_state import GuidanceMode, Lateral, Vertical
 from flight_guidance.steering.path import Arc, Line
 from flight_log.bag import LogAttachments
 from flight_log.tape_writer import write_run
@@ -45,7 +45,8 @@ def log(**channels: ArrayLike) -> Tape:
     """
     given = {name.replace("__", "."): value for name, value in channels.items()}
     level: dict[str, Any] = dict.fromkeys(names(("q", "V", "p", "r")), 0.0) | {
-        "mode": Mode.ENGAGED, "mode.lateral": Lateral.HEADING, "mode.vertical": Vertical.ALTITUDE,
+        "mode": GuidanceMode.ENGAGED, "mode.lateral": Lateral.HEADING,
+        "mode.vertical": Vertical.ALTITUDE,
         "V_c": SPEED, "pose.v_north": SPEED, "pose.north": SPEED * T,
     }  # fmt: skip
     assert set(given) <= set(level)

@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 import pytest
 from tests.conftest import invoke
 
-from flight_bringup.fleet import Fleet, Flown, read_fleet
+from flight_bringup.fleet import Fleet, MemberFlight, read_fleet
 from flight_cli import fleet
 from flight_core.outcome import COMPLETED, Outcome
 from flight_core.parameters import ParameterError
@@ -95,8 +95,11 @@ def test_interrupt_before_flight_leaves_no_folder(
 def test_interrupt_of_reports_shows_what_was_flown(
     without_ros: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    def flown(of: Fleet, runs: Sequence[Path], progress: object) -> list[Flown]:
-        return [Flown(member, run, COMPLETED) for member, run in zip(of.members, runs, strict=True)]
+    def flown(of: Fleet, runs: Sequence[Path], progress: object) -> list[MemberFlight]:
+        return [
+            MemberFlight(member, run, COMPLETED)
+            for member, run in zip(of.members, runs, strict=True)
+        ]
 
     def reported(run: Path, outcome: Outcome) -> NoReturn:
         raise ParameterError("no sample") if "-one-" in run.name else KeyboardInterrupt

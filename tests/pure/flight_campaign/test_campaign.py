@@ -50,7 +50,7 @@ from flight_campaign.campaign_report import figure_rows, overview
 from flight_campaign.definition import Definition, Sweep
 from flight_campaign.influence import rank_correlations
 from flight_campaign.rows import Chunk, encode, entry_names, tally_of
-from flight_campaign.statistics import WORST_KEPT, Figure, Tally, score, score_units
+from flight_campaign.statistics import WORST_KEPT, FigureStatistics, Tally, score, score_units
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 from flight_design.identification.model_identification import identify_model
@@ -78,8 +78,8 @@ def fly_campaign(folder: Path, of: Definition) -> Campaign:
 @given(VALUES, st.data())
 def test_figure_summed_from_parts_is_that_of_whole(values: FloatArray, data: st.DataObject) -> None:
     cut = data.draw(st.integers(0, len(values)))
-    whole = Figure.from_values(values)
-    parts = Figure.from_values(values[:cut]) + Figure.from_values(values[cut:])
+    whole = FigureStatistics.from_values(values)
+    parts = FigureStatistics.from_values(values[:cut]) + FigureStatistics.from_values(values[cut:])
     assert parts.count == len(values)
     assert parts.bins == whole.bins
     assert parts.largest == values.max()
@@ -94,7 +94,9 @@ def test_figure_summed_from_parts_is_that_of_whole(values: FloatArray, data: st.
 def test_quantile_is_accurate_to_width_of_bin(values: FloatArray, share: float) -> None:
     # inverted_cdf: the smallest value that so many reach. A bin is 10^(1/100) wide.
     exact = float(np.quantile(values, share, method="inverted_cdf"))
-    assert Figure.from_values(values).quantile(share) == approx(exact, rel=10 ** (1 / 100) - 1.0)
+    assert FigureStatistics.from_values(values).quantile(share) == approx(
+        exact, rel=10 ** (1 / 100) - 1.0
+    )
 
 
 def test_worst_flights_kept_with_diverged_ones_first() -> None:

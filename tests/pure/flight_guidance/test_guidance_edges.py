@@ -31,7 +31,7 @@ from flight_guidance import guidance as module
 from flight_guidance.fence.fence import Motion, last_safe_turn, turn_clearance
 from flight_guidance.fence.zones import Fence, Zone
 from flight_guidance.guidance import Guidance
-from flight_guidance.guidance_state import Begin, Mode
+from flight_guidance.guidance_state import Begin, GuidanceMode
 from flight_guidance.params import GuidanceConfig
 from flight_guidance.reach import AUTHORITY
 from flight_guidance.steering.attitude import AttitudeParams, body_rates, yaw_for_bank
@@ -306,7 +306,7 @@ def test_steps_that_fail_for_longer_than_the_age_limit_leave_no_u_m(
     assert said == [f"a step of guidance failed, the last u_m goes on: {CAUSE}"]
     assert made.failed == 200
     assert outputs[250].u_m is not None
-    assert made.mode is Mode.ENGAGED
+    assert made.mode is GuidanceMode.ENGAGED
     log = dict(zip(made.names, outputs[250].log.tolist(), strict=True))
     assert log["begin"] == Begin.AGAIN
 

@@ -29,7 +29,7 @@ from flight_core.tape import Signal, Tape
 from flight_core.vectors import ChannelError, FloatArray, StampedVector
 from flight_guidance import guidance
 from flight_guidance.guidance import Guidance
-from flight_guidance.guidance_state import Lateral, Mode, Vertical
+from flight_guidance.guidance_state import GuidanceMode, Lateral, Vertical
 from flight_guidance.modes import modes
 from flight_guidance.params import GuidanceConfig
 from flight_guidance.routes.route_file import Waypoint, read_route
@@ -156,7 +156,7 @@ def test_each_step_follows_from_log_to_last_bit() -> None:
             stamp_ns, dict(zip(signal.names, values.tolist(), strict=True)), params.outputs
         )
         state, commands = modes.step(state, inputs, None, params)
-        sample = guidance.Sample(
+        sample = guidance.GuidanceSample(
             inputs=inputs,
             state=state,
             commands=commands,
@@ -205,10 +205,10 @@ def test_stale_pose_levels_wings(y_too: bool) -> None:
     signal = run(made, 1, 300)
     mode = signal["mode"]
     phi = signal["state.phi"]
-    assert mode[8] == Mode.ENGAGED  # 0.18 s
-    assert mode[10] == Mode.DEAD_RECKONING
+    assert mode[8] == GuidanceMode.ENGAGED  # 0.18 s
+    assert mode[10] == GuidanceMode.DEAD_RECKONING
     assert abs(math.degrees(phi[200])) < 1.0  # 4 s
-    assert mode[-1] == Mode.POSE_LOST
+    assert mode[-1] == GuidanceMode.POSE_LOST
     assert signal["u_m.p"][-1] == signal["u_m.q"][-1] == signal["u_m.r"][-1] == 0.0
     if y_too:
         assert made.step(6400 * MS, 6400 * MS) is None

@@ -22,7 +22,7 @@ from flight_core.units import GRAVITY
 from flight_core.vectors import ChannelError, StampedVector
 from flight_guidance import guidance_state
 from flight_guidance.guidance import Guidance
-from flight_guidance.guidance_state import Mode
+from flight_guidance.guidance_state import GuidanceMode
 from flight_guidance.multicopter import multicopter
 from flight_guidance.params import GuidanceConfig
 from reference_model.reference import Reference
@@ -168,11 +168,11 @@ def test_stale_pose_levels_and_its_return_hovers() -> None:
         assert output is not None
         assert guide.state is not None
         modes.append((guide.mode, dict(zip(SECTION.outputs, output.u_m.tolist(), strict=False))))
-    assert modes[40][0] is Mode.DEAD_RECKONING
+    assert modes[40][0] is GuidanceMode.DEAD_RECKONING
     assert modes[40][1]["p"] < -0.1  # from a bank of 0.3 rad to a vertical thrust
-    assert modes[95][0] is Mode.POSE_LOST
+    assert modes[95][0] is GuidanceMode.POSE_LOST
     assert modes[95][1] == approx(dict.fromkeys(SECTION.outputs, 0.0), abs=0.05)
-    assert modes[-1][0] is Mode.ENGAGED
+    assert modes[-1][0] is GuidanceMode.ENGAGED
     assert guide.state is not None
     assert guide.state.target.altitude == approx(10.0, abs=0.01)
     with pytest.raises(ChannelError, match="expected north and east together"):

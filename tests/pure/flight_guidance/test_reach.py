@@ -13,9 +13,9 @@ from flight_core.vectors import StampedVector
 from flight_guidance.guidance import Guidance
 from flight_guidance.guidance_state import (
     Begin,
-    Commands,
     GuidanceState,
     Inputs,
+    StepCommands,
 )
 from flight_guidance.modes import modes
 from flight_guidance.modes.targets import reach_sentence, within_reach
@@ -39,7 +39,7 @@ OWN = CONFIG.params()
 
 def flown(
     target: dict[str, float], authority: Authority, **pose: float
-) -> tuple[GuidanceState, Commands]:
+) -> tuple[GuidanceState, StepCommands]:
     """The commands after 10 s at a constant pose, level but for `pose`."""
     values = dict.fromkeys(POSE, 0.0) | {"v_north": SPEED} | pose
     state = None

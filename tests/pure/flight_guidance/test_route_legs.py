@@ -22,7 +22,7 @@ from flight_core.units import GRAVITY
 from flight_core.vectors import ChannelError, StampedVector
 from flight_guidance import guidance
 from flight_guidance.guidance import Guidance
-from flight_guidance.guidance_state import Lateral, Mode
+from flight_guidance.guidance_state import GuidanceMode, Lateral
 from flight_guidance.notices import LEARNED
 from flight_guidance.params import GuidanceConfig
 from flight_guidance.reach import Authority
@@ -376,7 +376,12 @@ def log_of(count: int, **channels: ArrayLike) -> Tape:
     level: dict[str, Any] = (
         dict.fromkeys(names, 0.0)
         | dict(zip(LEARNED, Authority(), strict=True))
-        | {"mode": Mode.ENGAGED, "mode.lateral": Lateral.ROUTE, "V_c": SPEED, "pose.v_north": SPEED}
+        | {
+            "mode": GuidanceMode.ENGAGED,
+            "mode.lateral": Lateral.ROUTE,
+            "V_c": SPEED,
+            "pose.v_north": SPEED,
+        }
     )
     level |= {name.replace("__", "."): value for name, value in channels.items()}
     values = np.column_stack(

@@ -37,7 +37,7 @@ from flight_log.message_definitions import definition
 from flight_log.named_vectors import Samples, decoder, encoded, stamp_of, tables
 from flight_log.open_log import ROSBAG2
 from flight_log.playback import read_playback
-from flight_log.scan import MESSAGE_INDEX, RECORD, MessageBatch, Part, Scan, decode_batches
+from flight_log.scan import MESSAGE_INDEX, RECORD, FilePart, MessageBatch, Scan, decode_batches
 from flight_log.tape_reader import read_run
 from flight_log.tape_writer import write_run
 from flight_view.flight import Flight
@@ -392,7 +392,7 @@ def messages_of(chunk: bytes, index: bytes) -> list[tuple[int, bytes, int, int]]
     """Channel, content and times of the messages of a chunk with this message index."""
     return [
         (batch.channel_id, bytes(message), int(log_ns), int(publish_ns))
-        for batch in decode_batches([Part(Opcode.CHUNK, chunk, [index], 0)])
+        for batch in decode_batches([FilePart(Opcode.CHUNK, chunk, [index], 0)])
         if isinstance(batch, MessageBatch)
         for message, log_ns, publish_ns in zip(
             batch.data, batch.log_ns, batch.publish_ns, strict=True

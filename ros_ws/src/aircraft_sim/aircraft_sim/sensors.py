@@ -29,7 +29,7 @@ class Sensors(NamedTuple):
     quantum: FloatArray | None = None  # (m,) steps of the quantisation, SI, 0 = none
 
 
-class Drift(NamedTuple):
+class RandomWalk(NamedTuple):
     """State of the sensors: the random walk at a sample."""
 
     number: int  # of the sample
@@ -41,19 +41,19 @@ class Measured(NamedTuple):
 
     y: FloatArray  # (m,)
     error: FloatArray  # (m,) y measured - C x
-    drift: Drift
+    drift: RandomWalk
 
 
 # samples that have been measured and have not arrived yet, the oldest first
 DelayLine = tuple[StampedVector, ...]
 
 
-def initial_drift(params: Sensors) -> Drift:
+def initial_drift(params: Sensors) -> RandomWalk:
     """The random walk at sample 0, from zero."""
-    return Drift(0, np.zeros_like(params.noise))
+    return RandomWalk(0, np.zeros_like(params.noise))
 
 
-def measure(number: int, y: FloatArray, drift: Drift, params: Sensors) -> Measured:
+def measure(number: int, y: FloatArray, drift: RandomWalk, params: Sensors) -> Measured:
     """Measurement of y = C x, shape (m,), at sample `number`, not before the sample of `drift`:
 
         measured = quantised(y + error(number))
@@ -69,7 +69,7 @@ def measure(number: int, y: FloatArray, drift: Drift, params: Sensors) -> Measur
     return Measured(measured, added, drift)
 
 
-def error(number: int, drift: Drift, params: Sensors) -> tuple[FloatArray, Drift]:
+def error(number: int, drift: RandomWalk, params: Sensors) -> tuple[FloatArray, RandomWalk]:
     """Additive error at sample `number`, bias + walk(number) + noise(number), shape (m,).
 
     Returns further the walk; y plays no part.
@@ -107,7 +107,7 @@ def noise(number: int, params: Sensors) -> FloatArray:
     ).standard_normal(len(params.noise))
 
 
-def walk(number: int, drift: Drift, params: Sensors) -> Drift:
+def walk(number: int, drift: RandomWalk, params: Sensors) -> RandomWalk:
     """The random walk at sample `number`: w(0) = 0, w(k) = w(k-1) + drift_i n_i(k).
 
     n is standard normal and independent. Steps of skipped samples are added too, so the walk does
@@ -119,7 +119,7 @@ def walk(number: int, drift: Drift, params: Sensors) -> Drift:
     for k in range(drift.number + 1, number + 1):
         generator = random_streams.generator(k, random_streams.DRIFT, params.seed)
         value = value + params.drift * generator.standard_normal(len(value))
-    return Drift(number, value)
+    return RandomWalk(number, value)
 
 
 def arrives(number: int, params: Sensors) -> bool:

@@ -71,22 +71,22 @@ class AutopilotLock:
 
         Returns whether the sender is new, or has started again.
         """
-        changed = self._addresses.refresh(address, now_ns)
-        if changed:
+        is_new_sender = self._addresses.refresh(address, now_ns)
+        if is_new_sender:
             self._starts = self._new_lock()
         if since_boot_ns is None:
-            return changed
-        known = self._starts.publisher is not None
+            return is_new_sender
+        had_start = self._starts.publisher is not None
         boot_ns = now_ns - since_boot_ns
         if self._starts.refresh(self._start(since_boot_ns, now_ns), now_ns):
             self._newest_ns = since_boot_ns
             self._boot_ns = boot_ns
-            return changed or known
+            return is_new_sender or had_start
         self._newest_ns, self._boot_ns = (
             max(self._newest_ns, since_boot_ns),
             min(self._boot_ns, boot_ns),
         )
-        return changed
+        return is_new_sender
 
     def _start(self, since_boot_ns: int, now_ns: int) -> str:
         """The name of the start to which a time since boot belongs.

@@ -245,8 +245,8 @@ class Bridge:
         return sentences(self.conflict, *unmet)
 
     def _is_active(self, name: str, now_ns: int) -> bool:
-        engaged = self.phase in {Phase.ENGAGED, Phase.NEUTRAL}
-        return self.conditions.is_active(name, now_ns, engaged=engaged)
+        is_engaged = self.phase in {Phase.ENGAGED, Phase.NEUTRAL}
+        return self.conditions.is_active(name, now_ns, engaged=is_engaged)
 
     def _lacks(self, now_ns: int) -> str:
         """What an engagement lacks, as a sentence."""
@@ -426,14 +426,14 @@ class Bridge:
         """
         if self.phase is Phase.ENGAGING:
             self._continue_engagement(now_ns)
-        elif self.phase is Phase.NEUTRAL and (lost := self._lost(now_ns)):
-            self.disengage(lost, now_ns)
+        elif self.phase is Phase.NEUTRAL and (reason := self._lost(now_ns)):
+            self.disengage(reason, now_ns)
         elif self.phase is Phase.ENGAGED:
-            measured = joined(self.stale(now_ns))
-            cause = self.problem if measured else ""
-            reasons = sentences(self._lost(now_ns), measured, cause) or self._outside()
-            if ended := reasons or self._does_not_answer(now_ns):
-                self.disengage(ended, now_ns)
+            faults = joined(self.stale(now_ns))
+            cause = self.problem if faults else ""
+            reasons = sentences(self._lost(now_ns), faults, cause) or self._outside()
+            if end_reason := reasons or self._does_not_answer(now_ns):
+                self.disengage(end_reason, now_ns)
             elif timeout := self._u_timeout(now_ns):
                 self.reason = timeout
                 self._enter(Phase.NEUTRAL, now_ns)

@@ -29,7 +29,7 @@ VERSION = re.compile(r"_v\d+$")  # at the end of a topic of PX4
 SEA_LEVEL_DENSITY = 1.225
 
 
-class Line(NamedTuple):
+class LinearConversion(NamedTuple):
     """Channel = sign scale raw + offset.
 
     The channel is in SI and radians, the raw value in the autopilot's unit.
@@ -40,12 +40,12 @@ class Line(NamedTuple):
     offset: float  # unit of the channel
 
 
-def to_channel(raw: float, line: Line) -> float:
+def to_channel(raw: float, line: LinearConversion) -> float:
     """Channel = sign scale raw + offset."""
     return line.sign * line.scale * raw + line.offset
 
 
-def to_raw(channel: float, line: Line) -> float:
+def to_raw(channel: float, line: LinearConversion) -> float:
     """Raw = sign (channel - offset) / scale, the inverse of `to_channel`."""
     return line.sign * (channel - line.offset) / line.scale
 
@@ -180,8 +180,8 @@ def _turned(message: Any, path: str, attitude: str) -> float:
     v = np.array([float(get_field(message, f"{vector}.{name}")) for name in "xyz"])
     w, *r = _quaternion(get_field(message, attitude))
     across = np.cross(r, v)
-    turned = v + 2.0 * (w * across + np.cross(r, across))
-    return float(turned["xyz".index(axis)])
+    v_world = v + 2.0 * (w * across + np.cross(r, across))
+    return float(v_world["xyz".index(axis)])
 
 
 def read_raw(message: Any, path: str, function: str, turned_by: str | None = None) -> float:

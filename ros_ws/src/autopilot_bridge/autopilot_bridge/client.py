@@ -107,8 +107,8 @@ class EngagementClient(Client):
     def _received_phases(self) -> list[tuple[str, str]]:
         """Phases of the bridge with their reasons, since the request."""
         self._phases += [
-            (bounded(received.message.key), bounded(received.message.value))
-            for received in self._engagement_subscription.take()
+            (bounded(arrival.message.key), bounded(arrival.message.value))
+            for arrival in self._engagement_subscription.take()
         ]
         return self._phases
 

@@ -156,7 +156,9 @@ def joined(faults: Mapping[str, str]) -> str:
     for name, fault in faults.items():
         names.setdefault(fault, []).append(name)
     verbs = {
-        fault: "" if fault.startswith("not") else "is " if len(named) == 1 else "are "
-        for fault, named in names.items()
+        fault: "" if fault.startswith("not") else "is " if len(channels) == 1 else "are "
+        for fault, channels in names.items()
     }
-    return "; ".join(f"{', '.join(named)} {verbs[fault]}{fault}" for fault, named in names.items())
+    return "; ".join(
+        f"{', '.join(channels)} {verbs[fault]}{fault}" for fault, channels in names.items()
+    )

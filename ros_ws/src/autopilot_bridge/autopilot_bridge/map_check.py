@@ -144,17 +144,17 @@ def _element(field: Any) -> tuple[Nodetype, Any]:
 
 
 def _fault(types: Types, topic: str, kind: str, path: str, components: str | None) -> str:
-    known = {**typestore().fielddefs, **types}
+    definitions = {**typestore().fielddefs, **types}
     if not is_known(types, kind):
         return f"no {kind}"
-    version = next((value for name, _, value in known[kind][0] if name == VERSION), 0)
+    version = next((value for name, _, value in definitions[kind][0] if name == VERSION), 0)
     if (expected := versioned_topic(topic, version)) != topic:
         return f"{topic}: version {version}, whose topic is {expected}"
     member_kind = kind
     field = (Nodetype.NAME, kind)
     for step in path.split("."):
         match = STEP.fullmatch(step)
-        fields = dict(known[member_kind][1]) if member_kind in known else {}
+        fields = dict(definitions[member_kind][1]) if member_kind in definitions else {}
         if match is None or match[1] not in fields:
             return f"no {step}"
         node, content = fields[match[1]]
@@ -165,12 +165,12 @@ def _fault(types: Types, topic: str, kind: str, path: str, components: str | Non
         member_kind = element[1] if element[0] is Nodetype.NAME else ""
     return (
         ""
-        if components is None or _has(known, field, components)
+        if components is None or _has(definitions, field, components)
         else f"{path}: no {', '.join(components) or 'number'}"
     )
 
 
-def _has(known: Types, field: Any, components: str) -> bool:
+def _has(definitions: Types, field: Any, components: str) -> bool:
     """Whether a field has components, as members or in an array.
 
     Without components: whether it is a number.
@@ -179,8 +179,8 @@ def _has(known: Types, field: Any, components: str) -> bool:
     if node is Nodetype.NAME:
         return (
             bool(components)
-            and content in known
-            and {*components} <= {name for name, _ in known[content][1]}
+            and content in definitions
+            and {*components} <= {name for name, _ in definitions[content][1]}
         )
     if node is Nodetype.BASE:
         return not components and content[0] != "string"
@@ -195,10 +195,10 @@ def _constant_fault(types: Types, channel_map: ChannelMap, key: str, kind: str) 
     if row is None or not row.one_of or kind not in types:
         return ""
     values = {constant: value for constant, _, value in types[kind][0]}
-    named = [constant for constant in CONSTANT.findall(row.source) if constant in values]
+    constants = [constant for constant in CONSTANT.findall(row.source) if constant in values]
     wrong = [
         f"{constant} = {values[constant]}"
-        for constant in named
+        for constant in constants
         if values[constant] not in row.one_of
     ]
     return ", ".join(wrong)

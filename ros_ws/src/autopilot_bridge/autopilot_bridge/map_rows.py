@@ -7,7 +7,7 @@ from itertools import product
 from types import MappingProxyType
 from typing import Annotated, Literal, get_args
 
-from autopilot_bridge.channel_map import PATH, Line
+from autopilot_bridge.channel_map import PATH, LinearConversion
 from flight_core.fields import Field
 from flight_core.parameters import Config, NonNegative, Number, Numbers, Positive, require
 
@@ -84,9 +84,9 @@ class Row(Config):
     source: str = Field(min_length=1, description="where the row is from")
 
     @property
-    def line(self) -> Line:
+    def line(self) -> LinearConversion:
         """The conversion between the raw value and the channel."""
-        return Line(self.sign, self.scale, self.offset)
+        return LinearConversion(self.sign, self.scale, self.offset)
 
 
 class MovingRow(Row):

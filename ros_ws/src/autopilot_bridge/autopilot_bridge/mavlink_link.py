@@ -230,8 +230,10 @@ class Link:
             silence = f"no message of system {self._config.system} over {self._config.url}"
             silence += f" for {SILENCE:g} s" if silent else " is taken"
             systems = ", ".join(map(str, sorted(self._systems)))
-            known = f"an autopilot is system {systems} there: set link.system" if systems else ""
-            return sentences(silence, known, self._refused, self.conflict)
+            other_systems = (
+                f"an autopilot is system {systems} there: set link.system" if systems else ""
+            )
+            return sentences(silence, other_systems, self._refused, self.conflict)
         names = [name] if name else list(self._config.rates)
         slow = [sentence for message, sentence in self._rates.slow(now).items() if message in names]
         refusals = {
@@ -296,16 +298,16 @@ class Link:
         """
         system = self._stations_text()
         limit = self._config.station_silence
-        counted = f"FS_GCS_ENABL takes RC overrides for heartbeats of ground station {system}"
+        effect = f"FS_GCS_ENABL takes RC overrides for heartbeats of ground station {system}"
         if self._station_heard is None:
             return (
-                f"{counted}, and no such station is heard: it acts after each release, "
+                f"{effect}, and no such station is heard: it acts after each release, "
                 "FS_LONG_TIMEOUT after the last override"
             )
         watched = (
             "is not watched" if limit is None else f"ends the engagement by {limit:g} s of silence"
         )
-        return f"{counted}: station {system}, which is heard, {watched}"
+        return f"{effect}: station {system}, which is heard, {watched}"
 
     def _stations_text(self) -> str:
         numbers = self._station_numbers()
@@ -455,18 +457,18 @@ class Link:
             self._second = str(error)
             self._second_at = now
             return False
-        changed = self._lock.refresh(sender, since_boot_ns, now_ns)
-        if changed:
+        is_new_sender = self._lock.refresh(sender, since_boot_ns, now_ns)
+        if is_new_sender:
             self._parser = self._new_parser(self._connection.mav.signing)
             if before is not None:
                 self._second = (
                     f"the autopilot at {sender} is new, or has started again; before: {before}"
                 )
                 self._second_at = now
-        if changed and self._is_udp:
+        if is_new_sender and self._is_udp:
             with self._sending:
                 self._connection.clients = {address}
-        if changed or now - self._alive > SILENCE:
+        if is_new_sender or now - self._alive > SILENCE:
             self._to_request = dict(self._config.rates)
             self._denied = {}
             self._began = now
@@ -507,8 +509,8 @@ class Link:
 
     def _request_parameters(self, now: float) -> None:
         """Request each parameter, at first until it is known."""
-        known = all(name in self.parameters for name in self._to_read)
-        if now - self._alive > SILENCE or now - self._read < (READ_AGAIN if known else ANSWER):
+        has_all = all(name in self.parameters for name in self._to_read)
+        if now - self._alive > SILENCE or now - self._read < (READ_AGAIN if has_all else ANSWER):
             return
         self._read = now
         for name in (*self._to_read, *self._further):

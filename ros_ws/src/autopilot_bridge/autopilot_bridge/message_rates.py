@@ -34,7 +34,7 @@ class MessageRates:
     def begin(self, now: float) -> None:
         """Begin again: the autopilot may have started again, and the rates are requested."""
         self._rates = {name: _Rate(rate, now) for name, rate in self._requested.items()}
-        self._stepped = now
+        self._last_step = now
 
     def take(self, name: str, now: float) -> None:
         """Count a message."""
@@ -46,11 +46,11 @@ class MessageRates:
 
         After a pause of the host the messages that have come meanwhile are counted first.
         """
-        passed = now - self._stepped
-        if passed < JUDGED:
+        elapsed = now - self._last_step
+        if elapsed < JUDGED:
             return {}
-        self._stepped = now
-        if passed > PAUSE:
+        self._last_step = now
+        if elapsed > PAUSE:
             return {}
         return {name: rate.requested for name, rate in self._rates.items() if rate.step(now)}
 
@@ -88,8 +88,9 @@ class _Rate:
         self._instants: deque[float] = deque()  # of its messages within the window
         self._lowest = requested  # Hz, since it is slow
         self._slow_since: float | None = None
-        self._reached = False
-        self._taken: float | None = None  # when it was slow last, after it had been reached
+        self._was_reached = False
+        # when it was slow last, after it had been reached
+        self._last_slow: float | None = None
         self._repeated: float | None = None  # when it was requested again
 
     def take(self, now: float) -> None:
@@ -107,16 +108,16 @@ class _Rate:
         if not self.is_known(now):
             return False
         self._drop_old(now)
-        counted = len(self._instants) / self._window
-        if counted >= GRANTED * self.requested:
-            self._reached = True
+        rate = len(self._instants) / self._window
+        if rate >= GRANTED * self.requested:
+            self._was_reached = True
             self._slow_since = None
             return False
         if self._slow_since is None:
             self._slow_since = now
             self._lowest = self.requested
-        self._lowest = min(self._lowest, counted, self._present())
-        self._taken = now if self._reached else None
+        self._lowest = min(self._lowest, rate, self._present())
+        self._last_slow = now if self._was_reached else None
         if self._repeated is not None and now - self._repeated < REPEATED:
             return False
         self._repeated = now
@@ -126,7 +127,7 @@ class _Rate:
         rate = f"at {self._lowest:.2g} Hz, requested are {self.requested:g} Hz"
         if self._slow_since is not None:
             return f"{name} comes {rate}"
-        if self._taken is not None and now - self._taken < REMEMBERED:
+        if self._last_slow is not None and now - self._last_slow < REMEMBERED:
             return f"{name} came {rate}, less than {REMEMBERED:g} s ago"
         return ""
 

@@ -154,7 +154,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
 
     def _read_topics(self) -> list[tuple[PolledSubscription | MavlinkReader, list[NamedRow]]]:
         """Subscribe to the topics of the map. Returns each with its rows."""
-        named: list[NamedRow] = [
+        named_rows: list[NamedRow] = [
             *self._map.outputs.items(),
             *self._map.pose.items(),
             *self._map.sensors.items(),
@@ -163,7 +163,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
             *self._map.overrides.items(),
         ]
         rows_by_topic: dict[str, list[NamedRow]] = {}
-        for name, row in named:
+        for name, row in named_rows:
             rows_by_topic.setdefault(row.topic, []).append((name, row))
         readers: list[tuple[PolledSubscription | MavlinkReader, list[NamedRow]]] = []
         for topic, rows in rows_by_topic.items():
@@ -209,12 +209,12 @@ class BridgeNode(FlightNode[BridgeConfig]):
         self._disengage_after_pause(now_ns)
         step_ns = self.clock_step_ns()
         for subscription, rows in self._readers:
-            for received in subscription.take():
+            for arrival in subscription.take():
                 self._read(
                     subscription,
                     rows,
-                    received.message,
-                    self._arrived_ns(received, now_ns),
+                    arrival.message,
+                    self._arrived_ns(arrival, now_ns),
                     now_ns,
                     step_ns,
                 )
@@ -265,14 +265,14 @@ class BridgeNode(FlightNode[BridgeConfig]):
             else self.simulated.time_ns()
         )
 
-    def _arrived_ns(self, received: Any, now_ns: int) -> int:
+    def _arrived_ns(self, arrival: Any, now_ns: int) -> int:
         """The instant of a message that has no stamp, on the clock of the stamps."""
-        if not received.received_ns:
+        if not arrival.received_ns:
             return now_ns + self.clock_step_ns()
         return int(
-            received.received_ns
+            arrival.received_ns
             if self.simulated is None
-            else self.simulated.at(received.received_ns)
+            else self.simulated.at(arrival.received_ns)
         )
 
     def _disengage_after_pause(self, now_ns: int) -> None:
@@ -437,8 +437,8 @@ class BridgeNode(FlightNode[BridgeConfig]):
             self.get_logger().warning(bounded(f"{sentence}: {reason}"))
         else:
             self.get_logger().info(sentence)
-        engaged = phase is Phase.ENGAGED and before is not Phase.ENGAGED
-        if engaged and self._link is not None and self._overrides_sticks:
+        begins = phase is Phase.ENGAGED and before is not Phase.ENGAGED
+        if begins and self._link is not None and self._overrides_sticks:
             self.get_logger().info(self._link.station())
         if phase is not before and Phase.ENGAGED in (phase, before):
             self._activate(active=phase is Phase.ENGAGED)
@@ -479,13 +479,13 @@ class BridgeNode(FlightNode[BridgeConfig]):
     def _cause(self, subscription: PolledSubscription | MavlinkReader) -> str:
         """Why no sample of a topic was accepted, as a sentence."""
         if isinstance(subscription, MavlinkReader):
-            refused = (
+            refusal = (
                 what
                 for what in self.refusals.counts
                 if what.startswith(f"{subscription.topic.name}: ")
             )
             return next(
-                filter(None, (subscription.link.problem(subscription.message_name), *refused)),
+                filter(None, (subscription.link.problem(subscription.message_name), *refusal)),
                 "no such message comes",
             )
         publishers = self.get_publishers_info_by_topic(subscription.name)
@@ -494,10 +494,10 @@ class BridgeNode(FlightNode[BridgeConfig]):
         if not publishers:
             return no_publisher(os.environ)
         faults = self.endpoints.mismatches(subscription)
-        refused = (
+        refusal = (
             what for what in self.refusals.counts if what.startswith(f"{subscription.topic.name}: ")
         )
-        return next(iter((*faults, *refused)), "no sample of its publisher arrives")
+        return next(iter((*faults, *refusal)), "no sample of its publisher arrives")
 
     def graph_checks(self) -> list[Callable[[], None]]:
         """Also report a topic to which the autopilot cannot be connected.
@@ -519,19 +519,22 @@ class BridgeNode(FlightNode[BridgeConfig]):
         bridge reads, and the topics of setpoints. Several transmitters may override, and any node
         may request a mode.
         """
-        read = set()
+        read_topics = set()
         for subscription, rows in self._readers:
             overrides_alone = all(isinstance(row, OverrideRow) for _, row in rows)
             if isinstance(subscription, PolledSubscription) and not overrides_alone:
-                read.add(subscription.name)
+                read_topics.add(subscription.name)
         publishers = [self._outgoing[row.message].publisher for row in self._map.inputs.values()]
         setpoints = {
             publisher.topic_name for publisher in publishers if isinstance(publisher, Publisher)
         }
         # two messages may share a topic
-        sent = Counter(outgoing.publisher.topic_name for outgoing in self._outgoing.values())
+        publishers_here = Counter(
+            outgoing.publisher.topic_name for outgoing in self._outgoing.values()
+        )
         counts = {
-            topic: self.count_publishers(topic) - sent[topic] for topic in sorted(read | setpoints)
+            topic: self.count_publishers(topic) - publishers_here[topic]
+            for topic in sorted(read_topics | setpoints)
         }
         conflicts = [
             f"{topic} has {count} "

@@ -270,8 +270,8 @@ class ChannelMap(Config):
     def _check_fields(self) -> None:
         rows = self._readers() | {"inputs": self.inputs}
         paths: dict[str, str] = {}
-        for kind, named in rows.items():
-            paths |= {f"{kind}.{name}.field": row.field for name, row in named.items()}
+        for kind, rows_by_name in rows.items():
+            paths |= {f"{kind}.{name}.field": row.field for name, row in rows_by_name.items()}
         for name, message in self.messages.items():
             paths |= {f"messages.{name}.values.{path}": path for path in message.values}
         for key, path in paths.items():
@@ -323,9 +323,11 @@ class ChannelMap(Config):
 
         Topics with a quality of service, and what comes over MAVLink.
         """
-        rows = chain.from_iterable(named.values() for named in self._readers().values())
-        read = [row.topic for row in rows if row.topic.startswith(f"{MAVLINK}/")]
-        return [*self.topics, *dict.fromkeys(read)]
+        rows = chain.from_iterable(
+            rows_by_name.values() for rows_by_name in self._readers().values()
+        )
+        mavlink_topics = [row.topic for row in rows if row.topic.startswith(f"{MAVLINK}/")]
+        return [*self.topics, *dict.fromkeys(mavlink_topics)]
 
     def _readers(self) -> dict[str, Mapping[str, Any]]:
         """The sections whose rows read a field of a topic."""
@@ -336,8 +338,10 @@ class ChannelMap(Config):
         """(key of the row, topic, type) of each row that names a topic."""
         rows = self._readers() | {"messages": self.messages}
         topics: list[tuple[str, str, str]] = []
-        for kind, named in rows.items():
-            topics += [(f"{kind}.{name}", row.topic, row.type) for name, row in named.items()]
+        for kind, rows_by_name in rows.items():
+            topics += [
+                (f"{kind}.{name}", row.topic, row.type) for name, row in rows_by_name.items()
+            ]
         return topics
 
     def used_fields(self) -> list[tuple[str, str, str, str, str | None]]:
@@ -346,8 +350,8 @@ class ChannelMap(Config):
         The components are those of `COMPONENTS` for a field that a function reads, else None.
         """
         fields: list[tuple[str, str, str, str, str | None]] = []
-        for kind, named in self._readers().items():
-            for name, row in named.items():
+        for kind, rows_by_name in self._readers().items():
+            for name, row in rows_by_name.items():
                 source = (f"{kind}.{name}", row.topic, row.type)
                 components = COMPONENTS[getattr(row, "function", "value")]
                 fields.append((*source, row.field, components))

@@ -60,21 +60,23 @@ class NetworkClient(Client):
 
         Returns the hosts that are received, and of those that also receive this host the clocks.
         """
-        received: set[str] = set()
+        heard_hosts: set[str] = set()
         clocks: dict[str, ClockOfPeer] = {}
         end = time.monotonic() + timeout
         while (now := time.monotonic()) < end:
             self._clocks.exchange(0)
-            received |= {
+            heard_hosts |= {
                 self._instances[name] for name in self._clocks.received() if name in self._instances
             }
             known = self._clocks.clocks().items()
-            new = {self._instances[name]: clock for name, clock in known if name in self._instances}
-            if len(clocks) < len(new) == len(self._instances):
+            new_clocks = {
+                self._instances[name]: clock for name, clock in known if name in self._instances
+            }
+            if len(clocks) < len(new_clocks) == len(self._instances):
                 end = min(end, now + SETTLE_TIME)
-            clocks |= new
+            clocks |= new_clocks
             time.sleep(EXCHANGE_PERIOD)
-        return received, clocks
+        return heard_hosts, clocks
 
 
 def _instance(address: str) -> str:

@@ -213,13 +213,13 @@ def _nested(
         values = {key: getattr(old, key) for key in old.model_fields}
         return values | {key: merged(values.get(key), value) for key, value in new.items()}
 
-    nested = {}
+    tree = {}
     for name, section in changes.items():
         config = getattr(scenario, name, None)
-        nested[name] = {
+        tree[name] = {
             key: merged(getattr(config, key, None), value) for key, value in section.items()
         }
-    return nested
+    return tree
 
 
 @dataclass
@@ -307,7 +307,7 @@ class _Flight:
 
 
 @dataclass(frozen=True)
-class Flown:
+class MemberFlight:
     """How the flight of an aircraft of a fleet ended, and the folder of its run."""
 
     member: Member
@@ -322,7 +322,7 @@ def new_runs(fleet: Fleet, runs: Path) -> list[Path]:
 
 def fly_fleet(
     fleet: Fleet, runs: Sequence[Path], progress: Callable[[str, float, str], None]
-) -> list[Flown]:
+) -> list[MemberFlight]:
     """Fly a fleet over topics, with a run for each aircraft.
 
     `progress` is called with the name of an aircraft, flight time, s, and a text.
@@ -367,7 +367,7 @@ def fly_fleet(
                     flight.end(flight.outcome)
                 for flight in flights:
                     flight.join()
-    return [Flown(flight.member, flight.run, flight.outcome) for flight in flights]
+    return [MemberFlight(flight.member, flight.run, flight.outcome) for flight in flights]
 
 
 def _begin(flights: Sequence[_Flight], fleet: Fleet) -> None:

@@ -110,9 +110,9 @@ def fly_over_topics(
                 pause=interrupt.pause,
             ) as processes,
         ):
-            begun = processes.begin()
+            refusal = processes.begin()
             steps = follow(processes, progress, announce, engaged_for)
-            processes.outcome = begun or last(steps, interrupt.pause)
+            processes.outcome = refusal or last(steps, interrupt.pause)
             return processes.outcome
     except KeyboardInterrupt:
         return INTERRUPTED
@@ -169,7 +169,7 @@ class _Span:
         self._processes = processes
         self._monitor = monitor
         self._until = -math.inf  # s, flight time up to which the log holds y, y_m and u
-        self._moved = 0.0 if begins else -math.inf  # s, flight time of the last change
+        self._last_change = 0.0 if begins else -math.inf  # s, flight time of the last change
         self._flies = not begins
         self._begins = begins
         self.engaged = False  # the controller has published
@@ -180,12 +180,12 @@ class _Span:
             stamp := self._monitor.recorded()
         ) is not None and stamp - self._processes.start_time > self._until:
             self._until = stamp - self._processes.start_time
-            self._moved = t
+            self._last_change = t
         if t < self._duration:
             return None
         if self._until >= self._duration - STAMP_ERROR:
             return COMPLETED
-        if not self._flies or t < self._moved + LOG_TIMEOUT:
+        if not self._flies or t < self._last_change + LOG_TIMEOUT:
             return None
         return log_ends_at(self._until, self._duration) if self._begins else COMPLETED
 
@@ -256,8 +256,8 @@ def _announce_learned(
     """Announce what became of proposals since the last call, and the end of the learner."""
     for instant, sentence in processes.monitor.learned():
         announce(f"t = {instant - start_time:.2f} s: {sentence}")
-    if ended := processes.learner_ended():
-        announce(f"{ended}: the law flies on with the model that it has")
+    if outcome := processes.learner_ended():
+        announce(f"{outcome}: the law flies on with the model that it has")
 
 
 def _follow_lockstep(
@@ -376,11 +376,11 @@ def fly_and_report(
         progress,
         "a function of the flight time in s",
     )
-    chosen = find_scenario(scenario)
-    run = new_run(chosen, as_path(runs, "runs", "the path of a folder"))
-    chosen = as_file(chosen, run)
+    library_scenario = find_scenario(scenario)
+    run = new_run(library_scenario, as_path(runs, "runs", "the path of a folder"))
+    library_scenario = as_file(library_scenario, run)
     outcome = fly_in_process(
-        chosen, run, lambda t, _: None if progress is None else progress(t), learn
+        library_scenario, run, lambda t, _: None if progress is None else progress(t), learn
     )
     return write_report(run, outcome)
 

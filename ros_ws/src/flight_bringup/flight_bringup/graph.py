@@ -98,11 +98,11 @@ def require_limits(autopilot: Autopilot, scenario: Scenario) -> None:
     channel_map = autopilot.channel_map
     controller = scenario.controller
     key = f"scenario {scenario.name}: controller"
-    found = controller.on_deactivate
+    on_deactivate = controller.on_deactivate
     require(
-        found == "trim",
+        on_deactivate == "trim",
         f"{key}.on_deactivate",
-        repr(found),
+        repr(on_deactivate),
         "'trim' with a bridge, which engages only from a u near trim",
     )
     limits = controller.effector_limits()
@@ -264,8 +264,8 @@ def _recording(scenario: Scenario, run: Path, autopilot: Autopilot | None) -> Pa
         further += topics.recorded_with("probe")
     if autopilot is not None:
         further += autopilot.topics
-    recorded = {"topics": [*scenario.recorder.topics, *further]} if further else {}
-    return {"directory": str(run), **recorded}
+    overrides = {"topics": [*scenario.recorder.topics, *further]} if further else {}
+    return {"directory": str(run), **overrides}
 
 
 def _lockstep_rates(scenario: Scenario) -> dict[NodeSpec, ParameterOverrides]:
@@ -300,12 +300,12 @@ def _attachments(
 
 
 def replayed_topics(
-    recorded: Collection[str],
+    topics_of_log: Collection[str],
     nodes: Collection[NodeSpec],
     namespace: str = "",
     autopilot: Autopilot | None = None,
 ) -> list[str]:
-    """The recorded topics without a publisher among the nodes; full names, in order.
+    """The topics of a log without a publisher among the nodes; full names, in order.
 
     `namespace` belongs to the nodes. A bridge among the nodes also publishes the messages of its
     channel map.
@@ -313,8 +313,10 @@ def replayed_topics(
     prefix = f"/{namespace.strip('/')}/".replace("//", "/")
     names = {name for node in nodes for name in topics.published_by(node.executable)}
     # else others publish the topic, too
-    published = {prefix + name for name in names if not name.startswith("/")}
+    topics_of_nodes = {prefix + name for name in names if not name.startswith("/")}
     if BRIDGE in nodes and autopilot is not None:
-        sent = (message.topic for message in autopilot.channel_map.messages.values())
-        published |= {topic if topic.startswith("/") else prefix + topic for topic in sent}
-    return sorted(set(recorded) - published)
+        setpoint_topics = (message.topic for message in autopilot.channel_map.messages.values())
+        topics_of_nodes |= {
+            topic if topic.startswith("/") else prefix + topic for topic in setpoint_topics
+        }
+    return sorted(set(topics_of_log) - topics_of_nodes)

@@ -12,12 +12,12 @@ from flight_ros.startup import start_nodes
 
 def main() -> None:
     """Run them."""
-    guided = "guidance" in sys.argv
+    has_guidance = "guidance" in sys.argv
     learns = "learner" in sys.argv
     start_nodes(
         "aircraft_sim.node:AircraftNode",
         "reference_model.node:ReferenceModelNode",
-        *(["flight_guidance.node:GuidanceNode"] if guided else []),
+        *(["flight_guidance.node:GuidanceNode"] if has_guidance else []),
         "rise_di_controller.node:ControllerNode",
         *(["flight_design.learning.node:LearnerNode"] if learns else []),
         "flight_recorder.node:RecorderNode",

@@ -125,8 +125,8 @@ class FlightMonitor(Client):
         return self._state(node, pid) == NodeState.COMPLETED
 
     def _state(self, node: str, pid: int) -> str:
-        for received in self._node_state.take():
-            self._states[received.message.key] = received.message.value
+        for arrival in self._node_state.take():
+            self._states[arrival.message.key] = arrival.message.value
         return self._states.get(f"{self._namespace}/{node}#{pid}", "")
 
     def newest(self) -> tuple[str, FloatArray] | None:
@@ -141,8 +141,7 @@ class FlightMonitor(Client):
         """Phases of a bridge with their reasons, in order, since the last call."""
         messages = () if self._engagement is None else self._engagement.take()
         return [
-            (bounded(received.message.key), bounded(received.message.value))
-            for received in messages
+            (bounded(arrival.message.key), bounded(arrival.message.value)) for arrival in messages
         ]
 
     def learned(self) -> list[tuple[float, str]]:

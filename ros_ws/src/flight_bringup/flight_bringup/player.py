@@ -70,7 +70,7 @@ class Player(Client):
         is called with the instant of the log, ns, ten times a second.
         """
         begin_ns = begin_system_ns = first_ns = clock_ns = progress_ns = 0
-        for due_ns, topic, message, stamped in messages:
+        for due_ns, topic, message, has_stamp in messages:
             if begin_ns == 0:
                 begin_ns = time.monotonic_ns()
                 begin_system_ns = time.time_ns()
@@ -83,7 +83,7 @@ class Player(Client):
                     progress_ns = time.monotonic_ns() + PROGRESS_PERIOD_NS
                     progress(due_ns)
             _sleep_until(begin_ns + round((due_ns - first_ns) / rate))
-            restamp = stamps_now and stamped
+            restamp = stamps_now and has_stamp
             self._publishers[topic].publish(
                 _restamped(message, begin_system_ns, first_ns, rate) if restamp else message
             )

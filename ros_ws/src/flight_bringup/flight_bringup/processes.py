@@ -353,11 +353,11 @@ class FlightProcesses:
         processes = [
             process for process in self.processes if self.lockstep or process.node is not LEARNER
         ]
-        ended = [process for process in processes if process.popen.poll() is not None]
+        ended_processes = [process for process in processes if process.popen.poll() is not None]
         causes = {STATUS_LANDED: 0, STATUS_LOST_CONTACT: 2}
-        ended.sort(key=lambda process: causes.get(process.popen.returncode, 1))
-        if ended:
-            return _outcome(ended[0])
+        ended_processes.sort(key=lambda process: causes.get(process.popen.returncode, 1))
+        if ended_processes:
+            return _outcome(ended_processes[0])
         clock = self.monitor.clock_ended()
         return ended_early(clock) if clock else None
 

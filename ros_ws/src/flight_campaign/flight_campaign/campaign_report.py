@@ -45,7 +45,7 @@ from flight_campaign.statistics import (
     FIRST_MODEL,
     LOSS_OF_TRACK_SCORE,
     PER_DECADE,
-    Figure,
+    FigureStatistics,
     Tally,
 )
 from flight_core.files import display_path, write_file, writing
@@ -275,7 +275,7 @@ def overview(
     """Scores, lost aircraft and margins, a column for each case."""
     columns = []
     for tally, loop_margins in zip(tallies, margins, strict=True):
-        score = tally.figures.get("score", Figure())
+        score = tally.figures.get("score", FigureStatistics())
         lost = tally.lost + tally.diverged
         worst = "diverged" if tally.diverged else f"{score.largest:.3g}"
         columns.append(
@@ -448,7 +448,7 @@ def _spread(
     for place, name in enumerate(names):
         label_, factor = _label(name, units)
         for label, tally, colour in zip(labels, tallies, COLOURS * len(labels), strict=False):
-            x, y = _density(tally.figures.get(name, Figure()))
+            x, y = _density(tally.figures.get(name, FigureStatistics()))
             style: dict[str, Any] = {
                 "legendgroup": label,
                 "fill": "tozeroy",
@@ -462,7 +462,7 @@ def _spread(
     return set_layout(figure, below=44)
 
 
-def _density(figure: Figure) -> tuple[FloatArray, FloatArray]:
+def _density(figure: FigureStatistics) -> tuple[FloatArray, FloatArray]:
     """Centres of coarse bins and the share of the flights in each."""
     if not figure.count:
         return np.zeros(0), np.zeros(0)

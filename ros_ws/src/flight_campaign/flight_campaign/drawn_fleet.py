@@ -11,7 +11,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_campaign import equipment
 from flight_campaign.batch import batch, batch_matrices
 from flight_campaign.batch.batch_loop import Vehicle
-from flight_campaign.batch.batch_matrices import Fleet
+from flight_campaign.batch.batch_matrices import FleetMatrices
 from flight_campaign.batch.campaign_course import Course
 from flight_campaign.definition import Definition
 from flight_core.vectors import FloatArray
@@ -26,7 +26,7 @@ class DrawnFleet(NamedTuple):
     gust_directions: FloatArray  # (N, n, G), of `gust_directions`
     equipment: dict[str, FloatArray]  # by name, (N,) each
 
-    def on_device(self, course: Course, vehicle: Vehicle) -> tuple[Fleet, Vehicle]:
+    def on_device(self, course: Course, vehicle: Vehicle) -> tuple[FleetMatrices, Vehicle]:
         """The aircraft for the compiled loop, and the vehicle with their equipment."""
         delay = self.equipment.get(equipment.DELAY, np.zeros(1))
         fleet = batch_matrices.assemble(

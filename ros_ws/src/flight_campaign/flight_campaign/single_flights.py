@@ -81,14 +81,14 @@ def require_flyable(scenario: Scenario) -> None:
     )
 
 
-class Flight(NamedTuple):
+class SingleFlight(NamedTuple):
     """A flight of a campaign."""
 
     diverged: bool
     figures: dict[str, float]  # SI, by name
 
 
-def fly(scenario: Scenario, learner: MakeLearner | None = None) -> Flight:
+def fly(scenario: Scenario, learner: MakeLearner | None = None) -> SingleFlight:
     """Fly a scenario; the errors are the true ones at the ticks of the controller.
 
     Raises ParameterError.
@@ -104,7 +104,7 @@ def fly(scenario: Scenario, learner: MakeLearner | None = None) -> Flight:
     if scenario.learns():
         outcome = learned(tape, events)
         figures |= {name: float(value) for name, value in outcome._asdict().items()}
-    return Flight(diverged, figures)
+    return SingleFlight(diverged, figures)
 
 
 def _tracking_figures(tape: Tape, scenario: Scenario) -> dict[str, float]:

@@ -39,7 +39,7 @@ QUANTILES = (0.5, 0.95, 0.99)
 WORST_KEPT = 10  # number of worst flights in a tally
 
 
-class Figure(Config):
+class FigureStatistics(Config):
     """A figure over many flights. Sums have a fixed order: the same chunks give the same bits."""
 
     count: int = 0
@@ -115,7 +115,7 @@ class Tally(Config):
     diverged: int = 0
     lost: int = 0  # loss of track: did not diverge, score above LOSS_OF_TRACK_SCORE
     # "score", "rms.q", "max.q", "slew.elevator", of those that did not diverge
-    figures: dict[str, Figure] = Field(default={})
+    figures: dict[str, FigureStatistics] = Field(default={})
     worst: tuple[Worst, ...] = ()  # the worst first
 
     @classmethod
@@ -135,7 +135,7 @@ class Tally(Config):
             diverged=int((~bounded).sum()),
             lost=int(lost_track(diverged, score).sum()),
             figures={
-                name: Figure.from_values(np.asarray(values)[bounded])
+                name: FigureStatistics.from_values(np.asarray(values)[bounded])
                 for name, values in figures.items()
             },
             worst=tuple(
@@ -155,7 +155,8 @@ class Tally(Config):
             diverged=self.diverged + added.diverged,
             lost=self.lost + added.lost,
             figures={
-                name: self.figures.get(name, Figure()) + added.figures.get(name, Figure())
+                name: self.figures.get(name, FigureStatistics())
+                + added.figures.get(name, FigureStatistics())
                 for name in names
             },
             worst=tuple(worst[:WORST_KEPT]),

@@ -104,8 +104,8 @@ class Airframes:
     def _make(self, folder: Path) -> None:
         """Write airframe and scenario, and show the first flight."""
         sources = self.names or []
-        found = f"{len(sources)} sources"
-        require(len(sources) == 1, "airframes", found, "one beside --write")
+        sources_text = f"{len(sources)} sources"
+        require(len(sources) == 1, "airframes", sources_text, "one beside --write")
         lags = None if self.lag is None else parse_numbers(self.lag)
         require(lags is None or bool(lags), "lag", repr(self.lag), "seconds separated by commas")
         body = values_of(self, "mass", "Ixx", "Iyy", "Izz", "Ixz", "density", "length")
@@ -169,8 +169,8 @@ def _signs(facts: AirframeFacts) -> tuple[str, str, str]:
 
 def _assumptions(facts: AirframeFacts) -> tuple[str, str, str, str]:
     controllable = "yes" if facts.controllable else "no"
-    integrated = ", ".join(facts.integrated) or "-"
-    return f"{facts.n}, {facts.m}", controllable, facts.zero_dynamics, integrated
+    integrals = ", ".join(facts.integrated) or "-"
+    return f"{facts.n}, {facts.m}", controllable, facts.zero_dynamics, integrals
 
 
 def _roots(facts: AirframeFacts) -> tuple[str, str, str]:
@@ -180,14 +180,14 @@ def _roots(facts: AirframeFacts) -> tuple[str, str, str]:
 
 def _format_roots(roots: ComplexArray) -> str:
     """Roots as text: a conjugate pair once, a root that is zero to rounding as 0."""
-    shown = []
+    texts = []
     for root in roots:
         real, imaginary = (
             0.0 if abs(part) < 1e-6 else float(part) for part in (root.real, root.imag)
         )
         if imaginary >= 0.0:
-            shown.append(f"{real:.3g}" + (f"+-{imaginary:.3g}j" if imaginary else ""))
-    return "  ".join(shown) or "none"
+            texts.append(f"{real:.3g}" + (f"+-{imaginary:.3g}j" if imaginary else ""))
+    return "  ".join(texts) or "none"
 
 
 def _as_json(facts: AirframeFacts) -> dict[str, Any]:

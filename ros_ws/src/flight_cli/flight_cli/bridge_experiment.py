@@ -86,11 +86,11 @@ class BridgeExperiment:
         self._require_fit(channel_map)
         console = Console(quiet=as_json)
         run = self._excite(console, channel_map) if self.log is None else self.log
-        tape, spans, ended = _engaged(run, channel_map)
+        tape, spans, end_sentence = _engaged(run, channel_map)
         try:
             trims, response, channels = _identified(console, channel_map, tape, spans, self.speed)
         except ParameterError as error:
-            raise ParameterError(sentences(str(error), ended)) from None
+            raise ParameterError(sentences(str(error), end_sentence)) from None
         channels = self._with_link(console, channel_map, channels, imported=COMMANDS in tape)
         channel_map, narrower = within_range(channel_map, trims)
         for sentence in narrower:
@@ -98,21 +98,21 @@ class BridgeExperiment:
         flyable = self._flyable(channel_map, channels)
         written_map = map_text(channel_map, trims, run.resolve().name)  # the run, not `latest`
         files = {"airframe": flyable.airframe, "scenario": flyable.scenario, "map": written_map}
-        guided = guided_scenario(flyable.scenario, channel_map, self.speed)
-        if guided:
-            files["guided"] = guided
+        guidance_scenario = guided_scenario(flyable.scenario, channel_map, self.speed)
+        if guidance_scenario:
+            files["guided"] = guidance_scenario
         _write(self.folder, files)
         load_scenario(self.folder / "scenario.yaml")
-        if guided:
+        if guidance_scenario:
             load_scenario(self.folder / "guided.yaml")
         if as_json:
             print_json(_as_json(response, channels, flyable, trims, self.folder))
             return
         _show_gains(console, channels, response, flyable)
         scenario = shlex.quote(str(self.folder / "scenario.yaml"))
-        copied = shlex.quote(str(self.folder / "map.yaml"))
-        say(console, f"to fly it: rise-di fly {scenario} --bridge {copied} --send")
-        if guided:
+        map_copy = shlex.quote(str(self.folder / "map.yaml"))
+        say(console, f"to fly it: rise-di fly {scenario} --bridge {map_copy} --send")
+        if guidance_scenario:
             path = shlex.quote(str(self.folder / "guided.yaml"))
             say(console, f"under guidance: {path} in its place")
 
@@ -120,8 +120,8 @@ class BridgeExperiment:
         """Raise ParameterError for a mistake about the map, before anything flies."""
         expected = "above 0 and at most 1, a part of the limits of the map"
         require(0.0 < self.amplitude <= 1.0, "amplitude", self.amplitude, expected)
-        known = self.speed is not None or not has_airspeed(channel_map)
-        require(known, "--speed", "none", "the airspeed in trim, m/s: the map has one")
+        has_speed = self.speed is not None or not has_airspeed(channel_map)
+        require(has_speed, "--speed", "none", "the airspeed in trim, m/s: the map has one")
         fits = self.folder.is_dir() or not self.folder.exists()
         require(fits, "--write", self.folder, "a folder, or the name of a new one")
         if self.log is None:
@@ -131,19 +131,22 @@ class BridgeExperiment:
         """Fly the experiment; the folder of its run."""
         airframe = self.folder / "experiment_airframe.yaml"
         scenario = self.folder / "experiment.yaml"
-        planned = experiment(channel_map, self.speed, self.amplitude, str(airframe.resolve()))
-        _write(self.folder, {airframe.stem: planned.airframe, scenario.stem: planned.scenario})
-        chosen = load_scenario(scenario)
-        _announce(console, planned, chosen.flight.duration, hovers=self.speed is None)
-        run = new_run(chosen, Path("runs"))
-        with flight_progress(chosen.flight.duration, quiet=console.quiet) as (progress, announce):
+        plan = experiment(channel_map, self.speed, self.amplitude, str(airframe.resolve()))
+        _write(self.folder, {airframe.stem: plan.airframe, scenario.stem: plan.scenario})
+        flight_scenario = load_scenario(scenario)
+        _announce(console, plan, flight_scenario.flight.duration, hovers=self.speed is None)
+        run = new_run(flight_scenario, Path("runs"))
+        with flight_progress(flight_scenario.flight.duration, quiet=console.quiet) as (
+            progress,
+            announce,
+        ):
             outcome = fly_over_topics(
-                chosen,
+                flight_scenario,
                 run,
                 progress,
                 autopilot=find_autopilot(self.map_name, dry_run=False),
                 announce=announce,
-                engaged_for=planned.controller.duration,
+                engaged_for=plan.controller.duration,
             )
         link_latest(run)
         say(console, f"outcome: {outcome}\nlog:     {display_path(run)}")
@@ -214,8 +217,8 @@ def _identified(
     response = identify_response(
         tape["y"], tape["u"], pairing.outputs, pairing.inputs, engaged=spans
     )
-    engaged = sum(stop - start for start, stop in spans) / NANOSECONDS
-    _show_response(console, channel_map.name, response, trims, engaged)
+    engaged_time = sum(stop - start for start, stop in spans) / NANOSECONDS
+    _show_response(console, channel_map.name, response, trims, engaged_time)
     models = channel_models(channel_map, tape, spans, speed)
     _show_models(console, response, models)
     return trims, response, join(channel_map, response, models)
@@ -229,9 +232,9 @@ def _write(folder: Path, files: Mapping[str, str]) -> None:
             write_file(folder / f"{name}.yaml", content)
 
 
-def _announce(console: Console, planned: Experiment, duration: float, *, hovers: bool) -> None:
+def _announce(console: Console, plan: Experiment, duration: float, *, hovers: bool) -> None:
     """The whole experiment, before it begins."""
-    controller = planned.controller
+    controller = plan.controller
     table = new_table(
         f"Excitation, {controller.duration:.0f} s open loop after engagement, one input after "
         "another",
@@ -264,15 +267,17 @@ def _engaged(run: Path, channel_map: ChannelMap) -> tuple[Tape, list[tuple[int, 
     single span. Raises ParameterError for a log without an engagement, and for a flight under
     feedback: u follows y.
     """
-    recorded = read_run(run)
-    warn_of_lacks(recorded)
-    tape = recorded.tape
-    flown = recorded.engagements
+    recorded_run = read_run(run)
+    warn_of_lacks(recorded_run)
+    tape = recorded_run.tape
+    engagements = recorded_run.engagements
     if COMMANDS in tape:
-        require_map_of_import(channel_map, recorded)
-        recorded.require("y", "u")
+        require_map_of_import(channel_map, recorded_run)
+        recorded_run.require("y", "u")
         return tape, [(int(tape["u"].stamp_ns[0]), int(tape["u"].stamp_ns[-1]))], ""
-    parameters = None if recorded.scenario is None else recorded_parameters(recorded.scenario)
+    parameters = (
+        None if recorded_run.scenario is None else recorded_parameters(recorded_run.scenario)
+    )
     law = "not recorded" if parameters is None else parameters.law
     require(
         law == OPEN_LOOP,
@@ -282,18 +287,20 @@ def _engaged(run: Path, channel_map: ChannelMap) -> tuple[Tape, list[tuple[int, 
     )
     for topic in ("y", "u", "bridge/would_send"):
         require(topic in tape, str(run), f"no {topic}", "a log of a flight with a bridge")
-    if not flown:
+    if not engagements:
         raise ParameterError(
             f"{run}: found no engagement, expected a flight in which the bridge was engaged"
         )
     spans = [
         (engagement.start_ns, engagement.stop_ns or int(tape["u"].stamp_ns[-1]))
-        for engagement in flown
+        for engagement in engagements
     ]
     return (
         tape,
         spans,
-        cut_short(flown, parameters.duration) if isinstance(parameters, ExcitationConfig) else "",
+        cut_short(engagements, parameters.duration)
+        if isinstance(parameters, ExcitationConfig)
+        else "",
     )
 
 
@@ -306,12 +313,16 @@ def _digits(value: float, digits: int) -> str:
 
 
 def _show_response(
-    console: Console, name_of_map: str, response: Response, trims: dict[str, float], engaged: float
+    console: Console,
+    name_of_map: str,
+    response: Response,
+    trims: dict[str, float],
+    engaged_time: float,
 ) -> None:
     headings = ("input", "trim", "moves", "Omega", "+-", "lag", "+-", "delay", "+-")
     table = new_table(
         f"Response of the aircraft behind {name_of_map}, {response.seconds:.0f} s without gaps "
-        f"of {engaged:.0f} s engaged; SI, standard errors",
+        f"of {engaged_time:.0f} s engaged; SI, standard errors",
         headings,
         left_aligned=("input", "moves"),
     )

@@ -142,11 +142,13 @@ class Campaign:
             expected = "a file in a folder that exists"
             require(self.rows.parent.is_dir(), "rows", self.rows, expected)
         monte_carlo = self._continued() if Path(self.scenario).is_dir() else self._begun()
-        alone = flies_alone(monte_carlo.definition.scenario())
+        is_single = flies_alone(monte_carlo.definition.scenario())
         from flight_campaign.batch.device import device_name  # noqa: PLC0415 - JAX takes a second
 
-        place = "" if alone or self.scheduler is not None else f" on {device_name()}"
-        speed = _fly_missing(monte_carlo, self._engine(alone=alone), place, quiet=self.as_json)
+        place = "" if is_single or self.scheduler is not None else f" on {device_name()}"
+        speed = _fly_missing(
+            monte_carlo, self._engine(is_single=is_single), place, quiet=self.as_json
+        )
         figures, results = write_results(monte_carlo)
         if self.rows is not None:
             with writing("rows", self.rows, "the path of a file"):
@@ -173,16 +175,16 @@ class Campaign:
 
     def _begun(self) -> MonteCarlo:
         """A new campaign of the scenario."""
-        chosen = find_scenario(self.scenario, self.duration)
-        quick_learner(chosen)  # refuses what the aircraft could not learn with
-        spread = chosen.aircraft.uncertainty.spread()
+        scenario = find_scenario(self.scenario, self.duration)
+        quick_learner(scenario)  # refuses what the aircraft could not learn with
+        spread = scenario.aircraft.uncertainty.spread()
         if self.entry is not None:
             entries = _named_numbers("entry", self.entry, "A[q,alpha]=0.6")
             spread = spread._replace(entries=entries)
         if self.distribution is not None:
             spread = spread._replace(distribution=self.distribution)
         definition = define(
-            chosen,
+            scenario,
             self.aircraft,
             self.uncertainty,
             self.seed,
@@ -192,14 +194,14 @@ class Campaign:
             spread,
             None if self.score is None else _named_numbers("score", self.score, "q=0.02"),
         )
-        return MonteCarlo.begin(new_run(chosen, self.runs, "campaign-"), definition)
+        return MonteCarlo.begin(new_run(scenario, self.runs, "campaign-"), definition)
 
-    def _engine(self, *, alone: bool) -> engines.Engine:
+    def _engine(self, *, is_single: bool) -> engines.Engine:
         """The named engine, else dask for aircraft that fly one by one."""
-        named = self.engine or (EngineName.DASK if alone else EngineName.THREADS)
-        if named is EngineName.THREADS:
+        engine_name = self.engine or (EngineName.DASK if is_single else EngineName.THREADS)
+        if engine_name is EngineName.THREADS:
             return engines.threads(self.workers)
-        return engines.dask(self.workers, self.scheduler, on_devices=not alone)
+        return engines.dask(self.workers, self.scheduler, on_devices=not is_single)
 
 
 def _show_cases(
@@ -255,30 +257,32 @@ def _fly_missing(
     definition = monte_carlo.definition
     total = definition.aircraft * definition.cases
     missing = monte_carlo.missing()
-    stored = total - sum(definition.size(job) for job in missing)
+    stored_count = total - sum(definition.size(job) for job in missing)
     if not missing:
         return None
     seconds = definition.scenario().flight.duration
     begin = time.monotonic()
-    flown = 0
+    aircraft_count = 0
     try:
         with progress_bar(*COUNT_COLUMNS, SHOWN_COLUMN, quiet=quiet) as bar:
-            task = bar.add_task("aircraft", total=total, completed=stored, shown=f"starting{place}")
+            task = bar.add_task(
+                "aircraft", total=total, completed=stored_count, shown=f"starting{place}"
+            )
             for flights in monte_carlo.fly(engine, quick_learner):
-                flown += flights
-                speed = flown * seconds / (time.monotonic() - begin)
+                aircraft_count += flights
+                speed = aircraft_count * seconds / (time.monotonic() - begin)
                 bar.update(
                     task,
-                    completed=stored + flown,
+                    completed=stored_count + aircraft_count,
                     shown=f"{speed:,.0f} aircraft-seconds per second{place}",
                 )
     except KeyboardInterrupt:
         print(
-            f"interrupted after {stored + flown} of {total}; continue with:"
+            f"interrupted after {stored_count + aircraft_count} of {total}; continue with:"
             f" rise-di campaign {shlex.quote(display_path(monte_carlo.folder))}"
         )
         raise typer.Exit(INTERRUPTED) from None
-    return flown * seconds / (time.monotonic() - begin)
+    return aircraft_count * seconds / (time.monotonic() - begin)
 
 
 def _show(

@@ -76,31 +76,31 @@ class Check:
         topics = [(topic, kind) for _, topic, kind in channel_map.used_topics()]
         for fault in version_faults(row for row in topics if row[0].startswith("/fmu/")):
             warn(f"warning: {fault}")
-        chosen = find_scenario(self.scenario)
-        frame = load_airframe(self.airframe or chosen.aircraft.airframe)
+        scenario = find_scenario(self.scenario)
+        frame = load_airframe(self.airframe or scenario.aircraft.airframe)
         if self.run is not None:
             warn_of_lacks_in(self.run, self.namespace)
-        checked = check_scenario(channel_map, chosen, frame, self.run, self.namespace)
+        sign_check = check_scenario(channel_map, scenario, frame, self.run, self.namespace)
         if self.as_json:
             print_json(
                 {
                     "map": channel_map.name,
-                    "channels": [channel._asdict() for channel in checked.channels],
-                    "seconds": checked.seconds,
-                    "contradictions": list(checked.contradictions),
+                    "channels": [channel._asdict() for channel in sign_check.channels],
+                    "seconds": sign_check.seconds,
+                    "contradictions": list(sign_check.contradictions),
                 }
             )
         else:
-            _show(Console(), channel_map, checked, frame.name)
-        for sentence in checked.uncertain:
+            _show(Console(), channel_map, sign_check, frame.name)
+        for sentence in sign_check.uncertain:
             warn(f"not certain: {sentence}")
-        for sentence in checked.contradictions:
+        for sentence in sign_check.contradictions:
             warn(f"error: {sentence}")
-        if checked.contradictions:
+        if sign_check.contradictions:
             raise typer.Exit(CONTRADICTS)
 
 
-def _show(console: Console, channel_map: ChannelMap, checked: SignCheck, airframe: str) -> None:
+def _show(console: Console, channel_map: ChannelMap, sign_check: SignCheck, airframe: str) -> None:
     title = f"Map {channel_map.name}, airframe {airframe}: what a positive u does"
     headings = (
         "u",
@@ -109,10 +109,10 @@ def _show(console: Console, channel_map: ChannelMap, checked: SignCheck, airfram
         "effect",
         "D",
         "of law",
-        *(["recorded"] if checked.seconds else []),
+        *(["recorded"] if sign_check.seconds else []),
     )
     table = new_table(title, headings, left_aligned=("u", "moves", "seen in"))
-    for channel in checked.channels:
+    for channel in sign_check.channels:
         cells = [
             channel.input,
             motion_as_channel_grows(channel_map.inputs[channel.input]),
@@ -130,7 +130,7 @@ def _show(console: Console, channel_map: ChannelMap, checked: SignCheck, airfram
     print_table(console, table)
     headings = ("channel", "raw value", "topic")
     fields = new_table("", headings, left_aligned=headings)
-    for channel in checked.channels:
+    for channel in sign_check.channels:
         command = channel_map.inputs[channel.input]
         output = channel_map.outputs[channel.output]
         fields.add_row(
@@ -140,10 +140,10 @@ def _show(console: Console, channel_map: ChannelMap, checked: SignCheck, airfram
         )
         fields.add_row(f"y.{channel.output}", _format_field(output), output.topic)
     print_table(console, fields)
-    if checked.seconds:
+    if sign_check.seconds:
         say(
             console,
-            f"recorded: Omega_ii from {checked.seconds:.0f} s, in brackets the response in "
+            f"recorded: Omega_ii from {sign_check.seconds:.0f} s, in brackets the response in "
             f"standard errors; below {MIN_RATIO:g} the sign is not certain (?)",
             style="dim",
         )
@@ -207,8 +207,8 @@ def _show_rows(name: str, rows: Sequence[CheckedRow], releases: Sequence[str]) -
         table.add_row(key, *("no" if fault else "holds" for fault in by_release))
     Console().print(table)
     for k, release in enumerate(releases):
-        held = sum(not by_release[k] for by_release in faults.values())
-        print(f"{release}: {held} of {len(faults)} rows hold")
+        holding_count = sum(not by_release[k] for by_release in faults.values())
+        print(f"{release}: {holding_count} of {len(faults)} rows hold")
         for key, by_release in faults.items():
             if by_release[k]:
                 print(f"    {key}: {', '.join(by_release[k])}")

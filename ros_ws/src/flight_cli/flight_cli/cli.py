@@ -24,7 +24,7 @@ from typing import Annotated
 
 import typer
 
-from flight_cli.words import Command, as_function
+from flight_cli.words import RiseDiCommand, as_function
 
 FAILED = 1
 BAD_INPUT = 2
@@ -81,8 +81,8 @@ command; the module has _ after a keyword."""
 COMMANDS = MappingProxyType(dict(ChainMap(*GROUPS.values())))
 
 
-def _show_version(wanted: bool) -> None:
-    if wanted:
+def _show_version(is_set: bool) -> None:
+    if is_set:
         from importlib.metadata import version  # noqa: PLC0415 - --help does without
 
         print(f"rise-di {version('rise-di')}")
@@ -114,7 +114,7 @@ def application(words: Collection[str]) -> typer.Typer:
             if name in words:
                 command = as_function(resolve_name(f"flight_cli.{module}:{name.capitalize()}"))
             help_text = None if name in words else sentence
-            app.command(name, help=help_text, rich_help_panel=group, cls=Command)(command)
+            app.command(name, help=help_text, rich_help_panel=group, cls=RiseDiCommand)(command)
     return app
 
 

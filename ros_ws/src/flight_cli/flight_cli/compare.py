@@ -83,9 +83,9 @@ class Contest(NamedTuple):
 
     def untuned(self) -> list[tuple[str, str]]:
         """Laws and objectives for which the file has no gains."""
-        stored = tuned_gains.load(self.path)
+        tunings = tuned_gains.load(self.path)
         pairs = product(self.names, self.aims)
-        return [(name, aim) for name, aim in pairs if aim not in stored.get(name, {})]
+        return [(name, aim) for name, aim in pairs if aim not in tunings.get(name, {})]
 
     def tune(self, command: str, bar: Progress) -> None:
         """Tune laws for an objective per law. The file is written after every law."""
@@ -98,15 +98,15 @@ class Contest(NamedTuple):
                 generation: int,
                 least: float,
                 task: Any = task,
-                shown: str = f"tuning {name}, {aim}",
+                text: str = f"tuning {name}, {aim}",
             ) -> None:
-                bar.update(task, completed=generation, description=f"{shown}: cost {least:.3f}")
+                bar.update(task, completed=generation, description=f"{text}: cost {least:.3f}")
 
             objective = gain_tuning.OBJECTIVES[aim]
             result = gain_tuning.tune(law, objective, benchmark, SEEDS, progress=show_cost)
-            known = tuned_gains.load(self.path)
-            known.setdefault(name, {})[aim] = result
-            tuned_gains.save(self.path, known, list(gain_tuning.OBJECTIVES), command)
+            tunings = tuned_gains.load(self.path)
+            tunings.setdefault(name, {})[aim] = result
+            tuned_gains.save(self.path, tunings, list(gain_tuning.OBJECTIVES), command)
 
     def benchmark(self, *seed: int) -> Benchmark:
         """The winds and aircraft, with turbulence of a seed in place of the tuning's."""
@@ -118,11 +118,11 @@ class Contest(NamedTuple):
 
         Raises ParameterError without any.
         """
-        stored = tuned_gains.load(self.path)
+        tunings = tuned_gains.load(self.path)
         gains: Gains = {}
         for name in self.names:
-            known = stored.get(name, {})
-            gains[name] = {aim: known[aim] for aim in self.aims if aim in known}
+            law_tunings = tunings.get(name, {})
+            gains[name] = {aim: law_tunings[aim] for aim in self.aims if aim in law_tunings}
             if (controller := self.controllers[name]) is not None:
                 row = dict.fromkeys(self.aims, registered_laws.as_tuned(controller))
                 gains[name] = row | gains[name]
@@ -186,42 +186,42 @@ class Compare:
         if self.write is not None:
             _require_one_law(names, aims)
         contest = self._contest(names, aims)
-        tuned: Gains
+        gains: Gains
         with progress_bar(*COUNT_COLUMNS) as bar:
             if self.tune:
                 contest.tune(self._command(), bar)
-            tuned = contest.tuned()
+            gains = contest.tuned()
             benchmark = contest.benchmark(self.turbulence_seed)
-            task = bar.add_task("comparing", total=sum(len(by_aim) for by_aim in tuned.values()))
+            task = bar.add_task("comparing", total=sum(len(by_aim) for by_aim in gains.values()))
             results = []
             for result in law_comparison.compare(
-                benchmark, tuned, self.aircraft, levels, self.seed, laws=contest.entries
+                benchmark, gains, self.aircraft, levels, self.seed, laws=contest.entries
             ):
                 results.append(result)
                 bar.advance(task)
         console = Console()
-        self._show(console, contest, results, benchmark, tuned)
+        self._show(console, contest, results, benchmark, gains)
         if self.write is not None:
             law, aim = contest.names[0], aims[0]
-            _write(self.write, law, aim, tuned[law][aim], benchmark)
+            _write(self.write, law, aim, gains[law][aim], benchmark)
             console.print(f"controller: {display_path(self.write)}")
         if self.to_json is not None:
             write_text("--json", self.to_json, self._as_json(contest, results))
 
     def _contest(self, names: Sequence[str], aims: Sequence[str]) -> Contest:
         """The laws; laws of scenario files by the name of the file."""
-        chosen = find_scenario(self.scenario)
+        scenario = find_scenario(self.scenario)
         if self.wind is not None:
-            uncertainty = chosen.aircraft.uncertainty.model_dump() | {"wind": self.wind}
-            chosen = chosen.vary(aircraft={"uncertainty": uncertainty})
+            uncertainty = scenario.aircraft.uncertainty.model_dump() | {"wind": self.wind}
+            scenario = scenario.vary(aircraft={"uncertainty": uncertainty})
         files = {Path(name).stem: name for name in names if name.endswith(".yaml")}
         others = {stem: find_scenario(file) for stem, file in files.items()}
         laws = [Path(name).stem if name.endswith(".yaml") else name for name in names]
-        controllers = registered_laws.find_laws(laws, chosen, others)
+        controllers = registered_laws.find_laws(laws, scenario, others)
         entries = registered_laws.entries(controllers)
-        path = self.gains or tuned_gains.tuned_file(chosen)
+        path = self.gains or tuned_gains.tuned_file(scenario)
         return Contest(
-            scenario=chosen,
+            scenario=scenario,
             names=laws,
             aims=aims,
             controllers=controllers,
@@ -240,15 +240,15 @@ class Compare:
         contest: Contest,
         results: Sequence[LawResult],
         benchmark: Benchmark,
-        tuned: Gains,
+        gains: Gains,
     ) -> None:
         """Print a table an objective, and what the words mean."""
         scenario = contest.scenario
         for aim in contest.aims:
-            if shown := [result for result in results if result.objective == aim]:
+            if results_of_aim := [result for result in results if result.objective == aim]:
                 title = gain_tuning.OBJECTIVES[aim].title
-                print_table(console, _table(title, shown, contest.entries, scenario))
-        laws = {name: contest.entries[name] for name in tuned if tuned[name]}
+                print_table(console, _table(title, results_of_aim, contest.entries, scenario))
+        laws = {name: contest.entries[name] for name in gains if gains[name]}
         effect = WIND_EFFECTS[scenario.aircraft.uncertainty.wind]
         say(
             console,
@@ -343,12 +343,12 @@ def _table(
     )
     for result in results:
         law = entries[result.law]
-        lost = (result.levels[0].scores[gain_tuning.GUST].lost, *result.lost_late.values())
+        losses = (result.levels[0].scores[gain_tuning.GUST].lost, *result.lost_late.values())
         slew = zip(scenario.controller.inputs, result.slew.tolist(), strict=True)
         table.add_row(
             *(result.law, law.measurements, law.model_data),
             *law_comparison.score_cells(result),
-            "/".join(f"{100.0 * share:.3g}" for share in lost),
+            "/".join(f"{100.0 * share:.3g}" for share in losses),
             join_names(f"{value * units[name].factor:.0f}" for name, value in slew),
             "none" if result.margins is None else _format_margins(result.margins),
             f"{min(result.costs):.2f} +{max(result.costs) - min(result.costs):.2f}"

@@ -86,19 +86,19 @@ class Export:
     def execute(self) -> None:
         """Write the code, prove it, show the proof."""
         folders = {None: self.folder, "px4": self.px4, "ardupilot": self.ardupilot}
-        chosen = {autopilot: path for autopilot, path in folders.items() if path is not None}
-        if len(chosen) != 1:
+        folder_of = {autopilot: path for autopilot, path in folders.items() if path is not None}
+        if len(folder_of) != 1:
             raise typer.BadParameter("expected --c FOLDER, --px4 FOLDER or --ardupilot FOLDER")
-        ((autopilot, target),) = chosen.items()
-        recorded = None if self.run is None else read_run(self.run)
-        if recorded is not None:
-            warn_of_lacks(recorded)
+        ((autopilot, target),) = folder_of.items()
+        recorded_run = None if self.run is None else read_run(self.run)
+        if recorded_run is not None:
+            warn_of_lacks(recorded_run)
         with Console(stderr=True, quiet=self.as_json).status("flying and comparing"):
             exported = write_export(
                 self.scenario,
                 target,
                 **values_of(self, *PROOF, "float32", "samples", "rate", "fmu"),
-                run=recorded,
+                run=recorded_run,
                 compiler=self.compiler or (),
                 autopilot=autopilot,
                 proof=not self.without_proof,

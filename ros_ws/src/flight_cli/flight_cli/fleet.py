@@ -17,7 +17,7 @@ from flight_analysis.report.run_folder import (
     write_report,
 )
 from flight_analysis.report.summary import taken_over
-from flight_bringup.fleet import Fleet, Flown, fly_fleet, read_fleet
+from flight_bringup.fleet import Fleet, MemberFlight, fly_fleet, read_fleet
 from flight_cli.output import CLOCK_COLUMNS, NAME_COLUMN, clock, new_table, print_json, progress_bar
 from flight_cli.words import warn
 from flight_core.environment import require_ros_environment
@@ -35,39 +35,39 @@ def open_fleet(file: str, duration: float | None, *, use_sim_time: bool) -> Flee
     return read_fleet(file, duration, use_sim_time=use_sim_time)
 
 
-def fly_fleet_file(chosen: Fleet, runs: Sequence[Path], *, as_json: bool) -> int:
+def fly_fleet_file(fleet: Fleet, runs: Sequence[Path], *, as_json: bool) -> int:
     """Fly a fleet: every aircraft in a namespace, with nodes, a log and a report.
 
     Returns the severest exit status.
     """
-    totals = {member.name: member.scenario.flight.duration for member in chosen.members}
+    totals = {member.name: member.scenario.flight.duration for member in fleet.members}
     with progress_bar(NAME_COLUMN, *CLOCK_COLUMNS, quiet=as_json) as bar:
         tasks = {
             name: bar.add_task(name, total=total, clock="", shown="")
             for name, total in totals.items()
         }
 
-        def progress(name: str, t: float, shown: str) -> None:
-            bar.update(tasks[name], completed=t, clock=clock(t, totals[name]), shown=shown)
+        def progress(name: str, t: float, text: str) -> None:
+            bar.update(tasks[name], completed=t, clock=clock(t, totals[name]), shown=text)
 
-        flown = fly_fleet(chosen, runs, progress)
-        for each in flown:
+        flights = fly_fleet(fleet, runs, progress)
+        for each in flights:
             bar.update(tasks[each.member.name], shown=f"{each.outcome}, report to write")
-        reported: dict[str, _Result] = {}
+        reported: dict[str, _AircraftResult] = {}
         with suppress(KeyboardInterrupt):
-            for each in flown:
+            for each in flights:
                 reported[each.member.name] = _report(each)
-    results = {each.member.name: _unreported(each) for each in flown} | reported
+    results = {each.member.name: _unreported(each) for each in flights} | reported
     if as_json:
         print_json({name: result.summary for name, result in results.items()})
     else:
-        _show(chosen.name, flown, results)
+        _show(fleet.name, flights, results)
     statuses: list[int] = [result.summary["outcome"]["status"] for result in reported.values()]
-    statuses += [STATUS_INTERRUPTED] if len(reported) < len(flown) else []
+    statuses += [STATUS_INTERRUPTED] if len(reported) < len(flights) else []
     return max(statuses, key=SEVEREST.index)
 
 
-class _Result(NamedTuple):
+class _AircraftResult(NamedTuple):
     """The summary of an aircraft, and the fraction of its ticks with the controller ENGAGED.
 
     None without ticks.
@@ -77,14 +77,16 @@ class _Result(NamedTuple):
     engaged: float | None
 
 
-def _unreported(flown: Flown) -> _Result:
+def _unreported(flight: MemberFlight) -> _AircraftResult:
     """What is known of an aircraft before its report is written."""
-    outcome = flown.outcome.as_json()
-    outcome["sentence"] = f"{flown.outcome}, no report: rise-di report writes it"
-    return _Result({"outcome": outcome, "duration": None, "ticks": None, "account": None}, None)
+    outcome = flight.outcome.as_json()
+    outcome["sentence"] = f"{flight.outcome}, no report: rise-di report writes it"
+    return _AircraftResult(
+        {"outcome": outcome, "duration": None, "ticks": None, "account": None}, None
+    )
 
 
-def _report(flown: Flown) -> _Result:
+def _report(flown: MemberFlight) -> _AircraftResult:
     """Write the report of an aircraft."""
     try:
         flight = write_report(flown.run, flown.outcome).flight
@@ -98,27 +100,31 @@ def _report(flown: Flown) -> _Result:
         except ParameterError as unwritten:
             warn(f"error: {flown.member.name}: no summary: {unwritten}")
             return _unreported(replace(flown, outcome=outcome))
-        return _Result(summary, None)
+        return _AircraftResult(summary, None)
     internals = flight.tape.signals.get("internals")
-    return _Result(
+    return _AircraftResult(
         flight.summary,
         None if internals is None else float(np.mean(internals["mode"] == Mode.ENGAGED)),
     )
 
 
-def _show(name: str, flown: Sequence[Flown], results: Mapping[str, _Result]) -> None:
+def _show(
+    name: str, flights: Sequence[MemberFlight], results: Mapping[str, _AircraftResult]
+) -> None:
     """Print a line an aircraft, the folders of the runs, and what a busy host withheld."""
     headings = ("aircraft", "flown (s)", "ticks", "engaged", "outcome")
     table = new_table(f"Fleet {name}", headings, ("aircraft", "outcome"), ("outcome",))
     lines = []
-    for each in flown:
-        summary, engaged = results[each.member.name]
+    for each in flights:
+        summary, engaged_share = results[each.member.name]
         ticks = summary["ticks"]
         table.add_row(
             each.member.name,
             "-" if summary["duration"] is None else f"{summary['duration']:.1f}",
             "-" if ticks is None else str(ticks["ticks"]),
-            "-" if engaged is None else f"{100.0 * engaged:.4g} %{taken_over(summary, 'ticks')}",
+            "-"
+            if engaged_share is None
+            else f"{100.0 * engaged_share:.4g} %{taken_over(summary, 'ticks')}",
             summary["outcome"]["sentence"],
         )
         lines.append(f"{each.member.name}: {display_path(each.run)}")

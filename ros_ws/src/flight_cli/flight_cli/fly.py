@@ -117,26 +117,26 @@ class Fly(RouteWords):
             expected = "a scenario, or the key in the file of the fleet"
             require_unused(self, OF_AIRCRAFT, expected, "it beside a fleet")
             self._fly_fleet()
-        chosen = self._scenario()
+        scenario = self._scenario()
         namespace = absolute_namespace(self.namespace)
-        stepping = self.lockstep or chosen.flight.lockstep
+        stepping = self.lockstep or scenario.flight.lockstep
         autopilot = self._autopilot(stepping=stepping)
-        _require_flyable(chosen, autopilot, in_process=self.in_process)
+        _require_flyable(scenario, autopilot, in_process=self.in_process)
         if autopilot is None:
-            for sentence in limits_beyond_stops(chosen) + opposite_signs(chosen):
+            for sentence in limits_beyond_stops(scenario) + opposite_signs(scenario):
                 warn(f"warning: {sentence}")
-        learn = _learner(chosen)
-        run = new_run(chosen, self.runs)
+        learn = _learner(scenario)
+        run = new_run(scenario, self.runs)
         self.context.call_on_close(partial(remove_empty, run))
         if self.route or self.fence or self.settings or self.learn:
-            chosen = save_scenario(chosen, run / f"{chosen.name}.yaml")
+            scenario = save_scenario(scenario, run / f"{scenario.name}.yaml")
         self._watch(run)
-        with flight_progress(chosen.flight.duration, quiet=self.as_json) as (progress, announce):
+        with flight_progress(scenario.flight.duration, quiet=self.as_json) as (progress, announce):
             if self.in_process:
-                outcome = fly_in_process(chosen, run, progress, learn, announce)
+                outcome = fly_in_process(scenario, run, progress, learn, announce)
             else:
                 outcome = fly_over_topics(
-                    chosen,
+                    scenario,
                     run,
                     progress,
                     lockstep=stepping,
@@ -147,24 +147,26 @@ class Fly(RouteWords):
                     announce=announce,
                 )
             if outcome.end is End.COMPLETED:
-                progress(chosen.flight.duration, str(outcome))
-        raise typer.Exit(_report(chosen, run, outcome, as_json=self.as_json))
+                progress(scenario.flight.duration, str(outcome))
+        raise typer.Exit(_report(scenario, run, outcome, as_json=self.as_json))
 
     def _scenario(self) -> Scenario:
         """The scenario with settings, route and fence.
 
         Raises ParameterError for contradictory words.
         """
-        found = find_scenario(self.scenario, self.duration, with_route=self.route is None)
-        chosen = with_settings(found, self.settings)
-        self._require_one_way(stepping=self.lockstep or chosen.flight.lockstep)
+        library_scenario = find_scenario(
+            self.scenario, self.duration, with_route=self.route is None
+        )
+        scenario = with_settings(library_scenario, self.settings)
+        self._require_one_way(stepping=self.lockstep or scenario.flight.lockstep)
         files = self.route or self.fence
-        chosen = _that_learns(chosen) if self.learn else chosen
+        scenario = _that_learns(scenario) if self.learn else scenario
         needs = {"origin": files, "altitude": files, "simplify": self.route, "line": self.route}
         for name, file in needs.items():
             unset = file is not None or getattr(self, name) in (None, 0.0)
             require(unset, f"--{name}", "no --route", "the file of a route: --route FILE")
-        return chosen if files is None else self._with_files(chosen)
+        return scenario if files is None else self._with_files(scenario)
 
     def _require_one_way(self, *, stepping: bool) -> None:
         """Raise ParameterError for two ways to fly at once."""
@@ -172,11 +174,13 @@ class Fly(RouteWords):
         ways = not (self.in_process and (self.lockstep or self.composed))
         require(ways, "in_process", over_topics, "one of the two")
         has_nodes = "a flight over topics, which has nodes"
-        named = self.in_process and self.namespace
-        require(not named, "--namespace", "a flight in one process", has_nodes)
-        timed = self.use_sim_time and (self.in_process or stepping)
-        found = "a flight in lockstep or in one process"
-        require(not timed, "use_sim_time", found, "a flight in real time over topics")
+        has_namespace = self.in_process and self.namespace
+        require(not has_namespace, "--namespace", "a flight in one process", has_nodes)
+        has_own_time = self.use_sim_time and (self.in_process or stepping)
+        contradiction = "a flight in lockstep or in one process"
+        require(
+            not has_own_time, "use_sim_time", contradiction, "a flight in real time over topics"
+        )
 
     def _autopilot(self, *, stepping: bool) -> Autopilot | None:
         """The autopilot in the aircraft's place. Raises ParameterError where none can fly."""
@@ -201,8 +205,8 @@ class Fly(RouteWords):
         if self.fence is not None:
             origin = parse_origin(self.origin)
             sections = read_fence_file(self.fence, origin, self.altitude, above_sea=above_sea)
-        guided = not sections or scenario.guidance is not None
-        require(guided, "--fence", "a scenario without guidance", "one with guidance")
+        can_have_route = not sections or scenario.guidance is not None
+        require(can_have_route, "--fence", "a scenario without guidance", "one with guidance")
         if home := sections.get("home"):
             ground = "" if above_sea or home.get("altitude", 1.0) > 0.0 else ": the ground"
             warn(f"note: home by the fence file: {home}{ground}")

@@ -91,7 +91,7 @@ SELECTION = (
 """Fields of a loop, of a check, and of a selection."""
 
 
-class _Result(NamedTuple):
+class _GainsAnswer(NamedTuple):
     """Gain sets by name with their conditions: of a check, or of a `selection`."""
 
     answers: dict[str, Assessment]
@@ -220,7 +220,7 @@ class Gains:
             "--write beside it, without --observer",
         )
         require_guarantee(
-            check=self.check, guaranteed=self.guaranteed, worst=self.worst, late=self.late
+            check=self.check, is_wanted=self.guaranteed, worst=self.worst, late=self.late
         )
         rate, delay, origin = _loop_of_px4(self.px4, self.rate, self.delay)
         result = replace(self, rate=rate, delay=delay)._result()
@@ -234,31 +234,33 @@ class Gains:
         if unproved or (self.check and failing(result.last.loop)):
             raise typer.Exit(CONDITION_FAILS)
 
-    def _result(self) -> _Result:
+    def _result(self) -> _GainsAnswer:
         """The gain sets with all conditions; selected ones are written."""
         with Console(quiet=self.as_json).status("selecting gains on uncertain airframes") as status:
             if self.check:
                 return self._checked(status.update)
             return self._selected(status.update)
 
-    def _checked(self, progress: Callable[[str], None]) -> _Result:
+    def _checked(self, progress: Callable[[str], None]) -> _GainsAnswer:
         """The gains of the scenario."""
-        beside = "one of them: --check selects nothing to write"
-        require_unused(self, ("write", "feedforward", "observer"), beside, "it beside --check")
+        contradiction = "one of them: --check selects nothing to write"
+        require_unused(
+            self, ("write", "feedforward", "observer"), contradiction, "it beside --check"
+        )
         own_loop = all(value is None for value in values_of(self, *LOOP).values())
         expected = "the scenario's own rate, lag, delay and inputs"
         require(own_loop, "--check", "it beside another loop", expected)
         answer = check_gains(self.airframe, self.scenario, **values_of(self, *STUDY))
         if not self.guaranteed:
-            return _Result({"scenario": answer})
+            return _GainsAnswer({"scenario": answer})
         progress("bounding every aircraft of the box")
         loop = answer.loop_with_box()
         promise = guarantee(loop, self.late)
         keep(loop, promise)
         write_unstable(self.worst, promise, self.airframe, self.scenario)
-        return _Result({"scenario": answer}, promise=promise)
+        return _GainsAnswer({"scenario": answer}, promise=promise)
 
-    def _selected(self, progress: Callable[[str], None]) -> _Result:
+    def _selected(self, progress: Callable[[str], None]) -> _GainsAnswer:
         """Gains by Theorem 1 and by the procedure, or those beside an observer."""
         selection = select_gains(
             self.airframe,
@@ -275,11 +277,11 @@ class Gains:
             text = LICENCE + gain_yaml.selection_yaml(selection, theorem=self.theorem)
             write_text("--write", self.write, text)
         if self.observer:
-            return _Result({"observer": selection.engineering}, selection)
+            return _GainsAnswer({"observer": selection.engineering}, selection)
         answers = {"theorem": selection.theorem, "engineering": selection.engineering}
-        return _Result(answers, selection)
+        return _GainsAnswer(answers, selection)
 
-    def _show(self, console: Console, result: _Result, origin: str) -> None:
+    def _show(self, console: Console, result: _GainsAnswer, origin: str) -> None:
         """Print tables, the trade of a selection, origins and the paths of the files."""
         selection = result.selection
         _show_conditions(console, result.study, result.answers)
@@ -317,9 +319,9 @@ def _write_page(path: Path, answer: Assessment) -> None:
 
 def _require_margins(selection: Selection, *, theorem: bool) -> None:
     """Raises ParameterError for gains whose margins fall short of the requirement."""
-    assessed = selection.theorem if theorem else selection.engineering
-    short = "; ".join(row.sentence(assessed.controller.outputs) for row in assessed.unmet)
-    if short and not theorem and assessed.controller.observer is None:
+    assessment = selection.theorem if theorem else selection.engineering
+    short = "; ".join(row.sentence(assessment.controller.outputs) for row in assessment.unmet)
+    if short and not theorem and assessment.controller.observer is None:
         short = lacking(selection, options=("lag", "delay", "rate"))
     if short:
         raise ParameterError(f"--write: {short}; --accept writes them all the same")
@@ -333,8 +335,8 @@ def _show_trade(console: Console, selection: Selection) -> None:
     output_units = frame.units_of_outputs()
     shown = [display_unit(output_units[name]) for name in outputs]
     # no score of a height
-    counted = all(quantity(unit).dimension in SCORE_UNIT for unit in output_units.values())
-    units = score_units(outputs, output_units) if counted else np.full(len(outputs), np.nan)
+    have_scores = all(quantity(unit).dimension in SCORE_UNIT for unit in output_units.values())
+    units = score_units(outputs, output_units) if have_scores else np.full(len(outputs), np.nan)
     headings = (f"{name},\n{unit.unit}" for name, unit in zip(outputs, shown, strict=True))
     heads = ["phase margin,\ndeg", "least\nfound", "delay\nmargin", *headings, "score"]
     table = new_table(
@@ -471,10 +473,10 @@ def _format_delay_margin(study: Study, answer: Assessment) -> str:
     if answer.delay_margin == 0.0:
         return "predicted delay margin none: the linear loop is unstable with this lag"
     each = zip(answer.controller.outputs, answer.channel_margins, strict=True)
-    alone = ", ".join(f"{output} {_milliseconds(margin)}" for output, margin in each)
+    single_margins = ", ".join(f"{output} {_milliseconds(margin)}" for output, margin in each)
     margin = (
         f"predicted delay margin {_milliseconds(answer.delay_margin)}; in one channel "
-        f"alone: {alone}"
+        f"alone: {single_margins}"
     )
     return f"{margin}; {speed_of_margin(study, answer)}"
 
@@ -513,7 +515,7 @@ def _cells(condition: GainCondition) -> tuple[str, str]:
     )
 
 
-def _as_json(result: _Result, seed: int) -> dict[str, Any]:
+def _as_json(result: _GainsAnswer, seed: int) -> dict[str, Any]:
     study = result.study
     promise = result.promise
     inputs = list(study.airframe.inputs)

@@ -24,11 +24,11 @@ from flight_core.parameters import require
 FORMS = (".3f", ".1f", ".1f", ".3f")  # of the columns of a guarantee
 
 
-def require_guarantee(*, check: bool, guaranteed: bool, worst: Path | None, late: float) -> None:
+def require_guarantee(*, check: bool, is_wanted: bool, worst: Path | None, late: float) -> None:
     """Raise ParameterError for a guarantee without --check, or its settings without a guarantee."""
-    require(check or not guaranteed, "--guarantee", "it alone", "--check beside it")
-    require(guaranteed or worst is None, "worst", "it alone", "--guarantee beside it")
-    require(guaranteed or late == 0.0, "late", "it alone", "--guarantee beside it")
+    require(check or not is_wanted, "--guarantee", "it alone", "--check beside it")
+    require(is_wanted or worst is None, "worst", "it alone", "--guarantee beside it")
+    require(is_wanted or late == 0.0, "late", "it alone", "--guarantee beside it")
     as_number(late, "late", 0.0, MAX_DELAY_MARGIN, "s")
 
 
@@ -39,20 +39,18 @@ def write_unstable(folder: Path | None, promise: Guarantee, airframe: str, scena
     """
     if folder is None:
         return
-    chosen = find_scenario(scenario)
+    base = find_scenario(scenario)
     frame = load_airframe(airframe)
     require(promise.unstable is not None, "worst", "no unstable aircraft", "a loop that has one")
-    fits = (
-        not chosen.aircraft.is_jsbsim and load_airframe(chosen.aircraft.airframe).name == frame.name
-    )
-    require(fits, "worst", airframe, f"the aircraft of {chosen.name}, {chosen.aircraft.airframe}")
+    fits = not base.aircraft.is_jsbsim and load_airframe(base.aircraft.airframe).name == frame.name
+    require(fits, "worst", airframe, f"the aircraft of {base.name}, {base.aircraft.airframe}")
     assert promise.unstable is not None  # noqa: S101 - for mypy
     with writing("--worst", folder, "a folder that can"):
         folder.mkdir(parents=True, exist_ok=True)
     path = folder / "airframe.yaml"
     write_text("worst", path, LICENCE + as_yaml(with_entries(frame, promise.unstable.entries)))
-    flown = chosen.vary(aircraft={"airframe": str(path.absolute())})
-    write_text("worst", folder / "scenario.yaml", scenario_yaml(flown))
+    unstable_scenario = base.vary(aircraft={"airframe": str(path.absolute())})
+    write_text("worst", folder / "scenario.yaml", scenario_yaml(unstable_scenario))
 
 
 def show_guarantee(

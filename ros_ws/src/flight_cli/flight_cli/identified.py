@@ -19,15 +19,15 @@ from flight_design.identification.jsbsim_identification import IdentifiedAircraf
 LINEAR = 0.8
 
 
-def show_identified(console: Console, identified: IdentifiedAircraft) -> None:
+def show_identified(console: Console, aircraft: IdentifiedAircraft) -> None:
     """Print the trim, the effects, the gains and the flights of an aircraft."""
-    linear = identified.linear
+    linear = aircraft.linear
     trim = linear.trim
     states = dict(zip(STATES, trim.states, strict=True))
     degrees = {name: states[name] / si_per_unit("deg") for name in ("alpha", "beta", "phi")}
     say(
         console,
-        f"{identified.condition.title} in trim: V {states['V']:.4g} m/s, altitude "
+        f"{aircraft.condition.title} in trim: V {states['V']:.4g} m/s, altitude "
         f"{states['altitude']:.5g} m, "
         + ", ".join(f"{name} {value:.3g} deg" for name, value in degrees.items())
         + f"; largest residual acceleration {np.max(np.abs(trim.residuals[:3])):.1g} m/s^2,"
@@ -39,14 +39,14 @@ def show_identified(console: Console, identified: IdentifiedAircraft) -> None:
     columns = (
         "input",
         "steps of",
-        *(f"{name}_dot" for name in identified.condition.paired_outputs()),
+        *(f"{name}_dot" for name in aircraft.condition.paired_outputs()),
         "lag, s",
         "D",
     )
     responses = new_table(
         "\nEffects: Omega = C B per unit of a command, rad/s^2 and m/s^2", columns
     )
-    inputs = identified.condition.inputs()
+    inputs = aircraft.condition.inputs()
     for j, name in enumerate(inputs):
         stops.add_row(
             name,
@@ -54,7 +54,7 @@ def show_identified(console: Console, identified: IdentifiedAircraft) -> None:
         )
         column = [f"{value:.3g}" if abs(value) > 1e-3 else "0" for value in linear.Omega[:, j]]
         responses.add_row(
-            name, f"{linear.size[j]:.3g}", *column, f"{linear.lag[j]:.3f}", f"{identified.D[j]:+d}"
+            name, f"{linear.size[j]:.3g}", *column, f"{linear.lag[j]:.3f}", f"{aircraft.D[j]:+d}"
         )
     console.print(stops)
     console.print(responses)
@@ -67,13 +67,13 @@ def show_identified(console: Console, identified: IdentifiedAircraft) -> None:
     for sentence in linear.still:
         say(console, f"without effect: {sentence}")
 
-    _show_gains(console, identified)
-    _show_flights(console, identified)
+    _show_gains(console, aircraft)
+    _show_flights(console, aircraft)
 
 
-def _show_gains(console: Console, identified: IdentifiedAircraft) -> None:
-    Omega = identified.linear.Omega
-    answer = identified.selection.engineering
+def _show_gains(console: Console, aircraft: IdentifiedAircraft) -> None:
+    Omega = aircraft.linear.Omega
+    answer = aircraft.selection.engineering
     controller = answer.controller
     params = answer.controller.law_params()
     headings = ("channel", "bandwidth", "Lambda", "beta", "lag, s")
@@ -90,29 +90,29 @@ def _show_gains(console: Console, identified: IdentifiedAircraft) -> None:
         "" if answer.delay_margin is None else f"; delay margin {1e3 * answer.delay_margin:.0f} ms"
     )
     if answer.delay_margin:
-        margin += f", {speed_of_margin(identified.selection.study, answer)}"
-    held = "p and r"
+        margin += f", {speed_of_margin(aircraft.selection.study, answer)}"
+    outputs = "p and r"
     mend = "the sideslip feedback of --guidance flies it"
     if "r" not in controller.outputs:
-        held = "p"
+        outputs = "p"
         mend = "without a rudder no feedback holds it"
-    if identified.sideslip_zero > 0.0:
+    if aircraft.sideslip_zero > 0.0:
         say(
             console,
-            f"with {held} constant, sideslip grows at {identified.sideslip_zero:.2g} 1/s: a zero "
+            f"with {outputs} constant, sideslip grows at {aircraft.sideslip_zero:.2g} 1/s: a zero "
             f"in the right half plane, outside the theorem; {mend}",
         )
     sign = controller.sampled_sign()[0].name.lower()
-    say(console, f"coupling max abs(U - I) = {identified.coupling:.2g}; {sign} sign{margin}")
+    say(console, f"coupling max abs(U - I) = {aircraft.coupling:.2g}; {sign} sign{margin}")
 
 
-def _show_flights(console: Console, identified: IdentifiedAircraft) -> None:
-    condition = identified.condition
+def _show_flights(console: Console, aircraft: IdentifiedAircraft) -> None:
+    condition = aircraft.condition
     units = {name: display_unit(OUTPUTS[name]) for name in condition.paired_outputs()}
     headings = [f"{name}\n{unit.unit}" for name, unit in units.items()]
-    alone = ", with the gains alone" if identified.scenario().rise_di().learn is not None else ""
+    qualifier = ", with the gains alone" if aircraft.scenario().rise_di().learn is not None else ""
     flights = new_table(
-        f"\nFlights of 60 s in one process{alone}: rms of the error",
+        f"\nFlights of 60 s in one process{qualifier}: rms of the error",
         ["flight", *headings, "outcome"],
         ("flight", "outcome"),
         ("outcome",),
@@ -120,7 +120,7 @@ def _show_flights(console: Console, identified: IdentifiedAircraft) -> None:
     largest = new_table(
         "\nLargest deviation of a command from trim", ["flight", *condition.inputs()]
     )
-    for title, flight in identified.flights.items():
+    for title, flight in aircraft.flights.items():
         errors = [f"{flight.rms[name] * unit.factor:.3g}" for name, unit in units.items()]
         flights.add_row(title, *errors, flight.text)
         largest.add_row(title, *(f"{flight.largest[name]:.2g}" for name in condition.inputs()))
@@ -128,11 +128,11 @@ def _show_flights(console: Console, identified: IdentifiedAircraft) -> None:
     console.print(largest)
 
 
-def identified_as_json(identified: IdentifiedAircraft, path: Path) -> dict[str, Any]:
+def identified_as_json(aircraft: IdentifiedAircraft, path: Path) -> dict[str, Any]:
     """What the identification gave, SI."""
-    linear = identified.linear
+    linear = aircraft.linear
     trim = linear.trim
-    outputs = identified.condition.paired_outputs()
+    outputs = aircraft.condition.paired_outputs()
     by_input = {
         name: {
             "trim": float(trim.commands[j]),
@@ -142,23 +142,23 @@ def identified_as_json(identified: IdentifiedAircraft, path: Path) -> dict[str, 
             "spread": float(linear.spread[j]),
             "Omega": dict(zip(outputs, linear.Omega[:, j].tolist(), strict=True)),
             "lag": float(linear.lag[j]),
-            "D": identified.D[j],
+            "D": aircraft.D[j],
         }
-        for j, name in enumerate(identified.condition.inputs())
+        for j, name in enumerate(aircraft.condition.inputs())
     }
     return {
-        "airframe": identified.condition.title,
-        "speed": identified.condition.speed,
-        "altitude": identified.condition.altitude,
+        "airframe": aircraft.condition.title,
+        "speed": aircraft.condition.speed,
+        "altitude": aircraft.condition.altitude,
         "trim": dict(zip(STATES, trim.states.tolist(), strict=True)),
         "residuals": dict(zip(RESIDUALS, trim.residuals.tolist(), strict=True)),
         "inputs": by_input,
         "without_effect": list(linear.still),
-        "coupling": identified.coupling,
-        "sideslip_zero": identified.sideslip_zero,
-        "lost": identified.failure,
-        "delay_margin": identified.selection.engineering.delay_margin,
-        "controller": identified.scenario().controller.model_dump(exclude_defaults=True),
-        "flights": {title: flight._asdict() for title, flight in identified.flights.items()},
+        "coupling": aircraft.coupling,
+        "sideslip_zero": aircraft.sideslip_zero,
+        "lost": aircraft.failure,
+        "delay_margin": aircraft.selection.engineering.delay_margin,
+        "controller": aircraft.scenario().controller.model_dump(exclude_defaults=True),
+        "flights": {title: flight._asdict() for title, flight in aircraft.flights.items()},
         "scenario": str(path),
     }

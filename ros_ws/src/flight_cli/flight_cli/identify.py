@@ -246,8 +246,8 @@ class Identify:
             warn(f"error: {identified.condition.title} does not fly: {identified.failure}")
             raise typer.Exit(CANNOT_FLY)
         if lacking := "" if self.accept else what_lacks(identified.selection):
-            shown = f"{display_path(path)}, which says so in its first line; --accept takes it"
-            raise ParameterError(f"identify: {lacking}; the gains are in {shown}")
+            refusal = f"{display_path(path)}, which says so in its first line; --accept takes it"
+            raise ParameterError(f"identify: {lacking}; the gains are in {refusal}")
 
     def _scenario_path(self, name: str) -> Path:
         """The file of the scenario; --write alone replaces a file."""
@@ -299,16 +299,16 @@ class Identify:
         nominal = load_airframe(self.airframe or "")
         if self.write is not None:
             require_yaml("--write", self.write)
-        recorded = read_run(log, self.namespace, scenario_file(self.scenario))
-        recorded.require()
-        warn_of_lacks(recorded)
-        if recorded.scenario is None:
+        recorded_run = read_run(log, self.namespace, scenario_file(self.scenario))
+        recorded_run.require()
+        warn_of_lacks(recorded_run)
+        if recorded_run.scenario is None:
             raise ParameterError(
                 f"{log}: found a log without its scenario, expected --scenario NAME with the "
                 "controller's lags"
             )
         console = Console(quiet=self.as_json)
-        identification = self._identified_model(recorded, recorded.scenario, nominal)
+        identification = self._identified_model(recorded_run, recorded_run.scenario, nominal)
         _show_model(console, identification)
         if identification.refusal:
             raise ParameterError(f"{log}: {identification.refusal}")
@@ -318,24 +318,24 @@ class Identify:
         if self.refly:
             with console.status("flying with the model"):
                 again = _refly(
-                    recorded_scenario(recorded.scenario),
-                    recorded.tape,
+                    recorded_scenario(recorded_run.scenario),
+                    recorded_run.tape,
                     identification.airframe,
                     REFLY_MARGIN if self.margin is None else self.margin,
                 )
             _show_flights_of_model(console, again, _units(identification))
         if self.as_json:
-            flown = {} if again is None else {"refly": again._asdict()}
-            print_json(_model_as_json(identification, self.write) | flown)
+            refly_figures = {} if again is None else {"refly": again._asdict()}
+            print_json(_model_as_json(identification, self.write) | refly_figures)
 
     def _identified_model(
-        self, recorded: RecordedRun, scenario: StoredFile, nominal: Airframe
+        self, recorded_run: RecordedRun, scenario: StoredFile, nominal: Airframe
     ) -> Identification:
         """The model by a search on the log, with a bar."""
         controller = recorded_parameters(scenario)
         delay = controller.delay if self.delay is None else self.delay
         actuation = _actuation(controller, nominal, delay)
-        samples = recording(recorded.tape, nominal)
+        samples = recording(recorded_run.tape, nominal)
         pairing = ChannelPairing(controller.outputs, controller.inputs)
         with progress_bar(*COUNT_COLUMNS, quiet=self.as_json) as bar:
             show = partial(bar.update, bar.add_task("search"))

@@ -79,8 +79,8 @@ class Import:
         if (self.map_name is None) == (self.scenario is None):
             raise typer.BadParameter("expected --map MAP or --scenario SCENARIO")
         folder = self.output or Path("runs") / self.log.stem
-        found = f"{folder}, which exists"
-        require(not folder.exists(), "--output", found, "the name of a new folder")
+        existing_folder = f"{folder}, which exists"
+        require(not folder.exists(), "--output", existing_folder, "the name of a new folder")
         if self.map_name is None:
             _import_module(self.log, find_scenario(self.scenario or ""), folder)
         else:
@@ -91,11 +91,13 @@ class Import:
         channel_map = load_map(map_name)
         console = Console()
         choice = Choice(self.system, _numbers(self.instances or []), kind_of_map(channel_map))
-        read = read_foreign_log(self.log, choice)
+        vehicle_log = read_foreign_log(self.log, choice)
         show = partial(_show_agreement, console)
         window = Window(self.start, self.stop)
-        tape, parameters, notes = imported(channel_map, read, window, show, servos=self.servos)
-        source = {"log": self.log.name, "kind": read.kind, "map": channel_map.name}
+        tape, parameters, notes = imported(
+            channel_map, vehicle_log, window, show, servos=self.servos
+        )
+        source = {"log": self.log.name, "kind": vehicle_log.kind, "map": channel_map.name}
         units = {name: UNITS[row.motion[0]] for name, row in channel_map.outputs.items()}
         records = {IMPORTED: {**source, COMPARED: "; ".join(notes)}, CHANNEL_UNITS: units}
         with writing("--output", folder, "a folder that can"):
@@ -106,8 +108,8 @@ class Import:
         bag = write_run(tape, folder, LogAttachments(None, files, folder / PROVENANCE))
         for sentence in notes:
             warn(f"warning: {sentence}")
-        _show_topics(console, f"{self.log.name}, {read.kind}", tape)
-        log_start_ns = read.start_ns(channel_map.outputs[channel_map.instant].motion[0])
+        _show_topics(console, f"{self.log.name}, {vehicle_log.kind}", tape)
+        log_start_ns = vehicle_log.start_ns(channel_map.outputs[channel_map.instant].motion[0])
         begin = (tape.start_ns - log_start_ns) / NANOSECONDS
         length = (int(tape["y"].stamp_ns[-1]) - tape.start_ns) / NANOSECONDS
         say(
@@ -128,8 +130,8 @@ def _show_agreement(console: Console, rows: list[Agreement]) -> None:
 
 def _import_module(log: Path, scenario: Scenario, folder: Path) -> None:
     """Write the ticks of a module of PX4 as a run of its scenario."""
-    read = read_foreign_log(log)
-    flight = module_flight(read, scenario.controller)
+    module_log = read_foreign_log(log)
+    flight = module_flight(module_log, scenario.controller)
     with writing("--output", folder, "a folder that can"):
         folder.mkdir(parents=True)
     attachments = attachments_for(scenario, folder)
@@ -141,10 +143,10 @@ def _import_module(log: Path, scenario: Scenario, folder: Path) -> None:
     if flight.lost:
         warn(f"warning: {flight.lost} ticks after a gap of the log left out")
     console = Console()
-    _show_topics(console, f"{log.name}, {read.kind}", flight.tape)
+    _show_topics(console, f"{log.name}, {module_log.kind}", flight.tape)
     ticks = len(flight.tape["internals"].stamp_ns)
-    said = f"{flight.equal} of {ticks} ticks have the u of Python to the bit"
-    say(console, f"{said}\nlog:   {display_path(writer.path)}")
+    equality = f"{flight.equal} of {ticks} ticks have the u of Python to the bit"
+    say(console, f"{equality}\nlog:   {display_path(writer.path)}")
 
 
 def _show_topics(console: Console, title: str, tape: Tape) -> None:

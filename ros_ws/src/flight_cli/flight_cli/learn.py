@@ -60,26 +60,26 @@ class Learn:
         """Learn again, show the steps, write the model."""
         if self.write is not None:
             require_yaml("--write", self.write)
-        recorded = read_run(self.run, self.namespace, scenario_file(self.scenario))
-        recorded.require()
-        warn_of_lacks(recorded)
-        flown = recorded_scenario(recorded)
-        others = with_settings(flown, self.settings)
+        recorded_run = read_run(self.run, self.namespace, scenario_file(self.scenario))
+        recorded_run.require()
+        warn_of_lacks(recorded_run)
+        scenario = recorded_scenario(recorded_run)
+        others = with_settings(scenario, self.settings)
         console = Console(quiet=self.as_json)
         with console.status(f"learning from {printable(str(self.run))}"):
-            result = learn_again(recorded.tape, others)
+            result = learn_again(recorded_run.tape, others)
         for step in result.steps:
             lead = "" if step.proposed else "no model: "
             say(console, escape(f"t = {step.t:.2f} s: {lead}{step.sentence}"))
-        account = log_account(recorded)
+        account = log_account(recorded_run)
         over = "" if account is None else account.over("internals")
         part = f", {over}" if over else ""
         if result.entries:
             print_table(
                 console, entry_table(f"A and B of the last identification{part}", result.entries)
             )
-        if models := [span._asdict() for span in errors_by_model(recorded.tape)]:
-            show_table(console, model_table(models, display_units(flown), part))
+        if models := [span._asdict() for span in errors_by_model(recorded_run.tape)]:
+            show_table(console, model_table(models, display_units(scenario), part))
         if result.model is not None and self.write is not None:
             write_text("--write", self.write, learned_yaml(result, str(self.run)))
             say(console, f"model: {escape(display_path(self.write))}")

@@ -51,17 +51,17 @@ def scenario_file(name: str | None) -> Path | None:
     return None if name is None else find_scenario(name).path
 
 
-def warn_of_lacks(recorded: RecordedRun) -> None:
+def warn_of_lacks(recorded_run: RecordedRun) -> None:
     """Print what a log lacks, a warning each on standard error.
 
     So no result stands for more than was recorded.
     """
-    account = log_account(recorded)
-    imported = recorded.metadata.get(IMPORTED, {}).get(COMPARED, "")
+    account = log_account(recorded_run)
+    import_note = recorded_run.metadata.get(IMPORTED, {}).get(COMPARED, "")
     for sentence in (
-        *recorded.tape.notes,
+        *recorded_run.tape.notes,
         *(() if account is None else account.notes()),
-        *filter(None, [imported]),
+        *filter(None, [import_note]),
     ):
         warn(f"warning: {sentence}")
 

@@ -67,18 +67,18 @@ class Network:
         command = f"rise-di network --peers {self.peers} --check"
         print(f"waiting for {', '.join(others)}: {command}", flush=True)
         with NetworkClient(own_host, hosts) as client:
-            received, clocks = client.exchange(self.timeout)
+            heard_hosts, clocks = client.exchange(self.timeout)
         ports = "UDP ports {} to {}".format(*domain_ports())
         for address in others:
             if address in clocks:
                 clock = clocks[address]
-                found = f"received, receives this host; delay {1e3 * clock.delay:.1f} ms, "
-                found += f"its clock is {clock}"
-            elif address in received:
-                found = f"received, does not receive this host: open {ports} there"
+                sentence = f"received, receives this host; delay {1e3 * clock.delay:.1f} ms, "
+                sentence += f"its clock is {clock}"
+            elif address in heard_hosts:
+                sentence = f"received, does not receive this host: open {ports} there"
             else:
-                found = "not received: start the command there; check the address, and "
-                found += f"{ports} here"
-            print(f"{address}: {found}")
+                sentence = "not received: start the command there; check the address, and "
+                sentence += f"{ports} here"
+            print(f"{address}: {sentence}")
         if len(clocks) < len(others):
             raise typer.Exit(FAILED)

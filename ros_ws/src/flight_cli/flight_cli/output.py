@@ -51,8 +51,8 @@ def show_flight(console: Console, flight: RecordedFlight) -> None:
     summary = flight.summary
     if busy := (summary["account"] or {}).get("busy"):
         say(console, busy, style="bold")
-    shown = tables.imported_tables if flight.scenario is None else tables.metric_tables
-    for table in shown(summary, flight.units):
+    tables_of = tables.imported_tables if flight.scenario is None else tables.metric_tables
+    for table in tables_of(summary, flight.units):
         show_table(console, table)
     if flight.controllers and flight.scenario is not None:
         _show_margins(console, flight, flight.scenario)
@@ -122,10 +122,10 @@ def new_table(
     Columns outside `left_aligned`, by default the first, are aligned right. Columns outside
     `wrapped` keep to one line.
     """
-    left = headings[:1] if left_aligned is None else left_aligned
+    left_columns = headings[:1] if left_aligned is None else left_aligned
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
     for heading in headings:
-        justify: Literal["left", "right"] = "left" if heading in left else "right"
+        justify: Literal["left", "right"] = "left" if heading in left_columns else "right"
         table.add_column(heading, justify=justify, no_wrap=heading not in wrapped, overflow="fold")
     return table
 
@@ -183,8 +183,8 @@ def flight_progress(
     with progress_bar(*CLOCK_COLUMNS, quiet=quiet) as bar:
         task = bar.add_task("flight", total=duration, clock="", shown="")
 
-        def progress(t: float, shown: str) -> None:
-            bar.update(task, completed=t, clock=clock(t, duration), shown=shown)
+        def progress(t: float, text: str) -> None:
+            bar.update(task, completed=t, clock=clock(t, duration), shown=text)
 
         yield (
             progress,

@@ -62,8 +62,8 @@ class Play:
         messages = [message for message in playback.messages if message.topic in types]
         end = playback.t(playback.messages[-1].due_ns)
         with Player(types, SHARED) as sender, progress_bar(*CLOCK_COLUMNS) as bar:
-            shown = f"{', '.join(types)}, stamps {self.stamps}"
-            task = bar.add_task("play", total=end - self.start, clock="", shown=shown)
+            description = f"{', '.join(types)}, stamps {self.stamps}"
+            task = bar.add_task("play", total=end - self.start, clock="", shown=description)
 
             def progress(due_ns: int) -> None:
                 t = playback.t(due_ns)
@@ -84,17 +84,19 @@ class Play:
         """
         from flight_bringup.player import unsendable  # noqa: PLC0415 - as above
 
-        skipped = {**playback.skipped, **(unsendable(playback.types) if every else {})}
-        types = {topic: name for topic, name in playback.types.items() if topic not in skipped}
+        skipped_topics = {**playback.skipped, **(unsendable(playback.types) if every else {})}
+        types = {
+            topic: name for topic, name in playback.types.items() if topic not in skipped_topics
+        }
         require(
             bool(types),
             str(self.run),
-            f"no topic to play among {listed(skipped)}",
+            f"no topic to play among {listed(skipped_topics)}",
             "a topic whose message type is installed",
         )
-        if skipped:
+        if skipped_topics:
             warn(
-                f"warning: {printable(listed(skipped))} skipped: without CDR, or of a message type "
-                "that is not installed"
+                f"warning: {printable(listed(skipped_topics))} skipped: without CDR, or of a "
+                "message type that is not installed"
             )
         return types

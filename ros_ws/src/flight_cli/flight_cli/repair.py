@@ -22,21 +22,21 @@ def repair_log(run: Path) -> None:
 
     An intact log stays as it is.
     """
-    repaired = repair_bag(run)
-    for file in repaired.files:
+    repairs = repair_bag(run)
+    for file in repairs.files:
         if file.damaged is not None:
             damaged = f"the damaged file is {printable(file.damaged.name)}"
             print(
                 f"{printable(file.path.name)} had {file.faults}: {file.messages} messages kept; "
                 f"{damaged}"
             )
-    if repaired.wrote_metadata:
-        print(f"{METADATA} written; {_missing_at_end(run, repaired.files[-1])}")
-    elif not any(file.damaged for file in repaired.files) and not repaired.missing:
+    if repairs.wrote_metadata:
+        print(f"{METADATA} written; {_missing_at_end(run, repairs.files[-1])}")
+    elif not any(file.damaged for file in repairs.files) and not repairs.missing:
         print(f"{display_path(run)} is intact: nothing to repair")
-    if repaired.missing:
-        lost = printable(", ".join(repaired.missing))
-        print(f"{lost}: missing, and nothing here restores it; {METADATA} keeps the name")
+    if repairs.missing:
+        missing_files = printable(", ".join(repairs.missing))
+        print(f"{missing_files}: missing, and nothing here restores it; {METADATA} keeps the name")
 
 
 def _missing_at_end(run: Path, last: FileRepair) -> str:
@@ -49,12 +49,10 @@ def _missing_at_end(run: Path, last: FileRepair) -> str:
     if not last.faults:
         return "nothing is missing"
     try:
-        recorded = read_run(run)
+        tape = read_run(run).tape
     except ParameterError:
         return "it is unknown how much is missing at its end"
-    end = max(float(recorded.tape.time(name)[-1]) for name in recorded.tape.signals)
-    if recorded.tape.duration is not None:
-        return (
-            f"the log ends at t = {end:.3f} s of the {recorded.tape.duration:g} s of the scenario"
-        )
+    end = max(float(tape.time(name)[-1]) for name in tape.signals)
+    if tape.duration is not None:
+        return f"the log ends at t = {end:.3f} s of the {tape.duration:g} s of the scenario"
     return f"the log ends at t = {end:.3f} s; it is unknown how much is missing"

@@ -64,41 +64,45 @@ class Replay:
     def execute(self) -> None:
         """Compute every tick again, show what differs, exit with the status."""
         changes = parse_settings(self.settings, "controller")
-        changed = {name.removeprefix("controller."): value for name, value in changes.items()}
+        controller_changes = {
+            name.removeprefix("controller."): value for name, value in changes.items()
+        }
         source = scenario_file(self.scenario)
         name = printable(str(self.run))
         with Console(stderr=True, quiet=self.as_json).status(f"computing {name} again"):
-            recorded = read_run(self.run, self.namespace, source, remaps_of(self.remap))
-            recorded.require()
-            parameters = recorded_parameters(recorded.scenario_file())
-            others = vary(parameters, changed) if changed else None
-            result = recompute(recorded, parameters, others)
-            guided = None
-            if others is None and "guidance" in recorded.tape:
-                guided = replay_guidance(recorded.tape, recorded_scenario(recorded).guidance)
-        checked = bool(result.checked.any())
+            recorded_run = read_run(self.run, self.namespace, source, remaps_of(self.remap))
+            recorded_run.require()
+            parameters = recorded_parameters(recorded_run.scenario_file())
+            others = vary(parameters, controller_changes) if controller_changes else None
+            result = recompute(recorded_run, parameters, others)
+            guidance_replay = None
+            if others is None and "guidance" in recorded_run.tape:
+                guidance_replay = replay_guidance(
+                    recorded_run.tape, recorded_scenario(recorded_run).guidance
+                )
+        has_check = bool(result.checked.any())
         expected = "a log with two successive ticks"
-        require(checked, str(self.run), "no tick that could be checked", expected)
+        require(has_check, str(self.run), "no tick that could be checked", expected)
         if self.csv is not None:
             _write_csv(self.csv, result, parameters.inputs)
-        account = log_account(recorded)
-        counted = None if account is None else account.topics["internals"].expected
-        shown = Shown(
+        account = log_account(recorded_run)
+        expected_ticks = None if account is None else account.topics["internals"].expected
+        answer = Shown(
             result,
             parameters.inputs,
-            ticks=max(len(result.number), counted or 0),
+            ticks=max(len(result.number), expected_ticks or 0),
             open_loop=others is not None,
-            guided=guided,
+            guided=guidance_replay,
         )
         lacks = () if account is None else account.notes()
-        notes = (*recorded.tape.notes, *lacks, *shown.notes())
+        notes = (*recorded_run.tape.notes, *lacks, *answer.notes())
         with stdout_for(self.csv):
             if self.as_json:
-                print_json(_as_json(shown, notes, self.settings or []))
+                print_json(_as_json(answer, notes, self.settings or []))
             else:
-                _show(shown, notes)
-        equal = result.equal() and (guided is None or guided.equal())
-        part = STATUS_SHORTFALL if result.compared.sum() < WHOLE * shown.ticks else 0
+                _show(answer, notes)
+        equal = result.equal() and (guidance_replay is None or guidance_replay.equal())
+        part = STATUS_SHORTFALL if result.compared.sum() < WHOLE * answer.ticks else 0
         raise typer.Exit(part if equal else DIFFERS)
 
 
@@ -125,14 +129,14 @@ class Shown(NamedTuple):
         return notes
 
 
-def _show_guidance(guided: GuidanceReplay) -> None:
-    first = guided.first
-    summary = f"guidance: {guided.checked} of {guided.steps} steps checked"
+def _show_guidance(replay_of_guidance: GuidanceReplay) -> None:
+    first = replay_of_guidance.first
+    summary = f"guidance: {replay_of_guidance.checked} of {replay_of_guidance.steps} steps checked"
     if first is None:
         print(f"{summary}, every bit equal")
     else:
         print(
-            f"{summary}, {guided.differing} differ, the first at t = {first.t:.6g} s: "
+            f"{summary}, {replay_of_guidance.differing} differ, the first at t = {first.t:.6g} s: "
             f"{_difference(first)}"
         )
 
@@ -147,27 +151,27 @@ def _difference(first: ReplayDifference) -> str:
     return f"{first.channel} recorded {first.recorded!r}, computed {first.computed!r}, {distance}"
 
 
-def _guidance_as_json(guided: GuidanceReplay) -> dict[str, Any]:
-    first = guided.first
-    shown = None if first is None else {**first._asdict(), "ulps": first.ulps}
+def _guidance_as_json(replay_of_guidance: GuidanceReplay) -> dict[str, Any]:
+    first = replay_of_guidance.first
+    difference = None if first is None else {**first._asdict(), "ulps": first.ulps}
     return {
-        "steps": guided.steps,
-        "checked": guided.checked,
-        "differing": guided.differing,
-        "first": shown,
+        "steps": replay_of_guidance.steps,
+        "checked": replay_of_guidance.checked,
+        "differing": replay_of_guidance.differing,
+        "first": difference,
     }
 
 
-def _show(shown: Shown, notes: Sequence[str]) -> None:
+def _show(answer: Shown, notes: Sequence[str]) -> None:
     console = Console(soft_wrap=True, highlight=False)
-    result = shown.result
+    result = answer.result
     first = result.first()
-    checked = int(result.compared.sum())
-    summary = f"{checked} ticks"
-    if checked != shown.ticks:
-        summary = f"{checked} of {shown.ticks} ticks checked"
+    compared_count = int(result.compared.sum())
+    summary = f"{compared_count} ticks"
+    if compared_count != answer.ticks:
+        summary = f"{compared_count} of {answer.ticks} ticks checked"
     if first is None:
-        equal = ", every bit equal" if checked else ": the log holds no tick with y and u"
+        equal = ", every bit equal" if compared_count else ": the log holds no tick with y and u"
         others = ", yet with other parameters" if result.other_parameters.any() else ""
         console.print(f"{summary}{equal}{others}")
     else:
@@ -178,16 +182,16 @@ def _show(shown: Shown, notes: Sequence[str]) -> None:
         groups = ", ".join(f"{name} in {count}" for name, count in _count_by_group(result).items())
         last = result.t[rows[-1]]
         console.print(f"{summary}, {len(rows)} differ, the last at t = {last:.6g} s; {groups}")
-    if shown.open_loop:
+    if answer.open_loop:
         headings = ("input", "rms", "max", "at t (s)", "rms recorded")
         table = new_table("u computed minus u recorded", headings)
-        for name, figures in _u_figures(result, shown.inputs).items():
+        for name, figures in _u_figures(result, answer.inputs).items():
             table.add_row(name, *(f"{value:.4g}" for value in figures.values()))
         print_table(console, table)
     for note in notes:
         console.print(f"note: {note}")
-    if shown.guided is not None:
-        _show_guidance(shown.guided)
+    if answer.guided is not None:
+        _show_guidance(answer.guided)
 
 
 def _count_by_group(result: ReplayResult) -> dict[str, int]:
@@ -204,28 +208,30 @@ def _u_figures(result: ReplayResult, inputs: tuple[str, ...]) -> dict[str, dict[
 
     The figures are the rms, the largest, its time, and the rms of the recorded u; NaN without a u.
     """
-    known = np.isfinite(result.computed).all(axis=1)
-    recorded = result.group(result.recorded[known], "u")
-    computed = result.group(result.computed[known], "u")
+    is_finite = np.isfinite(result.computed).all(axis=1)
+    u_recorded = result.group(result.recorded[is_finite], "u")
+    u_computed = result.group(result.computed[is_finite], "u")
     figures = {}
     for name in inputs:
-        difference = computed[name] - recorded[name]
+        difference = u_computed[name] - u_recorded[name]
         rms, largest = error_metrics(difference)
         t_max = (
-            float(result.t[known][np.argmax(np.abs(difference))]) if len(difference) else math.nan
+            float(result.t[is_finite][np.argmax(np.abs(difference))])
+            if len(difference)
+            else math.nan
         )
         figures[name] = {
             "rms": rms,
             "max": largest,
             "t_max": t_max,
-            "rms_recorded": error_metrics(recorded[name]).rms,
+            "rms_recorded": error_metrics(u_recorded[name]).rms,
         }
     return figures
 
 
-def _as_json(shown: Shown, notes: Sequence[str], settings: list[str]) -> dict[str, Any]:
-    result = shown.result
-    guided = shown.guided
+def _as_json(answer: Shown, notes: Sequence[str], settings: list[str]) -> dict[str, Any]:
+    result = answer.result
+    replay_of_guidance = answer.guided
     first = result.first()
     return {
         "open_loop": bool(settings),
@@ -237,10 +243,10 @@ def _as_json(shown: Shown, notes: Sequence[str], settings: list[str]) -> dict[st
         "differing": int(result.different().any(axis=1).sum()),
         "differing_by_group": _count_by_group(result),
         "first": None if first is None else {**first._asdict(), "ulps": first.ulps},
-        "u_difference": _u_figures(result, shown.inputs),
+        "u_difference": _u_figures(result, answer.inputs),
         "notes": list(notes),
-        "expected": shown.ticks,
-        "guidance": None if guided is None else _guidance_as_json(guided),
+        "expected": answer.ticks,
+        "guidance": None if replay_of_guidance is None else _guidance_as_json(replay_of_guidance),
     }
 
 

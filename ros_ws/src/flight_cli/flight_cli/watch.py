@@ -81,24 +81,24 @@ class Watch:
         self._require_one_view()
         remaps = remaps_of(self.remap)
         file = scenario_file(self.scenario)
-        chosen = self.run or self._runs_in_progress()
-        for folder in chosen if not self.wait else ():
+        runs = self.run or self._runs_in_progress()
+        for folder in runs if not self.wait else ():
             require_log(folder, self.namespace, remaps)
         lines = []
         if self.background is not None:
             lines = read_background(self.background, parse_origin(self.origin))
         if self.foxglove:
-            require(len(chosen) == 1, "--foxglove", "a ghost beside it", "RUN alone")
-            _serve_foxglove(chosen[0], self.port)
+            require(len(runs) == 1, "--foxglove", "a ghost beside it", "RUN alone")
+            _serve_foxglove(runs[0], self.port)
             return
         scenario = None if file is None else stored_scenario(file)
         flights = [
             Flight(folder, namespace=name, scenario=scenario, background=lines, remaps=remaps)
-            for folder in chosen
+            for folder in runs
             for name in (namespaces(folder) if self.fleet else (self.namespace,))
         ]
         if self.text:
-            require(len(chosen) == 1, "--text", "two runs", "one run")
+            require(len(runs) == 1, "--text", "two runs", "one run")
             show(flights[0])
             return
         ports = (DEFAULT_PORT, 0) if self.port is None else (self.port,)
@@ -118,13 +118,13 @@ class Watch:
             "the folder of a run that will be recorded",
         )
         require(self.fleet or runs < 3, "RUN", f"{runs} runs", "a run and a ghost, or --fleet")
-        found = "--text, --foxglove or --control beside it"
+        contradiction = "--text, --foxglove or --control beside it"
         paged = not (self.text or self.foxglove or controlled)
-        require(paged or not self.fleet, "--fleet", found, "the page")
-        named = self.fleet and self.namespace is not None
-        require(not named, "--fleet", "--namespace beside it", "one of the two")
-        drawn = self.background is None or not (self.text or self.foxglove)
-        require(drawn, "background", "--text or --foxglove beside it", "the page")
+        require(paged or not self.fleet, "--fleet", contradiction, "the page")
+        has_two_aircraft = self.fleet and self.namespace is not None
+        require(not has_two_aircraft, "--fleet", "--namespace beside it", "one of the two")
+        can_draw = self.background is None or not (self.text or self.foxglove)
+        require(can_draw, "background", "--text or --foxglove beside it", "the page")
         for name in ("text", "foxglove"):
             twice = getattr(self, name) and controlled
             require(not twice, f"--{name}", "--control beside it", "one of the two")
@@ -143,14 +143,14 @@ def _in_progress(runs: Path) -> list[Path]:
 
 def _newest(runs: Path, namespace: str | None) -> Path:
     """The run to watch without a RUN; a note names the other aircraft in flight."""
-    chosen = newest_run(runs, namespace)
-    others = [display_path(folder) for folder in runs_in_recording(runs) if folder != chosen]
+    run = newest_run(runs, namespace)
+    others = [display_path(folder) for folder in runs_in_recording(runs) if folder != run]
     if others and namespace is None:
         warn(
-            f"note: shows {display_path(chosen)}; also in flight: {', '.join(others)}: name "
+            f"note: shows {display_path(run)}; also in flight: {', '.join(others)}: name "
             "one, or --namespace, or --fleet"
         )
-    return chosen
+    return run
 
 
 def _announce(line: str) -> None:

@@ -118,7 +118,7 @@ def scenario_names(incomplete: str) -> list[str]:
     return [name for name in names if name.startswith(incomplete)]
 
 
-class Command(TyperCommand):
+class RiseDiCommand(TyperCommand):
     """A command whose refusals name the option as it is typed."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:

@@ -29,12 +29,12 @@ from flight_guidance import guidance_state
 from flight_guidance.guidance_state import (
     TARGETS,
     Begin,
-    Commands,
+    GuidanceMode,
     GuidanceParams,
     GuidanceState,
     Inputs,
     Lateral,
-    Mode,
+    StepCommands,
     Target,
     Vertical,
 )
@@ -65,12 +65,12 @@ class GuidanceOutput(NamedTuple):
     notices: tuple[str, ...] = ()
 
 
-class Sample(NamedTuple):
+class GuidanceSample(NamedTuple):
     """What a step leaves for the log: inputs, state after the step, commands."""
 
     inputs: Inputs
     state: GuidanceState
-    commands: Commands
+    commands: StepCommands
     route: int  # a `digest`
     link_age: float  # s since the last message of an operator, 0 without a limit
     failed: int  # number of failed steps
@@ -90,14 +90,14 @@ def _tuple(*values: float) -> tuple[float, ...]:
     return values
 
 
-class Channels(NamedTuple):
-    """Channels of the log, and the attribute of a `Sample` that they hold."""
+class LogChannels(NamedTuple):
+    """Channels of the log, and the attribute of a `GuidanceSample` that they hold."""
 
     names: Sequence[str]
     attribute: str
     kind: Callable[..., Any] = float  # makes the attribute of the logged numbers
 
-    def logged(self, sample: Sample) -> Sequence[float]:
+    def logged(self, sample: GuidanceSample) -> Sequence[float]:
         """The numbers of the channels."""
         value = attrgetter(self.attribute)(sample)
         return value if isinstance(value, tuple) else (value,)
@@ -107,40 +107,40 @@ class Channels(NamedTuple):
         return self.kind(*(logged[name] for name in self.names))
 
 
-def channels(outputs: Sequence[str]) -> tuple[Channels, ...]:
+def channels(outputs: Sequence[str]) -> tuple[LogChannels, ...]:
     """The channels of the log, in its order."""
     return (
-        Channels(["mode"], "state.mode", Mode),
-        Channels(["mode.lateral"], "state.lateral", Lateral),
-        Channels(["mode.vertical"], "state.vertical", Vertical),
-        Channels(["leg"], "state.leg", int),
-        Channels(["route"], "route"),
-        Channels(["xtrack"], "commands.xtrack"),
-        Channels(["to_go"], "commands.to_go"),
-        Channels(["joining"], "state.joining"),
-        Channels(["track"], "commands.track"),
-        Channels(["missed"], "commands.missed"),
-        Channels(["fence.action"], "state.fence"),
-        Channels(["fence.clearance"], "commands.clearance"),
-        Channels(["fence.predicted"], "commands.predicted"),
-        Channels(["phi_c"], "commands.phi_c"),
-        Channels(["theta_c"], "commands.theta_c"),
-        Channels(["climb_c"], "state.climb_c"),
-        Channels(["V_c"], "state.V_c"),
-        *(Channels([f"limited.{name}"], f"commands.{name}_limited") for name in LIMITED),
-        Channels(["age.pose"], "pose_age"),
-        Channels([LINK_AGE], "link_age"),
-        Channels([FAILED], "failed"),
-        Channels(["begin"], "inputs.begin", Begin),
-        Channels(["given"], "given", int),
-        Channels(LEARNED, "inputs.authority", Authority),
-        Channels([f"target.{name}" for name in TARGETS], "state.target", Target),
-        *(Channels([f"state.{name}"], f"state.{name}") for name in STATE),
-        Channels([f"wind.{name}" for name in WIND], "state.wind", _tuple),
-        Channels(["loitered"], "state.loitered"),
-        Channels([f"pose.{name}" for name in POSE], "inputs.pose", _tuple),
-        Channels([f"y.{name}" for name in outputs], "inputs.y", _tuple),
-        Channels([f"u_m.{name}" for name in outputs], "state.u_m", _tuple),
+        LogChannels(["mode"], "state.mode", GuidanceMode),
+        LogChannels(["mode.lateral"], "state.lateral", Lateral),
+        LogChannels(["mode.vertical"], "state.vertical", Vertical),
+        LogChannels(["leg"], "state.leg", int),
+        LogChannels(["route"], "route"),
+        LogChannels(["xtrack"], "commands.xtrack"),
+        LogChannels(["to_go"], "commands.to_go"),
+        LogChannels(["joining"], "state.joining"),
+        LogChannels(["track"], "commands.track"),
+        LogChannels(["missed"], "commands.missed"),
+        LogChannels(["fence.action"], "state.fence"),
+        LogChannels(["fence.clearance"], "commands.clearance"),
+        LogChannels(["fence.predicted"], "commands.predicted"),
+        LogChannels(["phi_c"], "commands.phi_c"),
+        LogChannels(["theta_c"], "commands.theta_c"),
+        LogChannels(["climb_c"], "state.climb_c"),
+        LogChannels(["V_c"], "state.V_c"),
+        *(LogChannels([f"limited.{name}"], f"commands.{name}_limited") for name in LIMITED),
+        LogChannels(["age.pose"], "pose_age"),
+        LogChannels([LINK_AGE], "link_age"),
+        LogChannels([FAILED], "failed"),
+        LogChannels(["begin"], "inputs.begin", Begin),
+        LogChannels(["given"], "given", int),
+        LogChannels(LEARNED, "inputs.authority", Authority),
+        LogChannels([f"target.{name}" for name in TARGETS], "state.target", Target),
+        *(LogChannels([f"state.{name}"], f"state.{name}") for name in STATE),
+        LogChannels([f"wind.{name}" for name in WIND], "state.wind", _tuple),
+        LogChannels(["loitered"], "state.loitered"),
+        LogChannels([f"pose.{name}" for name in POSE], "inputs.pose", _tuple),
+        LogChannels([f"y.{name}" for name in outputs], "inputs.y", _tuple),
+        LogChannels([f"u_m.{name}" for name in outputs], "state.u_m", _tuple),
     )
 
 
@@ -163,7 +163,7 @@ def u_m(state: GuidanceState) -> FloatArray:
     return np.array([*state.u_m, state.phi, state.theta - state.alpha])
 
 
-def row(sample: Sample, outputs: Sequence[str]) -> FloatArray:
+def row(sample: GuidanceSample, outputs: Sequence[str]) -> FloatArray:
     """A sample of the log, in the order of `names`."""
     values = chain.from_iterable(each.logged(sample) for each in channels(outputs))
     return np.array([*values], dtype=np.float64)
@@ -203,7 +203,7 @@ def restored(
 
 def step(
     state: GuidanceState | None, inputs: Inputs, route: Route | None, params: GuidanceParams
-) -> tuple[GuidanceState, Commands]:
+) -> tuple[GuidanceState, StepCommands]:
     """The step of the kind of aircraft: `modes.step`, or `multicopter.step`."""
     flown = modes.step if params.multicopter is None else multicopter.step
     return flown(state, inputs, route, params)
@@ -248,9 +248,13 @@ class Guidance:
         self._roll = RollTest()
 
     @property
-    def mode(self) -> Mode:
+    def mode(self) -> GuidanceMode:
         """Mode of the last step."""
-        return Mode.OFF if self._state is None or self._begin is not Begin.NO else self._state.mode
+        return (
+            GuidanceMode.OFF
+            if self._state is None or self._begin is not Begin.NO
+            else self._state.mode
+        )
 
     @property
     def failed(self) -> int:
@@ -347,7 +351,7 @@ class Guidance:
 
         False while guidance does not fly.
         """
-        if self.mode is not Mode.ENGAGED or self._pose is None or self._y is None:
+        if self.mode is not GuidanceMode.ENGAGED or self._pose is None or self._y is None:
             return False
         held = modes.hold_now if self._params.multicopter is None else multicopter.hold
         self.take_target(held(self.pose(), tuple(self._y.value.tolist()), self._params))
@@ -355,7 +359,7 @@ class Guidance:
 
     def home(self) -> bool:
         """Fly home and orbit there; False while guidance does not fly."""
-        if self.mode is not Mode.ENGAGED or self._pose is None:
+        if self.mode is not GuidanceMode.ENGAGED or self._pose is None:
             return False
         self.take_target(
             targets.home(self.pose(), targets.within_reach(self._params, self._authority))
@@ -370,7 +374,7 @@ class Guidance:
         state = self._state
         route = self.route
         if (
-            self.mode is not Mode.ENGAGED
+            self.mode is not GuidanceMode.ENGAGED
             or state is None
             or state.lateral is not Lateral.ROUTE
             or route is None
@@ -393,7 +397,7 @@ class Guidance:
         state = self._state
         route = self.route
         if (
-            self.mode is not Mode.ENGAGED
+            self.mode is not GuidanceMode.ENGAGED
             or state is None
             or state.lateral is Lateral.ROUTE
             or route is None
@@ -533,15 +537,15 @@ class Guidance:
             self._failure = cause
             return None
         inputs = self._inputs(now_ns, pose, y)._replace(commands={})
-        log = self._row(inputs, state, Commands(), now_ns)
+        log = self._row(inputs, state, StepCommands(), now_ns)
         notices = (f"{LAST_GOES_ON}: {cause}",) if is_said else ()
         return GuidanceOutput(u_m(state), log, notices)
 
     def _row(
-        self, inputs: Inputs, state: GuidanceState, commands: Commands, now_ns: int
+        self, inputs: Inputs, state: GuidanceState, commands: StepCommands, now_ns: int
     ) -> FloatArray:
         """The sample of the log of a step at an instant."""
-        sample = Sample(
+        sample = GuidanceSample(
             inputs=inputs,
             state=state,
             commands=commands,

@@ -23,7 +23,7 @@ LARGEST = 1e9
 moon is 4e8 m away."""
 
 
-class Mode(IntEnum):
+class GuidanceMode(IntEnum):
     """What guidance does."""
 
     OFF = 0  # no u_m
@@ -90,7 +90,7 @@ VERTICAL: Mapping[str, Vertical] = {
 }
 
 
-class Channels(NamedTuple):
+class TargetChannels(NamedTuple):
     """The channels of Target that a kind of aircraft takes."""
 
     lateral: Mapping[str, Lateral]
@@ -104,8 +104,8 @@ class Channels(NamedTuple):
         return tuple(name for name in TARGETS if name in known)
 
 
-AIRPLANE = Channels(LATERAL, VERTICAL, ("V",), {Lateral.ORBIT: ("north", "east", "radius")})
-MULTICOPTER = Channels(
+AIRPLANE = TargetChannels(LATERAL, VERTICAL, ("V",), {Lateral.ORBIT: ("north", "east", "radius")})
+MULTICOPTER = TargetChannels(
     {
         **dict.fromkeys(("phi", "theta"), Lateral.PHI),
         "course": Lateral.COURSE,
@@ -175,7 +175,7 @@ class GuidanceParams(NamedTuple):
     link_timeout_ns: int = 0  # of the operator's link; 0: no limit
     dead: tuple[str, ...] = ()  # outputs without an input with an effect: no command asks for them
     rolls: bool = True  # else the yaw rate flies the bank
-    channels: Channels = AIRPLANE
+    channels: TargetChannels = AIRPLANE
     multicopter: MulticopterParams | None = None  # None: of an airplane
 
 
@@ -204,7 +204,7 @@ class GuidanceState(NamedTuple):
     """State after a step."""
 
     t_ns: int
-    mode: Mode
+    mode: GuidanceMode
     lateral: Lateral
     vertical: Vertical
     target: Target
@@ -226,7 +226,7 @@ class GuidanceState(NamedTuple):
     velocity: Wind = (0.0, 0.0)  # of the pose of the step, for the wind of a multicopter, m/s
 
 
-class Commands(NamedTuple):
+class StepCommands(NamedTuple):
     """Results of a step beside the state, for the log."""
 
     phi_c: float = 0.0

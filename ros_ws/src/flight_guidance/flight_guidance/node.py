@@ -20,13 +20,13 @@ from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import Marker, MarkerArray
 
 from flight_core import channels
-from flight_core.modes import Mode as ControllerMode
+from flight_core.modes import Mode
 from flight_core.parameters import ParameterError, require
 from flight_core.publisher_lock import PublisherLock, require_sender
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns, seconds
 from flight_core.vectors import ChannelError, StampedVector, select
 from flight_guidance.guidance import Guidance, GuidanceOutput
-from flight_guidance.guidance_state import Mode
+from flight_guidance.guidance_state import GuidanceMode
 from flight_guidance.modes.modes import yaw_rate
 from flight_guidance.odometry import BODY, MAP, ROUTE_FRAMES, body_velocity, quaternion
 from flight_guidance.params import GuidanceConfig
@@ -74,13 +74,16 @@ ODOMETRY_PERIOD_NS = NANOSECONDS // 10
 PATH_PERIOD_NS = NANOSECONDS
 PATH_LENGTH = 120  # poses of the flown path, one a second
 
-SENTENCES: Mapping[Mode, str] = {
-    Mode.OFF: "no u_m: disengaged, or pose or y is missing",
-    Mode.ENGAGED: "engaged",
-    Mode.DEAD_RECKONING: "pose is stale: wings are levelled by the rates of y",
-    Mode.POSE_LOST: "pose is lost: all rates are zero",
+SENTENCES: Mapping[GuidanceMode, str] = {
+    GuidanceMode.OFF: "no u_m: disengaged, or pose or y is missing",
+    GuidanceMode.ENGAGED: "engaged",
+    GuidanceMode.DEAD_RECKONING: "pose is stale: wings are levelled by the rates of y",
+    GuidanceMode.POSE_LOST: "pose is lost: all rates are zero",
 }
-LEVELS = {Mode.ENGAGED: DiagnosticStatus.OK, Mode.POSE_LOST: DiagnosticStatus.ERROR}  # else WARN
+LEVELS = {
+    GuidanceMode.ENGAGED: DiagnosticStatus.OK,
+    GuidanceMode.POSE_LOST: DiagnosticStatus.ERROR,
+}  # else WARN
 
 
 class GuidanceNode(FlightNode[GuidanceConfig]):
@@ -110,7 +113,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         self._u_m_encoder = self.encoder((*outputs, *channels.ATTITUDE))
         self._log_encoder = self.encoder(self._guidance.names)
         self._allowed = True
-        self._mode = Mode.OFF
+        self._mode = GuidanceMode.OFF
         self._waits = ""
         self._authority = self._receive_authority()
         self._authorities = deque[StampedVector]()
@@ -122,7 +125,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
             self._inputs = LockstepInputs(*inputs, self._receives_authority)
             self._empty_encoder = self.encoder(())
         else:
-            self._controller_mode = ControllerMode.WAITING
+            self._controller_mode = Mode.WAITING
             self._guidance.pause(paused=True, forget=False)
             self._internals = self._receive(INTERNALS, Decoder(["mode"]).decode, self._take_mode)
         self._advertise_views()
@@ -230,7 +233,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
             self.get_logger().warning(notice)
         if (mode := self._guidance.mode) is not self._mode:
             sentence = f"{self._mode.name} -> {mode.name}: {SENTENCES[mode]}"
-            if mode is Mode.ENGAGED:
+            if mode is GuidanceMode.ENGAGED:
                 self.get_logger().info(sentence)
             else:
                 self.get_logger().warning(sentence)
@@ -368,20 +371,20 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         After INACTIVE, hold what is measured; after a failsafe, go on.
         """
         try:
-            mode = ControllerMode(int(sample.value[0]))
+            mode = Mode(int(sample.value[0]))
         except ValueError as error:
             raise ChannelError("mode", str(error)) from None
         if mode is not self._controller_mode:
             self._controller_mode = mode
             self._guidance.pause(
-                paused=mode is not ControllerMode.ENGAGED, forget=mode is ControllerMode.INACTIVE
+                paused=mode is not Mode.ENGAGED, forget=mode is Mode.INACTIVE
             )
 
     def _engage(self, request: Any) -> bool | str:
         if (
             request.data
             and not self.parameters.lockstep
-            and self._controller_mode is not ControllerMode.ENGAGED
+            and self._controller_mode is not Mode.ENGAGED
         ):
             return f"the controller is {self._controller_mode.name}, expected ENGAGED"
         self._guidance.engage(engaged=request.data)

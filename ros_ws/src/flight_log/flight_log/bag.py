@@ -21,7 +21,7 @@ from mcap.writer import CompressionType, Writer
 from flight_core.files import read_yaml, write_file
 from flight_core.parameters import require
 from flight_log.disk import ReservedFile
-from flight_log.message_definitions import Definition, definition
+from flight_log.message_definitions import MessageDefinition, definition
 from flight_log.rosbag2_metadata import METADATA, FileContents, TopicCount, bag_metadata_yaml
 from flight_log.scan import RECORD
 
@@ -73,7 +73,7 @@ class BagChannel:
     """A topic of an unfinished bag."""
 
     topic: str
-    type: Definition
+    type: MessageDefinition
     qos: str
     identity: int
     messages: int = 0
@@ -218,13 +218,18 @@ class BagWriter:
         `qos` is rosbag2's YAML list of offered profiles, `before_remap` the name in the stack.
         Raises ParameterError when the definition of the type is unknown.
         """
-        known = definition(type_name)
-        schema = self._writer.register_schema(known.name, "ros2msg", known.text.encode())
-        metadata = {"offered_qos_profiles": qos, "topic_type_hash": known.type_hash}
+        type_definition = definition(type_name)
+        schema = self._writer.register_schema(
+            type_definition.name, "ros2msg", type_definition.text.encode()
+        )
+        metadata = {"offered_qos_profiles": qos, "topic_type_hash": type_definition.type_hash}
         if before_remap not in {"", topic}:
             metadata[BEFORE_REMAP] = before_remap
         channel = BagChannel(
-            topic, known, qos, self._writer.register_channel(topic, "cdr", schema, metadata)
+            topic,
+            type_definition,
+            qos,
+            self._writer.register_channel(topic, "cdr", schema, metadata),
         )
         self.channels.append(channel)
         return channel

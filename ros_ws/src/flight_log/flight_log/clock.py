@@ -35,7 +35,7 @@ class StampClock:
     """
 
     def __init__(self) -> None:
-        self._found = self._unset = self._repeated = self._left_out = 0
+        self._count = self._unset = self._repeated = self._left_out = 0
         self._step_ns = self._step_at_ns = 0
         self._last_ns: int | None = None  # of the usable part
         self._last_offset_ns = 0
@@ -61,42 +61,42 @@ class StampClock:
         unset = (stamp_ns == 0) & ((self._last_ns or 0) > STEP_NS)
         if self._step_ns:
             return self._taken(stamp_ns, self._after_step(stamp_ns), len(stamp_ns), 0)
-        known = np.flatnonzero(~unset)
-        stamps = stamp_ns[known]
-        offsets = stamp_ns[known] - log_ns[known]
-        timed = log_ns[known] != 0
+        places = np.flatnonzero(~unset)
+        stamps = stamp_ns[places]
+        offsets = stamp_ns[places] - log_ns[places]
+        has_time = log_ns[places] != 0
         before = stamps[:1] if self._last_ns is None else self._last_ns
         offset_before = offsets[:1] if self._last_ns is None else self._last_offset_ns
         jumps = np.diff(stamps, prepend=before)
         leads = np.diff(offsets, prepend=offset_before)
-        numbers = np.ones(len(stamps), dtype=np.int64) if steps is None else steps[known]
+        numbers = np.ones(len(stamps), dtype=np.int64) if steps is None else steps[places]
         back = (jumps < -STEP_NS) & ((numbers >= 0) | (np.abs(leads) > STEP_NS))
-        forth = (jumps > STEP_NS) & ((leads > STEP_NS) | ~timed) & (numbers <= 1)
+        forth = (jumps > STEP_NS) & ((leads > STEP_NS) | ~has_time) & (numbers <= 1)
         starts = np.flatnonzero(back | forth)  # of messages with one clock
         edges = [0, *starts[starts > 0].tolist(), len(stamps)]
         keep = ~unset
         for first, after in pairwise(edges if len(stamps) else []):
             is_last = after == len(stamps)
             jump_ns, is_ahead = self._jump_to(
-                int(stamps[first]), int(offsets[first]), has_time=bool(timed[first])
+                int(stamps[first]), int(offsets[first]), has_time=bool(has_time[first])
             )
             if after - first < (CONFIRMED_AT_END if is_last and end else CONFIRMED):
                 if is_last and more and first > 0:
-                    return self._taken(stamp_ns, keep[: known[first]], int(known[first]))
+                    return self._taken(stamp_ns, keep[: places[first]], int(places[first]))
                 if jump_ns < -STRAY_NS or is_ahead:
-                    keep[known[first:after]] = False
+                    keep[places[first:after]] = False
                 continue
             if (jump_ns < -STEP_NS and back[first]) or is_ahead:
                 self._step_ns = jump_ns
                 self._step_at_ns = self._last_ns or 0
-                after_step = int(known[first])
+                after_step = int(places[first])
                 keep[after_step:] = self._after_step(stamp_ns[after_step:])
                 return self._taken(stamp_ns, keep, len(stamp_ns), after_step)
             # the messages before are too few to be the begin of the clock
             if self._last_ns is None:
                 away_ns = stamps[first] - stamps[:first]
                 lead_ns = offsets[first] - offsets[:first]
-                keep[known[:first]] &= (away_ns >= -STEP_NS) & (
+                keep[places[:first]] &= (away_ns >= -STEP_NS) & (
                     (away_ns <= STRAY_NS) | (lead_ns <= LATE_NS)
                 )
             self._last_ns = int(stamps[after - 1])
@@ -132,7 +132,7 @@ class StampClock:
         after_step: int | None = None,
     ) -> tuple[NDArray[np.bool_], int]:
         before = count if after_step is None else after_step
-        self._found += count
+        self._count += count
         self._repeated += int(np.count_nonzero(np.diff(stamp_ns[:count]) == 0))
         self._unset += int(np.count_nonzero(~keep[:before]))
         self._left_out += count - before
@@ -141,7 +141,7 @@ class StampClock:
     def recording(self, unset: int = 0) -> Recording:
         """The result; `unset`: further messages without a usable stamp."""
         return Recording(
-            found=self._found,
+            found=self._count,
             unset=self._unset + unset,
             repeated=self._repeated,
             step_ns=self._step_ns,

@@ -36,8 +36,8 @@ class Columns:
         self._sender: list[NDArray[np.int16]] = []  # of each sample
         self._stamp_ns, self._store = self._new(expected)
 
-    def _new(self, capacity: int) -> tuple[NDArray[np.int64], "_Memory | _File"]:
-        kind = _File if 8 * self._width * capacity > IN_MEMORY else _Memory
+    def _new(self, capacity: int) -> tuple[NDArray[np.int64], "_MemoryColumns | _FileColumns"]:
+        kind = _FileColumns if 8 * self._width * capacity > IN_MEMORY else _MemoryColumns
         return np.empty(capacity, np.int64), kind(self._width, capacity)
 
     def append(self, stamp_ns: NDArray[np.int64], rows: FloatArray, sender: str = "") -> None:
@@ -61,14 +61,14 @@ class Columns:
         """The samples as a signal, in the order of arrival."""
         stamp_ns = self._stamp_ns[: self.count]
         sender = np.concatenate(self._sender) if len(self._senders) > 1 else None
-        if isinstance(self._store, _File):
+        if isinstance(self._store, _FileColumns):
             return _StoredSignal(
                 stamp_ns=stamp_ns, names=names, sender=sender, store=self._store, first=0
             )
         return Signal(stamp_ns, names, self._store.read(0, self._width, self.count), sender)
 
 
-class _Memory:
+class _MemoryColumns:
     def __init__(self, width: int, capacity: int) -> None:
         self._array = np.empty((width, capacity))
 
@@ -79,7 +79,7 @@ class _Memory:
         return self._array[first:end, :count].T
 
 
-class _File:
+class _FileColumns:
     """Columns in a temporary file without a name.
 
     They are written past memory, and mapped as long as an array of them is used.
@@ -132,7 +132,7 @@ class _StoredSignal(Signal):
         stamp_ns: NDArray[np.int64],
         names: tuple[str, ...],
         sender: NDArray[np.int16] | None,
-        store: _File,
+        store: _FileColumns,
         first: int,
     ) -> None:
         for name, value in (
@@ -144,7 +144,7 @@ class _StoredSignal(Signal):
         ):
             object.__setattr__(self, name, value)
 
-    _store: _File
+    _store: _FileColumns
     _first: int
 
     @property

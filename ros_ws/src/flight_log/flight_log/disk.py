@@ -64,7 +64,7 @@ class ReservedFile:
         self._reserved_bytes = 0
         # in the reserve; in memory once that is free
         self._kept_bytes = 0
-        self._kept = bytearray()
+        self._end_data = bytearray()
         self._position = 0
         self._closed = False
         self.full = False  # the reserve was needed
@@ -95,16 +95,16 @@ class ReservedFile:
                     raise
             self.full = True
             self.release()
-        self._kept += data
+        self._end_data += data
 
     def kept_data(self) -> bytes:
         """The kept data, once the reserve is free."""
-        return bytes(self._kept)
+        return bytes(self._end_data)
 
     def release(self) -> None:
         """Free the reserve."""
         if not self._reserve.closed:
-            self._kept += os.pread(self._reserve.fileno(), self._kept_bytes, 0)
+            self._end_data += os.pread(self._reserve.fileno(), self._kept_bytes, 0)
             self._reserve.close()
 
     def write(self, data: bytes | memoryview) -> int:

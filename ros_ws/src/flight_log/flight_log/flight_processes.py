@@ -25,16 +25,16 @@ UNNAMED = "a publisher without a name"
 INSTANCE = re.compile(r"(/.+)#\d+")  # node and process id
 
 
-class Span(NamedTuple):
+class SampleSpan(NamedTuple):
     """First and last stamp of the samples of a publisher, ns, and their number."""
 
     first_ns: int
     last_ns: int
     samples: int
 
-    def joined(self, later: "Span") -> "Span":
+    def joined(self, later: "SampleSpan") -> "SampleSpan":
         """The joint span."""
-        return Span(
+        return SampleSpan(
             min(self.first_ns, later.first_ns),
             max(self.last_ns, later.last_ns),
             self.samples + later.samples,
@@ -60,7 +60,7 @@ def ready_times(lines: Iterable[bytes]) -> list[tuple[str, int]]:
 
 
 def flight_processes(
-    spans: Mapping[str, Span], ready: Iterable[tuple[str, int]], namespace: str
+    spans: Mapping[str, SampleSpan], ready: Iterable[tuple[str, int]], namespace: str
 ) -> dict[str, Process]:
     """The processes by name, "/controller#4711", by the `spans` of the publishers.
 
@@ -103,13 +103,13 @@ def admitted(signal: Signal) -> Signal:
     keep = np.zeros(len(signal.stamp_ns), dtype=np.bool_)
     begin = 0
     while begin < len(keep):
-        own = begin + np.flatnonzero(signal.sender[begin:] == signal.sender[begin])
-        intervals_ns = np.diff(signal.stamp_ns[own])
+        places = begin + np.flatnonzero(signal.sender[begin:] == signal.sender[begin])
+        intervals_ns = np.diff(signal.stamp_ns[places])
         usual_ns = int(np.median(intervals_ns)) if len(intervals_ns) else 0
         silent_ns = max(SILENT_NS, SILENT_PERIODS * usual_ns)
         silences = np.flatnonzero(intervals_ns > silent_ns)
-        last = own[silences[0]] if len(silences) else own[-1]
-        keep[own[own <= last]] = True
+        last = places[silences[0]] if len(silences) else places[-1]
+        keep[places[places <= last]] = True
         begin = int(last) + 1
     return signal if keep.all() else signal.where(keep)
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from flight_core.parameters import ParameterError, require
 from flight_log.log_samples import Instances
-from flight_log.vehicle_tables import PLANE, Choice, Parameters, Table
+from flight_log.vehicle_tables import PLANE, Choice, MessageTable, Parameters
 
 STILL = 0.1  # of the largest motion: an instance with less does not fly
 UNLIKE = 0.4  # of the deviation of a quantity: two sensors of one quantity differ by less
@@ -26,7 +26,7 @@ CORES = ("XKF1", "NKF1", "EKF1")
 
 def flown(
     instances: Instances, fields: Mapping[str, Set[str]], parameters: Parameters, choice: Choice
-) -> tuple[dict[str, Table], list[tuple[str, str]]]:
+) -> tuple[dict[str, MessageTable], list[tuple[str, str]]]:
     """A table by message, and the choice among several instances with the reason.
 
     `fields`: the fields that are read, by message; further messages give their first instance.
@@ -39,20 +39,20 @@ def flown(
             name,
             f"a message of the log, as {', '.join([*instances][:8])}",
         )
-    tables: dict[str, Table] = {}
-    taken: list[tuple[str, str]] = []
-    for name, numbered in instances.items():
+    tables: dict[str, MessageTable] = {}
+    choices: list[tuple[str, str]] = []
+    for name, sensors in instances.items():
         number = choice.instances.get(name)
         reason = "by --instance"
         if number is not None:
-            require(number in numbered, f"--instance {name}", number, f"one of {_listed(numbered)}")
+            require(number in sensors, f"--instance {name}", number, f"one of {_listed(sensors)}")
         elif name == "ARSP":
-            tables[name], sentence = _airspeed(numbered)
-            taken += [(name, sentence)] * (len(numbered) > 1)
+            tables[name], sentence = _airspeed(sensors)
+            choices += [(name, sentence)] * (len(sensors) > 1)
             continue
-        elif len(numbered) == 1 or name not in fields or name in CORES:
-            number = min(numbered)
-            reason = "the first" if name in fields and len(numbered) > 1 else ""
+        elif len(sensors) == 1 or name not in fields or name in CORES:
+            number = min(sensors)
+            reason = "the first" if name in fields and len(sensors) > 1 else ""
         elif name in SURFACES:
             number, reason = (
                 (1, "the surfaces of a VTOL")
@@ -60,20 +60,18 @@ def flown(
                 else (0, "the rotors of a VTOL")
             )
         else:
-            usable = _used(numbered, parameters) if name == "IMU" else set(numbered)
-            number, reason = _of_motion(
-                name, {k: numbered[k] for k in sorted(usable)}, fields[name]
-            )
-        tables[name] = numbered[number]
-        taken += [(name, f"{number} of {_listed(numbered)}: {reason}")] * bool(reason)
-    return tables, taken
+            usable = _used(sensors, parameters) if name == "IMU" else set(sensors)
+            number, reason = _of_motion(name, {k: sensors[k] for k in sorted(usable)}, fields[name])
+        tables[name] = sensors[number]
+        choices += [(name, f"{number} of {_listed(sensors)}: {reason}")] * bool(reason)
+    return tables, choices
 
 
-def _of_motion(name: str, numbered: Mapping[int, Table], fields: Set[str]) -> tuple[int, str]:
+def _of_motion(name: str, tables: Mapping[int, MessageTable], fields: Set[str]) -> tuple[int, str]:
     """The moving instance; the first of several equal ones."""
-    motions = {number: _motion(table, fields) for number, table in numbered.items()}
+    motions = {number: _motion(table, fields) for number, table in tables.items()}
     moving = {
-        number: numbered[number] for number in moved(motions, MOST if fields & AIRSPEEDS else STILL)
+        number: tables[number] for number in moved(motions, MOST if fields & AIRSPEEDS else STILL)
     }
     first, *others = moving
     if all(_agree(moving[first], moving[number], fields) for number in others):
@@ -89,7 +87,7 @@ def moved(motions: Mapping[int, float], least: float = STILL) -> list[int]:
     return [number for number, motion in motions.items() if motion >= least * max(motions.values())]
 
 
-def _motion(table: Table, fields: Set[str]) -> float:
+def _motion(table: MessageTable, fields: Set[str]) -> float:
     """The sum of the deviations of the fields, or the typical value of an airspeed.
 
     A dead sensor has no airspeed.
@@ -105,86 +103,88 @@ def _deviation(values: np.ndarray) -> float:
     return float(finite.std()) if len(finite) else 0.0
 
 
-def _agree(first: Table, second: Table, fields: Set[str]) -> bool:
+def _agree(first: MessageTable, second: MessageTable, fields: Set[str]) -> bool:
     """Whether the fields of two sensors differ by less than UNLIKE of their deviations."""
     for field in fields & first.fields.keys() & second.fields.keys():
         values = first.fields[field]
         difference = values - second.at(field, first.stamp_ns)
-        known = np.isfinite(difference)
-        if known.any() and np.sqrt(np.mean(difference[known] ** 2)) > UNLIKE * _deviation(
-            values[known]
+        is_finite = np.isfinite(difference)
+        if is_finite.any() and np.sqrt(np.mean(difference[is_finite] ** 2)) > UNLIKE * _deviation(
+            values[is_finite]
         ):
             return False
     return True
 
 
-def _used(numbered: Mapping[int, Table], parameters: Parameters) -> set[int]:
+def _used(tables: Mapping[int, MessageTable], parameters: Parameters) -> set[int]:
     """The healthy gyroscopes in use, by INS_USE, INS_USE2 and INS_USE3."""
-    names = {number: f"INS_USE{number + 1 if number else ''}" for number in numbered}
-    used = {
+    names = {number: f"INS_USE{number + 1 if number else ''}" for number in tables}
+    numbers = {
         number
         for number, name in names.items()
         if name not in parameters or parameters[name][0].value
     }
-    healthy = {number for number in used if _share(numbered[number], "GH") >= MOST}
-    logged = ", ".join(
+    healthy = {number for number in numbers if _share(tables[number], "GH") >= MOST}
+    settings = ", ".join(
         f"{name} {parameters[name][0].value:g}" for name in names.values() if name in parameters
     )
     require(
         bool(healthy),
         "the log",
-        f"no IMU that is used and healthy ({logged})",
+        f"no IMU that is used and healthy ({settings})",
         "one, or --instance IMU=0",
     )
     return healthy
 
 
-def _share(table: Table, field: str) -> float:
+def _share(table: MessageTable, field: str) -> float:
     """The part of the samples in which a flag is set; 1 without the flag."""
     return float(np.mean(table.fields[field] != 0.0)) if field in table.fields else 1.0
 
 
-def _airspeed(numbered: Mapping[int, Table]) -> tuple[Table, str]:
+def _airspeed(sensors: Mapping[int, MessageTable]) -> tuple[MessageTable, str]:
     """The primary airspeed sensor at every instant where healthy, else a healthy sensor in use.
 
     NaN stands for a sensor that is not healthy.
     """
-    tables = {number: _healthy(table) for number, table in numbered.items()}
+    tables = {number: _healthy(table) for number, table in sensors.items()}
     live = {
         number: table
         for number, table in tables.items()
         if np.isfinite(table.fields["Airspeed"]).mean() >= MOST
     }
-    used = {number: table for number, table in live.items() if _share(table, "U") >= MOST} or live
+    candidates = {
+        number: table for number, table in live.items() if _share(table, "U") >= MOST
+    } or live
     primary = _primary(tables)
     if primary is not None and np.isfinite(primary[1].fields["Airspeed"]).mean() >= MOST:
         numbers, table = primary
         unlike = [
             number
-            for number in used
-            if number not in numbers and not _agree(used[number], table, {"Airspeed"})
+            for number in candidates
+            if number not in numbers and not _agree(candidates[number], table, {"Airspeed"})
         ]
         if not unlike:
             return table, f"{_listed(numbers)} of {_listed(tables)}: the primary"
-        used = {number: tables[number] for number in (*numbers, *unlike)}
+        candidates = {number: tables[number] for number in (*numbers, *unlike)}
     require(
-        bool(used),
+        bool(candidates),
         "the log",
         "no healthy airspeed sensor (ARSP.H is 0)",
         "one, or --instance ARSP=0",
     )
-    number, _ = _of_motion("ARSP", used, {"Airspeed"})
+    number, _ = _of_motion("ARSP", candidates, {"Airspeed"})
     return tables[number], f"{number} of {_listed(tables)}: healthy and used"
 
 
-def _healthy(table: Table) -> Table:
+def _healthy(table: MessageTable) -> MessageTable:
     healthy = table.fields.get("H", np.ones(len(table.stamp_ns))) != 0.0
     return table._replace(
         fields={**table.fields, "Airspeed": np.where(healthy, table.fields["Airspeed"], np.nan)}
     )
 
 
-def _primary(tables: Mapping[int, Table]) -> tuple[list[int], Table] | None:
+def _primary(tables: Mapping[int, MessageTable]) -> tuple[list[int], MessageTable] | None:
     """The samples of the primary sensor at every instant, and the numbers of the sensors.
 
     None for a log without `Pri`.
@@ -200,8 +200,8 @@ def _primary(tables: Mapping[int, Table]) -> tuple[list[int], Table] | None:
         [tables[number].fields["Airspeed"][masks[number]] for number in numbers]
     )
     order = np.argsort(stamps, kind="stable")
-    return numbers, Table(stamps[order], {"Airspeed": airspeed[order]})
+    return numbers, MessageTable(stamps[order], {"Airspeed": airspeed[order]})
 
 
-def _listed(numbers: Mapping[int, Table] | list[int]) -> str:
+def _listed(numbers: Mapping[int, MessageTable] | list[int]) -> str:
     return " and ".join(map(str, sorted(numbers)))

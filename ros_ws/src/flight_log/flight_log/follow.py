@@ -201,7 +201,7 @@ class Follower:
                 self._channels[record.id] = _Channel(topic, type_name, rate)
 
     def _take_messages(self, channel: _Channel, batch: MessageBatch) -> None:
-        chosen = channel.chosen(batch)
-        if data := [row.tobytes() for row in batch.data[chosen]]:
-            sent_ns = batch.sent_ns[chosen].tolist()
+        selection = channel.chosen(batch)
+        if data := [row.tobytes() for row in batch.data[selection]]:
+            sent_ns = batch.sent_ns[selection].tolist()
             self._pending.append(Messages(channel.topic, channel.type_name, sent_ns, data))

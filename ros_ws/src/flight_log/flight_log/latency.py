@@ -22,17 +22,17 @@ class Times(NamedTuple):
     sent_ns: NDArray[np.int64]
 
 
-def latency(sent: Mapping[str, Sequence[Times]]) -> Signal | None:
+def latency(times: Mapping[str, Sequence[Times]]) -> Signal | None:
     """Time from the sending of y to the sending of the u with the stamp of y, s.
 
-    The signal has one channel, by the stamps of u. `sent` holds the times by the full names of the
+    The signal has one channel, by the stamps of u. `times` holds the times by the full names of the
     topics y and u. None for a log without y or u, with several aircraft, or with equal times, as of
     a flight in one process.
     """
-    topics = {topic.rpartition("/")[2]: topic for topic in sent}
-    if len(sent) != len(TOPICS) or len(topics) != len(TOPICS) or not all(sent.values()):
+    topics = {topic.rpartition("/")[2]: topic for topic in times}
+    if len(times) != len(TOPICS) or len(topics) != len(TOPICS) or not all(times.values()):
         return None
-    y, u = (_last_of_each(sent[topics[name]]) for name in TOPICS)
+    y, u = (_last_of_each(times[topics[name]]) for name in TOPICS)
     stamps, place_y, place_u = np.intersect1d(
         y.stamp_ns, u.stamp_ns, assume_unique=True, return_indices=True
     )

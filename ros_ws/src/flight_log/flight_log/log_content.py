@@ -36,7 +36,7 @@ from flight_log.flight_processes import (
     READY,
     ROSOUT,
     UNNAMED,
-    Span,
+    SampleSpan,
 )
 from flight_log.latency import TOPICS as TIMED_TOPICS
 from flight_log.latency import Times
@@ -107,7 +107,7 @@ class TopicSamples:
         self._lost = 0
         self._unset = 0  # samples with a zero stamp that `signal` left out
         self._samples: dict[tuple[str, ...], Columns] = {}  # by names
-        self.spans: dict[str, Span] = {}  # by publisher
+        self.spans: dict[str, SampleSpan] = {}  # by publisher
         self._refused = 0
 
     def add(self, table: Table, log_ns: NDArray[np.int64], sequence: NDArray[np.int64]) -> None:
@@ -150,7 +150,7 @@ class TopicSamples:
                 )
                 if not len(stamp_ns):
                     continue
-                span = Span(int(stamp_ns.min()), int(stamp_ns.max()), len(stamp_ns))
+                span = SampleSpan(int(stamp_ns.min()), int(stamp_ns.max()), len(stamp_ns))
                 self.spans[sender] = (
                     span.joined(self.spans[sender]) if sender in self.spans else span
                 )
@@ -169,9 +169,9 @@ class TopicSamples:
 
         Values are matched by name.
         """
-        for known in self._samples:
-            if known != names and sorted(known) == sorted(names):
-                return known, values[:, [names.index(name) for name in known]]
+        for first_names in self._samples:
+            if first_names != names and sorted(first_names) == sorted(names):
+                return first_names, values[:, [names.index(name) for name in first_names]]
         return names, values
 
     def signal(self, name: str) -> Signal | None:
@@ -344,7 +344,7 @@ class LogContent:
             f"{name} is truncated: read up to its last complete chunk{where}{more}"
             for name in self.truncated
         ]
-        lost = [
+        losses = [
             f"{topic}: the recorder lost {count} messages"
             for topic, count in self.metadata.get(LOST_MESSAGES, {}).items()
         ]
@@ -356,7 +356,7 @@ class LogContent:
         if (clock := self.metadata.get(SIMULATED_TIME)) is not None:
             speed = f", at {clock['speed']} times real time" if "speed" in clock else ""
             simulated = [f"flown by the simulated time of {clock.get('topic', '')}{speed}"]
-        return [*truncated, *self.notes, *lost, *silent, *simulated]
+        return [*truncated, *self.notes, *losses, *silent, *simulated]
 
 
 def read_content(run: Path, remaps: Mapping[str, str]) -> LogContent:
@@ -386,9 +386,9 @@ def _add_metadata(folder: Path, log: LogContent) -> None:
         mend = f": rise-di report --repair {shlex.quote(str(folder))}" if is_plain else ""
         log.notes.append(f"{METADATA} {fault}{mend}")
     if missing := missing_parts(bag_files(folder), information):
-        known = f"named in {METADATA}" if information else "a number before the last"
+        evidence = f"named in {METADATA}" if information else "a number before the last"
         log.notes.append(
-            f"{', '.join(missing)}: {known} and missing; the log is a part of the recording"
+            f"{', '.join(missing)}: {evidence} and missing; the log is a part of the recording"
         )
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from flight_core.rates import NANOSECONDS
 from flight_core.vectors import FloatArray
-from flight_log.vehicle_tables import PARAMETER, ParameterRecord, Parameters, Table
+from flight_log.vehicle_tables import PARAMETER, MessageTable, ParameterRecord, Parameters
 
 LARGEST = 2**62  # ns, of a damaged stamp
 # an autopilot that goes back by a step has started again; a link may be lost
@@ -22,14 +22,14 @@ Sample = tuple[tuple[str, int], int, Any]
 """Name and instance, stamp in ns and content of a message; the content of a PARAMETER is a name and
 a value."""
 
-Instances = dict[str, dict[int, Table]]
+Instances = dict[str, dict[int, MessageTable]]
 """The tables of the messages, by name and by the number of the instance."""
 
 SETTING = (PARAMETER, 0)
 
 
 def tables_of(
-    samples: Iterable[Sample], wanted: Mapping[str, set[str]]
+    samples: Iterable[Sample], fields: Mapping[str, set[str]]
 ) -> tuple[Instances, Parameters, str]:
     """Tables of messages, parameters, and a note. A field that its first message lacks is absent.
 
@@ -40,7 +40,7 @@ def tables_of(
     """
     parts = [list[Sample]()]
     newest_ns = 0
-    apart: list[Sample] = []  # the samples before, near each other and not near those of the part
+    strays: list[Sample] = []  # the samples before, near each other and not near those of the part
     settings = [list[Sample]()]  # by part
     next_settings: list[Sample] = []
     for sample in samples:
@@ -50,26 +50,26 @@ def tables_of(
         if parts[-1] and abs(sample[1] - newest_ns) <= STEP_NS:
             parts[-1].append(sample)
             newest_ns = max(newest_ns, sample[1])
-            apart = []
+            strays = []
         else:
-            apart = (
-                [*apart, sample]
-                if apart and -STEP_NS <= sample[1] - apart[-1][1] <= LOST_NS
+            strays = (
+                [*strays, sample]
+                if strays and -STEP_NS <= sample[1] - strays[-1][1] <= LOST_NS
                 else [sample]
             )
-            if len(apart) < AGREEING:
+            if len(strays) < AGREEING:
                 continue
-            if parts[-1] and apart[0][1] < newest_ns:
+            if parts[-1] and strays[0][1] < newest_ns:
                 parts.append([])
                 settings.append([])
-            parts[-1] += apart
-            newest_ns, apart = max(stamp_ns for _, stamp_ns, _ in apart), []
+            parts[-1] += strays
+            newest_ns, strays = max(stamp_ns for _, stamp_ns, _ in strays), []
         settings[-1] += next_settings
         next_settings = []
     settings[-1] += next_settings
     note = f", the longest of {len(parts)} parts: its clock goes back" if len(parts) > 1 else ""
     longest = max(range(len(parts)), key=lambda number: len(parts[number]))
-    return _columns(parts[longest] or apart, wanted), parameters_of(settings[longest]), note
+    return _columns(parts[longest] or strays, fields), parameters_of(settings[longest]), note
 
 
 def parameters_of(records: Iterable[Sample]) -> Parameters:
@@ -80,14 +80,14 @@ def parameters_of(records: Iterable[Sample]) -> Parameters:
     return {name: tuple(values) for name, values in parameters.items()}
 
 
-def _columns(samples: Iterable[Sample], wanted: Mapping[str, set[str]]) -> Instances:
+def _columns(samples: Iterable[Sample], fields_of: Mapping[str, set[str]]) -> Instances:
     stamps: dict[tuple[str, int], list[int]] = {}
     columns: dict[tuple[str, int], dict[str, list[float]]] = {}
     for place, stamp_ns, message in samples:
         if place not in columns:
             columns[place] = {
                 field: []
-                for field in sorted(wanted[place[0]])
+                for field in sorted(fields_of[place[0]])
                 if is_number(getattr(message, field, None))
             }
         stamps.setdefault(place, []).append(stamp_ns)
@@ -121,7 +121,7 @@ def near(stamp_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
     )
 
 
-def table_of(stamp_ns: NDArray[np.int64], fields: Mapping[str, FloatArray]) -> Table:
+def table_of(stamp_ns: NDArray[np.int64], fields: Mapping[str, FloatArray]) -> MessageTable:
     """A table in the order of its stamps, without samples of a repeated stamp."""
     stamps, places = np.unique(stamp_ns, return_index=True)
-    return Table(stamps, {name: values[places] for name, values in fields.items()})
+    return MessageTable(stamps, {name: values[places] for name, values in fields.items()})

@@ -15,7 +15,7 @@ from typing import NamedTuple
 from flight_core.parameters import ParameterError
 
 
-class Definition(NamedTuple):
+class MessageDefinition(NamedTuple):
     """A message type as stored in a log."""
 
     name: str  # "sensor_msgs/msg/JointState"
@@ -24,7 +24,7 @@ class Definition(NamedTuple):
 
 
 @cache
-def definition(name: str) -> Definition:
+def definition(name: str) -> MessageDefinition:
     """Definition of "pkg/msg/Type".
 
     The text is the main definition, then for each referenced type a line of 80 "=", "MSG: pkg/Type"
@@ -41,7 +41,7 @@ def definition(name: str) -> Definition:
         store = typestore()
         if name not in store.fielddefs:
             raise
-        return Definition(
+        return MessageDefinition(
             name, store.generate_msgdef(name, ros_version=2)[0], store.hash_rihs01(name)
         )
     parts = [read_definition(name, "msg")]
@@ -51,7 +51,7 @@ def definition(name: str) -> Definition:
             f"{'=' * 80}\nMSG: {package}/{kind}\n{read_definition(referenced['type_name'], 'msg')}"
         )
     hashes = {entry["type_name"]: entry["hash_string"] for entry in description["type_hashes"]}
-    return Definition(name, "\n".join(parts), hashes[name])
+    return MessageDefinition(name, "\n".join(parts), hashes[name])
 
 
 def read_definition(name: str, suffix: str) -> str:

@@ -150,9 +150,9 @@ def _marks(k: int) -> FloatArray:
     return np.asarray(-np.arange(1.0, k + 1.0) * np.pi)
 
 
-def _position(marked: bytes, marks: FloatArray) -> slice:
+def _position(message: bytes, marks: FloatArray) -> slice:
     """The place of the values in a message with marks."""
-    start = marked.index(marks.tobytes())
+    start = message.index(marks.tobytes())
     return slice(start, start + marks.nbytes)
 
 
@@ -169,7 +169,7 @@ def decode_routes(table: Table) -> Decoded:
         except SerdeError:
             unreadable += 1
             continue
-        points = [stamped.pose.position for stamped in route.poses]
+        points = [stamped_pose.pose.position for stamped_pose in route.poses]
         if points:
             rows = np.array([(k, point.y, point.x, point.z) for k, point in enumerate(points)])
             samples.append(Samples(WAYPOINT, np.full(len(rows), stamp_of(message)), rows))
@@ -191,14 +191,14 @@ class _JointStateDecoder:
     def __call__(self, table: Table) -> Decoded:
         if not self._names and len(table):
             self._learn(bytes(table[0]))
-        same = self._same_layout(table)
+        has_layout = self._same_layout(table)
         samples = []
-        if same.any():
-            known = table if same.all() else table[same]
-            values = np.ascontiguousarray(known[:, self._values]).view("<f8")
-            samples.append(Samples(self._names, stamps_of(known), values, self._sender))
+        if has_layout.any():
+            rows = table if has_layout.all() else table[has_layout]
+            values = np.ascontiguousarray(rows[:, self._values]).view("<f8")
+            samples.append(Samples(self._names, stamps_of(rows), values, self._sender))
         unreadable = 0
-        unknown = [bytes(message) for message in table[~same]]
+        unknown = [bytes(message) for message in table[~has_layout]]
         for message in unknown:
             try:
                 vector: Any = self._store.deserialize_cdr(message, JOINT_STATE)
@@ -244,14 +244,14 @@ class _JointStateDecoder:
         ):
             return
         marks = _marks(k)
-        marked = bytes(
+        template = bytes(
             self._store.serialize_cdr(
                 type(vector)(vector.header, vector.name, marks, vector.velocity, vector.effort),
                 JOINT_STATE,
             )
         )
-        values = _position(marked, marks)
-        if len(marked) != len(message) or message[values] != vector.position.tobytes():
+        values = _position(template, marks)
+        if len(template) != len(message) or message[values] != vector.position.tobytes():
             return
         self._names = tuple(vector.name)
         self._values = values

@@ -103,8 +103,8 @@ def _is_bag(folder: Path) -> bool:
 
 def _some(names: Sequence[str]) -> str:
     """The first names, and the number of the rest."""
-    unnamed = len(names) - NAMED
-    return "; ".join(names[:NAMED]) + (f"; and {unnamed} more" if unnamed > 0 else "")
+    surplus = len(names) - NAMED
+    return "; ".join(names[:NAMED]) + (f"; and {surplus} more" if surplus > 0 else "")
 
 
 def missing_parts(files: Sequence[Path], information: Mapping[str, Any]) -> list[str]:
@@ -114,18 +114,18 @@ def missing_parts(files: Sequence[Path], information: Mapping[str, Any]) -> list
     files are compared by number.
     """
     paths = information.get("relative_file_paths")
-    named = [Path(str(path)).name for path in paths] if isinstance(paths, list) else []
+    file_names = [Path(str(path)).name for path in paths] if isinstance(paths, list) else []
     present = {plain_name(file.name) for file in files}
     numbers = {number for file in files if (number := part_number(file.name)) is not None}
-    if not named and len(numbers) == len(files) > 1 and max(numbers) < 2 * len(files) + 100:
+    if not file_names and len(numbers) == len(files) > 1 and max(numbers) < 2 * len(files) + 100:
         stem = re.sub(r"\d+$", "", Path(plain_name(files[0].name)).stem)
         suffix = files[0].name.removeprefix(Path(plain_name(files[0].name)).stem)
-        named = [f"{stem}{number}{suffix}" for number in range(max(numbers) + 1)]
-    if len(files) >= len(named):
+        file_names = [f"{stem}{number}{suffix}" for number in range(max(numbers) + 1)]
+    if len(files) >= len(file_names):
         return []
-    if any(plain_name(name) in present for name in named):
-        return [name for name in named if plain_name(name) not in present]
-    return [name for name in named if part_number(name) not in numbers]
+    if any(plain_name(name) in present for name in file_names):
+        return [name for name in file_names if plain_name(name) not in present]
+    return [name for name in file_names if part_number(name) not in numbers]
 
 
 @contextmanager
@@ -152,10 +152,10 @@ def _unpack(file: Path, plain: Path, kind: str) -> None:
     Raises ParameterError.
     """
     limit = shutil.disk_usage(plain.parent).free // 2
-    opened: Any = lz4.frame.open if kind == LZ4 else zstandard.open
+    open_packed: Any = lz4.frame.open if kind == LZ4 else zstandard.open
     size = 0
     try:
-        with opened(file, "rb") as source, plain.open("wb") as target:
+        with open_packed(file, "rb") as source, plain.open("wb") as target:
             while block := source.read1(COPY_BYTES):  # what a truncated file holds before its end
                 size += len(block)
                 unpack = UNPACK.get(file.suffix, "unpack")

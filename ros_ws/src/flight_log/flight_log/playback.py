@@ -76,16 +76,16 @@ def read_playback(
     stored = [message for message in stored if message.topic not in skipped]
     if namespace is not None:
         stored = _within(stored, namespace, str(run))
-    known = {message.topic: message for message in stored}
-    wanted = set[str]() if topics else set(known) - set(SHARED)
+    last_messages = {message.topic: message for message in stored}
+    selection = set[str]() if topics else set(last_messages) - set(SHARED)
     for name in topics:
-        wanted.update(_matching(name, known, str(run)))
+        selection.update(_matching(name, last_messages, str(run)))
     among = f" to play among {listed(skipped)}" if skipped else ""
-    require(bool(wanted), str(run), f"no message{among}", A_FLIGHT)
+    require(bool(selection), str(run), f"no message{among}", A_FLIGHT)
     lockstep = _is_lockstep(stored)
-    messages = [*_scheduled(stored, known, wanted, lockstep=lockstep)]
-    timed = (message for message in stored if _is_flight_time(message) is lockstep)
-    start_ns = _start_ns(timed, messages[0].due_ns)
+    messages = [*_scheduled(stored, last_messages, selection, lockstep=lockstep)]
+    starts = (message for message in stored if _is_flight_time(message) is lockstep)
+    start_ns = _start_ns(starts, messages[0].due_ns)
     begin_ns = start_ns + nanoseconds(start)
     end = seconds(messages[-1].due_ns - start_ns)
     require(
@@ -96,68 +96,68 @@ def read_playback(
     )
     if start > 0.0:
         later = (message for message in messages if message.due_ns >= begin_ns)
-        messages = [*_latched(messages, known, begin_ns), *later]
-    types = {topic: known[topic].type_name for topic in sorted(wanted)}
+        messages = [*_latched(messages, last_messages, begin_ns), *later]
+    types = {topic: last_messages[topic].type_name for topic in sorted(selection)}
     return Playback(types, messages, start_ns, skipped)
 
 
-def _within(stored: Sequence[StoredMessage], namespace: str, where: str) -> list[StoredMessage]:
+def _within(messages: Sequence[StoredMessage], namespace: str, where: str) -> list[StoredMessage]:
     """The messages of an aircraft, and of SHARED topics. Raises ParameterError."""
-    topics = {message.topic for message in stored}
+    topics = {message.topic for message in messages}
     names = names_within(chosen_namespace(topics, namespace, where), topics)
     inside = {*names, *SHARED}
-    return [message for message in stored if message.topic in inside]
+    return [message for message in messages if message.topic in inside]
 
 
-def _is_lockstep(stored: Iterable[StoredMessage]) -> bool:
+def _is_lockstep(messages: Iterable[StoredMessage]) -> bool:
     """Whether most stamps of named vectors are flight time, as in lockstep."""
     votes = [
         _is_flight_time(message)
-        for message in stored
+        for message in messages
         if message.type_name == JOINT_STATE and stamp_of(message.data)
     ]
     return 2 * sum(votes) > len(votes)
 
 
 def _scheduled(
-    stored: Iterable[StoredMessage],
-    known: Mapping[str, StoredMessage],
-    wanted: Collection[str],
+    messages: Iterable[StoredMessage],
+    last_messages: Mapping[str, StoredMessage],
+    selection: Collection[str],
     *,
     lockstep: bool,
 ) -> Iterator[ScheduledMessage]:
-    """The wanted messages with their due times."""
+    """The messages of the selected topics with their due times."""
     stamped_topics = {
-        topic for topic, message in known.items() if begins_with_stamp(_definition(message))
+        topic for topic, message in last_messages.items() if begins_with_stamp(_definition(message))
     }
     now_ns = 0
-    for message in stored:
+    for message in messages:
         # A stamp on the second time scale, or an unset stamp, gives no due time. The message is
         # sent unchanged.
-        stamped = message.topic in stamped_topics and _is_flight_time(message) is lockstep
+        has_stamp = message.topic in stamped_topics and _is_flight_time(message) is lockstep
         if not lockstep:
             now_ns = _sent_ns(message)
-        elif stamped:
+        elif has_stamp:
             now_ns = max(now_ns, stamp_of(message.data))
-        if message.topic in wanted:
-            yield ScheduledMessage(now_ns, message.topic, message.data, stamped)
+        if message.topic in selection:
+            yield ScheduledMessage(now_ns, message.topic, message.data, has_stamp)
 
 
 def _latched(
-    messages: Sequence[ScheduledMessage], known: Mapping[str, StoredMessage], begin_ns: int
+    messages: Sequence[ScheduledMessage], last_messages: Mapping[str, StoredMessage], begin_ns: int
 ) -> Iterator[ScheduledMessage]:
     """The last messages of latched topics before the begin, for late subscribers.
 
     /robot_description is such a topic.
     """
-    kept = {
+    depths = {
         topic: deque[ScheduledMessage](maxlen=latched_depth(message.qos))
-        for topic, message in known.items()
+        for topic, message in last_messages.items()
     }
     for message in messages:
         if message.due_ns < begin_ns:
-            kept[message.topic].append(message._replace(due_ns=begin_ns))
-    yield from chain.from_iterable(kept.values())
+            depths[message.topic].append(message._replace(due_ns=begin_ns))
+    yield from chain.from_iterable(depths.values())
 
 
 def latched_depth(qos: str) -> int:
@@ -204,27 +204,29 @@ def begins_with_stamp(text: str) -> bool:
     return bool(STAMPED.match(first))
 
 
-def _matching(name: str, known: Mapping[str, StoredMessage], where: str) -> list[str]:
-    topics = [topic for topic in known if name in (topic, topic.rpartition("/")[2])]
-    require(bool(topics), where, f"no message of {name}", f"some of {', '.join(sorted(known))}")
+def _matching(name: str, last_messages: Mapping[str, StoredMessage], where: str) -> list[str]:
+    topics = [topic for topic in last_messages if name in (topic, topic.rpartition("/")[2])]
+    require(
+        bool(topics), where, f"no message of {name}", f"some of {', '.join(sorted(last_messages))}"
+    )
     return topics
 
 
-def _sent_ns(stored: StoredMessage) -> int:
-    return stored.sent_ns or stored.received_ns
+def _sent_ns(message: StoredMessage) -> int:
+    return message.sent_ns or message.received_ns
 
 
-def _is_flight_time(stored: StoredMessage) -> bool:
-    return abs(stamp_of(stored.data) - _sent_ns(stored)) > MAX_CLOCK_OFFSET_NS
+def _is_flight_time(message: StoredMessage) -> bool:
+    return abs(stamp_of(message.data) - _sent_ns(message)) > MAX_CLOCK_OFFSET_NS
 
 
-def _start_ns(stored: Iterable[StoredMessage], otherwise: int) -> int:
+def _start_ns(messages: Iterable[StoredMessage], otherwise: int) -> int:
     """Stamp of flight time 0, by the first `truth` or else the first `y_m`.
 
     `otherwise` without both.
     """
     first: dict[str, StoredMessage] = {}
-    for message in stored:
+    for message in messages:
         first.setdefault(message.topic.rpartition("/")[2], message)
     truth = first.get("truth")
     y_m = first.get("y_m")

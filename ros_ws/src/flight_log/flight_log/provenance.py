@@ -113,10 +113,10 @@ def revision(source: Path) -> dict[str, str]:
         # an installed copy may be inside another project's checkout
         output("ls-files", "--error-unmatch", source.name)
         commit = output("rev-parse", "HEAD")
-        changed = output("status", "--porcelain", "--untracked-files=no")
+        changes = output("status", "--porcelain", "--untracked-files=no")
     except (OSError, subprocess.SubprocessError):
         return {}
-    return {"commit": commit, "dirty": "true" if changed else "false"}
+    return {"commit": commit, "dirty": "true" if changes else "false"}
 
 
 def host() -> dict[str, str]:

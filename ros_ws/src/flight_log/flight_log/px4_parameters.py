@@ -51,11 +51,11 @@ def rate_loop(path: Path, rate: float | None = None) -> RateLoop:
     """
     values = {**DEFAULTS, **_read(path)}
     fastest = values["IMU_GYRO_RATEMAX"]
-    chosen = fastest if rate is None else rate
+    design_rate = fastest if rate is None else rate
     require(
-        0.0 < chosen <= fastest,
+        0.0 < design_rate <= fastest,
         "rate",
-        chosen,
+        design_rate,
         f"at most IMU_GYRO_RATEMAX, {fastest:g} Hz",
     )
     cutoff = values["IMU_GYRO_CUTOFF"]
@@ -67,28 +67,28 @@ def rate_loop(path: Path, rate: float | None = None) -> RateLoop:
             width = values[f"{name}_BW"]
             delay += width / (2.0 * math.pi * frequency**2)
             words += f", notch {frequency:g} Hz"
-    delay += 1.0 / chosen
+    delay += 1.0 / design_rate
     origin = f"{path.name}: gyro at {fastest:g} Hz, {words}; delay {1e3 * delay:.3g} ms"
-    return RateLoop(chosen, delay, origin)
+    return RateLoop(design_rate, delay, origin)
 
 
 def _read(path: Path) -> dict[str, float]:
     """The parameters that a file has, of DEFAULTS. Raises ParameterError."""
     require(path.is_file(), "px4", f"no file {path}", EXPECTED)
     if "ULog" in file_kind(path):
-        recorded = read_foreign_log(path).parameters
-        values = {name: records[-1].value for name, records in recorded.items()}
+        parameters = read_foreign_log(path).parameters
+        values = {name: records[-1].value for name, records in parameters.items()}
     else:
         lines = read_file(path, "px4", EXPECTED).decode("utf-8", "replace").splitlines()
         rows = [line.split("\t") for line in lines if line and not line.startswith("#")]
         is_table = bool(rows) and all(len(row) >= COLUMNS and _is_number(row[3]) for row in rows)
         require(is_table, "px4", f"{path}, which has no rows of parameters", EXPECTED)
         values = {row[2]: float(row[3]) for row in rows}
-    known = {name: value for name, value in values.items() if name in DEFAULTS}
-    require(bool(known), "px4", f"{path} without IMU_GYRO_ parameters", EXPECTED)
-    wrong = [f"{name} {value}" for name, value in known.items() if not 0.0 <= value < math.inf]
+    defaults = {name: value for name, value in values.items() if name in DEFAULTS}
+    require(bool(defaults), "px4", f"{path} without IMU_GYRO_ parameters", EXPECTED)
+    wrong = [f"{name} {value}" for name, value in defaults.items() if not 0.0 <= value < math.inf]
     require(not wrong, "px4", ", ".join(wrong), "0 or more")
-    return known
+    return defaults
 
 
 def _is_number(text: str) -> bool:

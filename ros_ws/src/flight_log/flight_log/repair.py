@@ -71,14 +71,14 @@ def repair(run: Path) -> Repair:
     if not is_file(run):
         previous, end_ns = _previous_metadata(run / METADATA)
         missing = missing_parts(files, previous)
-    named = previous.get("relative_file_paths")
+    paths = previous.get("relative_file_paths")
     try:
         scans = [_FileScan(file) for file in files]
-        repaired = [scan.rebuild() if scan.faults else scan.unchanged() for scan in scans]
-        lists_all_files = isinstance(named, list) and {file.name for file in files} == {
-            *map(str, named)
+        repairs = [scan.rebuild() if scan.faults else scan.unchanged() for scan in scans]
+        lists_all_files = isinstance(paths, list) and {file.name for file in files} == {
+            *map(str, paths)
         } - {*missing}
-        write = not is_file(run) and (not lists_all_files or any(file.damaged for file in repaired))
+        write = not is_file(run) and (not lists_all_files or any(file.damaged for file in repairs))
         if write:
             if not previous and is_file(run / METADATA):
                 _keep_damaged(run / METADATA)
@@ -90,7 +90,7 @@ def repair(run: Path) -> Repair:
         raise ParameterError(
             f"{run}: cannot be repaired ({error.strerror}), expected a folder that can be written"
         ) from None
-    *others, last = repaired
+    *others, last = repairs
     return Repair(
         (*others, last._replace(known_end_ns=max(last.known_end_ns, end_ns))), write, tuple(missing)
     )
@@ -180,12 +180,12 @@ class _FileScan:
 
     def rebuild(self) -> FileRepair:
         """Write a file with the readable records, then replace the damaged file."""
-        known = {
+        counts = {
             identity: count
             for identity, count in self.messages.items()
             if identity in self.channels
         }
-        require(bool(known), str(self.path), "no message that could be read", "any")
+        require(bool(counts), str(self.path), "no message that could be read", "any")
         with replacing(self.path) as stream:
             self._copy(Writer(stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD))
             stream.flush()
@@ -194,7 +194,7 @@ class _FileScan:
             damaged = _keep_damaged(self.path)
         return FileRepair(
             path=self.path,
-            messages=sum(known.values()),
+            messages=sum(counts.values()),
             last_ns=self.last_ns,
             known_end_ns=self.known_end_ns,
             faults=self.faults,

@@ -69,7 +69,7 @@ def bag_files(run: Path) -> list[Path]:
     """
     if is_file(run):
         return [run]
-    named: dict[str, Path] = {}
+    by_name: dict[str, Path] = {}
     try:
         content = sorted(run.iterdir()) if is_folder(run) else []
     except OSError as error:
@@ -79,9 +79,9 @@ def bag_files(run: Path) -> list[Path]:
     for file in content:  # a plain file sorts before the packed file
         name = plain_name(file.name)
         if name.endswith(SUFFIXES) and is_file(file):
-            named.setdefault(name, file)
-    files = list(named.values())
-    kinds = {re.sub(r"(_\d+)?(?=\.\w+$)", "", name) for name in named}
+            by_name.setdefault(name, file)
+    files = list(by_name.values())
+    kinds = {re.sub(r"(_\d+)?(?=\.\w+$)", "", name) for name in by_name}
     require(len(kinds) < 2, str(run), _several(files), "one bag in the folder of a run")
     return sorted(files, key=lambda file: _order(file.name))
 
@@ -140,7 +140,7 @@ def bag_metadata_yaml(
         for count in counts.values()
     ]
     previous_content = previous or {}
-    described = {file.file: {"path": file.file, **_extent([file])} for file in files}
+    descriptions = {file.file: {"path": file.file, **_extent([file])} for file in files}
     information = {
         "version": ROSBAG2_VERSION,
         "storage_identifier": "mcap",
@@ -148,9 +148,9 @@ def bag_metadata_yaml(
         "topics_with_message_count": topics,
         "compression_format": previous_content.get("compression_format", ""),
         "compression_mode": previous_content.get("compression_mode", ""),
-        "relative_file_paths": sorted([*described, *missing], key=_order),
+        "relative_file_paths": sorted([*descriptions, *missing], key=_order),
         "files": sorted(
-            [*described.values(), *_entries(previous_content, missing)],
+            [*descriptions.values(), *_entries(previous_content, missing)],
             key=lambda entry: _order(entry["path"]),
         ),
         "custom_data": previous_content.get("custom_data"),
@@ -167,8 +167,12 @@ def _order(name: str) -> tuple[int, str]:
 def _entries(information: Mapping[str, Any], names: Sequence[str]) -> list[dict[str, Any]]:
     """The entries of files in the content of metadata.yaml."""
     entries = information.get("files")
-    listed = entries if isinstance(entries, list) else []
-    return [entry for entry in listed if isinstance(entry, dict) and entry.get("path") in names]
+    entries_of_files = entries if isinstance(entries, list) else []
+    return [
+        entry
+        for entry in entries_of_files
+        if isinstance(entry, dict) and entry.get("path") in names
+    ]
 
 
 def _profiles(qos: str) -> list[Any]:
@@ -181,9 +185,9 @@ def _profiles(qos: str) -> list[Any]:
 
 
 def _extent(files: Sequence[FileContents]) -> dict[str, Any]:
-    filled = [file for file in files if file.messages]
-    first_ns = min((file.first_ns for file in filled), default=0)
-    last_ns = max((file.last_ns for file in filled), default=0)
+    with_messages = [file for file in files if file.messages]
+    first_ns = min((file.first_ns for file in with_messages), default=0)
+    last_ns = max((file.last_ns for file in with_messages), default=0)
     return {
         "duration": {"nanoseconds": last_ns - first_ns},
         "starting_time": {"nanoseconds_since_epoch": first_ns},

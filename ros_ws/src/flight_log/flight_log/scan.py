@@ -113,7 +113,7 @@ class _Decompressor(threading.local):
 _OF_THREAD = _Decompressor()
 
 
-class Part(NamedTuple):
+class FilePart(NamedTuple):
     """A record between the two magics of a file."""
 
     opcode: int
@@ -186,9 +186,9 @@ class Scan:
 
     def _read(
         self,
-        decode: Callable[[Sequence[Part]], Iterator[R]],
+        decode: Callable[[Sequence[FilePart]], Iterator[R]],
         joined: int,
-        apply: Callable[..., Iterator[tuple[Part, list[R], int]]],
+        apply: Callable[..., Iterator[tuple[FilePart, list[R], int]]],
     ) -> Iterator[Sequence[R | Schema | Channel]]:
         with self.path.open("rb") as stream:
             size = os.fstat(stream.fileno()).st_size
@@ -244,7 +244,9 @@ class Scan:
         }
         return index
 
-    def _parts(self, stream: IO[bytes], size: int, index: Sequence[McapRecord]) -> Iterator[Part]:
+    def _parts(
+        self, stream: IO[bytes], size: int, index: Sequence[McapRecord]
+    ) -> Iterator[FilePart]:
         """The parts from the position to the end of the data, or of the file so far."""
         stream.seek(0)
         if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
@@ -276,19 +278,19 @@ def _known_places(index: Sequence[McapRecord], size: int) -> list[int]:
     return [*sorted(start for start in starts if start < size), size]
 
 
-def whole_parts(stream: IO[bytes], position: int, known: Sequence[int]) -> Iterator[Part]:
+def whole_parts(stream: IO[bytes], position: int, places: Sequence[int]) -> Iterator[FilePart]:
     """Every whole record from a place up to the end of the data, with the message indexes behind.
 
     After a damaged record, with the opcode DAMAGED, the next record of the index follows. The last
     record is in ENDS, or the file is truncated, or grows.
     """
     stream.seek(position)
-    size = known[-1]
-    before: Part | None = None
+    size = places[-1]
+    before: FilePart | None = None
     is_end = False
     while position + RECORD.size <= size and not is_end:
         opcode, length = RECORD.unpack(stream.read(RECORD.size))
-        next_known = known[bisect_right(known, position)]
+        next_known = places[bisect_right(places, position)]
         end = position + RECORD.size + length
         is_end = opcode in ENDS and next_known == size
         if end > next_known or is_end != (opcode in ENDS):
@@ -305,17 +307,17 @@ def whole_parts(stream: IO[bytes], position: int, known: Sequence[int]) -> Itera
             continue
         if before is not None:
             yield before
-        before = Part(opcode, content, [], end)
+        before = FilePart(opcode, content, [], end)
     if before is not None:
         yield before
 
 
-def _joined(parts: Iterator[Part], most: int) -> Iterator[Sequence[Part]]:
+def _joined(parts: Iterator[FilePart], most: int) -> Iterator[Sequence[FilePart]]:
     """Successive chunks with up to `most` bytes of records together; every further record alone.
 
     A chunk of more bytes is alone too.
     """
-    chunks: list[Part] = []
+    chunks: list[FilePart] = []
     size = 0
     for part in parts:
         # else it is damaged
@@ -335,8 +337,8 @@ def _joined(parts: Iterator[Part], most: int) -> Iterator[Sequence[Part]]:
 
 
 def _decoded(
-    decode: Callable[[Sequence[Part]], Iterator[R]], parts: Sequence[Part]
-) -> tuple[Part, list[R], int]:
+    decode: Callable[[Sequence[FilePart]], Iterator[R]], parts: Sequence[FilePart]
+) -> tuple[FilePart, list[R], int]:
     """The last of parts, their records without those of damaged parts, and how many these are."""
     try:
         return parts[-1], list(decode(parts)), 0
@@ -358,12 +360,12 @@ def map_ahead(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
     Decompression and NumPy leave the interpreter to the caller meanwhile.
     """
     with ThreadPoolExecutor(1) as pool:
-        ahead: deque[Future[R]] = deque()
+        queue: deque[Future[R]] = deque()
         for item in items:
-            ahead.append(pool.submit(function, item))
-            if len(ahead) > AHEAD:
-                yield ahead.popleft().result()
-        yield from (future.result() for future in ahead)
+            queue.append(pool.submit(function, item))
+            if len(queue) > AHEAD:
+                yield queue.popleft().result()
+        yield from (future.result() for future in queue)
 
 
 def split(data: bytes) -> Iterator[McapRecord]:
@@ -389,7 +391,7 @@ def _messages_in(record: object) -> int:
     return len(record.data) if isinstance(record, MessageBatch) else isinstance(record, Message)
 
 
-def decode_batches(parts: Sequence[Part]) -> Iterator[McapRecord | MessageBatch]:
+def decode_batches(parts: Sequence[FilePart]) -> Iterator[McapRecord | MessageBatch]:
     """As `decode` of chunks or of a single record, with the messages of a channel together.
 
     The message indexes of a chunk save most of the time. A wrong index changes nothing. Raises
@@ -398,7 +400,7 @@ def decode_batches(parts: Sequence[Part]) -> Iterator[McapRecord | MessageBatch]
     yield from _split_batches([(_plain(part), _places(part.message_indexes)) for part in parts])
 
 
-def _plain(part: Part) -> bytes:
+def _plain(part: FilePart) -> bytes:
     """The records of a part, those of a chunk decompressed. Raises DECODE_ERRORS."""
     if part.opcode == Opcode.CHUNK:
         return decompress(part.content)
@@ -493,7 +495,7 @@ def _walk(data: bytes, places: NDArray[np.int64]) -> tuple[list[McapRecord], NDA
     return others, np.sort(np.append(places, further)) if further else places
 
 
-def decode_parts(parts: Iterable[Part]) -> Iterator[McapRecord]:
+def decode_parts(parts: Iterable[FilePart]) -> Iterator[McapRecord]:
     """The records of parts of a file, in order. Raises DECODE_ERRORS."""
     for part in parts:
         yield from split(_plain(part))

@@ -72,30 +72,34 @@ def stored_messages(run: Path) -> Iterator[StoredMessage]:
             ) from None
 
 
-def parameter_changes(run: Path, node: str, known: Mapping[str, object]) -> list[dict[str, Any]]:
+def parameter_changes(
+    run: Path, node: str, parameters: Mapping[str, object]
+) -> list[dict[str, Any]]:
     """The changes of a node's parameters on `/parameter_events`, in the order of the stamps.
 
     `node` is the full name of a node, as in "/one/controller". A change maps dotted names to
-    values, for `known` parameters or groups of parameters. None stands for a deleted parameter. SI
+    values, for `parameters` or groups of parameters. None stands for a deleted parameter. SI
     units.
     """
     store = typestore()
     events: list[tuple[int, dict[str, Any]]] = []
-    for stored in stored_messages(run):
-        if stored.topic != PARAMETER_EVENTS or stored.type_name != PARAMETER_EVENT:
+    for message in stored_messages(run):
+        if message.topic != PARAMETER_EVENTS or message.type_name != PARAMETER_EVENT:
             continue
         try:
-            event: Any = store.deserialize_cdr(stored.data, PARAMETER_EVENT)
+            event: Any = store.deserialize_cdr(message.data, PARAMETER_EVENT)
         except SerdeError:
             continue
         if event.node != node:
             continue
         changes = {
-            new.name: parameter_value(new.value)
-            for new in (*event.new_parameters, *event.changed_parameters)
+            change.name: parameter_value(change.value)
+            for change in (*event.new_parameters, *event.changed_parameters)
         }
         changes |= {deleted.name: None for deleted in event.deleted_parameters}
-        values = {name: value for name, value in changes.items() if name.split(".")[0] in known}
+        values = {
+            name: value for name, value in changes.items() if name.split(".")[0] in parameters
+        }
         if values:
             events.append((event.stamp.sec * NANOSECONDS + event.stamp.nanosec, values))
     return [values for _, values in sorted(events, key=itemgetter(0))]
@@ -126,10 +130,10 @@ def parameter_event(stamp_ns: int, node: str, changes: Mapping[str, Any]) -> byt
             fields[kind - 1] = np.array(value, dtype=default.dtype) if is_table else value
         return types["Parameter"](name, types["ParameterValue"](kind, *fields))
 
-    changed = [parameter(name, value) for name, value in changes.items() if value is not None]
+    replacements = [parameter(name, value) for name, value in changes.items() if value is not None]
     deleted = [parameter(name, None) for name, value in changes.items() if value is None]
     stamp = store.types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, NANOSECONDS))
-    event = types["ParameterEvent"](stamp, node, [], changed, deleted)
+    event = types["ParameterEvent"](stamp, node, [], replacements, deleted)
     return bytes(store.serialize_cdr(event, PARAMETER_EVENT))
 
 

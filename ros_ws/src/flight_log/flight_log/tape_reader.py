@@ -30,7 +30,7 @@ from flight_log.clock import SINCE_EPOCH_NS, leap_note, recording_note, without_
 from flight_log.engagements import ENGAGEMENT, Engagement, engagements
 from flight_log.flight_processes import (
     INSTANCE,
-    Span,
+    SampleSpan,
     admitted,
     flight_processes,
     ready_times,
@@ -117,8 +117,8 @@ class RecordedRun(NamedTuple):
 def listed(topics: Mapping[str, str]) -> str:
     """Topics with the types, for a sentence; empty without topics."""
     names = [f"{topic} ({type_name or 'no type'})" for topic, type_name in sorted(topics.items())]
-    unnamed = len(names) - NAMED
-    return ", ".join(names[:NAMED]) + (f" and {unnamed} more topics" if unnamed > 0 else "")
+    surplus = len(names) - NAMED
+    return ", ".join(names[:NAMED]) + (f" and {surplus} more topics" if surplus > 0 else "")
 
 
 def read_run(
@@ -133,32 +133,34 @@ def read_run(
         None if scenario is None else stored_scenario(as_path(scenario, "scenario", A_SCENARIO))
     )
     log = read_content(run, full_names(remaps))
-    filled = {
+    signals = {
         topic: signal
         for topic, samples in log.topics.items()
         if (signal := samples.signal(topic.rpartition("/")[2])) is not None
     }
-    _require_samples(log, filled, run)
-    aircraft = chosen_namespace(filled, namespace, str(run))
-    names = names_within(aircraft, filled)
+    _require_samples(log, signals, run)
+    aircraft = chosen_namespace(signals, namespace, str(run))
+    names = names_within(aircraft, signals)
     require(
         bool(names),
         str(run),
-        f"topics that begin with no slash: {', '.join(filled)}",
+        f"topics that begin with no slash: {', '.join(signals)}",
         "a recorded flight",
     )
-    beside = [] if log.scenario else files_beside(run)
-    tape = _tape(log, aircraft, names, {name: filled[topic] for topic, name in names.items()})
-    tape = replace(tape, duration=_duration([*log.attachments, *beside]))
-    stepped = any(tape.recording[name].step_ns for name in TIMED_TOPICS if name in tape.recording)
-    sent = {topic: times for topic, times in log.sent.items() if names.get(topic) in TIMED_TOPICS}
-    other_files = (file for file in beside if file.name != PARAMETERS)
+    files = [] if log.scenario else files_beside(run)
+    tape = _tape(log, aircraft, names, {name: signals[topic] for topic, name in names.items()})
+    tape = replace(tape, duration=_duration([*log.attachments, *files]))
+    has_step = any(tape.recording[name].step_ns for name in TIMED_TOPICS if name in tape.recording)
+    sending_times = {
+        topic: times for topic, times in log.sent.items() if names.get(topic) in TIMED_TOPICS
+    }
+    other_files = (file for file in files if file.name != PARAMETERS)
     return RecordedRun(
         tape=tape,
         scenario=replacement or log.scenario or next(other_files, None),
         metadata=log.metadata,
         attachments=tuple(log.attachments),
-        latency=None if stepped else latency(sent),
+        latency=None if has_step else latency(sending_times),
         engagements=engagements(log.reports.get(f"{aircraft}{ENGAGEMENT}", [])),
         namespace=aircraft,
         path=run,
@@ -167,7 +169,7 @@ def read_run(
     )
 
 
-def _require_samples(log: LogContent, filled: Mapping[str, Signal], run: Path) -> None:
+def _require_samples(log: LogContent, signals: Mapping[str, Signal], run: Path) -> None:
     """Raise ParameterError for a log without a sample of a flight, with the reasons."""
     has = listed(log.kinds)
     lacks = [f"no sample of a flight among {has}" if has else "no sample on any topic"]
@@ -176,7 +178,7 @@ def _require_samples(log: LogContent, filled: Mapping[str, Signal], run: Path) -
             lacks.append(f"{topic}: {unset} samples without a usable stamp")
         if count := samples.refused():
             lacks.append(refusal_note(topic, count))
-    require(bool(filled), str(run), "; ".join([*lacks, *log.notes_at(None)]), A_FLIGHT)
+    require(bool(signals), str(run), "; ".join([*lacks, *log.notes_at(None)]), A_FLIGHT)
 
 
 def _tape(
@@ -186,24 +188,24 @@ def _tape(
 
     `names` are the names within the namespace by topic, `filled` the signals by name.
     """
-    stamped = {
+    samples_by_name = {
         name: log.topics[topic] for topic, name in names_within(aircraft, log.topics).items()
     }
     topics = {name: log.topics[topic] for topic, name in names.items()}
-    recordings = {printable(name): samples.recording() for name, samples in stamped.items()}
+    recordings = {printable(name): samples.recording() for name, samples in samples_by_name.items()}
     signals, recording, leaps = without_leaps(
         {printable(name): admitted(signal) for name, signal in filled.items()},
         {name: clock for name, clock in recordings.items() if clock.found},
     )
     start_ns = _start_ns(signals)
     end = seconds(max(int(signal.stamp_ns[-1]) for signal in signals.values()) - start_ns)
-    counts = {printable(name): samples.refused() for name, samples in stamped.items()}
-    refused = {name: count for name, count in counts.items() if count}
+    counts = {printable(name): samples.refused() for name, samples in samples_by_name.items()}
+    refusals = {name: count for name, count in counts.items() if count}
     conflicts = (topics[name].conflict(name) for name in filled if name in AIRCRAFT_TOPICS)
     notes = [
         *log.notes_at(end),
         *(leap_note(leap, start_ns) for leap in leaps),
-        *(refusal_note(name, count) for name, count in refused.items()),
+        *(refusal_note(name, count) for name, count in refusals.items()),
         *(recording_note(name, clock, start_ns) for name, clock in recording.items()),
         *conflicts,
     ]
@@ -217,12 +219,12 @@ def _tape(
         outcome,
         recording=recording,
         processes={printable(name): process for name, process in processes.items()},
-        refused=refused,
+        refused=refusals,
         is_by_clock=SIMULATED_TIME in log.metadata or _is_before_epoch(start_ns, spans),
     )
 
 
-def _is_before_epoch(start_ns: int, spans: Mapping[str, Span]) -> bool:
+def _is_before_epoch(start_ns: int, spans: Mapping[str, SampleSpan]) -> bool:
     """Whether processes stamped by /clock.
 
     Stamps by the host's time are since the epoch, and in lockstep a node leaves out its process id.
@@ -230,12 +232,12 @@ def _is_before_epoch(start_ns: int, spans: Mapping[str, Span]) -> bool:
     return start_ns <= SINCE_EPOCH_NS and any(INSTANCE.fullmatch(sender) for sender in spans)
 
 
-def _spans(topics: Iterable[tuple[str, Mapping[str, Span]]]) -> dict[str, Span]:
+def _spans(topics: Iterable[tuple[str, Mapping[str, SampleSpan]]]) -> dict[str, SampleSpan]:
     """The span of each publisher over its topics, which are names with spans.
 
     Of other programs only the topics of aircraft count.
     """
-    spans: dict[str, Span] = {}
+    spans: dict[str, SampleSpan] = {}
     for name, senders in topics:
         for sender, span in senders.items():
             if name in AIRCRAFT_TOPICS or INSTANCE.fullmatch(sender):
@@ -260,15 +262,13 @@ def files_beside(run: Path) -> list[StoredFile]:
     files = []
     for path in sorted(folder.glob("*.yaml")):
         with suppress(ParameterError, OSError):
-            stored = stored_scenario(path)
+            file = stored_scenario(path)
             if path.name == PARAMETERS or all(
-                section in stored.content for section in (b"/aircraft:", b"/controller:")
+                section in file.content for section in (b"/aircraft:", b"/controller:")
             ):
-                files.append(stored)
-    scenarios = [stored for stored in files if stored.name != PARAMETERS]
-    return (
-        files if len(scenarios) < 2 else [stored for stored in files if stored.name == PARAMETERS]
-    )
+                files.append(file)
+    scenarios = [file for file in files if file.name != PARAMETERS]
+    return files if len(scenarios) < 2 else [file for file in files if file.name == PARAMETERS]
 
 
 def aircraft_namespaces(topics: Collection[str]) -> list[str]:
@@ -288,38 +288,43 @@ def chosen_namespace(topics: Collection[str], namespace: str | None, where: str)
     `namespace` is the choice of the caller.
     """
     aircraft = aircraft_namespaces(topics)
-    known = ", ".join(name or "/" for name in aircraft) or "none"
+    aircraft_names = ", ".join(name or "/" for name in aircraft) or "none"
     if namespace is None:
         require(
             len(aircraft) < 2,
             where,
-            f"aircraft in the namespaces {known}",
+            f"aircraft in the namespaces {aircraft_names}",
             "that one of them is asked for: --namespace NAME",
         )
         return aircraft[0] if aircraft else ""
     chosen = f"/{str(namespace).strip('/')}".rstrip("/")
     require(
-        chosen in aircraft, where, f"aircraft in the namespaces {known}", f"one in {namespace!r}"
+        chosen in aircraft,
+        where,
+        f"aircraft in the namespaces {aircraft_names}",
+        f"one in {namespace!r}",
     )
     return chosen
 
 
-def names_within(chosen: str, topics: Collection[str]) -> dict[str, str]:
+def names_within(namespace: str, topics: Collection[str]) -> dict[str, str]:
     """Names within the namespace of an aircraft, by full topic name, without nested aircraft."""
-    nested = [f"{name}/" for name in aircraft_namespaces(topics) if name.startswith(f"{chosen}/")]
+    inner_aircraft = [
+        f"{name}/" for name in aircraft_namespaces(topics) if name.startswith(f"{namespace}/")
+    ]
     return {
-        topic: topic.removeprefix(f"{chosen}/")
+        topic: topic.removeprefix(f"{namespace}/")
         for topic in topics
-        if topic.startswith(f"{chosen}/") and not topic.startswith(tuple(nested))
+        if topic.startswith(f"{namespace}/") and not topic.startswith(tuple(inner_aircraft))
     }
 
 
 def _duration(attachments: Sequence[StoredFile]) -> float | None:
     """The duration of the whole flight by the attached parameters, s; None without them."""
-    for stored in attachments:
-        if stored.name == PARAMETERS:
+    for file in attachments:
+        if file.name == PARAMETERS:
             with suppress(ParameterError, LookupError, OverflowError, TypeError, ValueError):
-                tree = parse_yaml(stored.content, PARAMETERS, "parameters")
+                tree = parse_yaml(file.content, PARAMETERS, "parameters")
                 return float(tree["/**/flight"]["ros__parameters"]["duration"])
     return None
 

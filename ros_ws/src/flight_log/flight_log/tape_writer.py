@@ -69,16 +69,14 @@ class TapeWriter:
 
     def write(self, signals: Mapping[str, Signal]) -> None:
         """Write the samples of a part of a flight, by topic."""
-        joined = {
-            topic: signal.after(self._waiting.get(topic)) for topic, signal in signals.items()
-        }
+        parts = {topic: signal.after(self._waiting.get(topic)) for topic, signal in signals.items()}
         newest_ns = max(
-            (int(signal.stamp_ns.max()) for signal in joined.values() if len(signal.stamp_ns)),
+            (int(signal.stamp_ns.max()) for signal in parts.values() if len(signal.stamp_ns)),
             default=0,
         )
-        due = {topic: signal.stamp_ns <= newest_ns - DELAY_NS for topic, signal in joined.items()}
-        self._waiting = {topic: signal.where(~due[topic]) for topic, signal in joined.items()}
-        self._write({topic: signal.where(due[topic]) for topic, signal in joined.items()})
+        due = {topic: signal.stamp_ns <= newest_ns - DELAY_NS for topic, signal in parts.items()}
+        self._waiting = {topic: signal.where(~due[topic]) for topic, signal in parts.items()}
+        self._write({topic: signal.where(due[topic]) for topic, signal in parts.items()})
 
     def write_changes(self, stamp_ns: int, node: str, changes: Mapping[str, Any]) -> None:
         """Write a change of parameters of a node in flight, as the node itself publishes it."""

@@ -30,14 +30,16 @@ def read_vehicle_log(path: Path, choice: Choice = ANY) -> VehicleLog:
     """
     require(path.is_file(), str(path), "no such file", EXPECTED)
     kind = file_kind(path)
-    read = next((reader for word, reader in READERS.items() if f" {word} " in f"{kind} "), None)
-    if read is None:
+    reader_of_kind = next(
+        (reader for word, reader in READERS.items() if f" {word} " in f"{kind} "), None
+    )
+    if reader_of_kind is None:
         raise ParameterError(f"{path}: found {kind}, expected {EXPECTED}")
     only = "none: the log is of one autopilot"
     require(choice.system is None or " tlog " in f"{kind} ", "--system", choice.system, only)
     try:
         with _silent():
-            log = read(path, kind, choice)
+            log = reader_of_kind(path, kind, choice)
     except ParameterError:
         raise
     except Exception as error:  # pymavlink raises Exception itself for a damaged format

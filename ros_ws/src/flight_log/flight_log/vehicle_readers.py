@@ -45,7 +45,7 @@ from flight_log.vehicle_tables import (
     ULOG_TORQUES,
     Choice,
     Format,
-    Table,
+    MessageTable,
     VehicleLog,
 )
 
@@ -82,8 +82,10 @@ def _read_dataflash(path: Path, kind: str, choice: Choice) -> VehicleLog:
     require_package("pymavlink")
     from pymavlink import DFReader  # noqa: PLC0415 - an extra
 
-    read = _wanted(DATAFLASH)
-    wanted = {name: read.get(name, set()) | FLAGS.get(name, set()) for name in (*read, *FLAGS)}
+    fields = _wanted(DATAFLASH)
+    fields_and_flags = {
+        name: fields.get(name, set()) | FLAGS.get(name, set()) for name in (*fields, *FLAGS)
+    }
     firmwares: dict[str, None] = {}
 
     def samples() -> Iterator[Sample]:
@@ -95,7 +97,7 @@ def _read_dataflash(path: Path, kind: str, choice: Choice) -> VehicleLog:
         )
         with closing(reader):
             while (
-                message := reader.recv_match(type=[*wanted, *OLD_NAMES, PARAMETER, "MSG"])
+                message := reader.recv_match(type=[*fields_and_flags, *OLD_NAMES, PARAMETER, "MSG"])
             ) is not None:
                 name = message.get_type()
                 if name == "MSG":
@@ -121,8 +123,8 @@ def _read_dataflash(path: Path, kind: str, choice: Choice) -> VehicleLog:
                 "a ULog: that of PX4 since then",
             )
 
-    instances, parameters, parts = tables_of(samples(), wanted)
-    tables, taken = flown(instances, read, parameters, choice)
+    instances, parameters, parts = tables_of(samples(), fields_and_flags)
+    tables, choices = flown(instances, fields, parameters, choice)
     _true_airspeed(tables)
     vehicle = FIRMWARES.get(next(iter(firmwares), ""), "")
     if (attitude := tables.get("ATT")) is not None:
@@ -133,11 +135,11 @@ def _read_dataflash(path: Path, kind: str, choice: Choice) -> VehicleLog:
         parameters=parameters,
         format=DATAFLASH,
         vehicle=vehicle,
-        taken=tuple(taken),
+        taken=tuple(choices),
     )
 
 
-def _true_airspeed(tables: Mapping[str, Table]) -> None:
+def _true_airspeed(tables: Mapping[str, MessageTable]) -> None:
     """Turn equivalent into true airspeed by the ratio in CTUN, in place."""
     control = tables.get("CTUN")
     if control is None or "E2T" not in control.fields:
@@ -161,27 +163,27 @@ def _read_tlog(path: Path, kind: str, choice: Choice) -> VehicleLog:
     require_package("pymavlink")
     from pymavlink import mavutil  # noqa: PLC0415 - an extra
 
-    wanted = _wanted(TLOG)
+    fields = _wanted(TLOG)
     # MAV_AUTOPILOT and MAV_TYPE of systems in the order of their heartbeats
     autopilots: dict[int, tuple[int, int]] = {}
-    received: dict[int, list[Received]] = {}
+    messages: dict[int, list[Received]] = {}
     mavutil.set_dialect("ardupilotmega")
     with closing(mavutil.mavlogfile(str(path))) as reader:  # by its content, not by its name
-        while (message := reader.recv_match(type=[*wanted, "PARAM_VALUE"])) is not None:
+        while (message := reader.recv_match(type=[*fields, "PARAM_VALUE"])) is not None:
             name = message.get_type()
             if message.get_srcComponent() == AUTOPILOT:
                 system = message.get_srcSystem()
                 if name == "HEARTBEAT" and message.autopilot != NO_AUTOPILOT:
                     autopilots.setdefault(system, (message.autopilot, message.type))
                 stamp_ns = min(round(NANOSECONDS * message._timestamp), LARGEST)
-                received.setdefault(system, []).append(
+                messages.setdefault(system, []).append(
                     Received(name, message.get_seq(), stamp_ns, message)
                 )
-    system, taken = _flown_system(
-        {number: received[number] for number in autopilots}, choice.system
+    system, choices = _flown_system(
+        {number: messages[number] for number in autopilots}, choice.system
     )
-    instances, parameters, parts = tables_of(_dated(received.get(system, [])), wanted)
-    tables, _ = flown(instances, wanted, parameters, choice)
+    instances, parameters, parts = tables_of(_dated(messages.get(system, [])), fields)
+    tables, _ = flown(instances, fields, parameters, choice)
     autopilot, mav_type = autopilots.get(system, (0, -1))
     vehicle = "" if mav_type < 0 else MAV_TYPES.get(mav_type, f"vehicle of MAV_TYPE {mav_type}")
     manual = PX4_MANUAL if autopilot == PX4 else 0
@@ -192,7 +194,7 @@ def _read_tlog(path: Path, kind: str, choice: Choice) -> VehicleLog:
         format=TLOG,
         vehicle=vehicle,
         manual=manual,
-        taken=taken,
+        taken=choices,
     )
 
 
@@ -233,7 +235,7 @@ RECENT = 16  # messages with a time, of which one tells the time of a message wi
 AGAIN_NS = 30 * NANOSECONDS
 
 
-def _dated(received: list[Received]) -> Iterator[Sample]:
+def _dated(messages: list[Received]) -> Iterator[Sample]:
     """The samples by the clock of the autopilot.
 
     The times of arrival do not serve: a radio may bunch messages, and a second link repeats
@@ -241,15 +243,19 @@ def _dated(received: list[Received]) -> Iterator[Sample]:
     the nearest by the sequence. Stamps count from the first arrival. Without a clock in the
     messages the arrival is the time.
     """
-    timed = [message for message in received if hasattr(message.content, "time_boot_ms")]
-    times = {message.content.time_boot_ms for message in timed}
-    by_arrival = len(times) <= LEAST_TIMES * len(timed)
-    offset_ns = 0 if not timed else timed[0].arrival_ns - 1_000_000 * timed[0].content.time_boot_ms
-    newest_ns = timed[0].arrival_ns if timed else 0
+    with_time = [message for message in messages if hasattr(message.content, "time_boot_ms")]
+    times = {message.content.time_boot_ms for message in with_time}
+    by_arrival = len(times) <= LEAST_TIMES * len(with_time)
+    offset_ns = (
+        0
+        if not with_time
+        else with_time[0].arrival_ns - 1_000_000 * with_time[0].content.time_boot_ms
+    )
+    newest_ns = with_time[0].arrival_ns if with_time else 0
     # sequences and stamps; None of a message that came before
     recent = deque[tuple[int, int | None]](maxlen=RECENT)
     arrivals: dict[tuple[str, int], int] = {}  # by name and time
-    for name, sequence, arrival_ns, content in received:
+    for name, sequence, arrival_ns, content in messages:
         stamp_ns: int | None
         if by_arrival:
             stamp_ns = newest_ns = arrival_ns
@@ -311,9 +317,9 @@ def _read_ulog(path: Path, kind: str, choice: Choice) -> VehicleLog:
     sources = chain(*ULOG_SOURCES.values(), ULOG_TORQUES.values())
     places = [(source.message, source.field) for source in sources]
     fields = _by_message([*places, *ULOG_TORQUES])
-    tables, taken = flown(instances, fields, parameters, choice)
+    tables, choices = flown(instances, fields, parameters, choice)
     if (attitude := tables.get("vehicle_attitude")) is not None:
-        tables["vehicle_attitude"] = Table(
+        tables["vehicle_attitude"] = MessageTable(
             attitude.stamp_ns, {**attitude.fields, **_angles(attitude)}
         )
     return VehicleLog(
@@ -322,11 +328,11 @@ def _read_ulog(path: Path, kind: str, choice: Choice) -> VehicleLog:
         parameters=parameters,
         format=None,
         vehicle=vehicle,
-        taken=tuple(taken),
+        taken=tuple(choices),
     )
 
 
-def _angles(attitude: Table) -> dict[str, FloatArray]:
+def _angles(attitude: MessageTable) -> dict[str, FloatArray]:
     """Euler angles z, y, x, as of autopilot_bridge.channel_map."""
     w, x, y, z = (attitude.fields[f"q[{k}]"] for k in range(4))
     return {

@@ -24,7 +24,7 @@ STICKS = 16
 SERVOS = 16
 
 
-class Table(NamedTuple):
+class MessageTable(NamedTuple):
     """The samples of a message.
 
     The stamps, ns, have the shape (N,) and ascend. The fields, by name, have the shape (N,) each.
@@ -86,7 +86,7 @@ def _source(place: str) -> Source:
 
 
 def _sources(places: Mapping[str, Sequence[str]]) -> Sources:
-    return {name: tuple(map(_source, listed)) for name, listed in places.items()}
+    return {name: tuple(map(_source, texts)) for name, texts in places.items()}
 
 
 def _format(rows: Mapping[str, Any]) -> Format:
@@ -140,7 +140,7 @@ class VehicleLog(NamedTuple):
     """
 
     kind: str
-    tables: Mapping[str, Table]
+    tables: Mapping[str, MessageTable]
     parameters: Parameters
     format: Format | None
     vehicle: str = PLANE  # "": the log does not say
@@ -167,9 +167,9 @@ class VehicleLog(NamedTuple):
         """
         values: dict[str, float] = {}
         for name, records in self.parameters.items():
-            known = [record.value for record in records if record.stamp_ns <= stamp_ns]
-            if known:
-                values[name] = known[-1]
+            earlier = [record.value for record in records if record.stamp_ns <= stamp_ns]
+            if earlier:
+                values[name] = earlier[-1]
         return values
 
     def has(self, source: Source) -> bool:

@@ -115,20 +115,20 @@ class RecorderNode(FlightNode[RecorderConfig]):
         super().__init__("recorder", RecorderConfig)
         self.host = time  # in a pause of /clock the log is flushed too
         self._flight_time: HostTime = self.simulated or time  # of silences: a pause is none
-        wanted = [self._full_name(name) for name in self.parameters.topics]
+        topic_names = [self._full_name(name) for name in self.parameters.topics]
         self._bag = self._open_bag()
         self._topics: list[_RecordedTopic] = []
         for topic in FLIGHT:
             # ROS 2 keeps the lines of the log
             qos = RECORD_FOREIGN if topic.foreign and topic is not ROSOUT else RECORD
             self._topics.append(self._record(self._poll(topic, qos), [PUBLISH]))
-        recorded = {topic.name for topic in self._topics}
-        self._missing = [name for name in dict.fromkeys(wanted) if name not in recorded]
+        recorded_names = {topic.name for topic in self._topics}
+        self._missing = [name for name in dict.fromkeys(topic_names) if name not in recorded_names]
         self._publish_recorded = self.advertise(RECORDED)
         self.lost: Counter[str] = Counter()
         self._losses = Throttle(LOSS_PERIOD_NS)
         self.silent: Counter[str] = Counter()  # ns, by topic
-        self._ended = ""  # the reason why recording ended
+        self._end_reason = ""  # the reason why recording ended
         self._flushed_ns = self._drained_ns = self._disk_checked_ns = time.monotonic_ns()
         self._warn_missing_ns = time.monotonic_ns() + NO_PUBLISHER_WARNING_NS
         self._heard = 0  # messages of LOOP
@@ -172,9 +172,9 @@ class RecorderNode(FlightNode[RecorderConfig]):
 
         A new folder where this folder holds the log of a simulation that ended before.
         """
-        numbered = (directory.with_name(f"{directory.name}-{number}") for number in count(2))
-        taken = self.simulated is not None and any(directory.glob("*.mcap"))
-        return next(folder for folder in numbered if not folder.exists()) if taken else directory
+        folders = (directory.with_name(f"{directory.name}-{number}") for number in count(2))
+        has_log = self.simulated is not None and any(directory.glob("*.mcap"))
+        return next(folder for folder in folders if not folder.exists()) if has_log else directory
 
     def _space_shortage(self, directory: Path) -> str:
         """The sentence about too little free space; empty with enough."""
@@ -188,8 +188,8 @@ class RecorderNode(FlightNode[RecorderConfig]):
 
     def _among(self, topics: Sequence[Topic], *, heard: bool = False) -> list[_RecordedTopic]:
         """The recorded topics among `topics`; `heard`: with messages."""
-        chosen = (topic for topic in self._topics if topic.subscription.topic in topics)
-        return [topic for topic in chosen if topic.channel.messages or not heard]
+        selection = (topic for topic in self._topics if topic.subscription.topic in topics)
+        return [topic for topic in selection if topic.channel.messages or not heard]
 
     def _poll(self, topic: Topic, qos: QoSProfile) -> PolledSubscription:
         return PolledSubscription(self, topic, qos, raw=True)
@@ -238,10 +238,10 @@ class RecorderNode(FlightNode[RecorderConfig]):
             return
         self._flushed_ns = now_ns
         self._publish_span()
-        if self._ended:
+        if self._end_reason:
             return
         self._write_or_end(self._bag.flush)
-        if self._ended:
+        if self._end_reason:
             return
         self._subscribe_missing(now_ns)
         self._warn_of_a_part()
@@ -265,25 +265,25 @@ class RecorderNode(FlightNode[RecorderConfig]):
             return
         stamps: list[int] = []
         for topic in self._topics:
-            received = topic.subscription.take()
-            if not self._ended:
-                self._write_or_end(partial(self._append, topic, received))
-            if received:
-                self._hear(topic, received)
+            arrivals = topic.subscription.take()
+            if not self._end_reason:
+                self._write_or_end(partial(self._append, topic, arrivals))
+            if arrivals:
+                self._hear(topic, arrivals)
             if topic.subscription.topic is TRUTH and self.parameters.lockstep:
-                stamps += self.refusals.stamps(topic.subscription, received)
+                stamps += self.refusals.stamps(topic.subscription, arrivals)
         if stamps:
             self._publish_recorded(instant(stamps[-1]))
 
-    def _hear(self, topic: _RecordedTopic, received: Sequence[ReceivedMessage]) -> None:
+    def _hear(self, topic: _RecordedTopic, arrivals: Sequence[ReceivedMessage]) -> None:
         """Note the time of the newest message of a topic."""
         now_ns = self._flight_time.monotonic_ns()
-        last = received[-1]
+        last = arrivals[-1]
         topic.first_ns = topic.first_ns or now_ns
         topic.heard_ns = now_ns
         topic.sent_ns = last.sent_ns
         if topic.subscription.topic in LOOP and not self.parameters.lockstep:
-            for stamp_ns in self.refusals.stamps(topic.subscription, received):
+            for stamp_ns in self.refusals.stamps(topic.subscription, arrivals):
                 topic.stamp_ns = stamp_ns
         if topic.silent_ns:
             silent_ns = now_ns - topic.silent_ns
@@ -302,20 +302,20 @@ class RecorderNode(FlightNode[RecorderConfig]):
         if not self.parameters.lockstep and min(stamps) >= 0:
             self._publish_recorded(instant(min(stamps)))
 
-    def _append(self, topic: _RecordedTopic, received: Sequence[ReceivedMessage]) -> None:
+    def _append(self, topic: _RecordedTopic, arrivals: Sequence[ReceivedMessage]) -> None:
         write = self._bag.write
         channel = topic.channel
         # The sequences of several publishers interleave: a gap between publishers is no loss.
         # Foreign topics name no publisher.
-        counted = not topic.foreign and not topic.shared
-        for message, sent_ns, received_ns, sequence in received:
+        has_sequence = not topic.foreign and not topic.shared
+        for message, sent_ns, received_ns, sequence in arrivals:
             if self.simulated is not None:
                 sent_ns, received_ns = map(self.simulated.at, (sent_ns, received_ns))  # noqa: PLW2901 - the log has one time
             write(channel, received_ns, sent_ns, sequence, message)
-            if counted and sequence != topic.next_sequence:
+            if has_sequence and sequence != topic.next_sequence:
                 publisher = sender_of(message)
                 topic.shared = publisher == topic.publisher and sequence < topic.next_sequence
-                counted = not topic.shared
+                has_sequence = not topic.shared
                 if publisher == topic.publisher and sequence > topic.next_sequence:
                     count = sequence - topic.next_sequence
                     self.lost[topic.name] += count
@@ -338,9 +338,9 @@ class RecorderNode(FlightNode[RecorderConfig]):
                 self._end(f"no space left for {self._bag.path}")
 
     def _end(self, reason: str) -> None:
-        if not self._ended:
-            self._ended = f"recording ended: {reason}{self._close_bag()}"
-            self.get_logger().error(self._ended)
+        if not self._end_reason:
+            self._end_reason = f"recording ended: {reason}{self._close_bag()}"
+            self.get_logger().error(self._end_reason)
 
     def _close_bag(self) -> str:
         """Finish the bag. Return the error text when the bag cannot be finished."""
@@ -521,8 +521,8 @@ class RecorderNode(FlightNode[RecorderConfig]):
         }
         figures |= {f"lost {name}": count for name, count in self.lost.items()}
         figures |= {f"missing {name}": "no publisher" for name in self._missing}
-        if self._ended:
-            return DiagnosticStatus.ERROR, self._ended, figures
+        if self._end_reason:
+            return DiagnosticStatus.ERROR, self._end_reason, figures
         figures |= {
             f"silent {topic.name}": "no message" for topic in self._topics if topic.silent_ns
         }
@@ -553,10 +553,10 @@ class RecorderNode(FlightNode[RecorderConfig]):
 
     def close(self) -> None:
         self._drain()
-        if not self._ended:
-            self._ended = "recording ended"
+        if not self._end_reason:
+            self._end_reason = "recording ended"
             if sentence := self._close_bag():
-                self.get_logger().error(f"{self._ended}{sentence}")
+                self.get_logger().error(f"{self._end_reason}{sentence}")
         for name in self._missing:
             self.get_logger().warning(f"{name} is not in the log: it had no publisher")
         self.get_logger().info(

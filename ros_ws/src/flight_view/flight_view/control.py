@@ -280,7 +280,7 @@ class Control:
         """
         nodes = self._link.nodes()
         scenario = self._flight.scenario
-        shown: dict[str, Any] = {
+        page_state: dict[str, Any] = {
             "lease": self._lease,
             "nodes": nodes,
             "undo": len(self._undo),
@@ -289,7 +289,7 @@ class Control:
         # Before the first refresh the digest is 0 and no gain is known.
         are_gains_known = self._digest and "controller" in nodes
         if scenario is not None and are_gains_known and gains_of(scenario.controller):
-            shown |= {
+            page_state |= {
                 "gains": self._gains(scenario),
                 "digest": f"{self._digest:012x}",
                 "logged": f"{self._flight.digest:012x}",
@@ -299,18 +299,18 @@ class Control:
             truth = self._flight.samples.get("truth")
             names = () if truth is None else truth.names
             axes = [name.partition(".")[2] for name in names if name.startswith("gust.")]
-            shown["aircraft"] = {
+            page_state["aircraft"] = {
                 "outputs": list(channels.outputs),
                 "inputs": list(channels.inputs),
                 "axes": axes,
             }
-            shown["faults"] = self._faults
+            page_state["faults"] = self._faults
         if scenario is not None and scenario.guidance is not None and "guidance" in nodes:
             orbits = scenario.guidance.drag is None
-            shown["radius"] = math.ceil(scenario.guidance.least_radius()) if orbits else 0  # m
+            page_state["radius"] = math.ceil(scenario.guidance.least_radius()) if orbits else 0  # m
         if "bridge" in nodes:
-            shown["bridge"] = {"map": self._map(), "sends": self._sends()}
-        return shown
+            page_state["bridge"] = {"map": self._map(), "sends": self._sends()}
+        return page_state
 
     def _controller(self) -> ControllerConfig:
         if self._flight.scenario is None:
@@ -437,10 +437,10 @@ class Control:
     def _set_faults(self, request: Mapping[str, Any]) -> str:
         if self._flight.scenario is None:
             return "the log has no scenario"
-        known = _faults_of(self._flight.scenario)
+        fault_names = _faults_of(self._flight.scenario)
         values = values_by_name(request, "values")
         for name in values:
-            require_known(name, known, "fault")
+            require_known(name, fault_names, "fault")
         changes = {
             name: value if is_sentences(value) else finite_numbers(name, value)
             for name, value in values.items()

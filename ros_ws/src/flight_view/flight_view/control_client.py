@@ -42,19 +42,23 @@ class ControlClient(Client):
     def parameters(self, node: str, names: Sequence[str]) -> dict[str, Any]:
         """Values of a node's parameters and groups of parameters, without those not set."""
         everything = ListParameters.Request(depth=ListParameters.Request.DEPTH_RECURSIVE)
-        declared = self._call(ListParameters, f"{node}/list_parameters", everything).result.names
+        declared_names = self._call(
+            ListParameters, f"{node}/list_parameters", everything
+        ).result.names
         # an undeclared name among others empties the answer
-        asked = [name for name in declared if name in names or name.split(".")[0] in names]
+        selection = [
+            name for name in declared_names if name in names or name.split(".")[0] in names
+        ]
         values = self._call(
-            GetParameters, f"{node}/get_parameters", GetParameters.Request(names=asked)
+            GetParameters, f"{node}/get_parameters", GetParameters.Request(names=selection)
         ).values
-        read = {
+        python_values = {
             name: parameter_value_to_python(value)
-            for name, value in zip(asked, values, strict=True)
+            for name, value in zip(selection, values, strict=True)
         }
         return {
             name: value.tolist() if hasattr(value, "tolist") else value
-            for name, value in read.items()
+            for name, value in python_values.items()
             if value is not None
         }
 

@@ -21,7 +21,7 @@ from flight_guidance.routes.route_file import Waypoint
 
 KINDS: dict[str, type[IntEnum]] = {
     "": Mode,
-    "mode": guidance_state.Mode,
+    "mode": guidance_state.GuidanceMode,
     "mode.lateral": guidance_state.Lateral,
     "mode.vertical": guidance_state.Vertical,
 }
@@ -29,7 +29,7 @@ MODES = {channel: {str(int(mode)): mode.name for mode in kind} for channel, kind
 """Names of the modes of the controller and of guidance by channel and number."""
 
 
-class Flown(NamedTuple):
+class ParameterSpan(NamedTuple):
     """Successive ticks under the same parameters of the controller."""
 
     digest: float
@@ -40,29 +40,32 @@ class Flown(NamedTuple):
 
 
 def rms_by_model(
-    flown: Sequence[Flown], start_ns: int, scenario: Scenario | None, proposed_ns: Sequence[int]
+    spans: Sequence[ParameterSpan],
+    start_ns: int,
+    scenario: Scenario | None,
+    proposed_ns: Sequence[int],
 ) -> dict[str, Any]:
     """Headings and rows of the rms of the measured error by model.
 
     They come from the ticks of a flight and the stamps of proposed models.
     """
     first_ns: dict[float, int] = {}
-    for span in flown:
+    for span in spans:
         first_ns.setdefault(span.digest, span.start_ns)
     digests = list(first_ns)
     names = model_names(list(first_ns.values()), proposed_ns)
-    ends_ns = [*(span.start_ns for span in flown[1:]), flown[-1].stop_ns]
-    spans = []
-    for span, stop_ns in zip(flown, ends_ns, strict=True):
+    ends_ns = [*(span.start_ns for span in spans[1:]), spans[-1].stop_ns]
+    rows_of_spans = []
+    for span, stop_ns in zip(spans, ends_ns, strict=True):
         start, stop = ((stamp_ns - start_ns) / NANOSECONDS for stamp_ns in (span.start_ns, stop_ns))
         if span.ticks:
             rms = {name: math.sqrt(square / span.ticks) for name, square in span.squares.items()}
             model = digests.index(span.digest)
-            spans.append(
+            rows_of_spans.append(
                 ModelSpan(name=names[model], model=model, start=start, stop=stop, rms=rms)._asdict()
             )
-    known = {} if scenario is None else display_units(scenario)
-    headings, rows = model_rows(spans, dict.fromkeys(flown[0].squares, NO_UNIT) | known)
+    units = {} if scenario is None else display_units(scenario)
+    headings, rows = model_rows(rows_of_spans, dict.fromkeys(spans[0].squares, NO_UNIT) | units)
     return {"headings": ["", *headings], "rows": rows}
 
 
@@ -76,10 +79,10 @@ def described(scenario: Scenario) -> dict[str, Any]:
     Raises ParameterError where the airframe cannot be read.
     """
     controller = scenario.controller
-    guided = scenario.guidance
+    guidance = scenario.guidance
     limits = controller.effector_limits()
     bounds = zip(controller.effectors, limits.lower.tolist(), limits.upper.tolist(), strict=True)
-    waypoints = () if guided is None else guided.waypoints()
+    waypoints = () if guidance is None else guidance.waypoints()
     return {
         "scenario": controller.summary(),
         "duration": scenario.flight.duration,
@@ -89,14 +92,14 @@ def described(scenario: Scenario) -> dict[str, Any]:
         "gusts": [[name, *window] for name, window in scenario.gust_windows().items()],
         "commands": [[edge.name, edge.start, edge.stop] for edge in pulse_edges(scenario)],
         "speed": scenario.aircraft.channels().speed,
-        **({"route": []} if guided is None else mission(guided, waypoints)),
+        **({"route": []} if guidance is None else mission(guidance, waypoints)),
     }
 
 
-def mission(guided: GuidanceConfig, waypoints: Sequence[Waypoint]) -> dict[str, Any]:
+def mission(guidance: GuidanceConfig, waypoints: Sequence[Waypoint]) -> dict[str, Any]:
     """What the map shows of guidance with a route: `mission_drawing` and the waypoints.
 
     A waypoint is north, east, altitude, m. Raises ParameterError for a route with no way to fly.
     """
-    drawing = mission_drawing(guided, [guided.plan(waypoints)] if waypoints else [])
+    drawing = mission_drawing(guidance, [guidance.plan(waypoints)] if waypoints else [])
     return drawing | {"waypoints": [[*waypoint.point, waypoint.altitude] for waypoint in waypoints]}

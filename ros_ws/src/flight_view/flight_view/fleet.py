@@ -13,7 +13,7 @@ from flight_view.flight import POSE, Flight, PageEvent
 from flight_view.series import Series
 
 
-class Fleet:
+class FleetView:
     """The poses of several flights as topics of a single `Flight`, "0" the first."""
 
     def __init__(self, flights: Sequence[Flight]) -> None:

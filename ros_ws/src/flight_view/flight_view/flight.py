@@ -49,7 +49,7 @@ from flight_log.named_vectors import (
 from flight_log.stored_messages import PARAMETER_EVENT, PARAMETER_EVENTS, parameter_value
 from flight_log.tape_reader import listed, read_run
 from flight_view.background import Line
-from flight_view.description import MODES, Flown, described, mission, rms_by_model
+from flight_view.description import MODES, ParameterSpan, described, mission, rms_by_model
 from flight_view.series import Series
 
 LEARNED = "learned"  # entries of A and B, as identified in flight
@@ -170,7 +170,7 @@ class Flight:
         self._first_ns: int | None = None
         self._mode = -1
         self._banded = 0  # rows of internals behind the bands
-        self._flown: list[Flown] = []
+        self._flown: list[ParameterSpan] = []
         self._now = now
         self._changed = now()
         self._behind = False  # there is more to read at once
@@ -234,16 +234,16 @@ class Flight:
         """
         if LEARNED not in self.samples or not self._flown:
             return {}
-        learned = self.samples[LEARNED]
-        is_proposed = learned.values[:, learned.names.index("proposed")] > 0.0
-        proposed_ns = learned.stamp_ns[is_proposed].tolist()
+        entries = self.samples[LEARNED]
+        is_proposed = entries.values[:, entries.names.index("proposed")] > 0.0
+        proposed_ns = entries.stamp_ns[is_proposed].tolist()
         return rms_by_model(self._flown, self.start_ns, self.scenario, proposed_ns)
 
     def faults(self) -> list[str]:
         """Sentences on what the log lacks."""
         follower = self._follower
         among = f" among {_text(listed(self._kinds))}" if self._kinds else ""
-        refused = {
+        refusals = {
             name: samples.refused for name, samples in self.samples.items() if samples.refused
         }
         return [
@@ -267,7 +267,7 @@ class Flight:
             *([f"{self._unreadable} samples are unreadable"] if self._unreadable else []),
             *(
                 f"{name}: {count} samples out of order are left out"
-                for name, count in refused.items()
+                for name, count in refusals.items()
             ),
         ]
 
@@ -315,12 +315,12 @@ class Flight:
         The page reads a part of the samples; this reads the whole log.
         """
         with suppress(ParameterError, OSError):
-            recorded = read_run(self.run, self._namespace, None, self._remaps)
+            run = read_run(self.run, self._namespace, None, self._remaps)
             if self._given is not None:
-                recorded = recorded._replace(scenario=self._given)
-            account = log_account(recorded)
+                run = run._replace(scenario=self._given)
+            account = log_account(run)
             lacks = () if account is None else account.notes()
-            self._lacks = [_text(sentence) for sentence in (*recorded.tape.notes, *lacks)]
+            self._lacks = [_text(sentence) for sentence in (*run.tape.notes, *lacks)]
 
     def _rate_of(self, topic: str, type_name: str) -> float:
         if len(self._kinds) < MAX_CHANNELS:
@@ -411,18 +411,18 @@ class Flight:
         if names != topic.names and sorted(names) == sorted(topic.names):
             names, values = topic.names, values[:, [names.index(name) for name in topic.names]]
         if topic.columns is None:
-            shown = GROUPS.get(topic.name)
-            chosen = [
+            group = GROUPS.get(topic.name)
+            columns = [
                 i
                 for i, name in enumerate(names)
-                if shown is None or name in shown or name.partition(".")[0] in shown
+                if group is None or name in group or name.partition(".")[0] in group
             ]
-            if len(chosen) > MAX_CHANNELS:
+            if len(columns) > MAX_CHANNELS:
                 self._note(
-                    f"{topic.name}: {len(chosen) - MAX_CHANNELS} of its channels are not shown"
+                    f"{topic.name}: {len(columns) - MAX_CHANNELS} of its channels are not shown"
                 )
             topic.names = names
-            topic.columns = np.array(chosen[:MAX_CHANNELS], dtype=np.intp)
+            topic.columns = np.array(columns[:MAX_CHANNELS], dtype=np.intp)
             narrower = self.samples.get(topic.name)
             samples = self.samples[topic.name] = Series(
                 tuple(_text(names[i]) for i in topic.columns)
@@ -462,31 +462,31 @@ class Flight:
         self, stamp_ns: NDArray[np.int64], names: Sequence[str], values: FloatArray
     ) -> None:
         """Sum the squares of e in the engaged ticks under each set of parameters."""
-        flown = values[:, names.index("parameters")]
-        engaged = values[:, names.index("mode")] == Mode.ENGAGED
+        digests = values[:, names.index("parameters")]
+        is_engaged = values[:, names.index("mode")] == Mode.ENGAGED
         errors = {
             _text(name[2:]): values[:, k]
             for k, name in enumerate(names[:MAX_CHANNELS])
             if name.startswith("e.")
         }
-        for rows in np.split(np.arange(len(flown)), np.flatnonzero(np.diff(flown)) + 1):
-            digest = float(flown[rows[0]])
+        for rows in np.split(np.arange(len(digests)), np.flatnonzero(np.diff(digests)) + 1):
+            digest = float(digests[rows[0]])
             start_ns = int(stamp_ns[rows[0]])
             stop_ns = int(stamp_ns[rows[-1]])
-            counted = rows[engaged[rows]]
-            squares = {name: float(np.sum(e[counted] ** 2)) for name, e in errors.items()}
-            span = Flown(
+            engaged_rows = rows[is_engaged[rows]]
+            squares = {name: float(np.sum(e[engaged_rows] ** 2)) for name, e in errors.items()}
+            span = ParameterSpan(
                 digest=digest,
                 start_ns=start_ns,
                 stop_ns=stop_ns,
-                ticks=len(counted),
+                ticks=len(engaged_rows),
                 squares=squares,
             )
             if self._flown and (before := self._flown[-1]).digest == digest:
                 self._flown.pop()
                 total = {name: square + before.squares[name] for name, square in squares.items()}
                 span = before._replace(
-                    stop_ns=stop_ns, ticks=before.ticks + len(counted), squares=total
+                    stop_ns=stop_ns, ticks=before.ticks + len(engaged_rows), squares=total
                 )
             if len(self._flown) < MAX_SPANS:
                 self._flown.append(span)
@@ -495,12 +495,12 @@ class Flight:
         changes = np.flatnonzero(np.diff(modes, prepend=self._mode))
         for k in changes.tolist():
             number = modes[k]
-            known = number in set(Mode)
+            is_mode = number in set(Mode)
             self._add_event(
                 PageEvent(
                     int(stamp_ns[k]),
                     "mode",
-                    Mode(int(number)).name if known else f"mode {number:g}",
+                    Mode(int(number)).name if is_mode else f"mode {number:g}",
                 )
             )
         self._mode = modes[-1]
@@ -530,12 +530,12 @@ class Flight:
                     )
             elif messages.type_name == PARAMETER_EVENT:
                 # Before the first sample, starting nodes declare parameters.
-                new = message.new_parameters if self._first_ns is not None else []
-                changed = {
+                new_parameters = message.new_parameters if self._first_ns is not None else []
+                changes = {
                     entry.name: parameter_value(entry.value)
-                    for entry in (*new, *message.changed_parameters)
+                    for entry in (*new_parameters, *message.changed_parameters)
                 }
-                text = ", ".join(f"{name} = {_shown(value)}" for name, value in changed.items())
+                text = ", ".join(f"{name} = {_shown(value)}" for name, value in changes.items())
                 namespace, _, node = message.node.rpartition("/")
                 if text and self._shows(namespace):
                     self._add_event(PageEvent(sent_ns, "parameter", f"{node}: {text}"))
@@ -545,7 +545,7 @@ class Flight:
             elif messages.type_name == ROUTE_TYPE:
                 if message.header.frame_id not in ROUTE_FRAMES:
                     continue
-                places = [stamped.pose.position for stamped in message.poses]
+                places = [stamped_pose.pose.position for stamped_pose in message.poses]
                 self._take_route(sent_ns, [Waypoint(place.y, place.x, place.z) for place in places])
             else:
                 self._add_event(
@@ -557,11 +557,11 @@ class Flight:
 
         Where guidance refuses the new route, the route before stays.
         """
-        guided = None if self.scenario is None else self.scenario.guidance
-        if guided is None:
+        guidance = None if self.scenario is None else self.scenario.guidance
+        if guidance is None:
             return
         try:
-            self.description |= mission(guided, waypoints)
+            self.description |= mission(guidance, waypoints)
         except ParameterError:
             return  # guidance says so in the log
         self.described += 1

@@ -28,9 +28,9 @@ def serve(run: Path, port: int, announce: Callable[[str], None]) -> None:
     `announce` gets a line for the user. Raises ParameterError where the port is taken, or the
     recording has ended before.
     """
-    ended = threading.Event()
+    end = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: ended.set())
+        signal.signal(number, lambda *_: end.set())
     follower = Follower(run, lambda topic, type_name: math.inf)
     before = {
         record.topic: record._replace(data=[])
@@ -62,7 +62,7 @@ def serve(run: Path, port: int, announce: Callable[[str], None]) -> None:
     try:
         for first in before.values():
             _channel(first, follower, channels, context)
-        while not ended.wait(POLL_PERIOD) and not follower.complete and not follower.fault:
+        while not end.wait(POLL_PERIOD) and not follower.complete and not follower.fault:
             for record in follower.read():
                 if (
                     channel := _channel(record, follower, channels, context)

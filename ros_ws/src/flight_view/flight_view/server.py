@@ -37,7 +37,7 @@ from tornado.websocket import WebSocketClosedError, WebSocketHandler, WebSocketP
 from flight_analysis.report.summary import finite_or_null
 from flight_core.rates import NANOSECONDS
 from flight_view.control import Control
-from flight_view.fleet import Fleet
+from flight_view.fleet import FleetView
 from flight_view.flight import Flight
 from flight_view.request_values import RefusedError
 
@@ -97,7 +97,9 @@ class Server:
     ) -> None:
         self.followed = flights
         self.fleet = fleet
-        self.flights: Sequence[Flight | Fleet] = [*flights, Fleet(flights)] if fleet else flights
+        self.flights: Sequence[Flight | FleetView] = (
+            [*flights, FleetView(flights)] if fleet else flights
+        )
         self.control = control
         self.token = token
         self.port = 0
@@ -156,21 +158,21 @@ class Server:
         """
         looked = -math.inf
         while True:
-            changed = [flight.update(BUDGET) for flight in self.followed]
+            has_changed = [flight.update(BUDGET) for flight in self.followed]
             pause = POLL_PERIOD
-            if any(changed):
+            if any(has_changed):
                 self._news.set()
                 self._news.clear()
                 pause = (
                     0.0 if any(flight.state() == "reading" for flight in self.followed) else REST
                 )
-            if any(changed) or time.monotonic() > looked + STATE_PERIOD:
+            if any(has_changed) or time.monotonic() > looked + STATE_PERIOD:
                 looked = time.monotonic()
                 for stream in [*self.streams]:
                     stream.look()
             await asyncio.sleep(pause)
 
-    async def news(self, flight: Flight | Fleet, known: Mapping[str, str]) -> bytes:
+    async def news(self, flight: Flight | FleetView, known: Mapping[str, str]) -> bytes:
         """The answer to a browser with the `known` numbers of rows by topic.
 
         Waits up to MAX_WAIT s for news.
@@ -181,7 +183,7 @@ class Server:
                 await asyncio.wait_for(self._news.wait(), min(remaining, STATE_PERIOD))
         return self.answer(flight, known)
 
-    def answer(self, flight: Flight | Fleet, known: Mapping[str, str]) -> bytes:
+    def answer(self, flight: Flight | FleetView, known: Mapping[str, str]) -> bytes:
         """The answer to a browser with the `known` numbers of rows by topic.
 
         Raises HTTPError for too long a number.
@@ -197,7 +199,7 @@ class Server:
         )
 
 
-def _epoch(flight: Flight | Fleet) -> str:
+def _epoch(flight: Flight | FleetView) -> str:
     """A text that changes when rows known to a browser have changed.
 
     They change by thinning, or with the instant of flight time 0.
@@ -205,10 +207,12 @@ def _epoch(flight: Flight | Fleet) -> str:
     return f"{flight.start_ns}.{sum(samples.thinned for samples in flight.samples.values())}"
 
 
-def _first_rows(flight: Flight | Fleet, known: Mapping[str, str]) -> dict[str, int]:
+def _first_rows(flight: Flight | FleetView, known: Mapping[str, str]) -> dict[str, int]:
     """The first row unknown to a browser, by topic. Raises HTTPError for too long a number."""
-    same = known.get("epoch") == _epoch(flight)
-    rows = {name: known.get(name, "") if same else "" for name in (*flight.samples, "events")}
+    is_same_epoch = known.get("epoch") == _epoch(flight)
+    rows = {
+        name: known.get(name, "") if is_same_epoch else "" for name in (*flight.samples, "events")
+    }
     if any(len(text) > MAX_DIGITS for text in rows.values()):
         raise HTTPError(
             HTTPStatus.BAD_REQUEST, reason=f"A number of rows has more than {MAX_DIGITS} digits"
@@ -218,7 +222,7 @@ def _first_rows(flight: Flight | Fleet, known: Mapping[str, str]) -> dict[str, i
     }
 
 
-def has_news(flight: Flight | Fleet, known: Mapping[str, str]) -> bool:
+def has_news(flight: Flight | FleetView, known: Mapping[str, str]) -> bool:
     """Whether a browser lacks a row, an event, or the state."""
     first = _first_rows(flight, known)
     return (
@@ -230,7 +234,7 @@ def has_news(flight: Flight | Fleet, known: Mapping[str, str]) -> bool:
 
 
 def answer(
-    flight: Flight | Fleet,
+    flight: Flight | FleetView,
     known: Mapping[str, str],
     *,
     ghost: bool = False,
@@ -298,7 +302,11 @@ class _LimitedServer(HTTPServer):
     def handle_stream(self, stream: IOStream, address: tuple[Any, ...]) -> None:
         self._leave_out_closed()
         if len(self._admitted) >= MAX_CONNECTIONS + RESERVED:
-            next(held for held, admitted in self._admitted.items() if not admitted).close()
+            next(
+                stream_without_token
+                for stream_without_token, admitted in self._admitted.items()
+                if not admitted
+            ).close()
         self._admitted[stream] = False
         super().handle_stream(stream, address)
 
@@ -360,7 +368,7 @@ class _Handler(RequestHandler):
         stays_open = self._kept or self.get_status() == HTTPStatus.SWITCHING_PROTOCOLS
         if not stays_open:
             self.set_header("Connection", "close")
-        sent = super().finish(chunk)
+        future = super().finish(chunk)
         timeout = asyncio.get_running_loop().call_later(REQUEST_TIMEOUT, stream.close)
 
         def end(_: "Future[None]") -> None:
@@ -368,8 +376,8 @@ class _Handler(RequestHandler):
             if not stays_open:
                 stream.close()
 
-        sent.add_done_callback(end)
-        return sent
+        future.add_done_callback(end)
+        return future
 
     def require_page(self) -> None:
         """Refuse a request from a foreign page."""

@@ -99,12 +99,12 @@ def _attitude(flight: Flight) -> str:
     )
     altitude, climb = (_newest(flight, "pose", name) for name in ("altitude", "climb"))
     # a pose may have no psi
-    turned = f"{round(heading) % 360:03d}" if math.isfinite(heading) else "-"
-    angles = f"roll {roll:+.1f} deg, pitch {pitch:+.1f} deg, heading {turned} deg"
-    placed = (
+    heading_text = f"{round(heading) % 360:03d}" if math.isfinite(heading) else "-"
+    angles = f"roll {roll:+.1f} deg, pitch {pitch:+.1f} deg, heading {heading_text} deg"
+    place_text = (
         f", altitude {altitude:.1f} m, climb {climb:+.1f} m/s" if math.isfinite(altitude) else ""
     )
-    return angles + placed
+    return angles + place_text
 
 
 def _table(first: str, *others: str) -> Table:

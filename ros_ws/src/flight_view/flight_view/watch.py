@@ -37,8 +37,8 @@ def runs_in_recording(runs: Path, namespace: str | None = None) -> list[Path]:
     prefix = f"/{(namespace or '').strip('/')}/".replace("//", "/")
     for folder in folders:
         with suppress(ParameterError, OSError):
-            held = any(is_locked(file) for file in bag_files(folder))
-            if held and (
+            is_recording = any(is_locked(file) for file in bag_files(folder))
+            if is_recording and (
                 not namespace or any(topic.startswith(prefix) for topic in log_topics(folder))
             ):
                 recording.append(folder)

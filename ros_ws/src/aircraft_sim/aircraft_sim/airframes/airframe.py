@@ -430,7 +430,7 @@ def check_identities(airframe: Airframe) -> None:
         B = np.array(airframe.B)
         gravity = airframe.matrix_gravity()
         identities.check(
-            identities.Model(
+            identities.LinearModel(
                 name=airframe.name,
                 states=airframe.states,
                 effects=effects,

@@ -14,7 +14,7 @@ import numpy as np
 
 from aircraft_sim.airframes import identities
 from aircraft_sim.airframes.airframe import Airframe, load_airframe
-from aircraft_sim.airframes.model_readers import MOVES, Model, read_model
+from aircraft_sim.airframes.model_readers import MOVES, ToolModel, read_model
 from flight_core.parameters import ParameterError, one_of, require
 from flight_core.units import GRAVITY, in_si, quantity
 from flight_core.vectors import FloatArray
@@ -108,13 +108,13 @@ def _named(names: Named, key: str) -> dict[str, Any]:
     return dict.fromkeys(names, "")
 
 
-def _check_identities(model: Model, name: str, speed: float) -> None:
+def _check_identities(model: ToolModel, name: str, speed: float) -> None:
     """Raise ParameterError for a model that breaks an identity of physics; trim speed in m/s."""
     effects = {key: channel.get("positive", "") for key, channel in model.inputs.items()}
     units = tuple(channel["unit"] for channel in model.inputs.values())
     none = np.zeros_like(model.A)
     identities.check(
-        identities.Model(
+        identities.LinearModel(
             name=name,
             states=model.states,
             effects=effects,
@@ -127,7 +127,7 @@ def _check_identities(model: Model, name: str, speed: float) -> None:
     )
 
 
-def _with_thrust(model: Model) -> Model:
+def _with_thrust(model: ToolModel) -> ToolModel:
     """The model with an input thrust in units of the weight along the flight path.
 
     V_dot, or u_dot, = g.
@@ -148,7 +148,7 @@ def _with_thrust(model: Model) -> Model:
 
 
 def _airframe(
-    model: Model, name: str, speed: float, outputs: str | Sequence[str], source: str
+    model: ToolModel, name: str, speed: float, outputs: str | Sequence[str], source: str
 ) -> Airframe:
     names = list(model.states)
     wanted = (
@@ -193,7 +193,7 @@ def _airframe(
 
 
 def _rows_of_outputs(
-    model: Model, wanted: Sequence[str], labels: Sequence[str]
+    model: ToolModel, wanted: Sequence[str], labels: Sequence[str]
 ) -> tuple[dict[str, FloatArray], dict[str, str]]:
     """Rows of C by output, and units of the outputs that are no states.
 
@@ -248,7 +248,7 @@ def _output(text: str, names: Sequence[str]) -> tuple[str, str, FloatArray | Non
     return name, "", row
 
 
-def _default_outputs(model: Model) -> list[str]:
+def _default_outputs(model: ToolModel) -> list[str]:
     """q, V, p, r by elevator, thrust, aileron, rudder.
 
     V = u cos(alpha_0) + w sin(alpha_0) of body axes, by u_dot = -W0 q.
@@ -273,7 +273,7 @@ def _default_outputs(model: Model) -> list[str]:
     return outputs
 
 
-def _effect(model: Model, name: str) -> str:
+def _effect(model: ToolModel, name: str) -> str:
     """What a positive value of an input does, from the sign of B."""
     state, up, down = MOVES.get(name, ("", "", ""))
     state = "u" if state == "V" and "V" not in model.states else state

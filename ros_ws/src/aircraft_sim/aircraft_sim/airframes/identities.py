@@ -87,7 +87,7 @@ Published aircraft have 0.27 to 3.3, 0.04 to 0.93 and 0.04 to 1.1. A column per 
 """
 
 
-class Model(NamedTuple):
+class LinearModel(NamedTuple):
     """The linear model of an airframe in the units of the file."""
 
     name: str
@@ -125,7 +125,7 @@ class Finding(NamedTuple):
     expected: str
 
 
-def check(model: Model) -> None:
+def check(model: LinearModel) -> None:
     """Raise ParameterError for the first contradiction."""
     finding = next(contradictions(model), None)
     if finding is None:
@@ -137,7 +137,7 @@ def check(model: Model) -> None:
     )
 
 
-def contradictions(model: Model) -> Iterator[Finding]:
+def contradictions(model: LinearModel) -> Iterator[Finding]:
     """What contradicts physics, units first, then A, then B."""
     yield from _dimensions(model)
     yield from _entries(model)
@@ -147,7 +147,7 @@ def contradictions(model: Model) -> Iterator[Finding]:
     yield from _strengths(model)
 
 
-def _dimensions(model: Model) -> Iterator[Finding]:
+def _dimensions(model: LinearModel) -> Iterator[Finding]:
     for name, unit in model.states.items():
         known = "V" if name.lower() == "vt" else name.lower()  # as books have it
         if name not in KINDS and known in KINDS:
@@ -157,7 +157,7 @@ def _dimensions(model: Model) -> Iterator[Finding]:
             yield Finding(f"states.{name}", unit, words)
 
 
-def _entries(model: Model) -> Iterator[Finding]:
+def _entries(model: LinearModel) -> Iterator[Finding]:
     names = list(model.states)
     V0 = model.speed
     values = {
@@ -187,7 +187,7 @@ def _entries(model: Model) -> Iterator[Finding]:
         yield Finding("A", f"{row}_dot = {entry:.4g} {column} in SI", about + at_speed)
 
 
-def _kinematic_rows(model: Model) -> Iterator[Finding]:
+def _kinematic_rows(model: LinearModel) -> Iterator[Finding]:
     names = list(model.states)
     scale = float(np.max(np.abs(model.matrix_b()), initial=0.0))
     for row in (name for name in OF_RATES if name in names):
@@ -212,7 +212,7 @@ def _kinematic_rows(model: Model) -> Iterator[Finding]:
                 )
 
 
-def _dampings(model: Model) -> Iterator[Finding]:
+def _dampings(model: LinearModel) -> Iterator[Finding]:
     for i, name in enumerate(model.states):
         damping = float(model.matrix_a()[i, i])
         if name in {"p", "q", "r", "alpha", "beta", "w", "v"} and damping > 0.0:
@@ -221,7 +221,7 @@ def _dampings(model: Model) -> Iterator[Finding]:
             )
 
 
-def _effects(model: Model) -> Iterator[Finding]:
+def _effects(model: LinearModel) -> Iterator[Finding]:
     names = list(model.states)
     for k, (name, text) in enumerate(model.effects.items()):
         phrase = next((phrase for phrase in EFFECTS if phrase in text.lower()), None)
@@ -238,7 +238,7 @@ def _effects(model: Model) -> Iterator[Finding]:
             )
 
 
-def _strengths(model: Model) -> Iterator[Finding]:
+def _strengths(model: LinearModel) -> Iterator[Finding]:
     """Size of a control: angular acceleration per rad over stiffness + damping.
 
     The latter is |M_alpha| + |M_q| (|M_q| + |Z_alpha|).

@@ -45,7 +45,7 @@ MOVES = {
 """Output that an input drives, and what it does if positive, by the sign of B."""
 
 
-class Model(NamedTuple):
+class ToolModel(NamedTuple):
     """Matrices of a tool, in the units of `states` and `inputs`."""
 
     states: dict[str, str]  # units
@@ -110,7 +110,7 @@ def read_model(
     inputs: Mapping[str, Any],
     speed: float | None,
     body: Mapping[str, str | float],
-) -> Model:
+) -> ToolModel:
     """The model of a source of `import_airframe`. Raises ParameterError."""
     no_body = "none: it belongs to AVL's stability derivatives"
     if not isinstance(source, str | Path):
@@ -165,7 +165,7 @@ def _square(A: FloatArray, B: FloatArray) -> None:
     require(len(B) == n, "B", f"{len(B)} rows beside {n} of A", f"{n}, one a state")
 
 
-def _state_space(system: Any, states: Mapping[str, Any], inputs: Mapping[str, Any]) -> Model:
+def _state_space(system: Any, states: Mapping[str, Any], inputs: Mapping[str, Any]) -> ToolModel:
     """python-control's and SciPy's StateSpace, by their attributes."""
     if not all(hasattr(system, key) for key in "ABCD"):
         raise ParameterError(
@@ -190,12 +190,12 @@ def _state_space(system: Any, states: Mapping[str, Any], inputs: Mapping[str, An
     named = labels("state_labels")
     driven = labels("input_labels")
     known = _states(states, named, len(A)), _inputs(inputs, driven, B.shape[1])
-    return Model(
+    return ToolModel(
         *known, A, B, _finite(system.C, "C"), _finite(system.D, "D"), tuple(labels("output_labels"))
     )
 
 
-def _matlab(path: Path, states: Mapping[str, Any], inputs: Mapping[str, Any]) -> Model:
+def _matlab(path: Path, states: Mapping[str, Any], inputs: Mapping[str, Any]) -> ToolModel:
     """A, B, C, D of a .mat file, or of a structure in the file.
 
     The names are in StateName, InputName, OutputName.
@@ -233,7 +233,7 @@ def _matlab(path: Path, states: Mapping[str, Any], inputs: Mapping[str, Any]) ->
         _states(states, names("StateName", "states", "state_names"), len(A)),
         _inputs(inputs, names("InputName", "inputs", "input_names"), B.shape[1]),
     )
-    return Model(
+    return ToolModel(
         *known,
         A,
         B,
@@ -263,7 +263,7 @@ def _rows(lines: Sequence[str], count: int, columns: int, key: str) -> FloatArra
     return np.array(rows)
 
 
-def _xflr5(text: str, states: Mapping[str, Any], inputs: Mapping[str, Any]) -> Model:
+def _xflr5(text: str, states: Mapping[str, Any], inputs: Mapping[str, Any]) -> ToolModel:
     """Both 4 x 4 matrices of XFLR5's log, SI.
 
     The control matrices are per rad, a set of both a control.
@@ -295,7 +295,7 @@ def _xflr5(text: str, states: Mapping[str, Any], inputs: Mapping[str, Any]) -> M
     sets = re.findall(r"Control [Mm]atrices for set (\S+)", text)
     channels = _inputs(inputs, [_control(name) for name in sets], B.shape[1])
     V0 = float(np.hypot(A[1, 2], A[0, 2]))
-    return Model(
+    return ToolModel(
         _states(states, ["u", "w", "q", "theta", "v", "p", "r", "phi"], 8),
         channels,
         A,
@@ -329,7 +329,7 @@ def _avl_matrix(
     states: Mapping[str, Any],
     inputs: Mapping[str, Any],
     speed: float | None,
-) -> Model:
+) -> ToolModel:
     """AVL's system matrix, SI.
 
     The axes are those that physics confirms, x forward and z down, or x aft and z up.
@@ -353,7 +353,7 @@ def _avl_matrix(
     channels = _inputs(inputs or {_control(name): "deg" for name in controls}, (), m)
     V0 = float(np.hypot(A[1, 2], A[0, 2])) if speed is None else speed
     flip = np.array([-1.0 if name in {"u", "w", "p", "r", "phi"} else 1.0 for name in units])
-    aft = Model(
+    aft = ToolModel(
         units,
         channels,
         flip[:, None] * A * flip,
@@ -361,7 +361,7 @@ def _avl_matrix(
         speed=V0,
         note="AVL's system matrix, its axes turned",
     )
-    forward = Model(units, channels, A, B, speed=V0, note="AVL's system matrix")
+    forward = ToolModel(units, channels, A, B, speed=V0, note="AVL's system matrix")
     w, q = (list(units).index(name) for name in ("w", "q"))
     return forward if A[w, q] > 0.0 else aft
 
@@ -380,7 +380,7 @@ DERIVATIVES = "Sref Cref Bref Alpha CLtot CDtot CLa CYb Clb Cma Cnb CYp Clp Cnp 
 
 def _avl_derivatives(
     text: str, inputs: Mapping[str, Any], speed: float | None, body: Mapping[str, str | float]
-) -> Model:
+) -> ToolModel:
     """Linear equations about level flight in stability axes from AVL's stability derivatives.
 
     Derivatives by alpha_dot are left out. Source: R. C. Nelson, Flight Stability and Automatic
@@ -428,7 +428,7 @@ def _avl_derivatives(
     units = _states({}, ["V", "alpha", "q", "theta", "beta", "p", "r", "phi"], 8)
     channels = _inputs({name: inputs.get(name) or "deg" for name in used}, (), len(used))
     note = "AVL's stability derivatives, without those of alpha_dot"
-    return Model(units, channels, A, B, speed=V0, note=note)
+    return ToolModel(units, channels, A, B, speed=V0, note=note)
 
 
 def _avl_body(body: Mapping[str, str | float]) -> list[float]:

@@ -117,7 +117,7 @@ def _duration(name: str) -> float:
     return ENGINE_TIME if INPUTS[name].each_engine else SURFACE_TIME
 
 
-class _Steps(NamedTuple):
+class _InputSteps(NamedTuple):
     """The steps of an input."""
 
     effect: FloatArray  # (n,) column of B
@@ -127,7 +127,7 @@ class _Steps(NamedTuple):
     still: tuple[str, ...]
 
 
-def _steps(condition: FlightCondition, trim: Trim, name: str) -> _Steps | None:
+def _steps(condition: FlightCondition, trim: Trim, name: str) -> _InputSteps | None:
     """The response to steps of an input both ways; None where its output does not move."""
     output = driven(name)
     place = list(INPUTS).index(name)
@@ -151,7 +151,7 @@ def _steps(condition: FlightCondition, trim: Trim, name: str) -> _Steps | None:
         period * (1.0 + float(np.sum(1.0 - response[:, row] / response[-1, row])))
         for response in responses.values()
     ]
-    return _Steps(
+    return _InputSteps(
         effect=responses[size][-1],
         lag=max(*lags, 0.0),
         size=size,

@@ -17,7 +17,7 @@ from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
 from flight_guidance import guidance
-from flight_guidance.guidance_state import Begin, Commands, GuidanceState, Inputs
+from flight_guidance.guidance_state import Begin, GuidanceState, Inputs, StepCommands
 from flight_guidance.notices import FAILED, LINK_AGE
 from flight_guidance.params import GuidanceConfig
 from flight_guidance.routes.route_file import Waypoint
@@ -143,10 +143,10 @@ class _Comparison:
         """The channels of a step after a state, then u_m. `goes_on`: a failed step."""
         route = int(channels["route"])
         if goes_on and previous is not None:
-            state, commands = previous, Commands()
+            state, commands = previous, StepCommands()
         else:
             state, commands = guidance.step(previous, inputs, self._legs[route], self._params)
-        sample = guidance.Sample(
+        sample = guidance.GuidanceSample(
             inputs=inputs,
             state=state,
             commands=commands,

@@ -27,11 +27,11 @@ from flight_analysis.report.plotting import (
     set_layout,
     time_series_figure,
 )
-from flight_core.modes import Mode as ControllerMode
+from flight_core.modes import Mode
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 from flight_guidance.fence.fence import Fence
-from flight_guidance.guidance_state import Lateral, Mode, Vertical
+from flight_guidance.guidance_state import GuidanceMode, Lateral, Vertical
 from flight_guidance.steering.path import Route, leg_places, route_outline
 from flight_guidance.steering.wind import wind_of
 
@@ -41,8 +41,8 @@ WIND_ARROWS = 8
 ARROW_PIXELS = 45.0  # of the strongest wind
 LEAST_WIND = 0.3  # m/s, below which no arrow is drawn
 MODE_SHADES = {
-    Mode.DEAD_RECKONING: MODE_COLOURS[ControllerMode.HOLD],
-    Mode.POSE_LOST: MODE_COLOURS[ControllerMode.RAMP],
+    GuidanceMode.DEAD_RECKONING: MODE_COLOURS[Mode.HOLD],
+    GuidanceMode.POSE_LOST: MODE_COLOURS[Mode.RAMP],
 }
 
 # least and largest command by channel, SI; infinite without a limit

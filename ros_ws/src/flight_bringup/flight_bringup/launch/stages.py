@@ -277,11 +277,11 @@ def end_with(run: Path, outcome: Outcome) -> NoReturn:
 
 def say_on_exit(event: ProcessExited, context: LaunchContext) -> list[Action]:
     """Say that the learner has ended before the flight."""
-    ended = (
+    sentence = (
         f"{event.process_name} ended before the flight did: the law flies on with the model "
         "that it has"
     )
-    return [] if context.is_shutdown else [LogInfo(msg=ended)]
+    return [] if context.is_shutdown else [LogInfo(msg=sentence)]
 
 
 def on_state(
@@ -293,10 +293,12 @@ def on_state(
     """
     node = f"{_namespace(context)}/{spec.executable}"
     states = [*NodeState]
-    reached = {*states[states.index(state) :]}
+    states_from = {*states[states.index(state) :]}
 
     def matches(event: Event) -> bool:
-        return isinstance(event, NodeStateEvent) and event.node == node and event.state in reached
+        return (
+            isinstance(event, NodeStateEvent) and event.node == node and event.state in states_from
+        )
 
     return RegisterEventHandler(
         EventHandler(
@@ -488,12 +490,12 @@ def _complete_at(
     get_ros_node(context).create_subscription(
         topic.type, f"{_namespace(context)}/{topic.name}", receive, qos
     )
-    flown = EventHandler(
+    on_progress = EventHandler(
         matcher=lambda event: isinstance(event, FlownEvent),
         entities=[OpaqueFunction(function=lambda context: complete(run))],
         handle_once=True,
     )
-    return RegisterEventHandler(flown)
+    return RegisterEventHandler(on_progress)
 
 
 def complete(

@@ -29,7 +29,7 @@ from flight_campaign.batch.batch_loop import (
     Vehicle,
     figures,
 )
-from flight_campaign.batch.batch_matrices import Fleet, remainder_rows
+from flight_campaign.batch.batch_matrices import FleetMatrices, remainder_rows
 from flight_campaign.batch.batch_schedule import Schedule
 from flight_campaign.batch.campaign_course import Course, Segments
 from flight_campaign.batch.device import schedule_of_device
@@ -141,7 +141,7 @@ def _reduced(aircraft: Aircraft) -> tuple[NDArray[np.int64], Aircraft]:
 
 
 def fly(
-    fleet: Fleet,
+    fleet: FleetMatrices,
     vehicle: Vehicle,
     course: Course,
     control_law: ControlLaw,
@@ -177,7 +177,7 @@ def on_host(result: FleetResult) -> FleetResult:
     return jax.tree.map(np.asarray, result)
 
 
-def _timing(fleet: Fleet, course: Course) -> Timing:
+def _timing(fleet: FleetMatrices, course: Course) -> Timing:
     late = int(np.max(np.asarray(fleet.late)))
     return Timing(fleet.blocks, course.steps, course.late, late)
 
@@ -188,7 +188,7 @@ class Stepper:
     `sense`, then `advance`, for each tick of the course.
     """
 
-    def __init__(self, fleet: Fleet, vehicle: Vehicle, course: Course) -> None:
+    def __init__(self, fleet: FleetMatrices, vehicle: Vehicle, course: Course) -> None:
         self.ticks = len(course.segments.t)
         self._course = course
         self._k = 0
@@ -252,7 +252,7 @@ def _advance_once(
     command: Array,
     segments: Segments,
     k: int,
-    fleet: Fleet,
+    fleet: FleetMatrices,
     vehicle: Vehicle,
     timing: Timing,
 ) -> LoopState:

@@ -23,8 +23,8 @@ from aircraft_sim.plant.actuators import Actuators
 from aircraft_sim.plant.dynamics import Aircraft
 from aircraft_sim.plant.plant import DIVERGENCE_LIMIT
 from flight_campaign.batch.batch_allocation import allocate
-from flight_campaign.batch.batch_matrices import Fleet, StateBlock, at
-from flight_campaign.batch.batch_schedule import ASKED, Kind, Run
+from flight_campaign.batch.batch_matrices import FleetMatrices, StateBlock, at
+from flight_campaign.batch.batch_schedule import ASKED, TickKind, TickRun
 from flight_campaign.batch.campaign_course import Segments
 from flight_core.arithmetic import product
 from flight_core.vectors import Array
@@ -122,7 +122,7 @@ class LoopState(NamedTuple):
 class Constants(NamedTuple):
     """Inputs that stay from tick to tick: arguments, so that the compiler folds no arrays."""
 
-    fleet: Fleet  # without its blocks
+    fleet: FleetMatrices  # without its blocks
     vehicle: Vehicle
     params: Any  # of the law
 
@@ -152,7 +152,7 @@ def fly_run(
     segments: Segments,
     first: int,
     *,
-    run: Run,
+    run: TickRun,
     control_law: ControlLaw,
     timing: Timing,
 ) -> LoopState:
@@ -184,7 +184,7 @@ def _chosen(
 def tick(
     now: LoopState,
     segment: Segments,
-    kind: Kind,
+    kind: TickKind,
     constants: Constants,
     control_law: ControlLaw,
     timing: Timing,
@@ -232,7 +232,7 @@ def tick(
 
 
 def _measured(
-    now: LoopState, segment: Segments, sample: Sample, fleet: Fleet, vehicle: Vehicle
+    now: LoopState, segment: Segments, sample: Sample, fleet: FleetMatrices, vehicle: Vehicle
 ) -> Measurements:
     """What a law takes at a tick."""
     y, y_m, y_m_dot = sample
@@ -293,10 +293,10 @@ def advance(
     now: LoopState,
     command: Array,
     segment: Segments,
-    fleet: Fleet,
+    fleet: FleetMatrices,
     vehicle: Vehicle,
     timing: Timing,
-    kind: Kind = ASKED,
+    kind: TickKind = ASKED,
 ) -> LoopState:
     """The state at the next tick, with the command of this one."""
     blocks = timing.blocks
@@ -361,7 +361,7 @@ def figures(end: LoopState, ticks: int, period: Array) -> FleetResult:
     )
 
 
-def in_trim(fleet: Fleet, vehicle: Vehicle, timing: Timing) -> LoopState:
+def in_trim(fleet: FleetMatrices, vehicle: Vehicle, timing: Timing) -> LoopState:
     """The state of the closed loop before the first tick, without that of the law."""
     n = len(fleet.forced)
     count = len(fleet.wind)

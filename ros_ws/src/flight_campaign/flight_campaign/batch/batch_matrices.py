@@ -45,7 +45,7 @@ class Change(NamedTuple):
     forced_rate: Array
 
 
-class Fleet(NamedTuple):
+class FleetMatrices(NamedTuple):
     """N aircraft over one tick of the controller, in K steps of the integration.
 
     q rows of the remainder, r of the forcing. With p_k the actuators' mean positions over step k,
@@ -74,7 +74,7 @@ def assemble(
     wind: Array = 1.0,
     late: Array = 0,
     gust_directions: FloatArray | None = None,
-) -> Fleet:
+) -> FleetMatrices:
     """The matrices of N aircraft, A of shape (N, n, n) and B of (N, n, p).
 
     With L = A + gravity, Phi and Gamma the matrices of one Runge-Kutta step of x_dot = L x + u with
@@ -116,7 +116,7 @@ def assemble(
         end = computed(A * drift.A, B * drift.B, directions * drift.wind)
         moved, *others = (after - before for before, after in zip(begin, end, strict=True))
         change = Change(drift.start, drift.duration, by_block(moved), *map(_last, others))
-    return Fleet(
+    return FleetMatrices(
         blocks=blocks,
         tick=by_block(tick),
         forced=_last(forced),
@@ -151,7 +151,10 @@ def _matrices(
     dt: float,
     places: _Places,
 ) -> tuple[Array, Array, Array, Array]:
-    """tick, forced, rate and forced_rate of `Fleet`, the aircraft first; C in the law's order."""
+    """tick, forced, rate and forced_rate of `FleetMatrices`, the aircraft first.
+
+    C is in the law's order.
+    """
     xp = array_namespace(A)
     K = places.steps
     count = len(A)
@@ -205,7 +208,7 @@ def _blocks(moves: NDArray[np.bool_]) -> tuple[StateBlock, ...]:
     )
 
 
-def at(t: Array, fleet: Fleet) -> Fleet:
+def at(t: Array, fleet: FleetMatrices) -> FleetMatrices:
     """The matrices at t."""
     change = fleet.change
     if change is None:

@@ -24,34 +24,34 @@ UNROLL = 4
 LONGEST = 20  # ticks of a pattern, which is compiled tick by tick
 
 
-class Kind(NamedTuple):
+class TickKind(NamedTuple):
     """What is known of a tick when the loop is compiled; None: a branch asks at the tick."""
 
     phase: int | None
     forced: bool | None  # whether biases, gusts or turbulence act
 
 
-ASKED = Kind(None, None)
+ASKED = TickKind(None, None)
 
 
-class Run(NamedTuple):
+class TickRun(NamedTuple):
     """Ticks in one loop: a pattern of kinds again and again. Hashable."""
 
     length: int  # ticks, a multiple of the pattern
-    pattern: tuple[Kind, ...]
+    pattern: tuple[TickKind, ...]
     unroll: int  # patterns a step of the loop
 
 
-Schedule = Callable[[Course], Iterator[Run]]
+Schedule = Callable[[Course], Iterator[TickRun]]
 """The runs of a course."""
 
 
-def with_branches(course: Course) -> Iterator[Run]:
+def with_branches(course: Course) -> Iterator[TickRun]:
     """One loop, whose branches ask at each tick."""
-    yield Run(len(course.segments.t), (ASKED,), 1)
+    yield TickRun(len(course.segments.t), (ASKED,), 1)
 
 
-def without_branches(course: Course) -> Iterator[Run]:
+def without_branches(course: Course) -> Iterator[TickRun]:
     """Runs of at most RUN ticks, so that few loops are compiled, each used many times.
 
     A run without a short pattern of phases, as one with dropouts, keeps the branch of the phase.
@@ -65,12 +65,12 @@ def without_branches(course: Course) -> Iterator[Run]:
         for first in range(begin, end, RUN):
             run = slice(first, min(first + RUN, end))
             forced = bool(blows[run].any())
-            kinds = [Kind(int(of_law), forced) for of_law in phase[run]]
-            pattern = _pattern(kinds) or (Kind(None, forced),)
-            yield Run(len(kinds), pattern, max(UNROLL // len(pattern), 1))
+            kinds = [TickKind(int(of_law), forced) for of_law in phase[run]]
+            pattern = _pattern(kinds) or (TickKind(None, forced),)
+            yield TickRun(len(kinds), pattern, max(UNROLL // len(pattern), 1))
 
 
-def _pattern(kinds: list[Kind]) -> tuple[Kind, ...] | None:
+def _pattern(kinds: list[TickKind]) -> tuple[TickKind, ...] | None:
     """The shortest pattern of which the kinds are repetitions, None for one above LONGEST."""
     for length in range(1, min(len(kinds), LONGEST) + 1):
         repeats, rest = divmod(len(kinds), length)

@@ -17,7 +17,7 @@ from aircraft_sim.uncertainty import nominal_and_sampled
 from control_laws.catalogue import LAWS, Law
 from flight_analysis.linear_loop.input_margins import Margins
 from flight_campaign.batch import batch
-from flight_campaign.batch.batch_matrices import Fleet
+from flight_campaign.batch.batch_matrices import FleetMatrices
 from flight_campaign.comparison.tuning import (
     GUST,
     TURBULENCE,
@@ -98,7 +98,9 @@ def compare(
         TURBULENCE: benchmark_fleet(A, B, 0 * in_time, TURBULENCE, benchmark),
     }
 
-    study = _Study(benchmark=benchmark, flights=flights, levels=levels, parts=parts, delays=delays)
+    study = _LawStudy(
+        benchmark=benchmark, flights=flights, levels=levels, parts=parts, delays=delays
+    )
 
     def results(name: str) -> list[LawResult]:
         control_law = laws[name].control_law(benchmark.model)  # of all gain sets: compiled once
@@ -112,11 +114,11 @@ def compare(
             yield from scored
 
 
-class _Study(NamedTuple):
+class _LawStudy(NamedTuple):
     """The flights that all laws fly."""
 
     benchmark: Benchmark
-    flights: Mapping[str, Fleet]  # by wind
+    flights: Mapping[str, FleetMatrices]  # by wind
     levels: Sequence[float]
     parts: Sequence[NDArray[np.int64]]  # places of the aircraft of each level
     delays: Sequence[int]

@@ -26,7 +26,7 @@ from flight_analysis.linear_loop.loop_margins import law_order
 from flight_campaign import statistics
 from flight_campaign.batch import batch, batch_matrices
 from flight_campaign.batch.batch_loop import FleetResult, Vehicle
-from flight_campaign.batch.batch_matrices import Fleet
+from flight_campaign.batch.batch_matrices import FleetMatrices
 from flight_campaign.batch.campaign_course import Course, build_course, require_flyable
 from flight_campaign.statistics import score_units
 from flight_core.vectors import Array, FloatArray
@@ -234,7 +234,7 @@ def cost(result: FleetResult, benchmark: Benchmark) -> FloatArray:
 
 def benchmark_fleet(
     A: FloatArray, B: FloatArray, late: Array, wind: str, benchmark: Benchmark
-) -> Fleet:
+) -> FleetMatrices:
     """Aircraft in a wind of the benchmark, u late by whole ticks; shapes as in `fleet.assemble`."""
     aircraft = benchmark.scenario.aircraft
     directions = gust_directions(aircraft.sampled_airframe(), A, aircraft.uncertainty.wind)
@@ -247,7 +247,7 @@ class Evaluation(NamedTuple):
     """The flights of a cost in one wind, and their weights."""
 
     wind: str
-    fleet: Fleet
+    fleet: FleetMatrices
     weight: FloatArray  # (F,) of their costs in the sum
 
 
@@ -277,7 +277,7 @@ def evaluations(objective: Objective, benchmark: Benchmark) -> list[Evaluation]:
     ]
 
 
-def repeat_flights(flights: Fleet, times: int) -> Fleet:
+def repeat_flights(flights: FleetMatrices, times: int) -> FleetMatrices:
     """The same flights several times, one set after the other."""
     tiled = jax.tree.map(
         lambda array: np.tile(np.asarray(array), times), flights._replace(blocks=())

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from autopilot_bridge.channel_map import Line, to_channel
+from autopilot_bridge.channel_map import LinearConversion, to_channel
 from autopilot_bridge.map_rows import InputRow
 from autopilot_bridge.params import ChannelMap
 from flight_core.files import parse_yaml
@@ -232,7 +232,7 @@ class _Reader(NamedTuple):
 
     log: VehicleLog
     source: Source
-    line: Line
+    line: LinearConversion
     stick: Stick | None = None
     servo: Servo | None = None
 
@@ -320,7 +320,7 @@ def _torque(log: VehicleLog, name: str, row: InputRow, servos: bool) -> _Reader:
         "a multicopter",
         "none: the outputs of its rate controllers are the commands",
     )
-    return _Reader(log, source, Line(1 if sign > 0 else -1, row.scale, 0.0))
+    return _Reader(log, source, LinearConversion(1 if sign > 0 else -1, row.scale, 0.0))
 
 
 def _flight(

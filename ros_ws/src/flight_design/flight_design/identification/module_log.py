@@ -15,7 +15,7 @@ from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS, seconds
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray, StampedVector
-from flight_log.vehicle_tables import Table, VehicleLog
+from flight_log.vehicle_tables import MessageTable, VehicleLog
 from rise_di_controller import internals
 from rise_di_controller.guard import guard, retuning
 from rise_di_controller.params import ControllerConfig
@@ -64,7 +64,7 @@ def module_flight(log: VehicleLog, controller: ControllerConfig) -> ModuleFlight
 class _Ticks:
     """The rows of rise_di_status."""
 
-    def __init__(self, table: Table, controller: ControllerConfig) -> None:
+    def __init__(self, table: MessageTable, controller: ControllerConfig) -> None:
         m = len(controller.outputs)
         names = [f"{channel}[{i}]" for channel in CHANNELS for i in range(m)]
         names += ["timestamp_sample", "parameters", "number", "refusal", "y_m_offset"]

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from autopilot_bridge.channel_map import Line, to_raw
+from autopilot_bridge.channel_map import LinearConversion, to_raw
 from autopilot_bridge.map_rows import MOTIONS
 from autopilot_bridge.params import ChannelMap
 from flight_core.parameters import ParameterError, require
@@ -28,7 +28,7 @@ CHANNEL = re.compile(r"channels\[(\d+)\]|chan(\d+)_raw")
 AXES: Mapping[str, str] = {"p": "ROLL", "q": "PITCH", "V": "THROTTLE", "r": "YAW"}
 # SERVOn_FUNCTION: aileron, elevator, throttle, rudder
 FUNCTIONS = {"ROLL": 4, "PITCH": 19, "THROTTLE": 70, "YAW": 21}
-SAME_LINE = Line(1, 1.0, 0.0)
+SAME_LINE = LinearConversion(1, 1.0, 0.0)
 
 # share of half the range: the effect differs by as much, below the standard errors of `identify`
 END_TOLERANCE = 0.01
@@ -61,7 +61,7 @@ class Stick(NamedTuple):
 
     axis: str  # ROLL, PITCH, THROTTLE or YAW
     channel: int  # from 1
-    trim_line: Line
+    trim_line: LinearConversion
     raw_range: tuple[float, float]
     raw_sign: (
         int  # +1 where an increasing raw value is roll right, nose up, more thrust, nose right

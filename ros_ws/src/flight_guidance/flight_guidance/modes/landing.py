@@ -18,7 +18,7 @@ from flight_core.kinematics import clip
 from flight_core.parameters import require
 from flight_core.units import GRAVITY
 from flight_guidance.fence.zones import Zone, clearance
-from flight_guidance.guidance_state import GuidanceParams, GuidanceState, Lateral, Mode
+from flight_guidance.guidance_state import GuidanceMode, GuidanceParams, GuidanceState, Lateral
 from flight_guidance.modes.legs import course_and_speed
 from flight_guidance.sections import LandingConfig
 from flight_guidance.steering import path
@@ -127,7 +127,7 @@ class Lander:
         """Commands of the step after a state; none above the flare."""
         landing = self._landing
         height = pose["altitude"] - landing.ground
-        if state.mode is not Mode.ENGAGED:
+        if state.mode is not GuidanceMode.ENGAGED:
             return {}
         on_line = state.lateral is Lateral.ROUTE and state.leg == landing.leg and not state.joining
         self._flares = self._flares or (on_line and height <= landing.flare)

@@ -13,7 +13,7 @@ from typing import Any
 from flight_core.units import GRAVITY
 from flight_core.vectors import Scalar, array_namespace
 from flight_guidance.fence.fence import BACK, RIGHT, Escape
-from flight_guidance.guidance_state import GuidanceParams, GuidanceState, Lateral, Mode
+from flight_guidance.guidance_state import GuidanceMode, GuidanceParams, GuidanceState, Lateral
 from flight_guidance.modes.legs import EXIT, course_and_speed, has_loitered, leaves
 from flight_guidance.steering import path
 from flight_guidance.steering.lateral import (
@@ -44,7 +44,7 @@ def lateral_bank(
 
     Returns further the distance to the end of the leg, m.
     """
-    if state.mode is not Mode.ENGAGED:
+    if state.mode is not GuidanceMode.ENGAGED:
         return 0.0, NOWHERE, 0.0
     if state.lateral is Lateral.PHI:
         return state.target.phi, NOWHERE, 0.0

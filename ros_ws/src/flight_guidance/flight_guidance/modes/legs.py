@@ -8,10 +8,10 @@ from collections.abc import Callable, Mapping
 from flight_core.vectors import Scalar, array_namespace
 from flight_guidance.fence.fence import HOME
 from flight_guidance.guidance_state import (
-    Channels,
+    GuidanceMode,
     GuidanceState,
     Lateral,
-    Mode,
+    TargetChannels,
     Vertical,
 )
 from flight_guidance.steering import path
@@ -93,7 +93,7 @@ def with_commands(
     commands: Mapping[str, float],
     pose: Mapping[str, float],
     route: Route | None,
-    channels: Channels,
+    channels: TargetChannels,
     follow: Callable[[GuidanceState, Route], tuple[GuidanceState, float]],
     join: Callable[[GuidanceState, int, float, Route], GuidanceState],
 ) -> tuple[GuidanceState, float]:
@@ -106,7 +106,7 @@ def with_commands(
     """
     moved = channels.lateral.keys() & commands.keys()
     missed = 0.0
-    on_route = state.mode is Mode.ENGAGED and state.lateral is Lateral.ROUTE and not moved
+    on_route = state.mode is GuidanceMode.ENGAGED and state.lateral is Lateral.ROUTE and not moved
     if on_route and route is not None:
         state, missed = follow(state, route)
     if not commands:
@@ -146,7 +146,7 @@ def on_profile(
     Of the nearest point, or where the aircraft joins the leg.
     """
     flies = (
-        state.mode is Mode.ENGAGED
+        state.mode is GuidanceMode.ENGAGED
         and state.lateral is Lateral.ROUTE
         and state.vertical is Vertical.PROFILE
     )

@@ -23,12 +23,12 @@ from flight_guidance.fence.fence import AROUND, BACK, HOME, Escape, Motion, last
 from flight_guidance.guidance_state import (
     LARGEST,
     Begin,
-    Commands,
+    GuidanceMode,
     GuidanceParams,
     GuidanceState,
     Inputs,
     Lateral,
-    Mode,
+    StepCommands,
     Target,
     Vertical,
     begun_again,
@@ -65,7 +65,7 @@ def holding(
     alpha = pose["theta"] - path_angle(pose["climb"], speed)
     return GuidanceState(
         t_ns=t_ns - params.period_ns,
-        mode=Mode.ENGAGED,
+        mode=GuidanceMode.ENGAGED,
         lateral=Lateral.HEADING,
         vertical=Vertical.ALTITUDE,
         target=Target()._replace(**hold(pose, speed, params)),
@@ -117,7 +117,7 @@ def yaw_rate(y: Mapping[str, Scalar], phi: Scalar, theta: Scalar, speed: Scalar)
 
 def step(
     state: GuidanceState | None, inputs: Inputs, route: Route | None, params: GuidanceParams
-) -> tuple[GuidanceState, Commands]:
+) -> tuple[GuidanceState, StepCommands]:
     """A step: attitude, commands, u_m.
 
     1. Attitude: phi and theta of pose, brought to now over the age of pose by Euler's kinematics
@@ -152,7 +152,7 @@ def step(
     )
     state, escape = _within_fence(state, pose, y, speed, params)
     wanted, error, to_go = lateral_bank(state, pose, speed, route, params)
-    if state.mode is Mode.ENGAGED:
+    if state.mode is GuidanceMode.ENGAGED:
         wanted = escaping_bank(escape, wanted, pose, speed, params)
     state, commands = command(state, pose, y, wanted, dt, params)
     commands = commands._replace(xtrack=error.e, track=error.track, to_go=to_go, missed=missed)
@@ -174,7 +174,7 @@ def _wanted_rates(
 
     There are none after the loss of the pose, and none of a dead output.
     """
-    flies = state.mode is Mode.ENGAGED
+    flies = state.mode is GuidanceMode.ENGAGED
     attitude = params.attitude._replace(n_alpha=1.0 / (state.alpha_trim + 0.05))
     beta = pose["beta"] if flies else 0.0
     flat = flies and state.lateral is Lateral.PHI and state.target.r != 0.0
@@ -183,7 +183,7 @@ def _wanted_rates(
     )
     if flat:  # the sideslip is wanted
         rates = rates._replace(r=rates.r + state.target.r)
-    if state.mode is Mode.POSE_LOST:
+    if state.mode is GuidanceMode.POSE_LOST:
         rates = BodyRates(0.0, 0.0, 0.0)
     rates = rates._replace(**dict.fromkeys(params.dead, 0.0))
     if not params.rolls:
@@ -198,7 +198,7 @@ def command(
     phi_wanted: Scalar,
     dt: float,
     params: GuidanceParams,
-) -> tuple[GuidanceState, Commands]:
+) -> tuple[GuidanceState, StepCommands]:
     """Protection and u_m of `step`, from the bank of the lateral mode, rad.
 
     `t_ns` of the state stays. The values may be arrays with an element per aircraft of a fleet; the
@@ -206,7 +206,7 @@ def command(
     """
     speed = true_airspeed(y["V"], params)
     limits = params.limits
-    flies = state.mode is Mode.ENGAGED
+    flies = state.mode is GuidanceMode.ENGAGED
     if flies:
         state = _with_estimates(state, pose, y, speed, dt, params)
 
@@ -233,7 +233,7 @@ def command(
         wanted[name] if name == "V" else slewed(before, wanted[name], rate, dt)
         for name, before, rate in zip(params.outputs, state.u_m, params.slew, strict=True)
     )
-    commands = Commands(
+    commands = StepCommands(
         phi_c,
         theta_c,
         bank_limited=(phi_c != phi_wanted) | (abs(phi_c) == bank),
@@ -273,7 +273,7 @@ def _with_attitude(
     """Mode, and attitude from pose or by dead reckoning."""
     pose = dict(zip(POSE, inputs.pose, strict=True))
     if inputs.pose_age_ns <= params.max_age_ns:
-        if state.mode is Mode.POSE_LOST:  # the aircraft may be anywhere by now
+        if state.mode is GuidanceMode.POSE_LOST:  # the aircraft may be anywhere by now
             after_loss = (
                 home(pose, params)
                 if params.home.after_loss
@@ -287,11 +287,11 @@ def _with_attitude(
                 fence=0.0,
             )
             state = begin(level, inputs._replace(begin=Begin.AGAIN), params)
-        state = state._replace(mode=Mode.ENGAGED, phi=pose["phi"], theta=pose["theta"])
+        state = state._replace(mode=GuidanceMode.ENGAGED, phi=pose["phi"], theta=pose["theta"])
         since = min(seconds(inputs.pose_age_ns), LONGEST_LEAD)
     else:
         lost = inputs.pose_age_ns > params.max_age_ns + params.hold_ns
-        state = state._replace(mode=Mode.POSE_LOST if lost else Mode.DEAD_RECKONING)
+        state = state._replace(mode=GuidanceMode.POSE_LOST if lost else GuidanceMode.DEAD_RECKONING)
         since = dt
     y = dict(zip(params.outputs, inputs.y, strict=True))
     r = yaw_rate(y, state.phi, state.theta, airspeed(inputs.y, params))
@@ -299,7 +299,7 @@ def _with_attitude(
     phi = state.phi + since * phi_dot
     theta = state.theta + since * theta_dot
     psi_dot = heading_rate(state.phi, state.theta, y["q"], r)
-    measured = pose["psi"] + since * psi_dot if state.mode is Mode.ENGAGED else None
+    measured = pose["psi"] + since * psi_dot if state.mode is GuidanceMode.ENGAGED else None
     psi = heading_estimate(state.psi, measured, psi_dot, dt)
     return state._replace(phi=math.remainder(phi, 2.0 * math.pi), theta=theta, psi=psi)
 
@@ -343,7 +343,7 @@ def _within_fence(
 
     A lateral command during a turn is flown after the turn, unless the aircraft is outside.
     """
-    if params.fence is None or state.mode is not Mode.ENGAGED:
+    if params.fence is None or state.mode is not GuidanceMode.ENGAGED:
         return state, Escape(
             action=state.fence, begins=False, clearance=LARGEST, predicted=LARGEST, course=0.0
         )

@@ -30,13 +30,13 @@ from flight_guidance.fence.ways import line_clearance, ways
 from flight_guidance.guidance_state import (
     LARGEST,
     Begin,
-    Commands,
+    GuidanceMode,
     GuidanceParams,
     GuidanceState,
     Inputs,
     Lateral,
-    Mode,
     MulticopterParams,
+    StepCommands,
     Target,
     Vertical,
     begun_again,
@@ -61,7 +61,7 @@ LONGEST_LEAD = 0.5
 """s. Largest age of a pose over which the attitude is brought to now."""
 
 
-class Wanted(NamedTuple):
+class MotionCommand(NamedTuple):
     """What a lateral mode asks for. Complex numbers are vectors: north and i east."""
 
     velocity: complex = 0.0  # m/s, over ground
@@ -108,7 +108,7 @@ def _stop(pose: Mapping[str, float], gains: MulticopterParams) -> complex:
 
 def step(
     state: GuidanceState | None, inputs: Inputs, route: Route | None, params: GuidanceParams
-) -> tuple[GuidanceState, Commands]:
+) -> tuple[GuidanceState, StepCommands]:
     """A step: attitude, commands, u_m.
 
         v_c = towards the place or the path, within V
@@ -140,7 +140,7 @@ def step(
     )
     state = _with_wind(state, pose, dt, params)
     state, escape = _within_fence(state, pose, params)
-    flies = state.mode is Mode.ENGAGED
+    flies = state.mode is GuidanceMode.ENGAGED
     speed = min(max(state.target.V, 0.0), params.limits.largest_speed)
     state = state._replace(V_c=slewed(state.V_c, speed, gains.braking, dt))
     wanted = _wanted(state, pose, route, escape, params)
@@ -155,7 +155,7 @@ def step(
         slewed(before, values[channel], rate, dt)
         for channel, before, rate in zip(params.outputs, state.u_m, params.slew, strict=True)
     )
-    commands = Commands(
+    commands = StepCommands(
         phi_c=phi_c,
         theta_c=theta_c,
         xtrack=wanted.error.e,
@@ -190,7 +190,7 @@ def _begin(
     gains = _gains(params)
     held = GuidanceState(
         t_ns=inputs.t_ns - params.period_ns,
-        mode=Mode.ENGAGED,
+        mode=GuidanceMode.ENGAGED,
         lateral=Lateral.PLACE,
         vertical=Vertical.ALTITUDE,
         target=Target(V=params.speed)._replace(**hold(pose, inputs.y, params)),
@@ -224,17 +224,17 @@ def _with_attitude(
     age_ns = inputs.pose_age_ns
     since = dt
     if age_ns <= params.max_age_ns:
-        if state.mode is Mode.POSE_LOST:
+        if state.mode is GuidanceMode.POSE_LOST:
             state = _begin(None, inputs, pose, params)
             if params.home.after_loss:
                 state = state._replace(target=state.target._replace(**home(pose, params)))
         state = state._replace(
-            mode=Mode.ENGAGED, phi=pose["phi"], theta=pose["theta"], psi=pose["psi"]
+            mode=GuidanceMode.ENGAGED, phi=pose["phi"], theta=pose["theta"], psi=pose["psi"]
         )
         since = min(seconds(age_ns), LONGEST_LEAD)
     else:
         lost = age_ns > params.max_age_ns + params.hold_ns
-        state = state._replace(mode=Mode.POSE_LOST if lost else Mode.DEAD_RECKONING)
+        state = state._replace(mode=GuidanceMode.POSE_LOST if lost else GuidanceMode.DEAD_RECKONING)
     p, q, r = (inputs.y[params.outputs.index(name)] for name in ("p", "q", "r"))
     phi_dot, theta_dot = euler_rates(state.phi, state.theta, p, q, r)
     psi = state.psi + since * heading_rate(state.phi, state.theta, q, r)
@@ -296,7 +296,7 @@ def _within_fence(
     The action begins where the way to a stop comes nearer to the fence than MARGIN of flight.
     """
     fence = params.fence
-    if fence is None or state.mode is not Mode.ENGAGED:
+    if fence is None or state.mode is not GuidanceMode.ENGAGED:
         return state, Escape(
             action=state.fence, begins=False, clearance=LARGEST, predicted=LARGEST, course=0.0
         )
@@ -330,20 +330,20 @@ def _wanted(
     route: Route | None,
     escape: Escape,
     params: GuidanceParams,
-) -> Wanted:
+) -> MotionCommand:
     """What the lateral mode asks for; the way around a fence in its place."""
     gains = _gains(params)
     target = state.target
     place = (target.north, target.east)
-    if state.mode is not Mode.ENGAGED or state.lateral is Lateral.PHI:
-        return Wanted()
+    if state.mode is not GuidanceMode.ENGAGED or state.lateral is Lateral.PHI:
+        return MotionCommand()
     if escape.action in {AROUND, BACK} and params.fence is not None:
         position = (np.float64(pose["north"]), np.float64(pose["east"]))
         north, east, _ = ways(params.fence).aim(params.fence, *position)
         place = (float(north), float(east))
     elif state.lateral is Lateral.COURSE:
         velocity = cmath.rect(state.V_c, target.course)
-        return Wanted(velocity, velocity, error=PathError(0.0, target.course, 0.0))
+        return MotionCommand(velocity, velocity, error=PathError(0.0, target.course, 0.0))
     elif state.lateral is Lateral.ROUTE and route is not None:
         leg = route.legs[state.leg]
         if not state.joining and not path.is_orbit(leg):
@@ -367,14 +367,14 @@ def _approach(distance: float, speed: float, gains: MulticopterParams) -> tuple[
 
 def _to_place(
     place: complex, state: GuidanceState, pose: Mapping[str, float], gains: MulticopterParams
-) -> Wanted:
+) -> MotionCommand:
     """Towards a place, with the deceleration of the way."""
     distance, course = cmath.polar(place - _place(pose))
     speed, slope = _approach(distance, state.V_c, gains)
     velocity = cmath.rect(speed, course)
     closing = (_velocity(pose) * cmath.rect(1.0, -course)).real
     brake = cmath.rect(-slope * closing, course)
-    return Wanted(
+    return MotionCommand(
         velocity=velocity,
         ahead=velocity,
         acceleration=brake,
@@ -385,7 +385,7 @@ def _to_place(
 
 def _on_path(
     state: GuidanceState, pose: Mapping[str, float], route: Route, gains: MulticopterParams
-) -> Wanted:
+) -> MotionCommand:
     """Along a line or a fillet of the route."""
     leg = route.legs[state.leg]
     position = (pose["north"], pose["east"])
@@ -405,7 +405,7 @@ def _on_path(
     track = cmath.rect(1.0, error_later.track)
     bend = complex(-slope * speed, speed**2 * error_later.curvature)
     now = velocity * cmath.rect(1.0, error.track)
-    return Wanted(
+    return MotionCommand(
         velocity=now, ahead=velocity * track, acceleration=bend * track, error=error, to_go=to_go
     )
 
@@ -431,7 +431,7 @@ def _with_wind(
     """
     gains = _gains(params)
     v = _velocity(pose)
-    if state.mode is not Mode.ENGAGED:
+    if state.mode is not GuidanceMode.ENGAGED:
         return state._replace(velocity=_parts(v))
     wind = complex(*state.wind)
     attitude = {"phi": state.phi, "theta": state.theta, "psi": state.psi}
@@ -451,12 +451,12 @@ def _lift(pose: Mapping[str, float], gains: MulticopterParams) -> float:
 
 
 def _attitude_for(
-    state: GuidanceState, pose: Mapping[str, float], wanted: Wanted, params: GuidanceParams
+    state: GuidanceState, pose: Mapping[str, float], wanted: MotionCommand, params: GuidanceParams
 ) -> tuple[float, float, bool]:
     """Bank and pitch for the wanted acceleration, rad, and whether the tilt is limited."""
     gains = _gains(params)
     largest = params.limits.bank
-    if state.mode is not Mode.ENGAGED:
+    if state.mode is not GuidanceMode.ENGAGED:
         return 0.0, 0.0, False
     if state.lateral is Lateral.PHI:
         asked = complex(state.target.phi, state.target.theta)
@@ -480,7 +480,7 @@ def _with_climb(
     vertical_params = params.vertical
     wanted = 0.0
     permitted = 0.0
-    if state.mode is Mode.ENGAGED:
+    if state.mode is GuidanceMode.ENGAGED:
         wanted = state.target.climb
         if state.vertical is not Vertical.CLIMB:
             profile = wanted if state.vertical is Vertical.PROFILE else 0.0
@@ -505,7 +505,7 @@ def _rates(
     singularity short of a thrust downwards. Source: D. Brescianini, R. D'Andrea, Tilt-prioritized
     quadrocopter attitude control, IEEE Trans. Control Systems Technology 28 (2020).
     """
-    if state.mode is Mode.POSE_LOST:
+    if state.mode is GuidanceMode.POSE_LOST:
         return dict.fromkeys("pqr", 0.0)
     x = -math.cos(phi_c) * math.sin(theta_c)
     z = -math.cos(phi_c) * math.cos(theta_c)
@@ -517,7 +517,7 @@ def _rates(
     rate = min(gains.k_tilt * math.atan2(sine, -down), gains.tilt_rate) / max(sine, 1e-9)
     q = -rate * ahead
     turn = 0.0
-    if state.mode is Mode.ENGAGED:
+    if state.mode is GuidanceMode.ENGAGED:
         turn = gains.k_psi * math.remainder(state.target.heading - state.psi, 2.0 * math.pi)
     phi = tilt(state.phi)
     r = (clip(turn, gains.yaw_rate) * math.cos(state.theta) - q * math.sin(phi)) / math.cos(phi)

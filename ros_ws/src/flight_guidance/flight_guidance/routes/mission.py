@@ -7,7 +7,7 @@ from contextlib import suppress
 from typing import Any, NamedTuple
 
 from flight_core.parameters import require
-from flight_guidance.routes.route_places import Above, Home, Place, Places
+from flight_guidance.routes.route_places import Above, HomePlace, Place, Places
 
 FRAMES = {0: Above.SEA, 5: Above.SEA, 3: Above.HOME, 6: Above.HOME}  # MAV_FRAME
 TERRAIN = (10, 11)
@@ -141,7 +141,7 @@ def _in_order(key: str, items: Sequence[Item]) -> list[int]:
 
 
 def mission_route(
-    key: str, items: Sequence[Item], home: Home | None, notes: Sequence[str] = ()
+    key: str, items: Sequence[Item], home: HomePlace | None, notes: Sequence[str] = ()
 ) -> Places:
     """The waypoints and loiters of a mission in the order of flight.
 

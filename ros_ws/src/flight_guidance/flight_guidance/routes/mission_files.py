@@ -24,7 +24,7 @@ from flight_guidance.routes.route_json import (
 )
 from flight_guidance.routes.route_places import (
     Above,
-    Home,
+    HomePlace,
     Place,
     Places,
     is_position,
@@ -139,7 +139,7 @@ def read_wpl(content: bytes, key: str, line: str | None = None) -> Places:
     return mission_route(key, items, home, [note] * bool(note))
 
 
-def wpl_items(content: bytes, key: str) -> tuple[list[Item], Home | None]:
+def wpl_items(content: bytes, key: str) -> tuple[list[Item], HomePlace | None]:
     """The items of a QGC WPL 110, and the home of its item 0."""
     encoding = (
         "utf-16" if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else "utf-8-sig"
@@ -168,7 +168,7 @@ def wpl_items(content: bytes, key: str) -> tuple[list[Item], Home | None]:
         )
         # ArduPilot's item 0 is the home
         if index == 0 and frame == 0 and command == WAYPOINT and not items:
-            home = Home(*params[4:7]) if params[4] or params[5] else None
+            home = HomePlace(*params[4:7]) if params[4] or params[5] else None
             continue
         items.append(
             Item(
@@ -197,7 +197,7 @@ class FencePlaces(NamedTuple):
 
     zones: list[Area]
     rally: list[Place] = []  # noqa: RUF012 - never changed
-    home: Home | None = None
+    home: HomePlace | None = None
     back: Place | None = None  # where a breach sends the aircraft
 
 
@@ -342,11 +342,11 @@ def lat_lon(position: Any, above: Above = Above.AS_POSE) -> Place:
     return Place("fence", latitude, longitude, altitude[0] if altitude else None, above=above)
 
 
-def home_of(position: Any) -> Home | None:
+def home_of(position: Any) -> HomePlace | None:
     """The home in latitude, longitude and perhaps altitude; None for anything else."""
     if not is_position(position) or not all(isinstance(value, int | float) for value in position):
         return None
-    return Home(position[0], position[1], position[2] if len(position) == 3 else None)
+    return HomePlace(position[0], position[1], position[2] if len(position) == 3 else None)
 
 
 MOST_CORNERS = 10_000

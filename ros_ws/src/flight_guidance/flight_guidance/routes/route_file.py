@@ -22,7 +22,7 @@ from flight_guidance.routes import route_formats
 from flight_guidance.routes.mission_files import FencePlaces
 from flight_guidance.routes.route_formats import FORMATS
 from flight_guidance.routes.route_json import read_lines
-from flight_guidance.routes.route_places import Above, Home, Place
+from flight_guidance.routes.route_places import Above, HomePlace, Place
 from flight_guidance.steering.path import Point
 
 SEMI_MAJOR = 6378137.0
@@ -322,7 +322,11 @@ class _Heights:
     """Turns the altitude of a place to the altitude of `pose`."""
 
     def __init__(
-        self, fixed: float | None = None, home: Home | None = None, *, above_sea: bool | None = None
+        self,
+        fixed: float | None = None,
+        home: HomePlace | None = None,
+        *,
+        above_sea: bool | None = None,
     ) -> None:
         self._fixed = fixed
         self._sea = None if home is None else home.altitude

@@ -39,7 +39,7 @@ class Place(NamedTuple):
     climbs: bool = False
 
 
-class Home(NamedTuple):
+class HomePlace(NamedTuple):
     """The home of a mission."""
 
     latitude: float  # deg
@@ -52,7 +52,7 @@ class Places(NamedTuple):
 
     places: list[Place]
     notes: tuple[str, ...] = ()  # what is not flown
-    home: Home | None = None
+    home: HomePlace | None = None
 
 
 class Geometry(NamedTuple):
