@@ -376,9 +376,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
             raise ChannelError("mode", str(error)) from None
         if mode is not self._controller_mode:
             self._controller_mode = mode
-            self._guidance.pause(
-                paused=mode is not Mode.ENGAGED, forget=mode is Mode.INACTIVE
-            )
+            self._guidance.pause(paused=mode is not Mode.ENGAGED, forget=mode is Mode.INACTIVE)
 
     def _engage(self, request: Any) -> bool | str:
         if (
