@@ -54,11 +54,11 @@ class Proposer:
 
     def answer(self, propose: Callable[[], None]) -> Report:
         """What the controller says next."""
-        sent = self.flight.world.sent["/learning"]
-        count = len(sent)
+        messages = self.flight.world.sent["/learning"]
+        count = len(messages)
         propose()
-        self.flight.world.until(lambda: len(sent) > count, "an answer", self.flight.send)
-        return reports.decode(sent[count][1])
+        self.flight.world.until(lambda: len(messages) > count, "an answer", self.flight.send)
+        return reports.decode(messages[count][1])
 
 
 @pytest.fixture
@@ -88,9 +88,9 @@ def test_controller_refuses_a_lie_and_a_hasty_proposal_and_flies_a_certified_mod
     assert flies.values == {"event": "flies"}
     flight.run(0.1)
     assert flight.values("observer.part") == [0.6]  # its bound
-    flown = dict(zip(flight.at().tolist(), flight.column("parameters").tolist(), strict=True))
+    digests = dict(zip(flight.at().tolist(), flight.column("parameters").tolist(), strict=True))
     # u of a tick does not wait for its certificate
-    assert flown[flies.stamp_ns] == proposer.start.digest()
+    assert digests[flies.stamp_ns] == proposer.start.digest()
     assert flight.column("parameters")[-1] != proposer.start.digest()
 
 
@@ -102,15 +102,15 @@ def test_storm_of_proposals_costs_one_decoding_a_tick_and_delays_none(proposer: 
             proposer.propose("second#2")
         proposer.propose(change={"start": 1})
 
-    refused = "found a proposal for the parameters 1"
+    sentence = "found a proposal for the parameters 1"
     # the publisher that is locked
-    assert refused in proposer.answer(lambda: proposer.propose(change={"start": 1})).sentence
+    assert sentence in proposer.answer(lambda: proposer.propose(change={"start": 1})).sentence
     proposer.propose(change={"flown": None})
     for _ in range(20):
         proposer.propose(change={"start": 1})
     flight.run(0.1)
     assert len(flight.world.sent["/learning"]) == 1
-    assert refused in proposer.answer(storm).sentence
+    assert sentence in proposer.answer(storm).sentence
     counts = flight.node.refusals.counts
     assert counts["proposal: sender"] == 100
     assert counts["proposal: malformed"] == 1  # without the digest
@@ -125,19 +125,19 @@ def test_deactivated_law_ends_the_record(tmp_path: Path) -> None:
 
     The record before is forgotten.
     """
-    chosen = save_scenario(
+    scenario = save_scenario(
         find_scenario("osprey_learn").vary(
             controller={"learn": {"updates": [3.0], "latency": 0.5}}
         ),
         tmp_path / "learn.yaml",
     )
-    controller = chosen.rise_di()
+    controller = scenario.rise_di()
     names = ("mode", "age", "parameters", *(f"y.{name}" for name in controller.outputs))
     names += tuple(f"u.{name}" for name in controller.inputs)
     encoder = Encoder(
         (*names, *(f"given_up.{name}" for name in controller.outputs)), "/controller#1"
     )
-    with world_of("-p", f"scenario_file:={chosen.path}", "-p", "lockstep:=true") as world:
+    with world_of("-p", f"scenario_file:={scenario.path}", "-p", "lockstep:=true") as world:
         learner = world.make(LearnerNode)
         publisher = world.publisher(JointState, "/internals")
         for t, mode in (

@@ -117,9 +117,9 @@ def test_step_that_fails_leaves_the_last_y_m_and_the_node_goes_on(
         with monkeypatch.context() as patch:
             patch.setattr(model, "step", lambda x_m, u_m, matrices: np.full_like(x_m, np.nan))
             world.run(0.1, lambda: world.send("/u_m", command(0.3), "/guidance#1"))
-        held = world.vectors("/y_m")[len(before) :]
-        assert len(held) >= 45  # of 50 at 500 Hz
-        assert all(sample.channels == before[-1].channels for sample in held[1:-1])
+        rows = world.vectors("/y_m")[len(before) :]
+        assert len(rows) >= 45  # of 50 at 500 Hz
+        assert all(sample.channels == before[-1].channels for sample in rows[1:-1])
         world.run(1.1, lambda: world.send("/u_m", command(0.3), "/guidance#1"))
         assert world.last("/y_m")["p"] > before[-1].channels["p"]
         lines = [line for line in node.log.lines if "a step of the reference model failed" in line]

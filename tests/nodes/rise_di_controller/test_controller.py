@@ -118,15 +118,15 @@ class Flight:
 @contextmanager
 def flying(scenario: Scenario, **values: object) -> Iterator[Flight]:
     """A controller of a scenario with other parameters."""
-    given = parameters({f"controller.{name}": value for name, value in values.items()})
-    with world_of("--params-file", str(scenario.path), *given) as world:
+    updates = parameters({f"controller.{name}": value for name, value in values.items()})
+    with world_of("--params-file", str(scenario.path), *updates) as world:
         yield Flight(world)
 
 
 @pytest.fixture
 def flight(osprey_gust: Scenario) -> Iterator[Flight]:
-    with flying(osprey_gust) as made:
-        yield made
+    with flying(osprey_gust) as flight:
+        yield flight
 
 
 def test_forged_y_in_the_name_of_the_aircraft_is_held_and_told_until_it_ends(
@@ -150,8 +150,8 @@ def test_forged_y_in_the_name_of_the_aircraft_is_held_and_told_until_it_ends(
         Mode.RAMP,
         Mode.TRIM,
     }
-    told = "[ERROR] /y: sample refused: two publishers send under the name /peer#1: none is taken"
-    assert told in errors
+    line = "[ERROR] /y: sample refused: two publishers send under the name /peer#1: none is taken"
+    assert line in errors
     assert "[ERROR] /y: published by /peer, /rogue, expected one node" in errors
     assert "two publishers send under the name" in diagnostics(flight.world, "/controller")[0]
     rogue.leave()
@@ -216,10 +216,10 @@ def test_failsafe_holds_u_ramps_to_trim_re_engages_bumpless(osprey_gust: Scenari
         dt = flight.column("dt", begin)
         assert dt[again] == 0.0
         assert (u[again] == u[again - 1]).all()
-        moved = np.abs(np.diff(u[again:], axis=0))
-        assert (moved > 0.0).all()
+        change = np.abs(np.diff(u[again:], axis=0))
+        assert (change > 0.0).all()
         assert (
-            moved
+            change
             <= np.outer(dt[again + 1 :], law.input_scale * (law.K * law.Lambda * y + law.beta))
             + EXACT
         ).all()
@@ -362,8 +362,8 @@ def test_gains_change_in_flight_bumpless(osprey_gust: Scenario) -> None:
         rate = np.max(
             [law.input_scale * (law.K * law.Lambda * flight.y + law.beta) for law in laws], axis=0
         )
-        moved = np.abs(np.diff(flight.u(since), axis=0))
-        assert (moved <= np.outer(flight.column("dt", since)[1:], rate) + EXACT).all()
+        change = np.abs(np.diff(flight.u(since), axis=0))
+        assert (change <= np.outer(flight.column("dt", since)[1:], rate) + EXACT).all()
 
 
 def test_saturation_limits_can_be_added_in_flight(flight: Flight) -> None:
@@ -497,8 +497,8 @@ def test_tick_rate_is_kept_over_overruns(flight: Flight) -> None:
     assert ((late >= 0.0) & (late < PERIOD)).all()
     assert late.max() > 0.0
     deadlines = flight.at(begin) - np.array([nanoseconds(value) for value in late])
-    steps, rest = np.divmod(np.diff(deadlines), nanoseconds(PERIOD))
-    assert (rest == 0).all()
+    steps, remainder = np.divmod(np.diff(deadlines), nanoseconds(PERIOD))
+    assert (remainder == 0).all()
     assert (steps > 0).all()
     assert (steps - 1).sum() == missed(flight) - before
     assert missed(flight) - before >= 3 + 4 + 0 + 7 - 1
@@ -582,25 +582,25 @@ def test_rate_of_y_too_low_for_max_age_is_named_once_with_its_mend(
         flight.world.run(1.5, send)
         flight.world.run(0.15, lambda: send(paused=True))
     assert Mode.HOLD in set(flight.column("mode"))
-    told = [line for line in flight.node.log.lines if "fit into max_age" in line]
-    assert len(told) == named
+    lines = [line for line in flight.node.log.lines if "fit into max_age" in line]
+    assert len(lines) == named
     if named:
-        seen = re.search(
+        match = re.search(
             r"/y: ([\d.]+) samples a second, of which [\d.]+ fit into max_age = 0.1 s: send 30 ",
-            told[0],
+            lines[0],
         )
-        assert seen
-        assert float(seen[1]) == pytest.approx(rate, rel=0.1)
+        assert match
+        assert float(match[1]) == pytest.approx(rate, rel=0.1)
 
 
 def test_long_max_age_is_named_at_start_and_in_flight(osprey_gust: Scenario) -> None:
     with flying(osprey_gust, max_age=2.0) as flight:
-        told = [
+        lines = [
             line
             for line in flight.node.log.lines
             if "[WARNING] max_age = 2 s: the failsafe begins 2 s after" in line
         ]
-        assert len(told) == 1
+        assert len(lines) == 1
         for max_age in (0.1, 9.0):
             assert flight.set(max_age=max_age) == (True, "")
         assert [

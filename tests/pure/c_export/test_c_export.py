@@ -321,10 +321,10 @@ def test_check_names_an_edit_out_of_bounds(
     for member, value in members:
         if isinstance(value, np.ndarray):
             _, least, largest = TABLE.get(member, ("", -np.inf, np.inf))
-            beyond = [np.nan, np.inf, *np.array([least * 1.01 - 1.0, largest * 1.01 + 1.0])]
-            for k, edit in np.ndindex(value.size, len(beyond)):
+            outside = [np.nan, np.inf, *np.array([least * 1.01 - 1.0, largest * 1.01 + 1.0])]
+            for k, edit in np.ndindex(value.size, len(outside)):
                 wrong = bytearray(good)
-                wrong[place + 8 * k : place + 8 * k + 8] = np.float64(beyond[edit]).tobytes()
+                wrong[place + 8 * k : place + 8 * k + 8] = np.float64(outside[edit]).tobytes()
                 assert library.rise_di_check(bytes(wrong)).decode() == member
             place += 8 * value.size
     odd = {"period_ns": 0, "max_age_ns": -1, "hold_ns": -1, "ramp_ns": -1, "slope_ns": 0, "sign": 3}

@@ -86,13 +86,13 @@ def jittering_calls(count: int, seed: int) -> list[Call]:
         stamp_ns = k * NANOSECONDS // 250
         now_ns = stamp_ns + int(rng.integers(0, 1_000_000))
         y_m = 0.05 * np.sin(0.01 * k + np.arange(4.0))
-        lost = rng.random(2) < (0.2, 0.1)
+        is_lost = rng.random(2) < (0.2, 0.1)
         y = (
             []
-            if lost[0] or 500 <= k < 750
+            if is_lost[0] or 500 <= k < 750
             else [(stamp_ns - int(rng.integers(0, 500_000)), y_m + 0.01 * rng.normal(size=4))]
         )
-        calls.append(Call(now_ns, y, [] if lost[1] else [(stamp_ns, y_m)]))
+        calls.append(Call(now_ns, y, [] if is_lost[1] else [(stamp_ns, y_m)]))
     return calls
 
 
@@ -112,7 +112,7 @@ def test_caller_at_250_hz(name: str, c_controller: Callable[[RiseDiConfig], CCon
     python = Controller(controller)
     c = c_controller(exportable(controller))
     modes = set()
-    moved = np.zeros(4)
+    largest = np.zeros(4)
     for call in jittering_calls(1500, 3):
         for stamp_ns, value in call.y_m:
             python.take_y_m(StampedVector(stamp_ns, value), call.now_ns)
@@ -125,9 +125,9 @@ def test_caller_at_250_hz(name: str, c_controller: Callable[[RiseDiConfig], CCon
         assert mode == (-1 if output is None else python.mode)
         assert u.tobytes() == python.state.u.tobytes()
         modes.add(python.mode)
-        moved = np.maximum(moved, np.abs(u))
+        largest = np.maximum(largest, np.abs(u))
     assert modes >= {Mode.ENGAGED, Mode.HOLD, Mode.RAMP}
-    assert (moved > 0.0).all()
+    assert (largest > 0.0).all()
 
 
 UNITS = Units(("rad/s", "rad/s", "rad/s", "m/s"), ("rad", "rad", "rad", "1"))
@@ -380,7 +380,7 @@ def test_wrong_samples_are_lost_as_by_controller(
     rng = np.random.default_rng(4)
     python = Controller(config)
     c = c_controller(config)
-    lost = 0
+    count = 0
     for k in range(700):
         now_ns = k * NANOSECONDS // 100
         y, y_m = (0.1 * np.sin(0.01 * k + np.arange(8.0)) + 0.002 * rng.normal(size=8)).reshape(
@@ -401,12 +401,12 @@ def test_wrong_samples_are_lost_as_by_controller(
             (python.take_y(StampedVector(now_ns, y), now_ns), c.take_y(now_ns, y, now_ns)),
         ):
             assert status == (IMPLAUSIBLE if sentence else TAKEN)
-            lost += bool(sentence)
+            count += bool(sentence)
         output = python.tick(now_ns)
         u, mode = c.tick(now_ns)
         assert mode == (-1 if output is None else python.mode)
         assert u.tobytes() == python.state.u.tobytes()
-    assert lost > 10  # 5 spikes, 2 at each end of the jump, 1 of y_m, some of the noise
+    assert count > 10  # 5 spikes, 2 at each end of the jump, 1 of y_m, some of the noise
 
 
 def test_export_at_another_rate_is_the_loop_at_that_rate(tmp_path: Path) -> None:

@@ -312,9 +312,9 @@ def test_parameters_and_topics_are_those_of_the_source(folder: Path) -> None:
     module = folder / MODULE
     source = (module / "RiseDiControl.cpp").read_text()
     yaml = (module / "module.yaml").read_text()
-    used = set(re.findall(r"px4::params::(RDI_\w+)", source))
-    assert used == set(re.findall(r"^        (RDI_\w+):", yaml, re.MULTILINE))
-    assert all(len(name) <= 16 for name in used)
+    names = set(re.findall(r"px4::params::(RDI_\w+)", source))
+    assert names == set(re.findall(r"^        (RDI_\w+):", yaml, re.MULTILINE))
+    assert all(len(name) <= 16 for name in names)
     message = (folder / "msg" / "RiseDiStatus.msg").read_text()
     fields = re.findall(r"^(?:uint|float)\S+ ([a-z_]+)", message, re.MULTILINE)
     assert set(re.findall(r"\tstatus\.(\w+)", source)) == set(fields)
@@ -325,7 +325,7 @@ def test_flight_needs_no_more_samples_than_the_module_keeps(folder: Path) -> Non
     assert f"RISE_DI_SAMPLES {SAMPLES} " in (folder / MODULE / PARAMETERS).read_text("utf-8")
     flight = find_scenario(str(RATES), 4.0)
     sets = [exportable(flight.controller)]
-    few, many = (next(flight_recordings(flight, sets, kept)) for kept in (SAMPLES, 100))
+    few, many = (next(flight_recordings(flight, sets, size)) for size in (SAMPLES, 100))
     assert few.reals.tobytes() == many.reals.tobytes()
     with refusing("samples: found 3, expected 4 or more"):
         write_code(sets[0], "rates", folder / "few", float32=False, samples=3)
@@ -406,8 +406,8 @@ def test_log_of_the_module_replays_to_the_bit(shell: Shell, folder: Path) -> Non
     assert 1000 < ticks < 1200  # of 2400 cycles the law steps in every other one
     assert flight.equal == ticks
     assert flight.lost == 0
-    limited = flight.tape["internals"].group("limited").values
-    assert (limited == Saturation.MAGNITUDE).sum() > 100
+    limits = flight.tape["internals"].group("limited").values
+    assert (limits == Saturation.MAGNITUDE).sum() > 100
     assert len(flight.changes) > 20  # of the airspeed
     replayed = replay(flight.tape, controller, changes=[change.values for change in flight.changes])
     assert replayed.equal()
@@ -416,9 +416,9 @@ def test_log_of_the_module_replays_to_the_bit(shell: Shell, folder: Path) -> Non
     keep[700:710] = False
     fields = {name: values[keep] for name, values in table.fields.items()}
     log = VehicleLog("a ULog", {STATUS: MessageTable(table.stamp_ns[keep], fields)}, {}, None)
-    cut = module_flight(log, controller)
-    assert cut.lost > 90  # of the 100 up to the engagement
-    assert cut.equal == len(cut.tape["internals"].stamp_ns)
+    part = module_flight(log, controller)
+    assert part.lost > 90  # of the 100 up to the engagement
+    assert part.equal == len(part.tape["internals"].stamp_ns)
 
 
 @pytest.mark.parametrize(

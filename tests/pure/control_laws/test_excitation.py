@@ -119,9 +119,9 @@ def test_flight_commands_timetable_whatever_y_does() -> None:
     t = (u.stamp_ns - u.stamp_ns[0]) * 1e-9
     order = [u.names.index(name) for name in controller().inputs]
     expected = np.array([params.amplitude * excitation.signal(instant, params) for instant in t])
-    off = np.abs(u.values[:, order] - expected) > 1e-9
+    differs = np.abs(u.values[:, order] - expected) > 1e-9
     # only at an edge, where the law's sum of periods rounds to the other side
-    assert off.any(axis=1).mean() < 0.01
+    assert differs.any(axis=1).mean() < 0.01
     assert np.abs(tape["y"]["q"]).max() > 0.02  # rad/s: the aircraft answers
 
 

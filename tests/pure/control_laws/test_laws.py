@@ -115,8 +115,8 @@ def prepared(parameters: ControllerConfig) -> tuple[GuardParams, TunedLaw]:
 def at(y: Any, **others: Any) -> Measurements:
     """Measurements of four channels; what is not given is 0."""
     zero = np.zeros(4)
-    given = {"y_m": zero, "y_m_dot": zero, "u_trim": zero, "u_before": zero} | others
-    return Measurements(y + zero, **{key: value + zero for key, value in given.items()})
+    fields = {"y_m": zero, "y_m_dot": zero, "u_trim": zero, "u_before": zero} | others
+    return Measurements(y + zero, **{key: value + zero for key, value in fields.items()})
 
 
 def sample(ms: float, value: Any) -> StampedVector:
@@ -135,16 +135,16 @@ def tick(
 def random_flight(law: TunedLaw, size: float, ticks: int = 20) -> tuple[Any, Measurements]:
     """A state of a law after some ticks without limits, and the measurements of the last one."""
     generator = np.random.default_rng(1)
-    measured = at(size * generator.standard_normal(4))
-    state = law.control_law.engage(measured, law.params)
+    measurements = at(size * generator.standard_normal(4))
+    state = law.control_law.engage(measurements, law.params)
     for _ in range(ticks):
         y, y_m, y_m_dot, u_trim = size * generator.standard_normal((4, 4))
-        measured = Measurements(
-            y=y, y_m=y_m, y_m_dot=y_m_dot, u_trim=u_trim, u_before=measured.u_before
+        measurements = Measurements(
+            y=y, y_m=y_m, y_m_dot=y_m_dot, u_trim=u_trim, u_before=measurements.u_before
         )
-        state, u = law.control_law.step(state, measured, np.float64(DT), law.params)
-        measured = measured._replace(u_before=u)
-    return state, measured
+        state, u = law.control_law.step(state, measurements, np.float64(DT), law.params)
+        measurements = measurements._replace(u_before=u)
+    return state, measurements
 
 
 def bits(state: Any) -> dict[str, bytes]:
@@ -165,10 +165,10 @@ def first_change(name: str, parameters: Any, e: FloatArray, u: FloatArray) -> Fl
     scale = np.array(parameters.input_scale)
     # the filter releases -K e; the pole of the adaptation leaves dt / 2 of Omega u unestimated
     if law == "l1":
-        passed = 1.0 - np.exp(-np.array(parameters.bandwidth) * DT)
+        decay = 1.0 - np.exp(-np.array(parameters.bandwidth) * DT)
         Omega = np.reshape(parameters.Omega, (4, 4))
-        moved = np.array(parameters.K) * np.abs(e) + DT / 2.0 * (np.abs(Omega) @ np.abs(u))
-        return np.asarray(np.abs(np.linalg.inv(Omega)) @ (passed * moved))
+        change = np.array(parameters.K) * np.abs(e) + DT / 2.0 * (np.abs(Omega) @ np.abs(u))
+        return np.asarray(np.abs(np.linalg.inv(Omega)) @ (decay * change))
     K = (
         gain(np.array(parameters.k_g), np.array(parameters.k_d))
         if law == "rise_di"
@@ -184,9 +184,9 @@ def test_law_engages_without_jump_at_any_error(name: str, size: float) -> None:
     parameters = controller(name, lower=None, upper=None)
     u = np.array([0.1, -0.2, 0.3, -0.4])
     e = size * np.array([1.0, -2.0, 3.0, -4.0])
-    engaged = tick(parameters, guard.initial_state(4)._replace(u=u), 0, e)
-    assert engaged.u.tolist() == engaged.u_trim.tolist() == u.tolist()
-    after = tick(parameters, engaged, 10, e)
+    begin = tick(parameters, guard.initial_state(4)._replace(u=u), 0, e)
+    assert begin.u.tolist() == begin.u_trim.tolist() == u.tolist()
+    after = tick(parameters, begin, 10, e)
     observed = np.zeros(4) if parameters.observer is None else np.abs(after.law.u_o)
     # 1e-12 of u and of K e, which the law subtracts again, is rounding
     rounding = 1e-12 * (np.abs(u) + 1e3 * np.abs(e) * np.array(parameters.input_scale))
@@ -196,14 +196,14 @@ def test_law_engages_without_jump_at_any_error(name: str, size: float) -> None:
 @EVERY_LAW
 def test_limits_that_are_not_reached_change_no_bit(name: str) -> None:
     law = controller(name).tuned_law()
-    state, measured = random_flight(law, 0.05)
+    state, measurements = random_flight(law, 0.05)
     wide = Limits(np.full(4, -1e3), np.full(4, 1e3), np.full(4, 1e3 / DT))
-    after, u = law.control_law.step(state, measured, np.float64(DT), law.params)
-    limited, u_free, u_limited = law.control_law.limited(
-        state, measured, np.float64(DT), law.params, wide
+    after, u = law.control_law.step(state, measurements, np.float64(DT), law.params)
+    limited_state, u_free, u_limited = law.control_law.limited(
+        state, measurements, np.float64(DT), law.params, wide
     )
     assert u.tobytes() == u_free.tobytes() == u_limited.tobytes()
-    assert bits(after) == bits(limited)
+    assert bits(after) == bits(limited_state)
 
 
 @EVERY_LAW
@@ -278,16 +278,18 @@ def test_new_parameters_leave_u_as_it_is(name: str) -> None:
             if key in {"K", "Lambda", "beta"}
         }
     new = controller(name, **changes).tuned_law()
-    state, measured = random_flight(law, 1e-3)
-    measured = measured._replace(y_m_dot=np.zeros(4))
+    state, measurements = random_flight(law, 1e-3)
+    measurements = measurements._replace(y_m_dot=np.zeros(4))
     if name in OBSERVED:  # no innovation, so that the observer has nothing to add
-        state = state._replace(z=law.params.H.T @ (measured.y - measured.y_m), sigma=np.ones(1))
+        state = state._replace(
+            z=law.params.H.T @ (measurements.y - measurements.y_m), sigma=np.ones(1)
+        )
         state = state._replace(u_o=-law.params.F @ state.z)
     after = law.control_law.retune(state, law.params, new.params)
     # a tick of no time shows u: its filters and integrals do not move; 1e-12 s moves them by 1e-12
     # of their rates
-    _, u = law.control_law.step(state, measured, np.float64(1e-12), law.params)
-    _, u_new = new.control_law.step(after, measured, np.float64(1e-12), new.params)
+    _, u = law.control_law.step(state, measurements, np.float64(1e-12), law.params)
+    _, u_new = new.control_law.step(after, measurements, np.float64(1e-12), new.params)
     assert_allclose(u_new, u, rtol=1e-8, atol=1e-10)
 
 
@@ -365,9 +367,9 @@ def responses(name: str, parameters: Any, z: complex) -> FloatArray:
     )
     if name == "l1":
         Omega = np.reshape(parameters.Omega, (4, 4))
-        passed = 1.0 - np.exp(-np.array(parameters.bandwidth) * T)
+        decay = 1.0 - np.exp(-np.array(parameters.bandwidth) * T)
         # and a pole of 1 1/s in the adaptation
-        low_pass = np.diag(passed / (1.0 - (1.0 - passed) / z) / (np.exp(T) - 1.0))
+        low_pass = np.diag(decay / (1.0 - (1.0 - decay) / z) / (np.exp(T) - 1.0))
         # u = -Omega^-1 (K y + F ((1 - 1/z) y - T / z Omega u))
         return np.asarray(
             -np.linalg.solve(
@@ -391,8 +393,8 @@ def test_linear_model_has_frequency_response_of_law(name: str) -> None:
     A, B, C, D = linear_law(parameters.tuned_law(), 4, DT)
     for omega in (0.1, 1.0, 10.0, 100.0):  # rad/s
         z = np.exp(1j * omega * DT)
-        found = C @ np.linalg.solve(z * np.eye(len(A)) - A, B) + D
-        assert_allclose(found, responses(name, parameters, z), rtol=1e-6, atol=1e-9)
+        transfer = C @ np.linalg.solve(z * np.eye(len(A)) - A, B) + D
+        assert_allclose(transfer, responses(name, parameters, z), rtol=1e-6, atol=1e-9)
 
 
 @EVERY_LAW
@@ -426,22 +428,22 @@ def test_law_is_same_under_jax(name: str) -> None:
     limits = Limits(*(np.full((4, 1), value) for value in (-0.1, 0.1, 1.0)))
     many = law.control_law.engage(looks[0], params)
     compiled = jax.tree.map(jax.numpy.asarray, many)
-    alone = [
+    singles = [
         law.control_law.engage(Measurements(*(signal[:, k] for signal in looks[0][:5])), law.params)
         for k in range(3)
     ]
-    limited = jax.jit(
-        lambda state, measured: law.control_law.limited(state, measured, DT, params, limits)
+    limited_step = jax.jit(
+        lambda state, measurements: law.control_law.limited(state, measurements, DT, params, limits)
     )
     row = Limits(*(limit[:, 0] for limit in limits))
-    for measured in looks:
-        many, _, u = law.control_law.limited(many, measured, np.float64(DT), params, limits)
-        compiled, _, by_jax = limited(compiled, measured)
+    for measurements in looks:
+        many, _, u = law.control_law.limited(many, measurements, np.float64(DT), params, limits)
+        compiled, _, by_jax = limited_step(compiled, measurements)
         assert_allclose(by_jax, u, rtol=1e-9, atol=1e-12)  # the order of additions differs
         for k in range(3):
-            one = Measurements(*(value[:, k] for value in measured[:5]))
-            alone[k], _, of_one = law.control_law.limited(
-                alone[k], one, np.float64(DT), law.params, row
+            one = Measurements(*(value[:, k] for value in measurements[:5]))
+            singles[k], _, of_one = law.control_law.limited(
+                singles[k], one, np.float64(DT), law.params, row
             )
             assert_allclose(u[:, k], of_one, rtol=1e-9, atol=1e-12)
 
@@ -515,10 +517,10 @@ def test_a_re_engagement_restarts_the_observer(name: str) -> None:
         state = tick(parameters, state, 10 * k, 1e-3 * np.sin(k / 5.0))
     law = parameters.tuned_law()
     old = sample(990, 0.0)
-    held, _ = guard.tick(state, 1300 * MS, old, [old], parameters.guard(), law)
-    assert held.mode is Mode.HOLD
-    assert bits(held.law) == bits(state.law)  # nothing is estimated from what is not measured
-    again = tick(parameters, held, 1310, [0.01, 0.02, -0.01, 0.1])
+    after, _ = guard.tick(state, 1300 * MS, old, [old], parameters.guard(), law)
+    assert after.mode is Mode.HOLD
+    assert bits(after.law) == bits(state.law)  # nothing is estimated from what is not measured
+    again = tick(parameters, after, 1310, [0.01, 0.02, -0.01, 0.1])
     assert again.u.tolist() == state.u.tolist() == again.u_trim.tolist()
     H = matrices(parameters).H
     assert again.law.z.tolist() == (H.T @ [0.01, 0.02, -0.01, 0.1]).tolist()
@@ -564,12 +566,12 @@ def refused(sentence: str, values: dict[str, Any]) -> None:
 def test_page_names_every_registered_law_and_parameters() -> None:
     page = (REPOSITORY / "docs" / "laws.md").read_text()
     for name in laws.names():
-        own = (
+        own_section = (
             []
             if name in {"lqi", "indi", "mackunis"}
             else set(laws.schema(name).model_fields) - set(ControllerConfig.model_fields)
         )
-        for word in (name, *own):
+        for word in (name, *own_section):
             assert f"`{word}`" in page, word
 
 
@@ -721,6 +723,6 @@ def test_digest_depends_on_law() -> None:
     """Logs of versions without the key law keep the digest."""
     digests = {name: controller(name).digest() for name in (*NAMES, *OBSERVED)}
     assert len(set(digests.values())) == len(digests)
-    named = AnyLaw.validate_mapping(sections()["rise_di"] | {"law": "rise_di"}, "controller")
+    section = AnyLaw.validate_mapping(sections()["rise_di"] | {"law": "rise_di"}, "controller")
     without_name = {key: value for key, value in sections()["rise_di"].items() if key != "law"}
-    assert named.digest() == AnyLaw.validate_mapping(without_name, "controller").digest()
+    assert section.digest() == AnyLaw.validate_mapping(without_name, "controller").digest()

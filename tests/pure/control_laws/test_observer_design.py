@@ -81,7 +81,7 @@ def uncertain(count: int) -> NominalModel:
 def test_step_of_aircraft_model_is_motion_of_equations() -> None:
     model = osprey()
     wind_time = np.array([4.7, 0.6, 1.9])
-    sampled = observer_design.aircraft_model(model, NAMES, wind_time)
+    model_by_tick = observer_design.aircraft_model(model, NAMES, wind_time)
     generator = np.random.default_rng(2)
     z = 0.1 * generator.standard_normal(19)
     u = 0.1 * generator.standard_normal(4)
@@ -94,16 +94,16 @@ def test_step_of_aircraft_model_is_motion_of_equations() -> None:
         x_dot -= 0.01 * model.kinematic * x
         return np.concatenate([x_dot, (u - position) / model.lag, -wind / wind_time, -0.01 * d])
 
-    flown = solve_ivp(motion, (0.0, model.period), z, method="DOP853", rtol=1e-12, atol=1e-14).y[
+    solution = solve_ivp(motion, (0.0, model.period), z, method="DOP853", rtol=1e-12, atol=1e-14).y[
         :, -1
     ]
-    assert_allclose(sampled.Phi @ z + sampled.Gamma @ u, flown, atol=1e-11)
+    assert_allclose(model_by_tick.Phi @ z + model_by_tick.Gamma @ u, solution, atol=1e-11)
 
 
 def test_extended_state_step_solves_equations() -> None:
     model = osprey()
     decay = np.array([7.3, 5.8, 2.8, 4.6])
-    sampled = observer_design.extended_state_model(model, NAMES, decay)
+    model_by_tick = observer_design.extended_state_model(model, NAMES, decay)
     generator = np.random.default_rng(3)
     z = 0.1 * generator.standard_normal(16)
     u = 0.1 * generator.standard_normal(4)
@@ -114,30 +114,40 @@ def test_extended_state_step_solves_equations() -> None:
             [model.Omega @ position + d, (u - position) / model.lag, rate - 0.01 * d, -decay * rate]
         )
 
-    flown = solve_ivp(motion, (0.0, model.period), z, method="DOP853", rtol=1e-12, atol=1e-14).y[
+    solution = solve_ivp(motion, (0.0, model.period), z, method="DOP853", rtol=1e-12, atol=1e-14).y[
         :, -1
     ]
-    assert_allclose(sampled.Phi @ z + sampled.Gamma @ u, flown, atol=1e-11)
+    assert_allclose(model_by_tick.Phi @ z + model_by_tick.Gamma @ u, solution, atol=1e-11)
 
 
 @pytest.mark.parametrize("kind", ["aircraft", "extended state"])
 def test_gains_are_those_of_riccati_solver_of_scipy(kind: str) -> None:
     model = osprey()
     size = np.array([0.1, 1.0, 0.1, 0.1])
-    chosen: Weights | ExtendedStateWeights
+    design_weights: Weights | ExtendedStateWeights
     if kind == "aircraft":
-        chosen = weights()
-        design = observer_design.aircraft_observer(model, NAMES, chosen)
-        noise = [chosen.loose * model.size, np.full(M, 1e-6), chosen.gust, chosen.drift * size]
+        design_weights = weights()
+        design = observer_design.aircraft_observer(model, NAMES, design_weights)
+        noise = [
+            design_weights.loose * model.size,
+            np.full(M, 1e-6),
+            design_weights.gust,
+            design_weights.drift * size,
+        ]
     else:
-        chosen = extended_weights()
-        design = observer_design.extended_state_observer(model, NAMES, chosen)
-        noise = [np.zeros(M), np.full(M, 1e-6), chosen.drift * size, chosen.rate_drift * size]
+        design_weights = extended_weights()
+        design = observer_design.extended_state_observer(model, NAMES, design_weights)
+        noise = [
+            np.zeros(M),
+            np.full(M, 1e-6),
+            design_weights.drift * size,
+            design_weights.rate_drift * size,
+        ]
     Phi = design.Phi
     Gamma = design.Gamma
     H = design.H
     Q = H.T @ np.diag(1.0 / size**2) @ H
-    R = np.diag((chosen.effort / model.input_scale / size) ** 2)
+    R = np.diag((design_weights.effort / model.input_scale / size) ** 2)
     P = solve_discrete_are(Phi, Gamma, Q, R)
     expected = np.linalg.solve(R + Gamma.T @ P @ Gamma, Gamma.T @ P @ Phi)
     # scipy's own residuals are of that size: modes that decay with 0.01 1/s lie 1e-4 from the unit

@@ -61,7 +61,7 @@ def at(y: Any, y_m: Any = 0.0, **others: Any) -> Measurements:
     """Measurements of one aircraft; the others are 0, and x is y."""
     y = np.atleast_1d(np.asarray(y, dtype=float))[:, None]
     zero = np.zeros_like(y)
-    measured = Measurements(
+    measurements = Measurements(
         y=y,
         y_m=zero + y_m,
         y_m_dot=zero,
@@ -72,7 +72,7 @@ def at(y: Any, y_m: Any = 0.0, **others: Any) -> Measurements:
         x_air=y,
         y_dot=zero,
     )
-    return measured._replace(**{key: np.asarray(value) for key, value in others.items()})
+    return measurements._replace(**{key: np.asarray(value) for key, value in others.items()})
 
 
 class Flight(NamedTuple):
@@ -97,10 +97,10 @@ def fly(
     u is held over a tick, and d is its mean over one.
     """
     response = model.Omega[0, 0] if Omega is None else Omega
-    measured = at(y)
+    measurements = at(y)
     ys = []
     us = []
-    state = law.engage(measured, params)
+    state = law.engage(measurements, params)
     u = np.zeros(COLUMN)
     for k in range(ticks):
         state, _, u = law.limited(
@@ -127,14 +127,14 @@ def test_doubling_solves_the_riccati_equation(osprey: NominalModel) -> None:
     generator = np.random.default_rng(1)
     Q = np.tile(estimator.H.T @ estimator.H, (5, 1, 1))
     R = riccati.diagonal(np.exp(generator.normal(-3.0, 1.0, (4, 5))).T)
-    found = riccati.riccati(estimator.Phi, estimator.Gamma, Q, R)
+    solution = riccati.riccati(estimator.Phi, estimator.Gamma, Q, R)
     for k in range(
         5
         # scipy's own residuals are of that size: modes that decay with 0.01 1/s lie 1e-4 from the
         # unit circle
     ):
         expected = solve_discrete_are(estimator.Phi, estimator.Gamma, Q[k], R[k])
-        assert_allclose(found[k], expected, rtol=1e-7, atol=1e-8 * np.abs(expected).max())
+        assert_allclose(solution[k], expected, rtol=1e-7, atol=1e-8 * np.abs(expected).max())
 
 
 def recursion(F: FloatArray, G: FloatArray, Q: FloatArray, R: FloatArray, steps: int) -> FloatArray:
@@ -151,13 +151,13 @@ def test_lqi_is_limit_of_long_finite_horizon(osprey: NominalModel) -> None:
     size = osprey.C @ osprey.size
     weights = gains(integral=np.full((4, 1), 2.0), effort=np.full((4, 1), 0.1), fade=4.0)
     F, G, E = lqi.design(osprey, 4.0)
-    found = lqi.lqi_params(weights, osprey).gain[..., 0]
+    gain = lqi.lqi_params(weights, osprey).gain[..., 0]
     Q = E.T @ np.diag(np.concatenate([1.0 / size**2, (2.0 / size) ** 2])) @ E
     R = np.diag((0.1 / osprey.input_scale / size) ** 2)
     # what decays with LEAK alone, 0.01 1/s, is not in the gain; the loop's own modes have 50 s to
     # end
-    assert_allclose(found, recursion(F, G, Q, R, 5000), rtol=1e-6, atol=1e-6)
-    slow = np.sort(np.abs(np.linalg.eigvals(F - G @ found)))
+    assert_allclose(gain, recursion(F, G, Q, R, 5000), rtol=1e-6, atol=1e-6)
+    slow = np.sort(np.abs(np.linalg.eigvals(F - G @ gain)))
     # two angles and four references decay with LEAK for any gain; all other modes of the loop are
     # faster than 0.3 1/s
     assert np.all(slow[-6:] == approx(np.exp(-lqi.LEAK * osprey.period), abs=1e-6))
@@ -225,11 +225,11 @@ def test_l1_with_feedforward_does_not_cancel_disturbance_twice() -> None:
     d, y_m_dot = 0.7, 0.5
     u_ff = np.full(COLUMN, (y_m_dot - d) / model.Omega[0, 0])  # a model with d
     for k in range(500):
-        measured = at(
+        measurements = at(
             y, y_m_dot * k * DT, y_m_dot=np.full(COLUMN, y_m_dot), u_trim=u_ff, u_before=u
         )
-        state = control_law.engage(measured, params) if state is None else state
-        state, u = control_law.step(state, measured, np.array(DT), params)
+        state = control_law.engage(measurements, params) if state is None else state
+        state, u = control_law.step(state, measurements, np.array(DT), params)
         y += DT * (model.Omega[0, 0] * u.item() + d)
     assert u.item() == approx(u_ff.item(), rel=1e-2)
     assert abs(y - y_m_dot * 500 * DT) < 0.01 * 0.7 / 3.0
@@ -256,10 +256,10 @@ def test_pi_is_the_law_without_its_sign(osprey: NominalModel) -> None:
     Lambda = np.array([[3.0], [2.0], [1.0], [0.5]])
     control_law, params = law_of("pi", osprey, K=K, Lambda=Lambda)
     e = np.array([[0.1], [0.2], [0.0], [-0.3]])
-    measured = at(np.zeros(4))
-    state = control_law.engage(measured, params)
+    measurements = at(np.zeros(4))
+    state = control_law.engage(measurements, params)
     for k in range(1, 6):
-        state, u = control_law.step(state, measured._replace(y=k * e), np.array(DT), params)
+        state, u = control_law.step(state, measurements._replace(y=k * e), np.array(DT), params)
     # e rises by one step a tick from 0: its trapezoid up to tick 5 is 12.5 steps of dt
     assert_allclose(
         u, -osprey.input_scale[:, None] * K * (5.0 + Lambda * 12.5 * DT) * e, rtol=1e-12
@@ -312,14 +312,14 @@ def test_rival_law_is_same_under_jax(name: str, osprey: NominalModel) -> None:
     state = control_law.engage(looks[0], params)
     single = [np.asarray(signal)[..., :1] for signal in looks[0][:9]]
     compiled = jax.tree.map(jax.numpy.asarray, state)
-    alone = control_law.engage(Measurements(*single), params)
+    single_state = control_law.engage(Measurements(*single), params)
     step = jax.jit(control_law.step)
-    for measured in looks:
-        state, u = control_law.step(state, measured, np.array(DT), params)
-        compiled, by_jax = step(compiled, measured, DT, params)
-        alone, first = control_law.step(
-            alone,
-            Measurements(*(np.asarray(signal)[..., :1] for signal in measured[:9])),
+    for measurements in looks:
+        state, u = control_law.step(state, measurements, np.array(DT), params)
+        compiled, by_jax = step(compiled, measurements, DT, params)
+        single_state, first = control_law.step(
+            single_state,
+            Measurements(*(np.asarray(signal)[..., :1] for signal in measurements[:9])),
             np.array(DT),
             params,
         )

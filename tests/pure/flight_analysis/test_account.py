@@ -188,8 +188,8 @@ def test_flight_counts_from_its_first_u(
         "u": tape["u"].where(tape.time("u") >= begin)
     }
     flight = Tape(late, duration=2.0)
-    held = account(flight, osprey_gust)
-    assert str(judge(COMPLETED, flight, osprey_gust, held)).startswith(outcome)
+    flight_account = account(flight, osprey_gust)
+    assert str(judge(COMPLETED, flight, osprey_gust, flight_account)).startswith(outcome)
 
 
 @pytest.mark.parametrize("share, named", [(0.005, False), (0.02, True), (0.1, True), (0.5, True)])
@@ -216,8 +216,8 @@ def test_clock_that_stands_now_and_then_is_named(
 def test_replay_covers_no_tick_without_its_sample(topic: str, tape: Tape) -> None:
     """A twentieth of y or of u is missing: 95 % of the ticks are compared."""
     signal = tape[topic]
-    kept = ~np.isin(signal.stamp_ns, tape["internals"].stamp_ns[10::20])
-    result = replay(replace(tape, signals={**tape.signals, topic: signal.where(kept)}))
+    keep = ~np.isin(signal.stamp_ns, tape["internals"].stamp_ns[10::20])
+    result = replay(replace(tape, signals={**tape.signals, topic: signal.where(keep)}))
     assert result.equal()
     assert result.compared.mean() == pytest.approx(0.95, abs=0.01)
     assert result.checked.mean() > 0.98
@@ -415,13 +415,15 @@ def test_clock_step_is_found_across_batches() -> None:
     stamp_ns = np.concatenate([*stamps(range(1000, 1100), range(900, 1000))])
     log_ns = np.concatenate([*stamps(range(1000, 1200))])
     clock = StampClock()
-    taken = 0
+    count_taken = 0
     usable = 0
-    while taken < len(stamp_ns):
-        end = min(taken + 15, len(stamp_ns))
+    while count_taken < len(stamp_ns):
+        end = min(count_taken + 15, len(stamp_ns))
         more = end < len(stamp_ns)
-        keep, count = clock.usable(stamp_ns[taken:end], log_ns[taken:end], more=more, end=not more)
-        taken = taken + count
+        keep, count = clock.usable(
+            stamp_ns[count_taken:end], log_ns[count_taken:end], more=more, end=not more
+        )
+        count_taken = count_taken + count
         usable = usable + int(keep.sum())
     of = clock.recording()
     assert (usable, of.found, of.left_out, of.step_ns) == (100, 200, 100, -199 * NANOSECONDS // 100)
@@ -431,8 +433,8 @@ def test_channel_of_scenario_that_y_does_not_have_is_a_lack(
     tape: Tape, osprey_gust: Scenario
 ) -> None:
     y = tape["y"]
-    other = Signal(y.stamp_ns, ("pitch_rate", *y.names[1:]), y.values)
-    assert account(replace(tape, signals={**tape.signals, "y": other}), osprey_gust).lacks == (
+    renamed = Signal(y.stamp_ns, ("pitch_rate", *y.names[1:]), y.values)
+    assert account(replace(tape, signals={**tape.signals, "y": renamed}), osprey_gust).lacks == (
         f"{y.names[0]} of y",
     )
 
@@ -509,9 +511,9 @@ PARTS_HELD: Mapping[str, tuple[str, Damage, float]] = {
 def test_python_says_over_which_part_its_figures_are(
     whole: Path, tmp_path: Path, name: str
 ) -> None:
-    topic, change, held = PARTS_HELD[name]
+    topic, change, holds = PARTS_HELD[name]
     run = rise_di.read_run(damage(whole, tmp_path / "damaged.mcap", topic, change))
-    assert run.account.topics["y"].share == pytest.approx(held, abs=0.01)
+    assert run.account.topics["y"].share == pytest.approx(holds, abs=0.01)
     counts = run.account.topics["y"]
     assert f"the log lacks y {counts.found} of {counts.expected} samples" in " ".join(
         run.tape.notes
@@ -578,8 +580,8 @@ def test_fleet_says_the_share_of_the_ticks_engaged(
 ) -> None:
     monkeypatch.setenv("COLUMNS", "200")
     assert half.scenario is not None
-    flown = MemberFlight(Member("two", half.scenario), tmp_path, COMPLETED)
-    show_fleet("pair", [flown], {"two": FleetResult(half.summary, 0.9365)})
+    member = MemberFlight(Member("two", half.scenario), tmp_path, COMPLETED)
+    show_fleet("pair", [member], {"two": FleetResult(half.summary, 0.9365)})
     assert "93.65 %, over 49 % of internals" in capsys.readouterr().out
 
 
@@ -587,7 +589,7 @@ def test_note_on_the_modes_says_the_share_of_the_ticks(half: RecordedFlight) -> 
     signal = half.tape["internals"]
     values = signal.values.copy()
     values[-20:, signal.names.index("mode")] = Mode.HOLD
-    held = replace(signal, values=values)
-    tape = replace(half.tape, signals={**half.tape.signals, "internals": held})
+    signal_held = replace(signal, values=values)
+    tape = replace(half.tape, signals={**half.tape.signals, "internals": signal_held})
     notes = summarise(tape, half.scenario)["notes"]
     assert any("HOLD in 20% of the ticks, over 49 % of internals:" in note for note in notes)

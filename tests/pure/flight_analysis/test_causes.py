@@ -202,10 +202,10 @@ def test_no_damaged_byte_is_told_as_a_busy_host(
     content = log.read_bytes()
     place = int(at * len(content))
     middle = content[place : place + size]
-    rest = content[place + size :]
+    tail = content[place + size :]
     inverted = bytes(byte ^ 0x55 for byte in middle)
     log.write_bytes(
-        content[:place] + {"cut": b"", "inverted": inverted + rest, "removed": rest}[kind]
+        content[:place] + {"cut": b"", "inverted": inverted + tail, "removed": tail}[kind]
     )
     check(log)
     shutil.rmtree(folder)
@@ -316,9 +316,9 @@ def test_leap_of_all_topics_is_told_and_figures_are_over_flight_time(
         damaged(messages, kind, 0.5, by, ""),
     )
     summary = read_flight(log).summary
-    told = f"the clock of all stamps leaps forth by {by:.3f} s at t = 0.998 s"
-    assert summary["outcome"]["sentence"] == f"completed, log incomplete: {told}"
-    assert summary["notes"] == [f"{told}: later times are by the clock before the leap"]
+    sentence = f"the clock of all stamps leaps forth by {by:.3f} s at t = 0.998 s"
+    assert summary["outcome"]["sentence"] == f"completed, log incomplete: {sentence}"
+    assert summary["notes"] == [f"{sentence}: later times are by the clock before the leap"]
     assert figures(summary) == figures(intact)
     result = replay(log)
     assert result.equal()
@@ -332,14 +332,14 @@ def test_pause_of_all_processes_is_no_leap_of_the_clock(
 
     The numbers go on behind the pause.
     """
-    kept = [
+    remaining = [
         sent
         for sent in numbered
         if not EPOCH + NANOSECONDS // 2 < sent.log_ns < EPOCH + 17 * NANOSECONDS // 10
     ]
     counts: Counter[str] = Counter()
     messages = []
-    for sent in kept:
+    for sent in remaining:
         counts[sent.topic] += 1
         messages.append(sent._replace(number=counts[sent.topic]))
     log = write_messages(recorded / "run_0.mcap", tmp_path / "run_0.mcap", messages)
@@ -407,13 +407,15 @@ def test_ticks_of_another_controller_do_not_count_among_those_of_the_flight(
     nodes = dict.fromkeys(("u", "internals"), "/controller#7") | {"y_m": "/reference_model#8"}
     messages = []
     for name in ("y", "y_m", "truth", "u", "internals"):
-        own = tape[name]
+        signal = tape[name]
         parts = [
-            Samples(own.names, own.stamp_ns + EPOCH, own.values, nodes.get(name, "/aircraft#9"))
+            Samples(
+                signal.names, signal.stamp_ns + EPOCH, signal.values, nodes.get(name, "/aircraft#9")
+            )
         ]
         if name in {"u", "internals"}:
-            later_ns = own.stamp_ns[:40] + EPOCH + NANOSECONDS + 1_000_000
-            parts.append(Samples(own.names, later_ns, own.values[:40], "/controller#10"))
+            later_ns = signal.stamp_ns[:40] + EPOCH + NANOSECONDS + 1_000_000
+            parts.append(Samples(signal.names, later_ns, signal.values[:40], "/controller#10"))
         for part in parts:
             rows = zip(part.stamp_ns.tolist(), encoded(part), strict=True)
             messages += [
@@ -506,12 +508,12 @@ def test_summary_of_another_flight_is_not_believed(
     log = write_messages(recorded / "run_0.mcap", run / "run_0.mcap", numbered)
     summary = read_flight(log).summary
     summary["flight"]["start_ns"] += later_by
-    ended = ended_early("aircraft was killed by SIGKILL")
-    (run / "summary.json").write_text(json.dumps(summary | {"outcome": ended.as_json()}))
+    outcome = ended_early("aircraft was killed by SIGKILL")
+    (run / "summary.json").write_text(json.dumps(summary | {"outcome": outcome.as_json()}))
     assert read_run(log).tape.outcome == UNKNOWN
-    told = read_flight(log).summary["outcome"]["sentence"]
-    assert (told == str(ended)) is not bool(later_by)
-    assert told.startswith("completed") is bool(later_by)
+    sentence = read_flight(log).summary["outcome"]["sentence"]
+    assert (sentence == str(outcome)) is not bool(later_by)
+    assert sentence.startswith("completed") is bool(later_by)
 
 
 def test_scenario_beside_a_log_without_attachments_is_that_of_the_flight(run: Path) -> None:
@@ -524,9 +526,9 @@ def test_scenario_beside_a_log_without_attachments_is_that_of_the_flight(run: Pa
         messages = [
             (channel.topic, message) for _, channel, message in make_reader(stream).iter_messages()
         ]
-    sent = [
+    heads = [
         Sent(topic, message.log_time, message.sequence, message.data) for topic, message in messages
     ]
-    write_messages(path, run / "bare", sent, attached=False).replace(path)
+    write_messages(path, run / "bare", heads, attached=False).replace(path)
     assert read_run(run).scenario == attached
     assert figures(read_flight(run).summary) == figures(intact)

@@ -41,13 +41,13 @@ def test_csv_and_parquet_hold_every_sample_to_last_bit(
     write_parquet(tmp_path / "run.parquet", [flight])
     with (tmp_path / "run.csv").open(newline="") as stream:
         rows = list(csv.DictReader(stream))
-    read = pl.read_parquet(tmp_path / "run.parquet")
-    assert len(rows) == len(read) == 1501
+    table = pl.read_parquet(tmp_path / "run.parquet")
+    assert len(rows) == len(table) == 1501
     for topic, name in (("y", "q"), ("u", "thrust"), ("internals", "Pi.r"), ("truth", "x.alpha")):
         column = f"{topic}.{name}"
         expected = flight.tape[topic][name].tolist()
         assert [float(row[column]) for row in rows if row[column]] == expected
-        assert read[column].drop_nulls().to_list() == expected
+        assert table[column].drop_nulls().to_list() == expected
     # 100 Hz of 500
     assert [row["u.thrust"] != "" for row in rows[:11]] == [
         True,

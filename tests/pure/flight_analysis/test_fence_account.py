@@ -123,6 +123,6 @@ def test_landing_beside_its_touch_down_zone_says_so() -> None:
     touchdown = ZoneConfig.validate_mapping(zone, "touchdown")
     section = SECTION.model_copy(update={"touchdown": touchdown})
     place = Signal(np.zeros(1, dtype=np.int64), ("north", "east"), np.array([[300.0, 14.0]]))
-    beside = touched_beside(Tape({"pose": place}, 0), section)
-    assert beside == pytest.approx(4.0)
+    distance = touched_beside(Tape({"pose": place}, 0), section)
+    assert distance == pytest.approx(4.0)
     assert touched_beside(Tape({"pose": place}, 0), SECTION) == 0.0

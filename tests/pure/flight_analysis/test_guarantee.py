@@ -162,8 +162,8 @@ def test_loop_with_entries_pulled_out_is_the_exact_loop(name: str) -> None:
     linear = boxed(name, 0.7)
     assert linear.box is not None
     d = np.sign(np.random.default_rng(1).standard_normal((20, len(linear.box.names))))
-    whole = uncertain_loop(linear.nominal, linear.law, linear.loop, linear.box)
-    pulled = every_channel(whole).closed(d)[0]
+    uncertain = uncertain_loop(linear.nominal, linear.law, linear.loop, linear.box)
+    pulled = every_channel(uncertain).closed(d)[0]
     sizes = np.abs(np.linalg.eigvals(pulled)).max(axis=-1)
     assert sizes == approx(radii(linear, d), abs=1e-5)
 
@@ -177,8 +177,8 @@ def test_channels_of_a_delay_hold_each_constant_delay(late: float) -> None:
     linear = boxed("osprey_servo", 0.5)
     assert linear.box is not None
     rng = np.random.default_rng(5)
-    whole = uncertain_loop(linear.nominal, linear.law, linear.loop, linear.box, late)
-    channels = every_channel(whole)
+    uncertain = uncertain_loop(linear.nominal, linear.law, linear.loop, linear.box, late)
+    channels = every_channel(uncertain)
     m = len(linear.inputs)
     longest = late / linear.loop.period
     parts = np.minimum(longest - np.arange(np.ceil(longest)), 1.0)
@@ -238,11 +238,11 @@ def test_no_corner_is_unstable_or_has_less_than_guaranteed() -> None:
     assert promise.stable < promise.unstable.deviation < 1.02 * promise.stable
     corners = np.sign(np.random.default_rng(3).standard_normal((2000, len(linear.box.names))))
     assert (radii(linear, corners * promise.stable / 0.3) <= LIMIT).all()
-    found = input_margins(
+    margins = input_margins(
         aircraft_at(linear.nominal, linear.box, corners[:40]), linear.law, linear.loop
     )
-    assert (found.disk >= promise.disk).all()
-    assert (found.disk_all >= promise.disk_all).all()
+    assert (margins.disk >= promise.disk).all()
+    assert (margins.disk_all >= promise.disk_all).all()
 
 
 def test_search_is_at_or_below_corners() -> None:
@@ -251,12 +251,12 @@ def test_search_is_at_or_below_corners() -> None:
     assert linear.box is not None
     search = worst_in_box(linear.nominal, linear.law, linear.loop, linear.box)
     corners = np.sign(np.random.default_rng(8).standard_normal((150, len(linear.box.names))))
-    drawn = input_margins(
+    samples = input_margins(
         aircraft_at(linear.nominal, linear.box, corners), linear.law, linear.loop
     ).worst()
     for name in ("phase", "gain", "disk", "disk_all", "damping"):
         # a walk may end at a corner beside the least one: by less than a printed digit
-        assert (getattr(search.worst, name) <= 1.001 * getattr(drawn, name)).all(), name
+        assert (getattr(search.worst, name) <= 1.001 * getattr(samples, name)).all(), name
     # an aircraft of 29.6 deg, beside 29.62 at the least of 1,500 corners, lies within 30 %
     assert np.degrees(search.worst.phase.min()) == approx(29.61, abs=0.1)
 
@@ -340,8 +340,8 @@ def test_command_bounds_the_effectors_behind_an_allocation() -> None:
     earlier.
     """
     words = ["gains", "x8_elevons", "--scenario", "x8_elevons", "--check", "--guarantee", "--json"]
-    done = invoke(*words, "--samples", "2")
-    assert done.exit_code == 1
+    run = invoke(*words, "--samples", "2")
+    assert run.exit_code == 1
     promise = kept_guarantee(boxed("x8_elevons"))  # of the same loop and box
     assert promise is not None
-    assert json.loads(done.output)["guarantee"]["stable"] == approx(promise.stable)
+    assert json.loads(run.output)["guarantee"]["stable"] == approx(promise.stable)

@@ -43,14 +43,14 @@ def log(**channels: ArrayLike) -> Tape:
 
     `_` stands for a dot.
     """
-    given = {name.replace("__", "."): value for name, value in channels.items()}
+    replacements = {name.replace("__", "."): value for name, value in channels.items()}
     level: dict[str, Any] = dict.fromkeys(names(("q", "V", "p", "r")), 0.0) | {
         "mode": GuidanceMode.ENGAGED, "mode.lateral": Lateral.HEADING,
         "mode.vertical": Vertical.ALTITUDE,
         "V_c": SPEED, "pose.v_north": SPEED, "pose.north": SPEED * T,
     }  # fmt: skip
-    assert set(given) <= set(level)
-    return Tape({"guidance": signal((T * 1e3).tolist(), **level | given)}, EPOCH)
+    assert set(replacements) <= set(level)
+    return Tape({"guidance": signal((T * 1e3).tolist(), **level | replacements)}, EPOCH)
 
 
 def near(*values: Any) -> Any:
@@ -64,17 +64,17 @@ def after(instant: float, value: float) -> FloatArray:
 
 def test_segment_ends_where_mode_command_or_leg_changes() -> None:
     lateral = np.where(T < 10.0, Lateral.HEADING, Lateral.ROUTE)
-    found = segments(
+    result = segments(
         log(mode__lateral=lateral, leg=after(20.0, 1.0), target__altitude=after(30.0, 50.0))
     )
-    assert [(segment.start, segment.stop) for segment in found] == [
+    assert [(segment.start, segment.stop) for segment in result] == [
         near(0.0, 10.0),
         near(10.0, 20.0),
         near(20.0, 30.0),
         near(30.0, 39.98),
     ]
-    assert [segment.leg for segment in found] == [None, 0, 1, 1]
-    assert [segment.lateral.quantity for segment in found] == [
+    assert [segment.leg for segment in result] == [None, 0, 1, 1]
+    assert [segment.lateral.quantity for segment in result] == [
         "heading",
         "xtrack",
         "xtrack",
@@ -100,16 +100,16 @@ def test_a_step_has_overshoot_and_settling() -> None:
 
 
 def test_what_begins_within_band_has_no_step() -> None:
-    held = segments(log(pose__altitude=3.0))[0].vertical
-    assert (held.rms, held.max) == near(3.0, 3.0)
-    assert (held.overshoot, held.settling) == (None, None)
+    errors = segments(log(pose__altitude=3.0))[0].vertical
+    assert (errors.rms, errors.max) == near(3.0, 3.0)
+    assert (errors.overshoot, errors.settling) == (None, None)
 
 
 def test_heading_error_is_that_of_shorter_side() -> None:
-    held = segments(log(pose__psi=math.radians(-179.0), target__heading=math.radians(179.0)))[
+    errors = segments(log(pose__psi=math.radians(-179.0), target__heading=math.radians(179.0)))[
         0
     ].lateral
-    assert held.max == approx(math.radians(2.0))
+    assert errors.max == approx(math.radians(2.0))
 
 
 def test_summary_names_bank_age_and_limited_commands() -> None:
@@ -154,9 +154,9 @@ def test_log_without_a_channel_of_guidance_is_refused(
     flight: RecordedFlight, tmp_path: Path
 ) -> None:
     guidance = flight.tape["guidance"]
-    kept = [name for name in guidance.names if name not in {"missed", "age.link"}]
+    names = [name for name in guidance.names if name not in {"missed", "age.link"}]
     fewer = Signal(
-        guidance.stamp_ns, tuple(kept), np.column_stack([guidance[name] for name in kept])
+        guidance.stamp_ns, tuple(names), np.column_stack([guidance[name] for name in names])
     )
     tape = replace(flight.tape, signals={**flight.tape.signals, "guidance": fewer})
     write_run(tape, tmp_path / "run", LogAttachments(find_scenario("osprey_route").path))

@@ -71,17 +71,19 @@ def test_integrator_has_its_closed_forms(k: float) -> None:
     # L = kT / (z - 1): abs(L) = 1 at 2 sin(wT/2) = kT, angle -(pi/2 + wT/2); L(-1) = -kT/2; S(-1) =
     # 1 / (1 - kT/2); S - 1/2 = (z - 1 - kT) / (2 (z - 1 + kT)), largest at z = -1
     kT = k * NO_LAG.period
-    found = input_margins(INTEGRATOR, proportional(np.array([[k]])), NO_LAG)
-    assert found.stable
-    assert found.phase[0] == approx(math.pi / 2.0 - math.asin(kT / 2.0), rel=1e-8)
-    assert found.crossover[0] == approx(2.0 * math.asin(kT / 2.0) / NO_LAG.period, rel=1e-8)
-    assert found.gain_increase[0] == approx(2.0 / kT)
-    assert found.gain_decrease[0] == 0.0
-    assert found.gain[0] == approx(2.0 / kT)
-    assert found.sensitivity[0] == approx(1.0 / (1.0 - kT / 2.0))
-    assert found.disk[0] == approx(2.0 * (2.0 - kT) / (2.0 + kT))
-    assert [found.sensitivity_all, found.disk_all] == approx([found.sensitivity[0], found.disk[0]])
-    assert found.damping == 1.0  # its pole 1 - kT is real
+    margins = input_margins(INTEGRATOR, proportional(np.array([[k]])), NO_LAG)
+    assert margins.stable
+    assert margins.phase[0] == approx(math.pi / 2.0 - math.asin(kT / 2.0), rel=1e-8)
+    assert margins.crossover[0] == approx(2.0 * math.asin(kT / 2.0) / NO_LAG.period, rel=1e-8)
+    assert margins.gain_increase[0] == approx(2.0 / kT)
+    assert margins.gain_decrease[0] == 0.0
+    assert margins.gain[0] == approx(2.0 / kT)
+    assert margins.sensitivity[0] == approx(1.0 / (1.0 - kT / 2.0))
+    assert margins.disk[0] == approx(2.0 * (2.0 - kT) / (2.0 + kT))
+    assert [margins.sensitivity_all, margins.disk_all] == approx(
+        [margins.sensitivity[0], margins.disk[0]]
+    )
+    assert margins.damping == 1.0  # its pole 1 - kT is real
 
 
 def test_phase_margin_beside_modes_with_one_vector_for_two() -> None:
@@ -89,8 +91,8 @@ def test_phase_margin_beside_modes_with_one_vector_for_two() -> None:
     A = np.zeros((3, 3))
     A[0, 1] = 1.0
     plant = LinearPlant(A, np.eye(3)[:, 2:], np.eye(3)[2:])
-    found = phase_margins(plant, proportional(np.array([[60.0]])), NO_LAG)
-    assert found == approx(math.pi / 2.0 - math.asin(0.3), rel=1e-8)
+    phase = phase_margins(plant, proportional(np.array([[60.0]])), NO_LAG)
+    assert phase == approx(math.pi / 2.0 - math.asin(0.3), rel=1e-8)
 
 
 @pytest.mark.parametrize("near", [0.001, 0.05, 0.0625, 0.09])
@@ -102,10 +104,10 @@ def test_delay_margin_is_found_from_another_one(near: float) -> None:
 
 
 def test_law_is_linearised_at_all_values_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    tuned = find_scenario("osprey_observer").controller.tuned_law()
-    at_once = linear_law(tuned, 4, 0.01)
+    law = find_scenario("osprey_observer").controller.tuned_law()
+    at_once = linear_law(law, 4, 0.01)
     monkeypatch.setattr(linear_loop, "_takes_columns", lambda _: False)
-    for matrix, column_by_column in zip(at_once, linear_law(tuned, 4, 0.01), strict=True):
+    for matrix, column_by_column in zip(at_once, linear_law(law, 4, 0.01), strict=True):
         assert_array_equal(matrix, column_by_column)
 
 
@@ -113,37 +115,37 @@ def test_unstable_plant_has_a_gain_decrease() -> None:
     # y_dot = y + u under u = -k y is stable for k > 1 and, sampled, up to (e^T + 1) / (e^T - 1)
     plant = LinearPlant(np.eye(1), np.eye(1), np.eye(1))
     k = 4.0
-    found = input_margins(plant, proportional(np.array([[k]])), NO_LAG)
+    margins = input_margins(plant, proportional(np.array([[k]])), NO_LAG)
     # at w = 0, seen at the lowest frequency
-    assert found.gain_decrease[0] == approx(1.0 / k, rel=1e-3)
+    assert margins.gain_decrease[0] == approx(1.0 / k, rel=1e-3)
     growth = math.exp(NO_LAG.period)
-    assert found.gain_increase[0] == approx((growth + 1.0) / (growth - 1.0) / k)
-    assert found.gain[0] == approx(k, rel=1e-3)
+    assert margins.gain_increase[0] == approx((growth + 1.0) / (growth - 1.0) / k)
+    assert margins.gain[0] == approx(k, rel=1e-3)
 
 
 def test_unstable_loop_has_no_margin() -> None:
-    found = input_margins(INTEGRATOR, proportional(np.array([[-1.0]])), NO_LAG)
-    assert not found.stable
-    assert [*found.phase, *found.gain, *found.disk, found.disk_all] == [0.0, 1.0, 0.0, 0.0]
-    assert [*found.sensitivity, found.sensitivity_all] == [math.inf, math.inf]
+    margins = input_margins(INTEGRATOR, proportional(np.array([[-1.0]])), NO_LAG)
+    assert not margins.stable
+    assert [*margins.phase, *margins.gain, *margins.disk, margins.disk_all] == [0.0, 1.0, 0.0, 0.0]
+    assert [*margins.sensitivity, margins.sensitivity_all] == [math.inf, math.inf]
 
 
 def test_no_feedback_has_infinite_margins() -> None:
-    found = input_margins(INTEGRATOR, proportional(np.zeros((1, 1))), NO_LAG)
-    assert [*found.phase, *found.crossover, *found.gain] == [math.inf, 0.0, math.inf]
-    assert [*found.sensitivity, *found.disk, found.disk_all] == approx([1.0, 2.0, 2.0])
+    margins = input_margins(INTEGRATOR, proportional(np.zeros((1, 1))), NO_LAG)
+    assert [*margins.phase, *margins.crossover, *margins.gain] == [math.inf, 0.0, math.inf]
+    assert [*margins.sensitivity, *margins.disk, margins.disk_all] == approx([1.0, 2.0, 2.0])
 
 
 def test_least_delay_margin_beside_a_nominal_loop_that_tolerates_every_delay() -> None:
     gains = np.array([[[2.0]], [[4.0]]])  # an integrator of gain k has the delay margin pi / 2 k
     plant = LinearPlant(np.zeros((2, 1, 1)), gains, np.eye(1))
-    found = loop_margins(
+    margins = loop_margins(
         LinearLoop(
             model="two", inputs=("u",), plant=plant, law=proportional(np.eye(1)), loop=NO_LAG
         )
     )
-    assert found.delay == math.inf  # beyond MAX_DELAY_MARGIN
-    assert found.worst_delay == approx(math.pi / 8.0, rel=0.02)
+    assert margins.delay == math.inf  # beyond MAX_DELAY_MARGIN
+    assert margins.worst_delay == approx(math.pi / 8.0, rel=0.02)
 
 
 def test_second_order_loop_has_its_damping() -> None:
@@ -167,15 +169,15 @@ def test_disk_margin_of_the_spinning_satellite() -> None:
     a = 10.0
     A = np.array([[0.0, a], [-a, 0.0]])
     C = np.array([[1.0, a], [-a, 1.0]])
-    found = input_margins(
+    margins = input_margins(
         LinearPlant(A, np.eye(2), C), proportional(np.eye(2)), LoopTiming(np.zeros(2), 0.0, 1e-3)
     )
     expected = 1.0 / math.sqrt(np.linalg.eigvalsh([[0.25, a / 2.0], [a / 2.0, a**2 + 0.25]])[-1])
     assert expected == approx(0.0997, abs=1e-4)
     # the hold, and frequencies from 1e-5 pi / T on
-    assert found.disk_all == approx(expected, rel=0.02)
-    assert found.disk == approx([2.0, 2.0], rel=0.02)
-    assert math.degrees(disk_phase(found.disk_all)) == approx(5.7, abs=0.1)  # 2 atan(alpha / 2)
+    assert margins.disk_all == approx(expected, rel=0.02)
+    assert margins.disk == approx([2.0, 2.0], rel=0.02)
+    assert math.degrees(disk_phase(margins.disk_all)) == approx(5.7, abs=0.1)  # 2 atan(alpha / 2)
     assert disk_gain(np.array(1.0)) == 3.0
 
 
@@ -247,7 +249,7 @@ def loops_of_python_control(
 @pytest.mark.parametrize("delay", [0.0, 0.01])
 def test_margins_are_those_of_python_control(delay: float) -> None:
     scenario = find_scenario("osprey_servo").vary(controller={"delay": delay})
-    found = margins_of(scenario)
+    margins = margins_of(scenario)
     loops, closed = loops_of_python_control(scenario)
     w = np.geomspace(0.1, math.pi * scenario.controller.rate * (1.0 - 1e-9), 4000)
     for i, L in enumerate(loops):
@@ -256,12 +258,12 @@ def test_margins_are_those_of_python_control(delay: float) -> None:
             control.frd(L, w, smooth=True)
         )
         # they agree far below 1 deg and 2 %
-        assert math.degrees(found.phase[i]) == approx(phase, abs=0.1)
-        assert found.crossover[i] == approx(crossover, rel=1e-3)
-        assert found.gain_increase[i] == approx(gain, rel=1e-3)
-        assert found.sensitivity[i] == approx(1.0 / sensitivity, rel=5e-3)
+        assert math.degrees(margins.phase[i]) == approx(phase, abs=0.1)
+        assert margins.crossover[i] == approx(crossover, rel=1e-3)
+        assert margins.gain_increase[i] == approx(gain, rel=1e-3)
+        assert margins.sensitivity[i] == approx(1.0 / sensitivity, rel=5e-3)
         disk, *_ = control.disk_margins(L, w)
-        assert found.disk[i] == approx(float(disk), rel=5e-3)
+        assert margins.disk[i] == approx(float(disk), rel=5e-3)
         assert_allclose(
             loop_transfer(
                 plant_of(scenario), law_of(scenario), loop_of(scenario.controller), w[::400]
@@ -279,7 +281,7 @@ def test_margins_are_those_of_python_control(delay: float) -> None:
     assert slow == {
         (round(w, 3), round(zeta, 3)) for w, zeta in zip(*modes, strict=True) if zeta < 0.9999
     }
-    assert found.damping == approx(min(zeta for _, zeta in slow), abs=1e-3)
+    assert margins.damping == approx(min(zeta for _, zeta in slow), abs=1e-3)
 
 
 def law_of(scenario: Scenario) -> LinearLaw:
@@ -296,10 +298,10 @@ def test_phase_margin_over_crossover_is_delay_margin(name: str) -> None:
     # crossover. The two differ by the sampled delay, 0.1 ms of bisection and a further crossover: 3
     # %
     scenario = find_scenario(name)
-    found = margins_of(scenario)
+    margins = margins_of(scenario)
     plant = plant_of(scenario)
     loop = loop_of(scenario.controller)
-    for share, tolerated in zip(np.eye(4), found.phase / found.crossover, strict=True):
+    for share, tolerated in zip(np.eye(4), margins.phase / margins.crossover, strict=True):
         assert delay_margin(plant, law_of(scenario), loop, share) == approx(tolerated, rel=0.03)
 
 
@@ -316,8 +318,8 @@ def test_uncertain_aircraft_have_the_margins_of_each() -> None:
     # a sum over modes beside back substitution: the vectors of the modes have a condition up to 1e6
     assert_allclose(phase_margins(plants, law, loop), together.phase, rtol=1e-8)
     for k in (0, 7, 20):
-        alone = input_margins(LinearPlant(plants.A[k], plants.B[k], plants.C), law, loop)
-        for name, value in alone._asdict().items():
+        single = input_margins(LinearPlant(plants.A[k], plants.B[k], plants.C), law, loop)
+        for name, value in single._asdict().items():
             assert_allclose(getattr(together, name)[k], value, rtol=1e-6, err_msg=name)
     worst = together.worst()
     assert worst.stable

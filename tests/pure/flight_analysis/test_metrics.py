@@ -98,12 +98,12 @@ def guided(**channels: Any) -> list[Any]:
     """
     t = np.arange(0.0, 20_000.0, 20.0)
     level = {"phi_c": 0.0, "climb_c": 0.0, "xtrack": 0.0, "V_c": 40.0}
-    changed = {
+    changes = {
         name: np.where((t >= 5_000) & (t < 8_000), value, level[name])
         for name, value in channels.items()
     }
-    found = metrics.guided_transients(tape(guidance=signal(t.tolist(), **level | changed)))
-    return [(transient.kind, transient.start, transient.stop) for transient in found]
+    transients = metrics.guided_transients(tape(guidance=signal(t.tolist(), **level | changes)))
+    return [(transient.kind, transient.start, transient.stop) for transient in transients]
 
 
 @pytest.mark.parametrize(
@@ -172,10 +172,10 @@ def test_settling_measured_up_to_next_transient_of_channel() -> None:
         Transient("command", "p", 3.0, 3.1),
         Transient("gust", "vertical", 5.0, 5.1),
     ]
-    first, other, gust = metrics.settling_times(flight, transients)
+    first, second, gust = metrics.settling_times(flight, transients)
     assert first.until == {"q": 5.0}
     assert first.time == {"q": approx(0.2)}
-    assert (other.transient.name, other.until, other.time) == ("p", {"p": 5.0}, {"p": 0.0})
+    assert (second.transient.name, second.until, second.time) == ("p", {"p": 5.0}, {"p": 0.0})
     assert gust.until == {"q": 8.0, "p": 8.0}
     assert gust.time == {"q": approx(0.2), "p": 0.0}
 
@@ -184,8 +184,8 @@ def test_control_effort_is_rms_about_trim_and_mean_rate() -> None:
     # 0 -> 2 -> -2 -> -2 in 0.1 s each: a total variation of 6 in 0.3 s. sqrt((0 + 4 + 4 + 4) / 4) =
     # sqrt(3).
     flight = tape(u=signal([0, 100, 200, 300], elevator=[0.0, 2.0, -2.0, -2.0]))
-    whole = metrics.inputs_by_part(flight, [])["elevator"]["whole"]
-    assert tuple(whole) == approx((math.sqrt(3.0), 2.0, 20.0))
+    effort = metrics.inputs_by_part(flight, [])["elevator"]["whole"]
+    assert tuple(effort) == approx((math.sqrt(3.0), 2.0, 20.0))
     # The step into the gust and the one within it end there: 4 and 0 in 0.2 s.
     parts = metrics.inputs_by_part(flight, [Transient("gust", "g", 0.15, 0.35)], settle=0.0)[
         "elevator"

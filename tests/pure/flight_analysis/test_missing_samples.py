@@ -31,29 +31,29 @@ def scenario(**aircraft: object) -> Scenario:
     )
 
 
-def lacks(flown: Scenario, duration: int, kept: Mapping[str, Kept]) -> tuple[str, ...]:
+def lacks(flight: Scenario, duration: int, samples: Mapping[str, Kept]) -> tuple[str, ...]:
     """What the log of a flight of whole seconds lacks.
 
-    `kept`: which samples of a topic it has, (N,), all of the others.
+    `samples`: which samples of a topic it has, (N,), all of the others.
     """
     signals = {}
     for name, rate in RATES.items():
         stamp_ns = np.arange(duration * rate + 1) * (NANOSECONDS // rate)
         names = {
-            "y": flown.controller.outputs,
-            "y_m": flown.controller.outputs,
-            "u": flown.controller.inputs,
+            "y": flight.controller.outputs,
+            "y_m": flight.controller.outputs,
+            "u": flight.controller.inputs,
         }.get(name, ("a",))
         signal = Signal(stamp_ns, tuple(names), np.zeros((len(stamp_ns), len(names))))
-        signals[name] = signal.where(kept[name]) if name in kept else signal
-    return account(Tape(signals, duration=float(duration)), flown).lacks
+        signals[name] = signal.where(samples[name]) if name in samples else signal
+    return account(Tape(signals, duration=float(duration)), flight).lacks
 
 
 def dropped(name: str, duration: int, share: float) -> Kept:
     """Samples that stay of a topic that loses a share at random, never the last one."""
-    kept = np.random.default_rng(1).random(duration * RATES[name] + 1) >= share
-    kept[-1] = True
-    return kept
+    keep = np.random.default_rng(1).random(duration * RATES[name] + 1) >= share
+    keep[-1] = True
+    return keep
 
 
 def silent(name: str, duration: int, begin: float, end: float) -> Kept:
@@ -65,32 +65,34 @@ def silent(name: str, duration: int, begin: float, end: float) -> Kept:
 @pytest.mark.parametrize("share", [0.3])
 def test_samples_that_the_sensor_of_y_drops_are_no_lack(share: float) -> None:
     """And more than that are: half as many again is above four deviations of their number."""
-    flown = scenario(sensors={"dropout": share})
-    assert lacks(flown, 60, {"y": dropped("y", 60, share)}) == ()
-    assert lacks(flown, 60, {"y": dropped("y", 60, 1.5 * share)})[0].startswith("y ")
+    flight = scenario(sensors={"dropout": share})
+    assert lacks(flight, 60, {"y": dropped("y", 60, share)}) == ()
+    assert lacks(flight, 60, {"y": dropped("y", 60, 1.5 * share)})[0].startswith("y ")
 
 
 @pytest.mark.parametrize("share", [0.3])
 @pytest.mark.parametrize("name", [name for name in RATES if name != "y"])
 def test_what_the_sensor_of_y_drops_excuses_no_other_topic(name: str, share: float) -> None:
     """Half of what y may lose is missing of another topic."""
-    flown = scenario(sensors={"dropout": share})
-    kept = dropped(name, 60, share / 2.0)
+    flight = scenario(sensors={"dropout": share})
+    keep = dropped(name, 60, share / 2.0)
     expected = 60 * RATES[name] + 1
-    assert lacks(flown, 60, {name: kept}) == (f"{name} {kept.sum()} of {expected} samples",)
+    assert lacks(flight, 60, {name: keep}) == (f"{name} {keep.sum()} of {expected} samples",)
 
 
 @pytest.mark.parametrize("late", ["sensors", "pose"])
 @pytest.mark.parametrize("name", OF_AIRCRAFT)
 def test_delay_of_a_sensor_excuses_the_end_of_its_topic_alone(name: str, late: str) -> None:
     """0.5 s of 20 s: more than the hundredth that a topic may lack."""
-    flown = scenario(**{late: {"delay": 0.5}})
+    flight = scenario(**{late: {"delay": 0.5}})
     excused = {"sensors": "y", "pose": "pose"}[late]
-    found = lacks(flown, 20, {topic: silent(topic, 20, 19.5, 21.0) for topic in (excused, name)})
+    sentences = lacks(
+        flight, 20, {topic: silent(topic, 20, 19.5, 21.0) for topic in (excused, name)}
+    )
     expected = 20 * RATES[name] + 1
     missing = RATES[name] // 2
-    whole = f"{name} {expected - missing} of {expected} samples, ends at t = 19.500 of 20.000 s"
-    assert found == (() if name == excused else (whole,))
+    sentence = f"{name} {expected - missing} of {expected} samples, ends at t = 19.500 of 20.000 s"
+    assert sentences == (() if name == excused else (sentence,))
 
 
 @pytest.mark.parametrize("length", [1.1, 19.0])
@@ -100,17 +102,17 @@ def test_silence_of_a_steady_topic_is_named_by_its_times(
     name: str, duration: int, length: float
 ) -> None:
     """Of the long flight also a silence that leaves more than 99 % of the samples."""
-    found = lacks(scenario(), duration, {name: silent(name, duration, 30.0, 30.0 + length)})
-    assert len(found) == 1
-    assert found[0].startswith(f"{name} ")
-    assert found[0].endswith(f"no sample from t = 30.000 to {30.0 + length:.3f} s")
+    sentences = lacks(scenario(), duration, {name: silent(name, duration, 30.0, 30.0 + length)})
+    assert len(sentences) == 1
+    assert sentences[0].startswith(f"{name} ")
+    assert sentences[0].endswith(f"no sample from t = 30.000 to {30.0 + length:.3f} s")
 
 
 @pytest.mark.parametrize("end, named", [(598.0, True), (598.9, True), (599.1, False)])
 @pytest.mark.parametrize("name", ["y", "truth"])
 def test_topic_that_ends_a_second_early_is_named(name: str, end: float, named: bool) -> None:
     """Of a long flight, where the share of the missing samples is below a hundredth."""
-    found = lacks(scenario(), 600, {name: silent(name, 600, end, 601.0)})
-    assert [lack.endswith(f"ends at t = {end:.3f} of 600.000 s") for lack in found] == [
+    sentences = lacks(scenario(), 600, {name: silent(name, 600, end, 601.0)})
+    assert [lack.endswith(f"ends at t = {end:.3f} of 600.000 s") for lack in sentences] == [
         True
     ] * named

@@ -65,8 +65,8 @@ class Sequence:
             self._jump = rng.normal(size=len(self._jump)) * rng.choice([0.0, 0.1, 1.0, 30.0])
         if self.happens(0.004):
             self._stands = int(rng.integers(1, 40))
-        moved = 0.95 * self._y + 0.02 * rng.normal(size=len(self._y))
-        self._y = self._y if self._stands else moved
+        y = 0.95 * self._y + 0.02 * rng.normal(size=len(self._y))
+        self._y = self._y if self._stands else y
         self._stands = max(self._stands - 1, 0)
         self._y_m = 0.97 * self._y_m + 0.01 * rng.normal(size=len(self._y_m))
         if self._silence:

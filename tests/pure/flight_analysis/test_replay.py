@@ -310,11 +310,11 @@ def without(tape: Tape, keep: Callable[[FloatArray], Any]) -> Tape:
     """The tape with those samples of `internals` and `u` whose numbers `keep` accepts."""
     kept = np.asarray(keep(tape["internals"]["number"]), dtype=bool)
     pair = {name: tape[name] for name in ("internals", "u")}
-    cut = {
+    signals = {
         name: Signal(signal.stamp_ns[kept], signal.names, signal.values[kept])
         for name, signal in pair.items()
     }
-    return replace(tape, signals={**tape.signals, **cut})
+    return replace(tape, signals={**tape.signals, **signals})
 
 
 @pytest.mark.parametrize("name", ["osprey_gust", "feedforward"])
@@ -343,15 +343,15 @@ def test_lost_samples_of_log_cause_no_differences(
 
 
 def test_gains_changed_in_flight_differ_from_tick_of_change() -> None:
-    tuned = {"k_g": 2.0, "Lambda": [3.0, 4.0, 2.0, 1.0], "upper": [0.02] * 4}
-    tape = driven(GUST.controller, [FLY] * 30 + [Tick(changes=(tuned,))] + [FLY] * 30)
+    gains = {"k_g": 2.0, "Lambda": [3.0, 4.0, 2.0, 1.0], "upper": [0.02] * 4}
+    tape = driven(GUST.controller, [FLY] * 30 + [Tick(changes=(gains,))] + [FLY] * 30)
     result = replay(tape, GUST.controller)
     first = result.first()
     assert first is not None
     assert first.number == 30
     assert (~result.other_parameters).tolist() == [True] * 29 + [False] * 31
     # With the change from the log every bit is equal.
-    result = replay(tape, GUST.controller, changes=[tuned])
+    result = replay(tape, GUST.controller, changes=[gains])
     assert equal(result), result.first()
     assert result.notes == ("parameters changed before tick 30: Lambda, k_g, upper",)
 
@@ -417,9 +417,9 @@ def test_a_log_of_other_channels_is_refused() -> None:
         replay(less, GUST.controller)
     with refusing("the log: found no sample of internals"):
         replay(Tape({"y": tape["y"]}), GUST.controller)
-    other = vary(GUST.controller, {"outputs": ["p", "q", "r", "V"]})
+    swapped = vary(GUST.controller, {"outputs": ["p", "q", "r", "V"]})
     with refusing(r"controller.outputs: found p, q, r, V, expected q, p, r, V, as recorded"):
-        replay(tape, GUST.controller, other)
+        replay(tape, GUST.controller, swapped)
 
 
 def test_change_to_same_value_changes_no_bit() -> None:
@@ -549,8 +549,8 @@ def test_changes_of_parameters_read_from_log(tmp_path: Path) -> None:
         for number, message in enumerate(events):
             bag.write(channel, number, number, number, message)
     nodes = ("/controller", "/one/controller")
-    known = RiseDiConfig.model_fields
-    assert {node: parameter_changes(tmp_path / "run", node, known) for node in nodes} == {
+    fields = RiseDiConfig.model_fields
+    assert {node: parameter_changes(tmp_path / "run", node, fields) for node in nodes} == {
         "/controller": [{"upper": [1.0, 2.0]}, {"k_g": 2.5, "sign": "soft", "upper": None}],
         "/one/controller": [{"Lambda": [1.0, 2.0]}],
     }
@@ -558,4 +558,4 @@ def test_changes_of_parameters_read_from_log(tmp_path: Path) -> None:
     with BagWriter(tmp_path / "launched") as bag:
         bag.add_metadata("rise_di_flight", {})
     (tmp_path / "run").rename(tmp_path / "launched" / "rosbag2")
-    assert len(parameter_changes(tmp_path / "launched", "/controller", known)) == 2
+    assert len(parameter_changes(tmp_path / "launched", "/controller", fields)) == 2

@@ -63,13 +63,13 @@ def ticks(count: int = 101, /, **channels: Any) -> Signal:
 
     `channels` replace channels.
     """
-    limited = {f"limited.{name}": Saturation.NO for name in INPUTS}
+    limits = {f"limited.{name}": Saturation.NO for name in INPUTS}
     integrals = {f"{group}.{name}": 0.0 for group in ("integral_e", "Pi") for name in OUTPUTS}
     return held(
         count,
         **(
             {"mode": Mode.ENGAGED, "dt": 0.01, "late": 0.0, "age": 0.0}
-            | limited
+            | limits
             | integrals
             | channels
         ),
@@ -182,9 +182,9 @@ def test_every_colour_of_page_has_dark_counterpart(
     specifications = re.findall(
         r'<script type="application/json">(.*?)</script>', page_of(tmp_path, servo, complete)
     )
-    used = set(re.findall(r"#[0-9a-f]{6}", " ".join(specifications)))
-    assert used - shared <= set(plotting.DARK | figures.DARK)
-    assert len(used) > 5
+    colours = set(re.findall(r"#[0-9a-f]{6}", " ".join(specifications)))
+    assert colours - shared <= set(plotting.DARK | figures.DARK)
+    assert len(colours) > 5
 
 
 def test_each_event_listed_once_in_order_of_start() -> None:
@@ -265,9 +265,9 @@ def test_metrics_of_several_flights_compared_by_channel_name(pair: list[Recorded
         for table in comparison.error_tables(pair)
     }
     assert list(compared) == ["q (deg/s)", "p (deg/s)", "r (deg/s)", "V (m/s)"]
-    whole = compared["q (deg/s)"]["rms whole"]
-    assert whole.texts == ("11.5", "5.73")  # 0.2 and 0.1 rad/s
-    assert whole.ratios == pytest.approx((1.0, 0.5))
+    rms = compared["q (deg/s)"]["rms whole"]
+    assert rms.texts == ("11.5", "5.73")  # 0.2 and 0.1 rad/s
+    assert rms.ratios == pytest.approx((1.0, 0.5))
     assert compared["p (deg/s)"]["rms whole"].texts == ("0.00", "-")
     assert compared["p (deg/s)"]["rms whole"].ratios == (None, None)  # no ratio to 0
     assert "rms gust" not in compared["q (deg/s)"]  # neither flight had one
@@ -287,11 +287,11 @@ def test_a_comparison_is_a_page(tmp_path: Path, pair: list[RecordedFlight]) -> N
 
 def test_figures_of_a_comparison_are_those_of_the_report(pair: list[RecordedFlight]) -> None:
     """The flights have one reference, which is drawn once. A flight has one colour everywhere."""
-    shown = figures.plot_context(pair)
-    q = {trace.name: trace for trace in drawn(figures.tracking_figure(shown)).data[:3]}
+    context_of_pair = figures.plot_context(pair)
+    q = {trace.name: trace for trace in drawn(figures.tracking_figure(context_of_pair)).data[:3]}
     assert list(q) == ["y_m", "a", "b"]
     assert q["y_m"].line.color == figures.REFERENCE
-    errors = {trace.name: trace for trace in drawn(figures.error_figure(shown)).data[:2]}
+    errors = {trace.name: trace for trace in drawn(figures.error_figure(context_of_pair)).data[:2]}
     assert errors["b"].y == pytest.approx([0.1 / DEG] * 2)  # deg/s
     assert [errors[name].line.color for name in "ab"] == [q[name].line.color for name in "ab"]
     assert len({trace.line.color for trace in q.values()}) == 3
@@ -316,8 +316,8 @@ def test_every_time_of_the_summary_has_a_heading() -> None:
         "latency": LatencyMetrics,
         "age_of_u": AgeMetrics,
     }
-    measured = [(topic, name) for topic, kind in kinds.items() for name in kind._fields]
-    assert sorted(column.path for column in TIMING_COLUMNS) == sorted(measured)
+    columns = [(topic, name) for topic, kind in kinds.items() for name in kind._fields]
+    assert sorted(column.path for column in TIMING_COLUMNS) == sorted(columns)
     summary = {topic: dict.fromkeys(kind._fields, 0.0125) for topic, kind in kinds.items()}
     rows = {label: text for _, label, text in timing_rows(summary)}
     assert rows["period mean / p99 / max (ms)"] == "12.500 / 12.500 / 12.500"
@@ -340,8 +340,8 @@ def test_part_without_command_and_gust_is_named_by_what_was_in_the_air(
     figures_of_q = summarise(simulate(scenario))["errors"]["q"]
     assert figures_of_q[air]["rms"] > 0.0
     assert {*figures_of_q} & {"calm", "wind", "turbulence", "other"} == {air}
-    bound = figures_of_q[air]["max"] if air == "calm" else None
-    assert figures_of_q["bound"] == bound
+    ultimate = figures_of_q[air]["max"] if air == "calm" else None
+    assert figures_of_q["bound"] == ultimate
 
 
 def test_wind_of_an_aircraft_of_another_maker_is_not_known(servo: Scenario) -> None:
@@ -422,18 +422,18 @@ def test_channels_of_page_and_tables_are_in_order_of_the_controller(servo: Scena
     order = list(servo.controller.outputs)
     assert list(one.summary["errors"]) == order == ["q", "p", "r", "V"]
     assert list(one.summary["inputs"]) == list(servo.controller.inputs)
-    shown = figures.plot_context([one])
+    context_of_one = figures.plot_context([one])
     labels = ["q (deg/s)", "p (deg/s)", "r (deg/s)", "V (m/s)"]
-    assert titles(figures.tracking_figure(shown)) == labels
-    assert titles(figures.error_figure(shown)) == labels
-    assert titles(figures.integral_figure(shown))[::2] == [f"∫e {name}" for name in order]
+    assert titles(figures.tracking_figure(context_of_one)) == labels
+    assert titles(figures.error_figure(context_of_one)) == labels
+    assert titles(figures.integral_figure(context_of_one))[::2] == [f"∫e {name}" for name in order]
 
 
 def test_states_have_units_and_angles_are_in_degrees(servo: Scenario) -> None:
     """One degree of alpha is drawn as 1."""
     truth = held(x__alpha=DEG, x__theta=2.0 * DEG, x__q=3.0 * DEG, x__V=4.0)
-    shown = figures.state_figure(context(flight(truth=truth)), state_units(servo))
-    curves = dict(zip(titles(shown), drawn(shown).data, strict=True))
+    figure = figures.state_figure(context(flight(truth=truth)), state_units(servo))
+    curves = dict(zip(titles(figure), drawn(figure).data, strict=True))
     expected = {"V (m/s)": 4.0, "alpha (deg)": 1.0, "q (deg/s)": 3.0, "theta (deg)": 2.0}
     assert {title: curve.y[0] for title, curve in curves.items()} == pytest.approx(expected)
 
@@ -441,10 +441,10 @@ def test_states_have_units_and_angles_are_in_degrees(servo: Scenario) -> None:
 def test_sentence_on_the_sign_stands_at_the_law(tmp_path: Path, servo: Scenario) -> None:
     """The first line is of the flight: aircraft and time flown."""
     page = page_of(tmp_path, servo, simulate(servo.vary(flight={"duration": 1.0})))
-    head, _, rest = page.partition("<h2>")
+    head, _, following = page.partition("<h2>")
     assert "softened sign" not in head
     assert "osprey, 1.0 s flown" in head
-    law = rest.partition("Integrals of the law</h2>")[2].partition("</section>")[0]
+    law = following.partition("Integrals of the law</h2>")[2].partition("</section>")[0]
     assert "At 100 Hz with the softened sign" in law
 
 
@@ -470,11 +470,11 @@ def test_all_samples_of_long_curves_stored_once() -> None:
     shared = context(
         Tape({"y": y, "y_m": Signal(stamps, OUTPUTS, np.zeros((count, 4)))}, EPOCH - 7)
     )
-    found = [
+    ticks_found = [
         *drawn(figures.tracking_figure(shared)).data,
         *drawn(figures.error_figure(shared)).data,
     ]
-    q = [trace for trace in found if trace.yaxis == "y"]
+    q = [trace for trace in ticks_found if trace.yaxis == "y"]
     assert [trace.y for trace in q] == [None] * 3
     instants = np.cumsum(unpacked(shared.samples.packed[q[1].meta["t"]], "<f8"))
     assert instants.tolist() == (stamps - EPOCH + 7).tolist()  # to the nanosecond

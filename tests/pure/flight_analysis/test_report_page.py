@@ -74,11 +74,11 @@ def zoom(browser: Browser, start: float, stop: float, plot: int = 0) -> None:
 def curve(browser: Browser, plot: int, name: str, row: int = 1) -> tuple[list[float], list[float]]:
     """Instants and values of a drawn curve."""
     axis = "y" if row == 1 else f"y{row}"
-    found = (
+    errors = (
         f"{PLOTS}[{plot}]._fullData.find(trace => trace.name === '{name}' && trace.yaxis "
         f"=== '{axis}')"
     )
-    x, y = browser.run(f"(trace => [[...trace.x], [...trace.y]])({found})")
+    x, y = browser.run(f"(trace => [[...trace.x], [...trace.y]])({errors})")
     return x, y
 
 
@@ -88,11 +88,11 @@ def test_the_page_draws_all_figures_without_errors(browser: Browser, page: Path)
     headings = browser.run(
         "[...document.querySelectorAll('section h2')].map(heading => heading.textContent)"
     )
-    drawn = browser.run(
+    colours = browser.run(
         f"{PLOTS}.map(plot => plot.querySelectorAll('.scatterlayer .trace, .barlayer "
         ".trace').length)"
     )
-    curves = dict(zip(headings, drawn, strict=True))
+    curves = dict(zip(headings, colours, strict=True))
     # For each of four channels: y over y_m; two errors and the noise floor; command, actuator and
     # limits.
     assert curves["Output y over the reference y_m"] == 8
@@ -101,7 +101,7 @@ def test_the_page_draws_all_figures_without_errors(browser: Browser, page: Path)
     assert curves["States"] == 8
     assert curves["Integrals of the law"] == 8
     assert curves["Spectrum of u"] == 4
-    assert all(count > 0 for count in drawn)
+    assert all(count > 0 for count in colours)
 
 
 def test_zoom_shows_every_sample_in_all_figures(
@@ -109,8 +109,8 @@ def test_zoom_shows_every_sample_in_all_figures(
 ) -> None:
     open_page(browser, page)
     y = servo.tape["y"]
-    whole, _ = curve(browser, 0, "y")
-    assert len(whole) < len(y.stamp_ns)
+    samples, _ = curve(browser, 0, "y")
+    assert len(samples) < len(y.stamp_ns)
     zoom(browser, 2.0, 2.1)
     for plot, name in ((0, "y"), (1, "measured")):
         x, _ = curve(browser, plot, name)

@@ -112,8 +112,8 @@ def test_clock_gives_the_rate_of_nodes_with_a_shorter_period(step: float, servo:
 
 def test_node_that_skips_messages_of_clock_is_on_a_busy_host(servo: Scenario) -> None:
     """At ten times real time: of the messages of /clock each eighth, on average, came too late."""
-    kept = np.random.default_rng(2).random(6000) > 0.125
-    y_m = np.unique(np.floor((np.arange(0.0, END, 0.005)[kept] + 1e-9) / 0.002) * 0.002)
+    keep = np.random.default_rng(2).random(6000) > 0.125
+    y_m = np.unique(np.floor((np.arange(0.0, END, 0.005)[keep] + 1e-9) / 0.002) * 0.002)
     topics = {"y": np.arange(0.0, END, 0.01), "y_m": y_m, "u": np.arange(0.0, END, 0.01)}
     nodes = ("reference_model", "controller")
     tape = flight(topics, nodes, start_ns=3 * NANOSECONDS, is_by_clock=True)
@@ -170,13 +170,13 @@ def test_loss_of_a_foreign_publisher_is_told(
     """
     t = timer(100.0)
     keep = LOSSES[loss](t)
-    lost = int(np.count_nonzero(~keep)) if is_numbered else 0
+    missing = int(np.count_nonzero(~keep)) if is_numbered else 0
     topics = {"y": np.arange(0.0, END, 0.002), "y_m": np.arange(0.0, END, 0.002)}
     topics |= {"u": np.arange(0.0, END, 0.01), topic: t[keep]}
     nodes = ("controller", "reference_model" if topic == "y" else "aircraft")
     if topic == "y_m":
         topics["truth"] = topics["y"]
-    result = account(flight(topics, nodes, lost={topic: lost}), servo)
+    result = account(flight(topics, nodes, lost={topic: missing}), servo)
     assert any(lack.startswith(f"{topic} ") for lack in result.lacks)
     assert "busy" not in result.busy  # the cause of a foreign publisher is not known
     share = result.topics[topic].share
@@ -203,8 +203,8 @@ def test_two_senders_of_u_count_each_for_itself(servo: Scenario) -> None:
     )
     assert beside(tape, servo).topics["u"].share == 1.0
     half = np.arange(len(t)) % 2 == 0
-    cut = {name: tape[name].where(half) for name in ("u", "internals")}
-    lossy = beside(replace(tape, signals={**tape.signals, **cut}), servo)
+    signals = {name: tape[name].where(half) for name in ("u", "internals")}
+    lossy = beside(replace(tape, signals={**tape.signals, **signals}), servo)
     assert lossy.topics["u"].share == pytest.approx(0.5, abs=0.01)
 
 
@@ -217,12 +217,12 @@ def beside(tape: Tape, scenario: Scenario) -> Account:
         "internals": internals(np.arange(1.0, 5.0), other_ns, 0.004),
     }
     for name, of_other in other.items():
-        own = tape[name]
-        stamp_ns = np.concatenate([own.stamp_ns, of_other.stamp_ns])
+        signal = tape[name]
+        stamp_ns = np.concatenate([signal.stamp_ns, of_other.stamp_ns])
         order = np.argsort(stamp_ns, kind="stable")
-        sender = np.repeat(np.array([0, 1], np.int16), [len(own.stamp_ns), 4])
-        values = np.concatenate([own.values, of_other.values])
-        merged[name] = admitted(Signal(stamp_ns[order], own.names, values[order], sender[order]))
+        sender = np.repeat(np.array([0, 1], np.int16), [len(signal.stamp_ns), 4])
+        values = np.concatenate([signal.values, of_other.values])
+        merged[name] = admitted(Signal(stamp_ns[order], signal.names, values[order], sender[order]))
     return account(replace(tape, signals={**tape.signals, **merged}), scenario)
 
 

@@ -56,10 +56,10 @@ def servo_scenario(aircraft: dict[str, Any], controller: dict[str, Any]) -> Scen
 def test_a_flight_agrees_with_the_prototype(
     aircraft: dict[str, Any], controller: dict[str, Any], rms: tuple[float, ...]
 ) -> None:
-    flown = error(simulate(servo_scenario(aircraft, controller)))
+    errors = error(simulate(servo_scenario(aircraft, controller)))
     units = (1e3, 1.0, 1e3, 1e3)
     measured = [
-        unit * error_metrics(flown[name]).rms
+        unit * error_metrics(errors[name]).rms
         for unit, name in zip(units, ("q", "V", "p", "r"), strict=True)
     ]
     assert measured[: len(rms)] == approx(rms, rel=0.1)
@@ -73,9 +73,9 @@ def test_integrator_windup_and_anti_windup_of_thrust_agree_with_prototype() -> N
     back = 30.0
     metrics = {}
     for guarded in (False, True):
-        held = with_stops("thrust", 0.15, guarded=guarded)
+        scenario = with_stops("thrust", 0.15, guarded=guarded)
         tape = simulate(
-            held.vary(
+            scenario.vary(
                 flight={"duration": 60.0}, reference_model={"pulses": {"V": pulse(10.0, back, 4.0)}}
             )
         )

@@ -68,10 +68,10 @@ def worst_rms(tape: Tape) -> dict[str, float]:
 
 def times_healthy(tape: Tape) -> float:
     """Largest error over that of the flight without a fault, of the outputs that a user sees."""
-    beside = worst_rms(healthy())
+    largest = worst_rms(healthy())
     ratios = []
     for name, rms in worst_rms(tape).items():
-        ratios.append(rms / (beside[name] + LEAST.get(name, LEAST_RATE) / 2.0))
+        ratios.append(rms / (largest[name] + LEAST.get(name, LEAST_RATE) / 2.0))
     return max(ratios)
 
 
@@ -164,8 +164,8 @@ SENSORS: dict[str, Sample] = {
 def test_fault_of_y_is_told(fault: Sample) -> None:
     class Faulty(Controller):
         def take_y(self, sample: StampedVector, now_ns: int) -> str:
-            changed = fault(seconds(now_ns), sample)
-            return "" if changed is None else super().take_y(changed, now_ns)
+            sample_with_fault = fault(seconds(now_ns), sample)
+            return "" if sample_with_fault is None else super().take_y(sample_with_fault, now_ns)
 
     outcome = rise_di.simulate(servo(), control=Faulty).outcome
     aims = {shortfall.aim for shortfall in outcome.shortfalls}
@@ -206,8 +206,8 @@ def test_stronger_microburst_has_no_better_status(speed: float) -> None:
     strong = section.model_dump() | {"speed": speed}
     # a fifth of the samples, for a test in a fifth of the time
     coarse = {"microburst": strong, "rate": 100.0, "step": 0.005}
-    flown = rise_di.simulate(burst.vary(aircraft=coarse, reference_model={"rate": 100.0}))
-    assert flown.outcome.status in {3, 4}
+    tape = rise_di.simulate(burst.vary(aircraft=coarse, reference_model={"rate": 100.0}))
+    assert tape.outcome.status in {3, 4}
 
 
 def test_landing_does_not_swallow_what_else_was_short() -> None:
@@ -327,8 +327,8 @@ def test_error_that_is_not_a_number_is_told() -> None:
     (lack,) = judge(COMPLETED, replace(healthy(), signals=signals), servo(), WHOLE).shortfalls
     assert (lack.aim, "not a number" in lack.sentence) == (Aim.LOG, True)
     values[1200:, truth.names.index("x.p")] += 1.0  # what comes later is told as well
-    told = judge(COMPLETED, replace(healthy(), signals=signals), servo(), WHOLE)
-    assert [each.aim for each in told.shortfalls] == [Aim.LOG, Aim.ERROR]
+    outcome = judge(COMPLETED, replace(healthy(), signals=signals), servo(), WHOLE)
+    assert [each.aim for each in outcome.shortfalls] == [Aim.LOG, Aim.ERROR]
 
 
 STAMPS = np.arange(4000, dtype=np.int64) * 10_000_000  # 40 s at 100 Hz
@@ -371,5 +371,5 @@ def test_plant_that_the_law_loses_is_told() -> None:
         x[:] = np.clip(x + dt * (effect * u + 0.01), -3.0, 3.0)
         return x.copy()
 
-    lost = rise_di.fly_plant(plant, scenario.controller, scenario.reference_model, 15.0)
-    assert lost.outcome.status != 0
+    tape = rise_di.fly_plant(plant, scenario.controller, scenario.reference_model, 15.0)
+    assert tape.outcome.status != 0

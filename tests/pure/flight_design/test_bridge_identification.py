@@ -88,8 +88,8 @@ class Identified(NamedTuple):
 @pytest.fixture(scope="module")
 def identified(tmp_path_factory: pytest.TempPathFactory) -> Identified:
     folder = tmp_path_factory.mktemp("experiment")
-    planned = experiment(MAP, SPEED, 0.15, str(folder / "experiment_airframe.yaml"), wait=1.0)
-    tape = simulate(loaded(folder, "experiment", planned.airframe, planned.scenario))
+    plan = experiment(MAP, SPEED, 0.15, str(folder / "experiment_airframe.yaml"), wait=1.0)
+    tape = simulate(loaded(folder, "experiment", plan.airframe, plan.scenario))
     pairing, _ = channel_pairs(MAP)
     response = identify_response(tape["y"], tape["u"], pairing.outputs, pairing.inputs)
     models = channel_models(MAP, tape, [(0, 10**18)], SPEED)
@@ -105,10 +105,10 @@ def test_channels_of_unknown_aircraft_identified(identified: Identified) -> None
     channels = identified.channels
     rows = [OSPREY.outputs.index(name) for name in response.outputs]
     columns = [list(OSPREY.inputs).index(name) for name in response.inputs]
-    known = np.diag((OSPREY.matrix_c() @ OSPREY.matrix_b())[np.ix_(rows, columns)])
+    Omega = np.diag((OSPREY.matrix_c() @ OSPREY.matrix_b())[np.ix_(rows, columns)])
     # 30 %: Omega, lag and damping change places in what 8 Hz show; a loop with a phase margin of 54
     # degrees bears twice as much
-    assert_allclose(np.diag(channels.Omega), known, rtol=0.3)
+    assert_allclose(np.diag(channels.Omega), Omega, rtol=0.3)
     lag = np.array([0.02 if name != "thrust" else 0.1 for name in response.inputs])
     # u is held for a period of 10 ms, so that it acts half of one late. V has no model, and its
     # step response is slow: its lag is less certain, and its bandwidth of 1.4 rad/s turns 50 ms
@@ -120,10 +120,10 @@ def test_channels_of_unknown_aircraft_identified(identified: Identified) -> None
 
 
 def test_written_scenario_flies_aircraft_and_tracks(identified: Identified) -> None:
-    found = identified.flying
-    assert found.controller.D == (1, 1, 1, 1)
-    assert found.scenario.splitlines()[4].startswith("# Phase margins ")
-    tape = simulate(loaded(identified.folder, "flight", found.airframe, found.scenario))
+    flyable = identified.flying
+    assert flyable.controller.D == (1, 1, 1, 1)
+    assert flyable.scenario.splitlines()[4].startswith("# Phase margins ")
+    tape = simulate(loaded(identified.folder, "flight", flyable.airframe, flyable.scenario))
     _, error = best_error(tape)
     rms = {name: error_metrics(error[name]).rms for name in error.names}
     # the figures that a first flight of an autopilot is asked for: 10, 20, 15 mrad/s in q, p, r and
@@ -164,7 +164,7 @@ def of_second_order(tmp_path_factory: pytest.TempPathFactory) -> tuple[Identifie
     )
     Omega = np.diag([5.0 if name == "V" else 80.0 for name in MAP.outputs])
     none = 0.0 * damping
-    found = IdentifiedChannels(
+    channels = IdentifiedChannels(
         Omega=Omega,
         Omega_deviation=none,
         lag=none + 0.02,
@@ -174,8 +174,8 @@ def of_second_order(tmp_path_factory: pytest.TempPathFactory) -> tuple[Identifie
         zero=zero,
         misfit=none,
     )
-    return found, flying_scenario(
-        MAP, found, SPEED, str(tmp_path_factory.mktemp("known") / "airframe.yaml")
+    return channels, flying_scenario(
+        MAP, channels, SPEED, str(tmp_path_factory.mktemp("known") / "airframe.yaml")
     )
 
 
@@ -184,12 +184,12 @@ def test_stiff_channel_gets_integral_by_which_loop_crosses_one_at_bandwidth(
 ) -> None:
     # a light airplane: below 30 rad/s it answers the elevator with a pitch rate, not with its
     # derivative
-    found, flying = of_second_order
+    channels, flying = of_second_order
     controller = flying.controller
     k = list(MAP.outputs).index("q")
     params = controller.law_params()
     i = controller.outputs.index("q")
-    gain = params.K[i] * params.input_scale[i] * found.Omega[k, k]
+    gain = params.K[i] * params.input_scale[i] * channels.Omega[k, k]
     # the softened sign is one too
     integral = params.Lambda[i] + params.beta[i] / (params.K[i] * params.eps[i])
     s = 1j * gain
@@ -197,8 +197,8 @@ def test_stiff_channel_gets_integral_by_which_loop_crosses_one_at_bandwidth(
         gain
         * (s + integral)
         / s
-        * (s + found.zero[k])
-        / (s**2 + found.damping[k] * s + found.stiffness[k])
+        * (s + channels.zero[k])
+        / (s**2 + channels.damping[k] * s + channels.stiffness[k])
     )
     assert abs(loop) == approx(1.0, rel=1e-6)
 
@@ -206,12 +206,12 @@ def test_stiff_channel_gets_integral_by_which_loop_crosses_one_at_bandwidth(
 def test_channel_of_which_nothing_is_certain_refused(identified: Identified) -> None:
     response = identified.response
     models = identified.models
-    refused = response._replace(
+    refusals = response._replace(
         refusal=("", "V by thrust: found no movement, expected one", "", "")
     )
     unusable = [*models[:1], None, *models[2:]]
     with refusing(r"^V by thrust: found no movement, expected one$"):
-        join(MAP, refused, unusable)
+        join(MAP, refusals, unusable)
 
 
 class Known(NamedTuple):
@@ -280,16 +280,16 @@ def test_noise_as_large_as_response_leaves_model_with_standard_errors() -> None:
     assert model.usable
     gain, phase = model.at_loop_frequency()
     s = 0.5j / (model.delay + model.lag)
-    known = 80.0 / (s + 12.0) / (0.05 * s + 1.0) * np.exp(-0.08 * s)
-    assert abs(gain.value - abs(known)) < 3.0 * gain.deviation  # 99.7 %
-    assert abs(phase.value + np.angle(known)) < 3.0 * phase.deviation
+    response = 80.0 / (s + 12.0) / (0.05 * s + 1.0) * np.exp(-0.08 * s)
+    assert abs(gain.value - abs(response)) < 3.0 * gain.deviation  # 99.7 %
+    assert abs(phase.value + np.angle(response)) < 3.0 * phase.deviation
 
 
 def test_fast_oscillation_of_light_airplane_found() -> None:
     # that of PX4's airplane in yaw: 480 / s^2 is 3.5 Hz, and its response returns to 0 within 0.15
     # s
-    known = Known(Omega=500.0, damping=24.0, stiffness=480.0, lag=0.01, delay=0.02)
-    model = fit_channel(*known.measured(noise=0.02), "q", "elevator", 1.0)
+    channel = Known(Omega=500.0, damping=24.0, stiffness=480.0, lag=0.01, delay=0.02)
+    model = fit_channel(*channel.measured(noise=0.02), "q", "elevator", 1.0)
     assert model is not None
     assert model.usable
     assert_allclose(model[2:5], [500.0, 24.0, 480.0], rtol=0.1)
@@ -332,9 +332,9 @@ def thrust_with_phugoid(amplitude: float) -> Tape:
 
 def test_thrust_told_from_phugoid_by_climb() -> None:
     tape = thrust_with_phugoid(0.2)
-    whole = [(0, 10**18)]
+    spans = [(0, 10**18)]
     place = channel_pairs(MAP)[0].outputs.index("V")
-    model = channel_models(MAP, tape, whole, SPEED)[place]
+    model = channel_models(MAP, tape, spans, SPEED)[place]
     assert model is not None
     assert model.usable
     assert_allclose([model.Omega, model.damping], [14.0, 0.5], rtol=0.05)
@@ -365,14 +365,14 @@ def test_written_map_has_trims_that_were_sent() -> None:
     names = tuple(f"{row.message}.{row.field}" for row in MAP.inputs.values())
     raw = np.full((20, 4), 0.25)  # of the axes; the pause after engagement is at trim
     raw[10:] = 0.9
-    sent = Signal(np.arange(20) * 150_000_000, names, raw)
-    trims = measured_trims(MAP, sent, 0)
+    commands = Signal(np.arange(20) * 150_000_000, names, raw)
+    trims = measured_trims(MAP, commands, 0)
     assert trims["elevator"] == approx(0.25 * row.scale)
-    written = ChannelMap.validate_mapping(
+    channel_map = ChannelMap.validate_mapping(
         yaml.safe_load(map_text(MAP, {"elevator": trims["elevator"]}, "a log")), "map"
     )
-    assert written.inputs["elevator"].trim == approx(0.25 * row.scale, rel=1e-4)
-    assert written.outputs == MAP.outputs
+    assert channel_map.inputs["elevator"].trim == approx(0.25 * row.scale, rel=1e-4)
+    assert channel_map.outputs == MAP.outputs
 
 
 def test_trim_near_a_stop_narrows_the_limits_and_says_what_to_change() -> None:
@@ -409,22 +409,24 @@ def test_quadrotor_identified_and_flown_without_a_name_of_a_fixed_wing(tmp_path:
     frame = str(QUADROTOR / "airframe.yaml")
 
     def flown(name: str, airframe: str, scenario: str) -> Tape:
-        chosen = loaded(tmp_path, name, airframe, scenario)
+        scenario_of_flight = loaded(tmp_path, name, airframe, scenario)
         sensors = {"noise": [0.02, 0.05, 0.02, 0.01], "delay": 0.04}
         real = {"airframe": frame, "rate": 100.0, "step": 0.005, "sensors": sensors}
-        return simulate(replace(chosen, aircraft=AircraftConfig.validate_mapping(real, "aircraft")))
+        return simulate(
+            replace(scenario_of_flight, aircraft=AircraftConfig.validate_mapping(real, "aircraft"))
+        )
 
-    planned = experiment(HOVER_MAP, None, 0.2, str(tmp_path / "experiment_airframe.yaml"), wait=1.0)
-    tape = flown("experiment", planned.airframe, planned.scenario)
+    plan = experiment(HOVER_MAP, None, 0.2, str(tmp_path / "experiment_airframe.yaml"), wait=1.0)
+    tape = flown("experiment", plan.airframe, plan.scenario)
     pairing, _ = channel_pairs(HOVER_MAP)
     response = identify_response(tape["y"], tape["u"], pairing.outputs, pairing.inputs)
     channels = join(HOVER_MAP, response, channel_models(HOVER_MAP, tape, [(0, 10**18)], None))
-    known = load_airframe(frame)
+    airframe_file = load_airframe(frame)
     # q, p, r by a noise of 20 mrad/s
-    assert_allclose(np.diag(channels.Omega), np.diag(known.matrix_b()), rtol=0.1)
-    found = flying_scenario(HOVER_MAP, channels, None, str(tmp_path / "flight_airframe.yaml"))
-    assert "speed" not in yaml.safe_load(found.airframe)
-    _, error = best_error(flown("flight", found.airframe, found.scenario))
+    assert_allclose(np.diag(channels.Omega), np.diag(airframe_file.matrix_b()), rtol=0.1)
+    flyable = flying_scenario(HOVER_MAP, channels, None, str(tmp_path / "flight_airframe.yaml"))
+    assert "speed" not in yaml.safe_load(flyable.airframe)
+    _, error = best_error(flown("flight", flyable.airframe, flyable.scenario))
     rms = {name: error_metrics(error[name]).rms for name in error.names}
     # the noise alone is 0.02 rad/s and 0.05 m/s; the commands have 0.15 rad/s and 1 m/s
     assert max(rms["q"], rms["p"], rms["r"]) < 0.04

@@ -30,7 +30,7 @@ def damaged() -> tuple[FlightData, Airframe]:
 
     The elevator is lost, and half of the aileron.
     """
-    flown = find_scenario("osprey_servo").vary(
+    scenario = find_scenario("osprey_servo").vary(
         aircraft={
             "rate": 100.0,
             "step": 0.01,
@@ -44,8 +44,8 @@ def damaged() -> tuple[FlightData, Airframe]:
         },
         flight={"duration": 8.0},
     )
-    airframe = flown.aircraft.sampled_airframe()
-    return recording(simulate(flown), airframe), airframe
+    airframe = scenario.aircraft.sampled_airframe()
+    return recording(simulate(scenario), airframe), airframe
 
 
 def test_lost_elevator_is_dead_and_weak_aileron_changed(
@@ -71,8 +71,10 @@ def test_loss_within_what_a_model_may_err_is_no_change(
     """
     recorded, airframe = damaged
     B = airframe.matrix_b() * np.array([1.0, 1.0, model, 1.0])
-    flown = airframe.with_matrices(airframe.matrix_a(), B, np.ones((len(B), len(airframe.gusts))))
-    _, lat = change_test(recorded, flown, ACTUATION)
+    damaged_airframe = airframe.with_matrices(
+        airframe.matrix_a(), B, np.ones((len(B), len(airframe.gusts)))
+    )
+    _, lat = change_test(recorded, damaged_airframe, ACTUATION)
     assert lat.found is found
 
 

@@ -79,11 +79,11 @@ def test_input_with_wrong_sign_changes_own_d_only(name: str, channel: str) -> No
     flipped = changed(
         original, "inputs", channel, sign=-row.sign, offset=row.offset + row.sign * row.scale * span
     )
-    checked = check_osprey(flipped)
-    assert [channel.D for channel in checked.channels] == [-1 if i == k else 1 for i in range(4)]
-    assert len(checked.contradictions) == 1
+    check = check_osprey(flipped)
+    assert [channel.D for channel in check.channels] == [-1 if i == k else 1 for i in range(4)]
+    assert len(check.contradictions) == 1
     assert (
-        f"D of {OUTPUTS[k]} and {channel} is -1, the controller has +1" in checked.contradictions[0]
+        f"D of {OUTPUTS[k]} and {channel} is -1, the controller has +1" in check.contradictions[0]
     )
 
 
@@ -92,11 +92,11 @@ def test_two_wrong_signs_that_cancel_in_d_are_still_contradiction(channel: str) 
     k = OUTPUTS.index(channel)
     original = load_map("ardupilot")
     flipped = changed(original, "outputs", channel, sign=-original.outputs[channel].sign)
-    checked = check_osprey(
+    check = check_osprey(
         changed(flipped, "inputs", INPUTS[k], sign=-original.inputs[INPUTS[k]].sign)
     )
-    assert [channel.D for channel in checked.channels] == [1, 1, 1, 1]
-    assert f"outputs.{channel} of the map ardupilot has the wrong sign" in checked.contradictions[0]
+    assert [channel.D for channel in check.channels] == [1, 1, 1, 1]
+    assert f"outputs.{channel} of the map ardupilot has the wrong sign" in check.contradictions[0]
 
 
 def test_command_refuses_flipped_map_with_sentence(tmp_path: Path) -> None:
@@ -180,26 +180,23 @@ def experiment() -> Tape:
 
 
 def test_an_experiment_in_turbulence_shows_every_sign(experiment: Tape) -> None:
-    checked = check_osprey(load_map("ardupilot"), measured=response(experiment, None))
-    assert not checked.contradictions
-    assert not checked.uncertain
+    check = check_osprey(load_map("ardupilot"), measured=response(experiment, None))
+    assert not check.contradictions
+    assert not check.uncertain
     # within a factor of two of C B: enough for a sign; the elevator's is spread by the short period
     # of 10 rad/s
-    measured = np.array([channel.measured for channel in checked.channels])
-    assert (
-        np.abs(np.log2(measured / [channel.effect for channel in checked.channels])) < 1.0
-    ).all()
+    responses = np.array([channel.measured for channel in check.channels])
+    assert (np.abs(np.log2(responses / [channel.effect for channel in check.channels])) < 1.0).all()
 
 
 @pytest.mark.parametrize("topic, k", [("u", 0), ("u", 1), ("y", 2), ("y", 3)])
 def test_each_wrong_sign_found_in_experiment(experiment: Tape, topic: str, k: int) -> None:
     name = {"u": INPUTS, "y": OUTPUTS}[topic][k]
     wrong = Tape({**experiment.signals, topic: turned(experiment[topic], name)})
-    checked = check_osprey(load_map("ardupilot"), measured=response(wrong, None))
-    assert len(checked.contradictions) == 1
+    check = check_osprey(load_map("ardupilot"), measured=response(wrong, None))
+    assert len(check.contradictions) == 1
     assert (
-        f"the recorded flight has {OUTPUTS[k]}_dot fall with {INPUTS[k]}"
-        in checked.contradictions[0]
+        f"the recorded flight has {OUTPUTS[k]}_dot fall with {INPUTS[k]}" in check.contradictions[0]
     )
 
 
@@ -213,10 +210,10 @@ def test_flight_under_guidance_refused_since_commands_follow_y(tmp_path: Path) -
 
 def test_flight_that_does_not_show_sign_says_which_input_to_excite() -> None:
     tape = flown(EXCITATION | {"amplitude": [0.04, 0.04, 0.0, 0.2]}, 36.0, seed=1, wind=15.4)
-    checked = check_osprey(load_map("ardupilot"), measured=response(tape, None))
-    assert not checked.contradictions
-    assert len(checked.uncertain) == 1
+    check = check_osprey(load_map("ardupilot"), measured=response(tape, None))
+    assert not check.contradictions
+    assert len(check.uncertain) == 1
     assert (
         "the recorded flight does not show the sign of rudder: r by rudder: found rudder constant"
-        in checked.uncertain[0]
+        in check.uncertain[0]
     )

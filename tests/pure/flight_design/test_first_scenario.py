@@ -41,8 +41,8 @@ def test_command_needs_at_most_a_third_of_the_authority(
     commands = first_commands({"V": channel}, speed, 100.0, banks=False)
     y_m = Reference(ReferenceModelConfig.validate_mapping(commands.reference, "reference_model"))
     samples = np.array([y_m.sample(k)[0] for k in range(round(20.0 * 100.0))])
-    asked = np.gradient(samples, 0.01) + damping * samples
-    assert asked.max() <= authority / 3.0 * 1.01
+    demand = np.gradient(samples, 0.01) + damping * samples
+    assert demand.max() <= authority / 3.0 * 1.01
     assert samples.max() <= min(2.0, 0.03 * speed) * 1.006  # a height has three digits
 
 

@@ -94,14 +94,14 @@ def test_beta_follows_29_and_30_from_last_channel_up() -> None:
 
 @pytest.mark.equation(27, "Step 2", "Step 3")
 def test_k_g_and_k_d_follow_steps_2_and_3_from_last_channel_up() -> None:
-    found = gain_conditions.theorem_gains(HAND, np.ones(3))
+    gains = gain_conditions.theorem_gains(HAND, np.ones(3))
     # k_g = 1.5 2^2 / 4; k_3 = 1 + k_g = 2.5; a row of step 3 may take 0.3 / 2
     # zeta_Phi,2 = 0.5 2.5 = 1.25, k_d,2 = 1.25^2 / (4 0.15); k_2 = 2.5 + k_d,2
     # zeta_Phi,1^2 = (2 k_2)^2 + (1 2.5)^2
     k_2 = 2.5 + 1.5625 / 0.6
-    assert found.k_g == approx(1.5)
-    assert found.k_d.tolist() == approx([((2.0 * k_2) ** 2 + 6.25) / 0.6, 1.5625 / 0.6])
-    assert found.K.tolist() == approx([2.5 + found.k_d[0], k_2, 2.5])
+    assert gains.k_g == approx(1.5)
+    assert gains.k_d.tolist() == approx([((2.0 * k_2) ** 2 + 6.25) / 0.6, 1.5625 / 0.6])
+    assert gains.K.tolist() == approx([2.5 + gains.k_d[0], k_2, 2.5])
 
 
 @pytest.mark.equation("Step 3")
@@ -215,11 +215,11 @@ def test_gains_of_theorem_1_are_unstable_on_osprey_with_servos(
 
 
 def test_beta_stays_below_rate_of_actuators(osprey: Study) -> None:
-    limited = selection.gain_sets(osprey, SERVOS._replace(rate_limit={"thrust": 1.2})).engineering
-    params = limited.controller.law_params()
+    slow = selection.gain_sets(osprey, SERVOS._replace(rate_limit={"thrust": 1.2})).engineering
+    params = slow.controller.law_params()
     # the slew of the ideal thrust is 1.14 1/s
     assert params.beta[3] * params.input_scale[3] == approx(0.7 * 1.2)
-    assert failing_in_loop(limited) == ["beta above slew of V"]
+    assert failing_in_loop(slow) == ["beta above slew of V"]
 
 
 def osprey_channels(
@@ -228,8 +228,8 @@ def osprey_channels(
 ) -> tuple[FloatArray, ChannelPairing]:
     """Omega of the osprey with its inputs in some order, some of them counted the other way."""
     columns = [list(AIRFRAME.inputs).index(name) for name in inputs]
-    turned = np.array([-1.0 if name in flipped else 1.0 for name in inputs])
-    return (AIRFRAME.matrix_c() @ AIRFRAME.matrix_b())[:, columns] * turned, ChannelPairing(
+    signs = np.array([-1.0 if name in flipped else 1.0 for name in inputs])
+    return (AIRFRAME.matrix_c() @ AIRFRAME.matrix_b())[:, columns] * signs, ChannelPairing(
         AIRFRAME.outputs, inputs
     )
 
@@ -391,8 +391,8 @@ def test_delay_margin_lasts_up_to_speed_at_which_loop_with_responses_turns_unsta
     # the same response by a larger input_scale
     for factor, stable in ((ratio, True), (ratio + selection.SPEED_STEP, False)):
         scale = np.where(surfaces, factor**2, 1.0) * controller.input_scale
-        scaled = controller.model_copy(update={"input_scale": tuple(scale.tolist())})
-        assert (selection.assess_gains(osprey, scaled, SERVOS).delay_margin != 0.0) == stable
+        rescaled = controller.model_copy(update={"input_scale": tuple(scale.tolist())})
+        assert (selection.assess_gains(osprey, rescaled, SERVOS).delay_margin != 0.0) == stable
     assert selection.stable_speed_ratio(osprey, selected.literal) == 0.0
 
 
@@ -463,12 +463,12 @@ def test_command_shows_the_airframe_of_a_file(tmp_path: Path) -> None:
 
     They are -2.51 +-2.59j and -0.017 +-0.213j, p. 158.
     """
-    own = tmp_path / "own.yaml"
-    own.write_text(
+    path = tmp_path / "own.yaml"
+    path.write_text(
         (LIBRARY / "navion_longitudinal.yaml").read_text().replace("navion_longitudinal", "mine")
     )
-    (shown,) = json.loads(rise_di("airframes", str(own), "--json").stdout)
-    assert shown["name"] == "mine"
-    poles = sorted((real, abs(imaginary)) for real, imaginary in shown["poles"])
+    (facts,) = json.loads(rise_di("airframes", str(path), "--json").stdout)
+    assert facts["name"] == "mine"
+    poles = sorted((real, abs(imaginary)) for real, imaginary in facts["poles"])
     # A is printed to 3 digits
     assert_allclose(poles[::2], [(-2.51, 2.59), (-0.017, 0.213)], atol=0.021)

@@ -70,9 +70,9 @@ def test_aircraft_whose_sideslip_diverges_has_gains(monkeypatch: pytest.MonkeyPa
         return {"calm": manoeuvre_result(simulate(scenario.vary(aircraft={"gusts": {}})))}
 
     monkeypatch.setattr(jsbsim_identification, "fly_all", calm)
-    found = identify_jsbsim("f15", 180.0, 3000.0, guided=True)
-    assert found.sideslip_zero > 0.0
-    assert found.flights["calm"].outcome == "completed"
+    aircraft = identify_jsbsim("f15", 180.0, 3000.0, guided=True)
+    assert aircraft.sideslip_zero > 0.0
+    assert aircraft.flights["calm"].outcome == "completed"
 
 
 def test_zero_of_sideslip_is_that_of_its_equations() -> None:
@@ -81,8 +81,8 @@ def test_zero_of_sideslip_is_that_of_its_equations() -> None:
     A, B = airframe.matrix_a(), airframe.matrix_b()
     beta, p, r = (airframe.index(name) for name in ("beta", "p", "r"))
     u = [list(airframe.inputs).index(name) for name in ("aileron", "rudder")]
-    held = np.linalg.solve(B[np.ix_([p, r], u)], A[[p, r], beta])
-    assert sideslip_zero(airframe) == approx(A[beta, beta] - B[beta, u] @ held)
+    correction = np.linalg.solve(B[np.ix_([p, r], u)], A[[p, r], beta])
+    assert sideslip_zero(airframe) == approx(A[beta, beta] - B[beta, u] @ correction)
 
 
 def test_held_sideslip_has_the_opposite_zero() -> None:
@@ -135,9 +135,9 @@ def test_airframe_that_is_none_of_jsbsim_refused_with_one_sentence(
     airframe: str, sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    refused = rise_di(airframe, "--speed", "46", "--altitude", "900").exception
-    assert isinstance(refused, ParameterError)
-    assert str(refused).startswith(sentence)
+    error = rise_di(airframe, "--speed", "46", "--altitude", "900").exception
+    assert isinstance(error, ParameterError)
+    assert str(error).startswith(sentence)
     assert not list(tmp_path.iterdir())
 
 
@@ -154,19 +154,19 @@ def test_aircraft_that_does_not_trim_gives_one_sentence(tmp_path: Path) -> None:
         "--altitude",
         "900",
     ]
-    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert done.returncode == 3
-    assert done.stderr.startswith(
+    run = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert run.returncode == 3
+    assert run.stderr.startswith(
         "error: jsbsim:dr1 does not trim at 46 m/s and 900 m: its model needs the property "
     )
-    assert done.stderr.count("\n") == 1
+    assert run.stderr.count("\n") == 1
     assert not list(tmp_path.iterdir())
 
 
 def test_file_is_overwritten_only_if_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "jsbsim_c172p.yaml").write_text("mine\n")
-    refused = rise_di("jsbsim:c172p", "--speed", "46", "--altitude", "900").exception
-    assert isinstance(refused, ParameterError)
-    assert "jsbsim_c172p.yaml exists" in str(refused)
+    error = rise_di("jsbsim:c172p", "--speed", "46", "--altitude", "900").exception
+    assert isinstance(error, ParameterError)
+    assert "jsbsim_c172p.yaml exists" in str(error)
     assert (tmp_path / "jsbsim_c172p.yaml").read_text() == "mine\n"

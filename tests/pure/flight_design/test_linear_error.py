@@ -47,11 +47,11 @@ def test_error_in_turbulence_is_that_of_a_filtered_process() -> None:
 
 def test_noise_moves_u_from_tick_to_tick() -> None:
     # u_dot of white noise: sqrt(2 / pi) of the deviation sqrt(2) k sigma / T
-    found = response(noise=0.01)
-    assert found.activity == approx(2.0 / math.sqrt(math.pi) * GAIN * 0.01 / PERIOD, rel=0.005)
+    error = response(noise=0.01)
+    assert error.activity == approx(2.0 / math.sqrt(math.pi) * GAIN * 0.01 / PERIOD, rel=0.005)
     # and y as the white noise of this intensity: k sigma sqrt(T / 2k)
     expected = GAIN * 0.01 * math.sqrt(PERIOD / (2.0 * GAIN))
-    assert found.error == approx(TURBULENT * expected, rel=0.005)
+    assert error.error == approx(TURBULENT * expected, rel=0.005)
 
 
 def test_error_in_a_gust_is_that_of_a_fine_integration() -> None:

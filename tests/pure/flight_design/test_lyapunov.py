@@ -102,10 +102,12 @@ def test_V2_falls_by_integral_of_quadratic_form_up_to_sampling() -> None:
     # none of them the law's.
     worst = []
     for dt in PERIODS:
-        case, params, found = fly_example(dt, 6.0)
-        z = np.hstack([found.e, found.r])
-        fallen = integral(np.einsum("ki,ij,kj->k", z, decay_matrix(case.plant, params), z), found.t)
-        worst.append(float(np.max(np.abs(found.V2 - found.V2[0] + fallen))))
+        case, params, signals = fly_example(dt, 6.0)
+        z = np.hstack([signals.e, signals.r])
+        fallen = integral(
+            np.einsum("ki,ij,kj->k", z, decay_matrix(case.plant, params), z), signals.t
+        )
+        worst.append(float(np.max(np.abs(signals.V2 - signals.V2[0] + fallen))))
     assert all(after < 0.8 * before for before, after in pairwise(worst))
     assert worst[-1] < 0.05
 
@@ -122,14 +124,14 @@ def test_e_and_r_settle_on_band_of_second_order_where_conditions_hold() -> None:
 
 
 def test_r_is_the_error_filtered_by_Lambda() -> None:
-    _, params, found = fly_example(0.0025, 6.0)
+    _, params, signals = fly_example(0.0025, 6.0)
     # (4), e_dot by another route than the evidence's
-    r = np.gradient(found.e, found.t, axis=0) + params.Lambda * found.e
-    settled = found.t > 0.1  # at engagement e_dot turns within a tick
+    r = np.gradient(signals.e, signals.t, axis=0) + params.Lambda * signals.e
+    later = signals.t > 0.1  # at engagement e_dot turns within a tick
     # second differences at 2.5 ms differ by less than 1 %; Lambda wrong by a tenth makes 5 % and
     # more
     assert (
-        np.abs(r - found.r)[settled].max() < 0.02 * np.abs(params.Lambda * found.e)[settled].max()
+        np.abs(r - signals.r)[later].max() < 0.02 * np.abs(params.Lambda * signals.e)[later].max()
     )
 
 
@@ -157,10 +159,10 @@ def test_constant_of_lemma_2_is_hand_worked_one() -> None:
 
 @pytest.mark.equation(3, 47)
 def test_P_stays_positive_with_constant_of_lemma_2() -> None:
-    case, params, found = fly_example(0.005, 12.0)
+    case, params, signals = fly_example(0.005, 12.0)
     # measured 0.93: steps 2 and 3 of the theorem hold
     assert np.linalg.eigvalsh(decay_matrix(case.plant, params)).min() > 0.9
-    zeta_b = lemma_2(case.plant, found, params)
+    zeta_b = lemma_2(case.plant, signals, params)
     flight = fly_known_plant(case.plant, case.y_m, 0.005, params, case.x_0)
     P = evidence(case.plant, flight, params, zeta_b).P
     assert P[0] == zeta_b
@@ -195,12 +197,14 @@ def test_with_K_too_small_V2_rises_at_every_period() -> None:
     # K below G in (16): Q has the eigenvalue -7.0, V2 climbs by 3.0, 3.0 and 3.1, which is no
     # sampling term.
     for dt in (0.01, 0.005, 0.0025):
-        case, params, found = fly_example(
+        case, params, signals = fly_example(
             dt, 20.0, K=np.array([1.2, 1.1]), Lambda=np.array([4.0, 4.0])
         )
         assert np.linalg.eigvalsh(decay_matrix(case.plant, params)).min() < -6.0
-        assert largest_rise(found.V2) > 2.5
-        assert tail(found.e, found.t, 15.0) < 1e-3  # the conditions are sufficient, not necessary
+        assert largest_rise(signals.V2) > 2.5
+        assert (
+            tail(signals.e, signals.t, 15.0) < 1e-3
+        )  # the conditions are sufficient, not necessary
 
 
 def test_literal_sign_lets_V2_rise_by_chatter_that_fades_with_period() -> None:
@@ -225,12 +229,12 @@ def test_along_osprey_e_is_dt_squared_times_what_beta_has_to_cancel() -> None:
     # In the implicit sign's layer s = e / (dt^2 omega beta), and D U D beta s = N_d: so e = dt^2
     # omega (D U D)^-1 N_d.
     for rate in (100.0, 200.0):
-        scenario, plant, found = osprey(rate)
+        scenario, plant, signals = osprey(rate)
         _, D, U = decompose(plant.C @ plant.B)
-        needed = np.max(np.abs(np.linalg.solve(D[:, None] * U * D, found.N_d.T)), axis=1)
-        predicted = np.array(scenario.rise_di().omega) * needed / rate**2
+        least = np.max(np.abs(np.linalg.solve(D[:, None] * U * D, signals.N_d.T)), axis=1)
+        predicted = np.array(scenario.rise_di().omega) * least / rate**2
         # 2.4e-3, 4.9e-5, 7.4e-4, 7.2e-4
-        assert np.max(np.abs(found.e), axis=0) == pytest.approx(predicted, rel=0.05)
+        assert np.max(np.abs(signals.e), axis=0) == pytest.approx(predicted, rel=0.05)
 
 
 @pytest.mark.equation(16, 17, 18, 47)

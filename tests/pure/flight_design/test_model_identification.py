@@ -65,10 +65,10 @@ and that with rotary gusts.
 
 def servo(air: str, uncertainty: float, duration: float = DURATION, **reference: Any) -> Scenario:
     """osprey_servo at 100 Hz, with an uncertain aircraft."""
-    sampled = {"A": uncertainty, "B": uncertainty, "seed": 7, "number": 2}
+    uncertainty_of_aircraft = {"A": uncertainty, "B": uncertainty, "seed": 7, "number": 2}
     return find_scenario("osprey_servo").vary(
         flight={"duration": duration},
-        aircraft={"rate": 100.0, "step": 0.005, "uncertainty": sampled} | AIR[air],
+        aircraft={"rate": 100.0, "step": 0.005, "uncertainty": uncertainty_of_aircraft} | AIR[air],
         reference_model={"rate": 100.0} | reference,
     )
 
@@ -117,9 +117,9 @@ MATTER = (
 
 @pytest.mark.parametrize("air, uncertainty", FLIGHTS)
 def test_entries_that_matter_found_within_deviations(air: str, uncertainty: float) -> None:
-    found = identified(air, uncertainty)
-    true = true_errors(servo(air, uncertainty).aircraft.sampled_airframe(), found.entries)
-    by_name = {entry.name: entry for entry in found.entries}
+    model = identified(air, uncertainty)
+    true = true_errors(servo(air, uncertainty).aircraft.sampled_airframe(), model.entries)
+    by_name = {entry.name: entry for entry in model.entries}
     for name in MATTER:
         assert abs(by_name[name].error - true[name]) < 3.0 * by_name[name].deviation, name
     # turbulence hides what the inputs do: their effects are known less well
@@ -136,8 +136,8 @@ def test_entries_that_matter_found_within_deviations(air: str, uncertainty: floa
             "B[p, aileron]": 0.02,
             "B[r, rudder]": 0.12,
         }
-    for name, bound in largest.items():
-        assert abs((1.0 + by_name[name].error) / (1.0 + true[name]) - 1.0) < bound, name
+    for name, limit in largest.items():
+        assert abs((1.0 + by_name[name].error) / (1.0 + true[name]) - 1.0) < limit, name
 
 
 def test_effects_of_inputs_are_found_in_air_that_turns() -> None:
@@ -147,13 +147,13 @@ def test_effects_of_inputs_are_found_in_air_that_turns() -> None:
 
     The deviations are for the levels of the wind as found: the rudder is 3.4 of them off.
     """
-    found = identified("turning", 0.3)
-    true = true_errors(servo("turning", 0.3).aircraft.sampled_airframe(), found.entries)
-    for entry in found.entries:
+    model = identified("turning", 0.3)
+    true = true_errors(servo("turning", 0.3).aircraft.sampled_airframe(), model.entries)
+    for entry in model.entries:
         if entry.name in {"B[V, thrust]", "B[q, elevator]", "B[p, aileron]", "B[r, rudder]"}:
             assert abs(entry.error - true[entry.name]) < 3.5 * entry.deviation, entry.name
-    assert all("at a bound" not in part.refusal for part in found.parts)
-    assert found.after.whiteness.max() < MAX_WHITENESS
+    assert all("at a bound" not in part.refusal for part in model.parts)
+    assert model.after.whiteness.max() < MAX_WHITENESS
 
 
 def test_air_that_moves_the_aircraft_more_than_any_wind_does_is_refused() -> None:
@@ -168,47 +168,47 @@ def test_air_that_moves_the_aircraft_more_than_any_wind_does_is_refused() -> Non
 def test_innovations_of_held_out_samples_are_smaller_and_whiter(
     air: str, uncertainty: float
 ) -> None:
-    found = identified(air, uncertainty)
-    assert found.refusal == ""
-    assert len(found.parts) == 2  # nothing is taken as coupled that is not
-    assert found.after.log_likelihood > found.before.log_likelihood + 0.1
-    assert np.sum(found.after.whiteness) < 0.5 * np.sum(found.before.whiteness)
-    assert (found.after.rms <= 1.001 * found.before.rms).all()
+    model = identified(air, uncertainty)
+    assert model.refusal == ""
+    assert len(model.parts) == 2  # nothing is taken as coupled that is not
+    assert model.after.log_likelihood > model.before.log_likelihood + 0.1
+    assert np.sum(model.after.whiteness) < 0.5 * np.sum(model.before.whiteness)
+    assert (model.after.rms <= 1.001 * model.before.rms).all()
     # nothing of the fit is in the held-out samples, of which there are one in three
-    assert found.held_out.mean() == approx(1.0 / 3.0, abs=0.02)
+    assert model.held_out.mean() == approx(1.0 / 3.0, abs=0.02)
 
 
 def test_the_deviations_are_those_of_the_errors() -> None:
-    found = identified("gust", 0.5)
-    true = true_errors(servo("gust", 0.5).aircraft.sampled_airframe(), found.entries)
-    scaled = np.array(
-        [(entry.error - true[entry.name]) / entry.deviation for entry in found.entries]
+    model = identified("gust", 0.5)
+    true = true_errors(servo("gust", 0.5).aircraft.sampled_airframe(), model.entries)
+    ratios = np.array(
+        [(entry.error - true[entry.name]) / entry.deviation for entry in model.entries]
     )
     # of 26 normal numbers the mean square is below 2 with a probability of 0.998
-    assert np.mean(scaled**2) < 2.0
+    assert np.mean(ratios**2) < 2.0
 
 
 def test_flight_without_excitation_refused_with_channel_and_factor() -> None:
     scenario = servo("calm", 0.3, duration=20.0, pulses={}, coordinated_turn=None)
-    found = identify_model(
+    model = identify_model(
         innovation_filters.recording(simulate(scenario), OSPREY), OSPREY, ACTUATORS
     )
     pattern = (
         r"excitation of \w: found B\[\w, \w+\] known to [\d.]+ %, expected 10 %: \w needs "
         r"[\d.]+ times the amplitude"
     )
-    assert re.match(pattern, found.refusal)
+    assert re.match(pattern, model.refusal)
 
 
 def test_flight_without_noise_that_is_mostly_at_rest_has_deviations() -> None:
     """At rest the innovations are 0. The seconds that move are then no outliers."""
     scenario = find_scenario("osprey_gust").vary(flight={"duration": 20.0})  # p moves from 11 s on
-    found = identify_model(
+    model = identify_model(
         innovation_filters.recording(simulate(scenario), OSPREY),
         OSPREY,
         Actuation(np.zeros(4), 0.0),
     )
-    assert all(0.0 < entry.deviation < 0.3 for entry in found.entries)
+    assert all(0.0 < entry.deviation < 0.3 for entry in model.entries)
 
 
 def test_coupled_parts_are_identified_together(tmp_path: Path) -> None:
@@ -229,36 +229,36 @@ def test_coupled_parts_are_identified_together(tmp_path: Path) -> None:
     airframe = tmp_path / "coupled.yaml"
     airframe.write_text(as_yaml(OSPREY.with_matrices(A, B, np.ones((8, 3)))))
     scenario = servo("turbulence", 0.0, duration=20.0).vary(aircraft={"airframe": str(airframe)})
-    found = identify_model(
+    model = identify_model(
         innovation_filters.recording(simulate(scenario), OSPREY), OSPREY, ACTUATORS
     )
-    assert found.refusal == ""
-    assert [part.outputs for part in found.parts] == [OSPREY.outputs]
-    entries = {entry.name: entry for entry in found.entries}
+    assert model.refusal == ""
+    assert [part.outputs for part in model.parts] == [OSPREY.outputs]
+    entries = {entry.name: entry for entry in model.entries}
     for name, value in coupled.items():
         assert (
             abs(entries[name].value - value)
             < 3.0 * abs(entries[name].unit) * entries[name].deviation
         ), name
-    assert found.airframe.matrix_b()[row, elevator] == approx(coupled["B[p, elevator]"], rel=0.2)
-    assert "#   B[p, elevator]: " in model_yaml(found, "a flight")
+    assert model.airframe.matrix_b()[row, elevator] == approx(coupled["B[p, elevator]"], rel=0.2)
+    assert "#   B[p, elevator]: " in model_yaml(model, "a flight")
 
 
 def test_lost_samples_are_predicted_over() -> None:
     tape = flight("gust", 0.5)
     y = tape["y"]
-    kept = np.random.default_rng(1).random(len(y.stamp_ns)) > 0.2
+    keep = np.random.default_rng(1).random(len(y.stamp_ns)) > 0.2
     lossy = replace(
-        tape, signals={**tape.signals, "y": Signal(y.stamp_ns[kept], y.names, y.values[kept])}
+        tape, signals={**tape.signals, "y": Signal(y.stamp_ns[keep], y.names, y.values[keep])}
     )
     recorded = innovation_filters.recording(lossy, OSPREY)
     assert np.isnan(recorded.y[:, 0]).mean() == approx(0.2, abs=0.02)
-    found = identify_model(recorded, OSPREY, ACTUATORS)
-    true = true_errors(servo("gust", 0.5).aircraft.sampled_airframe(), found.entries)
-    assert found.refusal == ""
+    model = identify_model(recorded, OSPREY, ACTUATORS)
+    true = true_errors(servo("gust", 0.5).aircraft.sampled_airframe(), model.entries)
+    assert model.refusal == ""
     assert all(
         abs(entry.error - true[entry.name]) < 3.0 * entry.deviation
-        for entry in found.entries
+        for entry in model.entries
         if entry.name in MATTER
     )
 
@@ -378,14 +378,14 @@ def test_whiteness_is_one_for_white_noise_and_that_of_autocorrelation_for_colour
 
 def test_correlation_is_one_for_independent_noises_and_that_of_what_follows_later() -> None:
     generator = np.random.default_rng(1)
-    used = np.ones(20_000, dtype=bool)
+    mask = np.ones(20_000, dtype=bool)
     before, noise = generator.standard_normal((2, 20_000, 20))
     # the mean of 400 figures with a deviation of 0.32 each
-    assert correlation(noise, before, used).mean() == approx(1.0, abs=0.05)
+    assert correlation(noise, before, mask).mean() == approx(1.0, abs=0.05)
     # n rho^2 with rho = 0.1 at one of 20 lags
     following = np.vstack([np.zeros((7, 20)), 0.1 * before[:-7]]) + np.sqrt(0.99) * noise
-    found = np.diag(correlation(following, before, used))
-    assert found.mean() == approx(1.0 + 20_000 * 0.01 / 20, rel=0.1)
+    correlations = np.diag(correlation(following, before, mask))
+    assert correlations.mean() == approx(1.0 + 20_000 * 0.01 / 20, rel=0.1)
 
 
 # The command
@@ -424,9 +424,9 @@ def test_command_writes_airframe_and_page_of_innovations(tmp_path: Path) -> None
             "deviation": entry.deviation,
         }
         assert entries[entry.name] == shown | {"unit": entry.nominal}
-    written = load_airframe(str(model))
-    assert_array_equal(written.matrix_b(), found.airframe.matrix_b())
-    assert_array_equal(written.matrix_gusts(), found.airframe.matrix_gusts())
+    airframe = load_airframe(str(model))
+    assert_array_equal(airframe.matrix_b(), found.airframe.matrix_b())
+    assert_array_equal(airframe.matrix_gusts(), found.airframe.matrix_gusts())
     header = [line for line in model.read_text().splitlines() if line.startswith("#")]
     assert any("B[q, elevator]" in line for line in header)
     assert {"nominal", "identified", "held out"} <= set(

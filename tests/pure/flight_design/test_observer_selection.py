@@ -79,11 +79,11 @@ def Omega() -> FloatArray:  # noqa: N802 - the paper's name
 
 
 def test_shipped_scenarios_have_observer_that_command_writes(tmp_path: Path) -> None:
-    written = tmp_path / "gains.yaml"
-    result = invoke("gains", "osprey", "--observer", "--write", written)
+    path = tmp_path / "gains.yaml"
+    result = invoke("gains", "osprey", "--observer", "--write", path)
     assert result.exit_code == 0, result.output
     assert "gains of a search in osprey_servo" in result.output
-    section = yaml.safe_load(written.read_text())["/**/controller"]["ros__parameters"]
+    section = yaml.safe_load(path.read_text())["/**/controller"]["ros__parameters"]
     again = RiseDiConfig.validate_mapping(section, "controller")
     assert again.observer is not None
     for shipped in (find_scenario(name).controller for name in SHIPPED):
@@ -121,12 +121,12 @@ def _plant(controller: RiseDiConfig) -> tuple[FloatArray, FloatArray, FloatArray
 def test_search_finds_the_same_gains_from_faster_and_from_slower_ones(begin: float) -> None:
     model = model_for(OSPREY, SERVO.controller, NOISE)
     gains = gains_by_rule(model, tuple(OSPREY.gusts), OSPREY.speed)
-    found = with_aircraft_observer(
+    selection = with_aircraft_observer(
         SERVO.rise_di(), OSPREY, [gains], NOISE, 0.03, begin=np.full(4, begin)
     )
     # the logarithms of four channels: 3 % each
-    assert found.cost == pytest.approx(by_rule().cost, abs=0.12)
-    assert found.delay_margin >= 0.03
+    assert selection.cost == pytest.approx(by_rule().cost, abs=0.12)
+    assert selection.delay_margin >= 0.03
 
 
 def test_delay_beyond_margin_makes_flight_oscillate_and_one_within_it_does_not() -> None:
@@ -208,8 +208,8 @@ def test_aircraft_that_no_gains_hold_do_not_count() -> None:
     scenario = find_scenario(str(folder / "rates.yaml"))
     A, B = nominal_and_sampled(airframe, WORST_UNCERTAINTY, WORST_OF, WORST_SEED)
     C = airframe.matrix_c()
-    held = A - B @ np.linalg.solve(C @ B, C @ A)
-    diverging = int(np.sum(np.linalg.eigvals(held).real.max(axis=1)[1:] > FASTEST))
+    dynamics = A - B @ np.linalg.solve(C @ B, C @ A)
+    diverging = int(np.sum(np.linalg.eigvals(dynamics).real.max(axis=1)[1:] > FASTEST))
     loose = Requirement(
         phase=math.radians(20.0),
         gain=1.4,

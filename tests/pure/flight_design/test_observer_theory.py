@@ -90,13 +90,13 @@ def random_plant(seed: int, U_12: float = 0.0) -> Plant:
     zero_dynamics = rng.normal(size=(N - M, N - M))
     zero_dynamics -= (eigvals(zero_dynamics).real.max() + 1.0) * np.eye(N - M)
     top = rng.normal(size=(M, N))
-    left = rng.normal(size=(N - M, M))
+    left_columns = rng.normal(size=(N - M, M))
     root = 0.3 * rng.normal(size=(M, M))
     S = np.eye(M) + root @ root.T
     D = np.array([1.0, -1.0])
     U = np.array([[1.0, U_12], [0.0, 1.0]])
     change = np.eye(N) + 0.3 * np.vstack([np.zeros((M, N)), rng.normal(size=(N - M, N))])
-    A = np.vstack([top, np.hstack([left, zero_dynamics])])
+    A = np.vstack([top, np.hstack([left_columns, zero_dynamics])])
     back = np.linalg.inv(change)
     return Plant(
         A=back @ A @ change,
@@ -233,9 +233,9 @@ def test_zeros_with_observer_are_those_of_aircraft_and_poles_of_filter() -> None
         expected = np.concatenate(
             [invariant_zeros(plant.A, plant.B, plant.C), eigvals(filter_matrix)]
         )
-        found = invariant_zeros(both.A, both.B, both.C)
-        assert len(found) == len(expected)
-        assert all(np.min(np.abs(found - zero)) < 1e-6 for zero in expected)
+        zeros = invariant_zeros(both.A, both.B, both.C)
+        assert len(zeros) == len(expected)
+        assert all(np.min(np.abs(zeros - zero)) < 1e-6 for zero in expected)
         # the same without an eigenvalue problem: the determinants of the pencils are equal for
         # every s
         for s in rng.normal(size=(5, 2)) @ np.array([1.0, 1.0j]):
@@ -254,9 +254,9 @@ def test_on_osprey_observer_adds_only_own_filter_to_zeros() -> None:
     poles = eigvals(observer.error_matrix)
     assert np.array_equal(both.C @ both.B, plant.C @ plant.B)
     expected = np.concatenate([[-7.188, -0.69, 0.0, 0.0], poles])
-    found = invariant_zeros(both.A, both.B, both.C)
-    assert len(found) == len(expected) == 19
-    assert all(np.min(np.abs(found - zero)) < 1e-3 for zero in expected)
+    zeros = invariant_zeros(both.A, both.B, both.C)
+    assert len(zeros) == len(expected) == 19
+    assert all(np.min(np.abs(zeros - zero)) < 1e-3 for zero in expected)
     assert poles.real.max() < -0.009  # the disturbances' own leak
 
 
@@ -281,8 +281,8 @@ def ideal(
 def slew_left(plant: Plant, wave: Wave, observer: Observer | None) -> FloatArray:
     """Phasor of N_d on e = 0 by (c): -D U S_o j omega (u* - u_ff), S_o = I without observer."""
     u = ideal(plant, wave.omega, wave.f, wave.y_m)[1] - wave.u_ff
-    left = u if observer is None else observer.sensitivity(1j * wave.omega) @ u
-    return np.asarray(-plant.D * (plant.U @ (1j * wave.omega * left)))
+    remainder = u if observer is None else observer.sensitivity(1j * wave.omega) @ u
+    return np.asarray(-plant.D * (plant.U @ (1j * wave.omega * remainder)))
 
 
 @pytest.mark.parametrize("omega", [0.3, 3.0, 30.0])
@@ -344,23 +344,25 @@ def slews_of_the_osprey() -> tuple[FloatArray, FloatArray]:
     rows = []
     for k in range(21):
         u_dot = study.u_dot[:, k]
-        left = u_dot - calm.u_dot[:, 0]
-        of_law = lsim(filtered, left, np.asarray(0.01 * np.arange(len(left)), dtype=np.float64))[1]
-        rows.append([np.abs(rate).max(axis=0) * degrees for rate in (u_dot, left, of_law)])
+        remainder = u_dot - calm.u_dot[:, 0]
+        of_law = lsim(
+            filtered, remainder, np.asarray(0.01 * np.arange(len(remainder)), dtype=np.float64)
+        )[1]
+        rows.append([np.abs(rate).max(axis=0) * degrees for rate in (u_dot, remainder, of_law)])
     return np.array(rows[0]), np.mean(rows[1:], axis=0)
 
 
 def test_on_osprey_observer_halves_slew_of_elevator_and_rudder_in_gusts() -> None:
     # Pulses and gusts of osprey_servo within 8 s, ideal actuators: elevator, aileron, rudder in
     # deg/s, thrust in %/s
-    nominal, sampled = slews_of_the_osprey()
+    nominal, samples = slews_of_the_osprey()
     names = list(load_airframe("osprey").inputs)
     assert names == ["elevator", "thrust", "aileron", "rudder"]
     assert nominal == approx(
         np.array([[23.3, 115, 7.7, 43.6], [23.3, 114, 0.331, 43.7], [12.4, 60.3, 0.367, 22.2]]),
         rel=0.05,
     )
-    assert sampled == approx(
+    assert samples == approx(
         np.array([[26.5, 126, 8.1, 45.6], [26.6, 125, 1.6, 45.7], [14.2, 123, 0.8, 23.2]]), rel=0.05
     )
 
@@ -449,9 +451,9 @@ def test_above_k_star_matrix_P_makes_form_of_lemma_A_positive(
 ) -> None:
     # The lemma of Kalman, Yakubovich and Popov, by its Riccati equation: r is eliminated, then e.
     plant = random_plant(seed)
-    flown = extended(plant, observer_of(plant)) if with_observer else plant
-    terms = cross_terms(flown)
-    k = 1.01 * least_gain(flown)
+    extended_plant = extended(plant, observer_of(plant)) if with_observer else plant
+    terms = cross_terms(extended_plant)
+    k = 1.01 * least_gain(extended_plant)
     inverse = np.linalg.inv(k * np.eye(M) - (terms.G + terms.G.T) / 2.0) / 4.0
     R = np.eye(M) - terms.W_e.T @ inverse @ terms.W_e
     cross = terms.W_eta.T @ inverse @ terms.W_e
@@ -499,13 +501,15 @@ def flown_error(
             return of_x
         return np.concatenate([of_x, -observer.L @ (reference.y_m * np.cos(reference.omega * now))])
 
-    flown = plant if observer is None else extended(plant, observer)
-    x_0 = np.zeros(len(flown.A))
+    extended_plant = plant if observer is None else extended(plant, observer)
+    x_0 = np.zeros(len(extended_plant.A))
     x_0[:N] = 0.3
-    flight = fly_known_plant(KnownPlant(flown.A, flown.B, flown.C, f), y_m, dt, params, x_0)
-    settled = t > 12.0
-    e = np.asarray(flight.x @ flown.C.T - y_m)
-    return t[settled], e[settled]
+    flight = fly_known_plant(
+        KnownPlant(extended_plant.A, extended_plant.B, extended_plant.C, f), y_m, dt, params, x_0
+    )
+    late = t > 12.0
+    e = np.asarray(flight.x @ extended_plant.C.T - y_m)
+    return t[late], e[late]
 
 
 def largest_error(
@@ -609,11 +613,11 @@ def largest_w(plant: Plant, K: FloatArray, kind: str) -> tuple[float, float]:
 def test_error_stays_within_lemma_B_for_any_bounded_slew_of_observer(seed: int) -> None:
     plant = random_plant(seed, U_12=0.5)
     K = np.array([40.0, 30.0])
-    flown = {kind: largest_w(plant, K, kind) for kind in ("adverse", "bounded", "square")}
-    bound = ultimate_bound(plant, K, flown["adverse"][1])
-    assert all(largest < bound for largest, _ in flown.values())
-    assert flown["adverse"][0] > 0.05 * bound
-    assert flown["adverse"][0] == max(largest for largest, _ in flown.values())
+    results = {kind: largest_w(plant, K, kind) for kind in ("adverse", "bounded", "square")}
+    limit = ultimate_bound(plant, K, results["adverse"][1])
+    assert all(largest < limit for largest, _ in results.values())
+    assert results["adverse"][0] > 0.05 * limit
+    assert results["adverse"][0] == max(largest for largest, _ in results.values())
 
 
 # The error inside the softened sign, and what remains of the sign

@@ -78,13 +78,13 @@ def integrators() -> Airframe:
 
 @cache
 def selected(phase_margin: float, V_product: float = 0.46) -> RiseDiConfig:
-    whole = find_scenario("osprey_servo").reference_model.model_dump(exclude_none=True)
+    reference = find_scenario("osprey_servo").reference_model.model_dump(exclude_none=True)
     commands = {
         "rate": 100.0,
         "outputs": ["q", "V"],
         "second_order": {"natural_frequency": [4.0, 1.2], "damping": [0.9, 1.0]},
         "rise": 0.1,
-        "pulses": {"q": whole["pulses"]["q"]},
+        "pulses": {"q": reference["pulses"]["q"]},
     }
     manoeuvre = Manoeuvre(
         ReferenceModelConfig.validate_mapping(commands, "reference_model"), {}, 4.0
@@ -124,12 +124,12 @@ def test_selected_gains_have_the_phase_margin(phase_margin: float) -> None:
     # 0.5 degrees here. A step of the search is 5 % of the integral, at most 1.5 degrees, and a
     # sensitivity of 2 asks for more than 30 degrees.
     controller = selected(phase_margin)
-    found = [of_python_control(controller, i) for i in range(2)]
-    for phase, sensitivity in found:
+    margins = [of_python_control(controller, i) for i in range(2)]
+    for phase, sensitivity in margins:
         assert phase > phase_margin - 0.5
         assert sensitivity < 2.0 * 1.02
     if phase_margin > 40.0:
-        assert min(phase for phase, _ in found) < phase_margin + 2.0
+        assert min(phase for phase, _ in margins) < phase_margin + 2.0
 
 
 @pytest.mark.parametrize("phase_margin, product", [(45.0, 0.03), (60.0, 0.003)])
@@ -158,9 +158,9 @@ def test_no_gains_of_a_random_search_meet_the_margins_with_a_lower_error() -> No
     def log_error(controller: RiseDiConfig) -> float:
         loop = linear_loop(controller, study.airframe, study.A, study.B)
         loop_figures = input_margins(loop.nominal, loop.law, loop.loop, together=False)
-        met = least_fraction(loop_figures, Requirement()) >= 1.0
+        is_met = least_fraction(loop_figures, Requirement()) >= 1.0
         error = linear_error(loop, study.u_dot[:, 0][:, columns])
-        return float(np.log(error).sum()) if met else math.inf
+        return float(np.log(error).sum()) if is_met else math.inf
 
     rng = np.random.default_rng(3)
     others = []
@@ -206,11 +206,11 @@ def test_a_larger_margin_costs_integral_gain() -> None:
 
 
 def test_gains_of_osprey_meet_the_requirement() -> None:
-    chosen = select_gains("osprey", "osprey_servo", samples=20).engineering
-    assert not chosen.unmet
-    assert {condition.name for condition in chosen.loop} >= set(NAMES)
+    gains = select_gains("osprey", "osprey_servo", samples=20).engineering
+    assert not gains.unmet
+    assert {condition.name for condition in gains.loop} >= set(NAMES)
     # other aircraft than those of the selection
-    of = margins(SERVO.vary(controller=chosen.controller), aircraft=50, seed=9)
+    of = margins(SERVO.vary(controller=gains.controller), aircraft=50, seed=9)
     assert of.worst is not None
     assert math.degrees(of.nominal.phase.min()) >= 45.0 - 0.01
     assert math.degrees(of.worst.phase.min()) >= 30.0
@@ -259,8 +259,8 @@ def test_trade_predicts_the_flight() -> None:
     # without noise
     selection = select_gains("osprey", "osprey_servo", samples=2)
     (row,) = trade(selection, (45.0,))
-    flown = simulate(SERVO.vary(aircraft={"sensors": {}}, controller=selection.chosen))
-    _, error = best_error(flown)
+    tape = simulate(SERVO.vary(aircraft={"sensors": {}}, controller=selection.chosen))
+    _, error = best_error(tape)
     rms = [error_metrics(error[name]).rms for name in selection.chosen.outputs]
     np.testing.assert_allclose(row.rms, rms, rtol=0.05)
     assert row.reached >= row.phase_margin

@@ -50,10 +50,10 @@ def flown(
         x[:2] += STEP * gust
     arrivals = np.cumsum(0.02 + 0.001 * generator.standard_normal(round(seconds / 0.02) - 10))
     places = np.round(arrivals / STEP).astype(int)
-    measured = states[places] + noise * generator.standard_normal((len(places), 2))
+    y = states[places] + noise * generator.standard_normal((len(places), 2))
     stamps = np.array([nanoseconds(instant) for instant in STEP * places], dtype=np.int64)
     commanded = np.array([nanoseconds(instant) for instant in t[::20]], dtype=np.int64)
-    return Signal(stamps, OUTPUTS, measured), Signal(commanded, INPUTS, u[::20])
+    return Signal(stamps, OUTPUTS, y), Signal(commanded, INPUTS, u[::20])
 
 
 def identified(y: Signal, u: Signal) -> Response:
@@ -61,15 +61,15 @@ def identified(y: Signal, u: Signal) -> Response:
 
 
 def test_doublets_in_open_loop_give_omega_lag_and_delay_back_within_errors() -> None:
-    found = identified(*flown(0.1))
-    assert not any(found.refusal)
-    assert (np.abs(found.Omega - OMEGA) < 4.0 * found.Omega_deviation).all()
+    response = identified(*flown(0.1))
+    assert not any(response.refusal)
+    assert (np.abs(response.Omega - OMEGA) < 4.0 * response.Omega_deviation).all()
     assert (
-        np.abs(np.diag(found.Omega) / np.diag(OMEGA) - 1.0) < 0.2
+        np.abs(np.diag(response.Omega) / np.diag(OMEGA) - 1.0) < 0.2
     ).all()  # known well enough for gains
     # u is held for 0.02 s and y_dot is known every 0.02 s: delay and lag apart are finer than that,
     # their sum is known better
-    assert found.delay + found.lag == pytest.approx(DELAY + LAG, abs=0.015)
+    assert response.delay + response.lag == pytest.approx(DELAY + LAG, abs=0.015)
 
 
 def test_only_time_in_which_u_acts_on_aircraft_counts() -> None:
@@ -77,24 +77,24 @@ def test_only_time_in_which_u_acts_on_aircraft_counts() -> None:
     # which flies by itself.
     y, u = flown(0.1)
     engaged_ns = nanoseconds(20.0)
-    other = Signal(
+    reversed_u = Signal(
         u.stamp_ns, u.names, np.where((u.stamp_ns > engaged_ns)[:, None], -u.values, u.values)
     )
-    found = identify_response(y, other, OUTPUTS, INPUTS, engaged=[(0, engaged_ns)])
-    assert not any(found.refusal)
+    response = identify_response(y, reversed_u, OUTPUTS, INPUTS, engaged=[(0, engaged_ns)])
+    assert not any(response.refusal)
     assert (
-        np.abs(np.diag(found.Omega) / np.diag(OMEGA) - 1.0) < 0.3
+        np.abs(np.diag(response.Omega) / np.diag(OMEGA) - 1.0) < 0.3
     ).all()  # half of the time: 0.2 times sqrt(2)
     assert (
-        np.diag(identified(y, other).Omega) / np.diag(OMEGA) < 0.5
+        np.diag(identified(y, reversed_u).Omega) / np.diag(OMEGA) < 0.5
     ).all()  # the two halves contradict each other
-    assert (found.sign_ratio > 10.0).all()
+    assert (response.sign_ratio > 10.0).all()
 
 
 def test_input_that_hardly_moves_refused_with_excitation_that_it_needs() -> None:
-    found = identified(*flown(2e-4))
+    response = identified(*flown(2e-4))
     assert all(
-        "excite" in sentence and "times as strongly" in sentence for sentence in found.refusal
+        "excite" in sentence and "times as strongly" in sentence for sentence in response.refusal
     )
 
 

@@ -80,10 +80,10 @@ def test_sketch_of_other_channels_is_refused() -> None:
 
 def test_law_alone_learns_from_its_signs_and_sizes() -> None:
     """Omega = diag(D omega / input_scale) of the law: no entry of the airframe file is read."""
-    alone = find_scenario("osprey_servo")
-    learning = that_learns(alone)
-    law = alone.rise_di()
-    rough = sketched("osprey", learning.rise_di(), alone.aircraft.channels().speed)
+    scenario = find_scenario("osprey_servo")
+    learning = that_learns(scenario)
+    law = scenario.rise_di()
+    rough = sketched("osprey", learning.rise_di(), scenario.aircraft.channels().speed)
     rows = [rough.index(name) for name in law.outputs]
     columns = [list(rough.inputs).index(name) for name in law.inputs]
     Omega = rough.matrix_b()[rows][:, columns]

@@ -45,11 +45,11 @@ def selection(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, gain_sele
 
 def flown(folder: Path, selected: gain_selection.Selection, rate: float) -> FloatArray:
     """The largest errors, law's order, under the gains of Theorem 1 as written, at a rate in Hz."""
-    written = gain_yaml.selection_yaml(selected, theorem=True).replace(
+    text = gain_yaml.selection_yaml(selected, theorem=True).replace(
         "rate: 100.0  # Hz", f"rate: {rate}  # Hz"
     )
     path = folder / f"ideal_{rate:g}.yaml"
-    path.write_text(FILES["sections.yaml"] + written)
+    path.write_text(FILES["sections.yaml"] + text)
     _, error = best_error(simulate(load_scenario(path)))
     return np.asarray(np.abs(error.values).max(axis=0))
 

@@ -67,14 +67,14 @@ def test_last_y_m_goes_on_and_next_step_is_tried(
 
 
 def test_failure_is_said_again_after_ten_seconds_without_one() -> None:
-    made = reference()
+    model = reference()
     said = []
     for number in range(1, 3000):
         failing = number in {100, 110, 1900, 1910}
         u_m = np.array([math.nan if failing else 0.0, 0.0, 0.0, 0.0])
-        made.take((number - 1) * 10 * MS, u_m, np.array([0.0, 0.0]))
-        made.sample(number)
-        if made.failure():
+        model.take((number - 1) * 10 * MS, u_m, np.array([0.0, 0.0]))
+        model.sample(number)
+        if model.failure():
             said.append(number)
     assert said == [100, 1900]
-    assert made.failed == 4
+    assert model.failed == 4

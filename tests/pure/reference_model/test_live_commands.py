@@ -71,15 +71,15 @@ def test_command_acts_from_step_after_it_and_no_earlier() -> None:
 def test_bank_is_dead_reckoned_by_y_m_that_was_published_where_samples_skipped() -> None:
     model = reference(speed=25.0)
     bank = math.radians(20.0)
-    flown = 0
+    last = 0
     model.take(0, np.array([0.0, 0.0, 0.35, 0.0]), np.array([bank, 0.0]))
     p = model.sample(0)[2]
     # Of the 0.3 s after sample 90 the reference rolls back without a y_m: the law tracks the roll
     # rate of before.
     for number in [*range(1, 91), *range(150, 2000)]:
-        bank += (number - flown) / RATE * p
+        bank += (number - last) / RATE * p
         p = model.sample(number)[2]
-        flown = number
+        last = number
     # of an aircraft that tracks; 6 deg by the rates of the skipped samples
     assert abs(math.degrees(bank)) < 1.0
 
@@ -89,9 +89,9 @@ def test_without_attitude_command_that_times_out_becomes_zero() -> None:
     model.take(0, np.array([0.1, 1.0, 0.2, 0.0]))
     model.sample(40)  # 0.2 s: the age limit
     assert model.source() == "live commands"
-    held = model.sample(41)[2]
+    y_m = model.sample(41)[2]
     assert model.source() == "ending"
-    assert held > 0.05  # rad/s: 0.2 s of a reference of 5 rad/s and a command of 0.2 rad/s
+    assert y_m > 0.05  # rad/s: 0.2 s of a reference of 5 rad/s and a command of 0.2 rad/s
     # 40 s: the slowest channel has a time constant of 2 s
     assert np.abs(model.sample(8000)).max() < 1e-6
 

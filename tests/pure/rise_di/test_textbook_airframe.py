@@ -28,7 +28,7 @@ def test_a_weak_aileron_is_named_with_the_sideslip_that_asks_for_it(
     table = yaml.safe_load(TABLES.read_text())["b747"]
     A = np.array(table["A"])[4:, 4:]  # of beta, r, p, phi in rad and s
     B = np.array(table["B"])[4:, 2:]
-    made = own_airframe.new_airframe(
+    new_files = own_airframe.new_airframe(
         StateSpace(A, B, np.eye(4), np.zeros((4, 2))),
         folder=tmp_path,
         name="b747",
@@ -39,11 +39,11 @@ def test_a_weak_aileron_is_named_with_the_sideslip_that_asks_for_it(
         text="NASA CR-2144",
     )
     # the command of the header of the scenario
-    again = select_gains(made.airframe_file, made.scenario_file, samples=0).chosen
+    again = select_gains(new_files.airframe_file, new_files.scenario_file, samples=0).chosen
     assert dict(zip(again.outputs, again.inputs, strict=True)) == {"p": "aileron", "r": "rudder"}
-    assert made.note.endswith("paired by C B: p by aileron, r by rudder")
+    assert new_files.note.endswith("paired by C B: p by aileron, r by rudder")
     assert "The first flight has aileron at 100 % of its end stop: the gusts ask for it" in (
-        made.shortfall
+        new_files.shortfall
     )
-    assert "a degree of sideslip asks " in made.shortfall
-    assert made.scenario_file.read_text().count(f"# {made.shortfall}\n") == 1
+    assert "a degree of sideslip asks " in new_files.shortfall
+    assert new_files.scenario_file.read_text().count(f"# {new_files.shortfall}\n") == 1

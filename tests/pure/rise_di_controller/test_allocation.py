@@ -56,8 +56,8 @@ def demands(
 
 def test_a_demand_inside_the_limits_is_t_v_to_the_last_bit() -> None:
     for params, v in demands(1, 20, 0.05):
-        u, given = allocate(v, np.zeros(len(params.T)), DT, params)
-        assert given.tobytes() == v.tobytes()
+        u, effect = allocate(v, np.zeros(len(params.T)), DT, params)
+        assert effect.tobytes() == v.tobytes()
         assert_allclose(u, params.T @ v, rtol=1e-12, atol=1e-14)  # a sum in another order
 
 
@@ -66,10 +66,10 @@ def test_effectors_stay_inside_stops_and_rates_and_give_what_is_returned(size: f
     for params, v in demands(2, 40, size, rate=5.0):
         u_before = np.zeros(len(params.T))
         for _ in range(4):
-            u, given = allocate(v, u_before, DT, params)
+            u, effect = allocate(v, u_before, DT, params)
             assert (np.abs(u) <= params.limits.upper).all()
             assert (np.abs(u - u_before) <= 5.0 * DT + 1e-12).all()
-            assert_allclose(params.effect @ u, given, rtol=1e-9, atol=1e-12)
+            assert_allclose(params.effect @ u, effect, rtol=1e-9, atol=1e-12)
             u_before = u
 
 
@@ -107,8 +107,8 @@ def test_what_some_effectors_inside_the_stops_give_is_given() -> None:
         if (np.abs(params.T @ demand) <= params.limits.upper).all():
             continue
         hard += 1
-        _, given = allocate(demand, np.zeros(len(params.T)), DT, params)
-        misses += bool(np.linalg.norm(given - demand) > 0.01 * np.linalg.norm(demand))
+        _, effect = allocate(demand, np.zeros(len(params.T)), DT, params)
+        misses += bool(np.linalg.norm(effect - demand) > 0.01 * np.linalg.norm(demand))
     assert hard > 25
     assert misses <= 3
 
@@ -119,8 +119,8 @@ def test_beyond_the_stops_the_first_input_keeps_what_a_linear_program_finds_for_
     for params, v in demands(4, 40, 3.0):
         if most(params, v) >= 1.0:
             continue
-        _, given = allocate(v, np.zeros(len(params.T)), DT, params)
-        assert given[0] / v[0] >= min(most(params, np.eye(len(v))[0] * v), 1.0) - 1.0 / 16.0
+        _, effect = allocate(v, np.zeros(len(params.T)), DT, params)
+        assert effect[0] / v[0] >= min(most(params, np.eye(len(v))[0] * v), 1.0) - 1.0 / 16.0
         compared += 1
     assert compared > 20
 
@@ -182,8 +182,8 @@ def test_a_flight_with_an_allocation_at_its_stops_tracks_and_replays_to_the_bit(
     assert str(tape.outcome) == "completed"
     assert tape["u"].names == ("elevator", "thrust", "aileron", "rudder")
     assert np.abs(tape["u"]["elevator"]).max() == 0.01
-    limited = tape["internals"].group("limited")["v_q"] > 0.0
-    assert 0.1 < limited.mean() < 0.9
+    is_limited = tape["internals"].group("limited")["v_q"] > 0.0
+    assert 0.1 < is_limited.mean() < 0.9
     assert replay(tape).equal()
     # The command ends at 8 s, and q needs no elevator soon after: with integrals that wind up e
     # would stay large.
@@ -204,9 +204,9 @@ def test_shipped_aircraft_track_without_an_effector(name: str, effector: str, ch
     e is within twice that of the whole aircraft, 15 mrad/s; u is inside.
     """
     scenario = find_scenario(name)
-    lost = scenario.aircraft.actuators.model_dump() | {"faults": [f"{effector} lost 1"]}
+    actuators = scenario.aircraft.actuators.model_dump() | {"faults": [f"{effector} lost 1"]}
     scenario = scenario.vary(
-        aircraft={"actuators": lost, "rate": 200.0, "step": 0.005},
+        aircraft={"actuators": actuators, "rate": 200.0, "step": 0.005},
         reference_model={"rate": 200.0},
         flight={"duration": 5.0},
     )

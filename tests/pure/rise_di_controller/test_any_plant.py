@@ -218,9 +218,9 @@ def test_error_decreases_from_engagement_to_ultimate_bound(task: Task) -> None:
     second = round(1.0 / DT)
     first = errors[:second].max()
     third = errors[2 * second : 3 * second].max()
-    settled = errors[5 * second :].max()
+    largest = errors[5 * second :].max()
     assert third < 0.02 * first
-    assert settled < 0.02 * first
+    assert largest < 0.02 * first
 
 
 @settle

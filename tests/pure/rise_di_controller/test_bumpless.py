@@ -163,11 +163,11 @@ class Loop:
             np.array([logged[f"{key}.{name}"] for name in SCENARIO.controller.inputs])
             for key in ("u", "u_free")
         )
-        beyond = self._beyond
+        excess = self._beyond
         self._beyond = np.abs(u_free - u)
         self._dt = dt = logged["dt"]
         change = self._e - e_p + law.Lambda * dt * (self._e + e_p) / 2.0
-        step = law.input_scale * (law.K * np.abs(change) + dt * law.beta) + beyond
+        step = law.input_scale * (law.K * np.abs(change) + dt * law.beta) + excess
         outside = (self._u < limits.lower) | (self._u > limits.upper)
         return np.where(outside, SLEW * dt, np.minimum(step, SLEW * dt)) if dt else np.zeros(4)
 
@@ -382,8 +382,8 @@ class Engagement:
             if self.receives["y"]:
                 for name in self._map.outputs:
                     self.bridge.take_output(name, 0.0, now_ns, now_ns)
-            wanted = COMMANDED if self.bridge.phase is Phase.ENGAGED else 0.0
-            self._u += min(max(wanted - self._u, -RATE * TICK), RATE * TICK)
+            target = COMMANDED if self.bridge.phase is Phase.ENGAGED else 0.0
+            self._u += min(max(target - self._u, -RATE * TICK), RATE * TICK)
             if self.receives["u"]:
                 self._receive_u("/controller#1", self._u, now_ns)
             if self.receives["conflicting u"]:

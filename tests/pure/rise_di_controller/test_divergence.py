@@ -58,14 +58,14 @@ def flown(
 
     It ends where an oscillation is found.
     """
-    found = divergence.Oscillations(divergence.least(("q",)))
+    oscillations = divergence.Oscillations(divergence.least(("q",)))
     for value in before * noise(1.0, 0.5)[:2000]:
-        found.take(np.array([value]), DT, None)
+        oscillations.take(np.array([value]), DT, None)
     for value in e:
-        found.take(np.array([value]), DT, learned)
-        if found.periods.any():
+        oscillations.take(np.array([value]), DT, learned)
+        if oscillations.periods.any():
             break
-    return found
+    return oscillations
 
 
 @pytest.mark.parametrize("frequency", [0.5, 1.7, 4.6])
@@ -78,10 +78,10 @@ def test_limit_cycle_is_found_with_its_period(frequency: float) -> None:
 def test_limit_cycle_is_found_within_the_record_and_forgotten_by_the_law_of_the_start() -> None:
     e = 0.08 * np.sin(2.0 * np.pi * T)
     assert flown(e[:900]).periods == [0.0]
-    found = flown(e[:1100])
-    assert found.periods == pytest.approx([1.0], rel=0.05)
-    found.take(np.zeros(1), DT, None)
-    assert found.periods == [0.0]
+    oscillations = flown(e[:1100])
+    assert oscillations.periods == pytest.approx([1.0], rel=0.05)
+    oscillations.take(np.zeros(1), DT, None)
+    assert oscillations.periods == [0.0]
 
 
 @pytest.mark.parametrize(

@@ -173,8 +173,8 @@ def assert_no_jumps(records: list[Tick]) -> None:
 
 def engagements(records: list[Tick]) -> list[int]:
     """Numbers of the ticks that re-engaged the law."""
-    engaged = [tick.after.mode is Mode.ENGAGED for tick in records]
-    return [k for k in range(1, len(engaged)) if engaged[k] > engaged[k - 1]]
+    is_engaged = [tick.after.mode is Mode.ENGAGED for tick in records]
+    return [k for k in range(1, len(is_engaged)) if is_engaged[k] > is_engaged[k - 1]]
 
 
 def assert_bumpless_re_engagement(records: list[Tick], modes: set[Mode]) -> None:
@@ -186,17 +186,17 @@ def assert_bumpless_re_engagement(records: list[Tick], modes: set[Mode]) -> None
     slower, is nearer to it. Measured: within 4 mrad/s and 0.43 m/s, after errors of up to 120
     mrad/s and 0.9 m/s at engagement.
     """
-    engaged = engagements(records)
-    assert len(engaged) == 10
-    assert {records[k].before.mode for k in engaged} == modes
+    instants = engagements(records)
+    assert len(instants) == 10
+    assert {records[k].before.mode for k in instants} == modes
     assert_no_jumps(records)
     deviation = np.array(
         [np.abs(tick.error - calm.error) for tick, calm in zip(records, undisturbed(), strict=True)]
     )
     assert (
-        deviation[engaged].max(axis=0) > [0.05, 0.04, 0.03, 0.3]
+        deviation[instants].max(axis=0) > [0.05, 0.04, 0.03, 0.3]
     ).all()  # there is an error to recover from
-    assert (deviation[np.array(engaged) + 100].max(axis=0) < [0.005, 0.005, 0.005, 0.5]).all()
+    assert (deviation[np.array(instants) + 100].max(axis=0) < [0.005, 0.005, 0.005, 0.5]).all()
 
 
 @cache
@@ -216,7 +216,7 @@ def test_loop_equals_simulation_to_last_bit() -> None:
 def test_re_engagement_after_stale_inputs_is_bumpless() -> None:
     # y or y_m is missing for 0.2 to 1.5 s: some gaps end in HOLD, some in RAMP.
     rng = np.random.default_rng(11)
-    lost = {
+    stretches = {
         k: bool(y_lost)
         for begin, length, y_lost in zip(
             instants(1), rng.integers(20, 150, 10), rng.integers(0, 2, 10), strict=True
@@ -224,7 +224,9 @@ def test_re_engagement_after_stale_inputs_is_bumpless() -> None:
         for k in range(begin, begin + int(length))
     }
     records = fly(
-        lambda k: Conditions(y=k not in lost or not lost[k], y_m=k not in lost or lost[k])
+        lambda k: Conditions(
+            y=k not in stretches or not stretches[k], y_m=k not in stretches or stretches[k]
+        )
     )
     assert_bumpless_re_engagement(records, {Mode.HOLD, Mode.RAMP})
 
@@ -234,12 +236,12 @@ def test_re_engagement_after_deactivation_is_bumpless(policy: str) -> None:
     # The controller is inactive for 0.01 to 1.5 s.
     parameters = SERVO.vary(controller={"on_deactivate": policy}).controller
     lengths = np.random.default_rng(12).integers(1, 150, 10)
-    off = {
+    stretches = {
         k
         for begin, length in zip(instants(2), lengths, strict=True)
         for k in range(begin, begin + int(length))
     }
-    records = fly(lambda k: Conditions(active=k not in off, parameters=parameters))
+    records = fly(lambda k: Conditions(active=k not in stretches, parameters=parameters))
     assert_bumpless_re_engagement(records, {Mode.INACTIVE})
 
 
@@ -264,7 +266,7 @@ def test_new_gains_in_flight_are_bumpless(sign: str) -> None:
         lambda k: Conditions(parameters=sets[int(np.searchsorted(changes, k, side="right"))])
     )
     assert engagements(records) == []
-    without = []
+    errors = []
     for k in changes:
         tick = records[k]
         before = records[k - 1].after.law
@@ -272,8 +274,8 @@ def test_new_gains_in_flight_are_bumpless(sign: str) -> None:
         u = control(before, before, tick.old)
         retuned = retune(before, tick.old, tick.new)
         assert (np.abs(control(retuned, retuned, tick.new) - u) <= ROUNDING).all()
-        without.append((np.abs(control(before, before, tick.new) - u) / RANGE).max())
-    assert max(without) > 0.005  # without `retune`, u would jump by more than 0.5 % of its range
+        errors.append((np.abs(control(before, before, tick.new) - u) / RANGE).max())
+    assert max(errors) > 0.005  # without `retune`, u would jump by more than 0.5 % of its range
     assert_no_jumps(records)
     # Measured rms of q, p, r, V: soft 3.6, 2.6, 4.2 mrad/s, 0.10 m/s (3.7, 2.7, 4.2, 0.10 with the
     # same gains throughout), implicit 5.0, 6.9, 8.6, 0.15 (5.2, 6.8, 8.2, 0.14), literal 13, 19,
@@ -310,11 +312,11 @@ def test_engagement_with_error_commands_zero_at_first_tick() -> None:
     # 0.49 deg, 0.8 %; without latching 1.9, 2.4, 5.8 deg and the limit of 50 %. The prototype:
     # 2.55, 2.7, 7.1 deg, 100 %.
     _, u = upset(latched=True)
-    _, without = upset(latched=False)
+    _, without_latch = upset(latched=False)
     assert u[0].tolist() == [0.0] * 4
     assert (np.abs(u[1]) < [0.002, 0.001, 0.01, 0.01]).all()
-    assert (np.abs(without[1]) > 10.0 * np.abs(u[1])).all()
-    assert np.abs(without[1][3]) == LIMITS.upper[3]
+    assert (np.abs(without_latch[1]) > 10.0 * np.abs(u[1])).all()
+    assert np.abs(without_latch[1][3]) == LIMITS.upper[3]
 
 
 def test_latching_e_0_reduces_overshoot_and_peak_command() -> None:
@@ -337,7 +339,7 @@ def test_error_goes_to_zero_with_and_without_latching() -> None:
     # Latching is slower: measured 0.23 s to 5 % of e(0) in q, 0.07 s without. After 6 s at most a
     # hundredth is left.
     e = upset(latched=True)[0]
-    without = upset(latched=False)[0]
+    without_latch = upset(latched=False)[0]
     assert int(np.argmax(np.abs(e[:, 0]) < 0.05 * e[0, 0])) in range(15, 30)
     assert (np.abs(e[-1]) < 0.01 * np.abs(e[0])).all()
-    assert (np.abs(without[-1]) < 0.01 * np.abs(without[0])).all()
+    assert (np.abs(without_latch[-1]) < 0.01 * np.abs(without_latch[0])).all()

@@ -123,12 +123,12 @@ def test_one_tick_gives_the_hand_worked_numbers() -> None:
     # with y_m = t, is 4 (3 t - 1 + exp(-3 t)) / 9 = 0.0181414 then, and Runge-Kutta is within (3
     # t)^5 / 5! of it. In the middle x = (0.05, 0.0090707), so u = (1 - (-0.05 + 2 0.0090707)) / 2 =
     # 0.5159293.
-    state, added = feedforward.step(
+    state, u_ff = feedforward.step(
         feedforward.initial_state(np.zeros(1), BY_HAND), np.array([0.1]), np.array(0.1), BY_HAND
     )
     assert state.x == approx([0.1, 0.0181414], abs=1e-5)
     assert state.u == approx([0.5159293], abs=1e-5)
-    assert added.tolist() == [0.0]
+    assert u_ff.tolist() == [0.0]
 
 
 def test_input_extrapolated_linearly_from_last_two() -> None:
@@ -194,9 +194,9 @@ def short(**changes: Any) -> Scenario:
 
 def both(scenario: Scenario) -> tuple[Scenario, Scenario]:
     """The scenario without feedforward, and with that of its airframe as published."""
-    chosen = with_feedforward(scenario.controller, scenario.aircraft.load()[0])
+    config = with_feedforward(scenario.controller, scenario.aircraft.load()[0])
     return scenario.vary(controller={"feedforward": None}), scenario.vary(
-        controller=chosen.model_dump()
+        controller=config.model_dump()
     )
 
 
@@ -227,12 +227,12 @@ def ticks(
 def test_engagement_and_re_engagement_during_manoeuvre_bumpless() -> None:
     states = ticks(small_aircraft(), reference, missing=(0.8, 1.2))
     modes = [state.mode for state in states]
-    engaged = [0, modes.index(Mode.ENGAGED, modes.index(Mode.HOLD))]
-    assert engaged[1] == 70
+    ticks_of_engagement = [0, modes.index(Mode.ENGAGED, modes.index(Mode.HOLD))]
+    assert ticks_of_engagement[1] == 70
     # With y = y_m the law is at rest, so u changes by the feedforward only, by 0.04 to 0.07 per
     # tick. The whole u_ff would be a jump of 0.8 at the first engagement and of 4.6 at the second.
     nominal = nominal_of(small_aircraft())
-    for first in engaged:
+    for first in ticks_of_engagement:
         u = np.array([state.u for state in states[first : first + 20]])
         assert (u[:3] == u[0]).all()  # two ticks determine the slope and add nothing
         assert 0.005 < np.abs(np.diff(u[2:], axis=0)).max() < 0.1
@@ -303,16 +303,16 @@ def test_feedforward_lowers_needed_beta() -> None:
     # aileron and rudder; the test allows half.
     airframe = load_airframe("osprey")
     study = study_airframe(airframe, manoeuvre(short(), airframe)._replace(gusts={}), 0.3, 20)
-    whole = np.abs(study.u_dot[:, 1:]).max(axis=0)
-    left = np.abs(study.u_dot[:, 1:] - study.u_dot[:, :1]).max(axis=0)
-    assert (left.mean(axis=0) < 0.5 * whole.mean(axis=0)).all()
+    rates = np.abs(study.u_dot[:, 1:]).max(axis=0)
+    remainder = np.abs(study.u_dot[:, 1:] - study.u_dot[:, :1]).max(axis=0)
+    assert (remainder.mean(axis=0) < 0.5 * rates.mean(axis=0)).all()
 
 
 def test_feedforward_reduces_error_of_nominal_osprey_with_servos() -> None:
     # Measured in units of a score: 1.98 -> 0.22 in calm air, where noise remains. The margin is
     # half of the improvement.
     errors = [error(simulate(scenario)).values for scenario in both(short(aircraft={"gusts": {}}))]
-    without, with_it = (
+    error_without, with_it = (
         float(np.sqrt(np.mean(e**2, axis=0)) @ [100.0, 10.0, 50.0, 100.0]) for e in errors
     )
-    assert with_it < 0.55 * without
+    assert with_it < 0.55 * error_without

@@ -160,8 +160,8 @@ def test_new_sample_is_step_of_law() -> None:
 @pytest.mark.parametrize("gap_ms, dt_ms", [(1, 2), (25, 25), (80, 80), (110, 110), (111, 0)])
 def test_dt_is_the_time_that_passed_or_the_law_engages_again(gap_ms: int, dt_ms: int) -> None:
     """At least a fifth of the period of 10 ms, at most the age limit of 100 ms and a period."""
-    (engaged,) = run((0, sample(0, 1.0), [sample(0)]))
-    _, inputs = tick(engaged, gap_ms, sample(gap_ms, 1.0), [sample(gap_ms)])
+    (state,) = run((0, sample(0, 1.0), [sample(0)]))
+    _, inputs = tick(state, gap_ms, sample(gap_ms, 1.0), [sample(gap_ms)])
     assert inputs is not None
     assert inputs.dt == approx(dt_ms / 1000)
 
@@ -196,11 +196,11 @@ def test_failsafe_holds_ramps_and_re_engages(osprey_gust: Scenario) -> None:
     )
     modes = " ".join(state.mode.name for state in states)
     assert modes == "ENGAGED ENGAGED HOLD HOLD RAMP ENGAGED ENGAGED HOLD TRIM"
-    held = states[1].u
-    assert (held != 0).all()
-    assert (states[3].u == held).all()
+    u = states[1].u
+    assert (u != 0).all()
+    assert (states[3].u == u).all()
     assert states[3].law is states[1].law  # nothing is integrated
-    assert states[4].u == approx(0.5 * held)
+    assert states[4].u == approx(0.5 * u)
     assert (states[5].u == states[4].u).all()  # bumpless re-engagement
     assert (states[5].u_trim == states[4].u).all()
     law_state = states[5].law
@@ -279,19 +279,19 @@ def test_saturation_leaves_input_inside_limits(
 ) -> None:
     limits = limits_of(bound, rate)
     before = np.clip(before, -bound, bound)
-    limited = saturate(u, before, np.array(0.01), limits)
-    assert (np.abs(limited) <= bound).all()
-    assert (np.abs(limited - before) <= rate * 0.01 + 1e-12).all()
+    saturated = saturate(u, before, np.array(0.01), limits)
+    assert (np.abs(saturated) <= bound).all()
+    assert (np.abs(saturated - before) <= rate * 0.01 + 1e-12).all()
     inside = (np.abs(u) <= bound) & (np.abs(u - before) <= rate * 0.01)
-    assert (limited[inside] == u[inside]).all()
+    assert (saturated[inside] == u[inside]).all()
 
 
 def test_saturation_moves_to_new_limits_at_rate() -> None:
     """Without a limit of the rate u is inside at once."""
     u = np.array([5.0, -5.0])
     before = np.array([3.0, -3.0])
-    for rate, limited in ((10.0, [2.9, -2.9]), (1000.0, [1.0, -1.0]), (np.inf, [1.0, -1.0])):
-        assert saturate(u, before, np.array(0.01), limits_of(1.0, rate)).tolist() == limited
+    for rate, expected in ((10.0, [2.9, -2.9]), (1000.0, [1.0, -1.0]), (np.inf, [1.0, -1.0])):
+        assert saturate(u, before, np.array(0.01), limits_of(1.0, rate)).tolist() == expected
 
 
 @given(state=STATES, y=PAIRS, trim=PAIRS)
@@ -304,10 +304,10 @@ def test_integrals_stop_only_in_direction_that_worsens_saturation(
     dt = np.array(0.01)
     free, u = step(state, y, zero, dt, TWO)
     limited_state, _, _ = step_with_anti_windup(state, y, zero, dt, trim, zero, TWO, limits)
-    beyond = trim + u - saturate(trim + u, zero, dt, limits)
-    outward = -TWO.D * (free.integral_e - state.integral_e) * beyond > 0
+    excess = trim + u - saturate(trim + u, zero, dt, limits)
+    outward = -TWO.D * (free.integral_e - state.integral_e) * excess > 0
     assert (limited_state.integral_e == np.where(outward, state.integral_e, free.integral_e)).all()
-    outward = -TWO.D * (free.Pi - state.Pi) * beyond > 0
+    outward = -TWO.D * (free.Pi - state.Pi) * excess > 0
     assert (limited_state.Pi[~outward] == free.Pi[~outward]).all()
     assert (np.minimum(state.Pi, free.Pi) - 1e-9 <= limited_state.Pi).all()
     assert (limited_state.Pi <= np.maximum(state.Pi, free.Pi) + 1e-9).all()

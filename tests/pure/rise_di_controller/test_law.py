@@ -176,5 +176,5 @@ def test_outward_increment_is_reduced_by_what_is_beyond(
     It is a part where change and beyond have one sign.
     """
     values = (np.array([value]) for value in (before, after, change, beyond))
-    limited = limited_integral(*values)
-    assert limited[0] == (approx(expected, rel=1e-12) if change * beyond > 0 else expected)
+    integral = limited_integral(*values)
+    assert integral[0] == (approx(expected, rel=1e-12) if change * beyond > 0 else expected)

@@ -56,7 +56,7 @@ def by_hand(state: ControllerState, y: FloatArray, lost: int, predicted: int) ->
     y_m = y_m_at(LAST + lost + 1)
     dt = np.float64((lost + 1) * 0.01)
     zero = np.zeros(4)
-    held = Measurements(
+    at_last_y = Measurements(
         y=state.y.value,
         y_m=state.y_m,
         y_m_dot=zero,
@@ -65,13 +65,13 @@ def by_hand(state: ControllerState, y: FloatArray, lost: int, predicted: int) ->
     )
     law_state = state.law
     for _ in range(predicted):
-        law_state = law.control_law.missed(law_state, held, law.params)
+        law_state = law.control_law.missed(law_state, at_last_y, law.params)
     _, u_ff = feedforward.step(state.feedforward, y_m, dt, guard.nominal)
     u_trim = state.u_trim + u_ff
-    measured = Measurements(
+    measurements = Measurements(
         y=y, y_m=y_m, y_m_dot=(y_m - state.y_m) / dt, u_trim=u_trim, u_before=state.u
     )
-    after, _, u, _ = law_within_limits(law_state, measured, dt, law, guard, None)
+    after, _, u, _ = law_within_limits(law_state, measurements, dt, law, guard, None)
     return state._replace(law=after, u=u)
 
 
@@ -86,8 +86,8 @@ def test_law_predicts_over_every_lost_period(lost: int) -> None:
     assert after.law.z == pytest.approx(expected.law.z, rel=1e-12)
     assert after.u == pytest.approx(expected.u, rel=1e-12)
     for wrong in {max(lost - 1, 0), lost + 1} - {lost}:
-        other = by_hand(before, y, lost, wrong)
-        assert np.abs(other.law.z - after.law.z).max() > 1e-6
+        state = by_hand(before, y, lost, wrong)
+        assert np.abs(state.law.z - after.law.z).max() > 1e-6
 
 
 def test_prediction_keeps_the_estimates_of_a_motion_that_is_lost() -> None:
@@ -95,16 +95,16 @@ def test_prediction_keeps_the_estimates_of_a_motion_that_is_lost() -> None:
 
     After ten lost samples they are nearer to those without a loss than estimates that stood still.
     """
-    lost = 9
-    before, after, y = flown(lost)
+    count = 9
+    before, after, y = flown(count)
     controller = Controller(OBSERVER)
-    for k in range(1, LAST + lost + 2):
+    for k in range(1, LAST + count + 2):
         now_ns = k * PERIOD_NS
         controller.take_y_m(StampedVector(now_ns, y_m_at(k)), now_ns)
-        controller.take_y(StampedVector(now_ns, samples(LAST + lost + 2)[k]), now_ns)
+        controller.take_y(StampedVector(now_ns, samples(LAST + count + 2)[k]), now_ns)
         controller.tick(now_ns)
     complete = controller.state.law.z
-    still = by_hand(before, y, lost, 0).law.z
+    still = by_hand(before, y, count, 0).law.z
     hidden = slice(4, None)  # states that y does not correct at once
     assert (
         np.abs(after.law.z[hidden] - complete[hidden]).sum()

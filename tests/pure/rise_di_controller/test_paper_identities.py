@@ -205,14 +205,14 @@ class Loop:
         term is -M C A_m x_mu_dot.
         """
         p = self.p
-        shown = np.linalg.pinv(p.C) @ p.C
+        projection = np.linalg.pinv(p.C) @ p.C
         x_dot = self.x_dot(t)
         x_m_dot = self.x_m_dot(t)
-        x_mo_dot = shown @ x_m_dot
-        steady = p.C @ p.A @ (x_mo_dot + x_dot - shown @ x_dot) + p.C @ self.f_dot(t)
+        x_mo_dot = projection @ x_m_dot
+        steady = p.C @ p.A @ (x_mo_dot + x_dot - projection @ x_dot) + p.C @ self.f_dot(t)
         N_d = self.M @ (steady - p.C @ p.A_m @ x_mo_dot - p.C @ p.B_m @ p.u_m_dot(t))
         N_tilde = self.M @ (
-            p.C @ p.A @ (shown @ x_dot - x_mo_dot) + p.Lambda * self.e_dot(t)
+            p.C @ p.A @ (projection @ x_dot - x_mo_dot) + p.Lambda * self.e_dot(t)
         ) + self.e(t)
         return N_d, N_tilde, -self.M @ p.C @ p.A_m @ (x_m_dot - x_mo_dot)
 
@@ -298,11 +298,11 @@ def test_r_of_10_is_r_of_4(loop: Loop) -> None:
     p = loop.p
     for t in INSTANTS:
         x, x_m, _, _ = loop.unpack(t)
-        driven = (p.S * p.D) @ p.U @ loop.u(t)  # Omega u, Omega = S D U (11)
+        effect = (p.S * p.D) @ p.U @ loop.u(t)  # Omega u, Omega = S D U (11)
         r = (
             p.C @ p.A @ x
             + p.C @ p.f(t, x)
-            + driven
+            + effect
             - p.C @ (p.A_m @ x_m + p.B_m @ p.u_m(t))
             + p.Lambda * loop.e(t)
         )
@@ -650,8 +650,8 @@ def test_classical_condition_replaces_lemma_1() -> None:
     plant = case.plant._replace(B=np.vstack([S * D, 0.1 * np.eye(2)]))
     params = case.params._replace(beta=np.array([6.0, 6.0]))
     signals = evidence(plant, fly_known_plant(plant, case.y_m, 0.005, params, case.x_0), params)
-    settled = signals.t > 0.02  # the ends of a second difference have a lower order
-    N_d_dot = np.gradient(signals.N_d[settled], signals.t[settled], axis=0)
+    later = signals.t > 0.02  # the ends of a second difference have a lower order
+    N_d_dot = np.gradient(signals.N_d[later], signals.t[later], axis=0)
     required = (
         np.max(np.abs(signals.N_d), axis=0)
         + np.percentile(np.abs(N_d_dot), 99, axis=0) / params.Lambda
@@ -782,10 +782,10 @@ def test_bound_7_fails_in_gust() -> None:
     aircraft = osprey(gust=10.12)
     C = aircraft.C
     B = aircraft.B
-    held = np.eye(8) - B @ np.linalg.solve(C @ B, C)
+    projection = np.eye(8) - B @ np.linalg.solve(C @ B, C)
 
     def x_dot(t: float, x: FloatArray) -> FloatArray:
-        return np.asarray(held @ (aircraft.A @ x + dynamics.f(t, x, aircraft)))
+        return np.asarray(projection @ (aircraft.A @ x + dynamics.f(t, x, aircraft)))
 
     x = solve_ivp(x_dot, (0.0, 2.0), np.zeros(8), max_step=0.005, rtol=1e-8, atol=1e-10).y
     assert np.max(np.abs(C @ x)) < 1e-9

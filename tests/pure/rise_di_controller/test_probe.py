@@ -51,8 +51,8 @@ def alarms(tape: Tape) -> list[tuple[float, str]]:
     """(t, sentence) of each test that finds an input without effect."""
     effects = tape["effects"]
     sentences = (without_effect(effects.names, row) for row in effects.values.tolist())
-    told = zip(tape.time("effects").tolist(), sentences, strict=True)
-    return [(t, sentence) for t, sentence in told if sentence]
+    rows = zip(tape.time("effects").tolist(), sentences, strict=True)
+    return [(t, sentence) for t, sentence in rows if sentence]
 
 
 @pytest.mark.parametrize("surface", SURFACES)
@@ -100,12 +100,12 @@ def test_engagement_begins_at_the_u_of_before() -> None:
     u = tape["internals"]
     first = u.values[:2, [u.names.index(f"u.{name}") for name in SURFACES]]
     alone = simulate(probed(0.05).vary(controller=with_probe(effect=(1e-9, 0.0, 0.0, 0.0))))
-    other = alone["internals"]
-    without = other.values[:2, [other.names.index(f"u.{name}") for name in SURFACES]]
+    log = alone["internals"]
+    amplitudes = log.values[:2, [log.names.index(f"u.{name}") for name in SURFACES]]
     probe = probed(20.0).controller.guard().probe
     assert probe is not None
     omega = 2.0 * np.pi * probe.harmonic / WINDOW
-    assert (np.abs(first - without) <= 1.01 * (probe.amplitude * omega)[:3] * 0.01).all()
+    assert (np.abs(first - amplitudes) <= 1.01 * (probe.amplitude * omega)[:3] * 0.01).all()
 
 
 def test_false_alarms_are_no_more_than_stated() -> None:

@@ -109,20 +109,20 @@ def test_proposal_flies_after_certificate_in_parts() -> None:
 
 
 def test_part_that_is_learned_later_gets_its_feedforward() -> None:
-    whole = RiseDiConfig.validate_mapping(START.changed(CHANGE), "whole")
+    parameters = RiseDiConfig.validate_mapping(START.changed(CHANGE), "whole")
     lateral = RiseDiConfig.validate_mapping(
-        whole.changed({"feedforward.inputs": ["aileron", "rudder"]}), "lateral"
+        parameters.changed({"feedforward.inputs": ["aileron", "rudder"]}), "lateral"
     )
     flight = Flight()
-    acting = []
-    for model in (lateral, whole):
+    inputs = []
+    for model in (lateral, parameters):
         flight.receive(designed(START, model))
         flight.step()
         flight.now_ns += 10 * NANOSECONDS
         flown = flight.controller.parameters.feedforward
         assert flown is not None
-        acting.append(flown.inputs)
-    assert acting == [("aileron", "rudder"), None]
+        inputs.append(flown.inputs)
+    assert inputs == [("aileron", "rudder"), None]
 
 
 def test_authority_is_what_the_model_leaves_at_its_lower_bound() -> None:
@@ -137,21 +137,21 @@ def test_authority_is_what_the_model_leaves_at_its_lower_bound() -> None:
         CHANGE | {"feedforward.deviation": [0.05 * abs(value) for value in CHANGE["feedforward.B"]]}
     )
     flight.step()
-    flown = flight.controller.parameters
-    assert isinstance(flown, RiseDiConfig)
+    parameters = flight.controller.parameters
+    assert isinstance(parameters, RiseDiConfig)
     # of the file: 0.98 / s^2 per deg and 30 deg, 0.06 m/s^2 per % and 50 %. Twice 5 % less are 10 %
     # to first order
-    assert of(flown)["up.q"] == approx(0.9 * 0.98 * 30.0, rel=0.01)
-    assert of(flown)["down.V"] == approx(0.9 * 0.06 * 50.0, rel=0.01)
+    assert of(parameters)["up.q"] == approx(0.9 * 0.98 * 30.0, rel=0.01)
+    assert of(parameters)["down.V"] == approx(0.9 * 0.06 * 50.0, rel=0.01)
     np.testing.assert_array_equal(
-        flight.learning.authority(flight.controller), authority(flown, START)
+        flight.learning.authority(flight.controller), authority(parameters, START)
     )
     # of aileron, rudder
-    without = with_channels_of(
-        START, flown, [False, True, True, False], [False, True, False, False]
+    mixed = with_channels_of(
+        START, parameters, [False, True, True, False], [False, True, False, False]
     )
-    assert [of(without)[name] for name in ("down.p", "up.p", "up.r")] == [0.0, 0.0, UNKNOWN]
-    assert of(without)["up.q"] == of(flown)["up.q"]
+    assert [of(mixed)[name] for name in ("down.p", "up.p", "up.r")] == [0.0, 0.0, UNKNOWN]
+    assert of(mixed)["up.q"] == of(parameters)["up.q"]
 
 
 def scaled(name: str, factor: float) -> dict[str, Any]:
@@ -227,24 +227,25 @@ def test_input_without_effect_is_held_though_the_law_fell_back_meanwhile(
     flight = Flight()
     flight.receive()
     flight.step()
-    beside = flight.controller.parameters
-    assert isinstance(beside, RiseDiConfig)
+    parameters = flight.controller.parameters
+    assert isinstance(parameters, RiseDiConfig)
     flight.now_ns += 10 * NANOSECONDS
     monkeypatch.setattr(flight.controller, "diverging", lambda: ("q",))
     flight.step(1)
     monkeypatch.undo()
     assert flight.controller.digest == START.digest()
     of_q = [name in {"elevator", "thrust"} for name in START.inputs]
-    held = designed(
-        START, with_channels_of(START, beside, of_q, [name == "elevator" for name in START.inputs])
+    change = designed(
+        START,
+        with_channels_of(START, parameters, of_q, [name == "elevator" for name in START.inputs]),
     )
-    flight.receive(flown=beside.digest())  # a model alone: the law fell back because of one
-    flight.receive(held, flown=beside.digest() + 1)
+    flight.receive(flown=parameters.digest())  # a model alone: the law fell back because of one
+    flight.receive(change, flown=parameters.digest() + 1)
     assert [sentence.endswith("they changed meanwhile") for sentence in flight.sentences[-2:]] == [
         True,
         True,
     ]
-    flight.receive(held, flown=beside.digest())
+    flight.receive(change, flown=parameters.digest())
     flight.step()
     assert flight.sentences[-1] == "flies model"
     assert acting_inputs(flight.controller.parameters) == ("aileron", "rudder")  # type: ignore[arg-type]
@@ -380,21 +381,21 @@ def test_part_that_oscillates_flies_the_law_of_the_start_to_the_end_of_the_engag
     flight = Flight()
     flight.receive()
     flight.step()
-    whole = flight.controller.parameters
+    parameters = flight.controller.parameters
     monkeypatch.setattr(flight.controller, "oscillations", lambda: {"q": 0.25})
     flight.step(1)
     monkeypatch.undo()
     fallen = flight.controller.parameters
-    assert isinstance(whole, RiseDiConfig)
+    assert isinstance(parameters, RiseDiConfig)
     assert isinstance(fallen, RiseDiConfig)
     longitudinal = [name in {"q", "V"} for name in START.outputs]
-    assert fallen == without_models(START, whole, ["q", "V"])
+    assert fallen == without_models(START, parameters, ["q", "V"])
     assert outputs_without(fallen) == ("q", "V")
     flight.now_ns += 10_000_000
     logged = dict(zip(flight.controller.names, flight.engage().internals.tolist(), strict=True))
     assert [logged[f"given_up.{name}"] for name in ("q", "V", "p", "r")] == [1.0, 1.0, 0.0, 0.0]
     assert outputs_without(without_models(START, fallen, ["r", "p"])) == START.outputs
-    assert changes(fallen, fallen_back(START, whole, longitudinal)) == {"learn.without": None}
+    assert changes(fallen, fallen_back(START, parameters, longitudinal)) == {"learn.without": None}
     assert acting_inputs(fallen) == ("aileron", "rudder")
     flight.now_ns += 10 * NANOSECONDS
     # all parts, as of a learner that was started again
@@ -424,25 +425,25 @@ def test_part_that_oscillates_flies_the_law_of_the_start_to_the_end_of_the_engag
 
 
 def test_law_of_the_start_flies_where_all_parts_oscillate() -> None:
-    whole = RiseDiConfig.validate_mapping(START.changed(CHANGE), "whole")
-    assert fallen_back(START, whole, [True] * 4) == START
+    parameters = RiseDiConfig.validate_mapping(START.changed(CHANGE), "whole")
+    assert fallen_back(START, parameters, [True] * 4) == START
     assert fallen_back(START, START, [True, False, False, False]) == START
     flight = Flight()
-    flight.controller.retune(without_models(START, whole, START.outputs))
+    flight.controller.retune(without_models(START, parameters, START.outputs))
     flight.receive()
     flight.step()
-    refused = (
+    sentence = (
         "refused: proposal: found no model, expected one of other outputs than q, p, r, "
         "V, by learn.without"
     )
-    assert flight.sentences == [refused]
+    assert flight.sentences == [sentence]
     flight.now_ns += 10 * NANOSECONDS
     flight.receive({}, sentence="")  # nothing to say
-    assert flight.sentences == [refused]
+    assert flight.sentences == [sentence]
     flight.controller.tick(flight.now_ns + NANOSECONDS, active=False)
     flight.step(1)
     assert flight.controller.parameters == START
-    assert coupled(whole, ["r"]) == [name in {"p", "r"} for name in START.outputs]
+    assert coupled(parameters, ["r"]) == [name in {"p", "r"} for name in START.outputs]
 
 
 def diverge(flight: Flight, monkeypatch: pytest.MonkeyPatch, *outputs: str) -> None:
@@ -557,13 +558,15 @@ def test_authority_towards_each_limit_is_that_of_the_limit(sign: float) -> None:
 
     Its effect B is 56.15 / s^2.
     """
-    whole = RiseDiConfig.validate_mapping(START.changed(CHANGE), "whole")
-    assert whole.feedforward is not None
-    B = tuple(sign * value for value in whole.feedforward.B)
-    model = whole.feedforward.model_copy(update={"B": B, "deviation": None})
+    parameters = RiseDiConfig.validate_mapping(START.changed(CHANGE), "whole")
+    assert parameters.feedforward is not None
+    B = tuple(sign * value for value in parameters.feedforward.B)
+    model = parameters.feedforward.model_copy(update={"B": B, "deviation": None})
     limits = {"lower": (-0.1, -0.2, -0.3, -0.1), "upper": (0.4, 0.5, 0.6, 0.7)}
-    flown = whole.model_copy(update=limits | {"feedforward": model})
-    least = dict(zip(authority_names(START.outputs), authority(flown, START).tolist(), strict=True))
+    config = parameters.model_copy(update=limits | {"feedforward": model})
+    least = dict(
+        zip(authority_names(START.outputs), authority(config, START).tolist(), strict=True)
+    )
     lower, upper = ("down", "up") if sign > 0.0 else ("up", "down")
     assert least[f"{lower}.q"] == approx(56.1499 * 0.1)
     assert least[f"{upper}.q"] == approx(56.1499 * 0.4)

@@ -45,10 +45,10 @@ def take(controller: Controller, value: FloatArray, stamp_ns: int, now_ns: int) 
 def step(controller: Controller, value: FloatArray | None, k: int) -> str:
     """A tick with a y, or with none, and y_m of 0; why y is not taken."""
     now_ns = k * PERIOD_NS
-    lost = "" if value is None else take(controller, value, now_ns, now_ns)
+    reason = "" if value is None else take(controller, value, now_ns, now_ns)
     controller.take_y_m(StampedVector(now_ns, ZERO), now_ns)
     controller.tick(now_ns)
-    return lost
+    return reason
 
 
 # A sample that comes again
@@ -103,8 +103,8 @@ def test_sample_from_the_future_does_not_keep_later_ones_out() -> None:
 def garbage(kind: str, k: int, rng: np.random.Generator) -> FloatArray:
     """What a gyro that starts adds to q at the sample k."""
     size = {"one": 20.0 * (k == 60), "all": rng.uniform(-20.0, 20.0), "ramp": 0.3 * k}[kind]
-    added: FloatArray = size * np.eye(4)[0] * (k < 100)
-    return added
+    noise: FloatArray = size * np.eye(4)[0] * (k < 100)
+    return noise
 
 
 @pytest.mark.parametrize("kind", ["one", "all", "ramp"])
@@ -158,8 +158,8 @@ def test_knock_opens_the_test_of_jumps_for_less_than_a_minute(after: float, take
     last = 500 + round(100 * after)
     for k in range(501, last):
         assert step(controller, next(calm), k) == ""
-    lost = step(controller, next(calm) + 2.0 * q, last)
-    assert (lost == "") is taken
+    reason = step(controller, next(calm) + 2.0 * q, last)
+    assert (reason == "") is taken
 
 
 # Gaps
@@ -169,8 +169,8 @@ def at_rate(rate: float) -> ControllerConfig:
     """The controller of osprey_turbulence with its feedforward, without an observer."""
     section = find_scenario("osprey_turbulence").controller.model_dump()
     left_out = ("observer", "schedule", "learn")
-    kept = {name: value for name, value in section.items() if name not in left_out}
-    return AnyLaw.validate_mapping(kept | {"rate": rate, "max_age": 0.1}, "controller")
+    values = {name: value for name, value in section.items() if name not in left_out}
+    return AnyLaw.validate_mapping(values | {"rate": rate, "max_age": 0.1}, "controller")
 
 
 GAP = 0.09  # s
@@ -262,19 +262,19 @@ def test_y_that_stands_still_is_lost_and_the_failsafe_begins() -> None:
     """As a frozen pose: five periods, and from then on no sample, until a value changes."""
     controller = Controller(SERVO)
     last = moving(controller, 150)
-    lost = still(controller, 40, 151, last)
-    assert lost[: STILL - 1] == [""] * (STILL - 1)
-    assert all(lost[STILL - 1 :])
-    assert lost[STILL - 1] == (
+    reason = still(controller, 40, 151, last)
+    assert reason[: STILL - 1] == [""] * (STILL - 1)
+    assert all(reason[STILL - 1 :])
+    assert reason[STILL - 1] == (
         "y: found every value as before for 0.05 s, expected an aircraft that moves"
     )
     modes = [controller.mode]
-    changed = last + np.array([1e-12, 0.0, 0.0, 0.0])
-    assert step(controller, changed, 191) == ""
+    y = last + np.array([1e-12, 0.0, 0.0, 0.0])
+    assert step(controller, y, 191) == ""
     modes.append(controller.mode)
     assert modes in ([Mode.HOLD, Mode.ENGAGED], [Mode.RAMP, Mode.ENGAGED])
     # again at once: what has been seen is not forgotten
-    assert any(still(controller, 10, 192, changed))
+    assert any(still(controller, 10, 192, y))
 
 
 @pytest.mark.parametrize("count", [1, MOVING])
@@ -331,15 +331,15 @@ def test_frozen_y_in_flight_is_told_and_replayed_to_the_bit() -> None:
             if now_ns >= 5_000 * MS:
                 self.kept = sample.value if self.kept is None else self.kept
                 sample = sample._replace(value=self.kept)
-            lost = super().take_y(sample, now_ns)
-            if lost:
-                sentences.append(lost)
-            return lost
+            reason = super().take_y(sample, now_ns)
+            if reason:
+                sentences.append(reason)
+            return reason
 
     tape = simulate(scenario, control=Frozen)
     ticks = tape["internals"]
-    left = tape.time("internals")[ticks["mode"] != Mode.ENGAGED]
-    assert left[0] == approx(5.15, abs=0.011)
+    instants = tape.time("internals")[ticks["mode"] != Mode.ENGAGED]
+    assert instants[0] == approx(5.15, abs=0.011)
     assert "every value as before" in sentences[0]
     # the topic has what the controller received
     y = tape["y"]
@@ -355,13 +355,13 @@ def test_healthy_flights_have_no_frozen_y(name: str) -> None:
     """Without noise too, in trim before the first command and long after the last."""
     scenario = find_scenario(name, 20.0)
     quiet: dict[str, Any] = {"sensors": {}}
-    lost: list[str] = []
+    reasons: list[str] = []
 
     class Listening(Controller):
         def take_y(self, sample: StampedVector, now_ns: int) -> str:
-            lost.append(super().take_y(sample, now_ns))
-            return lost[-1]
+            reasons.append(super().take_y(sample, now_ns))
+            return reasons[-1]
 
     for flight in (scenario, scenario.vary(aircraft=quiet)):
         simulate(flight, control=Listening)
-    assert not any(lost)
+    assert not any(reasons)

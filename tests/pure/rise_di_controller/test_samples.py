@@ -48,16 +48,16 @@ def flown(
     """
     u = []
     modes = []
-    lost = []
+    reasons = []
     for k, value in enumerate(y, first):
         now_ns = k * PERIOD_NS
         if value is not None:
-            lost.append(controller.take_y(StampedVector(now_ns, value), now_ns))
+            reasons.append(controller.take_y(StampedVector(now_ns, value), now_ns))
         controller.take_y_m(StampedVector(now_ns, np.zeros(4)), now_ns)
         controller.tick(now_ns)
         u.append(controller.state.u)
         modes.append(controller.mode)
-    return np.array(u), modes, [sentence for sentence in lost if sentence]
+    return np.array(u), modes, [sentence for sentence in reasons if sentence]
 
 
 @cache
@@ -83,11 +83,11 @@ def test_wrong_sample_is_as_one_that_did_not_arrive(
     unit = np.array([1.0, 1.0, 1.0, 10.0])
     y = noisy(SPIKE + 60)
     y[SPIKE, channel] += size * unit[channel]
-    u, modes, lost = flown(Controller(config), y)
+    u, modes, reasons = flown(Controller(config), y)
     assert u.tobytes() == without_sample(observed).tobytes()
     assert set(modes) == {Mode.ENGAGED}
-    assert len(lost) == 1
-    assert config.outputs[channel] in lost[0]
+    assert len(reasons) == 1
+    assert config.outputs[channel] in reasons[0]
 
 
 @pytest.mark.parametrize("channel, bound", [(0, 34.9066), (3, 340.0)])
@@ -128,8 +128,8 @@ def test_jump_that_stays_is_taken_at_its_third_sample() -> None:
     controller = Controller(OBSERVER)
     before, _, _ = flown(controller, noisy(SPIKE))
     y = noisy(3, 2) + np.array([0.0, 3.0, 0.0, 0.0])
-    u, modes, lost = flown(controller, y, SPIKE)
-    assert len(lost) == 2
+    u, modes, reasons = flown(controller, y, SPIKE)
+    assert len(reasons) == 2
     assert (u == before[-1]).all()
     assert set(modes) == {Mode.ENGAGED}
     assert "and stays there" in controller.restarted()
@@ -137,8 +137,8 @@ def test_jump_that_stays_is_taken_at_its_third_sample() -> None:
     params = OBSERVER.tuned_law().params
     assert controller.state.law.z == pytest.approx(initial_estimates(y[-1], params), rel=1e-12)
     assert not controller.state.law.u_o.any()
-    _, _, lost = flown(controller, noisy(100, 3) + np.array([0.0, 3.0, 0.0, 0.0]), SPIKE + 3)
-    assert not lost
+    _, _, reasons = flown(controller, noisy(100, 3) + np.array([0.0, 3.0, 0.0, 0.0]), SPIKE + 3)
+    assert not reasons
 
 
 def test_samples_that_disagree_are_all_lost() -> None:
@@ -149,8 +149,8 @@ def test_samples_that_disagree_are_all_lost() -> None:
     controller = Controller(SERVO)
     flown(controller, noisy(SPIKE))
     garbage = 30.0 * np.where(np.arange(9)[:, None] % 2, 1.0, -1.0) * np.ones(4)
-    _, modes, lost = flown(controller, garbage, SPIKE)
-    assert len(lost) == len(garbage)
+    _, modes, reasons = flown(controller, garbage, SPIKE)
+    assert len(reasons) == len(garbage)
     assert modes == [Mode.ENGAGED] * 9  # within the age limit of 0.1 s
     quiet: list[FloatArray | None] = [None] * 10
     _, modes, _ = flown(controller, quiet, SPIKE + 9)
@@ -167,8 +167,8 @@ def test_samples_that_never_agree_are_taken_again() -> None:
     controller = Controller(SERVO)
     flown(controller, noisy(SPIKE))
     loud = noisy(100, 3) + 2.0 * np.where(np.arange(100)[:, None] % 2, 1.0, -1.0) * np.eye(4)[0]
-    _, modes, lost = flown(controller, loud, SPIKE)
-    assert 0 < len(lost) < 10
+    _, modes, reasons = flown(controller, loud, SPIKE)
+    assert 0 < len(reasons) < 10
     assert set(modes) == {Mode.ENGAGED}
 
 
@@ -178,9 +178,9 @@ def test_abrupt_motion_within_the_power_of_the_inputs_is_taken() -> None:
     limit = float(SERVO.guard().limits.upper[0]) / SERVO.input_scale[0] / 100.0
     assert limit == pytest.approx(0.29, abs=0.01)
     calm = np.zeros((SPIKE, 4))
-    moving = np.cumsum(np.full((5, 1), limit), axis=0) * np.eye(4)[0]
-    _, _, lost = flown(controller, [*calm, *moving])
-    assert not lost
+    ramp = np.cumsum(np.full((5, 1), limit), axis=0) * np.eye(4)[0]
+    _, _, reasons = flown(controller, [*calm, *ramp])
+    assert not reasons
 
 
 @pytest.mark.slow
@@ -212,8 +212,8 @@ def test_reading_beyond_half_a_turn_is_that_of_the_tick_before(reading: float) -
     y[SPIKE, 4:] = readings[SPIKE - 1]
     u, modes, _ = flown(Controller(config), y)
     y[SPIKE, 4:] = reading
-    after, _, lost = flown(Controller(config), y)
-    assert not lost
+    after, _, reasons = flown(Controller(config), y)
+    assert not reasons
     assert set(modes) == {Mode.ENGAGED}
     assert after.tobytes() == u.tobytes()
 

@@ -98,8 +98,8 @@ def test_change_of_scale_leaves_u_as_it_is() -> None:
     at_once = params._replace(time=np.float64(1e-9))
     y[3] += FASTER
     # the reference moved too: the same error
-    moved = Measurements(y=y, y_m=y_at(FASTER), y_m_dot=zero, u_trim=zero, u_before=zero)
-    state, after = control_law.step(state, moved, instant, at_once)
+    measurements = Measurements(y=y, y_m=y_at(FASTER), y_m_dot=zero, u_trim=zero, u_before=zero)
+    state, after = control_law.step(state, measurements, instant, at_once)
     assert state.scale[0] == approx((SPEED / (SPEED + y[3])) ** 2)
     assert after == approx(u, rel=1e-6)
 
@@ -140,7 +140,7 @@ def test_model_of_trim_beside_schedule_refused(name: str) -> None:
 def test_schedule_of_airspeed_alone_refused() -> None:
     """The factor of channel V is 1: nothing would follow the schedule."""
     values = flight(schedule=True, delay=0.0, duration=1.0).controller.model_dump()
-    alone = C172P.controller.outputs.index("V")
+    place = C172P.controller.outputs.index("V")
     for key in (
         "outputs",
         "inputs",
@@ -153,7 +153,7 @@ def test_schedule_of_airspeed_alone_refused() -> None:
         "lower",
         "upper",
     ):
-        values[key] = values[key][alone : alone + 1]
+        values[key] = values[key][place : place + 1]
     for key in ("k_d", "slew", "allocation"):
         values[key] = () if key == "k_d" else None
     with refusing(r"schedule: found the outputs V, expected V among them, and one that follows V"):

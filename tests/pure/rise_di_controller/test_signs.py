@@ -45,8 +45,8 @@ def trailing_edge_down(scenario: Scenario, folder: Path) -> Scenario:
 
 def first(t: FloatArray, values: FloatArray, bound: float) -> float:
     """The first instant at which abs(values) is above a bound; inf where there is none."""
-    beyond = np.abs(values) > bound
-    return float(t[beyond][0]) if beyond.any() else math.inf
+    is_beyond = np.abs(values) > bound
+    return float(t[is_beyond][0]) if is_beyond.any() else math.inf
 
 
 @pytest.mark.parametrize(
@@ -67,9 +67,9 @@ def test_flipped_elevator_tracks_with_right_d(scenario: Scenario, tmp_path: Path
 def test_sign_in_airframe_and_d_cancels(tmp_path: Path) -> None:
     """A sign change in the airframe and in D gives the same flight to the last bit."""
     original = CALM_SERVO.vary(flight={"duration": 4.0})
-    changed = trailing_edge_down(original, tmp_path).vary(controller={"D": [-1, 1, 1, 1]})
+    flipped = trailing_edge_down(original, tmp_path).vary(controller={"D": [-1, 1, 1, 1]})
     nose_up = simulate(original)
-    nose_down = simulate(changed)
+    nose_down = simulate(flipped)
     assert nose_down["y"].values.tobytes() == nose_up["y"].values.tobytes()
     assert (nose_down["u"]["elevator"] == -nose_up["u"]["elevator"]).all()
     assert np.abs(nose_up["u"]["elevator"]).max() > 0.0

@@ -76,30 +76,30 @@ def test_short_period_is_as_fast_as_the_aircraft_and_a_turn_as_wide() -> None:
     Frequencies and rates by a surface grow with V.
     """
     places = [OSPREY.index(name) for name in ("alpha", "q")]
-    moved = at_speed(OSPREY, 1.3, "thrust")
-    before, after = (frame.matrix_a()[np.ix_(places, places)] for frame in (OSPREY, moved))
+    faster = at_speed(OSPREY, 1.3, "thrust")
+    before, after = (frame.matrix_a()[np.ix_(places, places)] for frame in (OSPREY, faster))
     assert np.sort_complex(np.linalg.eigvals(after)) == approx(
         1.3 * np.sort_complex(np.linalg.eigvals(before))
     )
     steady = [
         np.linalg.solve(A, frame.matrix_b()[places, 0])
-        for A, frame in ((before, OSPREY), (after, moved))
+        for A, frame in ((before, OSPREY), (after, faster))
     ]
     assert steady[1] == approx(steady[0] * np.array([1.0, 1.3]))  # alpha as before, q with V
-    assert moved.matrix_gravity()[OSPREY.index("beta"), OSPREY.index("phi")] == approx(
+    assert faster.matrix_gravity()[OSPREY.index("beta"), OSPREY.index("phi")] == approx(
         9.81 / (1.3 * 25.0), rel=0.01
     )
-    vertical = moved.gust_direction("vertical")  # m/s of wind change alpha by 1 / V
-    assert vertical == approx(-moved.matrix_a()[:, 1] / moved.speed, abs=0.003)
-    assert moved.gust_direction("longitudinal") == approx(-moved.matrix_a()[:, 0])
+    vertical = faster.gust_direction("vertical")  # m/s of wind change alpha by 1 / V
+    assert vertical == approx(-faster.matrix_a()[:, 1] / faster.speed, abs=0.003)
+    assert faster.gust_direction("longitudinal") == approx(-faster.matrix_a()[:, 0])
 
 
 @pytest.mark.parametrize("ratio", [0.7, 1.4])
 def test_lift_balances_weight_at_each_speed(ratio: float) -> None:
     """A[alpha,V] is -2 g / V^2 in level flight; the file of the osprey has it 4 % smaller."""
-    moved = at_speed(OSPREY, ratio, "thrust")
-    found = moved.matrix_a()[OSPREY.index("alpha"), OSPREY.index("V")]
-    assert found == approx(-2.0 * 9.81 / (ratio * 25.0) ** 2, rel=0.05)
+    faster = at_speed(OSPREY, ratio, "thrust")
+    entry = faster.matrix_a()[OSPREY.index("alpha"), OSPREY.index("V")]
+    assert entry == approx(-2.0 * 9.81 / (ratio * 25.0) ** 2, rel=0.05)
 
 
 def test_margin_holds_from_slow_to_fast(scheduled: RiseDiConfig) -> None:
@@ -150,14 +150,14 @@ def test_flight_over_speeds_has_no_jump_of_u_and_is_replayed_to_the_bit(
     scheduled: RiseDiConfig,
 ) -> None:
     pulse = {"V": {"start": [1.0], "stop": [9.0], "value": [6.0]}}
-    flown = SHIPPED.vary(controller=scheduled, reference_model={"pulses": pulse})
-    tape = simulate(flown)
+    scenario = SHIPPED.vary(controller=scheduled, reference_model={"pulses": pulse})
+    tape = simulate(scenario)
     scale = tape["internals"]["scale.q"]
     assert scale.min() < 0.75
     assert replay(tape).equal()
     step = np.abs(np.diff(tape["u"].values, axis=0)).max(axis=0)
     fixed = np.abs(
-        np.diff(simulate(flown.vary(controller=SHIPPED.rise_di()))["u"].values, axis=0)
+        np.diff(simulate(scenario.vary(controller=SHIPPED.rise_di()))["u"].values, axis=0)
     ).max(axis=0)
     assert (step < 1.2 * fixed).all()  # noise of the sensors moves u of both
 
@@ -340,19 +340,19 @@ def test_effects_at_another_speed_are_reduced_to_the_trim_speed() -> None:
         },
     )
     ticks = simulate(scenario.vary(controller={"learn": None}))["internals"]
-    made = Learner(scenario.rise_di(), OSPREY, no_design)
+    learner = Learner(scenario.rise_di(), OSPREY, no_design)
     for stamp_ns, y, u in zip(
         ticks.stamp_ns.tolist(), ticks.group("y").values, ticks.group("u").values, strict=True
     ):
-        made.take(stamp_ns, y, u, 0)
-    made.propose(0)
-    found = made.identification
+        learner.take(stamp_ns, y, u, 0)
+    learner.propose(0)
+    identification = learner.identification
     true = scenario.aircraft.sampled_airframe()
     file = OSPREY.matrix_b()
-    assert found is not None
+    assert identification is not None
     # the seconds of the climb in speed are left out
-    assert 12.0 < len(found.recorded.t) * 0.01 < 18.5
-    for entry in best_known(found.entries, true.outputs):
+    assert 12.0 < len(identification.recorded.t) * 0.01 < 18.5
+    for entry in best_known(identification.entries, true.outputs):
         place = true.index(entry.row), list(true.inputs).index(entry.column)
         assert entry.nominal == approx(file[place])
         error = true.matrix_b()[place] / file[place] - 1.0
