@@ -192,6 +192,7 @@ def constants(controller: RiseDiConfig) -> list[Constant]:
     }
     reals |= {"y_max": guard.samples.largest, "y_reach": guard.samples.reach}
     reals |= _limits("limits", guard.limits)
+    # The extensions, where there are any.
     if (allocation := guard.allocation) is not None:
         integers["order"] = allocation.order
         reals |= {name: getattr(allocation, name) for name in ("T", "effect", "exchange")}
@@ -211,6 +212,7 @@ def constants(controller: RiseDiConfig) -> list[Constant]:
     if isinstance(law_params, ObserverParams):
         reals |= {name: getattr(law_params, name) for name in ("Phi", "Gamma", "H", "L", "F")}
         reals |= _limits("observer_limits", law_params.limits) | {"fade_rate": law_params.fade_rate}
+    # Whole numbers come first.
     arrays = [
         Constant(name, np.array(value, dtype=np.float64).ravel()) for name, value in reals.items()
     ]

@@ -66,17 +66,20 @@ def drawn_calls(
     stamp_m_ns = now_ns
     for k in range(ticks):
         draw = rng.random(10)
+        # The clock: in time with jitter, early or late, or a long pause.
         if draw[0] < 0.9:
             now_ns += round(period_ns * (1.0 + 0.2 * (draw[1] - 0.5)))
         elif draw[0] < 0.99:
             now_ns += round(period_ns * 10.0 ** (2.4 * draw[1] - 1.2))
         else:
             now_ns += round(period_ns * 300.0 * draw[1])
+        # The size of the error, and the silence of both topics.
         if k % 50 == 0:
             size = unit * 10.0 ** rng.uniform(-3.0, 2.5, m) * (rng.random(m) < 0.9)
         silence = int(draw[2] * 100.0) if draw[3] < 0.005 else max(silence - 1, 0)
         y_m = 0.98 * y_m + size * rng.normal(size=m)
         with suppress(ChannelError):
+            # Samples of y_m, up to three at once.
             if draw[4] < 0.92 and not silence:
                 late = rng.uniform(-0.1, 0.4 * draw[6])
                 first = 2 - int(3.0 * draw[5])
@@ -86,11 +89,13 @@ def drawn_calls(
                         StampedVector(stamp_m_ns, y_m * rng.uniform(0.9, 1.1)), now_ns
                     )
         with suppress(ChannelError):
+            # A sample of y: late, far too late, or with the stamp of y_m.
             if draw[7] < 0.95 and not 0 < silence < 30:
                 late = rng.uniform(-0.05, 0.6) if draw[8] < 0.97 else rng.uniform(-300.0, 30.0)
                 stamp_ns = stamp_m_ns if draw[8] < 0.1 else now_ns - round(period_ns * late)
                 y = y_m + size * rng.normal(size=m) + airspeed * rng.uniform(-1.0, 1.0)
                 recorder.take_y(StampedVector(stamp_ns, y + next(jumps)), now_ns)
+        # New parameters, an engagement, a new begin, or a deactivation.
         if draw[9] < 0.01:
             recorder.retune_to(int(rng.integers(len(sets))))
         elif draw[9] < 0.02:
@@ -304,12 +309,14 @@ def _stepped(
         u_trim=before["u_trim"] + before["u_ff"],
         u_before=u_before,
     )
+    # The prediction over lost periods.
     lost_periods = np.round(dt / period) - 1.0
     for k in range(round(lost_periods.max())):
         state = _where(k < lost_periods, law.control_law.missed(state, at_last_y, params), state)
     u_ff, model_state = _fed_forward(guard.nominal, before, y_m, dt)
     u_trim = before["u_trim"] if guard.nominal is None else before["u_trim"] + u_ff
     measurements = Measurements(y=y, y_m=y_m, y_m_dot=zero, u_trim=u_trim, u_before=u_before)
+    # The step of the law, and the step inside the limits where one acts.
     stepped, u_free = law.control_law.step(state, measurements, dt, params)
     last = before.get("effectors")
     u, _ = _effector_values(saturate(u_free, u_before, dt, limits), last, dt, guard.allocation)
@@ -319,6 +326,7 @@ def _stepped(
         state, measurements, dt, params, limits
     )
     u, effectors = _effector_values(np.where(is_limited, u_limited, u), last, dt, guard.allocation)
+    # The state afterwards, and the output of the tick.
     after = {
         **before,
         "u": u,

@@ -274,6 +274,7 @@ def parameter_sets(controller: RiseDiConfig) -> list[RiseDiConfig]:
         "upper": tuple(bound),
         "slew": tuple(4.0 * value for value in bound),
     }
+    # Changes of each parameter of the law and of the guard.
     changes: list[Mapping[str, Any]] = [
         {"k_g": 0.8 * controller.k_g, "Lambda": tuple(0.9 * value for value in controller.Lambda)},
         {"beta": tuple(0.7 * value for value in controller.beta)},
@@ -285,6 +286,7 @@ def parameter_sets(controller: RiseDiConfig) -> list[RiseDiConfig]:
         {"hold": 0.03, "ramp": 0.07, "max_age": 0.05},
         {"on_deactivate": "hold"},
     ]
+    # Changes of the extensions.
     if controller.schedule is not None:
         changes.append({"schedule.time": 5.0 / controller.rate})  # below the longest dt
     if controller.observer is not None:

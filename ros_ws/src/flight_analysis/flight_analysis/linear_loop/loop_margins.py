@@ -345,6 +345,7 @@ def _model(scenario: Scenario, controller: ControllerConfig) -> Airframe:
     aircraft = scenario.aircraft
     if not aircraft.is_jsbsim:
         return load_airframe(aircraft.airframe)
+    # The controller has A and B of its feedforward, or a bound of Omega.
     if controller.feedforward is not None and set(controller.feedforward.states) == set(
         controller.outputs
     ):
@@ -360,6 +361,7 @@ def _model(scenario: Scenario, controller: ControllerConfig) -> Airframe:
         raise ParameterError(
             f"{scenario.name}: found no linear model of {aircraft.airframe}, expected {expected}"
         )
+    # The airframe has the units and signs of the inputs of the aircraft.
     channels = aircraft.channels()
     inputs = {
         name: {

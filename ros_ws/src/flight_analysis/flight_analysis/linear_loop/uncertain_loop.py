@@ -100,6 +100,8 @@ def uncertain_loop(
     n, m = plant.B.shape
     k = len(box.names)
     size = n + TERMS * k
+    # The aircraft with two integrals of each z = F x + G u behind its states: the means over a
+    # period.
     A = np.zeros((size, size))
     A[:n, :n] = plant.A
     A[n : n + k, :n] = box.F / loop.period
@@ -110,6 +112,7 @@ def uncertain_loop(
     pulled = LinearPlant(A, B, C)
     by_tick = sampled_plant(pulled, loop, still)
 
+    # The motion over a period by w, constant or rising, as the zero-order hold of a chain.
     steps = np.zeros((size + k, size + k))  # the states, then s from 0 to 1 over the period
     steps[:size, :size] = A
     steps[:n, size:] = box.E
@@ -121,6 +124,7 @@ def uncertain_loop(
     rising = motion[:size, k:]
     drives = np.hstack([constant, ROOT * (2.0 * rising - constant)])
 
+    # The integrals are read at the end of a period, and are no states of the loop.
     rows = np.r_[0:n, size : len(by_tick.A)]
     P = by_tick.A[np.ix_(rows, rows)]
     Pu = by_tick.B[rows]
@@ -131,6 +135,7 @@ def uncertain_loop(
     none = np.zeros((states, TERMS * k))
     W = np.zeros((len(rows), TERMS * k))
     W[:n] = drives[:n]
+    # The law closes the loop.
     exact = UncertainLoop(
         A=np.block([[P + Pu @ law.D @ C, Pu @ law.C], [law.B @ C, law.A]]),
         W=np.vstack([W, none]),
@@ -141,6 +146,7 @@ def uncertain_loop(
         K=np.hstack([law.D @ C, law.C]),
         period=loop.period,
     )
+    # A delay is channels more.
     if late == 0.0:
         return exact
     ramps = sampled_plant(pulled, loop, still, rising=True)
@@ -173,20 +179,24 @@ def _with_late(
     ticks = int(np.ceil(late / exact.period - 1e-9))
     parts = np.minimum(late / exact.period - np.arange(ticks), 1.0)
     width = ticks * m  # u of earlier ticks, the newest first
+    # The states after the loop's own: u of earlier ticks, which a late u needs.
     now = np.hstack([exact.K, np.zeros((m, c + width))])
     before = np.eye(width, q + c + width, q + c)
     shifted = np.vstack([now, before[:-m]])
+    # The channels of a delay read the step of u from a tick to the next, by their half ranges.
     halves = np.minimum(parts, 0.5)
     sizes = np.repeat([parts / 2.0, ROOT / 2.0 * halves * (1.0 - halves)], m, axis=1)
     Z = np.vstack([size[:, None] * (shifted - before) for size in sizes])
     V = np.zeros((2 * width, m))
     V[:m] = np.diag(sizes[0, :m])
     V[width : width + m] = np.diag(sizes[1, :m])
+    # A channel acts as a constant u, or as a ramp over the period.
     held = np.vstack([exact.U, np.zeros((c + width, m))])
     ramp = np.zeros((q + c + width, m))
     ramp[np.r_[0 : n + m, q : q + c]] = ramps.B[rows]
     W = np.hstack([-held] * ticks + [ramp] * ticks)
     D = np.hstack([-exact.V] * ticks + [_coefficients(ramps.B, n, k)] * ticks)
+    # The loop with the states more, its delay in the middle of the ranges.
     A = np.zeros((q + c + width, q + c + width))
     A[:q, :q] = exact.A
     A[: n + m, q : q + c] = effect[rows[: n + m]]
@@ -326,6 +336,7 @@ def parts_of(loop: UncertainLoop, inputs: tuple[int, ...] = ()) -> list[Channels
     k = len(every.entries)
     m = len(loop.K)
     c = len(inputs)
+    # The pattern of the couplings at some frequencies, an entry or a delay a node.
     late = np.tile(k + np.arange(m), every.late // m)
     at = np.pi / loop.period * np.array(PATTERN_PARTS)
     sizes = np.abs(every.response(at, 1.0 + 1e-6)).max(axis=0)
@@ -334,6 +345,7 @@ def parts_of(loop: UncertainLoop, inputs: tuple[int, ...] = ()) -> list[Channels
     pattern = np.zeros((k + m + c, k + m + c), dtype=bool)
     np.logical_or.at(pattern, (node[:, None], node[None]), wide)
     count, label = connected_components(csr_array(pattern), directed=True, connection="strong")
+    # A part without a loop of its own bounds nothing.
     parts = []
     for number in range(count):
         nodes = np.flatnonzero(label == number)

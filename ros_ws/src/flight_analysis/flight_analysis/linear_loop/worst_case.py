@@ -281,6 +281,7 @@ def _slopes(
     diagonal = np.einsum("Fii->Fi", S)
     L = 1.0 / diagonal - 1.0
     log_gain = np.log(np.abs(L))
+    # The frequencies of the margins: crossings, then peaks, of each input and of all.
     phase_distance = np.abs(np.angle(-L))
     half = S - np.eye(m) / 2.0
     phase_at, phase_rate = _crossed(w, L, log_gain, phase_distance[:-1])
@@ -291,6 +292,7 @@ def _slopes(
     peaks += [[int(np.argmax(norm_bound(matrix)))] for matrix in (S, half)]
     frequencies = np.concatenate([phase_at, gain_at, w[np.concatenate(peaks)]])
     S_at, change = sensitivity_slopes(uncertain, d, frequencies)  # (4 m + 2, m, m), (.., k, m, m)
+    # The slopes of the figures of an input, by the formulas above.
     rows = np.tile(np.arange(m), 4)
     derivative = change[np.arange(4 * m), :, rows, rows]
     x = S_at[np.arange(4 * m), rows, rows][:, None]
@@ -305,6 +307,7 @@ def _slopes(
     each = np.where(
         kinds == 0, np.sign(np.angle(-loop_at)) * phase, np.where(kinds == 1, falling, peak)
     )
+    # The slopes of the peaks of all inputs, by the singular vectors of the balanced matrix.
     together = []
     for centre, matrix, part in zip((0.0, 0.5), S_at[4 * m :], change[4 * m :], strict=True):
         t = np.exp(balanced(matrix))[:, None]

@@ -270,6 +270,7 @@ def input_figure(
     figure = time_series_figure(context, curves)
     for index, name in enumerate(in_order(tape["u"].names, context.units)):
         factor = context.units.get(name, NO_UNIT).factor
+        # The limits are lines over the whole time.
         values = [
             curve.signal[name] * factor for curve in curves.values() if name in curve.signal.names
         ]
@@ -282,6 +283,7 @@ def input_figure(
         for (kind, pair), style in zip(bounds.items(), LIMIT_LINES, strict=False):
             for bound in pair[np.isfinite(pair)]:
                 add_line(figure, index, kind, [0.0, context.end], [bound, bound], style)
+        # A bar above the curves marks each saturation.
         mark = high + 0.07 * (high - low)
         top = high + 0.14 * (high - low)
         for saturation, colour in SATURATION_COLOURS.items():

@@ -199,6 +199,7 @@ def _comparison_page(flights: Sequence[RecordedFlight]) -> Page:
     context = figures.plot_context(flights)
     colours = {label: run.colour for label, run in context.runs.items()}
     scenarios = [flight.scenario for flight in flights if flight.scenario is not None]
+    # A line a flight, in its colour.
     lines = []
     for (label, colour), flight, scenario in zip(colours.items(), flights, scenarios, strict=True):
         text = f"{scenario.name}: {_description(flight, scenario)} ({flight.summary['error']})"
@@ -211,6 +212,7 @@ def _comparison_page(flights: Sequence[RecordedFlight]) -> Page:
         )
     )
     inputs = comparison.comparison_tables(flights, "inputs", INPUT_COLUMNS, lower_is_better=False)
+    # The tables, then the figures.
     groups = [
         *_condition_group(flights, list(colours)),
         TableGroup(comparison.error_tables(flights), "Tracking error", legend, palette),
@@ -224,6 +226,7 @@ def _comparison_page(flights: Sequence[RecordedFlight]) -> Page:
         Section("Spectrum of u", "", figures.spectrum_figure(context), over_time=False),
         Section("Timing of the ticks", "", figures.timing_figure(context), over_time=False),
     ]
+    # The ground tracks of guided flights come first.
     guided = {
         label: flight
         for label, flight in zip(colours, flights, strict=True)

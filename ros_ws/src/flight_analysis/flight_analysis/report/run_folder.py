@@ -200,6 +200,7 @@ def _flight(recorded: RecordedRun, run: Path, outcome: Outcome | None) -> Record
     recorded.require()
     folder = _folder(run)
     name = printable(run.resolve().name if run.is_dir() else run.stem)
+    # An imported log has a summary of y and u alone.
     if (source := recorded.metadata.get(IMPORTED)) is not None:
         recorded.require("y", "u")
         require(
@@ -217,6 +218,7 @@ def _flight(recorded: RecordedRun, run: Path, outcome: Outcome | None) -> Record
             si_units=recorded.metadata.get(CHANNEL_UNITS, {}),
         )
     scenario = _scenario_in(recorded, run)
+    # The times of messages are signals of the log.
     timed = {"latency": recorded.latency, "age_of_u": recorded.age_of_u}
     signals = {name: signal for name, signal in timed.items() if signal is not None}
     log = replace(recorded.tape, signals={**recorded.tape.signals, **signals})
@@ -226,12 +228,12 @@ def _flight(recorded: RecordedRun, run: Path, outcome: Outcome | None) -> Record
         outcome = NEVER_ENGAGED
     if "guidance" in log:
         require_channels(log["guidance"].names)
+    # The account is of the whole log, the figures are of the engaged part.
     tape = until_last_tick(log)
     flight_account = account(log, scenario, outcome, simulated=engagements is None)
     engaged_part = _engaged(tape, engagements or [])
-    has_figures = {"y", "y_m"} <= set(
-        engaged_part.signals
-    )  # an engagement may be shorter than a sample
+    # An engagement may be shorter than a sample.
+    has_figures = {"y", "y_m"} <= set(engaged_part.signals)
     summary = summarise(engaged_part if has_figures else tape, scenario, outcome, flight_account)
     summary["flight"] = _identity(recorded)
     if engagements is not None:

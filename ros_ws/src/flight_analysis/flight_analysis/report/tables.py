@@ -129,6 +129,7 @@ def events(tape: Tape, gusts: Windows, scenario: Scenario | None = None) -> list
     """
     of_flight = scenario if scenario is not None else tape.scenario
     listed = []
+    # Gusts and modes, the intervals of one name as one row.
     intervals = figures.gust_intervals(tape, gusts) + figures.mode_intervals(tape)
     for label, group in groupby(intervals, key=lambda interval: interval.label):
         spans = [(interval.start, interval.stop) for interval in group]
@@ -141,6 +142,7 @@ def events(tape: Tape, gusts: Windows, scenario: Scenario | None = None) -> list
                 f"{sum(stop - start for start, stop in spans):.2f} s{times}",
             )
         )
+    # Faults last to the end of the flight.
     end = figures.flight_end(tape)
     faults = of_flight.aircraft.actuators.read_faults() if isinstance(of_flight, Scenario) else ()
     listed += [
@@ -149,6 +151,7 @@ def events(tape: Tape, gusts: Windows, scenario: Scenario | None = None) -> list
         if fault.at < end
     ]
     if "internals" in tape:
+        # Saturations of the inputs, by kind.
         limits = tape["internals"].group("limited")
         t = tape.time("internals")
         for name, kind in product(limits.names, (Saturation.MAGNITUDE, Saturation.RATE)):
@@ -159,6 +162,7 @@ def events(tape: Tape, gusts: Windows, scenario: Scenario | None = None) -> list
                 listed.append(
                     EventInterval(f"{name} saturated: {kind.name.lower()}", first, last, extent)
                 )
+        # Vanes that stand still.
         measures = tape["internals"].group("vane_measures")
         observer = of_flight.controller.observer if isinstance(of_flight, Scenario) else None
         time = 0.0 if observer is None or observer.vanes is None else observer.vanes.time

@@ -364,6 +364,7 @@ def _allocated(loop: LoopSetting, scenario: Scenario, airframe: Airframe) -> Loo
     """
     actuators = scenario.aircraft.actuators
     names = list(airframe.inputs)
+    # The effectors: end stops, rates and lags of the scenario's actuators.
     same_airframe = (
         not scenario.aircraft.is_jsbsim
         and load_airframe(scenario.aircraft.airframe).name == airframe.name
@@ -385,6 +386,7 @@ def _allocated(loop: LoopSetting, scenario: Scenario, airframe: Airframe) -> Loo
     allocation, law = design_allocation(airframe, effectors, priority)
     m = len(law.names)
     slew = dict(zip(law.names, law.slew.tolist(), strict=True))
+    # The law has inputs of its own now: models and gains are to be selected.
     base = {
         "outputs": airframe.outputs,
         "inputs": law.names,

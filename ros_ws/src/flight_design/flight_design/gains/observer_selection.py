@@ -126,6 +126,7 @@ def with_aircraft_observer(
     activity_unit = np.array(
         [ACTIVITY_UNIT[airframe.inputs[name].unit] for name in controller.inputs]
     )
+    # A search for each gain set; the one with the least error is taken.
     searches = []
     for gains in sets:
         section = None
@@ -152,6 +153,7 @@ def with_aircraft_observer(
     if speeds is None:
         return selected
     others = searches[selected.place].others
+    # The models at the two speeds make a schedule.
     slow, fast = (speed.model(selected.relaxation).model_dump() for speed in others)
     schedule = {"speed": airframe.speed, "slow": slow, "fast": fast}
     if controller.schedule is not None:

@@ -343,6 +343,7 @@ def _flight(
         "no sample",
         f"a part of the {1e-9 * (stamps[-1] - start_ns):.0f} s of the log",
     )
+    # Without a window the flight is where the speed is that of flight.
     if speed is not None and window.start is None and window.stop is None:
         require(
             bool(np.isfinite(speed).any()),
@@ -353,6 +354,7 @@ def _flight(
         keep &= speed > AIRBORNE * np.nanpercentile(speed, TYPICAL)
     if log.has(FLOWN_AS):  # a VTOL flies as both
         keep &= log.at(FLOWN_AS, stamps) == VEHICLE_TYPES[log.vehicle]
+    # The sticks are the commands in MANUAL alone.
     if needs_manual:
         expected = "it, for only there the sticks are the commands, or --servos"
         mode = (

@@ -132,6 +132,7 @@ class _Ticks:
             state = state._replace(u=self._values["u"][stretch[0]].copy())
             number += 1
             for k in stretch:
+                # The limits of a row may be others than before: then the parameters changed.
                 change = self._limits(k)
                 if any(getattr(controller, key) != value for key, value in change.items()):
                     controller = vary(controller, change)
@@ -142,6 +143,7 @@ class _Ticks:
                     law = new_law
                     limits = new_limits
                     digest = controller.digest()
+                # The tick from the logged y and y_m, compared with the logged u.
                 stamp_ns = int(self._stamp_ns[k])
                 y_m = [StampedVector(stamp_ns, self._values["y_m"][k])]
                 if self._offset_ns[k] > 0:

@@ -130,6 +130,7 @@ def fit_channel(
     and may end with the opposite sign. `gravity` is a measured part of y_dot without u, a channel:
     then, and by `first_order`, the model is of first order.
     """
+    # The time of the excitation, with a little before and after.
     excited = np.flatnonzero(u[name] != 0.0)
     if not len(excited):
         return None
@@ -140,6 +141,7 @@ def fit_channel(
         return None
     t = (y_of_channel.stamp_ns - first) / NANOSECONDS
     t_u = (u.stamp_ns - first) / NANOSECONDS
+    # u and gravity act by their integrals.
     impulse = np.concatenate([[0.0], np.cumsum(u[name][:-1] * np.diff(t_u))])
     trend = [np.ones(len(t)), t]
     if gravity is not None:
@@ -159,6 +161,7 @@ def fit_channel(
         e = y_of_channel[output] - response(theta)
         return np.asarray(e - q @ (q.T @ e))
 
+    # A second order has to lower the misfit.
     orders = ORDERS[:1] if first_order or gravity is not None else ORDERS
     values = residuals(np.array([0.0, 1.0, 0.0, 0.0]))
     fits = [

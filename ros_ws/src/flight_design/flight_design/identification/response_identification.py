@@ -349,6 +349,7 @@ def explained(signal: Signal, names: Sequence[str], excitation: Signal, spans: S
         t_w = t_w + seconds(before - span[0])
         if len(t) < 2 or len(t_w) < 2 or t_w[-1] - t[0] < FOLDS * PERIOD:
             continue
+        # Means of the excitation over windows before each instant.
         instants = np.arange(t[0], min(t[-1], t_w[-1]), PERIOD)
         edges = [0.0]
         while edges[-1] < LOOP_MEMORY:
@@ -363,6 +364,7 @@ def explained(signal: Signal, names: Sequence[str], excitation: Signal, spans: S
         Z = Z / np.maximum(np.linalg.norm(Z, axis=0), np.finfo(float).tiny)
         X = values[np.searchsorted(t, instants, side="right") - 1]
         X = X - X.mean(axis=0)
+        # Each fold is predicted from the others, by both ridges.
         fold = np.arange(len(instants)) * FOLDS // len(instants)
         for number in range(FOLDS):
             others = Z[fold != number]

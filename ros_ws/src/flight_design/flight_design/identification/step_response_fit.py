@@ -201,6 +201,7 @@ def _search(
             [size * (whiten @ (Omega * first + slow * second - step)), theta / SPREAD[fitted]]
         )
 
+    # A start for each pair of delay and lag, its slope by least squares.
     starts = [] if start is None else [start]
     for delay in STARTS_DELAY:
         for lag in STARTS_LAG:
@@ -211,6 +212,7 @@ def _search(
             )
             starts.append(np.array([delay, lag, slope, 2.0, 0.0, 0.0]))
     bounds = LOWER[fitted], UPPER[fitted]
+    # The best end of all starts.
     best: Any = min(
         (
             least_squares(

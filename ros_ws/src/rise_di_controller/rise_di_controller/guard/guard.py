@@ -323,6 +323,7 @@ def _stepped(
     u_trim = _probed_trim(state, y.stamp_ns, guard)
     u_ff = state.u_ff
     ff_state = state.feedforward
+    # The feedforward moves the trim. In replay it may be that of the log.
     model = nominal_at_speed(guard, state.law)
     if model is not None and ff_state is not None:
         parts = feedforward.step_count(span_ns, guard.period_ns)
@@ -331,6 +332,7 @@ def _stepped(
     elif u_ff_recorded is not None:
         u_ff = u_ff_recorded
         u_trim = u_trim + u_ff
+    # The law from this trim, inside the limits.
     vanes = _vanes(vane, ff_state, guard, vane_m_recorded)
     slope = (inputs.y_m - state.y_m) / dt
     vane_m = None if vanes is None else vanes.reference

@@ -52,6 +52,7 @@ def retune(
         and isinstance(observing, ObserverState)
         and isinstance(observing.law, LawState)
     ):
+        # With a record of the last ticks the observer and the feedforward go on in the same motion.
         change: Array = np.zeros_like(state.u)  # of u_ff
         if other_nominal:
             state, change = _with_nominal(state, y_m, after)
@@ -60,6 +61,7 @@ def retune(
             z = observer.estimates_after(state.history, change, filters)
             observing = _with_estimates(state, observing, z, change, observers)
     else:
+        # Without a record they begin again, and what they gave becomes a part of u_trim.
         if other_model and not _same_model(*observers):
             z = observer.initial_estimates(y.value - y_m, observers[1])
             state = state._replace(u_trim=state.u_trim + observing.u_o)

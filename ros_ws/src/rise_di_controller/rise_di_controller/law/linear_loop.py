@@ -80,11 +80,13 @@ def linear_law(law: TunedLaw, m: int, period: float, candidates: int | None = No
         core = core.law
     literal = isinstance(core, LawParams) and core.sign is Sign.LITERAL
     require(not literal, "sign", "literal", "soft or implicit, which are linear near e = 0")
+    # The sets of gains stand in the last axis, or the columns of the matrix do.
     sets = () if candidates is None else (candidates,)
     at_once = candidates is None and _takes_columns(params)
     if at_once:
         params = _for_columns(params)
         sets = (1,)
+    # The equilibrium: at engagement, the observer faded in, the vanes measuring.
     zero = np.zeros((m, *sets))
     vanes = getattr(params, "vanes", None)
     none = None if vanes is None else np.zeros((len(vanes.H), *sets))
@@ -102,6 +104,7 @@ def linear_law(law: TunedLaw, m: int, period: float, candidates: int | None = No
     }
     if "sigma" in at_rest:
         at_rest["sigma"] = np.ones((1, *sets))
+    # A step from a vector of state and y to a vector of state and u.
     ends = np.cumsum([len(value) for value in at_rest.values()])
     size = int(ends[-1]) if len(ends) else 0
 
@@ -111,6 +114,7 @@ def linear_law(law: TunedLaw, m: int, period: float, candidates: int | None = No
         state, u = control_law.step(restored(control_law, parts), now, np.float64(period), params)
         return np.concatenate([*fields(state).values(), u])
 
+    # The differences of a step, a column each.
     begin = np.concatenate([*at_rest.values(), np.zeros((wide, *sets))])
     equilibrium = step(begin[:size], begin[size:])
     if at_once:
@@ -198,6 +202,7 @@ def sampled_plant(
     has_lag = loop.lag > 0.0
     # without an actuator: any rate, unused
     rate = np.where(has_lag, 1.0 / np.where(has_lag, loop.lag, 1.0), 1.0)
+    # Aircraft and actuators in continuous time.
     motion = np.zeros((*batch, n + m, n + m))
     drive = np.zeros((*batch, n + m, m))
     motion[..., :n, :n] = plant.A
@@ -205,6 +210,7 @@ def sampled_plant(
     motion[..., n:, n:] = -np.diag(rate)
     drive[..., :n, :] = plant.B * ~has_lag
     drive[..., n:, :] = np.diag(rate * has_lag)
+    # Whole periods of the delay, and the rest of one.
     ticks = np.floor((loop.delay + extra) / loop.period + 1e-9).astype(int)
     part = np.maximum(loop.delay + extra - ticks * loop.period, 0.0)
     kept_ticks = int(ticks.max()) + 1  # earlier ticks whose u still acts, the newest first
@@ -217,6 +223,8 @@ def sampled_plant(
     A[..., : n + m, : n + m], _ = zero_order_hold(motion, drive, loop.period)
     # effect of u of this tick, then of earlier ticks
     inputs = np.zeros((*batch, n + m, m + kept_ticks * m))
+    # Within a period the u of a tick acts from the instant `split` before the end, the one before
+    # it until then.
     for i in range(m):
         split = loop.period - part[i]
         transition, new = _driven(motion, drive, split, 0.0, loop.period if rising else None)

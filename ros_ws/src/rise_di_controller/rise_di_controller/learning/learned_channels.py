@@ -29,6 +29,7 @@ def with_channels_of(
     design = designed.law_params()
     last = design.K[-1]
     channels = np.array(bare)
+    # A K below the last one is this one with a smaller input scale.
     K = np.where(channels, np.maximum(law.K, last + MIN_GAIN), design.K)
     K[-1] = last
     share = np.where(channels, law.K / K, 1.0)
