@@ -49,10 +49,11 @@ def flown(*north: float, engaged: int = 0) -> Tape:
     [
         ((0.0, 400.0, 0.0), Outside(0.0, 0.0)),
         ((490.0, 510.0, 520.0, 490.0), Outside(2.0, 20.0)),
+        # The flight begins outside, and comes inside.
         (
             (520.0, 510.0, 490.0),
             Outside(2.0, 20.0),
-        ),  # which begins outside, and comes inside
+        ),
         ((520.0, 490.0, 500.5, 400.0), Outside(2.0, 20.0)),  # a second time
         ((520.0, 540.0), Outside(1.0, 40.0)),  # ends outside
     ],

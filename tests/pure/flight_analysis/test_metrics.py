@@ -241,9 +241,8 @@ def test_spectrum_of_sine_peaks_at_frequency_and_has_variance() -> None:
     assert np.sum(density["elevator"] ** 2) * (frequency[1] - frequency[0]) == approx(2.0, rel=0.01)
 
 
-@pytest.mark.parametrize(
-    "samples", [300, 2560, 6005]
-)  # a window of the whole, an even and an odd one
+# A window of the whole, an even and an odd one.
+@pytest.mark.parametrize("samples", [300, 2560, 6005])
 def test_a_spectrum_is_that_of_scipy(samples: int) -> None:
     values = np.random.default_rng(1).standard_normal((samples, 2)).cumsum(axis=0)
     frequency, density = spectra(

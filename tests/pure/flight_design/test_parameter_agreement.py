@@ -190,14 +190,16 @@ def test_changes_are_told_with_the_value_of_the_samples() -> None:
             ParameterRecord(20 * SECOND, 0.0),
             ParameterRecord(65 * SECOND, 1.0),
         ),
+        # The same value comes once more.
         "RC1_MIN": (
             ParameterRecord(0, 1000.0),
             ParameterRecord(40 * SECOND, 1000.0),
-        ),  # once more the same
+        ),
+        # This parameter is not between u and the surface.
         "TECS_SPDWEIGHT": (
             ParameterRecord(0, 1.0),
             ParameterRecord(40 * SECOND, 2.0),
-        ),  # not between u and the surface
+        ),
     }
     assert parameter_changes(recorded, 10 * SECOND, 30 * SECOND, 60 * SECOND) == [
         (

@@ -244,9 +244,8 @@ def test_no_event_makes_u_jump(state: str, event: str) -> None:
     policy=st.sampled_from(["trim", "hold"]),
     events=st.lists(st.tuples(st.sampled_from([*EVENTS]), st.integers(0, 12)), max_size=20),
 )
-@example(
-    policy="trim", events=[("y lost", 1), ("configured and activated", 10)]
-)  # stale before the law engages again
+# y is stale before the law engages again.
+@example(policy="trim", events=[("y lost", 1), ("configured and activated", 10)])
 def test_no_sequence_of_events_makes_u_jump(policy: str, events: list[tuple[str, int]]) -> None:
     loop = engaged(on_deactivate=policy)
     for name, count in events:
@@ -296,9 +295,8 @@ class Applied:
             self._number += 1
 
 
-@pytest.mark.parametrize(
-    "silence", [0.0, 0.1, 0.3, 0.5, 1.0]
-)  # s: in time, held, in the ramp twice, at trim
+# s: in time, held, in the ramp twice, at trim
+@pytest.mark.parametrize("silence", [0.0, 0.1, 0.3, 0.5, 1.0])
 @pytest.mark.parametrize("publisher", ["first", "restarted"])
 def test_u_that_returns_does_not_jump(publisher: str, silence: float) -> None:
     """A publisher goes on with another u after the ramp has begun.
@@ -452,9 +450,8 @@ REQUESTS: Mapping[str, Callable[[Engagement], object]] = {
 @settings(deadline=None)
 @given(st.lists(st.tuples(st.sampled_from([*REQUESTS]), st.integers(0, 25)), max_size=30))
 @example([("engage", 2), ("u", 3), ("u", 4)])  # u returns within the age limit
-@example(
-    [("engage", 3), ("u", 3), ("conflicting u", 9), ("engage", 9)]
-)  # a second publisher at the timeout of u
+# The second publisher comes at the timeout of u.
+@example([("engage", 3), ("u", 3), ("conflicting u", 9), ("engage", 9)])
 def test_no_sequence_of_events_makes_sent_u_jump(events: list[tuple[str, int]]) -> None:
     loop = Engagement()
     loop.ticks(1)

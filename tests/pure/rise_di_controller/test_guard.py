@@ -119,9 +119,8 @@ def test_y_bounded_behind_and_ahead_of_clock(offset: int) -> None:
     assert (state.mode is Mode.ENGAGED) == (abs(offset) <= AGE)
 
 
-@pytest.mark.parametrize(
-    "offset", [AGE, AGE + 1, 10_000]
-)  # ms; an old y_m has no value at the stamp of a fresh y
+# ms: an old y_m has no value at the stamp of a fresh y.
+@pytest.mark.parametrize("offset", [AGE, AGE + 1, 10_000])
 def test_y_m_bounded_ahead_of_clock(offset: int) -> None:
     (state,) = run((0, sample(0), [sample(0), sample(offset)]))
     assert (state.mode is Mode.ENGAGED) == (offset <= AGE)

@@ -378,9 +378,10 @@ def _around_peaks(S: ComplexArray, w: FloatArray) -> FloatArray:
     diagonal = np.einsum("NFii->NFi", S)
     half = S - np.eye(S.shape[-1]) / 2.0
     norms = [norm_bound(matrix)[..., None] for matrix in (S, half)]
+    # (N, Q)
     peaks = np.argmax(
         np.concatenate([np.abs(diagonal), np.abs(diagonal - 0.5), *norms], axis=2), axis=1
-    )  # (N, Q)
+    )
     first = np.maximum(peaks - 1, 0)
     last = np.minimum(peaks + 1, w.shape[1] - 1)
     rows = np.arange(len(w))[:, None]

@@ -48,11 +48,12 @@ PHASE_MARGINS = (5.0, 80.0)
 # weak near its stop has a bandwidth 200 times below the integral of the rule: 1000 leave V 85 deg
 MAX_SLOWER = 1000.0
 MAX_LOWER = 18.0
+# Exponents of `slower` and `lower` of all channels.
 FURTHER_STARTS = (
     (exponent(8.0), 0),
     (exponent(2.0), exponent(2.0)),
     (exponent(8.0), exponent(8.0)),
-)  # exponents of `slower` and `lower` of all channels
+)
 CHEAPER = ((-1, 0), (0, -1), (1, -1), (2, -1), (-3, 1))
 MOVES = Moves(mending=(*CHEAPER, (-1, 1), (1, 0), (0, 1)), cheaper=CHEAPER)
 """Of the two exponents of a channel, a of the integral and b of the bandwidth. The error after a

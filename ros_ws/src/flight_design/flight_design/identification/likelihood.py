@@ -466,9 +466,10 @@ class Likelihood:
 
     def entries(self, fit: Fit) -> list[Entry]:
         """The identified entries of A and B."""
+        # The winds follow the entries in theta.
         errors = zip(
             self.nominal_entries(), fit.theta.tolist(), fit.deviation.tolist(), strict=False
-        )  # winds follow the entries
+        )
         return [
             entry._replace(error=error, deviation=deviation) for entry, error, deviation in errors
         ]
