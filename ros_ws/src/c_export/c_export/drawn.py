@@ -79,7 +79,6 @@ def drawn_calls(
         silence = int(draw[2] * 100.0) if draw[3] < 0.005 else max(silence - 1, 0)
         y_m = 0.98 * y_m + size * rng.normal(size=m)
         with suppress(ChannelError):
-            # Samples of y_m, up to three at once.
             if draw[4] < 0.92 and not silence:
                 late = rng.uniform(-0.1, 0.4 * draw[6])
                 first = 2 - int(3.0 * draw[5])
