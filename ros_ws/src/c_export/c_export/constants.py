@@ -394,11 +394,9 @@ def _strings(names: tuple[str, ...]) -> str:
 
 def _octal(character: str) -> str:
     plain = character.isascii() and (character.isalnum() or character in "_. ")
-    return (
-        character
-        if plain
-        else "".join(f"\\{byte:03o}" for byte in character.encode("utf-8", "surrogatepass"))
-    )
+    if plain:
+        return character
+    return "".join(f"\\{byte:03o}" for byte in character.encode("utf-8", "surrogatepass"))
 
 
 def _comment(names: tuple[str, ...]) -> str:

@@ -322,11 +322,10 @@ def proof_report(proof: Proof, scenario: str) -> str:
         "",
         *(f"{FIGURES[name]}: {proof.figures[name]}" for name in FIGURES if name in proof.figures),
     ]
-    result = (
-        f"every mode is equal and u is within {FLOAT32_BOUND:.2g} of its range"
-        if proof.float32
-        else "every bit is equal"
-    )
+    if proof.float32:
+        result = f"every mode is equal and u is within {FLOAT32_BOUND:.2g} of its range"
+    else:
+        result = "every bit is equal"
     lines += ["", f"PROVED: {result}" if proof.holds else "NOT PROVED"]
     return "\n".join(lines) + "\n"
 

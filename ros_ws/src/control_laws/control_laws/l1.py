@@ -74,11 +74,10 @@ def _control_law(*, feedforward: bool) -> ControlLaw:
         error = state.y_before + dt * state.y_dot_u - measurements.y
         a = ADAPTATION_POLE + xp.zeros_like(params.K)
         sigma_hat = -a * xp.exp(-a * dt) / filter_gain(a, dt) * error
-        u_r = (
-            measurements.u_trim
-            if feedforward
-            else measurements.u_trim + params.inverse @ measurements.y_m_dot
-        )
+        if feedforward:
+            u_r = measurements.u_trim
+        else:
+            u_r = measurements.u_trim + params.inverse @ measurements.y_m_dot
         sigma_r = measurements.y_m_dot - params.Omega @ u_r
         sigma_f = state.sigma_f + filter_gain(params.bandwidth, dt) * (
             sigma_hat - sigma_r - state.sigma_f

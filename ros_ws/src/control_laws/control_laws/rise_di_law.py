@@ -17,11 +17,10 @@ def params_of(gains: dict[str, FloatArray], model: NominalModel) -> LawParams:
     """
     K = gains["K"]
     beta = gains["beta"]
-    eps = (
-        beta / K * gains["softening"] * model.total_lag[:, None]
-        if "softening" in gains
-        else np.ones_like(K)
-    )
+    if "softening" in gains:
+        eps = beta / K * gains["softening"] * model.total_lag[:, None]
+    else:
+        eps = np.ones_like(K)
     omega = gains.get("omega", 1.0) + 0.0 * K
     return LawParams(
         K=K,

@@ -198,12 +198,10 @@ def noise_floor(tape: Tape) -> dict[str, float]:
         y = tape["y"][name]
         if noise is not None and name in noise.names:
             rms = float(np.sqrt(np.mean(noise[name] ** 2)))
+        elif len(y) > 2:
+            rms = float(np.median(np.abs(np.diff(y, 2)))) / (0.6745 * 6.0**0.5)
         else:
-            rms = (
-                float(np.median(np.abs(np.diff(y, 2)))) / (0.6745 * 6.0**0.5)
-                if len(y) > 2
-                else math.nan
-            )
+            rms = math.nan
         largest = np.max(np.abs(y), initial=0.0)
         floor[name] = max(rms, float(np.spacing(largest)) if largest > 0.0 else 0.0)
     return floor

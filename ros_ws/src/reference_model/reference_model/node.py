@@ -87,11 +87,9 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
 
     def _decode_u_m(self, raw: bytes) -> LiveCommand | None:
         sample = self._decoder.decode(raw)
-        return (
-            None
-            if sample is None
-            else LiveCommand(sample.stamp_ns, sample.value, self._attitude(raw), sample.sender)
-        )
+        if sample is None:
+            return None
+        return LiveCommand(sample.stamp_ns, sample.value, self._attitude(raw), sample.sender)
 
     def _attitude(self, raw: bytes) -> FloatArray | None:
         """The attitude where the message has it."""
@@ -108,11 +106,10 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
 
     def _log_source(self, source: str) -> None:
         if source == "ending":
-            levels = (
-                "wings are levelled, then"
-                if self.parameters.live.speed is not None
-                else "from now on"
-            )
+            if self.parameters.live.speed is not None:
+                levels = "wings are levelled, then"
+            else:
+                levels = "from now on"
             self.get_logger().error(f"{self._u_m.name} timed out: {levels} all commands are zero")
         else:
             self.get_logger().info(f"commands from {self._u_m.name} replace the profile")

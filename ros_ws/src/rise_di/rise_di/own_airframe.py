@@ -141,11 +141,10 @@ def new_airframe(
     )
     for path in files[source_is_target:]:
         require(replace or not path.exists(), "folder", f"{path}", "a new file, or replace")
-    lags = (
-        first_flight.default_lags(airframe)
-        if lag is None
-        else tuple(lags_by_input(lag, airframe).values())
-    )
+    if lag is None:
+        lags = first_flight.default_lags(airframe)
+    else:
+        lags = tuple(lags_by_input(lag, airframe).values())
     text_of_airframe = LICENCE + as_yaml(airframe)
     with tempfile.TemporaryDirectory() as trial:
         (Path(trial) / files[0].name).write_text(text_of_airframe, encoding="utf-8")

@@ -419,11 +419,10 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
                 f"age of {name} (s)": f"{age:.4f}"
                 for name, age in self._controller.ages(self.now_ns()).items()
             }
-        still = (
-            {"vanes left out": ", ".join(self._still_vanes) or "none"}
-            if self.parameters.vanes
-            else {}
-        )
+        if self.parameters.vanes:
+            still = {"vanes left out": ", ".join(self._still_vanes) or "none"}
+        else:
+            still = {}
         restarts = {"restarts of the law": self._restarts}
         effects = {"without effect": self._stuck or "none"} if self.parameters.probe else {}
         return (

@@ -354,11 +354,9 @@ class ControllerConfig(NodeConfig):
     @property
     def vanes(self) -> tuple[str, ...]:
         """The channels of y for the observer alone."""
-        return (
-            ()
-            if self.observer is None or self.observer.vanes is None
-            else self.observer.vanes.channels
-        )
+        if self.observer is None or self.observer.vanes is None:
+            return ()
+        return self.observer.vanes.channels
 
     @property
     def measured(self) -> tuple[str, ...]:
@@ -473,11 +471,9 @@ class ControllerConfig(NodeConfig):
 
     def nominal(self) -> Nominal | None:
         """The arrays of the feedforward, None where there is none."""
-        return (
-            None
-            if self.feedforward is None
-            else self.feedforward.nominal(self.outputs, self.inputs, self.D)
-        )
+        if self.feedforward is None:
+            return None
+        return self.feedforward.nominal(self.outputs, self.inputs, self.D)
 
     def _flown_nominal(self) -> Nominal | None:
         """The nominal model along y_m.

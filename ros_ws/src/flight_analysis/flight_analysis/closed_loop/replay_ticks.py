@@ -205,11 +205,10 @@ class Ticks:
             return after, np.full(len(self.names), np.nan)
         late = float(self._signal["late"][k])
         age = float(self._signal["age"][k])
-        given_up = (
-            self._groups[internals.GIVEN_UP][k]
-            if internals.GIVEN_UP in self._groups
-            else np.zeros(0)
-        )
+        if internals.GIVEN_UP in self._groups:
+            given_up = self._groups[internals.GIVEN_UP][k]
+        else:
+            given_up = np.zeros(0)
         row = internals.values(after, inputs, limits, late, age, 0, 0, given_up)
         row[self._copied] = self.values[k, self._copied]
         return after, np.concatenate([row, after.command])

@@ -131,11 +131,10 @@ class Scenario:
             owners = [
                 key for key in SCHEMAS if name in getattr(getattr(self, key), "model_fields", ())
             ]
-            expected = (
-                f"it in a section: vary({owners[0]}={{{name!r}: ...}})"
-                if owners
-                else one_of(tuple(SCHEMAS), name)
-            )
+            if owners:
+                expected = f"it in a section: vary({owners[0]}={{{name!r}: ...}})"
+            else:
+                expected = one_of(tuple(SCHEMAS), name)
             raise ParameterError(f"{name}: found no such section, expected {expected}")
         if isinstance(changes, ControllerConfig if schema is AnyLaw else schema):
             return schema.validate_mapping(changes.model_dump(), name)

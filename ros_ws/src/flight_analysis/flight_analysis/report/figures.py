@@ -507,21 +507,19 @@ def state_figure(context: PlotContext, units: Mapping[str, DisplayUnit]) -> Figu
     """The states of a simulated aircraft, in these units."""
     x = _truth_group(context.tape, "x")
     context = context._replace(units=units)
-    return (
-        time_series_figure(context, {"x": Curve(x, PLANT)}, columns=2, height=130)
-        if x.names
-        else None
-    )
+    if x.names:
+        return time_series_figure(context, {"x": Curve(x, PLANT)}, columns=2, height=130)
+    return None
 
 
 def sensor_figure(context: PlotContext) -> Figure | None:
     """Y less the true output, of every sensor with an error."""
     noise = _nonzero_group(context.tape, "noise")
-    return (
-        time_series_figure(context, {"error": Curve(noise, ERROR, 0.8)}, columns=2, height=120)
-        if noise.names
-        else None
-    )
+    if noise.names:
+        return time_series_figure(
+            context, {"error": Curve(noise, ERROR, 0.8)}, columns=2, height=120
+        )
+    return None
 
 
 def tick_figure(context: PlotContext) -> Figure | None:
@@ -546,11 +544,9 @@ def tick_figure(context: PlotContext) -> Figure | None:
 
 def _truth_group(tape: Tape, group: str) -> Signal:
     """The channels "group.name" of `truth`; no channels on a tape without `truth`."""
-    return (
-        tape["truth"].group(group)
-        if "truth" in tape
-        else Signal(np.zeros(0, dtype=np.int64), (), np.zeros((0, 0)))
-    )
+    if "truth" in tape:
+        return tape["truth"].group(group)
+    return Signal(np.zeros(0, dtype=np.int64), (), np.zeros((0, 0)))
 
 
 def _nonzero_group(tape: Tape, group: str) -> Signal:

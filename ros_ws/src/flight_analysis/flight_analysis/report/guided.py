@@ -308,11 +308,9 @@ def _guided_pose(tape: Tape) -> Signal | None:
         return None
     pose = tape["pose"]
     is_guided = pose.stamp_ns >= tape["guidance"].stamp_ns[0]
-    return (
-        Signal(pose.stamp_ns[is_guided], pose.names, pose.values[is_guided])
-        if is_guided.any()
-        else None
-    )
+    if is_guided.any():
+        return Signal(pose.stamp_ns[is_guided], pose.names, pose.values[is_guided])
+    return None
 
 
 def _outside(tape: Tape, pose: Signal, inside: FloatArray) -> Outside:

@@ -149,11 +149,10 @@ def modes_text(margins: LoopMargins) -> str:
     """The slow modes with little damping as a sentence."""
     slow_modes = [(w, zeta) for w, zeta in zip(*margins.modes, strict=True) if zeta < SHOWN_DAMPING]
     modes = ", ".join(f"{w:.3g} rad/s {zeta:.2f}" for w, zeta in slow_modes)
-    least = (
-        f"; least of the uncertain aircraft {float(margins.worst.damping):.2f}"
-        if margins.worst is not None
-        else ""
-    )
+    if margins.worst is not None:
+        least = f"; least of the uncertain aircraft {float(margins.worst.damping):.2f}"
+    else:
+        least = ""
     return f"slow modes and their damping: {modes or f'all above {SHOWN_DAMPING:g}'}{least}"
 
 

@@ -286,11 +286,9 @@ def _engaged(tape: Tape, engagements: Sequence[Engagement]) -> Tape:
         default=0,
     )
     windows = [(engagement.start_ns, engagement.stop_ns or end_ns) for engagement in engagements]
-    signals = (
-        {name: signal.within(windows) for name, signal in tape.signals.items()}
-        if windows
-        else tape.signals
-    )
+    signals = tape.signals
+    if windows:
+        signals = {name: signal.within(windows) for name, signal in tape.signals.items()}
     return replace(
         tape, signals={name: signal for name, signal in signals.items() if len(signal.stamp_ns)}
     )

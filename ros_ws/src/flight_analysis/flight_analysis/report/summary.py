@@ -325,11 +325,10 @@ def command_results(summary: Mapping[str, Any]) -> str:
     if flight_account is None or flight_account.commands is None:
         return ""
     planned, flown, targets, steps_taken = flight_account.commands
-    parts = (
-        [f"{flown} of {planned} commands flown{taken_over(summary, 'commands')}"]
-        if flown < planned
-        else []
-    )
+    if flown < planned:
+        parts = [f"{flown} of {planned} commands flown{taken_over(summary, 'commands')}"]
+    else:
+        parts = []
     if targets:
         parts.append(
             f"{targets} targets and routes given, guidance took commands in {steps_taken} steps"
@@ -364,11 +363,10 @@ def _with_late_ticks(
     if ticks is None or not log_complete or not rated or ticks.without_new_y <= BUSY * ticks.ticks:
         return flight_account
     late = f"{ticks.without_new_y} ticks without a new y"
-    reason = (
-        f"; {flight_account.busy}"
-        if flight_account.busy
-        else ": this host is too busy; see docs/faults.md"
-    )
+    if flight_account.busy:
+        reason = f"; {flight_account.busy}"
+    else:
+        reason = ": this host is too busy; see docs/faults.md"
     return flight_account._replace(busy=f"{late}{reason}")
 
 
@@ -417,11 +415,10 @@ def engagement_notes(engagements: Sequence[Mapping[str, Any]], *, has_figures: b
         return ["never engaged: the figures are of an aircraft that this controller did not fly"]
     sentences = []
     for engagement in engagements:
-        end = (
-            "the end of the log"
-            if engagement["stop"] is None
-            else f"{engagement['stop']:.1f} s: {engagement['reason']}"
-        )
+        if engagement["stop"] is None:
+            end = "the end of the log"
+        else:
+            end = f"{engagement['stop']:.1f} s: {engagement['reason']}"
         sentences.append(f"engaged from {engagement['start']:.1f} s to {end}")
     return [
         *sentences,

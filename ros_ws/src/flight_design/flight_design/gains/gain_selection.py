@@ -458,11 +458,9 @@ def assess_gains(
         observer = controller.observer
         requirement = above_zeros(setting.requirement, loop.nominal)
         least = 1.0 / controller.rate if observer is None else observer.margin - controller.delay
-        requirement = (
-            requirement
-            if observer is None
-            else requirement._replace(phase=min(requirement.phase, OBSERVER_REQUIREMENT.phase))
-        )
+        if observer is not None:
+            phase = min(requirement.phase, OBSERVER_REQUIREMENT.phase)
+            requirement = requirement._replace(phase=phase)
         loop_conditions += (
             GainCondition("delay margin", None, margins.delay, least),
             *margin_conditions(margins, requirement),

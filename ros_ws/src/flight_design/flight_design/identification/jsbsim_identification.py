@@ -142,11 +142,9 @@ class IdentifiedAircraft(NamedTuple):
         too_large = [
             name for name, value in self.flights["calm"].rms.items() if not value < largest[name]
         ]
-        return (
-            f"calm: the error of {', '.join(too_large)} is larger than the command"
-            if too_large
-            else ""
-        )
+        if too_large:
+            return f"calm: the error of {', '.join(too_large)} is larger than the command"
+        return ""
 
 
 def identify_jsbsim(
@@ -519,11 +517,10 @@ def _heading(linear: Linearization, selection: Selection, stall: float | None) -
     assessed = selection.engineering
     at = f"{condition.speed:.6g} m/s and {condition.altitude:.6g} m"
     flight = "commands on every channel" if stall is None else "guidance turns and climbs"
-    air = (
-        "moderate turbulence. It learns A and B in flight: docs/learning.md"
-        if learns
-        else "a gust from above"
-    )
+    if learns:
+        air = "moderate turbulence. It learns A and B in flight: docs/learning.md"
+    else:
+        air = "a gust from above"
     options = f"{' --guidance' * (stall is not None)}{' --learn' * learns}"
     trims = zip(condition.inputs(), linear.trim.commands.tolist(), strict=False)
     effects = zip(

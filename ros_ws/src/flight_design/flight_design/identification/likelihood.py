@@ -456,11 +456,10 @@ class Likelihood:
         theta = np.zeros(len(self.prior))
         for k, entry in enumerate(self.nominal_entries()):
             row = airframe.index(entry.row)
-            value = (
-                A[row, airframe.index(entry.column)]
-                if entry.matrix == "A"
-                else B[row, inputs.index(entry.column)]
-            )
+            if entry.matrix == "A":
+                value = A[row, airframe.index(entry.column)]
+            else:
+                value = B[row, inputs.index(entry.column)]
             theta[k] = (value - entry.nominal) / entry.unit
         return np.clip(theta, self._lower, self._upper)
 

@@ -286,11 +286,12 @@ def _commands(
         (log.format.sticks, stick.channel) if servo is None else (log.format.servos, servo.output)
     )
     source = Source(place.message, place.field.format(number))
-    expected = (
-        "the transmitter's channel (bit RC of LOG_BITMASK, messages of the tlog), or --servos"
-        if servo is None
-        else "its pulses"
-    )
+    if servo is None:
+        expected = (
+            "the transmitter's channel (bit RC of LOG_BITMASK, messages of the tlog), or --servos"
+        )
+    else:
+        expected = "its pulses"
     require(
         log.has(source),
         f"inputs.{name}",
@@ -357,11 +358,10 @@ def _flight(
     # The sticks are the commands in MANUAL alone.
     if needs_manual:
         expected = "it, for only there the sticks are the commands, or --servos"
-        mode = (
-            next((source for source in log.format.mode if log.has(source)), None)
-            if log.format is not None
-            else None
-        )
+        if log.format is not None:
+            mode = next((source for source in log.format.mode if log.has(source)), None)
+        else:
+            mode = None
         if mode is None:
             raise ParameterError(
                 f"the log: found no message with the mode, expected MANUAL in {expected}"

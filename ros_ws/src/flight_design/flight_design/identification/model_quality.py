@@ -169,12 +169,9 @@ def other_signs(nominal: Airframe, identified: Airframe, channels: ChannelPairin
     order = np.ix_([nominal.outputs.index(name) for name in channels.outputs], columns)
     before = _minor_signs((nominal.matrix_c() @ nominal.matrix_b())[order])
     after = _minor_signs((identified.matrix_c() @ identified.matrix_b())[order])
-    return (
-        ""
-        if before == after
-        else "C B: found other signs of its minors than in the nominal airframe, expected the "
-        "same D"
-    )
+    if before == after:
+        return ""
+    return "C B: found other signs of its minors than in the nominal airframe, expected the same D"
 
 
 def no_better(before: Prediction, after: Prediction) -> str:

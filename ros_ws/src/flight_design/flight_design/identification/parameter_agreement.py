@@ -236,11 +236,9 @@ def require_agreement(name_of_map: str, rows: Iterable[Agreement]) -> str:
             f"{'; '.join(mends)}"
         )
     absent = ", ".join(row.what for row in rows if not row.is_known)
-    return (
-        f"the log has no {absent} before the samples: compare the map with them yourself"
-        if absent
-        else ""
-    )
+    if absent:
+        return f"the log has no {absent} before the samples: compare the map with them yourself"
+    return ""
 
 
 def parameter_changes(

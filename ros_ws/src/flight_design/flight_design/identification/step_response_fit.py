@@ -151,11 +151,9 @@ def _significance(t: FloatArray, responses: FloatArray, theta: FloatArray, size:
     whiten = _whitener(responses[:, early])
     none = whiten @ responses[0, early]
     misfit = whiten @ (responses[0, early] - fitted)
-    return (
-        max(float(none @ none - misfit @ misfit) - len(theta), 0.0)
-        if begins_with_Omega(t, theta)
-        else 0.0
-    )
+    if begins_with_Omega(t, theta):
+        return max(float(none @ none - misfit @ misfit) - len(theta), 0.0)
+    return 0.0
 
 
 def _whitener(responses: FloatArray) -> FloatArray:

@@ -107,11 +107,10 @@ class FeedforwardConfig(Config):
         require(
             not unknown, "feedforward.inputs", ", ".join(unknown), f"some of {', '.join(inputs)}"
         )
-        acts = (
-            None
-            if self.inputs is None
-            else np.array([float(name in self.inputs) for name in inputs])
-        )
+        if self.inputs is None:
+            acts = None
+        else:
+            acts = np.array([float(name in self.inputs) for name in inputs])
         return nominal_model(A, B, C, gravity, np.array(self.lead), acts)
 
 

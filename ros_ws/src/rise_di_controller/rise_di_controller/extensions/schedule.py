@@ -183,11 +183,9 @@ def observers_of(params: Any, scales: Sequence[Array | None]) -> list[ObserverPa
     """The observers of some ticks, with the factors of input_scale there beside a schedule."""
     if not isinstance(params, ScheduleParams):
         return [params] * len(scales)
-    return (
-        [params.law] * len(scales)
-        if params.observer is None
-        else params.observer.at_scales(np.array(scales))
-    )
+    if params.observer is None:
+        return [params.law] * len(scales)
+    return params.observer.at_scales(np.array(scales))
 
 
 @lru_cache(maxsize=64)

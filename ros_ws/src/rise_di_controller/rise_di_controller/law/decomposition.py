@@ -171,11 +171,11 @@ def search(Omega: FloatArray, largest_U: float = math.inf) -> Pairing | None:
         outputs, inputs = order
         return sum(map(ne, outputs, inputs)), sum(map(ne, outputs, places))
 
-    every = (
-        product(permutations(places), permutations(places))
-        if len(matrix) <= MANY
-        else _likely_orders(matrix)
-    )
+    every: Iterable[Order]
+    if len(matrix) <= MANY:
+        every = product(permutations(places), permutations(places))
+    else:
+        every = _likely_orders(matrix)
     for _, group in groupby(sorted(every, key=change), key=change):
         pairings = (_pairing(matrix, *order) for order in group)
         accepted = [

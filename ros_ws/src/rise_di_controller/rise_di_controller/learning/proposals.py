@@ -337,11 +337,8 @@ class Learning:
             )
         if self._simulated:
             is_due = proposal.stamp_ns in self._due and proposal.stamp_ns not in self._received
-            return (
-                ""
-                if is_due
-                else f"found {window}, expected that of an identification that is due, once"
-            )
+            late = f"found {window}, expected that of an identification that is due, once"
+            return "" if is_due else late
         longest = nanoseconds(self._settings.window)
         if self._since_ns is not None:
             longest = min(longest, now_ns - self._since_ns)
