@@ -39,7 +39,7 @@ from flight_campaign import engines
 from flight_campaign.batch import batch_matrices, device
 from flight_campaign.batch.batch_schedule import without_branches
 from flight_campaign.batch.campaign_course import build_course
-from flight_campaign.campaign import Campaign, define, fly_chunk, fly_chunk_figures
+from flight_campaign.campaign import MonteCarlo, define, fly_chunk, fly_chunk_figures
 from flight_core.vectors import FloatArray
 
 FINE = 1e-4  # s: a twentieth of the scenario's step, the reference for the integration error
@@ -61,7 +61,7 @@ class Speed(NamedTuple):
 def speed(scenario: Scenario, aircraft: int, chunk: int | None, workers: int | None) -> Speed:
     """Fly a campaign in threads of this process."""
     with TemporaryDirectory() as folder:
-        campaign = Campaign.begin(
+        campaign = MonteCarlo.begin(
             Path(folder), define(scenario, aircraft, UNCERTAINTY, SEED, chunk)
         )
         process = psutil.Process()

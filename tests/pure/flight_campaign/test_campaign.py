@@ -45,7 +45,7 @@ from flight_analysis.report.guided import control_errors
 from flight_analysis.report.run_folder import REPORT, SUMMARY
 from flight_campaign import campaign, engines, equipment, single_flights
 from flight_campaign.batch import device
-from flight_campaign.campaign import CHUNKS, Campaign, define, fly_chunk
+from flight_campaign.campaign import CHUNKS, MonteCarlo, define, fly_chunk
 from flight_campaign.campaign_report import figure_rows, overview
 from flight_campaign.definition import Definition, Sweep
 from flight_campaign.influence import rank_correlations
@@ -68,9 +68,9 @@ def definition(aircraft: int = 60, chunk: int = 20, sweep: Sweep | None = None) 
     return define(SHORT, aircraft, 0.3, 7, chunk, sweep)
 
 
-def fly_campaign(folder: Path, of: Definition) -> Campaign:
+def fly_campaign(folder: Path, of: Definition) -> MonteCarlo:
     folder.mkdir()
-    campaign = Campaign.begin(folder, of)
+    campaign = MonteCarlo.begin(folder, of)
     assert sum(campaign.fly(engines.threads(2))) == of.aircraft * of.cases
     return campaign
 
@@ -324,14 +324,14 @@ def proposing(*proposals: RiseDiConfig) -> Callable[[Scenario], Learn]:
     return learner
 
 
-def flown_rows(folder: Path, scenario: Scenario, learner: Any, count: int) -> Campaign:
+def flown_rows(folder: Path, scenario: Scenario, learner: Any, count: int) -> MonteCarlo:
     folder.mkdir()
-    campaign = Campaign.begin(folder, define(scenario, count, 0.3, 7))
+    campaign = MonteCarlo.begin(folder, define(scenario, count, 0.3, 7))
     assert list(campaign.fly(engines.threads(1), learner)) == [count]
     return campaign
 
 
-def flown_alone(campaign: Campaign, number: int, learner: Any) -> dict[str, float]:
+def flown_alone(campaign: MonteCarlo, number: int, learner: Any) -> dict[str, float]:
     """Figures of an aircraft of a campaign by the loop of `rise-di fly --in-process`."""
     scenario = campaign.definition.aircraft_scenario(number)
     figures = single_flights.fly(scenario, learner).figures
@@ -413,7 +413,7 @@ def test_same_seed_gives_same_figures_in_any_order_and_engine(tmp_path: Path) ->
         return ((job, work(job)) for job in reversed(list(jobs)))
 
     (tmp_path / "third").mkdir()
-    third = Campaign.begin(tmp_path / "third", definition())
+    third = MonteCarlo.begin(tmp_path / "third", definition())
     list(third.fly(backwards))
     assert third.tally(0).model_dump_json() == first.tally(0).model_dump_json()
     other = fly_campaign(tmp_path / "other", define(SHORT, 60, 0.3, 8, 20))
@@ -423,9 +423,9 @@ def test_same_seed_gives_same_figures_in_any_order_and_engine(tmp_path: Path) ->
 def test_stopped_campaign_resumes_with_missing_chunks(tmp_path: Path) -> None:
     whole = fly_campaign(tmp_path / "whole", definition())
     (tmp_path / "part").mkdir()
-    part = Campaign.begin(tmp_path / "part", definition())
+    part = MonteCarlo.begin(tmp_path / "part", definition())
     next(part.fly(engines.threads(1)))
-    resumed = Campaign.resume(tmp_path / "part")
+    resumed = MonteCarlo.resume(tmp_path / "part")
     assert 0 < len(resumed.missing()) < 3
     list(resumed.fly(engines.threads(1)))
     assert resumed.missing() == []
@@ -528,9 +528,9 @@ def test_results_have_margins_beside_score(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def flown(tmp_path: Path) -> Campaign:
+def flown(tmp_path: Path) -> MonteCarlo:
     """A campaign of one chunk, whose figures are made up."""
-    campaign = Campaign.begin(tmp_path, definition(20, 20))
+    campaign = MonteCarlo.begin(tmp_path, definition(20, 20))
     score = np.linspace(1.0, 2.0, 20)
     (tmp_path / CHUNKS / "0-000000.parquet").write_bytes(made_up(score))
     return campaign
@@ -555,7 +555,9 @@ def refusal(*words: str) -> str:
 
 
 @pytest.mark.parametrize("content", [b"", made_up(np.ones(20))[:-9], made_up(np.ones(9))])
-def test_damaged_chunk_or_chunk_of_another_campaign_named(flown: Campaign, content: bytes) -> None:
+def test_damaged_chunk_or_chunk_of_another_campaign_named(
+    flown: MonteCarlo, content: bytes
+) -> None:
     path = flown.folder / CHUNKS / "0-000000.parquet"
     path.write_bytes(content)
     assert refusal(str(flown.folder)).startswith(
@@ -563,7 +565,7 @@ def test_damaged_chunk_or_chunk_of_another_campaign_named(flown: Campaign, conte
     )
 
 
-def test_results_name_entry_that_decides_score_and_its_worst_corner(flown: Campaign) -> None:
+def test_results_name_entry_that_decides_score_and_its_worst_corner(flown: MonteCarlo) -> None:
     words = ["campaign", str(flown.folder)]
     shown = invoke(*words).stdout
     assert "B[p,aileron]" in shown
@@ -587,7 +589,7 @@ def test_results_name_entry_that_decides_score_and_its_worst_corner(flown: Campa
     assert "B[p,aileron]" in (flown.folder / REPORT).read_text()
 
 
-def test_command_writes_rows_in_one_file(flown: Campaign, tmp_path: Path) -> None:
+def test_command_writes_rows_in_one_file(flown: MonteCarlo, tmp_path: Path) -> None:
     path = tmp_path / "rows.parquet"
     words = ["campaign", str(flown.folder), "--rows", str(path), "--json"]
     assert invoke(*words).exit_code == 0
@@ -598,7 +600,7 @@ def test_command_writes_rows_in_one_file(flown: Campaign, tmp_path: Path) -> Non
     assert sentence.startswith("--rows: found ")
 
 
-def test_campaign_is_not_continued_with_another_definition(flown: Campaign) -> None:
+def test_campaign_is_not_continued_with_another_definition(flown: MonteCarlo) -> None:
     sentence = refusal(str(flown.folder), "--aircraft", "1000")
     assert (
         sentence

@@ -270,9 +270,9 @@ class AircraftConfig(NodeConfig):
         if self.kinematics == "thrust":
             needed = ("p", "q", "r", vertical([*airframe.states]) or "vertical_speed")
         missing = [name for name in needed if name not in airframe.states]
-        known = self.kinematics == "linear" or not missing
+        has_states = self.kinematics == "linear" or not missing
         require(
-            known,
+            has_states,
             "kinematics",
             f"{self.kinematics!r}",
             f"linear: {has_none} state {', '.join(missing)}",
@@ -391,25 +391,25 @@ class AircraftConfig(NodeConfig):
 
         The named airframe, or a sample of `uncertainty` around the named airframe.
         """
-        chosen = self.uncertainty
+        section = self.uncertainty
         return uncertainty.sample_airframe(
             self.nominal_airframe(),
-            chosen.A,
-            chosen.B,
-            chosen.seed,
-            chosen.number,
-            chosen.wind,
-            chosen.spread(),
+            section.A,
+            section.B,
+            section.seed,
+            section.number,
+            section.wind,
+            section.spread(),
         )
 
     def drifted_airframe(self) -> Airframe:
         """The airframe in flight after its drift."""
         airframe = self.sampled_airframe()
-        chosen = self.drift
-        if chosen is None:
+        section = self.drift
+        if section is None:
             return airframe
         return uncertainty.sample_airframe(
-            airframe, chosen.A, chosen.B, chosen.seed, chosen.number, self.uncertainty.wind
+            airframe, section.A, section.B, section.seed, section.number, self.uncertainty.wind
         )
 
     def drift_factors(self) -> Drift | None:
@@ -476,8 +476,8 @@ class AircraftConfig(NodeConfig):
         inputs = list(self.channels().inputs)
         columns |= effector_faults.arrays(section.read_faults(), self._stops(), inputs)
         fails = "lost_at" in columns or "weak_at" in columns
-        known = fails and not self.is_jsbsim  # the model of JSBSim has its own trim
-        return Actuators(**columns, no_thrust=self._no_thrust() if known else None)
+        needs_no_thrust = fails and not self.is_jsbsim  # the model of JSBSim has its own trim
+        return Actuators(**columns, no_thrust=self._no_thrust() if needs_no_thrust else None)
 
     def flight_condition(self) -> FlightCondition:
         """The aircraft of JSBSim and the flight condition.
@@ -489,13 +489,13 @@ class AircraftConfig(NodeConfig):
                 f"airframe: found {self.airframe!r}, expected {PREFIX}NAME with a speed and an "
                 "altitude"
             )
-        named = named_properties(self.commands, "commands")
+        properties = named_properties(self.commands, "commands")
         return FlightCondition(
             name=require_aircraft(self.airframe),
             speed=self.speed,
             altitude=self.altitude,
             step_ns=self.step_ns,
-            named=named,
+            named=properties,
         )
 
     def wind_model(self) -> WindModel:

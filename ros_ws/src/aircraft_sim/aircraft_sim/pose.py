@@ -74,7 +74,7 @@ def over_ground(pose: FloatArray, t: float, wind: Sequence[float], start: Start)
     The wind is in m/s to the north and to the east. The pose is that of a flight from the origin to
     the north. The heading of the start turns the pose, and its place moves it.
     """
-    moved = pose.copy()
+    pose_over_ground = pose.copy()
     if start.heading:
         sin = math.sin(start.heading)
         cos = math.cos(start.heading)
@@ -82,11 +82,11 @@ def over_ground(pose: FloatArray, t: float, wind: Sequence[float], start: Start)
             i = POSE.index(first)
             north = pose[i]
             east = pose[i + 1]
-            moved[i] = cos * north - sin * east
-            moved[i + 1] = sin * north + cos * east
+            pose_over_ground[i] = cos * north - sin * east
+            pose_over_ground[i + 1] = sin * north + cos * east
         psi = POSE.index("psi")
-        moved[psi] = wrapped(float(pose[psi]) + start.heading)
+        pose_over_ground[psi] = wrapped(float(pose[psi]) + start.heading)
     for i, (speed, place) in enumerate(zip(wind, (start.north, start.east), strict=True)):
-        moved[POSE.index("north") + i] += place + speed * t
-        moved[POSE.index("v_north") + i] += speed
-    return np.asarray(moved)
+        pose_over_ground[POSE.index("north") + i] += place + speed * t
+        pose_over_ground[POSE.index("v_north") + i] += speed
+    return np.asarray(pose_over_ground)

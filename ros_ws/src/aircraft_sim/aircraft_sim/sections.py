@@ -103,9 +103,9 @@ class ShearConfig(Config):
         every = {key for keys in NEEDS.values() for key in keys}
         for key in sorted(every):
             is_set = bool(getattr(self, key))
-            needed = key in NEEDS[self.law]
-            expected = f"{'a value' if needed else 'none'} beside law {self.law}"
-            require(is_set == needed, key, "a value" if is_set else "none", expected)
+            is_needed = key in NEEDS[self.law]
+            expected = f"{'a value' if is_needed else 'none'} beside law {self.law}"
+            require(is_set == is_needed, key, "a value" if is_set else "none", expected)
         for key in ("north", "east"):
             if self.law == "table":
                 require_length(key, getattr(self, key), [f"{h:g} m" for h in self.height])
@@ -154,8 +154,8 @@ def require_one_wind(
         require(not any(wind), "wind", list(wind), expected)
     if shear is not None and burst is not None:
         expected = f"{shear.ground:g} m, as in shear"
-        same = burst.ground == shear.ground
-        require(same, "microburst.ground", f"{burst.ground:g} m", expected)
+        is_same = burst.ground == shear.ground
+        require(is_same, "microburst.ground", f"{burst.ground:g} m", expected)
 
 
 def wind_field_of(

@@ -62,11 +62,11 @@ def measure(number: int, y: FloatArray, drift: RandomWalk, params: Sensors) -> M
     bit.
     """  # noqa: D400, D415 - what follows is an equation
     added, drift = error(number, drift, params)
-    measured = y + added
+    y_measured = y + added
     if params.quantum is not None:
-        measured = quantised(measured, params.quantum)
-        added = np.where(params.quantum > 0.0, measured - y, added)
-    return Measured(measured, added, drift)
+        y_measured = quantised(y_measured, params.quantum)
+        added = np.where(params.quantum > 0.0, y_measured - y, added)
+    return Measured(y_measured, added, drift)
 
 
 def error(number: int, drift: RandomWalk, params: Sensors) -> tuple[FloatArray, RandomWalk]:
@@ -142,6 +142,6 @@ def transmit(
     y enters the delay line with the stamp now; None: the sample is dropped. Samples as old as the
     delay arrive, the oldest first. A stamp stays the instant of measurement.
     """
-    sent = delay_line if y is None else (*delay_line, StampedVector(now_ns, y))
-    arrived = sum(sample.stamp_ns + params.delay_ns <= now_ns for sample in sent)
-    return sent[arrived:], sent[:arrived]
+    line = delay_line if y is None else (*delay_line, StampedVector(now_ns, y))
+    arrived = sum(sample.stamp_ns + params.delay_ns <= now_ns for sample in line)
+    return line[arrived:], line[:arrived]

@@ -120,15 +120,25 @@ class Simulator:
         now_ns = self._number * self.period_ns
         t = seconds(now_ns)
         for axis, gust in parameters.gusts.items():
-            old = self._gusts.get(axis)
-            if gust == old:
+            gust_before = self._gusts.get(axis)
+            if gust == gust_before:
                 continue
             require(
                 gust.start >= t, f"gusts.{axis}.start", f"{gust.start:g} s", f"at least t = {t:g} s"
             )
-            end = old.start + 2.0 * old.length / self._speed if old is not None and old.speed else t
-            end = math.inf if old is not None and old.speed and math.isfinite(old.every) else end
-            over = old is None or t <= old.start or end <= t
+            end = (
+                gust_before.start + 2.0 * gust_before.length / self._speed
+                if gust_before is not None and gust_before.speed
+                else t
+            )
+            end = (
+                math.inf
+                if gust_before is not None
+                and gust_before.speed
+                and math.isfinite(gust_before.every)
+                else end
+            )
+            over = gust_before is None or t <= gust_before.start or end <= t
             require(
                 over,
                 f"gusts.{axis}",
@@ -201,17 +211,17 @@ class Simulator:
         self._is_above_ground = at["altitude"] > self._ground
         if was_above and not self._is_above_ground:
             is_level = abs(at["phi"]) < LEVEL
-            ended = touch(self._title, t_ns, -at["climb"], is_on_wheels=is_level)
-            raise self._with_place(ended)
+            end = touch(self._title, t_ns, -at["climb"], is_on_wheels=is_level)
+            raise self._with_place(end)
 
-    def _with_place(self, ended: FlightEnded) -> FlightEnded:
+    def _with_place(self, end: FlightEnded) -> FlightEnded:
         """The end with the speed across the heading and the place, where it is a landing."""
-        if ended.end is not End.LANDED:
-            return ended
+        if end.end is not End.LANDED:
+            return end
         at = dict(zip(POSE, self.pose().tolist(), strict=True))
         across = at["v_east"] * math.cos(at["psi"]) - at["v_north"] * math.sin(at["psi"])
         place = f"north {at['north']:.0f} m, east {at['east']:.1f} m"
-        return FlightEnded(f"{ended}, {abs(across):.1f} m/s sideways, at {place}", ended.end)
+        return FlightEnded(f"{end}, {abs(across):.1f} m/s sideways, at {place}", end.end)
 
     def pose(self) -> FloatArray:
         """The true pose at the instant of the last sample, in the order of `channels.POSE`."""

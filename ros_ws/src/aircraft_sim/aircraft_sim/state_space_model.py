@@ -68,11 +68,11 @@ class StateSpaceModel:
             self._block_ns = t_ns
             begin = 0
             self._block = plant.forcing(t_ns, max(steps, BLOCK), self._plant, self._state.x)
-        forced = Forcing(*(part[2 * begin : 2 * (begin + steps) + 1] for part in self._block))
+        forcing = Forcing(*(part[2 * begin : 2 * (begin + steps) + 1] for part in self._block))
         if self._over_place is not None:
-            forced = forced._replace(rate=forced.rate + self._rate_by_wind())
+            forcing = forcing._replace(rate=forcing.rate + self._rate_by_wind())
         self._state = plant.advance(
-            t_ns, self._state, u, duration_ns, self._plant, self._tilted(forced)
+            t_ns, self._state, u, duration_ns, self._plant, self._tilted(forcing)
         )
         half = seconds(duration_ns) / 2.0
         self._fly_on(2.0 * half)
@@ -176,7 +176,9 @@ class StateSpaceModel:
     def truth(self, t_ns: int) -> FloatArray:
         """See FlightDynamicsModel."""
         index = 2 * ((t_ns - self._block_ns) // self._plant.step_ns)
-        flown = self._plant._replace(aircraft=plant.aircraft_at(t_ns, self._plant, self._state.x))
+        plant_now = self._plant._replace(
+            aircraft=plant.aircraft_at(t_ns, self._plant, self._state.x)
+        )
         rate = self._block.rate[index]
         wind = self._block.wind[index]
         if self._over_place is not None:
@@ -185,7 +187,7 @@ class StateSpaceModel:
             blown = [place for place, axis in enumerate(self._axes) if axis in AXES]
             wind = wind.copy()
             wind[blown] += along[[AXES.index(self._axes[place]) for place in blown]]
-        return truth.values(self._state, wind, rate, flown)
+        return truth.values(self._state, wind, rate, plant_now)
 
     def diverged(self) -> bool:
         """See FlightDynamicsModel."""

@@ -93,14 +93,12 @@ def wind_factors(airframe: Airframe, A: FloatArray, wind: WindEffect) -> FloatAr
     A published effect equal to minus the published column, per w / V0 or w, then equals minus the
     aircraft's own column.
     """
-    published = airframe.matrix_a()
+    nominal = airframe.matrix_a()
     factors = np.ones((len(A), len(airframe.states), len(airframe.gusts)))
     for k, axis in enumerate(airframe.gusts):
         if wind == AIR_RELATIVE and AIR_STATE[axis] in airframe.states:
             j = airframe.index(AIR_STATE[axis])
-            np.divide(
-                A[:, :, j], published[:, j], out=factors[:, :, k], where=published[:, j] != 0.0
-            )
+            np.divide(A[:, :, j], nominal[:, j], out=factors[:, :, k], where=nominal[:, j] != 0.0)
     return factors
 
 
@@ -149,11 +147,11 @@ def sampled_matrices(
     A = airframe.matrix_a()
     B = airframe.matrix_b()
     uniform = random_streams.uniform(first, count, A.size + B.size, random_streams.AIRFRAME, seed)
-    known = np.array([[float(state not in KINEMATIC)] for state in airframe.states])
+    is_free = np.array([[float(state not in KINEMATIC)] for state in airframe.states])
 
     def drawn(matrix: FloatArray, part: FloatArray, numbers: FloatArray) -> FloatArray:
         d = deviations(numbers.reshape(count, *matrix.shape), spread.distribution)
-        return np.asarray(matrix * (1.0 + known * part * d))
+        return np.asarray(matrix * (1.0 + is_free * part * d))
 
     return drawn(A, parts["A"], uniform[:, : A.size]), drawn(B, parts["B"], uniform[:, A.size :])
 
@@ -183,14 +181,14 @@ def drawn_entries(airframe: Airframe, A: FloatArray, B: FloatArray) -> dict[str,
 
 def drawn_places(airframe: Airframe) -> dict[str, tuple[str, int, int]]:
     """The entries that `sampled_matrices` draws: matrix, row and column by name."""
-    named = {
+    matrices = {
         "A": (airframe.matrix_a(), [*airframe.states]),
         "B": (airframe.matrix_b(), [*airframe.inputs]),
     }
     rows = [*airframe.states]
     places = {}
-    for matrix, (published, columns) in named.items():
-        for i, j in np.argwhere(published).tolist():
+    for matrix, (matrix_values, columns) in matrices.items():
+        for i, j in np.argwhere(matrix_values).tolist():
             if rows[i] not in KINEMATIC:
                 places[f"{matrix}[{rows[i]},{columns[j]}]"] = (matrix, i, j)
     return places

@@ -70,7 +70,7 @@ Address = tuple[Any, ...]
 """Host and port of a sender over UDP, else the URL."""
 
 
-class ReceivedMessage(NamedTuple):
+class MavlinkMessage(NamedTuple):
     """A message and its arrival, ns of the system clock."""
 
     message: Any
@@ -168,7 +168,7 @@ class Link:
         self._second_at = 0.0  # and when it sent last
         self.stations: set[int] = set()  # systems of ground stations beside this bridge
         self._refused = ""  # why the last message was refused, for its signature
-        self._queues: dict[str, deque[ReceivedMessage]] = {}
+        self._queues: dict[str, deque[MavlinkMessage]] = {}
         self.parameters: dict[str, float] = {}  # of the autopilot, as it last told
         self._to_read = tuple(parameters)
         self._further = tuple(further)
@@ -197,7 +197,7 @@ class Link:
         second = self._second if time.monotonic() - self._second_at <= SILENCE else ""
         return sentences(self._clash, second)
 
-    def listen(self, name: str) -> deque[ReceivedMessage]:
+    def listen(self, name: str) -> deque[MavlinkMessage]:
         """The queue in which messages of a name arrive."""
         return self._queues.setdefault(name, deque(maxlen=QUEUE))
 
@@ -437,7 +437,7 @@ class Link:
             self.parameters[message.param_id] = message.param_value
         self._rates.take(name, now)
         if (queue := self._queues.get(name)) is not None:
-            queue.append(ReceivedMessage(message, received_ns))
+            queue.append(MavlinkMessage(message, received_ns))
 
     def _admits(self, message: Any, address: Address, now: float) -> bool:
         """Whether a message of the autopilot is from the locked sender.
@@ -543,7 +543,7 @@ class MavlinkReader:
         self.fields = tuple(topic.type.fields)
         self._queue = link.listen(self.message_name)
 
-    def take(self) -> list[ReceivedMessage]:
+    def take(self) -> list[MavlinkMessage]:
         """The messages since the last call, oldest first."""
         return [self._queue.popleft() for _ in range(len(self._queue))]
 

@@ -102,7 +102,7 @@ def define(
     else:
         build_course(scenario)
     # each aircraft of the campaign has its own
-    published = scenario.vary(aircraft={"uncertainty": {}})
+    nominal = scenario.vary(aircraft={"uncertainty": {}})
     spread = scenario.aircraft.uncertainty.spread() if spread is None else spread
     spread = spread._replace(entries=equipment.expanded(spread.entries, scenario))
     stated_units = _permitted_units(scenario, units or {})
@@ -121,7 +121,7 @@ def define(
         "sections": {
             name: section.model_dump(mode="json")
             for name in SCHEMAS
-            if (section := getattr(published, name)) is not None
+            if (section := getattr(nominal, name)) is not None
         },
         "aircraft": aircraft,
         "uncertainty": uncertainty,
@@ -202,9 +202,9 @@ def _fly_at_once(text: str, case: int, first: int, count: int, size: int) -> Chu
 
     definition = Definition.model_validate_json(text)
     scenario, course, vehicle, law = _prepare(text, case)
-    drawn = drawn_fleet(definition, scenario, first, size)  # while the chunk before flies
+    fleet_of_chunk = drawn_fleet(definition, scenario, first, size)  # while the chunk before flies
     with turn():
-        fleet, equipped = drawn.on_device(course, vehicle)
+        fleet, equipped = fleet_of_chunk.on_device(course, vehicle)
         flown = batch.fly(fleet, equipped, course, law.control_law, law.params)
         result = batch.on_host(flown)
     rms, largest, slew = (part[:, :count] for part in (result.rms, result.max, result.slew))
@@ -217,7 +217,7 @@ def _fly_at_once(text: str, case: int, first: int, count: int, size: int) -> Chu
         ("slew", inputs, slew),
     ):
         figures |= {f"{kind}.{name}": row for name, row in zip(names, values, strict=True)}
-    entries = {name: value[:count] for name, value in drawn.entries().items()}
+    entries = {name: value[:count] for name, value in fleet_of_chunk.entries().items()}
     return Chunk(first, result.diverged[:count], figures, entries)
 
 
@@ -246,7 +246,7 @@ def _prepare(text: str, case: int) -> _Shared:
     )
 
 
-class Campaign:
+class MonteCarlo:
     """A campaign and its folder."""
 
     def __init__(self, folder: Path, definition: Definition) -> None:
@@ -254,7 +254,7 @@ class Campaign:
         self.definition = definition
 
     @classmethod
-    def begin(cls, folder: Path, definition: Definition) -> "Campaign":
+    def begin(cls, folder: Path, definition: Definition) -> "MonteCarlo":
         """A new campaign in an existing, empty folder."""
         campaign = cls(folder, definition)
         (folder / CHUNKS).mkdir()
@@ -262,7 +262,7 @@ class Campaign:
         return campaign
 
     @classmethod
-    def resume(cls, folder: Path) -> "Campaign":
+    def resume(cls, folder: Path) -> "MonteCarlo":
         """The campaign of a folder. Raises ParameterError for a folder without one."""
         try:
             definition = Definition.model_validate_json(

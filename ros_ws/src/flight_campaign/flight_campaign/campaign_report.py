@@ -38,7 +38,7 @@ from flight_analysis.report.summary import finite_or_null
 from flight_analysis.report.summary_rows import Column
 from flight_analysis.report.tables import MetricTable
 from flight_campaign import equipment
-from flight_campaign.campaign import Campaign
+from flight_campaign.campaign import MonteCarlo
 from flight_campaign.definition import Definition
 from flight_campaign.statistics import (
     EDGES,
@@ -92,7 +92,7 @@ LEARNER_LEGEND = (
 )
 
 
-def write_results(campaign: Campaign) -> tuple[dict[str, Any], MetricTable]:
+def write_results(campaign: MonteCarlo) -> tuple[dict[str, Any], MetricTable]:
     """Write the summary, the report and the scenarios of the worst aircraft.
 
     Returns the summary and the overview. Raises ParameterError.
@@ -114,16 +114,16 @@ def write_results(campaign: Campaign) -> tuple[dict[str, Any], MetricTable]:
                     "influence": _influence(campaign, case, tally),
                 }
             )
-        stated = {key: getattr(definition, key) for key in STATED}
+        statement = {key: getattr(definition, key) for key in STATED}
         sweep = None if definition.sweep is None else definition.sweep.parameter
-        figures = {"scenario": definition.name} | stated | {"sweep": sweep, "cases": cases}
+        figures = {"scenario": definition.name} | statement | {"sweep": sweep, "cases": cases}
         figures = finite_or_null(figures)
         write_file(campaign.folder / SUMMARY, json.dumps(figures, indent=1))
         write_page(campaign.folder / REPORT, definition, tallies, cases, margins)
     return figures, overview(definition, tallies, margins)
 
 
-def _write_worst(campaign: Campaign, case: int, tally: Tally) -> list[dict[str, Any]]:
+def _write_worst(campaign: MonteCarlo, case: int, tally: Tally) -> list[dict[str, Any]]:
     """Write the scenarios of the worst aircraft; returns them with the command that flies each."""
     definition = campaign.definition
     again = []
@@ -136,7 +136,7 @@ def _write_worst(campaign: Campaign, case: int, tally: Tally) -> list[dict[str, 
     return again
 
 
-def _influence(campaign: Campaign, case: int, tally: Tally) -> dict[str, Any]:
+def _influence(campaign: MonteCarlo, case: int, tally: Tally) -> dict[str, Any]:
     """Rank correlations of a case.
 
     Writes the airframe and the scenario of the worst corner where there is one.
@@ -155,11 +155,11 @@ def _influence(campaign: Campaign, case: int, tally: Tally) -> dict[str, Any]:
     airframe = path.with_name(
         "corner_airframe.yaml" if definition.sweep is None else f"corner_airframe_{case}.yaml"
     ).absolute()
-    known = equipment.references(scenario, definition.entries)
+    references = equipment.references(scenario, definition.entries)
     equipment_parts = {
-        name: known[name] * (1.0 + part) for name, part in corner.items() if name in known
+        name: references[name] * (1.0 + part) for name, part in corner.items() if name in references
     }
-    matrix_parts = {name: part for name, part in corner.items() if name not in known}
+    matrix_parts = {name: part for name, part in corner.items() if name not in references}
     write_file(
         airframe,
         as_yaml(
@@ -179,7 +179,7 @@ def _influence(campaign: Campaign, case: int, tally: Tally) -> dict[str, Any]:
     return ranked | {"command": _command(path)}
 
 
-def _path(campaign: Campaign, case: int, word: str) -> Path:
+def _path(campaign: MonteCarlo, case: int, word: str) -> Path:
     """The file of a scenario of a case."""
     definition = campaign.definition
     suffix = "" if definition.sweep is None else f"_{definition.factor(case):g}"
@@ -261,9 +261,9 @@ def _guarantees(labels: Sequence[str], cases: Sequence[Mapping[str, Any]]) -> Me
     for label, case in zip(labels, cases, strict=True):
         promise = case["guarantee"]
         first = None if promise is None else promise["unstable"]
-        shown = [None if promise is None else promise["stable"]]
-        shown.append(None if first is None else first["deviation"])
-        rows.append([label, *(NO_VALUE if x is None else f"{100.0 * x:.1f}" for x in shown)])
+        cells = [None if promise is None else promise["stable"]]
+        cells.append(None if first is None else first["deviation"])
+        rows.append([label, *(NO_VALUE if x is None else f"{100.0 * x:.1f}" for x in cells)])
     heads = ("stable for every aircraft within, %", "first unstable aircraft found, %")
     columns = [Column("", head) for head in heads]
     return MetricTable("Guarantee of the linear loop", columns, rows, GUARANTEE_LEGEND)
@@ -276,13 +276,13 @@ def overview(
     columns = []
     for tally, loop_margins in zip(tallies, margins, strict=True):
         score = tally.figures.get("score", FigureStatistics())
-        lost = tally.lost + tally.diverged
+        failures = tally.lost + tally.diverged
         worst = "diverged" if tally.diverged else f"{score.largest:.3g}"
         columns.append(
             [
                 f"{score.mean:.3g}",
                 worst,
-                f"{100.0 * lost / max(tally.flights, 1):.3g}",
+                f"{100.0 * failures / max(tally.flights, 1):.3g}",
                 *least_margins(loop_margins),
             ]
         )
@@ -313,13 +313,13 @@ def score_meaning(scenario: Scenario, score_units: Mapping[str, float] | None = 
             "of flight at the trim speed"
         )
     units = display_units(scenario)
-    stated = [
+    unit_texts = [
         f"{name} {unit * units[name].factor:g} {units[name].unit}"
         for name, unit in (score_units or {}).items()
     ]
     return (
         "the sum over the channels of rms error in "
-        f"{', '.join([*stated, '10 mrad/s (p: 20) and 0.1 m/s'])}"
+        f"{', '.join([*unit_texts, '10 mrad/s (p: 20) and 0.1 m/s'])}"
     )
 
 
@@ -390,8 +390,8 @@ def _label(name: str, units: Mapping[str, DisplayUnit]) -> tuple[str, float]:
     kind, _, channel = name.partition(".")
     if not channel:
         return OF_LEARNER.get(name, name), 1.0
-    shown = units.get(channel, NO_UNIT)
-    return f"{kind} {channel} ({shown.unit}{'/s' * (kind == 'slew')})", shown.factor
+    unit = units.get(channel, NO_UNIT)
+    return f"{kind} {channel} ({unit.unit}{'/s' * (kind == 'slew')})", unit.factor
 
 
 def _worst(labels: Sequence[str], cases: Sequence[Mapping[str, Any]]) -> MetricTable:

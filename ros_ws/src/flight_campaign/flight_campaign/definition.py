@@ -73,12 +73,12 @@ class Sweep(Config):
         require(
             by_channel, "sweep", self.parameter, f"{self.name}: it does not have a value a channel"
         )
-        named = [
+        values = [
             *enumerate(controller.outputs[: len(value)]),
             *enumerate(controller.inputs[: len(value)]),
         ]
-        places = [k for k, name in named if f"{self.name}[{name}]" == self.parameter]
-        names = ", ".join(name for _, name in named)
+        places = [k for k, name in values if f"{self.name}[{name}]" == self.parameter]
+        names = ", ".join(name for _, name in values)
         require(
             bool(places), "sweep", self.parameter, f"{self.name}[CHANNEL], CHANNEL one of {names}"
         )
@@ -131,8 +131,8 @@ class Definition(Config):
         scenario = scenario_of(self.name, Path(self.name), self.sections)
         if self.sweep is None:
             return scenario
-        scaled = self.sweep.scaled(scenario.controller, self.factor(case))
-        return scenario.vary(controller={self.sweep.name: scaled})
+        controller = self.sweep.scaled(scenario.controller, self.factor(case))
+        return scenario.vary(controller={self.sweep.name: controller})
 
     def aircraft_scenario(self, number: int, case: int = 0) -> Scenario:
         """The scenario of one aircraft of the campaign, as `rise-di fly` flies it."""
@@ -150,9 +150,9 @@ class Definition(Config):
             "parts": [*entries.values()],
             "distribution": self.distribution,
         }
-        drawn = self.drawn_equipment(scenario, number, 1)
+        equipment_values = self.drawn_equipment(scenario, number, 1)
         equipped = equipment.with_equipment(
-            scenario, {name: float(value[0]) for name, value in drawn.items()}
+            scenario, {name: float(value[0]) for name, value in equipment_values.items()}
         )
         return equipped.vary(aircraft={"uncertainty": uncertainty})
 

@@ -111,17 +111,17 @@ def dask(
         # they log the loss of a peer as tracebacks
         for part in ("", ".client", ".nanny", ".scheduler", ".worker"):
             logging.getLogger(f"distributed{part}").setLevel(logging.CRITICAL)
-        lost: list[Job] = []
+        lost_jobs: list[Job] = []
         while True:
             underway: dict[Any, Job] = {}
             with ExitStack() as stack:
                 client, threads_known = _connected(stack, scheduler, count, devices, patience)
-                ahead = AHEAD * max(count, threads_known)
-                first = [*lost, *islice(waiting, max(ahead - len(lost), 0))]
+                queue_length = AHEAD * max(count, threads_known)
+                first = [*lost_jobs, *islice(waiting, max(queue_length - len(lost_jobs), 0))]
                 try:
                     yield from _results(client, work, first, waiting, underway)
                 except (CancelledError, CommClosedError):
-                    lost = list(underway.values())
+                    lost_jobs = list(underway.values())
                     patience = RECONNECT
                 except KilledWorker as error:
                     failure = (

@@ -38,12 +38,12 @@ def published(scenario: Scenario) -> dict[str, float]:
     """The lags above 0 and the noise above 0 of a scenario by name, SI."""
     aircraft = scenario.aircraft
     channels = scenario.aircraft.channels()
-    named = (
+    entries = (
         ("lag", channels.inputs, aircraft.actuators.lag),
         ("noise", channels.outputs, aircraft.sensors.noise),
     )
     above: dict[str, float] = {}
-    for kind, names, values in named:
+    for kind, names, values in entries:
         above |= {
             f"{kind}[{name}]": value
             for name, value in zip(names, values, strict=False)
@@ -58,7 +58,7 @@ def expanded(entries: Mapping[str, float], scenario: Scenario) -> dict[str, floa
     A channel's own entry counts, and the delay is in whole periods. Raises ParameterError for an
     unknown entry.
     """
-    known = published(scenario)
+    entries_of_scenario = published(scenario)
     every = dict[str, float]()
     for name, part in entries.items():
         if name == DELAY:
@@ -70,13 +70,15 @@ def expanded(entries: Mapping[str, float], scenario: Scenario) -> dict[str, floa
         if name.startswith(("A[", "B[")):
             every[name] = part
             continue
-        chosen = [entry for entry in known if name in (entry, entry.partition("[")[0])]
+        matches = [
+            entry for entry in entries_of_scenario if name in (entry, entry.partition("[")[0])
+        ]
         expected = (
-            f"a lag or a noise above 0: {', '.join(known) or 'none'}; delay, or an entry "
-            "of A or B, as A[q,q]"
+            f"a lag or a noise above 0: {', '.join(entries_of_scenario) or 'none'}; delay, or an "
+            "entry of A or B, as A[q,q]"
         )
-        require(bool(chosen), "uncertainty", f"entry {name}", expected)
-        every |= {entry: entries.get(entry, part) for entry in chosen}
+        require(bool(matches), "uncertainty", f"entry {name}", expected)
+        every |= {entry: entries.get(entry, part) for entry in matches}
     return every
 
 
@@ -89,13 +91,15 @@ def drawn(
     A. A delay is (1 + d) / 2 of the largest one, in whole periods. A value depends on seed and
     number alone. The entries of `spread` are those of `expanded`.
     """
-    known = published(scenario)
+    published_values = published(scenario)
     rate = scenario.controller.rate
-    uniform = random_streams.uniform(first, count, len(known) + 1, random_streams.EQUIPMENT, seed)
+    uniform = random_streams.uniform(
+        first, count, len(published_values) + 1, random_streams.EQUIPMENT, seed
+    )
     d = deviations(uniform, spread.distribution)
     values = {
         name: value * (1.0 + spread.entries[name] * d[:, k])
-        for k, (name, value) in enumerate(known.items())
+        for k, (name, value) in enumerate(published_values.items())
         if name in spread.entries
     }
     if DELAY in spread.entries:

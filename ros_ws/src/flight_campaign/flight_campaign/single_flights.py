@@ -54,9 +54,11 @@ def learned(tape: Tape, events: Sequence[Event]) -> LearningOutcome:
         if event.kind is EventKind.FLIES and UNVERIFIED not in event.sentence
     ]
     fallbacks = sum(event.kind in {EventKind.FALLBACK, EventKind.RESTART} for event in events)
-    refused = sum(event.kind is EventKind.REFUSED for event in events)
-    refused += int(np.sum(proposed == 0.0))
-    return LearningOutcome(models[0] / 1e9 if models else math.nan, len(models), refused, fallbacks)
+    refusals = sum(event.kind is EventKind.REFUSED for event in events)
+    refusals += int(np.sum(proposed == 0.0))
+    return LearningOutcome(
+        models[0] / 1e9 if models else math.nan, len(models), refusals, fallbacks
+    )
 
 
 def flies_alone(scenario: Scenario) -> bool:

@@ -88,15 +88,15 @@ class FigureStatistics(Config):
 
     def quantile(self, share: float) -> float:
         """The upper bound of a share of the flights, to the width of a bin (2.3 %)."""
-        wanted = share * self.count
+        rank = share * self.count
         below = 0
         for place, number in self.bins.items():
-            if below + number >= wanted:
+            if below + number >= rank:
                 if place < 0:
                     return 0.0
                 low = EDGES[place]
                 high = EDGES[min(place + 1, len(EDGES) - 1)]
-                return min(float(low * (high / low) ** ((wanted - below) / number)), self.largest)
+                return min(float(low * (high / low) ** ((rank - below) / number)), self.largest)
             below += number
         return self.largest
 
@@ -177,10 +177,10 @@ class Tally(Config):
         for word, count in (("diverged", self.diverged), ("lost", self.lost)):
             share, low, high = self.share(count)
             shares[word] = {"count": count, "share": share, "low": low, "high": high}
-        named = {}
+        summaries = {}
         for name, figure in self.figures.items():
             quantiles = {f"q{100 * part:g}": figure.quantile(part) for part in QUANTILES}
-            named[name] = {
+            summaries[name] = {
                 "mean": figure.mean,
                 "deviation": figure.deviation,
                 "worst": figure.largest,
@@ -188,7 +188,7 @@ class Tally(Config):
         return {
             "flights": self.flights,
             **shares,
-            "figures": named,
+            "figures": summaries,
             "worst": [flight.model_dump() for flight in self.worst],
         }
 
@@ -219,18 +219,20 @@ def score_units(
     `stated` replaces usual units by output. Raises ParameterError for an output without a unit in
     the score.
     """
-    known = SCORE_UNIT_OF | dict(stated or {})
+    units_of_score = SCORE_UNIT_OF | dict(stated or {})
     for name in outputs:
-        counted = name in known or quantity(units[name]).dimension in SCORE_UNIT
+        has_score = name in units_of_score or quantity(units[name]).dimension in SCORE_UNIT
         require(
-            counted,
+            has_score,
             "outputs",
             f"{name} in {units[name]}",
             "rad/s or m/s, or a unit of the score for this output",
         )
     return np.array(
         [
-            known[name] if name in known else SCORE_UNIT[quantity(units[name]).dimension]
+            units_of_score[name]
+            if name in units_of_score
+            else SCORE_UNIT[quantity(units[name]).dimension]
             for name in outputs
         ]
     )

@@ -24,8 +24,7 @@ from flight_analysis.report.display_units import QUANTITY_UNITS, display_units
 from flight_analysis.report.run_folder import REPORT, new_run
 from flight_analysis.report.tables import MetricTable
 from flight_campaign import engines
-from flight_campaign.campaign import Campaign as MonteCarlo
-from flight_campaign.campaign import define
+from flight_campaign.campaign import MonteCarlo, define
 from flight_campaign.campaign_report import (
     FIGURE_HEADINGS,
     WIND_EFFECTS,

@@ -89,11 +89,11 @@ class GuidanceClient(Client):
 
         Every subscriber has to be matched, too.
         """
-        known = [
+        names = [
             endpoint.node_name
             for endpoint in self._node.get_subscriptions_info_by_topic(publisher.topic_name)
         ]
-        return NAME in known and len(known) <= publisher.get_subscription_count()
+        return NAME in names and len(names) <= publisher.get_subscription_count()
 
     def _reason(self, topic: Topic, is_taken: Callable[[], bool], unknown: str) -> str:
         """Wait until guidance has taken a message, or has refused it.
@@ -123,9 +123,9 @@ class GuidanceClient(Client):
         The reasons come from the log of the nodes.
         """
         texts = [
-            received.message.msg
-            for received in self._log.take()
-            if received.message.name.split(".")[-1] == NAME
+            arrival.message.msg
+            for arrival in self._log.take()
+            if arrival.message.name.split(".")[-1] == NAME
         ]
         parts = [text.partition(REFUSED) for text in texts]
         namespace = self._node.get_namespace().rstrip("/")
@@ -158,7 +158,7 @@ class TargetClient(GuidanceClient):
     def __init__(self, namespace: str = "", parent: Client | None = None) -> None:
         super().__init__("operator", namespace, parent)
         self._publisher = self._node.create_publisher(TARGET.type, TARGET.name, PUBLISH)
-        self._sent = -TARGET_PERIOD  # monotonic time of the last target, s
+        self._last_sending = -TARGET_PERIOD  # monotonic time of the last target, s
         self._silent = (
             f"{self._guidance.name}: not received, expected a flight with guidance in this domain"
         )
@@ -188,8 +188,8 @@ class TargetClient(GuidanceClient):
             time.sleep(LINK_PERIOD)
 
     def _published(self, values: Mapping[str, float]) -> bool:
-        if time.monotonic() - self._sent > TARGET_PERIOD:
-            self._sent = time.monotonic()
+        if time.monotonic() - self._last_sending > TARGET_PERIOD:
+            self._last_sending = time.monotonic()
             self._publish(values)
         return self._has_taken(values)
 

@@ -45,11 +45,11 @@ def speeds(waypoints: Sequence[Waypoint], first: float) -> tuple[float, ...]:
 
     The airspeed is that of the waypoint, or of the leg before; `first` where none is named yet.
     """
-    named = []
+    leg_speeds = []
     for waypoint in waypoints:
         first = waypoint.speed or first
-        named.append(first)
-    return tuple(named)
+        leg_speeds.append(first)
+    return tuple(leg_speeds)
 
 
 class FlyableRoute(NamedTuple):
@@ -78,19 +78,20 @@ def flyable(
     leg too short for the fillets. phi_max is the largest bank at V for the stall speed.
     """
     require_bounds(waypoints, can)
-    flown = speeds(waypoints, can.speed)
+    leg_speeds = speeds(waypoints, can.speed)
     least = 0.0
     slowest = 0.0
-    for speed in flown:
+    for speed in leg_speeds:
         bank = protection.bank_limit(can.bank, can.stall_speed, speed)
         least = max(least, least_radius(speed, can.wind, bank))
         slowest = max(slowest, least_period(speed, bank, can.roll_rate))
     expected = f"at least {_up(slowest, 0.1):g} s at this speed, bank and roll rate"
     require(period >= slowest, "guidance.period", f"{period:g} s", expected)
-    named = [
-        waypoint._replace(speed=speed) for waypoint, speed in zip(waypoints, flown, strict=True)
+    waypoints_by_number = [
+        waypoint._replace(speed=speed)
+        for waypoint, speed in zip(waypoints, leg_speeds, strict=True)
     ]
-    remaining, notes = _without_short_legs(named, radius, least)
+    remaining, notes = _without_short_legs(waypoints_by_number, radius, least)
     return _with_circles(dict(remaining), notes, radius, least, can)
 
 
@@ -107,7 +108,7 @@ def as_route(
     A fillet leads to the next waypoint; a leg leaves the waypoint before. An orbit changes the
     altitude at its waypoint.
     """
-    flown = speeds(waypoints, speed)
+    leg_speeds = speeds(waypoints, speed)
     numbers = path.leads(legs)
     before = [max(k - 1, 0) for k in numbers]
     altitude = []
@@ -121,9 +122,9 @@ def as_route(
     return Route(
         legs=legs,
         altitude=tuple(altitude),
-        V=tuple(flown[k] for k in numbers),
+        V=tuple(leg_speeds[k] for k in numbers),
         from_altitude=tuple(departures),
-        from_V=tuple(flown[k] for k in before),
+        from_V=tuple(leg_speeds[k] for k in before),
         slopes=slopes,
         notes=notes,
     )
@@ -193,7 +194,7 @@ def _offset(before: Point, point: Point, after: Point) -> float:
 
 
 def _with_circles(
-    numbered: Mapping[int, Waypoint],
+    by_number: Mapping[int, Waypoint],
     notes: tuple[str, ...],
     radius: float,
     least: float,
@@ -203,8 +204,8 @@ def _with_circles(
 
     The change is beyond the climb or sink along the leg. Waypoints are by number.
     """
-    numbers = list(numbered)
-    waypoints = list(numbered.values())
+    numbers = list(by_number)
+    waypoints = list(by_number.values())
     sentences = list(notes)
     while True:
         legs = _legs(waypoints, radius, least)
@@ -247,13 +248,20 @@ def require_bounds(waypoints: Sequence[Waypoint], can: Performance) -> None:
     """Raise ParameterError for a waypoint, an altitude or an airspeed out of bounds."""
     for k, waypoint in enumerate(waypoints):
         north, east, altitude = waypoint[:3]
-        known = all(abs(value) <= LARGEST for value in (north, east, altitude, waypoint.departure))
+        is_plausible = all(
+            abs(value) <= LARGEST for value in (north, east, altitude, waypoint.departure)
+        )
         position = f"north {north:g}, east {east:g}, altitude {altitude:g} m"
-        require(known, f"route[{k}]", position, f"finite values, at most {LARGEST:g} m either way")
+        require(
+            is_plausible,
+            f"route[{k}]",
+            position,
+            f"finite values, at most {LARGEST:g} m either way",
+        )
         for value in (altitude, waypoint.departure):
-            permitted = can.lowest <= value <= can.highest
+            is_permitted = can.lowest <= value <= can.highest
             require(
-                permitted,
+                is_permitted,
                 f"route[{k}].altitude",
                 f"{value:g} m",
                 f"{can.lowest:g} to {can.highest:g} m",

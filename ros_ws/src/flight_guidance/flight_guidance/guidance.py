@@ -102,9 +102,9 @@ class LogChannels(NamedTuple):
         value = attrgetter(self.attribute)(sample)
         return value if isinstance(value, tuple) else (value,)
 
-    def restored(self, logged: Mapping[str, float]) -> Any:
+    def restored(self, numbers: Mapping[str, float]) -> Any:
         """The attribute."""
-        return self.kind(*(logged[name] for name in self.names))
+        return self.kind(*(numbers[name] for name in self.names))
 
 
 def channels(outputs: Sequence[str]) -> tuple[LogChannels, ...]:
@@ -230,10 +230,10 @@ class Guidance:
         )
         self._pose: StampedVector | None = None
         self._y: StampedVector | None = None
-        self._given: dict[str, float] = {} if self.route is None else {"leg": 0.0}
+        self._commands: dict[str, float] = {} if self.route is None else {"leg": 0.0}
         self._route_waits = self.route is not None  # no step has flown it yet
         self._state: GuidanceState | None = None
-        self._engaged = True
+        self._is_engaged = True
         self._paused = False
         self._begin = Begin.HOLD
         self._notices = parameters.notices()
@@ -317,10 +317,10 @@ class Guidance:
         channels = self._params.channels
         for table in (channels.lateral, channels.vertical):
             if any(name in table for name in values):
-                self._given = {
-                    name: value for name, value in self._given.items() if name not in table
+                self._commands = {
+                    name: value for name, value in self._commands.items() if name not in table
                 }
-        self._given |= values
+        self._commands |= values
 
     def take_route(self, route: Route) -> None:
         """Fly a route from its first leg on.
@@ -331,7 +331,7 @@ class Guidance:
         self.route = route
         self._lander = None  # that of the parameters lands on their route
         self._digest = digest(route)
-        self._given = {}
+        self._commands = {}
         self._route_waits = True
         program = self._program
         self._program = deque()
@@ -353,8 +353,8 @@ class Guidance:
         """
         if self.mode is not GuidanceMode.ENGAGED or self._pose is None or self._y is None:
             return False
-        held = modes.hold_now if self._params.multicopter is None else multicopter.hold
-        self.take_target(held(self.pose(), tuple(self._y.value.tolist()), self._params))
+        hold_of_kind = modes.hold_now if self._params.multicopter is None else multicopter.hold
+        self.take_target(hold_of_kind(self.pose(), tuple(self._y.value.tolist()), self._params))
         return True
 
     def home(self) -> bool:
@@ -410,10 +410,10 @@ class Guidance:
 
     def engage(self, *, engaged: bool) -> None:
         """Engage, with the heading, the altitude and the airspeed of then; or command nothing."""
-        if engaged and not self._engaged:
+        if engaged and not self._is_engaged:
             self._begin = Begin.HOLD
             self._forget_commands()
-        self._engaged = engaged
+        self._is_engaged = engaged
 
     def pause(self, *, paused: bool, forget: bool) -> None:
         """Command nothing while the controller does not fly.
@@ -432,9 +432,9 @@ class Guidance:
         Before the first step commands wait.
         """
         if self._state is not None:
-            self._given = {
+            self._commands = {
                 name: value
-                for name, value in self._given.items()
+                for name, value in self._commands.items()
                 if name == "leg" and self._route_waits
             }
 
@@ -505,11 +505,11 @@ class Guidance:
             return
         if any(
             name in guidance_state.LATERAL or name in guidance_state.VERTICAL
-            for name in self._given
+            for name in self._commands
         ):
             self._lander.leave()
         elif self._begin is Begin.NO:
-            self._given |= self._lander.commands(state, self.pose(), self.route)
+            self._commands |= self._lander.commands(state, self.pose(), self.route)
 
     def step(self, now_ns: int, t_ns: int) -> GuidanceOutput | None:
         """A step at an instant and flight time t.
@@ -563,7 +563,7 @@ class Guidance:
             pose=tuple(pose.value.tolist()),
             pose_age_ns=max(now_ns - pose.stamp_ns, 0),
             y=tuple(y.value.tolist()),
-            commands=self._given,
+            commands=self._commands,
             authority=self._authority,
         )
 
@@ -572,7 +572,7 @@ class Guidance:
             self.take_target(self._program.popleft()[1])
         y = self._y
         pose = self._pose
-        flies = self._engaged and not self._paused
+        flies = self._is_engaged and not self._paused
         if pose is None or y is None or now_ns - y.stamp_ns > self._params.max_age_ns or not flies:
             self._begin = max(self._begin, Begin.AGAIN)
             return None
@@ -596,7 +596,7 @@ class Guidance:
         )
         self._state = state
         self._begin = Begin.NO
-        self._given = {}
+        self._commands = {}
         self._route_waits = False
         self._waits_from_ns = None
         return GuidanceOutput(output, log, (*route_notes, *(notice.text for notice in notices)))

@@ -100,8 +100,8 @@ class TargetChannels(NamedTuple):
 
     def known(self) -> tuple[str, ...]:
         """All of them."""
-        known = {*self.lateral, *self.vertical, *self.further}
-        return tuple(name for name in TARGETS if name in known)
+        names = {*self.lateral, *self.vertical, *self.further}
+        return tuple(name for name in TARGETS if name in names)
 
 
 AIRPLANE = TargetChannels(LATERAL, VERTICAL, ("V",), {Lateral.ORBIT: ("north", "east", "radius")})
@@ -141,7 +141,7 @@ class Home(NamedTuple):
     after_loss: bool = False  # whether the aircraft flies home when pose returns after a loss
 
 
-class Limits(NamedTuple):
+class CommandLimits(NamedTuple):
     """Limits of commands."""
 
     bank: float  # rad
@@ -165,7 +165,7 @@ class GuidanceParams(NamedTuple):
     attitude: AttitudeParams
     vertical: VerticalParams
     path: PathParams
-    limits: Limits
+    limits: CommandLimits
     slew: tuple[float, ...]  # largest derivatives of u_m
     max_age_ns: int
     hold_ns: int
@@ -255,17 +255,17 @@ CARRIED = ("mode", "lateral", "vertical", "target", "leg", "joining", "fence", "
 
 
 def begun_again(
-    held: GuidanceState,
+    holding: GuidanceState,
     state: GuidanceState | None,
     inputs: Inputs,
     params: GuidanceParams,
     *further: str,
 ) -> GuidanceState:
-    """The state `held` with what a state before leaves, and further values by name.
+    """The state `holding` with what a state before leaves, and further values by name.
 
     Up to the age limit of u_m the reference model still flies the last u_m.
     """
     if state is None or inputs.begin is Begin.HOLD:
-        return held
-    again = held._replace(**{name: getattr(state, name) for name in (*CARRIED, *further)})
+        return holding
+    again = holding._replace(**{name: getattr(state, name) for name in (*CARRIED, *further)})
     return again._replace(u_m=state.u_m) if inputs.t_ns - state.t_ns <= params.max_age_ns else again

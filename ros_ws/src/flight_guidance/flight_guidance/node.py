@@ -146,7 +146,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         )
         if self._broadcast is None:
             self.get_logger().info("no transforms on /tf: the package tf2_msgs is not installed")
-        self._flown: deque[PoseStamped] = deque(maxlen=PATH_LENGTH)
+        self._path_poses: deque[PoseStamped] = deque(maxlen=PATH_LENGTH)
 
     def _advertise_services(self) -> None:
         for kind, name, answer in (
@@ -287,10 +287,10 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         self._guidance.keep_link()
 
     def _take_routes(self) -> None:
-        for received in self._route_subscription.take():
+        for arrival in self._route_subscription.take():
             try:
-                require_size(received.message, MAX_ROUTE_SIZE)
-                message = deserialize_message(received.message, Path)
+                require_size(arrival.message, MAX_ROUTE_SIZE)
+                message = deserialize_message(arrival.message, Path)
                 frame = message.header.frame_id
                 require(
                     frame in ROUTE_FRAMES,
@@ -298,7 +298,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
                     f"the frame {frame!r}",
                     f"{MAP!r}, or none named",
                 )
-                points = [stamped.pose.position for stamped in message.poses]
+                points = [stamped_pose.pose.position for stamped_pose in message.poses]
                 route = self.parameters.plan(
                     [Waypoint(point.y, point.x, point.z) for point in points]
                 )
@@ -397,12 +397,12 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         message.header.stamp = _stamp(now_ns)
         message.header.frame_id = MAP
         message.child_frame_id = self._body
-        placed = message.pose.pose
-        placed.position = Point(x=pose["east"], y=pose["north"], z=pose["altitude"])
+        pose_of_message = message.pose.pose
+        pose_of_message.position = Point(x=pose["east"], y=pose["north"], z=pose["altitude"])
         for key, value in zip(
             "xyzw", quaternion(pose["phi"], pose["theta"], pose["psi"]), strict=True
         ):
-            setattr(placed.orientation, key, value)
+            setattr(pose_of_message.orientation, key, value)
         for key, value in zip("xyz", body_velocity(pose), strict=True):
             setattr(message.twist.twist.linear, key, value)
         speed = self.parameters.speed + y.get("V", 0.0)  # a multicopter has no V, and measures r
@@ -447,13 +447,13 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         self._fix.publish(fix)
 
     def _publish_path(self, odometry: Odometry) -> None:
-        self._flown.append(PoseStamped(header=odometry.header, pose=odometry.pose.pose))
-        flown = Path(header=odometry.header, poses=list(self._flown))
-        self._path.publish(flown)
+        self._path_poses.append(PoseStamped(header=odometry.header, pose=odometry.pose.pose))
+        path_message = Path(header=odometry.header, poses=list(self._path_poses))
+        self._path.publish(path_message)
         if (route := self._guidance.route) is None:
             return
         marker = Marker(ns="route", type=Marker.LINE_STRIP, action=Marker.ADD)
-        marker.header = flown.header
+        marker.header = path_message.header
         marker.pose.orientation.w = 1.0
         marker.scale.x = 3.0
         marker.color.r = marker.color.g = marker.color.a = 1.0
@@ -505,11 +505,11 @@ def _transform(odometry: Odometry) -> TransformStamped:
     """The transform from the map to the body frame."""
     transform = TransformStamped(header=odometry.header, child_frame_id=odometry.child_frame_id)
     place = odometry.pose.pose
-    moved = transform.transform
-    moved.translation.x = place.position.x
-    moved.translation.y = place.position.y
-    moved.translation.z = place.position.z
-    moved.rotation = place.orientation
+    translation = transform.transform
+    translation.translation.x = place.position.x
+    translation.translation.y = place.position.y
+    translation.translation.z = place.position.z
+    translation.rotation = place.orientation
     return transform
 
 

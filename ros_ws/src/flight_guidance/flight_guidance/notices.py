@@ -132,7 +132,7 @@ class Notices:
         self._tilted = _Lasting(0.0)
         self._reach = reach
         self._authority = Authority()
-        self._reached = ""
+        self._reach_text = ""
         self._wind = wind
         self._max_age = max_age
         self._largest_wind = largest_wind
@@ -169,11 +169,11 @@ class Notices:
         largest = self._largest_wind(log["V_c"])
         authority = Authority(*(log[name] for name in LEARNED))
         if authority != self._authority:
-            earlier = self._reached
+            earlier = self._reach_text
             self._authority = authority
-            self._reached = self._reach(authority)
-            if self._reached != earlier:
-                texts.append(f"from now on {self._reached or 'own limits again'}")
+            self._reach_text = self._reach(authority)
+            if self._reach_text != earlier:
+                texts.append(f"from now on {self._reach_text or 'own limits again'}")
         if self._link.due(t, holds=log[LINK_AGE] > self._link_timeout):
             texts.append(f"no message of an operator for {self._link_timeout:g} s: home")
         if self._stale.due(t, holds=log["age.pose"] > self._max_age):

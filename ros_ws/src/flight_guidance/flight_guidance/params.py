@@ -142,10 +142,10 @@ class GuidanceConfig(SteeringConfig):
         self._check_home()
 
     def _check_home(self) -> None:
-        needed = math.ceil(self.least_radius()) + self.fence_margin(self.speed)
+        least = math.ceil(self.least_radius()) + self.fence_margin(self.speed)
         inside = self.fence_clearance(self.home.north, self.home.east)
-        expected = f"at least {needed:.0f} m inside, for the orbit round home"
-        require(inside >= needed, "home", f"home {described(inside)}", expected)
+        expected = f"at least {least:.0f} m inside, for the orbit round home"
+        require(inside >= least, "home", f"home {described(inside)}", expected)
         if (fence := self.fence_zones()) is None:
             return
         margin = self.fence_margin(self.speed)
@@ -154,8 +154,8 @@ class GuidanceConfig(SteeringConfig):
             turn = f"a turn from home onto the orbit that is {described(room)}"
             north, east = fence.home
             wide = Zone((north,), (east,), radius=20.0 * fence.radius)
-            left = room_at_home(fence._replace(zones=(wide,)), self._at_home(), self.wind)
-            reach = wide.radius - left
+            room_in_wide = room_at_home(fence._replace(zones=(wide,)), self._at_home(), self.wind)
+            reach = wide.radius - room_in_wide
             size = f"with home {math.ceil(reach + margin)} m inside every turn fits"
             require(False, "home", turn, f"at least {margin:.0f} m inside; {size}")
 

@@ -77,9 +77,9 @@ class RollTest(NamedTuple):
 
         Without ASKED of evidence the verdict stays.
         """
-        kept = math.exp(-dt / MEMORY)
-        asked = kept * self.asked + dt * command**2
-        flown = kept * self.flown + dt * command * p
+        memory = math.exp(-dt / MEMORY)
+        asked = memory * self.asked + dt * command**2
+        flown = memory * self.flown + dt * command * p
         ignored = self.ignored
         if asked > ASKED * largest**2:
             ignored = flown < (FOLLOWED if ignored else IGNORED) * asked

@@ -21,7 +21,7 @@ from flight_core.parameters import (
 )
 from flight_core.units import GRAVITY
 from flight_guidance import reach
-from flight_guidance.guidance_state import MULTICOPTER, Limits, MulticopterParams
+from flight_guidance.guidance_state import MULTICOPTER, CommandLimits, MulticopterParams
 from flight_guidance.multicopter import multicopter_rules
 from flight_guidance.steering import protection
 from flight_guidance.steering.attitude import AttitudeParams
@@ -232,7 +232,7 @@ class SteeringConfig(NodeConfig):
             ),
             "vertical": self._vertical(climb, sink),
             "path": PathParams(self.period or self.least_period(), self.damping, self.capture),
-            "limits": Limits(
+            "limits": CommandLimits(
                 bank=self.bank,
                 least_pitch=self.pitch[0],
                 largest_pitch=self.pitch[1],
@@ -281,7 +281,7 @@ class SteeringConfig(NodeConfig):
                 k_h=gain, acceleration=self.acceleration, climb=climb, sink=sink, alpha_time=0.0
             ),
             "path": PathParams(0.0, self.damping, self.capture),
-            "limits": Limits(
+            "limits": CommandLimits(
                 bank=self.bank,
                 least_pitch=-self.bank,
                 largest_pitch=self.bank,

@@ -53,7 +53,7 @@ Parameters = Mapping[str, tuple[ParameterRecord, ...]]
 PARAMETER = "PARM"
 
 
-class Source(NamedTuple):
+class LogField(NamedTuple):
     """Where a log has a quantity: value = scale field."""
 
     message: str
@@ -61,7 +61,7 @@ class Source(NamedTuple):
     scale: float = 1.0
 
 
-Sources = Mapping[str, tuple[Source, ...]]
+Sources = Mapping[str, tuple[LogField, ...]]
 """By quantity the places that may have it, the first one first."""
 
 
@@ -73,16 +73,16 @@ class Format(NamedTuple):
     """
 
     sources: Sources
-    sticks: Source  # its field has the number of the channel in place of {}
-    servos: Source
-    mode: tuple[Source, ...]
+    sticks: LogField  # its field has the number of the channel in place of {}
+    servos: LogField
+    mode: tuple[LogField, ...]
     # of a multicopter's rate controllers, normalised, by what responds to them
     torques: Sources = MappingProxyType({})
 
 
-def _source(place: str) -> Source:
+def _source(place: str) -> LogField:
     message, field, *factors = place.split()
-    return Source(message, field, *(DEGREE if text == "deg" else float(text) for text in factors))
+    return LogField(message, field, *(DEGREE if text == "deg" else float(text) for text in factors))
 
 
 def _sources(places: Mapping[str, Sequence[str]]) -> Sources:
@@ -104,15 +104,15 @@ DATAFLASH = _format(_PLACES["dataflash"])
 TLOG = _format(_PLACES["tlog"])
 ULOG_SOURCES = _sources(_PLACES["ulog"]["sources"])
 
-ULOG_TORQUES: Mapping[tuple[str, str], Source] = MappingProxyType(
+ULOG_TORQUES: Mapping[tuple[str, str], LogField] = MappingProxyType(
     {
-        ("vehicle_torque_setpoint", f"xyz[{axis}]"): Source(
+        ("vehicle_torque_setpoint", f"xyz[{axis}]"): LogField(
             "actuator_controls_0", f"control[{axis}]"
         )
         for axis in range(3)
     }
-    | {("vehicle_thrust_setpoint", "xyz[0]"): Source("actuator_controls_0", "control[3]")}
-    | {("vehicle_thrust_setpoint", "xyz[2]"): Source("actuator_controls_0", "control[3]", -1.0)}
+    | {("vehicle_thrust_setpoint", "xyz[0]"): LogField("actuator_controls_0", "control[3]")}
+    | {("vehicle_thrust_setpoint", "xyz[2]"): LogField("actuator_controls_0", "control[3]", -1.0)}
 )
 """Where PX4 before 1.14 has the setpoints of torque and thrust (actuator_controls.msg: roll, pitch,
 yaw, thrust)."""
@@ -150,7 +150,7 @@ class VehicleLog(NamedTuple):
     # of several systems, sensors or instances: what is taken, and why
     taken: tuple[tuple[str, str], ...] = ()
 
-    def source(self, quantity: str) -> Source | None:
+    def source(self, quantity: str) -> LogField | None:
         """The place in this log that has a quantity of y or of the pose; None where it has none."""
         sources = ULOG_SOURCES if self.format is None else self.format.sources
         return next((source for source in sources.get(quantity, ()) if self.has(source)), None)
@@ -172,10 +172,10 @@ class VehicleLog(NamedTuple):
                 values[name] = earlier[-1]
         return values
 
-    def has(self, source: Source) -> bool:
+    def has(self, source: LogField) -> bool:
         """Whether the log has samples of a field."""
         return source.message in self.tables and source.field in self.tables[source.message].fields
 
-    def at(self, source: Source, stamp_ns: NDArray[np.int64]) -> FloatArray:
+    def at(self, source: LogField, stamp_ns: NDArray[np.int64]) -> FloatArray:
         """The newest value of a place at each of some instants, (n,); NaN before the first."""
         return source.scale * self.tables[source.message].at(source.field, stamp_ns)

@@ -29,7 +29,7 @@ MODES = {channel: {str(int(mode)): mode.name for mode in kind} for channel, kind
 """Names of the modes of the controller and of guidance by channel and number."""
 
 
-class ParameterSpan(NamedTuple):
+class ParameterTicks(NamedTuple):
     """Successive ticks under the same parameters of the controller."""
 
     digest: float
@@ -40,7 +40,7 @@ class ParameterSpan(NamedTuple):
 
 
 def rms_by_model(
-    spans: Sequence[ParameterSpan],
+    spans: Sequence[ParameterTicks],
     start_ns: int,
     scenario: Scenario | None,
     proposed_ns: Sequence[int],

@@ -49,7 +49,7 @@ from flight_log.named_vectors import (
 from flight_log.stored_messages import PARAMETER_EVENT, PARAMETER_EVENTS, parameter_value
 from flight_log.tape_reader import listed, read_run
 from flight_view.background import Line
-from flight_view.description import MODES, ParameterSpan, described, mission, rms_by_model
+from flight_view.description import MODES, ParameterTicks, described, mission, rms_by_model
 from flight_view.series import Series
 
 LEARNED = "learned"  # entries of A and B, as identified in flight
@@ -170,7 +170,7 @@ class Flight:
         self._first_ns: int | None = None
         self._mode = -1
         self._banded = 0  # rows of internals behind the bands
-        self._flown: list[ParameterSpan] = []
+        self._flown: list[ParameterTicks] = []
         self._now = now
         self._changed = now()
         self._behind = False  # there is more to read at once
@@ -475,7 +475,7 @@ class Flight:
             stop_ns = int(stamp_ns[rows[-1]])
             engaged_rows = rows[is_engaged[rows]]
             squares = {name: float(np.sum(e[engaged_rows] ** 2)) for name, e in errors.items()}
-            span = ParameterSpan(
+            span = ParameterTicks(
                 digest=digest,
                 start_ns=start_ns,
                 stop_ns=stop_ns,

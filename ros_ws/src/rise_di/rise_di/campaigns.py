@@ -14,7 +14,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.report.run_folder import REPORT, new_run
 from flight_campaign import engines
-from flight_campaign.campaign import Campaign, define
+from flight_campaign.campaign import MonteCarlo, define
 from flight_campaign.campaign_report import write_results
 from flight_campaign.definition import Definition, Sweep
 from flight_campaign.single_flights import flies_alone
@@ -51,7 +51,7 @@ class CampaignResult(NamedTuple):
         The entries have names as "A[q,alpha]", "B[V,thrust]", "lag[elevator]", "noise[q]" and
         "delay". The figures of a diverged aircraft are null.
         """
-        return Campaign.resume(self.folder).rows().collect()
+        return MonteCarlo.resume(self.folder).rows().collect()
 
 
 def fly_campaign(
@@ -125,7 +125,7 @@ def fly_campaign(
     flies = _engine(definition, workers)
     report = _progress(progress)
     folder = new_run(source, as_path(runs, "runs", "the path of a folder"), "campaign-")
-    return _fly(Campaign.begin(folder, definition), flies, report)
+    return _fly(MonteCarlo.begin(folder, definition), flies, report)
 
 
 def resume_campaign(
@@ -151,7 +151,7 @@ def resume_campaign(
         True
     """
     engines.require_jax()
-    campaign = Campaign.resume(as_path(folder, "folder", "the folder of a campaign"))
+    campaign = MonteCarlo.resume(as_path(folder, "folder", "the folder of a campaign"))
     return _fly(campaign, _engine(campaign.definition, workers), _progress(progress))
 
 
@@ -193,7 +193,7 @@ def _sweep(sweep: Mapping[str, ArrayLike] | None) -> Sweep | None:
     return Sweep.validate_mapping({"parameter": parameter, "factors": factors}, "sweep")
 
 
-def _fly(campaign: Campaign, engine: engines.Engine, progress: Progress) -> CampaignResult:
+def _fly(campaign: MonteCarlo, engine: engines.Engine, progress: Progress) -> CampaignResult:
     definition = campaign.definition
     missing = campaign.missing()
     total = definition.aircraft * definition.cases

@@ -289,7 +289,7 @@ class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray
         self._course = build_course(plain)
         self._vehicle = batch.vehicle(plain)
         self._assemble = batch_matrices.assemble
-        self._stepper = batch.Stepper
+        self._stepper = batch.FleetStepper
         self.single_action_space, self.single_observation_space, units = _channels(self.scenario)
         self.action_space = gymnasium.vector.utils.batch_space(
             self.single_action_space, self.num_envs

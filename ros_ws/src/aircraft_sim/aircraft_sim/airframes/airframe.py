@@ -157,10 +157,12 @@ class Airframe(Config):
         ):
             quantity(unit, key)
         self._check_outputs(n, len(self.outputs))
-        named = {} if self.C else {f"outputs[{i}]": name for i, name in enumerate(self.outputs)}
-        named |= {f"gravity[{i}].into": term.into for i, term in enumerate(self.gravity)}
-        named |= {f"gravity[{i}].angle": term.angle for i, term in enumerate(self.gravity)}
-        named |= {
+        output_names = (
+            {} if self.C else {f"outputs[{i}]": name for i, name in enumerate(self.outputs)}
+        )
+        output_names |= {f"gravity[{i}].into": term.into for i, term in enumerate(self.gravity)}
+        output_names |= {f"gravity[{i}].angle": term.angle for i, term in enumerate(self.gravity)}
+        output_names |= {
             f"inertial_coupling[{i}].into": term.into
             for i, term in enumerate(self.inertial_coupling)
         }
@@ -171,7 +173,7 @@ class Airframe(Config):
                 f"{len(term.product)} states",
                 "two of them",
             )
-            named |= {
+            output_names |= {
                 f"inertial_coupling[{i}].product[{k}]": state
                 for k, state in enumerate(term.product)
             }
@@ -189,8 +191,8 @@ class Airframe(Config):
                 f"an axis of the wind: {', '.join((*AXES, *ROTARY))}",
             )
         for gust, direction in self.gusts.items():
-            named |= {f"gusts.{gust}.{state}": state for state in direction}
-        for key, name in named.items():
+            output_names |= {f"gusts.{gust}.{state}": state for state in direction}
+        for key, name in output_names.items():
             require(name in self.states, key, f"{name!r}", f"a state: {', '.join(self.states)}")
 
     def _units(self) -> list[tuple[str, Unit]]:
@@ -234,12 +236,15 @@ class Airframe(Config):
                 "the unit of this output",
             )
             picked = [state for state, value in zip(self.states, row, strict=True) if value != 0.0]
-            same = name not in self.states or (
+            is_state = name not in self.states or (
                 picked == [name] and row[list(self.states).index(name)] == 1.0
             )
             row_of_it = f"the state {name} alone: give another combination another name"
             require(
-                same, "C", f"a row of {name} with {' and '.join(picked) or 'no state'}", row_of_it
+                is_state,
+                "C",
+                f"a row of {name} with {' and '.join(picked) or 'no state'}",
+                row_of_it,
             )
 
     def units_of_outputs(self) -> dict[str, Unit]:
@@ -277,8 +282,8 @@ class Airframe(Config):
         """
         units = [quantity(channel.unit) for channel in self.inputs.values()]
         unsaid = [0.0 if unit.dimension == ANGLE else math.nan for unit in units]
-        said = [channel.no_thrust for channel in self.inputs.values()]
-        pairs = zip(said, units, unsaid, strict=True)
+        values = [channel.no_thrust for channel in self.inputs.values()]
+        pairs = zip(values, units, unsaid, strict=True)
         return np.array(
             [default if value is None else value * unit.si for value, unit, default in pairs]
         )
@@ -404,8 +409,8 @@ class Airframe(Config):
         Raises:
             ParameterError: The axis is not in the file.
         """
-        known = ", ".join(self.gusts) or "none, write its key gusts, as rise_di.new_airframe does"
-        expected = f"a gust of the airframe {self.name}: {known}"
+        axes = ", ".join(self.gusts) or "none, write its key gusts, as rise_di.new_airframe does"
+        expected = f"a gust of the airframe {self.name}: {axes}"
         require(gust in self.gusts, "gusts", f"{gust!r}", expected)
         direction = np.zeros(len(self.states))
         for state, value in self.gusts[gust].items():

@@ -92,8 +92,8 @@ def _of_file(source: str | Path, name: str, options: Mapping[str, Any]) -> Airfr
     """
     for key, value in options.items():
         require(not value, key, f"{value!r} beside an airframe file", "none: the file has it")
-    loaded = load_airframe(source)
-    return loaded.model_copy(update={"name": name}) if name else loaded
+    airframe = load_airframe(source)
+    return airframe.model_copy(update={"name": name}) if name else airframe
 
 
 def _named(names: Named, key: str) -> dict[str, Any]:
@@ -151,17 +151,22 @@ def _airframe(
     model: ToolModel, name: str, speed: float, outputs: str | Sequence[str], source: str
 ) -> Airframe:
     names = list(model.states)
-    wanted = (
+    output_names = (
         [part.strip() for part in outputs.split(",")]
         if isinstance(outputs, str) and outputs
         else list(outputs)
     )
-    wanted = wanted or _default_outputs(model)
+    output_names = output_names or _default_outputs(model)
     fewer = f"{len(model.inputs)} or fewer, as many as inputs or fewer"
-    require(0 < len(wanted) <= len(model.inputs), "outputs", ", ".join(wanted) or "none", fewer)
+    require(
+        0 < len(output_names) <= len(model.inputs),
+        "outputs",
+        ", ".join(output_names) or "none",
+        fewer,
+    )
     labels = model.outputs if model.C is not None and len(model.outputs) == len(model.C) else ()
-    rows, units = _rows_of_outputs(model, wanted, labels)
-    shown = list(rows)
+    rows, units = _rows_of_outputs(model, output_names, labels)
+    outputs_of_rows = list(rows)
     selects = all(
         output in names and np.array_equal(row, np.eye(len(names))[names.index(output)])
         for output, row in rows.items()
@@ -175,17 +180,17 @@ def _airframe(
             key: channel | {"positive": channel.get("positive") or _effect(model, key)}
             for key, channel in model.inputs.items()
         },
-        "outputs": shown,
+        "outputs": outputs_of_rows,
         "A": model.A.tolist(),
         "B": model.B.tolist(),
     }
     if not selects:
         values |= {"C": np.array([*rows.values()]).tolist(), "output_units": units}
     if model.D is not None and np.any(model.D):
-        used = [labels.index(output) for output in shown if output in labels] or list(
-            range(len(model.D))
-        )
-        values["D"] = model.D[used].tolist()
+        row_numbers = [
+            labels.index(output) for output in outputs_of_rows if output in labels
+        ] or list(range(len(model.D)))
+        values["D"] = model.D[row_numbers].tolist()
     frame = Airframe.validate_mapping(values, f"airframe {name}")
     return Airframe.validate_mapping(
         frame.model_dump(exclude_defaults=True) | {"gusts": _gusts(frame)}, f"airframe {name}"
@@ -193,7 +198,7 @@ def _airframe(
 
 
 def _rows_of_outputs(
-    model: ToolModel, wanted: Sequence[str], labels: Sequence[str]
+    model: ToolModel, outputs: Sequence[str], labels: Sequence[str]
 ) -> tuple[dict[str, FloatArray], dict[str, str]]:
     """Rows of C by output, and units of the outputs that are no states.
 
@@ -206,12 +211,12 @@ def _rows_of_outputs(
         own_C = None
     rows: dict[str, FloatArray] = {}
     units = {}
-    for k, text in enumerate(wanted):
+    for k, text in enumerate(outputs):
         output, unit, row = _output(text, names)
         require(output not in rows, "outputs", f"{output} twice", "each once")
         if row is None and own_C is not None and output in labels:
             row = own_C[labels.index(output)]
-        elif row is None and own_C is not None and not labels and len(own_C) == len(wanted):
+        elif row is None and own_C is not None and not labels and len(own_C) == len(outputs):
             row = own_C[k]
         elif row is None:
             if output not in names:

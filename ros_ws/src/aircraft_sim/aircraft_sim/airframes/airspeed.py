@@ -109,16 +109,16 @@ def at_speed(airframe: Airframe, ratio: float, thrust: str) -> Airframe:
     """
     powers = exponents(airframe, thrust)
     wind = ratio ** (powers.wind + 1.0)  # the file has the effect per w / V0
-    moved = airframe.with_matrices(
+    airframe_at_speed = airframe.with_matrices(
         airframe.matrix_a() * ratio**powers.A, airframe.matrix_b() * ratio**powers.B, wind
     )
     gravity = [
         {**term.model_dump(), "gain": term.gain * ratio ** EXPONENTS[STATES[term.into]][ANGLE]}
         for term in airframe.gravity
     ]
-    changed = {"speed": ratio * airframe.speed, "gravity": gravity}
+    changes = {"speed": ratio * airframe.speed, "gravity": gravity}
     return type(airframe).validate_mapping(
-        moved.model_dump() | changed, f"airframe {airframe.name}"
+        airframe_at_speed.model_dump() | changes, f"airframe {airframe.name}"
     )
 
 
@@ -143,10 +143,10 @@ def level_flight(airframe: Airframe, ratio: float, thrust: str) -> tuple[FloatAr
     u = np.zeros(B.shape[1])
     for k in range(TRIM_STEPS):
         middle = 1.0 + width * (k + 0.5)
-        moved = A * middle**powers.A + gravity * middle**powers.gravity
+        matrix = A * middle**powers.A + gravity * middle**powers.gravity
         dx = airframe.speed * width * faster
         change = np.linalg.lstsq(
-            np.column_stack([moved @ higher, B * middle**powers.B]), -moved @ dx, rcond=None
+            np.column_stack([matrix @ higher, B * middle**powers.B]), -matrix @ dx, rcond=None
         )[0]
         x = x + dx + change[0] * higher
         u = u + change[1:]

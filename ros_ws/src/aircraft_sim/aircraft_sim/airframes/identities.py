@@ -149,9 +149,11 @@ def contradictions(model: LinearModel) -> Iterator[Finding]:
 
 def _dimensions(model: LinearModel) -> Iterator[Finding]:
     for name, unit in model.states.items():
-        known = "V" if name.lower() == "vt" else name.lower()  # as books have it
-        if name not in KINDS and known in KINDS:
-            yield Finding(f"states.{name}", name, f"{known}: the name by which a state is checked")
+        book_name = "V" if name.lower() == "vt" else name.lower()  # as books have it
+        if name not in KINDS and book_name in KINDS:
+            yield Finding(
+                f"states.{name}", name, f"{book_name}: the name by which a state is checked"
+            )
         dimension, words = KINDS.get(name, (None, ""))
         if dimension is not None and quantity(unit).dimension != dimension:
             yield Finding(f"states.{name}", unit, words)
@@ -257,9 +259,9 @@ def _strengths(model: LinearModel) -> Iterator[Finding]:
         )
         ratio = abs(float(model.matrix_b()[i, k])) / scale if scale > 0.0 else least
         if not least <= ratio <= most:
-            known = f"{least * scale:.2g} to {most * scale:.2g} for an aircraft with this A"
+            range_text = f"{least * scale:.2g} to {most * scale:.2g} for an aircraft with this A"
             yield Finding(
                 f"inputs.{name}.unit",
                 f"{rate}_dot = {model.matrix_b()[i, k]:.3g} {name} in SI",
-                known,
+                range_text,
             )

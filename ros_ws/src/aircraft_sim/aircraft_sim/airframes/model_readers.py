@@ -59,14 +59,14 @@ class ToolModel(NamedTuple):
     note: str = ""  # of what the file was read as
 
 
-def _states(named: Mapping[str, Any], labels: Sequence[str], n: int) -> dict[str, str]:
+def _states(units_by_name: Mapping[str, Any], labels: Sequence[str], n: int) -> dict[str, str]:
     """Units of the n states: as given, else by the names that the model carries."""
-    names = named or dict.fromkeys(labels, "")
-    known = ", ".join(names) or "no names"
+    names = units_by_name or dict.fromkeys(labels, "")
+    names_text = ", ".join(names) or "no names"
     require(
         len(names) == n,
         "states",
-        f"{known} beside {n} rows of A",
+        f"{names_text} beside {n} rows of A",
         f"{n} names in the order of A: u: ft/s, w: ft/s, ...",
     )
     units = {}
@@ -82,26 +82,28 @@ def _states(named: Mapping[str, Any], labels: Sequence[str], n: int) -> dict[str
     return units
 
 
-def _inputs(named: Mapping[str, Any], labels: Sequence[str], m: int) -> dict[str, dict[str, str]]:
+def _inputs(
+    units_by_name: Mapping[str, Any], labels: Sequence[str], m: int
+) -> dict[str, dict[str, str]]:
     """Units and effects of the m inputs: as given ("rad nose down"), else rad, and 1 for thrust."""
-    names = named or dict.fromkeys(labels, "")
-    known = ", ".join(names) or "no names"
+    names = units_by_name or dict.fromkeys(labels, "")
+    names_text = ", ".join(names) or "no names"
     require(
         len(names) == m,
         "inputs",
-        f"{known} beside {m} columns of B",
+        f"{names_text} beside {m} columns of B",
         f"{m} names in the order of B: elevator: rad, ...",
     )
-    read = {}
-    for name, said in names.items():
-        if isinstance(said, Mapping):
-            read[name] = {key: str(value) for key, value in said.items()}
+    channels = {}
+    for name, text in names.items():
+        if isinstance(text, Mapping):
+            channels[name] = {key: str(value) for key, value in text.items()}
             continue
-        unit, _, positive = str(said).strip().partition(" ")
+        unit, _, positive = str(text).strip().partition(" ")
         unit = unit or ("1" if name in {"thrust", "throttle"} else "rad")
         quantity(unit, f"inputs.{name}")
-        read[name] = {"unit": unit, "positive": positive.strip()}
-    return read
+        channels[name] = {"unit": unit, "positive": positive.strip()}
+    return channels
 
 
 def read_model(
@@ -187,9 +189,9 @@ def _state_space(system: Any, states: Mapping[str, Any], inputs: Mapping[str, An
         texts = [str(label) for label in getattr(system, attribute, None) or ()]
         return [] if any(re.fullmatch(r"[a-z]+\[\d+\]", label) for label in texts) else texts
 
-    named = labels("state_labels")
-    driven = labels("input_labels")
-    known = _states(states, named, len(A)), _inputs(inputs, driven, B.shape[1])
+    state_labels = labels("state_labels")
+    input_labels = labels("input_labels")
+    known = _states(states, state_labels, len(A)), _inputs(inputs, input_labels, B.shape[1])
     return ToolModel(
         *known, A, B, _finite(system.C, "C"), _finite(system.D, "D"), tuple(labels("output_labels"))
     )
@@ -416,9 +418,9 @@ def _avl_derivatives(
     A[4, 4:7] = per_V * lateral[0] - [0.0, 0.0, 1.0]
     A[4, 7] = GRAVITY / V0
     A[5:7, 4:7] = qS * b * inverse @ lateral[1:]
-    used = _avl_controls(text, inputs)
-    B = np.zeros((8, len(used)))
-    for k, number in enumerate(used.values()):
+    controls = _avl_controls(text, inputs)
+    B = np.zeros((8, len(controls)))
+    for k, number in enumerate(controls.values()):
         lift, side, roll, pitch, yaw = (
             value.get(f"C{row}d{number}", value.get(f"C{row}d{number:02d}", 0.0)) for row in "LYlmn"
         )
@@ -426,7 +428,7 @@ def _avl_derivatives(
         B[4, k] = per_V * side
         B[5:7, k] = qS * b * inverse @ np.array([roll, yaw])
     units = _states({}, ["V", "alpha", "q", "theta", "beta", "p", "r", "phi"], 8)
-    channels = _inputs({name: inputs.get(name) or "deg" for name in used}, (), len(used))
+    channels = _inputs({name: inputs.get(name) or "deg" for name in controls}, (), len(controls))
     note = "AVL's stability derivatives, without those of alpha_dot"
     return ToolModel(units, channels, A, B, speed=V0, note=note)
 
@@ -467,15 +469,15 @@ def _avl_values(text: str) -> dict[str, float]:
 
 def _avl_controls(text: str, inputs: Mapping[str, Any]) -> dict[str, int]:
     """The controls of AVL by number, of those that are named or have a name of the field."""
-    numbered = {
+    numbers = {
         _control(name): int(number) for name, number in re.findall(r"(\S+)\s+d0?(\d+)\b", text)
     }
-    used = {name: numbered[name] for name in (inputs or MOVES) if name in numbered}
-    known = ", ".join(numbered) or "none"
+    controls = {name: numbers[name] for name in (inputs or MOVES) if name in numbers}
+    names_text = ", ".join(numbers) or "none"
     require(
-        bool(used),
+        bool(controls),
         "inputs",
-        f"the controls {known}",
+        f"the controls {names_text}",
         "elevator, aileron or rudder, or the names of yours as inputs",
     )
-    return used
+    return controls

@@ -213,7 +213,7 @@ def normals(first: int, count: int, params: Turbulence) -> FloatArray:
     Step k depends on seed and k. The numbers of the winds are the same with and without rotary
     gusts.
     """
-    skipped = first % BLOCK
+    offset = first % BLOCK
     streams = [(random_streams.TURBULENCE, STATES)]
     if (more := params.spread.shape[1] - STATES) > 0:
         streams.append((random_streams.ROTARY, more))
@@ -223,7 +223,7 @@ def normals(first: int, count: int, params: Turbulence) -> FloatArray:
             _block(block, params.seed, stream, width)
             for block in range(first // BLOCK, (first + count - 1) // BLOCK + 1)
         ]
-        columns.append(np.concatenate(blocks)[skipped : skipped + count])
+        columns.append(np.concatenate(blocks)[offset : offset + count])
     return columns[0] if len(columns) == 1 else np.hstack(columns)
 
 

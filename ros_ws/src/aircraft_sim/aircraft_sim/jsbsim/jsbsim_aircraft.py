@@ -66,12 +66,12 @@ def named_properties(
     rudder. Raises ParameterError for an unknown input, for what is no property of an aircraft, and
     for the value 0.
     """
-    named = list[tuple[str, NamedProperties]]()
+    properties = list[tuple[str, NamedProperties]]()
     for name, text in commands.items():
         require(name in INPUTS, key, repr(name), f"an input: {', '.join(INPUTS)}")
         paths = []
         if (name, text.strip()) == ("rudder", NONE):
-            named.append((name, ()))
+            properties.append((name, ()))
             continue
         for word in text.split():
             path, _, number = word.partition("=")
@@ -85,8 +85,8 @@ def named_properties(
             )
             paths.append((path, at_one))
         require(bool(paths), f"{key}.{name}", repr(text), "a property of the aircraft")
-        named.append((name, tuple(paths)))
-    return tuple(named)
+        properties.append((name, tuple(paths)))
+    return tuple(properties)
 
 
 def _number(text: str) -> float:
@@ -96,7 +96,7 @@ def _number(text: str) -> float:
         return math.nan
 
 
-class Quantity(NamedTuple):
+class JsbsimQuantity(NamedTuple):
     """A state: a property of JSBSim and the SI value of the unit."""
 
     property: str
@@ -139,16 +139,16 @@ INPUTS: Mapping[str, Command] = {
     ),
 }
 
-STATES: Mapping[str, Quantity] = {
-    "q": Quantity("velocities/q-rad_sec", 1.0, "rad/s"),  # FRD body axes, nose up +
-    "V": Quantity("velocities/vt-fps", FOOT, "m/s"),  # true airspeed
-    "p": Quantity("velocities/p-rad_sec", 1.0, "rad/s"),  # roll right +
-    "r": Quantity("velocities/r-rad_sec", 1.0, "rad/s"),  # nose right +
-    "alpha": Quantity("aero/alpha-rad", 1.0, None),
-    "theta": Quantity("attitude/theta-rad", 1.0, None),
-    "beta": Quantity("aero/beta-rad", 1.0, None),
-    "phi": Quantity("attitude/phi-rad", 1.0, None),
-    "altitude": Quantity("position/h-sl-ft", FOOT, None),
+STATES: Mapping[str, JsbsimQuantity] = {
+    "q": JsbsimQuantity("velocities/q-rad_sec", 1.0, "rad/s"),  # FRD body axes, nose up +
+    "V": JsbsimQuantity("velocities/vt-fps", FOOT, "m/s"),  # true airspeed
+    "p": JsbsimQuantity("velocities/p-rad_sec", 1.0, "rad/s"),  # roll right +
+    "r": JsbsimQuantity("velocities/r-rad_sec", 1.0, "rad/s"),  # nose right +
+    "alpha": JsbsimQuantity("aero/alpha-rad", 1.0, None),
+    "theta": JsbsimQuantity("attitude/theta-rad", 1.0, None),
+    "beta": JsbsimQuantity("aero/beta-rad", 1.0, None),
+    "phi": JsbsimQuantity("attitude/phi-rad", 1.0, None),
+    "altitude": JsbsimQuantity("position/h-sl-ft", FOOT, None),
 }
 """States x.* of `truth`, deviations from trim: the outputs in the order of y, then the rest."""
 
@@ -186,10 +186,10 @@ class FlightCondition(NamedTuple):
 
     def commands(self) -> dict[str, Command]:
         """INPUTS, with the user's own properties."""
-        named = dict(self.named)
+        properties = dict(self.named)
         return {
-            name: command._replace(trim_property=None, named=named[name])
-            if named.get(name)
+            name: command._replace(trim_property=None, named=properties[name])
+            if properties.get(name)
             else command
             for name, command in INPUTS.items()
         }

@@ -128,16 +128,16 @@ def _moves(fdm: jsbsim.FGFDMExec, paths: Iterable[tuple[str, float]], part: floa
     """Whether properties move an acceleration by more than two equal runs differ."""
     before = {path: fdm[path] for path, _ in paths}
     runs = []
-    for moved in (0.0, 0.0, part):
+    for deflection in (0.0, 0.0, part):
         for path, at_one in paths:
-            fdm[path] = before[path] + moved * at_one
+            fdm[path] = before[path] + deflection * at_one
         settle(fdm, MOVED)
         runs.append(residuals(fdm))
     for path, value in before.items():
         fdm[path] = value
     settle(fdm, AFTERWARDS)
-    first, again, changed = runs
-    return bool(np.max(np.abs(changed - again)) > LEAST + NOISE * np.max(np.abs(again - first)))
+    first, again, third = runs
+    return bool(np.max(np.abs(third - again)) > LEAST + NOISE * np.max(np.abs(again - first)))
 
 
 def sentence_without_effect(
@@ -152,12 +152,14 @@ def sentence_without_effect(
         for name in names
     ]
     manager = fdm.get_property_manager()
-    read = (
+    properties = (
         [] if model is None else [path for path in _read_by_model(model) if manager.hasNode(path)]
     )
-    acting = [path for path in read if _moves(fdm, [(path, 1.0)], PART)]
+    effective = [path for path in properties if _moves(fdm, [(path, 1.0)], PART)]
     reads = (
-        f"; its flight control reads {', '.join(acting)}: name them in `commands`" if acting else ""
+        f"; its flight control reads {', '.join(effective)}: name them in `commands`"
+        if effective
+        else ""
     )
     return f"{', '.join(parts)} moves no acceleration{reads}"
 
@@ -178,7 +180,7 @@ def _read_by_model(model: Path) -> list[str]:
 
     No component writes them.
     """
-    read: set[str] = set()
+    inputs_of_components: set[str] = set()
     written: set[str] = set()
     for content in model_files(model).members.values():
         tree = ElementTree.fromstring(content)  # noqa: S314 - model_files has read it
@@ -187,11 +189,13 @@ def _read_by_model(model: Path) -> list[str]:
         ):
             text = (element.text or "").strip()
             if element.tag in {"input", "p", "property"}:
-                read.add(text.lstrip("-"))
+                inputs_of_components.add(text.lstrip("-"))
             elif element.tag == "output":
                 written.add(text)
             elif name := element.get("name"):
                 written |= {name, f"fcs/{'-'.join(name.lower().split())}"}
     return sorted(
-        path for path in read - written if path.startswith("fcs/") and not path.endswith(CONVENTION)
+        path
+        for path in inputs_of_components - written
+        if path.startswith("fcs/") and not path.endswith(CONVENTION)
     )

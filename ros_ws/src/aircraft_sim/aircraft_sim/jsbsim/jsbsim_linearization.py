@@ -95,16 +95,16 @@ def linearize(condition: FlightCondition) -> Linearization:
                 f"{condition.title}: {driven(name)} does not respond to {name} within "
                 f"{_duration(name):g} s, by steps of {SIZES[0]:g} to {SIZES[-1]:g}"
             )
-    moved = [step for step in steps if step is not None]
-    B = np.column_stack([step.effect for step in moved])
+    present_steps = [step for step in steps if step is not None]
+    B = np.column_stack([step.effect for step in present_steps])
     return Linearization(
         condition=condition,
         trim=trim,
         airframe=_airframe(condition, trim, B),
-        lag=np.array([step.lag for step in moved]),
-        size=np.array([step.size for step in moved]),
-        spread=np.array([step.spread for step in moved]),
-        still=tuple(sentence for step in moved for sentence in step.still),
+        lag=np.array([step.lag for step in present_steps]),
+        size=np.array([step.size for step in present_steps]),
+        spread=np.array([step.spread for step in present_steps]),
+        still=tuple(sentence for step in present_steps for sentence in step.still),
     )
 
 

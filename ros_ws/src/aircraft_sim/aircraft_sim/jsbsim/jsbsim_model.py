@@ -95,7 +95,7 @@ class JsbsimModel:
         self._engines = {
             number: node for number, node in running.items() if node.get_double_value()
         }
-        self._cut = False
+        self._are_engines_cut = False
         self._fuel, self._climb = self._node(jsbsim_trim.FUEL), self._node(CLIMB)
         self._structure = [self._node(path) for path in jsbsim_trim.structure_contacts(self._fdm)]
         inputs = condition.inputs()
@@ -228,10 +228,10 @@ class JsbsimModel:
 
         Whether they run is then no outcome.
         """
-        if cut == self._cut:
+        if cut == self._are_engines_cut:
             return
         jsbsim_trim.cut_engines(self._fdm, cut)
-        self._cut = cut
+        self._are_engines_cut = cut
         self._engines = {}  # one that was cut off may need longer than a step to run again
 
     def _deviations(self) -> FloatArray:

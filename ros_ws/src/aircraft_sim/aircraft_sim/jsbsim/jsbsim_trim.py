@@ -466,9 +466,9 @@ def _trim_failure(fdm: jsbsim.FGFDMExec, condition: FlightCondition) -> str:
     ]
     if stopped and not _engines_start(condition):
         return f"engine {', '.join(stopped)} cannot be started"
-    left = residuals(fdm)
-    axis = AXES_OF_RESIDUALS[int(np.argmax(np.abs(left) / TOLERANCE))]
-    linear, angular = np.abs(left).reshape(2, 3).max(axis=1)
+    accelerations = residuals(fdm)
+    axis = AXES_OF_RESIDUALS[int(np.argmax(np.abs(accelerations) / TOLERANCE))]
+    linear, angular = np.abs(accelerations).reshape(2, 3).max(axis=1)
     _, lower, upper = commands_and_limits(fdm, condition.commands().values())
     stopped_inputs = [
         name for name, low, high in zip(INPUTS, lower, upper, strict=True) if not low <= 0.0 <= high

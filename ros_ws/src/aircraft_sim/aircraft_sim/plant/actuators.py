@@ -65,15 +65,15 @@ def step(position: Array, command: Array, dt: Any, params: Actuators) -> Array:
     Digital Control, 4.3.
     """
     xp = array_namespace(position)
-    new = _input(position, command, params)
+    target = _input(position, command, params)
     if params.lag is not None:
-        new = new - (new - position) * xp.exp(-dt / xp.maximum(params.lag, MIN_LAG))
+        target = target - (target - position) * xp.exp(-dt / xp.maximum(params.lag, MIN_LAG))
     if params.rate is not None:
         largest = params.rate * dt
-        new = xp.minimum(xp.maximum(new, position - largest), position + largest)
+        target = xp.minimum(xp.maximum(target, position - largest), position + largest)
     if params.lower is not None:
-        new = xp.maximum(new, params.lower)
-    return new if params.upper is None else xp.minimum(new, params.upper)
+        target = xp.maximum(target, params.lower)
+    return target if params.upper is None else xp.minimum(target, params.upper)
 
 
 def mean_position(position: Array, command: Array, new: Array, dt: Any, params: Actuators) -> Array:
@@ -116,9 +116,9 @@ def move(
     The input is that of the aircraft; both are with faults, shapes (m,).
     """
     now = in_force(t, position, params)
-    new = step(position, command, dt, now)
-    mean = mean_position(position, command, new, dt, now)
-    return apply_faults(t, position, new, params), effect(
+    end = step(position, command, dt, now)
+    mean = mean_position(position, command, end, dt, now)
+    return apply_faults(t, position, end, params), effect(
         t, apply_faults(t, position, mean, params), params
     )
 

@@ -17,7 +17,7 @@ from flight_core.parameters import LARGEST, one_of, require
 from flight_core.vectors import FloatArray
 
 
-class Kind(NamedTuple):
+class FaultKind(NamedTuple):
     """A kind of fault: its keys in `actuators.Actuators`, and how strong a fault is."""
 
     begin: str
@@ -32,13 +32,13 @@ ENDS = ("lower", "upper")
 """Ends of a runaway, as the keys of the stops."""
 
 KINDS = {
-    "stuck": Kind("stuck_at"),
-    "lost": Kind("lost_at"),
-    "failed": Kind("lost_at"),
-    HARD_OVER: Kind("hard_over_at", "hard_over_to"),
-    "weak": Kind(begin="weak_at", strength="weak_effect", default=0.5, least=-2.0, most=2.0),
-    "slow": Kind("slow_at", "slow_lag", 0.2),
-    "loose": Kind("loose_at", "loose_play", 0.01),
+    "stuck": FaultKind("stuck_at"),
+    "lost": FaultKind("lost_at"),
+    "failed": FaultKind("lost_at"),
+    HARD_OVER: FaultKind("hard_over_at", "hard_over_to"),
+    "weak": FaultKind(begin="weak_at", strength="weak_effect", default=0.5, least=-2.0, most=2.0),
+    "slow": FaultKind("slow_at", "slow_lag", 0.2),
+    "loose": FaultKind("loose_at", "loose_play", 0.01),
 }
 """The kinds. Without a strength: half of the effect, ten times the lag of a servo of the osprey in
 s, and a half-width of 0.57 deg, or 1 % of thrust."""
@@ -73,22 +73,22 @@ def read(sentence: str, key: str) -> Fault:
     """The fault of a sentence. Raises ParameterError."""
     words = sentence.split()
     require(len(words) in {3, 4}, key, repr(sentence), FORM)
-    name, chosen, at, *how = words
-    require(chosen in KINDS, key, repr(chosen), one_of(tuple(KINDS), chosen))
-    kind = KINDS[chosen]
+    name, kind_name, at, *how = words
+    require(kind_name in KINDS, key, repr(kind_name), one_of(tuple(KINDS), kind_name))
+    kind = KINDS[kind_name]
     begin = _number(at, key, "a time in s, as 60")
     require(begin >= 0.0, key, f"{begin:g} s", "a time from 0 on")
-    if chosen == HARD_OVER:
+    if kind_name == HARD_OVER:
         end = how[0] if how else "no end stop"
-        require(end in ENDS, key, end, f"{name} {chosen} {at} lower, or upper")
-        return Fault(name, chosen, begin, end=end)
-    require(not how or bool(kind.strength), key, repr(sentence), f"{name} {chosen} {at} alone")
+        require(end in ENDS, key, end, f"{name} {kind_name} {at} lower, or upper")
+        return Fault(name, kind_name, begin, end=end)
+    require(not how or bool(kind.strength), key, repr(sentence), f"{name} {kind_name} {at} alone")
     if not kind.strength:
-        return Fault(name, chosen, begin)
+        return Fault(name, kind_name, begin)
     strength = _number(how[0], key, f"{kind.strength} as a number") if how else kind.default
     bounds = f"{kind.strength} from {kind.least:g} to {kind.most:g}"
     require(kind.least <= strength <= kind.most, key, f"{strength:g}", bounds)
-    return Fault(name, chosen, begin, strength)
+    return Fault(name, kind_name, begin, strength)
 
 
 def _number(word: str, key: str, expected: str) -> float:
@@ -123,16 +123,16 @@ def require_possible(
         meant = f"{fault.subject} at {fault.at:g} s"
         if fault.kind in {"lost", "failed", "weak"}:
             meaning = "its value without thrust, from trim; 0 for a surface"
-            needed = f"no_thrust of {fault.input} in {owner}: {meaning}"
-            require(bool(np.isfinite(position)), key, meant, needed)
+            expected = f"no_thrust of {fault.input} in {owner}: {meaning}"
+            require(bool(np.isfinite(position)), key, meant, expected)
         is_surface = position == 0.0
         require(fault.kind != "failed" or is_surface == 0.0, key, meant, "lost, of a surface")
         require(fault.kind != "lost" or is_surface, key, meant, "failed, of a thrust")
         if fault.kind == HARD_OVER:
             values = stops[fault.end]
             is_bounded = bool(values) and math.isfinite(values[place])
-            needed = f"an end stop of {fault.input} in actuators.{fault.end}"
-            require(is_bounded, key, meant, needed)
+            expected = f"an end stop of {fault.input} in actuators.{fault.end}"
+            require(is_bounded, key, meant, expected)
 
 
 def arrays(

@@ -186,13 +186,13 @@ def advance(
         position, mean = actuators.move(
             seconds(t_ns + k * plant.step_ns), position, u, dt, plant.actuators
         )
-        held = (
+        input_now = (
             aircraft.B.dot(mean) if aircraft.trim is None else aircraft.B.dot(mean) + aircraft.trim
         )
         if filters is not None:
-            held = held + aircraft.gust_direction @ turbulence.wind(z, filters)
+            input_now = input_now + aircraft.gust_direction @ turbulence.wind(z, filters)
             z = turbulence.step(z, normals[k], filters)
-        x = rk4(x_dot, 0.0, x, rate[2 * k : 2 * k + 3] + held, aircraft, dt)
+        x = rk4(x_dot, 0.0, x, rate[2 * k : 2 * k + 3] + input_now, aircraft, dt)
     return AircraftState(x, position, z)
 
 

@@ -23,8 +23,8 @@ from flight_campaign import equipment
 from flight_campaign.batch import batch_allocation, batch_loop
 from flight_campaign.batch.batch_loop import (
     FleetResult,
+    LoopSample,
     LoopState,
-    Sample,
     Timing,
     Vehicle,
     figures,
@@ -95,10 +95,10 @@ def with_equipment(
         vehicle = replace(vehicle, actuators=vehicle.actuators._replace(lag=_rows(lag)))
     if any(name.startswith("noise[") for name in values):
         noise = aircraft.sensors.noise
-        drawn = equipment.in_order(values, "noise", tuple(channels.outputs), noise)
+        noises = equipment.in_order(values, "noise", tuple(channels.outputs), noise)
         more = [
-            value / published - 1.0 if published else 0.0
-            for value, published in zip(drawn, noise, strict=True)
+            value / nominal - 1.0 if nominal else 0.0
+            for value, nominal in zip(noises, noise, strict=True)
         ]
         by_name = dict(zip(channels.outputs, more, strict=True))
         noisier = _rows([by_name[name] for name in scenario.controller.outputs])
@@ -182,7 +182,7 @@ def _timing(fleet: FleetMatrices, course: Course) -> Timing:
     return Timing(fleet.blocks, course.steps, course.late, late)
 
 
-class Stepper:
+class FleetStepper:
     """The flights of `fly` tick by tick, with u from outside.
 
     `sense`, then `advance`, for each tick of the course.
@@ -242,7 +242,7 @@ class Stepper:
 @jax.jit
 def _sense_once(
     now: LoopState, segments: Segments, k: int, vehicle: Vehicle
-) -> tuple[LoopState, Sample]:
+) -> tuple[LoopState, LoopSample]:
     return batch_loop.sense(now, jax.tree.map(lambda values: values[k], segments), vehicle)
 
 

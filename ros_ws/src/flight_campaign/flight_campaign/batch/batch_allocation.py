@@ -41,17 +41,17 @@ def allocate(v: Array, u_before: Array, dt: Array, params: Allocation) -> tuple[
     free = rate_range.has(u)
 
     def at_limits() -> tuple[Array, Array]:
-        passed = _exchanged(u, stops, params)
+        u_passed = _exchanged(u, stops, params)
         target = _where_not(
-            stops.has(passed) | free,
-            passed,
+            stops.has(u_passed) | free,
+            u_passed,
             lambda: _by_priority(jnp.zeros_like(u), v, stops, params),
         )
 
         def at_rate() -> Array:
             start = rate_range.clip(u_before)
-            moved = _by_priority(start, product(params.effect, target - start), rate_range, params)
-            return _towards(moved, product(params.exchange, target - moved), rate_range, params)
+            move = _by_priority(start, product(params.effect, target - start), rate_range, params)
+            return _towards(move, product(params.exchange, target - move), rate_range, params)
 
         limited_u = jnp.where(free, u, _where_not(rate_range.has(target) | free, target, at_rate))
         return limited_u, jnp.where(free, v, product(params.effect, limited_u))
@@ -73,8 +73,8 @@ def _by_priority(start: Array, v: Array, limits: _Range, params: Allocation) -> 
 
 def _towards(u: Array, move: Array, limits: _Range, params: Allocation) -> Array:
     """U after a move as far as the limits let it, from a u inside."""
-    moved = _exchanged(u + move, limits, params)
-    arrives = limits.has(moved)
+    destination = _exchanged(u + move, limits, params)
+    arrives = limits.has(destination)
 
     def partly() -> Array:
         def halve(
@@ -91,7 +91,9 @@ def _towards(u: Array, move: Array, limits: _Range, params: Allocation) -> Array
             )
 
         none = 0.0 * u[0]
-        reached, target, _, _ = jax.lax.fori_loop(0, HALVINGS, halve, (u, moved, none, none + 1.0))
+        reached, target, _, _ = jax.lax.fori_loop(
+            0, HALVINGS, halve, (u, destination, none, none + 1.0)
+        )
         step = target - reached
         room = jnp.where(step > 0.0, limits.high - reached, limits.low - reached)
         passes = jnp.abs(step) > jnp.abs(room)
@@ -100,7 +102,7 @@ def _towards(u: Array, move: Array, limits: _Range, params: Allocation) -> Array
         )
         return limits.clip(reached + last * step)
 
-    return _where_not(arrives, moved, partly)
+    return _where_not(arrives, destination, partly)
 
 
 def _exchanged(u: Array, limits: _Range, params: Allocation) -> Array:

@@ -94,7 +94,7 @@ class Timing(NamedTuple):
     u_late: int  # ticks, the largest
 
 
-class Sample(NamedTuple):
+class LoopSample(NamedTuple):
     """What a law takes at a tick, (m, N) or (m, 1)."""
 
     y: Array
@@ -137,9 +137,9 @@ def begin(
     none = 0.0 * start.u
 
     def stepped() -> Any:
-        measured = _measured(start, first, Sample(none, none, none), fleet, vehicle)
-        engaged = control_law.engage(measured, params)
-        return control_law.limited(engaged, measured, first.dt, params, vehicle.limits)[0]
+        measurements = _measured(start, first, LoopSample(none, none, none), fleet, vehicle)
+        law = control_law.engage(measurements, params)
+        return control_law.limited(law, measurements, first.dt, params, vehicle.limits)[0]
 
     law = jax.tree.map(lambda like: jnp.zeros(like.shape, like.dtype), jax.eval_shape(stepped))
     return start._replace(law=law)
@@ -160,8 +160,8 @@ def fly_run(
     size = len(run.pattern)
 
     def patterns(values: Array) -> Array:
-        chosen = jax.lax.dynamic_slice_in_dim(jnp.asarray(values), first, run.length)
-        return chosen.reshape(run.length // size, size, *values.shape[1:])
+        values_of_run = jax.lax.dynamic_slice_in_dim(jnp.asarray(values), first, run.length)
+        return values_of_run.reshape(run.length // size, size, *values.shape[1:])
 
     def pattern(now: LoopState, ticks: Any) -> tuple[LoopState, None]:
         for k, kind in enumerate(run.pattern):
@@ -173,12 +173,12 @@ def fly_run(
 
 
 def _chosen(
-    known: int | None, asked: Array, branches: Sequence[Callable[..., Any]], *arguments: Any
+    constant: int | None, value: Array, branches: Sequence[Callable[..., Any]], *arguments: Any
 ) -> Any:
-    """The result of the known branch, or of the branch that the tick asks for."""
-    if known is None:
-        return jax.lax.switch(asked, branches, *arguments)
-    return branches[known](*arguments)
+    """The result of the branch `constant`; None: of the branch `value` of the tick."""
+    if constant is None:
+        return jax.lax.switch(value, branches, *arguments)
+    return branches[constant](*arguments)
 
 
 def tick(
@@ -204,20 +204,20 @@ def tick(
         )
         return law, now.u, now.command
 
-    def step(now: LoopState, segment: Segments, sample: Sample) -> tuple[Any, Array, Array]:
-        measured = measure(now, segment, sample)
+    def step(now: LoopState, segment: Segments, sample: LoopSample) -> tuple[Any, Array, Array]:
+        measurements = measure(now, segment, sample)
         limits = vehicle.limits
         allocation = vehicle.allocation
         if allocation is None:
-            law, _, u = control_law.limited(now.law, measured, segment.dt, params, limits)
+            law, _, u = control_law.limited(now.law, measurements, segment.dt, params, limits)
             return law, u, u
         # As the guard: what the effectors give limits the law.
-        _, u_free = control_law.step(now.law, measured, segment.dt, params)
+        _, u_free = control_law.step(now.law, measurements, segment.dt, params)
         _, reachable = allocate(
             saturate(u_free, now.u, segment.dt, limits), now.command, segment.dt, allocation
         )
         law, _, u = control_law.limited(
-            now.law, measured, segment.dt, params, limits_of_effectors(u_free, reachable)
+            now.law, measurements, segment.dt, params, limits_of_effectors(u_free, reachable)
         )
         command, u = allocate(u, now.command, segment.dt, allocation)
         return law, u, command
@@ -227,22 +227,22 @@ def tick(
 
     sensed, sample = sense(now, segment, vehicle)
     law, u, command = _chosen(kind.phase, segment.phase, (hold, engage, step), now, segment, sample)
-    commanded = sensed._replace(law=law, u=u)
-    return advance(commanded, command, segment, fleet, vehicle, timing, kind)
+    state_with_u = sensed._replace(law=law, u=u)
+    return advance(state_with_u, command, segment, fleet, vehicle, timing, kind)
 
 
 def _measured(
-    now: LoopState, segment: Segments, sample: Sample, fleet: FleetMatrices, vehicle: Vehicle
+    now: LoopState, segment: Segments, sample: LoopSample, fleet: FleetMatrices, vehicle: Vehicle
 ) -> Measurements:
     """What a law takes at a tick."""
     y, y_m, y_m_dot = sample
-    measured = dict(zip(vehicle.outputs, y, strict=True))
-    x = jnp.stack([measured.get(k, row) for k, row in enumerate(now.x)])
+    by_output = dict(zip(vehicle.outputs, y, strict=True))
+    x = jnp.stack([by_output.get(k, row) for k, row in enumerate(now.x)])
     matrices = at(segment.t, fleet)
-    acting = _product(
+    x_dot_now = _product(
         matrices.rate, [*now.x, *actuators.effect(segment.t, now.position, vehicle.actuators)]
     )
-    moving = acting + fleet.wind * _product(matrices.forced_rate, segment.forcing_now)
+    moving = x_dot_now + fleet.wind * _product(matrices.forced_rate, segment.forcing_now)
     u_trim = segment.u_ff[:, None] + 0.0 * y
     x_air = x - fleet.wind * segment.air[:, None]
     vane = vane_m = None
@@ -267,7 +267,7 @@ def _measured(
     )
 
 
-def sense(now: LoopState, segment: Segments, vehicle: Vehicle) -> tuple[LoopState, Sample]:
+def sense(now: LoopState, segment: Segments, vehicle: Vehicle) -> tuple[LoopState, LoopSample]:
     """The sample of a tick for the law; the figures take the true error."""
     true = rows_of(now.x, vehicle.outputs)
     e = true - segment.y_m[:, None]
@@ -286,7 +286,7 @@ def sense(now: LoopState, segment: Segments, vehicle: Vehicle) -> tuple[LoopStat
         bounded=now.bounded
         & (jnp.max(jnp.abs(now.x), axis=0) < DIVERGENCE_LIMIT),  # False for NaN too
     )
-    return sensed, Sample(y, segment.sampled_y_m[:, None], segment.sampled_y_m_dot[:, None])
+    return sensed, LoopSample(y, segment.sampled_y_m[:, None], segment.sampled_y_m_dot[:, None])
 
 
 def advance(
@@ -337,13 +337,13 @@ def advance(
 
 
 def _actuated(
-    position: Array, acting: Array, times: Array, vehicle: Vehicle, *, unroll: bool
+    position: Array, command: Array, times: Array, vehicle: Vehicle, *, unroll: bool
 ) -> tuple[Array, Array]:
     """The positions of the actuators after the steps at some times, and their means in each."""
-    commanded = rows_of(acting, np.argsort(vehicle.inputs))
+    ordered_command = rows_of(command, np.argsort(vehicle.inputs))
 
     def move(before: Array, t: Array) -> tuple[Array, Array]:
-        return actuators.move(t, before, commanded, vehicle.dt, vehicle.actuators)
+        return actuators.move(t, before, ordered_command, vehicle.dt, vehicle.actuators)
 
     # A loop of its own: without one the compiler of a CPU computes all mean positions again for
     # each state that they act on.

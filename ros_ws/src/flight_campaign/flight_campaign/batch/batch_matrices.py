@@ -31,7 +31,7 @@ class StateBlock(NamedTuple):
     columns: tuple[int, ...]
 
 
-class Change(NamedTuple):
+class DriftMatrices(NamedTuple):
     """A drift of N aircraft: differences of the matrices of Fleet.
 
     Differences after `duration`, linear in time before.
@@ -63,7 +63,7 @@ class FleetMatrices(NamedTuple):
     forced_rate: Array  # (m, r, N)
     wind: Array  # (N,) factor of the course's gusts and turbulence
     late: Array  # (N,) delay of u, whole ticks
-    change: Change | None = None
+    change: DriftMatrices | None = None
 
 
 def assemble(
@@ -95,7 +95,7 @@ def assemble(
     directions = aircraft.gust_direction if gust_directions is None else gust_directions
     axes = tuple(course.axes.tolist())
     rows = tuple(remainder_rows(aircraft).tolist())
-    computed = partial(
+    matrices_of = partial(
         _matrices if is_cpu() else _compiled_matrices,
         gravity=aircraft.gravity,
         C=aircraft.C[course.order],
@@ -103,7 +103,7 @@ def assemble(
         dt=seconds(plant.step_ns),
         places=_Places(course.steps, axes, rows),
     )
-    tick, forced, rate, forced_rate = begin = computed(A, B, directions)
+    tick, forced, rate, forced_rate = begin = matrices_of(A, B, directions)
     blocks = _blocks(np.asarray((tick != 0.0).any(axis=0)))
 
     def by_block(matrices: Array) -> tuple[Array, ...]:
@@ -113,9 +113,9 @@ def assemble(
     change = None
     count = len(A)
     if (drift := plant.drift) is not None:
-        end = computed(A * drift.A, B * drift.B, directions * drift.wind)
+        end = matrices_of(A * drift.A, B * drift.B, directions * drift.wind)
         moved, *others = (after - before for before, after in zip(begin, end, strict=True))
-        change = Change(drift.start, drift.duration, by_block(moved), *map(_last, others))
+        change = DriftMatrices(drift.start, drift.duration, by_block(moved), *map(_last, others))
     return FleetMatrices(
         blocks=blocks,
         tick=by_block(tick),
@@ -163,17 +163,17 @@ def _matrices(
     pairs = ((eye, 0.0 * eye), (0.0 * eye, eye))
     Phi, Gamma = (rk4(lambda t, x, u, L: L @ x + u, 0.0, x, u, L, dt) for x, u in pairs)
     powers = list(accumulate(repeat(Phi, K), lambda power, step: step @ power, initial=eye))
-    held = [powers[K - 1 - k] @ Gamma for k in range(K)]
+    input_steps = [powers[K - 1 - k] @ Gamma for k in range(K)]
     tick = [
         powers[K],
-        *(held_step @ B for held_step in held),
-        sum(held)[..., list(places.rows)],
+        *(held_step @ B for held_step in input_steps),
+        sum(input_steps)[..., list(places.rows)],
     ]
     parts = (directions[..., list(places.axes)], basis)
     forcing = xp.concatenate(
         [xp.broadcast_to(part, (count, *part.shape[-2:])) for part in parts], axis=2
     )
-    forced = xp.concatenate([held_step @ forcing for held_step in held], axis=2)
+    forced = xp.concatenate([held_step @ forcing for held_step in input_steps], axis=2)
     return xp.concatenate(tick, axis=2), forced, C @ xp.concatenate([L, B], axis=2), C @ forcing
 
 

@@ -82,9 +82,12 @@ def require_flyable(scenario: Scenario) -> None:
         aircraft.airframe,
         "an airframe with matrices: JSBSim flies one at a time",
     )
-    fixed = getattr(controller, "learn", None) is None
+    learns_nothing = getattr(controller, "learn", None) is None
     require(
-        fixed, "controller.learn", "a section", "none: only rise-di fly and rise-di campaign learn"
+        learns_nothing,
+        "controller.learn",
+        "a section",
+        "none: only rise-di fly and rise-di campaign learn",
     )
     at_trim = controller.guard().over_speed is None
     require(
@@ -98,9 +101,9 @@ def require_flyable(scenario: Scenario) -> None:
         require(getattr(aircraft, key) is None, f"aircraft.{key}", "a section", expected)
     expected = "linear or euler: a campaign flies no multicopter"
     require(aircraft.kinematics != "thrust", "aircraft.kinematics", "thrust", expected)
-    fixed = aircraft.over_airspeed is None
+    learns_nothing = aircraft.over_airspeed is None
     require(
-        fixed,
+        learns_nothing,
         "aircraft.over_airspeed",
         aircraft.over_airspeed,
         "none: the aircraft of a campaign keep their trim speed",
@@ -155,18 +158,18 @@ def build_course(scenario: Scenario) -> Course:
     y_m, y_m_dot = _references(scenario, ticks, tick_ns)
     arrives = [sensors.arrives(k, errors) for k in range(ticks)]
     phase, dt = _phases(ticks, late, seconds(tick_ns), scenario.controller.max_age, arrives)
-    used = np.maximum(np.arange(ticks) - late, 0)
-    wind, timed = _forcing(ticks, steps, plant)
-    axes, basis, (over_step, now) = _reduced(wind, timed)
+    delayed_ticks = np.maximum(np.arange(ticks) - late, 0)
+    wind, forcing = _forcing(ticks, steps, plant)
+    axes, basis, (over_step, now) = _reduced(wind, forcing)
     guard = controller.guard()
-    u_ff, x_m = _feedforward(guard.nominal, phase, dt, y_m[used], seconds(tick_ns))
+    u_ff, x_m = _feedforward(guard.nominal, phase, dt, y_m[delayed_ticks], seconds(tick_ns))
     segments = Segments(
         t=np.arange(ticks) * np.float64(seconds(tick_ns)),
         phase=phase,
         dt=dt,
         y_m=y_m,
-        sampled_y_m=y_m[used],
-        sampled_y_m_dot=y_m_dot[used],
+        sampled_y_m=y_m[delayed_ticks],
+        sampled_y_m_dot=y_m_dot[delayed_ticks],
         u_ff=u_ff,
         error=error[:, order],
         noise=noise[:, order],

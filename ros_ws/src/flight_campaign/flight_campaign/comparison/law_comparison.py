@@ -70,7 +70,7 @@ class LawResult(NamedTuple):
 
 def compare(
     benchmark: Benchmark,
-    tuned: Mapping[str, Mapping[str, TuningResult]],
+    gains_by_law: Mapping[str, Mapping[str, TuningResult]],
     aircraft: int,
     levels: Sequence[float],
     seed: int,
@@ -106,11 +106,11 @@ def compare(
         control_law = laws[name].control_law(benchmark.model)  # of all gain sets: compiled once
         return [
             study.result(name, laws[name], control_law, objective, gains)
-            for objective, gains in tuned[name].items()
+            for objective, gains in gains_by_law[name].items()
         ]
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        for scored in pool.map(results, tuned):
+        for scored in pool.map(results, gains_by_law):
             yield from scored
 
 
@@ -134,29 +134,29 @@ class _LawStudy(NamedTuple):
         """The figures of a law with a gain set."""
         benchmark = self.benchmark
         params = law.params(as_gains(gains), benchmark.model)
-        flown = {}
+        results = {}
         for wind, disturbed in self.flights.items():
             course = benchmark.courses[wind][law.feedforward]
-            flown[wind] = batch.fly(disturbed, benchmark.vehicle, course, control_law, params)
-        scores = {wind: score(each, benchmark.unit) for wind, each in flown.items()}
+            results[wind] = batch.fly(disturbed, benchmark.vehicle, course, control_law, params)
+        scores = {wind: score(each, benchmark.unit) for wind, each in results.items()}
         in_time = 1 + sum(map(len, self.parts))
-        delayed = scores[GUST][in_time:].reshape(len(self.delays), len(self.parts[0]))
+        delayed_scores = scores[GUST][in_time:].reshape(len(self.delays), len(self.parts[0]))
         by_level = []
         for level, part in zip(self.levels, self.parts, strict=True):
             costs = {wind: _scores(of_wind[part]) for wind, of_wind in scores.items()}
             by_level.append(Level(level, costs))
-        lost = {}
-        for ticks, costs_late in zip(self.delays, delayed, strict=True):
-            lost[ticks * benchmark.model.period] = _lost(costs_late)
+        losses = {}
+        for ticks, costs_late in zip(self.delays, delayed_scores, strict=True):
+            losses[ticks * benchmark.model.period] = _lost(costs_late)
         return LawResult(
             law=name,
             objective=objective,
             costs=gains.costs,
             scores={wind: float(costs[0]) for wind, costs in scores.items()},
             levels=tuple(by_level),
-            lost_late=lost,
-            rms=np.asarray(flown[GUST].rms)[:, 0],
-            slew=np.asarray(flown[GUST].slew)[:, 0],
+            lost_late=losses,
+            rms=np.asarray(results[GUST].rms)[:, 0],
+            slew=np.asarray(results[GUST].slew)[:, 0],
             margins=_margins(law, gains, benchmark),
         )
 

@@ -53,12 +53,12 @@ def registered_law(controller: ControllerConfig, name: str) -> Law:
         each = []
         for k in range(count):
             values = {key: _value(gain[:, k], key in scalars) for key, gain in wide.items()}
-            tuned = (
+            controllers = (
                 type(controller)
                 .validate_mapping(controller.model_dump() | values, name)
                 .tuned_law()
             )
-            each.append(tuned.params)
+            each.append(controllers.params)
         return jax.tree.map(_last, *each)
 
     return Law(
@@ -112,13 +112,13 @@ def find_laws(
         elif name == scenario.controller.law:
             controller = scenario.controller
         else:
-            flown = (
+            flyable = (
                 "the path of a scenario file whose controller flies it"
                 if name in laws.names()
                 else "a scenario file"
             )
             raise ParameterError(
-                f"--laws: found {name!r}, expected laws among {', '.join(LAWS)}, or {flown}"
+                f"--laws: found {name!r}, expected laws among {', '.join(LAWS)}, or {flyable}"
             )
         for key in ("outputs", "inputs", "rate"):
             expected = getattr(scenario.controller, key)

@@ -43,7 +43,7 @@ def require_registered(name: str) -> None:
     require(name in REGISTERED, "--write", f"the law {name}", f"one of {', '.join(REGISTERED)}")
 
 
-def tuned_controller(name: str, tuned: TuningResult, benchmark: Benchmark) -> ControllerConfig:
+def tuned_controller(name: str, result: TuningResult, benchmark: Benchmark) -> ControllerConfig:
     """The controller that flies as a law of the catalogue with tuned gains.
 
     The inputs of the benchmark: 1 / abs(Omega_ii). Topics have no delay, as in the benchmark.
@@ -65,8 +65,8 @@ def tuned_controller(name: str, tuned: TuningResult, benchmark: Benchmark) -> Co
     if feedforward is not None:
         values["feedforward"] = feedforward.model_dump(exclude_none=True)
     if name in DESIGNS:
-        values["observer"] = _observer(name, tuned, benchmark).model_dump()
-    gains = as_gains(tuned)
+        values["observer"] = _observer(name, result, benchmark).model_dump()
+    gains = as_gains(result)
     if REGISTERED[name] == "rise_di":
         law_gains = {
             key: np.broadcast_to(gains[key][:, 0], model.lag.shape)
@@ -76,7 +76,7 @@ def tuned_controller(name: str, tuned: TuningResult, benchmark: Benchmark) -> Co
         values |= _rise_di(law_gains, model.input_scale)
     elif REGISTERED[name] != "lqg":
         values |= {
-            key: tuned.gains[key] for key in ("K", "Lambda", "bandwidth") if key in tuned.gains
+            key: result.gains[key] for key in ("K", "Lambda", "bandwidth") if key in result.gains
         }
     if REGISTERED[name] == "l1":
         values["Omega"] = model.Omega.ravel().tolist()
@@ -90,9 +90,9 @@ def _rise_di(gains: dict[str, FloatArray], input_scale: FloatArray) -> dict[str,
     """
     K = gains["K"]
     least = max(MIN_K, float(K[-1]))
-    permitted = np.maximum(K, least + np.append(np.full(len(K) - 1, MIN_GAIN), 0.0))
-    share = K / permitted
-    k_g, k_d = split_gain(permitted)
+    K_permitted = np.maximum(K, least + np.append(np.full(len(K) - 1, MIN_GAIN), 0.0))
+    share = K / K_permitted
+    k_g, k_d = split_gain(K_permitted)
     return {
         "k_g": k_g,
         "k_d": k_d.tolist(),
@@ -117,7 +117,7 @@ def _feedforward(name: str, benchmark: Benchmark) -> FeedforwardConfig | None:
     )
 
 
-def _observer(name: str, tuned: TuningResult, benchmark: Benchmark) -> ObserverConfig:
+def _observer(name: str, result: TuningResult, benchmark: Benchmark) -> ObserverConfig:
     """The observer of a law, with its bound of u_o.
 
     The margin is that of the search, so none is required of it.
@@ -129,7 +129,9 @@ def _observer(name: str, tuned: TuningResult, benchmark: Benchmark) -> ObserverC
         (controller.outputs, ()) if integrators else (tuple(airframe.states), tuple(airframe.gusts))
     )
     design = DESIGNS[name](
-        as_gains(tuned), benchmark.model, Names(states, controller.inputs, controller.outputs, axes)
+        as_gains(result),
+        benchmark.model,
+        Names(states, controller.inputs, controller.outputs, axes),
     )
     matrices = {
         key: np.asarray(getattr(design, key)).ravel().tolist() for key in ("Phi", "Gamma", "L", "F")

@@ -264,9 +264,9 @@ def evaluations(objective: Objective, benchmark: Benchmark) -> list[Evaluation]:
     airframe, _ = benchmark.scenario.aircraft.load()
     A, B = nominal_and_sampled(airframe, UNCERTAINTY, UNCERTAIN_AIRCRAFT, UNCERTAINTY_SEED)
     aircraft = np.arange(len(A))
-    delayed = aircraft if objective.all_late else aircraft[:1]
-    numbers = np.concatenate([aircraft, delayed])
-    counts = [len(A), len(delayed)]
+    late_aircraft = aircraft if objective.all_late else aircraft[:1]
+    numbers = np.concatenate([aircraft, late_aircraft])
+    counts = [len(A), len(late_aircraft)]
     late = np.repeat([0, objective.delay * benchmark.delay], counts)
     share = np.repeat([1.0 / count for count in counts], counts)
     return [
@@ -343,10 +343,10 @@ def tune(
 
     def costs(job: tuple[Any, Evaluation]) -> FloatArray:
         """Costs of a part of the candidates in one wind, (together,)."""
-        params, flown = job
-        course = benchmark.courses[flown.wind][law.feedforward]
-        result = batch.fly(flown.fleet, benchmark.vehicle, course, control_law, params)
-        return cost(result, benchmark).reshape(together, each) @ flown.weight
+        params, evaluation = job
+        course = benchmark.courses[evaluation.wind][law.feedforward]
+        result = batch.fly(evaluation.fleet, benchmark.vehicle, course, control_law, params)
+        return cost(result, benchmark).reshape(together, each) @ evaluation.weight
 
     lacking = partial(_lacking, law, objective, benchmark)
     options = {"popsize": POPULATION, "verbose": -9}
@@ -357,8 +357,8 @@ def tune(
     generations = generation_count(law, benchmark) if generations is None else generations
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for generation in range(generations):
-            asked = [np.array(search.ask()) for search in searches]
-            parts = [gains_of(part) for part in np.split(np.concatenate(asked), PARTS)]
+            candidates = [np.array(search.ask()) for search in searches]
+            parts = [gains_of(part) for part in np.split(np.concatenate(candidates), PARTS)]
             params = [
                 spread_over(law.params(part, benchmark.model), single, each) for part in parts
             ]
@@ -366,7 +366,9 @@ def tune(
             by_part = weighted.reshape(PARTS, len(flights), together).sum(axis=1)
             by_part += np.array(list(pool.map(lacking, parts)))
             by_search = by_part.reshape(len(seeds), POPULATION)
-            best = [_after(*each) for each in zip(searches, asked, by_search, best, strict=True)]
+            best = [
+                _after(*each) for each in zip(searches, candidates, by_search, best, strict=True)
+            ]
             if progress is not None:
                 progress(generation + 1, min(value for value, _ in best))
     winner = int(np.argmin([value for value, _ in best]))
@@ -387,10 +389,10 @@ def nominal_margins(law: Law, gains: Gains, model: NominalModel) -> Margins:
     Their shapes are (N, m) and (N,), without those of all inputs at once. u has no delay, as in a
     benchmark.
     """
-    tuned = TunedLaw(law.control_law(model), law.params(gains, model))
+    tuned_law = TunedLaw(law.control_law(model), law.params(gains, model))
     count = max((gain.shape[-1] for gain in gains.values()), default=1)
     plant = LinearPlant(model.A + model.gravity, model.B, model.C)
-    candidates = linear_law(tuned, len(model.lag), model.period, count)
+    candidates = linear_law(tuned_law, len(model.lag), model.period, count)
     loop = LoopTiming(model.lag, 0.0, model.period)
     return input_margins(plant, candidates, loop, together=False)
 
@@ -413,14 +415,14 @@ def _rounded(gains: Gains) -> dict[str, list[float]]:
 
 
 def _after(
-    search: Any, asked: FloatArray, values: FloatArray, best: tuple[float, FloatArray]
+    search: Any, point: FloatArray, values: FloatArray, best: tuple[float, FloatArray]
 ) -> tuple[float, FloatArray]:
     """The least cost so far and its candidate, after the search took the costs of those asked."""
-    search.tell(list(asked), list(values))
+    search.tell(list(point), list(values))
     least = int(np.argmin(values))
-    return (float(values[least]), asked[least]) if values[least] < best[0] else best
+    return (float(values[least]), point[least]) if values[least] < best[0] else best
 
 
-def as_gains(tuned: TuningResult) -> Gains:
+def as_gains(result: TuningResult) -> Gains:
     """Gains of shape (m, 1) and (1, 1)."""
-    return {name: np.array(values)[:, None] for name, values in tuned.gains.items()}
+    return {name: np.array(values)[:, None] for name, values in result.gains.items()}

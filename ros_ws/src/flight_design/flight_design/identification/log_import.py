@@ -29,7 +29,7 @@ from flight_design.identification.parameter_agreement import (
 )
 from flight_log.bag import IMPORTED
 from flight_log.tape_reader import RecordedRun
-from flight_log.vehicle_tables import COPTER, PLANE, ULOG_TORQUES, Source, VehicleLog
+from flight_log.vehicle_tables import COPTER, PLANE, ULOG_TORQUES, LogField, VehicleLog
 
 COMMANDS = "commands"  # the topic with trim + u, by input
 # share of the typical airspeed, of a multicopter the typical thrust: below, the aircraft is on the
@@ -39,7 +39,7 @@ AIRBORNE = 0.5
 TYPICAL = 90.0
 LEAST = 2.0  # s of flight that are worth a bag
 
-FLOWN_AS = Source("vehicle_status", "vehicle_type")
+FLOWN_AS = LogField("vehicle_status", "vehicle_type")
 VEHICLE_TYPES = {COPTER: 1.0, PLANE: 2.0}  # PX4, VehicleStatus.msg
 
 PARAMETERS = "vehicle_parameters.yaml"  # in the folder and in the log
@@ -143,7 +143,7 @@ def _require_kind(vehicle: str, channel_map: ChannelMap) -> None:
 def _speed(
     channel_map: ChannelMap,
     log: VehicleLog,
-    sources: Mapping[str, Source],
+    sources: Mapping[str, LogField],
     stamps: Stamps,
     servos: bool,
 ) -> FloatArray | None:
@@ -165,7 +165,7 @@ def _speed(
 def _tape(
     channel_map: ChannelMap,
     log: VehicleLog,
-    sources: Mapping[str, Source],
+    sources: Mapping[str, LogField],
     readers: Mapping[str, "_Reader"],
     ends: tuple[int, int],
 ) -> Tape:
@@ -202,7 +202,7 @@ def median_trims(commands: Signal) -> dict[str, float]:
     return {name: float(np.median(commands[name])) for name in commands.names}
 
 
-def _measured(log: VehicleLog, quantity: str, key: str) -> Source:
+def _measured(log: VehicleLog, quantity: str, key: str) -> LogField:
     source = log.source(quantity)
     if source is None:
         mask = log.parameters.get("LOG_BITMASK")
@@ -231,7 +231,7 @@ class _Reader(NamedTuple):
     """
 
     log: VehicleLog
-    source: Source
+    source: LogField
     line: LinearConversion
     stick: Stick | None = None
     servo: Servo | None = None
@@ -262,7 +262,7 @@ def _commands(
     row = channel_map.inputs[name]
     if log.format is None:
         topic = channel_map.messages[row.message].topic.rpartition("/")[2]
-        source = Source(topic, row.field)
+        source = LogField(topic, row.field)
         before_1_14 = ULOG_TORQUES.get((topic, row.field), source)
         source = source if log.has(source) or not log.has(before_1_14) else before_1_14
         require(
@@ -285,7 +285,7 @@ def _commands(
     place, number = (
         (log.format.sticks, stick.channel) if servo is None else (log.format.servos, servo.output)
     )
-    source = Source(place.message, place.field.format(number))
+    source = LogField(place.message, place.field.format(number))
     if servo is None:
         expected = (
             "the transmitter's channel (bit RC of LOG_BITMASK, messages of the tlog), or --servos"

@@ -199,12 +199,12 @@ def last_safe_turn(fence: Fence, action: Scalar, motion: Motion) -> Escape:
     flies_home = action != 0.0
     along = flies_home & (xp.cos(bearing - course) > math.cos(AHEAD))
     way = xp.where(along, line_clearance(fence, *place, *aim), -math.inf)
-    predicted = xp.maximum(turn, way)
-    needed = xp.where(flies_home, xp.minimum(margin, now), margin)
-    must_turn = (predicted < needed) & (turn > way)
+    clearances = xp.maximum(turn, way)
+    least = xp.where(flies_home, xp.minimum(margin, now), margin)
+    must_turn = (clearances < least) & (turn > way)
     remaining = _remaining(action, bearing, course)
-    passed = (remaining > math.pi) & (way >= needed)
-    turns = (abs(action) == RIGHT) & (remaining >= HOMEWARD) & ~passed
+    ends = (remaining > math.pi) & (way >= least)
+    turns = (abs(action) == RIGHT) & (remaining >= HOMEWARD) & ~ends
 
     after = xp.where(
         must_turn,
@@ -216,6 +216,6 @@ def last_safe_turn(fence: Fence, action: Scalar, motion: Motion) -> Escape:
         action=after,
         begins=(action == 0.0) & (after != 0.0),
         clearance=now,
-        predicted=predicted,
+        predicted=clearances,
         course=bearing,
     )

@@ -119,17 +119,17 @@ def ways(fence: Fence) -> Ways:
     cost = np.maximum(fence.radius / np.maximum(room, half), 1.0)
     to_go, following = _shortest(seeds, room, cost, cell)
     leads_home = np.isfinite(to_go)
-    if (lost := is_open & ~leads_home).any():
-        lost_room = np.where(lost, room, -math.inf)
-        roomiest = lost & (room >= np.max(_neighbours(lost_room, -math.inf), axis=0))
+    if (is_cut_off := is_open & ~leads_home).any():
+        lost_room = np.where(is_cut_off, room, -math.inf)
+        roomiest = is_cut_off & (room >= np.max(_neighbours(lost_room, -math.inf), axis=0))
         _, held = _shortest(roomiest, lost_room, cost, cell)
-        following = np.where(lost, held, following)
+        following = np.where(is_cut_off, held, following)
     following = np.where(~is_open & (room >= 0.0), _uphill(room), following)
-    ahead = following
+    aim = following
     for _ in range(CELLS_PER_RADIUS - 1):
-        ahead = following.ravel()[ahead]
-    aim_north = north.ravel()[ahead]
-    aim_east = east.ravel()[ahead]
+        aim = following.ravel()[aim]
+    aim_north = north.ravel()[aim]
+    aim_east = east.ravel()[aim]
     if (outside := room < 0.0).any() and leads_home.any():
         nearest = _nearest(north[outside], east[outside], north[leads_home], east[leads_home])
         aim_north[outside] = north[leads_home][nearest]

@@ -66,11 +66,11 @@ def landing_at(
     """
     key = f"landing.waypoint {section.waypoint}"
     lines = [k for k, leg in enumerate(route.legs) if isinstance(leg, Line)]
-    cut = max(route.radius * math.tan(STRAIGHT / 2.0), 1.0)  # by the fillet of a corner
+    fillet = max(route.radius * math.tan(STRAIGHT / 2.0), 1.0)  # by the fillet of a corner
     pairs = [
         (leg, around)
         for leg, around in pairwise(lines)
-        if math.dist(path.outline(route.legs[leg], place)[-1], place) <= cut
+        if math.dist(path.outline(route.legs[leg], place)[-1], place) <= fillet
     ]
     straight = f"a line to it, and one on to the next waypoint within {STRAIGHT_DEG:g} deg of it"
     require(bool(pairs), key, "a corner, a circle or no line", straight)
@@ -138,11 +138,11 @@ class Lander:
         if height > landing.decrab and self._misses(height, path_sink, pose):
             self._flares = False
             return self._go_around(pose, route)
-        ahead = height + self._params.vertical.alpha_time * pose["climb"]
-        given = {"climb": flare_climb(ahead, path_sink, landing), "V": landing.V}
+        height_ahead = height + self._params.vertical.alpha_time * pose["climb"]
+        commands = {"climb": flare_climb(height_ahead, path_sink, landing), "V": landing.V}
         if height > landing.decrab or "r" not in self._params.outputs:
-            return given
-        return given | self._along_line(pose, math.sin(course - landing.course) * ground_speed)
+            return commands
+        return commands | self._along_line(pose, math.sin(course - landing.course) * ground_speed)
 
     def _misses(self, height: float, path_sink: float, pose: Mapping[str, float]) -> bool:
         """Whether the aircraft would touch outside of the box."""
@@ -168,10 +168,10 @@ class Lander:
         landing = self._landing
         w = 2.0 * math.pi / self._params.path.period
         north, east = pose["north"] - landing.place[0], pose["east"] - landing.place[1]
-        beside = east * math.cos(landing.course) - north * math.sin(landing.course)
-        wanted = -(w**2) * beside - 2.0 * self._params.path.damping * w * drift
-        off = math.remainder(landing.course - pose["psi"], 2.0 * math.pi)
+        offset = east * math.cos(landing.course) - north * math.sin(landing.course)
+        acceleration = -(w**2) * offset - 2.0 * self._params.path.damping * w * drift
+        yaw_error = math.remainder(landing.course - pose["psi"], 2.0 * math.pi)
         return {
-            "phi": clip(math.atan(wanted / GRAVITY), WING_LOW),
-            "r": clip(YAW_GAIN * off, FASTEST_YAW),
+            "phi": clip(math.atan(acceleration / GRAVITY), WING_LOW),
+            "r": clip(YAW_GAIN * yaw_error, FASTEST_YAW),
         }

@@ -49,11 +49,11 @@ def lateral_bank(
     if state.lateral is Lateral.PHI:
         return state.target.phi, NOWHERE, 0.0
     if state.lateral in {Lateral.HEADING, Lateral.COURSE}:
-        asked = (state.target.course, *course_and_speed(pose))
+        motion = (state.target.course, *course_and_speed(pose))
         if state.lateral is Lateral.HEADING:
-            asked = (state.target.heading, state.psi, speed)
+            motion = (state.target.heading, state.psi, speed)
         angle = path_angle(pose["climb"], speed)
-        return bank_for(course_acceleration(*asked, params.k_chi), angle, STEEPEST), NOWHERE, 0.0
+        return bank_for(course_acceleration(*motion, params.k_chi), angle, STEEPEST), NOWHERE, 0.0
     if state.lateral is Lateral.ROUTE and route is not None:
         if state.joining:
             return _onto_leg(state, pose, speed, route, params)
@@ -62,9 +62,9 @@ def lateral_bank(
     orbit = _wide_enough(Arc((target.north, target.east), target.radius), params)
     position = (pose["north"], pose["east"])
     error = path.error(orbit, position)
-    entered: Callable[[Point], Any] = partial(path.entered, orbit, None)
-    wanted = follow(error, error.curvature, entered, state.slip, pose, speed, params)
-    return wanted, error, path.to_go(orbit, position)
+    is_entered: Callable[[Point], Any] = partial(path.entered, orbit, None)
+    bank = follow(error, error.curvature, is_entered, state.slip, pose, speed, params)
+    return bank, error, path.to_go(orbit, position)
 
 
 def _wide_enough(orbit: Arc, params: GuidanceParams) -> Arc:
@@ -92,8 +92,8 @@ def _onto_leg(
         return path.joined(start, course, route.near(state.leg), place, flown)
 
     entry = path.error(route.legs[state.leg], start).curvature
-    wanted = follow(error, entry, joined, state.slip, pose, speed, params)
-    return wanted, error, path.joining_length(start, course, radius, position, flown)
+    bank = follow(error, entry, joined, state.slip, pose, speed, params)
+    return bank, error, path.joining_length(start, course, radius, position, flown)
 
 
 def _along_leg(
@@ -113,22 +113,22 @@ def _along_leg(
     entry = error.curvature
     if following is not None and leg.end is not None:
         entry = path.error(following, leg.end).curvature
-    entered: Callable[[Point], Any] = partial(path.entered, leg, following)
+    is_entered: Callable[[Point], Any] = partial(path.entered, leg, following)
     if following is not None and path.is_orbit(leg) and has_loitered(state, pose, route):
         near = route.near(state.leg)
         late = leaves(leg, near, pose, position) and not leaves(
             leg, EXIT * course_and_speed(pose)[1], pose, position
         )
         if not late:
-            entered = partial(leaves, leg, near, pose)
-    wanted = follow(error, entry, entered, state.slip, pose, speed, params)
-    return wanted, error, path.to_go(leg, position)
+            is_entered = partial(leaves, leg, near, pose)
+    bank = follow(error, entry, is_entered, state.slip, pose, speed, params)
+    return bank, error, path.to_go(leg, position)
 
 
 def follow(
     error: PathError,
     entry: Scalar,
-    entered: Callable[[Point], Any],
+    is_entered: Callable[[Point], Any],
     slip: Scalar,
     pose: Mapping[str, Scalar],
     speed: Scalar,
@@ -137,8 +137,8 @@ def follow(
     """Bank to follow a path, rad, before protection.
 
     `entry` is the curvature of the following leg at the start, 1/m. `entry` replaces the curvature
-    of the leg early, by the lag of the bank: as soon as `entered` holds for the position a mean lag
-    ahead. The mean lag of a change of the bank d is abs(d) / (2 p_max) + 1 / (2 k_phi), a ramp,
+    of the leg early, by the lag of the bank: as soon as `is_entered` holds for the position a mean
+    lag ahead. The mean lag of a change of the bank d is abs(d) / (2 p_max) + 1 / (2 k_phi), a ramp,
     then the loop of the bank; without rudder and the lag of the turn behind the bank.
     """
     course, ground_speed = course_and_speed(pose)
@@ -148,20 +148,20 @@ def follow(
     )
     attitude = params.attitude
     lag = abs(change) / (2.0 * attitude.roll_rate) + 0.5 / attitude.k_phi + params.turn_lag
-    ahead = (pose["north"] + lag * pose["v_north"], pose["east"] + lag * pose["v_east"])
-    error = error._replace(curvature=xp.where(entered(ahead), entry, error.curvature))
+    position_ahead = (pose["north"] + lag * pose["v_north"], pose["east"] + lag * pose["v_east"])
+    error = error._replace(curvature=xp.where(is_entered(position_ahead), entry, error.curvature))
     acceleration = path_acceleration(error, course, ground_speed, params.path) + slip
     return bank_for(acceleration, path_angle(pose["climb"], speed), STEEPEST)
 
 
 def escaping_bank(
     escape: Escape,
-    wanted: Scalar,
+    bank: Scalar,
     pose: Mapping[str, Scalar],
     speed: Scalar,
     params: GuidanceParams,
 ) -> Scalar:
-    """Bank by the action of the fence, rad, in place of `wanted` by the lateral mode.
+    """Bank by the action of the fence, rad, in place of `bank` by the lateral mode.
 
     The bank of a turn, or of a course.
     """
@@ -169,5 +169,5 @@ def escaping_bank(
     xp = array_namespace(ground_speed)
     acceleration = params.k_chi * ground_speed * turn_towards(escape.course - course)
     towards = bank_for(acceleration, path_angle(pose["climb"], speed), STEEPEST)
-    wanted = xp.where(escape.action >= BACK, towards, wanted)
-    return xp.where(abs(escape.action) == RIGHT, escape.action * params.limits.bank, wanted)
+    bank = xp.where(escape.action >= BACK, towards, bank)
+    return xp.where(abs(escape.action) == RIGHT, escape.action * params.limits.bank, bank)

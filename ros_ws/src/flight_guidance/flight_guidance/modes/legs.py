@@ -104,15 +104,17 @@ def with_commands(
     command may come with a new route, and so with new legs. Returns further the distance from the
     end of a leg that ends here and is missed, m.
     """
-    moved = channels.lateral.keys() & commands.keys()
-    missed = 0.0
-    on_route = state.mode is GuidanceMode.ENGAGED and state.lateral is Lateral.ROUTE and not moved
+    lateral_names = channels.lateral.keys() & commands.keys()
+    miss = 0.0
+    on_route = (
+        state.mode is GuidanceMode.ENGAGED and state.lateral is Lateral.ROUTE and not lateral_names
+    )
     if on_route and route is not None:
-        state, missed = follow(state, route)
+        state, miss = follow(state, route)
     if not commands:
-        return on_profile(state, pose, route), missed
+        return on_profile(state, pose, route), miss
     state = state._replace(target=state.target._replace(**commands))
-    if state.fence >= HOME and moved:
+    if state.fence >= HOME and lateral_names:
         state = state._replace(fence=0.0)
     for name in commands:
         state = state._replace(
@@ -120,14 +122,14 @@ def with_commands(
             vertical=channels.vertical.get(name, state.vertical),
         )
     if "leg" in commands and route is not None:
-        held = state.vertical
+        vertical = state.vertical
         state = join(state, int(commands["leg"]), commands.get("along", 0.0), route)
         state = state._replace(target=state.target._replace(**commands))
         if channels.vertical.keys() & commands.keys():
-            state = state._replace(vertical=held)
+            state = state._replace(vertical=vertical)
     if state.vertical is Vertical.PROFILE and state.lateral is not Lateral.ROUTE:
         state = state._replace(vertical=Vertical.ALTITUDE)  # that of now
-    return on_profile(state, pose, route), missed
+    return on_profile(state, pose, route), miss
 
 
 def on_leg(state: GuidanceState, leg: int, route: Route) -> GuidanceState:

@@ -87,10 +87,10 @@ def begin(state: GuidanceState | None, inputs: Inputs, params: GuidanceParams) -
     """The state before a step, with filters at the measured values where the filters begin."""
     if state is not None and inputs.begin is Begin.NO:
         return state
-    held = holding(
+    holding_state = holding(
         inputs.t_ns, dict(zip(POSE, inputs.pose, strict=True)), airspeed(inputs.y, params), params
     )
-    return begun_again(held, state, inputs, params)
+    return begun_again(holding_state, state, inputs, params)
 
 
 def hold_now(
@@ -141,7 +141,7 @@ def step(
     y = dict(zip(params.outputs, inputs.y, strict=True))
     if params.channels.lateral.keys() & inputs.commands.keys():
         state = state._replace(target=state.target._replace(r=0.0))
-    state, missed = with_commands(
+    state, miss = with_commands(
         state,
         inputs.commands,
         pose,
@@ -151,11 +151,11 @@ def step(
         lambda state, leg, along, route: joining(state, leg, along, pose, route),
     )
     state, escape = _within_fence(state, pose, y, speed, params)
-    wanted, error, to_go = lateral_bank(state, pose, speed, route, params)
+    bank, error, to_go = lateral_bank(state, pose, speed, route, params)
     if state.mode is GuidanceMode.ENGAGED:
-        wanted = escaping_bank(escape, wanted, pose, speed, params)
-    state, commands = command(state, pose, y, wanted, dt, params)
-    commands = commands._replace(xtrack=error.e, track=error.track, to_go=to_go, missed=missed)
+        bank = escaping_bank(escape, bank, pose, speed, params)
+    state, commands = command(state, pose, y, bank, dt, params)
+    commands = commands._replace(xtrack=error.e, track=error.track, to_go=to_go, missed=miss)
     commands = commands._replace(clearance=escape.clearance, predicted=escape.predicted)
     velocity = (pose["v_north"], pose["v_east"])
     return state._replace(t_ns=inputs.t_ns, velocity=velocity), commands
@@ -195,7 +195,7 @@ def command(
     state: GuidanceState,
     pose: Mapping[str, Scalar],
     y: Mapping[str, Scalar],
-    phi_wanted: Scalar,
+    phi: Scalar,
     dt: float,
     params: GuidanceParams,
 ) -> tuple[GuidanceState, StepCommands]:
@@ -212,7 +212,7 @@ def command(
 
     xp = array_namespace(speed)
     bank = protection.bank_limit(limits.bank, limits.stall_speed, speed)
-    phi_c = clip(phi_wanted, bank)
+    phi_c = clip(phi, bank)
     climb_c, climb_limited = _climb(state, pose, speed, dt, params) if flies else (0.0, False)
     theta_wanted = pitch_for(climb_c, speed, state.alpha)
     if flies and state.vertical is Vertical.THETA:
@@ -228,20 +228,20 @@ def command(
 
     r = yaw_rate(y, state.phi, state.theta, speed)
     rates = _wanted_rates(state, pose, r, phi_c, theta_c, speed, params)
-    wanted = {"V": V_c - params.speed, **rates._asdict()}
+    reference = {"V": V_c - params.speed, **rates._asdict()}
     u_m = tuple(
-        wanted[name] if name == "V" else slewed(before, wanted[name], rate, dt)
+        reference[name] if name == "V" else slewed(before, reference[name], rate, dt)
         for name, before, rate in zip(params.outputs, state.u_m, params.slew, strict=True)
     )
     commands = StepCommands(
         phi_c,
         theta_c,
-        bank_limited=(phi_c != phi_wanted) | (abs(phi_c) == bank),
+        bank_limited=(phi_c != phi) | (abs(phi_c) == bank),
         theta_limited=theta_c != theta_wanted,
         climb_limited=climb_limited,
         V_limited=V_wanted != state.target.V,
         slew_limited=reduce(
-            or_, (value != wanted[name] for name, value in zip(params.outputs, u_m, strict=True))
+            or_, (value != reference[name] for name, value in zip(params.outputs, u_m, strict=True))
         ),
     )
     return state._replace(climb_c=climb_c, V_c=V_c, u_m=u_m), commands
@@ -259,9 +259,11 @@ def _with_estimates(
     alpha = alpha_estimate(state.alpha, state.theta, pose["climb"], speed, dt, params.vertical)
     turn = GRAVITY * array_namespace(speed).tan(tilt(state.phi))
     r = yaw_rate(y, state.phi, state.theta, speed)
-    flown = speed * heading_rate(state.phi, state.theta, y["q"], r)
+    turn_acceleration = speed * heading_rate(state.phi, state.theta, y["q"], r)
     rolling = abs(y["p"]) / params.attitude.roll_rate
-    slip = slip_estimate(state.slip, turn, flown, rolling, dt, params.vertical.alpha_time)
+    slip = slip_estimate(
+        state.slip, turn, turn_acceleration, rolling, dt, params.vertical.alpha_time
+    )
     return state._replace(
         alpha=alpha, slip=slip, wind=wind_estimate(state.wind, _measured_wind(pose, speed), dt)
     )
@@ -290,8 +292,10 @@ def _with_attitude(
         state = state._replace(mode=GuidanceMode.ENGAGED, phi=pose["phi"], theta=pose["theta"])
         since = min(seconds(inputs.pose_age_ns), LONGEST_LEAD)
     else:
-        lost = inputs.pose_age_ns > params.max_age_ns + params.hold_ns
-        state = state._replace(mode=GuidanceMode.POSE_LOST if lost else GuidanceMode.DEAD_RECKONING)
+        is_lost = inputs.pose_age_ns > params.max_age_ns + params.hold_ns
+        state = state._replace(
+            mode=GuidanceMode.POSE_LOST if is_lost else GuidanceMode.DEAD_RECKONING
+        )
         since = dt
     y = dict(zip(params.outputs, inputs.y, strict=True))
     r = yaw_rate(y, state.phi, state.theta, airspeed(inputs.y, params))
@@ -299,8 +303,8 @@ def _with_attitude(
     phi = state.phi + since * phi_dot
     theta = state.theta + since * theta_dot
     psi_dot = heading_rate(state.phi, state.theta, y["q"], r)
-    measured = pose["psi"] + since * psi_dot if state.mode is GuidanceMode.ENGAGED else None
-    psi = heading_estimate(state.psi, measured, psi_dot, dt)
+    heading = pose["psi"] + since * psi_dot if state.mode is GuidanceMode.ENGAGED else None
+    psi = heading_estimate(state.psi, heading, psi_dot, dt)
     return state._replace(phi=math.remainder(phi, 2.0 * math.pi), theta=theta, psi=psi)
 
 
@@ -353,13 +357,13 @@ def _within_fence(
             last_safe_turn(params.fence, state.fence, motion_of(state, pose, y, speed, params)),
         )
     )
-    commanded = (
+    bank = (
         state.lateral is not Lateral.ORBIT
         or (state.target.north, state.target.east) != params.home[:2]
     )
-    if commanded and escape.action in {HOME, AROUND}:
+    if bank and escape.action in {HOME, AROUND}:
         escape = escape._replace(action=0.0)
-    elif escape.begins or (commanded and escape.action == BACK):
+    elif escape.begins or (bank and escape.action == BACK):
         target = state.target._replace(**home(pose, params))
         state = state._replace(
             lateral=Lateral.ORBIT, vertical=Vertical.ALTITUDE, target=target, joining=0.0
@@ -385,13 +389,13 @@ def _climb(
         return pose["climb"], False  # the start value for the modes CLIMB and ALTITUDE
     vertical = params.vertical
     target = state.target
-    wanted = (
+    climb = (
         target.climb
         if state.vertical is Vertical.CLIMB
         else climb_for(target.altitude - pose["altitude"], vertical)
     )
     if state.vertical is Vertical.PROFILE:
-        wanted = wanted + target.climb
+        climb = climb + target.climb
     least, largest = protection.climb_range(
         vertical.climb, vertical.sink, state.V_c - speed, params.speed
     )
@@ -404,8 +408,8 @@ def _climb(
     largest = xp.minimum(
         largest, protection.climb_limit(vertical.climb, vertical.sink, speed, params.limits.floor)
     )
-    permitted = xp.minimum(xp.maximum(wanted, least), largest)
-    return slewed(state.climb_c, permitted, vertical.acceleration, dt), permitted != wanted
+    bounded_climb = xp.minimum(xp.maximum(climb, least), largest)
+    return slewed(state.climb_c, bounded_climb, vertical.acceleration, dt), bounded_climb != climb
 
 
 def _pitch_within(

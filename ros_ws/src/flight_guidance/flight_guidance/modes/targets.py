@@ -118,13 +118,13 @@ def read_target(
     channels = params.channels
     lateral_modes = {mode for name, mode in channels.lateral.items() if name in values}
     vertical_modes = {mode for name, mode in channels.vertical.items() if name in values}
-    commanded = [name for name in channels.known() if name != "r" or "r" in params.outputs]
-    unknown = [name for name in values if name not in commanded]
+    channels_of_step = [name for name in channels.known() if name != "r" or "r" in params.outputs]
+    unknown = [name for name in values if name not in channels_of_step]
     if unknown or not values:
         raise ChannelError(
             "name",
             f"{what}: found {', '.join(unknown) or 'no channel'}, expected some of "
-            f"{', '.join(commanded)}",
+            f"{', '.join(channels_of_step)}",
         )
     if len(lateral_modes) > 1 or len(vertical_modes) > 1:
         raise ChannelError(
@@ -137,10 +137,10 @@ def read_target(
         if not {*before, last} <= values.keys():
             group = f"{', '.join(before)} and {last} together"
             raise ChannelError("name", f"{what}: found {', '.join(values)}, expected {group}")
-    for name, needed in (("r", "phi"), ("along", "leg")):
-        if name in values and needed not in values:
+    for name, partner in (("r", "phi"), ("along", "leg")):
+        if name in values and partner not in values:
             raise ChannelError(
-                "name", f"{what}: found {name} without {needed}, expected {needed} too"
+                "name", f"{what}: found {name} without {partner}, expected {partner} too"
             )
     for name, value in values.items():
         if abs(value) > LARGEST:
@@ -174,9 +174,9 @@ def _require_limits(
         if name in values and not least <= values[name] <= largest:
             factor = math.degrees(1.0) if degrees and name in ANGLES else 1.0
             unit = UNITS.get(name, "deg" if degrees else "rad") + "/s" * (name == "r")
-            entered = f"{values[name] * factor:.6g}"
+            value_text = f"{values[name] * factor:.6g}"
             expected = f"{least * factor:.6g} to {largest * factor:.6g} {unit}"
-            raise ChannelError("bounds", f"{what}.{name}: found {entered}, expected {expected}")
+            raise ChannelError("bounds", f"{what}.{name}: found {value_text}, expected {expected}")
 
 
 def _read_leg(values: Mapping[str, float], route: Route | None, what: str) -> None:

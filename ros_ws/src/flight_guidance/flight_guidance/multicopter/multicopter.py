@@ -129,7 +129,7 @@ def step(
     state = _begin(state, inputs, pose, params)
     dt = seconds(inputs.t_ns - state.t_ns)
     state = _with_attitude(state, inputs, pose, dt, params)
-    state, missed = with_commands(
+    state, miss = with_commands(
         state,
         inputs.commands,
         pose,
@@ -143,10 +143,10 @@ def step(
     flies = state.mode is GuidanceMode.ENGAGED
     speed = min(max(state.target.V, 0.0), params.limits.largest_speed)
     state = state._replace(V_c=slewed(state.V_c, speed, gains.braking, dt))
-    wanted = _wanted(state, pose, route, escape, params)
+    motion = _wanted(state, pose, route, escape, params)
     if flies and state.lateral is not Lateral.PHI:
-        state = state._replace(V_c=min(state.V_c, abs(wanted.velocity)))
-    phi_c, theta_c, limited = _attitude_for(state, pose, wanted, params)
+        state = state._replace(V_c=min(state.V_c, abs(motion.velocity)))
+    phi_c, theta_c, limited = _attitude_for(state, pose, motion, params)
     state, climb_limited = _with_climb(state, pose, dt, params)
     rates = _rates(state, phi_c, theta_c, gains)
     name = vertical(params.outputs)
@@ -158,10 +158,10 @@ def step(
     commands = StepCommands(
         phi_c=phi_c,
         theta_c=theta_c,
-        xtrack=wanted.error.e,
-        to_go=wanted.to_go,
-        track=wanted.error.track,
-        missed=missed,
+        xtrack=motion.error.e,
+        to_go=motion.to_go,
+        track=motion.error.track,
+        missed=miss,
         clearance=escape.clearance,
         predicted=escape.predicted,
         bank_limited=limited,
@@ -188,7 +188,7 @@ def _begin(
     if state is not None and inputs.begin is Begin.NO:
         return state
     gains = _gains(params)
-    held = GuidanceState(
+    hover = GuidanceState(
         t_ns=inputs.t_ns - params.period_ns,
         mode=GuidanceMode.ENGAGED,
         lateral=Lateral.PLACE,
@@ -207,7 +207,7 @@ def _begin(
         wind=_parts(_velocity(pose) - _by_tilt(pose, pose, gains) / gains.drag),
         velocity=_parts(_velocity(pose)),
     )
-    return begun_again(held, state, inputs, params, "wind")
+    return begun_again(hover, state, inputs, params, "wind")
 
 
 def _with_attitude(
@@ -233,8 +233,10 @@ def _with_attitude(
         )
         since = min(seconds(age_ns), LONGEST_LEAD)
     else:
-        lost = age_ns > params.max_age_ns + params.hold_ns
-        state = state._replace(mode=GuidanceMode.POSE_LOST if lost else GuidanceMode.DEAD_RECKONING)
+        is_lost = age_ns > params.max_age_ns + params.hold_ns
+        state = state._replace(
+            mode=GuidanceMode.POSE_LOST if is_lost else GuidanceMode.DEAD_RECKONING
+        )
     p, q, r = (inputs.y[params.outputs.index(name)] for name in ("p", "q", "r"))
     phi_dot, theta_dot = euler_rates(state.phi, state.theta, p, q, r)
     psi = state.psi + since * heading_rate(state.phi, state.theta, q, r)
@@ -284,8 +286,8 @@ def _along_route(
     if not stopped and not path.passed(leg, position):
         return state, 0.0
     distance = math.dist(leg.end, position)
-    missed = distance if distance > route.near(state.leg) else 0.0
-    return on_leg(state, state.leg + 1, route), missed
+    miss = distance if distance > route.near(state.leg) else 0.0
+    return on_leg(state, state.leg + 1, route), miss
 
 
 def _within_fence(
@@ -311,9 +313,9 @@ def _within_fence(
         state = state._replace(
             lateral=Lateral.PLACE, vertical=Vertical.ALTITUDE, target=target, joining=0.0
         )
-    flown = action if begins or state.fence != 0.0 else 0.0
-    return state._replace(fence=flown), Escape(
-        action=flown, begins=begins, clearance=now, predicted=predicted, course=0.0
+    action_in_force = action if begins or state.fence != 0.0 else 0.0
+    return state._replace(fence=action_in_force), Escape(
+        action=action_in_force, begins=begins, clearance=now, predicted=predicted, course=0.0
     )
 
 
@@ -398,10 +400,10 @@ def _on_path(
     across = -clip(gains.k_p * error.e, ACROSS * speed)
     velocity = complex(math.sqrt(speed**2 - across**2), across)  # along, and i to the right
     later = _parts(_place(pose) + gains.lead * _velocity(pose))
-    entered = leg
+    entered_leg = leg
     if path.passed(leg, later) and not _stops(route, state.leg):
-        entered = route.legs[state.leg + 1]
-    error_later = path.error(entered, later)
+        entered_leg = route.legs[state.leg + 1]
+    error_later = path.error(entered_leg, later)
     track = cmath.rect(1.0, error_later.track)
     bend = complex(-slope * speed, speed**2 * error_later.curvature)
     now = velocity * cmath.rect(1.0, error.track)
@@ -451,7 +453,7 @@ def _lift(pose: Mapping[str, float], gains: MulticopterParams) -> float:
 
 
 def _attitude_for(
-    state: GuidanceState, pose: Mapping[str, float], wanted: MotionCommand, params: GuidanceParams
+    state: GuidanceState, pose: Mapping[str, float], motion: MotionCommand, params: GuidanceParams
 ) -> tuple[float, float, bool]:
     """Bank and pitch for the wanted acceleration, rad, and whether the tilt is limited."""
     gains = _gains(params)
@@ -462,15 +464,19 @@ def _attitude_for(
         asked = complex(state.target.phi, state.target.theta)
         angles = _within(asked, largest)
         return angles.real, angles.imag, angles != asked
-    needed = (
-        wanted.acceleration
-        + gains.k_v * (wanted.velocity - _velocity(pose))
-        + gains.drag * (wanted.ahead - complex(*state.wind))
+    acceleration = (
+        motion.acceleration
+        + gains.k_v * (motion.velocity - _velocity(pose))
+        + gains.drag * (motion.ahead - complex(*state.wind))
     )
     lift = _lift(pose, gains)
-    level = _within(needed, lift * math.tan(largest))
-    ahead, right = _parts(level * cmath.rect(1.0, -state.psi))
-    return math.atan2(right, math.hypot(ahead, lift)), math.atan2(-ahead, lift), level != needed
+    level = _within(acceleration, lift * math.tan(largest))
+    forward, right = _parts(level * cmath.rect(1.0, -state.psi))
+    return (
+        math.atan2(right, math.hypot(forward, lift)),
+        math.atan2(-forward, lift),
+        level != acceleration,
+    )
 
 
 def _with_climb(
@@ -478,18 +484,18 @@ def _with_climb(
 ) -> tuple[GuidanceState, bool]:
     """The state with the commanded climb rate, and whether the altitudes limit the rate."""
     vertical_params = params.vertical
-    wanted = 0.0
-    permitted = 0.0
+    climb = 0.0
+    bounded_climb = 0.0
     if state.mode is GuidanceMode.ENGAGED:
-        wanted = state.target.climb
+        climb = state.target.climb
         if state.vertical is not Vertical.CLIMB:
-            profile = wanted if state.vertical is Vertical.PROFILE else 0.0
-            wanted = profile + climb_for(state.target.altitude - pose["altitude"], vertical_params)
+            profile = climb if state.vertical is Vertical.PROFILE else 0.0
+            climb = profile + climb_for(state.target.altitude - pose["altitude"], vertical_params)
         least = climb_for(params.limits.lowest - pose["altitude"], vertical_params)
         most = climb_for(params.limits.highest - pose["altitude"], vertical_params)
-        permitted = float(min(max(wanted, least), most))
-    climb_c = slewed(state.climb_c, permitted, vertical_params.acceleration, dt)
-    return state._replace(climb_c=float(climb_c)), bool(permitted != wanted)
+        bounded_climb = float(min(max(climb, least), most))
+    climb_c = slewed(state.climb_c, bounded_climb, vertical_params.acceleration, dt)
+    return state._replace(climb_c=float(climb_c)), bool(bounded_climb != climb)
 
 
 def _rates(
@@ -509,13 +515,13 @@ def _rates(
         return dict.fromkeys("pqr", 0.0)
     x = -math.cos(phi_c) * math.sin(theta_c)
     z = -math.cos(phi_c) * math.cos(theta_c)
-    ahead = math.cos(state.theta) * x - math.sin(state.theta) * z
+    forward = math.cos(state.theta) * x - math.sin(state.theta) * z
     down = math.sin(state.theta) * x + math.cos(state.theta) * z
     right = math.cos(state.phi) * math.sin(phi_c) + math.sin(state.phi) * down
     down = math.cos(state.phi) * down - math.sin(state.phi) * math.sin(phi_c)
-    sine = math.hypot(ahead, right)
+    sine = math.hypot(forward, right)
     rate = min(gains.k_tilt * math.atan2(sine, -down), gains.tilt_rate) / max(sine, 1e-9)
-    q = -rate * ahead
+    q = -rate * forward
     turn = 0.0
     if state.mode is GuidanceMode.ENGAGED:
         turn = gains.k_psi * math.remainder(state.target.heading - state.psi, 2.0 * math.pi)

@@ -81,8 +81,12 @@ def named(command: int, number: int) -> str:
         with suppress(ModuleNotFoundError):
             from pymavlink.dialects.v20 import ardupilotmega  # noqa: PLC0415 - an extra
 
-            known = ardupilotmega.enums["MAV_CMD"].get(command)
-            name = name if known is None else f"{known.name.removeprefix('MAV_CMD_')} ({command})"
+            enum_entry = ardupilotmega.enums["MAV_CMD"].get(command)
+            name = (
+                name
+                if enum_entry is None
+                else f"{enum_entry.name.removeprefix('MAV_CMD_')} ({command})"
+            )
     return f"{name} (item {number})"
 
 
@@ -148,7 +152,7 @@ def mission_route(
     The notes tell the items that are not flown.
     """
     places: list[Place] = []
-    flown: set[int] = set()
+    route_items: set[int] = set()
     circles: list[str] = []  # of a radius, negative to the left
     speed: Any = None
     for k in _in_order(key, items):
@@ -176,15 +180,15 @@ def mission_route(
             speed = item.params[1]
         elif item.command != JUMP:
             continue
-        flown.add(k)
-    skipped = [item.name for k, item in enumerate(items) if k not in flown]
-    sentences = [f"not flown: {', '.join(dict.fromkeys(skipped))}"] * bool(skipped)
+        route_items.add(k)
+    skipped_names = [item.name for k, item in enumerate(items) if k not in route_items]
+    sentences = [f"not flown: {', '.join(dict.fromkeys(skipped_names))}"] * bool(skipped_names)
     sentences += [
         sentence
         for command, sentence in MEANINGS.items()
         if any(item.command == command for item in items)
     ]
-    waits = [item.name for k, item in enumerate(items) if k in flown and not item.goes_on]
+    waits = [item.name for k, item in enumerate(items) if k in route_items and not item.goes_on]
     sentences += [f"flown on without autocontinue: {', '.join(dict.fromkeys(waits))}"] * bool(waits)
     circle_note = "circles are clockwise, of the radius of the route"
     sentences += [f"{circle_note}, in place of {', '.join(dict.fromkeys(circles))}"] * bool(circles)

@@ -49,8 +49,8 @@ def read_plan_tree(tree: Any, key: str, line: str | None) -> Places:
         for number, entry in _plan_items(rows or (), key)
     ]
     fence = plan_fence(tree, key)
-    apart = "the fence and the rally points are no part of the route; --fence keeps them"
-    notes = [apart] * bool(fence.zones or fence.rally)
+    note = "the fence and the rally points are no part of the route; --fence keeps them"
+    notes = [note] * bool(fence.zones or fence.rally)
     notes += [f"not read: {FIRST_FENCE}"] * has_first_fence(tree)
     return mission_route(key, items, home_of(member(mission, "plannedHomePosition")), notes)
 
@@ -297,9 +297,9 @@ def wpl_fence(content: bytes, key: str) -> FencePlaces:
             if not missing:
                 zones.append(_grouped(Area([], None, exclude), _group(item, key)))
                 missing = int(count)
-            same = exclude or _group(item, key) == zones[-1].group
+            is_same_group = exclude or _group(item, key) == zones[-1].group
             require(
-                same,
+                is_same_group,
                 f"{key}: {item.name}",
                 f"group {item.params[1]:g}",
                 f"{zones[-1].group}, as of the corners before",

@@ -203,19 +203,19 @@ def _merged(waypoints: Sequence[Waypoint]) -> list[Waypoint]:
 
     The aircraft leaves at the last altitude. The airspeed of the last waypoint is for the next leg.
     """
-    merged: list[Waypoint] = []
+    places: list[Waypoint] = []
     speed: float | None = None
     for waypoint in waypoints:
-        if merged and waypoint.point == (last := merged[-1]).point:
+        if places and waypoint.point == (last := places[-1]).point:
             turns = last.turns + waypoint.turns
             wait = last.wait + waypoint.wait
             leave = None if waypoint.departure == last.altitude else waypoint.departure
-            merged[-1] = last._replace(turns=turns, wait=wait, leave=leave)
+            places[-1] = last._replace(turns=turns, wait=wait, leave=leave)
             speed = waypoint.speed or speed
         else:
-            merged.append(waypoint if waypoint.speed else waypoint._replace(speed=speed))
+            places.append(waypoint if waypoint.speed else waypoint._replace(speed=speed))
             speed = None
-    return merged
+    return places
 
 
 def read_fence_file(
@@ -278,11 +278,11 @@ def placed_lines(content: bytes, key: str, origin: Origin) -> list[list[Point]]:
     lines = [line for line in read_lines(content, key) if line]
     require(bool(lines), key, "no position", "lines, polygons or points")
     _require_order([*chain.from_iterable(lines)], origin)
-    placed: list[list[Point]] = []
+    lines_in_plane: list[list[Point]] = []
     for line in lines:
         flat = [place._replace(key=key, altitude=0.0) for place in line]
-        placed.append([_placed(place, origin, _Heights()).point for place in flat])
-    return placed
+        lines_in_plane.append([_placed(place, origin, _Heights()).point for place in flat])
+    return lines_in_plane
 
 
 def thinned(waypoints: Sequence[Waypoint], tolerance: float) -> list[Waypoint]:
@@ -293,15 +293,17 @@ def thinned(waypoints: Sequence[Waypoint], tolerance: float) -> list[Waypoint]:
     required to represent a line.
     """
     speed: float | None = None
-    flown = [waypoint._replace(speed=(speed := waypoint.speed or speed)) for waypoint in waypoints]
-    points = np.array([waypoint[:3] for waypoint in flown])
+    waypoints_with_speed = [
+        waypoint._replace(speed=(speed := waypoint.speed or speed)) for waypoint in waypoints
+    ]
+    points = np.array([waypoint[:3] for waypoint in waypoints_with_speed])
     changes = {
         k
-        for k, (before, after) in enumerate(pairwise(flown))
+        for k, (before, after) in enumerate(pairwise(waypoints_with_speed))
         if before.loiters or before.speed != after.speed
     }
-    needed = {0, len(points) - 1} | changes
-    spans = list(pairwise(sorted(needed)))
+    corner_numbers = {0, len(points) - 1} | changes
+    spans = list(pairwise(sorted(corner_numbers)))
     while spans:
         first, last = spans.pop()
         if last - first < 2:
@@ -313,9 +315,9 @@ def thinned(waypoints: Sequence[Waypoint], tolerance: float) -> list[Waypoint]:
         distance = np.linalg.norm(inside - share[:, None] * along, axis=1)
         farthest = first + 1 + int(np.argmax(distance))
         if distance.max() > tolerance:
-            needed.add(farthest)
+            corner_numbers.add(farthest)
             spans += [(first, farthest), (farthest, last)]
-    return [flown[k] for k in sorted(needed)]
+    return [waypoints_with_speed[k] for k in sorted(corner_numbers)]
 
 
 class _Heights:
@@ -368,23 +370,23 @@ class _Heights:
 
 
 def _home_of_fence(
-    read: FencePlaces, origin: Origin | None, heights: _Heights
+    places: FencePlaces, origin: Origin | None, heights: _Heights
 ) -> dict[str, Any] | None:
     """The section `home` by the rule of `read_fence_file`; None without one."""
-    rally = [_placed(place._replace(key="rally point"), origin, heights) for place in read.rally]
+    rally = [_placed(place._replace(key="rally point"), origin, heights) for place in places.rally]
     if rally:
         nearest = min(rally, key=lambda point: math.hypot(*point.point))
         return {"north": nearest.north, "east": nearest.east, "altitude": nearest.altitude}
-    if read.back is not None:
-        has_altitude = read.back.altitude is not None
-        level = read.back
+    if places.back is not None:
+        has_altitude = places.back.altitude is not None
+        level = places.back
         if not has_altitude:
-            level = read.back._replace(altitude=0.0, above=Above.AS_POSE)
+            level = places.back._replace(altitude=0.0, above=Above.AS_POSE)
         back = _placed(level._replace(key="return point"), origin, heights)
         section: dict[str, Any] = {"north": back.north, "east": back.east}
         return section | ({"altitude": back.altitude} if has_altitude else {})
-    if read.home is not None and origin is not None:
-        north, east = local(read.home.latitude, read.home.longitude, origin)
+    if places.home is not None and origin is not None:
+        north, east = local(places.home.latitude, places.home.longitude, origin)
         return {"north": north, "east": east}
     return None
 
@@ -444,7 +446,7 @@ def _read_yaml(content: bytes, key: str, origin: Origin | None) -> Iterator[Wayp
                 point.get(key) for key in (*position, "altitude", *FURTHER)
             )
             if position == POSITIONS[0]:
-                placed = _waypoint(
+                waypoint = _waypoint(
                     name,
                     _number(name, first, "north"),
                     _number(name, second, "east"),
@@ -452,7 +454,7 @@ def _read_yaml(content: bytes, key: str, origin: Origin | None) -> Iterator[Wayp
                     speed,
                 )
             else:
-                placed = _placed(
+                waypoint = _placed(
                     Place(
                         key=name, latitude=first, longitude=second, altitude=altitude, speed=speed
                     ),
@@ -464,8 +466,12 @@ def _read_yaml(content: bytes, key: str, origin: Origin | None) -> Iterator[Wayp
                 for key, value in (("turns", turns), ("wait", wait))
                 if value is not None
             }
-            placed = placed._replace(**circles)
-            yield placed if leave is None else placed._replace(leave=_number(name, leave, "leave"))
+            waypoint = waypoint._replace(**circles)
+            yield (
+                waypoint
+                if leave is None
+                else waypoint._replace(leave=_number(name, leave, "leave"))
+            )
         else:
             fits = isinstance(point, list) and 3 <= len(point) <= 4
             require(

@@ -35,8 +35,8 @@ def read(content: bytes, key: str, suffix: str, line: str | None = None) -> Plac
     """
     route = FORMATS[suffix](content, key, line)
     require(bool(route.places), key, "; ".join(["no position", *route.notes]), "a route")
-    named = [place._replace(key=f"route[{k}]") for k, place in enumerate(route.places)]
-    return route._replace(places=named)
+    places = [place._replace(key=f"route[{k}]") for k, place in enumerate(route.places)]
+    return route._replace(places=places)
 
 
 def read_fence(content: bytes, key: str, suffix: str) -> FencePlaces:

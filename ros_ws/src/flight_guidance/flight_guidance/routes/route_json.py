@@ -55,10 +55,10 @@ def json_route(tree: Any, key: str, line: str | None) -> Places:
         if isinstance(kind, str) and kind in GEOJSON:
             parts = GEOJSON[kind](coordinates if isinstance(coordinates, list) else [])
             part_kind = kind if len(parts) == 1 else PARTS.get(kind, kind)
-            named = name if isinstance(name, str) else ""
+            route_name = name if isinstance(name, str) else ""
             for part in parts:
                 places = [lon_lat(position, speed) for position in part]
-                geometries.append(Geometry(part_kind, places, named))
+                geometries.append(Geometry(part_kind, places, route_name))
         elif node is not None:
             others.append(f"geometry of the type {short_repr(kind)}")
     return one_route(key, geometries, others, line)
@@ -77,9 +77,12 @@ def read_lines(content: bytes, key: str) -> list[list[Place]]:
         coordinates = member(node, "coordinates")
         if node is None:
             continue
-        known = isinstance(kind, str) and kind in GEOJSON
+        is_geometry = isinstance(kind, str) and kind in GEOJSON
         require(
-            known, key, f"a geometry of the type {short_repr(kind)}", f"one of {', '.join(GEOJSON)}"
+            is_geometry,
+            key,
+            f"a geometry of the type {short_repr(kind)}",
+            f"one of {', '.join(GEOJSON)}",
         )
         parts = GEOJSON[kind](coordinates if isinstance(coordinates, list) else [])
         if kind == "MultiPoint":
@@ -141,11 +144,11 @@ def require_wgs84(tree: Any, key: str) -> None:
     """
     crs = member(tree, "crs")
     name = str(member(member(crs, "properties"), "name") or "")
-    known = crs is None or re.search(
+    is_wgs84 = crs is None or re.search(
         r"CRS84h?$|EPSG:+4326$|EPSG:+4979$|WGS ?84$", name, re.IGNORECASE
     )
     require(
-        bool(known),
+        bool(is_wgs84),
         key,
         f"the coordinate system {short_repr(name)}",
         "WGS84: ogr2ogr -t_srs EPSG:4326 converts it",

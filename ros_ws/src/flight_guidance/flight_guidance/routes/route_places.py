@@ -80,19 +80,19 @@ def one_route(
             f"{key}: found {kinds}, expected one, or {'Points alone' if others else _choice(lines)}"
         )
     if line is not None:
-        chosen = [
+        candidates = [
             geometry for k, geometry in enumerate(lines, start=1) if line in (f"{k}", geometry.name)
         ]
-        mismatch = f"{short_repr(line)}, which names {len(chosen)} lines"
+        mismatch = f"{short_repr(line)}, which names {len(candidates)} lines"
         require(
-            len(chosen) == 1,
+            len(candidates) == 1,
             "line",
             mismatch,
             _choice(lines) if lines else "a file with several lines",
         )
         if len(lines) > 1:
             ignored = " and ".join([f"{len(lines) - 1} further lines", *[ignored] * bool(points)])
-        lines = chosen
+        lines = candidates
     if lines:
         return Places(
             lines[0].places,
@@ -138,15 +138,17 @@ def _joined(lines: Sequence[Geometry]) -> list[Geometry]:
 
     Source: RFC 7946, section 3.1.9.
     """
-    joined: list[Geometry] = []
+    geometries: list[Geometry] = []
     for line in lines:
-        cut = bool(joined and joined[-1].places and line.places)
-        end, begin = (joined[-1].places[-1], line.places[0]) if cut else (None, None)
+        may_continue = bool(geometries and geometries[-1].places and line.places)
+        end, begin = (geometries[-1].places[-1], line.places[0]) if may_continue else (None, None)
         if end is not None and begin is not None and _meets(end, begin):
-            joined[-1] = joined[-1]._replace(places=[*joined[-1].places[:-1], *line.places[1:]])
+            geometries[-1] = geometries[-1]._replace(
+                places=[*geometries[-1].places[:-1], *line.places[1:]]
+            )
         else:
-            joined.append(line)
-    return joined
+            geometries.append(line)
+    return geometries
 
 
 def _meets(end: Place, begin: Place) -> bool:

@@ -148,15 +148,15 @@ def read_kmz(content: bytes, key: str, line: str | None = None) -> Places:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             names = [name for name in archive.namelist() if name.lower().endswith(".kml")]
             names = [name for name in names if "/" not in name] or names
-            chosen = "doc.kml" if "doc.kml" in names else names[0] if len(names) == 1 else ""
-            method = archive.getinfo(chosen).compress_type if chosen else zipfile.ZIP_STORED
+            file_name = "doc.kml" if "doc.kml" in names else names[0] if len(names) == 1 else ""
+            method = archive.getinfo(file_name).compress_type if file_name else zipfile.ZIP_STORED
             require(
                 method in {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED},
                 key,
                 f"the compression {method}",
                 "deflate, as in a KMZ",
             )
-            inside = archive.open(chosen).read(MAX_FILE_BYTES + 1) if chosen else b""
+            inside = archive.open(file_name).read(MAX_FILE_BYTES + 1) if file_name else b""
     except ParameterError:
         raise
     except (
@@ -171,8 +171,8 @@ def read_kmz(content: bytes, key: str, line: str | None = None) -> Places:
         raise ParameterError(
             f"{key}: cannot be unpacked ({error}), expected a KMZ archive"
         ) from None
-    require(bool(chosen), key, f"{len(names)} .kml files and no doc.kml", "one")
-    return read_kml(limited(inside, f"{key}: {chosen}", A_ROUTE), key, line)
+    require(bool(file_name), key, f"{len(names)} .kml files and no doc.kml", "one")
+    return read_kml(limited(inside, f"{key}: {file_name}", A_ROUTE), key, line)
 
 
 EARTH_RADIUS = 6371e3
@@ -200,25 +200,27 @@ def read_gpx(content: bytes, key: str, line: str | None = None) -> Places:
         for element in root.iter()
         if _kind(element) == "trk"
     ]
-    flown = (
+    geometries = (
         routes + tracks
         if line is not None or not any(segments for _, segments in routes)
         else routes
     )
     lines = [
         Geometry(_kind(element), [*chain(*segments)], (_text(element, "name") or "").strip())
-        for element, segments in flown
+        for element, segments in geometries
     ]
     require(
         bool(lines or marks), key, f"no rte, no trk and no wpt in {_kind(root)}", "a route in gpx"
     )
     route = one_route(key, [*lines, *(Geometry("wpt", [place]) for place in marks)], (), line)
     notes = [*route.notes]
-    if flown == routes and any(segments for _, segments in tracks):
+    if geometries == routes and any(segments for _, segments in tracks):
         notes.append(f"{len(tracks)} trk beside the rte: no part of the route")
     if shapes := sum(_kind(element) == "rpt" for element in root.iter()):
         notes.append(f"{shapes} rpt of extensions: no part of the route")
-    segments = next((segments for _, segments in flown if [*chain(*segments)] == route.places), [])
+    segments = next(
+        (segments for _, segments in geometries if [*chain(*segments)] == route.places), []
+    )
     gaps = [_gap(before[-1], after[0]) for before, after in pairwise(segments)]
     widest = max(gaps, default=0.0)
     fits = widest <= LARGEST_GAP

@@ -91,5 +91,5 @@ def yaw_for_bank(phi_c: Scalar, phi: Scalar, speed: Scalar) -> Scalar:
     """
     xp = array_namespace(phi)
     turn = GRAVITY / forward(speed)
-    off = SKIDDING * phi_c - phi
-    return clip(turn * xp.tan(phi_c) + YAW_TO_BANK * off, turn * math.tan(LARGEST_YAW))
+    bank_error = SKIDDING * phi_c - phi
+    return clip(turn * xp.tan(phi_c) + YAW_TO_BANK * bank_error, turn * math.tan(LARGEST_YAW))

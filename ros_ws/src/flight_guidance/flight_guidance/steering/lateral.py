@@ -59,9 +59,11 @@ def heading_estimate(psi: float, measured: float | None, psi_dot: float, dt: flo
     A complementary filter: noise of pose is smoothed, the gyro has no lag. A bias of the gyro turns
     the heading by T times it.
     """
-    predicted = psi + dt * psi_dot
-    off = 0.0 if measured is None else math.remainder(measured - predicted, 2.0 * math.pi)
-    return math.remainder(predicted + (1.0 - math.exp(-dt / HEADING_TIME)) * off, 2.0 * math.pi)
+    heading = psi + dt * psi_dot
+    innovation = 0.0 if measured is None else math.remainder(measured - heading, 2.0 * math.pi)
+    return math.remainder(
+        heading + (1.0 - math.exp(-dt / HEADING_TIME)) * innovation, 2.0 * math.pi
+    )
 
 
 def course_acceleration(course_c: float, course: float, speed: float, k: float) -> float:
@@ -107,14 +109,14 @@ def path_acceleration(
 
 
 def slip_estimate(
-    slip: Scalar, turn: Scalar, flown: Scalar, rolling: Scalar, dt: float, time: float
+    slip: Scalar, turn: Scalar, acceleration: Scalar, rolling: Scalar, dt: float, time: float
 ) -> Scalar:
     """Loss of turn by a sideslip at a bank, a step later, m/s^2.
 
-    `turn` = g tan(phi), `flown` = V psi_dot:
+    `turn` = g tan(phi), `acceleration` = V psi_dot:
 
-        slip+ = slip + (1 - exp(-dt/T)) max(1 - rolling / 0.2, 0) (turn - flown - slip) within
-        +-LARGEST_SLIP abs(turn)
+        slip+ = slip + (1 - exp(-dt/T)) max(1 - rolling / 0.2, 0) (turn - acceleration - slip),
+        within +-LARGEST_SLIP abs(turn)
 
     `rolling` is abs(p) / p_max: the turn lags the bank by the reference model of r, so a roll looks
     like a sideslip. A bias of the gyro of r looks like a sideslip too; the bound is 0 in straight
@@ -123,7 +125,7 @@ def slip_estimate(
     """
     steady = array_namespace(slip).maximum(1.0 - rolling / 0.2, 0.0)
     return clip(
-        slip + (1.0 - math.exp(-dt / time)) * steady * (turn - flown - slip),
+        slip + (1.0 - math.exp(-dt / time)) * steady * (turn - acceleration - slip),
         LARGEST_SLIP * abs(turn),
     )
 

@@ -99,14 +99,14 @@ class Route(NamedTuple):
 
         Of a line it is the point at a distance along, m.
         """
-        flown = self.legs[leg]
-        if isinstance(flown, Line):
-            course = course_of(flown.start, flown.end)
-            return _along(flown.start, course, along), course
-        if is_orbit(flown):
-            return flown.centre, 0.0
+        path = self.legs[leg]
+        if isinstance(path, Line):
+            course = course_of(path.start, path.end)
+            return _along(path.start, course, along), course
+        if is_orbit(path):
+            return path.centre, 0.0
         before = self.legs[leg - 1]  # an arc follows a line
-        return before.end or flown.centre, end_course(before)
+        return before.end or path.centre, end_course(before)
 
     def profile(self, leg: int, along: float) -> tuple[float, float]:
         """The altitude at a distance along a leg, m, and its slope, 1.
@@ -253,13 +253,13 @@ def joining_centre(point: Point, course: Scalar, radius: Scalar) -> Point:
 
 
 def joining_length(
-    point: Point, course: Scalar, radius: Scalar, position: Point, flown: Scalar
+    point: Point, course: Scalar, radius: Scalar, position: Point, course_flown: Scalar
 ) -> Scalar:
     """Length of the way onto a course at a point, m: R abs(turn) + sqrt(d^2 - R^2) + R sweep.
 
     turn: from the course flown to the tangent; d: distance from the centre of the joining circle;
-    sweep: from the point where the tangent touches the circle to the point of the leg. `flown` and
-    `course` in rad.
+    sweep: from the point where the tangent touches the circle to the point of the leg.
+    `course_flown` and `course` in rad.
     """
     xp = array_namespace(radius)
     centre = joining_centre(point, course, radius)
@@ -269,14 +269,19 @@ def joining_length(
     R = abs(radius)
     d = xp.hypot(north, east)
     touch = xp.atan2(east, north) + side * xp.acos(R / xp.maximum(d, R))  # bearing from the centre
-    turn = touch + side * math.pi / 2.0 - flown
+    turn = touch + side * math.pi / 2.0 - course_flown
     sweep = (side * (course - touch) - math.pi / 2.0 + SLACK) % (2.0 * math.pi) - SLACK
-    turned = xp.atan2(xp.sin(turn), xp.cos(turn))
-    return R * abs(turned) + xp.sqrt(xp.maximum(d * d - R * R, 0.0)) + R * xp.maximum(sweep, 0.0)
+    angle = xp.atan2(xp.sin(turn), xp.cos(turn))
+    return R * abs(angle) + xp.sqrt(xp.maximum(d * d - R * R, 0.0)) + R * xp.maximum(sweep, 0.0)
 
 
 def joining(
-    point: Point, course: Scalar, radius: Scalar, near: Scalar, position: Point, flown: Scalar
+    point: Point,
+    course: Scalar,
+    radius: Scalar,
+    near: Scalar,
+    position: Point,
+    course_flown: Scalar,
 ) -> Scalar:
     """Side of the shorter joining circle onto a course at a point.
 
@@ -284,16 +289,18 @@ def joining(
     OPPOSITE of the course.
     """
     right_way, left_way = (
-        joining_length(point, course, side * radius, position, flown) for side in (1.0, -1.0)
+        joining_length(point, course, side * radius, position, course_flown) for side in (1.0, -1.0)
     )
     xp = array_namespace(right_way)
     far = (xp.hypot(position[0] - point[0], position[1] - point[1]) > near) | (
-        xp.cos(flown - course) < math.cos(OPPOSITE)
+        xp.cos(course_flown - course) < math.cos(OPPOSITE)
     )
     return xp.where(far, xp.where(right_way <= left_way, 1.0, -1.0), 0.0)
 
 
-def joined(point: Point, course: Scalar, near: Scalar, position: Point, flown: Scalar) -> Any:
+def joined(
+    point: Point, course: Scalar, near: Scalar, position: Point, course_flown: Scalar
+) -> Any:
     """Whether an aircraft is beyond a point of a leg, and near the leg.
 
     Near means within `near`, m, and within JOINED of the course of the leg.
@@ -301,7 +308,9 @@ def joined(point: Point, course: Scalar, near: Scalar, position: Point, flown: S
     xp = array_namespace(course)
     is_near = xp.hypot(position[0] - point[0], position[1] - point[1]) <= near
     return (
-        is_near & is_beyond(point, course, position) & (xp.cos(flown - course) >= math.cos(JOINED))
+        is_near
+        & is_beyond(point, course, position)
+        & (xp.cos(course_flown - course) >= math.cos(JOINED))
     )
 
 
@@ -496,12 +505,12 @@ def filleted(waypoints: Sequence[Point], radius: float, first: int = 0) -> list[
         turn = math.remainder(course_of(corner, after) - course_of(before, corner), 2.0 * math.pi)
         turns.append(turn if abs(turn) <= SHARPEST else 0.0)
     turns.append(0.0)
-    cut = [radius * math.tan(abs(turn) / 2.0) for turn in turns]
+    fillets = [radius * math.tan(abs(turn) / 2.0) for turn in turns]
     legs: list[Leg] = []
     start = waypoints[0]
     for k, (start_point, end_point) in enumerate(pairwise(waypoints)):
         length = math.dist(start_point, end_point)
-        needed = cut[k] + cut[k + 1]
+        needed = fillets[k] + fillets[k + 1]
         if length <= needed:
             expected = f"expected more than {math.ceil(needed)} m, for fillets of {radius:g} m"
             number = first + k + 1
@@ -510,11 +519,11 @@ def filleted(waypoints: Sequence[Point], radius: float, first: int = 0) -> list[
             )
         course = course_of(start_point, end_point)
         turn = turns[k + 1]
-        end = _along(end_point, course, -cut[k + 1])
+        end = _along(end_point, course, -fillets[k + 1])
         legs.append(Line(start, end))
-        if cut[k + 1] > SHORTEST:
+        if fillets[k + 1] > SHORTEST:
             side = math.copysign(1.0, turn)
-            start = _along(end_point, course + turn, cut[k + 1])
+            start = _along(end_point, course + turn, fillets[k + 1])
             legs.append(
                 Arc(_along(end, course + side * math.pi / 2.0, radius), side * radius, start)
             )
