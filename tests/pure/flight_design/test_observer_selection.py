@@ -181,7 +181,7 @@ def test_models_that_do_not_fit_are_refused(monkeypatch: pytest.MonkeyPatch) -> 
     [
         (
             ["--model", "osprey"],
-            "error: --model: found osprey, expected observer beside it",
+            "error: --model: found osprey, expected an observer too",
         ),
         (["--observer", "--check"], "error: --observer: found it beside --check"),
         (

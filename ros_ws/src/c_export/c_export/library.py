@@ -41,8 +41,8 @@ class CController:
         self._u = np.zeros(p)
         if not self._library.library_start(self._memory):
             raise ParameterError(
-                "the exported code: its compiler does not compute what is written, expected one "
-                "with its flags"
+                "the exported code: found a compiler that does not compute what is written, "
+                "expected the flags of the proof"
             )
 
     def take_y(self, stamp_ns: int, value: FloatArray, now_ns: int) -> int:

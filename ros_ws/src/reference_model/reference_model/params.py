@@ -204,7 +204,7 @@ class ReferenceModelConfig(NodeConfig):
             finite,
             "second_order",
             "an A_m that is not finite",
-            "frequencies and dampings whose products are",
+            "frequencies and dampings with finite products",
         )
         largest = float(np.linalg.eigvals(A_m).real.max())
         require(

@@ -140,7 +140,12 @@ def new_airframe(
         isinstance(source, str | Path) and Path(source).absolute() == files[0].absolute()
     )
     for path in files[source_is_target:]:
-        require(replace or not path.exists(), "folder", f"{path}", "a new file, or replace")
+        require(
+            replace or not path.exists(),
+            "folder",
+            f"{path}, which exists",
+            "a new file, or replace",
+        )
     if lag is None:
         lags = first_flight.default_lags(airframe)
     else:

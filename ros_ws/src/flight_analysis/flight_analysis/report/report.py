@@ -95,7 +95,7 @@ def report(
     if figure is None:
         key = "channels" if channels else "width"
         unused = not channels and width == WIDTH
-        require(unused, key, "it without a figure", "figure beside it")
+        require(unused, key, "no figure to use it for", "a path for figure too")
     files = [
         File(key, as_path(path, key, A_FILE), write)
         for key, path, write in (
@@ -108,7 +108,12 @@ def report(
         if path is not None
     ]
     is_single = len(folders) == 1 and html is None
-    require(output is None or is_single, "output", "a comparison", "one run; html for several")
+    require(
+        output is None or is_single,
+        "output",
+        "a comparison",
+        "one run; html is the page of several",
+    )
     read_one = partial(read_flight, namespace=namespace, scenario=scenario, remaps=remaps)
     if is_single:
         folder = None if output is None else as_path(output, "output", "the path of a folder")

@@ -334,8 +334,8 @@ def _write_scenario(recorded: RecordedRun, path: Path) -> None:
     require(
         read_file(path, str(path), A_SCENARIO) == recorded.scenario.content,
         str(path),
-        "another file than the scenario that the log holds by this name",
-        "it elsewhere: the scenario is written there",
+        "a file that is not the scenario of the log",
+        "no file of this name: the scenario is written there",
     )
 
 

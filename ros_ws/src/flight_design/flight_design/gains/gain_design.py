@@ -150,10 +150,8 @@ def select_gains(
         feedforward=feedforward,
         requirement=requirement(phase_margin, accept=accept),
     )
-    require(observer or weights is None, "weights", weights, "observer beside it")
-    require(
-        observer or model is None, "model", model, "observer beside it: it is the observer's model"
-    )
+    require(observer or weights is None, "weights", weights, "an observer too: it has the weights")
+    require(observer or model is None, "model", model, "an observer too: it estimates by the model")
     margin = as_number(margin, "margin", 0.0, MAX_DELAY_MARGIN, "s")
     pair = _two_speeds(speeds, observer=observer)
     known_model = frame if model is None else load_airframe(model)
@@ -196,7 +194,7 @@ def _two_speeds(speeds: ArrayLike, *, observer: bool) -> tuple[float, float] | N
         observer or not ratios,
         "speeds",
         speeds,
-        "observer beside them: the bare law follows the airspeed by schedule alone",
+        "an observer too: the law alone follows the airspeed by a schedule",
     )
     pair = (ratios[0], ratios[1]) if len(ratios) == len(("slow", "fast")) else None
     fits = not ratios or (pair is not None and LEAST_SPEED <= pair[0] < 1.0 < pair[1] <= MOST_SPEED)

@@ -269,7 +269,7 @@ def _commands(
             log.has(source),
             f"inputs.{name}",
             f"no {topic}.{row.field} in the log",
-            "it: the map and the log fit together",
+            "this field: a map of the autopilot that wrote the log",
         )
         require(
             not servos,
@@ -350,7 +350,7 @@ def _flight(
             bool(np.isfinite(speed).any()),
             "the log",
             "no airspeed or thrust at the samples of y",
-            "a flight",
+            "one of them, as in a flight",
         )
         keep &= speed > AIRBORNE * np.nanpercentile(speed, TYPICAL)
     if log.has(FLOWN_AS):  # a VTOL flies as both

@@ -152,7 +152,10 @@ class _Ticks:
                 now_ns = int(self._now_ns[k])
                 state, inputs = guard.tick(state, now_ns, sample, y_m, limits, law, True)
                 if inputs is None:
-                    raise ParameterError(f"{STATUS}: found a tick in row {k} that the law refuses")
+                    raise ParameterError(
+                        f"{STATUS}: found a tick in row {k} that the law refuses, "
+                        "expected the samples and the stamps of a flight of the export"
+                    )
                 u = self._values["u"][k]
                 equal += state.u.tobytes() == u.tobytes()
                 age = seconds(now_ns - stamp_ns)

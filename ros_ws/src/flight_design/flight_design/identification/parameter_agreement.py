@@ -163,7 +163,7 @@ def servo_of(stick: Stick, name: str, values: Mapping[str, float]) -> Servo:
         not absent,
         f"inputs.{name}",
         f"no {', '.join(absent)} in the log before the samples",
-        f"it, {sticks_instead}",
+        f"these parameters, {sticks_instead}",
     )
     low, *trim, high, is_reversed = (values[key] for key in names)
     ends = [low, *trim, high]
