@@ -368,7 +368,7 @@ def test_quick_learner_of_campaign_finds_what_learner_of_node_finds(
         identified.append(identify_model(*arguments, **options))
         return identified[-1]
 
-    monkeypatch.setattr("flight_design.learning.learner.identify", kept)
+    monkeypatch.setattr("flight_design.learning.learner.identify_model", kept)
     scenario = learning(15.0, updates=[10.0, 14.0])
     campaign = flown_rows(tmp_path / "real", scenario, scenario_learner.quick_learner, 1)
     row = campaign.rows().collect().row(0, named=True)

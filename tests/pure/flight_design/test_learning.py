@@ -299,7 +299,7 @@ def test_identification_is_due_where_last_proposal_does_not_fly(
 ) -> None:
     made = made_learner(scenario(learn={"updates": [15.0]}))
     identified = Mock(return_value=SimpleNamespace(parts=()))
-    monkeypatch.setattr(design_learner, "identify", identified)
+    monkeypatch.setattr(design_learner, "identify_model", identified)
     record_rest(made)
     rough = made.propose(scenario(learn={"updates": [15.0]}).rise_di().digest()).controller
     assert rough is not None
@@ -326,7 +326,7 @@ def test_the_rough_model_flies_until_it_fell_back(monkeypatch: pytest.MonkeyPatc
     learned = unproven._replace(advantage=1.7)
     parts = [(unproven, refused), (learned, refused), (learned, refused)]
     identified = Mock(side_effect=[SimpleNamespace(parts=each) for each in parts])
-    monkeypatch.setattr(design_learner, "identify", identified)
+    monkeypatch.setattr(design_learner, "identify_model", identified)
     for k in range(1001):
         made.take(k * 10_000_000, np.zeros(4), np.zeros(4), rough.digest())
     made._planned.appendleft(0)  # an identification is due
@@ -367,7 +367,7 @@ def test_refused_part_goes_back_to_the_file_that_predicts_better(
     assert ("p", "r") in made._known
     refused = lateral(whiteness=9.0)._replace(advantage=advantage)
     monkeypatch.setattr(
-        design_learner, "identify", lambda *_, **__: SimpleNamespace(parts=(refused,))
+        design_learner, "identify_model", lambda *_, **__: SimpleNamespace(parts=(refused,))
     )
     made._planned.appendleft(0)  # an identification is due
     after = made.propose(first.controller.digest())
@@ -427,7 +427,7 @@ def test_model_with_coupling_is_not_replaced_by_one_of_a_part(
     worse_than_file = tuple(each._replace(advantage=-2.0) for each in apart)
     parts = [(whole,), apart, worse_than_file]
     identified = Mock(side_effect=[SimpleNamespace(parts=each) for each in parts])
-    monkeypatch.setattr(design_learner, "identify", identified)
+    monkeypatch.setattr(design_learner, "identify_model", identified)
     monkeypatch.setattr(made, "_design", lambda *_: SelectedObserver(start, 0.03, 0.6, ONES, 0.0))
     record_rest(made)
     assert made.propose(0).sentence == "B[q, elevator] +10 +- 1 %, with coupling"
@@ -512,7 +512,7 @@ def test_input_is_dead_only_where_a_free_a_predicts_as_well_without_it(
         )
         return SimpleNamespace(parts=(), after=SimpleNamespace(log_likelihood=gain * with_rudder))
 
-    monkeypatch.setattr(design_learner, "identify", identified)
+    monkeypatch.setattr(design_learner, "identify_model", identified)
     change = Change(("p", "r"), 10.0, {"aileron": 1.0, "rudder": 0.05}, "rudder")
     monkeypatch.setattr(made, "_changes", lambda _: [change])
     record_rest(made)
@@ -567,7 +567,7 @@ def lateral(*, whiteness: float = 1.0, latest: float = 0.0) -> Part:
 def learner_that_finds(part: Part, monkeypatch: pytest.MonkeyPatch, **learn: Any) -> Learner:
     """A learner with a record of 10 s, whose search finds a part."""
     made = made_learner(scenario(learn={"updates": [10.0]} | learn))
-    monkeypatch.setattr(design_learner, "identify", lambda *_, **__: SimpleNamespace(parts=(part,)))
+    monkeypatch.setattr(design_learner, "identify_model", lambda *_, **__: SimpleNamespace(parts=(part,)))
     record_rest(made)
     return made
 
