@@ -24,7 +24,7 @@ from flight_ros import reports
 from flight_ros.messages import Encoder
 from flight_ros.reports import Report
 from flight_ros.topics import PROPOSAL
-from rise_di_controller.learning.proposals import designed
+from rise_di_controller.learning.proposals import design_changes
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 
@@ -34,7 +34,7 @@ class Proposer:
     def __init__(self, flight: Flight, start: RiseDiConfig) -> None:
         self.flight = flight
         self.start = start
-        self.change = designed(start, find_scenario("osprey_observer").rise_di())
+        self.change = design_changes(start, find_scenario("osprey_observer").rise_di())
         self._publisher = flight.world.publisher(PROPOSAL.type, "/proposal")
 
     def propose(

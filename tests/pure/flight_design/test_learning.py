@@ -567,7 +567,9 @@ def lateral(*, whiteness: float = 1.0, latest: float = 0.0) -> Part:
 def learner_that_finds(part: Part, monkeypatch: pytest.MonkeyPatch, **learn: Any) -> Learner:
     """A learner with a record of 10 s, whose search finds a part."""
     made = made_learner(scenario(learn={"updates": [10.0]} | learn))
-    monkeypatch.setattr(design_learner, "identify_model", lambda *_, **__: SimpleNamespace(parts=(part,)))
+    monkeypatch.setattr(
+        design_learner, "identify_model", lambda *_, **__: SimpleNamespace(parts=(part,))
+    )
     record_rest(made)
     return made
 

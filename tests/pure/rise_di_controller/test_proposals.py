@@ -27,9 +27,9 @@ from rise_di_controller.learning.learned_channels import (
     authority,
     authority_names,
     coupled,
-    fallen_back,
     outputs_without,
     with_channels_of,
+    with_fallback,
     without_models,
 )
 from rise_di_controller.learning.proposals import (
@@ -40,7 +40,7 @@ from rise_di_controller.learning.proposals import (
     Proposal,
     Updates,
     changes,
-    designed,
+    design_changes,
 )
 from rise_di_controller.rise_di_config import LearnConfig, RiseDiConfig
 
@@ -116,7 +116,7 @@ def test_part_that_is_learned_later_gets_its_feedforward() -> None:
     flight = Flight()
     inputs = []
     for model in (lateral, parameters):
-        flight.receive(designed(START, model))
+        flight.receive(design_changes(START, model))
         flight.step()
         flight.now_ns += 10 * NANOSECONDS
         flown = flight.controller.parameters.feedforward
@@ -235,7 +235,7 @@ def test_input_without_effect_is_held_though_the_law_fell_back_meanwhile(
     monkeypatch.undo()
     assert flight.controller.digest == START.digest()
     of_q = [name in {"elevator", "thrust"} for name in START.inputs]
-    change = designed(
+    change = design_changes(
         START,
         with_channels_of(START, parameters, of_q, [name == "elevator" for name in START.inputs]),
     )
@@ -395,7 +395,9 @@ def test_part_that_oscillates_flies_the_law_of_the_start_to_the_end_of_the_engag
     logged = dict(zip(flight.controller.names, flight.engage().internals.tolist(), strict=True))
     assert [logged[f"given_up.{name}"] for name in ("q", "V", "p", "r")] == [1.0, 1.0, 0.0, 0.0]
     assert outputs_without(without_models(START, fallen, ["r", "p"])) == START.outputs
-    assert changes(fallen, fallen_back(START, parameters, longitudinal)) == {"learn.without": None}
+    assert changes(fallen, with_fallback(START, parameters, longitudinal)) == {
+        "learn.without": None
+    }
     assert acting_inputs(fallen) == ("aileron", "rudder")
     flight.now_ns += 10 * NANOSECONDS
     # all parts, as of a learner that was started again
@@ -403,7 +405,7 @@ def test_part_that_oscillates_flies_the_law_of_the_start_to_the_end_of_the_engag
     flight.step()
     assert acting_inputs(flight.controller.parameters) == ("aileron", "rudder")  # type: ignore[arg-type]
     flight.now_ns += 10 * NANOSECONDS
-    flight.receive(designed(START, fallen))  # a later model of p and r
+    flight.receive(design_changes(START, fallen))  # a later model of p and r
     flight.step()
     assert acting_inputs(flight.controller.parameters) == ("aileron", "rudder")  # type: ignore[arg-type]
     assert flight.sentences[1:] == [
@@ -426,8 +428,8 @@ def test_part_that_oscillates_flies_the_law_of_the_start_to_the_end_of_the_engag
 
 def test_law_of_the_start_flies_where_all_parts_oscillate() -> None:
     parameters = RiseDiConfig.validate_mapping(START.changed(CHANGE), "whole")
-    assert fallen_back(START, parameters, [True] * 4) == START
-    assert fallen_back(START, START, [True, False, False, False]) == START
+    assert with_fallback(START, parameters, [True] * 4) == START
+    assert with_fallback(START, START, [True, False, False, False]) == START
     flight = Flight()
     flight.controller.retune(without_models(START, parameters, START.outputs))
     flight.receive()

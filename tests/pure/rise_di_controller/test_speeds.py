@@ -34,7 +34,7 @@ from flight_design.learning.learner import Learner
 from rise_di_controller.controller import Controller
 from rise_di_controller.law.control_law import Measurements
 from rise_di_controller.law.linear_loop import LinearPlant, LoopTiming, linear_law
-from rise_di_controller.learning.proposals import Event, Learning, Proposal, designed
+from rise_di_controller.learning.proposals import Event, Learning, Proposal, design_changes
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 pytestmark = pytest.mark.slow
@@ -223,7 +223,7 @@ class Learns:
     """
 
     def __init__(self, scheduled: RiseDiConfig) -> None:
-        self.change = designed(LEARNS, scheduled)
+        self.change = design_changes(LEARNS, scheduled)
         self.model = RiseDiConfig.validate_mapping(LEARNS.changed(self.change), "controller")
         self.controller, self.events = Controller(LEARNS), list[Event]()
         self.learning = Learning(LEARNS, self.events.append, simulated=False)

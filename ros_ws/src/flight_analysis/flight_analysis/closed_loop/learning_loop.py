@@ -12,7 +12,12 @@ from flight_core.modes import Mode
 from flight_core.vectors import FloatArray, StampedVector
 from rise_di_controller.controller import Controller
 from rise_di_controller.learning.learned_channels import authority_names, outputs_without
-from rise_di_controller.learning.proposals import AUTHORITY_TICKS, Learning, Proposal, designed
+from rise_di_controller.learning.proposals import (
+    AUTHORITY_TICKS,
+    Learning,
+    Proposal,
+    design_changes,
+)
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 
@@ -124,7 +129,7 @@ def as_received(proposal: LearnerResult, start: RiseDiConfig, end_ns: int, flown
 
     The proposal has the end of the window, and the digest of the parameters in force there.
     """
-    change = {} if proposal.controller is None else designed(start, proposal.controller)
+    change = {} if proposal.controller is None else design_changes(start, proposal.controller)
     return Proposal(
         stamp_ns=end_ns,
         start=start.digest(),

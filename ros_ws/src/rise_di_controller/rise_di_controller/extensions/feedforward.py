@@ -114,7 +114,7 @@ def ideal_input(x: Array, y_m_dot: Array, nominal: Nominal) -> Array:
 def x_dot(t: Array, x: Array, forced: Array, nominal: Nominal) -> Array:
     """Nominal model under the ideal input, shape (n,).
 
-    x_dot = A x + f(x) + B ideal(x, y_m_dot), so C x_dot = y_m_dot.
+    x_dot = A x + f(x) + B ideal_input(x, y_m_dot), so C x_dot = y_m_dot.
 
     As (I - B Omega^-1 C) (A x + f(x)) + forced, with forced = B Omega^-1 y_m_dot.
     """

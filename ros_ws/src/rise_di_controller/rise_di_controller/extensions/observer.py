@@ -134,7 +134,7 @@ def estimates_after(
     return z
 
 
-def moving(
+def with_motion(
     state: VaneObserverState, reading: Array, dt: Array, params: VaneParams
 ) -> VaneObserverState:
     """The state with the motion of the readings, and the vanes in use.
@@ -207,7 +207,7 @@ def correct(state: Any, measurements: Measurements, dt: Array, params: ObserverP
     innovation = e - product(params.H, state.z)
     z = state.z + product(params.L, innovation)
     if params.vanes is not None and measurements.vane is not None:
-        state = moving(state, measurements.vane, dt, params.vanes)
+        state = with_motion(state, measurements.vane, dt, params.vanes)
         z = z + by_vanes(
             state.z,
             innovation,

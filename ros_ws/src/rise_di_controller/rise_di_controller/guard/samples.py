@@ -95,7 +95,8 @@ def sample_limits(
 ) -> SampleLimits:
     """The limits of outputs by name.
 
-    `authority`: y_dot by the full inputs, (m,), units of y / s; `largest`: of parameters.
+    `authority`: y_dot by the full inputs, (m,), units of y / s; `largest`: of the parameters, else
+    plausible ones.
     """
     least = [LEAST.get(name, LEAST_RATE) for name in names]
     reach = np.maximum(AUTHORITY * authority * seconds(period_ns), least)

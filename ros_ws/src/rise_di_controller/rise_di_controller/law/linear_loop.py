@@ -187,9 +187,9 @@ class SampledPlant(NamedTuple):
 def sampled_plant(
     plant: LinearPlant, loop: LoopTiming, extra: FloatArray, *, rising: bool = False
 ) -> SampledPlant:
-    """The exact motion over a period, with k = n + m + held m states.
+    """The exact motion over a period, with k = n + m + kept m states.
 
-    They are x, the actuators, and u of earlier ticks.
+    The states are x, the actuators, and u of the `kept` earlier ticks that still acts.
 
     u of a tick is held for a period and reaches actuator i after delay + extra_i, s, shape (m,).
     With `rising` u of a tick multiplies ROOT (2 s - 1), s from 0 to 1 over the period, in place of

@@ -128,7 +128,7 @@ def authority(parameters: RiseDiConfig, start: RiseDiConfig) -> FloatArray:
     return bounds.ravel()
 
 
-def fallen_back(
+def with_fallback(
     start: RiseDiConfig, parameters: RiseDiConfig, bare: Sequence[bool]
 ) -> RiseDiConfig:
     """What flies, with the law of the start in further channels.
@@ -160,7 +160,7 @@ def without_models(
 
     The outputs keep this law to the end of the engagement, and are added to `learn.without`.
     """
-    fallen = fallen_back(start, parameters, [name in outputs for name in start.outputs])
+    fallen = with_fallback(start, parameters, [name in outputs for name in start.outputs])
     assert start.learn is not None  # noqa: S101 - a controller that learns
     bare_outputs = tuple(
         name for name in start.outputs if name in {*outputs_without(parameters), *outputs}

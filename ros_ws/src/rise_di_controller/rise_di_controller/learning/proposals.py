@@ -19,8 +19,8 @@ from rise_di_controller.controller import Controller, Prepared, prepared, prepar
 from rise_di_controller.learning.learned_channels import (
     authority,
     coupled,
-    fallen_back,
     outputs_without,
+    with_fallback,
     without_models,
 )
 from rise_di_controller.params import ControllerConfig
@@ -480,7 +480,7 @@ def _certificate(
         others = f"one of other outputs than {', '.join(bare_outputs)}, by learn.without"
         require(proposed.feedforward is not None, "proposal", "no feedforward", others)
         bare = coupled(proposed, bare_outputs)
-        proposed = fallen_back(start, proposed, bare)
+        proposed = with_fallback(start, proposed, bare)
         require(not all(bare), "proposal", "no model", others)
         yield
     try:
@@ -501,7 +501,7 @@ def _speeds(parameters: RiseDiConfig) -> str:
     return f"{schedule.speed!r} m/s, {schedule.time!r} s, models at {ratios or 'no'} times it"
 
 
-def designed(old: ControllerConfig, new: ControllerConfig) -> dict[str, Any]:
+def design_changes(old: ControllerConfig, new: ControllerConfig) -> dict[str, Any]:
     """All of DESIGNED of a new set by dotted name.
 
     None for what an old set, or what flies meanwhile, may have besides.
