@@ -21,7 +21,7 @@ from flight_core.rates import seconds
 from flight_core.tape import Signal, Tape
 from flight_design.identification.bridge_identification import channel_pairs, experiment
 from flight_design.identification.response_identification import MIN_RATIO, identify_response
-from flight_design.identification.sign_check import check_map
+from flight_design.identification.sign_check import check_signs
 from flight_log.engagements import Engagement
 from flight_log.tape_reader import read_run
 
@@ -139,7 +139,7 @@ def judged(
             tape["y"], flipped_u, pairing.outputs, pairing.inputs, engaged=spans
         )
         D = tuple(int(sign) for sign in expected)
-        check = check_map(channel_map, Omega, pairing.outputs, pairing.inputs, D, response)
+        check = check_signs(channel_map, Omega, pairing.outputs, pairing.inputs, D, response)
         fraction = (
             (channel.input, channel.ratio or 0.0, (channel.measured or 0.0) * channel.effect)
             for channel in check.channels

@@ -31,7 +31,7 @@ from flight_analysis.linear_loop.loop_margins import (
     linear_loop,
     scenario_loop,
 )
-from flight_analysis.linear_loop.uncertain_loop import aircraft_at
+from flight_analysis.linear_loop.uncertain_loop import plants_at
 from flight_analysis.linear_loop.worst_case import worst_in_box
 from flight_analysis.report.account import account
 from flight_analysis.report.shortfalls import judge
@@ -130,7 +130,7 @@ def beyond(linear: LinearLoop, stable: float, count: int) -> str:
     for k in range(0, count, BATCH):
         d = generator.uniform(-1.0, 1.0, (min(BATCH, count - k), len(box.names)))
         d = d if k % (2 * BATCH) else np.sign(d)
-        aircraft = aircraft_at(linear.nominal, box, d * stable / box.part.max())
+        aircraft = plants_at(linear.nominal, box, d * stable / box.part.max())
         z = np.linalg.eigvals(closed_loop(aircraft, linear.law, linear.loop, still))
         radii = np.abs(z).max(axis=-1)
         unstable += int(np.count_nonzero(radii > 1.0 + SPECTRAL_RADIUS_TOLERANCE))

@@ -18,7 +18,7 @@ from tests.joint_states import JOINT_STATE, vector
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.report.html import script_json
-from flight_analysis.report.run_folder import read_flight, recorded_scenario
+from flight_analysis.report.run_folder import extract_scenario, read_flight
 from flight_core.files import parse_yaml
 from flight_core.parameters import ParameterError
 from flight_core.text import MAX_LENGTH
@@ -105,7 +105,7 @@ def test_scenario_in_log_extracted_without_overwriting_log(
 ) -> None:
     log_before = constant_flight(osprey_gust, name=name)
     run = write_run(tmp_path, log_before)
-    recorded_scenario(run)
+    extract_scenario(run)
     assert (run / "run_0.mcap").read_bytes() == log_before
     name_kept = "x.yaml" if name == "../../x.yaml" else "scenario.yaml"
     assert {path.name for path in run.iterdir()} == {"run_0.mcap", name_kept}

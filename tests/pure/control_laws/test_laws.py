@@ -537,7 +537,7 @@ def test_observer_with_other_matrices_restarts_without_jump(name: str) -> None:
         state = tick(parameters, state, 10 * k, e)
     weaker = [0.9 * gain for gain in sections()[name]["observer"]["F"]]
     new = controller(name, observer=sections()[name]["observer"] | {"F": weaker})
-    after = retuning.retune(state, parameters.tuned_law(), new.tuned_law())
+    after = retuning.retune_state(state, parameters.tuned_law(), new.tuned_law())
     assert state.law.u_o.any()
     assert_allclose(after.u_trim, state.u_trim + state.law.u_o, rtol=1e-12)
     assert after.law.z.tolist() == (matrices(new).H.T @ e).tolist()

@@ -30,8 +30,8 @@ from flight_analysis.linear_loop.structured_value import (
 )
 from flight_analysis.linear_loop.uncertain_loop import (
     Box,
-    aircraft_at,
     every_channel,
+    plants_at,
     uncertain_loop,
 )
 from flight_analysis.linear_loop.worst_case import worst_in_box
@@ -47,7 +47,7 @@ PERIOD = 0.01
 def radii(linear: LinearLoop, d: FloatArray) -> FloatArray:
     """The spectral radii of the exact loops of some deviations, (N, k)."""
     assert linear.box is not None
-    aircraft = aircraft_at(linear.nominal, linear.box, d)
+    aircraft = plants_at(linear.nominal, linear.box, d)
     still = np.zeros(len(linear.inputs))
     matrices = closed_loop(aircraft, linear.law, linear.loop, still)
     return np.asarray(np.abs(np.linalg.eigvals(matrices)).max(axis=-1))
@@ -239,7 +239,7 @@ def test_no_corner_is_unstable_or_has_less_than_guaranteed() -> None:
     corners = np.sign(np.random.default_rng(3).standard_normal((2000, len(linear.box.names))))
     assert (radii(linear, corners * promise.stable / 0.3) <= LIMIT).all()
     margins = input_margins(
-        aircraft_at(linear.nominal, linear.box, corners[:40]), linear.law, linear.loop
+        plants_at(linear.nominal, linear.box, corners[:40]), linear.law, linear.loop
     )
     assert (margins.disk >= promise.disk).all()
     assert (margins.disk_all >= promise.disk_all).all()
@@ -252,7 +252,7 @@ def test_search_is_at_or_below_corners() -> None:
     search = worst_in_box(linear.nominal, linear.law, linear.loop, linear.box)
     corners = np.sign(np.random.default_rng(8).standard_normal((150, len(linear.box.names))))
     samples = input_margins(
-        aircraft_at(linear.nominal, linear.box, corners), linear.law, linear.loop
+        plants_at(linear.nominal, linear.box, corners), linear.law, linear.loop
     ).worst()
     for name in ("phase", "gain", "disk", "disk_all", "damping"):
         # a walk may end at a corner beside the least one: by less than a printed digit
@@ -273,7 +273,7 @@ def test_search_over_two_entries_is_brute_force() -> None:
     plant = LinearPlant(np.array([[-2.0]]), np.ones((1, 1)), np.eye(1))
     search = worst_in_box(plant, linear.law, linear.loop, box)
     grid = np.array(list(itertools.product(np.linspace(-1.0, 1.0, 9), repeat=2)))
-    brute = input_margins(aircraft_at(plant, box, grid), linear.law, linear.loop).worst()
+    brute = input_margins(plants_at(plant, box, grid), linear.law, linear.loop).worst()
     assert search.worst.phase == approx(brute.phase, rel=1e-6)
     assert search.worst.disk == approx(brute.disk, rel=1e-3)
 

@@ -22,7 +22,12 @@ from flight_core.rates import nanoseconds
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 from flight_design.identification.response_identification import Response, identify_response
-from flight_design.identification.sign_check import SignCheck, check_map, recorded_response, through
+from flight_design.identification.sign_check import (
+    SignCheck,
+    check_signs,
+    recorded_response,
+    through,
+)
 from flight_log.tape_writer import write_run
 from rise_di_controller.laws import AnyLaw
 
@@ -38,7 +43,7 @@ OMEGA: FloatArray = AIRFRAME.matrix_c() @ AIRFRAME.matrix_b()
 def check_osprey(
     channel_map: ChannelMap, D: tuple[int, ...] = (1, 1, 1, 1), measured: Response | None = None
 ) -> SignCheck:
-    return check_map(channel_map, OMEGA, OUTPUTS, INPUTS, D, measured)
+    return check_signs(channel_map, OMEGA, OUTPUTS, INPUTS, D, measured)
 
 
 def changed(original: ChannelMap, kind: str, channel: str, **values: Any) -> ChannelMap:

@@ -30,7 +30,7 @@ from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 from flight_design.gains import gain_conditions, ideal_control
 from flight_design.gains import gain_selection as selection
-from flight_design.gains.channel_signs import require_channels
+from flight_design.gains.channel_signs import signs_of_pairing
 from flight_design.gains.gain_conditions import Bounds, GainCondition, GainSet
 from flight_design.gains.gain_design import select_gains
 from flight_design.gains.gain_selection import GainAssessment, LoopSetting
@@ -242,8 +242,8 @@ def test_wrong_D_refused_with_one_that_fits() -> None:
         r"elevator and keep D$"
     )
     with refusing(sentence):
-        require_channels(Omega, channels, [1, 1, 1, 1])
-    assert require_channels(Omega, channels, [-1, 1, 1, 1]).tolist() == [-1, 1, 1, 1]
+        signs_of_pairing(Omega, channels, [1, 1, 1, 1])
+    assert signs_of_pairing(Omega, channels, [-1, 1, 1, 1]).tolist() == [-1, 1, 1, 1]
 
 
 @pytest.mark.parametrize(
@@ -266,7 +266,7 @@ def test_pairing_without_decomposition_or_with_strong_coupling_refused(
     inputs: tuple[str, ...], sentence: str
 ) -> None:
     with refusing(sentence):
-        require_channels(*osprey_channels(inputs))
+        signs_of_pairing(*osprey_channels(inputs))
 
 
 OSPREY_LOOP = LoopTiming(np.array([0.02, 0.1, 0.02, 0.02]), 0.0, 0.01)

@@ -18,8 +18,8 @@ from flight_core.parameters import ParameterError
 from flight_design.identification.parameter_agreement import (
     Servo,
     Stick,
+    change_sentences,
     compared,
-    parameter_changes,
     require_agreement,
     servo_of,
     stick_of,
@@ -201,7 +201,7 @@ def test_changes_are_told_with_the_value_of_the_samples() -> None:
             ParameterRecord(40 * SECOND, 2.0),
         ),
     }
-    assert parameter_changes(recorded, 10 * SECOND, 30 * SECOND, 60 * SECOND) == [
+    assert change_sentences(recorded, 10 * SECOND, 30 * SECOND, 60 * SECOND) == [
         (
             "SERVO2_REVERSED changes from 1 to 0 at 10.0 s of the log, before the samples: signs "
             "and effects are those of 0"
@@ -217,5 +217,5 @@ def test_changes_are_told_with_the_value_of_the_samples() -> None:
 def test_change_between_the_samples_is_refused(name: str) -> None:
     recorded = {name: (ParameterRecord(0, 1.0), ParameterRecord(60 * SECOND, 2.0))}
     with refusing(f"found {name} changes from 1 to 2 at 50.0 s of the log, expected no change"):
-        parameter_changes(recorded, 10 * SECOND, 30 * SECOND, 60 * SECOND)
-    assert len(parameter_changes(recorded, 10 * SECOND, 60 * SECOND, 90 * SECOND)) == 1
+        change_sentences(recorded, 10 * SECOND, 30 * SECOND, 60 * SECOND)
+    assert len(change_sentences(recorded, 10 * SECOND, 60 * SECOND, 90 * SECOND)) == 1

@@ -87,7 +87,7 @@ def fly(
 ) -> list[Tick]:
     """Simulate the scenario, or the reference y_m from the state x_0. Without latching e_0 is 0.
 
-    New parameters are taken between two ticks by `retuning.retune`, as in the node.
+    New parameters are taken between two ticks by `retuning.retune_state`, as in the node.
     """
     hardware = SERVO.aircraft.plant()
     aircraft = plant.initial_state(hardware)
@@ -110,7 +110,7 @@ def fly(
         before = state
         law = now.parameters.tuned_law()
         if now.parameters != conditions(max(k - 1, 0)).parameters:
-            state = retuning.retune(state, old, law)
+            state = retuning.retune_state(state, old, law)
         state, inputs = guard.tick(
             state, now_ns, y, samples, now.parameters.guard(), law, now.active
         )

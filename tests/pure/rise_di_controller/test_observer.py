@@ -16,7 +16,7 @@ from rise_di_controller.extensions.observer import (
     with_observer,
 )
 from rise_di_controller.guard.guard import initial_state
-from rise_di_controller.guard.retuning import retune
+from rise_di_controller.guard.retuning import retune_state
 from rise_di_controller.law.control_law import ControlLaw, Measurements, TunedLaw
 from rise_di_controller.law.saturation import Limits
 
@@ -144,7 +144,9 @@ def test_new_observer_without_record_starts_from_error_and_trim_keeps_contributi
         u=vector(TRIM + 0.7),
         u_trim=vector(TRIM),
     )
-    after = retune(state, TunedLaw(law, old), TunedLaw(law, old._replace(L=np.array([[0.5]]))))
+    after = retune_state(
+        state, TunedLaw(law, old), TunedLaw(law, old._replace(L=np.array([[0.5]])))
+    )
     assert (after.u_trim.item(), after.law.u_o.item(), after.law.z.item()) == approx(
         (TRIM + 0.7, 0.0, 0.5)
     )

@@ -493,8 +493,8 @@ def inputs_by_part(
 ) -> dict[str, dict[str, InputMetrics]]:
     """Control effort by input and part: rms and max abs(u) about trim, and mean abs(u_dot).
 
-    `topic` y gives the same of y. mean abs(u_dot) = sum abs(u_k - u_(k-1)) / sum (t_k - t_(k-1))
-    over the steps with an end in the part; NaN without a step.
+    With `topic` y the metrics are of y. mean abs(u_dot) = sum abs(u_k - u_(k-1)) / sum (t_k -
+    t_(k-1)) over the steps with an end in the part; NaN without a step.
     """
     if topic not in tape:
         return {}

@@ -20,7 +20,7 @@ from launch_ros.substitutions import ExecutableInPackage
 
 from autopilot_bridge.params import maps
 from flight_analysis.closed_loop.scenario_library import find_scenario
-from flight_analysis.report.run_folder import new_run, recorded_scenario
+from flight_analysis.report.run_folder import extract_scenario, new_run
 from flight_bringup.graph import (
     AIRCRAFT,
     BRIDGE,
@@ -124,7 +124,7 @@ def _play(context: LaunchContext) -> list[Action]:
     run = Path()
     if nodes:
         name = argument(context, "scenario")
-        scenario = find_scenario(name) if name else recorded_scenario(log, namespace or None)
+        scenario = find_scenario(name) if name else extract_scenario(log, namespace or None)
         if RECORDER in nodes:
             run = new_run(scenario, Path(argument(context, "runs")))
     player = _player(context, topics, run, recorded=RECORDER in nodes)

@@ -185,7 +185,9 @@ class Controller:
             "the law and the observer that fly: these change at a restart",
         )
         before = self._parameters
-        self._state = retuning.retune(self._state, self._law, new.law, (self._guard, new.guard))
+        self._state = retuning.retune_state(
+            self._state, self._law, new.law, (self._guard, new.guard)
+        )
         self._law = new.law
         self._guard = new.guard
         self._digest = new.digest

@@ -77,7 +77,7 @@ class Entry(NamedTuple):
 
 
 class Learned(NamedTuple):
-    """Channels of the topic `learned_sample`.
+    """Channels of the topic `learned`.
 
     They are `proposed`, and the value and the deviation of entries of A and B in the rows of the
     outputs.

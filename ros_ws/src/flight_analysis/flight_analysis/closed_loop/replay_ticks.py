@@ -89,7 +89,7 @@ class ParametersInForce:
             limits = self.limits
             self._apply(step)
             if state is not None:
-                state = retuning.retune(state, law, self.law, (limits, self.limits))
+                state = retuning.retune_state(state, law, self.law, (limits, self.limits))
         return state
 
 

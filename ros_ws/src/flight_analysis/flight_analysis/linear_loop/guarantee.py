@@ -15,8 +15,8 @@ from flight_analysis.linear_loop.loop_margins import LinearLoop
 from flight_analysis.linear_loop.uncertain_loop import (
     Channels,
     UncertainLoop,
-    aircraft_at,
     parts_of,
+    plants_at,
     uncertain_loop,
 )
 from flight_analysis.linear_loop.worst_case import first_unstable, worst_in_box
@@ -173,7 +173,7 @@ def _confirmed(linear: LinearLoop, d: FloatArray) -> Unstable | None:
     assert box is not None  # noqa: S101 - for mypy
     still = np.zeros(len(linear.inputs))
     for _ in range(CONFIRMED):
-        aircraft = aircraft_at(linear.nominal, box, d)
+        aircraft = plants_at(linear.nominal, box, d)
         if not is_stable(aircraft, linear.law, linear.loop, still):
             matrix = closed_loop(aircraft, linear.law, linear.loop, still)
             z = np.linalg.eigvals(matrix)

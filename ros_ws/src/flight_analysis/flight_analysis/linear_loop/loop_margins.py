@@ -14,7 +14,7 @@ from aircraft_sim.uncertainty import UNIFORM, Spread, drawn_places, nominal_and_
 from flight_analysis.closed_loop.scenario import Scenario, as_scenario
 from flight_analysis.linear_loop.delay_margin import MAX_DELAY_MARGIN, delay_margin
 from flight_analysis.linear_loop.input_margins import Margins, SlowModes, input_margins, slow_modes
-from flight_analysis.linear_loop.uncertain_loop import Box, aircraft_at
+from flight_analysis.linear_loop.uncertain_loop import Box, plants_at
 from flight_analysis.linear_loop.worst_case import worst_in_box
 from flight_core.arguments import as_count, as_number
 from flight_core.parameters import ParameterError
@@ -149,7 +149,7 @@ def _assessed_by_search(linear: LinearLoop, box: Box) -> LoopMargins:
     )
     radii = np.abs(np.linalg.eigvals(samples)).max(axis=-1)
     search = worst_in_box(linear.nominal, linear.law, linear.loop, box)
-    aircraft = aircraft_at(_some(linear.plant, slice(1)), box, search.corners)
+    aircraft = plants_at(_some(linear.plant, slice(1)), box, search.corners)
     return nominal._replace(
         worst=search.worst,
         worst_delay=_least_delay(linear._replace(plant=aircraft), nominal.delay),
@@ -300,9 +300,9 @@ def _has_effectors(airframe: Airframe, controller: ControllerConfig) -> bool:
 def delay_margins(scenario: Scenario, controller: ControllerConfig) -> dict[str, Any]:
     """Delay margins of the nominal linear loop, s.
 
-    They are u late in every channel, in a single channel by output, and the least allowed. Empty
-    without a linear loop: an aircraft of JSBSim, the literal sign. 0 where the loop is unstable
-    with its own lag.
+    u is late in every channel, or in a single channel, by output. The least margin that is allowed
+    is there too. Empty without a linear loop: an aircraft of JSBSim, the literal sign. 0 where the
+    loop is unstable with its own lag.
     """
     if scenario.aircraft.is_jsbsim or is_literal(controller):
         return {}

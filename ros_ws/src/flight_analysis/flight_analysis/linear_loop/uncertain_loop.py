@@ -58,7 +58,7 @@ class Box(NamedTuple):
     G: FloatArray  # (k, m)
 
 
-def aircraft_at(plant: LinearPlant, box: Box, d: FloatArray) -> LinearPlant:
+def plants_at(plant: LinearPlant, box: Box, d: FloatArray) -> LinearPlant:
     """The plants of some deviations d, (..., k)."""
     effect = box.E * d[..., None, :]
     return LinearPlant(plant.A + effect @ box.F, plant.B + effect @ box.G, plant.C)
@@ -276,7 +276,7 @@ class Channels(NamedTuple):
 def every_channel(loop: UncertainLoop, inputs: tuple[int, ...] = ()) -> Channels:
     """All entries of the box as channels, and disks in some inputs.
 
-    v is added to u and u + v / 2: S - I / 2.
+    A disk adds v to u and reads u + v / 2: S - I / 2 from v.
     """
     channels = list(inputs)
     q, p = loop.W.shape

@@ -27,8 +27,8 @@ from flight_analysis.linear_loop.uncertain_loop import (
     Channels,
     ComplexArray,
     UncertainLoop,
-    aircraft_at,
     every_channel,
+    plants_at,
     sensitivity_slopes,
     uncertain_loop,
 )
@@ -216,7 +216,7 @@ def worst_in_box(plant: LinearPlant, law: LinearLaw, loop: LoopTiming, box: Box)
     random_corners = np.where(rng.random((BEGUN, k)) < 0.5, -1.0, 1.0)
     slopes = _slopes(plant, law, loop, box, uncertain, np.zeros(k))
     corners = np.unique(np.concatenate([_corners(slopes), random_corners]), axis=0)
-    margins = input_margins(aircraft_at(plant, box, corners), law, loop)
+    margins = input_margins(plants_at(plant, box, corners), law, loop)
     walked: set[tuple[int, int]] = set()
     for _ in range(WALKED):
         least = np.argsort(_figures(margins), axis=0)[:FOLLOWED]
@@ -232,7 +232,7 @@ def worst_in_box(plant: LinearPlant, law: LinearLaw, loop: LoopTiming, box: Box)
         if not fresh:
             break
         fresh_corners = np.unique(fresh, axis=0)
-        further = input_margins(aircraft_at(plant, box, fresh_corners), law, loop)
+        further = input_margins(plants_at(plant, box, fresh_corners), law, loop)
         corners = np.concatenate([corners, fresh_corners])
         margins = Margins(*(np.concatenate(pair) for pair in zip(margins, further, strict=True)))
     smallest = int(np.argmin(margins.phase.min(axis=1)))
@@ -274,7 +274,7 @@ def _slopes(
     abs(L) = 1, the log of the gain by Re a - Re b Im a / Im b at real L; a peak of abs(S - c) by
     its slope at constant frequency.
     """
-    at = aircraft_at(plant, box, d[None])
+    at = plants_at(plant, box, d[None])
     form = schur_form(at, law, loop)
     w, S = (values[0] for values in on_grid(form, loop.period))
     m = S.shape[-1]

@@ -294,8 +294,8 @@ def _disturbance_of_speed(
 ) -> FloatArray:
     """The disturbance d of y_dot = Omega u + d, (N, m), by `truth` of JSBSim.
 
-    Weight along the flight path and wind act on the airspeed. The rates have 0, and a log without
-    them.
+    Weight along the flight path and wind act on the airspeed. d is 0 for the rates, and where the
+    log has neither.
 
         V_dot = -g sin(theta) - W_dot
     """

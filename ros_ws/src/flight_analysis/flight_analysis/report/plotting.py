@@ -261,7 +261,7 @@ def time_series_figure(
 def set_layout(figure: Figure, labels: int = 6, below: int = 40) -> Figure:
     """Set size, margins and colours of a figure.
 
-    The legend and `labels` pixels are above the rows, the axis `below` the rows.
+    The legend and `labels` pixels are above the rows, `below` pixels for the axis under the rows.
     """
     above = 24 * any(trace.get("showlegend") for trace in figure.data) + labels
     rows = figure.height * figure.rows

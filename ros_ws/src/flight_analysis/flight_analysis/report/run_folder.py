@@ -303,7 +303,7 @@ def _engagement(tape: Tape, engagement: Engagement) -> dict[str, Any]:
     return {"start": start, "stop": stop, "reason": engagement.reason}
 
 
-def recorded_scenario(run: Path, namespace: str | None = None) -> Scenario:
+def extract_scenario(run: Path, namespace: str | None = None) -> Scenario:
     """The scenario in a log, written beside the log.
 
     Raises ParameterError where the log holds none.

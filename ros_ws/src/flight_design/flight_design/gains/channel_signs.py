@@ -17,7 +17,7 @@ MAX_COUPLING = 10.0
 procedure stabilises behind servos, and at most 2.2 on the other airframes of the library."""
 
 
-def require_channels(
+def signs_of_pairing(
     Omega: FloatArray,
     channels: ChannelPairing,
     D: Sequence[int] | None = None,

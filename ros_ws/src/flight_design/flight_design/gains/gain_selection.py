@@ -34,7 +34,7 @@ from flight_analysis.linear_loop.loop_margins import (
 from flight_core.parameters import LARGEST, require
 from flight_core.vectors import FloatArray
 from flight_design.gains import gain_conditions
-from flight_design.gains.channel_signs import require_channels
+from flight_design.gains.channel_signs import signs_of_pairing
 from flight_design.gains.gain_conditions import Bounds, GainCondition, GainSet
 from flight_design.gains.ideal_control import ChannelPairing, Study
 from flight_design.gains.lyapunov import KnownPlant, decay_matrix
@@ -200,7 +200,7 @@ def gain_sets(study: Study, setting: LoopSetting) -> Selection:
     Lambda = 1 1/s, which needs the smallest k_g. The other one is `engineering_gains` with the slew
     of the nominal airframe; behind servos, `within_requirement` finds the integrals and bandwidths
     of the least error whose margins meet the setting's requirement, on the samples too. `omega` is
-    the largest abs(Omega_ii) of the samples. Raises ParameterError as `require_channels` does, and
+    the largest abs(Omega_ii) of the samples. Raises ParameterError as `signs_of_pairing` does, and
     for parameters that the controller does not accept.
     """
     pairs = _paired(study, setting)
@@ -252,7 +252,7 @@ class _Paired(NamedTuple):
 
 
 def _paired(study: Study, setting: LoopSetting) -> _Paired:
-    """The channels of a study. Raises ParameterError as `require_channels`."""
+    """The channels of a study. Raises ParameterError as `signs_of_pairing`."""
     inputs = list(study.airframe.inputs)
     pairing = ChannelPairing(study.airframe.outputs, setting.inputs or tuple(inputs))
     require(
@@ -263,7 +263,7 @@ def _paired(study: Study, setting: LoopSetting) -> _Paired:
     )
     paired = [inputs.index(name) for name in pairing.inputs]
     Omega = study.Omega[:, paired]
-    require_channels(Omega, pairing)
+    signs_of_pairing(Omega, pairing)
     products = [
         setting.crossover_lag_products.get(name, DEFAULT_CROSSOVER_LAG_PRODUCT)
         for name in pairing.outputs
@@ -281,7 +281,7 @@ def _paired(study: Study, setting: LoopSetting) -> _Paired:
         rows=rows,
         columns=columns,
         bandwidth=bandwidth[rows],
-        D=require_channels(Omega[np.ix_(rows, rows)], channels),
+        D=signs_of_pairing(Omega[np.ix_(rows, rows)], channels),
         unit=1.0 / np.abs(np.diag(Omega))[rows],
         spread=np.abs(responses).max(axis=0),
     )
@@ -435,7 +435,7 @@ def assess_gains(
     """
     rows, columns = law_order(study.airframe, controller)
     channels = ChannelPairing(controller.outputs, controller.inputs)
-    D = require_channels(study.Omega[np.ix_(rows, columns)], channels, controller.D)
+    D = signs_of_pairing(study.Omega[np.ix_(rows, columns)], channels, controller.D)
     theorem: tuple[GainCondition, ...] = ()
     loop_conditions: tuple[GainCondition, ...] = ()
     bounds = None

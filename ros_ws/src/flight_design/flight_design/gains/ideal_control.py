@@ -126,7 +126,7 @@ def study_airframe(
 ) -> Study:
     """Rates of the ideal control along a manoeuvre.
 
-    The airframe as published has rates, and uncertain airframes.
+    The first rates are of the airframe as published, the rest of uncertain airframes.
 
     The ideal control keeps y on y_m. With x = P y_m + N eta, eta the states beside the outputs
     (`output_coordinates`):

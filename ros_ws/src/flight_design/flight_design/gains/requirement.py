@@ -83,7 +83,7 @@ class Requirement(NamedTuple):
     def uncertain_phase(self) -> float:
         """Phase margin of the worst uncertain aircraft, rad.
 
-        The nominal aircraft has to have as much.
+        At most what the nominal aircraft has to have.
         """
         return min(self.worst_phase, self.phase)
 

@@ -21,8 +21,8 @@ from flight_design.identification.parameter_agreement import (
     Agreement,
     Servo,
     Stick,
+    change_sentences,
     compared,
-    parameter_changes,
     require_agreement,
     servo_of,
     stick_of,
@@ -103,7 +103,7 @@ def imported(
     has_sticks = log.format is not None and log.vehicle == PLANE
     first, last = _flight(log, stamps, speed, window, needs_manual=has_sticks and not servos)
     parameters = log.parameters_at(first)
-    notes = parameter_changes(log.parameters, int(stamps[0]), first, last)
+    notes = change_sentences(log.parameters, int(stamps[0]), first, last)
     if speed is not None and (is_lost := ~np.isfinite(speed) & (stamps >= first)).any():
         instant = seconds(int(stamps[is_lost.argmax()] - stamps[0]))
         notes.append(

@@ -254,8 +254,8 @@ def identify_model(
     fitted = [study.fit(search, used, flown, quick=quick) for search in searches]
     fits = [(search, fit) for search, (fit, _) in zip(searches, fitted, strict=True)]
     parts = [part for _, part in fitted]
-    first = joined([fit.before for _, fit in fits], every)
-    last = joined([fit.after for _, fit in fits], every)
+    first = join_innovations([fit.before for _, fit in fits], every)
+    last = join_innovations([fit.after for _, fit in fits], every)
     z = 0.0
     if flown is not None and _couples(flown, airframe):
         search = study.search(model, whole_aircraft(model), coupled=True)
@@ -325,7 +325,7 @@ def with_entries(airframe: Airframe, entries: Iterable[Entry]) -> Airframe:
     return airframe.with_matrices(A, B, wind_factors(airframe, A[None], AIR_RELATIVE)[0])
 
 
-def joined(parts: Sequence[Innovations], blocks: Sequence[Block]) -> Innovations:
+def join_innovations(parts: Sequence[Innovations], blocks: Sequence[Block]) -> Innovations:
     """Innovations of all outputs from those of the blocks."""
     order = np.argsort(np.concatenate([block.outputs for block in blocks]))
     r = np.concatenate([part.r for part in parts], axis=1)[:, order]

@@ -139,7 +139,7 @@ class _Ticks:
                     changes.append(ModuleChange(int(self._stamp_ns[k]), change))
                     new_law = controller.tuned_law()
                     new_limits = controller.guard()
-                    state = retuning.retune(state, law, new_law, (limits, new_limits))
+                    state = retuning.retune_state(state, law, new_law, (limits, new_limits))
                     law = new_law
                     limits = new_limits
                     digest = controller.digest()

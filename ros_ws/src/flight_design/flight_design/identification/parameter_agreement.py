@@ -241,9 +241,7 @@ def require_agreement(name_of_map: str, rows: Iterable[Agreement]) -> str:
     return ""
 
 
-def parameter_changes(
-    recorded: Parameters, start_ns: int, first_ns: int, last_ns: int
-) -> list[str]:
+def change_sentences(recorded: Parameters, start_ns: int, first_ns: int, last_ns: int) -> list[str]:
     """Sentences on the decisive parameters that change beside the samples.
 
     They change before `first_ns` or after `last_ns`, the first and the last sample. `start_ns` is

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sign check: D of the controller against what moves the aircraft.
 
-A channel map, an airframe and a recorded flight have signs.
+The signs of a channel map, an airframe and a recorded flight are compared with D.
 """
 
 from collections.abc import Iterable, Sequence
@@ -106,7 +106,7 @@ def check_scenario(
     response = (
         None if bag is None else recorded_response(bag, outputs, inputs, namespace, channel_map)
     )
-    return check_map(channel_map, in_map, outputs, inputs, controller.D, response)
+    return check_signs(channel_map, in_map, outputs, inputs, controller.D, response)
 
 
 def recorded_response(
@@ -166,7 +166,7 @@ def recorded_response(
     )
 
 
-def check_map(
+def check_signs(
     channel_map: ChannelMap,
     Omega: FloatArray,
     outputs: tuple[str, ...],
@@ -243,8 +243,8 @@ def check_effectors(
 
     The output with the largest motion by an effector decides.
 
-    `Omega` as in `check_map`, (m, p). An output counts by the largest effect on it. D of a channel
-    is the sign of its effect.
+    `Omega` as in `check_signs`, (m, p). An output counts by the largest effect on it. D of a
+    channel is the sign of its effect.
     """
     mapped = _through(channel_map, Omega, outputs, effectors)
     largest = np.argmax(np.abs(effect) / np.abs(effect).max(axis=1, keepdims=True), axis=0).tolist()

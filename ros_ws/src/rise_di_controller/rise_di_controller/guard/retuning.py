@@ -16,7 +16,7 @@ from rise_di_controller.law.control_law import TunedLaw
 from rise_di_controller.law.law import LawState, shifted
 
 
-def retune(
+def retune_state(
     state: ControllerState,
     old: TunedLaw,
     new: TunedLaw,
