@@ -26,7 +26,7 @@ from flight_analysis.report.summary import RecordedFlight, summarise
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 from flight_guidance.fence.fence import Fence, Zone
-from flight_guidance.guidance import names
+from flight_guidance.guidance_log import names
 from flight_guidance.guidance_state import GuidanceMode, Lateral, Vertical
 from flight_guidance.steering.path import Arc, Line
 from flight_log.bag import LogAttachments

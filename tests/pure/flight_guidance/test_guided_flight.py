@@ -27,7 +27,7 @@ from flight_bringup.graph import GUIDANCE, second_stage
 from flight_core.parameters import ParameterError
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import ChannelError, FloatArray, StampedVector
-from flight_guidance import guidance
+from flight_guidance import guidance, guidance_log
 from flight_guidance.guidance import Guidance
 from flight_guidance.guidance_state import GuidanceMode, Lateral, Vertical
 from flight_guidance.modes import modes
@@ -152,11 +152,11 @@ def test_each_step_follows_from_log_to_last_bit() -> None:
     params = section.params()
     state = None
     for stamp_ns, values in zip(signal.stamp_ns.tolist(), signal.values, strict=True):
-        inputs, logged = guidance.restored(
+        inputs, logged = guidance_log.restored(
             stamp_ns, dict(zip(signal.names, values.tolist(), strict=True)), params.outputs
         )
         state, commands = modes.step(state, inputs, None, params)
-        sample = guidance.GuidanceSample(
+        sample = guidance_log.GuidanceSample(
             inputs=inputs,
             state=state,
             commands=commands,
@@ -164,7 +164,7 @@ def test_each_step_follows_from_log_to_last_bit() -> None:
             link_age=0.0,
             failed=0,
         )
-        assert guidance.row(sample, params.outputs).tobytes() == values.tobytes()
+        assert guidance_log.row(sample, params.outputs).tobytes() == values.tobytes()
         assert state == logged
         state = logged
 

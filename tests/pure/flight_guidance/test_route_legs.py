@@ -20,7 +20,7 @@ from flight_core.rates import nanoseconds
 from flight_core.tape import Signal, Tape
 from flight_core.units import GRAVITY
 from flight_core.vectors import ChannelError, StampedVector
-from flight_guidance import guidance
+from flight_guidance import guidance_log
 from flight_guidance.guidance import Guidance
 from flight_guidance.guidance_state import GuidanceMode, Lateral
 from flight_guidance.notices import LEARNED
@@ -372,7 +372,7 @@ def test_yaw_rate_beside_bank() -> None:
 
 def log_of(count: int, **channels: ArrayLike) -> Tape:
     """A log of guidance on a route to the north, a sample a second; `_` stands for a dot."""
-    names = guidance.names(CONFIG.outputs)
+    names = guidance_log.names(CONFIG.outputs)
     level: dict[str, Any] = (
         dict.fromkeys(names, 0.0)
         | dict(zip(LEARNED, Authority(), strict=True))

@@ -48,7 +48,7 @@ class AircraftNode(FlightNode[AircraftConfig]):
         self._applied = AppliedInput(len(self._u), held_ns, nanoseconds(self.parameters.ramp))
         self._publisher_lock = PublisherLock(self._timeouts_ns)
         self._timeout_logged = False
-        # ns, since the last diagnostics, by the own clock: a u has the stamp of its y
+        # ns, since the last diagnostics, by the own clock: a u has the stamp of its y.
         self._ages_of_u: list[int] = []
         decode = Decoder(self._simulator.inputs).decode
         self._u_receiver = self.receive(
@@ -100,7 +100,7 @@ class AircraftNode(FlightNode[AircraftConfig]):
             self._publish_pose(self._pose_encoder.encode(start_ns + pose.stamp_ns, pose.value))
         awaited = self.parameters.lockstep and number % every(self.parameters.rate) == 0
         if awaited and not (poses and start_ns + poses[-1].stamp_ns == stamp_ns):
-            # no pose of this instant comes later
+            # No pose of this instant comes later.
             self._publish_pose(self._empty_encoder.encode(stamp_ns, NO_CHANNELS))
         self._publish_truth(self._truth_encoder.encode(stamp_ns, self._simulator.truth()))
 
@@ -113,10 +113,10 @@ class AircraftNode(FlightNode[AircraftConfig]):
             return False
         if self._ahead_of_log():
             return False
-        # the next instant that needs a u
+        # The next instant that needs a u.
         waits_ns = -(-self._number * self.period_ns() // self._control_ns) * self._control_ns
         until_ns = min(waits_ns, self._end_ns or waits_ns)
-        # first: the reference model computes y_m while the aircraft integrates
+        # The clock comes first: the reference model computes y_m while the aircraft integrates.
         self._publish_clock(instant(until_ns))
         messages: list[bytes] = []
         while (t_ns := self._number * self.period_ns()) <= until_ns:
@@ -125,7 +125,8 @@ class AircraftNode(FlightNode[AircraftConfig]):
             ]
             self._publish_motion(self._number, 0)
             self._number += 1
-        for message in messages:  # together: each y by itself would wake up the controller
+        # The messages are sent together: each y by itself would wake up the controller.
+        for message in messages:
             self._publish_y(message)
         self._u_received = until_ns % self._control_ns != 0
         return True
@@ -161,7 +162,7 @@ class AircraftNode(FlightNode[AircraftConfig]):
         """
         publisher = self._publisher_lock.publisher
         u = self._u
-        # in lockstep there is one u for each y
+        # In lockstep there is one u for each y.
         valid = self._u_receiver.poll(now_ns, 1 if self.parameters.lockstep else None)
         if transfer := self._publisher_lock.publisher != publisher:
             self.get_logger().info(bounded(f"receiving u from {self._publisher_lock.publisher}"))

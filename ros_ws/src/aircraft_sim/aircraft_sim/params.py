@@ -527,7 +527,8 @@ class AircraftConfig(NodeConfig):
         self, speed: float, axes: Sequence[str], span: float | None
     ) -> Turbulence | None:
         section = self.turbulence
-        if section is None or not (section.wind or section.sigma):  # off, or of intensity 0
+        # The turbulence is off, or has the intensity 0.
+        if section is None or not (section.wind or section.sigma):
             return None
         # None where it has no effect
         spectrum = dryden(section.altitude, section.wind or 0.0, section.sigma or 0.0)

@@ -16,7 +16,7 @@ ROTARY, ROTARY_START = range(8, 10)
 """Streams, one for each use. Under the same seed they are independent of each other."""
 
 
-# as a text: np.random loads when it is used
+# The type is a text: np.random loads when it is used.
 def generator(number: int, stream: int, seed: int) -> "np.random.Generator":
     """Generator of draw `number` >= 0 of a stream, with seed >= 0.
 

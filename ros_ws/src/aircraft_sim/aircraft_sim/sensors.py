@@ -44,7 +44,7 @@ class Measured(NamedTuple):
     drift: RandomWalk
 
 
-# samples that have been measured and have not arrived yet, the oldest first
+# Samples that have been measured and have not arrived yet, the oldest first.
 DelayLine = tuple[StampedVector, ...]
 
 
@@ -100,7 +100,8 @@ def noise(number: int, params: Sensors) -> FloatArray:
 
     n_i is standard normal, white over channels and samples.
     """
-    if not any(params.noise.tolist()):  # a seventh of the time of .any() for a few channels
+    # A seventh of the time of .any() for a few channels.
+    if not any(params.noise.tolist()):
         return params.noise
     return params.noise * random_streams.generator(
         number, random_streams.NOISE, params.seed

@@ -171,7 +171,7 @@ class Simulator:
         self._advance(number, u)
         self._number = number
         true = self._model.y()
-        # false for NaN too
+        # The comparison is false for NaN too.
         if self._model.diverged() or not (np.abs(true) <= self._largest[: len(true)]).all():
             raise FlightEnded(f"diverged at t = {seconds(t_ns):.2f} s")
         if self._vanes is not None and self._vane_state is not None:

@@ -45,7 +45,7 @@ class StateSpaceModel:
         ]
         self._speed = airframe.speed
         self._euler = parameters.kinematics != "linear"
-        # north, east, altitude
+        # North, east, altitude.
         self._psi = 0.0
         self._position = [0.0, 0.0, 0.0]
         self._over_place = parameters.relative_wind()

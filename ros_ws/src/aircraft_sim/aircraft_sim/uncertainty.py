@@ -36,7 +36,7 @@ deviations; or the two limits, with equal probability."""
 class Spread(NamedTuple):
     """How the entries of A and B are drawn."""
 
-    # uncertainty by entry, named as in `drawn_entries`
+    # Uncertainty by entry, named as in `drawn_entries`.
     entries: Mapping[str, float] = MappingProxyType({})
     distribution: Distribution = "uniform"
 

@@ -25,8 +25,8 @@ class AutopilotLock:
         self._silence_ns = silence_ns
         self._addresses, self._starts = self._new_lock(), self._new_lock()
         self._newest_ns = 0  # the largest time since boot
-        # the earliest instant of the boot, by the messages so far: that of the message with the
-        # least delay
+        # The earliest instant of the boot, by the messages so far: that of the message with the
+        # least delay.
         self._boot_ns = 0
 
     def _new_lock(self) -> PublisherLock:

@@ -27,8 +27,8 @@ UNBOUNDED = (
     "the loss of the transmitter cannot be seen over this link: set max_engaged in the "
     "map, or engage with --blind"
 )
-# of the limits: beyond, a u that rests is at a limit of the law. The amplitudes of experiments are
-# below
+# Share of the limits beyond which a u that rests is at a limit of the law. The amplitudes of
+# experiments are below.
 LARGE = 0.5
 END_WARNING_NS = 10 * NANOSECONDS  # before the end of an engagement by `max_engaged`
 
@@ -60,13 +60,13 @@ class Bridge:
         self.outputs = tuple(channel_map.outputs)
         self.inputs = tuple(channel_map.inputs)
         self.phase = Phase.DISENGAGED
-        # why the bridge is not engaged, what an engagement waits for, or lacks
+        # Why the bridge is not engaged, what an engagement waits for, or lacks.
         self.reason = "not engaged yet"
-        # what refuses and ends an engagement, such as another publisher, as a sentence; set by the
-        # node
+        # What refuses and ends an engagement, such as another publisher, as a sentence; set by the
+        # node.
         self.conflict = ""
-        # what refuses an engagement and does not end one yet, as a rate of the link; set by the
-        # node
+        # What refuses an engagement and does not end one yet, as a rate of the link; set by the
+        # node.
         self.problem = ""
         sources = {trim_key(name): row for name, row in channel_map.trims.items()}
         self._rows: dict[str, MeasuredRow] = {
@@ -81,13 +81,13 @@ class Bridge:
         self._last_y_ns = -1  # stamp of the last y
         self._last_pose_ns = -1  # stamp of the last pose
         self._u: FloatArray = np.zeros(len(self.inputs))
-        # whether the newest u differs from the one before
+        # Whether the newest u differs from the one before.
         self._moves = np.ones(len(self.inputs), dtype=bool)
         self.u_lock = PublisherLock(self._u_timeouts_ns)
         self.conditions = Conditions(channel_map)
         self._parameters: dict[str, float] = {}
         self._phase_ns = 0  # start of the phase
-        # whether a release leaves the mode: a pilot requested it, or nothing was flown
+        # Whether a release leaves the mode: a pilot requested it, or nothing was flown.
         self._keeps_mode = True
         self._limit_ns: dict[str, int] = {}  # since when inputs are at a limit
         self._end_ns: int | None = None  # of the engagement by `max_engaged`

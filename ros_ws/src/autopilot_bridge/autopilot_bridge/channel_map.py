@@ -77,13 +77,14 @@ def set_field(message: Any, path: str, value: Any) -> None:
         if not math.isfinite(value):
             raise ChannelError("range", f"{path} takes integers, not {value:g}")
         value = round(value)
+    # NumPy 1.26 wraps a value beyond the range.
     if (
         isinstance(current, np.integer)
         and not np.iinfo(current).min <= value <= np.iinfo(current).max
     ):
         raise ChannelError(
             "range", f"{path} cannot be {value!r}, which {current.dtype} does not hold"
-        )  # NumPy 1.26 wraps it
+        )
     parents, _, last = path.rpartition(".")
     parent, ((name, place),) = get_field(message, parents), STEP.findall(last)
     try:
@@ -116,7 +117,7 @@ def _quaternion(field: Any) -> tuple[float, float, float, float]:
     """
     w, x, y, z = (field.w, field.x, field.y, field.z) if hasattr(field, "w") else field
     w, x, y, z = float(w), float(x), float(y), float(z)
-    # squares of the components could underflow, or overflow
+    # Squares of the components could underflow, or overflow.
     if not 0.0 < (length := math.hypot(w, x, y, z)) < math.inf:
         raise ValueError("a quaternion of length 0, infinity or NaN has no angles")
     return w / length, x / length, y / length, z / length

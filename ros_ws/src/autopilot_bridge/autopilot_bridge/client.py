@@ -13,11 +13,11 @@ from flight_ros.messages import NamedDecoder
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.topics import ENGAGEMENT, NEWEST_SAMPLES, PUBLISH, U
 
-# services
+# Services.
 ENGAGE = "bridge/engage"
 ENGAGE_BLIND = "bridge/engage_blind"
 WITHDRAW_TIMEOUT = 1.0  # s
-# s: the nodes of a flight start, and the autopilot may send its first messages late
+# s: the nodes of a flight start, and the autopilot may send its first messages late.
 U_TIMEOUT = 30.0
 TRIM_SAMPLES = 20  # equal samples of u in a row: u has reached trim
 

@@ -31,7 +31,7 @@ rosbags."""
 
 PACKAGE = re.compile(rb"<name>\s*(\w+)\s*</name>")  # of a package.xml (REP 149)
 CONSTANT = re.compile(r"\b[A-Z][A-Z0-9]*_[A-Z0-9_]+\b")
-# what ends the request in the definition of a service
+# What ends the request in the definition of a service.
 REQUEST = re.compile(r"^---\s*$", re.MULTILINE)
 VERSION = "MESSAGE_VERSION"  # the constant of PX4's definitions
 

@@ -52,11 +52,11 @@ MessageType = Annotated[str, Field(pattern=r"^[a-z]\w*/msg/[A-Z]\w*$")]
 SentType = Annotated[str, Field(pattern=r"^[a-z]\w*/(msg|srv)/[A-Z]\w*$")]
 TopicName = Annotated[str, Field(pattern=r"^/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*$")]
 SystemId = Annotated[int, Field(ge=1, le=255)]
-# of a message field, which may be NaN, infinite or FLT_MAX for "no value"
+# A value of a message field, which may be NaN, infinite or FLT_MAX for "no value".
 Raw = Annotated[float, Field(allow_inf_nan=True)]
 Integer = Annotated[int, Field(ge=-(2**63), lt=2**64)]  # of a message field: from int64 to uint64
 Mask = Annotated[int, Field(gt=0, lt=2**64)]
-# the least of termios, the highest of the USB converter FT232H
+# The least of termios, the highest of the USB converter FT232H.
 Baud = Annotated[int, Field(ge=50, le=12_000_000)]
 Limits = tuple[Number, Number]
 Value = bool | Integer | Raw | str | tuple[Integer, ...] | tuple[Raw, ...]

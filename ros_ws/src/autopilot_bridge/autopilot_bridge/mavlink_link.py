@@ -37,8 +37,8 @@ AUTOPILOT = 1  # MAV_COMP_ID_AUTOPILOT1
 # MAV_COMP_ID_ONBOARD_COMPUTER4: other companions mostly have 191. With the component of the ground
 # station,
 COMPANION = 194
-# such as 0 or 190, ArduPilot would not forward the station's heartbeats any more
-# (MAVLink_routing.cpp, handle_heartbeat)
+# Such as 0 or 190, ArduPilot would not forward the station's heartbeats any more
+# (MAVLink_routing.cpp, handle_heartbeat).
 SET_MESSAGE_INTERVAL = 511  # MAV_CMD
 ACCEPTED = 0  # MAV_RESULT
 SIGNED = 1  # MAVLINK_IFLAG_SIGNED, of a header
@@ -53,7 +53,7 @@ STICKS = frozenset({"RC_CHANNELS_OVERRIDE", "MANUAL_CONTROL"})  # messages of a 
 BEAT = 1.0  # s
 ANSWER = 1.0  # s, for an answer to a request, which is then repeated
 # s without the autopilot, after which all rates are requested again, and another sender may take
-# its place
+# its place.
 SILENCE = 3.0
 READ_AGAIN = 5.0  # s, after which a parameter is requested again: a ground station may have set it
 QUEUE = 256  # messages between two ticks
@@ -174,7 +174,7 @@ class Link:
         self._further = tuple(further)
         self._systems: set[int] = set()  # of autopilots beside that of the map
         self._to_request = dict(config.rates)
-        # the message whose interval was requested, and when
+        # The message whose interval was requested, and when.
         self._requested: tuple[str, float] | None = None
         self._denied: dict[str, str] = {}
         self._beat = 0.0
@@ -182,7 +182,7 @@ class Link:
         self._began = time.monotonic()
         self._rates = MessageRates(config.rates, self._began)
         self._read = 0.0  # when the parameters were requested
-        # the ground station with a number of the RC overrides
+        # The ground station with a number of the RC overrides.
         self._station_heard: float | None = None
         self._sending = Lock()
         self._closed = Event()
@@ -320,7 +320,8 @@ class Link:
                 self._connection.mav.srcSystem = system
                 self._connection.mav.send(message)
             except OSError:
-                return  # the cable is out: the ages of what is received say so
+                # The cable is out: the ages of what is received say so.
+                return
 
     def _receive(self) -> None:
         now = time.monotonic()

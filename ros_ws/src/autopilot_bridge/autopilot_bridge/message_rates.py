@@ -8,15 +8,15 @@ No clock is read: every instant is an argument, in s.
 from collections import deque
 from collections.abc import Mapping
 
-# s over which messages are counted: a host that pauses for half a second does not make a rate slow
+# s over which messages are counted: a host that pauses for half a second does not make a rate slow.
 COUNTED = 2.0
 MESSAGES = 4  # counted at least, where COUNTED has fewer
 GRANTED = 0.7  # of a requested rate: below, the rate is slow
 # s: an engagement ends after a slow rate of this length. A rate that is requested again comes back
-# sooner
+# sooner.
 SLOW_ENDS = 2.0
 # s after a rate was taken, in which an engagement is refused: MAVProxy requests its own rates every
-# 15 s
+# 15 s.
 REMEMBERED = 20.0
 REPEATED = 1.0  # s between two requests of a slow rate
 JUDGED = 0.1  # s between two judgements
@@ -89,7 +89,7 @@ class _Rate:
         self._lowest = requested  # Hz, since it is slow
         self._slow_since: float | None = None
         self._was_reached = False
-        # when it was slow last, after it had been reached
+        # When it was slow last, after it had been reached.
         self._last_slow: float | None = None
         self._repeated: float | None = None  # when it was requested again
 

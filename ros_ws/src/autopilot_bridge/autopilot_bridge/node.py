@@ -62,10 +62,10 @@ LEFT = (
     "itself: start its agent again"
 )
 RC_OVERRIDE = f"{MAVLINK}/RC_CHANNELS_OVERRIDE"  # the topic
-# messages with release values at the end of the node; a single one may be lost
+# Messages with release values at the end of the node; a single one may be lost.
 RELEASES_AT_SHUTDOWN = 5
 
-# of the controller at engagement; it answers within some of its ticks
+# ns, for the activation of the controller at engagement: the controller answers within some ticks.
 ACTIVATION_TIMEOUT_NS = NANOSECONDS
 
 NamedRow = tuple[str, MeasuredRow | WatchedRow]
@@ -92,7 +92,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         self._link = self._open_link()
         self._known_stations: set[int] = set()  # systems of ground stations that were told
         self._conflict = ""  # the topics that have two publishers, as a sentence
-        # what comes over MAVLink, as named vectors
+        # What comes over MAVLink, as named vectors.
         self._recorded: dict[str, tuple[Callable[[bytes], None], Encoder]] = {}
         self._readers = self._read_topics()
         self._outgoing = {name: self._make(name, row) for name, row in self._map.messages.items()}
@@ -134,7 +134,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         self._publish_would_send = self.advertise(WOULD_SEND)
         self._y_encoder = self.encoder(self._bridge.outputs)
         self._publish_pose = self.advertise(POSE) if self._map.pose else None
-        # by the names of the fresh channels
+        # Encoders by the names of the fresh channels.
         self._pose_encoders: dict[tuple[str, ...], Encoder] = {}
         names = [f"{row.message}.{row.field}" for row in self._map.inputs.values()]
         self._would_send_encoder = self.encoder(names)
@@ -238,7 +238,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         self._log_phase()
         if now_ns - self._report_ns >= NANOSECONDS:
             self._report(now_ns)
-        # else the tick was stopped half-way, and its u is old
+        # After a longer pause the tick was stopped half-way, and its u is old.
         if self._pause_ns() <= self._longest_pause_ns:
             self._send(now_ns, self.period_ns() // 2)
         self._warn_stale_inputs(now_ns)
@@ -247,7 +247,8 @@ class BridgeNode(FlightNode[BridgeConfig]):
         """Take the effects by the probe of the controller whose u flies."""
         controller = self._bridge.u_lock.publisher
         if controller is None:
-            return  # nothing flies yet
+            # Nothing flies yet.
+            return
         require_sender(sample.sender, controller)
         self._bridge.take_effects(sample, now_ns)
 
@@ -371,7 +372,8 @@ class BridgeNode(FlightNode[BridgeConfig]):
         """
         self._awaits_controller = active and not self._controller.service_is_ready()
         if not self._controller.service_is_ready():
-            return  # not discovered yet, or u of another node, which has no lifecycle
+            # Not discovered yet, or u of another node, which has no lifecycle.
+            return
         transition = Transition.TRANSITION_ACTIVATE if active else Transition.TRANSITION_DEACTIVATE
         future = self._controller.call_async(
             ChangeState.Request(transition=Transition(id=transition))
@@ -403,7 +405,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         ready = self._controller.service_is_ready() and self._controller_state.service_is_ready()
         before = self._u_sender
         self._u_sender = bridge.u_lock.publisher
-        # it can take less time than the loss of the service
+        # A restart can take less time than the loss of the service.
         restarted = bool(before) and self._u_sender != before
         if (
             ready
@@ -528,7 +530,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         setpoints = {
             publisher.topic_name for publisher in publishers if isinstance(publisher, Publisher)
         }
-        # two messages may share a topic
+        # Two messages may share a topic.
         publishers_here = Counter(
             outgoing.publisher.topic_name for outgoing in self._outgoing.values()
         )

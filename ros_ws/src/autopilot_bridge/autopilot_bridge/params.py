@@ -32,7 +32,7 @@ from flight_core.files import find_file, names_in, read_yaml
 from flight_core.parameters import Config, Name, NodeConfig, NonNegative, Positive, require
 
 LIBRARY = Path(str(files("autopilot_bridge"))) / "maps"
-# the name of a parameter; common.xml, PARAM_VALUE: 16 characters
+# The name of a parameter; common.xml, PARAM_VALUE: 16 characters.
 PARAMETER = re.compile(r"[A-Z][A-Z0-9_]{0,15}")
 
 

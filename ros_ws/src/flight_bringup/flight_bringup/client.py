@@ -18,7 +18,7 @@ from flight_ros.network import addresses, network_profile, own_address, ports
 from flight_ros.transport import DISCOVERY_VARIABLE
 
 EXCHANGE_PERIOD = 0.1  # s
-# s, of exchanges after every host has been received: the least delay of many counts
+# s, of exchanges after every host has been received: the least delay of many counts.
 SETTLE_TIME = 1.0
 
 

@@ -121,7 +121,7 @@ class Fleet:
         """The DDS participants of a flight: the command, and the processes."""
         scenarios = [member.scenario for member in self.members]
         if self.composed:
-            # a learner has a process of its own
+            # A learner has a process of its own.
             return 1 + sum(1 + scenario.learns() for scenario in scenarios)
         return 1 + sum(len(FIRST_STAGE) + len(second_stage(scenario)) for scenario in scenarios)
 
@@ -361,7 +361,7 @@ def fly_fleet(
         except KeyboardInterrupt:
             pass
         finally:
-            # as of FlightProcesses.stop, which runs in other threads
+            # A second Ctrl-C must not interrupt FlightProcesses.stop, which runs in other threads.
             with handle_signals(signal.SIG_IGN):
                 for flight in flights:
                     flight.end(flight.outcome)

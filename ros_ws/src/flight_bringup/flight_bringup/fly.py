@@ -271,7 +271,7 @@ def _follow_lockstep(
     and a complete log.
     """
     scenario = processes.scenario
-    # the last instant is the aircraft's last whole period
+    # The last instant is the aircraft's last whole period.
     end = scenario.flight.duration - 1.0 / scenario.aircraft.rate
     t = 0.0
     last_change = time.monotonic()

@@ -47,7 +47,7 @@ FIRST_STAGE = (RECORDER, CONTROLLER)
 SECOND_STAGE = (AIRCRAFT, REFERENCE_MODEL)
 SECOND_STAGE_WITH_BRIDGE = (BRIDGE, REFERENCE_MODEL)
 
-# of a namespace: stricter than ROS 2, which permits _ at the ends
+# A token of a namespace: stricter than ROS 2, which permits _ at the ends.
 NAME = re.compile(r"[A-Za-z](_?[A-Za-z0-9])*")
 
 
@@ -110,7 +110,8 @@ def require_limits(autopilot: Autopilot, scenario: Scenario) -> None:
         controller.effectors, limits.lower.tolist(), limits.upper.tolist(), strict=True
     ):
         if (row := channel_map.inputs.get(name)) is None:
-            continue  # another check names the channels that differ
+            # Another check names the channels that differ.
+            continue
         of_map = (
             f"of {name} in the map {channel_map.name}: what the bridge clips, the law's "
             "anti-windup does not know"
@@ -214,7 +215,7 @@ def parameter_overrides(
     if lockstep:
         for node, rates in _lockstep_rates(scenario).items():
             overrides[node] |= rates
-        # a recorder in the same process never lags
+        # A recorder in the same process never lags.
         overrides[AIRCRAFT]["recorded"] = not one_process
     if spec in (RECORDER, ONE_PROCESS):
         sections = {node.executable: values for node, values in overrides.items()}
@@ -245,7 +246,7 @@ def _stage_overrides(scenario: Scenario, *, lockstep: bool) -> dict[NodeSpec, Pa
             name: list(value) if isinstance(value, tuple) else value
             for name, value in scenario.guidance.by_rule()
         }
-        # without a learner no controller publishes `authority`, so that guidance must take none
+        # Without a learner no controller publishes `authority`, so that guidance must take none.
         authority_rate = scenario.learns() * scenario.controller.rate / AUTHORITY_TICKS
         overrides[GUIDANCE]["authority_rate"] = authority_rate
     if scenario.learns():
@@ -312,7 +313,7 @@ def replayed_topics(
     """
     prefix = f"/{namespace.strip('/')}/".replace("//", "/")
     names = {name for node in nodes for name in topics.published_by(node.executable)}
-    # else others publish the topic, too
+    # Topics with an absolute name are not those of the nodes: others publish them, too.
     topics_of_nodes = {prefix + name for name in names if not name.startswith("/")}
     if BRIDGE in nodes and autopilot is not None:
         setpoint_topics = (message.topic for message in autopilot.channel_map.messages.values())

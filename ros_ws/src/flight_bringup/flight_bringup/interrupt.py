@@ -38,7 +38,8 @@ def interrupt(number: int, frame: FrameType | None) -> None:
     process.
     """
     handle_shutdown(signal.SIG_IGN)
-    if number == signal.SIGHUP:  # the terminal is lost: writing to it is an error
+    # The terminal is lost: writing to it is an error.
+    if number == signal.SIGHUP:
         nowhere = os.open(os.devnull, os.O_WRONLY)
         for stream in (sys.stdout, sys.stderr):
             os.dup2(nowhere, stream.fileno())

@@ -32,7 +32,7 @@ from flight_ros.topics import (
     offered,
 )
 
-# s, until the publishers of another flight on this host are known, twice the measured 0.25 s
+# s, until the publishers of another flight on this host are known, twice the measured 0.25 s.
 DISCOVERY_TIME = 0.5
 LOOP_INPUTS = (Y.name, Y_M.name)  # of which a controller makes u
 FREE_DOMAIN = (

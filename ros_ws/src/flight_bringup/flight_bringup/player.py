@@ -94,7 +94,8 @@ class Player(Client):
 def _restamped(data: bytes, begin_ns: int, first_ns: int, rate: float) -> bytes:
     try:
         since_ns = stamp_of(data) - first_ns
-    except ChannelError:  # too short for a stamp: sent as it is in the log
+    except ChannelError:
+        # Too short for a stamp: sent as it is in the log.
         return data
     stamp_ns = begin_ns + (since_ns if rate == 1.0 else round(since_ns / rate))
     message = bytearray(data)
@@ -126,7 +127,8 @@ def _message_type(topic: str, name: str) -> Any:
     package, _, kind = name.partition("/msg/")
     try:
         return getattr(import_module(f"{package}.msg"), kind)
-    except (ImportError, AttributeError, ValueError):  # the name may hold anything
+    except (ImportError, AttributeError, ValueError):
+        # The name may hold anything.
         raise ParameterError(
             f"{topic}: its type {name} is not installed, expected the package {package}"
         ) from None

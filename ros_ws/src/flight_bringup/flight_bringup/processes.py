@@ -56,7 +56,7 @@ if TYPE_CHECKING:
     from flight_bringup.monitor import FlightMonitor
 
 STOP_TIMEOUT = 2.5  # s, for all processes but the recorder together; a node needs 0.2 s
-# s, for the recorder, which needs 0.2 s: on a busy host or disk it still closes its log
+# s, for the recorder, which needs 0.2 s: on a busy host or disk it still closes its log.
 CLOSE_TIMEOUT = 30.0
 SEARCH_TIMEOUT = 300.0  # s, for a learner in lockstep: a search takes 5 s of a core
 READY_TIMEOUT = 20.0  # s
@@ -94,7 +94,7 @@ def leave_outcome(run: Path, outcome: Outcome) -> None:
             write_file(run / OUTCOME_FILE, outcome.text())
 
 
-# begins the line in which a node says why it ends
+# Begins the line in which a node says why it ends.
 CAUSE = re.compile(r"\[FATAL\]|error: ")
 
 
@@ -126,7 +126,8 @@ class NodeProcess:
         arguments = ["--ros-args", "--params-file", str(scenario_file)]
         if namespace:
             arguments += ["-r", f"__ns:={namespace}"]
-        if node is ONE_PROCESS:  # `-p node:name` would mean a node without a namespace
+        # `-p node:name` would mean a node without a namespace.
+        if node is ONE_PROCESS:
             sections = nest({name.replace(":", ".", 1): value for name, value in overrides.items()})
             file = log.with_suffix(".yaml")
             write_file(
@@ -163,7 +164,8 @@ class NodeProcess:
             self.lines.append(line.rstrip())
             if CAUSE.match(line):
                 self.cause = line.rstrip()
-            with suppress(OSError):  # a full disk must not block the pipe, and with it the node
+            # A full disk must not block the pipe, and with it the node.
+            with suppress(OSError):
                 self._log.write(line)
                 self._log.flush()
 
@@ -210,7 +212,7 @@ class FlightProcesses:
         self.autopilot = autopilot
         self._first: tuple[NodeSpec, ...] = FIRST_STAGE
         self._second = second_stage(scenario, bridge=autopilot is not None)
-        # a search would delay ticks of its own process
+        # A search would delay ticks of its own process.
         apart = (LEARNER,) if LEARNER in self._second and not lockstep else ()
         self._in_one_process = [
             spec.executable for spec in (*self._first, *self._second) if spec not in apart
@@ -221,13 +223,14 @@ class FlightProcesses:
         self.processes: list[NodeProcess] = []
         self.outcome = INTERRUPTED  # what the log says of the flight
         self.start_time = math.inf  # time of t = 0 by the stamps, s
-        # the same by the time of the ticks: a step of the system clock is none of t
+        # The same by the time of the ticks: a step of the system clock is none of t.
         self.started = math.inf
         self._on_start = not lockstep and autopilot is None
 
     def __enter__(self) -> Self:
         try:
-            # before any node: a controller would engage on the y and y_m of another flight
+            # The check comes before any node: a controller would engage on the y and y_m of another
+            # flight.
             self.monitor.require_free_domain()
             begin = time.monotonic()
             for node in self._first:
@@ -409,7 +412,7 @@ class FlightProcesses:
         SIGKILL follows after STOP_TIMEOUT, and for the recorder after CLOSE_TIMEOUT. At the end of
         a lockstep flight a learner completes its search first.
         """
-        # a second Ctrl-C must not interrupt this: it would truncate the log
+        # A second Ctrl-C must not interrupt this: it would truncate the log.
         with handle_signals(signal.SIG_IGN):
             if self.processes:
                 leave_outcome(self._run, self.outcome)
@@ -430,7 +433,8 @@ class FlightProcesses:
                 group = [process for process in self.processes if process.node in timeouts]
                 for process in group:
                     if process.popen.poll() is None:
-                        # not SIGINT, which gives a traceback while Python still imports
+                        # SIGTERM and not SIGINT, which gives a traceback while Python still
+                        # imports.
                         process.popen.terminate()
                 for process in group:
                     try:

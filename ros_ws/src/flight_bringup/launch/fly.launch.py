@@ -123,7 +123,8 @@ def _fly(context: LaunchContext) -> list[Action]:
             end = begin_when_matched(
                 context, run, (*first, *nodes), duration, by_rosbag2=by_rosbag2
             )
-        else:  # a user activates the controller, or no user does
+        else:
+            # A user activates the controller, or no user does.
             end = end_with_log(
                 context, run, lead, start_time + duration, duration, by_rosbag2=by_rosbag2
             )

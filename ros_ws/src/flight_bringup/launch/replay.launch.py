@@ -49,7 +49,7 @@ from flight_core.topics import published_by
 from flight_log.playback import read_playback
 from launch import LaunchContext, LaunchDescription
 
-# nodes that run when the argument of their name is true
+# Nodes that run when the argument of their name is true.
 OPTIONAL = (RECORDER, CONTROLLER, REFERENCE_MODEL, AIRCRAFT)
 
 

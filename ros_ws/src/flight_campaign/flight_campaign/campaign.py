@@ -101,7 +101,7 @@ def define(
         single_flights.require_flyable(scenario)
     else:
         build_course(scenario)
-    # each aircraft of the campaign has its own
+    # Each aircraft of the campaign has entries of its own.
     nominal = scenario.vary(aircraft={"uncertainty": {}})
     spread = scenario.aircraft.uncertainty.spread() if spread is None else spread
     spread = spread._replace(entries=equipment.expanded(spread.entries, scenario))
@@ -178,7 +178,8 @@ def fly_chunk_figures(text: str, job: Job) -> Chunk:
         count = min(size, end - first)
         try:
             parts.append(_fly_at_once(text, case, first, count, size))
-        except (MemoryError, RuntimeError) as error:  # RuntimeError: of JAX
+        except (MemoryError, RuntimeError) as error:
+            # RuntimeError: of JAX.
             if isinstance(error, RuntimeError) and OUT_OF_MEMORY not in str(error):
                 raise
             if size == 1:

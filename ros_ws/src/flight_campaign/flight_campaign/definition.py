@@ -68,7 +68,7 @@ class Sweep(Config):
                 else factor * float(value)
             )
         m = len(controller.outputs)
-        # k_d of (22) has none for the last
+        # k_d of (22) has none for the last.
         by_channel = isinstance(value, tuple) and len(value) in (m - 1, m)
         require(
             by_channel, "sweep", self.parameter, f"{self.name}: it does not have a value a channel"

@@ -108,7 +108,7 @@ def dask(
         devices = _separate_devices() if on_devices and scheduler is None else []
         count = workers or len(devices) or os.cpu_count() or 1
         patience = CONNECT
-        # they log the loss of a peer as tracebacks
+        # These loggers write the loss of a peer as tracebacks.
         for part in ("", ".client", ".nanny", ".scheduler", ".worker"):
             logging.getLogger(f"distributed{part}").setLevel(logging.CRITICAL)
         lost_jobs: list[Job] = []
@@ -153,7 +153,8 @@ def _connected(
             client.register_plugin(_one_device_each(devices))
         workers = client.scheduler_info()["workers"].values()
         return client, sum(worker["nthreads"] for worker in workers)
-    except (OSError, ValueError) as error:  # ValueError: no address at all
+    except (OSError, ValueError) as error:
+        # ValueError: no address at all.
         if scheduler is None:
             raise ParameterError(
                 f"--engine dask: its workers did not start on this host ({error})"
@@ -216,7 +217,7 @@ def _local_cluster(workers: int, devices: Devices) -> Iterator[Any]:
         try:
             yield cluster
         finally:
-            # a worker that is just starting again cannot be joined yet; its outcome is no outcome
-            # of the campaign
+            # A worker that is just starting again cannot be joined yet; its outcome is no outcome
+            # of the campaign.
             with suppress(TimeoutError, AssertionError):
                 cluster.close()

@@ -46,7 +46,7 @@ class FigureStatistics(Config):
     mean: float = 0.0
     squares: float = 0.0  # sum of (value - mean)^2
     largest: float = -1.0  # none yet
-    # counts by index in EDGES, -1 below and len(EDGES) - 1 above; without empty ones
+    # Counts by index in EDGES, -1 below and len(EDGES) - 1 above; without empty ones.
     bins: dict[int, int] = Field(default={})
 
     @classmethod

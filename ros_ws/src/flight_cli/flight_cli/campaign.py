@@ -59,7 +59,7 @@ from flight_core.files import display_path, writing
 from flight_core.parameters import require
 from flight_design.learning.scenario_learner import quick_learner
 
-# options of a new campaign
+# Options of a new campaign.
 OF_DEFINITION = (
     *("aircraft", "uncertainty", "entry", "distribution", "score", "wind"),
     *("seed", "sweep", "duration", "chunk", "runs"),

@@ -30,7 +30,7 @@ FAILED = 1
 BAD_INPUT = 2
 INTERRUPTED = 130
 NICE = 10  # of a command that may run beside a flight
-# new objects before a collection, 700 by default: a flight keeps what it makes
+# New objects before a collection, 700 by default: a flight keeps what it makes.
 GARBAGE_THRESHOLD = 100_000
 REPEATED_AFTER = 0.01  # s, of an interrupt that Python ignores
 
@@ -133,10 +133,11 @@ def _repeat_interrupt(ignored: "sys.UnraisableHookArgs") -> None:
 def main() -> None:
     """Entry point: bad input is one sentence and exit status 2, Ctrl-C is quiet."""
     gc.set_threshold(GARBAGE_THRESHOLD)
-    if sys.argv[1:2] == ["watch"]:  # already while it loads: a flight beside it goes first
+    # A page is nice already while it loads: a flight beside it goes first.
+    if sys.argv[1:2] == ["watch"]:
         with suppress(OSError):
             os.nice(NICE)
-            # it interrupts no node when it wakes up
+            # A batch process interrupts no node when it wakes up.
             os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     words = [
         *sys.argv[1:2],
@@ -170,7 +171,7 @@ def main() -> None:
         )
         sys.exit(FAILED)
     except Exception as error:
-        # what a module in C makes of Ctrl-C: an ImportError while it loads, pybind11's TypeError
+        # What a module in C makes of Ctrl-C: an ImportError while it loads, pybind11's TypeError.
         if not isinstance(error.__cause__, KeyboardInterrupt):
             raise
         sys.exit(INTERRUPTED)

@@ -93,7 +93,8 @@ def _report(flown: MemberFlight) -> _AircraftResult:
     except UnwrittenReportError as error:
         flight = error.result.flight
         warn(f"error: {flown.member.name}: no report: {error}")
-    except ParameterError as error:  # before the first sample
+    except ParameterError as error:
+        # Before the first sample.
         outcome = never_flew(str(error)) if flown.outcome.status == 0 else flown.outcome
         try:
             summary = write_empty_summary(flown.run, flown.member.scenario, outcome)

@@ -51,7 +51,7 @@ from flight_core.parameters import ParameterError, require
 from flight_guidance.routes.route_file import ENDINGS, read_fence_file
 from flight_guidance.routes.route_formats import FENCES
 
-# fields of a flight of one aircraft alone
+# Fields of a flight of one aircraft alone.
 OF_AIRCRAFT = (
     *("settings", "in_process", "lockstep", "composed", "bridge"),
     *("send", "route", "fence", "namespace", "learn"),
@@ -236,7 +236,8 @@ def _report(scenario: Scenario, run: Path, outcome: Outcome, *, as_json: bool) -
     unwritten = ""
     try:
         result = write_report(run, outcome)
-    except UnwrittenReportError as error:  # the flight is over: its outcome comes first
+    except UnwrittenReportError as error:
+        # The flight is over: its outcome comes first.
         result = error.result
         unwritten = str(error)
     except ParameterError:

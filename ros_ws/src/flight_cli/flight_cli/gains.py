@@ -334,7 +334,7 @@ def _show_trade(console: Console, selection: Selection) -> None:
     outputs = controller.outputs
     output_units = frame.units_of_outputs()
     shown = [display_unit(output_units[name]) for name in outputs]
-    # no score of a height
+    # A height has no score.
     have_scores = all(quantity(unit).dimension in SCORE_UNIT for unit in output_units.values())
     units = score_units(outputs, output_units) if have_scores else np.full(len(outputs), np.nan)
     headings = (f"{name},\n{unit.unit}" for name, unit in zip(outputs, shown, strict=True))

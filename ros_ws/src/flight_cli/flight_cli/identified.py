@@ -15,7 +15,7 @@ from flight_cli.output import new_table, print_table, say
 from flight_core.units import si_per_unit
 from flight_design.identification.jsbsim_identification import IdentifiedAircraft
 
-# the ratio of smallest to largest effect below which an input is reported as not linear
+# The ratio of smallest to largest effect below which an input is reported as not linear.
 LINEAR = 0.8
 
 

@@ -354,7 +354,8 @@ def _jsbsim_name(aircraft: str) -> str:
     )
     try:
         return require_aircraft(aircraft)
-    except ParameterError as error:  # the option --airframe is that of a log
+    except ParameterError as error:
+        # The option --airframe is that of a log.
         raise ParameterError(f"aircraft{str(error).removeprefix('airframe')}") from None
 
 

@@ -35,9 +35,9 @@ from flight_core.parameters import require
 if TYPE_CHECKING:
     from flight_analysis.report.tables import MetricTable as PageTable
 
-# exit status; bad input is 2 (`flight_cli.cli`)
+# Exit status; bad input is 2 (`flight_cli.cli`).
 INTERRUPTED = 130
-# of a written file
+# The head of a written file.
 LICENCE = (
     "# SPDX-FileCopyrightText: RISE-DI contributors\n# SPDX-License-Identifier: Apache-2.0\n#\n"
 )
@@ -88,7 +88,8 @@ def entry_table(title: str, entries: Iterable[Entry]) -> Table:
         values = f"{entry.nominal:.4g}", f"{entry.value:.4g}"
         if entry.nominal:
             percent = f"{100 * entry.error:+.1f}", f"{100 * entry.deviation:.1f}"
-        else:  # it is new: there is no change in %
+        else:
+            # It is new: there is no change in %.
             percent = "", f"{100 * entry.deviation / abs(entry.error or 1.0):.1f}"
         table.add_row(escape(entry.name), *values, *percent)
     return table

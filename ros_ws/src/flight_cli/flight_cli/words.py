@@ -77,7 +77,7 @@ def as_function(command: Callable[..., Executable]) -> Callable[..., None]:
         command(**values).execute()
 
     execute.__doc__ = command.__doc__
-    # the command's own words before those of its base
+    # The command's own words before those of its base.
     words = sorted(fields(command), key=lambda word: word.name not in command.__annotations__)  # type: ignore[arg-type]
     parameters = [_parameter(word, hints[word.name]) for word in words]
     execute.__signature__ = Signature(parameters)  # type: ignore[attr-defined]

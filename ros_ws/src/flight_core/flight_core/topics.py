@@ -87,7 +87,7 @@ POSE = Topic(
 GUIDANCE = Topic(
     "guidance", VECTOR, "guidance -> log",
     "modes, leg, fence, errors, commands, limits, wind, y and pose as used: "
-    "`flight_guidance.guidance.names`",
+    "`flight_guidance.guidance_log.names`",
 )  # fmt: skip
 TARGET = Topic(
     "target", VECTOR, "external -> guidance, log",

@@ -81,7 +81,7 @@ class GuidanceClient(Client):
             )
             return self._reason(ROUTE, lambda: self._has_taken({"leg": 0.0}), "")
         finally:
-            # else guidance that starts later would receive the route, and fly it
+            # Guidance that starts later must not receive the route, and fly it.
             self._node.destroy_publisher(publisher)
 
     def _reaches_guidance(self, publisher: Publisher) -> bool:

@@ -169,7 +169,8 @@ def _without_short_legs(
                     ),
                 )
             ]
-        except ParameterError as error:  # of the rest, which has corners of its own
+        except ParameterError as error:
+            # The rest has corners of its own, which may be too short.
             raise refusal or error from None
     numbers = {number for number, _ in remaining}
     notes = []

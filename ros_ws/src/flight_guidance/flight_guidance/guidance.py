@@ -1,22 +1,19 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Guidance without ROS: the step of `modes` with state, the last samples, the program and the log.
+"""Guidance without ROS: the step of `modes` with state, the last samples and the program.
 
 The node and the simulation in one process use the same class `Guidance`.
 """
 
 import zlib
 from collections import deque
-from collections.abc import Callable, Collection, Mapping, Sequence
-from itertools import chain
-from operator import attrgetter
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from flight_core.channels import POSE, UNKNOWN
 from flight_core.failures import Failures, sentence
-from flight_core.parameters import require
 from flight_core.rates import nanoseconds, seconds
 from flight_core.vectors import (
     ChannelError,
@@ -25,9 +22,8 @@ from flight_core.vectors import (
     require_newer,
     require_not_future,
 )
-from flight_guidance import guidance_state
+from flight_guidance import guidance_log, guidance_state
 from flight_guidance.guidance_state import (
-    TARGETS,
     Begin,
     GuidanceMode,
     GuidanceParams,
@@ -35,16 +31,11 @@ from flight_guidance.guidance_state import (
     Inputs,
     Lateral,
     StepCommands,
-    Target,
-    Vertical,
 )
 from flight_guidance.modes import modes, targets
 from flight_guidance.multicopter import multicopter
 from flight_guidance.notices import (
-    FAILED,
     LAST_GOES_ON,
-    LEARNED,
-    LINK_AGE,
     STALE_TIME,
 )
 from flight_guidance.params import GuidanceConfig
@@ -52,107 +43,13 @@ from flight_guidance.reach import Authority, RollTest, authority_of
 from flight_guidance.steering import path
 from flight_guidance.steering.path import Line, Route
 
-LIMITED = ("bank", "theta", "climb", "V", "slew")
-STATE = ("phi", "theta", "alpha", "alpha_trim", "slip", "psi")
-WIND = ("north", "east")
-
 
 class GuidanceOutput(NamedTuple):
     """Output of a step."""
 
     u_m: FloatArray  # the commands in the order of the parameters' outputs, then ATTITUDE
-    log: FloatArray  # in the order of `names`
+    log: FloatArray  # in the order of `guidance_log.names`
     notices: tuple[str, ...] = ()
-
-
-class GuidanceSample(NamedTuple):
-    """What a step leaves for the log: inputs, state after the step, commands."""
-
-    inputs: Inputs
-    state: GuidanceState
-    commands: StepCommands
-    route: int  # a `digest`
-    link_age: float  # s since the last message of an operator, 0 without a limit
-    failed: int  # number of failed steps
-
-    @property
-    def pose_age(self) -> float:
-        """Age of the pose, s."""
-        return seconds(self.inputs.pose_age_ns)
-
-    @property
-    def given(self) -> int:
-        """The new commands, as `bits`."""
-        return guidance_state.bits(self.inputs.commands)
-
-
-def _tuple(*values: float) -> tuple[float, ...]:
-    return values
-
-
-class LogChannels(NamedTuple):
-    """Channels of the log, and the attribute of a `GuidanceSample` that they hold."""
-
-    names: Sequence[str]
-    attribute: str
-    kind: Callable[..., Any] = float  # makes the attribute of the logged numbers
-
-    def logged(self, sample: GuidanceSample) -> Sequence[float]:
-        """The numbers of the channels."""
-        value = attrgetter(self.attribute)(sample)
-        return value if isinstance(value, tuple) else (value,)
-
-    def restored(self, numbers: Mapping[str, float]) -> Any:
-        """The attribute."""
-        return self.kind(*(numbers[name] for name in self.names))
-
-
-def channels(outputs: Sequence[str]) -> tuple[LogChannels, ...]:
-    """The channels of the log, in its order."""
-    return (
-        LogChannels(["mode"], "state.mode", GuidanceMode),
-        LogChannels(["mode.lateral"], "state.lateral", Lateral),
-        LogChannels(["mode.vertical"], "state.vertical", Vertical),
-        LogChannels(["leg"], "state.leg", int),
-        LogChannels(["route"], "route"),
-        LogChannels(["xtrack"], "commands.xtrack"),
-        LogChannels(["to_go"], "commands.to_go"),
-        LogChannels(["joining"], "state.joining"),
-        LogChannels(["track"], "commands.track"),
-        LogChannels(["missed"], "commands.missed"),
-        LogChannels(["fence.action"], "state.fence"),
-        LogChannels(["fence.clearance"], "commands.clearance"),
-        LogChannels(["fence.predicted"], "commands.predicted"),
-        LogChannels(["phi_c"], "commands.phi_c"),
-        LogChannels(["theta_c"], "commands.theta_c"),
-        LogChannels(["climb_c"], "state.climb_c"),
-        LogChannels(["V_c"], "state.V_c"),
-        *(LogChannels([f"limited.{name}"], f"commands.{name}_limited") for name in LIMITED),
-        LogChannels(["age.pose"], "pose_age"),
-        LogChannels([LINK_AGE], "link_age"),
-        LogChannels([FAILED], "failed"),
-        LogChannels(["begin"], "inputs.begin", Begin),
-        LogChannels(["given"], "given", int),
-        LogChannels(LEARNED, "inputs.authority", Authority),
-        LogChannels([f"target.{name}" for name in TARGETS], "state.target", Target),
-        *(LogChannels([f"state.{name}"], f"state.{name}") for name in STATE),
-        LogChannels([f"wind.{name}" for name in WIND], "state.wind", _tuple),
-        LogChannels(["loitered"], "state.loitered"),
-        LogChannels([f"pose.{name}" for name in POSE], "inputs.pose", _tuple),
-        LogChannels([f"y.{name}" for name in outputs], "inputs.y", _tuple),
-        LogChannels([f"u_m.{name}" for name in outputs], "state.u_m", _tuple),
-    )
-
-
-def names(outputs: Sequence[str]) -> tuple[str, ...]:
-    """Names of the channels of the log."""
-    return tuple(chain.from_iterable(each.names for each in channels(outputs)))
-
-
-def require_channels(logged: Collection[str]) -> None:
-    """Raise ParameterError for a log of guidance without one of the channels of `names`."""
-    missing = [name for name in names(()) if name not in logged]
-    require(not missing, "guidance", f"a log without {', '.join(missing)}", "all of its channels")
 
 
 def u_m(state: GuidanceState) -> FloatArray:
@@ -163,50 +60,12 @@ def u_m(state: GuidanceState) -> FloatArray:
     return np.array([*state.u_m, state.phi, state.theta - state.alpha])
 
 
-def row(sample: GuidanceSample, outputs: Sequence[str]) -> FloatArray:
-    """A sample of the log, in the order of `names`."""
-    values = chain.from_iterable(each.logged(sample) for each in channels(outputs))
-    return np.array([*values], dtype=np.float64)
-
-
-def restored(
-    t_ns: int, logged: Mapping[str, float], outputs: Sequence[str]
-) -> tuple[Inputs, GuidanceState]:
-    """The inputs of a step and the state after the step, from a sample of the log."""
-    attributes = {each.attribute: each.restored(logged) for each in channels(outputs)}
-
-    def group(prefix: str) -> dict[str, Any]:
-        return {
-            name.removeprefix(prefix): value
-            for name, value in attributes.items()
-            if name.startswith(prefix)
-        }
-
-    state = GuidanceState(
-        t_ns=t_ns,
-        velocity=(logged["pose.v_north"], logged["pose.v_east"]),
-        **group("state."),
-    )
-    given = attributes["given"]
-    inputs = Inputs(
-        t_ns=t_ns,
-        pose_age_ns=nanoseconds(attributes["pose_age"]),
-        commands={
-            name: value
-            for k, (name, value) in enumerate(state.target._asdict().items())
-            if given >> k & 1
-        },
-        **group("inputs."),
-    )
-    return inputs, state
-
-
 def step(
     state: GuidanceState | None, inputs: Inputs, route: Route | None, params: GuidanceParams
 ) -> tuple[GuidanceState, StepCommands]:
     """The step of the kind of aircraft: `modes.step`, or `multicopter.step`."""
-    flown = modes.step if params.multicopter is None else multicopter.step
-    return flown(state, inputs, route, params)
+    step_of_kind = modes.step if params.multicopter is None else multicopter.step
+    return step_of_kind(state, inputs, route, params)
 
 
 def digest(route: Route | None) -> int:
@@ -220,7 +79,7 @@ class Guidance:
     def __init__(self, parameters: GuidanceConfig) -> None:
         self._params: GuidanceParams = parameters.params()
         self.period_ns = self._params.period_ns
-        self.names = names(parameters.outputs)
+        self.names = guidance_log.names(parameters.outputs)
         waypoints = parameters.waypoints()
         self.route = parameters.plan(waypoints) if waypoints else None
         self._digest = digest(self.route)
@@ -237,11 +96,11 @@ class Guidance:
         self._paused = False
         self._begin = Begin.HOLD
         self._notices = parameters.notices()
-        # for a pose that is young enough, or a step that does not fail
+        # Since when guidance waits for a pose that is young enough, or a step that does not fail.
         self._waits_from_ns: int | None = None
         self._failures = Failures()
         self._failure = ""  # why there is no u_m, as a sentence; empty where it waits for a pose
-        # the instant of the operator's last message, or of the first step
+        # The instant of the operator's last message, or of the first step.
         self._operated_ns: int | None = None
         self._link_lost = False
         self._authority = Authority()
@@ -481,7 +340,8 @@ class Guidance:
         if self._operated_ns is None:
             self._operated_ns = now_ns
         if now_ns - self._operated_ns > self._params.link_timeout_ns and not self._link_lost:
-            self._link_lost = self.home()  # again at the next step while guidance does not fly
+            # While guidance does not fly, `home` is tried again at the next step.
+            self._link_lost = self.home()
 
     def _link_age(self, now_ns: int) -> float:
         """Age of the operator's link, s, 0 without a limit."""
@@ -521,7 +381,8 @@ class Guidance:
         """
         try:
             return self._step(now_ns, t_ns)
-        except Exception as error:  # whatever it is, the next step is tried
+        except Exception as error:
+            # Whatever it is, the next step is tried.
             is_said = self._failures.add(seconds(t_ns))
             return self._last_goes_on(now_ns, sentence(error), is_said=is_said)
 
@@ -545,7 +406,7 @@ class Guidance:
         self, inputs: Inputs, state: GuidanceState, commands: StepCommands, now_ns: int
     ) -> FloatArray:
         """The sample of the log of a step at an instant."""
-        sample = GuidanceSample(
+        sample = guidance_log.GuidanceSample(
             inputs=inputs,
             state=state,
             commands=commands,
@@ -553,7 +414,7 @@ class Guidance:
             link_age=self._link_age(now_ns),
             failed=self.failed,
         )
-        return row(sample, self._params.outputs)
+        return guidance_log.row(sample, self._params.outputs)
 
     def _inputs(self, now_ns: int, pose: StampedVector, y: StampedVector) -> Inputs:
         """What a step takes at an instant."""

@@ -66,7 +66,7 @@ class Target(NamedTuple):
     climb: Scalar = 0.0  # m/s
     altitude: Scalar = 0.0  # m
     V: Scalar = 0.0  # airspeed, m/s, absolute
-    # m along a line of the route from the start, where the aircraft joins the line
+    # m along a line of the route from the start, where the aircraft joins the line.
     along: float = 0.0
     r: float = 0.0  # rad/s beside phi, more than the r of a coordinated turn
 
@@ -195,7 +195,7 @@ class Inputs(NamedTuple):
     pose: tuple[float, ...]  # the last pose, in the order of POSE
     pose_age_ns: int
     y: tuple[float, ...]  # the last y, in the order of u_m
-    # commands that are new, by channel of Target; they name the modes
+    # Commands that are new, by channel of Target; they name the modes.
     commands: Mapping[str, float]
     authority: Authority = Authority()  # of the inputs, as learned and tested in flight
 
@@ -217,7 +217,7 @@ class GuidanceState(NamedTuple):
     climb_c: float  # m/s
     V_c: float  # m/s
     u_m: tuple[float, ...]
-    # side of the circle onto the leg: 1 turns to the right, -1 to the left; 0 on the leg
+    # Side of the circle onto the leg: 1 turns to the right, -1 to the left; 0 on the leg.
     joining: float = 0.0
     wind: Wind = (0.0, 0.0)  # estimated, where the air moves to: north, east, m/s
     fence: float = 0.0  # action of the fence: of `fence.Escape`
@@ -234,7 +234,7 @@ class StepCommands(NamedTuple):
     xtrack: float = 0.0  # cross-track error, m, positive to the right of the path
     to_go: float = 0.0  # m, to the end of the leg, or to the point where the aircraft joins the leg
     track: float = 0.0  # course of the path at the nearest point, rad
-    # m, distance from the end of the leg that ended at this step; 0 where the leg was flown
+    # m, distance from the end of the leg that ended at this step; 0 where the leg was flown.
     missed: float = 0.0
     clearance: float = LARGEST  # m, from the fence
     predicted: float = LARGEST  # m, least clearance of the better turn away from the fence

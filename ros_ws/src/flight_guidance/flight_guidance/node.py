@@ -80,10 +80,11 @@ SENTENCES: Mapping[GuidanceMode, str] = {
     GuidanceMode.DEAD_RECKONING: "pose is stale: wings are levelled by the rates of y",
     GuidanceMode.POSE_LOST: "pose is lost: all rates are zero",
 }
+# Further modes have WARN.
 LEVELS = {
     GuidanceMode.ENGAGED: DiagnosticStatus.OK,
     GuidanceMode.POSE_LOST: DiagnosticStatus.ERROR,
-}  # else WARN
+}
 
 
 class GuidanceNode(FlightNode[GuidanceConfig]):
@@ -187,7 +188,8 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
             if y is not None:
                 self._y.accept(y, now_ns)
             for pose in poses:
-                if pose.value.size:  # one without channels says that no pose of the instant comes
+                # One without channels says that no pose of the instant comes.
+                if pose.value.size:
                     self._pose.accept(pose, now_ns)
             if due and (output := self._step(now_ns, now_ns)) is not None:
                 self._publish(output, now_ns)
@@ -282,7 +284,8 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         return self._max_age_ns(), self._max_age_ns() + nanoseconds(self.parameters.hold)
 
     def _take_target(self, sample: NamedSample, now_ns: int) -> None:
-        if sample.channels:  # a target without channels keeps the operator's link alone
+        # A target without channels keeps the operator's link alone.
+        if sample.channels:
             self._guidance.take_target(sample.channels)
         self._guidance.keep_link()
 
@@ -331,7 +334,8 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
 
     def _controller(self) -> str | None:
         """The controller that flies; None before its first sample."""
-        if self.parameters.lockstep:  # which has no process in its name
+        # In lockstep the sender has no process in its name.
+        if self.parameters.lockstep:
             return f"{self.get_namespace().rstrip('/')}/{CONTROLLER}"
         return None if self._internals.lock is None else self._internals.lock.publisher
 
@@ -355,7 +359,8 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
     def _take_authority(self, sample: StampedVector, now_ns: int) -> None:
         controller = self._controller()
         if controller is None:
-            return  # nothing flies yet, and the next sample says the same
+            # Nothing flies yet, and the next sample says the same.
+            return
         require_sender(sample.sender, controller)
         if np.any(sample.value < 0.0):
             raise ChannelError(
@@ -425,7 +430,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         imu = Imu(orientation=place.orientation, angular_velocity=twist.angular)
         imu.header.stamp = odometry.header.stamp
         imu.header.frame_id = self._body
-        # no estimate, as the definition of the message says
+        # -1 stands for no estimate, as the definition of the message says.
         imu.linear_acceleration_covariance[0] = -1.0
         self._imu.publish(imu)
         wind = Vector3Stamped(header=odometry.header)

@@ -8,7 +8,7 @@ The map frame is east, north, up, the body frame forward, left, up.
 import math
 from collections.abc import Mapping
 
-# frames of REP 105: east, north, up; forward, left, up
+# Frames of REP 105: east, north, up; forward, left, up.
 MAP = "map"
 BODY = "base_link"
 ROUTE_FRAMES = (MAP, "")  # of a route that guidance takes

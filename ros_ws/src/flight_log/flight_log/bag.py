@@ -31,15 +31,15 @@ BEFORE_REMAP = "rise_di_topic"  # of a channel: the full name of its topic befor
 OUTCOME = "rise_di_outcome"  # name of the metadata record with the outcome of the flight
 SILENCES = "rise_di_silent"  # name of the metadata record with the silences of topics, s
 OUTCOME_FILE = "outcome"  # in the folder of a run, from the flight to the recorder
-# name of the metadata record of a log that the stack did not fly: "log", "kind", "map", COMPARED
+# Name of the metadata record of a log that the stack did not fly: "log", "kind", "map", COMPARED.
 IMPORTED = "rise_di_imported"
-# what the parameters of the vehicle do not tell, a sentence; empty where all agree with the map
+# What the parameters of the vehicle do not tell, a sentence; empty where all agree with the map.
 COMPARED = "parameters"
-# name of the metadata record with the SI units of channels, for a log without a scenario
+# Name of the metadata record with the SI units of channels, for a log without a scenario.
 CHANNEL_UNITS = "rise_di_units"
-# name of the metadata record of a flight by /clock: topic, speed over real time
+# Name of the metadata record of a flight by /clock: topic, speed over real time.
 SIMULATED_TIME = "rise_di_simulated_time"
-# name of the metadata record that counts the messages the recorder lost, by topic
+# Name of the metadata record that counts the messages the recorder lost, by topic.
 LOST_MESSAGES = "rise_di_lost"
 CHUNK_BYTES = 256 * 1024
 
@@ -64,7 +64,7 @@ class LogAttachments(NamedTuple):
 
     scenario: Path | None = None
     files: tuple[Path, ...] = ()
-    # a YAML file: named sets of strings, each becomes a metadata record
+    # A YAML file: named sets of strings, each becomes a metadata record.
     metadata: Path | None = None
 
 

@@ -17,10 +17,10 @@ from flight_core.tape import Recording, Signal
 
 STEP_NS = NANOSECONDS // 10  # back: late samples are less late
 LEAP_NS = NANOSECONDS // 4  # forth, beside the time of the recording
-# back: fewer messages than CONFIRMED that are so much older have a damaged stamp
+# ns, back. Fewer messages than CONFIRMED that are so much older have a damaged stamp.
 STRAY_NS = NANOSECONDS
 LATE_NS = 4 * NANOSECONDS  # a recorder that starts on a busy host stores its first sample so late
-# successive messages after a step; fewer are those of a further publisher, or have a damaged stamp
+# Successive messages after a step. Fewer come from a further publisher, or have a damaged stamp.
 CONFIRMED = 10
 CONFIRMED_AT_END = 3
 SINCE_EPOCH_NS = 10**15  # larger stamps count from 1970, not from the start of the flight
@@ -72,7 +72,8 @@ class StampClock:
         numbers = np.ones(len(stamps), dtype=np.int64) if steps is None else steps[places]
         back = (jumps < -STEP_NS) & ((numbers >= 0) | (np.abs(leads) > STEP_NS))
         forth = (jumps > STEP_NS) & ((leads > STEP_NS) | ~has_time) & (numbers <= 1)
-        starts = np.flatnonzero(back | forth)  # of messages with one clock
+        # Places where the messages of a clock begin.
+        starts = np.flatnonzero(back | forth)
         edges = [0, *starts[starts > 0].tolist(), len(stamps)]
         keep = ~unset
         for first, after in pairwise(edges if len(stamps) else []):
@@ -92,7 +93,7 @@ class StampClock:
                 after_step = int(places[first])
                 keep[after_step:] = self._after_step(stamp_ns[after_step:])
                 return self._taken(stamp_ns, keep, len(stamp_ns), after_step)
-            # the messages before are too few to be the begin of the clock
+            # The messages before are too few to be the begin of the clock.
             if self._last_ns is None:
                 away_ns = stamps[first] - stamps[:first]
                 lead_ns = offsets[first] - offsets[:first]
@@ -111,7 +112,8 @@ class StampClock:
 
         The time is 0 without a usable part.
         """
-        if not self._last_ns:  # none, or a stamp that was not set
+        # There is no usable stamp, or a stamp that was not set.
+        if not self._last_ns:
             return 0, False
         jump_ns = stamp_ns - self._last_ns
         is_ahead = jump_ns > LEAP_NS and offset_ns > self._offset_ns + LEAP_NS
@@ -214,7 +216,8 @@ def without_leaps(
             for name in LOOP
             if name in mended and mended[name].stamp_ns[-1] > earlier.at_ns + STEP_NS
         ]
-        if len(loop) < 2 or not {*loop} <= {*leaping}:  # a single topic has a clock of its own
+        # A single topic has a clock of its own.
+        if len(loop) < 2 or not {*loop} <= {*leaping}:
             continue
         leaps.append(earlier)
         for name in leaping:
@@ -244,7 +247,8 @@ def _candidates(
     stamp_ns = signals[name].stamp_ns
     elapsed_ns = np.diff(stamp_ns)
     if "t" in signals[name].names:
-        with np.errstate(over="ignore", invalid="ignore"):  # a flight time that no flight has
+        # A damaged flight time may overflow.
+        with np.errstate(over="ignore", invalid="ignore"):
             flown_ns = np.diff(np.round(signals[name]["t"] * NANOSECONDS))
     elif len(elapsed_ns) and all(
         recording[topic].lost == 0 for topic in LOOP if topic in recording

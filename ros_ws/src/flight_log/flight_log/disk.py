@@ -62,7 +62,7 @@ class ReservedFile:
             raise
         try_lock(self._descriptor)
         self._reserved_bytes = 0
-        # in the reserve; in memory once that is free
+        # Bytes in the reserve, which are in memory once the reserve is free.
         self._kept_bytes = 0
         self._end_data = bytearray()
         self._position = 0
@@ -80,7 +80,8 @@ class ReservedFile:
         self._reserved_bytes = size + RESERVE_STEP
         try:
             os.posix_fallocate(self._reserve.fileno(), 0, self._reserved_bytes)
-        except OSError as error:  # on a file system without fallocate there is no reserve
+        except OSError as error:
+            # On a file system without fallocate there is no reserve.
             self.full = error.errno in NO_SPACE
 
     def keep(self, data: bytes) -> None:
@@ -90,7 +91,8 @@ class ReservedFile:
                 if os.pwrite(self._reserve.fileno(), data, self._kept_bytes) == len(data):
                     self._kept_bytes += len(data)
                     return
-            except OSError as error:  # on a file system without fallocate there may be no space
+            except OSError as error:
+                # On a file system without fallocate there may be no space.
                 if error.errno not in NO_SPACE:
                     raise
             self.full = True

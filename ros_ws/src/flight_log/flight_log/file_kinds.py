@@ -35,7 +35,7 @@ MAGICS = MappingProxyType(
         ZSTD_MAGIC: ZSTD,
         LZ4_MAGIC: LZ4,
         b"ULog\x01\x12\x35": "a ULog of PX4",  # PX4 guide, ULog file format
-        # a packet with the identity FMT (ArduPilot, AP_Logger/LogStructure.h)
+        # A packet with the identity FMT (ArduPilot, AP_Logger/LogStructure.h).
         b"\xa3\x95\x80": "a DataFlash log of ArduPilot",
         b"FMT, 128, 89,": "a DataFlash log of ArduPilot as text",
         b"H Product:Blackbox": "a blackbox log of Betaflight or INAV",
@@ -63,9 +63,9 @@ MAGICS = MappingProxyType(
 # POSIX.1-2017, pax, ustar Interchange Format
 TAR_PLACE = 257
 TAR = b"ustar"
-# first byte of a packet of MAVLink 2 and 1 (MAVLink guide, Packet Serialization)
+# First byte of a packet of MAVLink 2 and 1 (MAVLink guide, Packet Serialization).
 MAVLINK = (b"\xfd", b"\xfe")
-# us since 1970, before each packet of a tlog (MAVLink guide, mavlogdump)
+# us since 1970, before each packet of a tlog (MAVLink guide, mavlogdump).
 TLOG_TIME = struct.Struct(">Q")
 TLOG_YEARS = (2000, 2100)
 HEAD_BYTES = 4096
@@ -86,7 +86,8 @@ def kind_of(head: bytes) -> str:
 
     Bytes of no kind in the table are a text or unknown bytes.
     """
-    if MCAP0_MAGIC.startswith(head):  # also of a recorder that was killed at its start
+    # Also of a recorder that was killed at its start.
+    if MCAP0_MAGIC.startswith(head):
         return BEGUN if head else EMPTY
     text = head.removeprefix(b"\xef\xbb\xbf").lstrip(b" \t\r\n")
     by_magic = next(
@@ -118,7 +119,8 @@ def _text_kind(head: bytes) -> str:
     try:
         text = head.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        if error.start < len(head) - 4:  # a character may be cut at the end of the head
+        # A character may be cut at the end of the head.
+        if error.start < len(head) - 4:
             return "a file of unknown content"
         text = head[: error.start].decode("utf-8-sig")
     if any(not (c.isprintable() or c in "\t\r\n\f") for c in text):

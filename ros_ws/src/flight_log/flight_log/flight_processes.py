@@ -19,7 +19,7 @@ from flight_log.named_vectors import typestore
 
 ROSOUT = "/rosout"
 LOG = "rcl_interfaces/msg/Log"
-# the text of the line in CDR: its length with the final zero, and its bytes
+# The text of the line in CDR: its length with the final zero, and its bytes.
 READY = b"\x06\x00\x00\x00ready\x00"
 UNNAMED = "a publisher without a name"
 INSTANCE = re.compile(r"(/.+)#\d+")  # node and process id

@@ -72,7 +72,7 @@ class Follower:
         self.run = run
         self.complete = False  # the end of the data has been read
         self.fault = ""  # why nothing more of the log can be read
-        # of the message types that have occurred, ros2msg, by name
+        # Definitions of the message types that have occurred, ros2msg, by name.
         self.definitions: dict[str, str] = {}
         self._rate_of = rate_of
         self._remaps = remaps
@@ -88,7 +88,7 @@ class Follower:
         self._identity = (0, 0)  # device and inode of the file, once something of it has been read
         self._schemas: dict[int, str] = {}
         self._channels: dict[int, _Channel] = {}
-        # records of a packed file
+        # Records of a packed file.
         self._finished: Iterator[object] | None = None
 
     @property

@@ -13,7 +13,7 @@ from flight_log.named_vectors import typestore
 
 LEARNING = "learning"
 DIAGNOSTIC_ARRAY = "diagnostic_msgs/msg/DiagnosticArray"
-# levels of diagnostic_msgs/msg/DiagnosticStatus
+# Levels of diagnostic_msgs/msg/DiagnosticStatus.
 OK = 0
 WARN = 1
 

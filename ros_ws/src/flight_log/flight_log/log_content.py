@@ -65,8 +65,7 @@ from flight_log.scan import MessageBatch
 ROUTE = "route"
 
 
-# messages that are decoded together: of 1024, the tables are so large that the memory for each is
-# new
+# Messages that are decoded together. With 1024 the memory of each table would be new.
 BATCH = 512
 
 
@@ -97,7 +96,7 @@ class TopicSamples:
     def __init__(self, decode: Decoder, expected: int) -> None:
         self._decode = decode
         self._expected = expected
-        # of one length; log times, steps of numbers
+        # Tables of messages of one length, with their log times and the steps of their numbers.
         self._batch: list[tuple[Table, NDArray[np.int64], NDArray[np.int64]]] = []
         self._batched = 0  # messages
         self._clock = StampClock()
@@ -116,7 +115,7 @@ class TopicSamples:
         self._lost += int((steps[steps > 1] - 1).sum())
         self._numbered = self._numbered or bool(sequence.any())
         self._number = int(sequence[-1])
-        # another publisher, or a restarted one
+        # Another publisher, or a restarted one.
         self._restarted = self._restarted or bool(np.any(steps < 0))
         fits = not self._batch or self._batch[0][0].shape[1] == table.shape[1]
         if self._batched >= BATCH or not fits:
@@ -155,7 +154,7 @@ class TopicSamples:
                     span.joined(self.spans[sender]) if sender in self.spans else span
                 )
                 if names not in self._samples:
-                    # other names are few, or those of a hostile log
+                    # Samples with other names are few, or those of a hostile log.
                     expected = 0 if self._samples else self._expected
                     self._samples[names] = Columns(len(names), max(expected, len(values)))
                 self._samples[names].append(stamp_ns, values, sender)
@@ -189,7 +188,8 @@ class TopicSamples:
         zero = stamps == 0
         zeros = int(np.count_nonzero(zero))
         usual = len(stamps) - 1 if name in RESTING else 1
-        if zeros > usual:  # a recorder may take each message twice
+        # A recorder may take each message twice.
+        if zeros > usual:
             usual = int(np.unique(stamps[~zero], return_counts=True)[1].max(initial=usual))
         if (
             name not in UNSTAMPED
@@ -204,7 +204,7 @@ class TopicSamples:
             order = np.argsort(signal.stamp_ns, kind="stable")
             stamps = signal.stamp_ns[order]
             values = signal.values[order]
-            # of a part that is there twice
+            # A part of the log may be there twice.
             again = (np.diff(stamps) == 0) & (np.diff(values, axis=0) == 0.0).all(axis=1)
             keep = np.append(True, ~again)
             sender = None if signal.sender is None else signal.sender[order][keep]
@@ -264,7 +264,7 @@ class LogContent:
         self.sent = defaultdict[str, list[Times]](list)  # of y and u by full topic name
         self.lines: list[bytes] = []  # of /rosout: that a node is ready
         self.diagnostics: list[bytes] = []  # of /diagnostics: those with an age of u
-        # of bridges by full topic name: time of sending, ns, and message
+        # Reports of bridges by full topic name: time of sending, ns, and message.
         self.reports: dict[str, list[tuple[int, bytes]]] = {}
         self.times: Times | None = None  # of the last y or u of a chunk
         self.kinds: dict[str, str] = {}  # types of all topics, by full name

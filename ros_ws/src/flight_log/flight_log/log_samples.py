@@ -13,7 +13,7 @@ from flight_core.vectors import FloatArray
 from flight_log.vehicle_tables import PARAMETER, MessageTable, ParameterRecord, Parameters
 
 LARGEST = 2**62  # ns, of a damaged stamp
-# an autopilot that goes back by a step has started again; a link may be lost
+# An autopilot that goes back by a step has started again; a link may be lost.
 STEP_NS = NANOSECONDS
 LOST_NS = 60 * NANOSECONDS
 AGREEING = 5  # samples, after which another time is that of the clock

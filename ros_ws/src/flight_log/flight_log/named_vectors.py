@@ -71,7 +71,8 @@ def typestore() -> Typestore:
 @cache
 def joint_state_types() -> Typestore:
     """JOINT_STATE_TYPES, enough for most logs."""
-    store = get_typestore(Stores.EMPTY)  # which has Time
+    # The empty store has Time.
+    store = get_typestore(Stores.EMPTY)
     for name, definition in JOINT_STATE_TYPES.items():
         store.register(get_types_from_msg(definition, name))
     return store
@@ -256,7 +257,7 @@ class _JointStateDecoder:
         self._names = tuple(vector.name)
         self._values = values
         self._sender = vector.header.frame_id
-        # a message without velocity and effort ends with their lengths
+        # A message without velocity and effort ends with their lengths.
         self._template = np.frombuffer(message, dtype="<u4")
         constant = np.full(len(message), 255, dtype=np.uint8)
         constant[STAMP] = constant[self._values] = 0

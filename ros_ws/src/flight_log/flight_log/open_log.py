@@ -156,7 +156,8 @@ def _unpack(file: Path, plain: Path, kind: str) -> None:
     size = 0
     try:
         with open_packed(file, "rb") as source, plain.open("wb") as target:
-            while block := source.read1(COPY_BYTES):  # what a truncated file holds before its end
+            # `read1` gives what a truncated file holds before its end.
+            while block := source.read1(COPY_BYTES):
                 size += len(block)
                 unpack = UNPACK.get(file.suffix, "unpack")
                 require(
@@ -194,7 +195,8 @@ def log_topics(run: Path, remaps: Mapping[str, str] = {}) -> dict[str, str]:
                         stack_topic(record, remaps),
                         name if encoding == "cdr" else f"{name} in {encoding}",
                     )
-                elif topics and scan.message_counts:  # the index names all channels
+                elif topics and scan.message_counts:
+                    # The index names all channels.
                     break
     return topics
 

@@ -27,7 +27,7 @@ SHARED = ("/diagnostics", "/parameter_events", "/rosout")
 """Topics on which every node of a domain may publish. They are played only by name."""
 
 MAX_LATCHED = 100  # messages of a topic; a lockstep flight keeps 20,000, which is no latch
-# a stamp further than a day from the host's clock is flight time, as in lockstep
+# A stamp further than a day from the host's clock is flight time, as in lockstep.
 MAX_CLOCK_OFFSET_NS = 86_400 * NANOSECONDS
 NO_FIELD = re.compile(r"\s*(#|$|\S+\s+\w+\s*=)")  # a comment, an empty line, a constant
 STAMPED = re.compile(r"\s*((std_msgs(/|::)(msg::)?)?Header|builtin_interfaces(/|::)(msg::)?Time)\s")

@@ -110,7 +110,7 @@ def revision(source: Path) -> dict[str, str]:
         ).stdout.strip()
 
     try:
-        # an installed copy may be inside another project's checkout
+        # An installed copy may be inside another project's checkout.
         output("ls-files", "--error-unmatch", source.name)
         commit = output("rev-parse", "HEAD")
         changes = output("status", "--porcelain", "--untracked-files=no")

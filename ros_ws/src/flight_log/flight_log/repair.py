@@ -48,7 +48,7 @@ class Repair(NamedTuple):
 
     files: tuple[FileRepair, ...]
     wrote_metadata: bool
-    # names of the files that metadata.yaml names and the folder lacks
+    # Names of the files that metadata.yaml names and the folder lacks.
     missing: tuple[str, ...] = ()
 
 
@@ -62,7 +62,8 @@ def repair(run: Path) -> Repair:
     while a recorder writes the bag, for a bag without a readable message, for a metadata.yaml of
     another program, and for a folder that cannot be written.
     """
-    files = bag_files(run) or log_files(run)  # the latter says what is there
+    # `log_files` says what is there.
+    files = bag_files(run) or log_files(run)
     for file in files:
         require_mcap(file)
     previous: Mapping[str, Any] = {}
@@ -189,7 +190,7 @@ class _FileScan:
         with replacing(self.path) as stream:
             self._copy(Writer(stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD))
             stream.flush()
-            # a full disk shows here at the latest: the damaged file gets no second name then
+            # A full disk shows here at the latest: the damaged file gets no second name then.
             os.fsync(stream.fileno())
             damaged = _keep_damaged(self.path)
         return FileRepair(

@@ -76,7 +76,8 @@ def bag_files(run: Path) -> list[Path]:
         raise ParameterError(
             f"{run}: cannot be read ({error.strerror}), expected the folder of a run"
         ) from None
-    for file in content:  # a plain file sorts before the packed file
+    # A plain file sorts before the packed file.
+    for file in content:
         name = plain_name(file.name)
         if name.endswith(SUFFIXES) and is_file(file):
             by_name.setdefault(name, file)

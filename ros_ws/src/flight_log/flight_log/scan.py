@@ -52,9 +52,10 @@ DECODE_ERRORS = (
 )
 
 RECORD = struct.Struct("<BQ")  # opcode and length, before each record (MCAP specification, Records)
-# channel, sequence, log time and publish time, before each message
+# Channel, sequence, log time and publish time, before each message.
 MESSAGE = struct.Struct("<HIQQ")
-HEAD = np.dtype(  # of RECORD and MESSAGE
+# Fields of RECORD and MESSAGE.
+HEAD = np.dtype(
     [
         ("opcode", "u1"),
         ("length", "<i8"),
@@ -64,15 +65,15 @@ HEAD = np.dtype(  # of RECORD and MESSAGE
         ("publish_ns", "<i8"),
     ]
 )
-# channel and size, before the entries of a message index (MCAP specification, Message Index)
+# Channel and size, before the entries of a message index (MCAP specification, Message Index).
 MESSAGE_INDEX = struct.Struct("<HI")
 INDEX_ENTRY = np.dtype([("log_ns", "<i8"), ("place", "<i8")])
 NO_PLACES = np.zeros(0, dtype=np.int64)
 TIMES = struct.Struct("<QQ")  # log times of the first and the last message, before each chunk
-# these, size and checksum of the records, length of the compression's name before this name
+# TIMES, size and checksum of the records, length of the compression's name before this name.
 CHUNK = struct.Struct("<QQQII")
 LENGTH = struct.Struct("<Q")  # before the records of a chunk
-# opcode, length, offsets of the summary and of its offsets, checksum
+# Opcode, length, offsets of the summary and of its offsets, checksum.
 FOOTER = struct.Struct("<BQQQI")
 CRC = struct.Struct("<I")
 
@@ -155,9 +156,9 @@ class Scan:
         self.complete = False  # the file has its footer
         self.damaged = 0  # chunks and other parts that could not be read
         self.endless = 0  # bytes of a record that no file holds, at `position`
-        # the latest log time in the index and the chunk headers, including lost messages
+        # The latest log time in the index and the chunk headers, including lost messages.
         self.known_end_ns = 0
-        # by channel, as the index has them; known from the first record on
+        # Counts by channel, as the index has them; known from the first record on.
         self.message_counts: dict[int, int] = {}
         self._messages = 0  # that have been read
 
@@ -258,7 +259,8 @@ class Scan:
             yield part
             if part.opcode in ENDS:
                 return
-        stream.seek(position)  # of a record that is not whole
+        # A record that is not whole begins here.
+        stream.seek(position)
         head = stream.read(RECORD.size + TIMES.size)
         if len(head) == RECORD.size + TIMES.size:
             opcode, length = RECORD.unpack_from(head)
@@ -320,7 +322,7 @@ def _joined(parts: Iterator[FilePart], most: int) -> Iterator[Sequence[FilePart]
     chunks: list[FilePart] = []
     size = 0
     for part in parts:
-        # else it is damaged
+        # A value that is no number is damaged.
         is_chunk = part.opcode == Opcode.CHUNK and len(part.content) >= CHUNK.size
         more = CHUNK.unpack_from(part.content)[2] if is_chunk else 0
         if chunks and (not is_chunk or size + more > most):
@@ -377,7 +379,8 @@ def split(data: bytes) -> Iterator[McapRecord]:
         end = position + length
         if end > len(data):
             raise McapError("a record longer than its container")
-        if opcode == Opcode.MESSAGE and length >= MESSAGE.size:  # nearly all records are messages
+        # Nearly all records are messages.
+        if opcode == Opcode.MESSAGE and length >= MESSAGE.size:
             channel, sequence, log_time, publish_time = MESSAGE.unpack_from(data, position)
             yield Message(
                 channel, log_time, data[position + MESSAGE.size : end], publish_time, sequence
@@ -432,7 +435,8 @@ def _split_batches(
     for data, indexed in chunks:
         try:
             others, places = _walk(data, indexed)
-        except DECODE_ERRORS:  # an index may be wrong, or of another chunk
+        except DECODE_ERRORS:
+            # An index may be wrong, or of another chunk.
             others, places = _walk(data, NO_PLACES)
         yield from others
         joined_places.append(places + size)
@@ -503,7 +507,8 @@ def decode_parts(parts: Iterable[FilePart]) -> Iterator[McapRecord]:
 
 def decode(opcode: int, content: bytes) -> Iterator[McapRecord]:
     """A record that is no message. Raises DECODE_ERRORS."""
-    if opcode in {DAMAGED, Opcode.CHUNK, Opcode.MESSAGE}:  # no chunk holds another one
+    # No chunk holds another one.
+    if opcode in {DAMAGED, Opcode.CHUNK, Opcode.MESSAGE}:
         raise McapError("a record that is damaged")
     if opcode in RECORD_READERS:
         if opcode == Opcode.ATTACHMENT:
@@ -530,7 +535,7 @@ def decompress(chunk: bytes) -> bytes:
     if size > max(MAX_CHUNK_BYTES, len(compressed)):
         raise McapError(f"a chunk with a size of {size} bytes")
     if compression == b"zstd":
-        # the decompressor would allocate that much
+        # The decompressor would allocate that much.
         if zstandard.frame_content_size(compressed) > size:
             raise McapError("a chunk that holds more than its size")
         data = _OF_THREAD.zstd.decompress(compressed, max_output_size=size)

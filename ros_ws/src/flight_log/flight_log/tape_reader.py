@@ -49,7 +49,7 @@ from flight_log.open_log import (
 
 PARAMETERS = "parameters.yaml"  # attachment with every parameter of the flight
 A_FLIGHT = f"a recorded flight: y, y_m and u as {JOINT_STATE}"
-# a namespace with one of these topics is that of an aircraft
+# A namespace with one of these topics is that of an aircraft.
 AIRCRAFT_TOPICS = ("y", "y_m", "u", "u_m", "internals", "truth")
 
 
@@ -342,5 +342,5 @@ def _start_ns(signals: Mapping[str, Signal]) -> int:
     if "y_m" in signals:
         return int(signals["y_m"].stamp_ns[0])
     stamps = {name: int(signal.stamp_ns[0]) for name, signal in signals.items()}
-    # a route may have no stamp
+    # A route may have no stamp.
     return min([stamp_ns for name, stamp_ns in stamps.items() if name != ROUTE] or stamps.values())

@@ -42,7 +42,8 @@ def read_vehicle_log(path: Path, choice: Choice = ANY) -> VehicleLog:
             log = reader_of_kind(path, kind, choice)
     except ParameterError:
         raise
-    except Exception as error:  # pymavlink raises Exception itself for a damaged format
+    except Exception as error:
+        # pymavlink raises Exception itself for a damaged format.
         reason = str(error) or type(error).__name__
         raise ParameterError(
             f"{path}: found {kind} that cannot be decoded ({reason}), expected {EXPECTED}"
@@ -66,7 +67,8 @@ def _silent() -> Iterator[None]:
     ):
         try:
             stderr = os.dup(2)
-        except OSError:  # it is closed
+        except OSError:
+            # It is closed.
             yield
             return
         os.dup2(null.fileno(), 2)

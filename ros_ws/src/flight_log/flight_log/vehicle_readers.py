@@ -108,7 +108,7 @@ def _read_dataflash(path: Path, kind: str, choice: Choice) -> VehicleLog:
                     message, "TimeUS", 1e3 * getattr(message, "TimeMS", 1e-3 * stamp_us)
                 )
                 stamp_ns = min(round(1e3 * stamp_us), LARGEST)
-                # of the sensor or the core
+                # The number is that of the sensor or of the core.
                 number = int(getattr(message, "I", 0) or getattr(message, "C", 0))
                 if name == PARAMETER:
                     yield SETTING, stamp_ns, (message.Name, float(message.Value))
@@ -168,7 +168,8 @@ def _read_tlog(path: Path, kind: str, choice: Choice) -> VehicleLog:
     autopilots: dict[int, tuple[int, int]] = {}
     messages: dict[int, list[Received]] = {}
     mavutil.set_dialect("ardupilotmega")
-    with closing(mavutil.mavlogfile(str(path))) as reader:  # by its content, not by its name
+    # mavlogfile tells the kind by the content, not by the name.
+    with closing(mavutil.mavlogfile(str(path))) as reader:
         while (message := reader.recv_match(type=[*fields, "PARAM_VALUE"])) is not None:
             name = message.get_type()
             if message.get_srcComponent() == AUTOPILOT:
@@ -229,7 +230,7 @@ def _flown_system(
     return moving[0], (("system", reason),) * (len(received) > 1)
 
 
-# of the messages with a time of their own: with fewer different times the clock stands still
+# Share of different times among the messages with a time: with fewer the clock stands still.
 LEAST_TIMES = 0.1
 RECENT = 16  # messages with a time, of which one tells the time of a message without
 AGAIN_NS = 30 * NANOSECONDS
@@ -252,7 +253,7 @@ def _dated(messages: list[Received]) -> Iterator[Sample]:
         else with_time[0].arrival_ns - 1_000_000 * with_time[0].content.time_boot_ms
     )
     newest_ns = with_time[0].arrival_ns if with_time else 0
-    # sequences and stamps; None of a message that came before
+    # Sequences and stamps; None of a message that came before.
     recent = deque[tuple[int, int | None]](maxlen=RECENT)
     arrivals: dict[tuple[str, int], int] = {}  # by name and time
     for name, sequence, arrival_ns, content in messages:
@@ -305,13 +306,15 @@ def _read_ulog(path: Path, kind: str, choice: Choice) -> VehicleLog:
         table = table_of(stamps[keep], {name: values[keep] for name, values in columns.items()})
         instances.setdefault(data.name, {})[data.multi_id] = table
     vehicle, is_vtol = _vehicle(instances)
-    if is_vtol and "actuator_controls_1" in instances:  # before 1.14
+    # Before 1.14.
+    if is_vtol and "actuator_controls_1" in instances:
         instances["actuator_controls_0"] |= {1: instances["actuator_controls_1"][0]}
     initial = [(0, name, value) for name, value in log.initial_parameters.items()]
     records = [
         (SETTING, 1000 * stamp_us, (name, float(value)))
         for stamp_us, name, value in (*initial, *log.changed_parameters)
-        if is_number(value)  # else it is damaged
+        # A value that is no number is damaged.
+        if is_number(value)
     ]
     parameters = parameters_of(records)
     sources = chain(*ULOG_SOURCES.values(), ULOG_TORQUES.values())
@@ -348,7 +351,8 @@ def _vehicle(instances: Instances) -> tuple[str, bool]:
     if table is None:
         return "", False
     fields = dict(table.fields)
-    if "vehicle_type" not in fields and "is_rotary_wing" in fields:  # before 1.10
+    # Before 1.10.
+    if "vehicle_type" not in fields and "is_rotary_wing" in fields:
         fields["vehicle_type"] = np.where(fields["is_rotary_wing"] != 0.0, ROTORS, ROTORS + 1)
         instances["vehicle_status"][0] = table._replace(fields=fields)
     if fields.get("is_vtol", np.zeros(1)).any():

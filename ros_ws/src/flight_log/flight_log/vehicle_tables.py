@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from flight_core.vectors import FloatArray
 
 DEGREE = math.pi / 180.0
-# channels that are read
+# Channels that are read.
 STICKS = 16
 SERVOS = 16
 
@@ -49,7 +49,7 @@ class ParameterRecord(NamedTuple):
 Parameters = Mapping[str, tuple[ParameterRecord, ...]]
 """The records of the parameters by name, in the order of the log."""
 
-# a message of DataFlash; the samples of each format have their parameters by this name
+# A message of DataFlash; the samples of each format have their parameters by this name.
 PARAMETER = "PARM"
 
 
@@ -76,7 +76,7 @@ class Format(NamedTuple):
     sticks: LogField  # its field has the number of the channel in place of {}
     servos: LogField
     mode: tuple[LogField, ...]
-    # of a multicopter's rate controllers, normalised, by what responds to them
+    # Outputs of a multicopter's rate controllers, normalised, by what responds to them.
     torques: Sources = MappingProxyType({})
 
 
@@ -125,7 +125,7 @@ class Choice(NamedTuple):
     """What a user takes of a log, and the kind of vehicle of the map."""
 
     system: int | None = None  # of a tlog; None: the system that flew
-    # by message; else the sensor or the part that flew
+    # The number of the sensor by message; else the sensor or the part that flew.
     instances: Mapping[str, int] = MappingProxyType({})
     vehicle: str = PLANE
 
@@ -144,10 +144,10 @@ class VehicleLog(NamedTuple):
     parameters: Parameters
     format: Format | None
     vehicle: str = PLANE  # "": the log does not say
-    # the number of the mode in which the sticks of a plane are the commands: 0 of ArduPlane
-    # (mode.h)
+    # The number of the mode in which the sticks of a plane are the commands: 0 of ArduPlane
+    # (mode.h).
     manual: int = 0
-    # of several systems, sensors or instances: what is taken, and why
+    # What is taken of several systems, sensors or instances, and why.
     taken: tuple[tuple[str, str], ...] = ()
 
     def source(self, quantity: str) -> LogField | None:

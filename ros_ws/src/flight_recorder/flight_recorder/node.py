@@ -62,7 +62,7 @@ from flight_ros.topics import (
     Y,
 )
 
-# the longest loss when the recorder is killed; also the period of the graph checks
+# The longest loss when the recorder is killed; also the period of the graph checks.
 FLUSH_PERIOD_NS = nanoseconds(0.1)
 DISK_PERIOD_NS = NANOSECONDS
 LOSS_PERIOD_NS = 2 * NANOSECONDS  # between two lines on lost messages of a topic
@@ -71,9 +71,9 @@ MEGABYTE = 1e6
 LOOP = (Y, Y_M, U)  # every flight has these topics
 SILENCE_NS = 3 * NANOSECONDS  # a killed controller is back within 1 s
 
-# topics that no mode of a flight stops while the publisher runs
+# Topics that no mode of a flight stops while the publisher runs.
 STEADY = (Y, Y_M, U, INTERNALS, TRUTH, POSE)
-# a topic is steady after so many messages at such intervals
+# A topic is steady after so many messages at such intervals.
 STEADY_MESSAGES = 20
 STEADY_INTERVAL_NS = NANOSECONDS // 5
 TOPIC_SILENCE_NS = NANOSECONDS
@@ -90,7 +90,7 @@ class _RecordedTopic:
     channel: BagChannel
     next_sequence: int = 0  # 0 before the first message
     publisher: str | None = None  # of the last message
-    # the sequence of one name went back: of a second publisher under that name, or of a new one
+    # The sequence of a name went back: a second publisher has that name, or a new one.
     shared: bool = False
     publishers: int = 0  # number of publishers at the last check
     first_ns: int = 0  # monotonic time of the first and the last message
@@ -211,8 +211,8 @@ class RecorderNode(FlightNode[RecorderConfig]):
         return [topic.subscription for topic in self._among(LOOP)]
 
     def runs_in_lockstep(self) -> bool:
-        # in lockstep the recorder also writes at ticks, many instants at a time, and publishes the
-        # progress
+        # In lockstep the recorder also writes at ticks, many instants at a time, and publishes the
+        # progress.
         return False
 
     def advance(self) -> bool:

@@ -8,6 +8,7 @@ The page follows the growing log and joins no ROS graph, except for control.
 |---|---|
 | `series` | keeps the samples of a topic in bounded memory |
 | `flight` | follows the log of a run: samples, events, state |
+| `page_topics` | names the topics and channels that the page reads |
 | `server` | serves the page and the samples to browsers on this host |
 | `control` | checks and carries out commands of the page, over a link to the nodes |
 | `request_values` | refuses values of a request that are not well formed or in range |

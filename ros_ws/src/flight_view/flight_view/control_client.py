@@ -45,7 +45,7 @@ class ControlClient(Client):
         declared_names = self._call(
             ListParameters, f"{node}/list_parameters", everything
         ).result.names
-        # an undeclared name among others empties the answer
+        # An undeclared name among others empties the answer.
         selection = [
             name for name in declared_names if name in names or name.split(".")[0] in names
         ]
@@ -65,7 +65,7 @@ class ControlClient(Client):
     def set_parameters(self, node: str, values: Mapping[str, Any]) -> str:
         """Set parameters of a node together, or none of them."""
         request = SetParametersAtomically.Request()
-        # rclpy takes an empty list for bytes; the one list that may be empty is of faults
+        # rclpy takes an empty list for bytes; the one list that may be empty is of faults.
         request.parameters = [
             Parameter(name, STRINGS if value == [] else None, value).to_parameter_msg()
             for name, value in values.items()

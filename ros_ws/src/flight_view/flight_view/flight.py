@@ -50,44 +50,10 @@ from flight_log.stored_messages import PARAMETER_EVENT, PARAMETER_EVENTS, parame
 from flight_log.tape_reader import listed, read_run
 from flight_view.background import Line
 from flight_view.description import MODES, ParameterTicks, described, mission, rms_by_model
+from flight_view.page_topics import GROUPS, IN_TICKS, LEARNED, RATES
 from flight_view.series import Series
 
-LEARNED = "learned"  # entries of A and B, as identified in flight
-RATE = 50.0  # Hz
-RATES = {
-    "internals": math.inf,
-    LEARNED: math.inf,
-    **dict.fromkeys(("guidance", "pose", "truth", "u", "y", "y_m"), RATE),
-}
-"""Topics that are read, and the highest rate. Ticks are all read: a peak between two drawn samples
-would be hidden."""
-
-IN_TICKS = ("u", "y", "y_m")  # topics that the ticks have, too: not read from the first tick on
-
-GROUPS = {
-    "internals": ("mode", "late", "y", "y_m", "e", "u_free", "u", "limited"),
-    "truth": ("actuator", "gust", "x.phi", "x.theta"),
-    "guidance": (
-        "mode",
-        "leg",
-        "joining",
-        "missed",
-        "xtrack",
-        "to_go",
-        "phi_c",
-        "theta_c",
-        "climb_c",
-        "V_c",
-        "y",
-        "limited",
-        "target",
-        "wind",
-        "fence",
-    ),
-}
-"""Channels and groups of channels that are kept; of the other topics all."""
-
-# rcl_interfaces/msg/Log: WARN=30
+# rcl_interfaces/msg/Log: WARN=30.
 LOG = "/rosout"
 LOG_TYPE = "rcl_interfaces/msg/Log"
 WARN = 30
@@ -96,7 +62,7 @@ SHARED = (LOG, PARAMETER_EVENTS)  # topics of all aircraft
 POSE = "pose"
 ROUTE = "route"
 ROUTE_TYPE = "nav_msgs/msg/Path"
-# bytes of the log, about 1 s, that a busy host may leave unread: above it the state is "reading"
+# bytes of the log, about 1 s, that a busy host may leave unread: above it the state is "reading".
 LIVE_BACKLOG = 200_000
 MAX_EVENTS = 5000
 MAX_NOTES = 50
@@ -372,7 +338,7 @@ class Flight:
             path = Path("scenario.yaml")
             self.scenario = parse_scenario(content, path)
             self.described += 1
-            # reads the airframe, maybe a file of another machine
+            # `described` reads the airframe, maybe a file of another machine.
             self.description |= described(self.scenario)
         except ParameterError as error:
             self._note(f"units, limits and commands are unknown: {error}")
@@ -407,7 +373,7 @@ class Flight:
         # widest pose are left out.
         if topic.name == POSE and set(names) > set(topic.names):
             topic.columns = None
-        # of a second publisher: values are matched by name
+        # A second publisher may have another order: values are matched by name.
         if names != topic.names and sorted(names) == sorted(topic.names):
             names, values = topic.names, values[:, [names.index(name) for name in topic.names]]
         if topic.columns is None:
@@ -427,7 +393,7 @@ class Flight:
             samples = self.samples[topic.name] = Series(
                 tuple(_text(names[i]) for i in topic.columns)
             )
-            # pages read the topic again
+            # Pages read the topic again.
             samples.thinned = 0 if narrower is None else narrower.thinned + 1
         samples = self.samples[topic.name]
         if topic.name == POSE and set(names) < set(topic.names):
@@ -563,7 +529,8 @@ class Flight:
         try:
             self.description |= mission(guidance, waypoints)
         except ParameterError:
-            return  # guidance says so in the log
+            # Guidance says so in the log.
+            return
         self.described += 1
         self._add_event(PageEvent(sent_ns, ROUTE, f"{len(waypoints)} waypoints"))
 

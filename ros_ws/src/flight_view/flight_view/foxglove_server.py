@@ -32,11 +32,12 @@ def serve(run: Path, port: int, announce: Callable[[str], None]) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: end.set())
     follower = Follower(run, lambda topic, type_name: math.inf)
+    # A record without data defines a channel.
     before = {
         record.topic: record._replace(data=[])
         for record in follower.read()
         if isinstance(record, Messages)
-    }  # what defines a channel
+    }
     require(
         not follower.complete,
         f"--foxglove: {run}",

@@ -71,7 +71,8 @@ class Series:
                 [self.values, np.zeros((size - self.count, len(self.names)), dtype=np.float32)]
             )
         self._stamp_ns[self.count : end] = stamp_ns
-        with np.errstate(over="ignore"):  # beyond float32 a value is drawn as infinite
+        # Beyond float32 a value is drawn as infinite.
+        with np.errstate(over="ignore"):
             self._values[self.count : end] = values
         self.count = end
 
@@ -82,7 +83,8 @@ class Series:
         """
         grouped = self.count - self.count % 4
         k = len(self.names)
-        # in place: temporary arrays of all rows would stay in the heap of the process
+        # Rows are thinned in place: temporary arrays of all rows would stay in the heap of the
+        # process.
         for start in range(0, grouped, BLOCK):
             groups = self._values[start : min(start + BLOCK, grouped)].reshape(-1, 4, k)
             thin = np.stack(

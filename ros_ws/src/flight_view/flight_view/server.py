@@ -59,16 +59,16 @@ HEADERS = {
     "X-Content-Type-Options": "nosniff",
 }
 MAX_CONNECTIONS = 64  # with the token; a browser holds up to six
-# further connections: for requests of control, and for the first request of a connection
+# Further connections: for requests of control, and for the first request of a connection.
 RESERVED = 8
 # s, for a request to arrive in full, for the next request to begin, and for the peer to take the
-# answer
+# answer.
 REQUEST_TIMEOUT = 10.0
 MAX_REQUEST_BYTES = 8192
 MAX_WAIT = 2.0  # s that a request for samples waits for new samples
 MAX_ROWS = 10_000  # of a topic in one answer
 MAX_DIGITS = 18  # of a number of rows: below 2^63
-# status of a closed WebSocket, RFC 6455, 7.4.1, and the registry of IANA
+# Status of a closed WebSocket, RFC 6455, 7.4.1, and the registry of IANA.
 POLICY_VIOLATION = 1008
 TRY_AGAIN_LATER = 1013
 TOKEN_HEADER = "X-Page-Token"  # noqa: S105 - a name
@@ -296,7 +296,7 @@ class _LimitedServer(HTTPServer):
 
     def initialize(self, *args: Any, **kwargs: Any) -> None:
         super().initialize(*args, **kwargs)
-        # by connection in the order of arrival: whether it has a place for long
+        # Whether a connection has a place for long, in the order of arrival.
         self._admitted: dict[IOStream, bool] = {}
 
     def handle_stream(self, stream: IOStream, address: tuple[Any, ...]) -> None:
@@ -429,7 +429,8 @@ class _Data(_Handler):
         }
         content = await self.server.news(self.server.flights[number], known)
         self.set_header("Content-Type", "application/octet-stream")
-        with suppress(StreamClosedError):  # the browser has left
+        # The browser has left.
+        with suppress(StreamClosedError):
             await self.finish(content)
 
 
@@ -473,10 +474,11 @@ class _News(_Handler, WebSocketHandler):
             parse_qsl(message if isinstance(message, str) else "", keep_blank_values=True)
         )
         self._since = time.monotonic()
-        # done once the answer is in the buffers of the network
+        # Done once the answer is in the buffers of the network.
         self._answered = asyncio.get_running_loop().create_future()
         self.look()
-        return self._answered  # before it is done, the next message is not read
+        # Before it is done, the next message is not read.
+        return self._answered
 
     def look(self) -> None:
         """Answer the request on news or after MAX_WAIT.
@@ -487,7 +489,7 @@ class _News(_Handler, WebSocketHandler):
         if self._known is None:
             if waited > REQUEST_TIMEOUT:
                 self.close()
-                # the peer does not read the end of the answer either
+                # The peer does not read the end of the answer either.
                 if self._sending is not None and not self._sending.done():
                     self._peer.close()
             return
@@ -502,7 +504,8 @@ class _News(_Handler, WebSocketHandler):
         self._sending = asyncio.ensure_future(self._send(content))
 
     async def _send(self, content: bytes) -> None:
-        with suppress(WebSocketClosedError):  # the browser has left, or the stream is closed
+        # The browser has left, or the stream is closed.
+        with suppress(WebSocketClosedError):
             await self.write_message(content, binary=True)
         self._answered.set_result(None)
 
@@ -541,4 +544,5 @@ class _Control(_Handler):
 
 
 def _refuse_constant(text: str) -> float:
-    raise ValueError(text)  # NaN and Infinity are no JSON
+    # NaN and Infinity are no JSON.
+    raise ValueError(text)

@@ -98,7 +98,7 @@ def _attitude(flight: Flight) -> str:
         math.degrees(_newest(flight, "pose", name)) for name in ("phi", "theta", "psi")
     )
     altitude, climb = (_newest(flight, "pose", name) for name in ("altitude", "climb"))
-    # a pose may have no psi
+    # A pose may have no psi.
     heading_text = f"{round(heading) % 360:03d}" if math.isfinite(heading) else "-"
     angles = f"roll {roll:+.1f} deg, pitch {pitch:+.1f} deg, heading {heading_text} deg"
     place_text = (

@@ -20,7 +20,8 @@ from flight_log.open_log import log_files, log_topics
 from flight_log.rosbag2_metadata import bag_files
 from flight_log.tape_reader import A_FLIGHT, aircraft_namespaces, chosen_namespace, listed
 from flight_view.control import Control
-from flight_view.flight import RATES, Flight
+from flight_view.flight import Flight
+from flight_view.page_topics import RATES
 from flight_view.server import ADDRESS, Server
 
 DEFAULT_PORT = 8077
@@ -112,7 +113,7 @@ async def _serve(server: Server, ports: Sequence[int], announce: Callable[[str],
         try:
             server.listen(port)
         except OSError as error:
-            # the sentence of `strerror` may hold the address
+            # The sentence of `strerror` may hold the address.
             reason = os.strerror(error.errno or 0)
         else:
             break
@@ -127,7 +128,7 @@ async def _serve(server: Server, ports: Sequence[int], announce: Callable[[str],
     )
     follow = asyncio.ensure_future(server.follow())
     loop = asyncio.get_running_loop()
-    # also when a shell started this in the background, with SIGINT ignored
+    # The signals end the page also when a shell started it in the background, with SIGINT ignored.
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, follow.cancel)
     try:

@@ -179,9 +179,10 @@ def _entries(model: LinearModel) -> Iterator[Finding]:
             continue
         entry = float(model.matrix_a()[names.index(row), names.index(column)])
         expected = sign * values[symbol]
+        # A multirotor hovers: its entry of V0 is 0.
         left_out = entry == 0.0 and (
             symbol.startswith("2 g") or (symbol == "V0" and not model.angular)
-        )  # a multirotor hovers
+        )
         if least <= entry / expected <= most or left_out:
             continue
         about = f"{'-' if sign < 0.0 else ''}{symbol} = {expected:.4g}" if symbol else f"{sign:.0f}"

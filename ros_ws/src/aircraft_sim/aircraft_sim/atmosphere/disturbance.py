@@ -28,7 +28,7 @@ AIR_STATE = {
 V0, small angles; p - p_g, q - q_g, r - r_g."""
 
 # s, used for rise 0, a step: t / 1e-30 saturates for every t > 0, in float32 too, without division
-# by 0
+# by 0.
 MIN_RISE = 1e-30
 
 
@@ -69,8 +69,8 @@ def one_minus_cosine(t: Array, gusts: Gusts, airspeed: Array) -> Array:
     since = t - gusts.start
     if gusts.every is not None:
         since = xp.where(since > 0.0, since % gusts.every, since)
-    # minimum and maximum are several times faster than clip, which checks the types of its limits
-    # first
+    # Minimum and maximum are several times faster than clip, which checks the types of its limits
+    # first.
     s = xp.minimum(xp.maximum(airspeed * since / gusts.length, 0.0), 2.0)
     return gusts.speed / 2.0 * (1.0 - xp.cos(xp.pi * s))
 

@@ -25,11 +25,11 @@ from flight_core.parameters import ParameterError, require
 from flight_core.units import FOOT
 from flight_core.vectors import FloatArray
 
-# prefix of `airframe` in a scenario for an aircraft of JSBSim, as in jsbsim:c172p
+# Prefix of `airframe` in a scenario for an aircraft of JSBSim, as in jsbsim:c172p.
 PREFIX = "jsbsim:"
-# environment: a folder with aircraft, engine and systems in place of the package's
+# Environment: a folder with aircraft, engine and systems in place of the package's.
 ROOT_VARIABLE = "JSBSIM_ROOT"
-# of the file of a model
+# Suffix of the file of a model.
 SUFFIX = ".xml"
 MODEL_ELEMENT = "fdm_config"
 
@@ -52,7 +52,7 @@ NamedProperties = tuple[tuple[str, float], ...]
 NONE = "none"
 
 
-# outside of JSBSim's settings
+# A property outside of JSBSim's settings.
 PROPERTY = re.compile(r"(?!simulation/)[A-Za-z][\w-]*(\[\d+\])?(/[A-Za-z][\w-]*(\[\d+\])?)+")
 
 

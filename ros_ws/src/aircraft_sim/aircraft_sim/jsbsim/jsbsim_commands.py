@@ -28,7 +28,8 @@ still run."""
 PART = 0.2  # of a command, moved to see the effect
 MOVED = 0.5  # s of frozen flight after it: an engine begins to respond
 AFTERWARDS = 10.0  # s: an engine returns
-# of the difference between two equal runs, of an engine that settles: a change beyond is an effect
+# Multiple of the difference between two equal runs, as of an engine that settles: a change beyond
+# is an effect.
 NOISE = 2.0
 SYSTEMS = ("flight_control", "autopilot", "system")
 CONVENTION = "-cmd-norm"  # at the end of JSBSim's own commands

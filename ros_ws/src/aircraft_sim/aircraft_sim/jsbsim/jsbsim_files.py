@@ -23,10 +23,10 @@ from aircraft_sim.jsbsim.jsbsim_aircraft import SUFFIX, root_of
 from flight_core.files import open_nonblocking
 from flight_core.parameters import ParameterError, require
 
-# sections of a model that open a socket or write a file; within a section they name properties
+# Sections of a model that open a socket or write a file; within a section they name properties.
 LEFT_OUT = ("input", "output")
 CHILD = "child"  # a section with the name of a further model, which JSBSim does not support yet
-# properties of simulation/: JSBSim writes a file where one is set
+# Properties of simulation/: JSBSim writes a file where one is set.
 WRITERS = ("do_linearization", "write-state-file")
 
 ENGINE_FOLDERS = ("Engines", "engines", "Engine", "engine")
@@ -62,7 +62,7 @@ class ModelFiles(NamedTuple):
     """A model and the named files, as a root of JSBSim."""
 
     model: str  # its path in the root
-    # content by path: aircraft/NAME/ has what is beside the model, engine/ and systems/ the rest
+    # Content by path: aircraft/NAME/ has what is beside the model, engine/ and systems/ the rest.
     members: Mapping[str, bytes]
     left_out: tuple[str, ...]  # the sections that are not loaded, as <output name="x.csv">
 

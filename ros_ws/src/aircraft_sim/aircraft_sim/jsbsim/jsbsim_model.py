@@ -75,7 +75,8 @@ class JsbsimModel:
             condition, jsbsim_trim.trim_solution(condition)
         )
         engines = engine_count(self._fdm)
-        self._commands = [  # of an input: the nodes, their values in trim and at the command 1
+        # For each input the nodes, their values in trim and at the command 1.
+        self._commands = [
             [
                 (node := self._node(path), node.get_double_value(), at_one)
                 for path, at_one in command_paths(command, engines)
@@ -90,7 +91,7 @@ class JsbsimModel:
             self._node(path)
             for path in (jsbsim_trim.HEADING, jsbsim_trim.HEIGHT, jsbsim_trim.CONTACT)
         )
-        # the number and the flag of the engines that can stop: an electric engine has no flag
+        # The number and the flag of the engines that can stop: an electric engine has no flag.
         running = {i + 1: self._node(jsbsim_trim.running_property(i)) for i in range(engines)}
         self._engines = {
             number: node for number, node in running.items() if node.get_double_value()
@@ -113,7 +114,7 @@ class JsbsimModel:
         self._altitude = self._node("position/h-sl-ft")
         self._position_ground = np.zeros(2)  # to the north and the east of the start
         self._apply_wind(self._wind(0))
-        # one step: the wind of t = 0 acts from t = 0 on
+        # A step is made here: the wind of t = 0 acts from t = 0 on.
         settle(self._fdm, seconds(condition.step_ns))
         self._x = self._deviations()
         self._pose_nodes = [(self._node(path), si) for path, si in POSE]
@@ -242,7 +243,8 @@ class JsbsimModel:
 
     def _node(self, path: str) -> jsbsim.FGPropertyNode:
         node = self._fdm.get_property_manager().get_node(path)
-        if node is None:  # the trim has checked that it exists
+        # The trim has checked that it exists.
+        if node is None:
             raise FlightEnded(f"{self.condition.title} cannot be flown: it has no property {path}")
         return node
 

@@ -68,19 +68,18 @@ ATTEMPTS = (
 """Settling times, s, and the part of the pitch trim given by the elevator: all, for a model without
 a trim of its own."""
 
-# of TOLERANCE: accelerations that an engine leaves which has not settled; with more it is not the
-# engine
+# Multiple of TOLERANCE that an engine leaves which has not settled; with more it is not the engine.
 NEAR = 100.0
 FAR = 1e6  # of TOLERANCE: of a motion whose accelerations are not finite
 IDLE = 0.01  # throttle below which an engine without thrust is no failure
 
-# alpha (rad), throttle, pitch trim, aileron, rudder (1), bank (rad)
+# alpha (rad), throttle, pitch trim, aileron, rudder (1), bank (rad).
 START = np.array([0.05, 0.7, 0.0, 0.0, 0.0, 0.0])
 SCALE = np.array([0.1, 0.5, 0.5, 0.5, 0.5, 0.1])  # scales of these unknowns for the solver
-# of these unknowns
+# Bounds of these unknowns.
 LOWEST = (-0.5, 0.0, -1.0, -1.0, -1.0, -0.5)
 HIGHEST = (0.5, 1.0, 1.0, 1.0, 1.0, 0.5)
-# m/s^2, rad/s^2: a tenth of a degree of attitude
+# m/s^2, rad/s^2: a tenth of a degree of attitude.
 TOLERANCE = np.array([0.02, 0.02, 0.02, 0.002, 0.002, 0.002])
 
 NOT_BALANCED = "are left at best"  # words of a trim that the solver does not reach
@@ -90,7 +89,7 @@ NEIGHBOURS = ((0.9, 1.0), (1.1, 1.0), (0.75, 1.0), (1.35, 1.0), (1.0, 0.5), (0.7
 
 PROBE_TIME = 2.0  # s of the test flight in the isolated process
 PROBE_SIZE = 0.02  # how far the test flight moves each command
-# s of processor time for trim and test flight; every aircraft that trims needs less than one
+# s of processor time for trim and test flight; every aircraft that trims needs less than one.
 TIMEOUT = 30.0
 NEAR_TIMEOUT = 3.0  # the same for a condition beside one without a trim
 
@@ -270,7 +269,7 @@ def _solve_trim(condition: FlightCondition) -> TrimSolution:
             if residual < nearest or not problem:
                 nearest = residual
                 problem = _trim_failure(attempt, condition)
-            # a solver far from a trim may have left it with numbers that are not finite
+            # A solver far from a trim may have left it with numbers that are not finite.
             fdm = _load(condition)
     except jsbsim.BaseError as error:
         problem = error_text(error)
@@ -307,7 +306,8 @@ def _load(condition: FlightCondition) -> jsbsim.FGFDMExec:
             f"{condition.title} has no engine to control V with: no "
             f"{INPUTS['throttle'].property}[0]"
         )
-    for path in _properties(condition, engines):  # JSBSim creates a property that it does not have
+    # JSBSim creates a property that it does not have.
+    for path in _properties(condition, engines):
         if not manager.hasNode(path):
             raise FlightEnded(f"{condition.title} cannot be flown: it has no property {path}")
     fdm["ic/h-sl-ft"] = condition.altitude / FOOT
@@ -327,10 +327,11 @@ def _loaded(foreign: Path | None, name: str, folder: Path) -> jsbsim.FGFDMExec:
     Raises ParameterError, OSError and BaseError.
     """
     log = _Log()
-    jsbsim.set_logger(log)  # of this thread
+    # The logger is that of this thread.
+    jsbsim.set_logger(log)
     fdm = jsbsim.FGFDMExec(str(root() if foreign is None else folder))
     fdm.set_debug_level(0)
-    # some models write tables into the working folder while they load
+    # Some models write tables into the working folder while they load.
     fdm.set_output_path(os.devnull)
     if foreign is not None:
         files = model_files(foreign)
@@ -399,7 +400,8 @@ def _solve_accelerations(
         return residuals(fdm)
 
     _start_engines(fdm, condition)
-    # inside the stops, also where an input has no effect: a flying wing has no rudder
+    # The unknowns stay inside the stops, also where an input has no effect: a flying wing has no
+    # rudder.
     if by_elevator:
 
         def weighted(scaled: FloatArray) -> FloatArray:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from flight_core.vectors import Array, array_namespace
 
-# s, used for lag 0: exp(-dt / 1e-30) is exactly 0, in float32 too, and there is no division by 0
+# s, used for lag 0: exp(-dt / 1e-30) is exactly 0, in float32 too, and there is no division by 0.
 MIN_LAG = 1e-30
 
 

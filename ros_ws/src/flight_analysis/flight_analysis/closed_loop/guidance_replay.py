@@ -16,7 +16,7 @@ from flight_core.channels import ATTITUDE
 from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
-from flight_guidance import guidance
+from flight_guidance import guidance, guidance_log
 from flight_guidance.guidance_state import Begin, GuidanceState, Inputs, StepCommands
 from flight_guidance.notices import FAILED, LINK_AGE
 from flight_guidance.params import GuidanceConfig
@@ -67,7 +67,7 @@ def replay_guidance(tape: Tape, parameters: GuidanceConfig | None) -> GuidanceRe
     if parameters is None:
         raise ParameterError("the log: found guidance, expected its section in the scenario too")
     steps = len(tape.time("guidance"))
-    if tape["guidance"].names != guidance.names(parameters.outputs):
+    if tape["guidance"].names != guidance_log.names(parameters.outputs):
         why = "the log has other channels of guidance"
         return GuidanceReplay(
             steps=steps,
@@ -117,7 +117,7 @@ class _Comparison:
         rows = zip(self._signal.stamp_ns.tolist(), self._signal.values, strict=True)
         for k, (stamp_ns, row) in enumerate(rows):
             channels = dict(zip(self._names, row.tolist(), strict=True))
-            inputs, recorded = guidance.restored(stamp_ns, channels, self._outputs)
+            inputs, recorded = guidance_log.restored(stamp_ns, channels, self._outputs)
             begins = previous is not None or inputs.begin is Begin.HOLD
             # After a failed step without a sample in the log the filters begin again.
             failed = channels[FAILED]
@@ -146,7 +146,7 @@ class _Comparison:
             state, commands = previous, StepCommands()
         else:
             state, commands = guidance.step(previous, inputs, self._legs[route], self._params)
-        sample = guidance.GuidanceSample(
+        sample = guidance_log.GuidanceSample(
             inputs=inputs,
             state=state,
             commands=commands,
@@ -154,7 +154,7 @@ class _Comparison:
             link_age=channels[LINK_AGE],
             failed=int(channels[FAILED]),
         )
-        return np.append(guidance.row(sample, self._outputs), guidance.u_m(state))
+        return np.append(guidance_log.row(sample, self._outputs), guidance.u_m(state))
 
     def _difference(
         self, k: int, recorded: FloatArray, computed: FloatArray

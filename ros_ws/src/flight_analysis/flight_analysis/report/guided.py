@@ -19,7 +19,7 @@ from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 from flight_guidance.fence.zones import clearance
-from flight_guidance.guidance import WIND
+from flight_guidance.guidance_log import WIND
 from flight_guidance.guidance_state import (
     LATERAL,
     TARGETS,

@@ -42,7 +42,7 @@ from flight_core.rates import NANOSECONDS
 from flight_core.scenario_file import A_SCENARIO
 from flight_core.tape import Tape
 from flight_core.text import printable
-from flight_guidance.guidance import require_channels
+from flight_guidance.guidance_log import require_channels
 from flight_log.bag import CHANNEL_UNITS, IMPORTED, OUTCOME_FILE, LogAttachments
 from flight_log.engagements import Engagement
 from flight_log.provenance import FLIGHT, provenance

@@ -47,7 +47,7 @@ class Vehicle:
     inputs: tuple[int, ...]  # (p,) indices of the effectors in the airframe's order
     remainder_states: tuple[int, ...]  # (c,) indices of the states in the nonlinear remainder
     vanes: tuple[int, ...]  # indices in the state of what the vanes read
-    # reduced to the remainder: f_state of x[remainder_states] gives the rows `remainder_rows`
+    # Reduced to the remainder: f_state of x[remainder_states] gives the rows `remainder_rows`.
     remainder: Aircraft
     actuators: Actuators  # (p, 1), airframe's order
     limits: Limits  # (m, 1), law's order: of u, as the controller has them
@@ -301,7 +301,7 @@ def advance(
     """The state at the next tick, with the command of this one."""
     blocks = timing.blocks
     u_late = timing.u_late
-    # of the states in the order of the blocks
+    # Places of the states in the order of the blocks.
     places = np.argsort([*chain.from_iterable(block.rows for block in blocks)])
     history = jnp.concatenate([command[None], now.command_before])
     acting = (

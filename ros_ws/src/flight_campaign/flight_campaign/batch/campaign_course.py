@@ -101,9 +101,8 @@ def require_flyable(scenario: Scenario) -> None:
         require(getattr(aircraft, key) is None, f"aircraft.{key}", "a section", expected)
     expected = "linear or euler: a campaign flies no multicopter"
     require(aircraft.kinematics != "thrust", "aircraft.kinematics", "thrust", expected)
-    learns_nothing = aircraft.over_airspeed is None
     require(
-        learns_nothing,
+        aircraft.over_airspeed is None,
         "aircraft.over_airspeed",
         aircraft.over_airspeed,
         "none: the aircraft of a campaign keep their trim speed",
@@ -142,17 +141,10 @@ def build_course(scenario: Scenario) -> Course:
     order = np.array([outputs.index(name) for name in controller.outputs])
 
     errors = aircraft.sensor_arrays()
-    late = divide(errors.delay_ns, tick_ns, "sensors.delay", "a tick") if errors.delay_ns else 0
-    lossless = errors.dropout == 0.0 or tick_ns == sample_ns
-    require(
-        lossless,
-        "aircraft.rate",
-        f"{aircraft.rate:g} Hz",
-        f"controller.rate ({controller.rate:g} Hz) with dropouts",
-    )
+    late = _whole_ticks(errors.delay_ns, tick_ns, "sensors.delay")
+    _require_lossless(scenario, errors)
+    u_late = _whole_ticks(nanoseconds(aircraft.actuators.delay), tick_ns, "actuators.delay")
     vanes = [outputs.index(name) for name in controller.vanes]
-    u_delay_ns = nanoseconds(aircraft.actuators.delay)
-    u_late = divide(u_delay_ns, tick_ns, "actuators.delay", "a tick") if u_delay_ns else 0
     _require_plain_vanes(scenario, late)
     error, noise = _sensor_errors(errors, ticks, tick_ns // sample_ns, len(outputs))
     y_m, y_m_dot = _references(scenario, ticks, tick_ns)
@@ -188,6 +180,24 @@ def build_course(scenario: Scenario) -> Course:
         u_late=u_late,
         period=seconds(tick_ns),
         steps=steps,
+    )
+
+
+def _whole_ticks(delay_ns: int, tick_ns: int, key: str) -> int:
+    """A delay in ticks. Raises ParameterError for a part of a tick."""
+    return divide(delay_ns, tick_ns, key, "a tick") if delay_ns else 0
+
+
+def _require_lossless(scenario: Scenario, errors: sensors.Sensors) -> None:
+    """Raise ParameterError for dropouts of a y with a different rate than the ticks."""
+    y_rate = scenario.aircraft.rate
+    rate = scenario.controller.rate
+    has_same_rate = period_ns(rate, "controller.rate") == period_ns(y_rate, "aircraft.rate")
+    require(
+        errors.dropout == 0.0 or has_same_rate,
+        "aircraft.rate",
+        f"{y_rate:g} Hz",
+        f"controller.rate ({rate:g} Hz) with dropouts",
     )
 
 

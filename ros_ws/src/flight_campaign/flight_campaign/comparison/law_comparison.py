@@ -41,7 +41,7 @@ class Scores(NamedTuple):
 
     mean: float  # infinite if one diverged
     worst: float
-    # fraction with loss of track, a score above LOSS_OF_TRACK_SCORE; includes diverged ones
+    # Fraction with loss of track, a score above LOSS_OF_TRACK_SCORE; includes diverged ones.
     lost: float
 
 
@@ -60,11 +60,11 @@ class LawResult(NamedTuple):
     costs: list[float]  # of the seeds of its tuning; empty for gains of a scenario
     scores: dict[str, float]  # on the nominal aircraft, by wind
     levels: tuple[Level, ...]
-    # by delay of u in s: fraction of the aircraft of the first level that lose track in gusts
+    # By delay of u in s: fraction of the aircraft of the first level that lose track in gusts.
     lost_late: dict[float, float]
     rms: FloatArray  # (m,) of the true error, nominal aircraft in gusts
     slew: FloatArray  # (m,) mean abs(u_dot), nominal aircraft in gusts
-    # of the nominal aircraft; None for a law without a linear loop from y to u
+    # Margins of the nominal aircraft; None for a law without a linear loop from y to u.
     margins: Margins | None
 
 

@@ -128,7 +128,7 @@ def find_laws(
                 getattr(controller, key),
                 f"{expected}, as in {scenario.name}",
             )
-        # in a benchmark topics have no delay
+        # In a benchmark topics have no delay.
         controllers[name] = controller.model_copy(update={"delay": 0.0})
     return controllers
 

@@ -6,7 +6,7 @@ On the nominal aircraft and around.
 """
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from itertools import product
@@ -90,11 +90,11 @@ INITIAL_SIGMA = 0.4
 """A search has GENERATIONS, or GENERATIONS_PER_GAIN times its gains if that is more: from 15 gains
 on. INITIAL_SIGMA is the first standard deviation of log(gain)."""
 
-# of the candidates of a generation, flown side by side; a flight in a smaller part takes more
-# processor time
+# Parts of the candidates of a generation, flown side by side. A flight in a smaller part takes more
+# processor time.
 PARTS = 2
 
-# cost of a flight that diverged, of a loop without any margin, and upper bound of every other cost
+# Cost of a flight that diverged, of a loop without any margin, and upper bound of every other cost.
 MAX_COST = 1000.0
 # s. Step of the integration, or one tick if that is shorter. The scores are within 1 % of those of
 # a finer step.
@@ -371,6 +371,16 @@ def tune(
             ]
             if progress is not None:
                 progress(generation + 1, min(value for value, _ in best))
+    return _best_result(best, seeds, generations * POPULATION, gains_of)
+
+
+def _best_result(
+    best: Sequence[tuple[float, FloatArray]],
+    seeds: Sequence[int],
+    evaluation_count: int,
+    gains_of: Callable[[FloatArray], Gains],
+) -> TuningResult:
+    """The gains of the seed with the smallest cost; `best`: cost and logarithms by seed."""
     winner = int(np.argmin([value for value, _ in best]))
     gains = _rounded(gains_of(best[winner][1][None]))
     lowest = [round(value, 4) for value, _ in best]
@@ -379,7 +389,7 @@ def tune(
         cost=lowest[winner],
         seed=seeds[winner],
         costs=lowest,
-        evaluations=generations * POPULATION,
+        evaluations=evaluation_count,
     )
 
 

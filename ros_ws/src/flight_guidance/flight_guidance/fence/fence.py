@@ -61,7 +61,7 @@ class Motion(NamedTuple):
     wind: tuple[Scalar, Scalar]  # where the air moves to: north, east, m/s
     bank: Scalar  # largest bank, rad
     roll_rate: float  # rad/s
-    # s, of the turn behind the commanded bank: half of 1 / k_phi, and `turn_lag`
+    # s, of the turn behind the commanded bank: half of 1 / k_phi, and `turn_lag`.
     lag: float
 
 

@@ -56,9 +56,9 @@ def inside(zone: Zone, north: Array, east: Array) -> Array:
     distance = _distance(start_north, start_east, edge_north, edge_east, north, east)
     x = north[..., None] - start_north
     y = east[..., None] - start_east
-    # an edge to the east crosses no line to the east
+    # An edge to the east crosses no line to the east.
     level = np.where(edge_north == 0.0, 1.0, edge_north)
-    # by a ray to the east: even-odd rule
+    # A ray to the east counts the edges: even-odd rule.
     crossed = ((x < 0.0) != (x < edge_north)) & (y < x * edge_east / level)
     return xp.where(xp.sum(crossed, axis=-1) % 2 == 1, distance, -distance)
 
@@ -87,7 +87,8 @@ def clearance(zones: tuple[Zone, ...], north: Array, east: Array) -> Array:
     if not groups:
         return reduce(xp.minimum, out)
     stay = _deepest(groups, north, east)
-    if len(groups) > 1:  # a border inside of another group is no border
+    # A border inside of another group is no border.
+    if len(groups) > 1:
         stay = xp.where(
             stay >= 0.0, xp.maximum(stay, _distance(*_border(groups), north, east)), stay
         )

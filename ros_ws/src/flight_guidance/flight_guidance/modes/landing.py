@@ -66,7 +66,8 @@ def landing_at(
     """
     key = f"landing.waypoint {section.waypoint}"
     lines = [k for k, leg in enumerate(route.legs) if isinstance(leg, Line)]
-    fillet = max(route.radius * math.tan(STRAIGHT / 2.0), 1.0)  # by the fillet of a corner
+    # A fillet of a corner takes so much of the line.
+    fillet = max(route.radius * math.tan(STRAIGHT / 2.0), 1.0)
     pairs = [
         (leg, around)
         for leg, around in pairwise(lines)

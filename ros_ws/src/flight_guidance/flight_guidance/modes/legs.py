@@ -49,7 +49,8 @@ def along_route(
         return on_leg(state, state.leg + 1, route) if ends else state, 0.0
     if leg.end is None or not path.passed(leg, position):
         return state, 0.0
-    distance = math.dist(leg.end, position)  # after a sharp corner, too, the next leg is joined
+    # After a sharp corner, too, the next leg is joined.
+    distance = math.dist(leg.end, position)
     return joining(state, state.leg + 1, 0.0, pose, route), distance if distance > near else 0.0
 
 
@@ -175,14 +176,16 @@ def joining(
     """
     state = on_leg(state, leg, route)
     flown = route.legs[leg]
-    if path.is_orbit(flown):  # the law of circles leads to an orbit from afar
+    # The law of circles leads to an orbit from afar.
+    if path.is_orbit(flown):
         return state
     start, course = route.start(leg, along)
     position = (pose["north"], pose["east"])
     side = path.joining(
         start, course, route.radius, route.near(leg), position, course_and_speed(pose)[0]
     )
-    if isinstance(flown, Arc) and side:  # the circle of the arc itself
+    # The joining circle is that of the arc itself.
+    if isinstance(flown, Arc) and side:
         side = math.copysign(1.0, flown.radius)
     if side and not along and route.from_V:
         state = state._replace(target=state.target._replace(V=route.from_V[leg]))

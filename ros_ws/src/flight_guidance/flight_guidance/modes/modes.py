@@ -181,7 +181,8 @@ def _wanted_rates(
     rates = body_rates(
         phi_c, theta_c, state.phi, state.theta, r, 0.0 if flat else beta, speed, attitude
     )
-    if flat:  # the sideslip is wanted
+    # The sideslip is wanted.
+    if flat:
         rates = rates._replace(r=rates.r + state.target.r)
     if state.mode is GuidanceMode.POSE_LOST:
         rates = BodyRates(0.0, 0.0, 0.0)
@@ -275,7 +276,8 @@ def _with_attitude(
     """Mode, and attitude from pose or by dead reckoning."""
     pose = dict(zip(POSE, inputs.pose, strict=True))
     if inputs.pose_age_ns <= params.max_age_ns:
-        if state.mode is GuidanceMode.POSE_LOST:  # the aircraft may be anywhere by now
+        # The aircraft may be anywhere by now.
+        if state.mode is GuidanceMode.POSE_LOST:
             after_loss = (
                 home(pose, params)
                 if params.home.after_loss
@@ -386,7 +388,8 @@ def _climb(
 ) -> tuple[Scalar, Any]:
     """Commanded climb rate, m/s, and whether protection limits the rate."""
     if state.vertical is Vertical.THETA:
-        return pose["climb"], False  # the start value for the modes CLIMB and ALTITUDE
+        # The start value for the modes CLIMB and ALTITUDE.
+        return pose["climb"], False
     vertical = params.vertical
     target = state.target
     climb = (

@@ -44,7 +44,7 @@ def within_reach(params: GuidanceParams, authority: Authority) -> GuidanceParams
     if rolls:
         rate = min(rate, reach.roll_rate(authority.p, 4.0 * attitude.k_phi))
         bank = limits.bank * min(1.0, params.path.period / reach.least_period(limits.bank, rate))
-    # the airspeed flies the climb: its command moves by the bandwidth of V, 1 m/s each
+    # The airspeed flies the climb: its command moves by the bandwidth of V, 1 m/s each.
     if "q" in dead:
         faster = tuple(
             4.0 * rate if name == "V" else rate

@@ -55,7 +55,7 @@ MEANINGS = {
     179: "heights above the home stay above the first home, and not above that of DO_SET_HOME",
     601: "DO_JUMP_TAG repeats items, which are flown once here",
 }
-# after which an autopilot flies no item: a loiter without end, the return, the landings
+# Commands after which an autopilot flies no item: a loiter without end, the return, the landings.
 LAST = (UNLIMITED, 20, LAND, 85)
 OTHER_WAYS = (34, 35, 36, 94)  # to a place, no line and no loiter
 

@@ -98,7 +98,7 @@ def has_first_fence(tree: Any) -> bool:
     )
 
 
-# complexItemType, with the waypoints that QGroundControl made
+# complexItemType, with the waypoints that QGroundControl made.
 TRANSECTS = ("survey", "CorridorScan")
 LANDINGS = ("fwLandingPattern", "vtolLandingPattern")  # as NAV_LAND, not flown
 

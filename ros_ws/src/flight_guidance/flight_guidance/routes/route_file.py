@@ -40,11 +40,11 @@ class Waypoint(NamedTuple):
     north: float  # m from the origin
     east: float  # m from the origin
     altitude: float  # m, as `pose` counts it
-    # airspeed on the leg to the waypoint, m/s; None: as on the leg before
+    # Airspeed on the leg to the waypoint, m/s; None: as on the leg before.
     speed: float | None = None
     turns: float = 0.0  # turns round the waypoint before the aircraft flies on, 1
     wait: float = 0.0  # time on the circle round the waypoint, or in a hover, s
-    # altitude at which the aircraft leaves a circle round the waypoint, m; None: `altitude`
+    # Altitude at which the aircraft leaves a circle round the waypoint, m; None: `altitude`.
     leave: float | None = None
 
     @property
@@ -435,43 +435,7 @@ def _read_yaml(content: bytes, key: str, origin: Origin | None) -> Iterator[Wayp
     for k, point in enumerate(points or ()):
         name = f"route[{k}]"
         if isinstance(point, Mapping):
-            position = next((pair for pair in POSITIONS if pair[0] in point), POSITIONS[0])
-            unknown = sorted(map(str, set(point) - {*position, "altitude", *FURTHER}))
-            expected = (
-                "north and east or latitude and longitude, altitude, and perhaps V, "
-                "turns, wait, leave"
-            )
-            require(not unknown, name, f"the keys {short_repr(unknown)}", expected)
-            first, second, altitude, speed, turns, wait, leave = (
-                point.get(key) for key in (*position, "altitude", *FURTHER)
-            )
-            if position == POSITIONS[0]:
-                waypoint = _waypoint(
-                    name,
-                    _number(name, first, "north"),
-                    _number(name, second, "east"),
-                    altitude,
-                    speed,
-                )
-            else:
-                waypoint = _placed(
-                    Place(
-                        key=name, latitude=first, longitude=second, altitude=altitude, speed=speed
-                    ),
-                    origin,
-                    _Heights(),
-                )
-            circles = {
-                key: _loiter(name, value, key)
-                for key, value in (("turns", turns), ("wait", wait))
-                if value is not None
-            }
-            waypoint = waypoint._replace(**circles)
-            yield (
-                waypoint
-                if leave is None
-                else waypoint._replace(leave=_number(name, leave, "leave"))
-            )
+            yield _waypoint_of_mapping(name, point, origin)
         else:
             fits = isinstance(point, list) and 3 <= len(point) <= 4
             require(
@@ -484,6 +448,31 @@ def _read_yaml(content: bytes, key: str, origin: Origin | None) -> Iterator[Wayp
             yield _waypoint(
                 name, _number(name, north, "north"), _number(name, east, "east"), altitude, *speed
             )
+
+
+def _waypoint_of_mapping(name: str, point: Mapping[str, Any], origin: Origin | None) -> Waypoint:
+    position = next((pair for pair in POSITIONS if pair[0] in point), POSITIONS[0])
+    unknown = sorted(map(str, set(point) - {*position, "altitude", *FURTHER}))
+    expected = (
+        "north and east or latitude and longitude, altitude, and perhaps V, turns, wait, leave"
+    )
+    require(not unknown, name, f"the keys {short_repr(unknown)}", expected)
+    first, second, altitude, speed, turns, wait, leave = (
+        point.get(key) for key in (*position, "altitude", *FURTHER)
+    )
+    if position == POSITIONS[0]:
+        north = _number(name, first, "north")
+        waypoint = _waypoint(name, north, _number(name, second, "east"), altitude, speed)
+    else:
+        place = Place(key=name, latitude=first, longitude=second, altitude=altitude, speed=speed)
+        waypoint = _placed(place, origin, _Heights())
+    circles = {
+        key: _loiter(name, value, key)
+        for key, value in (("turns", turns), ("wait", wait))
+        if value is not None
+    }
+    waypoint = waypoint._replace(**circles)
+    return waypoint if leave is None else waypoint._replace(leave=_number(name, leave, "leave"))
 
 
 def _placed(place: Place, origin: Origin | None, heights: _Heights) -> Waypoint:

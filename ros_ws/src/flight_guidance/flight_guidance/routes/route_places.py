@@ -35,7 +35,7 @@ class Place(NamedTuple):
     altitude_text: str = ""  # what the file has in place of an altitude, for a sentence
     turns: Any = 0.0  # round the place, 1
     wait: Any = 0.0  # round the place, s
-    # whether the altitude is reached round the place, and not on the way to the place
+    # Whether the altitude is reached round the place, and not on the way to the place.
     climbs: bool = False
 
 

@@ -41,7 +41,8 @@ def _parsed_xml(content: bytes, key: str, kind: str) -> Element:
     try:
         parser.feed(content)
         root: Element = parser.close()
-    except (ParseError, ValueError, LookupError) as error:  # the last two: of an encoding
+    except (ParseError, ValueError, LookupError) as error:
+        # ValueError and LookupError come of an encoding.
         raise ParameterError(f"{key}: found {error}, expected the XML of {kind}") from None
     return root
 
@@ -81,13 +82,14 @@ def read_kml(content: bytes, key: str, line: str | None = None) -> Places:
     polygons = _outer_elements(kinds, "Polygon")
     tracks = _outer_elements(kinds, "Track")
     marks = _outer_elements(kinds, "Placemark")
-    # whose Model is a sign
+    # A Model beside a route is a sign.
     others = [kind for kind, element in kinds if kind in KML_OTHERS and element not in tracks]
     geometries: list[Geometry] = []
     for kind, element in kinds:
         if kind == "Point" and has_line:
             geometries.append(Geometry(kind, []))  # a mark, at any altitude
-        elif kind in (*KML_LINES, "Point"):  # the altitudeMode of a Polygon is that of its rings
+        elif kind in (*KML_LINES, "Point"):
+            # The altitudeMode of a Polygon is that of its rings.
             name = _text(marks.get(element), "name") or ""
             geometries.append(
                 Geometry(kind, _kml_places(key, kind, element, polygons.get(element)), name.strip())
@@ -131,7 +133,8 @@ def _kml_places(key: str, kind: str, element: Element, polygon: Element | None) 
     require(
         kind != "Point" or len(tuples) == 1, key, f"a Point with {len(tuples)} positions", "one"
     )
-    if mode == "clampToGround":  # which ignores the altitude
+    # clampToGround ignores the altitude.
+    if mode == "clampToGround":
         tuples = [[*position[:2], "0"] for position in tuples]
     return [
         lon_lat(list(map(number_of, position)), None, KML_MODES[mode], mode_text)

@@ -183,7 +183,8 @@ def circle_error(centre: Point, radius: Scalar, position: Point) -> PathError:
     north = position[0] - centre[0]
     east = position[1] - centre[1]
     side = xp.copysign(1.0, radius)
-    bearing = xp.atan2(east, north)  # from the centre
+    # The bearing is that from the centre.
+    bearing = xp.atan2(east, north)
     return PathError(
         side * (abs(radius) - xp.hypot(north, east)), bearing + side * math.pi / 2.0, 1.0 / radius
     )
@@ -476,7 +477,8 @@ def _between_circles(
             f"more than {radius:g} m, the radius of the circle",
         )
         bearing = course_of(centre, after)
-        if len(points) == 2:  # to a circle of the same radius
+        # The line leads to a circle of the same radius.
+        if len(points) == 2:
             start, end = (_along(point, bearing - math.pi / 2.0, radius) for point in points)
             return [Line(start, end)]
         points[0] = _along(

@@ -1,0 +1,40 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What the page reads of a log: topics with their highest rate, and the channels that it keeps."""
+
+import math
+
+LEARNED = "learned"  # entries of A and B, as identified in flight
+RATE = 50.0  # Hz
+RATES = {
+    "internals": math.inf,
+    LEARNED: math.inf,
+    **dict.fromkeys(("guidance", "pose", "truth", "u", "y", "y_m"), RATE),
+}
+"""Topics that are read, and the highest rate. Ticks are all read: a peak between two drawn samples
+would be hidden."""
+
+IN_TICKS = ("u", "y", "y_m")  # topics that the ticks have, too: not read from the first tick on
+
+GROUPS = {
+    "internals": ("mode", "late", "y", "y_m", "e", "u_free", "u", "limited"),
+    "truth": ("actuator", "gust", "x.phi", "x.theta"),
+    "guidance": (
+        "mode",
+        "leg",
+        "joining",
+        "missed",
+        "xtrack",
+        "to_go",
+        "phi_c",
+        "theta_c",
+        "climb_c",
+        "V_c",
+        "y",
+        "limited",
+        "target",
+        "wind",
+        "fence",
+    ),
+}
+"""Channels and groups of channels that are kept; of the other topics all."""
