@@ -200,7 +200,7 @@ def rival_figures(uncertainty: float, numbers: Sequence[int]) -> Iterator[eviden
         flown = batch.fly(
             flights, benchmark.vehicle, course, law.control_law(benchmark.model), params
         )
-        in_time, delayed = np.split(tuning.score(flown, benchmark.unit), 2)
+        in_time, delayed = np.split(tuning.result_score(flown, benchmark.unit), 2)
         subject = f"rivals, +-{100 * uncertainty:.0f} %"
         yield row(f"{subject}: score, {law.title}", float(np.mean(in_time)))
         yield row(f"{subject}: largest score, {law.title}", float(np.max(in_time)))

@@ -10,7 +10,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from flight_core.rates import NANOSECONDS
-from flight_log.named_vectors import STAMP, stamp_of
+from flight_log.named_vectors import STAMP, stamp_in
 
 STEP_NS = 5 * NANOSECONDS
 Damage = Callable[[int, int, bytes], bytes | None]
@@ -36,16 +36,16 @@ DAMAGES: Mapping[str, Damage] = {
     ),
     "stamps are zero to the middle": lambda k, n, data: restamped(data, 0) if k < n // 2 else data,
     "clock back": lambda k, n, data: (
-        restamped(data, stamp_of(data) - STEP_NS) if k >= n // 2 else data
+        restamped(data, stamp_in(data) - STEP_NS) if k >= n // 2 else data
     ),
     "clock forth": lambda k, n, data: (
-        restamped(data, stamp_of(data) + STEP_NS) if k >= n // 2 else data
+        restamped(data, stamp_in(data) + STEP_NS) if k >= n // 2 else data
     ),
     "clock back and forth": lambda k, n, data: (
-        restamped(data, stamp_of(data) - STEP_NS) if n // 3 <= k < 2 * n // 3 else data
+        restamped(data, stamp_in(data) - STEP_NS) if n // 3 <= k < 2 * n // 3 else data
     ),
     "clock forth and back": lambda k, n, data: (
-        restamped(data, stamp_of(data) + STEP_NS) if n // 3 <= k < 2 * n // 3 else data
+        restamped(data, stamp_in(data) + STEP_NS) if n // 3 <= k < 2 * n // 3 else data
     ),
 }
 """Damages by their names."""
@@ -92,7 +92,7 @@ def damage(log: Path, copy: Path, topic: str, change: Damage, *, from_ns: int = 
                 )
             k = places[channel.topic] = places.get(channel.topic, -1) + 1
             data: bytes | None = (
-                restamped(message.data, stamp_of(message.data) + from_ns)
+                restamped(message.data, stamp_in(message.data) + from_ns)
                 if from_ns
                 else message.data
             )

@@ -110,7 +110,7 @@ def test_frozen_vane_keeps_its_angle_and_lost_reading_repeats_one_before() -> No
     readings = []
     for number in range(1000):
         state = vanes.turned(0.001 * number, np.array([1.0, 2.0]) * number, state, params)
-        state = vanes.read(number, state.angle, state, params)
+        state = vanes.read_vanes(number, state.angle, state, params)
         readings.append(state.reading)
     alpha, beta = np.array(readings).T
     assert alpha[-1] == 499.0  # of the last sample before 0.5 s

@@ -19,7 +19,7 @@ from tests.maps import named_map
 
 from autopilot_bridge.channel_map import set_field
 from autopilot_bridge.map_rows import LinkConfig
-from autopilot_bridge.mavlink_link import COMPANION, Link, message_type
+from autopilot_bridge.mavlink_link import COMPANION, Link, mavlink_type
 from autopilot_bridge.params import ChannelMap
 from flight_core.vectors import ChannelError
 
@@ -198,7 +198,7 @@ def test_override_reaches_the_autopilot_and_leaves_other_channels(ends: Ends) ->
     made, port = ends.started()
     peer = ends.peer(port)
     peer.beat()
-    message = message_type("RC_CHANNELS_OVERRIDE")()
+    message = mavlink_type("RC_CHANNELS_OVERRIDE")()
     for path, value in {
         **named_map("ardupilot_mavlink").messages["override"].values,
         "chan2_raw": 1612.4,
@@ -244,7 +244,7 @@ def test_second_sender_is_conflict_is_not_taken_and_gets_nothing(ends: Ends) -> 
     overrides: list[Any] = []
 
     def send() -> None:
-        made.send(message_type("RC_CHANNELS_OVERRIDE")())
+        made.send(mavlink_type("RC_CHANNELS_OVERRIDE")())
         overrides.extend(
             message
             for message in autopilot.received()
@@ -269,7 +269,7 @@ def test_next_sender_gets_the_messages_once_the_first_one_is_silent(
 
     def send() -> None:
         second.beat()
-        made.send(message_type("RC_CHANNELS_OVERRIDE")())
+        made.send(mavlink_type("RC_CHANNELS_OVERRIDE")())
         sent.extend(second.received())
 
     until(lambda: "RC_CHANNELS_OVERRIDE" in [message.get_type() for message in sent], send)
@@ -340,7 +340,7 @@ def test_link_over_tcp_receives_and_sends(ends: Ends) -> None:
     received: list[Any] = []
 
     def send() -> None:
-        made.send(message_type("RC_CHANNELS_OVERRIDE")())
+        made.send(mavlink_type("RC_CHANNELS_OVERRIDE")())
         received.extend(message.get_type() for message in autopilot.received())
 
     until(lambda: "RC_CHANNELS_OVERRIDE" in received, send)
@@ -414,7 +414,7 @@ def test_bridge_is_no_ground_station_but_by_the_messages_of_its_map(ends: Ends) 
         mavlink.MAV_TYPE_ONBOARD_CONTROLLER,
         mavlink.MAV_AUTOPILOT_INVALID,
     )
-    made.send(message_type("RC_CHANNELS_OVERRIDE")())
+    made.send(mavlink_type("RC_CHANNELS_OVERRIDE")())
     messages.clear()
     until(lambda: any(message.get_type() == "RC_CHANNELS_OVERRIDE" for message in messages), take)
     override = next(message for message in messages if message.get_type() == "RC_CHANNELS_OVERRIDE")
@@ -660,9 +660,9 @@ def test_map_of_ardupilot_asks_for_loiter_after_a_release_that_no_pilot_requeste
 
 def test_wrong_map_or_message_is_one_sentence() -> None:
     with refusing("found no message ALTITUD, expected one of the dialect ardupilotmega"):
-        message_type("ALTITUD")
+        mavlink_type("ALTITUD")
     with pytest.raises(ChannelError, match="chan1_raw cannot be 70000"):
-        set_field(message_type("RC_CHANNELS_OVERRIDE")(), "chan1_raw", 70000.0)
+        set_field(mavlink_type("RC_CHANNELS_OVERRIDE")(), "chan1_raw", 70000.0)
     content = named_map("ardupilot_mavlink").model_dump()
     for changes, sentence in (
         (

@@ -32,7 +32,7 @@ from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS, nanoseconds
 from flight_core.tape import Process, Recording, Tape
 from flight_log.flight_processes import controller_starts
-from flight_log.named_vectors import Samples, encoded, stamp_of
+from flight_log.named_vectors import Samples, encoded, stamp_in
 from flight_log.tape_reader import read_run
 
 pytestmark = pytest.mark.slow
@@ -68,7 +68,7 @@ def read_messages(log: Path) -> Messages:
         for _, channel, message in make_reader(stream).iter_messages():
             if channel.topic in STAMPED:
                 numbers[channel.topic] += 1
-                stamp_ns = EPOCH + stamp_of(message.data)
+                stamp_ns = EPOCH + stamp_in(message.data)
                 data = restamped(message.data, stamp_ns)
                 messages.append(
                     Sent(channel.topic, stamp_ns + 1_000_000, numbers[channel.topic], data)
@@ -127,7 +127,7 @@ def damaged(messages: list[Sent], kind: str, at: float, size: float, topic: str)
 
     def moved(sent: Sent, stamp_by: int, log_by: int) -> Sent:
         is_later = is_hit(sent) and sent.log_ns > begin_ns
-        data = restamped(sent.data, stamp_of(sent.data) + stamp_by) if is_later else sent.data
+        data = restamped(sent.data, stamp_in(sent.data) + stamp_by) if is_later else sent.data
         return sent._replace(log_ns=sent.log_ns + log_by * is_later, data=data)
 
     changes: dict[str, Callable[[], list[Sent]]] = {

@@ -49,7 +49,7 @@ from flight_campaign.campaign import CHUNKS, MonteCarlo, define, fly_chunk
 from flight_campaign.campaign_report import figure_rows, overview
 from flight_campaign.definition import Definition, Sweep
 from flight_campaign.influence import rank_correlations
-from flight_campaign.rows import Chunk, encode, entry_names, tally_of
+from flight_campaign.rows import Chunk, encode_chunk, entry_names, tally_of
 from flight_campaign.statistics import WORST_KEPT, FigureStatistics, Tally, score, score_units
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
@@ -226,7 +226,7 @@ CORNER = ROUTE.vary(
 
 def test_figures_of_a_mission_are_those_of_its_flight_alone() -> None:
     definition = define(CORNER, 2, 0.3, 7, 2)
-    chunk = single_flights.fly_chunk(definition, (0, 0))
+    chunk = single_flights.fly_chunk_singly(definition, (0, 0))
     assert not chunk.diverged.any()
     figures = {key: values[1] for key, values in chunk.figures.items()}
     tape = simulate(definition.aircraft_scenario(1))
@@ -334,7 +334,7 @@ def flown_rows(folder: Path, scenario: Scenario, learner: Any, count: int) -> Mo
 def flown_alone(campaign: MonteCarlo, number: int, learner: Any) -> dict[str, float]:
     """Figures of an aircraft of a campaign by the loop of `rise-di fly --in-process`."""
     scenario = campaign.definition.aircraft_scenario(number)
-    figures = single_flights.fly(scenario, learner).figures
+    figures = single_flights.fly_single(scenario, learner).figures
     return {name: figures[name] for name in figures if name.startswith(("rms", "max", "slew"))}
 
 
@@ -452,7 +452,7 @@ def test_row_of_aircraft_has_its_figures_outcome_and_drawn_entries(tmp_path: Pat
 def test_figures_of_diverged_aircraft_are_null() -> None:
     score = np.array([1.0, np.inf, 11.0])
     chunk = Chunk(4, np.array([0.0, 1.0, 0.0]), {"score": score}, {"A[q,q]": np.ones(3)})
-    table = pl.read_parquet(io.BytesIO(encode(chunk, 7, 1.0)))
+    table = pl.read_parquet(io.BytesIO(encode_chunk(chunk, 7, 1.0)))
     assert table["score"].to_list() == [1.0, None, 11.0]
     assert table["diverged"].to_list() == [False, True, False]
     assert table["lost"].to_list() == [False, False, True]
@@ -538,7 +538,7 @@ def flown(tmp_path: Path) -> MonteCarlo:
 
 def made_up(score: FloatArray) -> bytes:
     """The rows of a chunk with these scores."""
-    return encode(
+    return encode_chunk(
         Chunk(
             0, np.zeros(len(score)), {"score": score, "rms.q": score}, {"B[p,aileron]": 6.0 - score}
         ),

@@ -44,7 +44,7 @@ REFUSALS: dict[str, tuple[Callable[[], Any], str]] = {
         r"learn: found observer\.vanes beside it, expected none: a learner designs",
     ),
     "a campaign of JSBSim": (
-        lambda: single_flights.require_flyable(find_scenario("jsbsim_c172p_learn")),
+        lambda: single_flights.require_single_flights(find_scenario("jsbsim_c172p_learn")),
         r"airframe: found jsbsim:c172p, expected an airframe with matrices",
     ),
     "a flight behind a bridge": (

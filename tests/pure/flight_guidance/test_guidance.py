@@ -302,8 +302,8 @@ def test_heading_is_smoothed_without_lag_across_180_deg() -> None:
 def test_error_of_line_is_positive_to_right() -> None:
     east = Line((0.0, 0.0), (0.0, 1000.0))
     assert path.error(east, (-7.0, 400.0)) == approx((7.0, math.pi / 2.0, 0.0))
-    assert not path.passed(east, (50.0, 999.0))
-    assert path.passed(east, (50.0, 1001.0))
+    assert not path.is_passed(east, (50.0, 999.0))
+    assert path.is_passed(east, (50.0, 1001.0))
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
@@ -322,7 +322,7 @@ def test_a_fillet_touches_both_legs(side: float) -> None:
     assert path.error(arc, (800.0, 0.0)) == approx((0.0, 0.0, side / 200.0), abs=1e-12)
     assert path.end_course(arc) == approx(side * math.pi / 2.0)
     assert (orbit.centre, orbit.end) == (corner[3], None)
-    assert not path.passed(orbit, (0.0, 0.0))
+    assert not path.is_passed(orbit, (0.0, 0.0))
 
 
 @pytest.mark.parametrize(

@@ -454,7 +454,10 @@ def test_waypoints_at_one_place_are_one(tmp_path: Path) -> None:
 def test_command_that_is_not_flown_is_named(command: int, sentence: str) -> None:
     items = [mission_item(47.4 + 0.01 * k, 8.52, 50.0) for k in range(3)]
     items[1] |= {"command": command}
-    assert sentence in route_formats.read(json.dumps(plan(items)).encode(), "r.plan", ".plan").notes
+    assert (
+        sentence
+        in route_formats.read_places(json.dumps(plan(items)).encode(), "r.plan", ".plan").notes
+    )
 
 
 def test_command_has_its_number_where_pymavlink_is_absent(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -463,14 +466,14 @@ def test_command_has_its_number_where_pymavlink_is_absent(monkeypatch: pytest.Mo
     items[1] |= {"command": 42702}
     assert (
         "not flown: MAV_CMD 42702 (item 2)"
-        in route_formats.read(json.dumps(plan(items)).encode(), "r.plan", ".plan").notes
+        in route_formats.read_places(json.dumps(plan(items)).encode(), "r.plan", ".plan").notes
     )
 
 
 def test_numbers_with_decimal_commas_are_named(tmp_path: Path) -> None:
     text = wpl((3, 16, 47.41, 8.5, 50.0), (3, 16, 47.42, 8.5, 50.0)).replace("47.41", "47,41")
     with refusing(r"line 3: found .*, expected 12 numbers, .* with a point and no comma: 47,41$"):
-        route_formats.read(text.encode(), "r.waypoints", ".waypoints")
+        route_formats.read_places(text.encode(), "r.waypoints", ".waypoints")
 
 
 @pytest.mark.parametrize("place", ["fence", "top"])
@@ -482,7 +485,7 @@ def test_fence_of_version_1_is_named(place: str) -> None:
     content = json.dumps(tree).encode()
     assert any(
         "not read: the fence of version 1" in note
-        for note in route_formats.read(content, "r.plan", ".plan").notes
+        for note in route_formats.read_places(content, "r.plan", ".plan").notes
     )
     with refusing(r"found the fence of version 1 .*, expected one of version 2"):
         route_formats.read_fence(content, "r.plan", ".plan")

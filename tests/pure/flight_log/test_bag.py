@@ -34,7 +34,7 @@ from flight_core.tape import Tape
 from flight_log.bag import BagWriter, LogAttachments
 from flight_log.engagements import Engagement
 from flight_log.message_definitions import definition
-from flight_log.named_vectors import Samples, decoder, encoded, stamp_of, tables
+from flight_log.named_vectors import Samples, decoder, encoded, stamp_in, tables
 from flight_log.open_log import ROSBAG2
 from flight_log.playback import read_playback
 from flight_log.scan import MESSAGE_INDEX, RECORD, FilePart, MessageBatch, Scan, decode_batches
@@ -464,7 +464,7 @@ def test_engagements_of_log_begin_with_phase_engaged_and_end_with_reason(tmp_pat
     kind = "diagnostic_msgs/msg/KeyValue"
     bag = BagWriter(tmp_path / "run")
     other = bag.add_topic("/y", JOINT_STATE, "")
-    bag.write(other, 1, stamp_of(SAMPLES[0]), 1, SAMPLES[0])
+    bag.write(other, 1, stamp_in(SAMPLES[0]), 1, SAMPLES[0])
     bag.flush()
     assert read_run(tmp_path / "run").engagements is None
     channel, of_another = (

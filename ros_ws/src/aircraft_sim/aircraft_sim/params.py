@@ -555,11 +555,9 @@ class AircraftConfig(NodeConfig):
     def pose_every(self) -> int:
         """Number of the aircraft's instants from pose to pose."""
         rate = self.pose.rate
-        return (
-            every(self.rate)
-            if rate is None
-            else divide(period_ns(rate, "pose.rate"), period_ns(self.rate, "rate"), "rate", "")
-        )
+        if rate is None:
+            return every(self.rate)
+        return divide(period_ns(rate, "pose.rate"), period_ns(self.rate, "rate"), "rate", "")
 
     def pose_sensors(self) -> Sensors | None:
         """The errors of pose as arrays, in the order of `channels.POSE`; None of an ideal pose.
@@ -593,8 +591,6 @@ STILL_AIR = Gust(start=0.0, speed=0.0, length=1.0)
 
 def _array(values: Sequence[float], zero_is_none: bool) -> FloatArray | None:
     """The values as an array; None for missing values and, with zero_is_none, for zeros alone."""
-    return (
-        None
-        if not values or (zero_is_none and not any(values))
-        else np.array(values, dtype=np.float64)
-    )
+    if not values or (zero_is_none and not any(values)):
+        return None
+    return np.array(values, dtype=np.float64)

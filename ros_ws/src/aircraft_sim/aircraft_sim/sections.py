@@ -303,7 +303,7 @@ class ActuatorConfig(Config):
     def read_faults(self) -> tuple[effector_faults.Fault, ...]:
         """The faults. Raises ParameterError."""
         return tuple(
-            effector_faults.read(sentence, f"faults[{number}]")
+            effector_faults.read_fault(sentence, f"faults[{number}]")
             for number, sentence in enumerate(self.faults)
         )
 

@@ -126,18 +126,12 @@ class Simulator:
             require(
                 gust.start >= t, f"gusts.{axis}.start", f"{gust.start:g} s", f"at least t = {t:g} s"
             )
-            end = (
-                gust_before.start + 2.0 * gust_before.length / self._speed
-                if gust_before is not None and gust_before.speed
-                else t
-            )
-            end = (
-                math.inf
-                if gust_before is not None
-                and gust_before.speed
-                and math.isfinite(gust_before.every)
-                else end
-            )
+            if gust_before is not None and gust_before.speed:
+                end = gust_before.start + 2.0 * gust_before.length / self._speed
+            else:
+                end = t
+            if gust_before is not None and gust_before.speed and math.isfinite(gust_before.every):
+                end = math.inf
             over = gust_before is None or t <= gust_before.start or end <= t
             require(
                 over,
@@ -183,7 +177,9 @@ class Simulator:
         )
         if self._vanes is not None and self._vane_state is not None:
             size_y = len(measured) - len(self._vanes.places)
-            self._vane_state = vanes.read(number, measured[size_y:], self._vane_state, self._vanes)
+            self._vane_state = vanes.read_vanes(
+                number, measured[size_y:], self._vane_state, self._vanes
+            )
             measured = np.concatenate([measured[:size_y], self._vane_state.reading])
         y = measured if sensors.arrives(number, self._sensors) else None
         self._delay_line, arrived = sensors.transmit(self._delay_line, t_ns, y, self._sensors)

@@ -73,11 +73,9 @@ def sample_airframe(
     rest of f stays as published. Raises as `sampled_matrices`.
     """
     A, B = sampled_matrices(airframe, part_A, part_B, seed, number, 1, spread)
-    return (
-        airframe
-        if part_A == part_B == 0.0 and not spread.entries
-        else airframe.with_matrices(A[0], B[0], wind_factors(airframe, A, wind)[0])
-    )
+    if part_A == part_B == 0.0 and not spread.entries:
+        return airframe
+    return airframe.with_matrices(A[0], B[0], wind_factors(airframe, A, wind)[0])
 
 
 def wind_factors(airframe: Airframe, A: FloatArray, wind: WindEffect) -> FloatArray:

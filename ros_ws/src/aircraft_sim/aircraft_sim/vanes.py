@@ -93,7 +93,7 @@ def turned(t: float, angles: FloatArray, state: VaneState, params: Vanes) -> Van
     )
 
 
-def read(number: int, measured: FloatArray, state: VaneState, params: Vanes) -> VaneState:
+def read_vanes(number: int, measured: FloatArray, state: VaneState, params: Vanes) -> VaneState:
     """The readings of sample `number`, (k,), from measured angles with errors.
 
     A lost reading repeats the last.

@@ -98,8 +98,6 @@ class AutopilotLock:
             since_boot_ns >= self._newest_ns - CLOCK_TOLERANCE_NS
             and boot_ns >= self._boot_ns - CLOCK_TOLERANCE_NS
         )
-        return (
-            self._starts.publisher
-            if self._starts.publisher is not None and advances
-            else str(boot_ns)
-        )
+        if self._starts.publisher is not None and advances:
+            return self._starts.publisher
+        return str(boot_ns)

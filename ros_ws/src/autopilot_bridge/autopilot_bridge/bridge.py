@@ -14,7 +14,7 @@ from enum import IntEnum
 import numpy as np
 
 from autopilot_bridge.channel_map import to_channel, to_raw
-from autopilot_bridge.conditions import Conditions, Reading, joined, staleness
+from autopilot_bridge.conditions import Conditions, Reading, joined_faults, staleness
 from autopilot_bridge.map_rows import InputRow, MeasuredRow, OutputRow
 from autopilot_bridge.params import ROUNDING, ChannelMap
 from flight_core.channels import without_effect
@@ -108,11 +108,10 @@ class Bridge:
         """
         row = self._rows[name]
         if abs(now_ns - stamp_ns) > nanoseconds(row.max_age):
-            hint = (
-                ""
-                if row.stamp == "arrival"
-                else "; set stamp: arrival in the map if the autopilot has another clock"
-            )
+            if row.stamp == "arrival":
+                hint = ""
+            else:
+                hint = "; set stamp: arrival in the map if the autopilot has another clock"
             side = "before" if stamp_ns < now_ns else "after"
             raise ChannelError(
                 "stamp",
@@ -251,11 +250,10 @@ class Bridge:
     def _lacks(self, now_ns: int) -> str:
         """What an engagement lacks, as a sentence."""
         ends = self._end_ns is not None and now_ns >= self._end_ns - END_WARNING_NS
-        warning = (
-            f"max_engaged releases in {seconds(END_WARNING_NS):g} s, unless engaged again"
-            if ends
-            else ""
-        )
+        if ends:
+            warning = f"max_engaged releases in {seconds(END_WARNING_NS):g} s, unless engaged again"
+        else:
+            warning = ""
         return sentences(
             warning,
             self.problem,
@@ -271,11 +269,9 @@ class Bridge:
         """The reason why u has timed out, as a sentence; empty where u is fresh."""
         if self.u_lock.publisher is None:
             return "u not received yet"
-        return (
-            f"u is {seconds(self.u_lock.age_ns(now_ns)):.2f} s old"
-            if self.u_timed_out(now_ns)
-            else ""
-        )
+        if self.u_timed_out(now_ns):
+            return f"u is {seconds(self.u_lock.age_ns(now_ns)):.2f} s old"
+        return ""
 
     def refusal(self, now_ns: int) -> str:
         """Why `engage` would be refused now; empty where it would not.
@@ -333,7 +329,7 @@ class Bridge:
         """
         keys = (*map(trim_key, self.channel_map.trims), *self.channel_map.engage_if)
         sources = {key: stale for key in keys if (stale := self._staleness(key, now_ns))}
-        return sentences(joined(self.stale(now_ns) | sources), self._u_timeout(now_ns))
+        return sentences(joined_faults(self.stale(now_ns) | sources), self._u_timeout(now_ns))
 
     def _away_from_trim(self) -> str:
         limits = self.channel_map.engage_within * np.where(self._u > 0.0, self._upper, -self._lower)
@@ -429,7 +425,7 @@ class Bridge:
         elif self.phase is Phase.NEUTRAL and (reason := self._lost(now_ns)):
             self.disengage(reason, now_ns)
         elif self.phase is Phase.ENGAGED:
-            faults = joined(self.stale(now_ns))
+            faults = joined_faults(self.stale(now_ns))
             cause = self.problem if faults else ""
             reasons = sentences(self._lost(now_ns), faults, cause) or self._outside()
             if end_reason := reasons or self._does_not_answer(now_ns):

@@ -163,10 +163,9 @@ NED: the row states it by its sign and offset.
 
 QUATERNION = "wxyz"
 COMPONENTS: Mapping[str, str] = MappingProxyType(
-    {
-        name: "xyz" if name == "norm" else QUATERNION if name.endswith("quaternion") else ""
-        for name in DERIVED
-    }
+    dict.fromkeys(DERIVED, "")
+    | {name: QUATERNION for name in DERIVED if name.endswith("quaternion")}
+    | {"norm": "xyz"}
 )
 """The members that the field of a function has; none for a number."""
 
@@ -228,11 +227,9 @@ def versioned_topic(topic: str, version: int) -> str:
     Definitions state it as MESSAGE_VERSION, and version 0 has no suffix. Source: PX4 guide, PX4 ROS
     2 message translation node.
     """
-    return (
-        VERSION.sub("", topic) + (f"_v{version}" if version else "")
-        if topic.startswith("/fmu/")
-        else topic
-    )
+    if topic.startswith("/fmu/"):
+        return VERSION.sub("", topic) + (f"_v{version}" if version else "")
+    return topic
 
 
 def version_fault(topic: str, message_class: Any) -> str:
@@ -242,11 +239,10 @@ def version_fault(topic: str, message_class: Any) -> str:
         return ""
     expected = versioned_topic(topic, version)
     definition = f"the installed {message_class.__name__} has version {version}"
+    if topic == expected:
+        return ""
     return (
-        ""
-        if topic == expected
-        else f"{topic}: {definition}, whose topic is {expected}: change the map, or install the "
-        "release"
+        f"{topic}: {definition}, whose topic is {expected}: change the map, or install the release"
     )
 
 

@@ -63,12 +63,10 @@ class Conditions:
     def _violation(self, name: str, row: ConditionRow, now_ns: int) -> str:
         reading = self._conditions.get(name)
         if stale := staleness(row.topic, reading, row.max_age, now_ns):
-            return joined({f"{name}: {row.field}": stale})
-        return (
-            ""
-            if reading is None or row.holds(reading.value)
-            else f"{row.sentence} ({row.field} is {reading.value:g})"
-        )
+            return joined_faults({f"{name}: {row.field}": stale})
+        if reading is None or row.holds(reading.value):
+            return ""
+        return f"{row.sentence} ({row.field} is {reading.value:g})"
 
     def is_contradicted(self) -> bool:
         """Whether a condition does not hold by its last value.
@@ -127,11 +125,10 @@ class Conditions:
             "rise-di engage --off",
             f"max_engaged after {self._map.max_engaged:g} s" if bounded else "",
         )
-        where = (
-            "is not watched (--blind)"
-            if self.watches_transmitter
-            else "cannot be seen over this link"
-        )
+        if self.watches_transmitter:
+            where = "is not watched (--blind)"
+        else:
+            where = "cannot be seen over this link"
         blind_override = f", and the override by {dead} has no effect then" if dead else ""
         return (
             f"the loss of the transmitter {where}{blind_override}; released by "
@@ -147,7 +144,7 @@ def staleness(topic: str, reading: Reading | None, max_age: float, now_ns: int) 
     return f"{seconds(age_ns):.2f} s old ({topic})" if age_ns > nanoseconds(max_age) else ""
 
 
-def joined(faults: Mapping[str, str]) -> str:
+def joined_faults(faults: Mapping[str, str]) -> str:
     """What is wrong with some channels, by name, as a sentence.
 
     Channels with the same fault stand together.
@@ -155,10 +152,9 @@ def joined(faults: Mapping[str, str]) -> str:
     names: dict[str, list[str]] = {}
     for name, fault in faults.items():
         names.setdefault(fault, []).append(name)
-    verbs = {
-        fault: "" if fault.startswith("not") else "is " if len(channels) == 1 else "are "
-        for fault, channels in names.items()
-    }
-    return "; ".join(
-        f"{', '.join(channels)} {verbs[fault]}{fault}" for fault, channels in names.items()
-    )
+    sentences_of_faults = []
+    for fault, channels in names.items():
+        verb = "is" if len(channels) == 1 else "are"
+        predicate = fault if fault.startswith("not") else f"{verb} {fault}"
+        sentences_of_faults.append(f"{', '.join(channels)} {predicate}")
+    return "; ".join(sentences_of_faults)

@@ -92,7 +92,7 @@ def installed_definitions(kinds: Iterable[str]) -> Types:
             require_package("pymavlink")
         try:
             if kind.startswith(f"{MAVLINK}/"):
-                fields = mavlink_link.message_type(kind.rpartition("/")[2]).fields
+                fields = mavlink_link.mavlink_type(kind.rpartition("/")[2]).fields
                 types[kind] = [], [(name, (Nodetype.BASE, ("float64", 0))) for name in fields]
             elif "/srv/" in kind:
                 types |= _parsed(read_definition(kind, "srv"), kind)
@@ -163,11 +163,9 @@ def _fault(types: Types, topic: str, kind: str, path: str, components: str | Non
         element = _element((node, content))
         field = (node, content) if match[2] is None else element
         member_kind = element[1] if element[0] is Nodetype.NAME else ""
-    return (
-        ""
-        if components is None or _has(definitions, field, components)
-        else f"{path}: no {', '.join(components) or 'number'}"
-    )
+    if components is None or _has(definitions, field, components):
+        return ""
+    return f"{path}: no {', '.join(components) or 'number'}"
 
 
 def _has(definitions: Types, field: Any, components: str) -> bool:

@@ -279,11 +279,9 @@ class ConditionRow(WatchedRow):
     def holds(self, raw: float) -> bool:
         """Whether the condition holds."""
         value = self.masked(raw)
-        return (
-            value in self.one_of
-            if self.within is None
-            else self.within[0] <= value <= self.within[1]
-        )
+        if self.within is None:
+            return value in self.one_of
+        return self.within[0] <= value <= self.within[1]
 
 
 class OverrideRow(WatchedRow):

@@ -77,7 +77,7 @@ class MavlinkMessage(NamedTuple):
     received_ns: int
 
 
-def message_type(name: str) -> Any:
+def mavlink_type(name: str) -> Any:
     """A class with the numeric fields of a message, all zero; `fields` has the names.
 
     Raises ParameterError for no message.
@@ -206,7 +206,7 @@ class Link:
         self._thread.start()
 
     def send(self, message: Any) -> None:
-        """Send a message of `message_type` to the autopilot.
+        """Send a message of `mavlink_type` to the autopilot.
 
         The sender has the number of the ground station.
         """
@@ -490,7 +490,7 @@ class Link:
         ):
             return
         name, rate = next(iter(self._to_request.items()))
-        identity = message_type(name).packed.id
+        identity = mavlink_type(name).packed.id
         self._requested = name, now
         encode = self._connection.mav.command_long_encode
         interval = encode(

@@ -40,7 +40,7 @@ from autopilot_bridge.outgoing import (
     OutgoingMessage,
     ServiceCaller,
     field_type,
-    prepared,
+    prepare_message,
     require_field,
 )
 from autopilot_bridge.params import BridgeConfig, load_map
@@ -186,7 +186,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         return reader
 
     def _make(self, name: str, row: MessageRow) -> OutgoingMessage:
-        message, rows = prepared(self._map, name, row)
+        message, rows = prepare_message(self._map, name, row)
         if self._link is not None and row.topic.startswith(f"{MAVLINK}/"):
             return OutgoingMessage(MavlinkPublisher(self._link, row.topic), message, row, rows)
         if row.is_service:
@@ -260,11 +260,9 @@ class BridgeNode(FlightNode[BridgeConfig]):
         return self._boot_ns() - self._began_ns
 
     def _boot_ns(self) -> int:
-        return (
-            time.clock_gettime_ns(time.CLOCK_BOOTTIME)
-            if self.simulated is None
-            else self.simulated.time_ns()
-        )
+        if self.simulated is None:
+            return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+        return self.simulated.time_ns()
 
     def _arrived_ns(self, arrival: Any, now_ns: int) -> int:
         """The instant of a message that has no stamp, on the clock of the stamps."""
@@ -319,11 +317,10 @@ class BridgeNode(FlightNode[BridgeConfig]):
         for name, row in rows:
             try:
                 if isinstance(row, WatchedRow):
-                    take = (
-                        self._bridge.take_condition
-                        if isinstance(row, ConditionRow)
-                        else self._bridge.take_override
-                    )
+                    if isinstance(row, ConditionRow):
+                        take = self._bridge.take_condition
+                    else:
+                        take = self._bridge.take_override
                     take(name, read_raw(message, row.field, "value"), now_ns)
                     continue
                 stamp_ns = arrived_ns
@@ -564,11 +561,10 @@ class BridgeNode(FlightNode[BridgeConfig]):
         bridge = self._bridge
         now_ns = self.now_ns()
         refusal = "" if bridge.phase is Phase.ENGAGED else bridge.refusal(now_ns)
-        level = (
-            DiagnosticStatus.OK
-            if bridge.phase is Phase.ENGAGED and not bridge.reason
-            else DiagnosticStatus.WARN
-        )
+        if bridge.phase is Phase.ENGAGED and not bridge.reason:
+            level = DiagnosticStatus.OK
+        else:
+            level = DiagnosticStatus.WARN
         sentence = ": ".join(filter(None, (bridge.phase.name, bridge.reason)))
         return (
             level,

@@ -55,7 +55,7 @@ class OutgoingMessage:
         self._sent_ns = now_ns
 
 
-def prepared(
+def prepare_message(
     channel_map: ChannelMap, name: str, row: MessageRow
 ) -> tuple[Any, list[tuple[int, InputRow]]]:
     """A message of a map with its constant fields, and the rows of its inputs by their places in u.
@@ -88,7 +88,7 @@ def prepared(
 def field_type(name: str) -> Any:
     """The class of a type of a map, of a message package or of MAVLink."""
     package, _, kind = name.split("/")
-    return mavlink_link.message_type(kind) if package == MAVLINK else message_type(name)
+    return mavlink_link.mavlink_type(kind) if package == MAVLINK else message_type(name)
 
 
 def require_field(empty: Any, name: str, row: MeasuredRow | WatchedRow) -> None:

@@ -398,8 +398,6 @@ def as_file(scenario: Scenario, run: Path) -> Scenario:
 
     Raises ParameterError.
     """
-    return (
-        scenario
-        if _is_its_file(scenario)
-        else save_scenario(scenario, run / f"{scenario.name}.yaml")
-    )
+    if _is_its_file(scenario):
+        return scenario
+    return save_scenario(scenario, run / f"{scenario.name}.yaml")

@@ -64,11 +64,10 @@ class FlightMonitor(Client):
         self.clock: HostTime = self._simulated or time  # of the flight
         self._namespace = self._node.get_namespace().rstrip("/")
         # Each subscription slows a lockstep flight down.
-        self._internals = (
-            None
-            if lockstep
-            else PolledSubscription(self._node, INTERNALS, NEWEST_SAMPLES, raw=True)
-        )
+        if lockstep:
+            self._internals = None
+        else:
+            self._internals = PolledSubscription(self._node, INTERNALS, NEWEST_SAMPLES, raw=True)
         self._recorded = PolledSubscription(self._node, RECORDED, LOCKSTEP, raw=True)
         self._node_state = PolledSubscription(self._node, NODE_STATE, STATES)
         self._states: dict[str, str] = {}  # by process

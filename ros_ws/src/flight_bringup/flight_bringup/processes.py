@@ -336,11 +336,10 @@ class FlightProcesses:
                 error = ParameterError if STATUS_BAD_INPUT in statuses else NotReadyError
                 raise error(outcome.reason)
             if time.monotonic() > deadline:
-                late = (
-                    f"timed out waiting for {', '.join(waiting)}: not ready"
-                    if waiting
-                    else NO_CLOCK
-                )
+                if waiting:
+                    late = f"timed out waiting for {', '.join(waiting)}: not ready"
+                else:
+                    late = NO_CLOCK
                 raise NotReadyError(
                     f"{late} after {READY_TIMEOUT:g} s; see the logs in {self._run / 'log'}"
                 )

@@ -103,13 +103,12 @@ def _fly(context: LaunchContext) -> list[Action]:
 
     def follow(lead: float, start_time: float) -> Sequence[Action]:
         span = scenario.flight.duration
-        end = (
-            end_with_log(
+        if duration:
+            end = end_with_log(
                 context, run, lead, start_time + span, span, by_rosbag2=recorder == "rosbag2"
             )
-            if duration
-            else []
-        )
+        else:
+            end = []
         return [*end, *(node(spec, start_time) for spec in second_stage(scenario, bridge=True))]
 
     page = watch_page(context, run) if recorded else []

@@ -84,11 +84,10 @@ def _fly(context: LaunchContext) -> list[Action]:
     scenario = find_scenario(
         argument(context, "scenario"), yaml.safe_load(argument(context, "duration"))
     )
-    lockstep = (
-        scenario.flight.lockstep
-        if (value := argument(context, "lockstep")) == ""
-        else value == "true"
-    )
+    if (value := argument(context, "lockstep")) == "":
+        lockstep = scenario.flight.lockstep
+    else:
+        lockstep = value == "true"
     by_rosbag2 = argument(context, "recorder") == "rosbag2"
     require(
         not (by_rosbag2 and lockstep),

@@ -29,7 +29,7 @@ from flight_campaign.batch.campaign_course import Course, build_course
 from flight_campaign.definition import Definition, Sweep
 from flight_campaign.engines import Engine, Job
 from flight_campaign.influence import RANKED, influence
-from flight_campaign.rows import Chunk, encode, joined, tally_of
+from flight_campaign.rows import Chunk, encode_chunk, join_chunks, tally_of
 from flight_campaign.single_flights import MakeLearner
 from flight_campaign.statistics import Tally, score_units
 from flight_core.files import replacing, write_file, writing
@@ -98,7 +98,7 @@ def define(
     if sweep is not None:
         sweep.scaled(scenario.controller, 1.0)
     if single_flights.flies_alone(scenario):
-        single_flights.require_flyable(scenario)
+        single_flights.require_single_flights(scenario)
     else:
         build_course(scenario)
     # Each aircraft of the campaign has entries of its own.
@@ -158,10 +158,10 @@ def fly_chunk(text: str, job: Job, learner: MakeLearner | None = None) -> bytes:
     """
     definition = Definition.model_validate_json(text)
     if single_flights.flies_alone(definition.scenario()):
-        figures = single_flights.fly_chunk(definition, job, learner)
+        figures = single_flights.fly_chunk_singly(definition, job, learner)
     else:
         figures = fly_chunk_figures(text, job)
-    return encode(figures, definition.seed, definition.factor(job[0]))
+    return encode_chunk(figures, definition.seed, definition.factor(job[0]))
 
 
 def fly_chunk_figures(text: str, job: Job) -> Chunk:
@@ -192,7 +192,7 @@ def fly_chunk_figures(text: str, job: Job) -> Chunk:
             size = _FITTING[text] = half
         else:
             first += count
-    return joined(parts)
+    return join_chunks(parts)
 
 
 def _fly_at_once(text: str, case: int, first: int, count: int, size: int) -> Chunk:

@@ -172,7 +172,7 @@ def _influence(campaign: MonteCarlo, case: int, tally: Tally) -> dict[str, Any]:
         scenario = scenario.vary(
             controller={"learn": {"prior": {"file": scenario.aircraft.airframe}}}
         )
-    cornered = equipment.with_equipment(scenario, equipment_parts).vary(
+    cornered = equipment.scenario_with_equipment(scenario, equipment_parts).vary(
         aircraft={"airframe": str(airframe)}
     )
     write_file(path, scenario_yaml(cornered))

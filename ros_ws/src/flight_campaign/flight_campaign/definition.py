@@ -62,11 +62,9 @@ class Sweep(Config):
         )
         value = getattr(controller, self.name)
         if self.name == self.parameter:
-            return (
-                tuple(factor * number for number in value)
-                if isinstance(value, tuple)
-                else factor * float(value)
-            )
+            if isinstance(value, tuple):
+                return tuple(factor * number for number in value)
+            return factor * float(value)
         m = len(controller.outputs)
         # k_d of (22) has none for the last.
         by_channel = isinstance(value, tuple) and len(value) in (m - 1, m)
@@ -151,7 +149,7 @@ class Definition(Config):
             "distribution": self.distribution,
         }
         equipment_values = self.drawn_equipment(scenario, number, 1)
-        equipped = equipment.with_equipment(
+        equipped = equipment.scenario_with_equipment(
             scenario, {name: float(value[0]) for name, value in equipment_values.items()}
         )
         return equipped.vary(aircraft={"uncertainty": uncertainty})

@@ -68,7 +68,7 @@ def threads(workers: int | None = None) -> Engine:
     def fly(work: Work, jobs: Iterable[Job]) -> Iterator[tuple[Job, Any]]:
         from flight_campaign.batch import device  # noqa: PLC0415 - JAX takes a second
 
-        count = workers or device.threads()
+        count = workers or device.thread_count()
         waiting = iter(jobs)
         pool = ThreadPoolExecutor(count, thread_name_prefix="campaign")
         try:

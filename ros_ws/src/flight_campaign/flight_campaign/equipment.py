@@ -128,18 +128,17 @@ def in_order(
     ]
 
 
-def with_equipment(scenario: Scenario, values: Mapping[str, float]) -> Scenario:
+def scenario_with_equipment(scenario: Scenario, values: Mapping[str, float]) -> Scenario:
     """The scenario with lags, noise and a further delay of u by name."""
     aircraft = scenario.aircraft
     channels = scenario.aircraft.channels()
     changes = {}
     delay = aircraft.actuators.delay + values.get(DELAY, 0.0)
     if any(name.startswith("lag[") or name == DELAY for name in values):
-        lag = (
-            in_order(values, "lag", tuple(channels.inputs), aircraft.actuators.lag)
-            if aircraft.actuators.lag
-            else []
-        )
+        if aircraft.actuators.lag:
+            lag = in_order(values, "lag", tuple(channels.inputs), aircraft.actuators.lag)
+        else:
+            lag = []
         changes["actuators"] = aircraft.actuators.model_dump() | {"lag": lag, "delay": delay}
     if any(name.startswith("noise[") for name in values):
         noise = in_order(values, "noise", tuple(channels.outputs), aircraft.sensors.noise)

@@ -30,7 +30,7 @@ class Chunk(NamedTuple):
     entries: dict[str, FloatArray]
 
 
-def joined(parts: Sequence[Chunk]) -> Chunk:
+def join_chunks(parts: Sequence[Chunk]) -> Chunk:
     """Consecutive parts of a chunk as one."""
     first, *others = parts
     if not others:
@@ -43,7 +43,7 @@ def joined(parts: Sequence[Chunk]) -> Chunk:
     return Chunk(first.first, np.concatenate([part.diverged for part in parts]), figures, entries)
 
 
-def encode(chunk: Chunk, seed: int, factor: float) -> bytes:
+def encode_chunk(chunk: Chunk, seed: int, factor: float) -> bytes:
     """The table of a chunk as Parquet (zstd), SI.
 
     Figures of a diverged aircraft, and NaN, are null.

@@ -66,7 +66,7 @@ def flies_alone(scenario: Scenario) -> bool:
     return scenario.learns() or scenario.guidance is not None
 
 
-def require_flyable(scenario: Scenario) -> None:
+def require_single_flights(scenario: Scenario) -> None:
     """Raise ParameterError for a scenario of single flights beyond a campaign."""
     aircraft = scenario.aircraft
     require(
@@ -90,7 +90,7 @@ class SingleFlight(NamedTuple):
     figures: dict[str, float]  # SI, by name
 
 
-def fly(scenario: Scenario, learner: MakeLearner | None = None) -> SingleFlight:
+def fly_single(scenario: Scenario, learner: MakeLearner | None = None) -> SingleFlight:
     """Fly a scenario; the errors are the true ones at the ticks of the controller.
 
     Raises ParameterError.
@@ -160,7 +160,7 @@ def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(values**2))) if len(values) else math.nan
 
 
-def fly_chunk(definition: Definition, job: Job, learner: MakeLearner | None = None) -> Chunk:
+def fly_chunk_singly(definition: Definition, job: Job, learner: MakeLearner | None = None) -> Chunk:
     """Fly a chunk of a campaign one by one."""
     from flight_campaign.drawn_fleet import drawn_fleet  # noqa: PLC0415 - JAX, as the loop of many
 
@@ -169,7 +169,9 @@ def fly_chunk(definition: Definition, job: Job, learner: MakeLearner | None = No
     count = definition.size(job)
     scenario = definition.scenario(case)
     entries = drawn_fleet(definition, scenario, first, count).entries()
-    flights = [fly(definition.aircraft_scenario(first + k, case), learner) for k in range(count)]
+    flights = [
+        fly_single(definition.aircraft_scenario(first + k, case), learner) for k in range(count)
+    ]
     figures = {
         name: np.array([flight.figures[name] for flight in flights]) for name in flights[0].figures
     }

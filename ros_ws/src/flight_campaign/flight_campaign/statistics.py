@@ -164,11 +164,9 @@ class Tally(Config):
 
     def without_model(self) -> int | None:
         """Number of flights without a model, diverged ones excluded; None without learners."""
-        return (
-            self.flights - self.diverged - self.figures[FIRST_MODEL].count
-            if FIRST_MODEL in self.figures
-            else None
-        )
+        if FIRST_MODEL in self.figures:
+            return self.flights - self.diverged - self.figures[FIRST_MODEL].count
+        return None
 
     def summary(self) -> dict[str, Any]:
         """The statistics as figures of a file, SI."""

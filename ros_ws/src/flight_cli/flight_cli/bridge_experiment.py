@@ -209,11 +209,10 @@ def _identified(
     Raises ParameterError for a channel that is not certain.
     """
     pairing, _ = channel_pairs(channel_map)
-    trims = (
-        median_trims(tape[COMMANDS])
-        if COMMANDS in tape
-        else measured_trims(channel_map, tape["bridge/would_send"], spans[0][0])
-    )
+    if COMMANDS in tape:
+        trims = median_trims(tape[COMMANDS])
+    else:
+        trims = measured_trims(channel_map, tape["bridge/would_send"], spans[0][0])
     response = identify_response(
         tape["y"], tape["u"], pairing.outputs, pairing.inputs, engaged=spans
     )

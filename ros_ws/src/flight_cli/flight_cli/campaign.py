@@ -61,8 +61,17 @@ from flight_design.learning.scenario_learner import quick_learner
 
 # Options of a new campaign.
 OF_DEFINITION = (
-    *("aircraft", "uncertainty", "entry", "distribution", "score", "wind"),
-    *("seed", "sweep", "duration", "chunk", "runs"),
+    "aircraft",
+    "uncertainty",
+    "entry",
+    "distribution",
+    "score",
+    "wind",
+    "seed",
+    "sweep",
+    "duration",
+    "chunk",
+    "runs",
 )
 
 

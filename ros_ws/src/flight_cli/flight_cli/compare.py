@@ -310,11 +310,10 @@ def _write(path: Path, name: str, aim: str, result: TuningResult, benchmark: Ben
     controller = tuned_controller.tuned_controller(name, result, benchmark)
     airframe, _ = benchmark.scenario.aircraft.load()
     origin = f"by rise-di compare: law {name}, tuned on {aim} in {benchmark.scenario.name}"
-    margins = (
-        loop_margins(scenario_loop(benchmark.scenario, controller, 1))
-        if LAWS[name].has_margins
-        else None
-    )
+    if LAWS[name].has_margins:
+        margins = loop_margins(scenario_loop(benchmark.scenario, controller, 1))
+    else:
+        margins = None
     comments = {"delay": "s, beyond sampling: topics have none in the benchmark"}
     write_text(
         "--write", path, LICENCE + section_yaml(controller, airframe, margins, origin, comments)
@@ -329,7 +328,9 @@ def _table(
     levels = ("nominal", *(f"+-{100.0 * level.uncertainty:g} %" for level in results[0].levels))
     delays = "/".join(f"{1e3 * delay:g}" for delay in (0.0, *results[0].lost_late))
     heads = (
-        *("law", "sees", "knows"),
+        "law",
+        "sees",
+        "knows",
         *(f"{wind}\n{level}" for wind, level in product(results[0].scores, levels)),
         f"lost, %, at {levels[1]},\nu late by, ms:\n{delays}",
         "slew\n" + join_names(name[:4] for name in scenario.controller.inputs),
@@ -346,7 +347,9 @@ def _table(
         losses = (result.levels[0].scores[gain_tuning.GUST].lost, *result.lost_late.values())
         slew = zip(scenario.controller.inputs, result.slew.tolist(), strict=True)
         table.add_row(
-            *(result.law, law.measurements, law.model_data),
+            result.law,
+            law.measurements,
+            law.model_data,
             *law_comparison.score_cells(result),
             "/".join(f"{100.0 * share:.3g}" for share in losses),
             join_names(f"{value * units[name].factor:.0f}" for name, value in slew),

@@ -53,8 +53,16 @@ from flight_guidance.routes.route_formats import FENCES
 
 # Fields of a flight of one aircraft alone.
 OF_AIRCRAFT = (
-    *("settings", "in_process", "lockstep", "composed", "bridge"),
-    *("send", "route", "fence", "namespace", "learn"),
+    "settings",
+    "in_process",
+    "lockstep",
+    "composed",
+    "bridge",
+    "send",
+    "route",
+    "fence",
+    "namespace",
+    "learn",
 )
 
 

@@ -85,8 +85,17 @@ Assessment = GainAssessment[Any]
 LOOP = ("rate", "y_rate", "lag", "delay", "inputs")
 STUDY = ("uncertainty", "gamma_2", "samples", "seed")
 SELECTION = (
-    *("rate", "y_rate", "delay", "feedforward", "observer", "model"),
-    *("margin", "weights", "phase_margin", "accept", "mixing"),
+    "rate",
+    "y_rate",
+    "delay",
+    "feedforward",
+    "observer",
+    "model",
+    "margin",
+    "weights",
+    "phase_margin",
+    "accept",
+    "mixing",
 )
 """Fields of a loop, of a check, and of a selection."""
 
@@ -389,11 +398,10 @@ def _show_conditions(console: Console, study: Study, answers: dict[str, Assessme
         print_table(console, _condition_table(answers, part, heading))
     if first.theorem and (marginal := marginal_sentence([airframe_facts(study.airframe)])):
         say(console, marginal)
-    estimate = (
-        ""
-        if first.bounds is None
-        else f"; ~ is an estimate: gamma_2 = {first.bounds.gamma_2[0]:g} 1/s is an assumption"
-    )
+    if first.bounds is None:
+        estimate = ""
+    else:
+        estimate = f"; ~ is an estimate: gamma_2 = {first.bounds.gamma_2[0]:g} 1/s is an assumption"
     say(console, f"margin: a condition holds above 1 and fails (!) below{estimate}")
     for word, meaning in MEANINGS.items() if first.bounds is not None else ():
         say(console, f"{word}: {meaning}")

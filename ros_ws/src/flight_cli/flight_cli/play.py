@@ -17,7 +17,7 @@ from flight_core.environment import require_ros_environment
 from flight_core.parameters import require
 from flight_core.text import printable
 from flight_log.playback import SHARED, Playback, read_playback
-from flight_log.tape_reader import listed
+from flight_log.tape_reader import topics_text
 
 
 class Stamps(StrEnum):
@@ -91,12 +91,12 @@ class Play:
         require(
             bool(types),
             str(self.run),
-            f"no topic to play among {listed(skipped_topics)}",
+            f"no topic to play among {topics_text(skipped_topics)}",
             "a topic whose message type is installed",
         )
         if skipped_topics:
             warn(
-                f"warning: {printable(listed(skipped_topics))} skipped: without CDR, or of a "
+                f"warning: {printable(topics_text(skipped_topics))} skipped: without CDR, or of a "
                 "message type that is not installed"
             )
         return types

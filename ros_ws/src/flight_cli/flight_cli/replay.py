@@ -143,11 +143,10 @@ def _show_guidance(replay_of_guidance: GuidanceReplay) -> None:
 
 def _difference(first: ReplayDifference) -> str:
     """A difference as a text."""
-    distance = (
-        "which is not a number"
-        if first.ulps is None
-        else f"{first.computed - first.recorded:+.3g}, {first.ulps} ULP"
-    )
+    if first.ulps is None:
+        distance = "which is not a number"
+    else:
+        distance = f"{first.computed - first.recorded:+.3g}, {first.ulps} ULP"
     return f"{first.channel} recorded {first.recorded!r}, computed {first.computed!r}, {distance}"
 
 
@@ -215,11 +214,10 @@ def _u_figures(result: ReplayResult, inputs: tuple[str, ...]) -> dict[str, dict[
     for name in inputs:
         difference = u_computed[name] - u_recorded[name]
         rms, largest = error_metrics(difference)
-        t_max = (
-            float(result.t[is_finite][np.argmax(np.abs(difference))])
-            if len(difference)
-            else math.nan
-        )
+        if len(difference):
+            t_max = float(result.t[is_finite][np.argmax(np.abs(difference))])
+        else:
+            t_max = math.nan
         figures[name] = {
             "rms": rms,
             "max": largest,

@@ -164,7 +164,9 @@ def _serve_foxglove(run: Path, port: int | None) -> None:
         if error.name != "foxglove":
             raise
         raise ParameterError(f"--foxglove: {missing(error.name)}") from None
-    foxglove_server.serve(run, foxglove_server.DEFAULT_PORT if port is None else port, _announce)
+    foxglove_server.serve_foxglove(
+        run, foxglove_server.DEFAULT_PORT if port is None else port, _announce
+    )
 
 
 def _serve_with_control(

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flight_core.parameters import ParameterError, require
-from flight_guidance.fence.zones import Fence, clearance, described
+from flight_guidance.fence.zones import Fence, clearance, clearance_text
 from flight_guidance.guidance_state import LARGEST
 from flight_guidance.routes.route_file import Waypoint
 from flight_guidance.steering import path, protection
@@ -307,7 +307,7 @@ def require_inside(route: Route, fence: Fence, margin: float) -> None:
             inside[-1] -= TURN_BACK * route.radius
         worst = int(np.argmin(inside))
         outermost = (
-            f"leg {number}, {described(inside[worst])} at north {north[worst]:.0f} m, "
+            f"leg {number}, {clearance_text(inside[worst])} at north {north[worst]:.0f} m, "
             f"east {east[worst]:.0f} m"
         )
         require(

@@ -109,11 +109,9 @@ class Guidance:
     @property
     def mode(self) -> GuidanceMode:
         """Mode of the last step."""
-        return (
-            GuidanceMode.OFF
-            if self._state is None or self._begin is not Begin.NO
-            else self._state.mode
-        )
+        if self._state is None or self._begin is not Begin.NO:
+            return GuidanceMode.OFF
+        return self._state.mode
 
     @property
     def failed(self) -> int:
@@ -303,11 +301,9 @@ class Guidance:
 
     def y(self) -> dict[str, float]:
         """The last y by channel; empty before the first y."""
-        return (
-            {}
-            if self._y is None
-            else dict(zip(self._params.outputs, self._y.value.tolist(), strict=True))
-        )
+        if self._y is None:
+            return {}
+        return dict(zip(self._params.outputs, self._y.value.tolist(), strict=True))
 
     def ages(self, now_ns: int) -> dict[str, float]:
         """Ages of the last received y and pose, s; a channel never received is absent."""

@@ -140,11 +140,10 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         self._path, self._markers = (self._view(topic, PATH_PERIOD_NS) for topic in (PATH, MARKERS))
         # REP 105: with several aircraft, each body frame has a prefix, and they share the map
         self._body = f"{self.get_namespace()}/{BODY}".lstrip("/")
-        self._broadcast = (
-            None
-            if TFMessage is None
-            else self.create_publisher(TFMessage, "/tf", TRANSFORMS).publish
-        )
+        if TFMessage is None:
+            self._broadcast = None
+        else:
+            self._broadcast = self.create_publisher(TFMessage, "/tf", TRANSFORMS).publish
         if self._broadcast is None:
             self.get_logger().info("no transforms on /tf: the package tf2_msgs is not installed")
         self._path_poses: deque[PoseStamped] = deque(maxlen=PATH_LENGTH)

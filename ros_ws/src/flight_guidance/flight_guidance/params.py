@@ -18,7 +18,7 @@ from flight_core.rates import nanoseconds, period_ns
 from flight_core.units import GRAVITY
 from flight_guidance.feasibility import Performance, as_route, flyable, require_inside, speeds
 from flight_guidance.fence.fence import MARGIN, Motion, room_at_home
-from flight_guidance.fence.zones import Fence, Zone, clearance, described
+from flight_guidance.fence.zones import Fence, Zone, clearance, clearance_text
 from flight_guidance.guidance_state import (
     TARGETS,
     GuidanceParams,
@@ -118,7 +118,7 @@ class GuidanceConfig(SteeringConfig):
         inside = self.fence_clearance(self.home.north, self.home.east)
         margin = self.fence_margin(self.speed)
         expected = f"at least {margin:.1f} m inside"
-        require(inside >= margin, "home", f"home {described(inside)}", expected)
+        require(inside >= margin, "home", f"home {clearance_text(inside)}", expected)
 
     def _check_airplane(self) -> None:
         floor = self._floor()
@@ -145,13 +145,13 @@ class GuidanceConfig(SteeringConfig):
         least = math.ceil(self.least_radius()) + self.fence_margin(self.speed)
         inside = self.fence_clearance(self.home.north, self.home.east)
         expected = f"at least {least:.0f} m inside, for the orbit round home"
-        require(inside >= least, "home", f"home {described(inside)}", expected)
+        require(inside >= least, "home", f"home {clearance_text(inside)}", expected)
         if (fence := self.fence_zones()) is None:
             return
         margin = self.fence_margin(self.speed)
         room = room_at_home(fence, self._at_home(), self.wind)
         if room < margin:
-            turn = f"a turn from home onto the orbit that is {described(room)}"
+            turn = f"a turn from home onto the orbit that is {clearance_text(room)}"
             north, east = fence.home
             wide = Zone((north,), (east,), radius=20.0 * fence.radius)
             room_in_wide = room_at_home(fence._replace(zones=(wide,)), self._at_home(), self.wind)

@@ -43,8 +43,6 @@ def age_of_u(messages: Iterable[bytes], namespace: str) -> Signal | None:
         except (SerdeError, LookupError, ValueError):
             continue
     stamps = sorted(rows)
-    return (
-        Signal(np.array(stamps), CHANNELS, np.array([rows[stamp] for stamp in stamps]))
-        if rows
-        else None
-    )
+    if rows:
+        return Signal(np.array(stamps), CHANNELS, np.array([rows[stamp] for stamp in stamps]))
+    return None

@@ -22,7 +22,7 @@ class Engagement(NamedTuple):
     reason: str  # of its end
 
 
-def engagements(reports: Iterable[tuple[int, bytes]]) -> list[Engagement] | None:
+def engagements_of(reports: Iterable[tuple[int, bytes]]) -> list[Engagement] | None:
     """The engagements, in order, from the reports of a bridge; None without a report.
 
     A report is the time of sending and the message.

@@ -78,10 +78,10 @@ def file_kind(path: Path) -> str:
             head = stream.read(HEAD_BYTES)
     except (OSError, ValueError):
         return UNREADABLE
-    return kind_of(head)
+    return kind_of_head(head)
 
 
-def kind_of(head: bytes) -> str:
+def kind_of_head(head: bytes) -> str:
     """The kind of a file by the first HEAD_BYTES bytes.
 
     Bytes of no kind in the table are a text or unknown bytes.

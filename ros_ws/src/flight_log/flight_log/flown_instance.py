@@ -24,7 +24,7 @@ SURFACES = ("vehicle_torque_setpoint", "actuator_controls_0")  # of a VTOL of PX
 CORES = ("XKF1", "NKF1", "EKF1")
 
 
-def flown(
+def instances_of_flight(
     instances: Instances, fields: Mapping[str, Set[str]], parameters: Parameters, choice: Choice
 ) -> tuple[dict[str, MessageTable], list[tuple[str, str]]]:
     """A table by message, and the choice among several instances with the reason.
@@ -54,11 +54,10 @@ def flown(
             number = min(sensors)
             reason = "the first" if name in fields and len(sensors) > 1 else ""
         elif name in SURFACES:
-            number, reason = (
-                (1, "the surfaces of a VTOL")
-                if choice.vehicle == PLANE
-                else (0, "the rotors of a VTOL")
-            )
+            if choice.vehicle == PLANE:
+                number, reason = (1, "the surfaces of a VTOL")
+            else:
+                number, reason = (0, "the rotors of a VTOL")
         else:
             usable = _used(sensors, parameters) if name == "IMU" else set(sensors)
             number, reason = _of_motion(name, {k: sensors[k] for k in sorted(usable)}, fields[name])
@@ -71,7 +70,8 @@ def _of_motion(name: str, tables: Mapping[int, MessageTable], fields: Set[str]) 
     """The moving instance; the first of several equal ones."""
     motions = {number: _motion(table, fields) for number, table in tables.items()}
     moving = {
-        number: tables[number] for number in moved(motions, MOST if fields & AIRSPEEDS else STILL)
+        number: tables[number]
+        for number in moving_numbers(motions, MOST if fields & AIRSPEEDS else STILL)
     }
     first, *others = moving
     if all(_agree(moving[first], moving[number], fields) for number in others):
@@ -82,7 +82,7 @@ def _of_motion(name: str, tables: Mapping[int, MessageTable], fields: Set[str]) 
     )
 
 
-def moved(motions: Mapping[int, float], least: float = STILL) -> list[int]:
+def moving_numbers(motions: Mapping[int, float], least: float = STILL) -> list[int]:
     """The numbers of all motions above a part of the largest motion."""
     return [number for number, motion in motions.items() if motion >= least * max(motions.values())]
 

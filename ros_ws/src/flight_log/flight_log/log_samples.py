@@ -52,11 +52,10 @@ def tables_of(
             newest_ns = max(newest_ns, sample[1])
             strays = []
         else:
-            strays = (
-                [*strays, sample]
-                if strays and -STEP_NS <= sample[1] - strays[-1][1] <= LOST_NS
-                else [sample]
-            )
+            if strays and -STEP_NS <= sample[1] - strays[-1][1] <= LOST_NS:
+                strays = [*strays, sample]
+            else:
+                strays = [sample]
             if len(strays) < AGREEING:
                 continue
             if parts[-1] and strays[0][1] < newest_ns:
@@ -109,11 +108,10 @@ def is_number(value: object) -> bool:
 
 def near(stamp_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Which stamps are near the median of the five around them: a damaged stamp is not."""
-    around = (
-        np.lib.stride_tricks.sliding_window_view(np.pad(stamp_ns, 2, mode="reflect"), 5)
-        if len(stamp_ns) > 2
-        else None
-    )
+    if len(stamp_ns) > 2:
+        around = np.lib.stride_tricks.sliding_window_view(np.pad(stamp_ns, 2, mode="reflect"), 5)
+    else:
+        around = None
     if around is None:
         return np.ones(len(stamp_ns), dtype=bool)
     return np.abs(stamp_ns - np.median(around, axis=1)) <= STEP_NS + 2.0 * np.median(

@@ -100,7 +100,7 @@ def tables(messages: Iterable[bytes]) -> Iterator[Table]:
         )
 
 
-def stamp_of(data: bytes) -> int:
+def stamp_in(data: bytes) -> int:
     """The stamp at the begin of a message, ns."""
     return int.from_bytes(data[STAMP][:4], "little", signed=True) * NANOSECONDS + int.from_bytes(
         data[STAMP][4:], "little"
@@ -173,7 +173,7 @@ def decode_routes(table: Table) -> Decoded:
         points = [stamped_pose.pose.position for stamped_pose in route.poses]
         if points:
             rows = np.array([(k, point.y, point.x, point.z) for k, point in enumerate(points)])
-            samples.append(Samples(WAYPOINT, np.full(len(rows), stamp_of(message)), rows))
+            samples.append(Samples(WAYPOINT, np.full(len(rows), stamp_in(message)), rows))
     return Decoded(samples, unreadable)
 
 

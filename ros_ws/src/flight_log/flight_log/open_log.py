@@ -68,11 +68,9 @@ def log_files(run: Path) -> list[Path]:
 def _what_is_there(run: Path, files: Sequence[Path], kinds: Sequence[str]) -> str:
     """What a path without a log holds, for a sentence."""
     if files:
-        return (
-            kinds[0]
-            if is_file(run)
-            else _some([f"{file.name}, {kind}" for file, kind in zip(files, kinds, strict=True)])
-        )
+        if is_file(run):
+            return kinds[0]
+        return _some([f"{file.name}, {kind}" for file, kind in zip(files, kinds, strict=True)])
     if not is_folder(run):
         return "no such file or folder"
     content = sorted(run.iterdir())
@@ -86,11 +84,10 @@ def _what_is_there(run: Path, files: Sequence[Path], kinds: Sequence[str]) -> st
         for path in content
         if is_file(path) and path.name != METADATA
     ]
-    content_text = (
-        f"the folders of runs {_some(runs)}"
-        if runs
-        else _some(others or [path.name for path in content])
-    )
+    if runs:
+        content_text = f"the folders of runs {_some(runs)}"
+    else:
+        content_text = _some(others or [path.name for path in content])
     return f"no .mcap file, but {content_text}" if content_text else "no .mcap file"
 
 

@@ -17,9 +17,9 @@ import yaml
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS, nanoseconds, seconds
 from flight_log.message_definitions import definition
-from flight_log.named_vectors import JOINT_STATE, decoder, flight_start_ns, stamp_of, tables
+from flight_log.named_vectors import JOINT_STATE, decoder, flight_start_ns, stamp_in, tables
 from flight_log.stored_messages import StoredMessage, stored_messages
-from flight_log.tape_reader import A_FLIGHT, chosen_namespace, listed, names_within
+from flight_log.tape_reader import A_FLIGHT, chosen_namespace, names_within, topics_text
 
 CLOCK = "/clock"  # never played: the player publishes its own clock
 
@@ -80,7 +80,7 @@ def read_playback(
     selection = set[str]() if topics else set(last_messages) - set(SHARED)
     for name in topics:
         selection.update(_matching(name, last_messages, str(run)))
-    among = f" to play among {listed(skipped)}" if skipped else ""
+    among = f" to play among {topics_text(skipped)}" if skipped else ""
     require(bool(selection), str(run), f"no message{among}", A_FLIGHT)
     lockstep = _is_lockstep(stored)
     messages = [*_scheduled(stored, last_messages, selection, lockstep=lockstep)]
@@ -114,7 +114,7 @@ def _is_lockstep(messages: Iterable[StoredMessage]) -> bool:
     votes = [
         _is_flight_time(message)
         for message in messages
-        if message.type_name == JOINT_STATE and stamp_of(message.data)
+        if message.type_name == JOINT_STATE and stamp_in(message.data)
     ]
     return 2 * sum(votes) > len(votes)
 
@@ -138,7 +138,7 @@ def _scheduled(
         if not lockstep:
             now_ns = _sent_ns(message)
         elif has_stamp:
-            now_ns = max(now_ns, stamp_of(message.data))
+            now_ns = max(now_ns, stamp_in(message.data))
         if message.topic in selection:
             yield ScheduledMessage(now_ns, message.topic, message.data, has_stamp)
 
@@ -217,7 +217,7 @@ def _sent_ns(message: StoredMessage) -> int:
 
 
 def _is_flight_time(message: StoredMessage) -> bool:
-    return abs(stamp_of(message.data) - _sent_ns(message)) > MAX_CLOCK_OFFSET_NS
+    return abs(stamp_in(message.data) - _sent_ns(message)) > MAX_CLOCK_OFFSET_NS
 
 
 def _start_ns(messages: Iterable[StoredMessage], otherwise: int) -> int:
@@ -230,7 +230,7 @@ def _start_ns(messages: Iterable[StoredMessage], otherwise: int) -> int:
         first.setdefault(message.topic.rpartition("/")[2], message)
     truth = first.get("truth")
     y_m = first.get("y_m")
-    otherwise = otherwise if y_m is None else stamp_of(y_m.data)
+    otherwise = otherwise if y_m is None else stamp_in(y_m.data)
     decode = None if truth is None else decoder(truth.type_name)
     if truth is None or decode is None:
         return otherwise

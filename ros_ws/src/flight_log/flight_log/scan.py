@@ -187,7 +187,7 @@ class Scan:
 
     def _read(
         self,
-        decode: Callable[[Sequence[FilePart]], Iterator[R]],
+        decode_record: Callable[[Sequence[FilePart]], Iterator[R]],
         joined: int,
         apply: Callable[..., Iterator[tuple[FilePart, list[R], int]]],
     ) -> Iterator[Sequence[R | Schema | Channel]]:
@@ -197,7 +197,7 @@ class Scan:
             yield [record for record in index if isinstance(record, Schema | Channel)]
             count = sum(record.message_count for record in index if isinstance(record, Statistics))
             parts = _joined(self._parts(stream, size, index), joined)
-            for last, records, damaged in apply(partial(_decoded, decode), parts):
+            for last, records, damaged in apply(partial(_decoded, decode_record), parts):
                 self.position = last.end
                 self.ended = last.opcode in ENDS
                 self.damaged += damaged
@@ -339,18 +339,18 @@ def _joined(parts: Iterator[FilePart], most: int) -> Iterator[Sequence[FilePart]
 
 
 def _decoded(
-    decode: Callable[[Sequence[FilePart]], Iterator[R]], parts: Sequence[FilePart]
+    decode_record: Callable[[Sequence[FilePart]], Iterator[R]], parts: Sequence[FilePart]
 ) -> tuple[FilePart, list[R], int]:
     """The last of parts, their records without those of damaged parts, and how many these are."""
     try:
-        return parts[-1], list(decode(parts)), 0
+        return parts[-1], list(decode_record(parts)), 0
     except DECODE_ERRORS:
         if len(parts) == 1:
             return parts[0], [], 1
     records = []
     damaged = 0
     for part in parts:
-        _, part_records, part_damaged = _decoded(decode, [part])
+        _, part_records, part_damaged = _decoded(decode_record, [part])
         records += part_records
         damaged += part_damaged
     return parts[-1], records, damaged
@@ -386,7 +386,7 @@ def split(data: bytes) -> Iterator[McapRecord]:
                 channel, log_time, data[position + MESSAGE.size : end], publish_time, sequence
             )
         else:
-            yield from decode(opcode, data[position:end])
+            yield from decode_record(opcode, data[position:end])
         position = end
 
 
@@ -395,7 +395,7 @@ def _messages_in(record: object) -> int:
 
 
 def decode_batches(parts: Sequence[FilePart]) -> Iterator[McapRecord | MessageBatch]:
-    """As `decode` of chunks or of a single record, with the messages of a channel together.
+    """As `decode_record` of chunks or of a single record, with the messages of a channel together.
 
     The message indexes of a chunk save most of the time. A wrong index changes nothing. Raises
     DECODE_ERRORS.
@@ -494,7 +494,7 @@ def _walk(data: bytes, places: NDArray[np.int64]) -> tuple[list[McapRecord], NDA
             if opcode == Opcode.MESSAGE and length >= MESSAGE.size:
                 further.append(position)
             else:
-                others += decode(opcode, data[begin : begin + length])
+                others += decode_record(opcode, data[begin : begin + length])
             position = begin + length
     return others, np.sort(np.append(places, further)) if further else places
 
@@ -505,7 +505,7 @@ def decode_parts(parts: Iterable[FilePart]) -> Iterator[McapRecord]:
         yield from split(_plain(part))
 
 
-def decode(opcode: int, content: bytes) -> Iterator[McapRecord]:
+def decode_record(opcode: int, content: bytes) -> Iterator[McapRecord]:
     """A record that is no message. Raises DECODE_ERRORS."""
     # No chunk holds another one.
     if opcode in {DAMAGED, Opcode.CHUNK, Opcode.MESSAGE}:

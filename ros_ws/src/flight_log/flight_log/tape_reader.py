@@ -27,7 +27,7 @@ from flight_log.bag import (
     full_names,
 )
 from flight_log.clock import SINCE_EPOCH_NS, leap_note, recording_note, without_leaps
-from flight_log.engagements import ENGAGEMENT, Engagement, engagements
+from flight_log.engagements import ENGAGEMENT, Engagement, engagements_of
 from flight_log.flight_processes import (
     INSTANCE,
     SampleSpan,
@@ -94,7 +94,7 @@ class RecordedRun(NamedTuple):
         missing = [name for name in names if name not in self.tape]
         if missing or (not names and not {*AIRCRAFT_TOPICS} & {*self.tape.signals}):
             where = "the log" if self.path is None else str(self.path)
-            has = listed(self.topics)
+            has = topics_text(self.topics)
             lack = (
                 f"no sample of {', '.join(missing) or 'a flight'}{f' among {has}' if has else ''}"
             )
@@ -114,7 +114,7 @@ class RecordedRun(NamedTuple):
         return self.scenario
 
 
-def listed(topics: Mapping[str, str]) -> str:
+def topics_text(topics: Mapping[str, str]) -> str:
     """Topics with the types, for a sentence; empty without topics."""
     names = [f"{topic} ({type_name or 'no type'})" for topic, type_name in sorted(topics.items())]
     surplus = len(names) - NAMED
@@ -161,7 +161,7 @@ def read_run(
         metadata=log.metadata,
         attachments=tuple(log.attachments),
         latency=None if has_step else latency(sending_times),
-        engagements=engagements(log.reports.get(f"{aircraft}{ENGAGEMENT}", [])),
+        engagements=engagements_of(log.reports.get(f"{aircraft}{ENGAGEMENT}", [])),
         namespace=aircraft,
         path=run,
         topics=log.kinds,
@@ -171,7 +171,7 @@ def read_run(
 
 def _require_samples(log: LogContent, signals: Mapping[str, Signal], run: Path) -> None:
     """Raise ParameterError for a log without a sample of a flight, with the reasons."""
-    has = listed(log.kinds)
+    has = topics_text(log.kinds)
     lacks = [f"no sample of a flight among {has}" if has else "no sample on any topic"]
     for topic, samples in log.topics.items():
         if unset := samples.recording().unset:

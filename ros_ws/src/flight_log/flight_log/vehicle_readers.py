@@ -21,7 +21,7 @@ from flight_core.installation import require_package
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS
 from flight_core.vectors import FloatArray
-from flight_log.flown_instance import flown, moved
+from flight_log.flown_instance import instances_of_flight, moving_numbers
 from flight_log.log_samples import (
     LARGEST,
     SETTING,
@@ -90,11 +90,10 @@ def _read_dataflash(path: Path, kind: str, choice: Choice) -> VehicleLog:
 
     def samples() -> Iterator[Sample]:
         stamp_us = 0.0
-        reader = (
-            DFReader.DFReader_text(str(path))
-            if "text" in kind
-            else DFReader.DFReader_binary(str(path))
-        )
+        if "text" in kind:
+            reader = DFReader.DFReader_text(str(path))
+        else:
+            reader = DFReader.DFReader_binary(str(path))
         with closing(reader):
             while (
                 message := reader.recv_match(type=[*fields_and_flags, *OLD_NAMES, PARAMETER, "MSG"])
@@ -124,7 +123,7 @@ def _read_dataflash(path: Path, kind: str, choice: Choice) -> VehicleLog:
             )
 
     instances, parameters, parts = tables_of(samples(), fields_and_flags)
-    tables, choices = flown(instances, fields, parameters, choice)
+    tables, choices = instances_of_flight(instances, fields, parameters, choice)
     _true_airspeed(tables)
     vehicle = FIRMWARES.get(next(iter(firmwares), ""), "")
     if (attitude := tables.get("ATT")) is not None:
@@ -184,7 +183,7 @@ def _read_tlog(path: Path, kind: str, choice: Choice) -> VehicleLog:
         {number: messages[number] for number in autopilots}, choice.system
     )
     instances, parameters, parts = tables_of(_dated(messages.get(system, [])), fields)
-    tables, _ = flown(instances, fields, parameters, choice)
+    tables, _ = instances_of_flight(instances, fields, parameters, choice)
     autopilot, mav_type = autopilots.get(system, (0, -1))
     vehicle = "" if mav_type < 0 else MAV_TYPES.get(mav_type, f"vehicle of MAV_TYPE {mav_type}")
     manual = PX4_MANUAL if autopilot == PX4 else 0
@@ -219,7 +218,7 @@ def _flown_system(
         motions[system] = float(np.std(rates, axis=0).sum()) if rates else 0.0
     if not received:
         return 0, ()
-    moving = moved(motions)
+    moving = moving_numbers(motions)
     if len(moving) > 1:
         ways_out = " or ".join(f"--system {system}" for system in moving)
         raise ParameterError(
@@ -247,11 +246,10 @@ def _dated(messages: list[Received]) -> Iterator[Sample]:
     with_time = [message for message in messages if hasattr(message.content, "time_boot_ms")]
     times = {message.content.time_boot_ms for message in with_time}
     by_arrival = len(times) <= LEAST_TIMES * len(with_time)
-    offset_ns = (
-        0
-        if not with_time
-        else with_time[0].arrival_ns - 1_000_000 * with_time[0].content.time_boot_ms
-    )
+    if not with_time:
+        offset_ns = 0
+    else:
+        offset_ns = with_time[0].arrival_ns - 1_000_000 * with_time[0].content.time_boot_ms
     newest_ns = with_time[0].arrival_ns if with_time else 0
     # Sequences and stamps; None of a message that came before.
     recent = deque[tuple[int, int | None]](maxlen=RECENT)
@@ -320,7 +318,7 @@ def _read_ulog(path: Path, kind: str, choice: Choice) -> VehicleLog:
     sources = chain(*ULOG_SOURCES.values(), ULOG_TORQUES.values())
     places = [(source.message, source.field) for source in sources]
     fields = _by_message([*places, *ULOG_TORQUES])
-    tables, choices = flown(instances, fields, parameters, choice)
+    tables, choices = instances_of_flight(instances, fields, parameters, choice)
     if (attitude := tables.get("vehicle_attitude")) is not None:
         tables["vehicle_attitude"] = MessageTable(
             attitude.stamp_ns, {**attitude.fields, **_angles(attitude)}

@@ -180,11 +180,9 @@ class RecorderNode(FlightNode[RecorderConfig]):
         """The sentence about too little free space; empty with enough."""
         free = free_bytes(directory) / MEGABYTE
         least = self.parameters.min_free
-        return (
-            ""
-            if free >= least
-            else f"found {free:.1f} MB free in {directory}, expected at least {least:g} MB"
-        )
+        if free >= least:
+            return ""
+        return f"found {free:.1f} MB free in {directory}, expected at least {least:g} MB"
 
     def _among(self, topics: Sequence[Topic], *, heard: bool = False) -> list[_RecordedTopic]:
         """The recorded topics among `topics`; `heard`: with messages."""
@@ -526,11 +524,10 @@ class RecorderNode(FlightNode[RecorderConfig]):
         figures |= {
             f"silent {topic.name}": "no message" for topic in self._topics if topic.silent_ns
         }
-        level = (
-            DiagnosticStatus.WARN
-            if self.lost or self._missing or any(topic.silent_ns for topic in self._topics)
-            else DiagnosticStatus.OK
-        )
+        if self.lost or self._missing or any(topic.silent_ns for topic in self._topics):
+            level = DiagnosticStatus.WARN
+        else:
+            level = DiagnosticStatus.OK
         return level, f"recording to {self._bag.path}", figures
 
     def _drain(self) -> None:

@@ -80,11 +80,9 @@ class ControlClient(Client):
         number = Transition.TRANSITION_ACTIVATE if active else Transition.TRANSITION_DEACTIVATE
         request = ChangeState.Request(transition=Transition(id=number))
         response = self._call(ChangeState, "controller/change_state", request)
-        return (
-            ""
-            if response.success
-            else f"the controller is {'active' if active else 'inactive'} already"
-        )
+        if response.success:
+            return ""
+        return f"the controller is {'active' if active else 'inactive'} already"
 
     def send_target(self, values: Mapping[str, float]) -> str:
         """Command guidance, as `rise-di guide`."""

@@ -73,7 +73,7 @@ def _finite_or_none(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def described(scenario: Scenario) -> dict[str, Any]:
+def scenario_description(scenario: Scenario) -> dict[str, Any]:
     """Units, what a positive input does, limits, gusts, commands and route of a scenario.
 
     Raises ParameterError where the airframe cannot be read.

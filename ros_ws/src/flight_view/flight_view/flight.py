@@ -47,9 +47,15 @@ from flight_log.named_vectors import (
     typestore,
 )
 from flight_log.stored_messages import PARAMETER_EVENT, PARAMETER_EVENTS, parameter_value
-from flight_log.tape_reader import listed, read_run
+from flight_log.tape_reader import read_run, topics_text
 from flight_view.background import Line
-from flight_view.description import MODES, ParameterTicks, described, mission, rms_by_model
+from flight_view.description import (
+    MODES,
+    ParameterTicks,
+    mission,
+    rms_by_model,
+    scenario_description,
+)
 from flight_view.page_topics import GROUPS, IN_TICKS, LEARNED, RATES
 from flight_view.series import Series
 
@@ -208,34 +214,23 @@ class Flight:
     def faults(self) -> list[str]:
         """Sentences on what the log lacks."""
         follower = self._follower
-        among = f" among {_text(listed(self._kinds))}" if self._kinds else ""
+        sentences = [*self.notes, *self._lacks]
+        if follower.complete and not self.samples:
+            among = f" among {_text(topics_text(self._kinds))}" if self._kinds else ""
+            sentences.append(f"no sample of a flight{among}")
+        if follower.fault:
+            sentences.append(f"the log cannot be read further: {_text(follower.fault)}")
+        if follower.damaged:
+            sentences.append(f"{follower.damaged} damaged parts of the log are left out")
+        if self._unreadable:
+            sentences.append(f"{self._unreadable} samples are unreadable")
         refusals = {
             name: samples.refused for name, samples in self.samples.items() if samples.refused
         }
-        return [
-            *self.notes,
-            *self._lacks,
-            *(
-                [f"no sample of a flight{among}"]
-                if self._follower.complete and not self.samples
-                else []
-            ),
-            *(
-                [f"the log cannot be read further: {_text(follower.fault)}"]
-                if follower.fault
-                else []
-            ),
-            *(
-                [f"{follower.damaged} damaged parts of the log are left out"]
-                if follower.damaged
-                else []
-            ),
-            *([f"{self._unreadable} samples are unreadable"] if self._unreadable else []),
-            *(
-                f"{name}: {count} samples out of order are left out"
-                for name, count in refusals.items()
-            ),
+        sentences += [
+            f"{name}: {count} samples out of order are left out" for name, count in refusals.items()
         ]
+        return sentences
 
     def update(self, budget: float = math.inf) -> bool:
         """Read for at most about `budget` s.
@@ -339,7 +334,7 @@ class Flight:
             self.scenario = parse_scenario(content, path)
             self.described += 1
             # `described` reads the airframe, maybe a file of another machine.
-            self.description |= described(self.scenario)
+            self.description |= scenario_description(self.scenario)
         except ParameterError as error:
             self._note(f"units, limits and commands are unknown: {error}")
 
@@ -560,11 +555,9 @@ class Flight:
 
 def _shown(value: Any) -> str:
     """The value of a parameter; of a matrix its size."""
-    return (
-        f"{len(value)} values"
-        if isinstance(value, list) and len(value) > MAX_VALUES
-        else str(value)
-    )
+    if isinstance(value, list) and len(value) > MAX_VALUES:
+        return f"{len(value)} values"
+    return str(value)
 
 
 def _text(text: str) -> str:

@@ -22,7 +22,7 @@ DEFAULT_PORT = 8765  # of the protocol
 BACKLOG = 4096  # messages that wait for a slow viewer; the oldest is dropped
 
 
-def serve(run: Path, port: int, announce: Callable[[str], None]) -> None:
+def serve_foxglove(run: Path, port: int, announce: Callable[[str], None]) -> None:
     """Serve a run until the end of the recording, SIGINT or SIGTERM.
 
     `announce` gets a line for the user. Raises ParameterError where the port is taken, or the

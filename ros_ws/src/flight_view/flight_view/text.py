@@ -128,10 +128,9 @@ def _names(flight: Flight, group: str) -> Sequence[str]:
 
 def _newest_of(flight: Flight, group: str, name: str) -> float:
     """The newest value of a channel in the ticks, in a log without ticks in the topic."""
-    return _newest(
-        flight,
-        *(("internals", f"{group}.{name}") if "internals" in flight.samples else (group, name)),
-    )
+    if "internals" in flight.samples:
+        return _newest(flight, "internals", f"{group}.{name}")
+    return _newest(flight, group, name)
 
 
 def _unit(flight: Flight, name: str) -> tuple[str, float]:

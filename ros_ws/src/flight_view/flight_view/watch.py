@@ -18,7 +18,7 @@ from flight_log.disk import is_locked
 from flight_log.named_vectors import JOINT_STATE, full_name
 from flight_log.open_log import log_files, log_topics
 from flight_log.rosbag2_metadata import bag_files
-from flight_log.tape_reader import A_FLIGHT, aircraft_namespaces, chosen_namespace, listed
+from flight_log.tape_reader import A_FLIGHT, aircraft_namespaces, chosen_namespace, topics_text
 from flight_view.control import Control
 from flight_view.flight import Flight
 from flight_view.page_topics import RATES
@@ -29,11 +29,10 @@ DEFAULT_PORT = 8077
 
 def runs_in_recording(runs: Path, namespace: str | None = None) -> list[Path]:
     """The runs in recording, the newest first; with a namespace those that hold a topic of it."""
-    folders = (
-        sorted((folder for folder in runs.iterdir() if is_folder(folder)), reverse=True)
-        if is_folder(runs)
-        else []
-    )
+    if is_folder(runs):
+        folders = sorted((folder for folder in runs.iterdir() if is_folder(folder)), reverse=True)
+    else:
+        folders = []
     recording = []
     prefix = f"/{(namespace or '').strip('/')}/".replace("//", "/")
     for folder in folders:
@@ -84,7 +83,7 @@ def require_log(run: Path, namespace: str | None = None, remaps: Mapping[str, st
         for topic, name in topics.items()
         if full_name(name) == JOINT_STATE and topic.rpartition("/")[2] in RATES
     ]
-    has = f"no topic of a flight among {listed(topics)}" if topics else "no topic"
+    has = f"no topic of a flight among {topics_text(topics)}" if topics else "no topic"
     require(bool(aircraft), str(run), has, A_FLIGHT)
     if namespace is not None:
         chosen_namespace(aircraft, namespace, str(run))

@@ -151,11 +151,10 @@ def _airframe(
     model: ToolModel, name: str, speed: float, outputs: str | Sequence[str], source: str
 ) -> Airframe:
     names = list(model.states)
-    output_names = (
-        [part.strip() for part in outputs.split(",")]
-        if isinstance(outputs, str) and outputs
-        else list(outputs)
-    )
+    if isinstance(outputs, str) and outputs:
+        output_names = [part.strip() for part in outputs.split(",")]
+    else:
+        output_names = list(outputs)
     output_names = output_names or _default_outputs(model)
     fewer = f"{len(model.inputs)} or fewer, as many as inputs or fewer"
     require(
@@ -285,7 +284,9 @@ def _effect(model: ToolModel, name: str) -> str:
     if state not in model.states:
         return "not stated"
     value = model.B[list(model.states).index(state), list(model.inputs).index(name)]
-    return up if value > 0.0 else down if value < 0.0 else "not stated"
+    if value > 0.0:
+        return up
+    return down if value < 0.0 else "not stated"
 
 
 def _gusts(frame: Airframe) -> dict[str, dict[str, float]]:

@@ -197,11 +197,10 @@ def _kinematic_rows(model: LinearModel) -> Iterator[Finding]:
         i = names.index(row)
         entering = OF_RATES[row]
         for column in KINDS if entering is not None else ():
-            value = (
-                float(model.matrix_a()[i, names.index(column)])
-                if column in names and column not in str(entering).split()
-                else 0.0
-            )
+            if column in names and column not in str(entering).split():
+                value = float(model.matrix_a()[i, names.index(column)])
+            else:
+                value = 0.0
             if abs(value) > FOREIGN:
                 yield Finding(
                     "A", f"{row}_dot = {value:.4g} {column} in SI", f"no {column} in {row}_dot"

@@ -68,11 +68,9 @@ def command_paths(command: Command, engines: int) -> list[tuple[str, float]]:
     """
     if command.named:
         return list(command.named)
-    return (
-        [(f"{command.property}[{i}]", 1.0) for i in range(engines)]
-        if command.each_engine
-        else [(command.property, 1.0)]
-    )
+    if command.each_engine:
+        return [(f"{command.property}[{i}]", 1.0) for i in range(engines)]
+    return [(command.property, 1.0)]
 
 
 def set_command(fdm: jsbsim.FGFDMExec, command: Command, value: float) -> None:
@@ -157,11 +155,10 @@ def sentence_without_effect(
         [] if model is None else [path for path in _read_by_model(model) if manager.hasNode(path)]
     )
     effective = [path for path in properties if _moves(fdm, [(path, 1.0)], PART)]
-    reads = (
-        f"; its flight control reads {', '.join(effective)}: name them in `commands`"
-        if effective
-        else ""
-    )
+    if effective:
+        reads = f"; its flight control reads {', '.join(effective)}: name them in `commands`"
+    else:
+        reads = ""
     return f"{', '.join(parts)} moves no acceleration{reads}"
 
 

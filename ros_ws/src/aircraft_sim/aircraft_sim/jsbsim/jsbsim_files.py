@@ -114,11 +114,8 @@ def model_files(model: Path) -> ModelFiles:
         _require_no_writer(tree, place.path)
         if place == first:
             left_out = _leave_out(tree, model)
-            content = (
-                ElementTree.tostring(tree, encoding="utf-8", xml_declaration=True)
-                if left_out
-                else content
-            )
+            if left_out:
+                content = ElementTree.tostring(tree, encoding="utf-8", xml_declaration=True)
         members[place.member] = content
         for element in tree.iter():
             if (name := element.get("file")) and (

@@ -105,11 +105,10 @@ class JsbsimModel:
         )
         self._actuator_model = actuator_model._replace(no_thrust=self._no_thrust)
         self._wind_model = wind_model
-        self._z = (
-            None
-            if wind_model.turbulence is None
-            else turbulence.initial_state(wind_model.turbulence)
-        )
+        if wind_model.turbulence is None:
+            self._z = None
+        else:
+            self._z = turbulence.initial_state(wind_model.turbulence)
         self._position = np.zeros(len(inputs))
         self._altitude = self._node("position/h-sl-ft")
         self._position_ground = np.zeros(2)  # to the north and the east of the start

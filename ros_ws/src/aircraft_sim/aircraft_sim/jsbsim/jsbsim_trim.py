@@ -230,11 +230,9 @@ def error_text(error: jsbsim.BaseError) -> str:
     """
     text = " ".join(str(error).split())
     missing = re.search(r"The property (\S+) does not exist", text)
-    return (
-        text
-        if missing is None
-        else f"its model needs the property {missing[1]}, which JSBSim alone does not have"
-    )
+    if missing is None:
+        return text
+    return f"its model needs the property {missing[1]}, which JSBSim alone does not have"
 
 
 def _solve_trim(condition: FlightCondition) -> TrimSolution:

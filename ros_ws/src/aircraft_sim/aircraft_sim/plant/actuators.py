@@ -193,11 +193,9 @@ def apply_faults(t: Any, position: Array, new: Array, params: Actuators) -> Arra
     xp = array_namespace(position)
     if params.stuck_at is not None:
         new = xp.where(t >= params.stuck_at, position, new)
-    return (
-        new
-        if params.lost_at is None
-        else xp.where(t >= params.lost_at, _no_thrust(new, params), new)
-    )
+    if params.lost_at is None:
+        return new
+    return xp.where(t >= params.lost_at, _no_thrust(new, params), new)
 
 
 def _no_thrust(position: Array, params: Actuators) -> Array:

@@ -143,11 +143,9 @@ def at_times(t: Array, params: Aircraft) -> Forcing:
     """Forcing by the gusts, biases and sines at T instants, t of shape (T,)."""
 
     def column(term: Any) -> Any:
-        return (
-            None
-            if term is None
-            else type(term)(*(None if values is None else values[:, None] for values in term))
-        )
+        if term is None:
+            return None
+        return type(term)(*(None if values is None else values[:, None] for values in term))
 
     columns = params._replace(
         gusts=column(params.gusts), bias=column(params.bias), sines=column(params.sines)

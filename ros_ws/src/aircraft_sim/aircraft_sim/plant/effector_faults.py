@@ -69,7 +69,7 @@ class Fault(NamedTuple):
         return self.end or ("" if self.strength is None else f"{self.strength:g}")
 
 
-def read(sentence: str, key: str) -> Fault:
+def read_fault(sentence: str, key: str) -> Fault:
     """The fault of a sentence. Raises ParameterError."""
     words = sentence.split()
     require(len(words) in {3, 4}, key, repr(sentence), FORM)

@@ -20,7 +20,7 @@ from flight_core.files import dump_yaml, is_file, read_file
 from flight_core.parameters import Config, ParameterError, one_of, require, require_channels
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns
 from flight_core.scenario_file import A_SCENARIO, Sections, parse_sections
-from flight_guidance.fence.zones import described
+from flight_guidance.fence.zones import clearance_text
 from flight_guidance.params import GuidanceConfig
 from flight_recorder.params import RecorderConfig
 from reference_model.params import ReferenceModelConfig
@@ -461,7 +461,9 @@ def require_guidable(scenario: Scenario) -> None:
     )
     start = aircraft.start
     inside = guidance.fence_clearance(start.north, start.east)
-    position = f"the start {described(inside)}, at north {start.north:g} m, east {start.east:g} m"
+    position = (
+        f"the start {clearance_text(inside)}, at north {start.north:g} m, east {start.east:g} m"
+    )
     require(inside >= 0.0, "guidance.fence", position, "a start inside")
 
 

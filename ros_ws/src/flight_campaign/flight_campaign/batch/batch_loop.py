@@ -304,13 +304,12 @@ def advance(
     # Places of the states in the order of the blocks.
     places = np.argsort([*chain.from_iterable(block.rows for block in blocks)])
     history = jnp.concatenate([command[None], now.command_before])
-    acting = (
-        command
-        if not u_late
-        else jnp.sum(
+    if not u_late:
+        acting = command
+    else:
+        acting = jnp.sum(
             jnp.where(jnp.arange(u_late + 1)[:, None, None] == fleet.late, history, 0.0), 0
         )
-    )
     times = segment.t + np.arange(timing.steps) * vehicle.dt
     position, means = _actuated(now.position, acting, times, vehicle, unroll=kind is not ASKED)
     remainder = remainder_of(rows_of(now.x, vehicle.remainder_states), vehicle.remainder)
@@ -390,8 +389,6 @@ def _product(matrices: Array, vector: Any) -> Array:
 
     0 for matrices without a column.
     """
-    return (
-        product(matrices, vector)
-        if matrices.shape[1]
-        else jnp.zeros((matrices.shape[0], matrices.shape[-1]))
-    )
+    if matrices.shape[1]:
+        return product(matrices, vector)
+    return jnp.zeros((matrices.shape[0], matrices.shape[-1]))

@@ -28,7 +28,7 @@ def is_cpu() -> bool:
 
 def device_name() -> str:
     """The device, for people: NVIDIA H200, or the cores of the processor."""
-    return f"{threads()} CPU cores" if is_cpu() else jax.devices()[0].device_kind
+    return f"{thread_count()} CPU cores" if is_cpu() else jax.devices()[0].device_kind
 
 
 def schedule_of_device() -> Schedule:
@@ -36,7 +36,7 @@ def schedule_of_device() -> Schedule:
     return with_branches if is_cpu() else without_branches
 
 
-def threads() -> int:
+def thread_count() -> int:
     """How many threads keep the device busy: one a core of a CPU."""
     return os.cpu_count() or 1 if is_cpu() else THREADS
 

@@ -25,7 +25,7 @@ from flight_campaign.comparison.tuning import (
     as_gains,
     benchmark_fleet,
     nominal_margins,
-    score,
+    result_score,
 )
 from flight_campaign.statistics import LOSS_OF_TRACK_SCORE
 from flight_core.vectors import FloatArray
@@ -138,7 +138,7 @@ class _LawStudy(NamedTuple):
         for wind, disturbed in self.flights.items():
             course = benchmark.courses[wind][law.feedforward]
             results[wind] = batch.fly(disturbed, benchmark.vehicle, course, control_law, params)
-        scores = {wind: score(each, benchmark.unit) for wind, each in results.items()}
+        scores = {wind: result_score(each, benchmark.unit) for wind, each in results.items()}
         in_time = 1 + sum(map(len, self.parts))
         delayed_scores = scores[GUST][in_time:].reshape(len(self.delays), len(self.parts[0]))
         by_level = []

@@ -112,11 +112,10 @@ def find_laws(
         elif name == scenario.controller.law:
             controller = scenario.controller
         else:
-            flyable = (
-                "the path of a scenario file whose controller flies it"
-                if name in laws.names()
-                else "a scenario file"
-            )
+            if name in laws.names():
+                flyable = "the path of a scenario file whose controller flies it"
+            else:
+                flyable = "a scenario file"
             raise ParameterError(
                 f"--laws: found {name!r}, expected laws among {', '.join(LAWS)}, or {flyable}"
             )

@@ -110,11 +110,9 @@ def _feedforward(name: str, benchmark: Benchmark) -> FeedforwardConfig | None:
     controller = benchmark.scenario.controller
     if LAWS[name].feedforward == AIRCRAFT:
         return with_feedforward(controller, benchmark.scenario.aircraft.load()[0]).feedforward
-    return (
-        integrator_model(controller, benchmark.model.Omega)
-        if LAWS[name].feedforward == INTEGRATORS
-        else None
-    )
+    if LAWS[name].feedforward == INTEGRATORS:
+        return integrator_model(controller, benchmark.model.Omega)
+    return None
 
 
 def _observer(name: str, result: TuningResult, benchmark: Benchmark) -> ObserverConfig:

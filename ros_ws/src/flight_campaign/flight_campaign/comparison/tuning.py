@@ -183,11 +183,9 @@ def turbulence_of(scenario: Scenario) -> dict[str, float]:
     Moderate at 100 m where the scenario has none.
     """
     turbulence = scenario.aircraft.turbulence
-    return (
-        MODERATE
-        if turbulence is None
-        else turbulence.model_dump(exclude={"seed"}, exclude_none=True)
-    )
+    if turbulence is None:
+        return MODERATE
+    return turbulence.model_dump(exclude={"seed"}, exclude_none=True)
 
 
 def _courses(scenario: Scenario) -> dict[str, Course]:
@@ -213,7 +211,7 @@ def _courses(scenario: Scenario) -> dict[str, Course]:
     }
 
 
-def score(result: FleetResult, unit: FloatArray) -> FloatArray:
+def result_score(result: FleetResult, unit: FloatArray) -> FloatArray:
     """Sum over the channels of rms of the true error / unit, shape (N,).
 
     Infinite if a flight diverged.
@@ -228,7 +226,7 @@ def cost(result: FleetResult, benchmark: Benchmark) -> FloatArray:
     At most MAX_COST.
     """
     activity = np.sum(np.asarray(result.slew) / benchmark.activity_unit[:, None], axis=0)
-    total = score(result, benchmark.unit) + activity
+    total = result_score(result, benchmark.unit) + activity
     return np.where(np.isfinite(total), np.minimum(total, MAX_COST), MAX_COST)
 
 

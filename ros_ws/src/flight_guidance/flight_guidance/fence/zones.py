@@ -180,6 +180,6 @@ def _cut(
     return points[:-1], points[1:]
 
 
-def described(distance: float) -> str:
+def clearance_text(distance: float) -> str:
     """A distance of `clearance` in words: "9 m inside of the fence"."""
     return f"{abs(distance):.0f} m {'inside' if distance >= 0.0 else 'outside'} of the fence"

@@ -62,7 +62,7 @@ def lateral_bank(
     orbit = _wide_enough(Arc((target.north, target.east), target.radius), params)
     position = (pose["north"], pose["east"])
     error = path.error(orbit, position)
-    is_entered: Callable[[Point], Any] = partial(path.entered, orbit, None)
+    is_entered: Callable[[Point], Any] = partial(path.is_entered, orbit, None)
     bank = follow(error, error.curvature, is_entered, state.slip, pose, speed, params)
     return bank, error, path.to_go(orbit, position)
 
@@ -89,7 +89,7 @@ def _onto_leg(
     error = path.circle_error(path.joining_centre(start, course, radius), radius, position)
 
     def joined(place: Point) -> Any:
-        return path.joined(start, course, route.near(state.leg), place, flown)
+        return path.is_joined(start, course, route.near(state.leg), place, flown)
 
     entry = path.error(route.legs[state.leg], start).curvature
     bank = follow(error, entry, joined, state.slip, pose, speed, params)
@@ -113,7 +113,7 @@ def _along_leg(
     entry = error.curvature
     if following is not None and leg.end is not None:
         entry = path.error(following, leg.end).curvature
-    is_entered: Callable[[Point], Any] = partial(path.entered, leg, following)
+    is_entered: Callable[[Point], Any] = partial(path.is_entered, leg, following)
     if following is not None and path.is_orbit(leg) and has_loitered(state, pose, route):
         near = route.near(state.leg)
         late = leaves(leg, near, pose, position) and not leaves(

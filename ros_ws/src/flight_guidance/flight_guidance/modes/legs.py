@@ -38,7 +38,7 @@ def along_route(
     near = route.near(state.leg)
     if state.joining:
         start, course = route.start(state.leg, state.target.along)
-        if path.joined(start, course, near, position, course_and_speed(pose)[0]):
+        if path.is_joined(start, course, near, position, course_and_speed(pose)[0]):
             state = on_leg(state, state.leg, route)
         return state, 0.0
     if isinstance(leg, Arc) and leg.loiter is not None and leg.end is not None:
@@ -47,11 +47,13 @@ def along_route(
             leg, EXIT * course_and_speed(pose)[1], pose, position
         )
         return on_leg(state, state.leg + 1, route) if ends else state, 0.0
-    if leg.end is None or not path.passed(leg, position):
+    if leg.end is None or not path.is_passed(leg, position):
         return state, 0.0
     # After a sharp corner, too, the next leg is joined.
     distance = math.dist(leg.end, position)
-    return joining(state, state.leg + 1, 0.0, pose, route), distance if distance > near else 0.0
+    return joining_state(
+        state, state.leg + 1, 0.0, pose, route
+    ), distance if distance > near else 0.0
 
 
 def _loitering(
@@ -85,7 +87,7 @@ def leaves(leg: Leg, reach: float, pose: Mapping[str, float], position: Point) -
     `reach`: largest distance from the end, m.
     """
     return leg.end is not None and bool(
-        path.joined(leg.end, path.end_course(leg), reach, position, course_and_speed(pose)[0])
+        path.is_joined(leg.end, path.end_course(leg), reach, position, course_and_speed(pose)[0])
     )
 
 
@@ -167,7 +169,7 @@ def on_profile(
     return state._replace(target=state.target._replace(altitude=altitude, climb=climb))
 
 
-def joining(
+def joining_state(
     state: GuidanceState, leg: int, along: float, pose: Mapping[str, float], route: Route
 ) -> GuidanceState:
     """The state on the way to a point of a leg, at the altitude and the airspeed there.

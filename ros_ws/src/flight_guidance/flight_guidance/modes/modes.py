@@ -34,7 +34,7 @@ from flight_guidance.guidance_state import (
     begun_again,
 )
 from flight_guidance.modes.lateral_modes import escaping_bank, lateral_bank
-from flight_guidance.modes.legs import along_route, joining, with_commands
+from flight_guidance.modes.legs import along_route, joining_state, with_commands
 from flight_guidance.modes.targets import hold, home, permitted_speed, within_reach
 from flight_guidance.steering import protection
 from flight_guidance.steering.attitude import BodyRates, body_rates, yaw_for_bank
@@ -148,7 +148,7 @@ def step(
         route,
         params.channels,
         lambda state, route: along_route(state, pose, dt, route),
-        lambda state, leg, along, route: joining(state, leg, along, pose, route),
+        lambda state, leg, along, route: joining_state(state, leg, along, pose, route),
     )
     state, escape = _within_fence(state, pose, y, speed, params)
     bank, error, to_go = lateral_bank(state, pose, speed, route, params)
@@ -278,11 +278,10 @@ def _with_attitude(
     if inputs.pose_age_ns <= params.max_age_ns:
         # The aircraft may be anywhere by now.
         if state.mode is GuidanceMode.POSE_LOST:
-            after_loss = (
-                home(pose, params)
-                if params.home.after_loss
-                else {"phi": 0.0, "altitude": pose["altitude"]}
-            )
+            if params.home.after_loss:
+                after_loss = home(pose, params)
+            else:
+                after_loss = {"phi": 0.0, "altitude": pose["altitude"]}
             lateral = Lateral.ORBIT if params.home.after_loss else Lateral.PHI
             level = state._replace(
                 lateral=lateral,
@@ -392,11 +391,10 @@ def _climb(
         return pose["climb"], False
     vertical = params.vertical
     target = state.target
-    climb = (
-        target.climb
-        if state.vertical is Vertical.CLIMB
-        else climb_for(target.altitude - pose["altitude"], vertical)
-    )
+    if state.vertical is Vertical.CLIMB:
+        climb = target.climb
+    else:
+        climb = climb_for(target.altitude - pose["altitude"], vertical)
     if state.vertical is Vertical.PROFILE:
         climb = climb + target.climb
     least, largest = protection.climb_range(

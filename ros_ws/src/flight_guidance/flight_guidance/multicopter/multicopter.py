@@ -283,7 +283,7 @@ def _along_route(
         ends = has_loitered(state, pose, route)
         return on_leg(state, state.leg + 1, route) if ends else state, 0.0
     stopped = _stops(route, state.leg) and _is_near(state, pose, leg.end)
-    if not stopped and not path.passed(leg, position):
+    if not stopped and not path.is_passed(leg, position):
         return state, 0.0
     distance = math.dist(leg.end, position)
     miss = distance if distance > route.near(state.leg) else 0.0
@@ -401,7 +401,7 @@ def _on_path(
     velocity = complex(math.sqrt(speed**2 - across**2), across)  # along, and i to the right
     later = _parts(_place(pose) + gains.lead * _velocity(pose))
     entered_leg = leg
-    if path.passed(leg, later) and not _stops(route, state.leg):
+    if path.is_passed(leg, later) and not _stops(route, state.leg):
         entered_leg = route.legs[state.leg + 1]
     error_later = path.error(entered_leg, later)
     track = cmath.rect(1.0, error_later.track)

@@ -82,11 +82,8 @@ def named(command: int, number: int) -> str:
             from pymavlink.dialects.v20 import ardupilotmega  # noqa: PLC0415 - an extra
 
             enum_entry = ardupilotmega.enums["MAV_CMD"].get(command)
-            name = (
-                name
-                if enum_entry is None
-                else f"{enum_entry.name.removeprefix('MAV_CMD_')} ({command})"
-            )
+            if enum_entry is not None:
+                name = f"{enum_entry.name.removeprefix('MAV_CMD_')} ({command})"
     return f"{name} (item {number})"
 
 

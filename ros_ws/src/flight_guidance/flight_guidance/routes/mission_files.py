@@ -14,9 +14,9 @@ from flight_core.fields import short_repr
 from flight_core.parameters import ParameterError, require
 from flight_guidance.routes.mission import FRAMES, LAND, WAYPOINT, Item, mission_route, named
 from flight_guidance.routes.route_json import (
+    as_list,
     entries,
     flag,
-    listed,
     member,
     nodes,
     parsed_json,
@@ -103,12 +103,12 @@ TRANSECTS = ("survey", "CorridorScan")
 LANDINGS = ("fwLandingPattern", "vtolLandingPattern")  # as NAV_LAND, not flown
 
 
-def _plan_items(listed: Sequence[Any], key: str) -> Iterator[tuple[int, Any]]:
+def _plan_items(as_list: Sequence[Any], key: str) -> Iterator[tuple[int, Any]]:
     """The items of a plan with their numbers from 1 on.
 
     Items inside of a survey have the number of the survey.
     """
-    for number, entry in enumerate(listed, start=1):
+    for number, entry in enumerate(as_list, start=1):
         if member(entry, "complexItemType") in TRANSECTS:
             inside = entries(member(entry, "TransectStyleComplexItem"), "Items", key)
             require(
@@ -131,11 +131,10 @@ def read_wpl(content: bytes, key: str, line: str | None = None) -> Places:
     """The mission of a QGC WPL 110."""
     require(line is None, "line", f"a mission, {key}", "a file with several lines")
     items, home = wpl_items(content, key)
-    note = (
-        ""
-        if home is None
-        else f"item 0 is the home, at {home.latitude:.7g},{home.longitude:.7g}, and no waypoint"
-    )
+    if home is None:
+        note = ""
+    else:
+        note = f"item 0 is the home, at {home.latitude:.7g},{home.longitude:.7g}, and no waypoint"
     return mission_route(key, items, home, [note] * bool(note))
 
 
@@ -206,7 +205,7 @@ def plan_fence(tree: Any, key: str) -> FencePlaces:
     fence = member(tree, "geoFence")
     zones = []
     for zone in entries(fence, "polygons", key):
-        corners = [lat_lon(corner) for corner in listed(member(zone, "polygon"), key)]
+        corners = [lat_lon(corner) for corner in as_list(member(zone, "polygon"), key)]
         zones.append(_grouped(Area(corners, None, not flag(zone, "inclusion", None, key))))
     for zone in entries(fence, "circles", key):
         circle = member(zone, "circle")
@@ -252,7 +251,7 @@ def json_fence(tree: Any, key: str) -> FencePlaces:
             f"a {short_repr(kind)}",
             "Polygons, or Points with a radius",
         )
-        coordinates = listed(member(node, "coordinates"), key)
+        coordinates = as_list(member(node, "coordinates"), key)
         exclude = flag(properties, "exclude", False, key)
         radius = member(properties, "radius")
         group = member(properties, "group")
@@ -266,8 +265,8 @@ def json_fence(tree: Any, key: str) -> FencePlaces:
             zones.append(Area([lon_lat(coordinates)], radius, exclude, group))
             continue
         for rings in [coordinates] if kind == "Polygon" else coordinates:
-            for k, ring in enumerate(listed(rings, key)):
-                corners = [lon_lat(position) for position in listed(ring, key)]
+            for k, ring in enumerate(as_list(rings, key)):
+                corners = [lon_lat(position) for position in as_list(ring, key)]
                 zones.append(
                     Area(corners, None, True) if k > 0 else Area(corners, None, exclude, group)
                 )

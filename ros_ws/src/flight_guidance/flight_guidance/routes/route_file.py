@@ -172,7 +172,7 @@ def read_route_file(
         waypoints = list(_read_yaml(content, str(path), origin))
         notes = list[str]()
     else:
-        route = route_formats.read(content, str(path), suffix, line)
+        route = route_formats.read_places(content, str(path), suffix, line)
         home = route.home
         notes = list(route.notes)
         if origin is None and home is not None and above_sea is not None:

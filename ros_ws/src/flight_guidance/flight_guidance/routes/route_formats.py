@@ -28,7 +28,7 @@ from flight_guidance.routes.route_places import Places
 from flight_guidance.routes.route_xml import read_gpx, read_kml, read_kmz
 
 
-def read(content: bytes, key: str, suffix: str, line: str | None = None) -> Places:
+def read_places(content: bytes, key: str, suffix: str, line: str | None = None) -> Places:
     """The route in the content of a file; `key` names the file in errors. Raises ParameterError.
 
     `line`: the number from 1 on, or the name, of the line that is flown of a file with several.

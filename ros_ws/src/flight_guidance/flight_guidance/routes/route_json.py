@@ -177,7 +177,7 @@ def flag(tree: Any, name: str, absent: bool | None, key: str) -> bool:
     return bool(value)
 
 
-def listed(value: Any, key: str) -> list[Any]:
+def as_list(value: Any, key: str) -> list[Any]:
     """A list that is not empty. Raises ParameterError."""
     require(isinstance(value, list) and bool(value), key, short_repr(value), "a list of positions")
     return list(value)

@@ -151,7 +151,9 @@ def read_kmz(content: bytes, key: str, line: str | None = None) -> Places:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             names = [name for name in archive.namelist() if name.lower().endswith(".kml")]
             names = [name for name in names if "/" not in name] or names
-            file_name = "doc.kml" if "doc.kml" in names else names[0] if len(names) == 1 else ""
+            if "doc.kml" in names:
+                names = ["doc.kml"]
+            file_name = names[0] if len(names) == 1 else ""
             method = archive.getinfo(file_name).compress_type if file_name else zipfile.ZIP_STORED
             require(
                 method in {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED},
@@ -203,11 +205,10 @@ def read_gpx(content: bytes, key: str, line: str | None = None) -> Places:
         for element in root.iter()
         if _kind(element) == "trk"
     ]
-    geometries = (
-        routes + tracks
-        if line is not None or not any(segments for _, segments in routes)
-        else routes
-    )
+    if line is not None or not any(segments for _, segments in routes):
+        geometries = routes + tracks
+    else:
+        geometries = routes
     lines = [
         Geometry(_kind(element), [*chain(*segments)], (_text(element, "name") or "").strip())
         for element, segments in geometries

@@ -147,11 +147,9 @@ def nearest(leg: Leg, position: Point) -> float:
 
     From 0 to the length; 0 for an arc.
     """
-    return (
-        min(max(length(leg) - to_go(leg, position), 0.0), length(leg))
-        if isinstance(leg, Line)
-        else 0.0
-    )
+    if isinstance(leg, Line):
+        return min(max(length(leg) - to_go(leg, position), 0.0), length(leg))
+    return 0.0
 
 
 def course_of(start: Point, end: Point) -> float:
@@ -199,7 +197,7 @@ def end_course(leg: Leg) -> float:
     return float(error(leg, leg.end).track)
 
 
-def passed(leg: Leg, position: Point) -> bool:
+def is_passed(leg: Leg, position: Point) -> bool:
     """Whether a position lies beyond the half plane at the end of a leg, across the course there.
 
     Never for an orbit.
@@ -219,10 +217,10 @@ def is_beyond(end: Point, course: Scalar, position: Point) -> Any:
     return north * xp.cos(course) + east * xp.sin(course) >= 0.0
 
 
-def entered(leg: Leg, following: Leg | None, position: Point) -> bool:
+def is_entered(leg: Leg, following: Leg | None, position: Point) -> bool:
     """Whether a position lies beyond the end of a leg, but not beyond a following arc."""
-    return passed(leg, position) and not (
-        isinstance(following, Arc) and passed(following, position)
+    return is_passed(leg, position) and not (
+        isinstance(following, Arc) and is_passed(following, position)
     )
 
 
@@ -299,7 +297,7 @@ def joining(
     return xp.where(far, xp.where(right_way <= left_way, 1.0, -1.0), 0.0)
 
 
-def joined(
+def is_joined(
     point: Point, course: Scalar, near: Scalar, position: Point, course_flown: Scalar
 ) -> Any:
     """Whether an aircraft is beyond a point of a leg, and near the leg.
@@ -338,13 +336,12 @@ def route_outline(route: Route) -> list[tuple[float, float, float]]:
     """Points along a route, for drawing: north, east and altitude, m."""
     points: list[tuple[float, float, float]] = []
     for number, leg in enumerate(route.legs):
-        start = (
-            leg.start
-            if isinstance(leg, Line)
-            else points[-1][:2]
-            if points
-            else _along(leg.centre, 0.0, abs(leg.radius))
-        )
+        if isinstance(leg, Line):
+            start = leg.start
+        elif points:
+            start = points[-1][:2]
+        else:
+            start = _along(leg.centre, 0.0, abs(leg.radius))
         points += [
             (*point, route.profile(number, nearest(leg, point))[0]) for point in outline(leg, start)
         ]
