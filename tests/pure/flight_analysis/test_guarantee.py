@@ -7,6 +7,7 @@ SLICOT is an independent program where installed.
 
 import itertools
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -309,11 +310,17 @@ def test_report_shows_the_guarantee_that_was_computed_for_its_loop(tmp_path: Pat
     assert kept_guarantee(linear) is None
 
 
-def test_command_fails_below_uncertainty_and_writes_an_unstable_aircraft(tmp_path: Path) -> None:
+def test_command_fails_below_uncertainty_and_writes_unstable_aircraft(tmp_path: Path) -> None:
+    """The first unstable one is inside the box, 1.2 times as far off is outside."""
     folder = tmp_path / "first"
-    arguments = ["gains", "osprey", "--check", "--guarantee", "--uncertainty", "0.75", "--json"]
+    arguments = ["gains", "osprey", "--check", "--guarantee", "--uncertainty", "0.75"]
     arguments += ["--worst", str(folder), "--samples", "1"]
-    result = invoke(*arguments)
+    said = " ".join(invoke(*arguments).output.split())
+    assert re.search(r"scenario\.yaml, 74\.\d % off, inside the 75 % of --uncertainty", said), said
+    farther = r"farther_scenario\.yaml, 89\.\d % off, outside the 75 % of --uncertainty"
+    assert re.search(farther, said), said
+    assert not margins(find_scenario(str(folder / "farther_scenario.yaml"))).nominal.stable
+    result = invoke(*arguments, "--json")
     assert result.exit_code == 1, result.output
     promise = json.loads(result.stdout)["guarantee"]
     assert not promise["holds"]

@@ -6,7 +6,7 @@ The gains of a scenario are checked, too.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
@@ -106,6 +106,7 @@ class _GainsAnswer(NamedTuple):
     answers: dict[str, Assessment]
     selection: Selection | None = None
     promise: Guarantee | None = None
+    unstable: Sequence[str] = ()  # sentences about the aircraft that were written
 
     @property
     def first(self) -> Assessment:
@@ -213,7 +214,7 @@ class Gains:
         default=False,
     )
     worst: Path | None = rare_option(
-        "With --guarantee: folder for the first unstable aircraft, airframe.yaml and scenario.yaml."
+        "With --guarantee: folder for the first unstable aircraft and one 1.2 times as far off."
     )
     late: float = rare_option(
         "With --guarantee: u is late by an unknown time of 0 to this in each input, s.", default=0.0
@@ -266,8 +267,8 @@ class Gains:
         loop = answer.loop_with_box()
         promise = guarantee(loop, self.late)
         keep(loop, promise)
-        write_unstable(self.worst, promise, self.airframe, self.scenario)
-        return _GainsAnswer({"scenario": answer}, promise=promise)
+        lines = write_unstable(self.worst, promise, self.airframe, self.scenario)
+        return _GainsAnswer({"scenario": answer}, promise=promise, unstable=lines)
 
     def _selected(self, progress: Callable[[str], None]) -> _GainsAnswer:
         """Gains by Theorem 1 and by the procedure, or those beside an observer."""
@@ -300,7 +301,8 @@ class Gains:
             lines.insert(0, selection.origin)
             if not self.observer and selection.engineering.has_requirement:
                 _show_trade(console, selection)
-        files = {"gains": self.write, "page": self.page, "unstable aircraft": self.worst}
+        lines += result.unstable
+        files = {"gains": self.write, "page": self.page}
         lines += [f"{key}: {display_path(path)}" for key, path in files.items() if path is not None]
         for line in filter(None, lines):
             say(console, line)

@@ -12,15 +12,16 @@ from aircraft_sim.uncertainty import as_yaml, with_entries
 from flight_analysis.closed_loop.scenario import scenario_yaml
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.linear_loop.delay_margin import MAX_DELAY_MARGIN
-from flight_analysis.linear_loop.guarantee import Guarantee
+from flight_analysis.linear_loop.guarantee import LARGEST, Guarantee
 from flight_analysis.linear_loop.input_margins import disk_gain, disk_phase
 from flight_analysis.linear_loop.loop_margins import LoopMargins
 from flight_analysis.report.margin_figures import decibels, guarantee_rows, guarantee_text
 from flight_cli.output import LICENCE, new_table, print_table, say, write_text
 from flight_core.arguments import as_number
-from flight_core.files import writing
+from flight_core.files import display_path, writing
 from flight_core.parameters import require
 
+FARTHER = 1.2  # times the deviations of the first unstable aircraft: a loop that diverges
 FORMS = (".3f", ".1f", ".1f", ".3f")  # of the columns of a guarantee
 
 
@@ -32,13 +33,16 @@ def require_guarantee(*, check: bool, is_wanted: bool, worst: Path | None, late:
     as_number(late, "late", 0.0, MAX_DELAY_MARGIN, "s")
 
 
-def write_unstable(folder: Path | None, promise: Guarantee, airframe: str, scenario: str) -> None:
-    """Write the first unstable aircraft as an airframe and the scenario that flies it.
+def write_unstable(
+    folder: Path | None, promise: Guarantee, airframe: str, scenario: str
+) -> list[str]:
+    """Write the first unstable aircraft and one FARTHER off, if a folder is named.
 
-    Without a `folder` nothing is written.
+    Each is an airframe and the scenario that flies it. Returns a sentence about each: how far off
+    it is, and whether that is inside `--uncertainty`.
     """
     if folder is None:
-        return
+        return []
     base = find_scenario(scenario)
     frame = load_airframe(airframe)
     require(promise.unstable is not None, "worst", "no unstable aircraft", "a loop that has one")
@@ -47,10 +51,22 @@ def write_unstable(folder: Path | None, promise: Guarantee, airframe: str, scena
     assert promise.unstable is not None  # noqa: S101 - for mypy
     with writing("--worst", folder, "a folder that can"):
         folder.mkdir(parents=True, exist_ok=True)
-    path = folder / "airframe.yaml"
-    write_text("worst", path, LICENCE + as_yaml(with_entries(frame, promise.unstable.entries)))
-    unstable_scenario = base.vary(aircraft={"airframe": str(path.absolute())})
-    write_text("worst", folder / "scenario.yaml", scenario_yaml(unstable_scenario))
+    first = promise.unstable.deviation
+    lines = []
+    for factor, prefix in ((1.0, ""), (min(FARTHER, LARGEST / first), "farther_")):
+        entries = {name: factor * value for name, value in promise.unstable.entries.items()}
+        path = folder / f"{prefix}airframe.yaml"
+        write_text("worst", path, LICENCE + as_yaml(with_entries(frame, entries)))
+        varied = base.vary(aircraft={"airframe": str(path.absolute())})
+        flight = folder / f"{prefix}scenario.yaml"
+        write_text("worst", flight, scenario_yaml(varied))
+        deviation = factor * first
+        place = "inside" if deviation <= promise.uncertainty else "outside"
+        lines.append(
+            f"unstable aircraft: {display_path(flight)}, {100.0 * deviation:.1f} % off, "
+            f"{place} the {100.0 * promise.uncertainty:g} % of --uncertainty"
+        )
+    return lines
 
 
 def show_guarantee(
