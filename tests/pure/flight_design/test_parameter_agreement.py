@@ -160,7 +160,8 @@ def test_raw_value_of_half_a_deflection(name: str, positive: str, raw: float) ->
 @pytest.mark.parametrize("absent", [name for name in SURFACE if name != "SERVO5_FUNCTION"])
 def test_servo_without_one_of_its_parameters_is_refused(absent: str) -> None:
     values = {name: value for name, value in SURFACE.items() if name != absent}
-    with refusing(f"inputs.elevator: found no {absent} in the log before the samples, expected it"):
+    cause = f"inputs.elevator: found no {absent} in the log before the samples"
+    with refusing(f"{cause}, expected these parameters"):
         servo_of(elevator(), "elevator", values)
 
 
