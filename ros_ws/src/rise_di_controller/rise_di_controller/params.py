@@ -2,38 +2,27 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameters of the controller under any control law.
 
-They are validated, and converted to the arrays of guard, feedforward and observer.
+They are validated here. `controller_section` has the fields, and the arrays that they make.
 
 The parameters of a law are a subclass; `AnyLaw.validate_mapping` finds it by the name of the law.
 """
 
-import json
 from collections.abc import Iterator, Sequence
-from hashlib import blake2b
 from itertools import combinations
-from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 
 from flight_core.arguments import as_instance
-from flight_core.fields import Field
 from flight_core.parameters import (
-    Names,
-    NodeConfig,
-    NonNegative,
-    NonNegatives,
-    Numbers,
     ParameterError,
-    Positives,
-    Signs,
-    flatten,
     require,
     require_distinct,
     require_length,
 )
-from flight_core.rates import divide, nanoseconds, period_ns
-from flight_core.vectors import FloatArray, selection_matrix
+from flight_core.rates import divide, period_ns
+from flight_core.vectors import selection_matrix
 from rise_di_controller import internals
+from rise_di_controller.controller_section import ControllerSection
 from rise_di_controller.extensions.feedforward import (
     LONGEST_PART,
     ZERO_REAL_PART,
@@ -41,20 +30,14 @@ from rise_di_controller.extensions.feedforward import (
     nominal_zeros,
 )
 from rise_di_controller.extensions.model_sections import (
-    AllocationConfig,
-    FeedforwardConfig,
     ObserverConfig,
 )
 from rise_di_controller.extensions.observer import (
-    ObserverParams,
     filter_matrix,
-    with_observer,
     without_frozen,
 )
-from rise_di_controller.guard import samples
-from rise_di_controller.guard.guard import GuardParams
-from rise_di_controller.guard.probe import LARGEST, Probe, ProbeConfig
-from rise_di_controller.law.control_law import ControlLaw, Measurements, TunedLaw, fields
+from rise_di_controller.guard.probe import LARGEST, ProbeConfig
+from rise_di_controller.law.control_law import Measurements, TunedLaw, fields
 from rise_di_controller.law.linear_loop import (
     LinearPlant,
     LoopTiming,
@@ -62,7 +45,6 @@ from rise_di_controller.law.linear_loop import (
     linear_law,
     spectral_radius,
 )
-from rise_di_controller.law.saturation import Limits
 
 # parts of the delay margin at which the nominal loop with an observer has to be stable
 MARGIN_PARTS = (0.0, 0.5, 1.0)
@@ -71,15 +53,12 @@ MAX_DELAY_PERIODS = 100
 """The linear loop has m states a period of the delay: 100 of four channels take 3 s of processor
 time, 1000 half a minute."""
 
-OF_NODE = frozenset({"lockstep", "y_rate", "autostart", "start_active"})
-"""Parameters that concern only the node: neither the law nor its guard depends on them."""
-
 MAX_STABLE_STEP = 2.5
 """Largest product of dt and the fastest zero. A Runge-Kutta step is stable up to 2.78; dt is the
 longest that the law takes."""
 
 
-class ControllerConfig(NodeConfig):
+class ControllerConfig(ControllerSection):
     """Parameters of the controller node that every control law has.
 
     A subclass has the parameters of a law, as fields.
@@ -94,66 +73,6 @@ class ControllerConfig(NodeConfig):
         >>> rise_di.find_scenario("osprey_servo").controller.outputs
         ('q', 'p', 'r', 'V')
     """
-
-    needs: ClassVar[str] = ""
-    """What the law needs beside y and y_m, as words; the controller refuses a law that needs
-    anything."""
-
-    rate: Annotated[float, Field(ge=1, le=1000)] = Field(description="the rate of the law, Hz")
-    y_rate: Annotated[float, Field(ge=0, le=1000)] = Field(
-        default=0.0, description="in lockstep: rate of y, Hz"
-    )
-    law: str = Field(default="rise_di", description="the law, by its registered name")
-    outputs: Names = Field(
-        description="the channels of y; in RISE-DI the last has the smallest gain (22)"
-    )
-    inputs: Names = Field(
-        description="the channels of u, paired with the outputs; with an allocation those of v"
-    )
-    D: Signs = Field(description="the diagonal of D (11), +1 or -1")
-    input_scale: Positives = Field(
-        description="the change of u that changes y_dot by one: 1 / abs(Omega_ii)"
-    )
-    lag: NonNegatives = Field(description="time constants of the actuators, s; 0: none")
-    delay: NonNegative = Field(description="delay from y to the actuators beside sampling, s")
-    y_max: Positives | None = Field(
-        default=None,
-        description="the largest abs(y), abs(y_m); none: p, q, r 2000 deg/s, V 340 m/s, else 1e6",
-    )
-    max_age: Annotated[float, Field(gt=0, le=1e6)] = Field(
-        description="the age above which y or y_m is stale, s"
-    )
-    hold: Annotated[float, Field(ge=0, le=1e6)] = Field(
-        description="failsafe: how long u is held, s"
-    )
-    ramp: Annotated[float, Field(ge=0, le=1e6)] = Field(
-        description="failsafe: how long the ramp to trim takes, s"
-    )
-    lower: Numbers | None = Field(default=None, description="lower limits of u from trim")
-    upper: Numbers | None = Field(default=None, description="upper limits of u from trim")
-    slew: Positives | None = Field(default=None, description="limits of abs(u_dot), units of u / s")
-    on_deactivate: Literal["trim", "hold"] = Field(
-        default="trim", description="u after deactivation: ramped to trim or held"
-    )
-    autostart: bool = Field(default=True, description="configure the node at start")
-    start_active: bool = Field(
-        default=True,
-        description="activate it too; else u is at trim",
-    )
-    allocation: AllocationConfig | None = Field(
-        default=None, description="extension: distributes the inputs of the law to effectors"
-    )
-    feedforward: FeedforwardConfig | None = Field(
-        default=None, description="extension: adds the input of a nominal model along y_m"
-    )
-    observer: ObserverConfig | None = Field(
-        default=None,
-        description="extension: corrects the trim by estimates of wind and model error",
-    )
-    probe: ProbeConfig | None = Field(
-        default=None,
-        description="extension: a small sine on each input while engaged, to find a stuck surface",
-    )
 
     @classmethod
     def tunable(cls) -> frozenset[str]:
@@ -348,223 +267,11 @@ class ControllerConfig(NodeConfig):
                 require(stable, "observer.margin", unstable_loop, expected_margin)
                 yield
 
-    def _model_states(self) -> tuple[str, ...]:
-        return () if self.feedforward is None else self.feedforward.states
-
-    @property
-    def vanes(self) -> tuple[str, ...]:
-        """The channels of y for the observer alone."""
-        if self.observer is None or self.observer.vanes is None:
-            return ()
-        return self.observer.vanes.channels
-
-    @property
-    def measured(self) -> tuple[str, ...]:
-        """The channels of y for the controller: the outputs, then the vanes."""
-        return (*self.outputs, *self.vanes)
-
-    def without_vanes(self) -> Self:
-        """The parameters with the observer of y alone."""
-        if self.observer is None or not self.vanes:
-            return self
-        return self.model_copy(
-            update={"observer": self.observer.model_copy(update={"vanes": None})}
-        )
-
     def check_law(self) -> None:
         """Checks of the law's own parameters against each other and the channels.
 
         Raises ParameterError.
         """
-
-    def control_law(self) -> ControlLaw:
-        """The law."""
-        raise NotImplementedError
-
-    def law_params(self) -> Any:
-        """The law's parameters as arrays."""
-        raise NotImplementedError
-
-    def summary(self) -> str:
-        """What flies, as a sentence for the log."""
-        return f"law {self.law}"
-
-    def tuned_law(self) -> TunedLaw:
-        """The law with its parameters, extended by the observer where there is one."""
-        law = self.control_law()
-        params = self.law_params()
-        nominal = self.nominal()
-        if self.observer is None or nominal is None:
-            return TunedLaw(law, params)
-        limits_of_u = self._limits()
-        part = self.observer.part
-        rate = part / self.observer.within * (limits_of_u.upper - limits_of_u.lower) / 2.0
-        limits = Limits(part * limits_of_u.lower, part * limits_of_u.upper, rate)
-        fade_rate = 1.0 / self.observer.fade if self.observer.fade else np.inf
-        Phi, Gamma, H, L, F = self.observer.matrices(nominal)
-        section = self.observer.vanes
-        vanes = None
-        if section is not None:
-            vanes = section.params(self.outputs, self._model_states(), len(Phi))
-        observed = ObserverParams(
-            law=params,
-            Phi=Phi,
-            Gamma=Gamma,
-            H=H,
-            L=L,
-            F=F,
-            limits=limits,
-            fade_rate=np.float64(fade_rate),
-            vanes=vanes,
-        )
-        return TunedLaw(
-            with_observer(law) if section is None else with_observer(law, vanes=True), observed
-        )
-
-    def models(self) -> tuple[Any, ...]:
-        """The sections with a model of the aircraft, for a learner to replace."""
-        return self.feedforward, self.observer
-
-    def logged_groups(self, law: ControlLaw | None = None) -> dict[str, tuple[str, ...]]:
-        """Groups of channels of `internals` and the names in each.
-
-        Args:
-            law: The law of `tuned_law`, if known; None: computed.
-
-        Returns:
-            Names of the channels by group.
-        """
-        estimates = () if self.observer is None else self.observer.states
-        effectors = () if self.allocation is None else self.allocation.effectors
-        return internals.groups(
-            law or self.tuned_law().control_law,
-            self.outputs,
-            self.inputs,
-            estimates,
-            effectors,
-            self.vanes,
-        )
-
-    @property
-    def effectors(self) -> tuple[str, ...]:
-        """The channels of u as published.
-
-        They are the effectors of an allocation, else the inputs of the law.
-        """
-        return self.inputs if self.allocation is None else self.allocation.effectors
-
-    def effector_limits(self) -> Limits:
-        """The limits of u as published, in the order of `effectors`."""
-        guard = self.guard()
-        return guard.limits if guard.allocation is None else guard.allocation.limits
-
-    def given_up(self) -> FloatArray:
-        """1 for an output without a model to the end of the engagement, else 0, (m,).
-
-        Empty without a learner.
-        """
-        return np.zeros(0)
-
-    def history_ticks(self) -> int:
-        """Ticks of the last y and u from which an observer that is replaced in flight starts."""
-        return 0
-
-    def nominal(self) -> Nominal | None:
-        """The arrays of the feedforward, None where there is none."""
-        if self.feedforward is None:
-            return None
-        return self.feedforward.nominal(self.outputs, self.inputs, self.D)
-
-    def _flown_nominal(self) -> Nominal | None:
-        """The nominal model along y_m.
-
-        Beside an observer of part 0 no input is added: only a learner needs the states.
-        """
-        nominal = self.nominal()
-        if nominal is None or self.observer is None or self.observer.part > 0.0:
-            return nominal
-        return nominal._replace(acts=np.zeros(len(self.inputs))) if self.history_ticks() else None
-
-    def digest(self) -> int:
-        """Hash of the parameters of the law and its guard, 0 to 2^48 - 1, exact as a float64.
-
-        BLAKE2b of names and values. It changes with any bit of any gain. Parameters that concern
-        only the node are left out.
-        """
-        content = self.model_dump(exclude=OF_NODE)
-        # logs of versions that had no other law have no name either
-        if content["law"] == "rise_di":
-            del content["law"]
-        return int.from_bytes(
-            blake2b(json.dumps(sorted(flatten(content))).encode(), digest_size=6).digest(), "big"
-        )
-
-    def probe_gain(self) -> FloatArray:
-        """abs(y_i / u_i) at the frequency of each sine, (m,), 0 without a sine.
-
-        Of the nominal model C (j omega - A)^-1 B, or of 1 / (input_scale omega) without one, behind
-        the lag of the actuator.
-        """
-        gain = np.zeros(len(self.outputs))
-        if self.probe is None:
-            return gain
-        nominal = self.nominal()
-        for i, harmonic in enumerate(self.probe.harmonics(self.outputs, self.input_scale).tolist()):
-            omega = 2.0 * np.pi * harmonic / self.probe.window
-            if omega == 0.0:
-                continue
-            response = 1.0 / (self.input_scale[i] * omega)
-            if nominal is not None:
-                dynamics = 1j * omega * np.eye(len(nominal.A)) - nominal.A - nominal.gravity
-                response = abs(nominal.C[i] @ np.linalg.solve(dynamics, nominal.B[:, i]))
-            gain[i] = response / abs(1.0 + 1j * omega * self.lag[i])
-        return gain
-
-    def _probe(self) -> Probe | None:
-        """The sines: an amplitude of y through the gain of the model; None where there is none."""
-        if self.probe is None:
-            return None
-        gain = self.probe_gain()
-        probed = gain > 0.0
-        amplitude = self.probe.amplitudes(self.outputs) / np.where(probed, gain, 1.0)
-        window_ns = nanoseconds(self.probe.window)
-        return Probe(
-            probed * amplitude, self.probe.harmonics(self.outputs, self.input_scale), window_ns
-        )
-
-    def _limits(self) -> Limits:
-        """The limits of u, infinite where there is none."""
-        unlimited = (np.inf,) * len(self.inputs)
-        return Limits(
-            -np.array(unlimited) if self.lower is None else np.array(self.lower),
-            np.array(self.upper or unlimited),
-            np.array(self.slew or unlimited),
-        )
-
-    def _authority(self) -> FloatArray:
-        """y_dot by the full inputs, (m,), units of y / s."""
-        limits = self._limits()
-        full = np.minimum(np.maximum(-limits.lower, limits.upper), samples.UNLIMITED)
-        return np.asarray(full / np.array(self.input_scale))
-
-    def guard(self) -> GuardParams:
-        """Times, limits and nominal model of the guard."""
-        return GuardParams(
-            period_ns=period_ns(self.rate, "rate"),
-            max_age_ns=nanoseconds(self.max_age),
-            hold_ns=nanoseconds(self.hold),
-            ramp_ns=nanoseconds(self.ramp),
-            deactivation_holds=self.on_deactivate == "hold",
-            limits=self._limits(),
-            samples=samples.sample_limits(
-                self.outputs, self._authority(), self.y_max, period_ns(self.rate, "rate")
-            ),
-            history=self.history_ticks(),
-            allocation=None if self.allocation is None else self.allocation.arrays(self.inputs),
-            nominal=self._flown_nominal(),
-            vanes=tuple(self._model_states().index(name) for name in self.vanes),
-            probe=self._probe(),
-        )
 
 
 def _subsets(names: Sequence[str]) -> Iterator[tuple[str, ...]]:

@@ -25,9 +25,10 @@ from flight_log.log_content import StoredFile
 from flight_log.provenance import recorded_arithmetic
 from flight_log.stored_messages import parameter_changes
 from flight_log.tape_reader import RecordedRun, read_run
+from rise_di_controller.controller_section import OF_NODE
 from rise_di_controller.guard.guard import ControllerState
 from rise_di_controller.laws import AnyLaw
-from rise_di_controller.params import OF_NODE, ControllerConfig, as_controller
+from rise_di_controller.params import ControllerConfig, as_controller
 
 SHOWN_CHANGES = 20  # of the parameters, in the notes
 
