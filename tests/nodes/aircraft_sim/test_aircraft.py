@@ -68,7 +68,7 @@ def test_u_that_times_out_held_then_ramped_to_trim_and_may_return(osprey_gust: S
             / NANOSECONDS
         )
         expected = 0.01 * np.clip(1.0 - (t - MAX_AGE - HOLD) / RAMP, 0.0, 1.0)
-        # ticks are 2 ms
+        # Ticks are 2 ms.
         assert flight.ailerons(begin) == pytest.approx(expected, abs=0.01 * 2 * TICK / RAMP)
         assert (
             sum(

@@ -54,7 +54,7 @@ SCENARIO = REPOSITORY / "tests" / "ros" / "slow_autopilot.yaml"
 RELEASE_AFTER = 3.0  # s, RC_OVERRIDE_TIME of ArduPilot
 FULL = math.radians(30.0)  # full deflection of a surface in the map
 MAX_AGE, RELEASE = 0.2, 0.5  # s, of u in the map, and of its release
-# s, between two ticks of the bridge, and between two messages to the autopilot
+# s, between two ticks of the bridge, and between two messages to the autopilot.
 TICK, JOY = (0.005, 0.02)
 QOS = {"reliability": "reliable", "durability": "volatile", "depth": 1}
 RATES = Vector3(x=0.3, y=-0.2, z=-0.1)
@@ -82,7 +82,7 @@ class Setup:
         self.begin_ns = world.clock.now_ns
         self.autopilot = Autopilot(SCENARIO, RELEASE_AFTER, world, world.clock.monotonic)
         self.autopilot_runs = True
-        # published each 5 ms; None: not published
+        # Published each 5 ms; None: not published.
         self.u: tuple[float, ...] | None = (0.0, 0.0, 0.0, 0.0)
         self.further: dict[str, Any] = {}  # messages that are published each 5 ms, by topic
         self.joys: list[Sent] = []
@@ -228,7 +228,7 @@ def test_unchanged_controller_tracks_through_map_and_when_killed_releases_channe
     assert max(finite) <= released_at - killed
     assert released[-1] - released[0] == approx(RELEASE, abs=JOY + TICK)
     assert np.diff(released).max() <= JOY + TICK
-    # so that its integrals do not wind up
+    # The controller is inactive, so that its integrals do not wind up.
     assert any("-> INACTIVE" in line for line in restarted.log.lines)
 
 
@@ -298,7 +298,7 @@ def test_step_of_system_clock_leaves_engagement_and_release_as_they_are(
     setup.start()
     setup.engaged()
     setup.world.clock.step_ns = nanoseconds(step)
-    # of a controller, whose time is not that of its system clock
+    # The controller's time is not that of its system clock.
     setup.world.send("/u", dict.fromkeys(INPUTS, 0.0), age=step)
     before = len(setup.world.sent["/y"])
     u = setup.u
@@ -354,7 +354,7 @@ def test_second_publisher_of_autopilot_releases_and_blocks(
     setup.engaged()
     second = setup.world.publisher(kind, topic, 5)
     begin = setup.t
-    # the graph is checked once a second
+    # The graph is checked once a second.
     assert setup.until_logged(f"ENGAGED -> RELEASE: {sentence}") - begin <= 1.1
     setup.run(1.0)
     assert setup.engage() == sentence
@@ -374,7 +374,7 @@ def test_engagement_waits_for_awaited_condition_and_can_be_withdrawn(setup: Setu
         "max_age": 1e3,
     }
     request = {"topic": "/ap/request", "type": "std_msgs/msg/UInt8", "rate": 5.0, "stamped": False}
-    # as with the map of PX4
+    # The requests are those of the map of PX4.
     requests = {"enter": request | {"when": "engaging"}, "leave": request | {"when": "release"}}
     setup.start(
         conditions={"guided": guided | {"awaited": True}},
@@ -500,7 +500,7 @@ def test_messages_of_autopilot_become_y_to_the_last_bit_and_dry_run_publishes_wh
         setup.run(1.0)
         would = setup.world.vectors("/bridge/would_send")[-1].channels
         assert list(would) == ["joy.axes[1]", "joy.axes[2]", "joy.axes[0]", "joy.axes[3]"]
-        # aileron at its limit
+        # Aileron at its limit.
         assert [*would.values()] == approx([0.1 / FULL, 0.2, 0.5, -0.1 / FULL], rel=1e-5)
         twists = setup.world.messages("/ap/twist/filtered")
         rates = {
@@ -525,7 +525,7 @@ def test_topic_whose_publisher_has_left_named_as_that_of_a_client(setup: Setup) 
     setup.autopilot_runs = False
     for publisher in (setup.autopilot._twist, setup.autopilot._airspeed):
         publisher.leave()
-    # as of a client that left its agent
+    # A client that left its agent has no publisher.
     setup.until_logged("waiting for /ap/twist/filtered: no publisher any more")
 
 
@@ -596,7 +596,7 @@ def test_domain_or_profile_named_where_a_topic_has_no_publisher() -> None:
 
 
 def test_topic_of_another_version_is_error_that_names_both_types(setup: Setup) -> None:
-    # as an AP_DDS would whose type has changed
+    # An AP_DDS whose type has changed publishes this.
     setup.world.publisher(TwistStamped, "/ap/airspeed", 10)
     setup.start()
     setup.world.subscribe(Imu, "/ap/joy", 10, "/peer", raw=True)

@@ -36,7 +36,7 @@ DO_SET_MODE = 176  # MAVLink's MAV_CMD_DO_SET_MODE, as PX4's VEHICLE_CMD_DO_SET_
 AS_PYTHON = {"float32": "float", "bool": "boolean"}  # as rclpy names the types of a definition
 
 
-# tests/pure/autopilot_bridge/test_mavlink_link.py has those over MAVLink
+# tests/pure/autopilot_bridge/test_mavlink_link.py has those over MAVLink.
 ROS_MAPS = [name for name in MAPS if named_map(name).link is None]
 
 
@@ -118,7 +118,7 @@ class Px4:
     def __init__(self, world: World) -> None:
         types = import_module("px4_msgs.msg")
         self._world = world
-        # nose up and 2 m/s fast
+        # Nose up and 2 m/s fast.
         odometry = fill(types.VehicleOdometry(q=[1.0, 0.0, 0.0, 0.0]), RATES["px4"])
         airspeed = fill(types.AirspeedValidated(), AIRSPEED["px4"])
         self._status = types.VehicleStatus(arming_state=self.ARMED, nav_state=self.HOLD)
@@ -177,7 +177,7 @@ def test_bridge_flies_px4_in_offboard_and_returns_it_to_hold() -> None:
         world.run(1.0, px4.publish)
         # V is captured: 0 until the engagement
         assert world.last("/y") == approx({**MOTION, "V": 0.0}, abs=1e-6)
-        # a heartbeat before the request would keep PX4 in offboard
+        # A heartbeat before the request would keep PX4 in offboard.
         assert not any(px4.received.values())
         assert world.call("/bridge/engage", SetBool.Request(data=True)).success
         world.run(1.0, px4.publish)

@@ -124,7 +124,7 @@ def test_guided_flight_in_lockstep_is_that_of_one_process_and_goes_home_without_
     world = flown(scenario, tmp_path)
     require_equal(world, scenario)
     assert world.last("/guidance")["mode.lateral"] == Lateral.ORBIT
-    # one at each instant but the first: y takes 10 ms
+    # One at each instant but the first: y takes 10 ms.
     assert len([sample for sample in world.vectors("/u_m") if sample.channels]) == 100
     assert len(world.sent["/odometry"]) == 20  # 2 s at 10 Hz
 
@@ -133,7 +133,8 @@ def test_flight_that_waits_for_a_refused_sample_ends_with_the_reason(
     osprey_gust: Scenario, tmp_path: Path
 ) -> None:
     with lockstep(osprey_gust, tmp_path) as (world, nodes):
-        for sender in ("/controller", "/second"):  # for the first y and the next
+        # For the first y and the next.
+        for sender in ("/controller", "/second"):
             world.publisher(JointState, "/u").publish(
                 Encoder(INPUTS, sender).encode(0, np.zeros(4))
             )

@@ -21,7 +21,7 @@ from flight_bringup.processes import FlightProcesses, NotReadyError
 from flight_core.outcome import ended_early, never_flew
 from flight_core.parameters import ParameterError
 
-# in place of a FlightMonitor
+# A stand-in for a FlightMonitor.
 SILENT_MONITOR: Any = SimpleNamespace(
     is_ready=lambda *_: False,
     is_matched=lambda *_: False,

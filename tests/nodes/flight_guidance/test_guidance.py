@@ -52,7 +52,7 @@ class Flight:
         self.world.send("/internals", {"mode": self.mode}, "/controller#1")
         if self.has_pose:
             pose = dict.fromkeys(POSE, 0.0) | LEVEL
-            # a pose that stands still is refused
+            # A pose that stands still is refused.
             self.world.send(
                 "/pose", pose | {"v_east": float(self._rng.normal(0.0, 0.01))}, "/aircraft#1"
             )
@@ -136,7 +136,7 @@ def test_targets_select_modes_and_bad_ones_refused(flight: Flight) -> None:
     }.items():
         flight.target(**values)
         assert flight.refused(f"target: {reason}") == 1
-    # of before a stop of guidance
+    # Of before a stop of guidance.
     flight.world.send("/target", {"heading": 0.5}, "/operator#1", age=MAX_AGE + 0.05)
     flight.run()
     assert flight.refused("target: old") == 1
@@ -227,7 +227,7 @@ def test_controller_that_was_inactive_holds_what_is_measured_and_one_in_failsafe
         flight.run(0.1)
         silent = len(flight.world.sent["/u_m"])
         flight.run(0.5)
-        # no command to a controller that does not fly
+        # No command to a controller that does not fly.
         assert len(flight.world.sent["/u_m"]) == silent
         flight.mode = ControllerMode.ENGAGED
         flight.run()
@@ -311,11 +311,11 @@ def test_route_flown_when_it_arrives(flight: Flight) -> None:
     flight.world.publish("/route", route("map", *TWO))
     flight.run()
     assert flight.last("mode.lateral") == Lateral.ROUTE
-    # the last line is a tangent to the last orbit, of the least radius at 25 m/s, 3 m/s of wind and
-    # 0.8 of a bank of 30 deg
+    # The last line is a tangent to the last orbit, of the least radius at 25 m/s, 3 m/s of wind and
+    # 0.8 of a bank of 30 deg.
     radius = math.ceil((25.0 + 3.0) ** 2 / (9.80665 * math.tan(0.8 * math.radians(30.0))))
     assert flight.last("to_go") == pytest.approx(math.sqrt(900.0**2 - radius**2))
-    # at the begin of the slope
+    # At the begin of the slope.
     assert flight.last("target.altitude") == pytest.approx(50.0, abs=0.1)
     assert flight.call(Trigger, "hold") == (True, "")
     flight.run()

@@ -355,12 +355,14 @@ def test_second_publisher_of_topic_is_no_loss(recorder: Recording) -> None:
     def send(number: int, sender: str, publisher: int) -> None:
         publishers[publisher].publish(Encoder(OUTPUTS, sender).encode(number, np.zeros(4)))
 
-    for number in range(50):  # their sequences begin apart
+    # Their sequences begin apart.
+    for number in range(50):
         send(number, "/aircraft#0", 0)
     for number in range(50, 100):
         for publisher in range(2):
             send(number, f"/aircraft#{publisher}", publisher)
-    for number in range(100, 125):  # now under one name, taken at several ticks of the recorder
+    # Now under one name, taken at several ticks of the recorder.
+    for number in range(100, 125):
         for publisher in range(2):
             send(number, "/aircraft#0", publisher)
         recorder.run(0.02)

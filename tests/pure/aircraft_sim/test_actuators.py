@@ -72,7 +72,7 @@ def test_ideal_actuator_passes_command_on_to_last_bit(
 
 @pytest.mark.parametrize("dt", [0.001, 0.01, 0.05])
 def test_step_response_is_exact_first_order_response_for_any_dt(dt: float) -> None:
-    # p(t) = c (1 - exp(-t / lag)): no error of integration, only rounding
+    # p(t) = c (1 - exp(-t / lag)): no error of integration, only rounding.
     history = positions([0.3] * 20, dt, actuator(lag=0.02))
     assert history == approx(
         [0.3 * (1.0 - math.exp(-dt * (k + 1) / 0.02)) for k in range(20)], rel=1e-13
@@ -111,7 +111,7 @@ def test_lag_comes_before_rate_limit_and_end_stop_last() -> None:
 
 
 def test_dead_zone_gives_zero_inside_and_excess_outside() -> None:
-    # input = c - clip(c, -w, w), w = 0.1
+    # Input = c - clip(c, -w, w), w = 0.1.
     params = Actuators(dead_zone=np.array([0.1]))
     commands = [0.0, 0.05, 0.1, 0.3, -0.1, -0.25]
     assert positions(commands, 0.01, params) == approx([0.0, 0.0, 0.0, 0.2, 0.0, -0.15], abs=1e-16)
@@ -167,7 +167,7 @@ def test_lost_surface_is_in_trim_from_instant_on_even_if_it_was_stuck() -> None:
     )
     assert lost[:, 0].tolist() == [0.2] * 5 + [0.0] * 3
     assert lost[:, 3].tolist() == [0.2] * 6 + [0.0] * 2
-    # one healthy, one stuck where it was commanded
+    # One healthy, one stuck where it was commanded.
     assert lost[:, 1:3].tolist() == [[0.2, 0.2]] * 8
 
 
@@ -277,7 +277,7 @@ def test_drift_ends_as_the_drifted_aircraft() -> None:
             (first + last) / 2.0
         )
         assert (getattr(plant.aircraft_at(1000 * MS, ice.plant()), matrix) == first).all()
-    # wind acts by the aircraft's own A
+    # Wind acts by the aircraft's own A.
     assert not np.allclose(after.gust_direction, before.gust_direction)
 
 
@@ -317,7 +317,7 @@ def test_late_command_acts_as_that_command_given_later(every: int) -> None:
     late = {"actuators": scenario.aircraft.actuators.model_dump() | {"delay": 0.006}}
     delayed = Simulator(scenario.vary(aircraft=late).aircraft)
     at_once = Simulator(scenario.aircraft)
-    # over the periods 0 and 1, 2 and 3, ...
+    # Over the periods 0 and 1, 2 and 3, ...
     held = np.repeat(0.1 * np.random.default_rng(1).normal(size=(20, 4)), 2, axis=0)
     shifted = np.vstack([np.zeros((periods, 4)), held])
     y = {k: at_once.sample(k, shifted[k - 1])[0].value for k in range(1, 41)}
@@ -385,7 +385,7 @@ def test_mean_position_at_limit_is_right_to_second_order(rate: float, stop: floa
     # which limits begin and cease to act fall anywhere in their steps, so that each halving alone
     # scatters.
     assert errors[1] < errors[0] / 16.0
-    # measured 2e-6 to 3e-6; the positions at the ends of the steps give 7e-5 to 1.4e-4
+    # Measured 2e-6 to 3e-6; the positions at the ends of the steps give 7e-5 to 1.4e-4.
     assert errors[1] < 5e-6
 
 

@@ -90,7 +90,7 @@ def test_gust_stays_between_zero_and_speed_with_bounded_derivative(
     gusts = Gusts(np.array([10.0]), np.array([speed]), np.array([length]))
     w = [float(one_minus_cosine(t + dt, gusts, np.array(25.0))[0]) for dt in (0.0, 1e-4)]
     assert min(0.0, speed) - 1e-12 <= w[0] <= max(0.0, speed) + 1e-12
-    # abs(w_dot) <= U/2 pi V0 / H
+    # abs(w_dot) <= U/2 pi V0 / H.
     assert abs(w[1] - w[0]) <= 1e-4 * abs(speed) / 2 * math.pi * 25.0 / length + 1e-12
 
 
@@ -130,7 +130,7 @@ def test_truth_holds_state_disturbance_and_actuators() -> None:
     )
     assert true["x.phi"] == 0.07
     assert true["gust.vertical"] == approx(2.0)  # s = 25 0.4 = H
-    # every axis of the airframe's gusts
+    # Every axis of the airframe's gusts.
     assert true["gust.lateral"] == true["gust.longitudinal"] == 0.0
     assert true["actuator.thrust"] == 0.2
     assert true["f.V"] == approx(-9.81 * math.sin(0.03) - 11.1 * 2.0 / 25)

@@ -27,7 +27,7 @@ from flight_design.gains.airframe_properties import (
 from rise_di_controller.law.decomposition import coupling
 
 ALL = tuple(sorted(file.stem for file in LIBRARY.glob("*.yaml")))
-# more inputs than outputs, and what was split
+# More inputs than outputs, and what was split.
 SPLIT = {"osprey_twin": "osprey", "osprey_vtail": "osprey", "x8_elevons": ""}
 NAMES = tuple(name for name in ALL if name not in SPLIT)
 
@@ -35,7 +35,7 @@ NAMES = tuple(name for name in ALL if name not in SPLIT)
 class Published(NamedTuple):
     """Properties by the signs and in the units of the source."""
 
-    # a positive input may give a negative rate; outputs p, r or q, V (osprey q, V, p, r)
+    # A positive input may give a negative rate; outputs p, r or q, V (osprey q, V, p, r).
     D: tuple[float, ...]
     coupling: float
 
@@ -384,9 +384,10 @@ def test_zeros_do_not_depend_on_coordinates_of_state() -> None:
     for _ in range(50):
         T = generator.standard_normal((8, 8))
         if np.linalg.cond(T) > 100.0:
-            continue  # beyond that the result measures the rounding of T, not the zeros
+            # Beyond that the result measures the rounding of T, not the zeros.
+            continue
         found = invariant_zeros(T @ A @ np.linalg.inv(T), T @ B, C @ np.linalg.inv(T))
-        # rounding in dense coordinates must not turn infinite zeros into finite ones
+        # Rounding in dense coordinates must not turn infinite zeros into finite ones.
         assert len(found) == 4
         assert_allclose(np.sort(found.real), np.sort(expected.real), atol=1e-6)
         assert controllable(T @ A @ np.linalg.inv(T), T @ B)

@@ -43,7 +43,7 @@ def test_small_motion_about_level_flight_is_that_of_the_airframe_of_the_speed(ra
         [x_dot(x + near * unit, u) - x_dot(x - near * unit, u) for unit in np.eye(8)]
     ).T / (2.0 * near)
     moved = at_speed(OSPREY, ratio, "thrust")
-    # the trims are 0.05 V0 apart and integrated in 20 steps: 1e-3 of the largest entry of V
+    # The trims are 0.05 V0 apart and integrated in 20 steps: 1e-3 of the largest entry of V.
     assert of_x == approx(moved.matrix_a() + moved.matrix_gravity() * np.cos(x), abs=2e-3)
 
 
@@ -57,7 +57,7 @@ def test_slow_flight_needs_more_incidence_and_less_thrust() -> None:
     )
     alpha = OSPREY.index("alpha")
     V0 = OSPREY.speed
-    # that of the trim, of rad
+    # The slope is that of the trim, per rad.
     lift = -OSPREY.matrix_a()[alpha, 0] * V0 / -OSPREY.matrix_a()[alpha, alpha] / 2.0
     for x, ratio in ((slow, 0.8), (fast, 1.25)):
         assert x[alpha] == approx(lift * (ratio**-2.0 - 1.0), rel=0.1)  # the elevator has lift too
@@ -78,7 +78,7 @@ def test_flight_to_another_speed_ends_in_its_trim() -> None:
     }
     x, _ = level_flight(OSPREY, 1.16, "thrust")
     assert last["x.V"] == approx(4.0, abs=0.02)
-    # q is held at 0, and theta where it is
+    # q is held at 0, and theta where it is.
     assert last["x.alpha"] == approx(x[OSPREY.index("alpha")], abs=2e-3)
     assert last["actuator.thrust"] > 0.1
 

@@ -47,9 +47,8 @@ def aircraft(**section: Any) -> Aircraft:
     return aircraft_parameters(**section).load()[1]
 
 
-@given(
-    H=st.floats(9.144, 106.68), peak=st.floats(-17.07, 17.07)
-)  # 30 to 350 ft and U_ref at sea level, CS-25.341
+# 30 to 350 ft and U_ref at sea level, CS-25.341.
+@given(H=st.floats(9.144, 106.68), peak=st.floats(-17.07, 17.07))
 def test_gust_has_peak_and_length_of_formula(H: float, peak: float) -> None:
     gust = single(Gusts, 40.0, peak, H)
 
@@ -68,7 +67,7 @@ def test_gust_comes_again_after_its_time() -> None:
     np.testing.assert_array_equal(
         one_minus_cosine(t, again, np.array(V0)), one_minus_cosine(t, once, np.array(V0))
     )
-    # before the first entry there was none
+    # Before the first entry there was none.
     later = one_minus_cosine(t + 21.0, again, np.array(V0))[t > 2.0]
     assert later == approx(one_minus_cosine(t, once, np.array(V0))[t > 2.0], abs=1e-12)
 

@@ -84,7 +84,7 @@ def test_fault_that_begins_now_is_one_that_was_scheduled(
     still = scenario.aircraft
     changed = flown(still, varied(scenario, **now))
     whole = flown(varied(scenario, **scheduled), varied(scenario, **scheduled))
-    # no bytes: a lag of 0 s gives -0.0 for a command of 0
+    # Bytes do not agree: a lag of 0 s gives -0.0 for a command of 0.
     assert np.array_equal(changed, whole, equal_nan=True)
     assert not np.array_equal(changed, flown(still, still), equal_nan=True)
 

@@ -215,7 +215,7 @@ def test_nothing_is_printed_and_nothing_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    # it asks for a table as output
+    # This model asks for a table as output.
     model = cessna(condition=FlightCondition("global5000", 169.8, 7620.0, STEP_NS))
     fly(model, command(), 0.1)
     assert not list(tmp_path.iterdir())
@@ -253,7 +253,7 @@ def test_isolated_process_keeps_limit_of_processor_time_that_user_has() -> None:
     done = subprocess.run(
         [sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, check=True
     )
-    # raising the second number needs a privilege, setrlimit(2)
+    # Raising the second number needs a privilege, setrlimit(2).
     assert done.stdout == "(30, 60) (60, 60)\n"
 
 
@@ -302,7 +302,7 @@ def test_condition_without_trim_refused_in_one_sentence(
     condition: tuple[str, float, float], sentence: str
 ) -> None:
     with pytest.raises(FlightEnded, match=f"^jsbsim:{condition[0]} {sentence}") as ended:
-        # larger steps: the search for a trim takes long
+        # Larger steps: the search for a trim takes long.
         cessna(condition=FlightCondition(*condition, 4 * STEP_NS))
     assert "\n" not in str(ended.value)
 

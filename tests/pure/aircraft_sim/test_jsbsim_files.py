@@ -96,9 +96,8 @@ def test_section_in_another_file_is_left_out_and_said(
     "line",
     [
         OUTPUT,
-        OUTPUT.replace(
-            "<output", '<output xmlns="urn:of-another-program"'
-        ),  # which JSBSim does not look at
+        # JSBSim does not look at these.
+        OUTPUT.replace("<output", '<output xmlns="urn:of-another-program"'),
     ],
 )
 def test_output_writes_no_file(line: str, table: Path) -> None:

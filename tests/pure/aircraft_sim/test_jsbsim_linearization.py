@@ -104,7 +104,8 @@ def test_flight_after_a_kick_follows_the_linear_aircraft(linear: Linearization, 
         known = deviations[:, list(JSBSIM_STATES).index(name)]
         found = np.array(predicted)[:, list(AIRPLANE_STATES).index(name)]
         scale = np.max(np.abs(known))
-        if scale > 1e-3:  # a state that the kick hardly moves shows rounding
+        # A state that the kick hardly moves shows rounding.
+        if scale > 1e-3:
             assert np.max(np.abs(found - known)) < 0.06 * scale, name
 
 
@@ -129,7 +130,8 @@ def test_an_input_without_effect_is_named(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_lag_and_effect_of_a_first_order_input(monkeypatch: pytest.MonkeyPatch) -> None:
-    # x_dot = effect (1 - exp(-t / T)): the area above the response is T, and JSBSim's step is added
+    # x_dot = effect (1 - exp(-t / T)): the area above the response is T, and JSBSim's step is
+    # added.
     T = 0.08
 
     def lagged(condition: FlightCondition, _: object, name: str, size: float) -> FloatArray:
@@ -138,7 +140,8 @@ def test_lag_and_effect_of_a_first_order_input(monkeypatch: pytest.MonkeyPatch) 
         effects = {"elevator": ("q", -3.0), "aileron": ("p", 5.0), "rudder": ("r", -1.0)}
         output, effect = effects.get(name, ("V", 2.0))
         response[:, list(AIRPLANE_STATES).index(output)] = effect * size * (1.0 - np.exp(-t / T))
-        return response + 0.3 * size**2  # an even part cancels
+        # An even part cancels.
+        return response + 0.3 * size**2
 
     monkeypatch.setattr(jsbsim_linearization, "_response", lagged)
     found = linearize(CONDITIONS["737"])

@@ -269,7 +269,7 @@ def test_archive_of_run_flies_alike(electric: Path, tmp_path: Path) -> None:
 def test_model_without_trim_of_its_own_trims_by_its_elevator(
     electric: Path, tmp_path: Path
 ) -> None:
-    # as flying wings have it: no surface reads fcs/pitch-trim-cmd-norm
+    # As on flying wings no surface reads fcs/pitch-trim-cmd-norm.
     text = electric.read_text()
     cut = text.replace("fcs/pitch-trim-cmd-norm", "fcs/yaw-trim-cmd-norm")
     assert cut != text
@@ -375,5 +375,5 @@ def test_nearest_trim_is_the_first_neighbour_that_trims(monkeypatch: pytest.Monk
     assert near(40.0, 5000.0) == "it trims at 40 m/s and 2500 m"
     assert near(15.0, 1000.0) == ""
     assert near(40.0, 9000.0) == ""
-    # a refusal waits for at most six conditions
+    # A refusal waits for at most six conditions.
     assert max(seconds) <= 3.0

@@ -60,7 +60,7 @@ def test_twin_yaws_toward_its_dead_engine_by_the_arm_times_the_remaining_thrust(
     """
     thrust = 0.5 * 0.06 * 100.0 * 13.5 / 2.0
     found = accelerations("osprey_twin", lost)
-    # the file has two figures: 0.046 of 0.04605
+    # The file has two figures: 0.046 of 0.04605.
     assert found["r"] == approx(toward * 0.2 * thrust / 1.759, rel=2e-3)
     assert found["V"] == approx(-thrust / 13.5, rel=2e-3)
     assert found["p"] == approx(0.0, abs=1e-3)

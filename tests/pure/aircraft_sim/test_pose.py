@@ -49,7 +49,7 @@ def test_velocity_over_ground_is_airspeed_turned_from_body_axes_to_north_east_do
     body = speed * np.array(
         [math.cos(alpha) * math.cos(beta), math.sin(beta), math.sin(alpha) * math.cos(beta)]
     )
-    # scipy's intrinsic rotations
+    # SciPy's intrinsic rotations.
     north, east, down = Rotation.from_euler("ZYX", [psi, theta, phi]).apply(body)
     assert pose.velocity(speed, alpha, beta, phi, theta, psi) == approx(
         (north, east, -down), rel=1e-14
@@ -160,7 +160,7 @@ def test_pose_of_airframe_agrees_with_another_integrator() -> None:
     }
     assert abs(exact[states.index("phi")]) > 0.05  # it has rolled
     for name, value in expected.items():
-        # m and rad: the trapezoidal rule at 100 Hz
+        # m and rad: the trapezoidal rule at 100 Hz.
         assert found[name] == approx(value, abs=2e-3), name
 
 
@@ -202,7 +202,8 @@ def test_pose_of_jsbsim_is_absolute_and_consistent() -> None:
         approx(altitude, rel=1e-6),
     )
     at = np.isin(tape["truth"].stamp_ns, found.stamp_ns)
-    for name in ("theta", "altitude", "phi"):  # truth holds deviations from trim
+    # Truth holds deviations from trim.
+    for name in ("theta", "altitude", "phi"):
         assert found[name] - found[name][0] == approx(truth[name][at] - truth[name][0], abs=1e-9), (
             name
         )

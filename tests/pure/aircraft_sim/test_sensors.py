@@ -74,7 +74,7 @@ def test_channel_without_noise_exact_and_does_not_change_others() -> None:
 @pytest.mark.parametrize("dropout", [0.05, 0.2, 0.5])
 def test_fraction_of_dropped_samples_is_specified_one(dropout: float) -> None:
     lost = np.array([not arrives(k, sensors(NOISE, dropout=dropout)) for k in range(COUNT)])
-    # four standard deviations of a fraction
+    # Four standard deviations of a fraction.
     tolerance = 4.0 * np.sqrt(dropout * (1.0 - dropout) / COUNT)
     assert lost.mean() == approx(dropout, abs=tolerance)
     # Dropouts are independent: the fraction of two in a row is dropout^2.
@@ -207,7 +207,7 @@ def test_truth_holds_whole_error_of_sensors_with_every_fault(servo: Scenario) ->
     at = np.searchsorted(truth.stamp_ns, y.stamp_ns)
     for name in y.names:
         assert y[name] == approx(truth[f"x.{name}"][at] + truth[f"noise.{name}"][at], abs=1e-15)
-    # the bias; the noise is 0.03 over 200 samples
+    # The bias; the noise is 0.03 over 200 samples.
     assert np.mean(truth["noise.V"]) == approx(0.5, abs=0.01)
     assert y["q"] / 1e-3 == approx(np.round(y["q"] / 1e-3), abs=1e-9)
     again = simulate(with_sensors(servo, dropout=0.3, **faults).vary(flight={"duration": 2.0}))

@@ -31,7 +31,7 @@ pytestmark = pytest.mark.slow
 FEET, KNOTS = 0.3048, 0.514444  # m, m/s
 V0 = 25.0
 SPAN = 3.0  # m
-# about 60 ft above the ground in 15 kt
+# About 60 ft above the ground in 15 kt.
 SMALL = Dryden(np.array([60.0, 60.0, 25.0]), np.array([1.1, 1.1, 0.8]))
 ALL = (0, 1, 2)
 TURBULENCE = {"altitude": 30.0, "wind": 7.7}

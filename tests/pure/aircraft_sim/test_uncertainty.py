@@ -91,7 +91,7 @@ def test_aircraft_that_drift_with_wind_do_not_notice_it() -> None:
         by_wind = effect[:, list(OSPREY.gusts).index(axis)]
         assert by_wind == approx(-by_state, rel=5e-3, abs=0.0), axis
         published = OSPREY.matrix_gusts()[:, list(OSPREY.gusts).index(axis)]
-        # what it would feel otherwise
+        # What it would feel otherwise.
         assert np.abs(published + by_state).max() > 0.1 * np.abs(published).max(), axis
 
 
@@ -110,7 +110,7 @@ def test_a_seed_determines_the_aircraft() -> None:
     sampled, again, other = (sample_airframe(OSPREY, 0.3, 0.3, seed) for seed in (7, 7, 8))
     assert sampled == again != other
     A, B = nominal_and_sampled(OSPREY, 0.3, 1, seed=7)
-    # rounding of the conversion to the file's units
+    # Rounding of the conversion to the file's units.
     assert sampled.matrix_a() == approx(A[1], rel=1e-15)
     assert sampled.matrix_b() == approx(B[1], rel=1e-15)
 

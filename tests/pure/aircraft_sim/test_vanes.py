@@ -38,7 +38,7 @@ from rise_di_controller.extensions.observer import VaneObserverState, correct, w
 from rise_di_controller.law.control_law import Measurements
 
 SHIPPED = find_scenario("osprey_vanes")
-# y at the rate of the law: a third of the time of the shipped one
+# y at the rate of the law: a third of the time of the shipped one.
 SHORT = SHIPPED.vary(
     flight={"duration": 12.0},
     aircraft={"rate": 100.0, "step": 0.005},
@@ -157,7 +157,7 @@ def test_gain_with_vane_is_that_of_the_stationary_filter() -> None:
     )
     found = vane_correction(sampled, model, (weights, weights), row, 0.0035)
     L = np.column_stack([aircraft_correction(sampled, model, weights), np.zeros(len(row))]) + found
-    # the same filter by scipy
+    # The same filter by scipy.
     H = np.vstack([sampled.H, row])
     noise = np.diag(np.append(model.noise, 0.0035) ** 2)
     size = [
@@ -218,8 +218,8 @@ def test_still_vane_is_left_out_and_moving_vane_corrects() -> None:
 def test_vanes_lower_errors_in_turbulence_and_flight_replays() -> None:
     tape = simulate(SHORT)
     alone = rms(simulate(SHORT.vary(controller=SHORT.controller.without_vanes().model_dump())))
-    # measured 0.79 in q in 12 s of moderate turbulence; 200 aircraft in
-    # docs/evidence/tables/laws-vanes.csv
+    # Measured 0.79 in q in 12 s of moderate turbulence; 200 aircraft in
+    # docs/evidence/tables/laws-vanes.csv.
     assert rms(tape)[0] < 0.9 * alone[0]
     replayed = replay(tape)
     assert replayed.equal()

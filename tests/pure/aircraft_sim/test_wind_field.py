@@ -48,7 +48,8 @@ def test_air_of_a_microburst_keeps_its_volume() -> None:
     step = 0.01
     for place in ([400.0, 100.0, 30.0], [100.0, -50.0, 200.0], [-900.0, 300.0, 80.0]):
         divergence = 0.0
-        for k, sign in enumerate((1.0, 1.0, -1.0)):  # the last component counts down
+        # The last component counts down.
+        for k, sign in enumerate((1.0, 1.0, -1.0)):
             ahead, behind = (np.array(place) + side * step * np.eye(3)[k] for side in (1.0, -1.0))
             change = BURST.wind(*ahead)[k] - BURST.wind(*behind)[k]
             divergence += sign * change / (2.0 * step)

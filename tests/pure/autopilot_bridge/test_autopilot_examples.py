@@ -24,7 +24,7 @@ OF_PX4 = ("px4_airplane", "px4_quadrotor")
 EXAMPLES = {"arduplane": "ardupilot"} | {
     name: str(REPOSITORY / "examples" / name / "map.yaml") for name in OF_PX4
 }
-# an aircraft that is lost leaves them at once
+# An aircraft that is lost leaves them at once.
 LARGEST = {"q": 0.1, "V": 1.0, "p": 0.2, "r": 0.2, "vertical_speed": 1.0}
 
 

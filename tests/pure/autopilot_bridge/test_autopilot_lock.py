@@ -41,7 +41,7 @@ def test_first_address_is_taken_until_it_is_silent_then_the_next_one() -> None:
     assert sequence.refuses(12.9, 7.9, SECOND) == (
         f"a second sender, {SECOND}, sends as the autopilot: {FIRST} was first and is taken alone"
     )
-    # a message without the time since boot counts for the address
+    # A message without the time since boot counts for the address.
     assert not sequence.takes(13.0, None)
     sequence.refuses(16.0, None, SECOND)
     assert sequence.takes(16.001, 80.0, SECOND)  # with a clock of its own

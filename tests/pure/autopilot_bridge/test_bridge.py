@@ -281,7 +281,7 @@ def test_low_pass_answers_step_as_first_order_does_at_any_spacing_of_samples() -
         receive_outputs(bridge, t, raw=1.0)
         sample = bridge.y(at(t))
         assert sample is not None
-        # the row of q has sign -1, that of p no filter
+        # The row of q has sign -1, that of p no filter.
         step = np.abs(sample.value[[OUTPUTS.index("q"), OUTPUTS.index("p")]])
         assert step == approx([1.0 - np.exp(-t / 0.05), 1.0])
 
@@ -316,7 +316,7 @@ def test_stamps_of_another_clock_and_samples_out_of_order_refused() -> None:
         bridge.take_output("q", 0.0, at(0.0), at(0.01))
 
 
-# armed, in Hold, with a transmitter
+# Armed, in Hold, with a transmitter.
 PX4_STATUS = {"armed": 2.0, "offboard": 4.0, "transmitter": 1.0}
 
 
@@ -359,7 +359,7 @@ def test_neutral_values_end_with_lost_condition_or_conflicting_publisher(lost: s
 
 def test_engagement_requests_mode_sends_setpoints_in_it_and_requests_hold_after_it() -> None:
     bridge = px4_bridge()
-    # no heartbeat before the request: without it PX4 leaves offboard
+    # No heartbeat comes before the request: without heartbeats PX4 leaves offboard.
     assert sent(bridge, 0.0) == set()
     engage(bridge)
     assert bridge.phase is Phase.ENGAGING
@@ -466,7 +466,7 @@ def test_blind_engagement_ignores_the_transmitter() -> None:
         "effect then; released by a lost condition (armed, offboard), rise-di engage --off"
     )
     bridge.disengage("disengaged by request", at(3.0))
-    # blind for one engagement
+    # The bridge is blind for one engagement.
     assert bridge.engage(at(3.0)) == "the transmitter is lost (valid is 0)"
 
 
@@ -537,7 +537,7 @@ def test_each_trim_captured_from_own_stick_at_engagement_and_kept() -> None:
     bridge = ardupilot_bridge()
     engage(bridge)
     for name in STICKS:
-        # while overridden, ArduPilot reports what it is sent
+        # While overridden, ArduPilot reports what it is sent.
         receive_outputs(bridge, 0.05, (trim_key(name),), 1900.0)
     assert bridge.raw() == approx([-0.2, -0.1, 0.04, -0.02], abs=1e-9)
     assert [bridge.trim(name) for name in STICKS] == approx(
@@ -704,9 +704,8 @@ OVERRIDE_TIME = (
 )
 
 
-@pytest.mark.parametrize(
-    "seconds", [-1.0, 0.0, 3.0]
-)  # without end, no overrides, ArduPilot's default
+# Without end, without overrides, and ArduPilot's default.
+@pytest.mark.parametrize("seconds", [-1.0, 0.0, 3.0])
 def test_engagement_needs_a_short_timeout_of_overrides(seconds: float) -> None:
     bridge = mavlink_bridge(seconds)
     assert (
@@ -853,7 +852,7 @@ def test_climb_refuses_an_engagement_and_does_not_end_one() -> None:
     engage(bridge, 0.01)
     receive_outputs(bridge, 0.02, ("climb",), raw=7.9)
     assert bridge.step(at(0.02)) is Phase.ENGAGED
-    # the sink of ArduPlane with a jammed elevator
+    # The sink of ArduPlane with a jammed elevator.
     receive_outputs(bridge, 0.03, ("climb",), raw=-8.4)
     assert bridge.step(at(0.03)) is Phase.RELEASE
     assert bridge.reason == "climb is -8.4, outside the envelope [-8, 8]"
@@ -1027,7 +1026,7 @@ def test_flight_announces_each_reason_once_without_those_in_which_number_alone_c
 
 
 def test_experiment_without_engagement_ends_when_too_little_time_left() -> None:
-    # osprey_gust has 60 s, of which the experiment needs 59.8; it began 0.3 s ago
+    # osprey_gust has 60 s, of which the experiment needs 59.8; it began 0.3 s ago.
     processes = SimpleNamespace(
         learner_ended=str,
         start_time=1000.0,

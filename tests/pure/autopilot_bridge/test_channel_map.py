@@ -57,16 +57,15 @@ RATES = {
     "px4": Message(angular_velocity=FRD),
 }
 AIRSPEED = {  # 27 m/s, 2 m/s above the trim of 25 m/s
-    "ardupilot": Message(
-        true_airspeed=Message(x=-18.0, y=18.0, z=-9.0)
-    ),  # 9 (2, 2, 1), of length 27
+    # 9 (2, 2, 1), of length 27.
+    "ardupilot": Message(true_airspeed=Message(x=-18.0, y=18.0, z=-9.0)),
     "ardupilot_2024": Message(vector=Message(x=-18.0, y=18.0, z=-9.0)),
     "ardupilot_mavlink": Message(airspeed=27.0),
     "odometry": Message(twist=Message(twist=Message(linear=Message(x=-18.0, y=18.0, z=-9.0)))),
     "px4": Message(true_airspeed_m_s=27.0, calibrated_airspeed_m_s=26.0),
 }
-# elevator 0.1 rad nose up, thrust 10 % above half, aileron 0.1 rad to the right, rudder 0.1 rad to
-# the right
+# Elevator 0.1 rad nose up, thrust 10 % above half, aileron 0.1 rad to the right, rudder 0.1 rad to
+# the right.
 SENT = {
     "ardupilot": {
         "axes[1]": 0.1 / 0.523599,
@@ -86,12 +85,13 @@ SENT = {
         "chan1_raw": 1595.493,
         "chan4_raw": 1595.493,
     },
+    # 12 of 20 N.
     "odometry": {
         "elevator.data": 0.1,
         "thrust.data": 12.0,
         "aileron.data": 0.1,
         "rudder.data": 0.1,
-    },  # 12 of 20 N
+    },
 }
 SENT["ardupilot_2024"] = SENT["ardupilot"]
 
@@ -102,7 +102,7 @@ def test_each_output_comes_in_si_and_frd(name: str, channel: str) -> None:
     row = named_map(name).outputs[channel]
     message = AIRSPEED[name] if channel == "V" else RATES[name]
     value = to_channel(read_raw(message, row.field, row.function), row.line)
-    # float32 in a message of PX4
+    # A value is float32 in a message of PX4.
     assert value == approx(2.0 if channel == "V" else MOTION[channel], abs=1e-6)
 
 
@@ -112,7 +112,7 @@ def test_each_input_sent_in_autopilots_unit_and_sign(name: str) -> None:
         SENT[name].items(), named_map(name).inputs.values(), strict=True
     ):
         assert path in (row.field, f"{row.message}.{row.field}")
-        # the fields in us are integers
+        # The fields in us are integers.
         assert to_raw(row.trim + 0.1, row.line) == approx(expected, abs=1e-3)
 
 
@@ -144,7 +144,8 @@ def test_each_field_of_map_published_and_accepts_values_of_map(name: str) -> Non
             input_row.release,
             to_raw(input_row.trim + 0.123, input_row.line),
         ):
-            if not isinstance(raw, float):  # trim, or nothing to be sent
+            # Trim, or nothing to be sent.
+            if not isinstance(raw, float):
                 continue
             set_field(message, input_row.field, raw)
             error = 1e-7 * abs(raw) if element == "float32" else 0.5
@@ -312,7 +313,7 @@ def test_service_is_requested_and_does_not_fly() -> None:
 
 shipped = cache(named_map)  # parsed once, not for each example
 ANGLE = st.floats(-math.pi, math.pi)
-# x east, y north, z up
+# x east, y north, z up.
 TURN_NED_ENU = Rotation.from_matrix([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 TURN_FLU_FRD = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
 

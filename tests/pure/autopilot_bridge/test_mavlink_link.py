@@ -216,7 +216,7 @@ def test_override_reaches_the_autopilot_and_leaves_other_channels(ends: Ends) ->
     until(lambda: taken, take)
     sent = taken[0]
     assert (sent.get_srcSystem(), sent.target_system, sent.target_component) == (255, 1, 1)
-    # released, set, as is, as is
+    # The channels are released, set, as is, as is.
     assert [getattr(sent, f"chan{n}_raw") for n in (1, 2, 5, 9)] == [0, 1612, 65535, 0]
 
 
@@ -321,7 +321,7 @@ def test_messages_of_other_components_of_the_system_are_not_taken(ends: Ends) ->
         routed = mavlink.MAVLink(autopilot.connection, srcSystem=1, srcComponent=component)
         routed.attitude_send(50_000, 0.0, 0.0, 0.0, 0.0, 0.9, 0.0)
         ends.peer(port, component=component).attitude(0.9, since_boot=50.0)
-    # of the packets to one socket the last one is read last
+    # Of the packets to one socket the last one is read last.
     autopilot.attitude(0.1, since_boot=50.1)
     until(lambda: len(queue) == 2, autopilot.received)
     assert [received.message.pitchspeed for received in queue] == [approx(0.1)] * 2
@@ -368,7 +368,7 @@ def test_joystick_of_a_ground_station_with_the_number_of_the_bridge_is_conflict(
         SENDER,
         0,
     )
-    # the station itself, whose failsafe FS_GCS_ENABL of the autopilot watches
+    # It is the station itself, which FS_GCS_ENABL of the autopilot watches.
     assert made.conflict == ""
     sticks = {
         "RC_CHANNELS_OVERRIDE": mavlink.MAVLink_rc_channels_override_message(1, 1, *[1500] * 8),
@@ -612,7 +612,7 @@ def test_autopilot_whose_clock_begins_again_is_not_told_to_have_another_passphra
         made._refused,
     )
     assert "the autopilot has started without the time" in made._refused
-    # a replay: the true sender goes on, and no problem is told
+    # A replay: the true sender goes on, and no problem is told.
     signing.timestamp += 1200 * 100_000
     until(lambda: len(queue) > 2, peer.beat)
     assert "signed" not in made.problem()
@@ -679,9 +679,8 @@ def test_wrong_map_or_message_is_one_sentence() -> None:
             ChannelMap.validate_mapping(content | changes, "map")
 
 
-@pytest.mark.filterwarnings(
-    "ignore::pytest.PytestUnraisableExceptionWarning"
-)  # pymavlink leaves its socket open
+# pymavlink leaves its socket open.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_address_that_cannot_be_opened_is_one_sentence() -> None:
     with refusing(r"link\.url: found udpin:192\.0\.2\.1:14550, which cannot be opened"):
         Link(LinkConfig(url="udpin:192.0.2.1:14550"))  # an address of documentation, RFC 5737

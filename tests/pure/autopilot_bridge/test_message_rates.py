@@ -10,7 +10,7 @@ import pytest
 
 from autopilot_bridge.message_rates import MessageRates
 
-# the highest and the lowest rate of the map ardupilot_mavlink
+# The highest and the lowest rate of the map ardupilot_mavlink.
 REQUESTED = {"ATTITUDE": 40.0, "EXTENDED_SYS_STATE": 2.0}
 
 
@@ -55,7 +55,7 @@ def test_rate_that_a_ground_station_takes_is_requested_again_and_ends_no_engagem
     stream = Stream().run(10.0)
     stream.run(10.8, ATTITUDE=4.0)
     ((instant, requested),) = stream.again
-    # a message of the 4 Hz is 0.25 s, a judgement 0.1 s
+    # A message of the 4 Hz is 0.25 s, a judgement 0.1 s.
     assert instant == pytest.approx(10.67, abs=0.15)
     assert requested == {"ATTITUDE": 40.0}
     assert stream.rates.slow(10.8) == {"ATTITUDE": "ATTITUDE comes at 4 Hz, requested are 40 Hz"}
@@ -64,7 +64,7 @@ def test_rate_that_a_ground_station_takes_is_requested_again_and_ends_no_engagem
     assert len(stream.again) <= 2
     came = {"ATTITUDE": "ATTITUDE came at 4 Hz, requested are 40 Hz, less than 20 s ago"}
     assert stream.rates.slow(20.0) == came
-    # longer than the 15 s after which MAVProxy takes it again
+    # Longer than the 15 s after which MAVProxy takes it again.
     assert stream.run(30.0).rates.slow(30.0) == came
     assert stream.run(33.0).rates.slow(33.0) == {}
 

@@ -38,7 +38,7 @@ def test_aircraft_share_what_fleet_sets_and_keep_what_is_their_own(tmp_path: Pat
     for member in (first, second, third):
         assert member.scenario.aircraft.wind == (2.0, -1.0)
         assert member.scenario.aircraft.turbulence is not None
-        # of osprey_route
+        # The limits are those of osprey_route.
         assert (
             member.scenario.aircraft.turbulence.seed,
             member.scenario.aircraft.turbulence.wind,

@@ -398,7 +398,7 @@ def test_flight_begins_once_all_are_matched_and_ends_once_log_holds_it(tmp_path:
     ((topic, message),) = context.ros_node.published
     start = stamp_of(message) / NANOSECONDS
     assert topic == "/start"
-    # half a second in which `start` reaches the nodes
+    # Half a second in which `start` reaches the nodes.
     assert start == pytest.approx(time.time() + 0.5, abs=0.4)
     assert not flown_to(context, follow, start + 4.9)
     (give_up,) = every(OpaqueFunction, timers[-1].actions)
@@ -453,7 +453,7 @@ def test_bridge_with_flipped_sign_refused_before_anything_starts(tmp_path: Path)
 
 def test_limits_beyond_those_of_map_refused_before_anything_sent(tmp_path: Path) -> None:
     """The bridge clips u, which the anti-windup of the law does not know."""
-    # thrust from -0.4 to 0.4, the map from -0.2 to 0.3
+    # Thrust from -0.4 to 0.4, the map from -0.2 to 0.3.
     scenario = REPOSITORY / "tests" / "ros" / "slow_autopilot.yaml"
     sentence = (
         r"controller\.lower: found -0\.4, expected at least -0\.2, the lower limit of "

@@ -26,7 +26,7 @@ EXAMPLES = [
     path for path in sorted(REPOSITORY.glob("examples/*/*.yaml")) if CONTROLLER in path.read_text()
 ]
 FILES = [*sorted(LIBRARY.glob("*.yaml")), *EXAMPLES]
-# how a first line names a loop without the margins
+# How a first line names a loop without the margins.
 STATED = ("An ideal loop", "Margins below the requirement")
 NOMINAL, OBSERVED = 40.0, 35.0  # deg
 WORST = 28.0  # deg, the worst found in the box: what 30 deg of uniform samples leave at its corners

@@ -142,7 +142,7 @@ def test_aircraft_of_campaign_has_same_score_in_single_process_simulation(tmp_pa
     at_ticks = true.stamp_ns % 10_000_000 == 0
     rms = np.array([[np.sqrt(np.mean(true[name][at_ticks] ** 2))] for name in outputs])
     unit = score_units(outputs, again.aircraft.channels().outputs)
-    # as of single flights: tests of fleets
+    # Tests of fleets compare with single flights as closely.
     assert worst.score == approx(score(rms, unit)[0], rel=1e-3)
 
 
@@ -175,7 +175,7 @@ def test_aircraft_with_entries_of_its_own_flies_again_with_same_score(tmp_path: 
         assert np.abs(rows[name].to_numpy() / published - 1.0) == approx(part)
     worst = campaign.tally(0).worst[0]
     again = campaign.definition.aircraft_scenario(worst.number)
-    # whole periods; +100 % of the reference is the largest
+    # Whole periods; +100 % of the reference is the largest.
     assert set(rows["delay"].to_list()) == {0.0, 0.03}
     assert 2.0 * equipment.references(SHORT, of.entries)["delay"] == 0.03
     assert again.aircraft.actuators.lag[-1] == rows["lag[rudder]"][worst.number]
@@ -315,7 +315,7 @@ def proposing(*proposals: RiseDiConfig) -> Callable[[Scenario], Learn]:
 
     def learner(_: Scenario) -> Learn:
         def made(_: RiseDiConfig) -> Any:
-            # nothing is known at the first tick
+            # Nothing is known at the first tick.
             results = [LearnerResult(None, ""), LearnerResult(next(each), "given")]
             return SimpleNamespace(take=lambda *_: None, propose=Mock(side_effect=results))
 
@@ -374,10 +374,10 @@ def test_quick_learner_of_campaign_finds_what_learner_of_node_finds(
     row = campaign.rows().collect().row(0, named=True)
     assert (row["first_model"], row["models"]) == (14.5, 1)
     alone = flown_alone(campaign, 0, scenario_learner.learner)
-    # the searches end within 0.3 of log-likelihood: 20 aircraft differ by up to 0.2 deviations
+    # The searches end within 0.3 of log-likelihood: 20 aircraft differ by up to 0.2 deviations.
     for near, thorough in zip(*(each.entries for each in identified[::2]), strict=True):
         assert near.error == approx(thorough.error, abs=0.2 * thorough.deviation)
-    # the searches of a design may end a step of 5 % apart, which moves an rms by 0.5 %
+    # The searches of a design may end a step of 5 % apart, which moves an rms by 0.5 %.
     assert {name: row[name] for name in alone} == approx(alone, rel=1e-2)
 
 
@@ -473,13 +473,13 @@ def test_rank_correlations_are_those_of_scipy() -> None:
         name: spearmanr(size, score).statistic
         for name, size in (("A[q,alpha]", strong), ("A[q,q]", weak))
     }
-    # the strongest first, without the one that is not uncertain
+    # The strongest first, without the one that is not uncertain.
     assert list(correlations) == list(expected)
     assert correlations == approx(expected, rel=1e-12)
     lost = table.with_columns(
         pl.when(pl.col("score") < score.max()).then(pl.col("score")).alias("score")
     )
-    # a diverged aircraft is the worst
+    # A diverged aircraft is the worst.
     assert rank_correlations(lost, {"A[q,q]": -1.5, "A[q,alpha]": -1.5}) == correlations
     assert rank_correlations(table.head(5), {}) == {}
 
@@ -523,7 +523,7 @@ def test_results_have_margins_beside_score(tmp_path: Path) -> None:
     phases = [input_margins(loop.nominal, loop.law, loop.loop).phase.min() for loop in loops]
     assert found[1] is not None
     assert found[1].worst is not None
-    # a search over the box is at or below each aircraft that flies
+    # A search over the box is at or below each aircraft that flies.
     assert found[1].worst.phase.min() < min(phases)
 
 

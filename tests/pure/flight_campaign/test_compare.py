@@ -120,8 +120,8 @@ def test_score_of_campaign_is_that_of_single_process_simulation(
     )
     true = error(simulate(flown))
     rms = np.array([error_metrics(true[name]).rms for name in controller.outputs])
-    # the campaign holds the nonlinear remainder over a tick, the simulation does not: far below the
-    # 1 % that a score needs
+    # The campaign holds the nonlinear remainder over a tick, the simulation does not: far below the
+    # 1 % that a score needs.
     assert found.scores[wind] == approx(float(np.sum(rms / short.unit)), rel=2e-3)
     if wind == GUST:
         assert_allclose(found.rms, rms, rtol=2e-3)

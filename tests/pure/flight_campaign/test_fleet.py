@@ -83,7 +83,7 @@ def alone(scenario: Scenario, number: int) -> dict[str, FloatArray]:
     period = round(1e9 / scenario.controller.rate)
     e = np.array([true[name][true.stamp_ns % period == 0] for name in scenario.controller.outputs])
     u = np.array([tape["u"][name] for name in scenario.controller.effectors])
-    # a tick without a new y publishes no u
+    # A tick without a new y publishes no u.
     moved = np.abs(np.diff(u, axis=1, prepend=0.0)).sum(axis=1)
     slew = moved / scenario.flight.duration
     return {"rms": np.sqrt((e**2).mean(axis=1)), "max": np.abs(e).max(axis=1), "slew": slew}
@@ -172,7 +172,7 @@ def test_each_aircraft_with_column_limits_flies_as_in_single_process_simulation(
     within = 2e-2 if scenario.aircraft.sensors.quantisation else 1e-3
     params = batch.shared(scenario.controller.law_params())
     together = fly(scenario, *sampled(0.3, 5, 2), params=params)
-    # the second one: what would fly as the first differs
+    # The second one: what would fly as the first differs.
     for number in range(2) if name == "turbulence" else (1,):
         for key, values in alone(scenario, number).items():
             assert np.asarray(getattr(together, key))[:, number] == approx(values, rel=within), (
@@ -295,7 +295,7 @@ def test_matrices_compiled_for_a_device_are_those_of_numpy(
     assert on_device.blocks == on_host.blocks
     leaves = (jax.tree.leaves(fleet._replace(blocks=())) for fleet in (on_host, on_device))
     for numpy_values, values in zip(*leaves, strict=True):
-        # a fused multiply-add rounds once where NumPy rounds twice
+        # A fused multiply-add rounds once where NumPy rounds twice.
         assert np.asarray(values) == approx(np.asarray(numpy_values), rel=1e-13, abs=1e-15)
 
 

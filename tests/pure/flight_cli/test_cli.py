@@ -284,7 +284,7 @@ KEY = ", or a key of the scenario: --set SECTION.KEY=VALUE"
         ("airframes --ixx 3", "one of rise-di airframes --help"),
         ("gains osprey --set rate=100", "one of rise-di gains --help"),
         ("fly --run x", f"--runs{KEY}"),
-        # a key of the scenario is never taken for --send, which commands an autopilot
+        # A key of the scenario is never taken for --send, which commands an autopilot.
         ("fly --seed 3", f"one of rise-di fly --help{KEY}"),
         ("fly --law rise", f"one of rise-di fly --help{KEY}"),
         ("replay --k-g 2", f"one of rise-di replay --help{KEY}"),

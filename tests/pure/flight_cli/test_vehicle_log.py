@@ -41,7 +41,7 @@ OUTPUTS = ("q", "V", "p", "r")
 INPUTS = ("elevator", "thrust", "aileron", "rudder")
 OMEGA = np.array([40.0, 8.0, 80.0, 30.0])  # SI, by channel
 DAMPING = np.array([6.0, 0.3, 8.0, 3.0])  # 1/s
-# rad as in the maps ardupilot and px4; m/s; throttle in trim
+# rad as in the maps ardupilot and px4; m/s; throttle in trim.
 FULL, SPEED, THROTTLE = (0.523599, 25.0, 0.5)
 EPOCH = 1_790_000_000_000_000  # us since 1970, of a tlog
 GROUND, DURATION, RATE = 10.0, 40.0, 50  # s on the ground before the flight, s, Hz
@@ -103,7 +103,7 @@ def on_ground(flight: Flight) -> Flight:
     )
 
 
-# us, those of the map ardupilot
+# us, those of the map ardupilot.
 ENDS = {"MIN": 1000.0, "TRIM": 1500.0, "MAX": 2000.0, "REVERSED": 0.0}
 AXES = ("ROLL", "PITCH", "THROTTLE", "YAW")
 PARAMETERS = {
@@ -318,7 +318,7 @@ def test_flight_in_each_format_gives_y_and_u(name: str, flight: Flight, tmp_path
     tape = read_run(bag).tape
     assert (tape["y"].names, tape["u"].names) == (OUTPUTS, INPUTS)
     assert len(tape["y"].stamp_ns) == len(flight.y)  # of the flight, without the time on the ground
-    # float32
+    # The log has float32.
     assert tape["y"].values == approx(
         flight.y - [0.0, np.median(flight.y[:, 1]), 0.0, 0.0], abs=1e-5
     )
@@ -332,7 +332,7 @@ def test_omega_of_a_ulog_is_that_of_the_aircraft(flight: Flight, tmp_path: Path)
     assert imported(ulog(tmp_path / "flight.ulg", flight), bag, map_name="px4").exit_code == 0
     response = recorded_response(bag, OUTPUTS, INPUTS)
     assert (response.sign_ratio >= MIN_RATIO).all()
-    # the least that the log of a real flight has to reach
+    # The least that the log of a real flight has to reach.
     assert response.Omega.diagonal() == approx(OMEGA, rel=0.15)
 
 
@@ -451,7 +451,7 @@ def test_change_between_the_samples_is_refused_and_left_out_by_the_window(
     assert imported(path, bag, "--from", "11", "--until", "29").exit_code == 0
     assert imported(path, tmp_path / "later", "--servos", "--from", "31").exit_code == 0
     u = read_run(tmp_path / "later").tape["u"]["elevator"]
-    # the pulses have not changed, their meaning has
+    # The pulses have not changed, their meaning has.
     assert np.abs(u + flight.u[-len(u) :, 0]).max() <= 1e-6
 
 

@@ -99,7 +99,7 @@ def test_altitude_beyond_climb_flown_on_circles(altitude: float, side: str, rate
     circles = [leg for leg in legs[:-1] if isinstance(leg, Arc) and leg.loiter]
     assert [circle.centre for circle in circles] == [route[0 if altitude > 1000.0 else 1].point]
     assert [waypoint.departure for waypoint in waypoints[:2]] == [max(altitude, 1000.0), altitude]
-    # as a scenario writes each waypoint
+    # A scenario writes each waypoint so.
     named = tuple(waypoint._replace(leave=waypoint.altitude) for waypoint in route)
     assert flyable(named, RADIUS, PERIOD, CAN).legs == legs
     within = tuple(
@@ -125,7 +125,7 @@ def test_waypoint_of_short_leg_left_out_where_route_passes_near() -> None:
     match = re.search(r"route\[(\d)\]: corner cut, (\d+) m from the waypoint", note)
     assert match
     point = near[int(match[1])].point
-    # without the last orbit
+    # The drawing leaves out the last orbit.
     drawn = route_outline(Route(legs, (0.0,) * len(legs), (40.0,) * len(legs)))[:-38]
     between = [
         along(*ends, k / 500)

@@ -144,7 +144,7 @@ def test_predicted_turn_drifts_with_wind_across(side: float, wind: float) -> Non
         roll_rate=1e9,
         lag=0.0,
     )
-    # home is beyond the nearest point
+    # Home is beyond the nearest point.
     right, left = turn_clearance(Fence((edge,), (-3000.0, -side * 5500.0)), motion)
     assert float(right if side > 0.0 else left) == approx(nearest, abs=0.5)
 
@@ -162,7 +162,7 @@ def test_predicted_turn_ends_after_lag_and_roll(side: float, phi: float) -> None
     lag = 3.0
     roll_rate = 0.35
     edge = Zone((-1000.0, 1000.0, 1000.0, -1000.0), (-2000.0, -2000.0, 2000.0, 2000.0))
-    # the bank to the other side turns by 10 deg before
+    # The bank to the other side turns by 10 deg before.
     bearing = math.radians(15.0) if phi == 0.0 else math.radians(4.0)
     home = (900.0, side * 900.0 * math.tan(bearing))
     motion = Motion(
@@ -262,7 +262,7 @@ def test_aircraft_outside_flies_home_in_wind(name: str) -> None:
     action = np.zeros(4)
     has_been_inside = np.zeros(4, dtype=bool)
     has_left = np.zeros(4, dtype=bool)
-    # the longest way round against the wind
+    # The longest way round against the wind.
     for _ in range(math.ceil(12.0 * LEAST_RADIUS / (0.6 * speed) / dt)):
         v_north = speed * np.cos(psi) + wind[0]
         v_east = speed * np.sin(psi) + wind[1]
@@ -309,12 +309,12 @@ def test_outside_is_a_state_of_its_own() -> None:
         return last_safe_turn(fence, before, motion(north, 0.0, heading))
 
     assert (float(escape(1400.0, 0.0).action), bool(escape(1400.0, 0.0).begins)) == (BACK, True)
-    # south
+    # South.
     assert abs(math.remainder(float(escape(1400.0, BACK).course) - math.pi, 2.0 * math.pi)) < 0.2
     assert float(escape(1400.0, HOME).action) == BACK
     assert float(escape(1290.0, BACK, math.pi).action) == BACK  # 10 m inside: less than 12.5 m
     assert float(escape(1280.0, BACK, math.pi).action) == HOME
-    # on the way home the clearance of now is enough
+    # On the way home the clearance of now is enough.
     assert float(escape(1290.0, HOME, math.pi).action) == HOME
 
 
@@ -367,7 +367,7 @@ def test_way_home_leads_round_a_zone() -> None:
         place = place + step
         length = length + 20.0
         least = min(least, float(clearance(fence.zones, *place)))
-        # the corners at 1600 m, past which the way is 3000 m at least in right angles
+        # The corners at 1600 m, past which the way is 3000 m at least in right angles.
         assert length < 3000.0
     assert least > 75.0  # half of a radius
 
@@ -625,7 +625,7 @@ def test_room_at_home_is_that_in_the_worst_wind_of_all_sides(wind: float) -> Non
     )
     assert of_strip == approx(of_turned, abs=1.0)
     calm_room = room_at_home(Fence((along,), (0.0, 0.0)), motion(0.0, 0.0), 0.0)
-    # a quarter of the turn towards the border takes 5 s of the wind
+    # A quarter of the turn towards the border takes 5 s of the wind.
     assert of_strip < calm_room - 5.0 * wind
 
 
@@ -635,7 +635,7 @@ def test_straight_way_home_has_a_cell_of_clearance(cells: float, is_straight: bo
     field = Zone((-1000.0, 1000.0, 1000.0, -1000.0), (-1000.0, -1000.0, 1000.0, 1000.0))
     home = (0.0, 0.0)
     empty = ways(Fence((field,), home, 100.0))
-    # the centre of a cell, and the line from there onto the orbit
+    # The centre of a cell, and the line from there onto the orbit.
     begin = np.array(empty.corner) + empty.cell * np.round(
         (np.array([-800.0, 0.0]) - empty.corner) / empty.cell
     )

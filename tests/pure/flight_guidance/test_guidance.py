@@ -137,13 +137,14 @@ def test_altitude_loop_keeps_margin(stall_speed: float) -> None:
     time = loop.alpha_time
     poles = Polynomial([1.0, time, lag * time]).roots()
     assert np.min(-np.real(poles) / np.abs(poles)) >= 0.5 - 1e-9  # the damping of the flight path
-    # a gain margin of 2.5
+    # A gain margin of 2.5.
     assert np.max(np.real(Polynomial([2.49 * loop.k_h, 1.0, time, lag * time]).roots())) < 0.0
 
 
 def test_pitch_settles_where_angle_of_attack_estimated() -> None:
     alpha = 0.0
-    for _ in range(1000):  # 20 s, ten time constants: exp(-10)
+    # 20 s, ten time constants: exp(-10).
+    for _ in range(1000):
         alpha = alpha_estimate(alpha, 0.13, 2.0, SPEED, 0.02, CLIMB)
     assert alpha == approx(0.13 - math.asin(2.0 / SPEED), abs=1e-5)
     assert pitch_for(2.0, SPEED, alpha) == approx(0.13, abs=1e-5)
@@ -152,7 +153,7 @@ def test_pitch_settles_where_angle_of_attack_estimated() -> None:
 
 def test_course_approached_on_shorter_side() -> None:
     """Beyond 90 degrees the turn is the largest turn."""
-    # to the right, over south
+    # To the right, over south.
     assert course_acceleration(math.radians(-170.0), math.radians(170.0), SPEED, 0.4) > 0.0
     assert course_acceleration(math.radians(135.0), 0.0, SPEED, 0.4) == 0.4 * SPEED
     assert course_acceleration(math.radians(30.0), 0.0, SPEED, 0.4) == approx(0.2 * SPEED)
@@ -195,7 +196,7 @@ def test_line_captured_from_far_at_capture_angle() -> None:
     e = cross_track(2000.0, times)
     assert np.diff(e)[100] / 0.5 == approx(-SPEED * math.sin(FOLLOW.capture), rel=1e-3)
     assert abs(e[-1]) < 0.01
-    # no limit cycle, small overshoot
+    # No limit cycle, small overshoot.
     assert e.min() > -0.05 * SPEED * FOLLOW.period * FOLLOW.damping
 
 
@@ -204,7 +205,7 @@ def test_opposite_course_gives_largest_turn(away: float) -> None:
     """An aircraft on the course opposite to a line turns with the largest acceleration."""
     full = 4.0 * math.pi * FOLLOW.damping / FOLLOW.period * SPEED
     turn = path_acceleration(PathError(0.0, 0.0, 0.0), math.radians(away), SPEED, FOLLOW)
-    # a sine would leave 0.2 % of it at 179.9 deg
+    # A sine would leave 0.2 % of it at 179.9 deg.
     assert turn == approx(math.copysign(full, -away), rel=1e-9)
 
 
@@ -212,7 +213,7 @@ def test_opposite_course_gives_largest_turn(away: float) -> None:
 def test_acceleration_on_circle_is_centripetal(radius: float) -> None:
     """On a circle the acceleration is centripetal, and drives an offset back."""
     orbit = Arc((0.0, 0.0), radius)
-    # to the north of the centre: east on a right turn, west on a left one
+    # To the north of the centre: east on a right turn, west on a left one.
     on = path.error(orbit, (300.0, 0.0))
     assert on == approx((0.0, math.copysign(math.pi / 2.0, radius), 1.0 / radius))
     assert path_acceleration(on, on.track, SPEED, FOLLOW) == approx(SPEED**2 / radius)
@@ -251,7 +252,7 @@ def test_aircraft_that_slips_flies_on_circle() -> None:
     assert offset_from_a_circle(estimated=False) == approx(
         0.1 * 50.0**2 / 800.0 / (2.0 * math.pi / 20.0) ** 2, rel=0.15
     )
-    # m, of the integration in steps of 50 ms
+    # m, of the integration in steps of 50 ms.
     assert abs(offset_from_a_circle(estimated=True)) < 0.01
 
 
@@ -265,13 +266,13 @@ def test_roll_is_no_sideslip() -> None:
 
 def test_gyro_bias_is_no_sideslip() -> None:
     """In straight flight a bias of the gyro of r gives no sideslip."""
-    # r reads 1 mrad/s too much at 154 m/s: unbounded, 0.15 m/s^2 would hold the aircraft 6.5 m
+    # R reads 1 mrad/s too much at 154 m/s: unbounded, 0.15 m/s^2 would hold the aircraft 6.5 m
     # beside a leg.
     slip = 0.0
     for _ in range(1000):
         slip = slip_estimate(slip, 0.0, 0.154, 0.0, 0.02, 2.0)
     assert slip == 0.0
-    # a fifth of the turn of a bank to the left
+    # A fifth of the turn of a bank to the left.
     assert slip_estimate(1.0, -2.0, -1.0, 0.0, 0.02, 2.0) == approx(0.4)
 
 

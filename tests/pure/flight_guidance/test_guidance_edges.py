@@ -99,7 +99,7 @@ def test_turn_without_bank_is_the_straight_way(wind: float) -> None:
     straight = motion(20.0, 0.0, (0.0, wind), np.float64(0.0))._replace(north=500.0)
     right, left = map(float, turn_clearance(FENCE, straight))
     assert right == left  # no side is the better one
-    # as long as nearly a full turn at 5 deg is predicted, with a fifth less turn
+    # As long as nearly a full turn at 5 deg is predicted, with a fifth less turn.
     rate = 0.8 * 9.81 * math.tan(math.radians(5.0)) / 20.0
     longest = 1.0 + 1.95 * math.pi / rate
     north, east = 500.0 + 20.0 * longest, wind * longest
@@ -121,7 +121,7 @@ def test_speeds_that_divide_have_numbers() -> None:
             path_acceleration(error, 0.3, speed, path),
         ]
         assert np.isfinite(values).all()
-    # with a flow from behind a climb is still one
+    # With a flow from behind a climb is still one.
     assert path_angle(5.0, -20.0) > 0.0 > path_angle(-5.0, 0.0)
 
 
@@ -159,7 +159,7 @@ CALM = 4  # of five values of a pose are calm, so that more than the first check
 POSES = st.fixed_dictionaries(
     {name: st.sampled_from([values[0]] * CALM + [*values]) for name, values in EDGES.items()}
 )
-# share of the trim speed by which V is off, and further outputs, rad/s
+# Share of the trim speed by which V is off, and further outputs, rad/s.
 AIRSPEEDS = st.sampled_from([0.0, 0.02, -0.1, -0.3, -0.5, -0.9, -1.0, -1.5, 40.0])
 RATES = st.sampled_from([0.0, 0.01, 0.1, -0.1, 1e-9, 3.0, -1e3])
 REACHES = st.sampled_from([UNKNOWN, 0.0, 1e-3, 0.5])
@@ -272,7 +272,7 @@ def test_step_that_fails_leaves_last_u_m_and_next_is_tried(
     assert replayed.equal()
     assert replayed.checked == replayed.steps
     assert replayed.notes == ("4 steps of guidance failed: the last u_m went on",)
-    # a u_m that did not go on is found
+    # A u_m that did not go on is found.
     changed = u_m.values.copy()
     changed[at[1], 0] += 1e-9
     signals = {**tape.signals, "u_m": replace(u_m, values=changed)}

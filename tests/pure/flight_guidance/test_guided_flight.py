@@ -47,7 +47,7 @@ SECTION: dict[str, Any] = {
     "throttle_authority": [3.0, 3.0],
 }
 MS = 1_000_000  # ns
-# a bank of 0.1 rad
+# A bank of 0.1 rad.
 BANKED = (0.1, 0.05, 0.3, 0.0, 0.0, 100.0, 25.0 * math.cos(0.3), 25.0 * math.sin(0.3), 0.0, 0.0)
 
 
@@ -119,7 +119,7 @@ def test_flying_wing_without_rudder_flies_route() -> None:
 def test_lost_aileron_is_found_without_a_learner() -> None:
     orbit = calm(40.0, program=program(north=0.0, east=400.0, radius=400.0))
     actuators = orbit.aircraft.actuators.model_dump() | {"faults": ["aileron lost 4"]}
-    # an osprey off by up to 30 %, which else banks by 21 deg from then on
+    # An osprey off by up to 30 %, which else banks by 21 deg from then on.
     weaker = {"A": 0.3, "B": 0.3, "seed": 7, "number": 2}
     tape = simulate(orbit.vary(aircraft={"actuators": actuators, "uncertainty": weaker}))
     phi, ignored = channels(tape["guidance"], "pose.phi", "authority.roll")
@@ -273,7 +273,7 @@ def test_route_waits_for_engagement(by: str) -> None:
     switch(made, by, on=True)
     signal = run(made, 3, 4)
     assert (signal["mode.lateral"][0], signal["leg"][0]) == (Lateral.ROUTE, 0.0)
-    # at the begin of the leg
+    # At the begin of the leg.
     assert (signal["target.altitude"][0], signal["target.V"][0]) == (100.0, 25.0)
 
 
@@ -322,7 +322,7 @@ def test_commands_continue_after_short_pause(gap: int, continues: bool) -> None:
     after_pause = run(made, number, number + 1, np.zeros(4))
     assert after_pause["target.phi"][0] == 0.5
     jump = abs(after_pause["u_m.p"][0] - before["u_m.p"][-1])
-    # a step of the slew limit; otherwise it starts from zero
+    # A step of the slew limit; otherwise it starts from zero.
     assert bool(jump <= 0.02 * 5.0 * 0.35 * (1.0 + 1e-9)) is continues
 
 
@@ -478,7 +478,8 @@ def test_route_received_in_flight_is_logged(tmp_path: Path) -> None:
     flown = simulate(scenario, guide=RoutedInFlight)
     with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as bag:
         topic = bag.add_connection("/route", PATH, typestore=typestore())
-        for points in ([(0.0, 0.0, 0.0)], WAYPOINTS):  # the first one is refused
+        # The first one is refused.
+        for points in ([(0.0, 0.0, 0.0)], WAYPOINTS):
             bag.write(topic, 1, path(*points))
     read = read_run(tmp_path / "bag").tape["route"]
     assert read.values.tolist() == [
@@ -510,7 +511,7 @@ def test_route_file_flown_and_stays_with_flight(tmp_path: Path) -> None:
         simulate(ROUTE.vary(aircraft={"kinematics": "linear"}))
     with refusing("kinematics: found 'linear' beside guidance"):
         second_stage(ROUTE.vary(aircraft={"kinematics": "linear"}))
-    # the autopilot flies
+    # The autopilot flies.
     assert GUIDANCE in second_stage(ROUTE.vary(aircraft={"kinematics": "linear"}), bridge=True)
 
 
@@ -559,5 +560,5 @@ def test_airspeed_error_limits_climb_and_sink(
     shortfall: float, expected: tuple[float, float]
 ) -> None:
     """The limits of climb and sink fall with the error of the airspeed."""
-    # d = 9.81 x 2 / (0.4 x 25) = 1.96
+    # d = 9.81 x 2 / (0.4 x 25) = 1.96.
     assert climb_range(2.0, 3.0, shortfall, 25.0) == approx(expected, abs=5e-3)

@@ -104,7 +104,8 @@ def test_flare_sinks_as_commanded_and_touches_in_the_time_said(across: Scenario)
     height = landing.flare
     elapsed = 0.0
     dt = 1e-3
-    while height > 0.0:  # Euler's method, without the lag of the flight path
+    # Euler's method, without the lag of the flight path.
+    while height > 0.0:
         height += dt * flare_climb(height, 1.25, landing)
         elapsed += dt
     assert flare_climb(0.0, 1.25, landing) == -0.5

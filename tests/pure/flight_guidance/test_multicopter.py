@@ -98,7 +98,7 @@ def test_square_at_3_m_per_s_stays_on_its_lines_and_replays_to_the_bit(
     assert np.max(np.abs(log["pose.psi"])) < math.radians(3.0)  # the nose stays
     first = (log["leg"] == 0) & (tape.time("guidance") > 5.0)
     assert np.mean(np.hypot(log["pose.v_north"], log["pose.v_east"])[first]) == approx(3.0, abs=0.1)
-    # the drag of a steady flight holds against the tilt: g tan(tilt) = d v
+    # The drag of a steady flight holds against the tilt: g tan(tilt) = d v.
     steady = math.atan(DRAG * 3.0 / GRAVITY)
     assert np.mean(log["pose.theta"][first]) == approx(-steady, abs=0.03)
     replayed = replay_guidance(tape, scenario.guidance)

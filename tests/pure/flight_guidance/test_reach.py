@@ -116,7 +116,7 @@ def test_airspeed_flies_the_climb_where_the_elevator_has_no_effect() -> None:
     assert 2.0 * GRAVITY / SPEED * (sinks.V_c - SPEED) == approx(0.4 * 1.0)
     climbs, _ = flown({"altitude": 0.0, "V": SPEED}, Authority(q=0.0), climb=1.0)
     assert climbs.V_c - SPEED == approx(SPEED - sinks.V_c)
-    # m/s^2, of 1.2 rad/s
+    # m/s^2, of 1.2 rad/s.
     assert within_reach(OWN, Authority(q=0.0)).slew[OWN.outputs.index("V")] == approx(1.2)
 
 
@@ -167,7 +167,7 @@ def rolled(share: float, test: RollTest) -> RollTest:
     The aircraft rolls with a share of the command, 0.4 s behind it, and with gusts.
     """
     dt = 0.02
-    # rad/s, of which 0.05 rms are left: ten times those of an osprey in moderate turbulence
+    # rad/s, of which 0.05 rms are left: ten times those of an osprey in moderate turbulence.
     noise = np.random.default_rng(3).normal(0.0, 0.35, 3000)
     p = 0.0
     gust = 0.0

@@ -29,9 +29,9 @@ from flight_guidance.routes.route_file import (
 )
 
 ZURICH = Origin(47.4, 8.5)
-# longitude, latitude, altitude
+# Longitude, latitude, altitude.
 SQUARE = [(8.5, 47.4, 500.0), (8.52, 47.4, 550.0), (8.52, 47.42, 600.5)]
-# north, east
+# North, east.
 PLACES = [pymap3d.geodetic2enu(lat, lon, 0.0, *ZURICH, 0.0)[1::-1] for lon, lat, _ in SQUARE]
 ROUTE = [
     approx((*place, altitude), abs=1e-6)
@@ -231,10 +231,11 @@ RING = f"<LinearRing><coordinates>{COORDINATES}</coordinates></LinearRing>"
             kml(f"<Polygon>{ABSOLUTE}<outerBoundaryIs>{RING}</outerBoundaryIs></Polygon>", mode=""),
         ),
         ("r.kml", kml(f"<Placemark>{TRACK}</gx:Track></Placemark>{KML_POINTS}")),
+        # The sign of this line is a model.
         (
             "r.kml",
             kml(f"<Placemark>{TRACK}<Model/></gx:Track></Placemark>"),
-        ),  # whose sign is a model
+        ),
         ("r.kml", kml(KML_LINE.replace(",", ", "))),
         ("r.kmz", zipped(doc_kml=kml(KML_LINE), other_kml="no", images_png="x")),
         ("r.kmz", zipped(route_kml=kml(KML_LINE), **{"__MACOSX/": "", "files/other_kml": "no"})),
@@ -259,11 +260,12 @@ def test_files_of_other_programs_hold_same_route(name: str, content: Any, tmp_pa
     "name, content, heights",
     [
         ("r.geojson", line([place[:2] for place in SQUARE]), [30.0, 30.0, 30.0]),
+        # A path of Google Earth: clampToGround.
         (
             "r.kml",
             kml(KML_LINE, mode=""),
             [30.0, 30.0, 30.0],
-        ),  # a path of Google Earth: clampToGround
+        ),
         (
             "r.kml",
             kml(KML_LINE, mode="<altitudeMode>relativeToGround</altitudeMode>"),
@@ -328,9 +330,8 @@ def test_loiters_of_mission_are_flown_and_further_items_named(tmp_path: Path) ->
 
 
 WPL_FENCE = [
-    *(
-        (3, 5001, *corner, 0.0, 3.0) for corner in ((47.39, 8.49), (47.42, 8.49), (47.42, 8.53))
-    ),  # of three corners
+    # The polygon has three corners.
+    *((3, 5001, *corner, 0.0, 3.0) for corner in ((47.39, 8.49), (47.42, 8.49), (47.42, 8.53))),
     *((3, 5004, 47.41, 8.51, 0.0, 200.0), (3, 5100, 47.401, 8.5, 40.0)),
 ]
 A, B, C, D = ((3, 16, 47.4 + 0.01 * k, 8.52, 50.0) for k in range(4))
@@ -353,11 +354,12 @@ def jump(item: int, count: int) -> tuple[float, ...]:
             "NAV_RETURN_TO_LAUNCH (item 3), NAV_WAYPOINT (item 4)",
         ),
         ((A, B, (3, 21, 47.43, 8.52, 0.0), C), "AB", "NAV_LAND (item 3), NAV_WAYPOINT (item 4)"),
+        # The item loiters where the aircraft is.
         (
             (A, B, (3, 17, 0.0, 0.0, 0.0), C),
             "AB",
             "NAV_WAYPOINT (item 4)",
-        ),  # loiters where the aircraft is
+        ),
     ],
 )
 def test_mission_is_flown_in_the_order_of_an_autopilot(
@@ -422,7 +424,7 @@ def test_waypoints_at_one_place_are_one(tmp_path: Path) -> None:
     path.write_text(
         "route: [[0, 0, 0], [900, 0, 0, 26], [900, 0, 0, 27], [900, 900, 0], [0, 900, 0]]",
     )
-    # as on the leg before
+    # The airspeed is that of the leg before.
     assert [waypoint.speed for waypoint in read_route(path)] == [None, 26.0, 27.0, None]
     circle = "{{north: 900, east: 0, altitude: 0, turns: {}}}"
     path.write_text(
@@ -508,9 +510,10 @@ GEOJSON_FENCE: dict[str, Any] = {
             "type": "Feature",
             "geometry": {
                 "type": "Polygon",
+                # A double click.
                 "coordinates": [
                     [[8.49, 47.39], [8.49, 47.42], [8.49, 47.42], [8.53, 47.42], [8.49, 47.39]]
-                ],  # a double click
+                ],
             },
         },
         {
@@ -570,7 +573,8 @@ def test_fence_of_file_is_zones_and_home(tmp_path: Path, ending: str) -> None:
         [corner[k] for corner in corners] for k in (0, 1)
     )
     assert (field["exclude"], hole["exclude"], hole["radius"]) == (False, True, 200.0)
-    if ending != ".geojson":  # the nearest rally point, above the home
+    # The nearest rally point, above the home.
+    if ending != ".geojson":
         assert sections["home"] == approx(
             {
                 "north": local(47.401, 8.5, ZURICH)[0],

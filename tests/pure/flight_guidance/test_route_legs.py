@@ -90,7 +90,7 @@ def test_last_line_touches_orbit(last: path.Point) -> None:
     assert isinstance(line, Line)
     assert isinstance(orbit, Arc)
     error = path.error(line, orbit.centre)
-    # the centre is one radius to the right of the line: a clockwise orbit
+    # The centre is one radius to the right of the line: a clockwise orbit.
     assert error.e == approx(200.0)
     touching = path.error(orbit, line.end)
     assert touching.e == approx(0.0, abs=1e-9)
@@ -121,7 +121,8 @@ def test_wind_is_velocity_over_ground_less_through_air() -> None:
     # 3-4-5: climbing at 3 m/s of 5 m/s, 4 m/s remain level, to the east.
     assert wind_of(1.0, -2.0, 3.0, math.pi / 2.0, 5.0) == approx((1.0, -6.0))
     wind = (0.0, 0.0)
-    for _ in range(250):  # a time constant of a step of 20 ms
+    # A time constant of a step of 20 ms.
+    for _ in range(250):
         wind = wind_estimate(wind, (10.0, -5.0), WIND_TIME / 250)
     assert wind == approx((10.0 * (1.0 - math.exp(-1.0)), -5.0 * (1.0 - math.exp(-1.0))))
 
@@ -291,13 +292,14 @@ def test_altitude_changes_along_leg_or_at_its_begin(profile: str) -> None:
     log = flown.at(500.0, 5.0)
     if profile == "step":
         assert (log["target.altitude"], log["target.climb"]) == (140.0, 0.0)
-    else:  # the last line touches the orbit: the legs meet at an angle of 4 deg
+    else:
+        # The last line touches the orbit: the legs meet at an angle of 4 deg.
         assert log["target.altitude"] == approx(110.0, abs=0.1)
         assert log["target.climb"] == approx(40.0 / 2000.0 * SPEED, abs=0.01)
     assert flown.made.hold()
     assert flown.at(520.0, 5.0)["target.altitude"] == 100.0
     flown.made.take_target({"leg": 0.0, "altitude": 120.0})
-    # a command of the user holds on the leg
+    # A command of the user holds on the leg.
     assert flown.at(540.0, 5.0)["target.altitude"] == 120.0
     assert flown.at(560.0, 5.0)["target.altitude"] == 120.0
 
@@ -329,7 +331,7 @@ def test_loiter_ends_after_its_turns_or_wait(turns: float, wait: float) -> None:
     centre = (2000.0, 0.0)
     flown = Flown((0.0, 0.0, 100.0), (*centre, 100.0, None, turns, wait), (5000.0, -R, 100.0))
     circle = flown.route.legs[1]
-    # the last line touches the orbit round the last waypoint
+    # The last line touches the orbit round the last waypoint.
     assert circle.end == approx((2000.0, -R), abs=10.0)
     end = flown.route.legs[0].end
     assert end is not None

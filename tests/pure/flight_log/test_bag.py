@@ -53,7 +53,7 @@ def test_written_tape_read_back_bit_by_bit(tape: Tape, recorded: Path) -> None:
 def test_log_has_bytes_that_library_writes_by_itself(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # not in order of time
+    # The messages are not in order of time.
     messages = [(k % 3, NANOSECONDS + (7919 * k) % 1000, k, bytes(k % 5) * k) for k in range(3000)]
     logs = []
     for name in ("ours", "library"):
@@ -75,7 +75,8 @@ def test_memory_of_long_recording_does_not_grow(tmp_path: Path) -> None:
         channels = [bag.add_topic(f"/{k}", JOINT_STATE, "") for k in range(9)]
         tracemalloc.start()
         try:
-            for k in range(1000):  # chunks: 100 s of flight
+            # Chunks: 100 s of flight.
+            for k in range(1000):
                 for channel in channels:
                     bag.write(channel, k, k, k, b"")
                 bag.flush()
@@ -207,7 +208,8 @@ def test_memory_for_chunks_of_few_bytes_that_hold_much_bounded(tmp_path: Path) -
     finally:
         tracemalloc.stop()
     assert messages == count
-    # chunk and batch of each of AHEAD, of the one that is decoded and of the one that is counted
+    # Chunk and batch are in memory for each of AHEAD, for the one that is decoded and the one that
+    # is counted.
     assert peak < 12 * size
 
 
@@ -310,7 +312,7 @@ def test_bags_of_other_recorders_are_played(compression: CompressionMode, tmp_pa
 
 
 def test_bag_in_several_files_is_one_flight(tmp_path: Path) -> None:
-    # more than ten, so that the order of numbers is not that of names
+    # There are more than ten parts, so that the order of numbers is not that of names.
     for part in range(12):
         record(tmp_path / f"part{part}", {"/y": SAMPLES[4 * part : 4 * part + 4]})
         (tmp_path / "bag").mkdir(exist_ok=True)
@@ -486,7 +488,7 @@ def test_engagements_of_log_begin_with_phase_engaged_and_end_with_reason(tmp_pat
         bag.write(channel, number, 10 * number, number, data)
         bag.write(of_another, number, 10 * number + 5, number, data)
     bag.close()
-    # when they were sent
+    # The instants are those of sending.
     assert read_run(tmp_path / "run").engagements == [
         Engagement(10, 30, "lost"),
         Engagement(60, None, ""),
@@ -537,7 +539,7 @@ def test_lost_messages_are_known_of_one_publisher_alone(
 
 def test_samples_of_two_publishers_at_same_time_noted(tmp_path: Path) -> None:
     bag = BagWriter(tmp_path / "run")
-    # a second one, a restarted one
+    # A second aircraft and a restarted one.
     spans = {
         "/y": ("/aircraft#1", "/aircraft#2"),
         "/y_m": ("/reference_model#3", "/reference_model#9"),

@@ -79,7 +79,7 @@ def test_log_that_grows_in_pieces_gives_what_whole_log_holds(
 
 
 def test_topic_thinned_to_rate_at_even_distances(recorded: Path, tape: Tape) -> None:
-    # y is sent at 500 Hz
+    # y is sent at 500 Hz.
     follower = Follower(recorded, lambda topic, _: 100.0 if topic == "/y" else 0.0)
     stamps, _ = vectors(
         [record for record in follower.read() if isinstance(record, Messages)], "/y"

@@ -108,7 +108,7 @@ def test_log_closes_where_last_chunk_would_need_larger_reserve(
 def test_end_of_file_has_reserve_until_it_closed(disk: Path) -> None:
     with BagWriter(disk / "run"):
         assert SIZE - free_bytes(disk) >= END_BYTES
-    # freed; a file without messages and metadata.yaml remain
+    # The space is freed; a file without messages and metadata.yaml remain.
     assert SIZE - free_bytes(disk) < 50_000
 
 

@@ -169,7 +169,8 @@ def test_pose_whose_first_samples_lack_channel_read_with_it(tmp_path: Path) -> N
                 vector(k, ["phi"], [0.1]) if k < 3 else vector(k, ["phi", "climb"], [0.1, float(k)])
             )
             bag.write(topic, k, k, k, message)
-        for k in range(7, 17):  # of another publisher
+        # Of another publisher.
+        for k in range(7, 17):
             bag.write(topic, k, k, k, vector(k, ["z"], [0.1]))
     tape = read_run(tmp_path / "run").tape
     assert tape["pose"]["climb"].tolist() == [3.0, 4.0, 5.0, 6.0]
@@ -198,7 +199,7 @@ def test_long_topic_kept_in_file_has_bits_of_one_in_memory(
     recorded: RecordedRun, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, *, indexed: bool
 ) -> None:
     log = next(Path(str(recorded.path)).glob("*.mcap")).read_bytes()
-    # cut: without the number of samples
+    # Without its index a log does not tell the number of samples.
     (tmp_path / "log.mcap").write_bytes(log if indexed else log[: -len(log) // 20])
     plain = read_run(tmp_path / "log.mcap").tape
     monkeypatch.setattr(columns, "IN_MEMORY", 1000)

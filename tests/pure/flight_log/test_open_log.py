@@ -96,7 +96,7 @@ def test_whole_flight_is_read_replayed_shown_and_played(
         m.data for m in messages if m.topic == "/y"
     ]
     assert all(message.stamped for message in playback.messages)
-    # nothing is written
+    # Nothing is written.
     assert {path.name for path in whole.parent.rglob("*.yaml")} <= {"metadata.yaml"}
 
 
@@ -209,7 +209,7 @@ def test_remapped_topics_are_one_aircraft_where_the_reader_is_told_their_names(
         [message._replace(topic=names.get(message.topic, message.topic)) for message in messages],
     )
     words = [word for name, topic in REMAPS.items() for word in ("--remap", f"{name}:={topic}")]
-    # the log ends before the flight of the scenario
+    # The log ends before the flight of the scenario.
     for command, status in (("report", STATUS_ENDED_EARLY), ("replay", 0)):
         given = ["--scenario", "osprey_gust"]
         assert refusal(command, str(tmp_path / "bag"), *given)
@@ -244,7 +244,8 @@ def test_two_aircraft_are_shown_one_at_time(
         assert "expected one in 'uav3'" in refusal(command, str(bag), *given, *third)
     assert "expected one in 'uav3'" in refusal("watch", str(bag), "--namespace", "uav3")
     assert "expected one in 'uav3'" in refusal("play", str(bag), "--namespace", "uav3")
-    for name, duration in (("uav1", 2.0), ("uav2", 0.99)):  # by the last u
+    # By the last u.
+    for name, duration in (("uav1", 2.0), ("uav2", 0.99)):
         assert read_flight(bag, namespace=name, scenario=osprey_gust.path).summary[
             "duration"
         ] == pytest.approx(duration)

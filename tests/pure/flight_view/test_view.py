@@ -54,7 +54,7 @@ pytestmark = pytest.mark.slow
 
 TOKEN = "a-token"  # noqa: S105 - of a test
 CORPUS = sorted((REPOSITORY / "tests" / "corpus" / "mcap").iterdir())
-# valid, and too large for a reader that allocates as it is told
+# Valid, and too large for a reader that allocates as it is told.
 INTACT = {"zstd_of_fifty_thousand_messages"}
 
 
@@ -214,7 +214,7 @@ def test_long_flight_becomes_coarser_in_place() -> None:
     samples.append(np.arange(rows, rows + 4), values[:4])
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    # of all rows at once it would be 1.5 times that
+    # A copy of all rows at once would take 1.5 times that.
     assert peak < values.astype(np.float32).nbytes / 2
     groups = values.astype(np.float32).reshape(-1, 4, channels)
     assert (samples.values[: rows // 2 : 2] == groups.min(axis=1)).all()
@@ -407,7 +407,7 @@ async def get(
 async def test_page_served_to_all_and_samples_with_token(recorded: Path) -> None:
     """The page asks no other host."""
     async with serving(recorded) as server:
-        # a browser sends no header with the address of a page
+        # A browser sends no header with the address of a page.
         page = await get(server, "/", token="")
         assert (page.code, page.body) == (200, FILES["index.html"].read_bytes())
         assert page.headers["Content-Security-Policy"].startswith("default-src 'none'")
@@ -421,7 +421,7 @@ async def test_page_served_to_all_and_samples_with_token(recorded: Path) -> None
         head, _ = decoded((await get(server, "/data/0")).body)
         assert (head["flight"]["name"], head["ghost"]) == ("run", False)
         assert (await get(server, "/data/1")).code == 404
-        # more digits than Python converts
+        # More digits than Python converts.
         long = await get(server, f"/data/0?epoch={head['epoch']}&y={'9' * 4301}")
         assert (long.code, long.body) == (400, b"400: A number of rows has more than 18 digits\n")
 
@@ -686,7 +686,7 @@ async def test_websocket_without_reader_gets_few_answers(
             ).encode()
         )
         browser.sendall(bytes([0x81, 0x80 | len(TOKEN), 0, 0, 0, 0]) + TOKEN.encode())
-        # empty texts with a mask, RFC 6455, 5.2
+        # Empty texts with a mask, RFC 6455, 5.2.
         browser.sendall(bytes([0x81, 0x80, 0, 0, 0, 0]) * 10_000)
         while not made:
             await asyncio.sleep(0.01)
@@ -782,7 +782,7 @@ def test_watch_prints_address_until_ctrl_c(recorded: Path, ignored: bool) -> Non
         port = address.split(":")[2].partition("/")[0]
         assert f"ssh -L {port}:127.0.0.1:{port} " in tunnel
         sockets = psutil.Process(process.pid).net_connections()
-        # no UDP: no ROS
+        # No UDP: no ROS.
         assert [(connection.type, connection.laddr.ip) for connection in sockets] == [
             (socket.SOCK_STREAM, "127.0.0.1")
         ]

@@ -72,7 +72,7 @@ def test_viewer_gets_messages_of_log_with_definitions(
         await connection.write_message(
             json.dumps({"op": SUBSCRIBE, "subscriptions": [subscription]})
         )
-        # the protocol does not acknowledge a subscription: the log grows until messages come
+        # The protocol does not acknowledge a subscription: the log grows until messages come.
         with path.open("ab") as log:
             while not received and (piece := rest.read(5000)):
                 log.write(piece)

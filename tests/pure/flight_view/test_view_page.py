@@ -105,7 +105,7 @@ def test_recorded_flight_drawn_and_asks_no_other_host(browser: Browser, recorded
         assert (
             browser.run("document.getElementById('events').textContent") == "0.00 s  mode: ENGAGED"
         )
-        # the token is not in the history
+        # The token is not in the history.
         assert browser.run("location.href") == f"{address.partition('#')[0]}#"
         assert browser.run("document.cookie") == ""
         browser.run("location.reload()")
@@ -117,7 +117,8 @@ def test_keys_step_ticks_and_play(browser: Browser, recorded: Path, tape: Tape) 
     """Keys step single ticks, jump to events, and play."""
     with shown(browser, recorded):
         assert browser.run(TIME) == 0.0
-        for expected in (0.01, 0.02, 0.03):  # 100 Hz
+        # 100 Hz.
+        for expected in (0.01, 0.02, 0.03):
             press(browser, "ArrowRight")
             browser.wait_for(f"{TIME} === {expected}")
         press(browser, "ArrowLeft")
@@ -142,7 +143,8 @@ def test_recording_flight_followed_to_end(browser: Browser, recorded: Path, tmp_
         browser.open(address)
         browser.wait_for(f"{STATE} === 'WAITING'")
         assert browser.run(TIME) == 0
-        with path.open("ab") as recorder:  # as a recorder, it never makes the file shorter
+        # As a recorder, it never makes the file shorter.
+        with path.open("ab") as recorder:
             recorder.write(content[: len(content) // 2])
             recorder.flush()
             assert try_lock(recorder)
@@ -243,7 +245,7 @@ def test_surfaces_deflect_in_sense_of_input(page: Browser) -> None:
     up = np.array(seen(page, edges % "elevator: 0.3")) - still
     assert up[right_elevator, 2] < 0 > up[left_elevator, 2]  # nose up: both go up
     roll = np.array(seen(page, edges % "aileron: 0.3")) - still
-    # roll right: the right one goes up, the left one down
+    # Roll right: the right one goes up, the left one down.
     assert roll[right_aileron, 2] < 0 < roll[left_aileron, 2]
     yaw = np.array(seen(page, edges % "rudder: 0.3")) - still
     assert yaw[rudder, 1] > 0  # nose right: it goes to the right
@@ -275,7 +277,7 @@ def test_horizon_moves_against_aircraft(page: Browser) -> None:
     )
     assert (sky(level, -0.6, -0.1), sky(level, -0.6, 0.1)) == (True, False)
     assert sky(up, -0.6, 0.1)
-    # the horizon falls on the left and rises on the right
+    # The horizon falls on the left and rises on the right.
     assert [sky(roll, -0.6, y) for y in (-0.1, 0.1)] == [True, True]
     assert [sky(roll, 0.6, y) for y in (-0.1, 0.1)] == [False, False]
 
@@ -311,7 +313,7 @@ def test_guided_flight_shows_route_and_modes(browser: Browser, tmp_path: Path) -
         # 100 m at 25 m/s
         for text in ("ENGAGED", "ROUTE, ALTITUDE", "3: 100 m, 0:04", "-2.5 m", "30.0 m"):
             assert text in readouts
-        # a guided flight shows its map
+        # A guided flight shows its map.
         assert browser.run("document.querySelector('[data-camera=map]').ariaPressed") == "true"
         browser.run(SAID)
         set_camera(browser, "map")
@@ -320,13 +322,14 @@ def test_guided_flight_shows_route_and_modes(browser: Browser, tmp_path: Path) -
         # 25 m/s and 30 m
         browser.wait_for("['V (kt)', '48.6', '98'].every(text => said.includes(text))")
         assert "98.4 ft" in browser.run("document.getElementById('readouts').innerText")
-        for colour in ("--plant", "--reference"):  # the altitude, and its command
+        # The altitude, and its command.
+        for colour in ("--plant", "--reference"):
             assert pixels_of(browser, "[aria-label=altitude]", colour) > 300
         assert pixels_of(browser, "#scene", "--reference") > 100
         assert browser.console == []
     with shown(browser, tmp_path / "other"):
         set_camera(browser, "map")
-        # nothing but a route has its colour
+        # Nothing but a route has its colour.
         assert pixels_of(browser, "#scene", "--reference") == 0
 
 
@@ -377,7 +380,7 @@ def test_gains_are_pending_until_applied(
         assert browser.run("document.getElementById('control-desk').hidden")
         take(browser, "abcd-efgx")
         browser.wait_for(said("the control key is wrong"))
-        # as long as the next key is refused
+        # The next key is refused as long as this.
         browser.wait_for("new Promise(resume => setTimeout(() => resume(true), 1000))")
         take(browser)
         browser.wait_for("document.querySelectorAll('#control-gains tr').length > 10")
@@ -393,9 +396,9 @@ def test_gains_are_pending_until_applied(
         assert nodes.values["controller"]["k_g"] == before  # a slider sends nothing
         browser.run("void document.getElementById('control-apply').click()")
         browser.wait_for(said("applied"))
-        # three digits
+        # Three digits.
         assert nodes.values["controller"]["k_g"] == pytest.approx(1.5 * before, rel=0.01)
-        # a recorded one
+        # A recorded one.
         browser.wait_for(
             "document.getElementById('control-logged').textContent === 'not in the log yet'"
         )

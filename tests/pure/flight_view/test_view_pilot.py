@@ -95,7 +95,7 @@ def test_nothing_is_off_the_screen(
             "[...document.querySelectorAll('#control-gains td:first-child')].map(one => "
             "one.textContent)"
         )
-        # k_d has a value per output but the last
+        # k_d has a value per output but the last.
         assert {"k_g", "k_d q", "Lambda V", "beta p"} <= set(gains)
     controls[0].close()
     wide(browser, 1280)
@@ -177,11 +177,11 @@ def test_failsafe_fills_the_header(browser: Browser, tmp_path: Path) -> None:
         assert "flash" in browser.run(
             "getComputedStyle(document.querySelector('header')).animationName"
         )
-        # a button is read in an alarm too
+        # A button is read in an alarm too.
         colours = "(({color, backgroundColor}) => color !== backgroundColor)"
         assert browser.run(f"{colours}(getComputedStyle(units))")
         wide(browser, PHONE)
-        # the longest state
+        # The longest state.
         browser.run("void (document.getElementById('mode').textContent = 'ENGAGED DEAD RECKONING')")
         assert browser.run("document.documentElement.scrollWidth") == PHONE
         wide(browser, 1280)
@@ -209,7 +209,7 @@ def test_readouts_and_gaps(browser: Browser, tmp_path: Path) -> None:
         assert any(text.startswith("y_m 0") for text in texts(browser, chart))
         press(browser, "a")
         assert texts(browser, chart)
-        # the gap is from a quarter to a half of 40 s
+        # The gap is from a quarter to a half of 40 s.
         assert browser.run(f"{inked}([0.32, 0.48])") == 0
         assert browser.run(f"{inked}([0.10, 0.25])") > 50
         browser.run(
@@ -239,7 +239,7 @@ def test_charts_are_chosen_ordered_and_added(browser: Browser, routed: Path) -> 
         added = "pose/altitude, guidance/xtrack"
         browser.wait_for(f"{TITLES}.includes('{added}')")
         browser.run("window.before = true; location.reload()")
-        # the browser keeps it
+        # The browser keeps it.
         browser.wait_for(f"!window.before && {DRAWN} > 1 && {TITLES}.includes('{added}')")
         assert browser.run(TITLES) == [first, *rest, added]
         browser.run("void document.getElementById('choice-reset').click()")
