@@ -507,11 +507,11 @@ def test_messages_of_autopilot_become_y_to_the_last_bit_and_dry_run_publishes_wh
             (-twist.twist.angular.y, twist.twist.angular.x, -twist.twist.angular.z)
             for twist in twists
         }
-        received = [y.channels for y in setup.world.vectors("/y")]
-        assert len(received) > 40
-        assert all(tuple(y) == OUTPUTS for y in received)
-        assert {(y["q"], y["p"], y["r"]) for y in received} <= rates
-        assert max(abs(y["V"]) for y in received) < 0.2  # m/s from trim: noise of 0.03 m/s
+        messages = [y.channels for y in setup.world.vectors("/y")]
+        assert len(messages) > 40
+        assert all(tuple(y) == OUTPUTS for y in messages)
+        assert {(y["q"], y["p"], y["r"]) for y in messages} <= rates
+        assert max(abs(y["V"]) for y in messages) < 0.2  # m/s from trim: noise of 0.03 m/s
         assert setup.engage().startswith(
             "dry_run is true: nothing is sent; u.elevator is 0.1 from trim"
         )
@@ -581,9 +581,9 @@ def test_bridge_without_topics_of_autopilot_ends_with_the_cause_of_each(tmp_path
         for publisher in (setup.autopilot._twist, setup.autopilot._airspeed):
             publisher.leave()
         setup.start()
-        with pytest.raises(FlightEnded) as ended:
+        with pytest.raises(FlightEnded) as error:
             setup.run(4.0)
-        sentence = str(ended.value)
+        sentence = str(error.value)
         assert sentence.startswith("no y after 3 s: ")
         assert "/ap/twist/filtered, /ap/airspeed: no publisher" in sentence
 
@@ -665,12 +665,12 @@ def test_imu_and_odometry_of_simulator_become_y_and_pose_in_namespace() -> None:
 def test_missing_message_package_named_with_command_that_builds_it(tmp_path: Path) -> None:
     absent = tmp_path / "absent.yaml"
     absent.write_text((LIBRARY / "px4.yaml").read_text().replace("px4_msgs/", "absent_msgs/"))
-    with world_of("-p", f"map:={absent}") as world, pytest.raises(ParameterError) as refused:
+    with world_of("-p", f"map:={absent}") as world, pytest.raises(ParameterError) as error:
         world.make(BridgeNode)
     assert "absent_msgs/msg/VehicleOdometry: found no Python package absent_msgs" in str(
-        refused.value
+        error.value
     )
-    assert "make messages PACKAGE=absent_msgs SOURCE=FOLDER" in str(refused.value)
+    assert "make messages PACKAGE=absent_msgs SOURCE=FOLDER" in str(error.value)
 
 
 @pytest.mark.parametrize("sign", [1, -1])

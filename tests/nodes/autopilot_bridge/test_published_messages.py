@@ -61,13 +61,13 @@ def needs_packages_of(channel_map: ChannelMap) -> None:
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_the_package_has_the_published_fields(name: str) -> None:
     needs(name.partition("/")[0])
-    found: dict[str, str] = message_type(name).get_fields_and_field_types()  # type: ignore[attr-defined]
+    result: dict[str, str] = message_type(name).get_fields_and_field_types()  # type: ignore[attr-defined]
     for field, published in PUBLISHED[name].items():
         element, length, is_array, most = kind(published)
         element = AS_PYTHON.get(element, element)
         sequence = f"sequence<{element}, {most}>" if most else f"sequence<{element}>"
         expected = f"{element}[{length}]" if length else sequence if is_array else element
-        assert found[field] == expected
+        assert result[field] == expected
 
 
 def fill(message: Any, like: SimpleNamespace) -> Any:
@@ -139,8 +139,8 @@ class Px4:
             "vehicle_command",
         ):
             name = topic.title().replace("_", "")
-            received = self.received[name] = []
-            world.create_subscription(getattr(types, name), f"/fmu/in/{topic}", received.append, 5)
+            messages = self.received[name] = []
+            world.create_subscription(getattr(types, name), f"/fmu/in/{topic}", messages.append, 5)
 
     def publish(self) -> None:
         """Publish y, the mode, and u: elevator 0.02 rad.

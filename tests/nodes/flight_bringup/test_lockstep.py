@@ -76,10 +76,10 @@ def require_equal(world: World, scenario: Scenario) -> None:
     tape = simulate(scenario)
     assert {"y", "y_m", "u", "internals", "truth"} <= tape.signals.keys()
     for name, signal in tape.signals.items():
-        sent = [sample for sample in world.vectors(f"/{name}") if sample.channels]
-        assert [sample.stamp_ns for sample in sent] == signal.stamp_ns.tolist(), name
+        messages = [sample for sample in world.vectors(f"/{name}") if sample.channels]
+        assert [sample.stamp_ns for sample in messages] == signal.stamp_ns.tolist(), name
         values = np.array(
-            [[sample.channels[channel] for channel in signal.names] for sample in sent]
+            [[sample.channels[channel] for channel in signal.names] for sample in messages]
         )
         assert values.tobytes() == signal.values.tobytes(), name
 

@@ -372,10 +372,10 @@ def test_step_that_fails_leaves_the_last_u_m_and_the_node_goes_on(
     with monkeypatch.context() as patch:
         patch.setattr(guidance_steps, "step", raises)
         flight.run(1.5)
-    sent = [sample.channels for sample in flight.world.vectors("/u_m")[before:]]
-    assert sent[:3] == [last] * 3
-    assert sent[3] != last
-    assert len(sent) > 70  # of 75: none is left out
+    messages = [sample.channels for sample in flight.world.vectors("/u_m")[before:]]
+    assert messages[:3] == [last] * 3
+    assert messages[3] != last
+    assert len(messages) > 70  # of 75: none is left out
     lines = [line for line in flight.node.log.lines if "a step of guidance failed" in line]
     goes_on = "a step of guidance failed, the last u_m goes on"
     assert lines == [f"[WARNING] {goes_on}: IndexError index 7 is out of bounds"]

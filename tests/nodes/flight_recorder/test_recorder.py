@@ -229,10 +229,10 @@ def test_log_of_remapped_topics_names_them_as_the_stack_does(
         log = read_run(folder)
         assert log.namespace == "/uav1"
         assert {"y", "y_m", "u", "truth"} <= log.tape.signals.keys()
-        shown: set[str] = set()
+        output: set[str] = set()
         for record in Follower(folder, lambda topic, _: 1e9).read():
-            shown |= {record.topic} if isinstance(record, Messages) else set()
-        assert {"/uav1/y", "/uav1/y_m", "/uav1/u", "/uav1/truth"} <= shown
+            output |= {record.topic} if isinstance(record, Messages) else set()
+        assert {"/uav1/y", "/uav1/y_m", "/uav1/u", "/uav1/truth"} <= output
         if folder.name == "run":
             shutil.copytree(folder, tmp_path / "repaired")
             file = next((tmp_path / "repaired").glob("*.mcap"))

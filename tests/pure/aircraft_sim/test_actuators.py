@@ -102,8 +102,8 @@ def test_position_saturation_does_not_wind_up() -> None:
 def test_lag_comes_before_rate_limit_and_end_stop_last() -> None:
     # Command 1 from 0 over 0.1 s: the lag alone would reach 1 - 1/e = 0.632, the rate allows 0.2,
     # the stop 0.05.
-    moved = step(np.zeros(6), np.ones(6), np.array(0.1), SIX)
-    assert moved == approx([1.0, 1.0 - math.exp(-1.0), 0.2, 0.2, 0.5, 0.05], abs=1e-15)
+    after = step(np.zeros(6), np.ones(6), np.array(0.1), SIX)
+    assert after == approx([1.0, 1.0 - math.exp(-1.0), 0.2, 0.2, 0.5, 0.05], abs=1e-15)
     # Close to the command the lag is slower than the rate limit: 0.1 (1 - 1/e) = 0.063 < 0.2.
     assert step(np.zeros(6), np.full(6, 0.1), np.array(0.1), SIX)[3] == approx(
         0.1 * (1.0 - math.exp(-1.0)), abs=1e-15
@@ -242,10 +242,10 @@ def test_runaway_takes_travel_over_rate_to_its_stop_whatever_is_commanded() -> N
 
 
 def test_runaway_without_a_rate_limit_is_at_its_stop_at_once() -> None:
-    found = position_history(
+    result = position_history(
         range(0, 30, 10), 0.0, upper=[0.3] * 4, faults=["rudder hard_over 0.01 upper"]
     )
-    assert found[:, 3].tolist() == [0.0, 0.3, 0.3]
+    assert result[:, 3].tolist() == [0.0, 0.3, 0.3]
 
 
 def test_loose_surface_follows_play_operator() -> None:
@@ -348,10 +348,10 @@ def continuous(
     history = []
     for command in commands:
         # The largest step bounds the overshoot of a stop: rate or command / lag times 1e-4 s.
-        found = solve_ivp(
+        result = solve_ivp(
             rates, (0.0, tick), state, args=(command,), max_step=1e-4, rtol=1e-8, atol=1e-11
         )
-        state = np.array([min(max(found.y[0, -1], -stop), stop), found.y[1, -1]])
+        state = np.array([min(max(result.y[0, -1], -stop), stop), result.y[1, -1]])
         history.append(state[1])
     return np.array(history)
 

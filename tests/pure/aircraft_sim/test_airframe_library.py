@@ -95,8 +95,8 @@ def test_poles_are_the_published_ones(name: str) -> None:
     # Sources print poles to two to four digits, matrices to two or three. Tolerance: 2 % of the
     # pole, or the last digit.
     expected = np.sort_complex(np.array(PUBLISHED_POLES[name], dtype=np.complex128))
-    found = np.sort_complex(airframe_facts(load_airframe(name)).poles)
-    assert np.all(np.abs(found - expected) <= np.maximum(0.02 * np.abs(expected), 1e-3))
+    result = np.sort_complex(airframe_facts(load_airframe(name)).poles)
+    assert np.all(np.abs(result - expected) <= np.maximum(0.02 * np.abs(expected), 1e-3))
 
 
 @pytest.mark.equation("Remark 1")
@@ -115,8 +115,8 @@ def test_flipping_inputs_alone_gives_every_airframe_d_equal_to_one(airframe: Air
 
 def test_coupling_in_published_units_matches_the_table(airframe: Airframe) -> None:
     tolerance = 0.05 if airframe.name.startswith("aerosonde_first") else 0.006
-    found = coupling(airframe.matrix_c() @ np.array(airframe.B))
-    assert found == approx(PUBLISHED[airframe.name].coupling, abs=tolerance)
+    result = coupling(airframe.matrix_c() @ np.array(airframe.B))
+    assert result == approx(PUBLISHED[airframe.name].coupling, abs=tolerance)
 
 
 @pytest.mark.parametrize(
@@ -386,8 +386,8 @@ def test_zeros_do_not_depend_on_coordinates_of_state() -> None:
         if np.linalg.cond(T) > 100.0:
             # Beyond that the result measures the rounding of T, not the zeros.
             continue
-        found = invariant_zeros(T @ A @ np.linalg.inv(T), T @ B, C @ np.linalg.inv(T))
+        result = invariant_zeros(T @ A @ np.linalg.inv(T), T @ B, C @ np.linalg.inv(T))
         # Rounding in dense coordinates must not turn infinite zeros into finite ones.
-        assert len(found) == 4
-        assert_allclose(np.sort(found.real), np.sort(expected.real), atol=1e-6)
+        assert len(result) == 4
+        assert_allclose(np.sort(result.real), np.sort(expected.real), atol=1e-6)
         assert controllable(T @ A @ np.linalg.inv(T), T @ B)

@@ -42,9 +42,9 @@ def test_small_motion_about_level_flight_is_that_of_the_airframe_of_the_speed(ra
     of_x = np.array(
         [x_dot(x + near * unit, u) - x_dot(x - near * unit, u) for unit in np.eye(8)]
     ).T / (2.0 * near)
-    moved = at_speed(OSPREY, ratio, "thrust")
+    after = at_speed(OSPREY, ratio, "thrust")
     # The trims are 0.05 V0 apart and integrated in 20 steps: 1e-3 of the largest entry of V.
-    assert of_x == approx(moved.matrix_a() + moved.matrix_gravity() * np.cos(x), abs=2e-3)
+    assert of_x == approx(after.matrix_a() + after.matrix_gravity() * np.cos(x), abs=2e-3)
 
 
 def test_slow_flight_needs_more_incidence_and_less_thrust() -> None:

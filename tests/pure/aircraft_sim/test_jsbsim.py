@@ -204,11 +204,11 @@ def test_flight_in_another_process_agrees_to_last_bit() -> None:
         "truth = fly(cessna(condition=C182), command(aileron=0.1), 1.0)\n"
         "print(np.array(list(truth.values())).tobytes().hex())\n"
     )
-    output = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, check=True, cwd=REPOSITORY
     ).stdout
     truth = fly(cessna(condition=C182), command(aileron=0.1), 1.0)
-    assert output.strip() == np.array(list(truth.values())).tobytes().hex()
+    assert process.strip() == np.array(list(truth.values())).tobytes().hex()
 
 
 def test_nothing_is_printed_and_nothing_written(
@@ -276,8 +276,8 @@ def test_crash_of_jsbsim_ends_flight_in_one_process_with_sentence(
     )
     # No other test has cached the trim of this condition.
     scenario = find_scenario("jsbsim_c172p").vary(aircraft={"speed": 47.11})
-    told = str(simulate(scenario).outcome)
-    assert told == "jsbsim:c172p cannot be flown: JSBSim was killed by SIGSEGV"
+    sentence = str(simulate(scenario).outcome)
+    assert sentence == "jsbsim:c172p cannot be flown: JSBSim was killed by SIGSEGV"
 
 
 @pytest.mark.parametrize(
@@ -301,10 +301,10 @@ def test_crash_of_jsbsim_ends_flight_in_one_process_with_sentence(
 def test_condition_without_trim_refused_in_one_sentence(
     condition: tuple[str, float, float], sentence: str
 ) -> None:
-    with pytest.raises(FlightEnded, match=f"^jsbsim:{condition[0]} {sentence}") as ended:
+    with pytest.raises(FlightEnded, match=f"^jsbsim:{condition[0]} {sentence}") as error:
         # Larger steps: the search for a trim takes long.
         cessna(condition=FlightCondition(*condition, 4 * STEP_NS))
-    assert "\n" not in str(ended.value)
+    assert "\n" not in str(error.value)
 
 
 def test_property_that_does_not_exist_refused_by_name(monkeypatch: pytest.MonkeyPatch) -> None:

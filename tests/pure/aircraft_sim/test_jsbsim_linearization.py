@@ -62,8 +62,8 @@ def test_a_is_that_of_jsbsims_own_linearisation(linear: Linearization) -> None:
     for into, by in ENTRIES:
         (row, unit), (column, per) = NAMES[into], NAMES[by]
         known = own.system_matrix[places.index(row), places.index(column)] * unit / per
-        found = A[list(AIRPLANE_STATES).index(into), list(AIRPLANE_STATES).index(by)]
-        assert found == approx(known, rel=0.03, abs=0.01), (into, by)
+        result = A[list(AIRPLANE_STATES).index(into), list(AIRPLANE_STATES).index(by)]
+        assert result == approx(known, rel=0.03, abs=0.01), (into, by)
 
 
 def test_effects_are_those_of_jsbsims_own_linearisation(linear: Linearization) -> None:
@@ -76,9 +76,9 @@ def test_effects_are_those_of_jsbsims_own_linearisation(linear: Linearization) -
         if output in names:
             row = list(own.x_names).index(output.upper())
             known = own.input_matrix[row, list(own.u_names).index(names[output])]
-            found = linear.Omega[j, j]
-            assert found == approx(known, rel=0.15)
-            assert found * linear.spread[j] == approx(known, rel=0.03)
+            result = linear.Omega[j, j]
+            assert result == approx(known, rel=0.15)
+            assert result * linear.spread[j] == approx(known, rel=0.03)
 
 
 @pytest.mark.parametrize("rate", ["q", "p", "r"])
@@ -87,11 +87,11 @@ def test_flight_after_a_kick_follows_the_linear_aircraft(linear: Linearization, 
     # states, is below 6 % of the peak of each state that the kick moves.
     fdm, trim = trimmed_fdm(linear.condition, trim_solution(linear.condition))
     jsbsim_linearization._set_rate(fdm, trim, rate, 0.02)
-    flown = []
+    states_of_flight = []
     for _ in range(400):
         fdm.run()
-        flown.append([fdm[key.property] * key.si for key in JSBSIM_STATES.values()])
-    deviations = np.array(flown) - trim.states
+        states_of_flight.append([fdm[key.property] * key.si for key in JSBSIM_STATES.values()])
+    deviations = np.array(states_of_flight) - trim.states
     x = np.zeros(len(AIRPLANE_STATES))
     x[list(AIRPLANE_STATES).index(rate)] = 0.02
     step = expm(jacobian(linear) * 0.005)
@@ -99,14 +99,14 @@ def test_flight_after_a_kick_follows_the_linear_aircraft(linear: Linearization, 
     for _ in range(400):
         x = step @ x
         predicted.append(x)
-    moved = ("alpha", "q", "theta") if rate == "q" else ("beta", "p", "r", "phi")
-    for name in moved:
+    after = ("alpha", "q", "theta") if rate == "q" else ("beta", "p", "r", "phi")
+    for name in after:
         known = deviations[:, list(JSBSIM_STATES).index(name)]
-        found = np.array(predicted)[:, list(AIRPLANE_STATES).index(name)]
+        result = np.array(predicted)[:, list(AIRPLANE_STATES).index(name)]
         scale = np.max(np.abs(known))
         # A state that the kick hardly moves shows rounding.
         if scale > 1e-3:
-            assert np.max(np.abs(found - known)) < 0.06 * scale, name
+            assert np.max(np.abs(result - known)) < 0.06 * scale, name
 
 
 def test_airframe_has_the_identities_of_physics(linear: Linearization) -> None:
@@ -144,7 +144,7 @@ def test_lag_and_effect_of_a_first_order_input(monkeypatch: pytest.MonkeyPatch) 
         return response + 0.3 * size**2
 
     monkeypatch.setattr(jsbsim_linearization, "_response", lagged)
-    found = linearize(CONDITIONS["737"])
-    assert np.diag(found.Omega) == approx([-3.0, 2.0, 5.0, -1.0], rel=1e-3)
-    assert found.lag == approx([T + 0.005] * 4, abs=0.004)
-    assert found.spread == approx(np.ones(4))
+    result = linearize(CONDITIONS["737"])
+    assert np.diag(result.Omega) == approx([-3.0, 2.0, 5.0, -1.0], rel=1e-3)
+    assert result.lag == approx([T + 0.005] * 4, abs=0.004)
+    assert result.spread == approx(np.ones(4))

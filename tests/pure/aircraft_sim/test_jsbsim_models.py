@@ -112,9 +112,9 @@ def test_hysteresis_of_a_model_is_named(external: Path) -> None:
 
 
 def test_command_without_effect_is_named_with_what_the_model_reads(external: Path) -> None:
-    with pytest.raises(FlightEnded) as ended:
+    with pytest.raises(FlightEnded) as error:
         trim_solution(FlightCondition(str(external), 46.3, 1219.2, STEP_NS))
-    sentence = str(ended.value)
+    sentence = str(error.value)
     assert (
         "cannot be flown: elevator: fcs/elevator-cmd-norm, aileron: fcs/aileron-cmd-norm moves "
         "no acceleration" in sentence
@@ -179,10 +179,10 @@ def test_rudder_that_moves_nothing_is_seen(effect: float, monkeypatch: pytest.Mo
         return rows
 
     monkeypatch.setattr(jsbsim_linearization, "_response", response)
-    found = jsbsim_linearization.linearize(FlightCondition("c172p", 46.3, 1219.2, STEP_NS))
-    assert ("rudder" in found.airframe.inputs) == bool(effect)
-    assert ("r" in found.airframe.outputs) == bool(effect)
-    assert "r" in found.airframe.states
+    result = jsbsim_linearization.linearize(FlightCondition("c172p", 46.3, 1219.2, STEP_NS))
+    assert ("rudder" in result.airframe.inputs) == bool(effect)
+    assert ("r" in result.airframe.outputs) == bool(effect)
+    assert "r" in result.airframe.states
 
 
 @pytest.mark.parametrize(
@@ -256,8 +256,8 @@ def test_archive_of_run_flies_alike(electric: Path, tmp_path: Path) -> None:
         reference_model=c172p.reference_model,
         controller=c172p.controller,
     )
-    flight = fly(own, tmp_path / "runs")
-    with zipfile.ZipFile(flight.mcap.parent / "aircraft.zip") as archive:
+    result = fly(own, tmp_path / "runs")
+    with zipfile.ZipFile(result.mcap.parent / "aircraft.zip") as archive:
         archive.extractall(tmp_path / "elsewhere")
     copy = tmp_path / "elsewhere" / "aircraft" / "plane"
     assert np.array_equal(throttle_step(f"{PREFIX}{copy}"), throttle_step(f"{PREFIX}{electric}"))
@@ -336,9 +336,9 @@ def test_wrong_path_refused_with_what_is_there(
         (tmp_path / "two" / f"{name}.xml").write_text('<?xml version="1.0"?><fdm_config/>')
     (tmp_path / "engine.xml").write_bytes((PACKAGE / "engine" / "eng_io320.xml").read_bytes())
     (tmp_path / "text.xml").write_text("x,y\n1,2\n")
-    with refusing(f"^aircraft.airframe: {sentence}") as refused:
+    with refusing(f"^aircraft.airframe: {sentence}") as error:
         aircraft_parameters(**SECTION, airframe=f"{PREFIX}{path}")
-    assert len(str(refused.value)) < 300  # no list of all names
+    assert len(str(error.value)) < 300  # no list of all names
 
 
 def test_missing_engine_named_with_folders_searched(electric: Path, tmp_path: Path) -> None:

@@ -59,11 +59,11 @@ def test_twin_yaws_toward_its_dead_engine_by_the_arm_times_the_remaining_thrust(
     3 m/s^2 by 13.5 kg in trim, half of it an engine, at 0.2 m, J_z 1.759 kg m^2.
     """
     thrust = 0.5 * 0.06 * 100.0 * 13.5 / 2.0
-    found = accelerations("osprey_twin", lost)
+    result = accelerations("osprey_twin", lost)
     # The file has two figures: 0.046 of 0.04605.
-    assert found["r"] == approx(toward * 0.2 * thrust / 1.759, rel=2e-3)
-    assert found["V"] == approx(-thrust / 13.5, rel=2e-3)
-    assert found["p"] == approx(0.0, abs=1e-3)
+    assert result["r"] == approx(toward * 0.2 * thrust / 1.759, rel=2e-3)
+    assert result["V"] == approx(-thrust / 13.5, rel=2e-3)
+    assert result["p"] == approx(0.0, abs=1e-3)
 
 
 @pytest.mark.parametrize("name", ["osprey", "osprey_vtail"])
@@ -72,9 +72,9 @@ def test_without_its_only_engine_the_osprey_slows_down_by_its_thrust(name: str) 
 
     0.06 m/s^2 per % rounds it by 2 %.
     """
-    found = accelerations(name, "thrust")
-    assert found["V"] == approx(-0.5 * 0.6 * GRAVITY, rel=0.02)
-    assert [found["q"], found["r"]] == approx([0.0, 0.0], abs=1e-3)
+    result = accelerations(name, "thrust")
+    assert result["V"] == approx(-0.5 * 0.6 * GRAVITY, rel=0.02)
+    assert [result["q"], result["r"]] == approx([0.0, 0.0], abs=1e-3)
 
 
 def test_thrust_of_flying_wing_in_trim_is_its_drag() -> None:
@@ -82,8 +82,8 @@ def test_thrust_of_flying_wing_in_trim_is_its_drag() -> None:
 
     The column is that of the file in which no thrust has a part.
     """
-    found = accelerations("x8_elevons", "thrust")
-    assert found["V"] == approx(-0.1142 * 18.0 / 2.0, rel=2e-3)
+    result = accelerations("x8_elevons", "thrust")
+    assert result["V"] == approx(-0.1142 * 18.0 / 2.0, rel=2e-3)
 
 
 @pytest.mark.parametrize("number", range(1, 7))
@@ -99,10 +99,10 @@ def test_hexarotor_loses_a_sixth_of_its_lift_and_the_moments_of_the_rotor(number
     east = 0.275 * math.sin(angle)
     roll, pitch = np.array([-east, north]) * thrust / 0.02  # of a thrust up: r x F
     yaw = 0.016 * thrust / 0.035 * (1.0 if number % 2 else -1.0)
-    found = accelerations(HEXAROTOR, f"rotor_{number}")
-    assert found["w"] == approx(GRAVITY / 6.0, rel=2e-3)  # down
+    result = accelerations(HEXAROTOR, f"rotor_{number}")
+    assert result["w"] == approx(GRAVITY / 6.0, rel=2e-3)  # down
     expected = np.array([-roll, -pitch, -yaw])
-    assert [found[rate] for rate in "pqr"] == approx(expected.tolist(), rel=2e-3, abs=1e-3)
+    assert [result[rate] for rate in "pqr"] == approx(expected.tolist(), rel=2e-3, abs=1e-3)
 
 
 def positions(params: AircraftConfig, commands: list[float]) -> FloatArray:
@@ -151,10 +151,10 @@ def test_no_command_and_no_other_fault_gives_a_lost_engine_thrust(
         (("weak",), nothing_else),
     ):
         for command in (-5.0, 0.0, 5.0):
-            found = positions(
+            result = positions(
                 configured(airframe, effector, *others, **properties), [command] * count
             )
-            assert found[:, place].tolist() == [nothing] * len(found)
+            assert result[:, place].tolist() == [nothing] * len(result)
 
 
 def refusal(airframe: str, *faults: str, **actuators: Any) -> str:

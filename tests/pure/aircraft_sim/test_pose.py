@@ -57,21 +57,21 @@ def test_velocity_over_ground_is_airspeed_turned_from_body_axes_to_north_east_do
 
 
 def test_a_start_elsewhere_turns_and_moves_the_flight() -> None:
-    flown = dict.fromkeys(POSE, 0.0) | {
+    pose_in_air = dict.fromkeys(POSE, 0.0) | {
         "psi": 3.0,
         "north": 10.0,
         "east": 2.0,
         "v_north": 5.0,
         "v_east": -1.0,
     }
-    moved = pose.over_ground(
-        np.array([*flown.values()]), 0.0, (0.0, 0.0), pose.Start(100.0, -50.0, math.pi / 2.0)
+    after = pose.over_ground(
+        np.array([*pose_in_air.values()]), 0.0, (0.0, 0.0), pose.Start(100.0, -50.0, math.pi / 2.0)
     )
-    found = dict(zip(POSE, moved.tolist(), strict=True))
+    result = dict(zip(POSE, after.tolist(), strict=True))
     # A quarter turn to the right: what was ahead is east, what was to the right is south.
-    assert (found["north"], found["east"]) == approx((100.0 - 2.0, -50.0 + 10.0))
-    assert (found["v_north"], found["v_east"]) == approx((1.0, 5.0))
-    assert found["psi"] == approx(3.0 + math.pi / 2.0 - 2.0 * math.pi)
+    assert (result["north"], result["east"]) == approx((100.0 - 2.0, -50.0 + 10.0))
+    assert (result["v_north"], result["v_east"]) == approx((1.0, 5.0))
+    assert result["psi"] == approx(3.0 + math.pi / 2.0 - 2.0 * math.pi)
 
 
 def euler_rates(x: dict[str, float]) -> dict[str, float]:
@@ -150,7 +150,7 @@ def test_pose_of_airframe_agrees_with_another_integrator() -> None:
     exact = solve_ivp(derivative, (0.0, 5.0), np.zeros(12), rtol=1e-10, atol=1e-12).y[:, -1]
     for number in range(int(5.0 * RATE) + 1):
         simulator.sample(number, u if number else np.zeros(4))
-    found = dict(zip(POSE, simulator.pose().tolist(), strict=True))
+    result = dict(zip(POSE, simulator.pose().tolist(), strict=True))
     expected = {
         "phi": exact[states.index("phi")],
         "psi": exact[8],
@@ -161,7 +161,7 @@ def test_pose_of_airframe_agrees_with_another_integrator() -> None:
     assert abs(exact[states.index("phi")]) > 0.05  # it has rolled
     for name, value in expected.items():
         # m and rad: the trapezoidal rule at 100 Hz.
-        assert found[name] == approx(value, abs=2e-3), name
+        assert result[name] == approx(value, abs=2e-3), name
 
 
 def guided(signal: Signal) -> dict[str, Any]:
@@ -192,27 +192,27 @@ def test_steady_wind_moves_position_and_nothing_else(scenario: Any) -> None:
 
 def test_pose_of_jsbsim_is_absolute_and_consistent() -> None:
     tape = simulate(C172P.vary(flight={"duration": 20.0}, aircraft=QUIET))
-    found = tape["pose"]
+    result = tape["pose"]
     t = tape.time("pose")
     truth = tape["truth"].group("x")
     speed = C172P.aircraft.speed
     altitude = C172P.aircraft.altitude
-    assert (found["v_north"][0], found["altitude"][0]) == (
+    assert (result["v_north"][0], result["altitude"][0]) == (
         approx(speed, rel=1e-3),
         approx(altitude, rel=1e-6),
     )
-    at = np.isin(tape["truth"].stamp_ns, found.stamp_ns)
+    at = np.isin(tape["truth"].stamp_ns, result.stamp_ns)
     # Truth holds deviations from trim.
     for name in ("theta", "altitude", "phi"):
-        assert found[name] - found[name][0] == approx(truth[name][at] - truth[name][0], abs=1e-9), (
-            name
-        )
+        assert result[name] - result[name][0] == approx(
+            truth[name][at] - truth[name][0], abs=1e-9
+        ), name
     # JSBSim integrates the altitude, the model the place from JSBSim's velocities: the derivatives
     # of both are the velocities.
     for position, velocity in (("altitude", "climb"), ("north", "v_north"), ("east", "v_east")):
-        slope = np.gradient(found[position], t)
-        assert slope[1:-1] == approx(found[velocity][1:-1], abs=0.05), position
-    assert np.abs(found["phi"]).max() > 0.1  # the scenario banks
+        slope = np.gradient(result[position], t)
+        assert slope[1:-1] == approx(result[velocity][1:-1], abs=0.05), position
+    assert np.abs(result["phi"]).max() > 0.1  # the scenario banks
 
 
 def test_place_of_jsbsim_is_that_of_own_latitude_and_longitude() -> None:
@@ -225,13 +225,13 @@ def test_place_of_jsbsim_is_that_of_own_latitude_and_longitude() -> None:
     for number in range(int(60.0 * aircraft.rate) + 1):
         pulse = 2.0 < number / aircraft.rate < 3.0
         simulator.sample(number, np.array([0.0, 0.0, 0.05 if pulse else 0.0, 0.0]))
-    found = dict(zip(POSE, simulator.pose().tolist(), strict=True))
+    result = dict(zip(POSE, simulator.pose().tolist(), strict=True))
     radius = 0.3048 * model._fdm["position/radius-to-vehicle-ft"]
     north, east = (
         radius * (model._fdm[path] - before) for path, before in zip(angles, start, strict=True)
     )
     assert abs(start[0]) < 1e-12  # it flies from the equator: no cosine of the latitude
-    assert (found["north"], found["east"]) == (approx(north, rel=0.01), approx(east, rel=0.01))
+    assert (result["north"], result["east"]) == (approx(north, rel=0.01), approx(east, rel=0.01))
     assert east > 300.0  # m: it has turned
 
 

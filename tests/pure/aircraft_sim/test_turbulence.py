@@ -97,9 +97,9 @@ def test_lengths_and_intensities_are_those_published(
     lengths: tuple[float, ...],
     intensities: tuple[float, ...],
 ) -> None:
-    found = dryden(feet * FEET, wind * KNOTS, sigma * KNOTS)
-    assert found.length == approx(np.array(lengths) * FEET)
-    assert found.sigma == approx(np.array(intensities) * KNOTS)
+    result = dryden(feet * FEET, wind * KNOTS, sigma * KNOTS)
+    assert result.length == approx(np.array(lengths) * FEET)
+    assert result.sigma == approx(np.array(intensities) * KNOTS)
 
 
 def continuous(model: Dryden) -> tuple[FloatArray, FloatArray]:
@@ -197,7 +197,7 @@ def test_rotary_gusts_have_the_published_intensities(dt: float) -> None:
     # behind the lags of q_g and r_g, an error of dt / T of the variance: T_r is 0.11 s.
     params = filters(SMALL, V0, dt, range(6), 1, SPAN)
     (p, q, r), spread = params.output[3:], params.stationary
-    found = [float(np.sqrt(row @ spread @ spread.T @ row)) for row in (p, q, r)]
+    result = [float(np.sqrt(row @ spread @ spread.T @ row)) for row in (p, q, r)]
 
     def phi_p(omega: float) -> float:
         L = SMALL.length[2]
@@ -216,7 +216,7 @@ def test_rotary_gusts_have_the_published_intensities(dt: float) -> None:
         quad(phi, 0.0, np.inf, args=(2, 4.0))[0],
         quad(phi, 0.0, np.inf, args=(1, 3.0))[0],
     ]
-    assert_allclose(found, np.sqrt(published), rtol=dt / 0.1 + 1e-6)
+    assert_allclose(result, np.sqrt(published), rtol=dt / 0.1 + 1e-6)
 
 
 def test_the_air_turns_nose_up_where_the_wind_down_falls_along_the_flight() -> None:

@@ -68,10 +68,10 @@ def test_vane_reads_angle_relative_to_air() -> None:
         "lateral": {"start": 0.0, "speed": -3.0, "length": 8.0},
     }
     turbulent = {"altitude": 100.0, "wind": 7.7}
-    found = aircraft_parameters(
+    result = aircraft_parameters(
         vanes={"channels": ["beta", "alpha"]}, gusts=gusts, turbulence=turbulent
     )
-    simulator = Simulator(found)
+    simulator = Simulator(result)
     assert simulator.outputs == ("q", "V", "p", "r", "beta", "alpha")
     speed = load_airframe("osprey").speed
     for number in range(30):
@@ -119,18 +119,18 @@ def test_frozen_vane_keeps_its_angle_and_lost_reading_repeats_one_before() -> No
 
 
 def test_a_vane_freezes_in_flight() -> None:
-    found = aircraft_parameters(vanes={"channels": ["alpha"]})
-    simulator = Simulator(found)
+    result = aircraft_parameters(vanes={"channels": ["alpha"]})
+    simulator = Simulator(result)
     u = np.array([0.05, 0.0, 0.0, 0.0])
-    read = [simulator.sample(number, u)[0].value[4] for number in range(20)]
+    contents = [simulator.sample(number, u)[0].value[4] for number in range(20)]
     simulator.retune(
-        found.validate_mapping(
-            found.model_dump() | {"vanes": {"channels": ["alpha"], "frozen_at": [0.2]}}, ""
+        result.validate_mapping(
+            result.model_dump() | {"vanes": {"channels": ["alpha"], "frozen_at": [0.2]}}, ""
         )
     )
     after = [simulator.sample(number, u)[0].value[4] for number in range(20, 30)]
-    assert read[-1] != read[-2]
-    assert set(after) == {read[-1]}
+    assert contents[-1] != contents[-2]
+    assert set(after) == {contents[-1]}
 
 
 # The observer
@@ -155,8 +155,8 @@ def test_gain_with_vane_is_that_of_the_stationary_filter() -> None:
     row = np.array(
         [1.0 * (name == "x.alpha") - 0.04 * (name == "wind.vertical") for name in sampled.states]
     )
-    found = vane_correction(sampled, model, (weights, weights), row, 0.0035)
-    L = np.column_stack([aircraft_correction(sampled, model, weights), np.zeros(len(row))]) + found
+    result = vane_correction(sampled, model, (weights, weights), row, 0.0035)
+    L = np.column_stack([aircraft_correction(sampled, model, weights), np.zeros(len(row))]) + result
     # The same filter by scipy.
     H = np.vstack([sampled.H, row])
     noise = np.diag(np.append(model.noise, 0.0035) ** 2)
@@ -200,13 +200,13 @@ def test_still_vane_is_left_out_and_moving_vane_corrects() -> None:
             correct(state, measured, np.float64(0.01), without_frozen(params, frozen)).z
         )
 
-    alone = z + params.L @ (e - params.H @ z)
+    single = z + params.L @ (e - params.H @ z)
     assert_array_equal(corrected(none, [False, False]), corrected(np.ones(2), [True, True]))
-    assert_allclose(corrected(none, [False, False]), alone, rtol=1e-12)
+    assert_allclose(corrected(none, [False, False]), single, rtol=1e-12)
     one = np.append(e - params.H @ z, (reading - params.vanes.H @ z)[1])
     assert_allclose(
         corrected(np.ones(2), [True, False]),
-        alone + params.vanes.L[1] @ one,
+        single + params.vanes.L[1] @ one,
         rtol=1e-12,
         atol=1e-12,
     )
@@ -217,10 +217,10 @@ def test_still_vane_is_left_out_and_moving_vane_corrects() -> None:
 
 def test_vanes_lower_errors_in_turbulence_and_flight_replays() -> None:
     tape = simulate(SHORT)
-    alone = rms(simulate(SHORT.vary(controller=SHORT.controller.without_vanes().model_dump())))
+    single = rms(simulate(SHORT.vary(controller=SHORT.controller.without_vanes().model_dump())))
     # Measured 0.79 in q in 12 s of moderate turbulence; 200 aircraft in
     # docs/evidence/tables/laws-vanes.csv.
-    assert rms(tape)[0] < 0.9 * alone[0]
+    assert rms(tape)[0] < 0.9 * single[0]
     replayed = replay(tape)
     assert replayed.equal()
     assert replayed.checked.all()

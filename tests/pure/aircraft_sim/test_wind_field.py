@@ -160,6 +160,6 @@ def test_start_heading_turns_the_flight_and_not_the_wind() -> None:
     ],
 )
 def test_wind_field_that_cannot_be_is_refused(section: dict[str, Any], sentence: str) -> None:
-    with pytest.raises(ParameterError) as refused:
+    with pytest.raises(ParameterError) as error:
         config(**section)
-    assert str(refused.value).startswith(f"aircraft.{sentence}")
+    assert str(error.value).startswith(f"aircraft.{sentence}")

@@ -29,10 +29,10 @@ class Sequence:
 
     def refuses(self, now: float, since_boot: float | None, address: str = FIRST) -> str:
         """The sentence with which the lock refuses a message."""
-        with pytest.raises(ChannelError) as refused:
+        with pytest.raises(ChannelError) as error:
             self.takes(now, since_boot, address)
-        assert refused.value.reason == "sender"
-        return str(refused.value)
+        assert error.value.reason == "sender"
+        return str(error.value)
 
 
 def test_first_address_is_taken_until_it_is_silent_then_the_next_one() -> None:

@@ -308,9 +308,9 @@ def test_stamps_of_another_clock_and_samples_out_of_order_refused() -> None:
     content = CHANNEL_MAP.model_dump()
     content["outputs"]["q"]["stamp"] = "header"
     bridge = new_bridge(ChannelMap.validate_mapping(content, "map"))
-    with pytest.raises(ChannelError, match="stamp: arrival") as refused:
+    with pytest.raises(ChannelError, match="stamp: arrival") as error:
         bridge.take_output("q", 0.0, nanoseconds(12.0), at(0.0))  # time since boot
-    assert refused.value.reason == "stamp"
+    assert error.value.reason == "stamp"
     bridge.take_output("q", 0.0, at(0.0), at(0.0))
     with pytest.raises(ChannelError, match="before the last one"):
         bridge.take_output("q", 0.0, at(0.0), at(0.01))
@@ -991,10 +991,10 @@ def test_flight_ends_once_log_holds_it(
         is_flying=lambda: True,
     )
     monitor = SimpleNamespace(learned=list, engagement=list, newest=lambda: None, recorded=recorded)
-    told = followed(
+    sentence = followed(
         cast("FlightProcesses", processes), cast("FlightMonitor", monitor), begins=begins
     )
-    assert str(told) == outcome
+    assert str(sentence) == outcome
     assert now[0] == approx(end, abs=0.1)
 
 

@@ -203,13 +203,13 @@ def test_lost_message_does_not_end_engagement(name: str) -> None:
         (row.topic, row.max_age) for row in channel_map.conditions.values()
     ]
     for topic, rate in MEASURED[name].items():
-        found = [
+        result = [
             age
             for full, age in ages
             if full.removeprefix("/fmu/out/").removeprefix("/ap/").removeprefix("mavlink/") == topic
         ]
-        assert found, topic
-        assert min(found) > 2.0 / rate, topic
+        assert result, topic
+        assert min(result) > 2.0 / rate, topic
 
 
 def test_check_map_tells_which_rows_hold_for_each_release(tmp_path: Path) -> None:
@@ -247,9 +247,9 @@ def test_check_map_tells_which_rows_hold_for_each_release(tmp_path: Path) -> Non
         "conditions.armed": ["", status],
         "conditions.offboard": ["", status],
     }
-    alone = invoke("check", "px4", *options[:2])
-    assert alone.exit_code == 0
-    assert "1: 24 of 24 rows hold" in alone.output
+    single = invoke("check", "px4", *options[:2])
+    assert single.exit_code == 0
+    assert "1: 24 of 24 rows hold" in single.output
     refused = invoke("check", "px4", "--definitions", str(tmp_path / "1" / "msg"))
     assert "expected a folder with the sources of a message package" in str(refused.exception)
 
@@ -445,9 +445,9 @@ def test_values_of_integer_fields_rounded_and_never_wrapped() -> None:
 
 @pytest.mark.parametrize("raw", [math.nan, math.inf])
 def test_value_that_is_not_finite_refused(raw: float) -> None:
-    with pytest.raises(ChannelError, match="not finite") as refused:
+    with pytest.raises(ChannelError, match="not finite") as error:
         read_raw(Message(q=raw), "q", "value")
-    assert refused.value.reason == "finite"
+    assert error.value.reason == "finite"
 
 
 def test_missing_message_package_is_one_sentence_that_tells_how_to_get_it() -> None:
@@ -508,9 +508,9 @@ def test_bad_map_is_one_sentence_that_names_row(
         part[key] = dict(part[key])  # merged keys share one object
         part = part[key]
     part[place[-1]] = value
-    with refusing(sentence) as refused:
+    with refusing(sentence) as error:
         ChannelMap.validate_mapping(content, "map test")
-    assert "\n" not in str(refused.value)
+    assert "\n" not in str(error.value)
 
 
 def test_a_missing_map_is_one_sentence() -> None:

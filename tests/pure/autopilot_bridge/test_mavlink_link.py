@@ -265,14 +265,14 @@ def test_next_sender_gets_the_messages_once_the_first_one_is_silent(
     until(first.received, first.beat)
     until(second.received, second.beat)
     first.received()
-    sent: list[Any] = []
+    messages: list[Any] = []
 
     def send() -> None:
         second.beat()
         made.send(mavlink_type("RC_CHANNELS_OVERRIDE")())
-        sent.extend(second.received())
+        messages.extend(second.received())
 
-    until(lambda: "RC_CHANNELS_OVERRIDE" in [message.get_type() for message in sent], send)
+    until(lambda: "RC_CHANNELS_OVERRIDE" in [message.get_type() for message in messages], send)
     assert first.received() == []
 
 
@@ -337,13 +337,13 @@ def test_link_over_tcp_receives_and_sends(ends: Ends) -> None:
     autopilot.attitude(0.1, since_boot=50.0)
     until(lambda: queue, autopilot.received)
     assert queue[0].message.pitchspeed == approx(0.1)
-    received: list[Any] = []
+    messages: list[Any] = []
 
     def send() -> None:
         made.send(mavlink_type("RC_CHANNELS_OVERRIDE")())
-        received.extend(message.get_type() for message in autopilot.received())
+        messages.extend(message.get_type() for message in autopilot.received())
 
-    until(lambda: "RC_CHANNELS_OVERRIDE" in received, send)
+    until(lambda: "RC_CHANNELS_OVERRIDE" in messages, send)
 
 
 def test_second_sender_with_the_number_of_the_bridge_is_conflict(ends: Ends) -> None:

@@ -281,8 +281,8 @@ def test_end_of_any_node_ends_launch_with_error(case: Case, tmp_path: Path) -> N
                 node.on_exit(ProcessExited(f"{executable}-1", status), context)
             if "recorder" in first:
                 text = next(tmp_path.glob("runs/*/outcome")).read_text()
-                told = ended_early(f"{executable}-1 ended before the flight did")
-                assert parsed_outcome(text) == told
+                sentence = ended_early(f"{executable}-1 ended before the flight did")
+                assert parsed_outcome(text) == sentence
             context.is_shutdown = True
             assert node.on_exit(ProcessExited(f"{executable}-1", status), context) is None
 
@@ -313,8 +313,8 @@ def test_node_of_first_stage_that_is_never_ready_ends_launch(case: Case, tmp_pat
     with pytest.raises(RuntimeError, match=f"^never flew: {first[-1]} not ready after 20 s$"):
         require_ready.function(context)
     left = [file.read_text() for file in tmp_path.glob("runs/*/outcome")]
-    told = never_flew(f"{first[-1]} not ready after 20 s").text()
-    assert left == ([told] if "recorder" in first else [])
+    sentence = never_flew(f"{first[-1]} not ready after 20 s").text()
+    assert left == ([sentence] if "recorder" in first else [])
     publish(actions, context, f"/{first[-1]}#{PID}")
     assert require_ready.function(context) is None
 
@@ -406,9 +406,9 @@ def test_flight_begins_once_all_are_matched_and_ends_once_log_holds_it(tmp_path:
         RuntimeError, match=r"^ended early: the log holds y, y_m and u up to t = 4\.900 of 5 s$"
     ):
         give_up.function(context)
-    flown = flown_to(context, follow, start + 5.0)
-    assert ends(flown)
-    (leave,) = every(OpaqueFunction, flown)
+    flight = flown_to(context, follow, start + 5.0)
+    assert ends(flight)
+    (leave,) = every(OpaqueFunction, flight)
     leave.function(context)
     text = (next(tmp_path.glob("*-osprey_servo")) / "outcome").read_text(encoding="utf-8")
     assert parsed_outcome(text) == COMPLETED

@@ -70,5 +70,5 @@ def test_margins_of_what_ships(path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     nominal, worst = (math.degrees(margins_of.phase.min()) for margins_of in (of.nominal, of.worst))
     needed = NOMINAL if scenario.controller.observer is None else OBSERVED
     meets = nominal >= needed and worst >= WORST and of.nominal.sensitivity.max() <= SENSITIVITY
-    found = f"{nominal:.1f} deg, worst {worst:.1f} deg, S {of.nominal.sensitivity.max():.2f}"
-    assert meets != line.startswith(STATED[1]), found
+    result = f"{nominal:.1f} deg, worst {worst:.1f} deg, S {of.nominal.sensitivity.max():.2f}"
+    assert meets != line.startswith(STATED[1]), result

@@ -258,22 +258,22 @@ def test_figures_of_a_mission_leave_out_what_is_no_leg() -> None:
     """
     route = {"north": [0.0, 100.0], "east": [0.0, 0.0], "altitude": [0.0, 0.0]}
     section = {"route": route, "home": {"north": -30.0}}
-    flight = ROUTE.vary(flight={"duration": 14.0}, guidance=section)
+    scenario = ROUTE.vary(flight={"duration": 14.0}, guidance=section)
     fence = {
         "field": {"north": [-400.0, 400.0, 400.0, -400.0], "east": [-400.0, -400.0, 400.0, 400.0]}
     }
-    fenced = flight.vary(guidance={"fence": fence})
+    fenced = scenario.vary(guidance={"fence": fence})
     tape = simulate(fenced)
     log = tape["guidance"]
     assert fenced.guidance is not None
-    assert flight.guidance is not None
+    assert scenario.guidance is not None
     assert log["leg"][-1] == 1
     assert np.abs(log["xtrack"]).max() > 60.0
     figures = single_flights.mission_figures(tape, fenced.guidance)
     assert figures["max.xtrack"] < 5.0
     assert figures["max.breach"] == 0.0
     assert figures["home"] == approx(math.hypot(log["pose.north"][-1] + 30.0, log["pose.east"][-1]))
-    assert "home" not in single_flights.mission_figures(simulate(flight), flight.guidance)
+    assert "home" not in single_flights.mission_figures(simulate(scenario), scenario.guidance)
 
 
 @pytest.mark.parametrize(
@@ -352,9 +352,9 @@ def test_aircraft_that_learn_fly_as_in_single_process_simulation(tmp_path: Path)
     assert tally.without_model() == 1
     assert figure_rows(tally, {})[-4] == ["first model (s)", *["1.5"] * 5]
     for number, proposal in enumerate((model, bare)):
-        alone = flown_alone(campaign, number, proposing(proposal))
+        single = flown_alone(campaign, number, proposing(proposal))
         row = rows.row(number, named=True)
-        assert {name: row[name] for name in alone} == alone
+        assert {name: row[name] for name in single} == single
     again = campaign.definition.aircraft_scenario(0)
     assert again.aircraft.sampled_airframe().matrix_b()[2, 0] == rows["B[q,elevator]"][0]
 
@@ -373,12 +373,12 @@ def test_quick_learner_of_campaign_finds_what_learner_of_node_finds(
     campaign = flown_rows(tmp_path / "real", scenario, scenario_learner.quick_learner, 1)
     row = campaign.rows().collect().row(0, named=True)
     assert (row["first_model"], row["models"]) == (14.5, 1)
-    alone = flown_alone(campaign, 0, scenario_learner.learner)
+    single = flown_alone(campaign, 0, scenario_learner.learner)
     # The searches end within 0.3 of log-likelihood: 20 aircraft differ by up to 0.2 deviations.
     for near, thorough in zip(*(each.entries for each in identified[::2]), strict=True):
         assert near.error == approx(thorough.error, abs=0.2 * thorough.deviation)
     # The searches of a design may end a step of 5 % apart, which moves an rms by 0.5 %.
-    assert {name: row[name] for name in alone} == approx(alone, rel=1e-2)
+    assert {name: row[name] for name in single} == approx(single, rel=1e-2)
 
 
 def test_campaign_flies_effect_of_wind_that_definition_names(tmp_path: Path) -> None:
@@ -508,23 +508,23 @@ def test_results_have_margins_beside_score(tmp_path: Path) -> None:
     campaign = fly_campaign(
         tmp_path / "swept", definition(6, 6, Sweep(parameter="softening", factors=(1.0, 4.0)))
     )
-    found = [campaign.margins(case) for case in range(2)]
+    result = [campaign.margins(case) for case in range(2)]
     tallies = [campaign.tally(case) for case in range(2)]
-    rows = {name: cells for name, *cells in overview(campaign.definition, tallies, found).rows}
+    rows = {name: cells for name, *cells in overview(campaign.definition, tallies, result).rows}
     narrow, wide = (float(cell.split()[0]) for cell in rows["phase margin, deg"])
     assert narrow < wide  # a wider sign integrates more slowly
     assert rows["score, mean"] == [f"{tally.figures['score'].mean:.3g}" for tally in tallies]
-    flown = [campaign.definition.aircraft_scenario(number, 1) for number in range(6)]
-    airframes = [scenario.aircraft.sampled_airframe() for scenario in flown]
+    scenarios = [campaign.definition.aircraft_scenario(number, 1) for number in range(6)]
+    airframes = [scenario.aircraft.sampled_airframe() for scenario in scenarios]
     loops = [
-        linear_loop(flown[0].controller, frame, frame.matrix_a()[None], frame.matrix_b()[None])
+        linear_loop(scenarios[0].controller, frame, frame.matrix_a()[None], frame.matrix_b()[None])
         for frame in airframes
     ]
     phases = [input_margins(loop.nominal, loop.law, loop.loop).phase.min() for loop in loops]
-    assert found[1] is not None
-    assert found[1].worst is not None
+    assert result[1] is not None
+    assert result[1].worst is not None
     # A search over the box is at or below each aircraft that flies.
-    assert found[1].worst.phase.min() < min(phases)
+    assert result[1].worst.phase.min() < min(phases)
 
 
 @pytest.fixture
@@ -567,8 +567,8 @@ def test_damaged_chunk_or_chunk_of_another_campaign_named(
 
 def test_results_name_entry_that_decides_score_and_its_worst_corner(flown: MonteCarlo) -> None:
     words = ["campaign", str(flown.folder)]
-    shown = invoke(*words).stdout
-    assert "B[p,aileron]" in shown
+    output = invoke(*words).stdout
+    assert "B[p,aileron]" in output
     ranked = json.loads((flown.folder / SUMMARY).read_text())["cases"][0]["influence"]
     published = find_scenario("osprey_servo").aircraft.load()[0].matrix_b()[5, 2]
     assert ranked["entries"] == [
@@ -604,8 +604,8 @@ def test_campaign_is_not_continued_with_another_definition(flown: MonteCarlo) ->
     sentence = refusal(str(flown.folder), "--aircraft", "1000")
     assert (
         sentence
-        == "--aircraft: found it beside a folder, expected none: the folder of a campaign holds "
-        "its definition"
+        == "--aircraft: found the folder of a campaign beside it, expected none: the folder of a "
+        "campaign holds its definition"
     )
 
 
@@ -648,10 +648,10 @@ def figures(process: "subprocess.Popen[str]") -> list[object]:
 
 def wait_for_chunks(runs: Path, count: int, process: "subprocess.Popen[str]") -> Path:
     """Wait until so many chunks of the one campaign in `runs` are done; return its folder."""
-    while len(found := list(runs.glob(f"*/{CHUNKS}/*.parquet"))) < count:
+    while len(result := list(runs.glob(f"*/{CHUNKS}/*.parquet"))) < count:
         assert process.poll() is None, process.communicate()
         time.sleep(0.02)
-    return found[0].parents[1]
+    return result[0].parents[1]
 
 
 @pytest.fixture(scope="module")
@@ -716,10 +716,10 @@ def test_campaign_goes_on_with_scheduler_that_is_back() -> None:
 
     with cluster(0) as first:
         address = first.scheduler_address
-        flown = engines.dask(2, address)(square, [(k,) for k in range(20)])
-        results = [next(flown) for _ in range(3)]
+        chunks = engines.dask(2, address)(square, [(k,) for k in range(20)])
+        results = [next(chunks) for _ in range(3)]
     with cluster(int(address.rsplit(":", 1)[1])):
-        results += list(flown)
+        results += list(chunks)
     assert sorted(results) == [((k,), k**2) for k in range(20)]
 
 
@@ -777,8 +777,8 @@ def test_each_worker_of_a_local_cluster_has_a_device_of_its_own(
         return [{"CUDA_VISIBLE_DEVICES": name} for name in ("2", "5")]
 
     monkeypatch.setattr(engines, "_separate_devices", two_devices)
-    flown = list(engines.dask()(device_of, [(k,) for k in range(12)]))
-    assert {name for _, name in flown} == {"2", "5"}
+    devices = list(engines.dask()(device_of, [(k,) for k in range(12)]))
+    assert {name for _, name in devices} == {"2", "5"}
 
 
 def test_devices_of_a_process_are_shared_out(monkeypatch: pytest.MonkeyPatch) -> None:

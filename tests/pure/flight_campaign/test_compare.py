@@ -111,20 +111,20 @@ def test_score_of_campaign_is_that_of_single_process_simulation(
         "K": np.array([controller.law_params().K]).T,
         "softening": np.atleast_2d(short.scenario.rise_di().softening).T,
     }
-    (found,) = law_comparison.compare(short, {"rise": {"gust": as_tuned(gains)}}, 1, [0.3], 1)
+    (result,) = law_comparison.compare(short, {"rise": {"gust": as_tuned(gains)}}, 1, [0.3], 1)
     turbulence = MODERATE | {"seed": tuning.TUNING_TURBULENCE_SEED}
-    flown = (
+    parts = (
         short.scenario
         if wind == GUST
         else short.scenario.vary(aircraft={"gusts": {}, "turbulence": turbulence})
     )
-    true = error(simulate(flown))
+    true = error(simulate(parts))
     rms = np.array([error_metrics(true[name]).rms for name in controller.outputs])
     # The campaign holds the nonlinear remainder over a tick, the simulation does not: far below the
     # 1 % that a score needs.
-    assert found.scores[wind] == approx(float(np.sum(rms / short.unit)), rel=2e-3)
+    assert result.scores[wind] == approx(float(np.sum(rms / short.unit)), rel=2e-3)
     if wind == GUST:
-        assert_allclose(found.rms, rms, rtol=2e-3)
+        assert_allclose(result.rms, rms, rtol=2e-3)
 
 
 def test_scenario_with_turbulence_is_compared_in_its_own(short: Benchmark) -> None:
@@ -132,34 +132,34 @@ def test_scenario_with_turbulence_is_compared_in_its_own(short: Benchmark) -> No
         flight={"duration": 0.1},
         aircraft={"turbulence": {"altitude": 3000.0, "sigma": 1.5, "seed": 9}},
     )
-    flown = tuning.build_benchmark(own, 3).scenarios[TURBULENCE].aircraft
-    assert flown.turbulence is not None
-    assert (flown.turbulence.altitude, flown.turbulence.sigma, flown.turbulence.seed) == (
+    aircraft = tuning.build_benchmark(own, 3).scenarios[TURBULENCE].aircraft
+    assert aircraft.turbulence is not None
+    assert (aircraft.turbulence.altitude, aircraft.turbulence.sigma, aircraft.turbulence.seed) == (
         3000.0,
         1.5,
         3,
     )
-    assert flown.gusts == {}
+    assert aircraft.gusts == {}
 
 
 def test_share_of_lost_aircraft_is_that_of_first_level_by_delay_of_u(short: Benchmark) -> None:
     # K of 40 1/s and the 35 ms of the loop of q are 1.4 rad at the crossover: stable below pi/2;
     # with 60 ms more it is unstable
     fast = as_tuned({"K": np.full((4, 1), 40.0), "Lambda": np.ones((4, 1))})
-    (found,) = law_comparison.compare(
+    (result,) = law_comparison.compare(
         short, {"pi": {"gust": fast}}, 3, [0.3, 0.5], 1, delays=(0, 6)
     )
-    assert found.lost_late == {0.0: 0.0, 0.06: 1.0}
-    assert found.levels[0].scores[GUST].lost == 0.0
+    assert result.lost_late == {0.0: 0.0, 0.06: 1.0}
+    assert result.levels[0].scores[GUST].lost == 0.0
 
 
 def test_tuned_gains_written_to_new_folder_or_refused_in_sentence(tmp_path: Path) -> None:
     path = tmp_path / "one" / "two" / "gains.yaml"
-    found = TuningResult(gains={"K": [1.0]}, cost=2.0, seed=1, costs=[2.0, 3.0], evaluations=100)
-    tuned_gains.save(path, {"pi": {"gust": found}}, ["gust"], "a command")
-    assert tuned_gains.load(path) == {"pi": {"gust": found}}
+    result = TuningResult(gains={"K": [1.0]}, cost=2.0, seed=1, costs=[2.0, 3.0], evaluations=100)
+    tuned_gains.save(path, {"pi": {"gust": result}}, ["gust"], "a command")
+    assert tuned_gains.load(path) == {"pi": {"gust": result}}
     with refusing(r"cannot be written \(.*\), expected a file of tuned gains that can$"):
-        tuned_gains.save(path / "gains.yaml", {"pi": {"gust": found}}, ["gust"], "a command")
+        tuned_gains.save(path / "gains.yaml", {"pi": {"gust": result}}, ["gust"], "a command")
 
 
 @pytest.mark.parametrize("name", SHIPPED)
@@ -306,10 +306,10 @@ def test_margins_of_tuned_gains_are_those_of_the_registered_law(short: Benchmark
             replace(short.scenario, controller=AnyLaw.validate_mapping(section, "controller"))
         ).nominal
         wide = {key: np.concatenate([0.9 * gain, gain], axis=1) for key, gain in gains.items()}
-        found = nominal_margins(LAWS[name], wide, short.model)
-        assert found.phase.shape == (2, 4)
+        result = nominal_margins(LAWS[name], wide, short.model)
+        assert result.phase.shape == (2, 4)
         for key in ("phase", "sensitivity", "damping"):
-            assert_allclose(getattr(found, key)[1], getattr(expected, key), rtol=1e-6)
+            assert_allclose(getattr(result, key)[1], getattr(expected, key), rtol=1e-6)
 
 
 def test_search_within_margins_has_them(short: Benchmark) -> None:
@@ -334,11 +334,11 @@ def test_written_controller_is_the_law_that_was_tuned(name: str, short: Benchmar
     result = tuned_gains.load(tuned_gains.TUNED / "osprey_servo.yaml")[name]["gust_turbulence"]
     controller = tuned_controller.tuned_controller(name, result, short)
     text = section_yaml(controller, short.scenario.aircraft.load()[0], None, "by a test", {})
-    read = AnyLaw.validate_mapping(
+    contents = AnyLaw.validate_mapping(
         yaml.safe_load(text)["/**/controller"]["ros__parameters"], "controller"
     )
-    assert (read.feedforward is None) == (LAWS[name].feedforward == "none")
-    law, params = read.tuned_law()
+    assert (contents.feedforward is None) == (LAWS[name].feedforward == "none")
+    law, params = contents.tuned_law()
     of_catalogue = LAWS[name].control_law(short.model)
     sets = LAWS[name].params(tuning.as_gains(result), short.model)
     generator = np.random.default_rng(1)

@@ -84,8 +84,8 @@ def alone(scenario: Scenario, number: int) -> dict[str, FloatArray]:
     e = np.array([true[name][true.stamp_ns % period == 0] for name in scenario.controller.outputs])
     u = np.array([tape["u"][name] for name in scenario.controller.effectors])
     # A tick without a new y publishes no u.
-    moved = np.abs(np.diff(u, axis=1, prepend=0.0)).sum(axis=1)
-    slew = moved / scenario.flight.duration
+    after = np.abs(np.diff(u, axis=1, prepend=0.0)).sum(axis=1)
+    slew = after / scenario.flight.duration
     return {"rms": np.sqrt((e**2).mean(axis=1)), "max": np.abs(e).max(axis=1), "slew": slew}
 
 
@@ -256,12 +256,12 @@ def test_loop_without_branches_gives_the_bits_of_the_loop_with_branches(
     course = build_course(scenario)
     A, B = sampled(0.3, 5, 6)
     aircraft = batch_matrices.assemble(A, B, scenario.aircraft.plant(), course)
-    flown = [
+    results = [
         batch.fly(aircraft, batch.vehicle(scenario), course, CONTROL_LAW, PARAMS, schedule=schedule)
         for schedule in (batch_schedule.with_branches, batch_schedule.without_branches)
     ]
     for name in ("rms", "max", "slew", "diverged"):
-        with_branches, without = (np.asarray(getattr(result, name)) for result in flown)
+        with_branches, without = (np.asarray(getattr(result, name)) for result in results)
         assert (with_branches == without).all(), name
 
 

@@ -53,16 +53,16 @@ def test_full_disk_behind_standard_output_is_one_sentence() -> None:
 def test_flight_ends_with_table_log_and_report(
     flown: tuple[Path, subprocess.CompletedProcess[str]],
 ) -> None:
-    where, shown = flown
-    assert shown.returncode == 0, shown.stderr
+    where, output = flown
+    assert output.returncode == 0, output.stderr
     run = (where / "runs" / "latest").resolve()
     assert {path.name for path in run.iterdir()} == {
         "metadata.yaml", "report.html", "osprey_gust.yaml", "summary.json", f"{run.name}_0.mcap",
         "airframe.yaml", "parameters.yaml", "provenance.yaml",
     }  # fmt: skip
-    assert "q (deg/s)" in shown.stdout
-    assert f"runs/{run.name}/report.html" in shown.stdout
-    assert "Traceback" not in shown.stderr
+    assert "q (deg/s)" in output.stdout
+    assert f"runs/{run.name}/report.html" in output.stdout
+    assert "Traceback" not in output.stderr
 
 
 def test_summary_holds_what_was_flown(flown: tuple[Path, subprocess.CompletedProcess[str]]) -> None:
@@ -88,9 +88,9 @@ def test_report_is_one_page_that_needs_no_network(
 
 
 def test_json_is_all_that_is_printed(tmp_path: Path) -> None:
-    shown = rise_di("fly", "--in-process", "--duration", "1", "--json", cwd=tmp_path)
-    assert json.loads(shown.stdout)["duration"] == 1.0
-    assert shown.stderr == ""
+    process = rise_di("fly", "--in-process", "--duration", "1", "--json", cwd=tmp_path)
+    assert json.loads(process.stdout)["duration"] == 1.0
+    assert process.stderr == ""
 
 
 @pytest.mark.parametrize(
@@ -115,11 +115,11 @@ def test_json_is_all_that_is_printed(tmp_path: Path) -> None:
 def test_bad_input_is_one_sentence_and_status_2(
     arguments: list[str], sentence: str, tmp_path: Path
 ) -> None:
-    shown = rise_di(*arguments, cwd=tmp_path)
-    assert shown.returncode == 2
-    assert shown.stderr.startswith(sentence)
-    assert ("the section is controller perhaps" in shown.stderr) == ("controler." in sentence)
-    assert len(shown.stderr.splitlines()) == 1
+    process = rise_di(*arguments, cwd=tmp_path)
+    assert process.returncode == 2
+    assert process.stderr.startswith(sentence)
+    assert ("the section is controller perhaps" in process.stderr) == ("controler." in sentence)
+    assert len(process.stderr.splitlines()) == 1
     assert list(tmp_path.iterdir()) == []
 
 
@@ -132,13 +132,13 @@ def test_flight_with_set_parameters_has_them_in_its_log(tmp_path: Path) -> None:
         "--set",
         "flight.duration=0.2",
     )
-    shown = rise_di("fly", "osprey_learn", "--in-process", *settings, cwd=tmp_path)
-    assert shown.returncode == 0, shown.stderr
-    flown = recorded_scenario(tmp_path / "runs" / "latest")
+    process = rise_di("fly", "osprey_learn", "--in-process", *settings, cwd=tmp_path)
+    assert process.returncode == 0, process.stderr
+    scenario = recorded_scenario(tmp_path / "runs" / "latest")
     expected = find_scenario("osprey_learn").rise_di().learn
     assert expected is not None
-    assert (flown.flight.duration, flown.rise_di().k_g) == (0.2, 2.5)
-    assert flown.rise_di().learn == expected.model_copy(update={"window": 40.0})
+    assert (scenario.flight.duration, scenario.rise_di().k_g) == (0.2, 2.5)
+    assert scenario.rise_di().learn == expected.model_copy(update={"window": 40.0})
 
 
 def test_scenario_file_may_lie_anywhere_and_wrong_sign_ends_flight_when_it_diverges(
@@ -146,20 +146,20 @@ def test_scenario_file_may_lie_anywhere_and_wrong_sign_ends_flight_when_it_diver
 ) -> None:
     text = osprey_gust.path.read_text()
     (tmp_path / "mine.yaml").write_text(text.replace("D: [1, 1, 1, 1]", "D: [-1, 1, 1, 1]"))
-    flown = rise_di("fly", "mine.yaml", "--in-process", cwd=tmp_path)
-    assert flown.returncode == 3
-    assert "outcome: diverged at t = " in flown.stdout
+    process = rise_di("fly", "mine.yaml", "--in-process", cwd=tmp_path)
+    assert process.returncode == 3
+    assert "outcome: diverged at t = " in process.stdout
     assert (tmp_path / "runs" / "latest").resolve().name.endswith("-mine")
 
 
 def test_command_whose_python_package_is_missing_says_what_installs_it(tmp_path: Path) -> None:
     (tmp_path / "jax.py").write_text("raise ModuleNotFoundError('No module named jax', name='jax')")
     # -m puts the working folder first
-    shown = rise_di("campaign", "osprey_servo", "--aircraft", "1", cwd=tmp_path)
-    assert shown.returncode == 2
+    process = rise_di("campaign", "osprey_servo", "--aircraft", "1", cwd=tmp_path)
+    assert process.returncode == 2
     sentence = "error: rise-di campaign: found no Python package jax, expected it: make setup-all"
-    assert shown.stderr.splitlines()[-1] == sentence
-    assert "Traceback" not in shown.stderr
+    assert process.stderr.splitlines()[-1] == sentence
+    assert "Traceback" not in process.stderr
 
 
 @pytest.mark.parametrize("command", ["campaign", "compare"])
@@ -168,12 +168,12 @@ def test_device_that_jax_lacks_is_one_sentence_without_a_folder(
 ) -> None:
     words = [sys.executable, "-m", "flight_cli.cli", command, "osprey_servo", "--aircraft", "1"]
     environment = {**os.environ, "JAX_PLATFORMS": "nonsense"}
-    shown = subprocess.run(
+    process = subprocess.run(
         words, cwd=tmp_path, capture_output=True, text=True, check=False, env=environment
     )
-    assert shown.returncode == 2
-    assert shown.stderr.splitlines()[-1].startswith("error: JAX_PLATFORMS: found 'nonsense' (")
-    assert "Traceback" not in shown.stderr
+    assert process.returncode == 2
+    assert process.stderr.splitlines()[-1].startswith("error: JAX_PLATFORMS: found 'nonsense' (")
+    assert "Traceback" not in process.stderr
     assert list(tmp_path.iterdir()) == []
 
 
@@ -191,13 +191,13 @@ def test_folder_of_runs_that_is_not_utf_8_is_refused_before_anything_is_made(
         "0.1",
         "--runs",
     ]
-    shown = subprocess.run(
+    process = subprocess.run(
         [*map(os.fsencode, words), b"r\xff"], cwd=tmp_path, capture_output=True, check=False
     )
-    assert shown.returncode == 2
+    assert process.returncode == 2
     assert re.fullmatch(
         rb"error: --runs: found .*udcff', expected a folder with a name in UTF-8.*\n",
-        shown.stderr,
+        process.stderr,
     )
     assert list(tmp_path.iterdir()) == []
 
@@ -301,7 +301,7 @@ def test_other_option_is_refused_with_its_mend(words: str, mend: str) -> None:
     [
         ("gains osprey --observer --margin 0.9", "--margin: found 0.9, expected 0 to 0.5 s"),
         ("gains osprey --rate nan", "--rate: found nan, expected 1 to 1000 Hz"),
-        ("gains osprey --late 0.1", "--late: found it alone, expected --guarantee beside it"),
+        ("gains osprey --late 0.1", "--late: found no --guarantee, expected --guarantee beside it"),
         ("identify log --link-delay 1", "--link-delay: found 1.0, expected --bridge beside it"),
         ("campaign --score q", "--score: found 'q', expected a name and a number: q=0.02"),
         ("fly --in-process --composed", "--in-process: found a flight over topics, in lockstep"),
@@ -333,10 +333,10 @@ def test_shell_completes_after_each_option(words: str, expected: str, tmp_path: 
         "COMP_CWORD": str(len(words.split())),
     }
     command = [sys.executable, "-m", "flight_cli.cli"]
-    shown = subprocess.run(
+    process = subprocess.run(
         command, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False
     )
-    assert expected in shown.stdout.split(), shown.stderr
+    assert expected in process.stdout.split(), process.stderr
 
 
 def test_scenarios_are_listed_with_their_sentence_aircraft_and_law() -> None:
@@ -345,16 +345,16 @@ def test_scenarios_are_listed_with_their_sentence_aircraft_and_law() -> None:
     (servo,) = (row for row in listed if row["name"] == "osprey_servo")
     assert (servo["aircraft"], servo["law"]) == ("osprey", "rise_di")
     assert servo["flies"].startswith("Commands on every channel and two gusts")
-    shown = invoke("scenarios", "osprey_gust")
-    assert "osprey_gust" in shown.output
-    assert "osprey_route" not in shown.output
+    answer = invoke("scenarios", "osprey_gust")
+    assert "osprey_gust" in answer.output
+    assert "osprey_route" not in answer.output
 
 
 def test_every_command_of_help_has_help_of_own(tmp_path: Path) -> None:
     for name in COMMANDS:
-        shown = invoke(name, "--help", prog_name="rise-di")
-        assert shown.exit_code == 0, name
-        assert f"Usage: rise-di {name}" in shown.stdout
+        answer = invoke(name, "--help", prog_name="rise-di")
+        assert answer.exit_code == 0, name
+        assert f"Usage: rise-di {name}" in answer.stdout
     listed = rise_di("--help", cwd=tmp_path).stdout
     assert all(name in listed for name in COMMANDS)
 

@@ -385,8 +385,8 @@ def test_log_whose_parameters_differ_from_the_map_is_refused(
     assert str(refused.exception).startswith(sentence)
     assert not (tmp_path / "bag").exists()
     table = dict(re.findall(r"(\w+) +(.*?) *\n", refused.stdout))
-    shown = {name: table[name].split() for name in ("RC1_MIN", "RC2_MIN", "vehicle")}
-    assert shown == {
+    rows = {name: table[name].split() for name in ("RC1_MIN", "RC2_MIN", "vehicle")}
+    assert rows == {
         "RC1_MIN": ["1100", "1000"],
         "RC2_MIN": ["1000", "1000"],
         "vehicle": ["plane", "plane"],
@@ -538,9 +538,9 @@ def test_log_whose_clock_goes_back_is_its_longest_part(flight: Flight, tmp_path:
         tmp_path / "short.bin", Flight(flight.stamp_us[:200], flight.y[:200], flight.u[:200])
     )
     (tmp_path / "both.bin").write_bytes(short.read_bytes() + whole.read_bytes())
-    both, alone = (read_vehicle_log(tmp_path / name) for name in ("both.bin", "whole.bin"))
+    both, single = (read_vehicle_log(tmp_path / name) for name in ("both.bin", "whole.bin"))
     assert both.kind == "a DataFlash log of ArduPilot, the longest of 2 parts: its clock goes back"
-    assert_array_equal(both.tables["IMU"].stamp_ns, alone.tables["IMU"].stamp_ns)
+    assert_array_equal(both.tables["IMU"].stamp_ns, single.tables["IMU"].stamp_ns)
 
 
 @pytest.mark.parametrize(
@@ -563,9 +563,9 @@ def test_samples_with_damaged_stamps_are_left_out(
     for place, stamp in places:
         whole = whole.replace(struct.pack("<Q", flown.stamp_us[place]), struct.pack("<Q", stamp), 1)
     (tmp_path / "damaged.bin").write_bytes(whole)
-    damaged, alone = (read_vehicle_log(tmp_path / f"{name}.bin") for name in ("damaged", "whole"))
-    assert damaged.kind == alone.kind
-    kept = np.delete(alone.tables["IMU"].stamp_ns, [place for place, _ in places])
+    damaged, single = (read_vehicle_log(tmp_path / f"{name}.bin") for name in ("damaged", "whole"))
+    assert damaged.kind == single.kind
+    kept = np.delete(single.tables["IMU"].stamp_ns, [place for place, _ in places])
     assert_array_equal(damaged.tables["IMU"].stamp_ns, kept)
 
 
@@ -612,9 +612,9 @@ def test_report_of_imported_flight_shows_y_and_u_and_no_error(
         "Spectrum of u",
     ]
     assert "flight.bin, a DataFlash log of ArduPilot, by the map ardupilot" in page
-    shown = View(bag)
-    shown.update()
-    assert shown.description["units"]["q"]["unit"] == "deg/s"
+    view = View(bag)
+    view.update()
+    assert view.description["units"]["q"]["unit"] == "deg/s"
     for command, sentence in (
         (["replay", str(bag)], "found an imported log, expected a flight of the stack"),
         (
@@ -640,20 +640,20 @@ def test_log_cut_in_the_middle_gives_what_it_has(flight: Flight, tmp_path: Path)
 
 def two_systems(folder: Path, flight: Flight, second: Flight) -> tuple[Path, Path]:
     """A tlog of the systems 1 and 7, whose RC2 is reversed, and that of the system 1 alone."""
-    alone = tlog(folder / "one.tlog", flight, {"RC2_REVERSED": 0.0})
+    single = tlog(folder / "one.tlog", flight, {"RC2_REVERSED": 0.0})
     other = tlog(folder / "other.tlog", second, {"RC2_REVERSED": 1.0}, system=7)
     (folder / "both.tlog").write_bytes(
-        in_order(packets_of(other.read_bytes() + alone.read_bytes()))
+        in_order(packets_of(other.read_bytes() + single.read_bytes()))
     )
-    return folder / "both.tlog", alone
+    return folder / "both.tlog", single
 
 
 def test_system_of_a_tlog_that_flew_is_taken_and_named(flight: Flight, tmp_path: Path) -> None:
     """The other one stands, half a sample later: its gyroscopes have noise alone."""
     still = Flight([stamp + 10_000 for stamp in flight.stamp_us], 0.01 * flight.y, flight.u)
-    path, alone = two_systems(tmp_path, flight, still)
+    path, single = two_systems(tmp_path, flight, still)
     both = read_vehicle_log(path)
-    expected = read_vehicle_log(alone)
+    expected = read_vehicle_log(single)
     assert both.taken == (("system", "1 of 7 and 1: it alone moves"),)
     assert both.parameters == expected.parameters
     for name, table in expected.tables.items():

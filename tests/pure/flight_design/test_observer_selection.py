@@ -183,7 +183,7 @@ def test_models_that_do_not_fit_are_refused(monkeypatch: pytest.MonkeyPatch) -> 
             ["--model", "osprey"],
             "error: --model: found osprey, expected an observer too",
         ),
-        (["--observer", "--check"], "error: --observer: found it beside --check"),
+        (["--observer", "--check"], "error: --observer: found --check beside it"),
         (
             ["--observer", "--margin", "0.9"],
             "error: --margin: found 0.9, expected 0 to 0.5 s",

@@ -30,16 +30,16 @@ STRAIGHT = 3000.0 - RADIUS * math.tan((math.pi / 2.0 - math.asin(RADIUS / 3000.0
 def refusal(
     waypoints: tuple[Waypoint, ...], radius: float = RADIUS, period: float = PERIOD, **can: Any
 ) -> str:
-    with pytest.raises(ParameterError) as refused:
+    with pytest.raises(ParameterError) as error:
         flyable(waypoints, radius, period, CAN._replace(**can))
-    return str(refused.value)
+    return str(error.value)
 
 
 def number(sentence: str) -> float:
     """The number that a sentence says would do."""
-    found = re.search(r"at (?:least|most) ([\d.]+)", sentence)
-    assert found
-    return float(found[1])
+    result = re.search(r"at (?:least|most) ([\d.]+)", sentence)
+    assert result
+    return float(result[1])
 
 
 def test_route_within_all_limits_gives_legs() -> None:
@@ -152,19 +152,19 @@ def test_routes_of_tutorial_are_as_shown(tmp_path: Path) -> None:
     for path, block in zip((triangle, short), blocks, strict=True):
         path.write_text(block)
     assert len(guidance.plan(read_route(triangle)).legs) == 6  # three lines, two fillets, an orbit
-    with pytest.raises(ParameterError) as refused:
+    with pytest.raises(ParameterError) as error:
         guidance.plan(read_route(short))
-    assert f"error: guidance.{refused.value}\n" in page
+    assert f"error: guidance.{error.value}\n" in page
 
 
 def test_route_file_replaces_program_of_targets() -> None:
     turns = find_scenario("osprey_route").vary(
         guidance={"program": {"heading": {"start": [2.0], "value": [1.0]}}}
     )
-    flown = with_route(turns, [Waypoint(0, 0, 0), Waypoint(2000, 0, 10, 26.0)]).guidance
-    assert flown is not None
-    assert flown.program == {}
-    assert [waypoint.speed for waypoint in flown.waypoints()] == [25.0, 26.0]
+    section = with_route(turns, [Waypoint(0, 0, 0), Waypoint(2000, 0, 10, 26.0)]).guidance
+    assert section is not None
+    assert section.program == {}
+    assert [waypoint.speed for waypoint in section.waypoints()] == [25.0, 26.0]
 
 
 def test_route_of_scenario_not_checked_where_file_replaces_it(tmp_path: Path) -> None:

@@ -284,10 +284,10 @@ def test_aircraft_outside_flies_home_in_wind(name: str) -> None:
         has_left |= has_been_inside & (escape.clearance < 0.0)
         has_been_inside |= escape.clearance >= 0.0
         off = np.remainder(escape.course - course + math.pi, 2.0 * math.pi) - math.pi
-        wanted = np.where(
+        expected = np.where(
             abs(action) == RIGHT, action * bank, np.arctan(0.36 * ground_speed * off / GRAVITY)
         )
-        phi = phi + np.clip(np.clip(wanted, -bank, bank) - phi, -0.35 * dt, 0.35 * dt)
+        phi = phi + np.clip(np.clip(expected, -bank, bank) - phi, -0.35 * dt, 0.35 * dt)
         psi = psi + dt * GRAVITY * np.tan(phi) / speed
         north = north + dt * v_north
         east = east + dt * v_east
@@ -603,9 +603,9 @@ def test_fence_in_which_no_turn_onto_the_orbit_fits_is_refused_with_the_size() -
     It leaves by twice its radius, 137 m with the slip of the prediction, and by what the aircraft
     flies meanwhile: the orbit of 144 m alone fits into the square.
     """
-    with pytest.raises(ParameterError) as refused:
+    with pytest.raises(ParameterError) as error:
         GuidanceConfig.validate_mapping(square(200.0), "guidance")
-    assert str(refused.value) == (
+    assert str(error.value) == (
         "guidance.home: found a turn from home onto the orbit that is 76 m outside of the fence, "
         "expected at least 12 m inside; with home 292 m inside every turn fits"
     )

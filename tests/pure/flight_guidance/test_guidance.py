@@ -78,10 +78,10 @@ def test_commanded_rates_turn_attitude_at_commanded_rates() -> None:
     rates = body_rates(phi_c, theta_c, phi, theta, r, 0.0, SPEED, HOLD)
     dt = 1e-6
     assert rates.r == approx(r, rel=1e-12)
-    moved = Rotation.from_euler("ZYX", [0.0, theta, phi]) * Rotation.from_rotvec(
+    after = Rotation.from_euler("ZYX", [0.0, theta, phi]) * Rotation.from_rotvec(
         np.array(rates) * dt
     )
-    psi_after, theta_after, phi_after = moved.as_euler("ZYX")
+    psi_after, theta_after, phi_after = after.as_euler("ZYX")
     assert (phi_after - phi) / dt == approx(HOLD.k_phi * (phi_c - phi), abs=1e-6)
     assert (theta_after - theta) / dt == approx(HOLD.k_theta * (theta_c - theta), abs=1e-6)
     assert psi_after / dt == approx(turn, abs=1e-6)

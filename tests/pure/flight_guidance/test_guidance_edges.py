@@ -201,18 +201,18 @@ def test_any_finite_y_and_pose_give_a_finite_u_m_and_no_failed_step(
 @pytest.mark.parametrize("fault", ["thrust hard_over 3 lower", "elevator hard_over 3 lower"])
 def test_lost_speed_in_a_fence_ends_with_an_outcome_and_a_report(fault: str) -> None:
     """The airspeed falls below 1.1 V_s, where no bank is left for the turn at the fence."""
-    flight = calm(25.0, fence=WIDE)
-    actuators = flight.aircraft.actuators.model_dump() | {"faults": [fault]}
-    flight = flight.vary(aircraft={"actuators": actuators})
-    tape = simulate(flight)
-    section = flight.guidance
+    scenario = calm(25.0, fence=WIDE)
+    actuators = scenario.aircraft.actuators.model_dump() | {"faults": [fault]}
+    scenario = scenario.vary(aircraft={"actuators": actuators})
+    tape = simulate(scenario)
+    section = scenario.guidance
     assert section is not None
     log = tape["guidance"]
     stall = section.params().limits.stall_speed
     assert (section.speed + log["y.V"]).min() < 1.1 * stall
     assert tape.outcome == COMPLETED
-    told = judge(tape.outcome, tape, flight, account(tape, flight, tape.outcome))
-    assert told.status == 4, "the airspeed is far below its command"
+    sentence = judge(tape.outcome, tape, scenario, account(tape, scenario, tape.outcome))
+    assert sentence.status == 4, "the airspeed is far below its command"
     assert log["failed"].max() == 0
     assert summarise(tape)["guidance"]["failed"] == 0
     replayed = replay_guidance(tape, section)
@@ -249,14 +249,14 @@ def test_step_that_fails_leaves_last_u_m_and_next_is_tried(
     kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Three steps of a climbing turn fail, and one 20 s later: said twice, and counted."""
-    flight = calm(28.0, program={"course": {"start": [1.0], "value": [1.0]}})
-    section = flight.guidance
+    scenario = calm(28.0, program={"course": {"start": [1.0], "value": [1.0]}})
+    section = scenario.guidance
     assert section is not None
     first = range(2000 * MS, 2060 * MS)
     later = range(26_000 * MS, 26_020 * MS)
     with monkeypatch.context() as patch:
         patch.setattr(module, "step", _Failing(kind, first, later))
-        tape = simulate(flight)
+        tape = simulate(scenario)
     log, u_m = tape["guidance"], tape["u_m"]
     at = np.flatnonzero(np.diff(log["failed"], prepend=0.0) > 0.0)
     assert (log.stamp_ns[at] // MS).tolist() == [2000, 2020, 2040, 26_000]

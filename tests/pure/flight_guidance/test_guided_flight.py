@@ -475,23 +475,23 @@ def test_route_received_in_flight_is_logged(tmp_path: Path) -> None:
     scenario = calm(3.0)
     section = scenario.guidance
     assert section is not None
-    flown = simulate(scenario, guide=RoutedInFlight)
+    flight = simulate(scenario, guide=RoutedInFlight)
     with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as bag:
         topic = bag.add_connection("/route", PATH, typestore=typestore())
         # The first one is refused.
         for points in ([(0.0, 0.0, 0.0)], WAYPOINTS):
             bag.write(topic, 1, path(*points))
-    read = read_run(tmp_path / "bag").tape["route"]
-    assert read.values.tolist() == [
+    contents = read_run(tmp_path / "bag").tape["route"]
+    assert contents.values.tolist() == [
         [0.0, 0.0, 0.0, 0.0],
         [0.0, 0.0, 0.0, 0.0],
         [1.0, 800.0, 0.0, 10.0],
     ]
-    tape = Tape({**flown.signals, "route": read})
+    tape = Tape({**flight.signals, "route": contents})
     result = replay_guidance(tape, section)
     assert (result.steps, result.checked, result.differing) == (151, 151, 0)
     assert flown_routes(scenario, tape) == [section.plan([Waypoint(*point) for point in WAYPOINTS])]
-    assert replay_guidance(flown, section).checked == 50  # without the route: those before it
+    assert replay_guidance(flight, section).checked == 50  # without the route: those before it
 
 
 def test_route_file_flown_and_stays_with_flight(tmp_path: Path) -> None:

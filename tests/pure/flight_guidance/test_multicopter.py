@@ -67,10 +67,10 @@ def test_body_rates_turn_thrust_to_its_direction_by_the_shortest_way(
     assert own is not None
     state = multicopter._begin(None, inputs_of(attitude), pose_of(attitude), PARAMS)
     rates = multicopter._rates(state, 0.1, -0.2, own._replace(tilt_rate=math.inf))
-    wanted = Rotation.from_euler("ZYX", [psi, -0.2, 0.1]).apply([0.0, 0.0, -1.0])
+    expected = Rotation.from_euler("ZYX", [psi, -0.2, 0.1]).apply([0.0, 0.0, -1.0])
     way = np.array([rates["p"], rates["q"], 0.0]) / own.k_tilt
-    assert (turned * Rotation.from_rotvec(way)).apply([0.0, 0.0, -1.0]) == approx(wanted)
-    assert np.linalg.norm(way) == approx(math.acos(wanted @ [north, east, down]))
+    assert (turned * Rotation.from_rotvec(way)).apply([0.0, 0.0, -1.0]) == approx(expected)
+    assert np.linalg.norm(way) == approx(math.acos(expected @ [north, east, down]))
 
 
 def pose_of(attitude: tuple[float, float, float], **values: float) -> dict[str, float]:

@@ -135,10 +135,10 @@ def test_limits_are_said_once_and_end_with_the_model() -> None:
     assert of(Authority(down=0.0, up=0.0)) == "no climb: V has no input with an effect"
     quiet = dict.fromkeys((*Notices.CHANNELS, *LEARNED), 0.0)
     notices = Notices(0.0, 0.2, lambda speed: 99.0, reach=of)
-    told = []
+    sentence = []
     for t, authority in enumerate([Authority(), Authority(p=0.0), Authority(p=0.0), Authority()]):
-        told += notices.take(float(t), quiet | dict(zip(LEARNED, authority, strict=True)))
-    assert [notice.text for notice in told] == [
+        sentence += notices.take(float(t), quiet | dict(zip(LEARNED, authority, strict=True)))
+    assert [notice.text for notice in sentence] == [
         f"from now on {dead}",
         "from now on own limits again",
     ]

@@ -200,14 +200,14 @@ class Flown:
 
 def test_first_waypoint_has_to_be_reached() -> None:
     """A route behind the aircraft is not passed at the start: the aircraft joins the first leg."""
-    flown = Flown((2500.0, 0.0, 150.0), (1200.0, 0.0, 100.0), (1200.0, 1200.0, 100.0))
-    log = flown.at(10.0, 0.0)
+    flight = Flown((2500.0, 0.0, 150.0), (1200.0, 0.0, 100.0), (1200.0, 1200.0, 100.0))
+    log = flight.at(10.0, 0.0)
     assert (log["leg"], log["missed"], abs(log["joining"])) == (0.0, 0.0, 1.0)
     assert log["target.altitude"] == 150.0  # of the first waypoint
     # The centre lies (2490, -R) ahead: a turn by 2 b to the tangent, b = atan(R / 2490), the
     # tangent, and an arc of pi + 2 b.
     assert log["to_go"] == approx(2490.0 + R * (math.pi + 4.0 * math.atan(R / 2490.0)))
-    log = flown.at(2499.0, 3.0, math.pi)
+    log = flight.at(2499.0, 3.0, math.pi)
     assert (log["leg"], log["joining"]) == (0.0, 0.0)
     assert log["target.altitude"] == approx(150.0, abs=0.1)  # at the begin of the slope
 
@@ -217,45 +217,45 @@ def test_leg_after_sharp_corner_is_joined() -> None:
 
     The aircraft passes the waypoint, and a circle leads it onto the leg back.
     """
-    flown = Flown(
+    flight = Flown(
         (0.0, 0.0, 100.0), (1000.0, 0.0, 100.0), (-600.0, 160.0, 100.0), (-600.0, 2000.0, 100.0)
     )
-    assert flown.at(990.0, 3.0)["leg"] == 0.0
-    log = flown.at(1001.0, 3.0)
+    assert flight.at(990.0, 3.0)["leg"] == 0.0
+    log = flight.at(1001.0, 3.0)
     assert (log["leg"], log["missed"], abs(log["joining"])) == (1.0, 0.0, 1.0)
     back = math.atan2(160.0, -1600.0)
-    assert flown.at(1000.0 + 5.0 * math.cos(back), 5.0 * math.sin(back), back)["joining"] == 0.0
+    assert flight.at(1000.0 + 5.0 * math.cos(back), 5.0 * math.sin(back), back)["joining"] == 0.0
 
 
 def test_leg_passed_far_away_is_missed() -> None:
-    flown = Flown(
+    flight = Flown(
         (0.0, 0.0, 100.0), (1000.0, 0.0, 100.0), (3000.0, 50.0, 100.0), (5000.0, 0.0, 100.0)
     )
-    assert flown.at(990.0, 600.0)["leg"] == 0.0
-    log = flown.at(1010.0, 600.0)
-    end = flown.route.legs[0].end
+    assert flight.at(990.0, 600.0)["leg"] == 0.0
+    log = flight.at(1010.0, 600.0)
+    end = flight.route.legs[0].end
     assert end is not None
     assert log["missed"] == approx(math.dist(end, (1010.0, 600.0)))
     assert (log["leg"], abs(log["joining"])) == (1.0, 1.0)
-    assert flown.notices == (f"leg 0 missed by {log['missed']:.0f} m",)
-    assert flown.at(1011.0, 600.0)["missed"] == 0.0
+    assert flight.notices == (f"leg 0 missed by {log['missed']:.0f} m",)
+    assert flight.at(1011.0, 600.0)["missed"] == 0.0
 
 
 def test_leg_passed_near_is_flown() -> None:
-    flown = Flown((0.0, 0.0, 100.0), (1000.0, 0.0, 100.0), (1000.0, 2000.0, 100.0))
-    flown.at(5.0, 0.0)
-    end = flown.route.legs[0].end
+    flight = Flown((0.0, 0.0, 100.0), (1000.0, 0.0, 100.0), (1000.0, 2000.0, 100.0))
+    flight.at(5.0, 0.0)
+    end = flight.route.legs[0].end
     assert end is not None
-    log = flown.at(end[0] + 1.0, 0.9 * R)
+    log = flight.at(end[0] + 1.0, 0.9 * R)
     assert (log["leg"], log["missed"], log["joining"]) == (1.0, 0.0, 0.0)
 
 
 def test_leg_joined_at_a_point_along_it() -> None:
-    flown = Flown(*CORNER)
-    flown.made.take_target({"leg": 0.0, "along": 900.0})
-    log = flown.at(0.0, 500.0)
+    flight = Flown(*CORNER)
+    flight.made.take_target({"leg": 0.0, "along": 900.0})
+    log = flight.at(0.0, 500.0)
     assert (log["target.along"], abs(log["joining"])) == (900.0, 1.0)
-    assert flown.at(905.0, 10.0)["joining"] == 0.0
+    assert flight.at(905.0, 10.0)["joining"] == 0.0
     for values, sentence in (
         (
             {"leg": 0.0, "along": 2500.0},
@@ -264,44 +264,44 @@ def test_leg_joined_at_a_point_along_it() -> None:
         ({"along": 10.0}, "found along without leg"),
     ):
         with pytest.raises(ChannelError, match=sentence):
-            flown.made.take_target(values)
+            flight.made.take_target(values)
 
 
 def test_skip_leaves_waypoint_ahead_out() -> None:
-    flown = Flown(*CORNER, (0.0, 3000.0, 100.0))
-    assert flown.made.skip()
-    log = flown.at(100.0, 0.0)
+    flight = Flown(*CORNER, (0.0, 3000.0, 100.0))
+    assert flight.made.skip()
+    log = flight.at(100.0, 0.0)
     assert log["leg"] == 2.0  # the line after the fillet
-    assert log["target.along"] == approx(path.length(flown.route.legs[2]))
+    assert log["target.along"] == approx(path.length(flight.route.legs[2]))
 
 
 def test_resume_flies_last_leg_from_nearest_point() -> None:
-    flown = Flown(*CORNER)
-    assert not flown.made.resume()  # the route is flown
-    assert flown.made.hold()
-    assert flown.at(700.0, 400.0)["mode.lateral"] == Lateral.HEADING
-    assert flown.made.resume()
-    log = flown.at(701.0, 400.0)
+    flight = Flown(*CORNER)
+    assert not flight.made.resume()  # the route is flown
+    assert flight.made.hold()
+    assert flight.at(700.0, 400.0)["mode.lateral"] == Lateral.HEADING
+    assert flight.made.resume()
+    log = flight.at(701.0, 400.0)
     assert (log["mode.lateral"], log["leg"], log["target.along"]) == (Lateral.ROUTE, 0.0, 700.0)
 
 
 @pytest.mark.parametrize("profile", ["slope", "step"])
 def test_altitude_changes_along_leg_or_at_its_begin(profile: str) -> None:
     config = GuidanceConfig.validate_mapping(SECTION | {"profile": profile}, "guidance")
-    flown = Flown((0.0, 0.0, 100.0), (2000.0, 0.0, 140.0), (4000.0, 0.0, 140.0), config=config)
-    log = flown.at(500.0, 5.0)
+    flight = Flown((0.0, 0.0, 100.0), (2000.0, 0.0, 140.0), (4000.0, 0.0, 140.0), config=config)
+    log = flight.at(500.0, 5.0)
     if profile == "step":
         assert (log["target.altitude"], log["target.climb"]) == (140.0, 0.0)
     else:
         # The last line touches the orbit: the legs meet at an angle of 4 deg.
         assert log["target.altitude"] == approx(110.0, abs=0.1)
         assert log["target.climb"] == approx(40.0 / 2000.0 * SPEED, abs=0.01)
-    assert flown.made.hold()
-    assert flown.at(520.0, 5.0)["target.altitude"] == 100.0
-    flown.made.take_target({"leg": 0.0, "altitude": 120.0})
+    assert flight.made.hold()
+    assert flight.at(520.0, 5.0)["target.altitude"] == 100.0
+    flight.made.take_target({"leg": 0.0, "altitude": 120.0})
     # A command of the user holds on the leg.
-    assert flown.at(540.0, 5.0)["target.altitude"] == 120.0
-    assert flown.at(560.0, 5.0)["target.altitude"] == 120.0
+    assert flight.at(540.0, 5.0)["target.altitude"] == 120.0
+    assert flight.at(560.0, 5.0)["target.altitude"] == 120.0
 
 
 def circling(
@@ -329,47 +329,49 @@ def test_loiter_ends_after_its_turns_or_wait(turns: float, wait: float) -> None:
     A circle takes 2 pi R / V = 36 s; the aircraft leaves it in the west.
     """
     centre = (2000.0, 0.0)
-    flown = Flown((0.0, 0.0, 100.0), (*centre, 100.0, None, turns, wait), (5000.0, -R, 100.0))
-    circle = flown.route.legs[1]
+    flight = Flown((0.0, 0.0, 100.0), (*centre, 100.0, None, turns, wait), (5000.0, -R, 100.0))
+    circle = flight.route.legs[1]
     # The last line touches the orbit round the last waypoint.
     assert circle.end == approx((2000.0, -R), abs=10.0)
-    end = flown.route.legs[0].end
+    end = flight.route.legs[0].end
     assert end is not None
-    assert flown.at(end[0] + 0.5, end[1], path.end_course(flown.route.legs[0]))["leg"] == 1.0
-    half = circling(flown, centre, max(turns, wait / 36.2) - 0.5)
+    assert flight.at(end[0] + 0.5, end[1], path.end_course(flight.route.legs[0]))["leg"] == 1.0
+    half = circling(flight, centre, max(turns, wait / 36.2) - 0.5)
     assert 0.5 < half["loitered"] < 1.0
-    flown.at(*end, path.end_course(flown.route.legs[0]))
-    log = circling(flown, centre, 2.0, first=math.degrees(path.course_of(centre, end)))
+    flight.at(*end, path.end_course(flight.route.legs[0]))
+    log = circling(flight, centre, 2.0, first=math.degrees(path.course_of(centre, end)))
     assert log["leg"] == 2.0
 
 
 def test_steep_leg_begins_with_circle_that_is_left_at_altitude() -> None:
-    flown = Flown((0.0, 0.0, 100.0), (1500.0, 0.0, 400.0), (1500.0, 2500.0, 400.0), start=(0.0, -R))
-    assert "flown on circles round the waypoint before" in flown.notices[0]
-    circle = flown.route.legs[0]
-    assert (isinstance(circle, Arc), flown.at(0.0, -R + 1.0)["target.altitude"]) == (True, 400.0)
+    flight = Flown(
+        (0.0, 0.0, 100.0), (1500.0, 0.0, 400.0), (1500.0, 2500.0, 400.0), start=(0.0, -R)
+    )
+    assert "flown on circles round the waypoint before" in flight.notices[0]
+    circle = flight.route.legs[0]
+    assert (isinstance(circle, Arc), flight.at(0.0, -R + 1.0)["target.altitude"]) == (True, 400.0)
     assert circle.end is not None
     course = path.end_course(circle)
-    assert flown.at(circle.end[0] + 1.0, circle.end[1], course, 300.0)["leg"] == 0.0
+    assert flight.at(circle.end[0] + 1.0, circle.end[1], course, 300.0)["leg"] == 0.0
     beyond = (circle.end[0] + 25.0 * math.cos(course), circle.end[1] + 25.0 * math.sin(course))
-    assert flown.at(*beyond, course, 396.0)["leg"] == 0.0  # too late to leave: another turn
-    assert flown.at(circle.end[0] + 1.0, circle.end[1], course, 396.0)["leg"] == 1.0
+    assert flight.at(*beyond, course, 396.0)["leg"] == 0.0  # too late to leave: another turn
+    assert flight.at(circle.end[0] + 1.0, circle.end[1], course, 396.0)["leg"] == 1.0
 
 
 def test_yaw_rate_beside_bank() -> None:
-    flown = Flown((0.0, 0.0, 100.0), (5000.0, 0.0, 100.0))
-    flown.made.take_target({"phi": 0.0, "r": 0.05})
+    flight = Flown((0.0, 0.0, 100.0), (5000.0, 0.0, 100.0))
+    flight.made.take_target({"phi": 0.0, "r": 0.05})
     for k in range(50):
-        log = flown.at(10.0 + k, 0.0)
+        log = flight.at(10.0 + k, 0.0)
     assert log["u_m.r"] == approx(0.05)
-    flown.made.take_target({"heading": 0.0})
-    assert flown.at(70.0, 0.0)["target.r"] == 0.0
+    flight.made.take_target({"heading": 0.0})
+    assert flight.at(70.0, 0.0)["target.r"] == 0.0
     for values, sentence in (
         ({"r": 0.1}, "found r without phi"),
         ({"phi": 0.0, "r": 0.5}, "expected -12.9[0-9]* to 12.9[0-9]* deg/s"),
     ):
         with pytest.raises(ChannelError, match=sentence):
-            flown.made.take_target(values)
+            flight.made.take_target(values)
 
 
 def log_of(count: int, **channels: ArrayLike) -> Tape:

@@ -244,9 +244,9 @@ def test_definitions_need_no_ros_package(
     installed = definition(type_name)
     monkeypatch.setattr(sys, "prefix", str(tmp_path))
     monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)
-    alone = definition.__wrapped__(type_name)
-    assert alone.type_hash == installed.type_hash
-    assert get_types_from_msg(alone.text, type_name) == get_types_from_msg(
+    single = definition.__wrapped__(type_name)
+    assert single.type_hash == installed.type_hash
+    assert get_types_from_msg(single.text, type_name) == get_types_from_msg(
         installed.text, type_name
     )
 
@@ -336,8 +336,8 @@ def test_two_aircraft_in_one_bag_selected_by_namespace(tmp_path: Path) -> None:
         "/one/u": SAMPLES[1:6],
     }
     record(tmp_path / "bag", topics)
-    found = "bag: found aircraft in the namespaces /fleet/two, /one, expected"
-    with refusing(f"{found} that one of them"):
+    result = "bag: found aircraft in the namespaces /fleet/two, /one, expected"
+    with refusing(f"{result} that one of them"):
         read_run(tmp_path / "bag")
     with refusing(r"namespaces /fleet/two, /one, expected one in '/three'"):
         read_run(tmp_path / "bag", "/three")

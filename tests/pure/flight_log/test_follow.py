@@ -59,23 +59,23 @@ def test_log_that_grows_in_pieces_gives_what_whole_log_holds(
     content = (recorded / "run_0.mcap").read_bytes()
     follower = Follower(tmp_path, all_of)
     assert list(follower.read()) == []  # the recorder has not begun
-    found: list[Messages | Attachment | Metadata] = []
+    result: list[Messages | Attachment | Metadata] = []
     path = tmp_path / "run_0.mcap"
     for start in range(0, len(content), piece):
         with path.open("ab") as stream:
             stream.write(content[start : start + piece])
-        found += follower.read()
+        result += follower.read()
     assert (follower.complete, follower.damaged, follower.fault) == (True, 0, "")
-    messages = [record for record in found if isinstance(record, Messages)]
+    messages = [record for record in result if isinstance(record, Messages)]
     for name, signal in tape.signals.items():
         stamps, values = vectors(messages, f"/{name}")
         assert stamps.tolist() == signal.stamp_ns.tolist()
         assert values.tobytes() == signal.values.tobytes()
     assert (
-        next(record.name for record in found if isinstance(record, Attachment))
+        next(record.name for record in result if isinstance(record, Attachment))
         == "osprey_gust.yaml"
     )
-    assert "rise_di_host" in [record.name for record in found if isinstance(record, Metadata)]
+    assert "rise_di_host" in [record.name for record in result if isinstance(record, Metadata)]
 
 
 def test_topic_thinned_to_rate_at_even_distances(recorded: Path, tape: Tape) -> None:
@@ -93,20 +93,20 @@ def test_logs_without_message_indexes_or_chunks_read(
     options: dict[str, object], tmp_path: Path
 ) -> None:
     path = tmp_path / "foreign.mcap"
-    sent = [vector(k, ["q"], [k / 7.0]) for k in range(50)]
+    messages = [vector(k, ["q"], [k / 7.0]) for k in range(50)]
     writer = Writer(str(path), chunk_size=2000, **options)  # type: ignore[arg-type]
     writer.start(profile="ros2", library="test")
     channel = writer.register_channel(
         "/y", "cdr", writer.register_schema(JOINT_STATE, "ros2msg", b"")
     )
-    for k, data in enumerate(sent):
+    for k, data in enumerate(messages):
         writer.add_message(channel, k, data, k)
     writer.finish()  # type: ignore[no-untyped-call]
     whole = list(Follower(path, all_of).read())
     follower = Follower(path, all_of)
     assert [
         data for record in whole if isinstance(record, Messages) for data in record.data
-    ] == sent
+    ] == messages
     assert [
         next(iter(follower.read())) for _ in whole
     ] == whole  # an iteration that is left is continued here, too
@@ -126,9 +126,9 @@ def test_topic_whose_first_message_comes_after_the_chunk_with_its_channel_is_rea
         write_chunk(bag, early, 2)
         write_chunk(bag, late, 3)
     follower = Follower(tmp_path, all_of)
-    found = [record for record in follower.read() if isinstance(record, Messages)]
+    result = [record for record in follower.read() if isinstance(record, Messages)]
     assert follower.damaged == 0
-    assert [stamp for topic in ("/y", "/late") for stamp in vectors(found, topic)[0].tolist()] == [
+    assert [stamp for topic in ("/y", "/late") for stamp in vectors(result, topic)[0].tolist()] == [
         1,
         2,
         3,

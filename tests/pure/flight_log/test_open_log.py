@@ -66,8 +66,8 @@ def figures_of(summary: dict[str, Any]) -> dict[str, Any]:
 def whole(request: pytest.FixtureRequest, messages: list[Recorded], tmp_path: Path) -> Path:
     """A bag with the whole flight; a file where only its path can name it."""
     WHOLE[request.param](tmp_path / "bag", messages)
-    alone = tmp_path / "bag" / "flight.log"
-    return alone if alone.exists() else tmp_path / "bag"
+    single = tmp_path / "bag" / "flight.log"
+    return single if single.exists() else tmp_path / "bag"
 
 
 def test_whole_flight_is_read_replayed_shown_and_played(
@@ -79,11 +79,11 @@ def test_whole_flight_is_read_replayed_shown_and_played(
     """
     with refusing(r"a log without its scenario, expected .* --scenario FILE"):
         read_flight(whole)
-    read = read_run(whole, scenario=osprey_gust.path)
+    contents = read_run(whole, scenario=osprey_gust.path)
     assert figures_of(read_flight(whole, scenario=osprey_gust.path).summary) == figures
-    result = replay(read)
+    result = replay(contents)
     assert (len(result.number), int(result.checked.sum()), result.equal()) == (TICKS, TICKS, True)
-    flight = Flight(whole, scenario=read.scenario)
+    flight = Flight(whole, scenario=contents.scenario)
     flight.update()
     assert (flight.state(), flight.faults(), flight.samples["internals"].count) == (
         "ended",

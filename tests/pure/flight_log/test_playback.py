@@ -98,12 +98,12 @@ def test_in_real_time_message_is_due_when_it_was_sent_not_when_it_was_received(
     tmp_path: Path,
 ) -> None:
     begin = EPOCH - 5_000 * MS  # t = 0
-    sent = [
+    messages = [
         ("/truth", begin + 2001 * MS, begin + 2000 * MS, 2.0),
         ("/y", begin + 2006 * MS, begin + 1990 * MS, 0.2),  # 16 ms old when it was sent
         ("/y", begin + 2003 * MS, begin + 1985 * MS, 0.1),
     ]
-    playback = read_playback(bag_of(tmp_path / "run", sent))
+    playback = read_playback(bag_of(tmp_path / "run", messages))
     assert [round(playback.t(message.due_ns), 6) for message in playback.messages] == [
         2.001,
         2.003,
@@ -113,10 +113,10 @@ def test_in_real_time_message_is_due_when_it_was_sent_not_when_it_was_received(
 
 def test_message_without_stamp_is_due_when_it_was_sent(tmp_path: Path) -> None:
     """Of a driver that forgets the header: no sample has a stamp."""
-    sent = [
+    messages = [
         (topic, EPOCH + k * NANOSECONDS, 0, 0.0) for k in range(3) for topic in ("/truth", "/y_m")
     ]
-    playback = read_playback(bag_of(tmp_path / "run", sent))
+    playback = read_playback(bag_of(tmp_path / "run", messages))
     assert [playback.t(message.due_ns) for message in playback.messages] == [
         0.0,
         0.0,
@@ -132,14 +132,14 @@ def test_in_lockstep_message_is_due_at_stamp_but_not_before_those_sent_before_it
 ) -> None:
     # The host sent all of it within 3 ms; the second y is 20 ms late, and /other carries the host's
     # time.
-    sent = [
+    messages = [
         ("/truth", EPOCH + MS, 0, 0.0),
         ("/y", EPOCH + 2 * MS, 0, 0.1),
         ("/truth", EPOCH + 3 * MS, 30 * MS, 0.03),
         ("/y", EPOCH + 4 * MS, 10 * MS, 0.2),
         ("/other", EPOCH + 5 * MS, EPOCH + 5 * MS, 0.0),
     ]
-    playback = read_playback(bag_of(tmp_path / "run", sent))
+    playback = read_playback(bag_of(tmp_path / "run", messages))
     assert [(message.topic, message.due_ns, message.stamped) for message in playback.messages] == [
         ("/truth", 0, True),
         ("/y", 0, True),

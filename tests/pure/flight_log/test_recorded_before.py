@@ -47,12 +47,12 @@ def test_every_sample_is_that_of_independent_reader(run: Path) -> None:
     for name in TOPICS:
         signal = tape.signals[name]
         stamps = signal.stamp_ns.tolist()
-        read = [
+        contents = [
             (stamp, signal.names, row.tobytes())
             for stamp, row in zip(stamps, signal.values, strict=True)
         ]
-        assert read == sorted(samples[name], key=lambda sample: sample[0]), name
-        assert len(read) > 30  # ticks of 10 ms
+        assert contents == sorted(samples[name], key=lambda sample: sample[0]), name
+        assert len(contents) > 30  # ticks of 10 ms
 
 
 def test_every_bit_is_replayed(run: Path) -> None:

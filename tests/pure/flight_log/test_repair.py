@@ -55,9 +55,9 @@ def test_repaired_truncated_log_read_in_full_by_rosbags(
     done = repair(run)
     assert done.files[0].damaged == run / "run_0.mcap.damaged"
     assert done.files[0].damaged.read_bytes() == before
-    read = messages(run)
-    assert len(read) == done.files[0].messages > 0
-    assert read == messages(recorded)[: len(read)]
+    contents = messages(run)
+    assert len(contents) == done.files[0].messages > 0
+    assert contents == messages(recorded)[: len(contents)]
     after = read_run(run)
     assert after.tape.notes == ()
     assert after.tape.time("truth")[-1] == readable.tape.time("truth")[-1]
@@ -65,7 +65,7 @@ def test_repaired_truncated_log_read_in_full_by_rosbags(
     assert after.metadata["rise_di_host"] == readable.metadata["rise_di_host"]
     statistics = summary_of(run / "run_0.mcap").statistics
     assert statistics is not None
-    assert statistics.message_count == len(read)
+    assert statistics.message_count == len(contents)
     assert not list(run.glob("*.new"))
 
 

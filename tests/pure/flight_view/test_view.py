@@ -144,12 +144,12 @@ def test_description_holds_scenario(recorded: Path) -> None:
     """The description has the units, limits, gusts and commands of the scenario."""
     flight = Flight(recorded)
     flight.update()
-    shown = flight.description
-    assert shown["units"]["q"] == {"unit": "deg/s", "factor": pytest.approx(180.0 / math.pi)}
-    assert shown["modes"][""]["1"] == "ENGAGED"
-    assert [name for name, *_ in shown["gusts"]] == ["vertical", "lateral"]
-    assert shown["commands"][0][1] > 0.0
-    json.dumps(shown, allow_nan=False)
+    description = flight.description
+    assert description["units"]["q"] == {"unit": "deg/s", "factor": pytest.approx(180.0 / math.pi)}
+    assert description["modes"][""]["1"] == "ENGAGED"
+    assert [name for name, *_ in description["gusts"]] == ["vertical", "lateral"]
+    assert description["commands"][0][1] > 0.0
+    json.dumps(description, allow_nan=False)
     assert [(event.kind, event.text) for event in flight.events] == [("mode", "ENGAGED")]
     assert set(flight.bands) == {"q", "V", "p", "r"}
 

@@ -52,11 +52,11 @@ class Desk:
     ) -> dict[str, Any]:
         """The answer to a request, a second after the one before."""
         self.time += 1.0
-        found = await self.control.answer(
+        result = await self.control.answer(
             {"do": do, **request}, key, self.lease if lease is None else lease
         )
-        self.lease = found.get("lease", self.lease)
-        return found
+        self.lease = result.get("lease", self.lease)
+        return result
 
     async def refused(self, do: str, **request: Any) -> tuple[int, str]:
         """Status and sentence of a refusal."""

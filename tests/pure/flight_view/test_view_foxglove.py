@@ -59,11 +59,11 @@ def test_viewer_gets_messages_of_log_with_definitions(
             if isinstance(data, bytes) and data[0] == MESSAGE_DATA:
                 _, number, sent_ns = HEAD.unpack_from(data)
                 assert number == 7
-                received.append((sent_ns, data[HEAD.size :]))
+                messages.append((sent_ns, data[HEAD.size :]))
             return data is not None
 
         channels: dict[str, Any] = {}
-        received: list[tuple[int, bytes]] = []
+        messages: list[tuple[int, bytes]] = []
         while "/y" not in channels:
             message = await text()
             channels |= {channel["topic"]: channel for channel in message.get("channels", ())}
@@ -74,7 +74,7 @@ def test_viewer_gets_messages_of_log_with_definitions(
         )
         # The protocol does not acknowledge a subscription: the log grows until messages come.
         with path.open("ab") as log:
-            while not received and (piece := rest.read(5000)):
+            while not messages and (piece := rest.read(5000)):
                 log.write(piece)
                 log.flush()
                 with suppress(TimeoutError):
@@ -83,7 +83,7 @@ def test_viewer_gets_messages_of_log_with_definitions(
         while await take():
             pass
         connection.close()
-        return channels, received
+        return channels, messages
 
     with subprocess.Popen(
         command(tmp_path, "--foxglove", "--port", 0), stdout=subprocess.PIPE, text=True
@@ -91,7 +91,7 @@ def test_viewer_gets_messages_of_log_with_definitions(
         assert process.stdout is not None
         address = re.match(r"ws://127\.0\.0\.1:\d+", process.stdout.readline())
         assert address is not None
-        channels, received = asyncio.run(asyncio.wait_for(view(address[0]), 60.0))
+        channels, messages = asyncio.run(asyncio.wait_for(view(address[0]), 60.0))
         assert process.wait(20.0) == 0  # with the recording
     y = channels["/y"]
     assert (y["encoding"], y["schemaName"], y["schemaEncoding"]) == (
@@ -103,7 +103,7 @@ def test_viewer_gets_messages_of_log_with_definitions(
         "cdr", Schema(data=y["schema"].encode(), encoding="ros2msg", id=1, name=y["schemaName"])
     )
     assert decode is not None
-    values = [list(decode(data).position) for _, data in received]
+    values = [list(decode(data).position) for _, data in messages]
     assert len(values) > 100
     assert values == tape["y"].values[-len(values) :].tolist()
 

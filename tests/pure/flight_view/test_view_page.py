@@ -305,9 +305,9 @@ def test_guided_flight_shows_route_and_modes(browser: Browser, tmp_path: Path) -
     pose = np.tile([0.1, 0.02, 0.0, 0.0, 0.0, 30.0, 25.0, 0.0, 0.0], (200, 1))
     pose[:, POSE.index("north")] = 25.0 * stamps / 1e9
     pose[:, POSE.index("altitude")] += np.sin(stamps / 1e9)
-    flown = {"guidance": guidance, "pose": Signal(stamps, POSE, pose)}
-    write_run(Tape(flown), tmp_path / "run", LogAttachments(find_scenario("osprey_route").path))
-    write_run(Tape(flown), tmp_path / "other", LogAttachments(find_scenario("osprey_servo").path))
+    signals = {"guidance": guidance, "pose": Signal(stamps, POSE, pose)}
+    write_run(Tape(signals), tmp_path / "run", LogAttachments(find_scenario("osprey_route").path))
+    write_run(Tape(signals), tmp_path / "other", LogAttachments(find_scenario("osprey_servo").path))
     with shown(browser, tmp_path / "run"):
         readouts = browser.run("document.getElementById('readouts').innerText")
         # 100 m at 25 m/s

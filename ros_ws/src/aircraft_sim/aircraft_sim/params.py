@@ -249,8 +249,8 @@ class AircraftConfig(NodeConfig):
         airframe = load_airframe(self.airframe)
         for name in self.gusts:
             airframe.gust_direction(name)
-        for key, named in (("bias", self.bias), ("sines", self.sines)):
-            for name in named:
+        for key, configs in (("bias", self.bias), ("sines", self.sines)):
+            for name in configs:
                 states = ", ".join(airframe.states)
                 require(
                     name in airframe.states,
@@ -266,10 +266,10 @@ class AircraftConfig(NodeConfig):
             f"{self.inertial_coupling:g}",
             f"0: {has_none} inertial_coupling",
         )
-        needed: tuple[str, ...] = ("alpha", *EULER_STATES)
+        state_names: tuple[str, ...] = ("alpha", *EULER_STATES)
         if self.kinematics == "thrust":
-            needed = ("p", "q", "r", vertical([*airframe.states]) or "vertical_speed")
-        missing = [name for name in needed if name not in airframe.states]
+            state_names = ("p", "q", "r", vertical([*airframe.states]) or "vertical_speed")
+        missing = [name for name in state_names if name not in airframe.states]
         has_states = self.kinematics == "linear" or not missing
         require(
             has_states,

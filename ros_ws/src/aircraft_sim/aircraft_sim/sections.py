@@ -370,8 +370,8 @@ class StartConfig(Config):
 
 
 def by_state(
-    named: Mapping[str, Config], keys: Sequence[str], states: Iterable[str]
+    configs: Mapping[str, Config], keys: Sequence[str], states: Iterable[str]
 ) -> list[FloatArray]:
     """An array per key, over the states, with 0 for an unnamed state."""
-    sections = [named.get(state) for state in states]
+    sections = [configs.get(state) for state in states]
     return [np.array([float(getattr(section, key, 0.0)) for section in sections]) for key in keys]

@@ -234,15 +234,17 @@ class Simulator:
         t_ns = self._number * self.period_ns
         if self._pose_sensors is None:
             return (StampedVector(t_ns, self.pose()),) if due else ()
-        measured = None
+        measured_pose = None
         if due:
             number = self._number // self._pose_every
-            measured, self._pose_error, self._pose_drift = sensors.measure(
+            measured_pose, self._pose_error, self._pose_drift = sensors.measure(
                 number, self.pose(), self._pose_drift, self._pose_sensors
             )
             for k in WRAPPED:
-                measured[k] = pose.wrapped(float(measured[k]))
-        self._poses, arrived = sensors.transmit(self._poses, t_ns, measured, self._pose_sensors)
+                measured_pose[k] = pose.wrapped(float(measured_pose[k]))
+        self._poses, arrived = sensors.transmit(
+            self._poses, t_ns, measured_pose, self._pose_sensors
+        )
         return arrived
 
     def truth(self) -> FloatArray:

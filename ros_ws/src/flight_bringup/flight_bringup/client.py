@@ -68,9 +68,11 @@ class NetworkClient(Client):
             heard_hosts |= {
                 self._instances[name] for name in self._clocks.received() if name in self._instances
             }
-            known = self._clocks.clocks().items()
+            known_clocks = self._clocks.clocks().items()
             new_clocks = {
-                self._instances[name]: clock for name, clock in known if name in self._instances
+                self._instances[name]: clock
+                for name, clock in known_clocks
+                if name in self._instances
             }
             if len(clocks) < len(new_clocks) == len(self._instances):
                 end = min(end, now + SETTLE_TIME)

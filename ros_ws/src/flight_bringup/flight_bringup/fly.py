@@ -282,8 +282,8 @@ def _follow_lockstep(
         if (outcome := processes.ended()) is not None:
             return outcome
         now = time.monotonic()
-        if (recorded := processes.monitor.recorded()) is not None:
-            t = recorded
+        if (recorded_t := processes.monitor.recorded()) is not None:
+            t = recorded_t
             last_change = now
             if first is None:
                 first = now, t

@@ -206,8 +206,8 @@ def _fly_at_once(text: str, case: int, first: int, count: int, size: int) -> Chu
     fleet_of_chunk = drawn_fleet(definition, scenario, first, size)  # while the chunk before flies
     with turn():
         fleet, equipped = fleet_of_chunk.on_device(course, vehicle)
-        flown = batch.fly(fleet, equipped, course, law.control_law, law.params)
-        result = batch.on_host(flown)
+        flight_result = batch.fly(fleet, equipped, course, law.control_law, law.params)
+        result = batch.on_host(flight_result)
     rms, largest, slew = (part[:, :count] for part in (result.rms, result.max, result.slew))
     outputs = scenario.controller.outputs
     inputs = scenario.controller.effectors

@@ -178,7 +178,7 @@ class Campaign:
             source = self.context.get_parameter_source(name)
             is_default = source is None or source.name != "COMMANDLINE"
             expected = "none: the folder of a campaign holds its definition"
-            require(is_default, name, "it beside a folder", expected)
+            require(is_default, name, "the folder of a campaign beside it", expected)
         return MonteCarlo.resume(Path(self.scenario))
 
     def _begun(self) -> MonteCarlo:

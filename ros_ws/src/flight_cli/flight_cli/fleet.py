@@ -86,21 +86,23 @@ def _unreported(flight: MemberFlight) -> _AircraftResult:
     )
 
 
-def _report(flown: MemberFlight) -> _AircraftResult:
+def _report(member_flight: MemberFlight) -> _AircraftResult:
     """Write the report of an aircraft."""
     try:
-        flight = write_report(flown.run, flown.outcome).flight
+        flight = write_report(member_flight.run, member_flight.outcome).flight
     except UnwrittenReportError as error:
         flight = error.result.flight
-        warn(f"error: {flown.member.name}: no report: {error}")
+        warn(f"error: {member_flight.member.name}: no report: {error}")
     except ParameterError as error:
         # Before the first sample.
-        outcome = never_flew(str(error)) if flown.outcome.status == 0 else flown.outcome
+        outcome = (
+            never_flew(str(error)) if member_flight.outcome.status == 0 else member_flight.outcome
+        )
         try:
-            summary = write_empty_summary(flown.run, flown.member.scenario, outcome)
+            summary = write_empty_summary(member_flight.run, member_flight.member.scenario, outcome)
         except ParameterError as unwritten:
-            warn(f"error: {flown.member.name}: no summary: {unwritten}")
-            return _unreported(replace(flown, outcome=outcome))
+            warn(f"error: {member_flight.member.name}: no summary: {unwritten}")
+            return _unreported(replace(member_flight, outcome=outcome))
         return _AircraftResult(summary, None)
     internals = flight.tape.signals.get("internals")
     return _AircraftResult(

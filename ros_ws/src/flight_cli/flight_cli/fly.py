@@ -123,7 +123,7 @@ class Fly(RouteWords):
         """Fly, write the report, show the figures."""
         if is_fleet(self.scenario):
             expected = "a scenario, or the key in the file of the fleet"
-            require_unused(self, OF_AIRCRAFT, expected, "it beside a fleet")
+            require_unused(self, OF_AIRCRAFT, expected, "a fleet beside it")
             self._fly_fleet()
         scenario = self._scenario()
         namespace = absolute_namespace(self.namespace)
@@ -257,17 +257,17 @@ def _report(scenario: Scenario, run: Path, outcome: Outcome, *, as_json: bool) -
         except ParameterError as error:
             warn(f"error: no summary: {error}")
         return outcome.status
-    told = result.flight.summary["outcome"]
+    outcome_record = result.flight.summary["outcome"]
     if as_json:
         print_json(result.flight.summary)
     else:
         show_flight(Console(), result.flight)
-        print(f"outcome: {told['sentence']}\nlog:     {display_path(result.mcap)}")
+        print(f"outcome: {outcome_record['sentence']}\nlog:     {display_path(result.mcap)}")
         if not unwritten:
             print(f"report:  {display_path(result.report)}")
     if unwritten:
         warn(f"error: no report: {unwritten}")
-    return int(told["status"])
+    return int(outcome_record["status"])
 
 
 def _require_flyable(scenario: Scenario, autopilot: Autopilot | None, *, in_process: bool) -> None:

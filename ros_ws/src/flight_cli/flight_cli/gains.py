@@ -226,7 +226,7 @@ class Gains:
         require(
             not self.theorem or (self.write is not None and not self.observer),
             "theorem",
-            "it alone",
+            "no --write, or --observer beside it",
             "--write beside it, without --observer",
         )
         require_guarantee(
@@ -253,13 +253,13 @@ class Gains:
 
     def _checked(self, progress: Callable[[str], None]) -> _GainsAnswer:
         """The gains of the scenario."""
-        contradiction = "one of them: --check selects nothing to write"
+        contradiction = "one of the two: --check selects nothing to write"
         require_unused(
-            self, ("write", "feedforward", "observer"), contradiction, "it beside --check"
+            self, ("write", "feedforward", "observer"), contradiction, "--check beside it"
         )
         own_loop = all(value is None for value in values_of(self, *LOOP).values())
         expected = "the scenario's own rate, lag, delay and inputs"
-        require(own_loop, "--check", "it beside another loop", expected)
+        require(own_loop, "--check", "another loop beside it", expected)
         answer = check_gains(self.airframe, self.scenario, **values_of(self, *STUDY))
         if not self.guaranteed:
             return _GainsAnswer({"scenario": answer})
@@ -314,7 +314,7 @@ def _loop_of_px4(
     """Rate and delay as given, or those of a parameter file, and what the latter come from."""
     if px4 is None:
         return rate, delay, ""
-    require(delay is None, "px4", "it beside --delay", "one of both")
+    require(delay is None, "px4", "--delay beside it", "one of the two")
     return rate_loop(px4, rate)
 
 
@@ -344,18 +344,19 @@ def _show_trade(console: Console, selection: Selection) -> None:
     frame = selection.study.airframe
     outputs = controller.outputs
     output_units = frame.units_of_outputs()
-    shown = [display_unit(output_units[name]) for name in outputs]
+    unit_texts = [display_unit(output_units[name]) for name in outputs]
     # A height has no score.
     have_scores = all(quantity(unit).dimension in SCORE_UNIT for unit in output_units.values())
     units = score_units(outputs, output_units) if have_scores else np.full(len(outputs), np.nan)
-    headings = (f"{name},\n{unit.unit}" for name, unit in zip(outputs, shown, strict=True))
+    headings = (f"{name},\n{unit.unit}" for name, unit in zip(outputs, unit_texts, strict=True))
     heads = ["phase margin,\ndeg", "least\nfound", "delay\nmargin", *headings, "score"]
     table = new_table(
         "\nTrade: rms of the error of the linear loop along the manoeuvre", heads, left_aligned=()
     )
     for row in trade(selection):
         errors = (
-            f"{rms * unit.factor:.3g}" for rms, unit in zip(row.rms.tolist(), shown, strict=True)
+            f"{rms * unit.factor:.3g}"
+            for rms, unit in zip(row.rms.tolist(), unit_texts, strict=True)
         )
         margins = f"{row.phase_margin:g}", f"{row.reached:.0f}", _milliseconds(row.delay_margin)
         table.add_row(*margins, *errors, f"{float(np.sum(row.rms / units)):.2f}")

@@ -27,9 +27,9 @@ FORMS = (".3f", ".1f", ".1f", ".3f")  # of the columns of a guarantee
 
 def require_guarantee(*, check: bool, is_wanted: bool, worst: Path | None, late: float) -> None:
     """Raise ParameterError for a guarantee without --check, or its settings without a guarantee."""
-    require(check or not is_wanted, "--guarantee", "it alone", "--check beside it")
-    require(is_wanted or worst is None, "worst", "it alone", "--guarantee beside it")
-    require(is_wanted or late == 0.0, "late", "it alone", "--guarantee beside it")
+    require(check or not is_wanted, "--guarantee", "no --check", "--check beside it")
+    require(is_wanted or worst is None, "worst", "no --guarantee", "--guarantee beside it")
+    require(is_wanted or late == 0.0, "late", "no --guarantee", "--guarantee beside it")
     as_number(late, "late", 0.0, MAX_DELAY_MARGIN, "s")
 
 

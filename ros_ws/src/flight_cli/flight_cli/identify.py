@@ -235,17 +235,18 @@ class Identify:
         require(0.0 <= self.altitude < math.inf, "--altitude", self.altitude, "0 m or more")
         path = self._scenario_path(name)
         console = Console(quiet=self.as_json)
-        identified = self._identified_aircraft(name, self.speed, self.altitude, console)
-        write_text("write", path, identified.text)
+        identified_aircraft = self._identified_aircraft(name, self.speed, self.altitude, console)
+        write_text("write", path, identified_aircraft.text)
         if self.as_json:
-            print_json(identified_as_json(identified, path))
+            print_json(identified_as_json(identified_aircraft, path))
         else:
-            show_identified(console, identified)
+            show_identified(console, identified_aircraft)
             say(console, f"scenario: {display_path(path)}")
-        if identified.failure:
-            warn(f"error: {identified.condition.title} does not fly: {identified.failure}")
+        if identified_aircraft.failure:
+            title = identified_aircraft.condition.title
+            warn(f"error: {title} does not fly: {identified_aircraft.failure}")
             raise typer.Exit(CANNOT_FLY)
-        if lacking := "" if self.accept else what_lacks(identified.selection):
+        if lacking := "" if self.accept else what_lacks(identified_aircraft.selection):
             refusal = f"{display_path(path)}, which says so in its first line; --accept takes it"
             raise ParameterError(f"identify: {lacking}; the gains are in {refusal}")
 

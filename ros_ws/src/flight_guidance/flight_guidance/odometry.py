@@ -36,10 +36,10 @@ def body_velocity(pose: Mapping[str, float]) -> tuple[float, float, float]:
     phi = pose["phi"]
     theta = pose["theta"]
     psi = pose["psi"]
-    ahead = pose["v_north"] * math.cos(psi) + pose["v_east"] * math.sin(psi)
+    along = pose["v_north"] * math.cos(psi) + pose["v_east"] * math.sin(psi)
     right = pose["v_east"] * math.cos(psi) - pose["v_north"] * math.sin(psi)
-    forward = ahead * math.cos(theta) + pose["climb"] * math.sin(theta)
-    down = ahead * math.sin(theta) - pose["climb"] * math.cos(theta)
+    forward = along * math.cos(theta) + pose["climb"] * math.sin(theta)
+    down = along * math.sin(theta) - pose["climb"] * math.cos(theta)
     return (
         forward,
         -right * math.cos(phi) - down * math.sin(phi),

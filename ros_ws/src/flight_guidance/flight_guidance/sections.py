@@ -67,7 +67,7 @@ class RouteConfig(Config):
             not both,
             "turns",
             f"turns and a wait at waypoint {both[0] if both else 0}",
-            "one of both",
+            "one of the two",
         )
 
     def waypoints(self) -> tuple[Waypoint, ...]:

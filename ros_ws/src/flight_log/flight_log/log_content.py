@@ -139,9 +139,9 @@ class TopicSamples:
             return
         decoded = self._decode(table)
         self._refused += decoded.unreadable
-        for received, stamps, unordered, sender in decoded.samples:
-            if unordered.shape[1] == len({*received}) == len(received):
-                names, values = self._ordered(received, unordered)
+        for sample_names, stamps, unordered, sender in decoded.samples:
+            if unordered.shape[1] == len({*sample_names}) == len(sample_names):
+                names, values = self._ordered(sample_names, unordered)
                 finite = np.isfinite(values).all(axis=1)
                 self._refused += int(np.count_nonzero(~finite))
                 stamp_ns, values = (

@@ -199,24 +199,24 @@ def _read_tlog(path: Path, kind: str, choice: Choice) -> VehicleLog:
 
 
 def _flown_system(
-    received: Mapping[int, list[Received]], chosen: int | None
+    messages_of: Mapping[int, list[Received]], choice: int | None
 ) -> tuple[int, tuple[tuple[str, str], ...]]:
     """The flying system of a tlog, and a row on the choice.
 
     Raises ParameterError where two systems moved.
     """
-    numbers = " and ".join(map(str, received)) or "none with a heartbeat"
-    if chosen is not None:
-        require(chosen in received, "--system", chosen, f"one of {numbers}")
-        return chosen, (("system", f"{chosen} of {numbers}: by --system"),)
+    numbers = " and ".join(map(str, messages_of)) or "none with a heartbeat"
+    if choice is not None:
+        require(choice in messages_of, "--system", choice, f"one of {numbers}")
+        return choice, (("system", f"{choice} of {numbers}: by --system"),)
     motions = {}
-    for system, messages in received.items():
+    for system, messages in messages_of.items():
         attitudes = [message.content for message in messages if message.name == "ATTITUDE"]
         rates = [
             [attitude.rollspeed, attitude.pitchspeed, attitude.yawspeed] for attitude in attitudes
         ]
         motions[system] = float(np.std(rates, axis=0).sum()) if rates else 0.0
-    if not received:
+    if not messages_of:
         return 0, ()
     moving = moving_numbers(motions)
     if len(moving) > 1:
@@ -226,7 +226,7 @@ def _flown_system(
             f"{ways_out}"
         )
     reason = f"{moving[0]} of {numbers}: it alone moves"
-    return moving[0], (("system", reason),) * (len(received) > 1)
+    return moving[0], (("system", reason),) * (len(messages_of) > 1)
 
 
 # Share of different times among the messages with a time: with fewer the clock stands still.

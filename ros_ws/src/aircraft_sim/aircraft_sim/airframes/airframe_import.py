@@ -302,14 +302,14 @@ def _gusts(frame: Airframe) -> dict[str, dict[str, float]]:
         if state is not None:
             per_speed = 1.0 if state in {"alpha", "beta"} else frame.speed
             column = -A[:, names.index(state)] * per_speed
-            moved = {
+            moved_states = {
                 name: float(f"{value:.6g}")
                 for name, value in zip(names, column, strict=True)
                 if value != 0.0
             }
             gusts[axis] = {
                 name: value
-                for name, value in moved.items()
+                for name, value in moved_states.items()
                 if name not in {"theta", "phi", "psi", "h", "altitude"}
             }
     return gusts

@@ -245,15 +245,15 @@ def root() -> Path:
         raise ParameterError(
             "airframe: found no Python package jsbsim, expected it for an aircraft of JSBSim"
         ) from None
-    chosen = os.environ.get(ROOT_VARIABLE)
-    if not chosen:
+    root_folder = os.environ.get(ROOT_VARIABLE)
+    if not root_folder:
         return Path(jsbsim.get_default_root_dir())
-    folder = Path(chosen).expanduser().absolute()
+    folder = Path(root_folder).expanduser().absolute()
     parts = ("aircraft", "engine")
     require(
         all((folder / part).is_dir() for part in parts),
         ROOT_VARIABLE,
-        chosen,
+        root_folder,
         f"a folder with {' and '.join(parts)}",
     )
     return folder
@@ -314,9 +314,9 @@ def _model_file(path: Path, airframe: str) -> Path:
             expected,
         )
         return path
-    named = path / f"{path.name}{SUFFIX}"
-    if named.is_file():
-        return _model_file(named, airframe)
+    named_file = path / f"{path.name}{SUFFIX}"
+    if named_file.is_file():
+        return _model_file(named_file, airframe)
     models = sorted(
         file for file in path.glob(f"*{SUFFIX}") if _first_element(file) == MODEL_ELEMENT
     )

@@ -296,15 +296,15 @@ class _Forcing(NamedTuple):
 
 
 def _reduced(
-    wind: _Forcing, timed: _Forcing
+    wind: _Forcing, forcing_over_time: _Forcing
 ) -> tuple[NDArray[np.int64], FloatArray, tuple[FloatArray, FloatArray]]:
     """`axes` and `basis` of a course, and the forcing along both over steps and at ticks."""
     axes = np.flatnonzero(wind.over_step.any(axis=0))
-    _, sizes, rows = np.linalg.svd(timed.over_step, full_matrices=False)
+    _, sizes, rows = np.linalg.svd(forcing_over_time.over_step, full_matrices=False)
     basis = rows[sizes > 1e-12 * max(sizes[0], 1e-300)].T
     over_step, now = (
         np.concatenate([blowing[:, axes], forcing @ basis], axis=1)
-        for blowing, forcing in zip(wind, timed, strict=True)
+        for blowing, forcing in zip(wind, forcing_over_time, strict=True)
     )
     return axes, basis, (over_step, now)
 

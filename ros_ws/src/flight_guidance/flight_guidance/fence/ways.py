@@ -242,11 +242,11 @@ def _is_straight(
     """
     to_north, to_east = onto_orbit(fence, north, east)
     at_end = clearance(fence.zones, to_north, to_east)
-    needed = np.minimum(np.minimum(room, at_end), cell)
+    bound = np.minimum(np.minimum(room, at_end), cell)
     least = np.full(room.shape, math.inf)
     for share in np.linspace(0.0, 1.0, sum(room.shape)):
         on_line = clearance(
             fence.zones, north + share * (to_north - north), east + share * (to_east - east)
         )
         least = np.minimum(least, on_line)
-    return np.asarray((room >= 0.0) & (least >= needed - 1e-6))
+    return np.asarray((room >= 0.0) & (least >= bound - 1e-6))

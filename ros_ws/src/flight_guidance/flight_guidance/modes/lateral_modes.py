@@ -83,17 +83,17 @@ def _onto_leg(
 ) -> tuple[float, PathError, float]:
     """`lateral_bank` on the circle onto a leg."""
     position = (pose["north"], pose["east"])
-    flown, _ = course_and_speed(pose)
+    course_over_ground, _ = course_and_speed(pose)
     start, course = route.start(state.leg, state.target.along)
     radius = state.joining * route.radius
     error = path.circle_error(path.joining_centre(start, course, radius), radius, position)
 
     def joined(place: Point) -> Any:
-        return path.is_joined(start, course, route.near(state.leg), place, flown)
+        return path.is_joined(start, course, route.near(state.leg), place, course_over_ground)
 
     entry = path.error(route.legs[state.leg], start).curvature
     bank = follow(error, entry, joined, state.slip, pose, speed, params)
-    return bank, error, path.joining_length(start, course, radius, position, flown)
+    return bank, error, path.joining_length(start, course, radius, position, course_over_ground)
 
 
 def _along_leg(

@@ -177,9 +177,9 @@ def joining_state(
     Where the point is near, the state is on the leg.
     """
     state = on_leg(state, leg, route)
-    flown = route.legs[leg]
+    leg_path = route.legs[leg]
     # The law of circles leads to an orbit from afar.
-    if path.is_orbit(flown):
+    if path.is_orbit(leg_path):
         return state
     start, course = route.start(leg, along)
     position = (pose["north"], pose["east"])
@@ -187,8 +187,8 @@ def joining_state(
         start, course, route.radius, route.near(leg), position, course_and_speed(pose)[0]
     )
     # The joining circle is that of the arc itself.
-    if isinstance(flown, Arc) and side:
-        side = math.copysign(1.0, flown.radius)
+    if isinstance(leg_path, Arc) and side:
+        side = math.copysign(1.0, leg_path.radius)
     if side and not along and route.from_V:
         state = state._replace(target=state.target._replace(V=route.from_V[leg]))
     return state._replace(joining=side, target=state.target._replace(along=along if side else 0.0))

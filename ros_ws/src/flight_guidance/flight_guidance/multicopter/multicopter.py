@@ -305,9 +305,9 @@ def _within_fence(
     position = (np.float64(pose["north"]), np.float64(pose["east"]))
     margin = MARGIN * max(abs(_velocity(pose)), 1.0)
     now = float(clearance(fence.zones, *position))
-    predicted = float(line_clearance(fence, *position, *_parts(_stop(pose, _gains(params)))))
+    stop_clearance = float(line_clearance(fence, *position, *_parts(_stop(pose, _gains(params)))))
     action = _action(fence, position, now)
-    begins = state.fence == 0.0 and predicted < margin
+    begins = state.fence == 0.0 and stop_clearance < margin
     if begins:
         target = state.target._replace(**home(pose, params))
         state = state._replace(
@@ -315,7 +315,7 @@ def _within_fence(
         )
     action_in_force = action if begins or state.fence != 0.0 else 0.0
     return state._replace(fence=action_in_force), Escape(
-        action=action_in_force, begins=begins, clearance=now, predicted=predicted, course=0.0
+        action=action_in_force, begins=begins, clearance=now, predicted=stop_clearance, course=0.0
     )
 
 
@@ -461,9 +461,9 @@ def _attitude_for(
     if state.mode is not GuidanceMode.ENGAGED:
         return 0.0, 0.0, False
     if state.lateral is Lateral.PHI:
-        asked = complex(state.target.phi, state.target.theta)
-        angles = _within(asked, largest)
-        return angles.real, angles.imag, angles != asked
+        commanded_tilt = complex(state.target.phi, state.target.theta)
+        angles = _within(commanded_tilt, largest)
+        return angles.real, angles.imag, angles != commanded_tilt
     acceleration = (
         motion.acceleration
         + gains.k_v * (motion.velocity - _velocity(pose))

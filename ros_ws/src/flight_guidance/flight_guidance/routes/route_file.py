@@ -239,13 +239,15 @@ def read_fence_file(
         f"the file {path}",
         f"one that ends in {', '.join(route_formats.FENCES)}",
     )
-    read = route_formats.read_fence(read_file(path, str(path), "a fence file"), str(path), suffix)
-    if origin is None and read.home is not None:
-        origin = Origin(read.home.latitude, read.home.longitude)
-    places = chain.from_iterable(area.places for area in read.zones)
+    fence_places = route_formats.read_fence(
+        read_file(path, str(path), "a fence file"), str(path), suffix
+    )
+    if origin is None and fence_places.home is not None:
+        origin = Origin(fence_places.home.latitude, fence_places.home.longitude)
+    places = chain.from_iterable(area.places for area in fence_places.zones)
     _require_order([place._replace(key=str(path)) for place in places], origin)
     zones: dict[str, Any] = {}
-    for k, area in enumerate(read.zones):
+    for k, area in enumerate(fence_places.zones):
         key = f"zone_{k}"
         flat = [
             place._replace(key=f"fence.{key}", altitude=0.0, above=Above.AS_POSE)
@@ -264,8 +266,8 @@ def read_fence_file(
             zones[key]["radius"] = _number(f"fence.{key}", area.radius, "radius")
         if area.group is not None:
             zones[key]["group"] = area.group
-    heights = _Heights(altitude, read.home, above_sea=above_sea)
-    home = _home_of_fence(read, origin, heights)
+    heights = _Heights(altitude, fence_places.home, above_sea=above_sea)
+    home = _home_of_fence(fence_places, origin, heights)
     return {"fence": zones} | ({} if home is None else {"home": home})
 
 

@@ -509,9 +509,11 @@ def filleted(waypoints: Sequence[Point], radius: float, first: int = 0) -> list[
     start = waypoints[0]
     for k, (start_point, end_point) in enumerate(pairwise(waypoints)):
         length = math.dist(start_point, end_point)
-        needed = fillets[k] + fillets[k + 1]
-        if length <= needed:
-            expected = f"expected more than {math.ceil(needed)} m, for fillets of {radius:g} m"
+        both_fillets = fillets[k] + fillets[k + 1]
+        if length <= both_fillets:
+            expected = (
+                f"expected more than {math.ceil(both_fillets)} m, for fillets of {radius:g} m"
+            )
             number = first + k + 1
             raise ShortLegError(
                 f"route[{number}]: found {length:g} m from the waypoint before, {expected}", number
