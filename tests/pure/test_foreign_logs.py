@@ -65,14 +65,17 @@ def test_decoding_without_end_is_one_sentence(
 
 
 def test_limits_follow_from_the_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    given: dict[str, Any] = {}
-    monkeypatch.setattr(isolated, "call", lambda *_, **limits: given.update(limits))
+    limits_of_call: dict[str, Any] = {}
+    monkeypatch.setattr(isolated, "call", lambda *_, **limits: limits_of_call.update(limits))
     path = tmp_path / "large.ulg"
     path.write_bytes(HEAD)
     with path.open("ab") as stream:
         stream.truncate(10_000_000)
     read_foreign_log(path)
-    assert (given["timeout"], given["memory"]) == (5.0 + 60.0, (1 << 30) + 1_000_000_000)
+    assert (limits_of_call["timeout"], limits_of_call["memory"]) == (
+        5.0 + 60.0,
+        (1 << 30) + 1_000_000_000,
+    )
 
 
 def test_log_from_the_isolated_process_is_that_of_this_one(tmp_path: Path) -> None:
@@ -80,17 +83,17 @@ def test_log_from_the_isolated_process_is_that_of_this_one(tmp_path: Path) -> No
     stamps = range(0, 2_000_000, 20_000)
     rows = [(stamp, (1.0, 0.01 * k, 0.0, 0.0)) for k, stamp in enumerate(stamps)]
     write_ulog(path, {"vehicle_attitude": ("float[4] q;", rows)}, {"FW_AIRSPD_TRIM": 25.0})
-    here = read_vehicle_log(path)
-    there = read_foreign_log(path)
-    assert there._replace(tables={}) == here._replace(tables={})
-    assert there.tables.keys() == here.tables.keys()
-    for name, table in here.tables.items():
-        assert np.array_equal(there.tables[name].stamp_ns, table.stamp_ns)
+    direct = read_vehicle_log(path)
+    foreign = read_foreign_log(path)
+    assert foreign._replace(tables={}) == direct._replace(tables={})
+    assert foreign.tables.keys() == direct.tables.keys()
+    for name, table in direct.tables.items():
+        assert np.array_equal(foreign.tables[name].stamp_ns, table.stamp_ns)
         assert all(
-            np.array_equal(there.tables[name].fields[field], values)
+            np.array_equal(foreign.tables[name].fields[field], values)
             for field, values in table.fields.items()
         )
-    assert there.source("theta") == here.source("theta")
+    assert foreign.source("theta") == direct.source("theta")
 
 
 def test_file_that_is_no_log_is_one_sentence(tmp_path: Path) -> None:

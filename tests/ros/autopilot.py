@@ -66,10 +66,8 @@ class Autopilot:
 
     def _on_joy(self, message: Joy) -> None:
         if len(message.axes) >= 4:  # messages with fewer axes are ignored
-            self._axes, self._received = (
-                [float(axis) for axis in message.axes[:4]],
-                self._monotonic(),
-            )
+            self._axes = [float(axis) for axis in message.axes[:4]]
+            self._received = self._monotonic()
 
     def _u(self) -> list[float]:
         """Elevator, thrust, aileron, rudder from trim, in rad and as a fraction of full thrust.
@@ -125,10 +123,8 @@ class Autopilot:
         twist.twist.angular.y = -q
         twist.twist.angular.z = -r
         alpha = 0.05
-        airspeed.vector.x, airspeed.vector.z = (
-            (SPEED + V) * math.cos(alpha),
-            (SPEED + V) * math.sin(alpha),
-        )
+        airspeed.vector.x = (SPEED + V) * math.cos(alpha)
+        airspeed.vector.z = (SPEED + V) * math.sin(alpha)
         self._twist.publish(twist)
         self._airspeed.publish(airspeed)
 
@@ -143,15 +139,20 @@ class Odometer(Autopilot):
         super().__init__(scenario, release_after, node)
         self._imu = self.node.create_publisher(Imu, "sim/imu", 10)
         self._odometry = self.node.create_publisher(Odometry, "sim/odom", 10)
-        self._held = {"elevator": 0.0, "thrust": FULL_THRUST / 2.0, "aileron": 0.0, "rudder": 0.0}
-        for name in self._held:
+        self._commands = {
+            "elevator": 0.0,
+            "thrust": FULL_THRUST / 2.0,
+            "aileron": 0.0,
+            "rudder": 0.0,
+        }
+        for name in self._commands:
             self.node.create_subscription(Float64, f"sim/{name}", partial(self._hold, name), 10)
 
     def _hold(self, name: str, message: Float64) -> None:
-        self._held[name] = message.data
+        self._commands[name] = message.data
 
     def _u(self) -> list[float]:
-        elevator, thrust, aileron, rudder = self._held.values()
+        elevator, thrust, aileron, rudder = self._commands.values()
         return [elevator, thrust / FULL_THRUST - 0.5, aileron, rudder]
 
     def _publish(self, q: float, V: float, p: float, r: float) -> None:

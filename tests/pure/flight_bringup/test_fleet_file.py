@@ -57,15 +57,15 @@ def test_aircraft_share_what_fleet_sets_and_keep_what_is_their_own(tmp_path: Pat
 
 @pytest.mark.parametrize("node", ["/blue/controller#2", "/stray#2", "/green/stray#2"])
 def test_samples_of_node_outside_of_aircraft_are_counted(node: str) -> None:
-    def of(*nodes: str) -> dict[str, Any]:
+    def summary_of(*nodes: str) -> dict[str, Any]:
         return {"account": {"processes": {name: {"samples": 3} for name in nodes}}}
 
     own = "/red/controller#1"
-    blue = of("/blue/controller#2")
-    assert fleet.foreign_samples({"red": of(own), "blue": blue}) == [
+    blue = summary_of("/blue/controller#2")
+    assert fleet.foreign_samples({"red": summary_of(own), "blue": blue}) == [
         "samples from outside of the aircraft: 0 of 6"
     ]
-    assert fleet.foreign_samples({"red": of(own, node), "blue": blue}) == [
+    assert fleet.foreign_samples({"red": summary_of(own, node), "blue": blue}) == [
         "red: 3 samples from outside of /red"
     ]
 
@@ -81,11 +81,11 @@ def without_ros(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
 def test_interrupt_before_flight_leaves_no_folder(
     words: list[str], without_ros: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    def interrupted(*runs: Path, **options: Any) -> NoReturn:
+    def interrupted_watch(*runs: Path, **options: Any) -> NoReturn:
         assert all(run.is_dir() for run in runs)
         raise KeyboardInterrupt
 
-    without_ros.setattr("flight_cli.watch.watched", interrupted)
+    without_ros.setattr("flight_cli.watch.watched", interrupted_watch)
     file = [str(fleet_file(tmp_path, FLEET_OF_TWO))] if words == ["fly"] else []
     arguments = [*words, *file, "--watch", "--runs", str(tmp_path / "runs")]
     assert invoke(*arguments).exit_code == 130
@@ -95,17 +95,19 @@ def test_interrupt_before_flight_leaves_no_folder(
 def test_interrupt_of_reports_shows_what_was_flown(
     without_ros: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    def flown(of: Fleet, runs: Sequence[Path], progress: object) -> list[MemberFlight]:
+    def fly_at_once(
+        fleet_file: Fleet, runs: Sequence[Path], progress: object
+    ) -> list[MemberFlight]:
         return [
             MemberFlight(member, run, COMPLETED)
-            for member, run in zip(of.members, runs, strict=True)
+            for member, run in zip(fleet_file.members, runs, strict=True)
         ]
 
-    def reported(run: Path, outcome: Outcome) -> NoReturn:
+    def refuse_report(run: Path, outcome: Outcome) -> NoReturn:
         raise ParameterError("no sample") if "-one-" in run.name else KeyboardInterrupt
 
-    without_ros.setattr(fleet, "fly_fleet", flown)
-    without_ros.setattr(fleet, "write_report", reported)
+    without_ros.setattr(fleet, "fly_fleet", fly_at_once)
+    without_ros.setattr(fleet, "write_report", refuse_report)
     arguments = [
         "fly",
         str(fleet_file(tmp_path, FLEET_OF_TWO)),

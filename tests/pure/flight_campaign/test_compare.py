@@ -52,16 +52,16 @@ SHIPPED = sorted(path.stem for path in tuned_gains.TUNED.glob("*.yaml"))
 @pytest.fixture(scope="module")
 def short() -> Benchmark:
     """The first 4 s of osprey_servo, with its vertical gust brought forward into them."""
-    return tuning.build_benchmark(brief(find_scenario("osprey_servo")))
+    return tuning.build_benchmark(first_seconds(find_scenario("osprey_servo")))
 
 
-def brief(scenario: Scenario) -> Scenario:
+def first_seconds(scenario: Scenario) -> Scenario:
     """The first 4 s of a scenario, with a vertical gust in them."""
     gust = {"vertical": {"start": 2.0, "speed": 10.12, "length": 15.24}}
     return scenario.vary(flight={"duration": 4.0}, aircraft={"gusts": gust})
 
 
-def as_tuned(gains: Gains, **changes: Any) -> TuningResult:
+def tuning_result(gains: Gains, **changes: Any) -> TuningResult:
     """A tuning result with these gains."""
     return TuningResult(
         gains={name: value[:, 0].tolist() for name, value in gains.items()},
@@ -72,19 +72,19 @@ def as_tuned(gains: Gains, **changes: Any) -> TuningResult:
     )._replace(**changes)
 
 
-def initial(name: str, benchmark: Benchmark, **changes: Any) -> TuningResult:
+def initial_result(name: str, benchmark: Benchmark, **changes: Any) -> TuningResult:
     """A tuning result with the initial gains of a law."""
-    return as_tuned(initial_gains(LAWS[name], benchmark.model), **changes)
+    return tuning_result(initial_gains(LAWS[name], benchmark.model), **changes)
 
 
 def test_search_is_repeatable_and_lowers_cost_of_initial_gains(short: Benchmark) -> None:
     law = LAWS["pi"]
     begin = initial_gains(LAWS["pi"], short.model)
     objective = OBJECTIVES["gust_turbulence"]
-    found = [tuning.tune(law, objective, short, (3, 4), generations=6) for _ in range(2)]
-    assert found[0] == found[1]
-    assert found[0].cost == min(found[0].costs)
-    assert found[0].evaluations == 6 * tuning.POPULATION
+    results = [tuning.tune(law, objective, short, (3, 4), generations=6) for _ in range(2)]
+    assert results[0] == results[1]
+    assert results[0].cost == min(results[0].costs)
+    assert results[0].evaluations == 6 * tuning.POPULATION
     control_law = law.control_law(short.model)
 
     def cost(gains: Gains) -> float:
@@ -96,8 +96,8 @@ def test_search_is_repeatable_and_lowers_cost_of_initial_gains(short: Benchmark)
             total += float(tuning.cost(result, short) @ part.weight)
         return total
 
-    after = cost(tuning.as_gains(found[0]))
-    assert after == approx(found[0].cost, rel=1e-3)  # gains are written with five digits
+    after = cost(tuning.as_gains(results[0]))
+    assert after == approx(results[0].cost, rel=1e-3)  # gains are written with five digits
     assert after < 0.95 * cost(begin)
 
 
@@ -111,7 +111,7 @@ def test_score_of_campaign_is_that_of_single_process_simulation(
         "K": np.array([controller.law_params().K]).T,
         "softening": np.atleast_2d(short.scenario.rise_di().softening).T,
     }
-    (result,) = law_comparison.compare(short, {"rise": {"gust": as_tuned(gains)}}, 1, [0.3], 1)
+    (result,) = law_comparison.compare(short, {"rise": {"gust": tuning_result(gains)}}, 1, [0.3], 1)
     turbulence = MODERATE | {"seed": tuning.TUNING_TURBULENCE_SEED}
     parts = (
         short.scenario
@@ -145,7 +145,7 @@ def test_scenario_with_turbulence_is_compared_in_its_own(short: Benchmark) -> No
 def test_share_of_lost_aircraft_is_that_of_first_level_by_delay_of_u(short: Benchmark) -> None:
     # K of 40 1/s and the 35 ms of the loop of q are 1.4 rad at the crossover: stable below pi/2;
     # with 60 ms more it is unstable
-    fast = as_tuned({"K": np.full((4, 1), 40.0), "Lambda": np.ones((4, 1))})
+    fast = tuning_result({"K": np.full((4, 1), 40.0), "Lambda": np.ones((4, 1))})
     (result,) = law_comparison.compare(
         short, {"pi": {"gust": fast}}, 3, [0.3, 0.5], 1, delays=(0, 6)
     )
@@ -195,7 +195,7 @@ def gains_file(short: Benchmark, tmp_path_factory: pytest.TempPathFactory) -> Pa
     """A file with gains of three laws."""
     path = tmp_path_factory.mktemp("gains") / "gains.yaml"
     tuned = {
-        name: {"gust": initial(name, short, cost=7.25, costs=[7.375, 7.25])}
+        name: {"gust": initial_result(name, short, cost=7.25, costs=[7.375, 7.25])}
         for name in ("rise", "l1", "indi")
     }
     tuned_gains.save(path, tuned, list(OBJECTIVES), "a test")
@@ -219,14 +219,14 @@ def test_the_command_writes_what_it_shows(
     arguments = [*options.split(), "--gains", str(gains_file)]
     result = invoke("compare", brief_file, *arguments, "--json", path)
     assert result.exit_code == 0, result.output
-    found = json.loads(path.read_text())
-    assert found["wind"] == "published"
+    results = json.loads(path.read_text())
+    assert results["wind"] == "published"
     assert "effect of wind on x_dot that of the airframe" in result.stdout
-    assert [row["law"] for row in found["laws"]] == ["rise", "l1"]
-    assert [row["knows"] for row in found["laws"]] == [
+    assert [row["law"] for row in results["laws"]] == ["rise", "l1"]
+    assert [row["knows"] for row in results["laws"]] == [
         LAWS[name].model_data for name in ("rise", "l1")
     ]
-    for row in found["laws"]:
+    for row in results["laws"]:
         (level,) = row["levels"]
         for wind in (GUST, TURBULENCE):
             assert f"{row['score'][wind]:.2f}" in result.stdout
@@ -258,7 +258,7 @@ def test_registered_law_flies_as_that_of_catalogue(short: Benchmark) -> None:
     controllers = registered_laws.find_laws(["rise", "rise_di"], scenario, {})
     laws = registered_laws.entries(controllers)
     tuned = {
-        "rise": {"gust": as_tuned(gains)},
+        "rise": {"gust": tuning_result(gains)},
         "rise_di": {"gust": registered_laws.as_tuned(scenario.controller)},
     }
     catalogue, registered = law_comparison.compare(short, tuned, 2, [0.3], 1, delays=(), laws=laws)
@@ -278,7 +278,7 @@ def test_interrupted_tuning_resumes_with_missing_laws(
         tuned.append(names[law.title])
         if tuned == ["rise", "pi"]:
             raise KeyboardInterrupt
-        return initial(names[law.title], short)
+        return initial_result(names[law.title], short)
 
     monkeypatch.setattr(tuning, "tune", tune)
     options = "--laws rise,pi,l1 --aircraft 1 --tune --gains"
@@ -321,8 +321,8 @@ def test_search_within_margins_has_them(short: Benchmark) -> None:
     )
 
     def least(gains: Gains) -> float:
-        found = nominal_margins(law, gains, short.model)
-        return least_fraction(Margins(*(values[0] for values in found)), REQUIREMENT)
+        results = nominal_margins(law, gains, short.model)
+        return least_fraction(Margins(*(values[0] for values in results)), REQUIREMENT)
 
     assert least(initial_gains(law, short.model)) < 0.98  # 43 degrees for 45
     result = tuning.tune(law, OBJECTIVES["margins"], short, (3, 4), generations=8)
@@ -353,7 +353,7 @@ def test_written_controller_is_the_law_that_was_tuned(name: str, short: Benchmar
         Measurements(y=y[0][:, None], y_m=none, y_m_dot=none, u_trim=none, u_before=none), sets
     )
     u = zero
-    found = none
+    results = none
     for sample in y[1:]:
         state, u = law.step(
             state,
@@ -361,10 +361,10 @@ def test_written_controller_is_the_law_that_was_tuned(name: str, short: Benchmar
             dt,
             params,
         )
-        wide, found = of_catalogue.step(
+        wide, results = of_catalogue.step(
             wide,
-            Measurements(y=sample[:, None], y_m=none, y_m_dot=none, u_trim=none, u_before=found),
+            Measurements(y=sample[:, None], y_m=none, y_m_dot=none, u_trim=none, u_before=results),
             dt,
             sets,
         )
-    assert_allclose(u, found[:, 0], rtol=2e-4, atol=1e-7)  # a file has six digits
+    assert_allclose(u, results[:, 0], rtol=2e-4, atol=1e-7)  # a file has six digits

@@ -50,8 +50,14 @@ class Loop:
         self._controller = Controller(self._scenario.controller)
         self._now_ns = nanoseconds(1.0)
         self._last_ns = 0
-        self._active, self._has_y, self._has_y_m, self._offset = True, True, True, 0.0
-        self._u, self._u_ns, self._e, self._beyond = np.zeros(4), 0, np.zeros(4), np.zeros(4)
+        self._active = True
+        self._has_y = True
+        self._has_y_m = True
+        self._offset = 0.0
+        self._u = np.zeros(4)
+        self._u_ns = 0
+        self._e = np.zeros(4)
+        self._excess = np.zeros(4)  # what the limits kept back
         # of the present failsafe: the largest abs(u), and the time to trim, s
         self._ramp = (np.zeros(4), 0.0)
         self._was_active = True  # at the last tick
@@ -163,8 +169,8 @@ class Loop:
             np.array([logged[f"{key}.{name}"] for name in SCENARIO.controller.inputs])
             for key in ("u", "u_free")
         )
-        excess = self._beyond
-        self._beyond = np.abs(u_free - u)
+        excess = self._excess
+        self._excess = np.abs(u_free - u)
         self._dt = dt = logged["dt"]
         change = self._e - e_p + law.Lambda * dt * (self._e + e_p) / 2.0
         step = law.input_scale * (law.K * np.abs(change) + dt * law.beta) + excess
@@ -188,39 +194,39 @@ EVENTS: Mapping[str, Callable[[Loop], None]] = {
 }
 
 
-def waiting() -> Loop:
+def waiting_loop() -> Loop:
     return Loop()
 
 
-def engaged(**changes: Any) -> Loop:
+def engaged_loop(**changes: Any) -> Loop:
     loop = Loop(**changes)
     loop.ticks(20)
     return loop
 
 
-def stale(count: int) -> Loop:
-    loop = engaged()
+def stale_loop(count: int) -> Loop:
+    loop = engaged_loop()
     loop.receive(y=False, y_m=False)
     loop.ticks(count)
     return loop
 
 
-def inactive(count: int, **changes: Any) -> Loop:
-    loop = engaged(**changes)
+def inactive_loop(count: int, **changes: Any) -> Loop:
+    loop = engaged_loop(**changes)
     loop.activate(active=False)
     loop.ticks(count)
     return loop
 
 
 STATES: Mapping[str, tuple[Callable[[], Loop], Mode]] = {
-    "waiting": (waiting, Mode.WAITING),
-    "engaged": (engaged, Mode.ENGAGED),
-    "hold": (lambda: stale(5), Mode.HOLD),
-    "ramp": (lambda: stale(15), Mode.RAMP),
-    "trim": (lambda: stale(40), Mode.TRIM),
-    "inactive, in the ramp": (lambda: inactive(8), Mode.INACTIVE),
-    "inactive, at trim": (lambda: inactive(40), Mode.INACTIVE),
-    "inactive, held": (lambda: inactive(8, on_deactivate="hold"), Mode.INACTIVE),
+    "waiting": (waiting_loop, Mode.WAITING),
+    "engaged": (engaged_loop, Mode.ENGAGED),
+    "hold": (lambda: stale_loop(5), Mode.HOLD),
+    "ramp": (lambda: stale_loop(15), Mode.RAMP),
+    "trim": (lambda: stale_loop(40), Mode.TRIM),
+    "inactive, in the ramp": (lambda: inactive_loop(8), Mode.INACTIVE),
+    "inactive, at trim": (lambda: inactive_loop(40), Mode.INACTIVE),
+    "inactive, held": (lambda: inactive_loop(8, on_deactivate="hold"), Mode.INACTIVE),
 }
 
 
@@ -247,14 +253,14 @@ def test_no_event_makes_u_jump(state: str, event: str) -> None:
 # y is stale before the law engages again.
 @example(policy="trim", events=[("y lost", 1), ("configured and activated", 10)])
 def test_no_sequence_of_events_makes_u_jump(policy: str, events: list[tuple[str, int]]) -> None:
-    loop = engaged(on_deactivate=policy)
+    loop = engaged_loop(on_deactivate=policy)
     for name, count in events:
         EVENTS[name](loop)
         loop.ticks(count)
 
 
 def test_configuration_engages_the_law_again() -> None:
-    loop = engaged()
+    loop = engaged_loop()
     loop.configure(active=True)
     loop.ticks(1)
     assert loop.dt == 0.0
@@ -331,7 +337,7 @@ def test_overrun_leaves_u_where_aircraft_has_it(duration: float) -> None:
 
     u of controller and aircraft are equal within two periods of the ramp.
     """
-    loop = engaged()
+    loop = engaged_loop()
     before = loop.u
     guard = SCENARIO.controller.guard()
     aircraft = AppliedInput(4, guard.max_age_ns + guard.hold_ns, guard.ramp_ns)

@@ -61,7 +61,10 @@ def drawn_calls(
     )
     recorder = Recorder(sets, samples=samples)
     now_ns = EPOCH_NS
-    y_m, size, inactive, silence = np.zeros(m), unit, 0, 0
+    y_m = np.zeros(m)
+    size = unit
+    inactive = 0
+    silence = 0
     jumps = _jumps(unit, np.random.default_rng([seed, 1]))
     stamp_m_ns = now_ns
     for k in range(ticks):
@@ -166,7 +169,7 @@ def drawn_steps(sets: Sequence[RiseDiConfig], index: int, steps: int, seed: int)
     )
     dt_ns = np.minimum(np.round(period_ns * factor).astype(np.int64), longest_ns)
     before, y, y_m = _drawn_states(sets[index], rng, dt_ns)
-    after = _stepped(sets[index], before, y, y_m, dt_ns)
+    after = _states_after(sets[index], before, y, y_m, dt_ns)
     zero = np.zeros((steps, 9), dtype=np.int64)
     integers = zero + np.array([1, 0, Mode.ENGAGED, 1, 0, 0, 0, 0, 0])
     integers[:, 4] = integers[:, 8] = EPOCH_NS + dt_ns
@@ -284,7 +287,7 @@ def _drawn_states(
     return states, y, y_m
 
 
-def _stepped(
+def _states_after(
     controller: RiseDiConfig,
     before: Mapping[str, FloatArray],
     y: FloatArray,
@@ -312,16 +315,16 @@ def _stepped(
     lost_periods = np.round(dt / period) - 1.0
     for k in range(round(lost_periods.max())):
         state = _where(k < lost_periods, law.control_law.missed(state, at_last_y, params), state)
-    u_ff, model_state = _fed_forward(guard.nominal, before, y_m, dt)
+    u_ff, model_state = _feedforward_step(guard.nominal, before, y_m, dt)
     u_trim = before["u_trim"] if guard.nominal is None else before["u_trim"] + u_ff
     measurements = Measurements(y=y, y_m=y_m, y_m_dot=zero, u_trim=u_trim, u_before=u_before)
     # The step of the law, and the step inside the limits where one acts.
-    stepped, u_free = law.control_law.step(state, measurements, dt, params)
+    law_state, u_free = law.control_law.step(state, measurements, dt, params)
     last = before.get("effectors")
     u, _ = _effector_values(saturate(u_free, u_before, dt, limits), last, dt, guard.allocation)
     is_limited = (u != u_free).any(axis=0)
     limits = limits if guard.allocation is None else limits_of_effectors(u_free, u)
-    stepped_limited, u_free_limited, u_limited = law.control_law.limited(
+    law_state_limited, u_free_limited, u_limited = law.control_law.limited(
         state, measurements, dt, params, limits
     )
     u, effectors = _effector_values(np.where(is_limited, u_limited, u), last, dt, guard.allocation)
@@ -332,7 +335,7 @@ def _stepped(
         "u_free": np.where(is_limited, u_free_limited, u_free),
         "u_ff": u_ff,
         **({} if effectors is None else {"effectors": effectors}),
-        **fields(_where(is_limited, stepped_limited, stepped)),
+        **fields(_where(is_limited, law_state_limited, law_state)),
         **model_state,
     }
     output = {
@@ -344,7 +347,7 @@ def _stepped(
     return after | {"y": y, "y_m": y_m} | output
 
 
-def _fed_forward(
+def _feedforward_step(
     nominal: Nominal | None,
     before: Mapping[str, FloatArray],
     y_m: FloatArray,
@@ -356,13 +359,13 @@ def _fed_forward(
     x, u, dt_before, ticks, u_0 = (
         before[f"feedforward.{name}"] for name in FeedforwardState._fields
     )
-    now, u_ff = feedforward.step(
+    model_state, u_ff = feedforward.step(
         FeedforwardState(x=x, u=u, dt=dt_before[0], ticks=ticks[0], u_0=u_0),
         y_m,
         dt,
         _columns(nominal),
     )
-    states = now._asdict().items()
+    states = model_state._asdict().items()
     return u_ff, {f"feedforward.{name}": np.atleast_2d(value) for name, value in states}
 
 

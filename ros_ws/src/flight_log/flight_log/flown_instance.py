@@ -45,10 +45,13 @@ def instances_of_flight(
         number = choice.instances.get(name)
         reason = "by --instance"
         if number is not None:
-            require(number in sensors, f"--instance {name}", number, f"one of {_listed(sensors)}")
+            require(
+                number in sensors, f"--instance {name}", number, f"one of {_enumeration(sensors)}"
+            )
         elif name == "ARSP":
             tables[name], sentence = _airspeed(sensors)
-            choices += [(name, sentence)] * (len(sensors) > 1)
+            if len(sensors) > 1:
+                choices.append((name, sentence))
             continue
         elif len(sensors) == 1 or name not in fields or name in CORES:
             number = min(sensors)
@@ -59,10 +62,11 @@ def instances_of_flight(
             else:
                 number, reason = (0, "the rotors of a VTOL")
         else:
-            usable = _used(sensors, parameters) if name == "IMU" else set(sensors)
+            usable = _usable_sensors(sensors, parameters) if name == "IMU" else set(sensors)
             number, reason = _of_motion(name, {k: sensors[k] for k in sorted(usable)}, fields[name])
         tables[name] = sensors[number]
-        choices += [(name, f"{number} of {_listed(sensors)}: {reason}")] * bool(reason)
+        if reason:
+            choices.append((name, f"{number} of {_enumeration(sensors)}: {reason}"))
     return tables, choices
 
 
@@ -78,7 +82,7 @@ def _of_motion(name: str, tables: Mapping[int, MessageTable], fields: Set[str]) 
         return first, "the first of those that agree" if others else "it alone is used and moves"
     ways_out = " or ".join(f"--instance {name}={number}" for number in moving)
     raise ParameterError(
-        f"the log: found {name} of {_listed(moving)}, which differ, expected {ways_out}"
+        f"the log: found {name} of {_enumeration(moving)}, which differ, expected {ways_out}"
     )
 
 
@@ -116,7 +120,7 @@ def _agree(first: MessageTable, second: MessageTable, fields: Set[str]) -> bool:
     return True
 
 
-def _used(tables: Mapping[int, MessageTable], parameters: Parameters) -> set[int]:
+def _usable_sensors(tables: Mapping[int, MessageTable], parameters: Parameters) -> set[int]:
     """The healthy gyroscopes in use, by INS_USE, INS_USE2 and INS_USE3."""
     names = {number: f"INS_USE{number + 1 if number else ''}" for number in tables}
     numbers = {
@@ -165,7 +169,7 @@ def _airspeed(sensors: Mapping[int, MessageTable]) -> tuple[MessageTable, str]:
             if number not in numbers and not _agree(candidates[number], table, {"Airspeed"})
         ]
         if not unlike:
-            return table, f"{_listed(numbers)} of {_listed(tables)}: the primary"
+            return table, f"{_enumeration(numbers)} of {_enumeration(tables)}: the primary"
         candidates = {number: tables[number] for number in (*numbers, *unlike)}
     require(
         bool(candidates),
@@ -174,7 +178,7 @@ def _airspeed(sensors: Mapping[int, MessageTable]) -> tuple[MessageTable, str]:
         "one, or --instance ARSP=0",
     )
     number, _ = _of_motion("ARSP", candidates, {"Airspeed"})
-    return tables[number], f"{number} of {_listed(tables)}: healthy and used"
+    return tables[number], f"{number} of {_enumeration(tables)}: healthy and used"
 
 
 def _healthy(table: MessageTable) -> MessageTable:
@@ -203,5 +207,5 @@ def _primary(tables: Mapping[int, MessageTable]) -> tuple[list[int], MessageTabl
     return numbers, MessageTable(stamps[order], {"Airspeed": airspeed[order]})
 
 
-def _listed(numbers: Mapping[int, MessageTable] | list[int]) -> str:
+def _enumeration(numbers: Mapping[int, MessageTable] | list[int]) -> str:
     return " and ".join(map(str, sorted(numbers)))

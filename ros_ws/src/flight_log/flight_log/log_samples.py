@@ -62,7 +62,8 @@ def tables_of(
                 parts.append([])
                 settings.append([])
             parts[-1] += strays
-            newest_ns, strays = max(stamp_ns for _, stamp_ns, _ in strays), []
+            newest_ns = max(stamp_ns for _, stamp_ns, _ in strays)
+            strays = []
         settings[-1] += next_settings
         next_settings = []
     settings[-1] += next_settings
@@ -108,15 +109,11 @@ def is_number(value: object) -> bool:
 
 def near(stamp_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Which stamps are near the median of the five around them: a damaged stamp is not."""
-    if len(stamp_ns) > 2:
-        around = np.lib.stride_tricks.sliding_window_view(np.pad(stamp_ns, 2, mode="reflect"), 5)
-    else:
-        around = None
-    if around is None:
+    if len(stamp_ns) <= 2:
         return np.ones(len(stamp_ns), dtype=bool)
-    return np.abs(stamp_ns - np.median(around, axis=1)) <= STEP_NS + 2.0 * np.median(
-        np.abs(np.diff(stamp_ns))
-    )
+    fives = np.lib.stride_tricks.sliding_window_view(np.pad(stamp_ns, 2, mode="reflect"), 5)
+    distance = np.abs(stamp_ns - np.median(fives, axis=1))
+    return distance <= STEP_NS + 2.0 * np.median(np.abs(np.diff(stamp_ns)))
 
 
 def table_of(stamp_ns: NDArray[np.int64], fields: Mapping[str, FloatArray]) -> MessageTable:

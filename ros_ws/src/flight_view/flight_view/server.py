@@ -74,8 +74,8 @@ TRY_AGAIN_LATER = 1013
 TOKEN_HEADER = "X-Page-Token"  # noqa: S105 - a name
 NO_TOKEN = "Open the whole address that rise-di watch printed"  # noqa: S105 - a sentence
 FULL = f"{MAX_CONNECTIONS} connections are open"
-REST = 0.09  # s
-POLL_PERIOD = 0.03  # after a chunk and until the next: the recorder closes a chunk each 0.1 s
+REST = 0.09  # s, after a chunk: the recorder closes a chunk each 0.1 s
+POLL_PERIOD = 0.03  # s, until the next chunk
 STATE_PERIOD = 0.25  # s, between two looks at the state of the recording
 BUDGET = 0.05  # s of reading between two answers
 
@@ -156,7 +156,7 @@ class Server:
 
         Raises as `Flight.update` does.
         """
-        looked = -math.inf
+        last_look = -math.inf
         while True:
             has_changed = [flight.update(BUDGET) for flight in self.followed]
             pause = POLL_PERIOD
@@ -166,34 +166,34 @@ class Server:
                 pause = (
                     0.0 if any(flight.state() == "reading" for flight in self.followed) else REST
                 )
-            if any(has_changed) or time.monotonic() > looked + STATE_PERIOD:
-                looked = time.monotonic()
+            if any(has_changed) or time.monotonic() > last_look + STATE_PERIOD:
+                last_look = time.monotonic()
                 for stream in [*self.streams]:
                     stream.look()
             await asyncio.sleep(pause)
 
-    async def news(self, flight: Flight | FleetView, known: Mapping[str, str]) -> bytes:
-        """The answer to a browser with the `known` numbers of rows by topic.
+    async def news(self, flight: Flight | FleetView, query: Mapping[str, str]) -> bytes:
+        """The answer to a browser whose `query` has the numbers of its rows by topic.
 
         Waits up to MAX_WAIT s for news.
         """
         deadline = time.monotonic() + MAX_WAIT
-        while not has_news(flight, known) and (remaining := deadline - time.monotonic()) > 0.0:
+        while not has_news(flight, query) and (remaining := deadline - time.monotonic()) > 0.0:
             with suppress(TimeoutError):
                 await asyncio.wait_for(self._news.wait(), min(remaining, STATE_PERIOD))
-        return self.answer(flight, known)
+        return self.answer(flight, query)
 
-    def answer(self, flight: Flight | FleetView, known: Mapping[str, str]) -> bytes:
-        """The answer to a browser with the `known` numbers of rows by topic.
+    def answer(self, flight: Flight | FleetView, query: Mapping[str, str]) -> bytes:
+        """The answer to a browser whose `query` has the numbers of its rows by topic.
 
         Raises HTTPError for too long a number.
         """
-        several = len(self.followed) > 1
+        has_ghost = len(self.followed) > 1
         fleet = len(self.followed) if self.fleet else 0
         return answer(
             flight,
-            known,
-            ghost=several and not fleet,
+            query,
+            ghost=has_ghost and not fleet,
             fleet=fleet,
             control=self.control is not None,
         )
@@ -207,11 +207,11 @@ def _epoch(flight: Flight | FleetView) -> str:
     return f"{flight.start_ns}.{sum(samples.thinned for samples in flight.samples.values())}"
 
 
-def _first_rows(flight: Flight | FleetView, known: Mapping[str, str]) -> dict[str, int]:
+def _first_rows(flight: Flight | FleetView, query: Mapping[str, str]) -> dict[str, int]:
     """The first row unknown to a browser, by topic. Raises HTTPError for too long a number."""
-    is_same_epoch = known.get("epoch") == _epoch(flight)
+    is_same_epoch = query.get("epoch") == _epoch(flight)
     rows = {
-        name: known.get(name, "") if is_same_epoch else "" for name in (*flight.samples, "events")
+        name: query.get(name, "") if is_same_epoch else "" for name in (*flight.samples, "events")
     }
     if any(len(text) > MAX_DIGITS for text in rows.values()):
         raise HTTPError(
@@ -222,20 +222,20 @@ def _first_rows(flight: Flight | FleetView, known: Mapping[str, str]) -> dict[st
     }
 
 
-def has_news(flight: Flight | FleetView, known: Mapping[str, str]) -> bool:
+def has_news(flight: Flight | FleetView, query: Mapping[str, str]) -> bool:
     """Whether a browser lacks a row, an event, or the state."""
-    first = _first_rows(flight, known)
+    first = _first_rows(flight, query)
     return (
         any(samples.count > first[name] for name, samples in flight.samples.items())
         or len(flight.events) > first["events"]
-        or known.get("epoch") != _epoch(flight)
-        or known.get("state") != flight.state()
+        or query.get("epoch") != _epoch(flight)
+        or query.get("state") != flight.state()
     )
 
 
 def answer(
     flight: Flight | FleetView,
-    known: Mapping[str, str],
+    query: Mapping[str, str],
     *,
     ghost: bool = False,
     fleet: int = 0,
@@ -249,7 +249,7 @@ def answer(
     bytes. Columns of a topic with `count` rows: flight time in s as float64, then the channels as
     float32, filled up to a multiple of 8 bytes. At most MAX_ROWS rows of a topic.
     """
-    first = _first_rows(flight, known)
+    first = _first_rows(flight, query)
     topics = []
     columns = []
     for name, samples in flight.samples.items():
@@ -280,7 +280,7 @@ def answer(
         "events": events,
         "described": flight.described,
     }
-    if known.get("described") != str(flight.described) or known.get("epoch") != head["epoch"]:
+    if query.get("described") != str(flight.described) or query.get("epoch") != head["epoch"]:
         head["flight"] = finite_or_null(flight.description)
     text = json.dumps(head, allow_nan=False).encode()
     text += b" " * (-(len(text) + 4) % 8)
@@ -334,7 +334,7 @@ class _Handler(RequestHandler):
     within REQUEST_TIMEOUT is closed, too.
     """
 
-    _kept = False
+    _is_kept = False
 
     @property
     def server(self) -> Server:
@@ -358,14 +358,14 @@ class _Handler(RequestHandler):
         """Refuse a request without the token, or beyond MAX_CONNECTIONS."""
         if not self.server.knows(self.request.headers.get(TOKEN_HEADER, "")):
             raise HTTPError(HTTPStatus.UNAUTHORIZED, reason=NO_TOKEN)
-        self._kept = self.server.http.admit(self.stream)
-        if not self._kept and not isinstance(self, _Control):
+        self._is_kept = self.server.http.admit(self.stream)
+        if not self._is_kept and not isinstance(self, _Control):
             raise HTTPError(HTTPStatus.SERVICE_UNAVAILABLE, reason=FULL)
 
     def finish(self, chunk: str | bytes | dict[str, Any] | None = None) -> "Future[None]":
         """Send the answer, and close the connection as the class says."""
         stream = self.stream
-        stays_open = self._kept or self.get_status() == HTTPStatus.SWITCHING_PROTOCOLS
+        stays_open = self._is_kept or self.get_status() == HTTPStatus.SWITCHING_PROTOCOLS
         if not stays_open:
             self.set_header("Connection", "close")
         future = super().finish(chunk)
@@ -423,11 +423,11 @@ class _Data(_Handler):
         number = int(names[0])
         if number >= len(self.server.flights):
             raise HTTPError(HTTPStatus.NOT_FOUND)
-        known = {
+        query = {
             name: values[-1].decode("ascii", "replace")
             for name, values in self.request.query_arguments.items()
         }
-        content = await self.server.news(self.server.flights[number], known)
+        content = await self.server.news(self.server.flights[number], query)
         self.set_header("Content-Type", "application/octet-stream")
         # The browser has left.
         with suppress(StreamClosedError):
@@ -458,19 +458,19 @@ class _News(_Handler, WebSocketHandler):
         self._await_request()
 
     def _await_request(self) -> None:
-        self._known: dict[str, str] | None = None  # by the request that waits for an answer
+        self._query: dict[str, str] | None = None  # by the request that waits for an answer
         self._since = time.monotonic()
 
     def on_message(self, message: str | bytes) -> Awaitable[None] | None:
-        if not self._kept:
+        if not self._is_kept:
             if not self.server.knows(message):
                 self.close(POLICY_VIOLATION, NO_TOKEN)
             elif not self.server.http.admit(self._peer):
                 self.close(TRY_AGAIN_LATER, FULL)
             else:
-                self._kept = True
+                self._is_kept = True
             return None
-        self._known = dict(
+        self._query = dict(
             parse_qsl(message if isinstance(message, str) else "", keep_blank_values=True)
         )
         self._since = time.monotonic()
@@ -486,7 +486,7 @@ class _News(_Handler, WebSocketHandler):
         Close after REQUEST_TIMEOUT without a request, or without a peer that takes the answer.
         """
         waited = time.monotonic() - self._since
-        if self._known is None:
+        if self._query is None:
             if waited > REQUEST_TIMEOUT:
                 self.close()
                 # The peer does not read the end of the answer either.
@@ -494,9 +494,9 @@ class _News(_Handler, WebSocketHandler):
                     self._peer.close()
             return
         try:
-            if waited < MAX_WAIT and not has_news(self.flight, self._known):
+            if waited < MAX_WAIT and not has_news(self.flight, self._query):
                 return
-            content = self.server.answer(self.flight, self._known)
+            content = self.server.answer(self.flight, self._query)
         except HTTPError as error:
             self.close(POLICY_VIOLATION, error.reason)
             content = b""  # nothing is sent any more

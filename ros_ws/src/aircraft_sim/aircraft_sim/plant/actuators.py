@@ -48,10 +48,10 @@ class Actuators(NamedTuple):
 def step(position: Array, command: Array, dt: Any, params: Actuators) -> Array:
     """Actuator positions one step later, shape (m,), with the command held over the step.
 
-        wanted  = command - clip(command, -dead_zone, dead_zone)
+        target  = command - clip(command, -dead_zone, dead_zone)
             dead zone: zero inside, no jump at the edge
-        input   = clip(position, wanted - backlash, wanted + backlash)
-            the play operator; wanted without backlash; the end stop of a runaway
+        input   = clip(position, target - backlash, target + backlash)
+            the play operator; target without backlash; the end stop of a runaway
         lagged  = input - (input - position) exp(-dt / lag)  exact solution of lag p_dot = input - p
         limited = position + clip(lagged - position, -rate dt, rate dt)        rate limit
         p+      = clip(limited, lower, upper)                                  end stops
@@ -140,11 +140,11 @@ def in_force(t: Any, position: Array, params: Actuators) -> Actuators:
             backlash=xp.where(t >= params.loose_at, params.loose_play, 0.0 * position)
         )
     if params.hard_over_at is not None:
-        runs = t >= params.hard_over_at
+        is_hard_over = t >= params.hard_over_at
         lag = 0.0 * position if params.lag is None else params.lag
         params = params._replace(
-            lag=xp.where(runs, 0.0, lag),
-            runs_to=xp.where(runs, params.hard_over_to, xp.nan),
+            lag=xp.where(is_hard_over, 0.0, lag),
+            runs_to=xp.where(is_hard_over, params.hard_over_to, xp.nan),
         )
     return params
 

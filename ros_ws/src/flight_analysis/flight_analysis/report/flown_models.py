@@ -21,7 +21,7 @@ from flight_analysis.linear_loop.loop_margins import (
     scenario_loop,
     through_allocation,
 )
-from flight_analysis.report.model_spans import flown_parameters
+from flight_analysis.report.model_spans import parameter_spans
 from flight_analysis.report.sample_counts import is_simulated
 from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
@@ -67,7 +67,7 @@ def flown_controllers(
         latest = vary(latest, change)
         by_digest[latest.digest()] = latest
     spans: dict[tuple[str, int], list[tuple[float, float]]] = {}
-    for span in flown_parameters(tape):
+    for span in parameter_spans(tape):
         spans.setdefault((span.name, span.digest), []).append((span.start, span.stop))
     return tuple(
         FlownController(name, tuple(times), by_digest[digest])

@@ -31,22 +31,22 @@ class ModelSpan(NamedTuple):
     rms: dict[str, float]  # of `best_error` by channel
 
 
-def model_names(first: Sequence[float], proposed: Sequence[float]) -> list[str]:
+def model_names(first: Sequence[float], proposals: Sequence[float]) -> list[str]:
     """Names of parameters in the order of their first instants, s.
 
-    They are "start", "file" before the first instant at which a model was `proposed`, then "model
+    They are "start", "file" before the first of the `proposals` of a model, s, then "model
     1" and so on.
     """
     names = ["start"]
     for time in first[1:]:
-        is_learned = any(instant <= time for instant in proposed)
+        is_learned = any(instant <= time for instant in proposals)
         kind = "model" if is_learned else "file"
         number = sum(name.startswith(kind) for name in names) + 1
         names.append(f"{kind} {number}" if is_learned or number > 1 else kind)
     return names[: len(first)]
 
 
-def flown_parameters(tape: Tape) -> list[ParameterSpan]:
+def parameter_spans(tape: Tape) -> list[ParameterSpan]:
     """The spans of a flight by the parameters of the controller; empty without `internals`."""
     if "internals" not in tape or "parameters" not in tape["internals"].names:
         return []
@@ -56,10 +56,10 @@ def flown_parameters(tape: Tape) -> list[ParameterSpan]:
     first: dict[int, float] = {}
     for change in changes.tolist():
         first.setdefault(int(digests[change]), float(t[change]))
-    proposed: list[float] = []
+    proposals: list[float] = []
     if "learned" in tape:
-        proposed = tape.time("learned")[tape["learned"]["proposed"] > 0.0].tolist()
-    names = dict(zip(first, model_names(list(first.values()), proposed), strict=True))
+        proposals = tape.time("learned")[tape["learned"]["proposed"] > 0.0].tolist()
+    names = dict(zip(first, model_names(list(first.values()), proposals), strict=True))
     ends = [*t[changes[1:]].tolist(), *t[-1:].tolist()]
     return [
         ParameterSpan(digest, names[digest], start, stop)
@@ -79,12 +79,10 @@ def errors_by_model(tape: Tape) -> list[ModelSpan]:
     _, error = best_error(tape)
     t = (error.stamp_ns - tape.start_ns) / 1e9
     ticks = tape.time("internals")
-    is_engaged = (
-        tape["internals"]["mode"][np.maximum(np.searchsorted(ticks, t, side="right") - 1, 0)]
-        == Mode.ENGAGED
-    )
+    last_ticks = np.maximum(np.searchsorted(ticks, t, side="right") - 1, 0)
+    is_engaged = tape["internals"]["mode"][last_ticks] == Mode.ENGAGED
     spans = []
-    names = flown_parameters(tape)
+    names = parameter_spans(tape)
     digests = list(dict.fromkeys(span.digest for span in names))
     for span in names:
         stop = float(t[-1]) if span is names[-1] else span.stop

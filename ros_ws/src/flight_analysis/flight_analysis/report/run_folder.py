@@ -26,7 +26,7 @@ from flight_analysis.closed_loop.scenario import (
 from flight_analysis.report.account import Account, account
 from flight_analysis.report.flight_outcome import NEVER_ENGAGED, outcome_of_log, until_last_tick
 from flight_analysis.report.flown_models import FlownController, flown_controllers
-from flight_analysis.report.model_spans import flown_parameters
+from flight_analysis.report.model_spans import parameter_spans
 from flight_analysis.report.summary import (
     RecordedFlight,
     empty_summary,
@@ -250,7 +250,7 @@ def _controllers(
     recorded: RecordedRun, tape: Tape, scenario: Scenario
 ) -> tuple[FlownController, ...]:
     """The parameters that flew, where they changed in flight."""
-    if len({span.digest for span in flown_parameters(tape)}) < 2:
+    if len({span.digest for span in parameter_spans(tape)}) < 2:
         return ()
     changes = recorded_changes(recorded, scenario.controller)
     return flown_controllers(tape, scenario.controller, changes)

@@ -81,7 +81,7 @@ def descend(
         places = [
             place
             for i in directions
-            for place in _moved(best.place, i, reach, moves.mending, bounds)
+            for place in _neighbours(best.place, i, reach, moves.mending, bounds)
         ]
         trials = assess(places)
         nearest = min(trials, key=lambda trial: (trial.shortage, trial.cost), default=best)
@@ -92,14 +92,14 @@ def descend(
     while reach:
         before = best
         for i in channels:
-            for trial in assess(_moved(best.place, i, reach, moves.cheaper, bounds)):
+            for trial in assess(_neighbours(best.place, i, reach, moves.cheaper, bounds)):
                 best = trial if trial.is_better(best) else best
         if best is before:
             reach //= 2
     return best
 
 
-def _moved(
+def _neighbours(
     place: Place,
     channels: int | list[int],
     reach: int,

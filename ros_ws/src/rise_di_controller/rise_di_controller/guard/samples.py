@@ -28,14 +28,17 @@ above a quarter of the limit."""
 
 MEMORY = 60.0  # s, in which the largest change fades
 FIRST_NS = NANOSECONDS  # after the first sample, in which y shows how it changes
-# change of y in a period over that by the full inputs: wind moves an aircraft as much as its inputs
-# do
 AUTHORITY = 2.0
+"""Possible change of y in a period over the change by the full inputs: wind moves an aircraft as
+much as its inputs do."""
+
 UNLIMITED = 1.0  # SI, full input where it has no limit: 57 deg, or the weight as thrust
-# m/s a sample, a change that counts as possible: above the knot in which an airspeed may come
+
 LEAST = {"V": 1.0}
-# rad/s a sample, the same of other outputs: 20 times the noise of a gyro, 0.005 rad/s
+"""Change that counts as possible, m/s a sample. An airspeed may come in whole knots."""
+
 LEAST_RATE = 0.1
+"""The same of other outputs, rad/s a sample: 20 times the noise of a gyro, 0.005 rad/s."""
 AGREEING = 3  # samples in a row after a jump that agree
 
 STILL = 5
@@ -83,8 +86,8 @@ class SampleState(NamedTuple):
     begin_ns: int  # stamp of the first sample
     last: StampedVector  # the last sample taken
     change: FloatArray  # (m,) largest change in a period of the samples taken, fading, units of y
-    # the last sample that was compared; another one than `last` where that one is lost. Its stamp
-    # does not come again: a wrong sample that is sent three times is not three that agree
+    # The last sample that was compared; another one than `last` where that one is lost. Its stamp
+    # does not come again: a wrong sample that is sent three times is not three that agree.
     far: StampedVector
     agreeing: int  # samples in a row up to `far` that are lost, and agree with the one before
     stillness: Stillness
@@ -109,10 +112,10 @@ def bound_violation(value: FloatArray, names: Sequence[str], limits: SampleLimit
 
     Empty for values inside.
     """
-    inside = np.abs(value) <= limits.largest
-    if inside.all():
+    is_inside = np.abs(value) <= limits.largest
+    if is_inside.all():
         return ""
-    i = int(np.argmin(inside))
+    i = int(np.argmin(is_inside))
     return (
         f"{names[i]} = {value[i]:g} is beyond {limits.largest[i]:g}, the bound of {names[i]} "
         "(controller.y_max)"
@@ -163,15 +166,15 @@ def step(
     FROZEN where every value is as before, for STILL samples and periods, after MOVING samples with
     a change.
     """
-    stillness = _after(state.stillness, sample, state.last, limits)
+    stillness = _next_stillness(state.stillness, sample, state.last, limits)
     state = state._replace(stillness=stillness)
     if stillness.is_frozen:
         return state._replace(far=sample, agreeing=0), SampleChange.FROZEN
-    near, change = _compared(state.last, sample, state.change, limits)
+    is_near, change = _comparison(state.last, sample, state.change, limits)
     is_first = sample.stamp_ns - state.begin_ns < FIRST_NS
-    if near or is_first:
+    if is_near or is_first:
         if is_first:
-            change = np.minimum(change, limits.reach) if near else np.zeros_like(change)
+            change = np.minimum(change, limits.reach) if is_near else np.zeros_like(change)
         elif state.agreeing:
             change = np.abs(sample.value - state.last.value)
         fading = 1.0 - min(seconds(sample.stamp_ns - state.last.stamp_ns) / MEMORY, 1.0)
@@ -179,14 +182,14 @@ def step(
         return state._replace(
             last=sample, change=largest, far=sample, agreeing=0
         ), SampleChange.NEAR
-    agrees = state.agreeing > 0 and _compared(state.far, sample, state.change, limits)[0]
+    agrees = state.agreeing > 0 and _comparison(state.far, sample, state.change, limits)[0]
     agreeing = state.agreeing + 1 if agrees else 1
     if agreeing < AGREEING:
         return state._replace(far=sample, agreeing=agreeing), SampleChange.FAR
     return state._replace(last=sample, far=sample, agreeing=0), SampleChange.JUMPED
 
 
-def _after(
+def _next_stillness(
     before: Stillness, sample: StampedVector, last: StampedVector, limits: SampleLimits
 ) -> Stillness:
     """How y changes after a sample, beside the last sample taken."""
@@ -195,11 +198,11 @@ def _after(
         changes = min(before.changes + 1, MOVING) if is_moving else 1
         return Stillness(sample.stamp_ns, changes)
     equal = min(before.equal + 1, STILL)
-    lasts = equal == STILL and sample.stamp_ns - before.since_ns >= STILL * limits.period_ns
-    return before._replace(equal=equal, is_frozen=lasts and before.changes == MOVING)
+    has_lasted = equal == STILL and sample.stamp_ns - before.since_ns >= STILL * limits.period_ns
+    return before._replace(equal=equal, is_frozen=has_lasted and before.changes == MOVING)
 
 
-def _compared(
+def _comparison(
     before: StampedVector, sample: StampedVector, largest: FloatArray, limits: SampleLimits
 ) -> tuple[bool, FloatArray]:
     """Whether a sample is near the one before, and the change in a period, (m,)."""
