@@ -172,11 +172,12 @@ def over_airspeed(airframe: Airframe, thrust: str) -> OverAirspeed:
     )
     ratio = np.arange(SLOWEST, FASTEST + SPACING / 2.0, SPACING)
     trims = [level_flight(airframe, float(part), thrust) for part in ratio]
-    powers = exponents(airframe, thrust)
+    x, u = map(np.array, zip(*trims, strict=True))
     return OverAirspeed(
-        airframe.speed,
-        airframe.index("V"),
-        *powers,
-        ratio,
-        *map(np.array, zip(*trims, strict=True)),
+        speed=airframe.speed,
+        place=airframe.index("V"),
+        **exponents(airframe, thrust)._asdict(),
+        ratio=ratio,
+        x=x,
+        u=u,
     )

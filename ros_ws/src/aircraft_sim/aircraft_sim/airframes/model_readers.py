@@ -191,9 +191,14 @@ def _state_space(system: Any, states: Mapping[str, Any], inputs: Mapping[str, An
 
     state_labels = labels("state_labels")
     input_labels = labels("input_labels")
-    known = _states(states, state_labels, len(A)), _inputs(inputs, input_labels, B.shape[1])
     return ToolModel(
-        *known, A, B, _finite(system.C, "C"), _finite(system.D, "D"), tuple(labels("output_labels"))
+        states=_states(states, state_labels, len(A)),
+        inputs=_inputs(inputs, input_labels, B.shape[1]),
+        A=A,
+        B=B,
+        C=_finite(system.C, "C"),
+        D=_finite(system.D, "D"),
+        outputs=tuple(labels("output_labels")),
     )
 
 
@@ -231,17 +236,14 @@ def _matlab(path: Path, states: Mapping[str, Any], inputs: Mapping[str, Any]) ->
     B = _finite(columns[:, None] if columns.ndim == 1 else columns, "B")
     _square(A, B)
     C, D = (_finite(group[keys[key]], key) if key in keys else None for key in "CD")
-    known = (
-        _states(states, names("StateName", "states", "state_names"), len(A)),
-        _inputs(inputs, names("InputName", "inputs", "input_names"), B.shape[1]),
-    )
     return ToolModel(
-        *known,
-        A,
-        B,
-        C,
-        D,
-        tuple(names("OutputName", "outputs", "output_names")),
+        states=_states(states, names("StateName", "states", "state_names"), len(A)),
+        inputs=_inputs(inputs, names("InputName", "inputs", "input_names"), B.shape[1]),
+        A=A,
+        B=B,
+        C=C,
+        D=D,
+        outputs=tuple(names("OutputName", "outputs", "output_names")),
         note=f"A and B of {path.name}",
     )
 
