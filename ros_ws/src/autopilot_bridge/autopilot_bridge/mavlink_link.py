@@ -403,6 +403,7 @@ class Link:
         is_station = name == "HEARTBEAT" and message.type == GCS
         joystick = name in STICKS and system in self._station_numbers()
         namesake = name == "HEARTBEAT" and system == self._config.source_system
+        # Other senders on the link: a joystick, another bridge, a ground station, an autopilot.
         if joystick or (namesake and not is_station):
             self._clash = (
                 f"another sender on {self._config.url} has system {system} too, and the "
@@ -419,6 +420,7 @@ class Link:
             self._systems.add(system)
         if name == "BAD_DATA" and "signature" in str(message.reason):
             self._refused = self._signature_fault(bytes(message.data))
+        # From here on only messages of the autopilot count, from the locked sender.
         if (message.get_srcSystem(), message.get_srcComponent()) != (
             self._config.system,
             AUTOPILOT,

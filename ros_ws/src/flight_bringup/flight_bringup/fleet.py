@@ -156,6 +156,7 @@ def read_fleet(
             f"{aircraft.delay:g} s",
             "0 in lockstep, which has no common time",
         )
+    # What holds for the fleet as a whole.
     by_clock = use_sim_time or config.use_sim_time
     require(
         not (by_clock and config.lockstep),

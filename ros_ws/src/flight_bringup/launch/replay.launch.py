@@ -114,6 +114,7 @@ def _play(context: LaunchContext) -> list[Action]:
         f"true with {', '.join(others)}",
         "controller and recorder alone",
     )
+    # Topics of the log that none of the nodes publishes are played.
     types = read_playback(log).types
     recorded = types.keys() - unsendable(types)
     topics = argument(context, "topics") or ",".join(
@@ -130,6 +131,7 @@ def _play(context: LaunchContext) -> list[Action]:
     player = _player(context, topics, run, recorded=RECORDER in nodes)
     if scenario is None:
         return [player]
+    # With nodes, the player is the second stage: it begins once all are ready.
     first_stage = {}
     for spec in nodes:
         overrides = parameter_overrides(

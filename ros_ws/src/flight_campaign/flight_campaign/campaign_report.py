@@ -213,6 +213,7 @@ def write_page(
         f" Score: {score_meaning(scenario, definition.score_units)}; loss of track: a score "
         f"above {LOSS_OF_TRACK_SCORE:g}."
     )
+    # Tables of all cases, then of each case.
     tables = [overview(definition, tallies, margins), _ends(labels, cases)]
     if any(case["guarantee"] for case in cases):
         tables.append(_guarantees(labels, cases))

@@ -370,6 +370,7 @@ def _show_models(console: Console, response: Response, models: list[ChannelModel
             )
     print_table(console, table)
     print_table(console, loop)
+    # Channels without a certain model fly by their step response.
     uncertain = [
         name
         for name, model in zip(response.outputs, models, strict=True)

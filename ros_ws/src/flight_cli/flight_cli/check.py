@@ -128,6 +128,7 @@ def _show(console: Console, channel_map: ChannelMap, sign_check: SignCheck, airf
             )
         table.add_row(*cells)
     print_table(console, table)
+    # The second table has the fields of the map and their topics.
     headings = ("channel", "raw value", "topic")
     fields = new_table("", headings, left_aligned=headings)
     for channel in sign_check.channels:

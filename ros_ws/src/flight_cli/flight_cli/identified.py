@@ -33,6 +33,7 @@ def show_identified(console: Console, aircraft: IdentifiedAircraft) -> None:
         + f"; largest residual acceleration {np.max(np.abs(trim.residuals[:3])):.1g} m/s^2,"
         f" {np.max(np.abs(trim.residuals[3:])):.1g} rad/s^2",
     )
+    # Two tables, a row an input: its stops, and its effects on the outputs.
     stops = new_table(
         "\nCommands: trim, and range down and up from trim", ("input", "trim", "down", "up")
     )
@@ -58,6 +59,7 @@ def show_identified(console: Console, aircraft: IdentifiedAircraft) -> None:
         )
     console.print(stops)
     console.print(responses)
+    # Sentences on inputs that are not linear or move nothing.
     for name, spread in zip(inputs, linear.spread, strict=True):
         if spread < LINEAR:
             differ = f"the effects of its steps differ by a factor of {1.0 / spread:.2g}"

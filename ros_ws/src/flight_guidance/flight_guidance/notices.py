@@ -152,6 +152,7 @@ class Notices:
         before = self._leg
         self._leg = int(log["leg"])
         texts = []
+        # Events of this step: a leg, the landing, the fence, new limits.
         if log["missed"] > 0.0:
             texts.append(f"leg {before} missed by {log['missed']:.0f} m")
         if self._landing is not None and before == self._landing.leg < self._leg:
@@ -174,6 +175,7 @@ class Notices:
             self._reach_text = self._reach(authority)
             if self._reach_text != earlier:
                 texts.append(f"from now on {self._reach_text or 'own limits again'}")
+        # Conditions that have lasted: the link, the pose, the tilt, the wind.
         if self._link.due(t, holds=log[LINK_AGE] > self._link_timeout):
             texts.append(f"no message of an operator for {self._link_timeout:g} s: home")
         if self._stale.due(t, holds=log["age.pose"] > self._max_age):

@@ -90,6 +90,7 @@ class GuidanceConfig(SteeringConfig):
                 f"{self.rate:g} Hz",
                 f"a whole fraction of y_rate ({self.y_rate:g} Hz)",
             )
+        # The altitudes, and home between them.
         lowest, highest = self.altitudes()
         require(
             lowest < highest, "ceiling", f"{highest:g} m", f"more than altitude_floor, {lowest:g} m"
@@ -102,6 +103,7 @@ class GuidanceConfig(SteeringConfig):
             self._check_multicopter()
         else:
             self._check_airplane()
+        # Route, landing and program need the numbers of the equations.
         params = self.params()
         route = None if self.route is None else self.plan(self.waypoints())
         if self.landing is not None:

@@ -428,6 +428,7 @@ def _read_file(file: Path, log: LogContent) -> None:
         raise ParameterError(
             f"{file}: cannot be read ({error.strerror}), expected {A_RUN}"
         ) from None
+    # What the file says of the whole log goes to its notes.
     if first_ns < before_ns - NANOSECONDS and file.parent.name != ROSBAG2:
         log.notes.append(
             f"{file.name} begins before the end of the part before: the parts are out of order, "

@@ -149,6 +149,7 @@ class Airframe(Config):
             require(
                 shape == [columns] * n, key, f"rows of {shape} values", f"{n} rows of {columns}"
             )
+        # Outputs: as many as inputs, with units that are known.
         fewer = f"{m} or fewer, as many as inputs or fewer"
         require(0 < len(self.outputs) <= m, "outputs", f"{len(self.outputs)} of them", fewer)
         for key, unit in (
@@ -157,12 +158,13 @@ class Airframe(Config):
         ):
             quantity(unit, key)
         self._check_outputs(n, len(self.outputs))
-        output_names = (
+        # Every name of a state in the file, by key, is that of a state.
+        states_by_key = (
             {} if self.C else {f"outputs[{i}]": name for i, name in enumerate(self.outputs)}
         )
-        output_names |= {f"gravity[{i}].into": term.into for i, term in enumerate(self.gravity)}
-        output_names |= {f"gravity[{i}].angle": term.angle for i, term in enumerate(self.gravity)}
-        output_names |= {
+        states_by_key |= {f"gravity[{i}].into": term.into for i, term in enumerate(self.gravity)}
+        states_by_key |= {f"gravity[{i}].angle": term.angle for i, term in enumerate(self.gravity)}
+        states_by_key |= {
             f"inertial_coupling[{i}].into": term.into
             for i, term in enumerate(self.inertial_coupling)
         }
@@ -173,7 +175,7 @@ class Airframe(Config):
                 f"{len(term.product)} states",
                 "two of them",
             )
-            output_names |= {
+            states_by_key |= {
                 f"inertial_coupling[{i}].product[{k}]": state
                 for k, state in enumerate(term.product)
             }
@@ -191,8 +193,8 @@ class Airframe(Config):
                 f"an axis of the wind: {', '.join((*AXES, *ROTARY))}",
             )
         for gust, direction in self.gusts.items():
-            output_names |= {f"gusts.{gust}.{state}": state for state in direction}
-        for key, name in output_names.items():
+            states_by_key |= {f"gusts.{gust}.{state}": state for state in direction}
+        for key, name in states_by_key.items():
             require(name in self.states, key, f"{name!r}", f"a state: {', '.join(self.states)}")
 
     def _units(self) -> list[tuple[str, Unit]]:
@@ -228,6 +230,7 @@ class Airframe(Config):
                 f"{name!r}",
                 expected,
             )
+        # A row of C is a state alone, or has a name and a unit of its own.
         for name, row in zip(self.outputs, self.C, strict=bool(self.C)):
             require(
                 name in self.states or name in self.output_units,

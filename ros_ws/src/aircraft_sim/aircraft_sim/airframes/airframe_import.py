@@ -170,6 +170,7 @@ def _airframe(
         output in names and np.array_equal(row, np.eye(len(names))[names.index(output)])
         for output, row in rows.items()
     )
+    # The content of an airframe file, with C and D only where needed.
     values: dict[str, Any] = {
         "name": name,
         "source": source,

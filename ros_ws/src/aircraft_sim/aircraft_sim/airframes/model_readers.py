@@ -402,7 +402,8 @@ def _avl_derivatives(
     require(0.8 < weights < 1.25, "CLtot", f"a lift of {weights:.3g} times the weight", level)
     CD_CL = 2.0 * CL * S / (np.pi * b**2 * value.get("e", 0.8))  # of the induced drag
     CD_alpha = value.get("CDa", CD_CL * value["CLa"])
-    cosine, sine = np.cos(alpha), np.sin(alpha)  # inertias of stability axes
+    # Inertias of the stability axes.
+    cosine, sine = np.cos(alpha), np.sin(alpha)
     Ix = Ixx * cosine**2 + Izz * sine**2 - 2.0 * Ixz * sine * cosine
     Iz = Ixx * sine**2 + Izz * cosine**2 + 2.0 * Ixz * sine * cosine
     cross = 0.5 * (Ixx - Izz) * np.sin(2.0 * alpha) + Ixz * np.cos(2.0 * alpha)
@@ -410,6 +411,7 @@ def _avl_derivatives(
     per_V, half_c, half_b = qS / (mass * V0), c / (2.0 * V0), b / (2.0 * V0)
     scale = np.array([1.0, half_b, half_b])  # of derivatives by beta, p and r
     lateral = np.array([[value[f"C{row}{by}"] for by in "bpr"] for row in "Yln"]) * scale
+    # Longitudinal motion V, alpha, q, theta, then lateral motion beta, p, r, phi.
     A = np.zeros((8, 8))
     A[0, [0, 1, 3]] = -2.0 * CD * per_V, GRAVITY - qS / mass * CD_alpha, -GRAVITY
     A[1, :3] = -2.0 * CL / V0, -(value["CLa"] + CD), -value["CLq"] * half_c

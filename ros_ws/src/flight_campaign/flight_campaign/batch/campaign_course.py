@@ -146,6 +146,7 @@ def build_course(scenario: Scenario) -> Course:
     u_late = _whole_ticks(nanoseconds(aircraft.actuators.delay), tick_ns, "actuators.delay")
     vanes = [outputs.index(name) for name in controller.vanes]
     _require_plain_vanes(scenario, late)
+    # What does not depend on the aircraft, tick by tick.
     error, noise = _sensor_errors(errors, ticks, tick_ns // sample_ns, len(outputs))
     y_m, y_m_dot = _references(scenario, ticks, tick_ns)
     arrives = [sensors.arrives(k, errors) for k in range(ticks)]

@@ -134,6 +134,7 @@ def build_benchmark(scenario: Scenario, turbulence_seed: int = TUNING_TURBULENCE
         reference_model={"rate": scenario.controller.rate},
         controller={"delay": 0.0, "feedforward": None, "observer": None},
     )
+    # The scenario in two winds, with the aircraft as the model of the feedforward.
     airframe, _ = scenario.aircraft.load()
     controller = scenario.controller
     with_model = scenario.vary(controller=with_feedforward(controller, airframe).model_dump())
@@ -147,6 +148,7 @@ def build_benchmark(scenario: Scenario, turbulence_seed: int = TUNING_TURBULENCE
         values = list(limits) or [default] * m
         return np.array([values[column] for column in columns])
 
+    # The nominal model in the order of the law, with its timing and its limits.
     unit = score_units(controller.outputs, airframe.units_of_outputs())
     noise = scenario.aircraft.sensor_arrays().noise[rows]
     loop = LoopTiming(np.array(controller.lag), 0.0, 1.0 / controller.rate)
@@ -346,6 +348,7 @@ def tune(
         result = batch.fly(evaluation.fleet, benchmark.vehicle, course, control_law, params)
         return cost(result, benchmark).reshape(together, each) @ evaluation.weight
 
+    # Each seed is a search of its own; all fly together, part by part.
     lacking = partial(_lacking, law, objective, benchmark)
     options = {"popsize": POPULATION, "verbose": -9}
     searches = [

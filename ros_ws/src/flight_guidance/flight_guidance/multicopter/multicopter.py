@@ -140,6 +140,7 @@ def step(
     )
     state = _with_wind(state, pose, dt, params)
     state, escape = _within_fence(state, pose, params)
+    # Speed, tilt and climb follow from the way to fly.
     flies = state.mode is GuidanceMode.ENGAGED
     speed = min(max(state.target.V, 0.0), params.limits.largest_speed)
     state = state._replace(V_c=slewed(state.V_c, speed, gains.braking, dt))
@@ -148,6 +149,7 @@ def step(
         state = state._replace(V_c=min(state.V_c, abs(motion.velocity)))
     phi_c, theta_c, limited = _attitude_for(state, pose, motion, params)
     state, climb_limited = _with_climb(state, pose, dt, params)
+    # The body rates and the climb are u_m, within the rates of the reference model.
     rates = _rates(state, phi_c, theta_c, gains)
     name = vertical(params.outputs)
     values = rates | {name: VERTICAL[name] * state.climb_c}

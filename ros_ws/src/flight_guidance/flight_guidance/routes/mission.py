@@ -178,6 +178,7 @@ def mission_route(
         elif item.command != JUMP:
             continue
         route_items.add(k)
+    # The notes say what is not flown as the mission has it.
     skipped_names = [item.name for k, item in enumerate(items) if k not in route_items]
     sentences = [f"not flown: {', '.join(dict.fromkeys(skipped_names))}"] * bool(skipped_names)
     sentences += [

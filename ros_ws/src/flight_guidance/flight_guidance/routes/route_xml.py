@@ -209,6 +209,7 @@ def read_gpx(content: bytes, key: str, line: str | None = None) -> Places:
         geometries = routes + tracks
     else:
         geometries = routes
+    # Lines and marks are the geometries; the rest goes to the notes.
     lines = [
         Geometry(_kind(element), [*chain(*segments)], (_text(element, "name") or "").strip())
         for element, segments in geometries
@@ -222,6 +223,7 @@ def read_gpx(content: bytes, key: str, line: str | None = None) -> Places:
         notes.append(f"{len(tracks)} trk beside the rte: no part of the route")
     if shapes := sum(_kind(element) == "rpt" for element in root.iter()):
         notes.append(f"{shapes} rpt of extensions: no part of the route")
+    # The segments of the track that is flown join, unless a gap is too wide.
     segments = next(
         (segments for _, segments in geometries if [*chain(*segments)] == route.places), []
     )
