@@ -43,8 +43,6 @@ CORES, MANY = 2, 1000  # of the scaled row
 class _Knowing:
     """A learner that proposes the true model at the first tick."""
 
-    has_fallen_back = False
-
     def __init__(self, scenario: Scenario, start: RiseDiConfig) -> None:
         assert start.observer is not None  # noqa: S101 - a controller that learns has one
         plain = start.model_copy(update={"learn": None})

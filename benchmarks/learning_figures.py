@@ -82,8 +82,11 @@ def learn_figures(name: str, cell: Cell, chosen: Sequence[Row]) -> Iterator[evid
     )
     worse = float(np.mean([each.learner > WORSE * each.file for each in chosen]))
     yield row(f"{name}: share 5 % worse than the model of the file", worse, at_most=0.05)
-    margins = [each.margin for each in chosen]
-    yield row(f"{name}: least delay margin left", min(margins), "s", at_least=0.0)
+    for key in ("file", "learner", "true"):
+        margins = [getattr(each, f"margin_{key}") for each in chosen]
+        limit = 0.0 if key == "learner" else None
+        subject = f"{name}: least delay margin left, {LABELS[key]}"
+        yield row(subject, float(np.nanmin(margins)), "s", at_least=limit)
     yield row(
         f"{name}: worse than the law alone",
         float(sum(each.learner > each.alone for each in chosen)),

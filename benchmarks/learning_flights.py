@@ -127,7 +127,10 @@ class Row(NamedTuple):
     late_file: int = 0
     late_learner: int = 0
     late_true: int = 0
-    margin: float = math.nan  # s, delay margin on the true aircraft, learner; -1: unstable
+    # s, delay margins on the true aircraft; -1: unstable
+    margin_file: float = math.nan
+    margin_learner: float = math.nan
+    margin_true: float = math.nan
     first: float = math.nan  # s, when the first model flew
     models: int = 0
     refused: int = 0
@@ -147,8 +150,6 @@ class Row(NamedTuple):
 
 class Timed:
     """A learner, and how long its steps take on one core."""
-
-    has_fallen_back = False
 
     def __init__(self, own: Learner) -> None:
         self._own, self.steps = own, list[float]()
@@ -379,19 +380,26 @@ def learn(name: str, cell: Cell, number: int) -> Row:
         flight = evaluation(chosen)
         aircraft = chosen.aircraft.sampled_airframe()
         start = start_of(chosen)
+        file = file_design()
+        true = designed(start, chosen, aircraft)
         if cell.kind == "rough":
-            others = others | {"file": frozen(designed(start, chosen, prior), flight, aircraft)}
+            file = designed(start, chosen, prior)
+            others = others | {"file": frozen(file, flight, aircraft)}
         if cell.kind in {"coupled", "untold"}:
-            true = designed(start, chosen, aircraft)
-            controllers = {"alone": start, "file": file_design(), "true": true}
+            controllers = {"alone": start, "file": file, "true": true}
             others = {
                 key: frozen(controller, flight, aircraft) for key, controller in controllers.items()
             }
         others = others | {"learner": frozen(flown.controller, flight, aircraft)}
-        margin = margin_left(flown.controller, chosen)
-    values: dict[str, Any] = {key: value for key, (value, _) in others.items()}
+        loops = {"file": file, "learner": flown.controller, "true": true}
+        values: dict[str, Any] = {
+            f"margin_{key}": margin_left(controller, chosen)
+            for key, controller in loops.items()
+            if controller is not None
+        }
+    values |= {key: value for key, (value, _) in others.items()}
     values |= {f"late_{key}": late for key, (_, late) in others.items()}
-    return flown.row._replace(margin=margin, **values)
+    return flown.row._replace(**values)
 
 
 def with_prior(chosen: Scenario, folder: str) -> Scenario:

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The learner's node and the controller beside a learner.
 
-The tests are of proposals of others, their storms, and the record of a flight.
+Proposals of others, their storms, and the record of a flight.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -121,10 +121,7 @@ def test_storm_of_proposals_costs_one_decoding_a_tick_and_delays_none(proposer: 
 
 
 def test_deactivated_law_ends_the_record(tmp_path: Path) -> None:
-    """The times of the identifications count from the next engagement.
-
-    The record before is forgotten.
-    """
+    """The times count from the next engagement, and the record before is forgotten."""
     scenario = save_scenario(
         find_scenario("osprey_learn").vary(
             controller={"learn": {"updates": [3.0], "latency": 0.5}}

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The test for a loss of effect, in a flight with damage.
+"""The test for a loss of effect in a flight with damage.
 
-Channels keep the law of the start.
+Channels of a damaged part keep the law of the start.
 """
 
 import numpy as np
@@ -13,7 +13,7 @@ from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_design.identification.innovation_filters import Actuation, FlightData, recording
 from flight_design.learning.change_test import LOSS, change_test
-from flight_design.learning.part_checks import changed
+from flight_design.learning.part_checks import change_sentence
 from rise_di_controller.learning.learned_channels import with_channels_of
 from rise_di_controller.rise_di_config import RiseDiConfig
 
@@ -26,9 +26,9 @@ FAULTS = ["elevator lost 0", "aileron weak 0"]
 
 @pytest.fixture(scope="module")
 def damaged() -> tuple[FlightData, Airframe]:
-    """8 s in light turbulence with a bank, and the aircraft before.
+    """A flight without elevator and with half of the aileron, and the aircraft before.
 
-    The elevator is lost, and half of the aileron.
+    8 s in light turbulence, with a bank.
     """
     scenario = find_scenario("osprey_servo").vary(
         aircraft={
@@ -52,30 +52,27 @@ def test_lost_elevator_is_dead_and_weak_aileron_changed(
     damaged: tuple[FlightData, Airframe],
 ) -> None:
     lon, lat = change_test(*damaged, ACTUATION)
-    assert (lon.outputs, lon.found, lon.dead) == (("q", "V"), True, "elevator")
-    assert (lat.outputs, lat.found, lat.dead) == (("p", "r"), True, "")
+    assert (lon.outputs, lon.is_found, lon.dead) == (("q", "V"), True, "elevator")
+    assert (lat.outputs, lat.is_found, lat.dead) == (("p", "r"), True, "")
     # the fault's own factor, and that of no fault, within half of the least loss that is a change
     assert lat.left["aileron"] == pytest.approx(0.5, abs=LOSS / 2.0)
     assert lat.left["rudder"] == pytest.approx(1.0, abs=LOSS / 2.0)
-    assert changed(lat).startswith("p and r changed, log-likelihood ")
-    assert changed(lat).endswith(f": aileron has {100 * lat.left['aileron']:.0f} % of its effect")
+    assert change_sentence(lat).startswith("p and r changed, log-likelihood ")
+    assert change_sentence(lat).endswith(
+        f": aileron has {100 * lat.left['aileron']:.0f} % of its effect"
+    )
 
 
 @pytest.mark.parametrize("model, found", [(0.6, False), (0.72, True)])
 def test_loss_within_what_a_model_may_err_is_no_change(
     damaged: tuple[FlightData, Airframe], model: float, *, found: bool
 ) -> None:
-    """Half of the effect is lost beside a model that has already most of the loss.
-
-    17 and 31 % are left to find.
-    """
+    """Half of the effect beside a model that has most of the loss: 17 and 31 % are left."""
     recorded, airframe = damaged
     B = airframe.matrix_b() * np.array([1.0, 1.0, model, 1.0])
-    damaged_airframe = airframe.with_matrices(
-        airframe.matrix_a(), B, np.ones((len(B), len(airframe.gusts)))
-    )
-    _, lat = change_test(recorded, damaged_airframe, ACTUATION)
-    assert lat.found is found
+    flown = airframe.with_matrices(airframe.matrix_a(), B, np.ones((len(B), len(airframe.gusts))))
+    _, lat = change_test(recorded, flown, ACTUATION)
+    assert lat.is_found is found
 
 
 def law_of(controller: RiseDiConfig) -> tuple[np.ndarray, ...]:

@@ -1,9 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Learning in the air.
+"""Learning in the air: a flight that learns beside the law alone, and its replay.
 
-The tests have a flight that learns beside the law alone, its replay, proposals that are wrong, and
-the fallback.
+Proposals that are wrong, damage, and the fallback.
 """
 
 import copy
@@ -132,8 +131,6 @@ def plant_of(airframe: Airframe, controller: RiseDiConfig) -> LinearPlant:
 class Fixed:
     """A learner whose proposals are given."""
 
-    has_fallen_back = False
-
     def __init__(self, *proposals: RiseDiConfig | None) -> None:
         self._proposals = list(proposals)
 
@@ -217,7 +214,7 @@ def test_log_teaches_what_flight_taught_and_model_starts_next_flight(
 def test_log_teaches_with_other_settings(flown: Flown) -> None:
     """The flight has other parameters than what this learner proposes.
 
-    It knows no refusal, and identifies once a window.
+    The learner knows no refusal, and identifies once a window.
     """
     result = invoke("learn", flown.run, "--set", "controller.learn.updates=[10,20]")
     first, second = (line for line in result.output.splitlines() if line.startswith("t ="))
@@ -303,9 +300,12 @@ def test_identification_is_due_where_last_proposal_does_not_fly(
     record_rest(made)
     rough = made.propose(scenario(learn={"updates": [15.0]}).rise_di().digest()).controller
     assert rough is not None
-    sentence = made.propose(rough.digest()).sentence
-    assert sentence == "no identification is due, and no part is tested for a change"
+    assert made.propose(rough.digest()) == LearnerResult(None, "")
     identified.assert_not_called()
+    # it is yet to act
+    assert made.propose(0) == LearnerResult(None, "")
+    for k in range(1001, 1500):
+        made.take(k * 10_000_000, np.zeros(4), np.zeros(4), 0)
     # other parameters fly: the proposal was refused, or the controller fell back
     assert made.propose(0).sentence == "each part flies the law of the start from before on"
     identified.assert_called_once()
@@ -339,8 +339,9 @@ def test_the_rough_model_flies_until_it_fell_back(monkeypatch: pytest.MonkeyPatc
     assert tested["after"] == approx(10.0)
     assert tested["flown"].matrix_b()[2, 0] == approx(1.1 * 56.15)
     assert acting_inputs(mixed) == start.inputs
-    # other parameters fly than any proposal, as after a fallback
-    made.take(10_020_000_000, np.zeros(4), np.zeros(4), 1)
+    # other parameters fly than any proposal, as after a fallback; it has had the time to act
+    for k in range(1002, 2200):
+        made.take(k * 10_000_000, np.zeros(4), np.zeros(4), 1)
     after = made.propose(1).controller
     assert after is not None
     assert acting_inputs(after) == ("elevator", "thrust")
@@ -415,7 +416,7 @@ def test_a_rougher_file_widens_the_bounds_of_the_search() -> None:
 def test_model_with_coupling_is_not_replaced_by_one_of_a_part(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    made = made_learner(scenario())
+    made = made_learner(scenario(learn={"updates": [10.0], "latency": 0.0}))
     start = scenario().rise_di()
     entry = Entry("B", "q", "elevator", 56.15, 0.1, 0.01, 56.15)
 
@@ -433,6 +434,7 @@ def test_model_with_coupling_is_not_replaced_by_one_of_a_part(
     assert made.propose(0).sentence == "B[q, elevator] +10 +- 1 %, with coupling"
     assert made.model is not None
     assert made.model.matrix_b()[5, 0] == approx(0.3 * 29.0)
+    made._planned.appendleft(0)  # an identification is due
     refused = made.propose(0)
     assert refused.controller is None
     assert refused.sentence.startswith(
@@ -442,6 +444,7 @@ def test_model_with_coupling_is_not_replaced_by_one_of_a_part(
     assert [call.kwargs["flown"] for call in identified.call_args_list] == [None, made.model]
     # 10 s of a window of 30 s are too short for a model with coupling
     assert not any(call.kwargs["may_couple"] for call in identified.call_args_list)
+    made._planned.appendleft(0)
     # a model with coupling that predicts worse than the file by two deviations is forgotten
     assert made.propose(0).sentence.startswith("no coupling any more: the file predicts")
     assert made.model.matrix_b()[5, 0] == 0.0
@@ -460,14 +463,13 @@ def test_part_that_the_controller_took_back_is_not_proposed_again(
     fallen = without_models(start, model, ["q", "V"])
     learned = copy.deepcopy(flown.learner)
     # all but this part is as proposed
-    assert learned.propose(fallen.digest(), ["q", "V"]) == LearnerResult(
-        None, "no identification is due, and no part is tested for a change"
-    )
+    assert learned.propose(fallen.digest(), ["q", "V"]) == LearnerResult(None, "")
     learned = copy.deepcopy(flown.learner)
     learned.propose(model.digest())
     # a later proposal, which lost the race with the fallback
     learned._proposed = 0
     learned._last = start
+    learned._planned.appendleft(0)  # an identification is due
     again = learned.propose(fallen.digest(), ["q", "V"]).controller
     assert again is not None
     assert acting_inputs(again) == ("aileron", "rudder")
@@ -488,35 +490,51 @@ def test_part_that_the_controller_took_back_is_not_proposed_again(
     ]
 
 
-@pytest.mark.parametrize(
-    "gain, sentence",
-    [
-        # of a sample; 333 of 1000 are held out, and the limit is 8
-        (0.03, "p and r changed, log-likelihood 10: rudder has 5 % of its effect"),
-        (0.0033, "rudder has no effect: p and r without it"),
-        (-1.0, "rudder has no effect: p and r without it"),
-    ],
-)
-def test_input_is_dead_only_where_a_free_a_predicts_as_well_without_it(
-    gain: float, sentence: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """An aircraft whose A was wrong had a rudder with 13 % of its effect by the test.
+DEAD_RUDDER = Change(("p", "r"), 60.0, {"aileron": 1.0, "rudder": 0.05}, "rudder")
+WEAK_AILERON = Change(("p", "r"), 20.0, {"aileron": 0.5, "rudder": 1.0}, "")
 
-    With A free it had 82 %.
-    """
-    made = made_learner(scenario())
 
-    def identified(_: Any, prior: Airframe, **__: Any) -> SimpleNamespace:
-        with_rudder = (
-            abs(prior.matrix_b()[prior.index("r"), list(prior.inputs).index("rudder")]) > 0.1
-        )
-        return SimpleNamespace(parts=(), after=SimpleNamespace(log_likelihood=gain * with_rudder))
-
-    monkeypatch.setattr(design_learner, "identify_model", identified)
-    change = Change(("p", "r"), 10.0, {"aileron": 1.0, "rudder": 0.05}, "rudder")
+def learned_part(monkeypatch: pytest.MonkeyPatch, change: Change) -> tuple[Learner, int]:
+    """A learner whose p and r are learned and then change, and the digest of what flies."""
+    made = learner_that_finds(lateral(), monkeypatch)
+    proposed = made.propose(0).controller
+    assert proposed is not None
+    for k in range(1001, 1201):
+        made.take(k * 10_000_000, np.zeros(4), np.zeros(4), proposed.digest())
     monkeypatch.setattr(made, "_changes", lambda _: [change])
-    record_rest(made)
-    assert made.propose(0).sentence.startswith(sentence)
+    return made, proposed.digest()
+
+
+def test_part_flies_without_a_dead_input_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    made, flown = learned_part(monkeypatch, DEAD_RUDDER)
+    identified = Mock(side_effect=AssertionError)  # a test tells: 10 s of record would be too late
+    monkeypatch.setattr(design_learner, "identify", identified)
+    proposal = made.propose(flown)
+    assert proposal.sentence == (
+        "rudder has no effect: p and r without it, by the law of the start"
+    )
+    assert proposal.controller is not None
+    names = authority_names(proposal.controller.outputs)
+    effects = authority(proposal.controller, scenario().rise_di()).tolist()
+    assert dict(zip(names, effects, strict=True))["up.r"] == 0.0
+    assert made.model is None
+
+
+def test_part_that_changed_is_told_at_once_and_identified_from_the_record_since(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    made, flown = learned_part(monkeypatch, WEAK_AILERON)
+    told = made.propose(flown)
+    assert told == LearnerResult(
+        None, "p and r changed, log-likelihood 20: aileron has 50 % of its effect"
+    )
+    monkeypatch.setattr(made, "_changes", lambda _: [])
+    assert made.propose(flown) == LearnerResult(None, "")  # 4 s of record are left
+    for k in range(1201, 2001):
+        made.take(k * 10_000_000, np.zeros(4), np.zeros(4), flown)
+    again = made.propose(flown)
+    assert again.sentence.startswith("B[p, aileron] +10")
+    assert again.controller is not None
 
 
 def test_effect_that_gusts_hide_does_not_replace_a_stronger_one() -> None:
@@ -622,10 +640,9 @@ def test_delay_margin_counts_the_delay_that_was_found(
 
 
 def test_learned_part_keeps_the_margin_of_the_file_and_the_other_part_its_gains() -> None:
-    """The elevator has 1.4 of its effect.
+    """An elevator with 1.4 of its effect makes the loop of the file faster.
 
-    The loop of the file is faster around it, and keeps less than the 30 ms that it was designed
-    for.
+    It keeps less than the 30 ms that it was designed for.
     """
     start = scenario().rise_di()
     plain = start.model_copy(update={"learn": None})
@@ -658,7 +675,7 @@ def test_learned_part_keeps_the_margin_of_the_file_and_the_other_part_its_gains(
 
 
 def test_price_of_a_margin_that_is_asked_for_is_told() -> None:
-    known: dict[tuple[str, ...], Known] = {("p", "r"): Known(0, {}, {}, False, (0.0, 0.0))}
+    known: dict[tuple[str, ...], Known] = {("p", "r"): Known({}, {}, (0.0, 0.0))}
     asked = made_learner(scenario(learn={"updates": [10.0], "margin": 0.04}))
     proposed, price = asked._designed(OSPREY, known, {})
     assert proposed.observer is not None
@@ -673,7 +690,7 @@ def test_price_of_a_margin_that_is_asked_for_is_told() -> None:
 def test_margin_that_is_asked_for_flies_where_that_of_the_file_has_no_design(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    known: dict[tuple[str, ...], Known] = {("p", "r"): Known(0, {}, {}, False, (0.0, 0.0))}
+    known: dict[tuple[str, ...], Known] = {("p", "r"): Known({}, {}, (0.0, 0.0))}
     made = made_learner(scenario(learn={"updates": [10.0], "margin": 0.025}))
     design = made._design
 
@@ -736,67 +753,54 @@ def test_model_of_a_late_u_has_margin_behind_its_delay_and_errs_less_than_the_la
 
 ONES = np.ones(4)
 OSPREY = load_airframe("osprey")
-RECORDED = 2000  # ticks of 10 ms; the last 1000 are tested
+RECORDED = 2000  # ticks of 10 ms; the last 400 are tested
 
 
 def loss(gain: float, dead: str = "") -> Change:
     return Change(("p", "r"), gain, {"aileron": 0.3, "rudder": 1.0}, dead)
 
 
-FELL_BACK = (1, 2, 1)
-LONG_AGO = (2, 1, 1)
-
-
 @pytest.mark.parametrize(
-    "flown, frequency, change, is_learned, counts",
+    "fallback, frequency, change, is_learned, counts",
     [
-        ((1, 1, 1), 0.0, loss(20.0), True, True),
-        (FELL_BACK, 0.0, loss(20.0), True, False),  # 5 s ago: a healthy surface had 34
-        (FELL_BACK, 0.0, loss(60.0, "aileron"), True, True),
-        (FELL_BACK, 0.0, loss(60.0, "aileron"), False, True),
-        (LONG_AGO, 0.0, loss(20.0), True, True),  # 15 s ago
-        ((1, 1, 1), 2.2, loss(60.0, "aileron"), True, False),
-        # beside the file's model an effect that has changed is the error of the file
-        ((1, 1, 1), 0.0, loss(60.0), False, False),
-        ((1, 1, 1), 0.0, loss(20.0, "aileron"), False, True),
+        (None, 0.0, loss(20.0), True, True),
+        (1800, 0.0, loss(20.0), True, False),  # 2 s ago: the model may be the cause
+        (1800, 0.0, loss(60.0, "aileron"), True, True),
+        (1500, 0.0, loss(20.0), True, True),  # 5 s ago
+        (None, 2.2, loss(60.0, "aileron"), True, False),
+        # beside the file's model a healthy aileron of an aircraft that couples had a gain of 147
+        (None, 0.0, loss(147.0, "aileron"), False, False),
+        (1800, 0.0, loss(147.0, "aileron"), False, False),
     ],
 )
 def test_damage_counts_by_its_gain_beside_a_fallback_and_not_in_an_oscillation(
-    flown: tuple[int, int, int],
+    fallback: int | None,
     frequency: float,
     change: Change,
     is_learned: bool,
     counts: bool,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A healthy engine had no effect by this test.
-
-    It flew in a q oscillation of 2.2 Hz, after two fallbacks.
-    """
+    """In a q oscillation of 2.2 Hz a healthy engine had no effect by this test."""
     made = made_learner(scenario(learn={"updates": [10.0]}))
     monkeypatch.setattr(design_learner, "change_test", Mock(return_value=(change,)))
     if is_learned:
-        made._known = {("p", "r"): Known(0, {}, {}, False, (0.0, 0.0))}
-    before, meanwhile, after = flown
+        made._known = {("p", "r"): Known({}, {}, (0.0, 0.0))}
     noise = np.random.default_rng(1).normal(size=(RECORDED, 4))
     for k in range(RECORDED):
-        digest = before if k < 500 else meanwhile if k < 1500 else after
+        has_fallen = fallback is not None and k >= fallback
         y = 1e-3 * noise[k]
         y[0] += 0.1 * np.sin(2.0 * np.pi * frequency * 0.01 * k)
-        made.take(k * 10_000_000, y, np.zeros(4), digest)
+        made.take(k * 10_000_000, y, np.zeros(4), 2 if has_fallen else 1)
     assert bool(made._changes((RECORDED - 1) * 10_000_000)) is counts
 
 
-def test_cause_of_a_fallback_is_tested_four_seconds_later() -> None:
-    updates = Updates(LearnConfig(updates=(10.0, 20.0), check=10.0))
-    due = []
-    for t_ns in range(0, 45 * NANOSECONDS, NANOSECONDS // 10):
-        if t_ns == 23 * NANOSECONDS:
-            updates.fell_back(t_ns)
-        if updates.due(t_ns):
-            due.append(t_ns / NANOSECONDS)
-    # 30 s is too soon after 27 s for another proposal: half of the spacing are 5 s
-    assert due == [0.0, 10.0, 20.0, 27.0, 40.0]
+def test_tests_for_damage_fill_the_time_between_identifications() -> None:
+    updates = Updates(LearnConfig(updates=(10.0, 15.0, 22.0), check=2.0))
+    ticks = range(0, 28 * NANOSECONDS, NANOSECONDS // 10)
+    due = [t_ns / NANOSECONDS for t_ns in ticks if updates.due(t_ns)]
+    # none before the first model, and none within a period of the next identification
+    assert due == [0.0, 10.0, 12.0, 15.0, 17.0, 19.0, 22.0, 24.0, 26.0]
 
 
 def test_flight_without_learner_is_refused() -> None:
@@ -810,7 +814,7 @@ def test_law_with_wrong_model_falls_back_and_replay_is_equal() -> None:
     The model alone is certified.
     """
     margin = {"observer": scenario().rise_di().model_dump()["observer"] | {"margin": 0.0}}
-    late = scenario(learn={"updates": [6.0], "latency": 0.0}, **margin).vary(
+    late = scenario(learn={"updates": [6.0], "check": 10.0, "latency": 0.0}, **margin).vary(
         aircraft={"sensors": {"delay": 0.03}}, flight={"duration": 12.0}
     )
     start = late.rise_di()
@@ -820,8 +824,7 @@ def test_law_with_wrong_model_falls_back_and_replay_is_equal() -> None:
     strong = tuple(5.0 * value for value in shipped.F)
     wrong = vary(start, given | {"observer.F": strong, "observer.part": 1.0})
     assert isinstance(wrong, RiseDiConfig)
-    # the last is the test of the cause of the fallback
-    tape = simulate(late, learn=lambda _: Fixed(None, wrong, None))
+    tape = simulate(late, learn=lambda _: Fixed(None, wrong))
     assert str(tape.outcome) == "completed"
     taken, back = tape.changes
     assert taken["observer.part"] == 1.0

@@ -34,6 +34,7 @@ from flight_design.identification.innovation_filters import Actuation, FlightDat
 from flight_design.identification.likelihood_search import Search
 from flight_design.identification.model_identification import (
     Identification,
+    Part,
     identify_model,
     model_yaml,
 )
@@ -113,6 +114,47 @@ MATTER = (
     "B[r, rudder]",
 )
 """What moves the outputs: the effect of each input, roll damping, and the coupling of yaw."""
+
+
+def rough(matrix: str, row: str, column: str) -> Airframe:
+    """The airframe with an entry four times too large, beyond the bounds of a search."""
+    A = OSPREY.matrix_a()
+    B = OSPREY.matrix_b()
+    if matrix == "A":
+        A[OSPREY.index(row), OSPREY.index(column)] *= 4.0
+    else:
+        B[OSPREY.index(row), list(OSPREY.inputs).index(column)] *= 4.0
+    return OSPREY.with_matrices(A, B, np.ones((len(B), len(OSPREY.gusts))))
+
+
+def lateral_part(airframe: Airframe, *, searches_again: bool) -> Part:
+    """The part of p and r in moderate turbulence, about an airframe."""
+    recorded = innovation_filters.recording(flight("turbulence", 0.3), OSPREY)
+    result = identify_model(
+        recorded, airframe, ACTUATORS, bound_count=1, searches_again=searches_again
+    )
+    return result.parts[1]
+
+
+def test_rough_damping_is_searched_again_about_what_was_found() -> None:
+    """A[p, p] of the file is four times too large: at the bound of 0.4 the part is refused."""
+    file = rough("A", "p", "p")
+    assert "found A[p, p] at a bound" in lateral_part(file, searches_again=False).refusal
+    part = lateral_part(file, searches_again=True)
+    assert part.refusal == ""
+    aircraft = servo("turbulence", 0.3).aircraft.sampled_airframe()
+    true = true_errors(aircraft, part.entries)
+    by_name = {entry.name: entry for entry in part.entries}
+    for name in ("A[p, p]", "B[p, aileron]", "B[r, rudder]"):
+        assert abs(by_name[name].error - true[name]) < 3.0 * by_name[name].deviation, name
+    assert by_name["A[p, p]"].error < -0.6  # beyond the bound about the file
+
+
+def test_rough_effect_of_an_input_is_refused() -> None:
+    """An aircraft that couples by 10 % looked as if its aileron had a fifth of its effect."""
+    part = lateral_part(rough("B", "p", "aileron"), searches_again=True)
+    assert "B[p, aileron]" in part.refusal
+    assert "at a bound of the search" in part.refusal
 
 
 @pytest.mark.parametrize("air, uncertainty", FLIGHTS)

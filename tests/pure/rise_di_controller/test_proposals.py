@@ -264,7 +264,7 @@ def test_second_and_late_proposals_are_refused() -> None:
     assert [sentence.partition(", expected ")[2] for sentence in flight.sentences] == [
         "one at a time",
         "",
-        "one that ends at least 2.5 s after that of the last proposal",
+        "one that ends at least 1 s after that of the last proposal",
         "0 to 30 s",
         "0 to 30 s",
     ]

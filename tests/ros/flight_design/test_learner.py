@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The learner's node beside the controller.
-
-Lockstep, proposals of others, and a learner that is killed and started again.
-"""
+"""The learner's node beside the controller: lockstep, proposals of others, and a restart."""
 
 from pathlib import Path
 
@@ -26,10 +23,7 @@ from rise_di_controller.learning.proposals import Event
 
 
 def scenario(folder: Path, **learn: object) -> Scenario:
-    """osprey_learn at 100 Hz, with an aircraft that is that of the file.
-
-    Its search is the shortest.
-    """
+    """osprey_learn at 100 Hz with the aircraft of the file, whose search is the shortest."""
     learning = find_scenario("osprey_learn").vary(
         flight={"duration": 11.0},
         aircraft={"rate": 100.0, "step": 0.005, "uncertainty": {"A": 0.0, "B": 0.0}},

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What `rise-di gains --check --guarantee` shows and writes."""
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -62,8 +63,9 @@ def write_unstable(
         write_text("worst", flight, scenario_yaml(varied))
         deviation = factor * first
         place = "inside" if deviation <= promise.uncertainty else "outside"
+        far = math.ceil(1e3 * deviation) / 10.0
         lines.append(
-            f"unstable aircraft: {display_path(flight)}, {100.0 * deviation:.1f} % off, "
+            f"unstable aircraft: {display_path(flight)}, {far:.1f} % off, "
             f"{place} the {100.0 * promise.uncertainty:g} % of --uncertainty"
         )
     return lines

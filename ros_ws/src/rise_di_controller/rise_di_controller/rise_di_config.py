@@ -111,7 +111,7 @@ class LearnConfig(Config):
         description="when identifications begin, from the first tick, s; then one a window",
     )
     check: Annotated[float, Field(ge=1, le=600)] = Field(
-        default=10.0, description="then: period of the test for a changed aircraft, s"
+        default=2.0, description="period of the test for a changed aircraft, s"
     )
     prior: PriorConfig | None = Field(default=None, description="the rough model")
     margin: Annotated[float, Field(ge=0, le=0.5)] | None = Field(
@@ -136,9 +136,10 @@ class LearnConfig(Config):
         return min(margin, LEAST_MARGIN) if self.margin is None else self.margin
 
     def spacing(self) -> float:
-        """The shortest time between two identifications or tests, s."""
-        times = (*self.updates, self.updates[-1] + self.check)
-        return min(after - before for before, after in pairwise(times))
+        """The shortest time between two of `updates`, s; `window` for one."""
+        return min(
+            (after - before for before, after in pairwise(self.updates)), default=self.window
+        )
 
 
 class RiseDiConfig(ControllerConfig):
@@ -226,7 +227,7 @@ class RiseDiConfig(ControllerConfig):
                 f"outputs among {', '.join(self.outputs)}",
             )
             spacing = self.learn.spacing()
-            least = f"at most {spacing:g} s, the shortest time between two identifications"
+            least = f"at most {spacing:g} s, the shortest time between two of learn.updates"
             require(
                 self.learn.latency <= spacing, "learn.latency", f"{self.learn.latency:g} s", least
             )

@@ -31,8 +31,6 @@ class LearnerResult(NamedTuple):
 class Learner(Protocol):
     """What learns from a flight. Channels in the law's order."""
 
-    has_fallen_back: bool  # whether the law fell back with the last tick
-
     def take(self, stamp_ns: int, y: FloatArray, u: FloatArray, flown: int) -> None:
         """Take y and u, (m,), and the digest of the parameters of a tick of the engaged law.
 

@@ -464,6 +464,7 @@ def selected_observer(
     weights: FilePath | None = None,
     earlier_design: SelectedObserver | None = None,
     is_free: Sequence[bool] | None = None,
+    activity: float = 1.0,
     progress: Callable[[str], None] = lambda _: None,
 ) -> SelectedObserver:
     """A controller with feedforward and observer of a model, and what it comes from.
@@ -475,8 +476,8 @@ def selected_observer(
     each; gains of a file and those beside a sketch are only relaxed, where the margins need it.
     `uncertain` counts the phase margin of uncertain aircraft too, `sketched` takes the gains for a
     model from a sketch, and `speeds` are two ratios to the trim speed, with models there. `margin`,
-    `is_free` and `progress` as for `with_aircraft_observer`; the search begins at the gains and the
-    relaxation of the design `earlier_design`.
+    `is_free`, `activity` and `progress` as for `with_aircraft_observer`; the search begins at the
+    gains and the relaxation of the design `earlier_design`.
     """
     noise, vanes = _noise(controller, scenario, model)
     nominal = model_for(model, controller, noise)
@@ -501,6 +502,7 @@ def selected_observer(
         keeps_gains=sketched or weights is not None,
         begin=None if earlier_design is None else earlier_design.relaxation,
         is_free=is_free,
+        activity=activity,
         progress=progress,
     )
     origin = origins[selected.place]

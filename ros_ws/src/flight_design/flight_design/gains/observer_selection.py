@@ -99,6 +99,7 @@ def with_aircraft_observer(
     keeps_gains: bool = False,
     begin: FloatArray | None = None,
     is_free: Sequence[bool] | None = None,
+    activity: float = 1.0,
     progress: Callable[[str], None] = lambda _: None,
 ) -> SelectedObserver:
     """The controller with the feedforward and the observer of an airframe.
@@ -114,9 +115,9 @@ def with_aircraft_observer(
     all outputs there. `speeds` are two ratios to the trim speed: the controller has a schedule
     then, and the margins at these speeds too. With `keeps_gains` the gains are only relaxed, where
     the margins need it. The search begins at the relaxation `begin`, (m,), and changes it in the
-    channels that are free. `progress` gets a sentence a loop. Raises ParameterError for an airframe
-    with another D or without a wind, one that a feedforward refuses, and for margins that no
-    relaxation reaches.
+    channels that are free. `activity` is the weight of the activity of u beside the error.
+    `progress` gets a sentence a loop. Raises ParameterError for an airframe with another D or
+    without a wind, one that a feedforward refuses, and for margins that no relaxation reaches.
     """
     designs = _AircraftDesigns.around(controller, airframe, noise)
     if speeds is not None:
@@ -124,7 +125,7 @@ def with_aircraft_observer(
     model = designs.model
     plant = designs.plant(WORST_OF * uncertain, vanes)
     activity_unit = np.array(
-        [ACTIVITY_UNIT[airframe.inputs[name].unit] for name in controller.inputs]
+        [ACTIVITY_UNIT[airframe.inputs[name].unit] / activity for name in controller.inputs]
     )
     # A search for each gain set; the one with the least error is taken.
     searches = []

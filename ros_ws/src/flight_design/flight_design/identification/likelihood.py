@@ -5,7 +5,7 @@
 The observer's filter gives the innovations at the levels of the wind.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -233,12 +233,16 @@ class Likelihood:
         self._factor = unknown.factor
         self.believe(np.repeat([unknown.error, unknown.effect], [count_A, count_B]))
 
-    def believe(self, deviation: FloatArray) -> None:
-        """Take these standard deviations of the relative errors before the flight, (p - G,)."""
+    def believe(self, deviation: FloatArray, centre: FloatArray | None = None) -> None:
+        """Take these standard deviations of the relative errors before the flight, (p - G,).
+
+        The errors lie about a `centre`, (p - G,), by default 0: deviations and bounds are then
+        relative to the values there.
+        """
         delay_prior = np.ones(len(self._block.inputs) if self._delay_deviation else 0)
         wind_prior = np.full(len(self._block.winds), WIND_PRIOR)
         if self.coarse is not self:
-            self.coarse.believe(deviation)
+            self.coarse.believe(deviation, centre)
         shear_prior = np.full(len(SHEARED) * self._is_sheared, SHEAR_PRIOR)
         self.prior = np.concatenate(
             [deviation, wind_prior, shear_prior, np.ones(len(self._angles)), delay_prior]
@@ -255,6 +259,13 @@ class Likelihood:
         rough[self._errors] = (deviation > PRIOR) & (nominal != 0.0)
         self._upper[rough] = self._factor - 1.0
         self._lower[rough] = 1.0 / self._factor - 1.0
+        self.centre = np.zeros(len(self.prior))
+        if centre is not None:
+            self.centre[self._errors] = centre
+            scale = np.where(nominal != 0.0, 1.0 + centre, 1.0)
+            for bounds in (self._lower, self._upper):
+                bounds[self._errors] = centre + scale * bounds[self._errors]
+            self.prior[self._errors] *= scale
         if len(delay_prior):  # no u acts before it is sent
             earliest = -self._delay / self._delay_deviation
             self._lower[self._late] = np.maximum(-MAX_DELAY_ERROR, earliest)
@@ -446,10 +457,7 @@ class Likelihood:
         return names + others[: len(self.prior) - len(names)]
 
     def model_errors(self, airframe: Airframe) -> FloatArray:
-        """Theta, (p,), of a model in the winds and with the delay of theta = 0.
-
-        Theta is within the bounds.
-        """
+        """Theta, (p,), of a model in the winds and with the delay of theta = 0."""
         A = airframe.matrix_a()
         B = airframe.matrix_b()
         inputs = list(airframe.inputs)
@@ -461,7 +469,7 @@ class Likelihood:
             else:
                 value = B[row, inputs.index(entry.column)]
             theta[k] = (value - entry.nominal) / entry.unit
-        return np.clip(theta, self._lower, self._upper)
+        return theta
 
     def entries(self, fit: Fit) -> list[Entry]:
         """The identified entries of A and B."""
@@ -472,6 +480,15 @@ class Likelihood:
         return [
             entry._replace(error=error, deviation=deviation) for entry, error, deviation in errors
         ]
+
+    def about_centre(self, entries: Iterable[Entry]) -> list[Entry]:
+        """Entries with their errors and deviations relative to the centre of the search."""
+        centred = []
+        for entry, centre in zip(entries, self.centre.tolist(), strict=False):
+            scale = 1.0 + centre if entry.nominal else 1.0
+            error = (entry.error - centre) / scale
+            centred.append(entry._replace(error=error, deviation=entry.deviation / scale))
+        return centred
 
     def strange_air(self, fit: Fit) -> str:
         """The state that the slope of the wind moves most, if by the bound of the search.
@@ -528,5 +545,5 @@ class Likelihood:
         e = innovations.e[:, used]
         total = np.sum(innovations.half_log_det[:, used], axis=1)
         costs = e.shape[1] / 2.0 * np.sum(np.log(np.mean(e**2, axis=1)), axis=1) + total
-        costs = costs + np.sum((thetas / self.prior) ** 2, axis=1) / 2.0
+        costs = costs + np.sum(((thetas - self.centre) / self.prior) ** 2, axis=1) / 2.0
         return np.where(np.isfinite(costs), costs, np.inf), e, total

@@ -75,12 +75,18 @@ class Search(Likelihood):
         if begin is None:
             ends = self._ends(flown, used)
         else:
-            theta = self._started(np.clip(begin, self._lower, self._upper), None, winds=True)
+            theta = self._started(self._within(begin), None, winds=True)
             ends = [self._refined(theta, None, used)]
         best = min(ends, key=lambda end: end.cost)
         same = np.full_like(best.levels, np.bincount(best.levels).argmax())
         steady = self._refined(best.theta, same, used)
         return self._fit_at(min(best, steady, key=lambda end: end.cost), same, used, flown)
+
+    def fit_about(self, fit: Fit, used: NDArray[np.bool_], flown: FloatArray | None = None) -> Fit:
+        """The minimum of `fit` about the errors of an earlier fit, from there."""
+        deviation = self.prior[self._errors]
+        self.believe(deviation, fit.theta[self._errors])
+        return self.fit(used, fit.theta, flown)
 
     def fit_alike(self, used: NDArray[np.bool_], flown: FloatArray | None = None) -> Fit | None:
         """The minimum of `fit` in air as in every span, from a single start.
@@ -90,7 +96,7 @@ class Search(Likelihood):
         None where fewer than ALIKE of the spans have the same level.
         """
         coarse = self.coarse
-        begin = np.zeros(len(self.prior)) if flown is None else flown
+        begin = self._within(np.zeros(len(self.prior)) if flown is None else flown)
         turbulent = np.full(len(coarse._spans), TURBULENT)
         theta = self._started(begin, turbulent, winds=True)
         counts = np.bincount(coarse.levels(theta))
@@ -149,12 +155,16 @@ class Search(Likelihood):
             theta = self._started(begin, np.full(len(coarse._spans), level), winds=False)
             candidates.append((coarse.cost(theta, fitted), theta))
         if flown is not None and flown.any():
-            theta = self._started(flown, None, winds=True)
+            theta = self._started(self._within(flown), None, winds=True)
             candidates.append((coarse.cost(theta, fitted), theta))
         best = sorted(candidates, key=lambda start: start[0])[:REFINED]
         return [
             self._refined(theta, None, used) for cost, theta in best if cost < best[0][0] + CLOSE
         ]
+
+    def _within(self, theta: FloatArray) -> FloatArray:
+        """Theta, (p,), within the bounds of the search."""
+        return np.clip(theta, self._lower, self._upper)
 
     def _started(
         self, theta: FloatArray, levels: NDArray[np.int64] | None, *, winds: bool
@@ -227,7 +237,7 @@ class Search(Likelihood):
         J = np.zeros((size, e[0].size))
         J[indices] = ((e[1:] - e[0]) / DIFFERENCE / rms).reshape(len(indices), -1)
         hessian = J @ J.T + np.diag(self.prior**-2)
-        slope = J @ (e[0] / rms).ravel() + theta / self.prior**2
+        slope = J @ (e[0] / rms).ravel() + (theta - self.centre) / self.prior**2
         slope[indices] += (half_log_det[1:] - half_log_det[0]) / DIFFERENCE
         trials = np.clip(
             theta + damped_steps(theta, slope, hessian, self._lower, self._upper, free),

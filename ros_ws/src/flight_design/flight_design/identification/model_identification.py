@@ -58,6 +58,7 @@ from flight_design.identification.model_quality import (
     Prediction,
     advantage,
     another_airframe,
+    at_bound,
     correlation,
     no_better,
     other_signs,
@@ -70,6 +71,8 @@ from flight_design.identification.model_quality import (
 FOLLOWS = 10.0
 # gain in log-likelihood of held-out samples by coupling: uncoupled aircraft have -20
 COUPLED_GAIN = 20.0
+# searches about what was found, at most: a factor of 2.5 each
+AGAIN = 2
 
 
 class Part(NamedTuple):
@@ -120,7 +123,8 @@ class _Study(NamedTuple):
     validating: NDArray[np.bool_]  # (T,)
     later: NDArray[np.bool_]  # (T,) samples on which the model `flown` is tested
     channels: ChannelPairing
-    at_bound: int
+    bound_count: int  # of entries that may lie at their bound
+    searches_again: bool
     step: Callable[[], None]
 
     def search(self, model: NominalModel, block: Block, *, coupled: bool = False) -> Search:
@@ -144,7 +148,7 @@ class _Study(NamedTuple):
         before = prediction(fit.before, self.validating)
         after = prediction(fit.after, self.validating)
         sentences = (
-            another_airframe(entries, self.airframe.name, self.at_bound, self.unknown.factor),
+            self.is_beyond(search.about_centre(entries)),
             search.strange_air(fit),
             too_little_excitation(entries, outputs),
             other_signs(self.airframe, with_entries(self.airframe, entries), self.channels),
@@ -180,6 +184,28 @@ class _Study(NamedTuple):
             parts=tuple(parts),
         )
 
+    def again(
+        self, search: Search, fit: Fit, used: NDArray[np.bool_], flown: Airframe | None
+    ) -> Fit:
+        """A fit, or one about it where too many entries stand at a bound: the file was rough.
+
+        Effects of inputs stay within the bounds about the file: with others no law of the file
+        flies, and a part that couples with another one looks so.
+        """
+        for _ in range(AGAIN * self.searches_again):
+            entries = search.about_centre(search.entries(fit))
+            found = at_bound(entries, self.unknown.factor)
+            is_beyond = self.is_beyond(entries)
+            if not is_beyond or any(entry.matrix == "B" for entry in found):
+                break
+            also = None if flown is None else search.model_errors(flown)
+            fit = search.fit_about(fit, used, also)
+        return fit
+
+    def is_beyond(self, entries: Sequence[Entry]) -> str:
+        """The entries at a bound, if too many."""
+        return another_airframe(entries, self.airframe.name, self.bound_count, self.unknown.factor)
+
     def fit(
         self,
         search: Search,
@@ -195,8 +221,24 @@ class _Study(NamedTuple):
             part = self.part(search, quick_fit)
             if not part.refusal and part.after.whiteness.max() <= MAX_WHITENESS:
                 return quick_fit, part
-        fit = search.fit(used, flown=also)
+        fit = self.again(search, search.fit(used, flown=also), used, flown)
         return fit, self.part(search, fit)
+
+    def whole(
+        self,
+        model: NominalModel,
+        fits: Sequence[tuple[Search, Fit]],
+        used: NDArray[np.bool_],
+        apart: Innovations,
+    ) -> tuple[Fit, Part] | None:
+        """The aircraft as one part, where this predicts better than its parts `apart`."""
+        search = self.search(model, whole_aircraft(model), coupled=True)
+        fit = self.again(search, search.fit(used, begin=search.joined(fits)), used, None)
+        part = self.part(search, fit)
+        gain = part.after.log_likelihood - prediction(apart, self.validating).log_likelihood
+        is_white = part.after.whiteness.max() <= MAX_WHITENESS
+        is_better = gain * self.validating.sum() > COUPLED_GAIN
+        return (fit, part) if is_white and is_better and not part.refusal else None
 
     def advantage(self, flown: Innovations, nominal: Innovations) -> float:
         """The advantage of the model `flown` over the nominal one in later samples."""
@@ -209,23 +251,26 @@ def identify_model(
     actuation: Actuation,
     channels: ChannelPairing | None = None,
     progress: Callable[..., None] = lambda **_: None,
-    at_bound: int = 0,
+    bound_count: int = 0,
     unknown: Unknown = KNOWN,
     flown: Airframe | None = None,
     *,
     after: float = -np.inf,
     may_couple: bool = True,
     quick: bool = False,
+    searches_again: bool = False,
 ) -> Identification:
     """The model of a flight, with the reason why it must not be used if there is one.
 
     Arguments: `airframe` the nominal one; `channels` in the law's order, whose D the model has to
-    keep, by default the airframe's order; `at_bound` how many entries of a part may lie at their
+    keep, by default the airframe's order; `bound_count` how many entries of a part may lie at their
     bound; `unknown` what else is identified; `flown` the model in flight, a further start, whose
     advantage over the nominal one is that of the samples `after` a flight time, s; `may_couple`
     whether parts may become one; `quick` whether the search of a part begins once, where the air is
-    the same in every span and the model may be used; `progress` takes the steps `completed` and
-    their largest number `total`. Raises ParameterError for an output that does not move.
+    the same in every span and the model may be used; `searches_again` whether a part with too many
+    entries of A at their bounds is searched again, about what was found; `progress` takes the
+    steps `completed` and their largest number `total`. Raises ParameterError for an output that
+    does not move.
     """
     blown = in_rolling_air(airframe)
     model = filter_model(blown, actuation, recorded)
@@ -235,10 +280,6 @@ def identify_model(
     used = is_known & ~validating
     later = is_known & (recorded.t > after)
     every = blocks(model)
-    starts = len(STARTS) + len(SIGNS) + (flown is not None)
-    total = len(every) * (starts * START_STEPS + REFINED * STEPS)
-    total += (len(every) > 1) * (START_STEPS + STEPS)
-    pairs = channels or ChannelPairing(airframe.outputs, tuple(airframe.inputs))
     study = _Study(
         recorded=recorded,
         airframe=blown,
@@ -246,9 +287,10 @@ def identify_model(
         unknown=unknown,
         validating=validating,
         later=later,
-        channels=pairs,
-        at_bound=at_bound,
-        step=_counter(progress, total),
+        channels=channels or ChannelPairing(airframe.outputs, tuple(airframe.inputs)),
+        bound_count=bound_count,
+        searches_again=searches_again,
+        step=_counter(progress, len(every), starts_at_flown=flown is not None),
     )
     searches = [study.search(model, block) for block in every]
     fitted = [study.fit(search, used, flown, quick=quick) for search in searches]
@@ -263,20 +305,22 @@ def identify_model(
         z = study.advantage(by_flown, first)
         parts = [part._replace(advantage=z) for part in parts]
     if may_couple and len(every) > 1 and _follows(fits, every, recorded.u, is_known) > FOLLOWS:
-        search = study.search(model, whole_aircraft(model), coupled=True)
-        fit = search.fit(used, begin=search.joined(fits))
-        part = study.part(search, fit)._replace(advantage=z)
-        gain = part.after.log_likelihood - prediction(last, validating).log_likelihood
-        white = part.after.whiteness.max() <= MAX_WHITENESS
-        if white and not part.refusal and gain * validating.sum() > COUPLED_GAIN:
-            parts = [part]
+        whole = study.whole(model, fits, used, last)
+        if whole is not None:
+            fit, part = whole
+            parts = [part._replace(advantage=z)]
             first = fit.before
             last = fit.after
     return study.identification(airframe, parts, first, last)
 
 
-def _counter(progress: Callable[..., None], total: int) -> Callable[[], None]:
-    """A function to call at each step, which tells how many of at most `total` are done."""
+def _counter(
+    progress: Callable[..., None], parts: int, *, starts_at_flown: bool
+) -> Callable[[], None]:
+    """A function to call at each step of the searches of some parts, which tells `progress`."""
+    starts = len(STARTS) + len(SIGNS) + starts_at_flown
+    total = parts * (starts * START_STEPS + REFINED * STEPS)
+    total += (parts > 1) * (START_STEPS + STEPS)
     steps = count(1)
 
     def step() -> None:

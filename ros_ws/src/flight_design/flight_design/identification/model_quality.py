@@ -129,30 +129,34 @@ def too_little_excitation(entries: Iterable[Entry], outputs: Iterable[str]) -> s
     )
 
 
-def another_airframe(
-    entries: Iterable[Entry], name: str, allowed: int = 0, factor: float = MAX_FACTOR
-) -> str:
-    """The entries at a bound of the search, if more than `allowed`; `factor` is the largest one.
-
-    One that the record shows, to half of its deviation before, is too many: the aircraft is beyond.
-    """
-    at_bound = []
-    is_shown = False
+def at_bound(entries: Iterable[Entry], factor: float = MAX_FACTOR) -> list[Entry]:
+    """The entries at a bound of a search whose largest factor is `factor`."""
+    found = []
     for entry in entries:
         lower, upper = -MAX_ERROR, largest_error(entry)
         if factor > MAX_FACTOR and entry.nominal:
             lower, upper = 1.0 / factor - 1.0, factor - 1.0
         if not lower < entry.error < upper:
-            at_bound.append(entry.name)
-            is_shown |= entry.deviation < PRIOR / 2.0
-    if len(at_bound) > allowed or is_shown:
-        return (
-            f"airframe {name}: found {', '.join(at_bound)} at a bound of the search, "
-            f"{1.0 / factor:.2g} or {factor:.2g}"
-            " times the nominal value, expected a log of this airframe, in calm air if its "
-            "effect of wind is not known"
-        )
-    return ""
+            found.append(entry)
+    return found
+
+
+def another_airframe(
+    entries: Iterable[Entry], name: str, allowed: int = 0, factor: float = MAX_FACTOR
+) -> str:
+    """The entries at a bound of the search, if more than `allowed`.
+
+    One that the record shows, to half of its deviation before, is too many: the aircraft is beyond.
+    """
+    found = at_bound(entries, factor)
+    is_shown = any(entry.deviation < PRIOR / 2.0 for entry in found)
+    if len(found) <= allowed and not is_shown:
+        return ""
+    return (
+        f"airframe {name}: found {', '.join(entry.name for entry in found)} at a bound of the "
+        f"search, {1.0 / factor:.2g} or {factor:.2g} times the nominal value, expected a log of "
+        "this airframe, in calm air if its effect of wind is not known"
+    )
 
 
 def _minor_signs(Omega: FloatArray) -> list[float]:

@@ -34,8 +34,9 @@ class FlightRecord:
     """The last samples of a flight, over a window."""
 
     def __init__(self, controller: RiseDiConfig, airframe: Airframe, window: float) -> None:
-        """`window`: length, s. Samples have the order of the controller, recordings that of the
-        airframe.
+        """An empty record of a `window`, its length in s.
+
+        Samples have the order of the controller, recordings that of the airframe.
         """
         self._rows = [controller.outputs.index(name) for name in airframe.outputs]
         self._columns = [controller.inputs.index(name) for name in airframe.inputs]
@@ -78,8 +79,9 @@ class FlightRecord:
         self._samples = deque(self._after(stamp_ns))
 
     def recording(self, after_ns: int = -1) -> FlightData:
-        """The record after an instant in equal periods, in the airframe's order; y of a lost tick
-        is NaN, u is held.
+        """The record after an instant in equal periods, in the airframe's order.
+
+        y of a lost tick is NaN, u is held.
         """
         record = self._after(after_ns)
         stamp_ns = np.array([sample.stamp_ns for sample in record])
@@ -94,8 +96,9 @@ class FlightRecord:
         return FlightData(self.period, t, padded_y[:, self._rows], held[:, self._columns])
 
     def fell_back(self, after_ns: int, proposals: Collection[int]) -> bool:
-        """Whether the law fell back after an instant: other parameters than one of the proposals,
-        by digest, replaced those that flew.
+        """Whether the law fell back after an instant.
+
+        Other parameters than one of the proposals, by digest, then replaced those that flew.
         """
         flown = [sample.flown for sample in self._after(after_ns)]
         return any(new != old and new not in proposals for old, new in pairwise(flown))

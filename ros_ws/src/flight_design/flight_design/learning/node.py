@@ -37,8 +37,7 @@ NICE = 10  # of a search in real time, above the nodes of the loop: it takes a c
 
 
 class LearnerNode(FlightNode[LearnerConfig]):
-    """Takes y and u of each tick from `internals`, and publishes a proposal for each identification
-    that is due.
+    """Takes y and u of each tick from `internals`, and publishes the proposals that are due.
 
     While a search runs, the samples wait in the queue of the subscription: the record of a search
     does not change, and in lockstep the proposals are those of the loop in one process. In real
@@ -105,7 +104,8 @@ class LearnerNode(FlightNode[LearnerConfig]):
 
     def _advance(self, now_ns: int) -> bool:
         """Publish the proposal of a search that has ended, and take samples until the next search.
-        Whether there was one.
+
+        Returns whether there was a sample or a proposal.
         """
         advanced = False
         if self._search is not None and not self._search.is_alive():
@@ -147,8 +147,6 @@ class LearnerNode(FlightNode[LearnerConfig]):
         self._end_ns = sample.stamp_ns + round(age * NANOSECONDS)
         if mode == Mode.ENGAGED:
             self._learner.take(sample.stamp_ns, y, u, int(flown))
-            if self._learner.has_fallen_back:
-                self._updates.fell_back(self._end_ns)
         self._has_record = True
         self._flown = int(flown)
         self._given_up = tuple(
@@ -168,8 +166,9 @@ class LearnerNode(FlightNode[LearnerConfig]):
             )
 
     def close(self) -> None:
-        """In lockstep complete the searches that are due: the log has their entries, as that of one
-        process.
+        """In lockstep complete the searches that are due.
+
+        The log then has their entries, as that of one process.
         """
         if self.parameters.lockstep:
             self._advance(0)

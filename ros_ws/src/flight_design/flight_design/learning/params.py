@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of the learner. What it identifies, and when, is the section `learn` of the controller
-in its scenario.
+"""Parameters of the learner.
+
+What it identifies, and when, is the section `learn` of the controller in its scenario.
 """
 
 from flight_core.fields import Field

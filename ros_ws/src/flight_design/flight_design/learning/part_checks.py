@@ -25,19 +25,11 @@ def is_within(part: Iterable[str], outputs: Iterable[str]) -> bool:
     return set(part) <= set(outputs)
 
 
-def changed(change: Change) -> str:
+def change_sentence(change: Change) -> str:
     """The part that has changed, and its weakest input."""
     name, effectiveness = min(change.left.items(), key=lambda effect: effect[1])
     weakest = f"{name} has {100 * effectiveness:.0f} % of its effect"
     return f"{' and '.join(change.outputs)} changed, log-likelihood {change.gain:.3g}: {weakest}"
-
-
-def explains(part: Part) -> bool:
-    """Whether the nominal airframe predicts the held-out samples as well as the identified model,
-    with white innovations.
-    """
-    is_white = part.before.whiteness.max() <= MAX_WHITENESS
-    return bool(is_white and part.after.log_likelihood <= part.before.log_likelihood)
 
 
 def not_white(part: Part) -> str:
@@ -54,8 +46,9 @@ def not_white(part: Part) -> str:
 
 
 def too_late(part: Part, delay: float) -> str:
-    """The refusal of a part whose inputs are as late as the search goes beyond the known `delay` of
-    the loop, s.
+    """The refusal of a part whose inputs are as late as the search goes.
+
+    The search goes on from the known `delay` of the loop, s.
     """
     bound = delay + MAX_DELAY_ERROR * DELAY_DEVIATION
     late = [
@@ -71,9 +64,10 @@ def too_late(part: Part, delay: float) -> str:
     )
 
 
-def back_to_file(part: Part) -> bool:
-    """Whether the nominal model predicts later samples better than the one that flies, with a
-    probability of at most 5 % where both are as near to the aircraft.
+def is_file_better(part: Part) -> bool:
+    """Whether the nominal model predicts later samples better than the one that flies.
+
+    The probability of that is at most 5 % where both are as near to the aircraft.
     """
     return part.advantage < -LIKELIER
 
@@ -95,27 +89,26 @@ def unproven(part: Part, name: str, *, flies: bool) -> str:
     )
 
 
-def back(part: Part, name: str) -> str:
-    """What flies where the airframe file predicts better than the model that flew: the airframe of
-    a name, or the law of the start.
+def return_to_file(part: Part, name: str) -> str:
+    """What flies where the airframe file predicts better than the model that flew.
+
+    That is the airframe of a name, or the law of the start.
     """
     flies = f"the airframe {name} as it is" if name else "the law of the start"
-    return f"{' and '.join(part.outputs)} by {flies}: {_file_is_better(part)}"
+    return f"{' and '.join(part.outputs)} by {flies}: {_file_advantage(part)}"
 
 
-def _file_is_better(part: Part) -> str:
+def _file_advantage(part: Part) -> str:
     return f"the file predicts later seconds better, by {-part.advantage:.2g} standard deviations"
 
 
-def as_in_file(part: Part) -> tuple[Entry, ...]:
+def entries_of_file(part: Part) -> tuple[Entry, ...]:
     """The entries of a part as in the airframe file."""
     return tuple(entry._replace(error=0.0) for entry in part.entries)
 
 
 def uncoupled(part: Part, known: Iterable[tuple[str, ...]]) -> str:
-    """The refusal of a part alone where the flown model couples the part with another; empty where
-    it does not.
-    """
+    """The refusal of a part alone where the flown model couples it with another; else empty."""
     if not any(is_within(part.outputs, outputs) for outputs in known if outputs != part.outputs):
         return ""
     return (
@@ -124,14 +117,13 @@ def uncoupled(part: Part, known: Iterable[tuple[str, ...]]) -> str:
     )
 
 
-def forgotten(part: Part) -> str:
+def forgotten_coupling(part: Part) -> str:
     """Why a model with coupling is forgotten."""
-    return f"no coupling any more: {_file_is_better(part)}"
+    return f"no coupling any more: {_file_advantage(part)}"
 
 
 def weaker(part: Part, flown: Airframe | None) -> str:
-    """The effect that a record of gusts has weaker than the model that flies, if by more than
-    MAX_DEVIATION.
+    """The effect that a record of gusts has weaker than the model that flies, by MAX_DEVIATION.
 
     Gusts hide what the inputs do: the effects come out too weak, a design with them too strong.
     """
@@ -150,9 +142,10 @@ def weaker(part: Part, flown: Airframe | None) -> str:
     return ""
 
 
-def sentence(part: Part) -> str:
-    """The effects of inputs on outputs that the flight shows, relative to the rough airframe, with
-    deviations.
+def effect_sentence(part: Part) -> str:
+    """The effects of inputs on outputs that the flight shows.
+
+    They are relative to the rough airframe, with deviations.
     """
     effects = (entry for entry in part.entries if entry.matrix == "B" and entry.row in part.outputs)
     known = (entry for entry in effects if entry.nominal and entry.deviation < PRIOR / 2.0)
@@ -160,13 +153,3 @@ def sentence(part: Part) -> str:
         f"{entry.name} {100 * entry.error:+.0f} +- {100 * entry.deviation:.0f} %" for entry in known
     )
     return text if all(entry.nominal for entry in part.entries) else f"{text}, with coupling"
-
-
-def unchanged(changes: Iterable[Change]) -> str:
-    """The sentence of tests without a change."""
-    effects = ", ".join(
-        f"{name} {100 * left:.0f} %" for change in changes for name, left in change.left.items()
-    )
-    if not effects:
-        return "no identification is due, and no part is tested for a change"
-    return f"the aircraft has not changed: effects of inputs, of those of the model, {effects}"

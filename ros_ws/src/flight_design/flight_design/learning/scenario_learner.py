@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The learner of a scenario: its airframe file is the rough model, and its observers have the gains
-of `rise-di gains`.
+"""The learner of a scenario: its airframe file is the rough model.
+
+Its observers have the gains of `rise-di gains`.
 """
 
 from pathlib import Path
@@ -29,7 +30,7 @@ from flight_design.gains.observer_search import SelectedObserver
 from flight_design.identification.jsbsim_identification import NOISE, STEP_MARGIN
 from flight_design.identification.likelihood import KNOWN
 from flight_design.identification.sketch import ROUGH, sketched, with_sketch
-from flight_design.learning.designs import Goal, asked_margin
+from flight_design.learning.designs import ACTIVITY, Goal, asked_margin
 from flight_design.learning.learner import Learner
 from flight_log.tape_reader import RecordedRun
 from rise_di_controller.internals import GIVEN_UP
@@ -38,8 +39,7 @@ from rise_di_controller.rise_di_config import LearnConfig, PriorConfig, RiseDiCo
 
 
 def learner(scenario: Scenario, *, real_time: bool = False, quick: bool = False) -> Learn | None:
-    """What `simulate` and `fly_and_report` take as `learn`; None for a scenario that does not
-    learn.
+    """What `simulate` and `fly_and_report` take as `learn`; None without learning.
 
     The published airframe is the rough model, not the aircraft in flight. For an aircraft of JSBSim
     the rough model is the controller's feedforward. In real time the loop has the delay of the
@@ -94,6 +94,7 @@ def learner(scenario: Scenario, *, real_time: bool = False, quick: bool = False)
             speeds=speeds,
             earlier_design=goal.beside,
             is_free=goal.is_free,
+            activity=ACTIVITY,
         )
 
     of_rough: dict[RiseDiConfig, SelectedObserver] = {}
@@ -117,8 +118,7 @@ def learner(scenario: Scenario, *, real_time: bool = False, quick: bool = False)
 
 
 def that_learns(scenario: Scenario) -> Scenario:
-    """A scenario that learns in flight with no model of its aircraft, from a scenario of the law
-    alone.
+    """A scenario that learns with no model of its aircraft, from one of the law alone.
 
         Omega = diag(D omega / input_scale),   V0 the trim speed
 
@@ -156,8 +156,9 @@ def with_law_inputs(airframe: Airframe, controller: RiseDiConfig) -> Airframe:
 
 
 def _speeds(controller: RiseDiConfig, airframe: Airframe) -> tuple[float, float] | None:
-    """The speeds of the models of a schedule, over the trim speed; None without one. Raises
-    ParameterError for a schedule about another speed than that of the rough model.
+    """The speeds of the models of a schedule, over the trim speed; None without one.
+
+    Raises ParameterError for a schedule about another speed than that of the rough model.
     """
     if controller.schedule is None:
         return None
@@ -241,11 +242,11 @@ def _ticks(tape: Tape, controller: RiseDiConfig) -> _Ticks:
 
 
 def learn_again(tape: Tape, scenario: Scenario) -> LearnResult:
-    """Step the learner of a scenario with y and u of the engaged ticks of a log. Raises
-    ParameterError.
+    """Step the learner of a scenario with y and u of the engaged ticks of a log.
 
     A deactivated law ends a record, as in flight. Where the log has other settings of the learner
-    than the scenario, or none, each proposal is taken as flown.
+    than the scenario, or none, each proposal is taken as flown. Raises ParameterError for a log
+    that cannot teach.
     """
     # simulated time begins at 0
     make = learner(scenario, real_time=tape.start_ns > 0)
@@ -277,8 +278,6 @@ def learn_again(tape: Tape, scenario: Scenario) -> LearnResult:
         flown = proposed if ticks.flown is None else int(ticks.flown[k])
         if ticks.mode[k] == Mode.ENGAGED:
             learned.take(int(ticks.stamp_ns[k]), ticks.y[k].copy(), ticks.u[k].copy(), flown)
-            if learned.has_fallen_back:
-                updates.fell_back(now_ns)
         if updates.due(now_ns):
             proposal = learned.propose(flown, ticks.left(k))
             proposed = proposed if proposal.controller is None else proposal.controller.digest()
@@ -294,8 +293,9 @@ def learn_again(tape: Tape, scenario: Scenario) -> LearnResult:
 
 
 def with_last_model(scenario: Scenario, run: RecordedRun) -> Scenario:
-    """A scenario that learns, with what flew last in one of its runs in place of `learn`. Raises
-    ParameterError for a run of another controller.
+    """A scenario that learns, with what flew last in one of its runs in place of `learn`.
+
+    Raises ParameterError for a run of another controller.
     """
     start = scenario.rise_di()
     recorded = recorded_parameters(run.scenario_file())
@@ -308,8 +308,9 @@ def with_last_model(scenario: Scenario, run: RecordedRun) -> Scenario:
 
 
 def learned_yaml(result: LearnResult, origin: str) -> str:
-    """The model of a result as the text of an airframe file; the header has the steps. Raises
-    ParameterError without one.
+    """The model of a result as the text of an airframe file; the header has the steps.
+
+    Raises ParameterError without a model.
     """
     require(result.model is not None, "the learner", "no model", "one")
     assert result.model is not None  # noqa: S101 - for the type checker

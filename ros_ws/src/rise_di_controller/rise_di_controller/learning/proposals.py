@@ -112,52 +112,35 @@ class Fallback(NamedTuple):
         return any(new == SMALLEST < old for new, old in zip(scale, self.input_scale, strict=False))
 
 
-AFTER_FALLBACK = 4.0  # s, from a fallback to the test of its cause
-
-
 class Updates:
-    """When proposals are due.
+    """When proposals are due: at the first tick, and at each of the times, counted from it.
 
-    They are due at the first tick, with the rough model as it is, then at the first tick at or
-    after every time of the list, counted from the first tick; and AFTER_FALLBACK after a fallback.
+    At the first tick the rough model is proposed as it is. Between the times, and after the last
+    one, the aircraft is tested every `learn.check`, but not so soon before the next of the times.
     """
 
     def __init__(self, settings: LearnConfig) -> None:
         self._check_ns = nanoseconds(settings.check)
         self._times_ns = deque(map(nanoseconds, (0.0, *settings.updates)))
-        self._spacing_ns = nanoseconds(settings.spacing()) // 2
+        self._begin_ns = nanoseconds(settings.updates[0])  # of the tests
         self._first_ns: int | None = None
-        self._last_ns: int | None = None  # the last that was due
-        self._test_ns: int | None = None  # the next test of the cause of a fallback
-        self._tested_ns: int | None = None  # the last one
-
-    def fell_back(self, now_ns: int) -> None:
-        """Note a fallback."""
-        self._test_ns = now_ns + nanoseconds(AFTER_FALLBACK)
+        self._last_ns = 0  # the last that was due, from the first tick on
 
     def due(self, now_ns: int) -> bool:
-        """Whether an identification begins at this tick. Call it at each tick in order.
-
-        A proposal half of `learn.spacing` after another would be refused: the test of a fallback
-        waits so long, and a time so soon after such a test is left out.
-        """
+        """Whether an identification or a test begins at this tick, of ticks in order."""
         self._first_ns = now_ns if self._first_ns is None else self._first_ns
-        due = False
-        while now_ns - self._first_ns >= self._times_ns[0]:
-            due = True
-            last_ns = self._times_ns.popleft()
-            if not self._times_ns:
-                self._times_ns.append(last_ns + self._check_ns)
-        is_test = self._test_ns is not None and now_ns >= self._test_ns
-        soon_ns = now_ns - self._spacing_ns
-        if due and (self._tested_ns is None or self._tested_ns <= soon_ns):
-            self._last_ns = now_ns
-        elif is_test and (self._last_ns is None or self._last_ns <= soon_ns):
-            self._last_ns = self._tested_ns = now_ns
-        else:
+        elapsed_ns = now_ns - self._first_ns
+        is_planned = False
+        while self._times_ns and elapsed_ns >= self._times_ns[0]:
+            is_planned = True
+            self._last_ns = self._times_ns.popleft()
+        if is_planned:
+            return True
+        next_ns = self._last_ns + self._check_ns
+        is_late = bool(self._times_ns) and next_ns + self._check_ns > self._times_ns[0]
+        if next_ns <= self._begin_ns or is_late or elapsed_ns < next_ns:
             return False
-        if is_test:
-            self._test_ns = None
+        self._last_ns = elapsed_ns - (elapsed_ns - self._last_ns) % self._check_ns
         return True
 
 
@@ -183,7 +166,7 @@ class Learning:
         self._due = deque[int]()
         self._received: dict[int, Proposal] = {}  # by the end of the window, in simulated time
         self._certificate: tuple[Proposal, Generator[None, None, Prepared]] | None = None
-        self._spacing_ns = nanoseconds(parameters.learn.spacing()) // 2
+        self._spacing_ns = nanoseconds(min(parameters.learn.spacing(), parameters.learn.check)) // 2
         # end of the window of the last proposal that was not refused at once
         self._last_ns: int | None = None
         # when the law was last inactive: an earlier window is of another engagement
@@ -269,7 +252,6 @@ class Learning:
         lasting = f", in {', '.join(ends)} to the end of the engagement" * bool(ends)
         reason = " and ".join(f"{name} diverges{' again' * bool(ends)}" for name in diverging)
         self._fallback = Fallback(controller.digest, parameters.input_scale, fallen.digest())
-        self._updates.fell_back(now_ns)
         self._diverged.add(controller.digest)
         what = f"falls back to the law of the start{lasting}: {reason}"
         self._take(controller, now_ns, prepared(fallen), EventKind.FALLBACK, what)
