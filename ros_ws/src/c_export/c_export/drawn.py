@@ -69,13 +69,7 @@ def drawn_calls(
     stamp_m_ns = now_ns
     for k in range(ticks):
         draw = rng.random(10)
-        # The clock: in time with jitter, early or late, or a long pause.
-        if draw[0] < 0.9:
-            now_ns += round(period_ns * (1.0 + 0.2 * (draw[1] - 0.5)))
-        elif draw[0] < 0.99:
-            now_ns += round(period_ns * 10.0 ** (2.4 * draw[1] - 1.2))
-        else:
-            now_ns += round(period_ns * 300.0 * draw[1])
+        now_ns += _interval_ns(draw[0], draw[1], period_ns)
         # The size of the error, and the silence of both topics.
         if k % 50 == 0:
             size = unit * 10.0 ** rng.uniform(-3.0, 2.5, m) * (rng.random(m) < 0.9)
@@ -110,6 +104,19 @@ def drawn_calls(
         inactive = max(inactive - 1, 0)
         recorder.tick(now_ns, active=not inactive)
     return recorder.recording("drawn calls")
+
+
+def _interval_ns(kind: float, size: float, period_ns: int) -> int:
+    """Time to the next tick, ns: a period with jitter, far from one, or a long pause.
+
+    `kind` and `size` are drawn from 0 to 1.
+    """
+    if kind < 0.9:
+        return round(period_ns * (1.0 + 0.2 * (size - 0.5)))
+    if kind < 0.99:
+        far: float = 10.0 ** (2.4 * size - 1.2)
+        return round(period_ns * far)
+    return round(period_ns * 300.0 * size)
 
 
 def _jumps(unit: FloatArray, rng: np.random.Generator) -> Iterator[FloatArray]:
