@@ -254,8 +254,8 @@ def _finite(metrics: TickMetrics | LatencyMetrics | AgeMetrics | None) -> dict[s
 def summarise_imported(tape: Tape, source: Mapping[str, str]) -> dict[str, Any]:
     """The metrics of a flight that the stack did not fly.
 
-    y and u about trim have metrics, and the topics an account. It has no reference, and so no
-    error. `source`: of `rise-di import`, the metadata record IMPORTED.
+    y and u about trim have metrics, and the topics an account. Such a flight has no reference, and
+    so no error. `source`: of `rise-di import`, the metadata record IMPORTED.
     """
     flight_account = account(tape, None)
     deviations = {}
@@ -432,7 +432,8 @@ def engagement_notes(engagements: Sequence[Mapping[str, Any]], *, has_figures: b
 def mode_notes(tape: Tape, part: str) -> list[str]:
     """A sentence on a controller that did not fly the law for more than 1 % of the ticks.
 
-    The ticks count from the first engagement on. `part`: that the log has of the ticks.
+    The ticks count from the first engagement on. `part`: what the log has of the ticks, after a
+    comma.
     """
     if "internals" not in tape:
         return []
