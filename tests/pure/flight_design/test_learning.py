@@ -656,6 +656,9 @@ def test_learned_part_keeps_the_margin_of_the_file_and_the_other_part_its_gains(
     assert 0.02 <= q == V < 0.029
     assert p == r == approx(0.03, abs=1e-3)
     assert aim.is_free == [True, False, False, True]
+    assert aim.beside is file
+    # once every part is learned no gain set has to stay
+    assert goal(start, file, model, [("q", "V"), ("p", "r")], {}).beside is None
     design = selected_observer(
         plain,
         flight,
