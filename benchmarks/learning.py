@@ -1,11 +1,12 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Learning in the air: uncertain aircraft that learn in every air, beside the law alone, the file's
-model and the true one.
+"""Learning in the air: uncertain aircraft that learn in every air.
 
-python -m benchmarks.learning  # every cell, 50 aircraft: at most 3 h on two idle cores
-python -m benchmarks.learning --aircraft 6  # with fewer; run again, it flies what is missing
-python -m benchmarks.learning --aircraft 20 --cell "rough prior"  # of one cell
+They fly beside the law alone, the file's model and the true one.
+
+    python -m benchmarks.learning  # every cell, 50 aircraft: at most 3 h on two idle cores
+    python -m benchmarks.learning --aircraft 6  # with fewer; run again, it flies what is missing
+    python -m benchmarks.learning --aircraft 20 --cell "rough prior"  # of one cell
 
 An aircraft learns for 64 s of osprey_learn. The model that flies then is frozen and flies the
 commands and the two gusts of osprey_observer, as the others do, and as the laws of `rise-di
@@ -45,8 +46,9 @@ def count(name: str, aircraft: int) -> int:
 
 
 def code() -> list[str]:
-    """The paths of the code that flies: this file, and the packages of this stack that it
-    imports.
+    """The paths of the code that flies.
+
+    They are this file, and the packages of this stack that it imports.
     """
     sources = REPOSITORY / "ros_ws" / "src"
     imported = {name.partition(".")[0] for name in sys.modules} & {
@@ -62,8 +64,9 @@ def code() -> list[str]:
 
 
 def read(path: Path) -> list[Row]:
-    """The rows of a file of results; none of a file with other columns, which an earlier version
-    wrote.
+    """The rows of a file of results.
+
+    None of a file with other columns, which an earlier version wrote.
     """
     if not path.exists():
         return []

@@ -183,10 +183,10 @@ CELL_FIGURES = {
 
 
 def rival_figures(uncertainty: float, numbers: Sequence[int]) -> Iterator[evidence.Row]:
-    """Scores of the laws of RIVALS in the flight with gusts, and the share that loses track there
-    with u LATE.
+    """Scores of the laws of RIVALS in the flight with gusts.
 
-    All aircraft have the same noise. Each law has its model and gains by the airframe file.
+    The share that loses track there with u LATE is beside them. All aircraft have the same noise.
+    Each law has its model and gains by the airframe file.
     """
     benchmark = tuning.build_benchmark(find_scenario("osprey_observer"))
     tuned = load(tuned_file(find_scenario("osprey_servo")))
@@ -212,8 +212,9 @@ def rival_figures(uncertainty: float, numbers: Sequence[int]) -> Iterator[eviden
 
 
 def plot(rows: Sequence[Row]) -> Figure:
-    """The score of every aircraft in the flight with gusts, a panel an uncertainty; the bar is the
-    mean.
+    """The score of every aircraft in the flight with gusts, a panel an uncertainty.
+
+    The bar is the mean.
     """
     figure = Figure(figsize=(9.0, 3.6), layout="constrained")
     for axis, uncertainty in zip(figure.subplots(1, 2, sharey=True), (0.3, 0.5), strict=True):

@@ -113,8 +113,9 @@ OSPREY = Cell("learn", "calm", 0.3)
 
 
 class Row(NamedTuple):
-    """One aircraft. Scores in the flight with gusts, or after damage; NaN for what was not
-    flown.
+    """One aircraft.
+
+    Scores in the flight with gusts, or after damage; NaN for what was not flown.
     """
 
     cell: str
@@ -167,8 +168,9 @@ class Timed:
 
 
 def learning(cell: Cell, number: int, duration: float, **changed: Any) -> Scenario:
-    """osprey_learn at 100 Hz with an aircraft, wind and noise of its own, and its commands again
-    and again.
+    """osprey_learn at 100 Hz with an aircraft, wind and noise of its own.
+
+    Its commands come again and again.
     """
     shipped = find_scenario("osprey_learn")
     seed = {"seed": 1000 + number}
@@ -194,8 +196,9 @@ def learning(cell: Cell, number: int, duration: float, **changed: Any) -> Scenar
 
 
 def evaluation(flown: Scenario) -> Scenario:
-    """osprey_observer, its commands and two gusts, with the aircraft of a flight that learned and
-    other noise.
+    """osprey_observer, its commands and two gusts, with the aircraft of a flight that learned.
+
+    The noise is another one.
     """
     shipped = find_scenario("osprey_observer")
     own = {
@@ -211,8 +214,9 @@ def evaluation(flown: Scenario) -> Scenario:
 def score(
     tape: Tape, first: float = 0.0, without: Sequence[str] = (), end: float = math.inf
 ) -> float:
-    """Sum over the outputs of the true rms error in units of a score; infinite for a flight that
-    ended early.
+    """Sum over the outputs of the true rms error in units of a score.
+
+    Infinite for a flight that ended early.
     """
     if tape.outcome != COMPLETED:
         return math.inf
@@ -241,8 +245,9 @@ def file_design() -> RiseDiConfig | None:
 def designed(
     start: RiseDiConfig, scenario: Scenario, model: Airframe, *, uncertain: bool = False
 ) -> RiseDiConfig | None:
-    """The start with feedforward and observer of a model; None where no relaxation has the
-    margins.
+    """The start with feedforward and observer of a model.
+
+    None where no relaxation has the margins.
     """
     try:
         return observed(start, scenario, model, MARGIN, uncertain=uncertain)[0]
@@ -268,8 +273,9 @@ def is_unstable(controller: ControllerConfig, aircraft: Airframe) -> int:
 
 
 def margin_left(controller: RiseDiConfig, chosen: Scenario) -> float:
-    """The delay margin of the linear loop of the true aircraft with its lags, beyond the delays of
-    u and y, s; -1 where the loop is unstable.
+    """The delay margin of the linear loop of the true aircraft with its lags, s.
+
+    It is beyond the delays of u and y; -1 where the loop is unstable.
     """
     aircraft = chosen.aircraft
     true = aircraft.sampled_airframe()
@@ -335,8 +341,9 @@ def start_of(chosen: Scenario) -> RiseDiConfig:
 
 @lru_cache(maxsize=4)
 def beside(uncertainty: float, number: int) -> dict[str, tuple[float, int]]:
-    """Score in the flight with gusts, and whether unstable with u late, of what does not learn: the
-    same in every air.
+    """Score in the flight with gusts, and whether unstable with u late, of what does not learn.
+
+    It is the same in every air.
     """
     chosen = learning(Cell("learn", "calm", uncertainty), number, LEARNED)
     flight = evaluation(chosen)
@@ -411,8 +418,9 @@ def with_prior(chosen: Scenario, folder: str) -> Scenario:
 
 
 def rough(number: int) -> Airframe:
-    """The osprey with every entry off by a factor exp(ROUGH N), those of C B by up to 30 %; rows of
-    angles stay.
+    """The osprey with every entry off by a factor exp(ROUGH N), those of C B by up to 30 %.
+
+    Rows of angles stay.
     """
     airframe = load_airframe("osprey")
     rng = np.random.default_rng([SEED, number])
@@ -430,8 +438,9 @@ def rough(number: int) -> Airframe:
 
 
 def coupled(number: int) -> Airframe:
-    """The osprey with entries between its two parts of up to COUPLING of the largest effect on the
-    row, in units of motion.
+    """The osprey with entries between its two parts.
+
+    They have up to COUPLING of the largest effect on the row, in units of motion.
     """
     airframe = load_airframe("osprey")
     rng = np.random.default_rng([SEED, number, 1])
@@ -461,8 +470,9 @@ def coupled(number: int) -> Airframe:
 
 
 def damage(name: str, cell: Cell, number: int) -> Row:
-    """A learner beside the others when elevator and aileron lose half of their effect, or one
-    surface all of it.
+    """A learner beside the others when elevator and aileron lose half of their effect.
+
+    Or one surface loses all of it.
     """
     inputs = tuple(load_airframe("osprey").inputs)
     surfaces = [key for key in inputs if key != "thrust"]
@@ -499,8 +509,9 @@ def damage(name: str, cell: Cell, number: int) -> Row:
 def over_windows(
     tapes: dict[str, Tape], chosen: Scenario, aircraft: Airframe
 ) -> dict[str, list[float]]:
-    """Scores over WINDOWS; those of the true model until the damage with the model of the aircraft
-    as it was.
+    """Scores over WINDOWS.
+
+    Those of the true model until the damage are with the model of the aircraft as it was.
     """
     found = {
         key: [score(tape, first, (), end) for first, end in WINDOWS] for key, tape in tapes.items()
