@@ -6,7 +6,7 @@ For scenarios that ship and for the F-4C of the tutorial (f4c), with the flight 
 aircraft.
 
     python -m benchmarks.guarantee osprey_servo osprey_observer f4c
-    python -m benchmarks.guarantee osprey_servo --corners 20000  # with corners and samples at the limit
+    python -m benchmarks.guarantee osprey_servo --corners 20000  # corners and samples at the limit
 """
 
 import argparse

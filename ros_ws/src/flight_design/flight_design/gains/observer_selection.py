@@ -153,9 +153,17 @@ def with_aircraft_observer(
     selected = selected._replace(left_out=1 + WORST_OF * uncertain - len(plant.A))
     if speeds is None:
         return selected
-    others = searches[selected.place].others
-    # The models at the two speeds make a schedule.
-    slow, fast = (speed.model(selected.relaxation).model_dump() for speed in others)
+    return _with_schedule(selected, searches[selected.place], controller, airframe)
+
+
+def _with_schedule(
+    selected: SelectedObserver,
+    search: ObserverSearch,
+    controller: RiseDiConfig,
+    airframe: Airframe,
+) -> SelectedObserver:
+    """The selected observer with the models of the search at two speeds as a schedule."""
+    slow, fast = (speed.model(selected.relaxation).model_dump() for speed in search.others)
     schedule = {"speed": airframe.speed, "slow": slow, "fast": fast}
     if controller.schedule is not None:
         schedule["time"] = controller.schedule.time
