@@ -432,8 +432,8 @@ def engagement_notes(engagements: Sequence[Mapping[str, Any]], *, has_figures: b
 def mode_notes(tape: Tape, part: str) -> list[str]:
     """A sentence on a controller that did not fly the law for more than 1 % of the ticks.
 
-    The ticks count from the first engagement on. `part`: what the log has of the ticks, after a
-    comma.
+    The ticks count from the first engagement on. `part`: the part of the ticks in the log, as "over
+    49 % of internals"; empty for all.
     """
     if "internals" not in tape:
         return []
