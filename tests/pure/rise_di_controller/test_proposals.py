@@ -274,6 +274,16 @@ def test_second_and_late_proposals_are_refused() -> None:
     assert flight.sentences[-1] == "flies model"
 
 
+def test_empty_proposal_of_a_test_delays_and_refuses_nothing() -> None:
+    """The learner tests the aircraft every 2 s, also while a model is certified."""
+    flight = Flight()
+    flight.receive({}, sentence="")
+    flight.receive()  # 0 s later: a proposal would be too soon
+    flight.receive({}, sentence="")  # while that is certified
+    flight.step()
+    assert flight.sentences == ["flies model"]
+
+
 def test_storm_of_proposals_costs_one_certificate() -> None:
     flight = Flight()
     for _ in range(1000):

@@ -199,6 +199,8 @@ class Learning:
 
     def receive(self, proposal: Proposal, controller: Controller, now_ns: int) -> None:
         """Take a proposal, or refuse it with an event."""
+        if not (self._simulated or proposal.change or proposal.sentence):
+            return  # a test without a change: nothing to certify or to say
         if refusal := self._refusal(proposal, now_ns, controller):
             self._refuse(refusal, now_ns)
         elif self._simulated:
