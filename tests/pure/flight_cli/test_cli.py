@@ -269,31 +269,47 @@ def test_natural_options_are_taken(words: str) -> None:
     command.make_context(name, rest)
 
 
-KEY = ", or a key of the scenario: --set SECTION.KEY=VALUE"
+KEY = ", or set a key of the scenario, --set SECTION.KEY=VALUE"
 
 
 @pytest.mark.parametrize(
     "words, mend",
     [
-        ("gains osprey --rates 3", "--rate"),
-        ("gains osprey --y_rate 50", "--y-rate"),
-        ("gains osprey --phase_margin=45", "--phase-margin"),
-        ("campaign --run x", "--runs"),
-        ("campaign --worker 3", "--workers"),
-        ("campaign --jobs 3", "one of rise-di campaign --help"),
-        ("airframes --ixx 3", "one of rise-di airframes --help"),
-        ("gains osprey --set rate=100", "one of rise-di gains --help"),
-        ("fly --run x", f"--runs{KEY}"),
+        ("gains osprey --rates 3", "did you mean --rate?"),
+        ("gains osprey --y_rate 50", "did you mean --y-rate?"),
+        ("gains osprey --phase_margin=45", "did you mean --phase-margin?"),
+        ("campaign --run x", "did you mean --runs?"),
+        ("campaign --worker 3", "did you mean --workers?"),
+        ("campaign --jobs 3", "did you mean --workers?"),
+        ("campaign --samples 3", "did you mean --aircraft?"),
+        ("airframes --ixx 3", "did you mean --Ixx?"),
+        ("report --html a.html", "did you mean --page?"),
+        ("import log.bin --out bag", "did you mean --output?"),
+        ("play runs/latest --speed 2", "did you mean --rate?"),
+        ("gains osprey --set rate=100", "rise-di gains --help lists them"),
+        ("fly --run x", "did you mean --runs?"),
+        ("fly --out x", "did you mean --runs?"),
+        ("fly --scenario osprey_gust", "give it without a name, rise-di fly SCENARIO"),
         # A key of the scenario is never taken for --send, which commands an autopilot.
-        ("fly --seed 3", f"one of rise-di fly --help{KEY}"),
-        ("fly --law rise", f"one of rise-di fly --help{KEY}"),
-        ("replay --k-g 2", f"one of rise-di replay --help{KEY}"),
+        ("fly --seed 3", f"rise-di fly --help lists them{KEY}"),
+        ("fly --law rise", f"rise-di fly --help lists them{KEY}"),
+        ("replay --k-g 2", f"rise-di replay --help lists them{KEY}"),
     ],
 )
 def test_other_option_is_refused_with_its_mend(words: str, mend: str) -> None:
     error = invoke(*words.split()).exception
     option = next(word for word in words.split() if word.startswith("--")).partition("=")[0]
-    assert str(error) == f"{option}: found no option, expected {mend}"
+    assert str(error) == f"{option} is no option of rise-di {words.split(maxsplit=1)[0]}: {mend}"
+
+
+@pytest.mark.parametrize("words", ["campaign osprey_servo --runs 10", "fly --runs=3"])
+def test_number_of_runs_is_no_folder(
+    words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It made a folder of this name and flew the whole campaign."""
+    monkeypatch.chdir(tmp_path)
+    assert "expected the folder for the logs" in str(invoke(*words.split()).exception)
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(

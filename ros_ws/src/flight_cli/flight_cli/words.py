@@ -3,11 +3,13 @@
 """The words of a command line: options and arguments with their help."""
 
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import MISSING, Field, field, fields
 from difflib import get_close_matches
 from inspect import Parameter, Signature
-from itertools import takewhile
+from itertools import takewhile, zip_longest
+from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any, Protocol, get_type_hints
 
 import typer
@@ -19,6 +21,21 @@ DECLARE = "declare"  # key of what declares a field to Typer
 ALIKE = 0.85  # of a misspelt option: --run is near to --runs, --seed not to --send
 REQUIRED = MISSING
 """The default of a field without a default."""
+
+OTHER_NAMES: Mapping[str, Sequence[str]] = MappingProxyType(
+    {
+        "--out": ("--output", "--runs"),
+        "--outdir": ("--output", "--runs"),
+        "--output": ("--runs",),
+        "--html": ("--page",),
+        "--samples": ("--aircraft",),
+        "--jobs": ("--workers",),
+        "--threads": ("--workers",),
+        "--speed": ("--rate",),
+        "--gui": ("--watch",),
+    }
+)
+"""Names of options in other tools, and those of the same meaning here."""
 
 
 class Executable(Protocol):
@@ -124,13 +141,33 @@ class RiseDiCommand(TyperCommand):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the words after the name. Raises ParameterError for an unknown option."""
         names = [name for each in self.get_params(ctx) for name in each.opts]
-        key = ", or a key of the scenario: --set SECTION.KEY=VALUE" * ("--set" in names)
-        for word in takewhile("--".__ne__, () if ctx.resilient_parsing else args):
-            name = word.partition("=")[0]
-            near = get_close_matches(name, names, n=1, cutoff=ALIKE)
-            mend = near[0] if near else f"one of rise-di {self.name} --help"
-            require(name in names or name[:2] != "--", name, "no option", mend + key)
+        words = [] if ctx.resilient_parsing else [*takewhile("--".__ne__, args)]
+        for word, value in zip_longest(words, words[1:], fillvalue=""):
+            name, equals, text = word.partition("=")
+            if name.startswith("--") and name not in names:
+                mend = self._mend(name, names)
+                raise ParameterError(f"{name} is no option of rise-di {self.name}: {mend}")
+            folder = text if equals else value
+            if name == "--runs" and folder.isdecimal() and not Path(folder).is_dir():
+                raise ParameterError(
+                    f"--runs: found {folder}, expected the folder for the logs, and no such folder "
+                    "exists; a campaign has --aircraft for a number"
+                )
         return super().parse_args(ctx, args)
+
+    def _mend(self, name: str, names: Sequence[str]) -> str:
+        """What to type in place of an unknown option."""
+        if name[2:] in names:
+            return f"give it without a name, rise-di {self.name} {name[2:].upper()}"
+        near = [
+            *(known for known in names if known.lower() == name.lower()),
+            *get_close_matches(name, names, n=1, cutoff=ALIKE),
+            *(known for known in OTHER_NAMES.get(name, ()) if known in names),
+        ]
+        if near:
+            return f"did you mean {near[0]}?"
+        key = ", or set a key of the scenario, --set SECTION.KEY=VALUE" * ("--set" in names)
+        return f"rise-di {self.name} --help lists them{key}"
 
     def invoke(self, ctx: Any) -> Any:
         """Call the function. Raises ParameterError with the option for its name."""
