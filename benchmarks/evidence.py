@@ -73,7 +73,8 @@ A table is a CSV file: your spreadsheet opens it, `pandas.read_csv` reads it. It
 | revision | the commit that was measured; `-dirty` with changes beside it |
 | host, date | where and when; `busy with other work`: times are longer than on an idle host |
 
-Most tables in `tables/` have a row a case instead, and the column `conditions` says what was flown. "mean (worst)" is over the aircraft of the row, "+-30 %" draws
+Most tables of other pages have a row a case instead, as [those laws](evidence/tables/laws-vanes.csv): each column names its
+quantity, and `conditions` says what was flown. "mean (worst)" is over the aircraft of the row, "+-30 %" draws
 each entry of A and B within 30 % of the airframe's, and a [score](glossary.md) sums the errors of the outputs.
 """  # noqa: E501 - a text as it is written
 
