@@ -55,12 +55,13 @@ def control_law(_: NominalModel, *, vanes: bool) -> ControlLaw:
         e = measurements.y - measurements.y_m
         increment = dt * (e + state.e) / 2.0
         integral_e = state.integral_e + increment
-        none = xp.zeros_like(e)
+        # An addend that gives y_m and y_m_dot a column for each aircraft.
+        zeros = xp.zeros_like(e)
         z = xp.concat(
             [
                 state_of(measurements, vanes=vanes),
-                measurements.y_m + none,
-                measurements.y_m_dot + none,
+                measurements.y_m + zeros,
+                measurements.y_m_dot + zeros,
                 integral_e,
             ]
         )
@@ -132,12 +133,12 @@ def lqi_params(gains: dict[str, FloatArray], model: NominalModel) -> LqiParams:
     model following; B. D. O. Anderson, J. B. Moore, "Optimal Control", ch. 9.
     """
     size = (model.C @ model.size)[:, None]
-    solved = []
+    gains_by_set = []
     for k, fade in enumerate(gains["fade"][0]):
         F, G, E = design(model, float(fade))
         weights = np.concatenate([np.ones(len(size)), gains["integral"][:, k] ** 2]) / np.tile(
             size[:, 0] ** 2, 2
         )
         R = np.diag((gains["effort"][:, k] / model.input_scale / size[:, 0]) ** 2)
-        solved.append(gain_of(F, G, E.T @ np.diag(weights) @ E, R))
-    return LqiParams(np.stack(solved, axis=-1))
+        gains_by_set.append(gain_of(F, G, E.T @ np.diag(weights) @ E, R))
+    return LqiParams(np.stack(gains_by_set, axis=-1))

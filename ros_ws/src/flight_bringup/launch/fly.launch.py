@@ -96,11 +96,16 @@ def _fly(context: LaunchContext) -> list[Action]:
         "true: the aircraft waits for the stack's recorder",
     )
     if argument(context, "use_sim_time") == "true":
-        found = "true in lockstep, or with rosbag2"
-        require(not (lockstep or by_rosbag2), "use_sim_time", found, "it in real time")
+        require(
+            not (lockstep or by_rosbag2),
+            "use_sim_time",
+            f"true {'in lockstep' if lockstep else 'with rosbag2'}",
+            "a flight in real time, recorded by the stack",
+        )
         return by_rise_di(context, argument(context, "scenario"))
     run = new_run(scenario, Path(argument(context, "runs")))
     end_with_launch(context)
+    first = (CONTROLLER,) if by_rosbag2 else FIRST_STAGE
 
     def node(spec: NodeSpec, start_time: float = ON_START) -> Node:
         return flight_node(
@@ -129,12 +134,11 @@ def _fly(context: LaunchContext) -> list[Action]:
             )
         return [*end, *(node(spec, ON_START if begins else start_time) for spec in nodes)]
 
-    first = (CONTROLLER,) if by_rosbag2 else FIRST_STAGE
-    beside: list[Action] = []
+    recorders: list[Action] = []
     if by_rosbag2:
         overrides = parameter_overrides(RECORDER, scenario, run, ON_START, lockstep=False)
-        beside.append(rosbag2(context, scenario, overrides))
+        recorders.append(rosbag2(context, scenario, overrides))
     stages = start_in_stages(
-        context, run, {spec: node(spec) for spec in first}, follow, beside=beside
+        context, run, {spec: node(spec) for spec in first}, follow, beside=recorders
     )
     return watch_page(context, run) + stages

@@ -22,12 +22,11 @@ if TYPE_CHECKING:  # it loads in some tenths of a second
 
 FORMATS = ("pdf", "svg", "eps", "png")
 WIDTH = "88mm"  # a column of IEEE and of many journals
-# m
-NARROWEST = 0.03
-WIDEST = 1.0
-# height of a channel over the width; inches
-ROW_RATIO = 0.42
-LEGEND_HEIGHT = 0.35
+NARROWEST = 0.03  # m
+WIDEST = 1.0  # m
+ROW_RATIO = 0.42  # height of a channel over the width
+INCH = FOOT / 12.0  # m
+LEGEND_HEIGHT = 0.35  # inches
 FONT_SIZE = 8.0  # points
 LINE_WIDTH = 0.8  # points
 DPI = 300.0  # of PNG
@@ -82,7 +81,7 @@ def write_figure(
     rows = as_names(channels, "channels", "names of channels: q,V,elevator") or tuple(outputs)
     for name in rows:
         require(name in names, "channels", f"{name!r}", one_of(names, name))
-    inches = metres / (FOOT / 12.0)
+    inches = metres / INCH
     with mpl.rc_context(STYLE):
         figure = Figure(
             figsize=(inches, ROW_RATIO * inches * len(rows) + LEGEND_HEIGHT), layout="constrained"
@@ -124,18 +123,20 @@ def draw_channel(
 ) -> None:
     """Draw a channel of each flight, with the reference and the gusts of the first."""
     units = common_units(flights)
-    plain = name.removeprefix("e.")
-    is_error = name != plain
+    channel = name.removeprefix("e.")
+    is_error = name != channel
     first = flights[0]
-    is_output = any(plain in flight.tape["y"].names for flight in flights if "y" in flight.tape)
-    factor = units.get(plain, NO_UNIT).factor
+    is_output = any(channel in flight.tape["y"].names for flight in flights if "y" in flight.tape)
+    factor = units.get(channel, NO_UNIT).factor
 
     def plot(tape: Tape, signal: Signal, **style: Any) -> None:
-        axes.plot((signal.stamp_ns - tape.start_ns) / NANOSECONDS, signal[plain] * factor, **style)
+        axes.plot(
+            (signal.stamp_ns - tape.start_ns) / NANOSECONDS, signal[channel] * factor, **style
+        )
 
     for gust in gust_intervals(first.tape, first.gusts):
         axes.axvspan(gust.start, gust.stop, color=GUST, alpha=0.2, linewidth=0)
-    if is_output and not is_error and "y_m" in first.tape and plain in first.tape["y_m"].names:
+    if is_output and not is_error and "y_m" in first.tape and channel in first.tape["y_m"].names:
         plot(
             first.tape, first.tape["y_m"], color=REFERENCE, linewidth=3.0 * line_width, label="y_m"
         )
@@ -144,7 +145,7 @@ def draw_channel(
             signal: Signal | None = best_error(tape)[1]
         else:
             signal = tape.signals.get("y" if is_output else "u")
-        if signal is None or plain not in signal.names:
+        if signal is None or channel not in signal.names:
             continue
         style = {} if is_output else {"drawstyle": "steps-post"}
         # A single flight needs no name; its y is told from y_m.
@@ -152,6 +153,6 @@ def draw_channel(
         if len(flights) == 1:
             legend = "y" if is_output and not is_error else ""
         plot(tape, signal, color=colour, linewidth=line_width, label=legend, **style)
-    axes.set_ylabel(("e of " if is_error else "") + channel_label(plain, units))
+    axes.set_ylabel(("e of " if is_error else "") + channel_label(channel, units))
     axes.grid(alpha=0.3, linewidth=0.4)
     axes.spines[["top", "right"]].set_visible(False)

@@ -107,6 +107,7 @@ def report(
         )
         if path is not None
     ]
+    # One run has its own page; with `html`, as several runs, it has the page of a comparison.
     is_single = len(folders) == 1 and html is None
     require(
         output is None or is_single,
@@ -125,10 +126,9 @@ def report(
     else:
         flights = [read_one(folder) for folder in folders]
         _require_comparable(folders, flights)
+        page = folders[0].absolute().parent / "comparison.html" if html is None else Path(html)
         if html is None:
-            comparison = folders[0].absolute().parent / "comparison.html"
-            files.insert(0, File("html", comparison, write_page))
-        page = files[0].path
+            files.insert(0, File("html", page, write_page))
     for file in files:
         with writing(file.key, file.path, A_FILE):
             file.write(file.path, flights)
@@ -139,5 +139,6 @@ def _require_comparable(folders: Sequence[Path], flights: Sequence[RecordedFligh
     """Raise ParameterError for an imported log among several runs."""
     expected = "a flight of the stack: a comparison is of tracking errors"
     for folder, flight in zip(folders, flights, strict=True):
-        comparable = len(flights) == 1 or flight.scenario is not None
-        require(comparable, str(folder), "an imported log", expected)
+        # A single imported log is compared with nothing.
+        is_comparable = len(flights) == 1 or flight.scenario is not None
+        require(is_comparable, str(folder), "an imported log", expected)

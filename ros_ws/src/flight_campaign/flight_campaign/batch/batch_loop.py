@@ -24,7 +24,7 @@ from aircraft_sim.plant.dynamics import Aircraft
 from aircraft_sim.plant.plant import DIVERGENCE_LIMIT
 from flight_campaign.batch.batch_allocation import allocate
 from flight_campaign.batch.batch_matrices import FleetMatrices, StateBlock, at
-from flight_campaign.batch.batch_schedule import ASKED, TickKind, TickRun
+from flight_campaign.batch.batch_schedule import UNKNOWN, TickKind, TickRun
 from flight_campaign.batch.campaign_course import Segments
 from flight_core.arithmetic import product
 from flight_core.vectors import Array
@@ -296,7 +296,7 @@ def advance(
     fleet: FleetMatrices,
     vehicle: Vehicle,
     timing: Timing,
-    kind: TickKind = ASKED,
+    kind: TickKind = UNKNOWN,
 ) -> LoopState:
     """The state at the next tick, with the command of this one."""
     blocks = timing.blocks
@@ -311,7 +311,7 @@ def advance(
             jnp.where(jnp.arange(u_late + 1)[:, None, None] == fleet.late, history, 0.0), 0
         )
     times = segment.t + np.arange(timing.steps) * vehicle.dt
-    position, means = _actuated(now.position, acting, times, vehicle, unroll=kind is not ASKED)
+    position, means = _actuated(now.position, acting, times, vehicle, unroll=kind is not UNKNOWN)
     remainder = remainder_of(rows_of(now.x, vehicle.remainder_states), vehicle.remainder)
     moves = [*now.x, *chain(*means), *(1.5 * remainder - 0.5 * now.remainder)]
     matrices = at(segment.t, fleet)

@@ -31,7 +31,7 @@ class TickKind(NamedTuple):
     forced: bool | None  # whether biases, gusts or turbulence act
 
 
-ASKED = TickKind(None, None)
+UNKNOWN = TickKind(None, None)  # a branch asks for both at the tick
 
 
 class TickRun(NamedTuple):
@@ -48,7 +48,7 @@ Schedule = Callable[[Course], Iterator[TickRun]]
 
 def with_branches(course: Course) -> Iterator[TickRun]:
     """One loop, whose branches ask at each tick."""
-    yield TickRun(len(course.segments.t), (ASKED,), 1)
+    yield TickRun(len(course.segments.t), (UNKNOWN,), 1)
 
 
 def without_branches(course: Course) -> Iterator[TickRun]:
@@ -58,14 +58,14 @@ def without_branches(course: Course) -> Iterator[TickRun]:
     """
     phase = course.segments.phase
     ticks = len(phase)
-    blows = (course.segments.forcing != 0.0).any(axis=1)
+    is_forced = (course.segments.forcing != 0.0).any(axis=1)
     engaging = np.flatnonzero(phase == ENGAGE)
     cuts = np.unique([0, *engaging, *(engaging + 1), ticks])
     for begin, end in pairwise(cuts.tolist()):
         for first in range(begin, end, RUN):
             run = slice(first, min(first + RUN, end))
-            forced = bool(blows[run].any())
-            kinds = [TickKind(int(of_law), forced) for of_law in phase[run]]
+            forced = bool(is_forced[run].any())
+            kinds = [TickKind(int(phase_of_tick), forced) for phase_of_tick in phase[run]]
             pattern = _pattern(kinds) or (TickKind(None, forced),)
             yield TickRun(len(kinds), pattern, max(UNROLL // len(pattern), 1))
 
