@@ -84,10 +84,8 @@ def _fly(context: LaunchContext) -> list[Action]:
     scenario = find_scenario(
         argument(context, "scenario"), yaml.safe_load(argument(context, "duration"))
     )
-    if (value := argument(context, "lockstep")) == "":
-        lockstep = scenario.flight.lockstep
-    else:
-        lockstep = value == "true"
+    value = argument(context, "lockstep")
+    lockstep = value == "true" or (value == "" and scenario.flight.lockstep)
     by_rosbag2 = argument(context, "recorder") == "rosbag2"
     require(
         not (by_rosbag2 and lockstep),
