@@ -508,7 +508,7 @@ def learned_part(monkeypatch: pytest.MonkeyPatch, change: Change) -> tuple[Learn
 def test_part_flies_without_a_dead_input_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     made, flown = learned_part(monkeypatch, DEAD_RUDDER)
     identified = Mock(side_effect=AssertionError)  # a test tells: 10 s of record would be too late
-    monkeypatch.setattr(design_learner, "identify", identified)
+    monkeypatch.setattr(design_learner, "identify_model", identified)
     proposal = made.propose(flown)
     assert proposal.sentence == (
         "rudder has no effect: p and r without it, by the law of the start"

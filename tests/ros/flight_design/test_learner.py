@@ -19,11 +19,11 @@ from flight_core.outcome import COMPLETED
 from flight_core.rates import nanoseconds
 from flight_design.learning.scenario_learner import learner
 from flight_log.tape_reader import read_run
-from rise_di_controller.learning.proposals import Event
+from rise_di_controller.learning.proposals import Event, EventKind
 
 
 def scenario(folder: Path, **learn: object) -> Scenario:
-    """osprey_learn at 100 Hz with the aircraft of the file, whose search is the shortest."""
+    """osprey_learn at 100 Hz, with the aircraft of the file."""
     learning = find_scenario("osprey_learn").vary(
         flight={"duration": 11.0},
         aircraft={"rate": 100.0, "step": 0.005, "uncertainty": {"A": 0.0, "B": 0.0}},
@@ -36,15 +36,18 @@ def scenario(folder: Path, **learn: object) -> Scenario:
 def test_lockstep_with_a_learner_is_equal_to_the_byte_to_one_process_and_replays_to_the_bit(
     tmp_path: Path,
 ) -> None:
-    # the flight ends at the tick that waits for the second proposal, and that begins the third
-    # search
-    guided = scenario(tmp_path, updates=[10.0, 10.5, 11.0]).vary(
-        aircraft={"kinematics": "euler"},
+    """An aircraft off by 30 %: a fallback, then two models.
+
+    It ends at the tick that waits for the third proposal, and that begins the fourth search.
+    """
+    guided = scenario(tmp_path, updates=[14.0, 14.5, 15.0]).vary(
+        flight={"duration": 15.0},
+        aircraft={"kinematics": "euler", "uncertainty": {"A": 0.3, "B": 0.3, "seed": 3}},
         reference_model={"pulses": {}, "coordinated_turn": None, "live": {"speed": 25.0}},
         guidance={
             "program": {
-                "heading": {"start": [1.0], "value": [0.5]},
-                "altitude": {"start": [1.0], "value": [20.0]},
+                "heading": {"start": [1.0, 8.0], "value": [0.5, -0.5]},
+                "altitude": {"start": [1.0, 6.0], "value": [20.0, 0.0]},
             }
         },
     )
@@ -57,9 +60,10 @@ def test_lockstep_with_a_learner_is_equal_to_the_byte_to_one_process_and_replays
     )
     assert outcome == COMPLETED
     tape = simulate(flight_scenario, learn=learner(flight_scenario), announce=events.append)
-    assert [event.stamp_ns for event in events] == [nanoseconds(t) for t in (0.5, 10.5, 11.0)]
-    assert events[0].change  # the airframe file, before there is a record
-    assert events[1].change
+    proposals = [event for event in events if event.kind is not EventKind.FALLBACK]
+    assert [event.stamp_ns for event in proposals] == [nanoseconds(t) for t in (0.5, 14.5, 15.0)]
+    # the airframe file, before there is a record, and two models
+    assert all(event.change for event in proposals)
     assert lines == [f"t = {event.stamp_ns / 1e9:.2f} s: {event.sentence}" for event in events]
     recorded = read_run(run).tape
     require_equal_bits(recorded, tape)
