@@ -110,6 +110,10 @@ def test_json_is_all_that_is_printed(tmp_path: Path) -> None:
             "error: --set: found 'controller.k_g', expected a parameter of the scenario and",
         ),
         (["report", "nowhere"], "error: nowhere: found no such file or folder"),
+        (
+            ["fly", "osprey_srvo"],
+            "error: scenario: found 'osprey_srvo', expected osprey_servo perhaps, or another of",
+        ),
     ],
 )
 def test_bad_input_is_one_sentence_and_status_2(

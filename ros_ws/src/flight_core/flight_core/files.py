@@ -21,7 +21,7 @@ import yaml
 from yaml.composer import Composer
 
 from flight_core.arguments import FilePath, as_path
-from flight_core.parameters import ParameterError, require
+from flight_core.parameters import ParameterError, one_of, require
 from flight_core.text import printable
 
 # Exceptions of PyYAML: YAMLError for invalid syntax, the rest for an invalid scalar ("0b_",
@@ -174,8 +174,9 @@ def find_file(name: FilePath, library: Path, key: str, kind: str) -> Path:
     A path that begins with `examples/` is found from any working folder. `key` and `kind` are of
     the sentence: "scenario", "a scenario file". Raises ParameterError with the names.
     """
-    expected = f"one of {', '.join(names_in(library))}, or the path of {kind} (.yaml)"
-    text = os.fspath(as_path(name, key, expected))
+    path_text = f"the path of {kind} (.yaml)"
+    text = os.fspath(as_path(name, key, path_text))
+    expected = f"{one_of(names_in(library), text)}, or {path_text}"
     path = Path(text) if text.endswith(".yaml") else library / f"{text}.yaml"
     if text.endswith(".yaml") and not path.is_absolute():
         expected = f"{expected}, from the folder {Path.cwd()}"
