@@ -122,7 +122,10 @@ class Shown(NamedTuple):
         rows = np.flatnonzero(result.other_parameters)
         if not self.open_loop and len(rows):
             begin = f"from tick {result.number[rows[0]]} at t = {result.t[rows[0]]:.6g} s on"
-            why = "changed in flight (`ros2 param set`), or set on the command line of the node"
+            why = (
+                "changed in flight (`ros2 param set`), set on the command line of the node, or "
+                "of a revision of the stack with other keys (rise_di_revision of the log)"
+            )
             notes.append(
                 f"{len(rows)} ticks, {begin}, flew with other parameters than the log holds: {why}"
             )
