@@ -140,7 +140,7 @@ scenario: Any = SCENARIO
 SENTENCES: dict[str, tuple[Callable[..., Any], str]] = {
     "unknown scenario": (
         lambda: api.find_scenario("osprey_gast"),
-        "scenario: found 'osprey_gast', expected one of ",
+        "scenario: found 'osprey_gast', expected osprey_gust perhaps, or another of ",
     ),
     "no scenario": (lambda: api.find_scenario(None), "scenario: found None, expected one of "),
     "text as duration": (

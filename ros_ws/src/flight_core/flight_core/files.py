@@ -174,9 +174,10 @@ def find_file(name: FilePath, library: Path, key: str, kind: str) -> Path:
     A path that begins with `examples/` is found from any working folder. `key` and `kind` are of
     the sentence: "scenario", "a scenario file". Raises ParameterError with the names.
     """
+    known = names_in(library)
     path_text = f"the path of {kind} (.yaml)"
-    text = os.fspath(as_path(name, key, path_text))
-    expected = f"{one_of(names_in(library), text)}, or {path_text}"
+    text = os.fspath(as_path(name, key, f"{one_of(known, '')}, or {path_text}"))
+    expected = f"{one_of(known, text)}, or {path_text}"
     path = Path(text) if text.endswith(".yaml") else library / f"{text}.yaml"
     if text.endswith(".yaml") and not path.is_absolute():
         expected = f"{expected}, from the folder {Path.cwd()}"
