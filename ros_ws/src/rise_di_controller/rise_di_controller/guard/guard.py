@@ -287,15 +287,16 @@ def _with_sample(
     period = seconds(guard.period_ns)
     dt = max(seconds(span_ns), LEAST_DT * period)
     missed = max(round(dt / period) - 1, 0)
-    u_trim = _probed_trim(state, y.stamp_ns, guard)
-    at_last_y = Measurements(
-        y=last.value,
-        y_m=state.y_m,
-        y_m_dot=np.zeros_like(state.u_ff),
-        u_trim=u_trim + state.u_ff,
-        u_before=state.u,
-    )
-    predicted = state._replace(law=_predicted(state.law, at_last_y, missed, law))
+    predicted = state
+    if missed:
+        at_last_y = Measurements(
+            y=last.value,
+            y_m=state.y_m,
+            y_m_dot=np.zeros_like(state.u_ff),
+            u_trim=_probed_trim(state, y.stamp_ns, guard) + state.u_ff,
+            u_before=state.u,
+        )
+        predicted = state._replace(law=_predicted(state.law, at_last_y, missed, law))
     stepped = _stepped(predicted, y, inputs, vane, guard, law, u_ff_recorded, vane_m_recorded)
     if not _is_finite(stepped):
         return _engaged(state, y, inputs, vane, guard, law, vane_m_recorded), inputs
@@ -362,7 +363,7 @@ def _stepped(
 
 
 def _predicted(law_state: Any, held: Measurements, missed: int, law: TunedLaw) -> Any:
-    """The state of the law over periods without a y, u held."""
+    """The state of the law after periods without a y, u held."""
     for _ in range(missed):
         law_state = law.control_law.missed(law_state, held, law.params)
     return law_state
