@@ -18,7 +18,7 @@ from tests.builders import rms
 from tests.closed_loop import PROTOTYPE_SERVO
 from tests.conftest import REPOSITORY, invoke, refusing
 
-from aircraft_sim.airframes.airframe import load_airframe
+from aircraft_sim.airframes.airframe import Airframe, load_airframe
 from aircraft_sim.uncertainty import nominal_and_sampled
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
@@ -27,12 +27,14 @@ from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 from flight_design.gains import observer_search
 from flight_design.gains.gain_design import STABLE, observed
+from flight_design.gains.nominal import activity_units
 from flight_design.gains.observer_gains import gains_by_rule
 from flight_design.gains.observer_search import WORST_OF
 from flight_design.gains.observer_selection import (
     FASTEST,
     WORST_SEED,
     WORST_UNCERTAINTY,
+    law_activity_unit,
     model_for,
     with_aircraft_observer,
     with_extended_state_observer,
@@ -153,6 +155,39 @@ def test_observer_by_rule_halves_error_of_speed_roll_and_yaw() -> None:
     alone = rms_alone()
     observed = rms(simulate(with_observer(by_rule().controller)))
     assert (observed < [1.0, 0.5, 0.5, 0.5] * alone).all()
+
+
+def test_activity_of_law_inputs_is_that_of_the_effectors_that_they_move() -> None:
+    """Halves of a surface cost as much as the surface: 60 deg/s of each, 600 %/s of a throttle."""
+    osprey = SERVO.rise_di()
+    twin = find_scenario("osprey_twin")
+    controller = twin.rise_di()
+    whole = law_activity_unit(OSPREY, osprey)
+    halves = law_activity_unit(twin.aircraft.load()[0], controller)
+    surface, throttle = np.deg2rad(60.0), 6.0
+    assert whole.tolist() == [surface, surface, surface, throttle]
+    # v is y_dot: Omega of the osprey turns the unit of its input into that of v
+    Omega = np.diag(OSPREY.matrix_c() @ OSPREY.matrix_b())
+    by_output = dict(zip(OSPREY.outputs, Omega, strict=True))
+    of_input = dict(zip(osprey.outputs, whole, strict=True))
+    place = dict(zip(controller.outputs, halves, strict=True))
+    assert place["q"] == pytest.approx(of_input["q"] * by_output["q"], rel=1e-6)
+    assert place["V"] == pytest.approx(of_input["V"] * by_output["V"], rel=1e-2)  # B[V, elevator]
+
+
+def test_a_thrust_in_newtons_costs_by_the_thrust_in_trim() -> None:
+    """40 N in trim: 480 N/s; without `no_thrust` in the file there is no cost."""
+    values = OSPREY.model_dump()
+    thrust = {"unit": "N", "positive": "more thrust", "no_thrust": -40.0}
+    known = Airframe.validate_mapping(
+        values | {"inputs": values["inputs"] | {"thrust": thrust}}, "airframe"
+    )
+    unknown = Airframe.validate_mapping(
+        values | {"inputs": values["inputs"] | {"thrust": thrust | {"no_thrust": None}}}, "airframe"
+    )
+    place = list(known.inputs).index("thrust")
+    assert activity_units(known)[place] == 480.0
+    assert activity_units(unknown)[place] == math.inf
 
 
 def test_models_that_do_not_fit_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -35,6 +35,7 @@ class Quantity(NamedTuple):
         return self[1:]
 
 
+DIMENSIONLESS = (0, 0, 0, 0)
 ANGLE = (1, 0, 0, 0)
 LENGTH = (0, 1, 0, 0)
 SPEED = (0, 1, -1, 0)

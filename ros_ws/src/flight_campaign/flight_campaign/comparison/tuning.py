@@ -32,7 +32,7 @@ from flight_campaign.statistics import score_units
 from flight_core.vectors import Array, FloatArray
 from flight_design.gains.extended_state import integrator_model
 from flight_design.gains.gain_selection import with_feedforward
-from flight_design.gains.nominal import ACTIVITY_UNIT, airframe_model
+from flight_design.gains.nominal import activity_units, airframe_model
 from flight_design.gains.requirement import REQUIREMENT, Requirement, least_fractions
 from flight_design.gains.tuned_gains import TuningResult
 from rise_di_controller.law.control_law import TunedLaw
@@ -168,9 +168,7 @@ def build_benchmark(scenario: Scenario, turbulence_seed: int = TUNING_TURBULENCE
         scenario=scenario,
         model=model,
         unit=unit,
-        activity_unit=np.array(
-            [ACTIVITY_UNIT[airframe.inputs[name].unit] for name in controller.inputs]
-        ),
+        activity_unit=activity_units(airframe)[columns],
         plant=scenario.aircraft.plant(),
         vehicle=batch.vehicle(scenario),
         scenarios={GUST: with_model, TURBULENCE: turbulent},

@@ -163,7 +163,7 @@ def select_gains(
     controller, origin = observed(
         selection.chosen,
         flight,
-        through_allocation(known_model, setting.base),
+        known_model,
         margin,
         needed,
         speeds=pair,
@@ -479,10 +479,11 @@ def selected_observer(
     `is_free`, `activity` and `progress` as for `with_aircraft_observer`; the search begins at the
     gains and the relaxation of the design `earlier_design`.
     """
-    noise, vanes = _noise(controller, scenario, model)
-    nominal = model_for(model, controller, noise)
+    seen = through_allocation(model, controller)
+    noise, vanes = _noise(controller, scenario, seen)
+    nominal = model_for(seen, controller, noise)
     if weights is None:
-        candidates = _gain_sets(controller, scenario, model, nominal, sketched=sketched)
+        candidates = _gain_sets(controller, scenario, seen, nominal, sketched=sketched)
     else:
         gains = read_gains(Path(weights), nominal.total_lag, len(model.gusts), len(model.states))
         candidates = [(gains, f"gains of {Path(weights).name}")]
@@ -551,10 +552,8 @@ def _gain_sets(
         return [(gains, BY_RULE)]
     flight = _tuned_scenario(scenario)
     results = {law: tuned_gains.find(flight, law, OBJECTIVE) for law in OBSERVER_LAWS}
-    searched = sorted(
-        ((result.cost, law, result) for law, result in results.items() if result is not None),
-        key=lambda row: row[0],
-    )
+    searched = [(law, result) for law, result in results.items() if result is not None]
+    searched.sort(key=lambda row: row[1].cost)
     tuned_lag = dict(zip(flight.controller.outputs, loop_of(flight.controller).total, strict=True))
     ratios = [
         lag / tuned_lag.get(name, np.inf)
@@ -568,7 +567,7 @@ def _gain_sets(
             gains_of_search(result.gains, nominal.total_lag),
             f"gains of a search in {flight.name}, law {law} on {OBJECTIVE}",
         )
-        for _, law, result in searched
+        for law, result in searched
     ]
 
 

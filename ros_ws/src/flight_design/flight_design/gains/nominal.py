@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The nominal model of an airframe, for observers, filters and model-based laws."""
 
+import math
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from aircraft_sim.airframes.airframe import Airframe
 from aircraft_sim.uncertainty import KINEMATIC
 from control_laws.nominal_model import NominalModel
-from flight_core.units import LENGTH, SPEED, quantity
+from flight_core.units import ANGLE, DIMENSIONLESS, LENGTH, SPEED, quantity
 from flight_core.vectors import FloatArray
 from rise_di_controller.law.linear_loop import LoopTiming
 
@@ -17,9 +18,28 @@ SIZES = {SPEED: 1.0, LENGTH: 1.0}  # m/s, m: the units of states in weights, "si
 ANGLE_SIZE = 0.1  # rad (/s), and of states without a dimension
 ERROR_SHARE = 0.1  # of a size: the unit of an error in a score, 0.1 m/s or 0.01 rad/s
 
-ACTIVITY_UNIT = {"deg": np.deg2rad(60.0), "rad": np.deg2rad(60.0), "%": 6.0, "1": 6.0}
-"""rad/s and 1/s by the unit of an input: mean abs(u_dot) that costs as much as one unit of error.
-60 deg/s and 600 %/s."""
+# Mean abs(u_dot) that costs as much as one unit of error
+SURFACE_ACTIVITY = np.deg2rad(60.0)  # rad/s
+THROTTLE_ACTIVITY = 6.0  # 1/s: 600 %/s
+THRUST_ACTIVITY = 12.0  # 1/s, of the thrust in trim: 600 %/s where trim needs half of the throttle
+
+
+def activity_units(airframe: Airframe) -> FloatArray:
+    """Mean abs(u_dot) of each input that costs as much as one unit of error, (p,), SI per s.
+
+    A thrust in newtons whose file has no `no_thrust` has no cost: infinity.
+    """
+    units = []
+    channels = zip(airframe.inputs.values(), airframe.no_thrust(), strict=True)
+    for channel, no_thrust in channels:
+        dimension = quantity(channel.unit).dimension
+        if dimension == ANGLE:
+            units.append(SURFACE_ACTIVITY)
+        elif dimension == DIMENSIONLESS:
+            units.append(THROTTLE_ACTIVITY)
+        else:
+            units.append(math.inf if np.isnan(no_thrust) else THRUST_ACTIVITY * abs(no_thrust))
+    return np.array(units)
 
 
 def unit_sizes(units: Iterable[str]) -> FloatArray:

@@ -32,14 +32,19 @@ from control_laws.observer_design import (
     feedback_gain,
     vane_correction,
 )
-from flight_analysis.linear_loop.loop_margins import law_order, loop_of
+from flight_analysis.linear_loop.loop_margins import (
+    distribution,
+    law_order,
+    loop_of,
+    through_allocation,
+)
 from flight_core.parameters import require
 from flight_core.vectors import FloatArray
 from flight_design.gains.airframe_properties import fastest_zero
 from flight_design.gains.extended_state import extended_state_weights, integrator_model
 from flight_design.gains.gain_selection import with_feedforward
 from flight_design.gains.linear_error import Air, discrete_gust
-from flight_design.gains.nominal import ACTIVITY_UNIT, airframe_model
+from flight_design.gains.nominal import activity_units, airframe_model
 from flight_design.gains.observer_gains import ObserverGains
 from flight_design.gains.observer_search import (
     WORST_OF,
@@ -119,14 +124,13 @@ def with_aircraft_observer(
     `progress` gets a sentence a loop. Raises ParameterError for an airframe with another D or
     without a wind, one that a feedforward refuses, and for margins that no relaxation reaches.
     """
+    activity_unit = law_activity_unit(airframe, controller) / activity
+    airframe = through_allocation(airframe, controller)
     designs = _AircraftDesigns.around(controller, airframe, noise)
     if speeds is not None:
         _require_no_vanes(vanes, controller.outputs)
     model = designs.model
     plant = designs.plant(WORST_OF * uncertain, vanes)
-    activity_unit = np.array(
-        [ACTIVITY_UNIT[airframe.inputs[name].unit] / activity for name in controller.inputs]
-    )
     # A search for each gain set; the one with the least error is taken.
     searches = []
     for gains in sets:
@@ -154,6 +158,22 @@ def with_aircraft_observer(
     if speeds is None:
         return selected
     return _with_schedule(selected, searches[selected.place], controller, airframe)
+
+
+def law_activity_unit(airframe: Airframe, controller: ControllerConfig) -> FloatArray:
+    """Mean abs(v_dot) of each input of the law that costs as much as one unit of error, (m,).
+
+        unit_i = min_j unit_j / abs(T_ji),  u = T v
+
+    unit_j is that of the effector j, by `activity_units`.
+    """
+    T = distribution(airframe, controller)
+    cost = (np.abs(T) / activity_units(airframe)[:, None]).max(axis=0)
+    inputs = list(through_allocation(airframe, controller).inputs)
+    columns = [inputs.index(name) for name in controller.inputs]
+    with np.errstate(divide="ignore"):
+        unit: FloatArray = 1.0 / cost[columns]
+    return unit
 
 
 def _with_schedule(
