@@ -520,6 +520,16 @@ def test_part_flies_without_a_dead_input_at_once(monkeypatch: pytest.MonkeyPatch
     assert made.model is None
 
 
+def test_dead_input_is_told_where_no_controller_without_it_is_stable(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    made, flown = learned_part(monkeypatch, DEAD_RUDDER)
+    refusal = ParameterError("proposal.observer.margin: found a nominal loop that is unstable")
+    monkeypatch.setattr(made, "_designed", Mock(side_effect=refusal))
+    assert made.propose(flown) == LearnerResult(None, f"rudder has no effect; refused: {refusal}")
+    assert made.model is not None  # that of what flies
+
+
 def test_part_that_changed_is_told_at_once_and_identified_from_the_record_since(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -251,11 +251,18 @@ class Learner:
         dead = {change.outputs: change.dead for change in changes if change.dead}
         others = [change for change in changes if not change.dead]
         self._changed |= {change.outputs for change in others}
-        sentences = _without_effect(dead) + [change_sentence(change) for change in others]
+        weaker_parts = [change_sentence(change) for change in others]
         if not dead:
-            return LearnerResult(None, "; ".join(sentences))
+            return LearnerResult(None, "; ".join(weaker_parts))
         known = {part: value for part, value in self._known.items() if part not in dead}
-        sentences.append(self._adopt(self._model, known, self._dead | dead))
+        try:
+            price_text = self._adopt(self._model, known, self._dead | dead)
+        except ParameterError as error:
+            # the loss is told although no controller without the input can be proposed
+            self._changed |= set(dead)
+            losses = [f"{name} has no effect" for name in dead.values()]
+            return LearnerResult(None, "; ".join([*losses, *weaker_parts, f"refused: {error}"]))
+        sentences = [*_without_effect(dead), *weaker_parts, price_text]
         return LearnerResult(self._last, "; ".join(filter(None, sentences)))
 
     def _verdict(self, identified: Identification, *, lost: bool) -> Verdict:
