@@ -48,9 +48,15 @@ struct SRV_Channels {
     static float get_output_scaled(SRV_Channel::Function function);
     static void set_output_scaled(SRV_Channel::Function function, float value);
 };
-struct RC_Channels {
-    static uint16_t get_radio_in(const uint8_t channel);
+struct RC_Channel {
+    enum class AUX_FUNC : uint16_t { SCRIPTING_1 = 300 };
+    enum class AuxSwitchPos : uint8_t { LOW, MIDDLE, HIGH };
+    AuxSwitchPos get_aux_switch_pos() const;
 };
+struct RC_Channels {
+    RC_Channel *find_channel_for_option(RC_Channel::AUX_FUNC option);
+};
+RC_Channels &rc();
 
 struct AP_PIDInfo {
     float target;
@@ -71,9 +77,6 @@ private:
         const Vector3f &get_gyro() const;
         bool airspeed_EAS(float &airspeed) const;
     } ahrs;
-    struct {
-        uint16_t get_loop_rate_hz() const;
-    } scheduler;
     struct {
         bool in_vtol_mode() const;
         bool in_assisted_flight() const;

@@ -6,7 +6,6 @@ The parts are the exported C code, source/rates that decides which controller fl
 autopilot's shell, source/px4 or source/ardupilot.
 """
 
-import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -45,6 +44,7 @@ float64[{m}] e           # [rad/s] y - y_m
 float64[{m}] u           # units of the input
 float64[{m}] u_end       # abs(u) of the torque of 1 at this airspeed
 float64 y_m_offset       # [s] of the newest y_m after y
+float32 rate             # [Hz] of the samples of the rates, measured; 0: not yet
 """
 
 PX4 = {
@@ -53,6 +53,12 @@ PX4 = {
     "extras.txt": "fw_rate_control stop\nfw_rate_control start vtol\nrise_di_control start\n",
     "msg/RiseDiStatus.msg": MESSAGE,
 }
+
+MULTICOPTER: Mapping[str, str] = MappingProxyType(
+    {"fw_rate_control": "mc_rate_control", "virtual_fw": "virtual_mc"}
+)
+"""The module and topics of PX4 for a multicopter, in place of those of the fixed wing."""
+TORQUES = {"roll", "pitch", "yaw"}  # inputs of a multicopter
 
 
 HEADER = """/* Axes, signs and sizes of the autopilot for the channels of the scenario, written by `rise-di export`. */
@@ -104,11 +110,13 @@ def write_module(
     lines of the tree in hooks.txt. Raises ParameterError.
 
     The outputs are body rates. An input of u at the upper end stop of its actuator is a torque of
-    1, in ArduPlane a deflection of 45 degrees, with the sign of D.
+    1, in ArduPlane a deflection of 45 degrees, with the sign of D. The spare in PX4 is
+    fw_rate_control, or mc_rate_control for a multicopter.
     """
     shell = SHELLS[autopilot]
     controller = exportable(scenario.controller)
     outputs = controller.outputs
+    words = _words_of_vehicle(autopilot, scenario)
     expected = f"some of {', '.join(shell.axes)}: {shell.reason}"
     require(set(outputs) <= set(shell.axes), "controller.outputs", ", ".join(outputs), expected)
     require(
@@ -120,18 +128,48 @@ def write_module(
     code = folder / shell.place
     model = scenario.reference_model
     files = write_code(controller, scenario.name, code, model, float32=float32, samples=samples)
-    with writing(autopilot, folder, "a folder that can"):
-        for part in ("rates", autopilot):
-            for source in sorted((SOURCE / part).iterdir()):
-                files.append(Path(shutil.copyfile(source, code / source.name)))
     channels = {"channels": ", ".join(outputs), "m": len(outputs)}
     texts = {name: text.format(**channels) for name, text in shell.texts.items()}
+    for part in ("rates", autopilot):
+        for source in sorted((SOURCE / part).iterdir()):
+            texts[f"{shell.place}/{source.name}"] = source.read_text("utf-8")
     texts[f"{shell.place}/rise_di_axes.h"] = _axes(scenario, "F" if float32 else "")
     with writing("export", folder, "a folder that can"):
         for name, text in texts.items():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            write_file(folder / name, text)
+            write_file(folder / name, _with_words(text, words))
     return [*files, *(folder / name for name in texts)]
+
+
+def _words_of_vehicle(autopilot: str, scenario: Scenario) -> Mapping[str, str]:
+    """Words of the shell to replace: those of a multicopter, none for a fixed wing.
+
+    A fixed wing has a trim speed, a multicopter none, and torques about the axes as inputs. Raises
+    ParameterError for what is neither.
+    """
+    channels = scenario.aircraft.channels()
+    has_torques = set(scenario.controller.inputs) <= TORQUES
+    if channels.speed > 0.0 and not has_torques:
+        return {}
+    found = f"{channels.speed:g} m/s with the inputs {', '.join(scenario.controller.inputs)}"
+    fixed_wing = "a trim speed with surfaces as inputs (fixed wing)"
+    is_multicopter = channels.speed == 0.0 and has_torques
+    require(
+        is_multicopter and autopilot == "px4",
+        "aircraft.airframe",
+        found,
+        f"{fixed_wing} or none with some of roll, pitch, yaw (multicopter)"
+        if autopilot == "px4"
+        else fixed_wing,
+    )
+    return MULTICOPTER
+
+
+def _with_words(text: str, words: Mapping[str, str]) -> str:
+    """A text with other words."""
+    for word, replacement in words.items():
+        text = text.replace(word, replacement)
+    return text
 
 
 def _axes(scenario: Scenario, suffix: str) -> str:

@@ -31,6 +31,7 @@ DEFAULTS: Mapping[str, float] = MappingProxyType(
 
 EXPECTED = "a parameter file of QGroundControl, or a ULog"
 COLUMNS = 5  # of a row of a parameter file
+LIKE_PART = 1.05  # of the rate of the law: a faster gyro is interpolated (rise_di_rates.c)
 
 
 class RateLoop(NamedTuple):
@@ -44,10 +45,11 @@ class RateLoop(NamedTuple):
 def rate_loop(path: Path, rate: float | None = None) -> RateLoop:
     """The loop for a law at a rate, by default at that of the gyro.
 
-        delay = 1 / (sqrt(2) pi f) + sum_k b_k / (2 pi f_k^2) + 1 / rate
+        delay = 1 / (sqrt(2) pi f) + sum_k b_k / (2 pi f_k^2) + 1 / rate + wait
 
     with the cut-off f of a second-order Butterworth filter, the notches of frequency f_k and width
-    b_k, and a period of the law. Raises ParameterError.
+    b_k, and a period of the law. Beside a faster gyro a tick waits for the next sample, at most a
+    period of the gyro. Raises ParameterError.
     """
     values = {**DEFAULTS, **_read(path)}
     fastest = values["IMU_GYRO_RATEMAX"]
@@ -68,6 +70,8 @@ def rate_loop(path: Path, rate: float | None = None) -> RateLoop:
             delay += width / (2.0 * math.pi * frequency**2)
             words += f", notch {frequency:g} Hz"
     delay += 1.0 / design_rate
+    if fastest > LIKE_PART * design_rate:
+        delay += 1.0 / fastest
     origin = f"{path.name}: gyro at {fastest:g} Hz, {words}; delay {1e3 * delay:.3g} ms"
     return RateLoop(design_rate, delay, origin)
 

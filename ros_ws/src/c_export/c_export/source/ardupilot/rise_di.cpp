@@ -9,15 +9,16 @@ extern "C" {
 #include "rise_di_rates.h"
 }
 
-#ifndef RISE_DI_SWITCH
-#define RISE_DI_SWITCH 8 // channel of the transmitter, 1 to 16: above 1700 us RISE-DI flies
-#endif
 #ifndef RISE_DI_MAX_AGE
 #define RISE_DI_MAX_AGE 0.04f // s, of the gyro, at which the spare takes over
 #endif
 #ifndef RISE_DI_MAX_ERROR
 #define RISE_DI_MAX_ERROR 3.0f // rad/s, distance of a rate from its reference at which the spare takes over
 #endif
+
+static_assert(RISE_DI_MAX_AGE >= RISE_DI_MAX_AGE_LEAST && RISE_DI_MAX_AGE <= RISE_DI_MAX_AGE_LARGEST, "RISE_DI_MAX_AGE: 0.01 to 1 s");
+static_assert(RISE_DI_MAX_ERROR >= RISE_DI_MAX_ERROR_LEAST && RISE_DI_MAX_ERROR <= RISE_DI_MAX_ERROR_LARGEST,
+              "RISE_DI_MAX_ERROR: 0.1 to 30 rad/s");
 
 static const float END = 4500.0f;
 static const SRV_Channel::Function surfaces[3] {SRV_Channel::k_aileron, SRV_Channel::k_elevator, SRV_Channel::k_rudder};
@@ -31,6 +32,13 @@ template <class T> static auto take_airspeed(const T &ahrs, float &airspeed, int
 template <class T> static auto take_airspeed(const T &ahrs, float &airspeed, long) -> decltype(ahrs.airspeed_estimate(airspeed))
 {
     return ahrs.airspeed_estimate(airspeed);
+}
+
+// The switch of the transmitter: the channel whose RCx_OPTION is 300, "Scripting1", above 1800 us. Without one RISE-DI is off.
+static bool is_enabled()
+{
+    const RC_Channel *input = rc().find_channel_for_option(RC_Channel::AUX_FUNC::SCRIPTING_1);
+    return input != nullptr && input->get_aux_switch_pos() == RC_Channel::AuxSwitchPos::HIGH;
 }
 
 static const char *text_of(bool flies, const rise_di_rates &rates)
@@ -62,7 +70,7 @@ void Plane::rise_di()
     static bool begun = false;
 
     if (!begun) {
-        rise_di_rates_start(&rates, (float)scheduler.get_loop_rate_hz());
+        rise_di_rates_start(&rates);
         begun = true;
     }
 
@@ -76,7 +84,8 @@ void Plane::rise_di()
     const float cutoff = AP::ins().get_gyro_filter_hz(); // of a second-order filter: delay 1 / (sqrt(2) pi f)
     cycle.filter_us = cutoff > 1.0f ? (uint64_t)(225079.0f / cutoff) : 0;
     cycle.setpoint_us = cycle.now_us; // stabilize has run in this loop
-    cycle.enabled = RC_Channels::get_radio_in(RISE_DI_SWITCH - 1) > 1700;
+    cycle.spare_us = cycle.now_us;
+    cycle.enabled = is_enabled();
     cycle.armed = hal.util->get_soft_armed();
     cycle.has_rates = !manual;
     cycle.landed = !is_flying();
@@ -96,14 +105,17 @@ void Plane::rise_di()
     cycle.max_error = RISE_DI_MAX_ERROR;
 
     const bool flew = rates.refusal == RISE_DI_FLIES;
+    const rise_di_refusal refused = rates.refusal;
     const bool flies = rise_di_rates_run(&rates, &cycle);
+    const bool is_told = cycle.enabled && rates.refusal != refused && rates.refusal != RISE_DI_WAITS;
 
     for (int k = 0; k < 3 && !manual; k++) {
         SRV_Channels::set_output_scaled(surfaces[k], rates.torque[k] * END);
     }
 
-    if (flies != flew) {
-        GCS_SEND_TEXT(flies ? MAV_SEVERITY_INFO : MAV_SEVERITY_WARNING, "RISE-DI: %s", text_of(flies, rates));
+    if (flies != flew || is_told) {
+        GCS_SEND_TEXT(flies ? MAV_SEVERITY_INFO : MAV_SEVERITY_WARNING, "RISE-DI: %s (%.0f Hz)", text_of(flies, rates),
+                      (double)rates.rate);
     }
 
     write_log(rates);

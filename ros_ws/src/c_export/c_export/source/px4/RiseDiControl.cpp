@@ -2,9 +2,11 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // A module of PX4: topics to rise_di_rates.c and back. `fw_rate_control start vtol` runs on as the spare.
+#include <mathlib/mathlib.h>
 #include <px4_platform_common/module.h>
 #include <px4_platform_common/module_params.h>
 #include <px4_platform_common/px4_work_queue/ScheduledWorkItem.hpp>
+#include <systemlib/mavlink_log.h>
 #include <uORB/Publication.hpp>
 #include <uORB/Subscription.hpp>
 #include <uORB/SubscriptionCallback.hpp>
@@ -30,10 +32,7 @@ class RiseDiControl : public ModuleBase<RiseDiControl>, public ModuleParams, pub
 public:
 	RiseDiControl() : ModuleParams(nullptr), ScheduledWorkItem(MODULE_NAME, px4::wq_configurations::nav_and_controllers)
 	{
-		rise_di_rates_start(&_rates, (float)_fastest.get());
-
-		if (_rates.slow) { PX4_ERR("fw_rate_control flies on: %s", rise_di_refusal_text(RISE_DI_SLOW)); }
-
+		rise_di_rates_start(&_rates);
 		_torque_pub.advertise();
 		_thrust_pub.advertise();
 		_status_pub.advertise();
@@ -49,6 +48,7 @@ private:
 	void Run() override;
 	bool is_enabled() const;
 	hrt_abstime filter_delay() const;
+	void report(bool flew, bool was_alone, const rise_di_cycle &cycle);
 	void publish(bool flies);
 
 	uORB::SubscriptionCallbackWorkItem _velocity_sub{this, ORB_ID(vehicle_angular_velocity)};
@@ -74,16 +74,18 @@ private:
 	vehicle_torque_setpoint_s _spare_torque{};
 
 	rise_di_rates _rates{};
+	rise_di_refusal _told{RISE_DI_OFF};
 	uint32_t _takeovers{0};
 	uint32_t _fallbacks{0};
+	orb_advert_t _mavlink_log_pub{nullptr};
 
 	DEFINE_PARAMETERS(
 		(ParamInt<px4::params::RDI_EN>) _enabled,
 		(ParamInt<px4::params::RDI_AUX>) _aux,
 		(ParamFloat<px4::params::RDI_MAX_AGE>) _max_age,
 		(ParamFloat<px4::params::RDI_MAX_ERR>) _max_error,
-		(ParamFloat<px4::params::IMU_GYRO_CUTOFF>) _cutoff,
-		(ParamInt<px4::params::IMU_GYRO_RATEMAX>) _fastest
+		(ParamFloat<px4::params::COM_OF_LOSS_T>) _hold,
+		(ParamFloat<px4::params::IMU_GYRO_CUTOFF>) _cutoff
 	)
 };
 
@@ -130,6 +132,7 @@ void RiseDiControl::Run()
 	cycle.rates_us = _velocity.timestamp_sample;
 	cycle.filter_us = filter_delay();
 	cycle.setpoint_us = _setpoint.timestamp;
+	cycle.spare_us = math::min(_spare_torque.timestamp, _spare_thrust.timestamp);
 	cycle.enabled = is_enabled();
 	cycle.armed = _mode.flag_armed;
 	cycle.has_rates = _mode.flag_control_rates_enabled;
@@ -139,42 +142,67 @@ void RiseDiControl::Run()
 	for (int k = 0; k < 3; k++) {
 		cycle.rates[k] = _velocity.xyz[k];
 		cycle.setpoint[k] = setpoint[k];
+		cycle.setpoint_thrust[k] = _setpoint.thrust_body[k];
 		cycle.spare[k] = _spare_torque.xyz[k];
+		cycle.spare_thrust[k] = _spare_thrust.xyz[k];
 	}
 
 	cycle.airspeed = now < _airspeed.timestamp + 1_s ? _airspeed.calibrated_airspeed_m_s : 0.f;
 	cycle.max_age = _max_age.get();
 	cycle.max_error = _max_error.get();
+	cycle.hold = _hold.get();
 
 	const bool flew = _rates.refusal == RISE_DI_FLIES;
+	const bool was_alone = _rates.is_alone;
 	const bool flies = rise_di_rates_run(&_rates, &cycle);
+	report(flew, was_alone, cycle);
 
-	if (flies && !flew) {
-		_takeovers++;
-		PX4_INFO("RISE-DI flies");
-
-	} else if (flew && !flies) {
-		_fallbacks++;
-		PX4_WARN("fw_rate_control flies: %s", rise_di_refusal_text(_rates.refusal));
-	}
-
-	if (flies ? fresh : (spare_fresh || flew)) { publish(flies); }
+	if (flies ? fresh : (spare_fresh || flew || _rates.is_alone)) { publish(flies); }
 
 	ScheduleDelayed(20_ms); // where the rates stop
+}
+
+// Each change of what flies, and what speaks against RISE-DI where it is wanted.
+void RiseDiControl::report(bool flew, bool was_alone, const rise_di_cycle &cycle)
+{
+	const rise_di_refusal refusal = _rates.refusal;
+	const bool flies = refusal == RISE_DI_FLIES;
+	_takeovers += flies && !flew ? 1 : 0;
+	_fallbacks += flew && !flies ? 1 : 0;
+
+	if (flies && !flew) {
+		PX4_INFO("RISE-DI flies");
+
+	} else if (flew ? !flies : (cycle.enabled && refusal != RISE_DI_WAITS && refusal != _told)) {
+		mavlink_log_warning(&_mavlink_log_pub, "RISE-DI: fw_rate_control flies: %s (rates %.0f Hz)\t",
+				    rise_di_refusal_text(refusal), (double)_rates.rate);
+	}
+
+	_told = refusal == RISE_DI_WAITS ? _told : refusal;
+
+	if (_rates.is_alone && !was_alone) {
+		mavlink_log_emergency(&_mavlink_log_pub, "RISE-DI: fw_rate_control is silent, no fall-back, land\t");
+	}
 }
 
 void RiseDiControl::publish(bool flies)
 {
 	vehicle_torque_setpoint_s torque{};
 	rise_di_status_s status{};
-	torque.timestamp_sample = flies ? _velocity.timestamp_sample : _spare_torque.timestamp_sample;
+	torque.timestamp_sample = flies || _rates.is_silent ? _velocity.timestamp_sample : _spare_torque.timestamp_sample;
 
 	for (int k = 0; k < 3; k++) { torque.xyz[k] = _rates.torque[k]; }
 
 	torque.timestamp = hrt_absolute_time();
 	_torque_pub.publish(torque);
-	_spare_thrust.timestamp = torque.timestamp;
-	_thrust_pub.publish(_spare_thrust);
+
+	vehicle_thrust_setpoint_s thrust{};
+	thrust.timestamp = torque.timestamp;
+	thrust.timestamp_sample = torque.timestamp_sample;
+
+	for (int k = 0; k < 3; k++) { thrust.xyz[k] = _rates.thrust[k]; }
+
+	_thrust_pub.publish(thrust);
 
 	status.timestamp = torque.timestamp;
 	status.timestamp_sample = flies ? _rates.y_us : _velocity.timestamp_sample;
@@ -183,6 +211,7 @@ void RiseDiControl::publish(bool flies)
 	status.number = _rates.number;
 	status.parameters = _rates.parameters[0].digest;
 	status.y_m_offset = (double)_rates.y_m_offset;
+	status.rate = _rates.rate;
 
 	for (int i = 0; i < RISE_DI_M; i++) {
 		status.y[i] = (double)(flies ? _rates.controller.y[i] : _rates.y[i]);
@@ -220,6 +249,7 @@ int RiseDiControl::print_status()
 {
 	PX4_INFO("%s flies, %u take-overs, %u fall-backs, refusal: %s", _rates.refusal == RISE_DI_FLIES ? "RISE-DI" : "fw_rate_control",
 		 (unsigned)_takeovers, (unsigned)_fallbacks, rise_di_refusal_text(_rates.refusal));
+	PX4_INFO("rates at %.1f Hz, fw_rate_control %s", (double)_rates.rate, _rates.is_silent ? "silent" : "alive");
 	return PX4_OK;
 }
 

@@ -8,6 +8,10 @@
 #define LONGEST 0.04f     /* s, of a step of these two */
 #define PAUSE_PERIODS 50U /* without a sample: the reference model starts again */
 #define BIGGEST 1e30f     /* a larger number counts as infinite */
+#define DWELL_US 1000000U  /* without a fault before RISE-DI flies again */
+#define WINDOW_US 1000000U /* in which the rate of the samples is measured: a lost one is 1 % of 100 Hz */
+#define SLOWEST_PART 0.98f /* of the rate of the law: slower samples are refused */
+#define LIKE_PART 1.05f    /* of the rate of the law: up to it each sample is a tick */
 
 static const rise_di_parameters exported = RISE_DI_PARAMETERS;
 static const rise_di_reference_parameters model = RISE_DI_REFERENCE;
@@ -22,9 +26,20 @@ static float least_of(float a, float b) { return (a < b) ? a : b; }
 
 static int64_t in_ns(uint64_t time_us) { return (int64_t)time_us * 1000; }
 
-static bool is_stale(const rise_di_cycle *cycle, uint64_t stamp_us) {
+/* NaN is not. */
+static bool is_within(float value, float low, float high) { return (value >= low) && (value <= high); }
+
+static float rate_of_law(void) { return 1e9f / (float)exported.period_ns; }
+
+/* With an age that is NaN, too. */
+static bool is_stale(const rise_di_cycle *cycle, uint64_t stamp_us, float max_age) {
     const uint64_t age_us = (cycle->now_us > stamp_us) ? (cycle->now_us - stamp_us) : 0U;
-    return (float)age_us > (cycle->max_age * 1e6f);
+    return !((float)age_us <= (max_age * 1e6f));
+}
+
+/* An autopilot holds the last setpoint: one that comes slowly is not stale. */
+static bool is_setpoint_stale(const rise_di_cycle *cycle) {
+    return is_stale(cycle, cycle->setpoint_us, (cycle->hold > cycle->max_age) ? cycle->hold : cycle->max_age);
 }
 
 static bool are_numbers(const rise_di_cycle *cycle) {
@@ -35,13 +50,29 @@ static bool are_numbers(const rise_di_cycle *cycle) {
     return numbers;
 }
 
-static rise_di_refusal refusal_before(const rise_di_rates *rates, const rise_di_cycle *cycle) {
-    rise_di_refusal refusal = rates->latched;
+/* What an engineer has to change first. */
+static rise_di_refusal wrong_setting(const rise_di_rates *rates, const rise_di_cycle *cycle) {
+    rise_di_refusal refusal = RISE_DI_FLIES;
     if (!rates->started) {
         refusal = RISE_DI_REFUSED;
-    } else if (rates->slow) {
+    } else if (!is_within(cycle->max_age, RISE_DI_MAX_AGE_LEAST, RISE_DI_MAX_AGE_LARGEST)) {
+        refusal = RISE_DI_WRONG_AGE;
+    } else if (!is_within(cycle->max_error, RISE_DI_MAX_ERROR_LEAST, RISE_DI_MAX_ERROR_LARGEST)) {
+        refusal = RISE_DI_WRONG_ERROR;
+    } else if (!is_within(cycle->hold, 0.0f, RISE_DI_HOLD_LARGEST)) {
+        refusal = RISE_DI_WRONG_HOLD;
+    } else if ((rates->rate > 0.0f) && (rates->rate < (SLOWEST_PART * rate_of_law()))) {
         refusal = RISE_DI_SLOW;
-    } else if (!cycle->enabled) {
+    } else {
+        /* none */
+    }
+    return refusal;
+}
+
+/* What the pilot and the autopilot want. A spare that fell silent cannot be switched to. */
+static rise_di_refusal not_wanted(const rise_di_rates *rates, const rise_di_cycle *cycle) {
+    rise_di_refusal refusal = RISE_DI_FLIES;
+    if ((!cycle->enabled) && (!rates->is_alone)) {
         refusal = RISE_DI_OFF;
     } else if (!cycle->armed) {
         refusal = RISE_DI_NOT_ARMED;
@@ -49,16 +80,80 @@ static rise_di_refusal refusal_before(const rise_di_rates *rates, const rise_di_
         refusal = RISE_DI_NO_RATES;
     } else if (cycle->landed) {
         refusal = RISE_DI_LANDED;
-    } else if (is_stale(cycle, cycle->rates_us)) {
+    } else {
+        /* none */
+    }
+    return refusal;
+}
+
+/* What passes by itself. */
+static rise_di_refusal fault_of(const rise_di_rates *rates, const rise_di_cycle *cycle) {
+    rise_di_refusal refusal = RISE_DI_FLIES;
+    if (is_stale(cycle, cycle->rates_us, cycle->max_age)) {
         refusal = RISE_DI_STALE_RATES;
-    } else if (is_stale(cycle, cycle->setpoint_us)) {
+    } else if (is_setpoint_stale(cycle)) {
         refusal = RISE_DI_STALE_SETPOINT;
     } else if (!are_numbers(cycle)) {
         refusal = RISE_DI_NO_NUMBER;
+    } else if (rates->is_silent && (!rates->is_alone)) {
+        refusal = RISE_DI_SILENT;
     } else {
-        /* that of a fault, or none */
+        /* none */
     }
     return refusal;
+}
+
+/* Settings, switches, faults, a fault of the law, then the time that a take-over waits: no return within a second of a fault. */
+static rise_di_refusal refusal_before(rise_di_rates *rates, const rise_di_cycle *cycle, bool flew) {
+    const rise_di_refusal setting = wrong_setting(rates, cycle);
+    const rise_di_refusal wish = not_wanted(rates, cycle);
+    const rise_di_refusal fault = fault_of(rates, cycle);
+    rise_di_refusal refusal = setting;
+    if ((refusal == RISE_DI_FLIES) && (wish != RISE_DI_FLIES)) {
+        refusal = wish;
+    } else {
+        refusal = (refusal == RISE_DI_FLIES) ? fault : refusal;
+        rates->fault_us = (refusal == RISE_DI_FLIES) ? rates->fault_us : cycle->now_us;
+    }
+    refusal = (refusal == RISE_DI_FLIES) ? rates->latched : refusal;
+    if ((refusal == RISE_DI_FLIES) && (!flew)) {
+        const bool dwells = (!rates->is_alone) && (rates->fault_us > 0U) && ((cycle->now_us - rates->fault_us) < DWELL_US);
+        refusal = (dwells || (!(rates->rate > 0.0f))) ? RISE_DI_WAITS : RISE_DI_FLIES;
+    }
+    return refusal;
+}
+
+/* The rate of the samples, over a second. */
+static void measure_rate(rise_di_rates *rates, uint64_t stamp_us) {
+    const uint64_t span_us = stamp_us - rates->window_us;
+    if (rates->window_us == 0U) {
+        rates->window_us = stamp_us;
+    } else {
+        rates->window_samples++;
+        if (span_us >= WINDOW_US) {
+            rates->rate = ((float)rates->window_samples * 1e6f) / (float)span_us;
+            rates->window_us = stamp_us;
+            rates->window_samples = 0U;
+        }
+    }
+}
+
+/* Torque and thrust of the spare, the last that are numbers; without any for max_age it is silent, and RISE-DI alone if it flies. */
+static void take_spare(rise_di_rates *rates, const rise_di_cycle *cycle) {
+    bool numbers = true;
+    for (int32_t k = 0; k < 3; k++) {
+        numbers = numbers && is_number(cycle->spare[k]) && is_number(cycle->spare_thrust[k]);
+    }
+    if (numbers && (cycle->spare_us > 0U)) {
+        rates->spare_us = cycle->spare_us;
+        for (int32_t k = 0; k < 3; k++) {
+            rates->spare[k] = cycle->spare[k];
+            rates->spare_thrust[k] = cycle->spare_thrust[k];
+        }
+    }
+    const bool has_age = is_within(cycle->max_age, RISE_DI_MAX_AGE_LEAST, RISE_DI_MAX_AGE_LARGEST);
+    rates->is_silent = is_stale(cycle, rates->spare_us, has_age ? cycle->max_age : RISE_DI_MAX_AGE_LARGEST);
+    rates->is_alone = rates->is_silent && cycle->armed && (rates->is_alone || (rates->refusal == RISE_DI_FLIES));
 }
 
 /* Torque of u = 1 at this airspeed over that at the speed of the scenario: less where the surfaces have more effect. */
@@ -75,9 +170,29 @@ static rise_di_real effect_scale(const rise_di_cycle *cycle) {
     return scale;
 }
 
-/* The samples of y and of y_m for the controller: the reference model steps past the instant of the rates. */
-static void take_samples(rise_di_rates *rates, const rise_di_cycle *cycle) {
+/* Whether a y of the law falls due by this sample of the rates: its instant and its values. Samples at the rate of the law are
+ * taken as they come. Of faster ones y is interpolated at the periods of the law, as late as the next sample. */
+static bool resample(rise_di_rates *rates, const rise_di_cycle *cycle, uint64_t *instant_us) {
+    const uint64_t period_us = ((uint64_t)exported.period_ns + 500U) / 1000U;
     const uint64_t stamp_us = (cycle->rates_us > cycle->filter_us) ? (cycle->rates_us - cycle->filter_us) : 0U;
+    const uint64_t step_us = cycle->rates_us - rates->last_us;
+    const bool is_like = rates->rate <= (LIKE_PART * rate_of_law());
+    const bool is_due = is_like || (stamp_us >= rates->due_us);
+    if (is_due) {
+        const uint64_t late_us = (is_like || ((stamp_us - rates->due_us) >= step_us)) ? 0U : (stamp_us - rates->due_us);
+        const rise_di_real part = (rise_di_real)late_us / (rise_di_real)step_us;
+        for (int32_t i = 0; i < RISE_DI_M; i++) {
+            const rise_di_real now = (rise_di_real)cycle->rates[axis_of[i]];
+            rates->y[i] = (late_us > 0U) ? (now - ((now - (rise_di_real)rates->last[axis_of[i]]) * part)) : now;
+        }
+        *instant_us = stamp_us - late_us;
+        rates->due_us = *instant_us + period_us;
+    }
+    return is_due;
+}
+
+/* A y, and the y_m past its instant, for the controller. */
+static void take_samples(rise_di_rates *rates, const rise_di_cycle *cycle, uint64_t stamp_us) {
     const int64_t stamp_ns = in_ns(stamp_us);
     const int64_t now_ns = in_ns(cycle->now_us);
     rise_di_real u_m[RISE_DI_M];
@@ -85,7 +200,6 @@ static void take_samples(rise_di_rates *rates, const rise_di_cycle *cycle) {
         const rise_di_real setpoint = (rise_di_real)cycle->setpoint[axis_of[i]];
         const rise_di_real bound = model.bounds[i];
         u_m[i] = (setpoint > bound) ? bound : ((setpoint < -bound) ? -bound : setpoint);
-        rates->y[i] = (rise_di_real)cycle->rates[axis_of[i]];
     }
     if ((cycle->rates_us - rates->last_us) > (((uint64_t)model.period_ns * PAUSE_PERIODS) / 1000U)) {
         rise_di_reference_start(&rates->reference, &model);
@@ -133,11 +247,10 @@ static void limit(rise_di_rates *rates, rise_di_real scale) {
 }
 
 /* A tick of the law, and the torque of u; what speaks against it. */
-static rise_di_refusal tick(rise_di_rates *rates, const rise_di_cycle *cycle, rise_di_real scale, float *torque) {
+static rise_di_refusal tick(rise_di_rates *rates, const rise_di_cycle *cycle, bool has_y, rise_di_real scale, float *torque) {
     rise_di_refusal refusal = RISE_DI_FLIES;
     rise_di_output output;
-    if ((in_ns(cycle->rates_us - rates->tick_us) * 4) >= (exported.period_ns * 3)) { /* the rates may come faster */
-        rates->tick_us = cycle->rates_us;
+    if (has_y) {
         limit(rates, scale);
         if (rise_di_tick(&rates->controller, in_ns(cycle->now_us), true, &output)) {
             rates->number = (output.dt > (rise_di_real)0) ? (rates->number + 1U) : 1U;
@@ -162,17 +275,22 @@ static rise_di_refusal tick(rise_di_rates *rates, const rise_di_cycle *cycle, ri
     return refusal;
 }
 
-void rise_di_rates_start(rise_di_rates *rates, float rate) {
+void rise_di_rates_start(rise_di_rates *rates) {
     rates->parameters[0] = exported;
     rates->parameters[1] = exported;
     rates->parameters[1].digest = exported.digest + 1U;
     rates->started = rise_di_start(&rates->controller, rates->parameters);
-    rates->slow = !((rate * (float)exported.period_ns) >= 0.99e9f); /* of a rate that is no number, too */
     rise_di_reference_start(&rates->reference, &model);
+    rates->is_silent = true;
+    rates->is_alone = false;
     rates->refusal = RISE_DI_OFF;
     rates->latched = RISE_DI_FLIES;
+    rates->fault_us = 0;
     rates->last_us = 0;
-    rates->tick_us = 0;
+    rates->due_us = 0;
+    rates->window_us = 0;
+    rates->window_samples = 0;
+    rates->rate = 0.0f;
     rates->reference_us = 0;
     for (int32_t i = 0; i < RISE_DI_M; i++) {
         rates->y[i] = (rise_di_real)0;
@@ -182,10 +300,34 @@ void rise_di_rates_start(rise_di_rates *rates, float rate) {
     rates->number = 0;
     rates->y_us = 0;
     rates->y_m_offset = (rise_di_real)0;
+    rates->spare_us = 0;
     for (int32_t k = 0; k < 3; k++) {
+        rates->last[k] = 0.0f;
         rates->torque[k] = 0.0f;
+        rates->thrust[k] = 0.0f;
+        rates->spare[k] = 0.0f;
+        rates->spare_thrust[k] = 0.0f;
         rates->mean[k] = 0.0f;
         rates->handover[k] = 0.0f;
+    }
+}
+
+/* The spare's torque, and the difference to what flew before, which fades. */
+static void fall_back(rise_di_rates *rates, bool changed, bool flew, float step) {
+    for (int32_t k = 0; k < 3; k++) {
+        const float spare = rates->is_silent ? 0.0f : rates->spare[k];
+        rates->handover[k] = changed ? (rates->torque[k] - spare) : (rates->handover[k] * (1.0f - (step / FADE)));
+        rates->torque[k] = within(spare + rates->handover[k], -1.0f, 1.0f);
+        rates->mean[k] = flew ? rates->torque[k] : (rates->mean[k] + ((rates->torque[k] - rates->mean[k]) * (step / MEAN)));
+    }
+}
+
+/* The thrust of the spare; of a silent one that of the setpoint, which it would hand on, and 0 where that is old. */
+static void choose_thrust(rise_di_rates *rates, const rise_di_cycle *cycle) {
+    const bool is_old = is_setpoint_stale(cycle);
+    for (int32_t k = 0; k < 3; k++) {
+        const float wanted = (is_old || (!is_number(cycle->setpoint_thrust[k]))) ? 0.0f : cycle->setpoint_thrust[k];
+        rates->thrust[k] = rates->is_silent ? within(wanted, -1.0f, 1.0f) : rates->spare_thrust[k];
     }
 }
 
@@ -194,36 +336,50 @@ bool rise_di_rates_run(rise_di_rates *rates, const rise_di_cycle *cycle) {
     const float step = fresh ? least_of((float)(cycle->rates_us - rates->last_us) * 1e-6f, LONGEST) : 0.0f;
     const rise_di_real scale = effect_scale(cycle);
     const bool flew = rates->refusal == RISE_DI_FLIES;
-    float torque[3] = {cycle->spare[0], cycle->spare[1], cycle->spare[2]}; /* an axis without a channel is the spare's */
+    const bool was_silent = rates->is_silent;
+    bool has_y = false;
+    uint64_t y_us = 0;
+    float torque[3];
+    take_spare(rates, cycle);
     if (!cycle->enabled) {
         rates->latched = RISE_DI_FLIES;
     }
-    rates->refusal = refusal_before(rates, cycle);
-    if (fresh && are_numbers(cycle)) {
-        take_samples(rates, cycle);
+    if (fresh) {
+        measure_rate(rates, cycle->rates_us);
+        has_y = are_numbers(cycle) && resample(rates, cycle, &y_us);
+        if (has_y) {
+            take_samples(rates, cycle, y_us);
+        }
     }
-    if ((rates->refusal == RISE_DI_FLIES) && (flew || fresh)) {
-        if (!flew) {
+    rates->refusal = refusal_before(rates, cycle, flew);
+    if ((rates->refusal == RISE_DI_FLIES) && (!flew)) {
+        if (has_y) {
             engage(rates, scale);
+        } else { /* take-over needs a y */
+            rates->refusal = RISE_DI_WAITS;
         }
-        rates->refusal = tick(rates, cycle, scale, torque);
+    }
+    if (rates->refusal == RISE_DI_FLIES) {
+        for (int32_t k = 0; k < 3; k++) {
+            torque[k] = rates->is_silent ? 0.0f : rates->spare[k]; /* an axis without a channel is the spare's */
+        }
+        rates->refusal = tick(rates, cycle, has_y, scale, torque);
         rates->latched = rates->refusal;
-    } else if (rates->refusal == RISE_DI_FLIES) { /* take-over needs a sample */
-        rates->refusal = RISE_DI_STALE_RATES;
-    } else {
-        /* the spare flies */
     }
-    for (int32_t k = 0; k < 3; k++) {
-        if (rates->refusal == RISE_DI_FLIES) {
+    if (rates->refusal == RISE_DI_FLIES) {
+        for (int32_t k = 0; k < 3; k++) {
             rates->torque[k] = torque[k];
-        } else {
-            const float before = flew ? (rates->torque[k] - cycle->spare[k]) : (rates->handover[k] * (1.0f - (step / FADE)));
-            rates->handover[k] = is_number(before) ? before : 0.0f;
-            rates->torque[k] = within(cycle->spare[k] + rates->handover[k], -1.0f, 1.0f);
-            rates->mean[k] = flew ? rates->torque[k] : (rates->mean[k] + ((rates->torque[k] - rates->mean[k]) * (step / MEAN)));
+        }
+    } else {
+        fall_back(rates, flew || (rates->is_silent && (!was_silent)), flew, step);
+    }
+    choose_thrust(rates, cycle);
+    if (fresh) {
+        rates->last_us = cycle->rates_us;
+        for (int32_t k = 0; k < 3; k++) {
+            rates->last[k] = is_number(cycle->rates[k]) ? cycle->rates[k] : rates->last[k];
         }
     }
-    rates->last_us = fresh ? cycle->rates_us : rates->last_us;
     return rates->refusal == RISE_DI_FLIES;
 }
 
@@ -232,7 +388,9 @@ const char *rise_di_refusal_text(rise_di_refusal refusal) {
         "none", "off", "not armed", "no rate control in this mode", "landed", "stale rates", "stale setpoint",
         "a rate or a setpoint that is not finite", "compiler flags that change the bits", "failsafe of the law",
         "a rate too far from its reference", "a torque that is not finite",
-        "rates slower than the controller: export it with --rate",
+        "rates slower than the controller: export it with --rate", "the spare does not publish", "maximum age not within 0.01 to 1 s",
+        "maximum error not within 0.1 to 30 rad/s", "hold of the setpoint not within 0 to 60 s",
+        "waits: measures the rates, or a second since a fault",
     };
     return texts[refusal];
 }

@@ -2,7 +2,7 @@
  * SPDX-License-Identifier: Apache-2.0
  *
  * Which rate controller flies: RISE-DI or the spare, the autopilot's own. No header of an autopilot: times in us of its clock,
- * roll, pitch, yaw in rad/s, torque setpoints from -1 to 1. rise_di_axes.h maps these to the channels of the scenario.
+ * roll, pitch, yaw in rad/s, torque and thrust setpoints from -1 to 1. rise_di_axes.h maps these to the channels of the scenario.
  */
 #ifndef RISE_DI_RATES_H
 #define RISE_DI_RATES_H
@@ -24,8 +24,20 @@ typedef enum {
     RISE_DI_FAILSAFE = 9,       /* of the law; this and the next two until not enabled */
     RISE_DI_DIVERGED = 10,      /* a rate is too far from its reference */
     RISE_DI_WRONG_TORQUE = 11,  /* not finite */
-    RISE_DI_SLOW = 12           /* the rates come slower than the controller's rate */
+    RISE_DI_SLOW = 12,          /* the measured rate of the samples is below the controller's */
+    RISE_DI_SILENT = 13,        /* the spare does not publish: no take-over */
+    RISE_DI_WRONG_AGE = 14,     /* max_age is out of its bounds */
+    RISE_DI_WRONG_ERROR = 15,   /* max_error */
+    RISE_DI_WRONG_HOLD = 16,    /* hold */
+    RISE_DI_WAITS = 17          /* for the measured rate of the samples, or a second since the last fault */
 } rise_di_refusal;
+
+/* Bounds of what a pilot sets; NaN is out of them. */
+#define RISE_DI_MAX_AGE_LEAST 0.01f    /* s */
+#define RISE_DI_MAX_AGE_LARGEST 1.0f
+#define RISE_DI_MAX_ERROR_LEAST 0.1f   /* rad/s */
+#define RISE_DI_MAX_ERROR_LARGEST 30.0f
+#define RISE_DI_HOLD_LARGEST 60.0f     /* s, from 0 on */
 
 /* What a cycle takes. */
 typedef struct {
@@ -33,13 +45,17 @@ typedef struct {
     uint64_t rates_us;    /* of the sample of the rates */
     uint64_t filter_us;   /* delay of the filters of the rates: y is of the instant before it */
     uint64_t setpoint_us; /* of the setpoint */
+    uint64_t spare_us;    /* of torque and thrust of the spare, the older of the two; 0: none yet */
     bool enabled, armed, has_rates, landed;
     float rates[3];
     float setpoint[3];
+    float setpoint_thrust[3]; /* that the spare hands on */
     float spare[3];       /* torque of the spare */
+    float spare_thrust[3];
     float airspeed;       /* m/s; not finite or 0: unknown, the torque is not scaled */
-    float max_age;        /* s */
+    float max_age;        /* s, of the rates and of the spare */
     float max_error;      /* rad/s */
+    float hold;           /* s, how long the autopilot holds a setpoint; at least max_age */
 } rise_di_cycle;
 
 typedef struct {
@@ -47,11 +63,17 @@ typedef struct {
     rise_di_controller controller;
     rise_di_reference reference;
     bool started;
-    bool slow; /* the rates come slower than a tick a period needs */
+    bool is_silent; /* the spare: no torque, or none with all numbers, for max_age */
+    bool is_alone;  /* RISE-DI since the spare fell silent while it flew: nothing to fall back to */
     rise_di_refusal refusal;
-    rise_di_refusal latched; /* one of the last three, or RISE_DI_FLIES */
+    rise_di_refusal latched; /* a fault until not enabled, or RISE_DI_FLIES */
+    uint64_t fault_us;       /* of the last cycle with a fault that passes */
     uint64_t last_us;        /* sample of the rates of the last cycle */
-    uint64_t tick_us;        /* and of the last tick */
+    float last[3];           /* and the rates */
+    uint64_t due_us;         /* of the next y of the law */
+    uint64_t window_us;      /* begin of the window in which the rate is measured */
+    uint32_t window_samples;
+    float rate;              /* Hz, measured, of the samples of the rates; 0: not yet */
     uint64_t reference_us;   /* start of the reference model */
     rise_di_real y[RISE_DI_M];
     rise_di_real y_m[RISE_DI_M];
@@ -60,14 +82,22 @@ typedef struct {
     rise_di_real y_m_offset;    /* s, of the newest y_m after y, of the last tick */
     rise_di_real u_end[RISE_DI_M]; /* abs(u) of the torque of 1 at the airspeed of the last tick */
     float torque[3];         /* to be sent */
+    float thrust[3];
+    uint64_t spare_us;       /* of the last torque and thrust of the spare with all numbers */
+    float spare[3];
+    float spare_thrust[3];
     float mean[3];           /* torque of the spare, low-passed while it flies */
     float handover[3];       /* the last torque less that of the spare when it took over; fades */
 } rise_di_rates;
 
-/* Begin with the spare. `rate`, Hz, of the samples of the rates: below that of the controller the spare flies on. */
-void rise_di_rates_start(rise_di_rates *rates, float rate);
+/* Begin with the spare. */
+void rise_di_rates_start(rise_di_rates *rates);
 
-/* A cycle, at each sample of the rates and when these stop. Returns whether RISE-DI flies; rates->torque is to be sent. */
+/* A cycle, at each sample of the rates and when these stop. Returns whether RISE-DI flies; rates->torque and rates->thrust are to
+ * be sent. The law steps at its own period: rates up to 5 % faster are a tick each, those of faster rates are interpolated.
+ * Where the spare is silent RISE-DI does not take over. One that falls silent while RISE-DI flies cannot be fallen back to:
+ * RISE-DI flies on, not enabled too, with the thrust of the setpoint. Where the law cannot, the torque fades to 0, and RISE-DI
+ * returns at once. */
 bool rise_di_rates_run(rise_di_rates *rates, const rise_di_cycle *cycle);
 
 /* The words for a refusal. */
