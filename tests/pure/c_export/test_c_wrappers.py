@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from tests.conftest import REPOSITORY, refusing
 
-from c_export.constants import exportable
+from c_export.constants import exportable, packed
 from c_export.events import run_recording
 from c_export.library import CController, Units, build_fmu, build_library
 from c_export.proof import FLAGS, build, write_code
@@ -430,3 +430,31 @@ def test_export_at_another_rate_is_the_loop_at_that_rate(tmp_path: Path) -> None
     assert "125 Hz" in (tmp_path / "rise_di_parameters.h").read_text()
     with refusing("found a spectral radius of"):  # too slow for this observer
         export(str(REPOSITORY / "examples/px4_airplane/rates_observer.yaml"), tmp_path, rate=200.0)
+
+
+BYTES_OF_PARAMETERS = """
+#include <cstdio>
+#include "rise_di.h"
+static const rise_di_parameters parameters = RISE_DI_PARAMETERS;
+int main() { return std::fwrite(&parameters, sizeof parameters, 1, stdout) == 1 ? 0 : 1; }
+"""
+
+
+@pytest.mark.parametrize("float32", [False, True])
+def test_constants_are_those_of_python_in_strict_cpp_14(tmp_path: Path, *, float32: bool) -> None:
+    """Decimal digits, as C++ before 17 has no hexadecimal ones, are read to the same bits.
+
+    The gains are drawn over many powers of two: each number of a struct has other last bits.
+    """
+    rng = np.random.default_rng(8)
+    scenario = find_scenario("osprey_observer")
+    for k in range(5):
+        scales = 2.0 ** rng.uniform(-20.0, 20.0, 4)
+        config = exportable(scenario.vary(controller={"beta": scales}).controller)
+        code = tmp_path / str(k)
+        write_code(config, "drawn", code, float32=float32)
+        (code / "bytes.cpp").write_text(BYTES_OF_PARAMETERS)
+        flags = ["-std=c++14", "-pedantic-errors", "-Wall", "-Wextra", "-Werror"]
+        build(["g++", *flags, "-o", "bytes", "bytes.cpp"], code)
+        written = subprocess.run([str(code / "bytes")], capture_output=True, check=True).stdout
+        assert written == packed(config, float32=float32)

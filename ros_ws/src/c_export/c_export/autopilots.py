@@ -183,7 +183,7 @@ def _axes(scenario: Scenario, suffix: str) -> str:
         require(
             end > 0.0, "aircraft.actuators.upper", f"no end stop of {name}", "that of the torque 1"
         )
-        per_u.append(f"{float(sign / end).hex()}{suffix}")
+        per_u.append(f"{float(sign / end)!r}{suffix}")
     speed = channels.speed
     observer = exportable(controller).observer
     part = 0.0 if observer is None else observer.part
@@ -195,6 +195,6 @@ def _axes(scenario: Scenario, suffix: str) -> str:
         speed=speed,
         slowest=SLOWEST * speed,
         fastest=FASTEST * speed,
-        part=part.hex() + suffix,
-        slew=slew.hex() + suffix,
+        part=f"{part!r}{suffix}",
+        slew=f"{slew!r}{suffix}",
     )

@@ -275,7 +275,7 @@ def header(
     real = np.float32 if float32 else np.float64
 
     def numbers(value: FloatArray) -> str:
-        return ", ".join(f"{float(real(x)).hex()}{suffix}" for x in _finite(value, real))
+        return ", ".join(f"{float(real(x))!r}{suffix}" for x in _finite(value, real))
 
     def struct(members: list[Constant]) -> list[str]:
         return [f"    /* {name} */ {_initialiser(name, value, numbers)}" for name, value in members]
