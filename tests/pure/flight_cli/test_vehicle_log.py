@@ -8,7 +8,7 @@ It also gives Omega of the aircraft.
 import json
 import re
 import struct
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 import yaml
 from numpy.testing import assert_array_equal
+from pymavlink import DFReader
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from pytest import approx
 from tests.conftest import REPOSITORY, invoke, refusing
@@ -31,6 +32,7 @@ from flight_core.vectors import FloatArray
 from flight_design.identification.log_import import require_map_of_import
 from flight_design.identification.response_identification import MIN_RATIO
 from flight_design.identification.sign_check import recorded_response
+from flight_log.file_kinds import file_kind
 from flight_log.tape_reader import read_run
 from flight_log.vehicle_log import read_vehicle_log
 from flight_view.flight import Flight as View
@@ -928,6 +930,152 @@ def test_log_without_what_the_map_needs_is_one_sentence(flight: Flight, tmp_path
         assert sentence in str(
             imported(tmp_path / name, tmp_path / "no", map_name=map_name).exception
         )
+
+
+def as_text(path: Path, flight: Flight) -> Path:
+    """A log of ArduPlane as the text that Mission Planner makes of it."""
+    reader = DFReader.DFReader_binary(str(dataflash(path.with_suffix(".bin"), flight)))
+    lines = []
+    while (message := reader.recv_msg()) is not None:
+        name, *values = message.to_dict().values()
+        lines.append(", ".join([name, *map(str, values)]))
+    reader.close()
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def overwritten(content: bytes, places: Sequence[int], filling: bytes) -> bytes:
+    data = bytearray(content)
+    for place in places:
+        data[place : place + len(filling)] = filling
+    return bytes(data)
+
+
+def removed(content: bytes, places: Sequence[int], filling: bytes) -> bytes:
+    data = bytearray(content)
+    for place in reversed(places):
+        del data[place : place + len(filling)]
+    return bytes(data)
+
+
+LOSSES: Mapping[str, tuple[Callable[[bytes, Sequence[int], bytes], bytes], int, bytes]] = {
+    "zeros in places": (overwritten, 60, bytes(20)),
+    "erased places": (overwritten, 40, bytes([0xFF]) * 20),
+    "bytes that are missing": (removed, 40, bytes(37)),
+    "other bytes": (overwritten, 40, np.random.default_rng(5).bytes(20)),
+    "blocks of a card": (overwritten, 3, bytes(4096)),
+}
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+@pytest.mark.parametrize("name", ["flight.bin", "flight.log", "flight.ulg", "flight.tlog"])
+def test_log_with_lost_bytes_is_read_on_and_gives_the_aircraft(
+    name: str, loss: str, flight: Flight, tmp_path: Path
+) -> None:
+    """Omega of the whole log and of the damaged one differ by less than their standard errors."""
+    write, map_name = {**WRITERS, "flight.log": (as_text, "ardupilot")}[name]
+    damage, count, filling = LOSSES[loss]
+    path = write(tmp_path / name, flight)
+    content = path.read_bytes()
+    random = np.random.default_rng(2)
+    first = len(content) // 4  # behind the formats and the parameters
+    places = sorted(random.integers(first, len(content) - len(filling), count).tolist())
+    path.write_bytes(damage(content, places, filling))
+    bag = tmp_path / "bag"
+    result = imported(path, bag, map_name=map_name)
+    assert result.exit_code == 0, result.output
+    tape = read_run(bag).tape
+    lost = len(filling) * count / len(content)
+    # A place of 20 bytes may cost a part of two messages each.
+    assert len(tape["y"].stamp_ns) >= (1.0 - 4.0 * lost - 0.02) * len(flight.y)
+    assert tape.time("y")[-1] == approx(DURATION, abs=1.5)
+    assert re.search(
+        r"warning: y lacks \d+ of \d+ samples: the longest gap, [\d.]+ s, begins at", result.stderr
+    )
+    if not name.endswith(".tlog"):  # whose packets have a checksum and no order
+        assert re.search(
+            r"warning: the log is incomplete: \d+ of \d+ (bytes|lines).* hold no message, "
+            r"(from [\d.]+ to|at) [\d.]+ s of the log",
+            result.stderr,
+        )
+    response = recorded_response(bag, OUTPUTS, INPUTS)
+    deviations = response.Omega_deviation.diagonal()
+    assert np.abs(response.Omega.diagonal() - OMEGA) / deviations == approx(np.zeros(4), abs=3.0)
+
+
+def test_refusal_of_an_incomplete_log_tells_the_loss(flight: Flight, tmp_path: Path) -> None:
+    path = dataflash(tmp_path / "flight.bin", flight, mode=11)
+    content = path.read_bytes()
+    path.write_bytes(overwritten(content, [len(content) // 2], bytes(2000)))
+    refused = str(imported(path, tmp_path / "bag").exception)
+    assert "found no flight in MANUAL" in refused
+    assert re.search(r"; the log is incomplete: 20\d\d of \d+ bytes hold no message, at ", refused)
+
+
+def test_dropouts_of_a_logger_are_told(flight: Flight, tmp_path: Path) -> None:
+    """PX4 guide, ULog file format: the message O has the duration, ms."""
+    path = ulog(tmp_path / "a.ulg", flight)
+    content = path.read_bytes()
+    sample = content.index(b"D", len(content) // 2) - 2
+    while content[sample + 2 : sample + 3] != b"D" or content[sample : sample + 2] != b"\x16\x00":
+        sample = content.index(b"D", sample + 3) - 2
+    dropout = struct.pack("<HcH", 2, b"O", 250)
+    path.write_bytes(content[:sample] + dropout + content[sample:])
+    result = imported(path, tmp_path / "bag", map_name="px4")
+    assert result.exit_code == 0, result.output
+    assert (
+        "the log is incomplete: a dropout of the logger, 0.25 s in all, at 19.9 s" in result.stderr
+    )
+
+
+def test_sample_of_no_airspeed_does_not_end_the_flight(flight: Flight, tmp_path: Path) -> None:
+    """An aircraft does not land and take off within a second; behind a longer time it may."""
+    for samples, expected in ((RATE // 2, len(flight.y)), (3 * RATE, len(flight.y) * 3 // 4)):
+        y = flight.y.copy()
+        y[len(y) // 4 - samples : len(y) // 4, 1] = -SPEED
+        bag = tmp_path / str(samples)
+        assert imported(dataflash(tmp_path / "a.bin", flight._replace(y=y)), bag).exit_code == 0
+        assert len(read_run(bag).tape["y"].stamp_ns) == expected
+
+
+def test_tlog_behind_the_text_of_a_radio_is_one(flight: Flight, tmp_path: Path) -> None:
+    path = tlog(tmp_path / "a.tlog", flight)
+    whole = read_vehicle_log(path)
+    for text in (b"SiK 2.2 on HM-TRP\r\nBOARD: HM-TRP\r\n", b"\xfd\x00\xff", b"+++OK"):
+        (tmp_path / "b.tlog").write_bytes(text + path.read_bytes())
+        assert file_kind(tmp_path / "b.tlog") == "a tlog of MAVLink"
+        log = read_vehicle_log(tmp_path / "b.tlog")
+        assert_array_equal(log.tables["ATTITUDE"].stamp_ns, whole.tables["ATTITUDE"].stamp_ns)
+
+
+@pytest.mark.parametrize(
+    "flags, parameters, reason",
+    [
+        ({}, {"ARSPD_USE": 0.0}, "0 is not used, ARSPD_USE 0"),
+        ({"H": (1,), "U": (0,)}, {"ARSPD_USE": 0.0}, "0 is not used, ARSPD_USE 0"),
+        ({"H": (0,), "U": (1,)}, {"ARSPD_USE": 1.0}, "0 is not healthy, ARSPD_USE 1"),
+    ],
+    ids=["parameter", "flag", "not healthy"],
+)
+def test_airspeed_without_a_sensor_in_use_is_the_estimate_of_the_autopilot(
+    flags: Mapping[str, tuple[int]],
+    parameters: Mapping[str, float],
+    reason: str,
+    flight: Flight,
+    tmp_path: Path,
+) -> None:
+    path = sensors(tmp_path / "a.bin", flight, "ARSP", parameters, DEAD, **flags)
+    bag = tmp_path / "bag"
+    result = imported(path, bag)
+    assert result.exit_code == 0, result.output
+    assert f"{reason}: V is the estimate in CTUN" in " ".join(result.stdout.split())
+    y = read_run(bag).tape["y"]
+    assert len(y.stamp_ns) == len(flight.y)
+    assert y["V"] == approx(flight.y[:, 1] - np.median(flight.y[:, 1]), abs=1e-5)
+    assert imported(path, tmp_path / "dead", "--instance", "ARSP=0").exit_code == 0
+    path.write_bytes(path.read_bytes().replace(b"CTUN", b"XTUN", 1))
+    refused = str(imported(path, tmp_path / "no").exception)
+    assert f"found no airspeed sensor in use ({reason}), expected its estimate in CTUN" in refused
 
 
 def test_damaged_bytes_cost_what_they_hold_and_print_nothing(

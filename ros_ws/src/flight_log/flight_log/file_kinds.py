@@ -103,10 +103,34 @@ def kind_of_head(head: bytes) -> str:
     kinds = {
         "a file of zeros": not any(head),
         "a tar archive": head[TAR_PLACE : TAR_PLACE + len(TAR)] == TAR,
-        "a tlog of MAVLink": head[8:9] in MAVLINK and _is_time(*TLOG_TIME.unpack_from(head)),
+        "a tlog of MAVLink": tlog_start(head) is not None,
         "a stream of MAVLink": head[:1] in MAVLINK,
     }
     return next((kind for kind, fits in kinds.items() if fits), "") or _text_kind(head)
+
+
+def tlog_start(head: bytes) -> int | None:
+    """The place of the first packet with its time before it; None without one.
+
+    The text that a radio sends at its start may come before: then a second packet has to follow.
+    """
+    for start in range(len(head) - TLOG_TIME.size):
+        end = _packet_end(head, start)
+        if end and (start == 0 or end + TLOG_TIME.size >= len(head) or _packet_end(head, end)):
+            return start
+    return None
+
+
+def _packet_end(head: bytes, start: int) -> int:
+    """The end of a packet of MAVLink behind its time; 0 without one."""
+    place = start + TLOG_TIME.size
+    magic = head[place : place + 1]
+    if magic not in MAVLINK or not _is_time(*TLOG_TIME.unpack_from(head, start)):
+        return 0
+    # Beside the payload, MAVLink guide, Packet Serialization; a signature has 13 bytes.
+    size, flags = (*head[place + 1 : place + 3], 0, 0)[:2]
+    frame = 8 if magic == MAVLINK[1] else 12 + 13 * (flags & 1)
+    return place + frame + size
 
 
 def _is_time(microseconds: int) -> bool:

@@ -3,8 +3,9 @@
 """The sensor or instance of an autopilot's log with the flight.
 
 Sources: ArduPilot, AP_Logger/LogStructure.h (ARSP: H healthy, U used, Pri primary; IMU: GH),
-AP_InertialSensor.cpp (INS_USE); PX4, vtol_att_control (instance 0 of the setpoints of torque is of
-the rotors, 1 of the surfaces).
+AP_InertialSensor.cpp (INS_USE), AP_Airspeed.cpp (ARSPD_USE); ArduPlane/Log.cpp (CTUN.As: the
+airspeed sensor where used and healthy, else the estimate by wind and ground speed); PX4,
+vtol_att_control (instance 0 of the setpoints of torque is of the rotors, 1 of the surfaces).
 """
 
 from collections.abc import Mapping, Set
@@ -49,6 +50,11 @@ def instances_of_flight(
                 number in sensors, f"--instance {name}", number, f"one of {_enumeration(sensors)}"
             )
         elif name == "ARSP":
+            if (unused := _unused(sensors, parameters)) and _has_estimate(instances):
+                choices.append((name, f"{unused}: V is the estimate in CTUN"))
+                continue
+            ways_out = "its estimate in CTUN, or --instance ARSP=0"
+            require(not unused, "the log", f"no airspeed sensor in use ({unused})", ways_out)
             tables[name], sentence = _airspeed(sensors)
             if len(sensors) > 1:
                 choices.append((name, sentence))
@@ -171,14 +177,33 @@ def _airspeed(sensors: Mapping[int, MessageTable]) -> tuple[MessageTable, str]:
         if not unlike:
             return table, f"{_enumeration(numbers)} of {_enumeration(tables)}: the primary"
         candidates = {number: tables[number] for number in (*numbers, *unlike)}
-    require(
-        bool(candidates),
-        "the log",
-        "no healthy airspeed sensor (ARSP.H is 0)",
-        "one, or --instance ARSP=0",
-    )
     number, _ = _of_motion("ARSP", candidates, {"Airspeed"})
     return tables[number], f"{number} of {_enumeration(tables)}: healthy and used"
+
+
+def _unused(sensors: Mapping[int, MessageTable], parameters: Parameters) -> str:
+    """Why the autopilot flew by none of its airspeed sensors, by U and H, else by ARSPD_USE.
+
+    "" where it flew by one, or where the log does not say.
+    """
+    reasons = []
+    for number, table in sorted(sensors.items()):
+        setting = f"ARSPD{number + 1 if number else ''}_USE"
+        records = parameters.get(setting, ())
+        if "U" in table.fields:
+            is_used = _share(table, "U") >= MOST
+        else:
+            is_used = not records or records[0].value != 0.0
+        if is_used and _share(table, "H") >= MOST:
+            return ""
+        value = f", {setting} {records[0].value:g}" if records else ""
+        reasons.append(f"{number} is not {'healthy' if is_used else 'used'}{value}")
+    return "; ".join(reasons)
+
+
+def _has_estimate(instances: Instances) -> bool:
+    """Whether CTUN has an airspeed: the estimate by which ArduPlane flies."""
+    return any({"As", "Aspd"} & table.fields.keys() for table in instances.get("CTUN", {}).values())
 
 
 def _healthy(table: MessageTable) -> MessageTable:

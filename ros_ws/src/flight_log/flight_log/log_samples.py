@@ -94,7 +94,13 @@ def _columns(samples: Iterable[Sample], fields_of: Mapping[str, set[str]]) -> In
         for field, values in columns[place].items():
             values.append(float(getattr(message, field)))
     tables: Instances = {}
+    most: dict[str, int] = {}
+    for (name, _), values_ns in stamps.items():
+        most[name] = max(most.get(name, 0), len(values_ns))
     for (name, number), lists in columns.items():
+        # A damaged number is that of no sensor.
+        if len(stamps[name, number]) < min(AGREEING, most[name]):
+            continue
         fields = {field: np.array(values) for field, values in lists.items()}
         tables.setdefault(name, {})[number] = table_of(
             np.array(stamps[name, number], dtype=np.int64), fields

@@ -26,7 +26,7 @@ from flight_log.bag import (
     SIMULATED_TIME,
     full_names,
 )
-from flight_log.clock import SINCE_EPOCH_NS, leap_note, recording_note, without_leaps
+from flight_log.clock import SINCE_EPOCH_NS, Leap, leap_note, recording_note, without_leaps
 from flight_log.engagements import ENGAGEMENT, Engagement, engagements_of
 from flight_log.flight_processes import (
     INSTANCE,
@@ -193,10 +193,12 @@ def _tape(
     }
     topics = {name: log.topics[topic] for topic, name in names.items()}
     recordings = {printable(name): samples.recording() for name, samples in samples_by_name.items()}
-    signals, recording, leaps = without_leaps(
-        {printable(name): admitted(signal) for name, signal in filled.items()},
-        {name: clock for name, clock in recordings.items() if clock.found},
-    )
+    signals = {printable(name): admitted(signal) for name, signal in filled.items()}
+    recording = {name: clock for name, clock in recordings.items() if clock.found}
+    leaps: list[Leap] = []
+    # The import numbers the samples that it found: a gap is one of the log, not of its clock.
+    if IMPORTED not in log.metadata:
+        signals, recording, leaps = without_leaps(signals, recording)
     start_ns = _start_ns(signals)
     end = seconds(max(int(signal.stamp_ns[-1]) for signal in signals.values()) - start_ns)
     counts = {printable(name): samples.refused() for name, samples in samples_by_name.items()}

@@ -8,8 +8,9 @@ sequence of a link).
 
 import re
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
+from io import BytesIO
 from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
@@ -21,6 +22,7 @@ from flight_core.installation import require_package
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS
 from flight_core.vectors import FloatArray
+from flight_log.file_kinds import HEAD_BYTES, tlog_start
 from flight_log.flown_instance import instances_of_flight, moving_numbers
 from flight_log.log_samples import (
     LARGEST,
@@ -33,6 +35,7 @@ from flight_log.log_samples import (
     table_of,
     tables_of,
 )
+from flight_log.ulog_messages import whole_messages
 from flight_log.vehicle_tables import (
     COPTER,
     DATAFLASH,
@@ -45,6 +48,7 @@ from flight_log.vehicle_tables import (
     ULOG_TORQUES,
     Choice,
     Format,
+    Loss,
     MessageTable,
     VehicleLog,
 )
@@ -80,20 +84,18 @@ airspeed."""
 
 def _read_dataflash(path: Path, kind: str, choice: Choice) -> VehicleLog:
     require_package("pymavlink")
-    from pymavlink import DFReader  # noqa: PLC0415 - an extra
+    from flight_log.dataflash import Lines, Packets, stamp_us  # noqa: PLC0415 - an extra
 
     fields = _wanted(DATAFLASH)
     fields_and_flags = {
         name: fields.get(name, set()) | FLAGS.get(name, set()) for name in (*fields, *FLAGS)
     }
     firmwares: dict[str, None] = {}
+    reader = Lines(str(path)) if "text" in kind else Packets(str(path))
+    loss = reader.loss()
 
     def samples() -> Iterator[Sample]:
-        stamp_us = 0.0
-        if "text" in kind:
-            reader = DFReader.DFReader_text(str(path))
-        else:
-            reader = DFReader.DFReader_binary(str(path))
+        newest_us = 0.0
         with closing(reader):
             while (
                 message := reader.recv_match(type=[*fields_and_flags, *OLD_NAMES, PARAMETER, "MSG"])
@@ -102,11 +104,8 @@ def _read_dataflash(path: Path, kind: str, choice: Choice) -> VehicleLog:
                 if name == "MSG":
                     firmwares.update(dict.fromkeys(FIRMWARE.findall(str(message.Message))))
                     continue
-                # Logs of 2014 and before have ms, and MODE has no time: that of the message before.
-                stamp_us = getattr(
-                    message, "TimeUS", 1e3 * getattr(message, "TimeMS", 1e-3 * stamp_us)
-                )
-                stamp_ns = min(round(1e3 * stamp_us), LARGEST)
+                newest_us = stamp_us(message, newest_us)
+                stamp_ns = min(round(1e3 * newest_us), LARGEST)
                 # The number is that of the sensor or of the core.
                 number = int(getattr(message, "I", 0) or getattr(message, "C", 0))
                 if name == PARAMETER:
@@ -135,6 +134,7 @@ def _read_dataflash(path: Path, kind: str, choice: Choice) -> VehicleLog:
         format=DATAFLASH,
         vehicle=vehicle,
         taken=tuple(choices),
+        loss=loss,
     )
 
 
@@ -168,7 +168,10 @@ def _read_tlog(path: Path, kind: str, choice: Choice) -> VehicleLog:
     messages: dict[int, list[Received]] = {}
     mavutil.set_dialect("ardupilotmega")
     # mavlogfile tells the kind by the content, not by the name.
+    with path.open("rb") as stream:
+        start = tlog_start(stream.read(HEAD_BYTES)) or 0
     with closing(mavutil.mavlogfile(str(path))) as reader:
+        reader.f.seek(start)
         while (message := reader.recv_match(type=[*fields, "PARAM_VALUE"])) is not None:
             name = message.get_type()
             if message.get_srcComponent() == AUTOPILOT:
@@ -289,13 +292,16 @@ def _read_ulog(path: Path, kind: str, choice: Choice) -> VehicleLog:
 
     if path.stat().st_size < ULOG_HEAD:
         raise ValueError("its head is cut")
+    content, loss = whole_messages(path.read_bytes())
     try:
-        _require_short(ULog(str(path), parse_header_only=True).message_formats)
-        log = ULog(str(path))
+        _require_short(ULog(BytesIO(content), parse_header_only=True).message_formats)
+        log = ULog(BytesIO(content))
     except ULogException as error:
         raise ValueError(error) from None
     if log.file_corruption:
         kind += ", damaged: what can be read"
+    if log.dropouts:
+        loss = _with_dropouts(loss, log.dropouts)
     instances: Instances = {}
     for data in log.data_list:
         columns = {name: np.asarray(values, dtype=np.float64) for name, values in data.data.items()}
@@ -330,6 +336,22 @@ def _read_ulog(path: Path, kind: str, choice: Choice) -> VehicleLog:
         format=None,
         vehicle=vehicle,
         taken=tuple(choices),
+        loss=loss,
+    )
+
+
+def _with_dropouts(loss: Loss | None, dropouts: Sequence[Any]) -> Loss:
+    """The loss of bytes, and what the logger says that it did not write: message O of a ULog."""
+    seconds = 1e-3 * sum(dropout.duration for dropout in dropouts)
+    count = "a dropout" if len(dropouts) == 1 else f"{len(dropouts)} dropouts"
+    what = f"{count} of the logger, {seconds:.2g} s in all"
+    stamps = [1000 * int(dropout.timestamp) for dropout in dropouts]
+    if loss is None:
+        return Loss(what, min(stamps), max(stamps))
+    return Loss(
+        f"{loss.what}, and {what}",
+        min(loss.first_ns, *stamps),
+        max(loss.last_ns, *stamps),
     )
 
 

@@ -16,6 +16,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from flight_core.rates import seconds
 from flight_core.vectors import FloatArray
 
 DEGREE = math.pi / 180.0
@@ -133,6 +134,22 @@ class Choice(NamedTuple):
 ANY = Choice()
 
 
+class Loss(NamedTuple):
+    """What a log has lost, and the stamps before the first and the last loss, ns."""
+
+    what: str
+    first_ns: int
+    last_ns: int
+
+    def sentence(self, start_ns: int) -> str:
+        """The loss with its times since the begin of the log."""
+        first, last = (
+            max(seconds(stamp_ns - start_ns), 0.0) for stamp_ns in (self.first_ns, self.last_ns)
+        )
+        span = f"at {first:.1f} s" if first == last else f"from {first:.1f} to {last:.1f} s"
+        return f"the log is incomplete: {self.what}, {span} of the log"
+
+
 class VehicleLog(NamedTuple):
     """A log of an autopilot.
 
@@ -149,6 +166,7 @@ class VehicleLog(NamedTuple):
     manual: int = 0
     # What is taken of several systems, sensors or instances, and why.
     taken: tuple[tuple[str, str], ...] = ()
+    loss: Loss | None = None
 
     def source(self, quantity: str) -> LogField | None:
         """The place in this log that has a quantity of y or of the pose; None where it has none."""

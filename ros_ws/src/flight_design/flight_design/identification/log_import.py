@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from autopilot_bridge.channel_map import LinearConversion, to_channel
@@ -38,6 +39,9 @@ AIRBORNE = 0.5
 # percentile of either in a log, which may have more time on the ground than in the air
 TYPICAL = 90.0
 LEAST = 2.0  # s of flight that are worth a bag
+# s below that speed, for which an aircraft is still in the air: no landing is as short
+BRIDGED = 1.0
+AROUND = 5  # samples, of which the median is no damaged one
 
 FLOWN_AS = LogField("vehicle_status", "vehicle_type")
 VEHICLE_TYPES = {COPTER: 1.0, PLANE: 2.0}  # PX4, VehicleStatus.msg
@@ -90,8 +94,26 @@ def imported(
     MANUAL. `show` gets the comparison of the log with the map before each check of the comparison.
     Raises ParameterError for a channel that the log does not have, for another vehicle, without
     such a stretch, and for parameters of the log that differ from the map or change between the
-    samples.
+    samples. The sentence ends with what the log has lost.
     """
+    start_ns = log.start_ns(channel_map.outputs[channel_map.instant].motion[0])
+    losses = [] if log.loss is None else [log.loss.sentence(start_ns)]
+    try:
+        flight = _imported(channel_map, log, window, show, servos=servos)
+    except ParameterError as error:
+        raise ParameterError("; ".join([str(error), *losses])) from None
+    gaps = [gap_sentence(name, flight.tape[name].stamp_ns, start_ns) for name in ("y", "u")]
+    return flight._replace(notes=(*losses, *filter(None, gaps), *flight.notes))
+
+
+def _imported(
+    channel_map: ChannelMap,
+    log: VehicleLog,
+    window: Window,
+    show: Callable[[list[Agreement]], None],
+    *,
+    servos: bool,
+) -> Imported:
     kind = kind_of_map(channel_map)
     logged_kind = log.vehicle
     log = log._replace(vehicle=logged_kind or kind)
@@ -177,14 +199,17 @@ def _tape(
     y = np.column_stack(
         [row.motion[1] * log.at(sources[name], y_stamps) for name, row in rows.items()]
     )
-    y_stamps, y = _complete(y_stamps, y)
+    is_damaged = log.loss is not None
+    y_stamps, y = _complete(y_stamps, y, is_damaged)
     require(len(y_stamps) > 1, "the log", "no instant with all outputs of the map", "a flight")
     for column, row in enumerate(rows.values()):
         y[:, column] += -np.median(y[:, column]) if row.captured else row.offset
     u_stamps = np.unique(np.concatenate([reader.stamp_ns for reader in readers.values()]))
     u_stamps = u_stamps[(u_stamps >= first) & (u_stamps <= last)]
     u_stamps, commands = _complete(
-        u_stamps, np.column_stack([reader.commands_at(u_stamps) for reader in readers.values()])
+        u_stamps,
+        np.column_stack([reader.commands_at(u_stamps) for reader in readers.values()]),
+        is_damaged,
     )
     require(len(u_stamps) > 1, "the log", "no instant with all inputs of the map", "a flight")
     signals = {
@@ -352,9 +377,16 @@ def _flight(
             "no airspeed or thrust at the samples of y",
             "one of them, as in a flight",
         )
-        keep &= speed > AIRBORNE * np.nanpercentile(speed, TYPICAL)
+        in_air = speed > AIRBORNE * np.nanpercentile(speed, TYPICAL)
+        keep &= _bridged(stamps, in_air)
     if log.has(FLOWN_AS):  # a VTOL flies as both
         keep &= log.at(FLOWN_AS, stamps) == VEHICLE_TYPES[log.vehicle]
+    require(
+        bool(keep.any()),
+        "the log",
+        f"no time in the air {where}",
+        "a flight, or --from and --until",
+    )
     # The sticks are the commands in MANUAL alone.
     if needs_manual:
         expected = "it, for only there the sticks are the commands, or --servos"
@@ -368,12 +400,6 @@ def _flight(
             )
         keep &= log.at(mode, stamps) == log.manual
         require(bool(keep.any()), "the log", f"no flight in MANUAL {where}", expected)
-    require(
-        bool(keep.any()),
-        "the log",
-        f"no time in the air {where}",
-        "a flight, or --from and --until",
-    )
     first, last = _longest_run(stamps, keep)
     length = 1e-9 * (last - first)
     require(
@@ -383,6 +409,13 @@ def _flight(
         f"{LEAST:g} s or more in one stretch",
     )
     return first, last
+
+
+def _bridged(stamps: Stamps, keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """A mask (N,) with its gaps of at most BRIDGED between two kept samples closed."""
+    before = np.maximum.accumulate(np.where(keep, stamps, np.iinfo(np.int64).min // 2))
+    after = np.minimum.accumulate(np.where(keep, stamps, np.iinfo(np.int64).max // 2)[::-1])[::-1]
+    return keep | (after - before <= nanoseconds(BRIDGED))
 
 
 def _longest_run(stamps: Stamps, keep: NDArray[np.bool_]) -> tuple[int, int]:
@@ -395,10 +428,35 @@ def _longest_run(stamps: Stamps, keep: NDArray[np.bool_]) -> tuple[int, int]:
     return max(runs, key=lambda run: run[1] - run[0])
 
 
-def _complete(stamp_ns: Stamps, values: FloatArray) -> tuple[Stamps, FloatArray]:
-    """The samples in which every channel is known."""
-    is_finite = np.isfinite(values).all(axis=1)
-    return stamp_ns[is_finite], values[is_finite]
+def _complete(stamp_ns: Stamps, values: FloatArray, is_damaged: bool) -> tuple[Stamps, FloatArray]:
+    """The samples in which every channel is known.
+
+    Lost bytes within a message leave other values. In a damaged log a value counts as one of them
+    where it lies outside the range of the medians of AROUND samples by more than that range.
+    """
+    is_known = np.isfinite(values).all(axis=1)
+    stamp_ns, values = stamp_ns[is_known], values[is_known]
+    if not is_damaged or len(values) < AROUND:
+        return stamp_ns, values
+    medians = np.median(sliding_window_view(values, AROUND, axis=0), axis=-1)
+    lowest, highest = medians.min(axis=0), medians.max(axis=0)
+    middle, reach = (highest + lowest) / 2.0, 1.5 * (highest - lowest)
+    is_near = (np.abs(values - middle) <= reach).all(axis=1)
+    return stamp_ns[is_near], values[is_near]
+
+
+def gap_sentence(name: str, stamp_ns: Stamps, start_ns: int) -> str:
+    """A sentence on the samples that a topic lacks, by its usual period; "" where it has all."""
+    gaps = np.diff(stamp_ns)
+    period = float(np.median(gaps))
+    expected = round(float(stamp_ns[-1] - stamp_ns[0]) / period) + 1
+    if expected <= len(stamp_ns) or gaps.max() < 1.5 * period:
+        return ""
+    instant = seconds(int(stamp_ns[gaps.argmax()]) - start_ns)
+    return (
+        f"{name} lacks {expected - len(stamp_ns)} of {expected} samples: the longest gap, "
+        f"{seconds(int(gaps.max())):.2g} s, begins at {instant:.1f} s of the log"
+    )
 
 
 def _pose(channel_map: ChannelMap, log: VehicleLog, first: int, last: int) -> Signal | None:

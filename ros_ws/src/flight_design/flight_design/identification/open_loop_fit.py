@@ -22,12 +22,14 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.signal import cont2discrete, lfilter, ss2tf
 
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal
 from flight_core.vectors import FloatArray
+from flight_design.identification.response_identification import BRIDGED
 
 STEP = 0.004  # s, of the simulation
 # s around the excitation of an input
@@ -47,6 +49,7 @@ STARTS = ((0.03, 0.03, 5.0, 30.0, 6.0), (0.1, 0.1, 5.0, 30.0, 6.0), (0.03, 0.01,
 LOWER = np.array([0.0, 0.003, -np.inf, 0.0, 0.0, -np.inf])
 UPPER = np.array([0.4, 1.0, np.inf, 120.0, 3000.0, np.inf])
 ORDERS = (4, 6)  # parameters of the first and of the second order
+SETTLED = 2.0  # s after a gap, in which the response to the unknown u of the gap decays
 CORRELATION = 0.5  # s, over which errors of neighbouring samples are taken as correlated
 
 
@@ -137,9 +140,11 @@ def fit_channel(
     first = int(u.stamp_ns[excited[0]] - BEFORE * NANOSECONDS)
     last = int(u.stamp_ns[excited[-1]] + AFTER * NANOSECONDS)
     y_of_channel = y.within([(first, last)])
-    if not len(y_of_channel.stamp_ns) or not np.ptp(y_of_channel[output]):
+    is_settled = _settled(y_of_channel.stamp_ns / NANOSECONDS)
+    measured = y_of_channel[output][is_settled]
+    if not len(measured) or not np.ptp(measured):
         return None
-    t = (y_of_channel.stamp_ns - first) / NANOSECONDS
+    t = (y_of_channel.stamp_ns[is_settled] - first) / NANOSECONDS
     t_u = (u.stamp_ns - first) / NANOSECONDS
     # u and gravity act by their integrals.
     impulse = np.concatenate([[0.0], np.cumsum(u[name][:-1] * np.diff(t_u))])
@@ -158,7 +163,7 @@ def fit_channel(
     def residuals(theta: FloatArray) -> FloatArray:
         decay = [] if gravity is None else [_decay(t, theta[3])]
         q, _ = np.linalg.qr(np.stack(trend + decay, axis=1))
-        e = y_of_channel[output] - response(theta)
+        e = measured - response(theta)
         return np.asarray(e - q @ (q.T @ e))
 
     # A second order has to lower the misfit.
@@ -170,6 +175,15 @@ def fit_channel(
     misfits = [float(np.linalg.norm(fit.fun) / np.linalg.norm(values)) for fit in fits]
     chosen = 1 if misfits[-1] < MIN_GAIN * misfits[0] and _has_zero_of_its_own(fits[-1].x) else 0
     return _model(fits[chosen], misfits[chosen], float(np.median(np.diff(t))))
+
+
+def _settled(t: FloatArray) -> NDArray[np.bool_]:
+    """Mask (N,) of the samples that are SETTLED or more after each long gap of the log."""
+    if len(t) < 2:
+        return np.ones(len(t), dtype=bool)
+    gaps = np.diff(t)
+    ends = np.concatenate([[-np.inf], t[1:][gaps > BRIDGED + np.median(gaps)]])
+    return np.asarray(t - ends[np.searchsorted(ends, t, side="right") - 1] >= SETTLED)
 
 
 def _decay(t: FloatArray, damping: float) -> FloatArray:

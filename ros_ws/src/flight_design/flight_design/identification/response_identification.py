@@ -19,6 +19,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from flight_core.parameters import require
@@ -61,6 +62,8 @@ RIDGES = (1e-4, 1e-2)  # many disturbances the other
 # s, in a closed loop: an earlier response is the reaction of u to y, for no servo is as fast
 LEAST_DELAY = 0.01
 ITERATIONS = 3  # of the variance of a prediction and the coefficients
+# s without a sample of y, over which a straight line serves; no prediction looks over a longer gap
+BRIDGED = 0.1
 MIN_RATIO = 5.0  # standard errors from which on the sign of Omega is certain
 
 
@@ -221,6 +224,21 @@ def _within(
     )
 
 
+def bridged(
+    t: FloatArray, values: FloatArray, period: float
+) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+    """Samples (N, m) with straight lines over gaps of at most BRIDGED, and which were recorded."""
+    missing = np.rint(np.diff(t) / period).astype(np.int64) - 1
+    counts = 1 + np.where(missing * period <= BRIDGED, np.maximum(missing, 0), 0)
+    before = np.repeat(np.arange(len(counts)), counts)
+    share = (np.arange(len(before)) - np.repeat(np.cumsum(counts) - counts, counts)) / counts[
+        before
+    ]
+    filled = np.append(t[before] + share * np.diff(t)[before], t[-1:])
+    columns = [np.interp(filled, t, column) for column in values.T] if len(t) else list(values.T)
+    return filled, np.stack(columns, axis=1), np.append(share == 0.0, np.ones(len(t[-1:]), bool))
+
+
 def _integral(t: FloatArray, steps: FloatArray, instants: FloatArray) -> FloatArray:
     """Integral from t[0] to the `instants` of a signal with the means `steps` from t to t."""
     sums = np.concatenate(
@@ -243,7 +261,10 @@ def _rows(
         _within(u, inputs, span),
         len(outputs),
     )
+    t, values, is_recorded = bridged(t, values, layout.period)
+    gaps = np.concatenate([[0], np.cumsum(np.diff(t) > BRIDGED + layout.period)])
     k = np.arange(layout.past, len(t))
+    k = k[is_recorded[k] & (gaps[k] == gaps[k - layout.past])]
     if len(t_u) > 1:
         k = k[(t[k] - layout.u_windows[-1][1] * layout.period >= t_u[0]) & (t[k] <= t_u[-1])]
     if len(t_u) < 2 or not len(k):

@@ -1,0 +1,172 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Finds the messages of a DataFlash log from a card that lost bytes.
+
+Source: ArduPilot, AP_Logger/LogStructure.h (log_Format). A packet has no checksum.
+"""
+
+import struct
+from collections.abc import Callable
+from typing import Any
+
+from pymavlink import DFReader
+
+from flight_log.vehicle_tables import Loss
+
+HEAD = b"\xa3\x95"
+FORMAT = 0x80  # identity of a packet that declares a format
+TAIL = 528  # bytes: with fewer at its end a log is whole (pymavlink, DFReader.py)
+
+
+class Packets(DFReader.DFReader_binary):
+    """The packets of a log that another packet or the end follows.
+
+    The index of pymavlink ends at the first unknown packet, as lost bytes leave one.
+    """
+
+    def init_arrays(self, progress_callback: Callable[[int], None] | None = None) -> None:
+        """Index the packets, and list the bytes without a packet."""
+        self.name_to_id: dict[str, int] = {}
+        self.id_to_name: dict[int, str] = {}
+        self.offsets: list[list[int]] = [[] for _ in range(256)]
+        # first byte, end, and the packet before
+        self.lost: list[tuple[int, int, int]] = []
+        here = before = 0
+        while here < self.data_len:
+            if length := self._length(here):
+                self.offsets[self.data_map[here + 2]].append(here)
+                before = here
+                here += length
+                continue
+            start = here
+            while here < self.data_len and not self._length(here):
+                here = self.data_map.find(HEAD, here + 1)
+                here = self.data_len if here < 0 else here
+            self.lost.append((start, here, before))
+        self.counts = [len(places) for places in self.offsets]
+        self._count = sum(self.counts)
+        self.offset = 0
+
+    init_arrays_fast = init_arrays
+
+    def _length(self, here: int) -> int:
+        """The length of the packet at a place in bytes; 0 without a whole packet there."""
+        form = self.formats.get(int.from_bytes(self.data_map[here + 2 : here + 3], "little"))
+        if self.data_map[here : here + 2] != HEAD or form is None:
+            return 0
+        end = here + form.len
+        if end > self.data_len or self.data_map[end : end + 2] not in (HEAD, b"", HEAD[:1]):
+            return 0
+        if form.type == FORMAT and not self._declare(self.data_map[here + 3 : end]):
+            return 0
+        return int(form.len)
+
+    def _declare(self, content: bytes) -> bool:
+        """Take the format that a packet declares; False for a damaged one."""
+        identity, length, *texts = struct.unpack(self.formats[FORMAT].msg_struct, content)
+        name, types, columns = map(DFReader.null_term, texts)
+        try:
+            form = DFReader.DFFormat(
+                identity, name, length, types, columns, oldfmt=self.formats.get(identity)
+            )
+        # pymavlink raises Exception itself for a format with unknown types.
+        except Exception:
+            return False
+        size = len(HEAD) + 1 + struct.calcsize(form.msg_struct)
+        if not name or size != length or len(form.columns) != len(types):
+            return False
+        self.formats[identity] = form
+        self.name_to_id[name] = identity
+        self.id_to_name[identity] = name
+        return True
+
+    def _stamp_ns(self, place: int) -> int:
+        """The stamp of the packet at a place; 0 of one without."""
+        self.offset = place
+        return round(1e3 * stamp_us(self._parse_next(), 0.0))
+
+    def loss(self) -> Loss | None:
+        """The bytes without a packet; None for a whole log."""
+        lost = self.lost
+        if lost and lost[-1][1] == self.data_len and lost[-1][1] - lost[-1][0] < TAIL:
+            lost = lost[:-1]
+        if not lost:
+            return None
+        count = sum(end - start for start, end, _ in lost)
+        places = f" at {len(lost)} places" if len(lost) > 1 else ""
+        return Loss(
+            f"{count} of {self.data_len} bytes{places} hold no message",
+            self._stamp_ns(lost[0][2]),
+            self._stamp_ns(lost[-1][2]),
+        )
+
+
+class Lines(DFReader.DFReader_text):
+    """The lines of a log as text that fit their format."""
+
+    offset: int
+
+    def init_arrays(self, progress_callback: Callable[[int], None] | None = None) -> None:
+        """Index the lines, and count those without a message."""
+        self.offsets: dict[str, list[int]] = {}
+        self.lost_us: list[float] = []  # the stamp before each line without a message
+        newest_us = 0.0
+        here: int = self.offset
+        self._count = 0
+        while 0 <= here < self.data_len:
+            end = self.data_map.find(b"\n", here)
+            end = self.data_len if end < 0 else end
+            line = self.data_map[here:end].strip()
+            if (message := self._message(here, line)) is not None:
+                newest_us = stamp_us(message, newest_us)
+                self.offsets.setdefault(message.get_type(), []).append(here)
+            elif line:
+                self.lost_us.append(newest_us)
+            self._count += bool(line)
+            here = end + 1
+        self.counts = {name: len(places) for name, places in self.offsets.items()}
+        self.offset = 0
+
+    def _parse_next(self) -> Any:
+        """The next message, behind damaged lines."""
+        while True:
+            start: int = self.offset
+            try:
+                return super()._parse_next()
+            # pymavlink raises Exception itself.
+            except Exception:
+                end = self.data_map.find(b"\n", start)
+                self.offset = self.data_len + 1 if end < 0 else end + 1
+
+    def _message(self, here: int, line: bytes) -> Any:
+        """The message of a line; None of a damaged one."""
+        try:
+            name, *values = line.decode().split(self.delimiter)
+            form = self.formats.get(name)
+            if form is None or len(values) < len(form.format):
+                return None
+            message = DFReader.DFMessage(form, values, False, self)
+            # Each value is converted.
+            message.to_dict()
+            if name == "FMT":
+                self.offset = here
+                self._parse_next()
+        # pymavlink raises Exception itself for a format with unknown types.
+        except Exception:
+            return None
+        return message
+
+    def loss(self) -> Loss | None:
+        """The lines without a message; None for a whole log."""
+        if not self.lost_us:
+            return None
+        what = f"{len(self.lost_us)} of {self._count} lines hold no message"
+        return Loss(what, round(1e3 * self.lost_us[0]), round(1e3 * self.lost_us[-1]))
+
+
+def stamp_us(message: Any, before_us: float) -> float:
+    """The stamp of a message, us; `before_us` of one without, as MODE of 2014 and before.
+
+    Such logs have ms.
+    """
+    return float(getattr(message, "TimeUS", 1e3 * getattr(message, "TimeMS", 1e-3 * before_us)))

@@ -1,0 +1,115 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Finds the messages of a ULog from a card that lost bytes.
+
+Source: PX4 guide, ULog file format: before a message are its size, 16 bits, and its type.
+"""
+
+import struct
+from types import MappingProxyType
+from typing import NamedTuple
+
+from flight_log.vehicle_tables import Loss
+
+HEAD = 16  # bytes: magic, version and time
+MESSAGE = struct.Struct("<HB")  # size and type
+DATA, SUBSCRIPTION, FLAGS = b"DAB"
+LEAST = MappingProxyType(
+    {FLAGS: 40, SUBSCRIPTION: 4, DATA: 10}
+    | {ord("S"): 8, ord("O"): 2, ord("L"): 9, ord("C"): 11, ord("R"): 2}
+    | dict.fromkeys(b"FIMPQ", 3)
+)
+"""The least bytes of a message, by its type."""
+
+LARGEST = 10_000  # bytes, of a message (pyulog, core.py)
+APPENDED = slice(HEAD + MESSAGE.size + 16, HEAD + MESSAGE.size + 40)  # offsets, of FLAGS
+TAIL = 528  # bytes: with fewer at its end a log is whole, cut inside a message
+
+
+class Messages(NamedTuple):
+    """The messages of a ULog as a ULog without other bytes, and the loss."""
+
+    content: bytes
+    loss: Loss | None
+
+
+def whole_messages(content: bytes) -> Messages:
+    """The messages that another message or the end follows.
+
+    The content is unchanged without lost bytes, and with appended parts, which offsets name.
+    """
+    if any(content[APPENDED]) and content[HEAD + 2 : HEAD + 3] == b"B":
+        return Messages(content, None)
+    log = _Log(content)
+    parts = [content[:HEAD]]
+    lost: list[tuple[int, int, int]] = []  # first byte, end, and the stamp before, us
+    here = HEAD
+    while here < len(content):
+        if end := log.end_of(here):
+            log.take(here, end)
+            parts.append(content[here:end])
+            here = end
+            continue
+        start = here
+        while here < len(content) and not log.end_of(here):
+            here += 1
+        lost.append((start, here, log.stamp_us))
+    if lost and lost[-1][1] == len(content) and lost[-1][1] - lost[-1][0] < TAIL:
+        lost.pop()
+    if not lost:
+        return Messages(content, None)
+    count = sum(end - start for start, end, _ in lost)
+    places = f" at {len(lost)} places" if len(lost) > 1 else ""
+    what = f"{count} of {len(content)} bytes{places} hold no message"
+    return Messages(b"".join(parts), Loss(what, 1000 * lost[0][2], 1000 * lost[-1][2]))
+
+
+class _Log:
+    """What the messages so far tell of the next ones."""
+
+    def __init__(self, content: bytes) -> None:
+        self._content = content
+        self._sizes: dict[int, int] = {}  # of the data by number; 0 before the first
+        self.stamp_us = 0  # of the newest data
+
+    def end_of(self, here: int) -> int:
+        """The end of the whole message at a place; 0 without one."""
+        size = self._size(here)
+        end = here + MESSAGE.size + size
+        if not size or end > len(self._content):
+            return 0
+        is_last = len(self._content) - end < MESSAGE.size
+        subscribes = self._content[here + 2] == SUBSCRIPTION
+        number = self._number(here, 1) if subscribes else None
+        return end if is_last or self._size(end, number) else 0
+
+    def _size(self, here: int, subscribed: int | None = None) -> int:
+        """The size by the head of a message, bytes; 0 of a head that no message has.
+
+        `subscribed`: the number of data that the message before subscribes.
+        """
+        if here + MESSAGE.size + 2 > len(self._content):
+            return 0
+        size, kind = MESSAGE.unpack_from(self._content, here)
+        if not LEAST.get(kind, LARGEST + 1) <= size <= LARGEST:
+            return 0
+        if kind == DATA:
+            number = self._number(here, 0)
+            unknown = 0 if number == subscribed else -1
+            if self._sizes.get(number, unknown) not in (0, size):
+                return 0
+        return int(size)
+
+    def _number(self, here: int, place: int) -> int:
+        start = here + MESSAGE.size + place
+        return int.from_bytes(self._content[start : start + 2], "little")
+
+    def take(self, here: int, end: int) -> None:
+        """Take a whole message."""
+        kind = self._content[here + 2]
+        if kind == SUBSCRIPTION:
+            self._sizes.setdefault(self._number(here, 1), 0)
+        elif kind == DATA:
+            self._sizes[self._number(here, 0)] = end - here - MESSAGE.size
+            start = here + MESSAGE.size + 2
+            self.stamp_us = int.from_bytes(self._content[start : start + 8], "little")
