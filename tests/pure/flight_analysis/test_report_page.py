@@ -24,6 +24,8 @@ from flight_core.tape import Signal, Tape
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")]
 DRAWN = "Number(document.body?.dataset.drawn ?? 0)"  # counts the views of all figures
+# of a value on the page: plotting.MANTISSA, and float32
+RESOLUTION = 2.0**-15.9
 PLOTS = "[...document.querySelectorAll('figure > div')]"
 
 
@@ -71,14 +73,20 @@ def zoom(browser: Browser, start: float, stop: float, plot: int = 0) -> None:
     browser.wait_for(f"{DRAWN} > {before}")
 
 
-def curve(browser: Browser, plot: int, name: str, row: int = 1) -> tuple[list[float], list[float]]:
-    """Instants and values of a drawn curve."""
-    axis = "y" if row == 1 else f"y{row}"
-    errors = (
-        f"{PLOTS}[{plot}]._fullData.find(trace => trace.name === '{name}' && trace.yaxis "
-        f"=== '{axis}')"
+def curve(
+    browser: Browser, plot: int, name: str, channel: str = "q"
+) -> tuple[list[float], list[float]]:
+    """Instants and values of a drawn curve, in the row of a channel."""
+    layout = f"{PLOTS}[{plot}]._fullLayout"
+    axis = (
+        f"Object.keys({layout}).find(key => /^yaxis/.test(key) && {layout}[key].title.text"
+        f".startsWith('{channel} ')).replace('axis', '')"
     )
-    x, y = browser.run(f"(trace => [[...trace.x], [...trace.y]])({errors})")
+    drawn = (
+        f"{PLOTS}[{plot}]._fullData.find(trace => trace.name === '{name}' && trace.yaxis "
+        f"=== {axis})"
+    )
+    x, y = browser.run(f"(trace => [[...trace.x], [...trace.y]])({drawn})")
     return x, y
 
 
@@ -117,9 +125,8 @@ def test_zoom_shows_every_sample_in_all_figures(
         inside = [t for t in x if 2.0 <= t <= 2.1]
         assert inside == pytest.approx(np.arange(51) * 0.002 + 2.0, abs=1e-9)  # 500 Hz
     t = servo.tape.time("y")
-    x, values = curve(browser, 0, "y", row=2)
-    # plotting.MANTISSA, and float32
-    assert values == pytest.approx(np.interp(x, t, y["V"]), rel=2.0**-15.9)
+    x, values = curve(browser, 0, "y", "V")
+    assert values == pytest.approx(np.interp(x, t, y["V"]), rel=RESOLUTION)
     assert (
         browser.run(f"{PLOTS}.slice(0, 3).map(plot => plot._fullLayout.xaxis4.range)")
         == [[2.0, 2.1]] * 3
@@ -178,7 +185,8 @@ def test_zoom_keeps_peaks_of_each_pixel(
     for start, stop in ((0.0, 80.0), (50.0, 70.0), (60.0, 60.01)):
         zoom(browser, start, stop)
         _, y = curve(browser, 0, "y")
-        assert max(y) == pytest.approx(np.degrees(5.0))  # within half a view of each
+        # within half a view of each
+        assert max(y) == pytest.approx(np.degrees(5.0), rel=RESOLUTION)
         assert len(y) < 5000
 
 
