@@ -194,7 +194,11 @@ def test_report_opens_with_track_of_numbered_legs_and_fence(
         trace.name: trace
         for trace in drawn(guided_figures.track_figure(flight.tape, routes, 25.0, fence)).data
     }
-    assert list(traces["legs"].text) == ["0", "2", "4", "6", "7"]  # the fillets are 1, 3, 5
+    assert list(traces["legs"].text) == list("01234567")
+    fillet = routes[0].legs[1]
+    assert isinstance(fillet, Arc)
+    number = traces["legs"].y[1], traces["legs"].x[1]
+    assert math.dist(number, fillet.centre) == approx(abs(fillet.radius))
     assert (traces["start and end"].y[0], traces["start and end"].x[0]) == approx(
         (0.0, 0.0), abs=1.0
     )

@@ -22,7 +22,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report import comparison, figures, html, plotting
-from flight_analysis.report.display_units import DisplayUnit, state_units
+from flight_analysis.report.display_units import DisplayUnit, display_units, state_units
 from flight_analysis.report.html import write_page
 from flight_analysis.report.plotting import Figure, PlotContext
 from flight_analysis.report.spectra import spectra
@@ -426,15 +426,19 @@ def test_channels_of_page_and_tables_are_in_order_of_the_controller(servo: Scena
     labels = ["q (deg/s)", "p (deg/s)", "r (deg/s)", "V (m/s)"]
     assert titles(figures.tracking_figure(context_of_one)) == labels
     assert titles(figures.error_figure(context_of_one)) == labels
-    assert titles(figures.integral_figure(context_of_one))[::2] == [f"∫e {name}" for name in order]
+    integrals = ["∫e q (deg)", "∫e p (deg)", "∫e r (deg)", "∫e V (m)"]
+    assert titles(figures.integral_figure(context_of_one))[::2] == integrals
 
 
 def test_states_have_units_and_angles_are_in_degrees(servo: Scenario) -> None:
     """One degree of alpha is drawn as 1."""
     truth = held(x__alpha=DEG, x__theta=2.0 * DEG, x__q=3.0 * DEG, x__V=4.0)
-    figure = figures.state_figure(context(flight(truth=truth)), state_units(servo))
+    labels = {"V": "V - 25 (m/s)"}
+    units = display_units(servo)
+    figure = figures.state_figure(context(flight(truth=truth), units), state_units(servo), labels)
     curves = dict(zip(titles(figure), drawn(figure).data, strict=True))
-    expected = {"V (m/s)": 4.0, "alpha (deg)": 1.0, "q (deg/s)": 3.0, "theta (deg)": 2.0}
+    expected = {"q (deg/s)": 3.0, "V - 25 (m/s)": 4.0, "alpha (deg)": 1.0, "theta (deg)": 2.0}
+    assert list(curves) == list(expected)  # outputs first, in their order
     assert {title: curve.y[0] for title, curve in curves.items()} == pytest.approx(expected)
 
 

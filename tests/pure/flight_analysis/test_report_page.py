@@ -138,6 +138,37 @@ def test_zoom_shows_every_sample_in_all_figures(
     assert browser.console == []
 
 
+def test_labels_of_intervals_are_apart_on_a_narrow_screen(
+    browser: Browser, tmp_path: Path, servo: RecordedFlight
+) -> None:
+    """Two gusts of the default flight are 6 s apart, of 60 s: a tenth of a phone's figure."""
+    scenario = find_scenario("osprey_servo")
+    tape = servo.tape["y"]
+    stamps = np.arange(6000, dtype=np.int64) * 10_000_000
+    still = Signal(stamps, tape.names, np.zeros((6000, 4)))
+    # a simulated flight has `truth`
+    truth = Signal(stamps, ("x.q",), np.zeros((6000, 1)))
+    path = tmp_path / "gusts.html"
+    tape_of_gusts = Tape({"y": still, "y_m": still, "truth": truth})
+    write_page(path, [recorded("gusts", scenario, tape_of_gusts)])
+    labels = (
+        f"[...{PLOTS}[0].querySelectorAll('.annotation-text')].map(text => "
+        "[text.textContent, text.getBoundingClientRect().left, "
+        "text.getBoundingClientRect().right])"
+    )
+    screen = {"height": 800, "deviceScaleFactor": 1, "mobile": False}
+    open_page(browser, path)
+    assert [label[0] for label in browser.run(labels)] == ["vertical gust", "lateral gust"]
+    browser.call("Emulation.setDeviceMetricsOverride", width=400, **screen)
+    browser.wait_for(f"{labels}.length === 1")
+    ((text, left, right),) = browser.run(labels)
+    assert text == "vertical gust, lateral gust"
+    assert left >= 0.0
+    assert right <= 400.0
+    assert browser.run("document.documentElement.scrollWidth") <= 400
+    browser.call("Emulation.clearDeviceMetricsOverride")
+
+
 def test_replay_shows_pose_and_surfaces_of_flight(
     browser: Browser, page: Path, servo: RecordedFlight
 ) -> None:

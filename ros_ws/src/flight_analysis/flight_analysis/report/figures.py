@@ -219,10 +219,15 @@ def _is_same_curve(first: Curve, second: Curve) -> bool:
     return True
 
 
-def tracking_figure(context: PlotContext) -> Figure:
-    """Y over y_m of every output; of several flights over the distinct references."""
+def tracking_figure(
+    context: PlotContext, labels: Mapping[str, str] = MappingProxyType({})
+) -> Figure:
+    """Y over y_m of every output; of several flights over the distinct references.
+
+    `labels` of axes replace those of their channels.
+    """
     y = _curves(context, "y", lambda tape: tape.signals.get("y"))
-    return time_series_figure(context, _references(context) | y)
+    return time_series_figure(context, _references(context) | y, labels=labels)
 
 
 def error_figure(context: PlotContext, floors: Mapping[str, float] | None = None) -> Figure:
@@ -343,14 +348,18 @@ def integral_figure(context: PlotContext) -> Figure | None:
         return None
     internals = context.tape["internals"]
     outputs = in_order(internals.group("Pi").names, context.units)
-    channels: dict[str, str] = {}
-    for name in outputs:
-        channels |= {f"{label} {name}": f"{group}.{name}" for group, label in INTEGRALS.items()}
     if not outputs:
         return None
+    channels: dict[str, str] = {}
+    units: dict[str, DisplayUnit] = {}
+    for name in outputs:
+        channels |= {f"{label} {name}": f"{group}.{name}" for group, label in INTEGRALS.items()}
+        unit, factor = context.units.get(name, NO_UNIT)
+        integrated = unit.removesuffix("/s") if unit.endswith("/s") else f"{unit} s".strip()
+        units |= {f"∫e {name}": DisplayUnit(integrated, factor), f"Pi {name}": NO_UNIT}
     values = np.stack([internals[channel] for channel in channels.values()]).T
     curve = Curve(Signal(internals.stamp_ns, tuple(channels), values), PLANT)
-    return time_series_figure(context, {"": curve}, columns=2, height=120)
+    return time_series_figure(context._replace(units=units), {"": curve}, columns=2, height=120)
 
 
 BEYOND_END = 1.02  # of the length of a flight: the last bar is whole
@@ -503,13 +512,19 @@ def wind_figure(context: PlotContext) -> Figure | None:
     )
 
 
-def state_figure(context: PlotContext, units: Mapping[str, DisplayUnit]) -> Figure | None:
-    """The states of a simulated aircraft, in these units."""
+def state_figure(
+    context: PlotContext, units: Mapping[str, DisplayUnit], labels: Mapping[str, str]
+) -> Figure | None:
+    """The states of a simulated aircraft in these units, the outputs among them first.
+
+    `labels` of axes replace those of their channels.
+    """
     x = _truth_group(context.tape, "x")
-    context = context._replace(units=units)
-    if x.names:
-        return time_series_figure(context, {"x": Curve(x, PLANT)}, columns=2, height=130)
-    return None
+    outputs = {name: units[name] for name in context.units if name in units}
+    context = context._replace(units={**outputs, **units})
+    if not x.names:
+        return None
+    return time_series_figure(context, {"x": Curve(x, PLANT)}, columns=2, height=130, labels=labels)
 
 
 def sensor_figure(context: PlotContext) -> Figure | None:

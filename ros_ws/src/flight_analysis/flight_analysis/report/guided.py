@@ -330,7 +330,7 @@ def mission_drawing(section: GuidanceConfig, routes: Sequence[Route]) -> dict[st
     legs: list[list[float]] = []
     outline: list[Any] = []
     for route in routes:
-        legs += [[number, *place] for number, place in leg_places(route).items()]
+        legs += [[number, *place] for number, place in enumerate(leg_places(route))]
         outline += route_outline(route)
     fence = [zone.model_dump() for zone in section.fence.values()]
     return {
@@ -394,6 +394,20 @@ def control_errors(tape: Tape) -> dict[str, FloatArray]:
     # V of y is a deviation from the trim speed V0, and so is that of u_m: V_c - V0.
     V = log["y.V"] - log["u_m.V"] if "y.V" in log.names else flown_speed(tape, 0.0) - log["V_c"]
     return errors | {"xtrack": log["xtrack"], "V": V}
+
+
+def distance(tape: Tape) -> float | None:
+    """Length of the path over ground, the integral of the speed over ground, m; None unlogged."""
+    pose = tape.signals.get("pose")
+    if pose is None or not {"v_north", "v_east"} <= set(pose.names):
+        return None
+    return float(np.trapezoid(np.hypot(pose["v_north"], pose["v_east"]), tape.time("pose")))
+
+
+def top_speed(tape: Tape, trim: float) -> float | None:
+    """Largest airspeed by y, m/s, with `trim` added; None without V in y."""
+    y = tape.signals.get("y")
+    return None if y is None or "V" not in y.names else trim + float(np.max(y["V"]))
 
 
 def flown_speed(tape: Tape, trim: float) -> FloatArray:

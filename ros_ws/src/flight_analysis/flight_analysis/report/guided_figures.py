@@ -19,6 +19,7 @@ from flight_analysis.report.figures import END_STOP, ERROR, MODE_COLOURS, PLANT,
 from flight_analysis.report.guided import flown_speed
 from flight_analysis.report.plotting import (
     INTERVAL_OPACITY,
+    PAPER,
     Curve,
     Figure,
     Interval,
@@ -109,17 +110,19 @@ def track_figure(
     return set_layout(figure, labels=16)
 
 
-def _add_labels(
-    figure: Figure, name: str, east: Any, north: Any, mode: str = "markers+text", **style: Any
-) -> None:
-    style |= {"textposition": "top center", "hoverinfo": "skip", "showlegend": False}
-    figure.add_scatter(name, east, north, mode=mode, **style)
+def _add_labels(figure: Figure, name: str, east: Any, north: Any, **style: Any) -> None:
+    style = {"textposition": "top center", "hoverinfo": "skip", "showlegend": False, **style}
+    figure.add_scatter(name, east, north, mode="markers+text", **style)
 
 
 def _add_numbers(figure: Figure, route: Route) -> None:
     places = leg_places(route)
-    north, east = (np.array(values) for values in zip(*places.values(), strict=True))
-    _add_labels(figure, "legs", east, north, "text", text=[f"{number}" for number in places])
+    north, east = (np.array(values) for values in zip(*places, strict=True))
+    disc = {"color": PAPER, "size": 17, "line": {"color": REFERENCE, "width": 1.5}}
+    numbers = [f"{number}" for number in range(len(places))]
+    _add_labels(
+        figure, "legs", east, north, text=numbers, marker=disc, textposition="middle center"
+    )
 
 
 def _add_fence(figure: Figure, fence: Fence) -> None:
@@ -257,7 +260,7 @@ def cross_track_figure(context: PlotContext) -> Figure | None:
     for leg in np.unique(legs[legs >= 0.0]):
         colour = END_STOP if leg % 2 else "#ffffff"
         spans += [
-            Interval(f"leg {int(leg)}", *span, colour, True) for span in mask_spans(t, legs == leg)
+            Interval(f"{int(leg)}", *span, colour, True) for span in mask_spans(t, legs == leg)
         ]
     return time_series_figure(context._replace(intervals=[*context.intervals, *spans]), {"": error})
 

@@ -22,6 +22,7 @@ from flight_analysis.linear_loop.loop_margins import LinearLoop, loop_margins
 from flight_analysis.report import (
     comparison,
     figures,
+    guided,
     guided_figures,
     margin_figures,
     plotting,
@@ -263,7 +264,15 @@ def _condition_group(flights: Sequence[RecordedFlight], labels: Sequence[str]) -
 
 
 def _description(flight: RecordedFlight, scenario: Scenario) -> str:
-    return f"{scenario.aircraft.airframe}, {time_flown(flight.summary)}"
+    """Airframe, duration, distance and top speed."""
+    parts = [scenario.aircraft.airframe, time_flown(flight.summary)]
+    distance = guided.distance(flight.tape)
+    if distance is not None:
+        parts.append(f"{distance / 1e3:.2f} km over ground")
+    speed = guided.top_speed(flight.tape, scenario.aircraft.channels().speed)
+    if speed is not None:
+        parts.append(f"at most {speed:.1f} m/s")
+    return ", ".join(parts)
 
 
 def _law(scenario: Scenario) -> str:
@@ -272,12 +281,10 @@ def _law(scenario: Scenario) -> str:
     return f"At {controller.rate:g} Hz with the {controller.summary()}"
 
 
-def _about_trim(scenario: Scenario) -> str:
-    """What V means in a figure of y."""
+def _about_trim(scenario: Scenario) -> dict[str, str]:
+    """What stands in place of V in a figure of y: the airspeed less that of trim."""
     channels = scenario.aircraft.channels()
-    if "V" not in channels.outputs:
-        return ""
-    return f"V is the airspeed less that of trim, {channels.speed:g} m/s"
+    return {"V": f"V - {channels.speed:g} (m/s)"} if "V" in channels.outputs else {}
 
 
 def _sections(
@@ -287,9 +294,10 @@ def _sections(
     limits = figures.input_limits(scenario, flight.tape)
     spectrum = figures.spectrum_figure(context)
     trim = _about_trim(scenario)
+    about = "V is the airspeed; its value at trim is subtracted." if trim else ""
     return [
         *_guidance_sections(flight, scenario, context),
-        Section("Output y over the reference y_m", trim, figures.tracking_figure(context)),
+        Section("Output y over the reference y_m", about, figures.tracking_figure(context, trim)),
         Section(
             "Tracking error e = y - y_m",
             "The noise floor is drawn where it is wide enough to see.",
@@ -308,11 +316,10 @@ def _sections(
             figures.learned_figure(context, learned_lines(flight.tape, scenario)),
         ),
         Section("Wind", "along the body axes of trim", figures.wind_figure(context)),
-        Section("States", trim, figures.state_figure(context, state_units(scenario))),
+        Section("States", about, figures.state_figure(context, state_units(scenario), trim)),
         Section(
             "Integrals of the law",
-            f"{_law(scenario)}. Integrals of e, in SI times s; Pi, of the sign term, in scaled "
-            "inputs",
+            f"{_law(scenario)}. Pi, the integral of the sign term, is in scaled inputs.",
             figures.integral_figure(context),
         ),
         Section("Error of the sensors", "y less the true output", figures.sensor_figure(context)),
@@ -388,7 +395,9 @@ def _guidance_sections(
         ),
         Section("Attitude over its commands", "", guided_figures.attitude_figure(context, bounds)),
         Section(
-            "Cross-track error", "positive to the right", guided_figures.cross_track_figure(context)
+            "Cross-track error",
+            "Positive to the right. Numbers: legs of the route.",
+            guided_figures.cross_track_figure(context),
         ),
     ]
 

@@ -313,7 +313,7 @@ def nyquist_figure(loops: Mapping[str, LinearLoop]) -> Figure:
     There is a subplot an input, with the loops by label.
     """
     inputs = _inputs(loops)
-    figure = Figure(len(inputs), min(len(inputs), 2), 420)
+    figure = Figure(len(inputs), min(len(inputs), 2), 420, spacing=0.08)
     turn = np.linspace(0.0, 2.0 * np.pi, 181)
     circles = {
         "abs(L) = 1": (np.cos(turn), np.sin(turn), UNIT_CIRCLE),

@@ -3,6 +3,8 @@
 
 const MARGIN = 0.5; // of the view, drawn on both sides of it for panning
 const SHEET = {width: 690, height: 0.72}; // pixels; scale of the height, so that two figures fit a sheet
+const LETTER = 0.6; // of the size of a font, the width of a letter
+const BETWEEN = 6; // pixels between two labels
 const DARK = JSON.parse(document.getElementById("dark").textContent);
 const scheme = matchMedia("(prefers-color-scheme: dark)");
 const figures = [...document.querySelectorAll("figure")].map(node => ({
@@ -83,6 +85,27 @@ async function views(data) { // of the traces that the page decimates, by index
     async ([index, {meta}]) => [index, view(await samples(meta.t), await samples(meta.v), wide, meta.most)])));
 }
 
+// ---- Labels of intervals
+
+function labelled(figure, {margin}, [from, to], width) { // the annotations; labels that would overlap are joined
+  const wide = width - margin.l - margin.r, joined = [], all = figure.annotations;
+  const fitted = (texts, left, size) => {
+    const whole = texts.join(", "), text = LETTER * size * whole.length > wide ? `${texts[0]} and ${texts.length - 1} more` : whole;
+    const long = LETTER * size * text.length;
+    return {texts, text, long, left: Math.max(Math.min(left, wide - long), 0)};
+  };
+  for (const label of all.filter(one => one.name === "interval" && one.x >= from && one.x < to)) {
+    let one = fitted([label.text], (label.x - from) / (to - from) * wide, label.font.size);
+    while (joined.length && joined.at(-1).left + joined.at(-1).long + BETWEEN > one.left) {
+      const before = joined.pop();
+      one = fitted([...before.texts, ...one.texts], before.left, label.font.size);
+    }
+    joined.push({...one, label});
+  }
+  const placed = joined.map(({label, text, left}) => ({...label, text, x: from + left / wide * (to - from)}));
+  return [...all.filter(one => one.name !== "interval"), ...placed];
+}
+
 // ---- Drawing
 
 const look = () => (scheme.matches ? "dark" : "light");
@@ -97,6 +120,8 @@ async function draw(figure, style) {
   const {data, layout} = specification(figure, style);
   for (const [index, {x, y}] of await views(data)) Object.assign(data[index], {x, y});
   if (range && figure.inTime) for (const axis of axes(layout)) layout[axis].range = [...range];
+  figure.annotations = layout.annotations ?? [];
+  if (figure.inTime) layout.annotations = labelled(figure, layout, layout.xaxis.range, figure.plot.clientWidth);
   await Plotly.newPlot(figure.plot, data, layout, {displaylogo: false, responsive: true, doubleClick: "reset"});
   if (figure.inTime) figure.plot.on("plotly_relayout", change => moved(figure, change));
 }
@@ -105,6 +130,7 @@ async function follow(figure) { // show the time range of the other figures
   const decimated = await views(figure.plot.data), all = [...decimated.values()];
   const traces = {x: all.map(one => one.x), y: all.map(one => one.y)};
   const ranges = Object.fromEntries(axes(figure.plot.layout).map(axis => [`${axis}.range`, [...range]]));
+  ranges.annotations = labelled(figure, figure.plot.layout, range, figure.plot.clientWidth);
   await Plotly.update(figure.plot, traces, ranges, [...decimated.keys()]);
 }
 
@@ -132,11 +158,19 @@ async function showAll() { // the figure nearest to the view first, which may be
   document.body.dataset.drawn = turn;
 }
 
+function resized() { // the labels of intervals by the new width; plotly moves all else
+  for (const figure of figures.filter(one => one.inTime && one.annotations?.length)) {
+    const {plot} = figure, {layout} = plot;
+    Plotly.relayout(plot, {annotations: labelled(figure, layout, layout.xaxis.range, plot.clientWidth)});
+  }
+}
+
 function print() { // light colours, width of a sheet; synchronous, for the browser does not wait
   for (const figure of figures) {
     const {data, layout} = specification(figure, "light"), current = figure.plot.data ?? data;
     for (const [index, {x, y}] of current.entries()) Object.assign(data[index], {x, y});
     if (range && figure.inTime) for (const axis of axes(layout)) layout[axis].range = [...range];
+    if (figure.inTime) layout.annotations = labelled(figure, layout, layout.xaxis.range, SHEET.width);
     for (const text of [layout, ...(layout.annotations ?? [])]) text.font.size *= SHEET.height;
     Object.assign(layout, {width: SHEET.width, height: SHEET.height * layout.height});
     figure.plot.style.height = "auto";
@@ -156,6 +190,7 @@ async function start() {
   await showAll();
   if (document.getElementById("replay-code")) await run("replay-code");
   scheme.addEventListener("change", showAll);
+  addEventListener("resize", resized, {passive: true});
   addEventListener("beforeprint", print);
   addEventListener("afterprint", showAll);
 }

@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from hashlib import blake2b
 from itertools import chain
+from types import MappingProxyType
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -35,9 +36,11 @@ MAX_STORED = 60_000
 # bits of a stored value, with the leading one: within 1 in 2^16, finer than a pixel and the 4
 # digits of a hover
 MANTISSA = 16
+COLUMN_WIDTH = 320  # pixels
 MIN_GAP_PERIODS = 10.0  # a curve is broken at a gap of this many median periods
 INTERVAL_OPACITY = 0.25
-LABEL_WIDTH = 0.08  # width of the label of an interval, as a fraction of the flight's duration
+INTERVAL_LABEL = 11  # pixels
+INTERVAL = "interval"  # name of its label, which the page places
 TRANSPARENT = "rgba(0,0,0,0)"
 PAPER = "#ffffff"
 INK = "#2b3640"
@@ -189,6 +192,8 @@ class Figure:
     def __init__(self, count: int, columns: int, height: int, spacing: float | None = None) -> None:
         self.rows = -(-count // columns)
         self.height = height
+        # px, below which the labels of a column would cover its neighbour; the page then scrolls it
+        self.least_width = COLUMN_WIDTH * columns if columns > 1 else 0
         across = 0.24 / columns
         between = min(0.14, 24.0 / (self.rows * height)) if spacing is None else spacing
         wide = (1.0 - across * (columns - 1)) / columns
@@ -224,11 +229,16 @@ def axis(name: str, index: int) -> str:
 
 
 def time_series_figure(
-    context: PlotContext, curves: Mapping[str, Curve], *, columns: int = 1, height: int = 150
+    context: PlotContext,
+    curves: Mapping[str, Curve],
+    *,
+    columns: int = 1,
+    height: int = 150,
+    labels: Mapping[str, str] = MappingProxyType({}),
 ) -> Figure:
     """A subplot of `height` pixels per channel, with the curves of the channel.
 
-    Two columns are filled row by row.
+    Two columns are filled row by row. `labels` of axes replace those of their channels.
     """
     names = dict.fromkeys(chain.from_iterable(curve.signal.names for curve in curves.values()))
     channels = in_order(names, context.units)
@@ -248,12 +258,13 @@ def time_series_figure(
                     "hovertemplate": f"%{{y:.4g}} {unit}",
                 }
                 figure.add(trace, index)
-        figure.y[index]["title"] = {"text": channel_label(channel, context.units)}
+        title = labels.get(channel) or channel_label(channel, context.units)
+        figure.y[index]["title"] = {"text": title}
         lowest = index + columns >= len(channels)
         figure.x[index] |= {"range": [0.0, context.end], "showticklabels": lowest}
         figure.x[index] |= {"title": {"text": "t (s)"}} if lowest else {}
         figure.x[index] |= {"matches": axis("x", followed)} if index != followed else {}
-    _shade_intervals(figure, context.intervals, columns, context.end)
+    _shade_intervals(figure, context.intervals, columns)
     figure.layout["hovermode"] = "x unified"
     return set_layout(figure, labels=16 if columns == 1 else 6)
 
@@ -282,9 +293,10 @@ def set_layout(figure: Figure, labels: int = 6, below: int = 40) -> Figure:
         "font": {"family": "system-ui, sans-serif", "size": 12, "color": INK},
         "paper_bgcolor": TRANSPARENT,
         "plot_bgcolor": TRANSPARENT,
-        "modebar": {"bgcolor": TRANSPARENT},
+        # beside the figure, where it covers no label
+        "modebar": {"bgcolor": TRANSPARENT, "orientation": "v"},
         "hoverlabel": {"bgcolor": PAPER, "font": {"color": INK}},
-        "margin": {"l": 80, "r": 20, "t": above, "b": below},
+        "margin": {"l": 80, "r": 36, "t": above, "b": below},
         "legend": {
             "orientation": "h",
             "x": 0.0,
@@ -392,9 +404,7 @@ def _instants(t_ns: NDArray[np.int64], steps: bool) -> Instants:
     return Instants(stamps, before + 1, width)
 
 
-def _shade_intervals(
-    figure: Figure, intervals: Sequence[Interval], columns: int, end: float
-) -> None:
+def _shade_intervals(figure: Figure, intervals: Sequence[Interval], columns: int) -> None:
     for interval in intervals:
         for column in range(columns):
             figure.layout["shapes"].append(
@@ -408,27 +418,14 @@ def _shade_intervals(
             )  # fmt: skip
     if columns > 1:
         return  # too narrow for labels
-    for start, text in _merged_labels(
-        [interval for interval in intervals if interval.labelled], end
-    ).items():
-        position = {"x": start, "xanchor": "left", "y": 1.0, "yref": "paper", "yanchor": "bottom"}
-        figure.layout["annotations"].append(
-            {"text": text, **position, "showarrow": False, "font": {"size": 11}}
-        )
+    for interval in sorted(intervals, key=lambda interval: interval.start):
+        if interval.labelled:
+            position = {"x": interval.start, "xanchor": "left", "y": 1.0, "yref": "paper"}
+            text = {"text": interval.label, "font": {"size": INTERVAL_LABEL}}
+            style = {"name": INTERVAL, "yanchor": "bottom", "showarrow": False}
+            figure.layout["annotations"].append({**position, **text, **style})
     for label, colour in {
         interval.label: interval.colour for interval in intervals if not interval.labelled
     }.items():
         mark = {"symbol": "square", "size": 12, "color": colour, "opacity": 2 * INTERVAL_OPACITY}
         figure.add_scatter(label, [None], [None], mode="markers", marker=mark, showlegend=True)
-
-
-def _merged_labels(intervals: Sequence[Interval], end: float) -> dict[float, str]:
-    """Labels of intervals by start, s. Overlapping labels are merged."""
-    labels: dict[float, str] = {}
-    for interval in sorted(intervals, key=lambda interval: interval.start):
-        start = next(
-            (start for start in labels if interval.start - start < LABEL_WIDTH * end),
-            interval.start,
-        )
-        labels[start] = f"{labels[start]}, {interval.label}" if start in labels else interval.label
-    return labels

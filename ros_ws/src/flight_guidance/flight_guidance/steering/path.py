@@ -359,17 +359,18 @@ def lengths_after(route: Route) -> list[float]:
     return [sum(lengths[number + 1 :]) for number in range(len(route.legs))]
 
 
-def leg_places(route: Route) -> dict[int, Point]:
-    """Where the number of a leg is drawn.
-
-    The middle of a line, the centre of a circle; fillets have no number.
-    """
-    places: dict[int, Point] = {}
-    for number, leg in enumerate(route.legs):
+def leg_places(route: Route) -> list[Point]:
+    """Where the number of each leg is drawn: the middle of a line or of an arc."""
+    places = []
+    point = route.start(0)[0]
+    for leg in route.legs:
         if isinstance(leg, Line):
-            places[number] = along(leg.start, leg.end, 0.5)
-        elif is_orbit(leg):
-            places[number] = leg.centre
+            places.append(along(leg.start, leg.end, 0.5))
+            point = leg.end
+        else:
+            points = outline(leg, point)
+            places.append(points[len(points) // 2])
+            point = points[-1]
     return places
 
 

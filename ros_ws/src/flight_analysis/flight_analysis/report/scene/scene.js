@@ -16,6 +16,7 @@ const WRAPPED = new Set(["phi", "psi"]); // in (-pi, pi]
 export const ON_ROUTE = 4; // flight_guidance.modes.modes.Lateral.ROUTE
 const IN_ORBIT = 3; // flight_guidance.modes.modes.Lateral.ORBIT
 const CLICK = 4; // px, that a pointer moves at most between down and up
+const MARK = 12; // px, of a text in the corner
 const MAX_WIND = 10; // m/s, drawn as one span
 
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
@@ -197,7 +198,10 @@ export class Scene {
     if (map) {
       this.legend = "";
       drawGround(ctx, see, this.shownMap, flight.info, colour);
-    } else this.grid(ctx, see, pose, flight, colour);
+    } else {
+      this.earth(ctx, eye, focal, width, height, colour);
+      this.grid(ctx, see, pose, flight, colour);
+    }
     this.route(ctx, see, flight, pose, colour);
     for (const beside of others) this.trail(ctx, see, beside.flight, Infinity, () => colour("--ghost"), 0.6);
     this.trail(ctx, see, flight, t, mode => MODE_COLOURS[mode] ?? colour("--plant"), 1);
@@ -252,6 +256,12 @@ export class Scene {
       if (altitude[this.seen.count] < this.seen.lowest) this.seen.lowest = altitude[this.seen.count];
     }
     return this.seen.lowest < Infinity ? this.seen.lowest : 0;
+  }
+
+  earth(ctx, eye, focal, width, height, colour) { // from the horizon down; the camera does not roll
+    const level = unit([eye.ahead[0], eye.ahead[1], 0]), horizon = height / 2 + focal * dot(level, eye.down) / dot(level, eye.ahead);
+    ctx.fillStyle = colour("--earth");
+    ctx.fillRect(0, horizon, width, Math.max(height - horizon, 0));
   }
 
   grid(ctx, see, {place}, flight, colour) { // below the lowest point, with a line down to it
@@ -352,12 +362,10 @@ export class Scene {
     ctx.lineWidth = 3;
     const start = plus(pose.place, along, -this.span / MAX_WIND);
     this.line(ctx, see, start, pose.place);
-    const at = see(start);
-    if (!at) return;
     ctx.fillStyle = colour("--bad");
     ctx.font = "12px system-ui, sans-serif";
-    ctx.textAlign = "center";
-    ctx.fillText(`wind ${Math.hypot(...gust).toFixed(1)} m/s`, at[0], at[1] - 6);
+    ctx.textAlign = "left";
+    ctx.fillText(`wind ${Math.hypot(...gust).toFixed(1)} m/s`, MARK, MARK + 6);
   }
 }
 
