@@ -39,12 +39,13 @@ from flight_guidance.steering.path import route_outline
 from flight_log.bag import BagWriter, LogAttachments
 from flight_log.disk import try_lock
 from flight_log.engagements import KEY_VALUE
+from flight_log.log_messages import MAX_TEXT
 from flight_log.named_vectors import typestore
 from flight_log.stored_messages import PARAMETER_EVENT, PARAMETER_EVENTS
 from flight_view import flight as followed_flight
 from flight_view import server as http
 from flight_view.background import read_background
-from flight_view.flight import MAX_TEXT, ROUTE_TYPE, Flight
+from flight_view.flight import ROUTE_TYPE, Flight
 from flight_view.series import Series
 from flight_view.server import FILES, Server, answer
 from flight_view.text import picture
@@ -291,7 +292,7 @@ def test_events_of_another_aircraft_are_not_shown(tmp_path: Path) -> None:
             )
     flight = Flight(tmp_path / "run")
     flight.update()
-    assert sorted(event[1:] for event in flight.events) == [
+    assert sorted(event[1:3] for event in flight.events) == [
         ("bridge", "ENGAGED one"),
         ("parameter", "controller: k_g = 2.5"),
     ]

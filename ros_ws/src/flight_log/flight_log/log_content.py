@@ -30,17 +30,11 @@ from flight_log.bag import (
 )
 from flight_log.clock import SINCE_EPOCH_NS, StampClock
 from flight_log.columns import Columns
-from flight_log.engagements import ENGAGEMENT, KEY_VALUE
-from flight_log.flight_processes import (
-    LOG,
-    READY,
-    ROSOUT,
-    UNNAMED,
-    SampleSpan,
-)
+from flight_log.flight_processes import UNNAMED, SampleSpan
 from flight_log.latency import TOPICS as TIMED_TOPICS
 from flight_log.latency import Times
 from flight_log.learning_messages import DIAGNOSTIC_ARRAY
+from flight_log.log_messages import StoredText, holds_texts
 from flight_log.named_vectors import (
     PATH,
     STAMP,
@@ -262,10 +256,8 @@ class LogContent:
         self.last_ns = 0  # log time of the last message
         self.known_end_ns = 0  # the latest log time in any index or metadata
         self.sent = defaultdict[str, list[Times]](list)  # of y and u by full topic name
-        self.lines: list[bytes] = []  # of /rosout: that a node is ready
+        self.texts: list[StoredText] = []  # what the log says in words
         self.diagnostics: list[bytes] = []  # of /diagnostics: those with an age of u
-        # Reports of bridges by full topic name: time of sending, ns, and message.
-        self.reports: dict[str, list[tuple[int, bytes]]] = {}
         self.times: Times | None = None  # of the last y or u of a chunk
         self.kinds: dict[str, str] = {}  # types of all topics, by full name
 
@@ -285,18 +277,14 @@ class LogContent:
                         self.sent[topic].append(self.times)
 
             return take
-        if topic == ROSOUT and type_name == LOG:
-            return lambda batch: self.lines.extend(
-                line for line in map(bytes, batch.data) if READY in line
-            )
         if topic == DIAGNOSTICS and type_name == DIAGNOSTIC_ARRAY:
             return lambda batch: self.diagnostics.extend(
                 data for data in map(bytes, batch.data) if IN_MESSAGE in data
             )
-        if topic.endswith(ENGAGEMENT) and type_name == KEY_VALUE:
-            reports = self.reports.setdefault(topic, [])
-            return lambda batch: reports.extend(
-                zip(map(self._time_of_stamps, batch.sent_ns), map(bytes, batch.data), strict=True)
+        if holds_texts(topic, type_name):
+            return lambda batch: self.texts.extend(
+                StoredText(topic, type_name, self._time_of_stamps(sent_ns), data)
+                for sent_ns, data in zip(batch.sent_ns, map(bytes, batch.data), strict=True)
             )
         return None
 

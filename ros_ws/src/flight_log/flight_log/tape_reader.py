@@ -30,6 +30,8 @@ from flight_log.clock import SINCE_EPOCH_NS, Leap, leap_note, recording_note, wi
 from flight_log.engagements import ENGAGEMENT, Engagement, engagements_of
 from flight_log.flight_processes import (
     INSTANCE,
+    READY,
+    ROSOUT,
     SampleSpan,
     admitted,
     flight_processes,
@@ -38,6 +40,7 @@ from flight_log.flight_processes import (
 from flight_log.latency import TOPICS as TIMED_TOPICS
 from flight_log.latency import latency
 from flight_log.log_content import ROUTE, LogContent, StoredFile, read_content
+from flight_log.log_messages import LogMessage, log_messages
 from flight_log.named_vectors import (
     JOINT_STATE,
     flight_start_ns,
@@ -59,7 +62,8 @@ class RecordedRun(NamedTuple):
     `metadata` holds the named sets of strings, `attachments` the files except the scenario.
     `latency` is that of the loop from y to u, `age_of_u` the age of u at the aircraft,
     `engagements` are the engagements of a bridge; None for a log without samples of the kind, or
-    without times of sending. `path` is where the log was read, `topics` are the types of all topics
+    without times of sending. `messages` are its warnings, errors, parameter changes, and those of
+    learning and of a bridge. `path` is where the log was read, `topics` are the types of all topics
     of the log by full name.
     """
 
@@ -73,6 +77,7 @@ class RecordedRun(NamedTuple):
     path: Path | None = None
     topics: Mapping[str, str] = {}
     age_of_u: Signal | None = None
+    messages: tuple[LogMessage, ...] = ()
 
     @property
     def account(self) -> Any:
@@ -161,11 +166,16 @@ def read_run(
         metadata=log.metadata,
         attachments=tuple(log.attachments),
         latency=None if has_step else latency(sending_times),
-        engagements=engagements_of(log.reports.get(f"{aircraft}{ENGAGEMENT}", [])),
+        engagements=engagements_of(
+            (text.sent_ns, text.data)
+            for text in log.texts
+            if text.topic == f"{aircraft}{ENGAGEMENT}"
+        ),
         namespace=aircraft,
         path=run,
         topics=log.kinds,
         age_of_u=age_of_u(log.diagnostics, aircraft),
+        messages=tuple(log_messages(log.texts, aircraft, tape.start_ns)),
     )
 
 
@@ -213,7 +223,8 @@ def _tape(
     ]
     outcome = read_outcome(log.metadata.get(OUTCOME))
     spans = _spans((name, topics[name].spans) for name in filled)
-    processes = flight_processes(spans, ready_times(log.lines), aircraft)
+    lines = (text.data for text in log.texts if text.topic == ROSOUT and READY in text.data)
+    processes = flight_processes(spans, ready_times(lines), aircraft)
     return Tape(
         signals,
         start_ns,

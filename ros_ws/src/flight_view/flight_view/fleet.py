@@ -9,7 +9,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from flight_core.rates import NANOSECONDS
-from flight_view.flight import POSE, Flight, PageEvent
+from flight_log.log_messages import LogMessage
+from flight_view.flight import POSE, Flight
 from flight_view.series import Series
 
 
@@ -18,7 +19,7 @@ class FleetView:
 
     def __init__(self, flights: Sequence[Flight]) -> None:
         self.flights = flights
-        self.events: list[PageEvent] = []
+        self.events: list[LogMessage] = []
         self.bands: Mapping[str, float] = {}
         self.models: Mapping[str, Any] = {}
 

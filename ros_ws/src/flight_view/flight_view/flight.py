@@ -12,7 +12,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Thread
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from mcap.records import Attachment, Metadata
@@ -34,9 +34,11 @@ from flight_guidance.routes.route_file import Waypoint
 from flight_log.bag import CHANNEL_UNITS, LOST_MESSAGES, SCENARIO_MEDIA_TYPE, full_names
 from flight_log.disk import is_locked
 from flight_log.engagements import ENGAGEMENT, KEY_VALUE
+from flight_log.flight_processes import LOG, ROSOUT
 from flight_log.follow import Follower, Messages
-from flight_log.learning_messages import DIAGNOSTIC_ARRAY, LEARNING, stamped_sentence
+from flight_log.learning_messages import DIAGNOSTIC_ARRAY, LEARNING
 from flight_log.log_content import StoredFile
+from flight_log.log_messages import LogMessage, bounded, log_message
 from flight_log.named_vectors import (
     JOINT_STATE,
     Decoder,
@@ -46,7 +48,7 @@ from flight_log.named_vectors import (
     tables,
     typestore,
 )
-from flight_log.stored_messages import PARAMETER_EVENT, PARAMETER_EVENTS, parameter_value
+from flight_log.stored_messages import PARAMETER_EVENT, PARAMETER_EVENTS
 from flight_log.tape_reader import read_run, topics_text
 from flight_view.background import Line
 from flight_view.description import (
@@ -59,12 +61,7 @@ from flight_view.description import (
 from flight_view.page_topics import GROUPS, IN_TICKS, LEARNED, RATES
 from flight_view.series import Series
 
-# rcl_interfaces/msg/Log: WARN=30.
-LOG = "/rosout"
-LOG_TYPE = "rcl_interfaces/msg/Log"
-WARN = 30
-CONTROL = "control"  # name of the node that carries out the requests of a page
-SHARED = (LOG, PARAMETER_EVENTS)  # topics of all aircraft
+SHARED = (ROSOUT, PARAMETER_EVENTS)  # topics of all aircraft
 POSE = "pose"
 ROUTE = "route"
 ROUTE_TYPE = "nav_msgs/msg/Path"
@@ -75,17 +72,7 @@ MAX_NOTES = 50
 MAX_CHANNELS = 200
 MAX_SPANS = 200
 BATCH = 2000  # messages that are decoded together
-MAX_TEXT = 400  # characters of a text from the log
-MAX_VALUES = 16  # of a parameter: one a channel, not a matrix
 SILENT = 1.0  # s without a sample after which the state is "no data"
-
-
-class PageEvent(NamedTuple):
-    """An event of the flight. `stamp_ns` as in the samples, or by the clock of the host."""
-
-    stamp_ns: int
-    kind: str  # "mode", "warning", "error", "parameter", "route", "learning", "bridge" or "control"
-    text: str
 
 
 @dataclass
@@ -118,7 +105,7 @@ class Flight:
         self._remaps = remaps
         self.name = printable(run.stem if run.is_file() else run.resolve().name)
         self.samples: dict[str, Series] = {}  # by topic
-        self.events: list[PageEvent] = []
+        self.events: list[LogMessage] = []
         # What a page shows beside the samples, ready for JSON: the names of modes; `described`
         # once the scenario is read.
         self.description: dict[str, Any] = {
@@ -216,10 +203,10 @@ class Flight:
         follower = self._follower
         sentences = [*self.notes, *self._lacks]
         if follower.complete and not self.samples:
-            among = f" among {_text(topics_text(self._kinds))}" if self._kinds else ""
+            among = f" among {bounded(topics_text(self._kinds))}" if self._kinds else ""
             sentences.append(f"no sample of a flight{among}")
         if follower.fault:
-            sentences.append(f"the log cannot be read further: {_text(follower.fault)}")
+            sentences.append(f"the log cannot be read further: {bounded(follower.fault)}")
         if follower.damaged:
             sentences.append(f"{follower.damaged} damaged parts of the log are left out")
         if self._unreadable:
@@ -281,12 +268,12 @@ class Flight:
                 run = run._replace(scenario=self._given)
             account = log_account(run)
             lacks = () if account is None else account.notes()
-            self._lacks = [_text(sentence) for sentence in (*run.tape.notes, *lacks)]
+            self._lacks = [bounded(sentence) for sentence in (*run.tape.notes, *lacks)]
 
     def _rate_of(self, topic: str, type_name: str) -> float:
         if len(self._kinds) < MAX_CHANNELS:
             self._kinds[topic] = type_name
-        if (topic, type_name) in ((LOG, LOG_TYPE), (PARAMETER_EVENTS, PARAMETER_EVENT)):
+        if (topic, type_name) in ((ROSOUT, LOG), (PARAMETER_EVENTS, PARAMETER_EVENT)):
             return math.inf
         if topic.endswith(ENGAGEMENT) and type_name == KEY_VALUE:
             return math.inf
@@ -311,7 +298,7 @@ class Flight:
         return self._namespace in {None, namespace}
 
     def _note(self, sentence: str) -> None:
-        if (line := _text(sentence)) not in self.notes and len(self.notes) < MAX_NOTES:
+        if (line := bounded(sentence)) not in self.notes and len(self.notes) < MAX_NOTES:
             self.notes.append(line)
 
     def _take_record(self, record: Attachment | Metadata) -> None:
@@ -386,7 +373,7 @@ class Flight:
             topic.columns = np.array(columns[:MAX_CHANNELS], dtype=np.intp)
             narrower = self.samples.get(topic.name)
             samples = self.samples[topic.name] = Series(
-                tuple(_text(names[i]) for i in topic.columns)
+                tuple(bounded(names[i]) for i in topic.columns)
             )
             # Pages read the topic again.
             samples.thinned = 0 if narrower is None else narrower.thinned + 1
@@ -426,7 +413,7 @@ class Flight:
         digests = values[:, names.index("parameters")]
         is_engaged = values[:, names.index("mode")] == Mode.ENGAGED
         errors = {
-            _text(name[2:]): values[:, k]
+            bounded(name[2:]): values[:, k]
             for k, name in enumerate(names[:MAX_CHANNELS])
             if name.startswith("e.")
         }
@@ -458,7 +445,7 @@ class Flight:
             number = modes[k]
             is_mode = number in set(Mode)
             self._add_event(
-                PageEvent(
+                LogMessage(
                     int(stamp_ns[k]),
                     "mode",
                     Mode(int(number)).name if is_mode else f"mode {number:g}",
@@ -481,37 +468,16 @@ class Flight:
             except SerdeError:
                 self._unreadable += 1
                 continue
-            if messages.type_name == LOG_TYPE:
-                if message.level >= WARN:
-                    kind = "warning" if message.level == WARN else "error"
-                    self._add_event(PageEvent(sent_ns, kind, f"{message.name}: {message.msg}"))
-                elif message.name.rpartition(".")[2] == CONTROL:
-                    self._add_event(
-                        PageEvent(sent_ns, CONTROL, message.msg.removeprefix(f"{CONTROL}: "))
-                    )
-            elif messages.type_name == PARAMETER_EVENT:
-                # Before the first sample, starting nodes declare parameters.
-                new_parameters = message.new_parameters if self._first_ns is not None else []
-                changes = {
-                    entry.name: parameter_value(entry.value)
-                    for entry in (*new_parameters, *message.changed_parameters)
-                }
-                text = ", ".join(f"{name} = {_shown(value)}" for name, value in changes.items())
-                namespace, _, node = message.node.rpartition("/")
-                if text and self._shows(namespace):
-                    self._add_event(PageEvent(sent_ns, "parameter", f"{node}: {text}"))
-            elif messages.type_name == DIAGNOSTIC_ARRAY:
-                stamp_ns, sentence = stamped_sentence(message)
-                self._add_event(PageEvent(stamp_ns, LEARNING, sentence))
-            elif messages.type_name == ROUTE_TYPE:
+            if messages.type_name == ROUTE_TYPE:
                 if message.header.frame_id not in ROUTE_FRAMES:
                     continue
                 places = [stamped_pose.pose.position for stamped_pose in message.poses]
                 self._take_route(sent_ns, [Waypoint(place.y, place.x, place.z) for place in places])
-            else:
-                self._add_event(
-                    PageEvent(sent_ns, "bridge", f"{message.key} {message.value}".strip())
-                )
+                continue
+            has_begun = self._first_ns is not None
+            event = log_message(message, messages.type_name, sent_ns, has_begun=has_begun)
+            if event is not None and (event.namespace is None or self._shows(event.namespace)):
+                self._add_event(event)
 
     def _take_route(self, sent_ns: int, waypoints: Sequence[Waypoint]) -> None:
         """A route received in flight replaces the route before.
@@ -527,11 +493,11 @@ class Flight:
             # Guidance says so in the log.
             return
         self.described += 1
-        self._add_event(PageEvent(sent_ns, ROUTE, f"{len(waypoints)} waypoints"))
+        self._add_event(LogMessage(sent_ns, ROUTE, f"{len(waypoints)} waypoints"))
 
-    def _add_event(self, event: PageEvent) -> None:
+    def _add_event(self, event: LogMessage) -> None:
         if len(self.events) < MAX_EVENTS:
-            self.events.append(event._replace(text=_text(event.text)))
+            self.events.append(event._replace(text=bounded(event.text)))
         else:
             self._note(f"events after the first {MAX_EVENTS} are left out")
 
@@ -551,15 +517,3 @@ class Flight:
         columns = [k for k, name in enumerate(ticks.names) if name.startswith(f"{group}.")]
         names = tuple(ticks.names[k].removeprefix(f"{group}.") for k in columns)
         return Signal(ticks.stamp_ns, names, ticks.values[:, columns].astype(float))
-
-
-def _shown(value: Any) -> str:
-    """The value of a parameter; of a matrix its size."""
-    if isinstance(value, list) and len(value) > MAX_VALUES:
-        return f"{len(value)} values"
-    return str(value)
-
-
-def _text(text: str) -> str:
-    """A text from the log: printable and of bounded length."""
-    return printable(text)[:MAX_TEXT]

@@ -89,6 +89,7 @@ HISTOGRAM_BINS = 80
 FREQUENCIES = [digit * 10.0**power for power, digit in product(range(-4, 4), (1, 2, 5))]
 # share of the axis, about two pixels: shorter intervals are lengthened
 MIN_VISIBLE_FRACTION = 1 / 500
+MOST_MARKED = 100  # times of messages: plotly is slow with more shapes
 LIMIT_VIEW_RATIO = 3.0  # a limit is in view where it is at most this many times the largest u
 
 # lower and upper limit by input, SI; infinite without a limit
@@ -111,12 +112,14 @@ def plot_context(flights: Sequence[RecordedFlight]) -> PlotContext:
         intervals += gust_intervals(longest, gusts)
     if len(flights) == 1:
         intervals += mode_intervals(longest, end * MIN_VISIBLE_FRACTION)
+    of_one = flights[0].message_times if len(flights) == 1 else []
     return PlotContext(
         runs=runs_of(flights),
         units=common_units(flights),
         intervals=intervals,
         end=end,
         samples=SampleStore(),
+        messages=[time for time in dict.fromkeys(of_one) if 0.0 <= time <= end][:MOST_MARKED],
     )
 
 

@@ -35,6 +35,7 @@ from flight_analysis.report.display_units import (
     state_units,
 )
 from flight_analysis.report.flown_models import FILE, TRUE, FlownLoop, flown_loops, learned_lines
+from flight_analysis.report.parameter_rows import parameter_rows
 from flight_analysis.report.plotting import Curve, Figure, SampleStore, pack, time_series_figure
 from flight_analysis.report.replay_scene import Replay, replay_of
 from flight_analysis.report.summary import (
@@ -49,6 +50,7 @@ from flight_core.files import replacing
 from flight_core.vectors import FloatArray
 
 HERE = Path(__file__).parent
+MOST_MESSAGES = 500  # messages of a log on a page
 
 
 class TitleLine(NamedTuple):
@@ -73,6 +75,14 @@ class TableGroup(NamedTuple):
     colours: Sequence[str] = ()
 
 
+class MessageLine(NamedTuple):
+    """A message of the log, as text."""
+
+    time: str
+    kind: str
+    text: str
+
+
 class Section(NamedTuple):
     """A figure with a heading; left out without a figure."""
 
@@ -93,6 +103,8 @@ class Page(NamedTuple):
     samples: SampleStore
     notes: Sequence[str] = ()
     replay: Replay | None = None
+    messages: Sequence[MessageLine] = ()
+    parameters: tables.MetricTable | None = None
 
 
 def write_page(path: Path, flights: Sequence[RecordedFlight]) -> None:
@@ -187,7 +199,24 @@ def _flight_page(flight: RecordedFlight, scenario: Scenario) -> Page:
         samples=context.samples,
         notes=flight.summary["notes"],
         replay=replay_of(flight, context),
+        messages=_message_lines(flight),
+        parameters=_parameter_table(scenario),
     )
+
+
+def _message_lines(flight: RecordedFlight) -> list[MessageLine]:
+    """The messages of the log, at most MOST_MESSAGES."""
+    lines = [
+        MessageLine(f"{time:.2f} s", message.kind, message.text)
+        for time, message in zip(flight.message_times, flight.messages, strict=True)
+    ]
+    more = len(lines) - MOST_MESSAGES
+    return lines if more <= 0 else [*lines[:MOST_MESSAGES], MessageLine("", "", f"and {more} more")]
+
+
+def _parameter_table(scenario: Scenario) -> tables.MetricTable:
+    columns = [Column("", head) for head in ("flown", "default")]
+    return tables.MetricTable("", columns, parameter_rows(scenario))
 
 
 def _outcome_line(text: str, flight: RecordedFlight) -> TitleLine:

@@ -13,7 +13,7 @@ import zlib
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from hashlib import blake2b
-from itertools import chain
+from itertools import chain, product
 from types import MappingProxyType
 from typing import Any, NamedTuple, TypeVar
 
@@ -41,6 +41,7 @@ MIN_GAP_PERIODS = 10.0  # a curve is broken at a gap of this many median periods
 INTERVAL_OPACITY = 0.25
 INTERVAL_LABEL = 11  # pixels
 INTERVAL = "interval"  # name of its label, which the page places
+MESSAGE_LINE = {"color": "#7a6a00", "width": 1.2, "dash": "dot"}
 TRANSPARENT = "rgba(0,0,0,0)"
 PAPER = "#ffffff"
 INK = "#2b3640"
@@ -158,6 +159,7 @@ class PlotContext(NamedTuple):
     intervals: Sequence[Interval]
     end: float  # of the longest flight, s
     samples: SampleStore
+    messages: Sequence[float] = ()  # times of the messages of a log, s
 
     @property
     def tape(self) -> Tape:
@@ -265,6 +267,7 @@ def time_series_figure(
         figure.x[index] |= {"title": {"text": "t (s)"}} if lowest else {}
         figure.x[index] |= {"matches": axis("x", followed)} if index != followed else {}
     _shade_intervals(figure, context.intervals, columns)
+    _mark_messages(figure, context.messages, columns)
     figure.layout["hovermode"] = "x unified"
     return set_layout(figure, labels=16 if columns == 1 else 6)
 
@@ -429,3 +432,14 @@ def _shade_intervals(figure: Figure, intervals: Sequence[Interval], columns: int
     }.items():
         mark = {"symbol": "square", "size": 12, "color": colour, "opacity": 2 * INTERVAL_OPACITY}
         figure.add_scatter(label, [None], [None], mode="markers", marker=mark, showlegend=True)
+
+
+def _mark_messages(figure: Figure, times: Sequence[float], columns: int) -> None:
+    """A dotted line over every subplot for each message of the log."""
+    for time, column in product(times, range(columns)):
+        position = {"type": "line", "xref": axis("x", column), "yref": "paper", "y0": 0, "y1": 1}
+        figure.layout["shapes"].append(
+            {**position, "x0": time, "x1": time, "layer": "below", "line": MESSAGE_LINE}
+        )
+    if times and columns == 1:
+        figure.add_scatter("message of the log", [None], [None], line=MESSAGE_LINE, showlegend=True)

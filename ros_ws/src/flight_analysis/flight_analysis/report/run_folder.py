@@ -243,7 +243,14 @@ def _flight(recorded: RecordedRun, run: Path, outcome: Outcome | None) -> Record
             *summary["notes"],
         ]
     controllers = _controllers(recorded, tape, scenario)
-    return RecordedFlight(name, scenario, tape, summary, controllers=controllers)
+    return RecordedFlight(
+        name=name,
+        scenario=scenario,
+        tape=tape,
+        summary=summary,
+        controllers=controllers,
+        messages=recorded.messages,
+    )
 
 
 def _controllers(

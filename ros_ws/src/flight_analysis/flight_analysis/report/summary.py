@@ -61,10 +61,11 @@ from flight_analysis.report.tracking import saturation_notes
 from flight_core.modes import Mode
 from flight_core.outcome import End, Outcome
 from flight_core.parameters import ParameterError, require
-from flight_core.rates import period_ns
+from flight_core.rates import NANOSECONDS, period_ns
 from flight_core.tape import Tape, as_tape, refusal_note
 from flight_log.bag import COMPARED
 from flight_log.clock import SINCE_EPOCH_NS
+from flight_log.log_messages import LogMessage
 
 
 def pulse_edges(scenario: Scenario) -> list[Transient]:
@@ -110,6 +111,7 @@ class RecordedFlight(NamedTuple):
     si_units: Mapping[str, str] = {}  # by channel, of an imported flight
     # the parameters that flew, where they changed in flight
     controllers: tuple[FlownController, ...] = ()
+    messages: tuple[LogMessage, ...] = ()
 
     @property
     def period_ns(self) -> int:
@@ -124,6 +126,11 @@ class RecordedFlight(NamedTuple):
         if self.scenario is None:
             return {name: display_unit(unit) for name, unit in self.si_units.items()}
         return display_units(self.scenario)
+
+    @property
+    def message_times(self) -> list[float]:
+        """Flight times of the messages of the log, s."""
+        return [(message.stamp_ns - self.tape.start_ns) / NANOSECONDS for message in self.messages]
 
     @property
     def gusts(self) -> dict[str, tuple[float, float]]:

@@ -1,0 +1,43 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The parameters of a flight that have no default, or another value."""
+
+from collections.abc import Iterator
+
+from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario
+from flight_core.fields import REQUIRED
+from flight_core.parameters import Config, flatten
+from flight_log.log_messages import shown
+
+NONE = "none"
+LEFT_OUT = ("recorder.", "flight.")  # of the log and of the executable, not of the flight
+
+
+def parameter_rows(scenario: Scenario) -> list[tuple[str, str, str]]:
+    """Name, flown value and default of each parameter that differs from its default, SI.
+
+    Those without a default follow, with NONE.
+    """
+    rows: list[tuple[str, str, str]] = []
+    for section in SCHEMAS:
+        if (config := getattr(scenario, section)) is not None:
+            rows += _rows(config, f"{section}.")
+    flown = [row for row in rows if not row[0].startswith(LEFT_OUT)]
+    return sorted(flown, key=lambda row: row[2] == NONE)
+
+
+def _rows(config: Config, prefix: str) -> Iterator[tuple[str, str, str]]:
+    for name, field in type(config).model_fields.items():
+        value = getattr(config, name)
+        if isinstance(value, Config):
+            yield from _rows(value, f"{prefix}{name}.")
+        elif value != field.default:
+            has_default = field.default is not REQUIRED and field.default is not None
+            default = _text(field.default) if has_default else NONE
+            tree = config.model_dump()[name]
+            for key, flown in flatten({name: tree}):
+                yield f"{prefix}{key}", _text(flown), default
+
+
+def _text(value: object) -> str:
+    return shown(list(value) if isinstance(value, tuple) else value)
