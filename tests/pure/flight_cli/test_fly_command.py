@@ -4,7 +4,8 @@
 
 import errno
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -14,7 +15,7 @@ from tests.conftest import invoke
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.report import run_folder
 from flight_bringup.fly import fly_in_process
-from flight_cli import fly
+from flight_cli import fly, watch
 from flight_core.outcome import STATUS_ENDED_EARLY, STATUS_SHORTFALL, Outcome, never_flew
 from flight_core.parameters import ParameterError
 
@@ -88,3 +89,20 @@ def test_log_that_cannot_be_read_is_no_outcome(
 
     monkeypatch.setattr(fly, "write_report", unreadable)
     assert isinstance(fly_one_second(tmp_path).exception, ParameterError)
+
+
+@pytest.mark.parametrize(("cores", "is_warned"), [(2, True), (16, False)])
+def test_small_host_is_warned_of_a_browser_beside_the_flight(
+    cores: int, is_warned: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On two cores a browser without a GPU took samples from the flight, on 16 none."""
+
+    @contextmanager
+    def watched(*runs: Path, fleet: bool) -> Iterator[list[str]]:
+        yield ["page: http://127.0.0.1:8077", ""]
+
+    monkeypatch.setattr(watch, "watched", watched)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: set(range(cores)))
+    words = ["fly", "osprey_servo", "--watch", "--in-process", "--duration", "0.5"]
+    result = invoke(*words, "--runs", str(tmp_path))
+    assert (f"this host has {cores} cores: a browser" in result.stderr) is is_warned

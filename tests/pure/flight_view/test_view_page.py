@@ -87,14 +87,16 @@ def test_recorded_flight_drawn_and_asks_no_other_host(browser: Browser, recorded
             "[...document.querySelectorAll('#charts canvas')].map(one => "
             "one.getAttribute('aria-label'))"
         )
-        assert titles[:5] == [
+        assert titles[:6] == [
+            "altitude",
+            "V - 25: y over y_m",
             "q: y over y_m",
             "p: y over y_m",
             "r: y over y_m",
-            "V: y over y_m",
             "q: error e",
         ]
-        assert {"elevator", "wind", "altitude", "ticks: lateness"} <= set(titles)
+        assert {"elevator", "wind", "ticks: lateness"} <= set(titles)
+        assert browser.run("document.getElementById('modes').textContent") == "ENGAGED"
         for selector in ("#scene", "#horizon", "#timeline", "#charts canvas"):
             assert colours_of(browser, selector) > 5
         hosts = browser.run(

@@ -101,6 +101,24 @@ def test_nothing_is_off_the_screen(
     wide(browser, 1280)
 
 
+def test_all_values_are_above_the_fold_of_a_small_laptop(browser: Browser, routed: Path) -> None:
+    size = {"width": 1280, "height": 800, "deviceScaleFactor": 1, "mobile": False}
+    browser.call("Emulation.setDeviceMetricsOverride", **size)
+    with shown(browser, routed):
+        box = "document.querySelector('{}').getBoundingClientRect()"
+        fold = browser.run(f"{box.format('footer')}.top")
+        assert fold < 800.0
+        for part in ("#scene", "#airspeed", "#altitude", "#readouts", "#events"):
+            assert 0.0 < browser.run(f"{box.format(part)}.bottom") <= fold, part
+        titles = browser.run(
+            f"[...document.querySelectorAll('#charts canvas')].filter(one => "
+            f"one.getBoundingClientRect().bottom <= {fold}).map(one => "
+            "one.getAttribute('aria-label'))"
+        )
+        assert titles[:2] == ["altitude", "V - 25: y over y_m"]
+    wide(browser, 1280)
+
+
 def test_header_holds_flies_home_and_deactivates(
     browser: Browser, routed: Path, route: Scenario
 ) -> None:

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`rise-di fly`: fly a scenario over topics or in one process, then show its figures."""
 
+import os
 import sys
 from dataclasses import dataclass
 from functools import partial
@@ -51,6 +52,7 @@ from flight_core.parameters import ParameterError, require
 from flight_guidance.routes.route_file import ENDINGS, read_fence_file
 from flight_guidance.routes.route_formats import FENCES
 
+SPARE_CORES = 4  # with two the flight loses samples to a browser that draws without a GPU
 # Fields of a flight of one aircraft alone.
 OF_AIRCRAFT = (
     "settings",
@@ -237,6 +239,17 @@ class Fly(RouteWords):
         from flight_cli.watch import watched  # noqa: PLC0415 - loads the server, which few flights need
 
         print(*self.context.with_resource(watched(*runs, fleet=fleet)), sep="\n", file=sys.stderr)
+        _warn_of_browser()
+
+
+def _warn_of_browser() -> None:
+    """On a host without cores to spare, say what a browser beside the flight takes."""
+    cores = len(os.sched_getaffinity(0))
+    if cores < SPARE_CORES:
+        warn(
+            f"this host has {cores} cores: a browser on it takes a third of one or more from the "
+            "flight. From another machine it takes none: docs/live-view.md"
+        )
 
 
 def _report(scenario: Scenario, run: Path, outcome: Outcome, *, as_json: bool) -> int:

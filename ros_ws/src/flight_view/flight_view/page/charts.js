@@ -85,7 +85,13 @@ export function chartsOf(flight, ghost) {
   const {units, limits} = flight.info;
   const unit = name => units[name] ?? {unit: "", factor: 1};
   const line = (topic, channel, label, colour, width, more = {}) => ({flight, topic, channel, label, colour, width, factor: 1, ...more});
-  const charts = guidanceCharts(flight, line);
+  const charts = guidanceCharts(flight, line), first = []; // a pilot's charts, altitude and speed
+  if (flight.get("pose")?.channels.includes("altitude")) {
+    const lines = [line("pose", "altitude", "altitude", "--plant", 1.4)];
+    if (flight.get("guidance")?.channels.includes("target.altitude")) lines.unshift(line("guidance", "target.altitude", "command", "--reference", 4));
+    if (ghost) lines.unshift(line("pose", "altitude", "of the ghost", "--ghost", 1.2, {flight: ghost, dash: [5, 3]}));
+    first.push({title: "altitude", unit: "m", lines});
+  }
   const names = group => flight.get("internals")?.group(group) ?? [];
   const outputs = names("y").length ? names("y") : flight.get("y")?.channels ?? [];
   for (const name of outputs) {
@@ -96,7 +102,8 @@ export function chartsOf(flight, ghost) {
     ];
     if (ghost) lines.splice(1, 0, line(...timed(ghost, `y.${name}`), "y of the ghost", "--ghost", 1.2, {factor, flight: ghost, dash: [5, 3]}));
     const referenced = names("y_m").length || flight.get("y_m");
-    charts.push({title: referenced ? `${name}: y over y_m` : name, unit: unit(name).unit, lines});
+    const isSpeed = name === "V", label = isSpeed && flight.info.speed ? `V - ${Number(flight.info.speed.toPrecision(4))}` : name; // about trim
+    (isSpeed ? first : charts).push({title: referenced ? `${label}: y over y_m` : label, unit: unit(name).unit, lines});
   }
   for (const name of names("e")) {
     const {factor, unit: text} = unit(name), band = flight.head.bands[name];
@@ -121,16 +128,10 @@ export function chartsOf(flight, ghost) {
     const colours = ["--plant", "--ghost", "--error"];
     charts.push({title: "wind", unit: "m/s", lines: winds.map((name, k) => line("truth", `gust.${name}`, name, colours[k % 3], 1.2))});
   }
-  if (flight.get("pose")?.channels.includes("altitude")) {
-    const lines = [line("pose", "altitude", "altitude", "--plant", 1.4)];
-    if (flight.get("guidance")?.channels.includes("target.altitude")) lines.unshift(line("guidance", "target.altitude", "command", "--reference", 4));
-    if (ghost) lines.unshift(line("pose", "altitude", "of the ghost", "--ghost", 1.2, {flight: ghost, dash: [5, 3]}));
-    charts.push({title: "altitude", unit: "m", lines});
-  }
   if (flight.get("internals")?.column("late")) {
     charts.push({title: "ticks: lateness", unit: "ms", lines: [line("internals", "late", "late", "--plant", 1, {factor: 1e3})]});
   }
-  return charts;
+  return [...first, ...charts];
 }
 
 function guidanceCharts(flight, line) { // attitude over its command, and the distance from the path, of a guided flight
@@ -304,8 +305,9 @@ function drawTitle(ctx, chart, drawn, [cursor, pointer], largest, width, colour)
 }
 
 // The timeline: the mode of the controller over the whole flight, gusts, events, the view and the cursor.
+// Returns the numbers of the modes on it.
 export function drawTimeline(canvas, flight, [from, to], view, cursor, colour) {
-  const {ctx, width, height} = prepared(canvas), x = t => LEFT / 6 + ((t - from) / (to - from)) * (width - LEFT / 3);
+  const found = new Set(), {ctx, width, height} = prepared(canvas), x = t => LEFT / 6 + ((t - from) / (to - from)) * (width - LEFT / 3);
   const strip = height - 22;
   const internals = flight.get("internals"), modes = internals?.column("mode");
   ctx.fillStyle = colour("--panel");
@@ -315,7 +317,8 @@ export function drawTimeline(canvas, flight, [from, to], view, cursor, colour) {
     for (let first = 0, k = 1; k <= chosen.length; k++) {
       if (k < chosen.length && modes[chosen[k]] === modes[chosen[first]]) continue;
       const start = x(internals.t[chosen[first]]), stop = x(internals.t[chosen[Math.min(k, chosen.length - 1)]]);
-      ctx.fillStyle = MODE_COLOURS[modes[chosen[first]]] ?? "#d62728";
+      found.add(modes[chosen[first]]);
+      ctx.fillStyle = modeColour(modes[chosen[first]]);
       ctx.fillRect(start, 4, Math.max(stop - start, 1.5), strip);
       first = k;
     }
@@ -342,7 +345,10 @@ export function drawTimeline(canvas, flight, [from, to], view, cursor, colour) {
     ctx.textAlign = x(value) < 12 ? "left" : x(value) > width - 12 ? "right" : "center";
     ctx.fillText(`${text} s`, x(value), height - 4);
   }
+  return [...found].sort();
 }
+
+export const modeColour = mode => MODE_COLOURS[mode] ?? "#d62728";
 
 function drawLegs(ctx, flight, [from, to], x, strip, colour) { // where a leg of the route begins, with its number where there is room
   const series = flight.get("guidance"), [legs, lateral] = ["leg", "mode.lateral"].map(name => series?.column(name));

@@ -1,6 +1,6 @@
 // The page: asks the server for news, keeps the time and the view, draws what has changed.
 import {MODE_COLOURS} from "./canvas.js";
-import {chartsOf, drawChart, drawTimeline, timeAt, timelineTime} from "./charts.js";
+import {chartsOf, drawChart, drawTimeline, modeColour, timeAt, timelineTime} from "./charts.js";
 import * as choice from "./choice.js";
 import {flyTo, offer, togglesFlyTo} from "./control.js";
 import {Flight} from "./data.js";
@@ -339,6 +339,18 @@ function drawReadouts() {
   Object.values(values).forEach((value, k) => text(node.children[2 * k + 1], value));
 }
 
+let shownModes = "";
+function drawModes(modes) { // the legend of the timeline
+  if (shownModes === `${modes}`) return;
+  shownModes = `${modes}`;
+  $("modes").replaceChildren(...modes.map(mode => {
+    const item = document.createElement("span"), square = document.createElement("i");
+    square.style.background = modeColour(mode);
+    item.append(square, flight.info.modes[""]?.[mode] ?? `mode ${mode}`);
+    return item;
+  }));
+}
+
 function drawEvents() { // in the order of time; the last one before the cursor is marked
   const node = $("events");
   if (shownEvents !== flight.events.length) {
@@ -392,7 +404,7 @@ function frame(now) {
       const {top, bottom} = chart.canvas.getBoundingClientRect();
       if (bottom > 0 && top < innerHeight) drawChart(chart.canvas, chart, flight, shown, clock.t, {selection, pointer}, colour);
     }
-    drawTimeline($("timeline"), flight, [begin(), Math.max(end(), begin() + 1)], shown, clock.t, colour);
+    drawModes(drawTimeline($("timeline"), flight, [begin(), Math.max(end(), begin() + 1)], shown, clock.t, colour));
     document.body.dataset.drawn = Number(document.body.dataset.drawn ?? 0) + 1;
   }
 }
