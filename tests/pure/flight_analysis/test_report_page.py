@@ -138,6 +138,36 @@ def test_zoom_shows_every_sample_in_all_figures(
     assert browser.console == []
 
 
+def test_angles_are_shown_in_rad_by_choice(
+    browser: Browser, page: Path, servo: RecordedFlight
+) -> None:
+    open_page(browser, page)
+    zoom(browser, 2.0, 2.1)
+    table = "[...document.querySelectorAll('.tables td')].filter(one => one.offsetParent)"
+    first = f"{table}.slice(0, 2).map(one => one.textContent)"
+    rms = servo.summary["errors"]["q"]["whole"]["rms"]
+    assert browser.run(first) == ["q (deg/s)", f"{np.degrees(rms):#.3g}"]
+    before = browser.run(DRAWN)
+    browser.run(
+        "void (document.getElementById('angles').value = 'rad', "
+        "document.getElementById('angles').dispatchEvent(new Event('change')))"
+    )
+    browser.wait_for(f"{DRAWN} > {before}")
+    assert browser.run(first) == ["q (rad/s)", f"{rms:#.3g}"]
+    x, values = curve(browser, 0, "y")
+    y = servo.tape["y"]
+    expected = np.interp(x, servo.tape.time("y"), y["q"])
+    assert values == pytest.approx(expected, rel=RESOLUTION, abs=1e-12)
+    titles = browser.run(
+        f"{PLOTS}.flatMap(plot => Object.entries(plot._fullLayout).filter(([key]) => "
+        "/^yaxis/.test(key)).map(([, axis]) => axis.title.text))"
+    )
+    # the phase of the linear loop alone is in degrees
+    assert {title for title in titles if "deg" in title} == {"phase (deg)"}
+    assert {"q (rad/s)", "alpha (rad)", "V - 25 (m/s)", "elevator (rad/√Hz)"} <= set(titles)
+    assert browser.console == []
+
+
 def test_labels_of_intervals_are_apart_on_a_narrow_screen(
     browser: Browser, tmp_path: Path, servo: RecordedFlight
 ) -> None:

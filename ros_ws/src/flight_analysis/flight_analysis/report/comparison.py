@@ -142,13 +142,18 @@ def has_same_conditions(
 
 
 def comparison_tables(
-    flights: Sequence[RecordedFlight], key: str, columns: Sequence[Column], *, lower_is_better: bool
+    flights: Sequence[RecordedFlight],
+    key: str,
+    columns: Sequence[Column],
+    *,
+    lower_is_better: bool,
+    units: Mapping[str, DisplayUnit] | None = None,
 ) -> list[ComparisonTable]:
     """Metrics of "errors" or "inputs" of the summaries: a table per channel.
 
-    A table has a row per column with a value.
+    A table has a row per column with a value. `units`: those of the flights by default.
     """
-    display = common_units(flights)
+    display = common_units(flights) if units is None else units
     same = has_same_conditions(flights)
     tables = []
     for channel in dict.fromkeys(chain.from_iterable(flight.summary[key] for flight in flights)):
@@ -163,12 +168,18 @@ def comparison_tables(
     return tables
 
 
-def error_tables(flights: Sequence[RecordedFlight]) -> list[ComparisonTable]:
-    """Metrics of the error and settling times, by channel."""
+def error_tables(
+    flights: Sequence[RecordedFlight], units: Mapping[str, DisplayUnit] | None = None
+) -> list[ComparisonTable]:
+    """Metrics of the error and settling times, by channel; `units` as in `comparison_tables`."""
     return [
         table._replace(rows=(*table.rows, *_settling_rows(flights, table.channel)))
         for table in comparison_tables(
-            flights, "errors", (*ERROR_COLUMNS, SWITCH_COLUMN), lower_is_better=True
+            flights,
+            "errors",
+            (*ERROR_COLUMNS, SWITCH_COLUMN),
+            lower_is_better=True,
+            units=units,
         )
     ]
 

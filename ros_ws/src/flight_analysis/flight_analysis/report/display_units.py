@@ -60,6 +60,16 @@ def display_units(scenario: Scenario) -> dict[str, DisplayUnit]:
     return {name: units[name] for name in first if name in units} | units
 
 
+def in_radians(units: Mapping[str, DisplayUnit]) -> dict[str, DisplayUnit]:
+    """The units with rad in place of deg, also in deg/s."""
+    return {
+        name: DisplayUnit(shown.unit.replace("deg", "rad"), 1.0)
+        if shown.unit.startswith("deg")
+        else shown
+        for name, shown in units.items()
+    }
+
+
 STATES = {
     **dict.fromkeys(("alpha", "beta", "phi", "theta", "psi"), "rad"),
     **dict.fromkeys(("p", "q", "r"), "rad/s"),

@@ -24,6 +24,7 @@ from flight_analysis.metrics import (
 )
 from flight_analysis.report.display_units import NO_UNIT, DisplayUnit, in_order
 from flight_analysis.report.plotting import (
+    SHOWS_ANGLES,
     Curve,
     Figure,
     Interval,
@@ -445,6 +446,7 @@ def spectrum_figure(context: PlotContext) -> Figure | None:
         title = {"text": f"{name} ({units.get(name, NO_UNIT).unit}/√Hz)"}
         y |= {"type": "log", "dtick": 1, "exponentformat": "power", "title": title}
         x |= {"type": "log", "tickvals": FREQUENCIES, "title": {"text": "Hz"}}
+    figure.layout["meta"] = SHOWS_ANGLES
     return set_layout(figure, below=44)
 
 

@@ -21,6 +21,7 @@ from flight_analysis.linear_loop.kept_guarantee import kept_guarantee
 from flight_analysis.linear_loop.loop_margins import LinearLoop, loop_margins
 from flight_analysis.report import (
     comparison,
+    display_units,
     figures,
     guided,
     guided_figures,
@@ -66,13 +67,17 @@ class TitleLine(NamedTuple):
     colour: str = ""
 
 
-class TableGroup(NamedTuple):
-    """Adjacent tables. With `colours` of the flights: comparison tables."""
+Tables = Sequence[tables.MetricTable] | Sequence[comparison.ComparisonTable]
 
-    tables: Sequence[tables.MetricTable] | Sequence[comparison.ComparisonTable]
+
+class TableGroup(NamedTuple):
+    """Adjacent tables, the same in radians; with `colours` of the flights comparison tables."""
+
+    tables: Tables
     title: str = ""
     legend: str = ""
     colours: Sequence[str] = ()
+    in_radians: Tables = ()
 
 
 class MessageLine(NamedTuple):
@@ -105,6 +110,11 @@ class Page(NamedTuple):
     replay: Replay | None = None
     messages: Sequence[MessageLine] = ()
     parameters: tables.MetricTable | None = None
+
+    @property
+    def has_angles(self) -> bool:
+        """Whether the page can show its angles in deg or in rad."""
+        return any(group.in_radians for group in self.tables)
 
 
 def write_page(path: Path, flights: Sequence[RecordedFlight]) -> None:
@@ -185,15 +195,18 @@ def _flight_page(flight: RecordedFlight, scenario: Scenario) -> Page:
     gusts = flight.gusts
     context = figures.plot_context([flight])
     loops = flown_loops(flight.tape, scenario, flight.controllers)
-    flight_tables = tables.flight_tables(
-        flight.summary, units, tables.events(flight.tape, gusts, scenario)
+    events = tables.events(flight.tape, gusts, scenario)
+    margins = _margin_tables(loops)
+    shown, in_radians = (
+        [*tables.flight_tables(flight.summary, each, events), *margins]
+        for each in (units, display_units.in_radians({**QUANTITY_UNITS, **units}))
     )
     description = filter(None, [_description(flight, scenario), command_results(flight.summary)])
     return Page(
         title=f"Flight {flight.name}",
         lines=[_outcome_line(f"{'; '.join(description)}.", flight)],
         tables=[
-            TableGroup([*flight_tables, *_margin_tables(loops)]),
+            TableGroup(shown, in_radians=in_radians),
         ],
         sections=[*_sections(flight, scenario, context), *_loop_sections(_drawn_loops(loops))],
         samples=context.samples,
@@ -241,12 +254,19 @@ def _comparison_page(flights: Sequence[RecordedFlight]) -> Page:
             [*(summary_legend(flight.summary) for flight in flights), tables.ERROR_LEGEND]
         )
     )
-    inputs = comparison.comparison_tables(flights, "inputs", INPUT_COLUMNS, lower_is_better=False)
+    units = (context.units, display_units.in_radians(context.units))
+    errors, errors_in_radians = (comparison.error_tables(flights, each) for each in units)
+    inputs, inputs_in_radians = (
+        comparison.comparison_tables(
+            flights, "inputs", INPUT_COLUMNS, lower_is_better=False, units=each
+        )
+        for each in units
+    )
     # The tables, then the figures.
     groups = [
         *_condition_group(flights, list(colours)),
-        TableGroup(comparison.error_tables(flights), "Tracking error", legend, palette),
-        TableGroup(inputs, "Inputs", tables.INPUT_LEGEND, palette),
+        TableGroup(errors, "Tracking error", legend, palette, errors_in_radians),
+        TableGroup(inputs, "Inputs", tables.INPUT_LEGEND, palette, inputs_in_radians),
         TableGroup(comparison.tick_tables(flights), "Time", "", palette),
     ]
     sections = [

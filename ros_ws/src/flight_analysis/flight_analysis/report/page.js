@@ -5,6 +5,7 @@ const MARGIN = 0.5; // of the view, drawn on both sides of it for panning
 const SHEET = {width: 690, height: 0.72}; // pixels; scale of the height, so that two figures fit a sheet
 const LETTER = 0.6; // of the size of a font, the width of a letter
 const BETWEEN = 6; // pixels between two labels
+const DEGREE = Math.PI / 180; // rad
 const DARK = JSON.parse(document.getElementById("dark").textContent);
 const scheme = matchMedia("(prefers-color-scheme: dark)");
 const figures = [...document.querySelectorAll("figure")].map(node => ({
@@ -80,9 +81,32 @@ function view(t, v, [from, to], most) {
 async function views(data) { // of the traces that the page decimates, by index
   const [from, to] = range ?? [-Infinity, Infinity], margin = range ? MARGIN * (to - from) : 0;
   const wide = [from - margin, to + margin];
-  const long = [...data.entries()].filter(([, {meta}]) => meta);
-  return new Map(await Promise.all(long.map(
-    async ([index, {meta}]) => [index, view(await samples(meta.t), await samples(meta.v), wide, meta.most)])));
+  const long = [...data.entries()].filter(([, {meta}]) => meta?.t);
+  return new Map(await Promise.all(long.map(async ([index, {meta}]) => {
+    const {x, y} = view(await samples(meta.t), await samples(meta.v), wide, meta.most);
+    return [index, {x, y: meta.scale ? y.map(value => value * meta.scale) : y}];
+  })));
+}
+
+// ---- Angles in rad
+
+const numbers = y => (y.bdata ? [...new {f8: Float64Array, f4: Float32Array}[y.dtype](Uint8Array.from(atob(y.bdata), one => one.charCodeAt(0)).buffer)] : y);
+
+function inRadians({data, layout}) { // a specification with its axes in deg converted
+  const axisOf = name => (/^y\d*$/.test(name) ? name.replace("y", "yaxis") : ""), rad = text => text?.replace(/\bdeg\b/, "rad");
+  const converted = Object.keys(layout).filter(key => /^yaxis\d*$/.test(key) && /\bdeg\b/.test(layout[key].title.text));
+  const scaled = value => (value === null ? null : value * DEGREE);
+  for (const key of converted) {
+    layout[key].title.text = rad(layout[key].title.text);
+    if (layout[key].range) layout[key].range = layout[key].range.map(scaled);
+  }
+  for (const trace of data.filter(({yaxis}) => converted.includes(axisOf(yaxis)))) {
+    trace.hovertemplate = rad(trace.hovertemplate);
+    if (trace.meta) trace.meta.scale = DEGREE;
+    if (trace.y) trace.y = numbers(trace.y).map(scaled);
+  }
+  for (const shape of layout.shapes) if (converted.includes(axisOf(shape.yref))) [shape.y0, shape.y1] = [shape.y0, shape.y1].map(scaled);
+  return {data, layout};
 }
 
 // ---- Labels of intervals
@@ -108,16 +132,18 @@ function labelled(figure, {margin}, [from, to], width) { // the annotations; lab
 
 // ---- Drawing
 
-const look = () => (scheme.matches ? "dark" : "light");
+const angles = () => document.getElementById("angles")?.value ?? "deg";
+const look = () => `${scheme.matches ? "dark" : "light"} ${angles()}`;
 
 const axes = layout => Object.keys(layout).filter(key => /^xaxis\d*$/.test(key));
 
 function specification(figure, style) {
-  return JSON.parse(style === "dark" ? figure.text.replace(/#[0-9a-f]{6}/g, colour => DARK[colour] ?? colour) : figure.text);
+  const stored = JSON.parse(style === "dark" ? figure.text.replace(/#[0-9a-f]{6}/g, colour => DARK[colour] ?? colour) : figure.text);
+  return angles() === "rad" && stored.layout.meta?.angles ? inRadians(stored) : stored;
 }
 
 async function draw(figure, style) {
-  const {data, layout} = specification(figure, style);
+  const {data, layout} = specification(figure, style.split(" ")[0]);
   for (const [index, {x, y}] of await views(data)) Object.assign(data[index], {x, y});
   if (range && figure.inTime) for (const axis of axes(layout)) layout[axis].range = [...range];
   figure.annotations = layout.annotations ?? [];
@@ -190,6 +216,7 @@ async function start() {
   await showAll();
   if (document.getElementById("replay-code")) await run("replay-code");
   scheme.addEventListener("change", showAll);
+  document.getElementById("angles")?.addEventListener("change", () => { document.body.dataset.in = angles(); showAll(); });
   addEventListener("resize", resized, {passive: true});
   addEventListener("beforeprint", print);
   addEventListener("afterprint", showAll);

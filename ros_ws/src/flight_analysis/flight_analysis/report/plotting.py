@@ -42,6 +42,7 @@ INTERVAL_OPACITY = 0.25
 INTERVAL_LABEL = 11  # pixels
 INTERVAL = "interval"  # name of its label, which the page places
 MESSAGE_LINE = {"color": "#7a6a00", "width": 1.2, "dash": "dot"}
+SHOWS_ANGLES = {"angles": True}  # the page can draw the figure in rad
 TRANSPARENT = "rgba(0,0,0,0)"
 PAPER = "#ffffff"
 INK = "#2b3640"
@@ -268,7 +269,7 @@ def time_series_figure(
         figure.x[index] |= {"matches": axis("x", followed)} if index != followed else {}
     _shade_intervals(figure, context.intervals, columns)
     _mark_messages(figure, context.messages, columns)
-    figure.layout["hovermode"] = "x unified"
+    figure.layout |= {"hovermode": "x unified", "meta": SHOWS_ANGLES}
     return set_layout(figure, labels=16 if columns == 1 else 6)
 
 

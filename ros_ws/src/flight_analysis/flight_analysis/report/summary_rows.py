@@ -191,9 +191,10 @@ def timing_rows(summary: Mapping[str, Any]) -> list[tuple[str, str, str]]:
 
 
 def segment_table(
-    segments: Sequence[Mapping[str, Any]],
+    segments: Sequence[Mapping[str, Any]], units: Mapping[str, DisplayUnit]
 ) -> tuple[list[Column], list[list[str]]]:
-    """Columns and rows of what guidance held in each segment."""
+    """Columns and rows of what guidance held in each segment, in `units` or QUANTITY_UNITS."""
+    units = {**QUANTITY_UNITS, **units}
     columns = [Column("", head) for head in ("from (s)", "to (s)")]
     for group in ("lateral", "vertical"):
         columns += [Column(group, "held"), *(each._replace(group=group) for each in HELD_COLUMNS)]
@@ -203,8 +204,8 @@ def segment_table(
         name = segment["lateral"]["quantity"] if segment["leg"] is None else f"leg {segment['leg']}"
         row = [name, f"{segment['start']:.1f}", f"{segment['stop']:.1f}"]
         for quantity in (segment["lateral"], segment["vertical"]):
-            row.append(channel_label(quantity["quantity"], QUANTITY_UNITS))
-            unit = QUANTITY_UNITS[quantity["quantity"]]
+            row.append(channel_label(quantity["quantity"], units))
+            unit = units[quantity["quantity"]]
             row += [each.text(quantity, unit) for each in HELD_COLUMNS]
         rows.append([*row, *(each.text(segment["V"]) for each in HELD_COLUMNS[:2])])
     return columns, rows

@@ -196,7 +196,7 @@ def metric_tables(
             input_rows(summary, units),
             INPUT_LEGEND + SATURATION_LEGEND,
         ),
-        _guidance_table(summary),
+        _guidance_table(summary, units),
         model_table(summary["models"], units, taken_over(summary, "errors")),
         _tick_table(summary),
     )
@@ -260,9 +260,9 @@ def _error_table(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -
     )
 
 
-def _guidance_table(summary: Mapping[str, Any]) -> MetricTable:
+def _guidance_table(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -> MetricTable:
     guidance = summary["guidance"] or {"segments": (), "legs": ()}
-    columns, rows = segment_table(guidance["segments"])
+    columns, rows = segment_table(guidance["segments"], units)
     results = (landing_results(guidance.get("landing")), leg_results(guidance["legs"]))
     legend = sentences(*results, GUIDANCE_LEGEND) if rows else ""
     return MetricTable(
