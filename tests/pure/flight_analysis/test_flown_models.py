@@ -26,6 +26,7 @@ from flight_analysis.report.flown_models import (
     learned_lines,
 )
 from flight_analysis.report.html import write_page
+from flight_analysis.report.learned_figure import learned_figure
 from flight_analysis.report.model_spans import model_names
 from flight_analysis.report.summary import RecordedFlight, summarise
 from flight_core.tape import Tape
@@ -106,7 +107,8 @@ def test_page_has_margins_and_curves_of_each_model(
     )
     page = (tmp_path / "page.html").read_text()
     assert "by the parameters that flew" in page
-    assert page.count("<td>start</td>") == page.count("<td>file</td>") == 3
+    in_degrees = page.partition('data-angles="deg"')[2].partition('data-angles="rad"')[0]
+    assert in_degrees.count("<td>start</td>") == in_degrees.count("<td>file</td>") == 3
     bode = page.partition("Bode plot")[2].partition("</section>")[0]
     assert '"name":"start"' in bode
     assert '"name":"file"' in bode
@@ -122,5 +124,5 @@ def test_what_was_learned_is_drawn_beside_true_value_and_file(
     assert 0.7 <= ratio <= 1.3
     assert ratio != 1.0
     context = figures.plot_context([RecordedFlight("run", learns, flight, {})])
-    names = {trace.name for trace in drawn(figures.learned_figure(context, lines)).data}
+    names = {trace.name for trace in drawn(learned_figure(context, lines)).data}
     assert {FILE, TRUE} <= names

@@ -36,6 +36,7 @@ from flight_analysis.report.display_units import (
     state_units,
 )
 from flight_analysis.report.flown_models import FILE, TRUE, FlownLoop, flown_loops, learned_lines
+from flight_analysis.report.learned_figure import learned_figure
 from flight_analysis.report.parameter_rows import parameter_rows
 from flight_analysis.report.plotting import Curve, Figure, SampleStore, pack, time_series_figure
 from flight_analysis.report.replay_scene import Replay, replay_of
@@ -248,27 +249,6 @@ def _comparison_page(flights: Sequence[RecordedFlight]) -> Page:
         text = f"{scenario.name}: {_description(flight, scenario)} ({flight.summary['error']})"
         line = _outcome_line(text, flight)
         lines.append(line._replace(label=label, colour=colour))
-    palette = list(colours.values())
-    legend = ". ".join(
-        dict.fromkeys(
-            [*(summary_legend(flight.summary) for flight in flights), tables.ERROR_LEGEND]
-        )
-    )
-    units = (context.units, display_units.in_radians(context.units))
-    errors, errors_in_radians = (comparison.error_tables(flights, each) for each in units)
-    inputs, inputs_in_radians = (
-        comparison.comparison_tables(
-            flights, "inputs", INPUT_COLUMNS, lower_is_better=False, units=each
-        )
-        for each in units
-    )
-    # The tables, then the figures.
-    groups = [
-        *_condition_group(flights, list(colours)),
-        TableGroup(errors, "Tracking error", legend, palette, errors_in_radians),
-        TableGroup(inputs, "Inputs", tables.INPUT_LEGEND, palette, inputs_in_radians),
-        TableGroup(comparison.tick_tables(flights), "Time", "", palette),
-    ]
     sections = [
         Section("Output y over the reference y_m", "", figures.tracking_figure(context)),
         Section("Tracking error e = y - y_m", "", figures.error_figure(context)),
@@ -295,10 +275,36 @@ def _comparison_page(flights: Sequence[RecordedFlight]) -> Page:
     return Page(
         title=f"{len(flights)} flights compared",
         lines=lines,
-        tables=groups,
+        tables=_comparison_groups(flights, context, colours),
         sections=sections,
         samples=context.samples,
     )
+
+
+def _comparison_groups(
+    flights: Sequence[RecordedFlight], context: plotting.PlotContext, colours: Mapping[str, str]
+) -> list[TableGroup]:
+    """The tables of a comparison; `colours` of the flights by label."""
+    palette = list(colours.values())
+    legend = ". ".join(
+        dict.fromkeys(
+            [*(summary_legend(flight.summary) for flight in flights), tables.ERROR_LEGEND]
+        )
+    )
+    units = (context.units, display_units.in_radians(context.units))
+    errors, errors_in_radians = (comparison.error_tables(flights, each) for each in units)
+    inputs, inputs_in_radians = (
+        comparison.comparison_tables(
+            flights, "inputs", INPUT_COLUMNS, lower_is_better=False, units=each
+        )
+        for each in units
+    )
+    return [
+        *_condition_group(flights, list(colours)),
+        TableGroup(errors, "Tracking error", legend, palette, errors_in_radians),
+        TableGroup(inputs, "Inputs", tables.INPUT_LEGEND, palette, inputs_in_radians),
+        TableGroup(comparison.tick_tables(flights), "Time", "", palette),
+    ]
 
 
 def _condition_group(flights: Sequence[RecordedFlight], labels: Sequence[str]) -> list[TableGroup]:
@@ -362,7 +368,7 @@ def _sections(
             "What was learned",
             "A and B as identified, SI, with bars of two standard deviations; open marks: no "
             "model was proposed. Lines: the true value before a drift, and the value of the file",
-            figures.learned_figure(context, learned_lines(flight.tape, scenario)),
+            learned_figure(context, learned_lines(flight.tape, scenario)),
         ),
         Section("Wind", "along the body axes of trim", figures.wind_figure(context)),
         Section("States", about, figures.state_figure(context, state_units(scenario), trim)),
