@@ -4,6 +4,7 @@
 
 import itertools
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +12,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from pytest import approx
+from tests.conftest import REPOSITORY, refusing
 
 from flight_analysis.closed_loop.scenario import parse_scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.parameters import ParameterError
 from flight_core.units import GRAVITY
-from flight_design.gains.first_scenario import Channel, first_commands, scenario_text
+from flight_design.gains.first_scenario import (
+    GAINS,
+    Channel,
+    first_commands,
+    scenario_text,
+    scenario_to_design,
+)
+from flight_design.gains.gain_design import select_gains
 from reference_model.params import ReferenceModelConfig
 from reference_model.reference import Reference
 
@@ -114,3 +124,25 @@ def test_text_reads_back_with_units_beside_the_keys() -> None:
     # every section is there: the first complaint is about the values of the controller
     with pytest.raises(ParameterError, match=r"controller"):
         parse_scenario(text.encode(), Path("first.yaml"))
+
+
+def test_scenario_without_gains_has_those_of_the_scenario_with_gains(tmp_path: Path) -> None:
+    """Selected are the same: none of the gains of a section counts."""
+    example = REPOSITORY / "examples" / "arduplane" / "rates.yaml"
+    text = example.read_text("utf-8").replace("examples/arduplane", str(example.parent))
+    keys = "|".join([*GAINS, "sign", "softening"])
+    bare = re.sub(rf"^    (?:{keys}):.*\n", "", text, flags=re.MULTILINE)
+    bare = re.sub(r"    feedforward:.*?(?=/\*\*/recorder)", "", bare, flags=re.DOTALL)
+    assert len(bare) < len(text)
+    path = tmp_path / "bare.yaml"
+    path.write_text(bare, "utf-8")
+    with refusing(r"^controller\.D: missing"):
+        find_scenario(str(path))
+    airframe = str(example.parent / "rates_airframe.yaml")
+    selections = [select_gains(airframe, name, samples=1) for name in (str(path), str(example))]
+    bare_gains, gains = (selection.chosen for selection in selections)
+    assert bare_gains == gains
+    partial = tmp_path / "partial.yaml"
+    partial.write_text(re.sub(r"^    beta:.*\n", "", text, flags=re.MULTILINE), "utf-8")
+    with refusing(r"^controller\.beta: missing"):  # a forgotten gain is no choice
+        scenario_to_design(str(partial))

@@ -6,10 +6,19 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from flight_core.files import comment
+from flight_analysis.closed_loop.scenario import (
+    Scenario,
+    parse_scenario_sections,
+    scenario_of,
+)
+from flight_analysis.closed_loop.scenario_library import LIBRARY, find_scenario
+from flight_core.arguments import FilePath
+from flight_core.files import comment, find_file, read_file
+from flight_core.scenario_file import A_SCENARIO
 from flight_core.units import GRAVITY
 from flight_design.gains import gain_yaml
 from flight_design.gains.gain_selection import SOFTENING
+from rise_di_controller.laws import DEFAULT
 
 LICENCE = "# SPDX-FileCopyrightText: RISE-DI contributors\n# SPDX-License-Identifier: Apache-2.0\n"
 
@@ -33,6 +42,7 @@ PULSE = 1.0  # s, of a rate
 TURNS_TIME = 9.0  # s, of the four pulses
 SPEED_PULSE = 20.0  # s, of an airspeed or a climb
 LAST = 20.0  # s, after the last command: for a gust and the way back
+GAINS = {"k_g", "k_d", "Lambda", "beta", "omega", "input_scale", "D"}  # that are selected
 
 
 class Channel(NamedTuple):
@@ -156,6 +166,24 @@ def unit_gains(lag: Sequence[float], delay: float) -> dict[str, Any]:
         "lag": list(lag),
         "delay": delay,
     }
+
+
+def scenario_to_design(scenario: FilePath | Scenario) -> Scenario:
+    """A scenario whose section controller may lack the gains: they are 1 then, to be selected.
+
+    Rate, channels, lags, delay and failsafe are needed. Raises ParameterError.
+    """
+    if isinstance(scenario, Scenario):
+        return find_scenario(scenario)
+    path = find_file(scenario, LIBRARY, "scenario", A_SCENARIO).absolute()
+    sections = parse_scenario_sections(read_file(path, str(path), A_SCENARIO), path)
+    controller = sections["controller"]
+    outputs = controller.get("outputs")
+    is_rise_di = controller.get("law", DEFAULT) == DEFAULT
+    if not (is_rise_di and isinstance(outputs, list)) or GAINS & {*controller}:
+        return find_scenario(scenario)
+    ones = unit_gains([0.0] * len(outputs), 0.0)
+    return scenario_of(path.stem, path, {**sections, "controller": {**ones, **controller}})
 
 
 COMMENTS = {

@@ -21,6 +21,7 @@ from flight_core.parameters import require
 from flight_core.vectors import FloatArray
 from flight_design.gains import gain_selection, ideal_control, tuned_gains
 from flight_design.gains.effectors import LAW_INPUT, Effectors, design_allocation
+from flight_design.gains.first_scenario import scenario_to_design
 from flight_design.gains.gain_selection import GainAssessment, LoopSetting, Selection
 from flight_design.gains.ideal_control import Effected, Study
 from flight_design.gains.nominal import unit_sizes
@@ -58,8 +59,7 @@ MESSAGES = 3.0  # of y: the age limit of the law, at least
 RATES = (1.0, 1000.0)  # Hz, the lowest and the highest
 MAX_SAMPLES = 10_000
 PERFECT_VANE = 1e-4  # rad, noise in place of none of a perfect vane
-LEAST_SPEED = 0.6  # parts of the trim speed
-MOST_SPEED = 1.8  # within the range of the schedule's factor
+LEAST_SPEED, MOST_SPEED = 0.6, 1.8  # parts of the trim speed, in the range of the schedule
 
 
 def select_gains(
@@ -94,7 +94,7 @@ def select_gains(
 
     Args:
         airframe: Name in the library, path of an airframe file (.yaml), or an Airframe.
-        scenario: Name, path of a scenario file (.yaml), or a Scenario.
+        scenario: Name, path of a file (.yaml) whose controller may lack the gains, or a Scenario.
         uncertainty: Largest relative deviation of each entry of A and B, 0 to 1.
         rate: Rate of the law in Hz; None: that of the scenario.
         y_rate: Rate of y in Hz: a period above that of the law counts as delay, and y is stale
@@ -137,7 +137,7 @@ def select_gains(
         >>> len(selection.chosen.beta)
         4
     """
-    flight = find_scenario(scenario)
+    flight = scenario_to_design(scenario)
     frame = load_airframe(airframe)
     flight.rise_di()
     require(callable(progress), "progress", progress, "a function of a text")
