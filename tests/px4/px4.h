@@ -1,8 +1,8 @@
 // SPDX-FileCopyrightText: RISE-DI contributors
 // SPDX-License-Identifier: Apache-2.0
 //
-// What RiseDiControl.cpp takes of PX4, as far as a compiler needs it: names and types of PX4 1.16, no function of it.
-// Each header that the module includes is a link to this file.
+// What RiseDiControl.cpp takes of PX4: names and types of PX4 1.16. Topics and parameters are in the memory of the process, so
+// that host.cpp can run the module. Each header that the module includes is a link to this file.
 #pragma once
 #include <cstdint>
 #include <cstring>
@@ -31,7 +31,7 @@ namespace math { template <class T> constexpr T min(T a, T b) { return a < b ? a
 namespace time_literals { constexpr hrt_abstime operator""_ms(unsigned long long t) { return t * 1000; }
 constexpr hrt_abstime operator""_s(unsigned long long t) { return t * 1000000; } }
 
-struct orb_metadata {};
+struct orb_metadata { unsigned char data[256]; unsigned generation; };
 extern orb_metadata orb_vehicle_angular_velocity, orb_airspeed_validated, orb_vehicle_land_detected, orb_vehicle_control_mode,
        orb_parameter_update, orb_vehicle_rates_setpoint, orb_vehicle_thrust_setpoint_virtual_fw,
        orb_vehicle_torque_setpoint_virtual_fw, orb_vehicle_thrust_setpoint_virtual_mc,
@@ -62,51 +62,73 @@ namespace wq_configurations { constexpr wq_config_t nav_and_controllers{}; }
 struct ScheduledWorkItem {
 	ScheduledWorkItem(const char *, const wq_config_t &) {}
 	virtual ~ScheduledWorkItem() = default;
-	void ScheduleNow();
-	void ScheduleDelayed(uint32_t us);
-private:
+	void ScheduleNow() {}
+	void ScheduleDelayed(uint32_t) {}
+public: // private in PX4: host.cpp calls it
 	virtual void Run() = 0;
 };
 enum class params { RDI_EN, RDI_AUX, RDI_MAX_AGE, RDI_MAX_ERR, COM_OF_LOSS_T, IMU_GYRO_CUTOFF };
 }
-template <px4::params> struct ParamInt { int32_t get() const; };
-template <px4::params> struct ParamFloat { float get() const; };
+extern float parameter_values[8]; // by px4::params
+template <px4::params name> struct ParamInt { int32_t get() const { return (int32_t)parameter_values[(int)name]; } };
+template <px4::params name> struct ParamFloat { float get() const { return parameter_values[(int)name]; } };
 struct ModuleParams {
 	explicit ModuleParams(ModuleParams *) {}
-	void updateParams();
+	void updateParams() {}
 };
 #define DEFINE_PARAMETERS(a, b, c, d, e, f) PX4_DECLARE(a) PX4_DECLARE(b) PX4_DECLARE(c) PX4_DECLARE(d) PX4_DECLARE(e) PX4_DECLARE(f)
 #define PX4_DECLARE(x) PX4_TYPE x;
 #define PX4_TYPE(...) __VA_ARGS__
 
 template <class T> struct ModuleBase {
-	static T *get_instance();
-	static int main(int argc, char *argv[]);
-	static bool should_exit();
-	static void exit_and_cleanup();
+	static T *get_instance() { return _object.instance; }
+	static int main(int argc, char *argv[]) { return argc > 1 && strcmp(argv[1], "status") == 0 ? get_instance()->print_status() : T::task_spawn(argc, argv); }
+	static bool should_exit() { return false; }
+	static void exit_and_cleanup() {}
 	virtual ~ModuleBase() = default;
 	virtual int print_status() = 0;
-	struct { void store(T *); } static _object;
+	struct Object { T *instance; void store(T *value) { instance = value; } };
+	static Object _object;
 	static int _task_id;
 	static constexpr int task_id_is_work_queue = -2;
 };
+template <class T> typename ModuleBase<T>::Object ModuleBase<T>::_object{};
+template <class T> int ModuleBase<T>::_task_id = -1;
 
 namespace uORB
 {
 struct Subscription {
-	explicit Subscription(const orb_metadata *) {}
-	bool updated();
-	bool update(void *);
-	bool copy(void *);
+	explicit Subscription(orb_metadata *topic) : _topic(topic) {}
+	bool updated() const { return _topic->generation != _seen; }
+	template <class T> bool copy(T *value)
+	{
+		static_assert(sizeof(T) <= sizeof _topic->data, "a larger topic");
+		memcpy(value, _topic->data, sizeof(T));
+		_seen = _topic->generation;
+		return true;
+	}
+	template <class T> bool update(T *value) { return updated() && copy(value); }
+private:
+	orb_metadata *_topic;
+	unsigned _seen{0};
 };
 struct SubscriptionCallbackWorkItem : Subscription {
-	SubscriptionCallbackWorkItem(px4::ScheduledWorkItem *, const orb_metadata *topic) : Subscription(topic) {}
+	SubscriptionCallbackWorkItem(px4::ScheduledWorkItem *item, orb_metadata *topic) : Subscription(topic), _item(item) {}
 	bool registerCallback();
-	void unregisterCallback();
+	void unregisterCallback() {}
+private:
+	px4::ScheduledWorkItem *_item;
 };
 template <typename T> struct Publication {
-	explicit Publication(const orb_metadata *) {}
-	bool advertise();
-	bool publish(const T &);
+	explicit Publication(orb_metadata *topic) : _topic(topic) {}
+	bool advertise() { return true; }
+	bool publish(const T &value)
+	{
+		memcpy(_topic->data, &value, sizeof value);
+		_topic->generation++;
+		return true;
+	}
+private:
+	orb_metadata *_topic;
 };
 }
