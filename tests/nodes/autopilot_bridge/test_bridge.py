@@ -667,9 +667,7 @@ def test_missing_message_package_named_with_command_that_builds_it(tmp_path: Pat
     absent.write_text((LIBRARY / "px4.yaml").read_text().replace("px4_msgs/", "absent_msgs/"))
     with world_of("-p", f"map:={absent}") as world, pytest.raises(ParameterError) as error:
         world.make(BridgeNode)
-    assert "absent_msgs/msg/VehicleOdometry: found no Python package absent_msgs" in str(
-        error.value
-    )
+    assert "absent_msgs/msg/VehicleOdometry: the Python package absent_msgs" in str(error.value)
     assert "make messages PACKAGE=absent_msgs SOURCE=FOLDER" in str(error.value)
 
 

@@ -354,5 +354,5 @@ def test_parameters_that_do_not_fit_are_refused(changes: dict[str, Any], sentenc
 def test_without_jsbsim_aircraft_refused_in_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     aircraft_names.cache_clear()
     monkeypatch.setitem(sys.modules, "jsbsim", None)  # its import then fails
-    with refusing(r"^aircraft\.airframe: found no Python package jsbsim, expected it"):
+    with refusing(r"^aircraft\.airframe: the Python package jsbsim is not installed"):
         aircraft_parameters(**SECTION)

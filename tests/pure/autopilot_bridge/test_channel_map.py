@@ -259,7 +259,7 @@ def test_check_map_of_mavlink_without_pymavlink_is_one_sentence(
 ) -> None:
     monkeypatch.setattr(installation, "find_spec", lambda name: None)
     result = invoke("check", "ardupilot_mavlink", "--definitions", "installed")
-    assert str(result.exception) == "found no Python package pymavlink, expected it: make autopilot"
+    assert str(result.exception) == "the Python package pymavlink is not installed: make autopilot"
 
 
 @pytest.mark.parametrize(

@@ -161,7 +161,7 @@ def test_command_whose_python_package_is_missing_says_what_installs_it(tmp_path:
     # -m puts the working folder first
     process = rise_di("campaign", "osprey_servo", "--aircraft", "1", cwd=tmp_path)
     assert process.returncode == 2
-    sentence = "error: rise-di campaign: found no Python package jax, expected it: make setup-all"
+    sentence = "error: rise-di campaign: the Python package jax is not installed: make setup-all"
     assert process.stderr.splitlines()[-1] == sentence
     assert "Traceback" not in process.stderr
 

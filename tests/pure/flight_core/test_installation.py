@@ -16,7 +16,7 @@ from flight_core.installation import EXTRAS, TARGETS, missing
 
 
 def test_a_checkout_names_the_target_of_make() -> None:
-    assert missing("jax") == "found no Python package jax, expected it: make setup-all"
+    assert missing("jax") == "the Python package jax is not installed: make setup-all"
 
 
 class Installed(NamedTuple):
@@ -51,7 +51,7 @@ def test_installed_stack_names_what_it_came_from(
     """
     monkeypatch.setattr(installation, "CHECKOUT", tmp_path)
     monkeypatch.setattr(installation, "distribution", lambda name: Installed(origin))
-    assert missing("jax") == f"found no Python package jax, expected it: {command}"
+    assert missing("jax") == f"the Python package jax is not installed: {command}"
 
 
 def test_workspace_names_a_checkout(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -132,8 +132,8 @@ def sampled_matrices(
     for name, part in spread.entries.items():
         require(
             name in places,
-            "uncertainty",
-            f"entry {name}",
+            "entry",
+            name,
             f"an entry of the airframe: {', '.join(places)}",
         )
         matrix, i, j = places[name]

@@ -64,7 +64,7 @@ def expanded(entries: Mapping[str, float], scenario: Scenario) -> dict[str, floa
         if name == DELAY:
             rate = scenario.controller.rate
             expected = f"at least a period of the controller, {1.0 / rate:g} s"
-            require(part >= 1.0 / rate, "uncertainty", f"delay {part:g} s", expected)
+            require(part >= 1.0 / rate, "entry", f"delay {part:g} s", expected)
             every[name] = math.floor(part * rate + 1e-9) / rate if math.isfinite(part) else part
             continue
         if name.startswith(("A[", "B[")):
@@ -77,7 +77,7 @@ def expanded(entries: Mapping[str, float], scenario: Scenario) -> dict[str, floa
             f"a lag or a noise above 0: {', '.join(entries_of_scenario) or 'none'}; delay, or an "
             "entry of A or B, as A[q,q]"
         )
-        require(bool(matches), "uncertainty", f"entry {name}", expected)
+        require(bool(matches), "entry", name, expected)
         every |= {entry: entries.get(entry, part) for entry in matches}
     return every
 

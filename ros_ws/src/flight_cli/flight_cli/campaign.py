@@ -230,11 +230,13 @@ def _named_numbers(option: str, texts: Sequence[str], example: str) -> dict[str,
     for text in texts:
         name, _, value = text.rpartition("=")
         parsed = parse_numbers(value)
+        is_single = bool(name) and "=" not in name and len(parsed) == 1
+        again = f"; --{option} again for each further one" if "=" in name else ""
         require(
-            bool(name) and len(parsed) == 1 and name not in numbers,
+            is_single and name not in numbers,
             option,
             repr(text),
-            f"a name and a number: {example}",
+            f"a name and a number: {example}{again}",
         )
         numbers[name] = parsed[0]
     return numbers

@@ -218,11 +218,13 @@ class Fly(RouteWords):
         can_have_route = not sections or scenario.guidance is not None
         require(can_have_route, "--fence", "a scenario without guidance", "one with guidance")
         if home := sections.get("home"):
+            place = ", ".join(f"{name} {value:.7g} m" for name, value in home.items())
             ground = "" if above_sea or home.get("altitude", 1.0) > 0.0 else ": the ground"
-            warn(f"note: home by the fence file: {home}{ground}")
+            warn(f"note: home by the fence file: {place}{ground}")
         if self.route is None:
             return scenario.vary(guidance=sections)
-        return with_route(scenario, self.read_waypoints(self.route, above_sea=above_sea), sections)
+        waypoints = self.read_waypoints(self.route, above_sea=above_sea, fence=self.fence)
+        return with_route(scenario, waypoints, sections)
 
     def _fly_fleet(self) -> NoReturn:
         """Fly a fleet, with the page of all aircraft, and exit with the severest status."""

@@ -184,8 +184,10 @@ class Identify:
         )
         if log is None:
             self._identify_jsbsim()
-        else:
-            self._identify_log(log)
+            return
+        expected = "the folder of a run, an MCAP file, or jsbsim:NAME"
+        require(log.exists(), str(log), "no such file or folder", expected)
+        self._identify_log(log)
 
     def _log(self) -> Path | None:
         """The log that the source is; None for an aircraft or no source."""

@@ -10,6 +10,7 @@ from typing import overload
 from flight_cli.output import parse_numbers
 from flight_cli.words import rare_option, warn
 from flight_core.parameters import require
+from flight_guidance.routes.mission_files import FENCE_NOTE
 from flight_guidance.routes.route_file import Origin, Waypoint, read_route_file
 
 
@@ -34,10 +35,12 @@ class RouteWords:
         metavar="LINE",
     )
 
-    def read_waypoints(self, file: Path, *, above_sea: bool | None) -> tuple[Waypoint, ...]:
+    def read_waypoints(
+        self, file: Path, *, above_sea: bool | None, fence: Path | None = None
+    ) -> tuple[Waypoint, ...]:
         """The waypoints of a route file; notes on the rest of the file go to standard error.
 
-        Raises as `read_route_file`.
+        `fence`: the file of the fence, which may be the same. Raises as `read_route_file`.
         """
         for key, value in (("altitude", self.altitude), ("simplify", self.simplify)):
             require(value is None or math.isfinite(value), f"--{key}", value, "a number")
@@ -50,6 +53,9 @@ class RouteWords:
             line=self.line,
         )
         for note in route.notes:
+            # A fence that is given is kept.
+            if note == FENCE_NOTE and fence is not None and fence.samefile(file):
+                continue
             warn(f"note: {note}")
         return route.waypoints
 

@@ -135,6 +135,41 @@ def scenario_names(incomplete: str) -> list[str]:
     return [name for name in names if name.startswith(incomplete)]
 
 
+EXPECTED: Mapping[str, str] = MappingProxyType(
+    {
+        "greater_than": "more than {gt:g}",
+        "greater_than_equal": "{ge:g} or more",
+        "less_than": "less than {lt:g}",
+        "less_than_equal": "{le:g} or less",
+        "finite_number": "a finite number",
+    }
+    | dict.fromkeys(("float_parsing", "float_type"), "a number")
+    | dict.fromkeys(
+        ("int_parsing", "int_type", "int_from_float", "int_parsing_size"), "a whole number"
+    )
+    | dict.fromkeys(("bool_parsing", "bool_type"), "true or false")
+    | dict.fromkeys(("path_type", "string_type"), "a text")
+)
+"""What a value of the command line has to be, by the type of pydantic's error."""
+
+
+def refused_value(error: typer.BadParameter) -> Exception:
+    """The refusal of a value as a sentence; the error itself where Typer wrote its own sentence."""
+    cause: Any = error.__cause__
+    if cause is None or not hasattr(cause, "errors") or error.param is None:
+        return error
+    first = cause.errors(include_url=False)[0]
+    message = str(first["msg"]).removeprefix("Value error, ").removeprefix("Input should be ")
+    _, is_choice, choices = message.rstrip(".").partition(" is not one of ")
+    if is_choice:
+        expected = f"one of {choices.replace(chr(39), '')}"
+    else:
+        expected = EXPECTED.get(first["type"], message).format(**first.get("ctx", {}))
+    names = [name for name in error.param.opts if name.startswith("-")]
+    key = names[0] if names else str(error.param.name).upper()
+    return ParameterError(f"{key}: found {first['input']}, expected {expected}")
+
+
 class RiseDiCommand(TyperCommand):
     """A command whose refusals name the option as it is typed."""
 
@@ -153,7 +188,10 @@ class RiseDiCommand(TyperCommand):
                     f"--runs: found {folder}, expected the folder for the logs, and no such folder "
                     "exists; a campaign has --aircraft for a number"
                 )
-        return super().parse_args(ctx, args)
+        try:
+            return super().parse_args(ctx, args)
+        except typer.BadParameter as error:
+            raise refused_value(error) from None
 
     def _mend(self, name: str, names: Sequence[str]) -> str:
         """What to type in place of an unknown option."""

@@ -53,7 +53,7 @@ def require_package(package: str, remark: str = "") -> None:
 def missing(package: str) -> str:
     """A sentence on a package that is not installed.
 
-    For example "found no Python package jax, expected it: make setup-all".
+    For example "the Python package jax is not installed: make setup-all".
     """
     in_checkout = (CHECKOUT / "Makefile").is_file() and (CHECKOUT / "ros_ws").is_dir()
     has_messages = package.endswith(MESSAGE_SUFFIXES)
@@ -71,7 +71,7 @@ def missing(package: str) -> str:
             f": {build}on a full ROS 2 install ros-jazzy-{package.replace('_', '-')}, or "
             "source a workspace with it"
         )
-    return f"found no Python package {package}, expected it{ways}"
+    return f"the Python package {package} is not installed{ways}"
 
 
 def _pip_command(extra: str) -> str:

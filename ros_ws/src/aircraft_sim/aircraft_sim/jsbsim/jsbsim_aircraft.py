@@ -243,7 +243,7 @@ def root() -> Path:
         import jsbsim  # noqa: PLC0415 - other aircraft fly without it
     except ModuleNotFoundError:
         raise ParameterError(
-            "airframe: found no Python package jsbsim, expected it for an aircraft of JSBSim"
+            "airframe: the Python package jsbsim is not installed: an aircraft of JSBSim needs it"
         ) from None
     root_folder = os.environ.get(ROOT_VARIABLE)
     if not root_folder:

@@ -179,7 +179,7 @@ def mission_route(
             continue
         route_items.add(k)
     # The notes say what is not flown as the mission has it.
-    skipped_names = [item.name for k, item in enumerate(items) if k not in route_items]
+    skipped_names = [_skipped_name(item) for k, item in enumerate(items) if k not in route_items]
     sentences = [f"not flown: {', '.join(dict.fromkeys(skipped_names))}"] * bool(skipped_names)
     sentences += [
         sentence
@@ -191,6 +191,13 @@ def mission_route(
     circle_note = "circles are clockwise, of the radius of the route"
     sentences += [f"{circle_note}, in place of {', '.join(dict.fromkeys(circles))}"] * bool(circles)
     return Places(places, (*notes, *sentences), home)
+
+
+def _skipped_name(item: Item) -> str:
+    """The name of an item that is not flown; of one at 0, 0 with the reason."""
+    is_place = item.command in (WAYPOINT, SPLINE, *LOITERS)
+    nowhere = is_place and not any(item.params[4:6])
+    return f"{item.name}, at latitude and longitude 0" if nowhere else item.name
 
 
 def _mission_place(key: str, item: Item, speed: Any, before: Place | None) -> Place:

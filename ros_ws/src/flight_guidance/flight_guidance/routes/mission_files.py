@@ -32,6 +32,8 @@ from flight_guidance.routes.route_places import (
     number_of,
 )
 
+FENCE_NOTE = "the fence and the rally points of the plan are no part of the route"
+
 
 def read_plan(content: bytes, key: str, line: str | None = None) -> Places:
     """The mission of a plan of QGroundControl."""
@@ -49,8 +51,7 @@ def read_plan_tree(tree: Any, key: str, line: str | None) -> Places:
         for number, entry in _plan_items(rows or (), key)
     ]
     fence = plan_fence(tree, key)
-    note = "the fence and the rally points are no part of the route; --fence keeps them"
-    notes = [note] * bool(fence.zones or fence.rally)
+    notes = [FENCE_NOTE] * bool(fence.zones or fence.rally)
     notes += [f"not read: {FIRST_FENCE}"] * has_first_fence(tree)
     return mission_route(key, items, home_of(member(mission, "plannedHomePosition")), notes)
 
