@@ -6,6 +6,7 @@
 # make test-fast   the quick tests without ROS, for the inner loop
 # make test-sitl   fly a real autopilot in software: docs/autopilots.md
 # make docs   write the site of docs/ to site/; make docs ARGS=serve shows it while it is written
+# make pictures   draw the pictures of docs/ again from today's code     make pictures ARGS="report.png"
 # make pages   run every block of the tutorials as it stands, half an hour     make pages ARGS=landing
 # make mutants   change the law, the guard, the decomposition and the account in many places: each change must fail a test
 # make evidence   measure what has no file in docs/evidence/, write docs/evidence.md     make evidence ARGS="--again speed"
@@ -42,7 +43,7 @@ ifdef MOVED
 .PHONY: .venv/.uv .venv/.fly .venv/.messages .venv/.all .venv/.workspace
 endif
 
-.PHONY: fly test test-fast test-sitl mutants check docs pages evidence source-proof foxglove autopilot messages wheel setup setup-all lock clean
+.PHONY: fly test test-fast test-sitl mutants check docs pictures pages evidence source-proof foxglove autopilot messages wheel setup setup-all lock clean
 
 fly: setup
 	@$(BIN)/rise-di fly $(SCENARIO) $(ARGS)
@@ -80,6 +81,9 @@ docs: setup-all
 	$(BIN)/python -m tools.parameters
 	$(BIN)/python -m tools.topics
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs $(or $(ARGS),build --quiet)
+
+pictures: setup-all
+	@$(BIN)/python -m benchmarks.pictures $(ARGS)
 
 pages: setup-all
 	@$(BIN)/python -m benchmarks.pages $(ARGS)

@@ -217,8 +217,10 @@ class Client(threading.Thread):
 
 
 @contextmanager
-def flying(runs: Path, seconds: float) -> Iterator[tuple["subprocess.Popen[str]", Path]]:
-    """A flight in real time, and the folder of its run."""
+def flying(
+    runs: Path, seconds: float, *options: str
+) -> Iterator[tuple["subprocess.Popen[str]", Path]]:
+    """A flight over topics, in real time unless `options` say otherwise, and its folder."""
     command = [
         RISE_DI,
         "fly",
@@ -228,6 +230,7 @@ def flying(runs: Path, seconds: float) -> Iterator[tuple["subprocess.Popen[str]"
         "--runs",
         str(runs),
         "--json",
+        *options,
     ]
     runs_before = set(runs.iterdir())
     with subprocess.Popen(  # noqa: S603

@@ -1,0 +1,236 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The pictures of the documentation, drawn again from today's code.
+
+.venv/bin/python -m benchmarks.pictures                  # all; those of pages need a browser
+.venv/bin/python -m benchmarks.pictures report.png nodes.svg
+"""
+
+import base64
+import json
+import sys
+import tempfile
+from collections.abc import Callable, Sequence
+from io import BytesIO
+from pathlib import Path
+from typing import NamedTuple
+
+from benchmarks import counterexample, diagrams, lyapunov
+from benchmarks.tables import parser_of
+from benchmarks.view import flying, watching
+from PIL import Image
+from PIL.PngImagePlugin import PngInfo
+from tests.browser import CHROMIUM, Browser
+
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
+from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.report.run_folder import REPORT, attachments_for, write_report
+from flight_log.tape_writer import write_run
+
+IMAGES = Path(__file__).resolve().parents[1] / "docs" / "images"
+TITLE = "Title"
+"""Key of a PNG under which it says what it shows."""
+FIGURES = "Figures"
+"""Key of its figures: JSON."""
+WIDTH, HEIGHT, COLOURS = 1280, 800, 64
+SCREEN = {"width": WIDTH, "height": HEIGHT, "deviceScaleFactor": 1, "mobile": False}
+DRAWN = "Number(document.body?.dataset.drawn ?? 0)"
+STATE = "document.getElementById('state')?.textContent"
+ENDED = f"{STATE} === 'ENDED'"
+TIME = "parseFloat(document.getElementById('time').textContent.slice(4))"
+# s: a roll, the vertical gust, the second leg of the route
+LIVE_AT, GHOST_AT, GUIDED_AT = (12.0, 40.6, 60.0)
+LIVE_SECONDS = 60.0  # s, of a flight faster than real time
+DEFAULT = "osprey_servo"
+ROUTE = "osprey_route"
+
+
+class Picture(NamedTuple):
+    """A picture: the scenario or the table that it shows, and what draws it to a file.
+
+    A picture without `draw` is written by the measurement that it belongs to.
+    """
+
+    shows: str
+    draw: Callable[[Path, str], None] | None = None
+    is_of_page: bool = False
+
+
+def flown(scenario: Scenario, folder: Path, name: str) -> Path:
+    """A flight in one process, as a run."""
+    run = folder / name
+    run.mkdir()
+    write_run(simulate(scenario), run, attachments_for(scenario, run))
+    return run
+
+
+# ---- Pages
+
+
+def save(shots: Sequence[str], path: Path, shows: str, figures: str = "") -> None:
+    """Write screenshots, as base64, below each other, as a PNG of a third of their size.
+
+    `figures` of what it shows are kept as text, by which a test knows a picture of another flight.
+    """
+    parts = [Image.open(BytesIO(base64.b64decode(shot))).convert("RGB") for shot in shots]
+    whole = Image.new("RGB", (parts[0].width, sum(part.height for part in parts)))
+    top = 0
+    for part in parts:
+        whole.paste(part, (0, top))
+        top += part.height
+    info = PngInfo()
+    info.add_text(TITLE, shows)
+    info.add_text(FIGURES, figures)
+    whole.quantize(COLOURS).save(path, optimize=True, pnginfo=info)
+
+
+def save_view(
+    runs: Sequence[Path],
+    until: str,
+    path: Path,
+    shows: str,
+    *,
+    at: str = "",
+    clicks: Sequence[str] = (),
+) -> None:
+    """Open the live page of runs, at an instant, click on elements, and save its picture.
+
+    It is saved once a condition holds, unless a failsafe tells that the host was too busy.
+    """
+    with (
+        tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile,
+        Browser(Path(profile), WIDTH, HEIGHT) as browser,
+        watching(*runs) as (_, address),
+    ):
+        browser.call("Emulation.setDeviceMetricsOverride", **SCREEN)
+        browser.open(f"{address}{at}")
+        browser.wait_for(f"{DRAWN} > 2 && {until}", limit=60.0)
+        for selector in clicks:
+            before = browser.run(DRAWN)
+            browser.run(f"void document.querySelector('{selector}').click()")
+            browser.wait_for(f"{DRAWN} > {before}")
+        modes = browser.run("document.getElementById('modes').textContent")
+        if modes == "ENGAGED":
+            save([browser.call("Page.captureScreenshot")["data"]], path, shows)
+        else:
+            print(f"{path.name}: left as it is, this host is too busy for its flight: {modes}")
+        browser.open("about:blank")
+
+
+def report(path: Path, shows: str) -> None:
+    """The page of the default flight: the title, the table of errors, y over y_m."""
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as temporary:
+        run = flown(find_scenario(shows), Path(temporary), shows)
+        errors = write_report(run).flight.summary["errors"]
+        figures = json.dumps({name: metrics["whole"]["rms"] for name, metrics in errors.items()})
+        with Browser(Path(temporary) / "profile", WIDTH, HEIGHT) as browser:
+            browser.call("Emulation.setDeviceMetricsOverride", **SCREEN)
+            browser.open(run / REPORT)
+            browser.wait_for(f"{DRAWN} === 1")
+            table = "document.querySelector('.tables > div').getBoundingClientRect().bottom"
+            below_errors = browser.run(table)
+            figure = browser.run(
+                "(one => { const {top, bottom} = one.closest('section').getBoundingClientRect();"
+                " return [top, bottom]; })(document.querySelector('figure[data-time]'))"
+            )
+            save(
+                [
+                    browser.call(
+                        "Page.captureScreenshot",
+                        captureBeyondViewport=True,
+                        clip={"x": 60, "y": top, "width": 1160, "height": low - top, "scale": 1},
+                    )["data"]
+                    for top, low in ((0.0, below_errors + 10.0), figure)
+                ],
+                path,
+                shows,
+                figures,
+            )
+
+
+def view_ghost(path: Path, shows: str) -> None:
+    """The default flight in its gust, and the same with half the gain as a ghost."""
+    with tempfile.TemporaryDirectory() as folder:
+        servo = find_scenario(shows)
+        run = flown(servo, Path(folder), shows)
+        weak = flown(servo.vary(controller={"k_g": 0.5}), Path(folder), "half_the_gain")
+        save_view((run, weak), ENDED, path, shows, at=f"&t={GHOST_AT}", clicks=["#window"])
+
+
+def view_guided(path: Path, shows: str) -> None:
+    """A guided flight on its second leg, on the map."""
+    with tempfile.TemporaryDirectory() as folder:
+        run = flown(find_scenario(shows), Path(folder), shows)
+        clicks = ["[data-camera=map]"]
+        save_view((run,), ENDED, path, shows, at=f"&t={GUIDED_AT}", clicks=clicks)
+
+
+def view_live(path: Path, shows: str) -> None:
+    """The default flight over topics, in the air; in lockstep, which no other work disturbs."""
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        flying(Path(folder), LIVE_SECONDS, "--lockstep") as (flight, live),
+    ):
+        save_view((live,), f"{STATE} === 'LIVE' && {TIME} > {LIVE_AT}", path, shows)
+        flight.communicate()
+
+
+# ---- The pictures
+
+
+def drawing(name: str) -> Callable[[Path, str], None]:
+    """What writes a drawing of `benchmarks.diagrams`."""
+
+    def draw(path: Path, shows: str) -> None:
+        diagrams.save_drawing(getattr(diagrams, name)(), path, shows)
+
+    return draw
+
+
+def plotted(main: Callable[[], object]) -> Callable[[Path, str], None]:
+    """What runs a program that plots its own picture."""
+
+    def draw(path: Path, shows: str) -> None:
+        main()
+
+    return draw
+
+
+PICTURES = {
+    "report.png": Picture(DEFAULT, report, is_of_page=True),
+    "view_live.png": Picture(DEFAULT, view_live, is_of_page=True),
+    "view_ghost.png": Picture(DEFAULT, view_ghost, is_of_page=True),
+    "view_guided.png": Picture(ROUTE, view_guided, is_of_page=True),
+    "leg.svg": Picture(diagrams.LEG_ROUTE, drawing("leg")),
+    "effectors.svg": Picture(diagrams.WING, drawing("effectors")),
+    "nodes.svg": Picture("flight_core.topics", drawing("nodes")),
+    "bridge.svg": Picture("autopilot_bridge", drawing("bridge")),
+    "packages.svg": Picture("tests/pure/imports.yaml", drawing("packages")),
+    "laws.svg": Picture("docs/evidence/tables/experiments-laws.csv", drawing("laws")),
+    "lyapunov.png": Picture("benchmarks.lyapunov", plotted(lyapunov.main)),
+    "counterexample.png": Picture("benchmarks.counterexample", plotted(counterexample.main)),
+    "learning.png": Picture("benchmarks.learning"),
+}
+
+
+def main() -> None:
+    """Draw all pictures, or those that are named."""
+    parser = parser_of(__doc__)
+    parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(PICTURES))
+    names = parser.parse_args().names
+    if unknown := [name for name in names if name not in PICTURES]:
+        sys.exit(f"names: found {', '.join(unknown)}, expected some of {', '.join(PICTURES)}")
+    for name in names or PICTURES:
+        picture = PICTURES[name]
+        if picture.draw is None:
+            print(f"{name}: {picture.shows} draws it")
+        elif picture.is_of_page and CHROMIUM is None:
+            print(f"{name}: left as it is, no browser is installed")
+        else:
+            picture.draw(IMAGES / name, picture.shows)
+            print(f"{name}: {(IMAGES / name).stat().st_size / 1e3:.0f} kB, {picture.shows}")
+
+
+if __name__ == "__main__":
+    main()
