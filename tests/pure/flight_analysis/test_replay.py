@@ -356,6 +356,19 @@ def test_gains_changed_in_flight_differ_from_tick_of_change() -> None:
     assert result.notes == ("parameters changed before tick 30: Lambda, k_g, upper",)
 
 
+def test_changes_of_the_same_parameters_are_one_note() -> None:
+    """As those of a module whose limits follow the airspeed, a thousand in a flight."""
+    limits = [{"upper": [0.02 + 0.001 * k] * 4} for k in range(25)]
+    ticks = [Tick(changes=(change,)) for change in limits]
+    tape = driven(GUST.controller, [FLY] * 30 + ticks + [Tick(changes=({"k_g": 2.0},)), FLY])
+    result = replay(tape, GUST.controller, changes=[*limits, {"k_g": 2.0}])
+    assert equal(result), result.first()
+    assert result.notes == (
+        "parameters changed before tick 30 and 24 later ones: upper",
+        "parameters changed before tick 55: k_g",
+    )
+
+
 def test_replay_applies_successive_gain_changes_one_by_one() -> None:
     changes: list[dict[str, Any]] = [{"k_g": 2.0}, {"Lambda": [3.0, 4.0, 2.0, 1.0]}]
     changes += [{"k_g": 3.3}, {"slew": [0.2] * 4}, {"k_g": 1.0}]

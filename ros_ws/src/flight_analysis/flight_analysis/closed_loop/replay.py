@@ -30,8 +30,6 @@ from rise_di_controller.guard.guard import ControllerState
 from rise_di_controller.laws import AnyLaw
 from rise_di_controller.params import ControllerConfig, as_controller
 
-SHOWN_CHANGES = 20  # of the parameters, in the notes
-
 # prefixes of the channels of u, from `internals` and from the topic `u`
 U_PREFIXES = ("u.", "published.")
 OPEN_LOOP = "open loop: the recorded aircraft did not fly this u"
@@ -239,7 +237,7 @@ def _replay(
     steps = _Steps(ticks, in_force, open_loop=others is not None)
     steps.compute()
     opened = () if others is None else (OPEN_LOOP,)
-    notes = (*opened, *_few(in_force.notes), *_coverage_notes(ticks, steps.checked))
+    notes = (*opened, *in_force.notes(), *_coverage_notes(ticks, steps.checked))
     # A tick without a y on the topic is computed from the y in `internals`; a u that is not on the
     # topic is not compared.
     missing = np.flatnonzero(~ticks.u_found)
@@ -368,13 +366,6 @@ def _coverage_notes(ticks: Ticks, checked: NDArray[np.bool_]) -> Iterator[str]:
         yield f"{unmatched} ticks have no sample on the topic y: y taken from internals"
     if unmatched := int((~ticks.u_found).sum()):
         yield f"{unmatched} ticks have no sample on the topic u: what was sent is not compared"
-
-
-def _few(notes: Sequence[str]) -> tuple[str, ...]:
-    """The first notes on changes of the parameters, and how many more there are."""
-    more = len(notes) - SHOWN_CHANGES
-    remainder = (f"parameters changed {more} more times",) if more > 0 else ()
-    return (*notes[:SHOWN_CHANGES], *remainder)
 
 
 def _controller_at(processes: Mapping[str, Process], stamp_ns: int) -> str:

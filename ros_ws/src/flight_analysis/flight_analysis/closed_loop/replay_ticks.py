@@ -42,7 +42,7 @@ class ParametersInForce:
     """The parameters in force at a tick, and the later changes."""
 
     def __init__(self, parameters: ControllerConfig, changes: Sequence[Change]) -> None:
-        self.notes: list[str] = []
+        self._changed: dict[str, list[int]] = {}  # ticks by names of the parameters
         self._first = parameters
         self._changes = list(changes)
         self.begin()
@@ -57,6 +57,15 @@ class ParametersInForce:
         self.digest = parameters.digest()
         self.law = parameters.tuned_law()
         self.limits = parameters.guard()
+
+    def notes(self) -> tuple[str, ...]:
+        """A note for each kind of change, by the names of the parameters."""
+        return tuple(
+            f"parameters changed before tick {numbers[0]}"
+            + (f" and {len(numbers) - 1:,} later ones" if len(numbers) > 1 else "")
+            + f": {names}"
+            for names, numbers in self._changed.items()
+        )
 
     def change(
         self, digest: int, number: int, state: ControllerState | None
@@ -81,7 +90,7 @@ class ParametersInForce:
         for change, old, new in zip(applied, steps, steps[1:], strict=False):
             if new != old:
                 names.update(change)
-        self.notes.append(f"parameters changed before tick {number}: {', '.join(sorted(names))}")
+        self._changed.setdefault(", ".join(sorted(names)), []).append(number)
         for step in steps[1:]:
             if step.digest() == self.digest:
                 continue
