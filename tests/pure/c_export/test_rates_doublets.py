@@ -15,13 +15,14 @@ import pytest
 import yaml
 from numpy.typing import NDArray
 from pytest import approx
-from scipy.linalg import expm
 from tests.conftest import REPOSITORY
 
+from aircraft_sim.airframes.airframe import load_airframe
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_core.units import GRAVITY
+from flight_design.identification.own_loop import own_loop
 
 EXAMPLE = REPOSITORY / "examples" / "px4_airplane"
 TABLE = REPOSITORY / "docs" / "evidence" / "tables" / "export-axes.csv"
@@ -29,15 +30,22 @@ AXES = ("q", "p", "r")
 NOISE = np.array([0.07, 0.14, 0.028])  # rad/s, as in rates_observer.yaml
 WINDOWS = {"q": (3.0, 4.7), "p": (6.0, 7.7), "r": (9.0, 10.7)}  # s, around each doublet
 PERIOD = 0.004  # s
-STEPS = 8  # of the aircraft in a period
-END_STOP = 0.261799  # rad, at a torque of 1
-LAG = 0.004  # s, of the actuators
-
-# of PX4's fw_rate_control in q, p, r, found by a search for the least error on this aircraft
-FF = np.array([0.331, 0.206, 0.259])
-P = np.array([0.086, 0.05, 0.4155])
-I = np.array([1.19, 2.95, 10.0])  # noqa: E741 - FW_PR_I, FW_RR_I, FW_YR_I
-IMAX = 0.4
+# of fw_rate_control, found by a search for the least error on this aircraft
+PARAMETERS = {
+    "FW_AIRSPD_TRIM": 11.5,
+    "FW_PR_FF": 0.331,
+    "FW_PR_P": 0.086,
+    "FW_PR_I": 1.19,
+    "FW_PR_IMAX": 0.4,
+    "FW_RR_FF": 0.206,
+    "FW_RR_P": 0.05,
+    "FW_RR_I": 2.95,
+    "FW_RR_IMAX": 0.4,
+    "FW_YR_FF": 0.259,
+    "FW_YR_P": 0.4155,
+    "FW_YR_I": 10.0,
+    "FW_YR_IMAX": 0.4,
+}
 
 Rows = NDArray[np.float64]
 
@@ -86,34 +94,14 @@ def flown(name: str, airframe: Path) -> tuple[dict[str, Rows], Rows, Rows]:
     return rms(t, y - y_m), t, y_m
 
 
-def flown_by_px4(t: Rows, y_m: Rows) -> dict[str, Rows]:
-    """The errors of PI with feedforward, torque = FF r + P (r - y) + I integral of r - y.
-
-    y_m is the setpoint r. y is 4 ms late, the torque a period.
-    """
-    airframe = with_bank()
-    A = np.array(airframe["A"])
-    B = np.array(airframe["B"])
-    step = PERIOD / STEPS
-    both = expm(np.block([[A, B], [np.zeros((3, 9))]]) * step)
-    rng = np.random.default_rng(1)
+def flown_by_px4(airframe: Path, t: Rows, y_m: Rows) -> dict[str, Rows]:
+    """The errors of the rate loop of PX4 with y_m as the setpoint; y is 4 ms late."""
+    scenario = find_scenario(str(EXAMPLE / "rates.yaml"))
+    loop = own_loop(PARAMETERS, scenario, "px4")
+    assert loop is not None
     instants = np.arange(0.0, t[-1], PERIOD)
     setpoints = np.column_stack([np.interp(instants, t, column) for column in y_m.T])
-    x = np.zeros(6)
-    position = integral = late_u = np.zeros(3)
-    late_y = np.zeros(3)
-    y = np.zeros_like(setpoints)
-    for k, setpoint in enumerate(setpoints):
-        y[k] = x[[1, 3, 4]]
-        error = setpoint - late_y
-        late_y = y[k] + NOISE * rng.normal(size=3)
-        integral = np.clip(integral + I * error * PERIOD, -IMAX, IMAX)
-        u = END_STOP * np.clip(FF * setpoint + P * error + integral, -1.0, 1.0)
-        for _ in range(STEPS):
-            position = position + (1.0 - np.exp(-step / LAG)) * (late_u - position)
-            x = both[:6, :6] @ x + both[:6, 6:] @ position
-        late_u = u
-    return rms(instants, y - setpoints)
+    return rms(instants, loop.flown(scenario, load_airframe(str(airframe)), setpoints, NOISE))
 
 
 @pytest.fixture(scope="module")
@@ -121,7 +109,7 @@ def errors(airframe: Path) -> dict[str, dict[str, Rows]]:
     """The errors by controller."""
     by_law, t, y_m = flown("rates.yaml", airframe)
     with_observer, _, _ = flown("rates_observer.yaml", airframe)
-    return {"law": by_law, "observer": with_observer, "px4": flown_by_px4(t, y_m)}
+    return {"law": by_law, "observer": with_observer, "px4": flown_by_px4(airframe, t, y_m)}
 
 
 def test_no_axis_is_much_worse_than_by_px4(errors: dict[str, dict[str, Rows]]) -> None:

@@ -61,6 +61,8 @@ GROUPS = MappingProxyType(
             "airframe from a log.",
             "learn": "Repeat the learner on the log of a flight, with other settings, and write "
             "the model.",
+            "tune": "Identify the aircraft of an autopilot's log, and export the module with its "
+            "gains.",
             "export": "Write the controller of a scenario as C99, with a proof that C and "
             "Python give the same bits.",
         },

@@ -118,15 +118,22 @@ def too_little_excitation(entries: Iterable[Entry], outputs: Iterable[str]) -> s
     worst = max(best_known(entries, outputs), key=lambda effect: effect.deviation)
     if worst.deviation <= MAX_DEVIATION:
         return ""
-    # information adds up with the square of the amplitude
-    information = worst.deviation**-2 - PRIOR**-2
-    factor = np.sqrt((MAX_DEVIATION**-2 - PRIOR**-2) / max(information, 1e-2 * PRIOR**-2))
+    factor = excitation_factor(worst)
     return (
         f"excitation of {worst.row}: found {worst.name} known to {100 * worst.deviation:.2g} %, "
         "expected"
         f" {100 * MAX_DEVIATION:.2g} %: {worst.row} needs {factor:.2g} times the amplitude, or "
         f"{factor**2:.2g} times the time"
     )
+
+
+def excitation_factor(effect: Entry) -> float:
+    """The factor on the amplitude with which an effect is known to MAX_DEVIATION; 1 or less: it is.
+
+    Information adds up with the square of the amplitude.
+    """
+    information = effect.deviation**-2 - PRIOR**-2
+    return float(np.sqrt((MAX_DEVIATION**-2 - PRIOR**-2) / max(information, 1e-2 * PRIOR**-2)))
 
 
 def at_bound(entries: Iterable[Entry], factor: float = MAX_FACTOR) -> list[Entry]:

@@ -1,0 +1,436 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""`rise-di tune`: from the log of an autopilot to the module that flies better.
+
+Import, identification, gains, guarantee and export are those of the commands of these names.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import typer
+from rich.console import Console
+
+from aircraft_sim.airframes.airframe import Airframe, load_airframe
+from flight_analysis.closed_loop.scenario import Scenario, scenario_yaml
+from flight_analysis.closed_loop.scenario_library import find_scenario
+from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.linear_loop.guarantee import Guarantee, guarantee
+from flight_analysis.linear_loop.loop_margins import LoopMargins, margins
+from flight_analysis.report.html import Page, TableGroup, TitleLine, page_html
+from flight_analysis.report.margin_figures import guarantee_text, margin_table
+from flight_analysis.report.plotting import SampleStore
+from flight_analysis.report.summary_rows import Column
+from flight_analysis.report.tables import MetricTable
+from flight_cli.output import (
+    COUNT_COLUMNS,
+    LICENCE,
+    entry_table,
+    new_table,
+    print_table,
+    progress_bar,
+    say,
+    write_text,
+)
+from flight_cli.words import REQUIRED, argument, option, rare_option, scenario_names, warn
+from flight_core.files import display_path, writing
+from flight_core.parameters import ParameterError, require
+from flight_core.rates import period_ns
+from flight_core.vectors import FloatArray
+from flight_design.gains.gain_design import check_gains, select_gains
+from flight_design.gains.gain_selection import Selection
+from flight_design.gains.ideal_control import ChannelPairing
+from flight_design.identification.innovation_filters import (
+    Actuation,
+    FlightData,
+    measured_noise,
+)
+from flight_design.identification.log_import import Window
+from flight_design.identification.model_identification import (
+    Identification,
+    identify_model,
+    model_yaml,
+    with_entries,
+)
+from flight_design.identification.model_quality import (
+    best_known,
+    excitation_factor,
+    no_better,
+)
+from flight_design.identification.own_loop import OwnLoop, own_loop
+from flight_design.identification.rates_log import rates_of_log
+from flight_log.px4_parameters import rate_loop
+from flight_log.vehicle_log import read_foreign_log
+from rise_di.c_code import export
+
+UNPROVED = 1
+LEAST, MOST = 0.05, 0.3  # of A and B, of which the margins are asked
+SAMPLES = 60  # uncertain aircraft
+DELAY_MARGIN = 0.01  # s, beside the observer, as of examples/px4_airplane/rates_observer.yaml
+FEWEST = 3  # doublets of an axis
+LENGTH = 0.5  # s of a half of a doublet where the scenario has none
+APART = 2.0  # s
+STEPS = {
+    "px4": (
+        (
+            "To fly it: build PX4 with EXTERNAL_MODULES_LOCATION as this folder, start the lines "
+            "of extras.txt, fly level, set RDI_EN to 1."
+        ),
+        (
+            "To go back: RDI_EN 0, or the input of RDI_AUX. To fly without the module: remove "
+            "extras.txt."
+        ),
+        (
+            "Then: log the doublets with rise_di_status, and tune again with scenario.yaml of this "
+            "folder."
+        ),
+    ),
+    "ardupilot": (
+        (
+            "To fly it: copy ArduPlane/ over that folder of ArduPilot, add the lines of hooks.txt, "
+            "set RCx_OPTION of a free channel to 300, fly level, turn the switch on."
+        ),
+        "To go back: turn the switch off.",
+        "Then: log the doublets, and tune again with scenario.yaml of this folder.",
+    ),
+}
+
+
+class Predicted(NamedTuple):
+    """What a loop does on the identified aircraft: rms of e, (m,), and margins."""
+
+    rms: FloatArray
+    margins: LoopMargins
+
+
+class _Tuned(NamedTuple):
+    """The steps of a tuning."""
+
+    identification: Identification
+    uncertainty: float
+    scenario: Scenario
+    selection: Selection
+    promise: Guarantee
+    law: Predicted
+    own: OwnLoop | None
+    by_own: Predicted | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tune:
+    """Identify the aircraft of a log, select its gains, and export the module that flies them.
+
+    The log is a ULog of PX4, or a DataFlash log of ArduPlane, in which the autopilot or an earlier
+    module flew doublets of each rate. The scenario has the rates, the end stops and the commands;
+    that in the folder of an earlier tuning is better. A log with too little motion names the
+    doublets to fly.
+
+    Exit status: 0; 1 if an aircraft within the errors of the identification may be unstable, or a
+    bit of the code differs; 2 bad input, a model that is refused, or short margins.
+    """
+
+    log: Path = argument("ULog of PX4, or DataFlash log of ArduPlane.", default=REQUIRED)
+    scenario: str = option(
+        "Scenario of body rates, as of export --px4: name, or path of a file (.yaml).",
+        default=REQUIRED,
+        autocompletion=scenario_names,
+    )
+    px4: Path | None = option("Folder for a module of PX4, what it was made of, and a page.")
+    ardupilot: Path | None = option("Folder for a task of ArduPlane, in place of --px4.")
+    start: float | None = option("Begin, s since the begin of the log.", "--from")
+    stop: float | None = option("End, s since the begin of the log.", "--until")
+    calm: bool = option(
+        "Without an observer, which hands on the noise of the gyro in calm air.", default=False
+    )
+    float32: bool = option("Compute in float.", default=False)
+    accept: bool = rare_option("Write gains whose margins fall short.", default=False)
+    without_proof: bool = rare_option(
+        "Write the code without a proof.", "--no-proof", default=False
+    )
+
+    def execute(self) -> None:
+        """Identify, select, bound, export, show."""
+        autopilot, folder = self._target()
+        console = Console()
+        tuned = self._tuned(console, autopilot, folder)
+        page = folder / "tuning.html"
+        scenario = folder / "scenario.yaml"
+        write_text("--write", scenario, LICENCE + scenario_yaml(tuned.scenario))
+        with console.status("exporting and comparing"):
+            exported = export(
+                tuned.scenario,
+                folder,
+                autopilot=autopilot,
+                float32=self.float32,
+                drawn=5_000,
+                proof=not self.without_proof,
+            )
+        write_text("--write", page, page_html(_page(tuned, self.log.name, autopilot)))
+        _show(console, tuned)
+        files = {"airframe": folder / "airframe.yaml", "scenario": scenario, "page": page}
+        for name, path in files.items():
+            say(console, f"{name}: {display_path(path)}")
+        if not tuned.promise.holds or (exported.proof is not None and not exported.proof.holds):
+            raise typer.Exit(UNPROVED)
+
+    def _target(self) -> tuple[str, Path]:
+        """The autopilot and the folder. Raises ParameterError for none or both."""
+        folders = {"px4": self.px4, "ardupilot": self.ardupilot}
+        named = {name: path for name, path in folders.items() if path is not None}
+        if len(named) != 1:
+            raise typer.BadParameter("expected --px4 FOLDER or --ardupilot FOLDER")
+        ((autopilot, folder),) = named.items()
+        with writing(f"--{autopilot}", folder, "a folder that can"):
+            folder.mkdir(parents=True, exist_ok=True)
+        return autopilot, folder
+
+    def _tuned(self, console: Console, autopilot: str, folder: Path) -> _Tuned:
+        """Everything but the code."""
+        scenario = find_scenario(self.scenario)
+        controller = scenario.rise_di()
+        nominal = load_airframe(scenario.aircraft.airframe)
+        log = read_foreign_log(self.log)
+        recorded, taken = rates_of_log(
+            log, scenario, nominal, autopilot, Window(self.start, self.stop)
+        )
+        for sentence in taken.notes:
+            warn(f"warning: {sentence}")
+        if autopilot == "px4":
+            loop = rate_loop(self.log, controller.rate)
+            scenario = scenario.vary(controller={"delay": loop.delay})
+            say(console, loop.origin)
+        identification = _identified(console, scenario, nominal, recorded)
+        airframe = _kept(nominal, identification)
+        if airframe is None:
+            raise ParameterError(_what_to_fly(identification, scenario, self.log))
+        identification = identification._replace(airframe=airframe)
+        path = folder / "airframe.yaml"
+        write_text("--write", path, model_yaml(identification, self.log.name))
+        noise = measured_noise(recorded.y, np.ones(recorded.y.shape[1]))
+        uncertainty = _uncertainty(identification)
+        flight = _on_airframe(scenario, path, noise)
+        selection = self._selection(console, airframe, flight, uncertainty)
+        chosen = flight.vary(controller=selection.chosen)
+        with console.status("bounding every aircraft within the errors"):
+            answer = check_gains(airframe, chosen, uncertainty=uncertainty, samples=SAMPLES)
+            promise = guarantee(answer.loop_with_box())
+        own = own_loop(taken.parameters, chosen, autopilot)
+        law, by_own = _predicted(chosen, airframe, own, uncertainty)
+        return _Tuned(
+            identification=identification,
+            uncertainty=uncertainty,
+            scenario=chosen,
+            selection=selection,
+            promise=promise,
+            law=law,
+            own=own,
+            by_own=by_own,
+        )
+
+    def _selection(
+        self, console: Console, airframe: Airframe, flight: Scenario, uncertainty: float
+    ) -> Selection:
+        """Gains for the identified airframe. Raises ParameterError for short margins."""
+        with console.status("selecting gains") as status:
+            selection = select_gains(
+                airframe,
+                flight,
+                uncertainty=uncertainty,
+                samples=SAMPLES,
+                feedforward=True,
+                observer=not self.calm,
+                margin=DELAY_MARGIN,
+                accept=self.accept,
+                progress=status.update,
+            )
+        answer = selection.engineering
+        short = "; ".join(row.sentence(answer.controller.outputs) for row in answer.unmet)
+        expected = "--accept, which writes them all the same, or --calm"
+        require(self.accept or not short, "gains", short, expected)
+        return selection
+
+
+def _identified(
+    console: Console, scenario: Scenario, nominal: Airframe, recorded: FlightData
+) -> Identification:
+    """The model by a search on the log, with a bar."""
+    controller = scenario.rise_di()
+    lag = dict(zip(controller.inputs, controller.lag, strict=True))
+    actuation = Actuation(np.array([lag[name] for name in nominal.inputs]), controller.delay)
+    pairing = ChannelPairing(controller.outputs, controller.inputs)
+    with progress_bar(*COUNT_COLUMNS, quiet=console.quiet) as bar:
+        show: Callable[..., None] = partial(bar.update, bar.add_task("search"))
+        identification = identify_model(
+            recorded, nominal, actuation, pairing, show, searches_again=True
+        )
+        show(completed=1, total=1)
+    return identification
+
+
+def _what_to_fly(identification: Identification, scenario: Scenario, log: Path) -> str:
+    """Why the model is refused, and the doublets that would show what is missing."""
+    y = identification.recorded.y
+    reference = scenario.reference_model
+    texts = []
+    for part in identification.parts:
+        for effect in best_known(part.entries, part.outputs):
+            factor = excitation_factor(effect)
+            if factor <= 1.0:
+                continue
+            moved = float(np.nanpercentile(np.abs(y[:, _column(identification, effect.row)]), 99.0))
+            pulses = reference.pulses.get(effect.row)
+            size = moved if pulses is None else max(moved, *np.abs(pulses.value))
+            length = LENGTH if pulses is None else pulses.stop[0] - pulses.start[0]
+            number = max(FEWEST, math.ceil(FEWEST * (factor * moved / size) ** 2))
+            texts.append(
+                f"{effect.row}: {number} doublets of {size:.2g} rad/s, {length:.2g} s each way"
+            )
+    fly = f"; fly, {APART:g} s apart, {', then '.join(texts)}" if texts else ""
+    return f"{log}: {identification.refusal}{fly}"
+
+
+def _column(identification: Identification, output: str) -> int:
+    return identification.airframe.outputs.index(output)
+
+
+def _kept(nominal: Airframe, identification: Identification) -> Airframe | None:
+    """The airframe with the parts that may be used; None where one must not be.
+
+    A part whose nominal model explains the log better stays nominal.
+    """
+    used = []
+    for part in identification.parts:
+        if part.refusal and part.refusal != no_better(part.before, part.after):
+            return None
+        used += [] if part.refusal else [*part.entries]
+    return with_entries(nominal, used)
+
+
+def _uncertainty(identification: Identification) -> float:
+    """Twice the largest standard deviation of the best known effects, from LEAST to MOST."""
+    effects = best_known(identification.entries, identification.airframe.outputs)
+    return float(np.clip(2.0 * max(effect.deviation for effect in effects), LEAST, MOST))
+
+
+def _on_airframe(scenario: Scenario, airframe: Path, noise: FloatArray) -> Scenario:
+    """The scenario with the identified aircraft and the noise of the log's gyro, rad/s rms."""
+    changes = {"airframe": str(airframe.resolve()), "sensors": {"noise": noise.tolist()}}
+    return scenario.vary(aircraft=changes)
+
+
+def _predicted(
+    scenario: Scenario, airframe: Airframe, own: OwnLoop | None, uncertainty: float
+) -> tuple[Predicted, Predicted | None]:
+    """RISE-DI and the autopilot's own loop along the commands of the scenario.
+
+    Both follow y_m on the identified aircraft, with the noise of the log's gyro.
+    """
+    controller = scenario.rise_di()
+    tape = simulate(scenario)
+    truth = tape["truth"]
+    rows = [airframe.outputs.index(name) for name in controller.outputs]
+    C = airframe.matrix_c()[rows]
+    y = np.column_stack([truth[f"x.{state}"] for state in airframe.states]) @ C.T
+    y_m = np.column_stack(
+        [
+            np.interp(truth.stamp_ns, tape["y_m"].stamp_ns, tape["y_m"][name])
+            for name in controller.outputs
+        ]
+    )
+    law = Predicted(_rms(y - y_m), margins(scenario, SAMPLES, uncertainty))
+    if own is None:
+        return law, None
+    length = tape["y_m"].stamp_ns[-1] - tape.start_ns
+    stamps = tape.start_ns + np.arange(0, length, period_ns(controller.rate, "rate"))
+    setpoints = np.column_stack(
+        [np.interp(stamps, tape["y_m"].stamp_ns, tape["y_m"][name]) for name in controller.outputs]
+    )
+    noise = np.array(scenario.aircraft.sensors.noise)[rows]
+    error = own.flown(scenario, airframe, setpoints, noise)
+    own_margins = margins(own.in_place(scenario), SAMPLES, uncertainty)
+    return law, Predicted(_rms(error), own_margins)
+
+
+def _rms(e: FloatArray) -> FloatArray:
+    return np.asarray(np.sqrt(np.mean(e**2, axis=0)))
+
+
+def _error_rows(tuned: _Tuned) -> list[list[str]]:
+    """Output, rms of RISE-DI and of the own loop, mrad/s, and the ratio."""
+    outputs = tuned.scenario.controller.outputs
+    rows = []
+    for i, name in enumerate(outputs):
+        cells = [name, f"{1e3 * tuned.law.rms[i]:.1f}", "", ""]
+        if tuned.by_own is not None:
+            ratio = tuned.law.rms[i] / tuned.by_own.rms[i]
+            cells[2:] = [f"{1e3 * tuned.by_own.rms[i]:.1f}", f"{ratio:.2f}"]
+        rows.append(cells)
+    return rows
+
+
+def _show(console: Console, tuned: _Tuned) -> None:
+    """Print what was identified, and the errors that are predicted."""
+    identification = tuned.identification
+    title = f"A and B of {identification.airframe.name}"
+    print_table(console, entry_table(title, identification.entries))
+    headings = ("output", "RISE-DI\nmrad/s", "own loop\nmrad/s", "ratio")
+    table = new_table("\nPredicted rms of the error along the commands", headings)
+    for row in _error_rows(tuned):
+        table.add_row(*row)
+    print_table(console, table)
+    for sentence in (tuned.selection.origin, *guarantee_text(tuned.promise)):
+        say(console, sentence)
+
+
+def _page(tuned: _Tuned, log: str, autopilot: str) -> Page:
+    """What was identified, predicted and bounded, and what to do."""
+    identification = tuned.identification
+    entries = MetricTable(
+        f"Identified from {log}",
+        [Column("nominal", "SI"), Column("identified", "SI"), Column("deviation", "%")],
+        [
+            [
+                entry.name,
+                f"{entry.nominal:.4g}",
+                f"{entry.value:.4g}",
+                f"{100 * entry.deviation:.1f}",
+            ]
+            for entry in identification.entries
+        ],
+        "deviation: standard, of the change",
+    )
+    own = "no parameters of it in the log" if tuned.own is None else tuned.own.source
+    errors = MetricTable(
+        "Predicted rms of the error along the commands of the scenario",
+        [Column("RISE-DI", "mrad/s"), Column("own loop", "mrad/s"), Column("ratio", "")],
+        _error_rows(tuned),
+        f"with the noise of the log's gyro, without wind. Own loop: {own}",
+    )
+    law = margin_table(tuned.law.margins, tuned.promise)
+    tables = [entries, errors, law._replace(caption="Margins of RISE-DI")]
+    if tuned.by_own is not None:
+        own_margins = margin_table(tuned.by_own.margins)
+        tables.append(own_margins._replace(caption="Margins of the own loop"))
+    lines = [TitleLine(sentence) for sentence in _what_to_do(tuned, autopilot)]
+    return Page(
+        title=f"Tuning of {identification.airframe.name} from {log}",
+        lines=lines,
+        tables=[TableGroup(tables)],
+        sections=[],
+        samples=SampleStore(),
+    )
+
+
+def _what_to_do(tuned: _Tuned, autopilot: str) -> list[str]:
+    """What holds, what to set and switch, and how to go back."""
+    part = f"A and B within {100 * tuned.uncertainty:.0f} %"
+    holds = "every aircraft is stable" if tuned.promise.holds else "an aircraft may be unstable"
+    return [
+        f"{part}: {holds} by the guarantee, up to {100 * tuned.promise.stable:.0f} %",
+        *STEPS[autopilot],
+    ]

@@ -1,0 +1,98 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The rates and the torque of an autopilot's log, as y and u of a scenario of body rates.
+
+A torque of 1 is u at the upper end stop, as in the module of `rise-di export`.
+"""
+
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+
+import numpy as np
+
+from aircraft_sim.airframes.airframe import Airframe
+from autopilot_bridge.params import ChannelMap, load_map
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_core.parameters import require
+from flight_core.tape import Signal, Tape
+from flight_core.vectors import FloatArray
+from flight_design.identification.innovation_filters import FlightData, coarser, recording
+from flight_design.identification.log_import import Imported, Window, imported
+from flight_design.identification.parameter_agreement import Agreement
+from flight_log.vehicle_tables import VehicleLog
+
+MAPS: Mapping[str, str] = MappingProxyType({"px4": "px4", "ardupilot": "ardupilot"})
+"""The channel map with the topics of an autopilot."""
+SLOWEST, FASTEST = 0.6, 1.6  # of the trim speed, as c_export.autopilots clips the dynamic pressure
+PERIOD = 0.012  # s, of the identification at least: a search over more samples takes longer
+
+
+def rates_map(scenario: Scenario, autopilot: str) -> ChannelMap:
+    """The channel map of an autopilot with the channels and the end stops of a scenario.
+
+    V stays for a fixed wing, as evidence of flight. Raises ParameterError for an input without a
+    row that moves its output, or without an end stop.
+    """
+    base = load_map(MAPS[autopilot])
+    controller = scenario.controller
+    channels = scenario.aircraft.channels()
+    upper = dict(zip(channels.inputs, scenario.aircraft.actuators.upper or (), strict=False))
+    by_motion = {row.motion[0]: row for row in base.inputs.values()}
+    inputs = {}
+    for output, name, sign in zip(
+        controller.outputs, controller.inputs, scenario.rise_di().D, strict=True
+    ):
+        expected = f"a rate that the map {base.name} has an input of"
+        require(output in by_motion, "controller.outputs", output, expected)
+        end = upper.get(name) or 0.0
+        require(
+            end > 0.0, "aircraft.actuators.upper", f"no end stop of {name}", "that of the torque 1"
+        )
+        row = by_motion[output]
+        signed = 1 if row.sign * sign > 0 else -1
+        inputs[name] = row.model_copy(update={"scale": end, "sign": signed})
+    speed = {"V"} if channels.speed > 0.0 else set()
+    names = {*controller.outputs, *speed}
+    outputs = {name: row for name, row in base.outputs.items() if name in names}
+    return base.model_copy(update={"outputs": outputs, "inputs": inputs, "pose": {}})
+
+
+def rates_of_log(
+    log: VehicleLog,
+    scenario: Scenario,
+    airframe: Airframe,
+    autopilot: str,
+    window: Window,
+    show: Callable[[list[Agreement]], None] = lambda _: None,
+) -> tuple[FlightData, Imported]:
+    """Y and u of a log for the identification of an airframe, and what was imported.
+
+        u = sign(D) end torque (V / V0)^2
+
+    with V clipped as in the module. u of ArduPlane is that of its servos. Raises ParameterError.
+    """
+    channel_map = rates_map(scenario, autopilot)
+    taken = imported(channel_map, log, window, show, servos=autopilot == "ardupilot")
+    tape = taken.tape
+    u = tape["u"]
+    values = np.column_stack([u[name] for name in airframe.inputs])
+    values = values * _pressure(log, scenario, u)[:, None]
+    y = tape["y"]
+    signals = {
+        "y": Signal(
+            y.stamp_ns, airframe.outputs, np.column_stack([y[name] for name in airframe.outputs])
+        ),
+        "u": Signal(u.stamp_ns, tuple(airframe.inputs), values),
+    }
+    recorded = recording(Tape(signals, tape.start_ns), airframe)
+    return coarser(recorded, max(1, round(PERIOD / recorded.period))), taken
+
+
+def _pressure(log: VehicleLog, scenario: Scenario, u: Signal) -> FloatArray:
+    """(V / V0)^2 at the stamps of u, (N,); 1 in hover, or where the airspeed is not known."""
+    speed = scenario.aircraft.channels().speed
+    source = log.source("V")
+    if speed <= 0.0 or source is None:
+        return np.ones(len(u.stamp_ns))
+    ratio = np.clip(log.at(source, u.stamp_ns) / speed, SLOWEST, FASTEST)
+    return np.asarray(np.where(np.isfinite(ratio), ratio, 1.0) ** 2)

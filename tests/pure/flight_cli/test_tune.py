@@ -1,0 +1,247 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""`rise-di tune`: from the log of an autopilot to its module.
+
+The logs are of simulated aircraft whose A and B differ from the airframes of the scenarios by 10 %,
+under a rate controller of PX4's form, in doublets of each rate.
+"""
+
+import math
+import shutil
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from pytest import approx
+from scipy.linalg import expm
+from tests.conftest import REPOSITORY, invoke, refusing
+from tests.vehicle_logs import write_dataflash, write_ulog
+
+from aircraft_sim.airframes.airframe import load_airframe
+from flight_analysis.closed_loop.scenario_library import find_scenario
+from flight_cli.cli import application
+from flight_core.vectors import FloatArray
+from flight_design.identification.own_loop import own_loop
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc, which export looks for"),
+]
+app = application(["tune", "gains", "export"])
+PX4 = REPOSITORY / "examples" / "px4_airplane" / "rates.yaml"
+PLANE = REPOSITORY / "examples" / "arduplane" / "rates.yaml"
+STEPS = 8  # of the aircraft in a period
+EFFECT, DAMPING = 0.9, 1.1  # of B, and of the diagonal of A, over the nominal ones
+APART = 3.0  # s, from a doublet to the next, which lasts 1 s
+
+
+class Gains(NamedTuple):
+    """Of the autopilot, by output of the airframe: torque a rad/s, rad/s, rad."""
+
+    FF: tuple[float, ...]
+    P: tuple[float, ...]
+    I: tuple[float, ...]  # noqa: E741 - as the parameters are named
+
+
+class Flight(NamedTuple):
+    """y, rad/s, and the torque, rows as stamps."""
+
+    stamp_us: list[int]
+    y: FloatArray
+    torque: FloatArray
+
+
+def flown(
+    scenario: Path,
+    gains: Gains,
+    size: tuple[float, ...],
+    noise: tuple[float, ...],
+    length: float,
+    delay_of_log: float = 0.0,
+) -> Flight:
+    """A flight with doublets of these sizes, rad/s; u acts after the delay of the scenario."""
+    flight = find_scenario(str(scenario))
+    airframe = load_airframe(flight.aircraft.airframe)
+    A = airframe.matrix_a() * np.where(np.eye(len(airframe.states)) > 0.0, DAMPING, 1.0)
+    B = EFFECT * airframe.matrix_b()
+    C = airframe.matrix_c()
+    n, m = B.shape
+    lag = flight.controller.lag[0]
+    end = np.array(flight.aircraft.actuators.upper)
+    period = 1.0 / flight.controller.rate
+    both = expm(np.block([[A, B], [np.zeros((m, n + m))]]) * period / STEPS)
+    rng = np.random.default_rng(3)
+    x = np.zeros(n)
+    position = integral = late = np.zeros(m)
+    delay = delay_of_log or flight.controller.delay
+    under_way = [np.zeros(m)] * round(delay / period)
+    count = int(length / period)
+    y, torque = np.zeros((count, m)), np.zeros((count, m))
+    for k in range(count):
+        number, phase = divmod(k * period, APART)
+        setpoint = np.zeros(m)
+        axis = int(number) % m
+        setpoint[axis] = size[axis] * ((phase < 0.5) - (0.5 <= phase < 1.0))
+        y[k] = C @ x + np.array(noise) * rng.normal(size=m)
+        error = setpoint - late
+        late = y[k]
+        integral = np.clip(integral + np.array(gains.I) * error * period, -0.4, 0.4)
+        command = np.array(gains.FF) * setpoint + np.array(gains.P) * error + integral
+        torque[k] = np.clip(command, -1.0, 1.0)
+        before = under_way.pop(0)
+        for _ in range(STEPS):
+            position = position + (1.0 - math.exp(-period / STEPS / lag)) * (before - position)
+            x = both[:n, :n] @ x + both[:n, n:] @ position
+        under_way.append(end * torque[k])
+    stamps = [1_000_000 + round(1e6 * period) * k for k in range(count)]
+    return Flight(stamps, y, torque)
+
+
+PX4_GAINS = Gains((0.331, 0.206, 0.259), (0.086, 0.05, 0.4155), (1.19, 2.95, 10.0))  # q, p, r
+
+
+def px4_log(path: Path, size: tuple[float, ...], length: float) -> Path:
+    """A ULog at 250 Hz."""
+    flight = flown(PX4, PX4_GAINS, size, (0.02, 0.04, 0.01), length, 0.004)
+    axes = [1, 0, 2]  # of PX4: roll, pitch, yaw
+    ones = np.ones((len(flight.y), 1))
+
+    def rows(values: FloatArray) -> list[tuple[int, FloatArray]]:
+        return list(zip(flight.stamp_us, values, strict=True))
+
+    topics = {
+        "vehicle_angular_velocity": ("float[3] xyz;", rows(flight.y[:, axes])),
+        "vehicle_torque_setpoint": ("float[3] xyz;", rows(flight.torque[:, axes])),
+        "airspeed_validated": ("float true_airspeed_m_s;", rows(11.5 * ones)),
+    }
+    parameters = {"IMU_GYRO_RATEMAX": 250.0, "IMU_GYRO_CUTOFF": 0.0, "FW_AIRSPD_TRIM": 11.5}
+    for k, axis in enumerate("PRY"):
+        gains = {"FF": PX4_GAINS.FF[k], "P": PX4_GAINS.P[k], "I": PX4_GAINS.I[k], "IMAX": 0.4}
+        parameters |= {f"FW_{axis}R_{name}": value for name, value in gains.items()}
+    write_ulog(path, topics, parameters)
+    return path
+
+
+def ardupilot_log(path: Path, length: float) -> Path:
+    """A DataFlash log at 200 Hz: servos 1 and 2 are aileron and elevator, 1000 to 2000 us."""
+    gains = Gains((0.25, 0.2), (0.3, 0.2), (0.5, 0.5))
+    flight = flown(PLANE, gains, (0.3, 0.6), (0.01, 0.01), length)
+    pulses = 1500.0 + 500.0 * flight.torque[:, [1, 0]]
+    stamps = flight.stamp_us
+    gyro = np.column_stack([flight.y[:, 1], flight.y[:, 0], np.zeros(len(stamps))])
+    speed = [(stamp, (23.9, 1.0)) for stamp in stamps]
+    messages = {
+        "MODE": (("Mode", "ModeNum"), [(1, (5.0, 5.0))]),
+        "IMU": (("GyrX", "GyrY", "GyrZ"), list(zip(stamps, gyro, strict=True))),
+        "CTUN": (("As", "E2T"), speed),
+        "RCOU": (("C1", "C2"), list(zip(stamps, pulses, strict=True))),
+    }
+    parameters = {"SCALING_SPEED": 23.9}
+    for number, function in ((1, 4.0), (2, 19.0)):
+        limits = {"MIN": 1000.0, "MAX": 2000.0, "TRIM": 1500.0, "REVERSED": 0.0}
+        parameters |= {f"SERVO{number}_{name}": value for name, value in limits.items()}
+        parameters |= {f"RC{number}_{name}": value for name, value in limits.items()}
+        parameters[f"SERVO{number}_FUNCTION"] = function
+    factor = math.radians(45.0)  # a gain of 1 gives rad, 45 deg are the torque 1
+    for k, axis in enumerate(("PTCH", "RLL")):
+        values = {"FF": gains.FF[k], "P": gains.P[k], "I": gains.I[k]}
+        parameters |= {f"{axis}_RATE_{name}": factor * value for name, value in values.items()}
+    write_dataflash(path, messages, parameters, "ArduPlane V4.7.0 (1f2e3d4c)")
+    return path
+
+
+@pytest.fixture(autouse=True)
+def _in_repository(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The scenarios name their airframes from there."""
+    monkeypatch.chdir(REPOSITORY)
+
+
+def test_log_of_px4_becomes_a_module_and_the_next_log_another_one(tmp_path: Path) -> None:
+    """The effects are those that flew, 10 % less than in the scenario, and so the errors fall."""
+    pytest.importorskip("pyulog", reason="pyulog is not installed: make autopilot")
+    log = px4_log(tmp_path / "flight.ulg", (0.3, 0.6, 0.2), 60.0)
+    folder = tmp_path / "first"
+    words = ["tune", str(log), "--px4", str(folder), "--calm", "--no-proof"]
+    result = invoke(*words, "--scenario", str(PX4))
+    assert result.exit_code == 0, result.output
+    nominal = load_airframe(str(REPOSITORY / "examples/px4_airplane/rates_airframe.yaml"))
+    found = load_airframe(str(folder / "airframe.yaml"))
+    for row, column in (("q", 0), ("p", 1), ("r", 2)):
+        ratio = found.matrix_b()[found.index(row), column]
+        ratio /= nominal.matrix_b()[nominal.index(row), column]
+        # a mean over 12 ms in place of 4 ms, and a lag of a period that is not quite known
+        assert ratio == approx(EFFECT, abs=0.08), row
+    scenario = find_scenario(str(folder / "scenario.yaml"))
+    assert scenario.rise_di().feedforward is not None
+    assert scenario.rise_di().delay == approx(0.004)  # of the log: a period, no cut-off
+    assert (folder / "src" / "modules" / "rise_di_control" / "RiseDiControl.cpp").is_file()
+    page = (folder / "tuning.html").read_text("utf-8")
+    assert "set RDI_EN to 1" in page
+    assert "To go back: RDI_EN 0" in page
+    assert "FW_RR_FF 0.206, P 0.05, I 2.95" in page
+    assert "Margins of the own loop" in page
+    # Every rate is closer to its reference than under the loop of the log.
+    ratios = [
+        float(line.split()[-1])
+        for line in result.output.splitlines()
+        if line.split()[:1] in (["q"], ["p"], ["r"]) and len(line.split()) == 4
+    ]
+    assert len(ratios) == 3
+    assert max(ratios) < 0.9
+    again = ["tune", str(log), "--px4", str(tmp_path / "second"), "--calm", "--no-proof"]
+    next_result = invoke(*again, "--scenario", str(folder / "scenario.yaml"))
+    assert next_result.exit_code == 0, next_result.output
+
+
+def test_log_without_motion_names_the_doublets_to_fly(tmp_path: Path) -> None:
+    pytest.importorskip("pyulog", reason="pyulog is not installed: make autopilot")
+    log = px4_log(tmp_path / "flight.ulg", (0.0, 0.0, 0.0), 40.0)
+    words = ["tune", str(log), "--px4", str(tmp_path / "module"), "--scenario", str(PX4)]
+    with refusing(
+        r"excitation of q: found B\[q, elevator\] known to .*"
+        r"; fly, 2 s apart, q: 3 doublets of 0.3 rad/s, 0.5 s each way, then p: "
+    ):
+        invoke(*words, catch_exceptions=False)
+    assert not (tmp_path / "module" / "src").exists()
+
+
+def test_log_of_arduplane_becomes_a_task(tmp_path: Path) -> None:
+    pytest.importorskip("pymavlink", reason="pymavlink is not installed: make autopilot")
+    log = ardupilot_log(tmp_path / "flight.bin", 80.0)
+    folder = tmp_path / "task"
+    words = ["tune", str(log), "--ardupilot", str(folder), "--scenario", str(PLANE), "--calm"]
+    result = invoke(*words, "--float32", "--no-proof", "--accept")
+    assert result.exit_code in (0, 1), result.output
+    assert (folder / "ArduPlane" / "rise_di.cpp").is_file()
+    nominal = load_airframe(str(REPOSITORY / "examples/arduplane/rates_airframe.yaml"))
+    found = load_airframe(str(folder / "airframe.yaml"))
+    for row, column in (("q", 0), ("p", 1)):
+        ratio = found.matrix_b()[found.index(row), column]
+        ratio /= nominal.matrix_b()[nominal.index(row), column]
+        assert ratio == approx(EFFECT, abs=0.1), row
+    assert "RLL_RATE_FF" in (folder / "tuning.html").read_text("utf-8")
+
+
+@pytest.mark.parametrize("options", [[], ["--px4", "a", "--ardupilot", "b"]])
+def test_one_autopilot_is_named(tmp_path: Path, options: list[str]) -> None:
+    result = invoke("tune", str(tmp_path / "no.ulg"), "--scenario", str(PX4), *options)
+    assert result.exit_code == 2
+    assert "--px4 FOLDER or --ardupilot FOLDER" in result.output
+
+
+@pytest.mark.parametrize("ratio", [1.0, 2.0])
+def test_gains_of_arduplane_are_an_angle_of_45_deg_at_full_torque(ratio: float) -> None:
+    """P and I follow the square of SCALING_SPEED over the trim speed, FF the ratio."""
+    scenario = find_scenario(str(PLANE))
+    parameters = {"SCALING_SPEED": ratio * 23.9}
+    for axis in ("PTCH", "RLL"):
+        gains = dict.fromkeys(("FF", "P", "I"), math.radians(45.0))
+        parameters |= {f"{axis}_RATE_{name}": value for name, value in gains.items()}
+    loop = own_loop(parameters, scenario, "ardupilot")
+    assert loop is not None
+    assert approx([ratio, ratio]) == loop.FF
+    assert approx([ratio**2] * 2) == loop.P
+    assert approx([ratio**2] * 2) == loop.I
+    del parameters["RLL_RATE_P"]
+    assert own_loop(parameters, scenario, "ardupilot") is None
