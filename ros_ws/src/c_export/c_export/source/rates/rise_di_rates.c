@@ -37,9 +37,16 @@ static bool is_stale(const rise_di_cycle *cycle, uint64_t stamp_us, float max_ag
     return !((float)age_us <= (max_age * 1e6f));
 }
 
+/* The maximum age; out of its bounds the largest, for a RISE-DI that has nothing to fall back to. */
+static float age_of(const rise_di_cycle *cycle) {
+    return is_within(cycle->max_age, RISE_DI_MAX_AGE_LEAST, RISE_DI_MAX_AGE_LARGEST) ? cycle->max_age : RISE_DI_MAX_AGE_LARGEST;
+}
+
 /* An autopilot holds the last setpoint: one that comes slowly is not stale. */
 static bool is_setpoint_stale(const rise_di_cycle *cycle) {
-    return is_stale(cycle, cycle->setpoint_us, (cycle->hold > cycle->max_age) ? cycle->hold : cycle->max_age);
+    const float age = age_of(cycle);
+    const bool is_longer = is_within(cycle->hold, age, RISE_DI_HOLD_LARGEST);
+    return is_stale(cycle, cycle->setpoint_us, is_longer ? cycle->hold : age);
 }
 
 static bool are_numbers(const rise_di_cycle *cycle) {
@@ -55,6 +62,8 @@ static rise_di_refusal wrong_setting(const rise_di_rates *rates, const rise_di_c
     rise_di_refusal refusal = RISE_DI_FLIES;
     if (!rates->started) {
         refusal = RISE_DI_REFUSED;
+    } else if (rates->is_alone) {
+        /* nothing else can fly */
     } else if (!is_within(cycle->max_age, RISE_DI_MAX_AGE_LEAST, RISE_DI_MAX_AGE_LARGEST)) {
         refusal = RISE_DI_WRONG_AGE;
     } else if (!is_within(cycle->max_error, RISE_DI_MAX_ERROR_LEAST, RISE_DI_MAX_ERROR_LARGEST)) {
@@ -89,7 +98,7 @@ static rise_di_refusal not_wanted(const rise_di_rates *rates, const rise_di_cycl
 /* What passes by itself. */
 static rise_di_refusal fault_of(const rise_di_rates *rates, const rise_di_cycle *cycle) {
     rise_di_refusal refusal = RISE_DI_FLIES;
-    if (is_stale(cycle, cycle->rates_us, cycle->max_age)) {
+    if (is_stale(cycle, cycle->rates_us, age_of(cycle))) {
         refusal = RISE_DI_STALE_RATES;
     } else if (is_setpoint_stale(cycle)) {
         refusal = RISE_DI_STALE_SETPOINT;
@@ -151,8 +160,7 @@ static void take_spare(rise_di_rates *rates, const rise_di_cycle *cycle) {
             rates->spare_thrust[k] = cycle->spare_thrust[k];
         }
     }
-    const bool has_age = is_within(cycle->max_age, RISE_DI_MAX_AGE_LEAST, RISE_DI_MAX_AGE_LARGEST);
-    rates->is_silent = is_stale(cycle, rates->spare_us, has_age ? cycle->max_age : RISE_DI_MAX_AGE_LARGEST);
+    rates->is_silent = is_stale(cycle, rates->spare_us, age_of(cycle));
     rates->is_alone = rates->is_silent && cycle->armed && (rates->is_alone || (rates->refusal == RISE_DI_FLIES));
 }
 
