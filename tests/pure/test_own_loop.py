@@ -5,14 +5,19 @@
 The aircraft as an environment of gymnasium is beside them.
 """
 
+import re
+import subprocess
+import sys
 from typing import Any
 
 import control
+import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from numpy.typing import ArrayLike
 from pytest import approx
+from tests.conftest import REPOSITORY
 
 import rise_di
 from aircraft_sim.simulator import Simulator
@@ -151,10 +156,66 @@ def test_python_control_flies_law_to_rounding(flown: Tape) -> None:
 # gymnasium
 
 
-@pytest.mark.filterwarnings("ignore:.*Box observation space (min|max)imum value is.*infinity")
 @pytest.mark.filterwarnings("ignore:.*we recommend using a symmetric and normalized space")
 def test_environment_passes_checks_of_gymnasium() -> None:
-    check_env(rise_di.FlightEnv(SCENARIO, uncertainty=0.3), skip_render_check=True)
+    named = gymnasium.make("rise_di/Flight-v0", duration=1.0, uncertainty=0.3, render_mode="ansi")
+    check_env(named.unwrapped)
+
+
+def test_environment_has_a_name_bounds_facts_and_a_line_of_text() -> None:
+    env = gymnasium.make(
+        "rise_di/Flight-v0", scenario="osprey_gust", duration=0.05, render_mode="ansi"
+    )
+    observed, info = env.reset(seed=1)
+    space: Any = env.observation_space
+    assert np.isfinite(space.low).all()
+    assert space.low == approx(-space.high)
+    assert info["error"] == approx(observed[:M] - observed[M:])
+    ended = False
+    while not ended:
+        observed, _, _, ended, info = env.step(np.zeros(M))
+        assert info["error"] == approx(observed[:M] - observed[M:])
+        assert ("outcome" in info) == ended
+    assert info["outcome"] == "completed"
+    text = str(env.render())
+    assert text.startswith("t 0.05 s  ")
+    # y and y_m of each output, with the four decimals of the line
+    numbers = [float(number) for number in re.findall("[+-][0-9.]+", text)]
+    assert numbers == approx(np.column_stack(np.split(observed, 2)).ravel(), abs=1e-4)
+    with pytest.raises(rise_di.ParameterError, match="render_mode: found human, expected ansi"):
+        rise_di.FlightEnv(SCENARIO, render_mode="human")
+
+
+def test_aircraft_beyond_its_bounds_terminates_with_an_observation_within_them() -> None:
+    flights = gymnasium.make_vec(
+        "rise_di/Flight-v0",
+        num_envs=2,
+        vectorization_mode="vector_entry_point",
+        scenario="osprey_gust",
+        duration=3.0,
+    )
+    flights.reset(seed=1)
+    has_terminated = np.zeros(2, dtype=bool)
+    for _ in range(20):
+        observed, _, terminated, _, info = flights.step(np.array([[0.0] * M, [1e9] * M]))
+        assert flights.observation_space.contains(observed)
+        assert info["error"].shape == (2, M)
+        has_terminated |= terminated
+    assert has_terminated.tolist() == [False, True]
+
+
+def test_example_trains_a_policy() -> None:
+    """Each generation draws about the best of the one before: the mean return of the best rises."""
+    process = subprocess.run(
+        [sys.executable, REPOSITORY / "examples/gymnasium/cross_entropy.py", "3"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    lines = process.stdout.splitlines()
+    scores = [[float(x) for x in re.findall(r"-[0-9.]+", line)] for line in lines[:3]]
+    # The worst that the fleet may do is to leave u at 0.
+    assert scores[2][0] > scores[0][0] > scores[0][1]
 
 
 def test_environment_under_law_flies_as_simulation(flown: Tape) -> None:
@@ -188,7 +249,8 @@ def test_diverged_aircraft_terminates_episode(monkeypatch: pytest.MonkeyPatch) -
 
     monkeypatch.setattr(Simulator, "sample", diverge)
     _, reward, terminated, truncated, info = env.step(u)
-    assert (terminated, truncated, info) == (True, False, {"outcome": "diverged at t = 0.02 s"})
+    assert (terminated, truncated) == (True, False)
+    assert info["outcome"] == "diverged at t = 0.02 s"
     # the score of a loss of track for the seconds from the last tick on
     assert reward == approx(-10.0 * (3.0 - 0.01))
     with pytest.raises(rise_di.ParameterError, match="expected reset"):

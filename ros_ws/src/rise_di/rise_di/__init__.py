@@ -14,6 +14,7 @@ The names keep their meaning within a minor version; see CHANGELOG.md.
 """
 
 import ast
+import sys
 from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
@@ -49,3 +50,10 @@ def __getattr__(name: str) -> object:
 
 def __dir__() -> list[str]:
     return [*__all__, "__version__"]
+
+
+# gymnasium takes longer to load than all else here; who makes environments by name has it.
+if "gymnasium" in sys.modules:
+    from rise_di.environment_ids import register
+
+    register()

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from aircraft_sim.uncertainty import gust_directions, sampled_matrices
 from flight_analysis.closed_loop.scenario import Scenario, as_scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.stations import (
     AircraftStation,
     FlightLoop,
@@ -22,10 +23,12 @@ from flight_campaign.batch.campaign_course import HOLD, build_course
 from flight_campaign.statistics import LOSS_OF_TRACK_SCORE, score_units
 from flight_core.arguments import as_count, as_number
 from flight_core.installation import require_package
-from flight_core.outcome import FlightEnded
+from flight_core.outcome import End, FlightEnded, Outcome
 from flight_core.parameters import require
+from flight_core.plausible import largest
 from flight_core.rates import nanoseconds
 from flight_core.vectors import FloatArray, StampedVector, as_array
+from rise_di.environment_ids import register
 
 require_package("gymnasium")
 import gymnasium  # noqa: E402 - an extra
@@ -43,17 +46,20 @@ class _Channels(NamedTuple):
 
 
 def _channels(scenario: Scenario) -> _Channels:
-    """Spaces of u within the limits of the controller, and of y then y_m."""
+    """Spaces of u within the limits of the controller, and of y then y_m.
+
+    The bounds of y and y_m are those beyond which an aircraft is lost.
+    """
     controller = scenario.controller
     limits = controller.effector_limits()
     low, high = (
         np.where(np.isfinite(limit), limit, sign * UNLIMITED)
         for limit, sign in ((limits.lower, -1), (limits.upper, 1))
     )
-    shape = (2 * len(controller.outputs),)
+    beyond = np.tile(largest(controller.outputs), 2)
     return _Channels(
         gymnasium.spaces.Box(low, high, dtype=np.float64),
-        gymnasium.spaces.Box(-np.inf, np.inf, shape, np.float64),
+        gymnasium.spaces.Box(-beyond, beyond, dtype=np.float64),
         score_units(controller.outputs, scenario.aircraft.channels().outputs),
     )
 
@@ -108,7 +114,8 @@ class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
     limits. Reward of a step: -T sum_i abs(y_i - y_m_i) / unit_i, T the period of the controller and
     unit_i the unit of the score, 10 mrad/s (p 20) or 0.1 m/s. An aircraft that diverges terminates
     the episode: LOSS_OF_TRACK_SCORE for each second left. The end of the flight's duration
-    truncates the episode.
+    truncates the episode. `info` has the error y - y_m, shape (m,), and at the end the outcome, a
+    sentence.
 
     Args:
         scenario: The aircraft, the reference model, and rate, channels and limits of the
@@ -117,6 +124,7 @@ class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
             up to this fraction, 0 to 1, with the entries and the distribution of
             `aircraft.uncertainty`. None: every episode has the aircraft, the noise and the
             turbulence of the scenario.
+        render_mode: "ansi": `render` returns a line of t, y and y_m. None: it returns nothing.
 
     Raises:
         ParameterError: gymnasium is missing, an aircraft of JSBSim has an uncertainty, or an output
@@ -130,10 +138,17 @@ class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
         (8,)
     """
 
-    metadata = {"render_modes": []}  # noqa: RUF012 - as gymnasium declares it
+    metadata = {"render_modes": ["ansi"]}  # noqa: RUF012 - as gymnasium declares it
 
-    def __init__(self, scenario: Scenario, uncertainty: float | None = None) -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        uncertainty: float | None = None,
+        render_mode: str | None = None,
+    ) -> None:
         self.scenario = as_scenario(scenario)
+        require(render_mode in (None, "ansi"), "render_mode", render_mode, "ansi or None")
+        self.render_mode = render_mode
         self._uncertainty = (
             None if uncertainty is None else as_number(uncertainty, "uncertainty", 0.0, 1.0)
         )
@@ -147,6 +162,7 @@ class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
         self.outputs = controller.outputs
         self.inputs = controller.effectors
         self.action_space, self.observation_space, self._units = _channels(scenario)
+        self.metadata = {**self.metadata, "render_fps": controller.rate}
         self._period = 1.0 / controller.rate
         self._period_ns = nanoseconds(self._period)
         self._k = -1
@@ -170,7 +186,7 @@ class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
             options: Unused; gymnasium has the argument.
 
         Returns:
-            The observation, shape (2 m,), SI, and an empty mapping.
+            The observation, shape (2 m,), SI, and the facts of `step`.
         """
         super().reset(seed=seed, options=options)
         self._y = np.zeros(len(self.outputs))
@@ -184,7 +200,15 @@ class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
         self._loop = FlightLoop([reference, aircraft])
         self._k = 0
         self._loop.run(0)
-        return self._observed(), {}
+        return self._observed(), {"error": self._error()}
+
+    def render(self) -> str | None:
+        """A line of t, and of y and y_m by output, SI, in the mode "ansi"; else None."""
+        if self.render_mode is None:
+            return None
+        rows = zip(self.outputs, self._y, self._y_m, strict=True)
+        texts = [f"{name} {y:+.4f} of {y_m:+.4f}" for name, y, y_m in rows]
+        return f"t {self.t:.2f} s  {'  '.join(texts)}\n"
 
     def _take_y(self, sample: StampedVector, _t_ns: int) -> None:
         self._y = sample.value
@@ -220,17 +244,19 @@ class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
                 -LOSS_OF_TRACK_SCORE * remaining,
                 True,
                 False,
-                {"outcome": str(error)},
+                {"error": self._error(), "outcome": str(error)},
             )
-        observed = self._observed()
-        e = observed[: len(self._y)] - observed[len(self._y) :]
-        return (
-            observed,
-            -self._period * float(np.sum(np.abs(e) / self._units)),
-            False,
-            self._k >= self._ticks,
-            {},
-        )
+        e = self._error()
+        is_over = self._k >= self._ticks
+        info: dict[str, Any] = {"error": e}
+        if is_over:
+            info["outcome"] = str(Outcome(End.COMPLETED))
+        reward = -self._period * float(np.sum(np.abs(e) / self._units))
+        return self._observed(), reward, False, is_over, info
+
+    def _error(self) -> FloatArray:
+        """Y - y_m, (m,)."""
+        return self._y - self._y_m
 
     def _drawn(self) -> Scenario:
         """The scenario of the episode, drawn by the generator of the environment."""
@@ -248,7 +274,9 @@ class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
         return self.scenario.vary(aircraft=aircraft)
 
     def _observed(self) -> FloatArray:
-        return np.concatenate([self._y, self._y_m])
+        space = self.observation_space
+        observed = np.concatenate([self._y, self._y_m])
+        return np.clip(observed, space.low, space.high)  # type: ignore[attr-defined]
 
 
 class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray[Any]]):
@@ -298,6 +326,7 @@ class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray
             self.single_observation_space, self.num_envs
         )
         self._units = units[:, None]
+        self._largest = largest(scenario.controller.outputs)[:, None]
         self._k = 0
         self._last = 0
         self._y, self._ended = (
@@ -356,14 +385,15 @@ class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray
             self._flights.restart(started)
             self._y = np.where(started, 0.0, self._y)
         y, y_m = self._sense()
-        self._ended = ~self._flights.bounded
+        self._ended = ~self._flights.bounded | (np.abs(y) > self._largest).any(axis=0)
         remaining = (self._last - self._k + 1) * self._course.period
         reward = -self._course.period * np.sum(np.abs(y - y_m) / self._units, axis=0)
         reward = np.where(
             self._ended, -LOSS_OF_TRACK_SCORE * remaining, np.where(started, 0.0, reward)
         )
         truncated = ~self._ended if self._k == self._last else none
-        return self._observed(y, y_m), reward, self._ended, truncated, {}
+        info = {"error": (y - y_m).T, "_error": np.ones(self.num_envs, dtype=bool)}
+        return self._observed(y, y_m), reward, self._ended, truncated, info
 
     def _begin(self) -> FloatArray:
         """Draw N aircraft."""
@@ -389,6 +419,28 @@ class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray
             self._y = y
         return self._y, np.broadcast_to(self._course.segments.y_m[self._k][:, None], y.shape)
 
-    @staticmethod
-    def _observed(y: FloatArray, y_m: FloatArray) -> FloatArray:
-        return np.concatenate([y, y_m]).T
+    def _observed(self, y: FloatArray, y_m: FloatArray) -> FloatArray:
+        # nan of a diverged aircraft counts as its bound
+        known = np.nan_to_num(np.concatenate([y, y_m]), nan=np.inf)
+        beyond = np.tile(self._largest, (2, 1))
+        return np.asarray(np.clip(known, -beyond, beyond).T)
+
+
+def make_flight(
+    scenario: str = "osprey_servo", duration: float | None = None, **options: Any
+) -> FlightEnv:
+    """The environment rise_di/Flight-v0 of a scenario by name, with the options of FlightEnv."""
+    return FlightEnv(find_scenario(scenario, duration), **options)
+
+
+def make_flights(
+    num_envs: int,
+    scenario: str = "osprey_servo",
+    duration: float | None = None,
+    **options: Any,
+) -> FlightVectorEnv:
+    """N aircraft of rise_di/Flight-v0, with the options of FlightVectorEnv."""
+    return FlightVectorEnv(find_scenario(scenario, duration), num_envs, **options)
+
+
+register()

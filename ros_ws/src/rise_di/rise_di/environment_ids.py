@@ -1,0 +1,17 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The identifiers of gymnasium, which has had no entry point for them since 1.0."""
+
+ID = "rise_di/Flight-v0"
+
+
+def register() -> None:
+    """Register the environments once."""
+    import gymnasium  # noqa: PLC0415 - an extra
+
+    if ID not in gymnasium.registry:
+        gymnasium.register(
+            id=ID,
+            entry_point="rise_di.flight_env:make_flight",
+            vector_entry_point="rise_di.flight_env:make_flights",
+        )
