@@ -137,7 +137,8 @@ def test_spare_that_never_published_is_not_taken_over_from(program: Path) -> Non
 def test_spare_that_stops_in_flight_leaves_rise_di_alone(program: Path) -> None:
     """It flies on, and returns at once after a NaN of the gyro.
 
-    So it does switched off, with a wrong parameter, and with a gyro that became slow. The thrust is that of the setpoint, which the spare would hand on: it moves on, not frozen.
+    So it does switched off, with a wrong parameter, and with a gyro that became slow. The thrust is
+    that of the setpoint, which the spare would hand on: it moves on, not frozen.
     """
     nothing_to_go_to = {"wrong_age_at": 6.0}, {"hz_at": 6.0, "next_hz": 200.0}
     for words in ({}, {"off_at": 6.0}, *nothing_to_go_to):
