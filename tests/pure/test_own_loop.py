@@ -153,6 +153,25 @@ def test_python_control_flies_law_to_rounding(flown: Tape) -> None:
     np.testing.assert_allclose(response.outputs.T, u, atol=1e-9)
 
 
+@pytest.mark.parametrize("name", ["osprey_servo", "osprey_observer", "osprey_twin"])
+def test_linear_systems_have_the_eigenvalues_and_margins_of_the_loop(name: str) -> None:
+    """python-control closes plant and law by itself; the margins are those of the product."""
+    scenario = rise_di.find_scenario(name)
+    plant, law, loop = rise_di.linear_systems(scenario)
+    m = len(plant.input_labels)
+    closed = control.feedback(plant, law, sign=1)
+    expected = np.sort_complex(closed.poles())
+    assert np.sort(np.abs(loop.poles())) == approx(np.sort(np.abs(expected)), abs=1e-6)
+    nominal = rise_di.margins(scenario).nominal
+    frequencies = np.geomspace(0.01, 0.999 * np.pi / float(loop.dt), 4000)
+    for i, channel in enumerate(plant.input_labels):
+        response = loop[channel, f"d_{channel[2:]}"](np.exp(1j * frequencies * float(loop.dt)))
+        # S of the loop opened at an input alone: u of the law, with the disturbance of u.
+        assert np.abs(1.0 + response).max() == approx(nominal.sensitivity[i], rel=1e-2)
+    assert loop.input_labels[:m] == [f"d_{label[2:]}" for label in plant.input_labels]
+    assert law.input_labels == plant.output_labels
+
+
 # gymnasium
 
 

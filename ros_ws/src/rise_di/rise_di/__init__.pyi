@@ -30,6 +30,7 @@ from rise_di.c_code import Exported, export
 from rise_di.campaigns import CampaignResult, fly_campaign, resume_campaign
 from rise_di.flight_env import FlightEnv, FlightVectorEnv
 from rise_di.in_memory import simulate
+from rise_di.linear_systems import LinearSystems, linear_systems
 from rise_di.own_airframe import NewAirframe, new_airframe
 from rise_di.own_loop import Loop, as_control, fly_plant
 from rise_di_controller.controller import Controller
@@ -58,6 +59,7 @@ __all__ = [
     "LawParams",
     "LawState",
     "Limits",
+    "LinearSystems",
     "Loop",
     "LoopMargins",
     "Measurements",
@@ -97,6 +99,7 @@ __all__ = [
     "laws",
     "learner",
     "limited_integral",
+    "linear_systems",
     "load_airframe",
     "margins",
     "new_airframe",
