@@ -249,8 +249,10 @@ def _comparison_page(flights: Sequence[RecordedFlight]) -> Page:
         text = f"{scenario.name}: {_description(flight, scenario)} ({flight.summary['error']})"
         line = _outcome_line(text, flight)
         lines.append(line._replace(label=label, colour=colour))
+    trims = [_about_trim(scenario) for scenario in scenarios]
+    trim = trims[0] if all(each == trims[0] for each in trims) else {"V": "V about trim (m/s)"}
     sections = [
-        Section("Output y over the reference y_m", "", figures.tracking_figure(context)),
+        Section("Output y over the reference y_m", "", figures.tracking_figure(context, trim)),
         Section("Tracking error e = y - y_m", "", figures.error_figure(context)),
         Section("Input u", "", figures.input_figure(context)),
         Section("Spectrum of u", "", figures.spectrum_figure(context), over_time=False),
