@@ -33,7 +33,9 @@ from flight_design.identification.model_quality import MAX_DEVIATION
 RECORD = 4.0
 # 1, of the effect of an input: up to two deviations of an accepted model are no change
 LOSS = 2.0 * MAX_DEVIATION
-MAX_GAIN = 8.0  # of log-likelihood: four standard deviations, see `change_test`
+# of log-likelihood: 4.9 standard deviations, see `change_test`. Healthy surfaces in a gust every
+# 3 s had up to 10.3, once 17.4, for a gust is no normal process; those of half effect from 18 on
+MAX_GAIN = 12.0
 # rad, standard deviation of pitch and bank at the begin of the record, which may lie in a turn
 ANGLE = 0.3
 # rad, the same of alpha and beta: with 0.3 a gust before the record passed for a loss of effect
@@ -45,7 +47,7 @@ DEAD = -1.0  # 1
 MOST = 2.0  # bounds of a change of effect
 NONE = MAX_DEVIATION  # 1, of an effect: what is known no better is none
 # of log-likelihood: so close to the best loss an input without effect explains the flight as well
-DEAD_WITHIN = MAX_GAIN / 2.0
+DEAD_WITHIN = 4.0
 
 
 class Change(NamedTuple):
@@ -79,8 +81,8 @@ def change_test(
     effector changes a column by a factor, so a part has as many unknowns as inputs. A is known.
     Winds, and angles at the begin, are free in the two J, which have the same winds. G is 0 while
     the losses are within LOSS. For a loss z standard deviations beyond, 2 G = z^2, by S. S. Wilks
-    (Ann. Math. Statist. 9(1), 1938): an input with a loss of LOSS exceeds G = 8 with a probability
-    of 3e-5, and a lesser loss more seldom.
+    (Ann. Math. Statist. 9(1), 1938): an input with a loss of LOSS exceeds G = 12 with a probability
+    of 5e-7, and a lesser loss more seldom.
 
     The input j is dead if kappa_j <= NONE - 1 has a J lower than the first J by more than MAX_GAIN,
     and at most DEAD_WITHIN above the second. Arguments: `delays` of u by the outputs of a part, s,

@@ -63,8 +63,9 @@ SHORTEST = 20.0 * TRANSIENT
 AFTER_FALLBACK = 4.0
 # s, from one identification to the next that no plan asks for; and of a record that oscillates
 RETRY = 10.0
-# of log-likelihood beside a fallback, where the model may be wrong: dead surfaces had 49 to 240
-FALLBACK_GAIN = 40.0
+# of log-likelihood: of an input without effect, and of any change beside a fallback, where the
+# model may be wrong. Dead surfaces had 46 to 656, healthy ones in gusts up to 17
+SURE_GAIN = 40.0
 
 Design = Callable[[RiseDiConfig, Airframe, Goal], SelectedObserver]
 """A controller with the feedforward and the observer of a model. Raises ParameterError."""
@@ -497,11 +498,11 @@ class Learner:
         changes = change_test(recent, self._at_speed(self._model, ratio), self._actuation, delays)
         has_fallen = self._record.fell_back(begin_ns, self._proposals)
         return [
-            change
+            change if change.gain >= SURE_GAIN else change._replace(dead="")
             for change in changes
             if change.outputs in learned
             and change.is_found
-            and (change.gain >= FALLBACK_GAIN or not has_fallen)
+            and (change.gain >= SURE_GAIN or not has_fallen)
         ]
 
     def _designed(
