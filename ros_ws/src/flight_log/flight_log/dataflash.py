@@ -6,6 +6,7 @@ Source: ArduPilot, AP_Logger/LogStructure.h (log_Format). A packet has no checks
 """
 
 import struct
+from bisect import bisect_left
 from collections.abc import Callable
 from typing import Any
 
@@ -109,6 +110,7 @@ class Lines(DFReader.DFReader_text):
     def init_arrays(self, progress_callback: Callable[[int], None] | None = None) -> None:
         """Index the lines, and count those without a message."""
         self.offsets: dict[str, list[int]] = {}
+        self._places: list[int] = []
         self.lost_us: list[float] = []  # the stamp before each line without a message
         newest_us = 0.0
         here: int = self.offset
@@ -120,6 +122,7 @@ class Lines(DFReader.DFReader_text):
             if (message := self._message(here, line)) is not None:
                 newest_us = stamp_us(message, newest_us)
                 self.offsets.setdefault(message.get_type(), []).append(here)
+                self._places.append(here)
             elif line:
                 self.lost_us.append(newest_us)
             self._count += bool(line)
@@ -128,15 +131,13 @@ class Lines(DFReader.DFReader_text):
         self.offset = 0
 
     def _parse_next(self) -> Any:
-        """The next message, behind damaged lines."""
-        while True:
-            start: int = self.offset
-            try:
-                return super()._parse_next()
-            # pymavlink raises Exception itself.
-            except Exception:
-                end = self.data_map.find(b"\n", start)
-                self.offset = self.data_len + 1 if end < 0 else end + 1
+        """The message of the next line that has one."""
+        place = bisect_left(self._places, self.offset)
+        if place == len(self._places):
+            self.offset = self.data_len
+            return None
+        self.offset = self._places[place]
+        return super()._parse_next()
 
     def _message(self, here: int, line: bytes) -> Any:
         """The message of a line; None of a damaged one."""
@@ -150,7 +151,7 @@ class Lines(DFReader.DFReader_text):
             message.to_dict()
             if name == "FMT":
                 self.offset = here
-                self._parse_next()
+                super()._parse_next()
         # pymavlink raises Exception itself for a format with unknown types.
         except Exception:
             return None
