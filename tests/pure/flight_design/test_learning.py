@@ -781,8 +781,8 @@ def loss(gain: float, dead: str = "") -> Change:
         (1800, 0.0, loss(60.0, "aileron"), True, ["aileron"]),
         (1500, 0.0, loss(20.0), True, [""]),  # 5 s ago
         # an elevator that lived had a gain of 10 in gusts, as one without effect
-        (None, 0.0, loss(20.0, "aileron"), True, [""]),
-        (None, 0.0, loss(10.0, "aileron"), True, []),
+        (None, 0.0, loss(10.0), True, []),
+        (None, 0.0, loss(60.0, "aileron"), True, []),  # the first test of two
         (None, 2.2, loss(60.0, "aileron"), True, []),
         # beside the file's model a healthy aileron of an aircraft that couples had a gain of 147
         (None, 0.0, loss(147.0, "aileron"), False, []),
@@ -809,6 +809,37 @@ def test_damage_counts_by_its_gain_beside_a_fallback_and_not_in_an_oscillation(
         y[0] += 0.1 * np.sin(2.0 * np.pi * frequency * 0.01 * k)
         made.take(k * 10_000_000, y, np.zeros(4), 2 if has_fallen else 1)
     assert [change.dead for change in made._changes((RECORDED - 1) * 10_000_000)] == told
+
+
+def test_input_without_effect_in_two_tests_in_a_row_is_dead(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """In one lateral gust of 10 min a healthy rudder had a gain of 47, and 2 s later none."""
+    made = made_learner(scenario(learn={"updates": [10.0]}))
+    made._known = {("p", "r"): Known({}, {}, (0.0, 0.0))}
+    noise = np.random.default_rng(1).normal(size=(RECORDED, 4))
+    for k in range(RECORDED):
+        made.take(k * 10_000_000, 1e-3 * noise[k], np.zeros(4), 1)
+    healthy = Change(("p", "r"), 0.0, {"aileron": 1.0, "rudder": 1.0}, "")
+    tests = [loss(60.0, "aileron"), healthy, loss(60.0, "rudder"), loss(60.0, "aileron")]
+    told = []
+    for change in [*tests, loss(15.0, "aileron")]:
+        monkeypatch.setattr(design_learner, "change_test", Mock(return_value=(change,)))
+        told.append([part.dead for part in made._changes((RECORDED - 1) * 10_000_000)])
+    assert told == [[], [], [], [], ["aileron"]]
+
+
+def test_input_without_effect_in_one_test_is_a_doubt(monkeypatch: pytest.MonkeyPatch) -> None:
+    made, flown = learned_part(monkeypatch, DEAD_RUDDER)
+    monkeypatch.setattr(made, "_changes", type(made)._changes.__get__(made))
+    monkeypatch.setattr(design_learner, "change_test", Mock(return_value=(DEAD_RUDDER,)))
+    moved = np.random.default_rng(1).normal(size=(400, 4))
+    for k in range(400):
+        made.take((1201 + k) * 10_000_000, 1e-3 * moved[k], np.zeros(4), flown)
+    doubt = made.propose(flown)
+    assert doubt == LearnerResult(None, "rudder may have no effect, by one test")
+    again = made.propose(flown)
+    assert again.sentence.startswith("rudder has no effect")
 
 
 def test_tests_for_damage_fill_the_time_between_identifications() -> None:

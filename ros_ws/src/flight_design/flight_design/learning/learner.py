@@ -63,8 +63,7 @@ SHORTEST = 20.0 * TRANSIENT
 AFTER_FALLBACK = 4.0
 # s, from one identification to the next that no plan asks for; and of a record that oscillates
 RETRY = 10.0
-# of log-likelihood: of an input without effect, and of any change beside a fallback, where the
-# model may be wrong. Dead surfaces had 46 to 656, healthy ones in gusts up to 17
+# of log-likelihood beside a fallback, where the model may be wrong: dead surfaces had 46 to 656
 SURE_GAIN = 40.0
 
 Design = Callable[[RiseDiConfig, Airframe, Goal], SelectedObserver]
@@ -153,6 +152,8 @@ class Learner:
         # of `learn.without`
         self._dead: dict[PartName, str] = {}
         self._start = controller  # with the `learn.without` of what flies
+        # inputs without effect by the last test: a gust alone hides an effect once
+        self._suspected: dict[PartName, str] = {}
         self._has_ended = False
         self._give_up(outputs_without(controller))
         self._changed: set[PartName] = set()  # parts whose model is that of before a change
@@ -220,7 +221,10 @@ class Learner:
         if changes := self._changes(end_ns):
             return self._damaged(changes, end_ns)
         if not self._is_due(end_ns, lost=lost):
-            return LearnerResult(None, "")
+            doubts = [
+                f"{name} may have no effect, by one test" for name in self._suspected.values()
+            ]
+            return LearnerResult(None, "; ".join(doubts))
         return self._learned(end_ns, lost=lost)
 
     def _learned(self, end_ns: int, *, lost: bool) -> LearnerResult:
@@ -477,9 +481,11 @@ class Learner:
     def _changes(self, end_ns: int) -> list[Change]:
         """Changes of the parts with a learned model over the last RECORD.
 
-        There is none where the speed was not steady over it, an output stood still, or one
+        Without a fallback an input without effect counts in the second test in a row. There is
+        none where the speed was not steady over the record, an output stood still, or one
         oscillated over RETRY: a loop near instability moves y as no model with a stable loop says.
         """
+        suspected, self._suspected = self._suspected, {}
         begin_ns = end_ns - nanoseconds(RECORD)
         learned = {part: known for part, known in self._known.items() if part not in self._changed}
         if (
@@ -497,13 +503,17 @@ class Learner:
         delays = {part: np.array(known.delays) for part, known in learned.items()}
         changes = change_test(recent, self._at_speed(self._model, ratio), self._actuation, delays)
         has_fallen = self._record.fell_back(begin_ns, self._proposals)
-        return [
-            change if change.gain >= SURE_GAIN else change._replace(dead="")
-            for change in changes
-            if change.outputs in learned
-            and change.is_found
-            and (change.gain >= SURE_GAIN or not has_fallen)
-        ]
+        found = []
+        for change in changes:
+            is_counted = change.gain >= SURE_GAIN or not has_fallen
+            if change.outputs not in learned or not change.is_found or not is_counted:
+                continue
+            is_seen_again = suspected.get(change.outputs) == change.dead
+            if change.dead and not (has_fallen or is_seen_again):
+                self._suspected[change.outputs] = change.dead
+            else:
+                found.append(change)
+        return found
 
     def _designed(
         self, model: Airframe, known: Mapping[PartName, Known], dead: Mapping[PartName, str]
