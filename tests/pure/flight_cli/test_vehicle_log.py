@@ -329,6 +329,14 @@ def test_flight_in_each_format_gives_y_and_u(name: str, flight: Flight, tmp_path
     assert np.median(tape["commands"].values, axis=0) == approx([0.0, THROTTLE, 0.0, 0.0], abs=1e-6)
 
 
+def test_ulog_with_a_cut_message_of_an_unknown_type_is_refused(tmp_path: Path) -> None:
+    """Pyulog goes back from the end of such a file to its begin, for ever."""
+    path = tmp_path / "cut.ulg"
+    path.write_bytes(b"ULog\x01\x12\x35\x01" + bytes(8) + struct.pack("<HB", 17, 0))
+    with refusing(r"found a ULog of PX4 that cannot be decoded \(a damaged message has no end\)"):
+        read_vehicle_log(path)
+
+
 def test_omega_of_a_ulog_is_that_of_the_aircraft(flight: Flight, tmp_path: Path) -> None:
     bag = tmp_path / "bag"
     assert imported(ulog(tmp_path / "flight.ulg", flight), bag, map_name="px4").exit_code == 0

@@ -56,6 +56,8 @@ from flight_log.vehicle_tables import (
 AUTOPILOT = 1  # MAV_COMP_ID_AUTOPILOT1, common.xml
 NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID, of a ground station and of other components
 ULOG_HEAD = 16  # bytes: magic, version and time
+# a step of a byte over damaged ones reads a head and what may be its message, twice
+READS_PER_BYTE = 4
 FIRMWARE = re.compile(r"(?:Ardu|APM:)(Plane|Copter|Rover|Sub)")  # in a MSG of ArduPilot
 FIRMWARES = MappingProxyType(
     {"Plane": PLANE, "Copter": COPTER, "Rover": "rover", "Sub": "submarine"}
@@ -294,9 +296,9 @@ def _read_ulog(path: Path, kind: str, choice: Choice) -> VehicleLog:
         raise ValueError("its head is cut")
     content, loss = whole_messages(path.read_bytes())
     try:
-        _require_short(ULog(BytesIO(content), parse_header_only=True).message_formats)
-        log = ULog(BytesIO(content))
-    except ULogException as error:
+        _require_short(ULog(UlogContent(content), parse_header_only=True).message_formats)
+        log = ULog(UlogContent(content))
+    except (ULogException, EOFError) as error:
         raise ValueError(error) from None
     if log.file_corruption:
         kind += ", damaged: what can be read"
@@ -338,6 +340,22 @@ def _read_ulog(path: Path, kind: str, choice: Choice) -> VehicleLog:
         taken=tuple(choices),
         loss=loss,
     )
+
+
+class UlogContent(BytesIO):
+    """The content of a ULog: pyulog may go back from a cut message to the same one for ever."""
+
+    def __init__(self, content: bytes) -> None:
+        """Permit more reads than messages and single steps over damaged bytes need."""
+        super().__init__(content)
+        self._left = READS_PER_BYTE * len(content)
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Read as usual. Raises EOFError after too many reads."""
+        self._left -= 1
+        if self._left < 0:
+            raise EOFError("a damaged message has no end")
+        return super().read(size)
 
 
 def _with_dropouts(loss: Loss | None, dropouts: Sequence[Any]) -> Loss:
