@@ -193,7 +193,7 @@ def test_aircraft_with_entries_of_its_own_flies_again_with_same_score(tmp_path: 
     [
         (
             {"spread": Spread({"A[q,gamma]": 0.5})},
-            r"entry A\[q,gamma\], expected an entry of the airframe",
+            r"entry: found A\[q,gamma\], expected an entry of the airframe",
         ),
         ({"spread": Spread({"A[q,q]": 1.5})}, "expected a part of each entry"),
         (

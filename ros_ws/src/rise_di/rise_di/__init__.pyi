@@ -30,9 +30,9 @@ from rise_di.c_code import Exported, export
 from rise_di.campaigns import CampaignResult, fly_campaign, resume_campaign
 from rise_di.flight_env import FlightEnv, FlightVectorEnv
 from rise_di.in_memory import simulate
-from rise_di.linear_systems import LinearSystems, linear_systems
 from rise_di.own_airframe import NewAirframe, new_airframe
 from rise_di.own_loop import Loop, as_control, fly_plant
+from rise_di.state_spaces import LinearSystems, linear_systems
 from rise_di_controller.controller import Controller
 from rise_di_controller.law.control_law import ControlLaw, Measurements, TunedLaw, without_limits
 from rise_di_controller.law.decomposition import decompose
