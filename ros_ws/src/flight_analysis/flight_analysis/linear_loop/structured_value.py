@@ -37,7 +37,10 @@ TINY = 1e-30
 # abs(log abs(z)) below which an eigenvalue of the pencil counts as on the circle: what is found
 # too much costs a shorter interval
 ON_CIRCLE = 1e-7
-CHECKED = 7  # points of an interval at which the bound is computed again
+# points of an interval at which the bound is computed again, and of each of its decades: rounding
+# hides a crossing beside an integrator, where the pencil has eigenvalues of high multiplicity
+CHECKED = 8
+DECADES = 6
 
 
 class Scaling(NamedTuple):
@@ -226,11 +229,17 @@ def interval_at(
 
     None where there are none.
     """
-    ends = crossings(part, scaling, scale)
     highest = np.pi / part.period
+    ends = crossings(part, scaling, scale)
     low = float(np.max(ends[ends <= w], initial=0.0))
     high = float(np.min(ends[ends > w], initial=highest))
-    inside = np.linspace(low, high, CHECKED + 2)[1:-1].astype(np.float64)
-    M = scale[:, None] * part.response(inside, RADIUS)
-    holds = high - low > NARROWEST * highest and (bound_at(M, scaling) < 1.0).all()
-    return (low, high) if holds else None
+    from_low = np.geomspace(10.0**-DECADES, 1.0, CHECKED * DECADES, endpoint=False)
+    parts = np.r_[from_low, np.linspace(0.0, 1.0, CHECKED + 2)[1:-1]]
+    inside = np.unique(np.r_[w, low + (high - low) * parts])
+    fails = inside[bound_at(scale[:, None] * part.response(inside, RADIUS), scaling) >= 1.0]
+    below = float(np.max(fails[fails <= w], initial=-1.0))
+    above = float(np.min(fails[fails > w], initial=2.0 * highest))
+    held = inside[(inside > below) & (inside < above)]
+    low = low if below < 0.0 else float(np.min(held, initial=highest))
+    high = high if above > highest else float(np.max(held, initial=0.0))
+    return (low, high) if high - low > NARROWEST * highest else None
