@@ -32,6 +32,7 @@ PARAMETERS = "rise_di_parameters.h"
 # beside the code
 REPORT = "proof.txt"
 FMU = "rise_di.fmu"
+CERTIFICATE = "certificate.json"  # of the guarantee of the loop
 COMPILERS = ("gcc", "clang")
 FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic", "-ffp-contract=off")
 COUNTING_FLAGS = ("-x", "c++", "-std=c++20", "-O2", "-include", "counting.h")
@@ -88,7 +89,7 @@ def write_code(
     require(samples >= LEAST_SAMPLES, "samples", samples, f"{LEAST_SAMPLES} or more")
     with writing("c", folder, "a folder that can"):
         folder.mkdir(parents=True, exist_ok=True)
-        for name in (REPORT, FMU):
+        for name in (REPORT, FMU, CERTIFICATE):
             (folder / name).unlink(missing_ok=True)
         for name in CODE:
             shutil.copyfile(SOURCE / name, folder / name)

@@ -17,6 +17,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from flight_analysis.linear_loop.certificate import certificate
 from flight_analysis.linear_loop.guarantee import Guarantee, guarantee
 from flight_analysis.linear_loop.kept_guarantee import keep
 from flight_analysis.report.display_units import display_unit
@@ -68,6 +69,7 @@ from flight_design.gains.relaxation import lacking
 from flight_design.gains.requirement import PHASE_MARGIN
 from flight_design.gains.trade import trade
 from flight_log.px4_parameters import rate_loop
+from rise_di.c_code import certificate_sources
 from rise_di_controller.params import ControllerConfig
 
 CONDITION_FAILS = 1
@@ -219,6 +221,10 @@ class Gains:
     late: float = rare_option(
         "With --guarantee: u is late by an unknown time of 0 to this in each input, s.", default=0.0
     )
+    certificate: Path | None = rare_option(
+        "With --guarantee: file for its proof (JSON), which examples/check_certificate.py checks "
+        "with numpy alone."
+    )
     as_json: bool = json_option()
 
     def execute(self) -> None:
@@ -230,7 +236,10 @@ class Gains:
             "--write beside it, without --observer",
         )
         require_guarantee(
-            check=self.check, is_wanted=self.guaranteed, worst=self.worst, late=self.late
+            check=self.check,
+            is_wanted=self.guaranteed,
+            late=self.late,
+            files={"worst": self.worst, "certificate": self.certificate},
         )
         rate, delay, origin = _loop_of_px4(self.px4, self.rate, self.delay)
         result = replace(self, rate=rate, delay=delay)._result()
@@ -267,6 +276,9 @@ class Gains:
         loop = answer.loop_with_box()
         promise = guarantee(loop, self.late)
         keep(loop, promise)
+        if self.certificate is not None:
+            sources = certificate_sources(self.airframe, self.scenario)
+            write_text("certificate", self.certificate, certificate(loop, promise, sources))
         lines = write_unstable(self.worst, promise, self.airframe, self.scenario)
         return _GainsAnswer({"scenario": answer}, promise=promise, unstable=lines)
 
@@ -302,7 +314,7 @@ class Gains:
             if not self.observer and selection.engineering.has_requirement:
                 _show_trade(console, selection)
         lines += result.unstable
-        files = {"gains": self.write, "page": self.page}
+        files = {"gains": self.write, "page": self.page, "certificate": self.certificate}
         lines += [f"{key}: {display_path(path)}" for key, path in files.items() if path is not None]
         for line in filter(None, lines):
             say(console, line)

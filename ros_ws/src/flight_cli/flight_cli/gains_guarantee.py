@@ -3,6 +3,7 @@
 """What `rise-di gains --check --guarantee` shows and writes."""
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -26,12 +27,17 @@ FARTHER = 1.2  # times the deviations of the first unstable aircraft: a loop tha
 FORMS = (".3f", ".1f", ".1f", ".3f")  # of the columns of a guarantee
 
 
-def require_guarantee(*, check: bool, is_wanted: bool, worst: Path | None, late: float) -> None:
+def require_guarantee(
+    *, check: bool, is_wanted: bool, late: float, files: Mapping[str, Path | None]
+) -> None:
     """Raise ParameterError for a guarantee without --check, or its settings without a guarantee."""
     require(check or not is_wanted, "--guarantee", "no --check", "--check beside it")
-    require(is_wanted or worst is None, "worst", "no --guarantee", "--guarantee beside it")
+    for name, path in files.items():
+        require(is_wanted or path is None, name, "no --guarantee", "--guarantee beside it")
     require(is_wanted or late == 0.0, "late", "no --guarantee", "--guarantee beside it")
     as_number(late, "late", 0.0, MAX_DELAY_MARGIN, "s")
+    in_time = late == 0.0 or files["certificate"] is None
+    require(in_time, "certificate", f"--late {late:g} beside it", "u in time")
 
 
 def write_unstable(

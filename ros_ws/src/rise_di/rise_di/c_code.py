@@ -2,19 +2,37 @@
 # SPDX-License-Identifier: Apache-2.0
 """The controller of a scenario as C99 with its proof, as `rise-di export` writes it."""
 
+import hashlib
+import json
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from aircraft_sim.airframes.airframe import load_airframe
+from aircraft_sim.uncertainty import as_yaml
 from c_export.autopilots import SAMPLES, SHELLS, write_module
-from c_export.constants import exportable
+from c_export.constants import exportable, header
 from c_export.drawn import drawn_calls, drawn_commands, drawn_standstill, drawn_steps
 from c_export.events import Recording, flight_recordings, parameter_sets, run_recording
 from c_export.library import Units, build_fmu, si_units
-from c_export.proof import FMU, REPORT, Proof, compilers, proof_report, prove, words, write_code
-from flight_analysis.closed_loop.scenario import Scenario
+from c_export.proof import (
+    CERTIFICATE,
+    FMU,
+    PARAMETERS,
+    REPORT,
+    Proof,
+    compilers,
+    proof_report,
+    prove,
+    words,
+    write_code,
+)
+from flight_analysis.closed_loop.scenario import Scenario, scenario_yaml
 from flight_analysis.closed_loop.scenario_library import find_scenario
+from flight_analysis.linear_loop.certificate import certificate
+from flight_analysis.linear_loop.kept_guarantee import kept_guarantee
+from flight_analysis.linear_loop.loop_margins import is_literal, scenario_loop
 from flight_core.arguments import FilePath, as_number, as_path
 from flight_core.files import write_file, writing
 from flight_core.parameters import require
@@ -119,6 +137,11 @@ def export(
     if fmu:
         units = _units(source, controller)
         files.append(build_fmu(code, commands[0], controller, title, folder / FMU, units))
+    stated = _certified(source, code / PARAMETERS)
+    if stated is not None:
+        with writing("c", folder, "a folder that can"):
+            write_file(folder / CERTIFICATE, stated)
+        files.append(folder / CERTIFICATE)
     if not proof:
         return Exported(files, None, "")
     if run is None:
@@ -131,6 +154,8 @@ def export(
         code, commands, material.sets, material.recordings, float32=float32, runner=starter
     )
     text = proof_report(proved, title) + material.line
+    if stated is not None:
+        text += f"{CERTIFICATE}: {json.loads(stated)['claim'][0]}\n"
     with writing("c", folder, "a folder that can"):
         write_file(folder / REPORT, text)
     return Exported([*files, folder / REPORT], proved, text)
@@ -155,6 +180,40 @@ def at_rate(scenario: Scenario, rate: float) -> Scenario:
         controller=changes,
         reference_model={"rate": rate},
         aircraft={"rate": rate, "step": seconds(period // steps)},
+    )
+
+
+def certificate_sources(airframe: FilePath, scenario: FilePath | Scenario) -> dict[str, str]:
+    """SHA-256 of scenario, airframe and exported constants, of the loop of a certificate.
+
+    The constants are those of rise_di_parameters.h as `export` writes it by default; none of a law
+    without C code.
+    """
+    flight = find_scenario(scenario)
+    texts = {"scenario": scenario_yaml(flight), "airframe": as_yaml(load_airframe(airframe))}
+    if isinstance(flight.controller, RiseDiConfig):
+        texts["constants"] = header(
+            exportable(flight.controller),
+            printable(flight.name),
+            flight.reference_model,
+            float32=False,
+            samples=SAMPLE_BUFFER_SIZE,
+        )
+    return {name: hashlib.sha256(text.encode()).hexdigest() for name, text in texts.items()}
+
+
+def _certified(scenario: Scenario, constants: Path) -> str | None:
+    """The certificate of the guarantee that was computed for a loop; None without one."""
+    airframe = scenario.aircraft.airframe
+    if scenario.aircraft.is_jsbsim or is_literal(scenario.controller):
+        return None
+    loop = scenario_loop(scenario, scenario.controller, 1)
+    promise = kept_guarantee(loop)
+    if promise is None or not promise.stable:
+        return None
+    digest = hashlib.sha256(constants.read_bytes()).hexdigest()
+    return certificate(
+        loop, promise, certificate_sources(airframe, scenario) | {"constants": digest}
     )
 
 

@@ -13,4 +13,5 @@
 | `branch_and_bound` | proves a bound over parts of the box |
 | `guarantee` | the largest box for which stability and a disk are proved |
 | `kept_guarantee` | keeps a guarantee for the pages of later flights |
+| `certificate` | a guarantee as a file that is checked without this stack |
 """

@@ -6,7 +6,7 @@ The box is halved along one parameter, and each half again, over the frequencies
 Source: M. P. Newlin, P. M. Young, International Journal of Robust and Nonlinear Control 7, 1997.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from flight_analysis.linear_loop.uncertain_loop import Channels, ComplexArray
 from flight_core.vectors import FloatArray
 
 SLOW = 1e-3  # part of pi / T of a slow motion
+DIGITS = 5  # of D and G in a step
 
 
 class Region(NamedTuple):
@@ -45,27 +46,35 @@ class Region(NamedTuple):
         narrowed = self._replace(half=half, scaling=scaling)
         return [narrowed._replace(centre=self.centre + side * step) for side in (-1.0, 1.0)]
 
-    def outside(
-        self, begin: float, end: float, scaling: Scaling, narrowest: float
-    ) -> list["Region"]:
-        """The frequencies below and above an interval, where wider than rounding, rad/s."""
+    def within(self, begin: float, end: float, narrowest: float) -> tuple[float, float]:
+        """The frequencies of an interval, to the ends of the region where rounding is left."""
+        low = self.low if begin - self.low <= narrowest else begin
+        return low, self.high if self.high - end <= narrowest else end
+
+    def outside(self, begin: float, end: float, scaling: Scaling) -> list["Region"]:
+        """The frequencies below and above an interval, rad/s."""
         below = self._replace(high=begin, scaling=scaling)
         above = self._replace(low=end, scaling=scaling)
-        return [side for side in (below, above) if side.high - side.low > narrowest]
+        return [side for side in (below, above) if side.high > side.low]
 
 
-def boxes_until_proved(part: Channels, size: float, disk: float, most: int) -> int | None:
-    """The number of boxes bounded until the loop is proved stable; None if `most` are too few.
+def proof_of(part: Channels, size: float, disk: float, most: int) -> list[dict[str, Any]] | None:
+    """The steps that prove the loop stable; None if `most` boxes are too few.
 
     The proof holds for every abs(d_i) <= size, every delay of the part, and complex disks of a size
     in the channels of disks. The loop of d = 0 is stable. None of the box has a mode on abs(z) =
     RADIUS, so none leaves.
+
+    A step takes the last box of a list, at first the whole one from 0 to pi / T. It halves the box
+    along an entry, {"halve": i}, and appends both halves; or it proves the box from "low" to
+    "high", rad/s, by "t" and "g", and appends what is left below and above.
     """
     highest = np.pi / part.period
     half = np.r_[np.full(len(part.entries), size), np.ones(part.late)]
     disks = np.full(len(part.D) - part.real, disk)
     regions = [Region(centre=np.zeros(len(half)), half=half, low=0.0, high=highest, scaling=None)]
-    for count in range(1, most + 1):
+    steps: list[dict[str, Any]] = []
+    while regions and len(steps) < most:
         region = regions.pop()
         w = _frequency(region, highest)
         around = part.centred(np.r_[region.centre[part.parameters], np.zeros(len(disks))])
@@ -76,12 +85,24 @@ def boxes_until_proved(part: Channels, size: float, disk: float, most: int) -> i
         if interval is None and bound < 1.0 and w == 0.0:
             interval = _from_zero(around, scaling, scale)
         if interval is None:
-            regions += region.halves(int(np.argmax(_effects(part, M, scaling))), scaling)
+            entry = int(np.argmax(_effects(part, M, scaling)))
+            steps.append({"halve": entry})
+            regions += region.halves(entry, scaling)
         else:
-            regions += region.outside(*interval, scaling, NARROWEST * highest)
-        if not regions:
-            return count
-    return None
+            low, high = region.within(*interval, NARROWEST * highest)
+            steps.append({"low": low, "high": high} | _as_step(scaling, len(part.entries)))
+            regions += region.outside(low, high, scaling)
+    return None if regions else steps
+
+
+def _as_step(scaling: Scaling, entries: int) -> dict[str, list[float]]:
+    """D and G as `t` and `g`, rounded: any of them prove what they prove.
+
+    Those of the means alone where the others follow from them, as in `tightened_at`.
+    """
+    t, g = (np.array([float(f"{x:.{DIGITS}g}") for x in values]) for values in scaling)
+    count = len(t) if g[entries:].any() else entries
+    return {"t": t[:count].tolist(), "g": g[:count].tolist()}
 
 
 def _from_zero(part: Channels, near: Scaling, scale: FloatArray) -> tuple[float, float] | None:

@@ -6,11 +6,12 @@ The guarantee has the deviation up to which the loop is stable, and the remainin
 deviations are constant in time and the loop is linear: no saturation, no rate limit.
 """
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from flight_analysis.linear_loop.branch_and_bound import boxes_until_proved
+from flight_analysis.linear_loop.branch_and_bound import proof_of
 from flight_analysis.linear_loop.loop_margins import LinearLoop
 from flight_analysis.linear_loop.uncertain_loop import (
     Channels,
@@ -34,6 +35,9 @@ GAPS = (0.005, 0.01, 0.02, 0.04, 0.08, 0.16, 0.32, 0.64, 1.28, 2.56)
 FIRST_GAP = GAPS.index(0.08)
 BOXES = 1500  # up to the first gap
 FEWER_BOXES = 300  # at the others, and of disks
+# part of the deviations that is proved beyond those that are stated: it covers the coefficients
+# that are left out, and what a check by intervals loses
+SLACK = 1e-3
 
 
 class Unstable(NamedTuple):
@@ -54,6 +58,7 @@ class Guarantee(NamedTuple):
     disk: FloatArray  # (m,) balanced disk margin that every aircraft of the box has, an input open
     disk_all: float  # with independent disks in all inputs at once
     late: float = 0.0  # s: u is late by an unknown time of 0 to this
+    proof: Sequence[dict[str, Any]] = ()  # "entries" and "steps" of each part, see `proof_of`
 
     @property
     def holds(self) -> bool:
@@ -86,8 +91,8 @@ def guarantee(linear: LinearLoop, late: float = 0.0) -> Guarantee:
     uncertain = uncertain_loop(linear.nominal, linear.law, linear.loop, box, late)
     first = _first_unstable(linear, late)
     size = (1.0 if first is None else first.deviation) / largest
-    stable = largest * _proved(parts_of(uncertain), size, disks=False, exact=first is None)
-    promise = none._replace(stable=stable, unstable=first)
+    proved, proof = _proved(parts_of(uncertain), size, disks=False, exact=first is None)
+    promise = none._replace(stable=largest * proved, unstable=first, proof=proof)
     if not promise.holds:
         return promise
     loops = _loops(linear, late)
@@ -128,43 +133,51 @@ def _first_unstable(linear: LinearLoop, late: float) -> Unstable | None:
 
 def _disk(loop: UncertainLoop, inputs: tuple[int, ...], least: float) -> float:
     """The disk margin of every aircraft of the box, with the least one found."""
-    return _proved(parts_of(loop, inputs), min(least, WIDEST_DISK), disks=True)
+    return _proved(parts_of(loop, inputs), min(least, WIDEST_DISK), disks=True)[0]
 
 
-def _proved(parts: list[Channels], least: float, *, disks: bool, exact: bool = False) -> float:
-    """The largest size proved beside the least one found that is too large, 0 for none.
+def _proved(
+    parts: list[Channels], least: float, *, disks: bool, exact: bool = False
+) -> tuple[float, list[dict[str, Any]]]:
+    """The largest size proved beside the least one found that is too large, and the proof.
 
-    The size is of the deviations, or of the disks beside the whole box. With `exact` least itself
-    may be proved.
+    The size is of the deviations, or of the disks beside the whole box; 0 where none is proved.
+    With `exact` least itself may be proved.
     """
-    if exact and _boxes(parts, least, BOXES, disks=disks) is not None:
-        return least
+    proof = _proof(parts, least, BOXES, disks=disks) if exact else None
+    if proof is not None:
+        return least, proof
     for place, gap in enumerate(GAPS[FIRST_GAP:], FIRST_GAP):
         most = FEWER_BOXES if disks or place > FIRST_GAP else BOXES
-        count = _boxes(parts, least / (1.0 + gap), most, disks=disks)
-        if count is not None:
+        proof = _proof(parts, least / (1.0 + gap), most, disks=disks)
+        if proof is not None:
             break
     else:
-        return 0.0
+        return 0.0, []
     proved = gap
     for finer in reversed(GAPS[:place] if place == FIRST_GAP else ()):
-        if count is None or count > FEWER_BOXES:
+        if sum(len(part["steps"]) for part in proof) > FEWER_BOXES:
             break
-        count = _boxes(parts, least / (1.0 + finer), FEWER_BOXES, disks=disks)
-        proved = proved if count is None else finer
-    return least / (1.0 + proved)
+        tighter = _proof(parts, least / (1.0 + finer), FEWER_BOXES, disks=disks)
+        if tighter is None:
+            break
+        proof, proved = tighter, finer
+    return least / (1.0 + proved), proof
 
 
-def _boxes(parts: list[Channels], size: float, most: int, *, disks: bool) -> int | None:
-    """The number of boxes with which each part is proved; None if `most` are not enough."""
-    remaining = most
+def _proof(
+    parts: list[Channels], size: float, most: int, *, disks: bool
+) -> list[dict[str, Any]] | None:
+    """The proof of each part, of a size SLACK larger; None if `most` boxes are not enough."""
+    proof = []
     for part in parts:
-        deviation, disk = (1.0, size) if disks else (size, 0.0)
-        count = boxes_until_proved(part, deviation, disk, remaining)
-        if count is None:
+        deviation, disk = (1.0, size) if disks else ((1.0 + SLACK) * size, 0.0)
+        steps = proof_of(part, deviation, disk, most)
+        if steps is None:
             return None
-        remaining -= count
-    return most - remaining
+        most -= len(steps)
+        proof.append({"entries": list(part.entries), "steps": steps})
+    return proof
 
 
 def _confirmed(linear: LinearLoop, d: FloatArray) -> Unstable | None:

@@ -21,7 +21,7 @@ from flight_analysis.linear_loop.loop_margins import LinearLoop
 from flight_core.files import write_file
 
 DIGITS = 10  # of the entries in the digest: two ways to the same loop differ by rounding
-BOUND = 2  # counts the ways by which this stack has bounded a loop
+BOUND = 3  # counts the ways by which this stack has bounded a loop
 
 
 def keep(linear: LinearLoop, promise: Guarantee) -> None:

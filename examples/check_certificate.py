@@ -1,0 +1,329 @@
+#!/usr/bin/env python3
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Check a certificate of `rise-di gains --guarantee --certificate FILE` with numpy alone.
+
+    python check_certificate.py certificate.json [rise_di_parameters.h]
+
+Aircraft x_dot = (A + E diag(d) F) x + (B + E diag(d) G) u_a, y = C x, abs(d_i) <= size; actuators
+lag u_a_dot = u - u_a; u is held for a period and acts after `delay`; law xi+ = A xi + B y, u = C xi
++ D y. Over a period, s in [0, 1], w(s) = diag(d) z(s) with z = F x + G u_a. The channels are the
+first TERMS Legendre coefficients of w and z. Of v, the rest of w, the norm is bounded:
+
+    zeta+ = A zeta + W w + V v,    z = Z zeta + D w + V_z v,    rest of z = S (zeta, w) + K v
+
+Theorem. Let d = 0 have no mode at abs(z) >= RADIUS, and no d of the box one at abs(z) = RADIUS.
+Then no d of the box has one outside: modes are continuous in d. A box c + half delta, abs(delta)
+<= 1, has none at z if there are real t and g with
+
+    lambda_max(N* N + j (g N - N* g)) < 1,    N = exp(t) half M_c(z) exp(-t)
+
+(M. Fan, A. Tits, J. Doyle, IEEE TAC 36(1), 1991). M_c is the transfer function from w to z around
+c. A part r of z beside N w, norm(r) <= b norm(w), adds at most 2 norm((N - j g)* r) + b^2. Along
+the frequency, level + x change is convex in its largest eigenvalue, and norms bound what is left.
+Each step of the file halves a box, or proves it from `low` to `high`, rad/s.
+"""
+
+import hashlib
+import json
+import sys
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.polynomial.legendre import Legendre, leggauss
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+RADIUS = 1.0 + 1e-6  # a mode may grow by a millionth a tick: integrators have a mode at 1
+ROUNDING = 1e-6  # left of the bound 1 for sums of 100 products whose sizes are up to 1e6
+EPS = np.finfo(float).eps
+TERMS = 4
+BASIS = [Legendre.basis(i, [0, 1]) * (2 * i + 1) ** 0.5 for i in range(TERMS)]
+# exact to degree 23: for exponentials over a period, beyond rounding
+GAUSS, WEIGHTS = leggauss(12)
+NARROWEST = 1e-6  # part of a frequency: an interval below it counts as not proved
+MOST, BATCH = 20_000, 64  # intervals of a step, and how many at once
+
+
+class Loop(NamedTuple):
+    """[[A, W, V], [Z, D, V_z], [S, 0]]: states, channels, and the rest at the nodes of Gauss."""
+
+    big: Array
+    node: Array  # of each row and column: the state, or the number of states + the entry
+    K: Array  # squares of its norm from entry to entry
+    states: int
+    period: float
+
+
+def exponential(M: Array) -> Array:
+    """Exp of a matrix: the series of M / 2^k, whose norm is below 1/4, then k squares."""
+    k = max(0, int(np.ceil(np.log2(max(np.abs(M).sum(axis=1).max(), 1e-300)))) + 2)
+    term = total = np.eye(len(M))
+    for i in range(1, 19):
+        term = term @ M / (2.0**k * i)
+        total = total + term
+    return np.linalg.matrix_power(total, 2**k)
+
+
+def loop_of(file: dict[str, Any]) -> Loop:
+    """The motion over a period from the numbers of a certificate."""
+    A, B, C, E, F, G, lag = (np.array(file[key], float) for key in [*"ABCEFG", "lag"])
+    law = {key: np.array(value, float) for key, value in file["law"].items()}
+    T, (n, m), k = file["period"], B.shape, E.shape[1]
+    size, has_lag = n + m, lag > 0.0
+    rate = np.diag(1.0 / np.where(has_lag, lag, 1.0))
+    drive = np.vstack([B * ~has_lag, rate * has_lag])
+    E, F, G = np.vstack([E, np.zeros((m, k))]), np.hstack([F, G * has_lag]), G * ~has_lag
+    chain = np.kron(np.eye(TERMS + 1, k=1), np.eye(size))
+    chain[:size, :size] = T * np.block([[A, B * has_lag], [np.zeros((m, n)), -rate]])
+
+    def over(s: float) -> list[Array]:
+        """X(s) = exp(motion T s), then the integrals of X(s - r) r^j / j! over r from 0 to s."""
+        return np.split(exponential(chain * s)[:size], TERMS + 1, axis=1)
+
+    # The states are aircraft and actuators, u of earlier ticks, the newest first, and the law.
+    ticks = int(np.floor(file["delay"] / T + 1e-9))
+    split = max(file["delay"] / T - ticks, 0.0)
+    kept, own = (ticks + 1) * m, len(law["A"])
+    states, channels = size + kept + own, TERMS * k
+    u_now = np.hstack([law["D"] @ C, np.zeros((m, m + kept)), law["C"]])
+    inputs = np.vstack([u_now, np.eye(states)[size : size + kept]])
+    new, old = inputs[ticks * m :][:m], inputs[(ticks + 1) * m :][:m]
+    X, first = over(split), np.eye(size, states)
+    second = X[0] @ first + T * X[1] @ drive @ old
+    nodes = np.r_[split * (GAUSS + 1) / 2, split + (1 - split) * (GAUSS + 1) / 2]
+    weights = np.r_[split * WEIGHTS, (1 - split) * WEIGHTS] / 2
+    reads, ends = [], []
+    for s in nodes:  # z at s by (zeta, w), and (x, z) at the end by an impulse of w at s
+        Y = over(s)
+        X, x, u = (over(s - split), second, new) if s >= split else (Y, first, old)
+        drives = [sum(p.deriv(j)(0.0) * Y[j + 1] for j in range(TERMS)) for p in BASIS]
+        free = F @ (X[0] @ x + T * X[1] @ drive @ u) + G @ u
+        reads.append(np.hstack([free, *(T * F @ integral @ E for integral in drives)]))
+        Y = over(1.0 - s)
+        to_z = [sum((-1) ** j * p.deriv(j)(1.0) * Y[j + 1] for j in range(TERMS)) for p in BASIS]
+        ends.append(T * np.vstack([Y[0] @ E, *(F @ integral @ E for integral in to_z)]))
+    values, root = np.array([p(nodes) for p in BASIS]), np.sqrt(weights)[:, None, None]
+    ZD, WV = (np.einsum("is,s,sab->iab", values, weights, f) for f in (reads, ends))
+    S = (root * (reads - np.einsum("is,iab->sab", values, ZD))).reshape(-1, states + channels)
+    V = np.hstack(list(root * (ends - np.einsum("is,iab->sab", values, WV))))
+    by_w = np.array(reads)[:, :, states:].reshape(len(nodes), k, TERMS, k)
+    by_v = np.array(ends)[:, size:].reshape(len(nodes), TERMS, k, k)
+    kernel = np.array([T * F @ over((1.0 + s) / 2.0)[0] @ E for s in GAUSS])
+    K = np.einsum("s,skc->kc", WEIGHTS * (1.0 - GAUSS) / 4.0, kernel**2)
+    K = K - np.einsum("s,skic->kc", weights, by_w**2) - np.einsum("s,sikc->kc", weights, by_v**2)
+    K = K + np.einsum("ikjc->kc", ZD[:, :, states:].reshape(TERMS, k, TERMS, k) ** 2)
+    X = over(1.0 - split)
+    motion = X[0] @ second + T * X[1] @ drive @ new
+    law_motion = np.hstack([law["B"] @ C, np.zeros((own, m + kept)), law["A"]])
+    A = np.vstack([motion, inputs[:kept], law_motion])
+    below = np.zeros((kept + own, channels + V.shape[1]))
+    WV = np.vstack([np.hstack([*WV[:, :size], V[:size]]), below])
+    big = np.block(
+        [
+            [A, WV],
+            [np.vstack(list(ZD)), V[size:]],
+            [S, np.zeros((len(S), V.shape[1]))],
+        ]
+    )
+    node = np.r_[0:states, np.tile(states + np.arange(k), TERMS + len(nodes))]
+    return Loop(big, node, np.maximum(K, 0.0), states, T)
+
+
+def parts_of(loop: Loop) -> list[tuple[tuple[int, ...], Loop]]:
+    """The strongly connected parts and their entries: the modes of the loop are those of these."""
+    total = loop.states + len(loop.K)
+    reach = np.eye(total)
+    np.add.at(reach, (loop.node[:, None], loop.node[None]), np.abs(loop.big) > 0.0)
+    reach[loop.states :, loop.states :] += loop.K
+    for _ in range(int(np.ceil(np.log2(total)))):
+        reach = (reach @ reach > 0.0).astype(float)
+    parts = []
+    for member in np.unique(reach * reach.T > 0.0, axis=0):
+        rows, entries = np.flatnonzero(member[loop.node]), np.flatnonzero(member[loop.states :])
+        big, K = loop.big[np.ix_(rows, rows)], loop.K[np.ix_(entries, entries)]
+        part = Loop(big, rows, K, int(member[: loop.states].sum()), loop.period)
+        parts.append((tuple(entries.tolist()), part))
+    return parts
+
+
+def is_stable(A: Array) -> bool:
+    """Whether every eigenvalue has abs(z) < RADIUS: P > 0 with P - A' P A / RADIUS^2 > 0."""
+    P, power = np.eye(len(A)), A / RADIUS
+    for _ in range(40):
+        with np.errstate(over="ignore", invalid="ignore"):
+            P, power = P + power.T @ P @ power, power @ power
+    if not np.isfinite(P).all():
+        return False
+    left = P - A.T @ P @ A / RADIUS**2
+    least = (np.min(np.linalg.eigvalsh(matrix), initial=1.0) for matrix in (P, left + left.T))
+    return bool(min(least) > 0.5)
+
+
+def norm(X: Array) -> Array:
+    """The Frobenius norm, at least the largest singular value."""
+    return np.asarray(np.sqrt((np.abs(X) ** 2).sum(axis=(-2, -1))))
+
+
+def adjoint(X: Array) -> Array:
+    """X*."""
+    return np.asarray(X.conj().swapaxes(-2, -1))
+
+
+class System(NamedTuple):
+    """A part around the middle of a box, scaled by D: from (state, w, v) to (state, y, rest)."""
+
+    big: Array
+    K: float
+    g: Array
+
+
+def closed(big: Array, w: slice, c: Array) -> Array:
+    """The system from w - c z in place of w, z = big[w] (x, w, v)."""
+    z = np.linalg.solve(np.eye(len(c)) - big[w, w] * c, big[w])
+    return np.asarray(big + big[:, w] @ (c[:, None] * z))
+
+
+def system_of(
+    part: Loop, middle: Array, half: Array, step: dict[str, Any], frequency: float
+) -> System:
+    """The system of a step. t of the coefficients without one balances those before it."""
+    n, k, known = part.states, len(part.K), len(step["t"])
+    p = TERMS * k
+    w, rest, c = slice(n, n + p), slice(n + p, None), np.tile(middle, TERMS)
+    few = closed(part.big[: n + p, : n + p], w, c)
+    z = RADIUS * np.exp(1j * frequency * part.period)
+    M = few[w, :n] @ np.linalg.solve(z * np.eye(n) - few[:n, :n], few[:n, w]) + few[w, w]
+    sizes = np.abs(np.tile(half, TERMS)[:, None] * M) ** 2 + 1e-30
+    t = np.r_[step["t"], np.zeros(p - known)]
+    for i in range(known, p, k):
+        to = np.exp(2.0 * t[:i]) @ sizes[:i, i : i + k]
+        t[i : i + k] = np.log(to / (sizes[i : i + k, :i] @ np.exp(-2.0 * t[:i]))) / 4.0
+    # The rest at the nodes is scaled, then turned to as few values as it has.
+    most, last = np.abs(middle) + half, np.exp(t[-k:])
+    nodes = (len(part.big) - n - p) // k
+    wide = np.tile(most * last, nodes)[:, None] * part.big[rest, : n + p]
+    tall = (part.big[: n + p, rest] / np.tile(last, nodes)).T
+    S, V = (np.array(np.linalg.qr(side, "r")) for side in (wide, tall))
+    big = np.block([[part.big[: n + p, : n + p], V.T], [S, np.zeros((len(S), len(V)))]])
+    big = closed(big, w, c)
+    big[w] *= (np.tile(half, TERMS) * np.exp(t))[:, None]
+    big[:, w] /= np.exp(t)
+    for i in np.tile(np.arange(n), 8):  # balanced states make the norms small
+        into, out = (np.sum(side**2) - big[i, i] ** 2 for side in (big[i], big[:, i]))
+        factor = (out / into) ** 0.25 if into > 0.0 and out > 0.0 else 1.0
+        big[i] *= factor
+        big[:, i] /= factor
+    K = float(np.sqrt((part.K * np.outer(most * last, 1.0 / last) ** 2).sum()))
+    return System(big, K, np.r_[step["g"], np.zeros(p - len(step["g"]))])
+
+
+def bounds(system: System, n: int, period: float, w: Array, x: Array) -> Array:
+    """Bounds of lambda_max at all frequencies from w - x to w + x, inf where there is none."""
+    big, p = system.big, len(system.g)
+    z = RADIUS * np.exp(1j * w * period)[:, None, None]
+    pencil = z * np.eye(n) - big[:n, :n]
+    R = np.linalg.inv(pencil)
+    left, right = big[n:, :n] @ R, R @ big[:n, n:]
+    M = big[n:, n:] + big[n:, :n] @ right
+    N, outer, inner = M[:, :p, :p], left[:, :p], right[:, :, :p]
+    H = adjoint(N - 1j * np.diag(system.g))
+    slope = -1j * period * z * (outer @ inner)
+    level = H @ N + adjoint(H @ N) - adjoint(N) @ N
+    change = x[:, None, None] * (H @ slope + adjoint(H @ slope))
+    ends = [np.linalg.eigvalsh(level + side * change)[:, -1] for side in (1.0, -1.0)]
+    # The inverse as computed is R (I - slip): its effect on M, with rounding entry by entry.
+    slip = np.abs(np.eye(n) - pencil @ R) + n * EPS * np.abs(pencil) @ np.abs(R)
+    error = norm(slip)
+    wrong = np.abs(left) @ slip @ np.abs(big[:n, n:])
+    wrong = wrong + (norm(left) * error**2 * norm(big[:n, n:]))[:, None, None]
+    # R at z + delta is R - delta R R + delta^2 R (R - delta R / (I + delta R) R) R.
+    delta = RADIUS * x * period
+    room = np.maximum(1.0 - delta * norm(R) - error, 1e-3)
+    square, cube = outer @ inner, outer @ R @ inner
+    turn, bend = delta * x * period / 2.0, delta**3 / room * norm(R @ inner)
+    curve = turn * norm(square) + delta**2 * norm(cube) + bend * norm(outer @ R)
+    H_curve = turn * norm(H @ square) + delta**2 * norm(H @ cube) + bend * norm(H @ outer @ R)
+    curve = curve + norm(wrong[:, :p, :p])
+    H_curve = H_curve + norm(np.abs(H) @ wrong[:, :p, :p])
+    linear = x * norm(slope) + curve
+    # The rest: v is at most `rest`, and adds to z what V_z v is through the loop.
+    reach = delta / room
+    loop_gain = system.K + norm(M[:, p:, p:]) + norm(wrong[:, p:, p:])
+    loop_gain = loop_gain + reach * norm(left[:, p:]) * norm(right[:, :, p:])
+    rest = norm(M[:, p:, :p]) + norm(wrong[:, p:, :p]) + reach * norm(left[:, p:]) * norm(inner)
+    rest = rest / np.maximum(1.0 - loop_gain, 1e-3)
+    into, by_v = np.abs(M[:, :p, p:]) + wrong[:, :p, p:], reach * norm(right[:, :, p:])
+    added = (norm(into) + norm(outer) * by_v) * rest
+    H_into = norm(H @ M[:, :p, p:]) + norm(np.abs(H) @ wrong[:, :p, p:])
+    H_added = (H_into + norm(H @ outer) * by_v) * rest + linear * added
+    total = np.maximum(*ends) + 2.0 * (H_curve + H_added) + (linear + added) ** 2
+    return np.where((room > 1e-3) & (loop_gain < 0.999), total, np.inf)
+
+
+def prove(part: Loop, steps: list[dict[str, Any]], size: float) -> int:
+    """Replay the steps from the whole box, 0 to pi / T; the number of bounds. Raises ValueError."""
+    k, count = len(part.K), 0
+    boxes = [(np.zeros(k), np.full(k, size), 0.0, np.pi / part.period)]
+    for number, step in enumerate(steps):
+        middle, half, low, high = boxes.pop()
+        if "halve" in step:
+            side = np.where(np.arange(k) == step["halve"], half / 2.0, 0.0)
+            boxes += [(middle + turn * side, half - side, low, high) for turn in (-1.0, 1.0)]
+            continue
+        todo, most = [(step["low"], step["high"])], count + MOST
+        while todo:
+            now, todo = np.array(todo[-BATCH:]), todo[:-BATCH]
+            system = system_of(part, middle, half, step, float(now.mean()))
+            found = bounds(
+                system, part.states, part.period, now.mean(axis=1), np.ptp(now, axis=1) / 2
+            )
+            count += len(now)
+            narrow = np.ptp(now, axis=1) < NARROWEST * now.mean(axis=1)
+            failed = ~(found < 1.0 - ROUNDING)
+            if (failed & narrow).any() or count > most:
+                raise ValueError(f"step {number}: not proved at {now[failed].mean():.6g} rad/s")
+            for a, b in now[failed]:
+                todo += [(a, (a + b) / 2.0), ((a + b) / 2.0, b)]
+        boxes += [(middle, half, low, step["low"])] if step["low"] > low else []
+        boxes += [(middle, half, step["high"], high)] if step["high"] < high else []
+    if boxes:
+        raise ValueError(f"{len(boxes)} boxes are not proved")
+    return count
+
+
+def check(file: dict[str, Any]) -> int:
+    """The number of bounds that prove a certificate. Raises ValueError for one that does not."""
+    steps = {tuple(part["entries"]): part["steps"] for part in file["parts"]}
+    count = 0
+    for entries, part in parts_of(loop_of(file)):
+        if not is_stable(part.big[: part.states, : part.states]):
+            raise ValueError("the aircraft of the file, d = 0, is not stable")
+        if entries and (
+            part.big[part.states :, part.states :].any() or part.states or part.K.any()
+        ):
+            if entries not in steps:
+                raise ValueError(f"no proof for {[file['names'][i] for i in entries]}")
+            count += prove(part, steps[entries], file["size"])
+    return count
+
+
+def main() -> None:
+    """Check a certificate, and the constants of an exported controller beside it."""
+    try:
+        file = json.loads(Path(sys.argv[1]).read_text())
+        text = json.dumps({key: file[key] for key in file if key != "digest"}, sort_keys=True)
+        if hashlib.sha256(text.encode()).hexdigest() != file["digest"]:
+            raise ValueError("the digest is not that of the content")
+        for header in sys.argv[2:]:
+            if hashlib.sha256(Path(header).read_bytes()).hexdigest() != file["constants"]:
+                raise ValueError(f"{header} holds other constants")
+        count = check(file)
+    except (ValueError, KeyError, TypeError, OSError, np.linalg.LinAlgError) as error:
+        sys.exit(f"REFUSED: {error}")
+    print(f"PROVED by {count} bounds:", *file["claim"], sep="\n  ")
+
+
+if __name__ == "__main__":
+    main()

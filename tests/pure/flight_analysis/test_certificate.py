@@ -1,0 +1,240 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The certificate of a guarantee, by the checker that imports nothing of this stack."""
+
+import hashlib
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pytest import approx
+from tests.conftest import REPOSITORY, invoke
+
+import rise_di
+from flight_analysis.closed_loop.scenario_library import find_scenario
+from flight_analysis.linear_loop.certificate import certificate
+from flight_analysis.linear_loop.guarantee import guarantee
+from flight_analysis.linear_loop.kept_guarantee import keep
+from flight_analysis.linear_loop.loop_margins import LinearLoop, scenario_loop
+from flight_analysis.linear_loop.uncertain_loop import plants_at
+from rise_di_controller.law.linear_loop import closed_loop
+
+CHECKER = REPOSITORY / "examples" / "check_certificate.py"
+Content = dict[str, Any]
+
+
+def _checker() -> Any:
+    spec = spec_from_file_location("check_certificate", CHECKER)
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def loop_of(name: str) -> LinearLoop:
+    scenario = find_scenario(name)
+    return scenario_loop(scenario, scenario.controller, 1, 0.3)
+
+
+@pytest.fixture(scope="module")
+def servo() -> Content:
+    linear = loop_of("osprey_servo")
+    content: Content = json.loads(certificate(linear, guarantee(linear), {}))
+    return content
+
+
+def signed(content: Content) -> Content:
+    """The content with the digest that it has."""
+    rest = {key: value for key, value in content.items() if key != "digest"}
+    text = json.dumps(rest, sort_keys=True)
+    return rest | {"digest": hashlib.sha256(text.encode()).hexdigest()}
+
+
+def run(content: Content, folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    path = folder / "certificate.json"
+    path.write_text(json.dumps(content))
+    command = [sys.executable, str(CHECKER), str(path), *words]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize("name", ["osprey_servo", "osprey_observer", "jsbsim_c172p"])
+def test_checker_proves_a_guarantee(name: str, tmp_path: Path) -> None:
+    """The size is the guarantee's.
+
+    Of c172p an interval was proved across a crossing that the pencil hid beside an integrator: the
+    checker refused it.
+    """
+    linear = loop_of(name)
+    promise = guarantee(linear)
+    done = run(json.loads(certificate(linear, promise, {})), tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("PROVED")
+    within = np.floor(1e3 * promise.stable) / 10.0
+    assert linear.box is not None
+    assert f"{linear.box.names[-1]} {within:g}" in done.stdout
+
+
+def test_motion_of_the_checker_is_the_exact_loop(servo: Content) -> None:
+    """Four coefficients of w close it within 1e-8, at the corners of the guarantee."""
+    module = _checker()
+    linear = loop_of("osprey_servo")
+    assert linear.box is not None
+    loop = module.loop_of(servo)
+    k = len(linear.box.names)
+    q, p = loop.states, module.TERMS * k
+    d = servo["size"] * np.sign(np.random.default_rng(5).standard_normal(k))
+    closed = module.closed(loop.big[: q + p, : q + p], slice(q, q + p), np.tile(d, module.TERMS))
+    aircraft = plants_at(linear.nominal, linear.box, d)
+    exact = closed_loop(aircraft, linear.law, linear.loop, np.zeros(4))
+    assert closed[:q, :q] == approx(exact, abs=1e-8)
+    # the proof's own two coefficients are 100 times worse: what they leave out, the checker bounds
+    two = np.r_[0:q, q : q + 2 * k]
+    fewer = module.closed(loop.big[np.ix_(two, two)], slice(q, q + 2 * k), np.tile(d, 2))
+    assert np.abs(fewer[:q, :q] - exact).max() > 100.0 * np.abs(closed[:q, :q] - exact).max()
+
+
+def _numbers(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    """The places of all numbers of a JSON value."""
+    if isinstance(value, dict):
+        return [place for key, inner in value.items() for place in _numbers(inner, (*path, key))]
+    if isinstance(value, list):
+        return [place for i, inner in enumerate(value) for place in _numbers(inner, (*path, i))]
+    return [path] if isinstance(value, (int, float)) else []
+
+
+def test_certificate_with_an_altered_number_is_refused(
+    servo: Content, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A hundred numbers, one at a time, in the last digit: the digest is another."""
+    module = _checker()
+    places = _numbers(servo)
+    path = tmp_path / "certificate.json"
+    for place in np.random.default_rng(2).choice(len(places), 100, replace=False).tolist():
+        altered = json.loads(json.dumps(servo))
+        inner = altered
+        for key in places[place][:-1]:
+            inner = inner[key]
+        value = inner[places[place][-1]]
+        inner[places[place][-1]] = value + 1 if isinstance(value, int) else np.nextafter(value, 9e9)
+        path.write_text(json.dumps(altered))
+        monkeypatch.setattr(sys, "argv", [str(CHECKER), str(path)])
+        with pytest.raises(SystemExit, match="digest"):
+            module.main()
+
+
+def _larger(content: Content) -> None:
+    content["size"] *= 1.01  # an unstable aircraft is at 1.005 of what is guaranteed
+
+
+def _steered_backwards(content: Content) -> None:
+    content["B"] = (-np.array(content["B"])).tolist()
+
+
+def _faster_law(content: Content) -> None:
+    law = content["law"]
+    law["C"] = (1.5 * np.array(law["C"])).tolist()
+    law["D"] = (1.5 * np.array(law["D"])).tolist()
+
+
+def _later(content: Content) -> None:
+    content["delay"] += 0.02
+
+
+def _slower_actuators(content: Content) -> None:
+    content["lag"] = [3.0 * lag for lag in content["lag"]]
+
+
+def _wider_entry(content: Content) -> None:
+    content["F"][content["names"].index("A[q,alpha]")] = [
+        1.5 * value for value in content["F"][content["names"].index("A[q,alpha]")]
+    ]
+
+
+def _one_step_less(content: Content) -> None:
+    content["parts"][0]["steps"].pop()
+
+
+def _step_skipped(content: Content) -> None:
+    proved = [step for step in content["parts"][1]["steps"] if "low" in step]
+    proved[3]["high"] = 2.0 * proved[3]["high"]
+
+
+def _one_part_less(content: Content) -> None:
+    content["parts"].pop()
+
+
+def _no_scaling(content: Content) -> None:
+    for part in content["parts"]:
+        for step in part["steps"]:
+            step.update({key: [0.0] * len(step[key]) for key in ("t", "g") if key in step})
+
+
+def _not_finite(content: Content) -> None:
+    content["A"][0][0] = float("nan")
+
+
+FALSE: tuple[Callable[[Content], None], ...] = (
+    _larger, _steered_backwards, _faster_law, _later, _slower_actuators, _wider_entry,
+    _one_step_less, _step_skipped, _one_part_less, _no_scaling, _not_finite,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("altered", FALSE, ids=lambda f: f.__name__.strip("_"))
+def test_false_certificate_with_its_own_digest_is_refused(
+    altered: Callable[[Content], None], servo: Content, tmp_path: Path
+) -> None:
+    """Who alters the digest too meets the inequalities."""
+    content = json.loads(json.dumps(servo))
+    altered(content)
+    done = run(signed(content), tmp_path)
+    assert done.returncode == 1, done.stdout
+    assert done.stderr.startswith("REFUSED"), done.stderr
+
+
+@pytest.fixture(autouse=True)
+def _caches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is computed is kept in a folder of the test."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "caches"))
+
+
+def test_command_writes_a_certificate_and_refuses_what_it_cannot_state(tmp_path: Path) -> None:
+    path = tmp_path / "certificate.json"
+    words = ["gains", "osprey", "--check", "--samples", "1", "--certificate", str(path)]
+    refusals = {
+        (): "found no --guarantee, expected --guarantee beside it",
+        ("--guarantee", "--late", "0.01"): "found --late 0.01 beside it, expected u in time",
+    }
+    for more, sentence in refusals.items():
+        assert sentence in str(invoke(*words, *more).exception)
+        assert not path.exists()
+    done = invoke(*words, "--guarantee")
+    # 1: beta is below the slew of a gust, as without a certificate
+    assert done.exit_code == 1, done.output
+    assert "certificate.json" in done.output
+    content = json.loads(path.read_text())
+    assert content == signed(content)
+    assert {"scenario", "airframe", "constants"} <= set(content)
+
+
+def test_export_puts_the_certificate_beside_the_code_of_its_constants(tmp_path: Path) -> None:
+    """Without a computed guarantee there is none; with other constants the checker refuses it."""
+    code = tmp_path / "c"
+    exported = rise_di.export("osprey_servo", code, proof=False)
+    assert not any(path.name == "certificate.json" for path in exported.files)
+    linear = loop_of("osprey_servo")
+    keep(linear, guarantee(linear))
+    exported = rise_di.export("osprey_servo", code, proof=False)
+    assert code / "certificate.json" in exported.files
+    content = json.loads((code / "certificate.json").read_text())
+    header = code / "rise_di_parameters.h"
+    assert run(content, tmp_path, str(header)).returncode == 0
+    header.write_text(header.read_text().replace("RISE_DI_M 4", "RISE_DI_M 5"))
+    assert "holds other constants" in run(content, tmp_path, str(header)).stderr
