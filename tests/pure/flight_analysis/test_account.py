@@ -34,8 +34,8 @@ from flight_analysis.report.sample_counts import TopicAccount
 from flight_analysis.report.shortfalls import judge
 from flight_analysis.report.summary import (
     RecordedFlight,
+    command_edges,
     command_results,
-    pulse_edges,
     summarise,
     taken_over,
 )
@@ -489,7 +489,7 @@ def test_process_has_ready_time_of_its_own_start() -> None:
 
 def test_summary_counts_commands_of_flight(figures: dict[str, Any]) -> None:
     """The first edge of the scenario is at 2.0 s, the end of the flight."""
-    edges = pulse_edges(find_scenario("osprey_gust"))
+    edges = command_edges(find_scenario("osprey_gust"))
     assert figures["account"]["commands"] == {
         "given": len(edges),
         "flown": 1,

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from flight_analysis.closed_loop.learning_loop import Learn
 from flight_analysis.closed_loop.scenario import Scenario, load_scenario
-from flight_analysis.closed_loop.scenario_library import find_scenario, save_scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario, save_scenario, with_recorded
 from flight_analysis.closed_loop.simulate import fly
 from flight_analysis.report.display_units import display_units
 from flight_analysis.report.run_folder import FlightResult, attachments_for, new_run, write_report
@@ -399,5 +399,5 @@ def as_file(scenario: Scenario, run: Path) -> Scenario:
     Raises ParameterError.
     """
     if _is_its_file(scenario):
-        return scenario
+        return with_recorded(scenario, run)
     return save_scenario(scenario, run / f"{scenario.name}.yaml")

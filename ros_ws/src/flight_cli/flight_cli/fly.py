@@ -14,7 +14,12 @@ from rich.console import Console
 
 from flight_analysis.closed_loop.learning_loop import Learn
 from flight_analysis.closed_loop.scenario import Scenario, limits_beyond_stops, opposite_signs
-from flight_analysis.closed_loop.scenario_library import find_scenario, save_scenario, with_route
+from flight_analysis.closed_loop.scenario_library import (
+    find_scenario,
+    save_scenario,
+    with_recorded,
+    with_route,
+)
 from flight_analysis.report.run_folder import (
     UnwrittenReportError,
     new_run,
@@ -140,6 +145,8 @@ class Fly(RouteWords):
         self.context.call_on_close(partial(remove_empty, run))
         if self.route or self.fence or self.settings or self.learn:
             scenario = save_scenario(scenario, run / f"{scenario.name}.yaml")
+        else:
+            scenario = with_recorded(scenario, run)
         self._watch(run)
         with flight_progress(scenario.flight.duration, quiet=self.as_json) as (progress, announce):
             if self.in_process:

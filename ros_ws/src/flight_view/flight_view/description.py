@@ -11,7 +11,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.report.display_units import NO_UNIT, display_units
 from flight_analysis.report.guided import mission_drawing
 from flight_analysis.report.model_spans import ModelSpan, model_names
-from flight_analysis.report.summary import pulse_edges
+from flight_analysis.report.summary import command_edges
 from flight_analysis.report.summary_rows import model_rows
 from flight_core.modes import Mode
 from flight_core.rates import NANOSECONDS
@@ -90,7 +90,7 @@ def scenario_description(scenario: Scenario) -> dict[str, Any]:
         "positive": scenario.aircraft.channels().positive,
         "limits": {name: [*map(_finite_or_none, pair)] for name, *pair in bounds},
         "gusts": [[name, *window] for name, window in scenario.gust_windows().items()],
-        "commands": [[edge.name, edge.start, edge.stop] for edge in pulse_edges(scenario)],
+        "commands": [[edge.name, edge.start, edge.stop] for edge in command_edges(scenario)],
         "speed": scenario.aircraft.channels().speed,
         **({"route": []} if guidance is None else mission(guidance, waypoints)),
     }

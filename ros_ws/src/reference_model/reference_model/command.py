@@ -1,13 +1,70 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Commands u_m(t): pulses and sines with bounded derivative, as a pure function of time.
+"""Commands u_m(t) with bounded derivative, as a pure function of time.
 
 Equation (2) requires bounded u_m and u_m_dot, so the edges of a pulse are ramps, never steps.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
-from flight_core.vectors import Array, array_namespace
+import numpy as np
+
+from flight_core.vectors import Array, FloatArray
+
+
+class Line(NamedTuple):
+    """A piecewise linear signal through points, held before the first and after the last one."""
+
+    time: FloatArray  # (N,) s, increasing
+    value: FloatArray  # (N,) in the channel's unit
+
+
+class Edge(NamedTuple):
+    """A change of the command by `change`, linear from `start` to `stop`."""
+
+    start: float  # s
+    stop: float  # s
+    change: float  # in the channel's unit
+
+    def line(self) -> Line:
+        """The edge as a signal: 0 before, `change` after."""
+        return Line(np.array([self.start, self.stop]), np.array([0.0, self.change]))
+
+
+class Polyline(NamedTuple):
+    """The sum of the piecewise linear signals of m channels, by K common knots."""
+
+    time: FloatArray  # (K,) s, increasing
+    value: FloatArray  # (K, m) at the knots
+    slope: FloatArray  # (K, m) 1/s, after the knots; 0 after the last one
+    area: FloatArray  # (K, m) integral from the first knot
+
+    @classmethod
+    def through(cls, lines: Sequence[Sequence[Line]]) -> "Polyline":
+        """The sums of the lines of each channel; the first knot is 0, or before it."""
+        every = [line for channel in lines for line in channel]
+        time = np.unique(np.concatenate([[0.0], *(line.time for line in every)]))
+        value = np.zeros((len(time), len(lines)))
+        for column, channel in enumerate(lines):
+            for line in channel:
+                value[:, column] += np.interp(time, line.time, line.value)
+        length = np.diff(time)[:, None]
+        slope = np.zeros_like(value)
+        slope[:-1] = np.diff(value, axis=0) / length
+        area = np.zeros_like(value)
+        area[1:] = np.cumsum(length * (value[:-1] + value[1:]) / 2.0, axis=0)
+        return cls(time, value, slope, area)
+
+
+class Chirps(NamedTuple):
+    """A linear chirp per channel; amplitude 0 on a channel without one."""
+
+    amplitude: FloatArray  # (m,)
+    start: FloatArray  # (m,) s
+    duration: FloatArray  # (m,) of the sweep, s, > 0
+    frequency: FloatArray  # (m,) at the start, rad/s, > 0
+    sweep: FloatArray  # (m,) change of the frequency, rad/s^2, not 0
 
 
 class Profile(NamedTuple):
@@ -17,7 +74,9 @@ class Profile(NamedTuple):
     """
 
     time: Array  # (m, E) start of each edge
-    change: Array  # (m, E) change of the command by each edge; a pulse is two edges
+    change: (
+        Array  # (m, E) change of the command by each edge; a pulse is two edges, a doublet three
+    )
     rise: Array  # () duration of each edge, > 0
     amplitude: Array  # (m,) of the sine
     frequency: Array  # (m,) rad/s, > 0
@@ -26,32 +85,89 @@ class Profile(NamedTuple):
     bank_rate: Array
     # (m,) g/V0 (rad/s) on the channel to which the turn rate g/V0 sin(bank) is added, else 0
     turn_rate: Array
+    lines: Polyline | None = None  # ramps and recorded commands
+    chirps: Chirps | None = None
 
 
-def command(t: Array, profile: Profile) -> Array:
+def command(t: Array, profile: Profile) -> FloatArray:
     """u_m(t), shape (m,), or (T, m) at T instants together.
 
     u_m = w(t) + turn_rate sin(phi(t)),  phi(t) = bank_rate . integral_0^t w
-    w_i = sum_k change_ik G(t - time_ik) + amplitude_i sin(frequency_i t + phase_i),
-        G(s) = clip(s / rise, 0, 1)
+    w_i = sum_k change_ik G(t - time_ik) + amplitude_i sin(frequency_i t + phase_i)
+          + lines_i(t) + chirps_i(t),  G(s) = clip(s / rise, 0, 1)
 
-    The two integrals have closed forms, so the function has no state: the integral of G is r^2 / (2
-    rise) + max(s - rise, 0), with r = s clipped to [0, rise]. g/V0 sin(phi) is the turn rate of a
-    coordinated turn.
+    The integrals of the four have closed forms, so the function has no state: the integral of G is
+    r^2 / (2 rise) + max(s - rise, 0), with r = s clipped to [0, rise]. g/V0 sin(phi) is the turn
+    rate of a coordinated turn.
     """
-    xp = array_namespace(profile.change)
-    t = xp.asarray(t)[..., None]
-    since = t[..., None] - profile.time
-    elapsed = xp.maximum(since, 0.0 * since)
-    rising = xp.minimum(elapsed, profile.rise + 0.0 * elapsed)
-    angle = profile.frequency * t + profile.phase
-    # a product with it sums over the edges several times faster than xp.sum
-    ones = xp.ones_like(profile.change[0, :])
-    w = (profile.change * rising) @ ones / profile.rise + profile.amplitude * xp.sin(angle)
+    t = np.asarray(t, dtype=np.float64)
+    since = t[..., None, None] - profile.time
+    elapsed = np.maximum(since, 0.0)
+    rising = np.minimum(elapsed, profile.rise)
+    angle = profile.frequency * t[..., None] + profile.phase
+    # a product with it sums over the edges several times faster than np.sum
+    ones = np.ones_like(profile.change[0, :])
+    w = (profile.change * rising) @ ones / profile.rise + profile.amplitude * np.sin(angle)
     w_integral = (
         profile.change * (rising * rising / (2.0 * profile.rise) + elapsed - rising)
     ) @ ones
     w_integral = w_integral + profile.amplitude / profile.frequency * (
-        xp.cos(profile.phase) - xp.cos(angle)
+        np.cos(profile.phase) - np.cos(angle)
     )
-    return w + profile.turn_rate * xp.sin(w_integral @ profile.bank_rate)[..., None]
+    further = []
+    if profile.lines is not None:
+        further.append(polyline(t, profile.lines))
+    if profile.chirps is not None:
+        further.append(linear_chirp(t, profile.chirps))
+    for signal, integral in further:
+        w = w + signal
+        w_integral = w_integral + integral
+    u_m: FloatArray = w + profile.turn_rate * np.sin(w_integral @ profile.bank_rate)[..., None]
+    return u_m
+
+
+def polyline(t: FloatArray, lines: Polyline) -> tuple[FloatArray, FloatArray]:
+    """Piecewise linear signals at t and their integrals, each of shape t.shape + (m,).
+
+    With s = t - time_k since the last knot: value_k + slope_k s, and area_k + value_k s + slope_k
+    s^2 / 2.
+    """
+    k = np.maximum(np.searchsorted(lines.time, t, side="right") - 1, 0)
+    since = np.maximum(t - lines.time[k], 0.0)[..., None]
+    value = lines.value[k]
+    change = lines.slope[k] * since
+    return value + change, lines.area[k] + since * (value + change / 2.0)
+
+
+def linear_chirp(t: FloatArray, chirps: Chirps) -> tuple[FloatArray, FloatArray]:
+    """Linear chirps at t and their integrals, each of shape t.shape + (m,).
+
+    amplitude sin(theta), theta = frequency s + sweep s^2 / 2, s = t - start in [0, duration]. Then
+    the last frequency goes on to the next zero, so that no step ends the chirp. With c =
+    frequency^2 / (2 sweep) and x = (frequency + sweep s) / sqrt(pi abs(sweep)) the integral is that
+    of Fresnel's S and C,
+
+        sqrt(pi / abs(sweep)) (cos c (S(x) - S(x_0)) - sign(sweep) sin c (C(x) - C(x_0)))
+
+    Source: Abramowitz and Stegun, Handbook of Mathematical Functions, 7.3.1 and 7.3.2.
+    """
+    from scipy.special import fresnel  # noqa: PLC0415 - a tenth of a second, which few commands need
+
+    frequency, sweep = chirps.frequency, chirps.sweep
+    since = t[..., None] - chirps.start
+    s = np.clip(since, 0.0, chirps.duration)
+    last_frequency = frequency + sweep * chirps.duration
+    swept = (frequency + last_frequency) / 2.0 * chirps.duration
+    end = np.pi * np.ceil(swept / np.pi)
+    sweeping = (frequency + sweep * s / 2.0) * s
+    theta = np.minimum(sweeping + last_frequency * np.maximum(since - s, 0.0), end)
+    wave = np.where(theta < end, np.sin(theta), 0.0)
+
+    scale = np.sqrt(np.pi * np.abs(sweep))
+    c = frequency * frequency / (2.0 * sweep)
+    S, C = fresnel((frequency + sweep * s) / scale)
+    S_0, C_0 = fresnel(frequency / scale)
+    sweep_integral = np.cos(c) * (S - S_0) - np.sign(sweep) * np.sin(c) * (C - C_0)
+    tail = (np.cos(sweeping) - np.cos(theta)) / last_frequency
+    integral = sweep_integral * scale / np.abs(sweep) + tail
+    return chirps.amplitude * wave, chirps.amplitude * integral

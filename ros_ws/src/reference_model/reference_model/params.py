@@ -6,13 +6,15 @@ They are validated, and converted to the arrays of model and profile.
 """
 
 import math
-from typing import Annotated
+from collections.abc import Mapping
+from itertools import pairwise
+from typing import Annotated, Any, Self
 
 import numpy as np
 
 from flight_core import parameters
 from flight_core.channels import WITHOUT_RUDDER, vertical
-from flight_core.fields import Field
+from flight_core.fields import Field, Problems
 from flight_core.parameters import (
     Config,
     Names,
@@ -27,9 +29,15 @@ from flight_core.parameters import (
 from flight_core.rates import nanoseconds, period_ns
 from flight_core.units import GRAVITY
 from flight_core.vectors import selection_matrix
-from reference_model.command import Profile
+from reference_model.command import Chirps, Edge, Line, Polyline, Profile
 from reference_model.live import LiveParams
 from reference_model.model import ReferenceMatrices, second_order, stepper
+from reference_model.stick import read_stick
+
+SIGNALS = ("pulses", "doublets", "ramps", "sines", "chirps", "recorded")
+"""The parameters with commands by channel."""
+
+MOST_RECORDED = 10_000  # points: a scenario file with their values stays below its largest size
 
 
 class Pulses(Config):
@@ -40,12 +48,49 @@ class Pulses(Config):
     value: Numbers = Field(description="heights of the pulses, in the channel's unit")
 
     def _check(self) -> None:
-        for key in ("stop", "value"):
-            parameters.require_length(
-                key, getattr(self, key), [f"pulse {k + 1}" for k in range(len(self.start))]
-            )
-        for k, (start, stop) in enumerate(zip(self.start, self.stop, strict=True)):
-            require(stop > start, f"stop[{k}]", stop, f"later than start[{k}] = {start:g} s")
+        _require_spans(self.start, self.stop, self.value, "pulse")
+
+    def edges(self, rise: float) -> list[Edge]:
+        """Two edges a pulse."""
+        return [
+            Edge(t, t + rise, sign * value)
+            for times, sign in ((self.start, 1.0), (self.stop, -1.0))
+            for t, value in zip(times, self.value, strict=True)
+        ]
+
+
+class Doublets(Config):
+    """Doublets on a channel: a pulse, then its opposite."""
+
+    start: Numbers = Field(description="start times of the first pulses, s")
+    width: Positives = Field(description="durations of each of the two pulses, s")
+    value: Numbers = Field(description="heights of the first pulses, in the channel's unit")
+
+    def _check(self) -> None:
+        _require_one_each(self.start, {"width": self.width, "value": self.value}, "doublet")
+
+    def edges(self, rise: float) -> list[Edge]:
+        """Three edges a doublet; the middle one has twice the height."""
+        return [
+            Edge(start + k * width, start + k * width + rise, factor * value)
+            for start, width, value in zip(self.start, self.width, self.value, strict=True)
+            for k, factor in ((0.0, 1.0), (1.0, -2.0), (2.0, 1.0))
+        ]
+
+
+class Ramps(Config):
+    """Ramps on a channel: a linear change from `start` to `stop`, held from there on."""
+
+    start: Numbers = Field(description="start times, s")
+    stop: Numbers = Field(description="end times, s")
+    value: Numbers = Field(description="changes of the command, in the channel's unit")
+
+    def _check(self) -> None:
+        _require_spans(self.start, self.stop, self.value, "ramp")
+
+    def edges(self, _rise: float) -> list[Edge]:
+        """One edge a ramp."""
+        return list(map(Edge, self.start, self.stop, self.value))
 
 
 class Sine(Config):
@@ -54,6 +99,78 @@ class Sine(Config):
     amplitude: Number = Field(description="the amplitude, in the channel's unit")
     frequency: Positive = Field(description="the frequency, rad/s")
     phase: Number = Field(default=0.0, description="the phase, rad")
+
+
+class Chirp(Config):
+    """A linear chirp on a channel: a sine whose frequency changes linearly.
+
+    After the sweep the last frequency goes on to the next zero.
+    """
+
+    amplitude: Number = Field(description="the amplitude, in the channel's unit")
+    start: Number = Field(description="the start of the sweep, s")
+    stop: Number = Field(description="the end of the sweep, s; the next zero ends the chirp")
+    first_frequency: Positive = Field(description="the frequency at `start`, rad/s")
+    last_frequency: Positive = Field(description="the frequency at `stop`, rad/s")
+
+    def _check(self) -> None:
+        require(self.stop > self.start, "stop", self.stop, f"later than start = {self.start:g} s")
+        sweeps = self.last_frequency != self.first_frequency
+        require(sweeps, "last_frequency", self.last_frequency, "another than first_frequency")
+
+
+class Recorded(Config):
+    """A recorded command on a channel, interpolated linearly; the last value is held.
+
+    A `file` is read once: the set holds its values, and its path as `source`.
+    """
+
+    file: str = Field(
+        default="",
+        description="path of a CSV file `time,value`, from the folder of the scenario",
+    )
+    source: str = Field(default="", description="the file that the values are from")
+    time: Numbers = Field(default=(), max_length=MOST_RECORDED, description="times from 0 on, s")
+    value: Numbers = Field(default=(), description="values at `time`, in the channel's unit")
+
+    @classmethod
+    def read(
+        cls, values: Mapping[Any, Any], key: str, problems: Problems, *, check: bool = True
+    ) -> Self | None:
+        """Build the set, from the file where there is one."""
+        if isinstance(file := values.get("file"), str) and file:
+            try:
+                others = ", ".join(name for name in values if name != "file" and values[name])
+                require(not others, f"{key}.file", f"it beside {others}", "a file alone")
+                values = read_stick(file, f"{key}.file") | {"source": file}
+            except ParameterError as error:
+                problems.others.append(str(error))
+                return None
+        return super().read(values, key, problems, check=check)
+
+    def _check(self) -> None:
+        points = [f"time {k + 1}" for k in range(len(self.time))]
+        parameters.require_length("value", self.value, points)
+        require(len(self.time) > 1, "time", f"{len(self.time)} values", "at least 2, or a file")
+        require(self.time[0] == 0.0, "time[0]", self.time[0], "0: the start of the flight")
+        for k, (before, t) in enumerate(pairwise(self.time), 1):
+            require(t > before, f"time[{k}]", t, f"later than time[{k - 1}] = {before:g} s")
+
+    def line(self) -> Line:
+        """The command through its points."""
+        return Line(np.array(self.time), np.array(self.value))
+
+
+def _require_one_each(start: Numbers, others: Mapping[str, Numbers], kind: str) -> None:
+    for key, values in others.items():
+        parameters.require_length(key, values, [f"{kind} {k + 1}" for k in range(len(start))])
+
+
+def _require_spans(start: Numbers, stop: Numbers, value: Numbers, kind: str) -> None:
+    """Raise ParameterError for values in different numbers, and a stop that is not later."""
+    _require_one_each(start, {"stop": stop, "value": value}, kind)
+    for k, (begin, end) in enumerate(zip(start, stop, strict=True)):
+        require(end > begin, f"stop[{k}]", end, f"later than start[{k}] = {begin:g} s")
 
 
 class CoordinatedTurn(Config):
@@ -123,9 +240,17 @@ class ReferenceModelConfig(NodeConfig):
         default=None, description="the model, one filter per channel"
     )
     linear: Linear | None = Field(default=None, description="the model, as matrices")
-    rise: Positive = Field(description="the duration of a pulse's edge, s: bounds u_m_dot")
+    rise: Positive = Field(
+        description="the duration of an edge of a pulse or doublet, s: bounds u_m_dot"
+    )
     pulses: dict[str, Pulses] = Field(default={}, description="pulses by channel")
+    doublets: dict[str, Doublets] = Field(default={}, description="doublets by channel")
+    ramps: dict[str, Ramps] = Field(default={}, description="ramps by channel")
     sines: dict[str, Sine] = Field(default={}, description="sines by channel")
+    chirps: dict[str, Chirp] = Field(default={}, description="linear chirps by channel")
+    recorded: dict[str, Recorded] = Field(
+        default={}, description="recorded commands by channel, as of a stick"
+    )
     coordinated_turn: CoordinatedTurn | None = Field(default=None, description="turn coordination")
     live: LiveCommands = Field(default=LiveCommands(), description="live commands u_m")
     u_m_rate: float = Field(
@@ -146,9 +271,7 @@ class ReferenceModelConfig(NodeConfig):
                 f"a whole fraction of rate ({self.rate:g} Hz)",
             )
         turn = self.coordinated_turn
-        names = {f"pulses.{name}": name for name in self.pulses} | {
-            f"sines.{name}": name for name in self.sines
-        }
+        names = {f"{key}.{name}": name for key in SIGNALS for name in getattr(self, key)}
         if turn is not None:
             names |= {
                 "coordinated_turn.bank_rate": turn.bank_rate,
@@ -272,20 +395,36 @@ class ReferenceModelConfig(NodeConfig):
             roll_rate=section.roll_rate,
         )
 
-    def profile(self) -> Profile:
-        """The commands u_m(t) as arrays over the outputs.
+    def edges(self) -> dict[str, list[Edge]]:
+        """The edges of pulses, doublets and ramps by channel, in the order of the outputs."""
+        return self._edges(self.pulses, self.doublets, self.ramps)
 
-        There are two edges per pulse, padded with edges of height 0.
+    def _edges(self, *signals: Mapping[str, Pulses | Doublets | Ramps]) -> dict[str, list[Edge]]:
+        return {
+            name: [
+                edge
+                for by_channel in signals
+                if name in by_channel
+                for edge in by_channel[name].edges(self.rise)
+            ]
+            for name in self.outputs
+        }
+
+    def profile(self) -> Profile:
+        """The commands u_m(t) as arrays over the outputs; the signals of a channel add up.
+
+        The edges of pulses and doublets are padded with edges of height 0.
         """
         m = len(self.outputs)
-        edges = 2 * max((len(pulses.start) for pulses in self.pulses.values()), default=0)
-        time = np.zeros((m, edges))
-        change = np.zeros((m, edges))
-        for name, pulses in self.pulses.items():
-            row = self.outputs.index(name)
-            count = 2 * len(pulses.start)
-            time[row, :count] = (*pulses.start, *pulses.stop)
-            change[row, :count] = (*pulses.value, *(-value for value in pulses.value))
+        rows = [*self._edges(self.pulses, self.doublets).values()]
+        time = np.zeros((m, max(map(len, rows))))
+        change = np.zeros_like(time)
+        for row, edges in enumerate(rows):
+            time[row, : len(edges)] = [edge.start for edge in edges]
+            change[row, : len(edges)] = [edge.change for edge in edges]
+        lines = [[edge.line() for edge in edges] for edges in self._edges(self.ramps).values()]
+        for name, recorded in self.recorded.items():
+            lines[self.outputs.index(name)].append(recorded.line())
         sines = [self.sines.get(name) for name in self.outputs]
         bank_rate = np.zeros(m)
         turn_rate = np.zeros(m)
@@ -301,4 +440,22 @@ class ReferenceModelConfig(NodeConfig):
             phase=np.array([0.0 if sine is None else sine.phase for sine in sines]),
             bank_rate=bank_rate,
             turn_rate=turn_rate,
+            lines=Polyline.through(lines) if any(lines) else None,
+            chirps=self._chirps() if self.chirps else None,
         )
+
+    def _chirps(self) -> Chirps:
+        """The chirps; a channel without one has amplitude 0."""
+        columns = [
+            (0.0, 0.0, 1.0, 1.0, 1.0)
+            if chirp is None
+            else (
+                chirp.amplitude,
+                chirp.start,
+                chirp.stop - chirp.start,
+                chirp.first_frequency,
+                (chirp.last_frequency - chirp.first_frequency) / (chirp.stop - chirp.start),
+            )
+            for chirp in map(self.chirps.get, self.outputs)
+        ]
+        return Chirps(*np.array(columns).T)

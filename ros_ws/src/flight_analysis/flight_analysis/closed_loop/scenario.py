@@ -256,16 +256,20 @@ def scenario_of(name: str, path: Path, sections: Mapping[str, Mapping[str, Any]]
 def parse_scenario_sections(content: bytes, path: Path) -> Sections:
     """The sections in the content of a scenario file, not validated yet. Raises ParameterError.
 
-    A path of an airframe that is none from the working folder is one from the folder of the
-    scenario, or that file itself lies there.
+    A path of an airframe or of a recorded command that is none from the working folder is one from
+    the folder of the scenario, or that file itself lies there.
     """
     sections = parse_sections(
         content, path, tuple(name for name in SCHEMAS if name not in OPTIONAL), OPTIONAL
     )
-    airframe = sections["aircraft"].get("airframe")
-    if isinstance(airframe, str) and airframe.endswith(".yaml") and not is_file(Path(airframe)):
-        candidates = (path.parent.absolute() / name for name in (airframe, Path(airframe).name))
-        sections["aircraft"]["airframe"] = str(next(filter(is_file, candidates), airframe))
+    recorded = sections["reference_model"].get("recorded")
+    signals = recorded.values() if isinstance(recorded, Mapping) else ()
+    files = [(sections["aircraft"], "airframe", ".yaml"), *((part, "file", "") for part in signals)]
+    for part, key, ending in files:
+        file = part.get(key) if isinstance(part, dict) else None
+        if isinstance(file, str) and file.endswith(ending) and not is_file(Path(file)):
+            candidates = (path.parent.absolute() / name for name in (file, Path(file).name))
+            part[key] = str(next(filter(is_file, candidates), file))
     return sections
 
 

@@ -89,6 +89,17 @@ def with_route(
     return scenario.vary(guidance={"route": route, "program": {}, **fence})
 
 
+def with_recorded(scenario: Scenario, run: Path) -> Scenario:
+    """The scenario with the values of its recorded commands in a file of the folder `run`.
+
+    The log stores this file, so that the flight needs no other one to be flown again. A scenario
+    without recorded commands stays as given. Raises ParameterError where it cannot be written.
+    """
+    if not scenario.reference_model.recorded:
+        return scenario
+    return save_scenario(scenario, run / f"{scenario.name}.yaml")
+
+
 def save_scenario(scenario: Scenario, path: Path) -> Scenario:
     """A scenario that differs from its file, as a file of its own.
 

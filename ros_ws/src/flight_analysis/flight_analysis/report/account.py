@@ -42,7 +42,7 @@ class ProcessAccount(NamedTuple):
 class Commands(NamedTuple):
     """Commands of a flight, without the legs of a route."""
 
-    given: int  # edges of the scenario's pulses and of u_m
+    given: int  # edges of the scenario's commands and of u_m
     flown: int  # those that began before the end of the flight
     targets: int  # messages of targets and routes in the log
     taken: int  # steps of guidance with a new command: of a target, a route or a service

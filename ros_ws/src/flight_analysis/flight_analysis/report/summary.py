@@ -68,16 +68,14 @@ from flight_log.clock import SINCE_EPOCH_NS
 from flight_log.log_messages import LogMessage
 
 
-def pulse_edges(scenario: Scenario) -> list[Transient]:
-    """Edges of the scenario's pulses as transients, in order of time."""
-    profile = scenario.reference_model.profile()
-    edges = []
-    for name, times, changes in zip(
-        scenario.reference_model.outputs, profile.time, profile.change, strict=True
-    ):
-        for time, change in zip(times, changes, strict=True):
-            if change != 0.0:
-                edges.append(Transient("command", name, float(time), float(time + profile.rise)))
+def command_edges(scenario: Scenario) -> list[Transient]:
+    """Edges of the scenario's pulses, doublets and ramps as transients, in order of time."""
+    edges = [
+        Transient("command", name, edge.start, edge.stop)
+        for name, of_channel in scenario.reference_model.edges().items()
+        for edge in of_channel
+        if edge.change != 0.0
+    ]
     return sorted(edges, key=lambda edge: edge.start)
 
 
@@ -95,7 +93,7 @@ def transients(scenario: Scenario, tape: Tape) -> list[Transient]:
     until = float(tape.time("u_m")[0]) if live else math.inf
     return [
         *engagements(tape),
-        *(edge for edge in pulse_edges(scenario) if edge.start < until),
+        *(edge for edge in command_edges(scenario) if edge.start < until),
         *live,
         *gusts,
     ]

@@ -21,7 +21,7 @@ from flight_core.vectors import Array, FloatArray
 from flight_design.gains.airframe_properties import fastest_zero, output_coordinates
 from reference_model import model
 from reference_model.command import command
-from reference_model.params import ReferenceModelConfig
+from reference_model.params import SIGNALS, ReferenceModelConfig
 from rise_di_controller.extensions.feedforward import ZERO_REAL_PART
 
 STEP = 0.01
@@ -101,7 +101,7 @@ def manoeuvre(scenario: Scenario, airframe: Airframe) -> Manoeuvre:
         values["outputs"] = airframe.outputs
         for key, row in values["second_order"].items():
             values["second_order"][key] = [row[i] for i in rows]
-        for key in ("pulses", "sines"):
+        for key in SIGNALS:
             values[key] = {
                 name: signal for name, signal in values[key].items() if name in airframe.outputs
             }
