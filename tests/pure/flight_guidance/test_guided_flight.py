@@ -494,6 +494,26 @@ def test_route_received_in_flight_is_logged(tmp_path: Path) -> None:
     assert replay_guidance(flight, section).checked == 50  # without the route: those before it
 
 
+def test_loiters_are_flown_on_their_side() -> None:
+    """Half a turn to the left, then the last orbit to the right."""
+    centres = [(500.0, 0.0), (500.0, 500.0)]
+    waypoints = [Waypoint(0.0, 0.0, 0.0), *(Waypoint(*centre, 0.0) for centre in centres)]
+    waypoints[1] = waypoints[1]._replace(turns=0.5, left=True)
+    tape = simulate(with_route(ROUTE, waypoints).vary(flight={"duration": 100.0}))
+    log = tape["guidance"]
+    legs = np.interp(tape["pose"].stamp_ns, log.stamp_ns, log["leg"])
+    turns = []
+    for number, (north, east) in zip((1, 3), centres, strict=True):
+        bearing = np.arctan2(tape["pose"]["east"] - east, tape["pose"]["north"] - north)
+        flown = np.unwrap(bearing[legs == number])
+        turns.append(float(flown[-1] - flown[0]) / (2.0 * math.pi))
+    # The aircraft flies on at the first tangent after the half turn.
+    assert -1.5 < turns[0] < -0.4
+    assert turns[1] > 0.4
+    # On circles the path is held within half a second of flight, but for the roll into them.
+    assert np.percentile(np.abs(log["xtrack"][log["leg"] % 2 == 1]), 95.0) < 12.5
+
+
 def test_route_file_flown_and_stays_with_flight(tmp_path: Path) -> None:
     file = tmp_path / "line.yaml"
     file.write_text("route: [[0, 0, 0], [800, 0, 10, 26.5], [800, 900, 10]]")

@@ -16,6 +16,7 @@ from pymap3d.vincenty import vdist
 from pytest import approx
 from tests.conftest import refusing
 
+from flight_analysis.closed_loop.scenario_library import find_scenario, with_route
 from flight_guidance.routes import route_formats
 from flight_guidance.routes.route_file import (
     MAX_DISTANCE,
@@ -27,6 +28,7 @@ from flight_guidance.routes.route_file import (
     read_route,
     read_route_file,
 )
+from flight_guidance.steering.path import Arc
 
 ZURICH = Origin(47.4, 8.5)
 # Longitude, latitude, altitude.
@@ -327,6 +329,62 @@ def test_loiters_of_mission_are_flown_and_further_items_named(tmp_path: Path) ->
         home,
         "not flown: NAV_TAKEOFF (item 1), DO_JUMP (item 5), NAV_WAYPOINT (item 7)",
     )
+
+
+RADII = [(80.0, False), (-80.0, True), (0.0, None)]
+"""Radius of a loiter in m, and whether it is counter-clockwise. MAVLink, MAV_CMD_NAV_LOITER_TURNS,
+parameter 3: "If positive loiter clockwise, negative counter-clockwise"."""
+
+
+@pytest.mark.parametrize(("radius", "left"), RADII)
+def test_sign_of_a_loiters_radius_is_its_direction(
+    tmp_path: Path, radius: float, left: bool | None
+) -> None:
+    last = "3\t0\t3\t17\t0\t0\t{}\t0\t47.43\t8.52\t90\t1"
+    rows = [
+        "0\t0\t0\t16\t0\t0\t0\t0\t47.4\t8.5\t400\t1",
+        "1\t0\t3\t18\t2\t0\t{}\t0\t47.41\t8.52\t90\t1",
+        "2\t0\t3\t31\t0\t{}\t0\t0\t47.42\t8.52\t120\t1",
+        last,
+    ]
+    path = tmp_path / "r.waypoints"
+    path.write_text("\n".join(["QGC WPL 110", *(row.format(radius) for row in rows)]))
+    route = read_route_file(path)
+    assert [waypoint.left for waypoint in route.waypoints] == [left] * 3
+    told = any("circles have the radius of the route, in place of 80 m" in n for n in route.notes)
+    assert told == (radius != 0.0)
+    item = {
+        "type": "SimpleItem",
+        "frame": 3,
+        "command": 19,
+        "params": [60, 0, radius, 0, 47.41, 8.52, 50],
+    }
+    path = tmp_path / "r.plan"
+    path.write_text(json.dumps(plan([item])))
+    assert read_route(path)[0].left is left
+
+
+def test_direction_of_circles_stays_in_files_and_sections(tmp_path: Path) -> None:
+    path = tmp_path / "r.yaml"
+    circle = "{{north: {}, east: 0, altitude: 0, turns: 2, left: {}}}"
+    path.write_text(
+        f"route: [[0, 0, 0], {circle.format(900, 'true')}, {circle.format(1900, 'false')}]"
+    )
+    waypoints = read_route(path)
+    assert [waypoint.left for waypoint in waypoints] == [None, True, False]
+    guidance = with_route(find_scenario("osprey_route"), waypoints).guidance
+    assert guidance is not None
+    legs = guidance.plan(guidance.waypoints()).legs
+    radii = [leg.radius for leg in legs if isinstance(leg, Arc)]
+    assert [math.copysign(1.0, radius) for radius in radii] == [-1.0, 1.0]
+    path.write_text(f"route: [[0, 0, 0], {circle.format(900, '-1')}]")
+    with refusing(r"route\[1\].left: found -1, expected true or false"):
+        read_route(path)
+    path.write_text(
+        f"route: [[0, 0, 0], {circle.format(900, 'true')}, {circle.format(900, 'false')}]"
+    )
+    with refusing(r"route\[1\]: found circles to the left and to the right round one place"):
+        read_route(path)
 
 
 WPL_FENCE = [

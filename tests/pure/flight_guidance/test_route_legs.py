@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.typing import ArrayLike
 from pytest import approx
 from scipy.integrate import solve_ivp
@@ -95,6 +97,60 @@ def test_last_line_touches_orbit(last: path.Point) -> None:
     touching = path.error(orbit, line.end)
     assert touching.e == approx(0.0, abs=1e-9)
     assert math.cos(touching.track - error.track) == approx(1.0)
+
+
+@given(
+    sides=st.lists(st.booleans(), min_size=2, max_size=5),
+    bearings=st.lists(st.floats(-3.1, 3.1), min_size=4, max_size=4),
+    distances=st.lists(st.floats(2.01 * R, 20.0 * R), min_size=4, max_size=4),
+)
+def test_lines_between_circles_touch_both_on_their_sides(
+    sides: list[bool], bearings: list[float], distances: list[float]
+) -> None:
+    points = [(0.0, 0.0)]
+    for bearing, distance, _ in zip(bearings, distances, sides[1:], strict=False):
+        north, east = points[-1]
+        points.append((north + distance * math.cos(bearing), east + distance * math.sin(bearing)))
+    loiters = {k: path.Loiter(turns=1.0) for k in range(len(points) - 1)}
+    left = [k for k, is_left in enumerate(sides) if is_left]
+    legs = path.route(points, R, 0.9 * R, loiters, left)
+    circles, lines = legs[::2], legs[1::2]
+    assert [circle.radius < 0.0 for circle in circles if isinstance(circle, Arc)] == sides
+    for k, line in enumerate(lines):
+        assert isinstance(line, Line)
+        course = path.course_of(line.start, line.end)
+        for circle, touch in ((circles[k], line.start), (circles[k + 1], line.end)):
+            assert isinstance(circle, Arc)
+            # The centre of a clockwise circle is one radius to the right, across the course.
+            north = circle.centre[0] - touch[0]
+            east = circle.centre[1] - touch[1]
+            ahead = north * math.cos(course) + east * math.sin(course)
+            right = east * math.cos(course) - north * math.sin(course)
+            assert (ahead, right) == approx((0.0, circle.radius), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("sides", "distance"), [((1, 1), 5.0), ((1, -1), 3.0), ((-1, 1), 4.0), ((0, -1), 3.0)]
+)
+def test_length_of_a_tangent_is_that_of_its_right_triangle(
+    sides: tuple[int, int], distance: float
+) -> None:
+    line = path.tangent(((0.0, 0.0), (0.0, distance)), 1.0, sides)
+    # the offset of the parallel through the other centre is the other leg
+    assert path.length(line) == approx(math.sqrt(distance**2 - (sides[1] - sides[0]) ** 2))
+
+
+@pytest.mark.parametrize(
+    ("left", "distance", "sentence"),
+    [
+        ((1,), 400.0, r"route\[2\]: found 400 m from the loiter before, expected more than 400 m"),
+        ((), 200.0, r"route\[2\]: found 200 m from the loiter before, expected more than 200 m"),
+    ],
+)
+def test_overlapping_circles_refused(left: tuple[int, ...], distance: float, sentence: str) -> None:
+    points = [(0.0, 0.0), (2000.0, 0.0), (2000.0, distance)]
+    with refusing(sentence):
+        path.route(points, 200.0, 100.0, {1: path.Loiter(turns=1.0)}, left)
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])

@@ -110,10 +110,9 @@ class Guide(RouteWords):
                     f"route[{k}].V: found {waypoint.speed:g} m/s, expected none in flight: rise-di "
                     "guide V=VALUE"
                 )
-            if waypoint.loiters:
-                raise ParameterError(
-                    f"route[{k}]: found a circle round the waypoint, expected none in flight"
-                )
+            circle = "a circle to the left" if waypoint.left else "a circle round the waypoint"
+            has_none = not (waypoint.loiters or waypoint.left)
+            require(has_none, f"route[{k}]", circle, "none in flight")
         return [(waypoint.north, waypoint.east, waypoint.altitude) for waypoint in waypoints]
 
 

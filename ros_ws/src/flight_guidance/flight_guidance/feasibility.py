@@ -136,7 +136,8 @@ def _legs(waypoints: Sequence[Waypoint], radius: float, least: float) -> tuple[L
         for k, waypoint in enumerate(waypoints)
         if waypoint.loiters
     }
-    return path.route([waypoint.point for waypoint in waypoints], radius, least, loiters)
+    left = [k for k, waypoint in enumerate(waypoints) if waypoint.left]
+    return path.route([waypoint.point for waypoint in waypoints], radius, least, loiters, left)
 
 
 def _without_short_legs(

@@ -49,13 +49,16 @@ class RouteConfig(Config):
         default=(),
         description="altitude at which a circle is left, m; none: `altitude`",
     )
+    left: tuple[bool, ...] = Field(
+        default=(), description="whether the circles are counter-clockwise; none: clockwise"
+    )
 
     def _check(self) -> None:
         waypoints = [f"waypoint {k}" for k in range(len(self.north))]
         for key in (
             "east",
             "altitude",
-            *(key for key in ("V", "turns", "wait", "leave") if getattr(self, key)),
+            *(key for key in ("V", "turns", "wait", "leave", "left") if getattr(self, key)),
         ):
             require_length(key, getattr(self, key), waypoints)
         both = [
@@ -77,9 +80,10 @@ class RouteConfig(Config):
             self.V or (None,) * count,
             self.turns or (0.0,) * count,
             self.wait or (0.0,) * count,
+            self.leave or (None,) * count,
+            self.left or (None,) * count,
         )
-        places = (self.north, self.east, self.altitude)
-        rows = zip(*places, *columns, self.leave or (None,) * count, strict=True)
+        rows = zip(self.north, self.east, self.altitude, *columns, strict=True)
         return tuple(Waypoint(*row) for row in rows)
 
 

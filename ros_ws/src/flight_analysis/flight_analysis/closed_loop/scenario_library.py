@@ -80,10 +80,10 @@ def with_route(
         "turns": [waypoint.turns for waypoint in waypoints],
         "wait": [waypoint.wait for waypoint in waypoints],
         "leave": [waypoint.departure for waypoint in waypoints],
+        "left": [bool(waypoint.left) for waypoint in waypoints],
     }
-    route = {
-        key: values for key, values in route.items() if key not in {"turns", "wait"} or any(values)
-    }
+    optional = {"turns", "wait", "left"}
+    route = {key: values for key, values in route.items() if key not in optional or any(values)}
     if route["leave"] == route["altitude"]:
         del route["leave"]
     return scenario.vary(guidance={"route": route, "program": {}, **fence})

@@ -150,7 +150,7 @@ def mission_route(
     """
     places: list[Place] = []
     route_items: set[int] = set()
-    circles: list[str] = []  # of a radius, negative to the left
+    circles: list[str] = []  # of a radius of their own
     speed: Any = None
     for k in _in_order(key, items):
         item = items[k]
@@ -162,13 +162,15 @@ def mission_route(
                 TIME: {"wait": item.params[0]},
                 TO_ALTITUDE: {"climbs": True},
             }
-            places.append(
-                _mission_place(key, item, speed, before)._replace(**loiter.get(item.command, {}))
+            place = _mission_place(key, item, speed, before)._replace(
+                **loiter.get(item.command, {})
             )
-            if item.command in LOITERS and (
-                radius := item.params[1 if item.command == TO_ALTITUDE else 2]
-            ):
-                circles.append(f"{radius:g} m of {item.name}")
+            # MAVLink: a negative radius flies the circle counter-clockwise, 0 is the default
+            radius = item.params[1 if item.command == TO_ALTITUDE else 2]
+            if item.command in LOITERS and radius:
+                place = place._replace(left=radius < 0.0)
+                circles.append(f"{abs(radius):g} m of {item.name}")
+            places.append(place)
         elif (
             item.command == CHANGE_SPEED
             and item.params[0] == AIRSPEED
@@ -188,7 +190,7 @@ def mission_route(
     ]
     waits = [item.name for k, item in enumerate(items) if k in route_items and not item.goes_on]
     sentences += [f"flown on without autocontinue: {', '.join(dict.fromkeys(waits))}"] * bool(waits)
-    circle_note = "circles are clockwise, of the radius of the route"
+    circle_note = "circles have the radius of the route"
     sentences += [f"{circle_note}, in place of {', '.join(dict.fromkeys(circles))}"] * bool(circles)
     return Places(places, (*notes, *sentences), home)
 
@@ -207,7 +209,7 @@ def _mission_place(key: str, item: Item, speed: Any, before: Place | None) -> Pl
         latitude = before.latitude
         longitude = before.longitude
         if not altitude:
-            return before._replace(turns=0.0, wait=0.0, climbs=False, speed=speed)
+            return before._replace(turns=0.0, wait=0.0, climbs=False, left=None, speed=speed)
     frame_text = f"the frame {item.frame}{', above the ground' if item.frame in TERRAIN else ''}"
     expected = "0 or 3: above the sea or the home, for the height of the ground is not known"
     require(item.frame in FRAMES, f"{key}: {item.name}", frame_text, expected)

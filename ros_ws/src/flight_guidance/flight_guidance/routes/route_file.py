@@ -4,7 +4,7 @@
 
 `route_formats` reads the formats with latitudes and longitudes. A YAML file holds the list `route`
 of [north, east, altitude], [north, east, altitude, V] or a mapping: north and east, or latitude and
-longitude, altitude, and perhaps V, turns, wait and leave of `Waypoint`.
+longitude, altitude, and perhaps V, turns, wait, leave and left of `Waypoint`.
 """
 
 import math
@@ -46,6 +46,8 @@ class Waypoint(NamedTuple):
     wait: float = 0.0  # time on the circle round the waypoint, or in a hover, s
     # Altitude at which the aircraft leaves a circle round the waypoint, m; None: `altitude`.
     leave: float | None = None
+    # Whether circles round the waypoint are counter-clockwise; None: not said, so clockwise.
+    left: bool | None = None
 
     @property
     def point(self) -> Point:
@@ -78,7 +80,7 @@ class Origin(NamedTuple):
 
 
 POSITIONS = (("north", "east"), ("latitude", "longitude"))  # keys of a waypoint of a YAML file
-FURTHER = ("V", "turns", "wait", "leave")
+FURTHER = ("V", "turns", "wait", "leave", "left")
 
 
 def local(latitude: float, longitude: float, origin: Origin) -> Point:
@@ -202,6 +204,7 @@ def _merged(waypoints: Sequence[Waypoint]) -> list[Waypoint]:
     """The waypoints, successive ones at a place as a single waypoint with all circles.
 
     The aircraft leaves at the last altitude. The airspeed of the last waypoint is for the next leg.
+    Raises ParameterError for circles in both directions at a place.
     """
     places: list[Waypoint] = []
     speed: float | None = None
@@ -210,7 +213,11 @@ def _merged(waypoints: Sequence[Waypoint]) -> list[Waypoint]:
             turns = last.turns + waypoint.turns
             wait = last.wait + waypoint.wait
             leave = None if waypoint.departure == last.altitude else waypoint.departure
-            places[-1] = last._replace(turns=turns, wait=wait, leave=leave)
+            sides = {last.left, waypoint.left} - {None}
+            both = "circles to the left and to the right round one place"
+            require(len(sides) < 2, f"route[{len(places) - 1}]", both, "one direction a place")
+            left = next(iter(sides), None)
+            places[-1] = last._replace(turns=turns, wait=wait, leave=leave, left=left)
             speed = waypoint.speed or speed
         else:
             places.append(waypoint if waypoint.speed else waypoint._replace(speed=speed))
@@ -456,10 +463,11 @@ def _waypoint_of_mapping(name: str, point: Mapping[str, Any], origin: Origin | N
     position = next((pair for pair in POSITIONS if pair[0] in point), POSITIONS[0])
     unknown = sorted(map(str, set(point) - {*position, "altitude", *FURTHER}))
     expected = (
-        "north and east or latitude and longitude, altitude, and perhaps V, turns, wait, leave"
+        "north and east or latitude and longitude, altitude, and perhaps V, turns, wait, leave, "
+        "left"
     )
     require(not unknown, name, f"the keys {short_repr(unknown)}", expected)
-    first, second, altitude, speed, turns, wait, leave = (
+    first, second, altitude, speed, turns, wait, leave, left = (
         point.get(key) for key in (*position, "altitude", *FURTHER)
     )
     if position == POSITIONS[0]:
@@ -473,7 +481,9 @@ def _waypoint_of_mapping(name: str, point: Mapping[str, Any], origin: Origin | N
         for key, value in (("turns", turns), ("wait", wait))
         if value is not None
     }
-    waypoint = waypoint._replace(**circles)
+    is_boolean = left is None or isinstance(left, bool)
+    require(is_boolean, f"{name}.left", short_repr(left), "true or false")
+    waypoint = waypoint._replace(**circles, left=left)
     return waypoint if leave is None else waypoint._replace(leave=_number(name, leave, "leave"))
 
 
@@ -504,6 +514,7 @@ def _placed(place: Place, origin: Origin | None, heights: _Heights) -> Waypoint:
     return waypoint._replace(
         turns=_loiter(key, place.turns or 0.0, "turns"),
         wait=_loiter(key, place.wait or 0.0, "wait"),
+        left=place.left,
     )
 
 

@@ -37,6 +37,7 @@ class Place(NamedTuple):
     wait: Any = 0.0  # round the place, s
     # Whether the altitude is reached round the place, and not on the way to the place.
     climbs: bool = False
+    left: bool | None = None  # whether circles are counter-clockwise; None: not said
 
 
 class HomePlace(NamedTuple):

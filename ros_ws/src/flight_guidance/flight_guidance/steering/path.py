@@ -6,7 +6,7 @@ The corners of a route are fillets.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from itertools import pairwise
 from types import MappingProxyType
@@ -422,16 +422,18 @@ def route(
     radius: float,
     least: float,
     loiters: Mapping[int, Loiter] = MappingProxyType({}),
+    left: Collection[int] = frozenset(),
 ) -> tuple[Leg, ...]:
-    """Legs through waypoints, then a clockwise orbit round the last waypoint.
+    """Legs through waypoints, then an orbit round the last waypoint.
 
     The corners have fillets of a radius, m. A corner of the turn tau begins and ends radius tan(tau
     / 2) from the waypoint; one beyond SHARPEST has no fillet. At a waypoint of `loiters`, by the
-    number, a clockwise circle round the waypoint takes the place of the fillet. Lines touch circles
-    and the orbit; a line too short for a tangent leads to the waypoint. Raises ParameterError for
-    fewer than two waypoints, a radius below `least` (`lateral.least_radius`), and a waypoint within
-    the circle of a loiter; ShortLegError for a leg too short for the fillets. Source: R. W. Beard,
-    T. W. McLain, Small Unmanned Aircraft (2012), algorithm 8.
+    number, a circle round the waypoint takes the place of the fillet. Circles and the orbit are
+    clockwise, at the waypoints of `left` counter-clockwise. Lines touch them; a line too short for
+    a tangent leads to the waypoint. Raises ParameterError for fewer than two waypoints, a radius
+    below `least` (`lateral.least_radius`), a waypoint within the circle of a loiter, and circles of
+    opposite sides that overlap; ShortLegError for a leg too short for the fillets. Source: R. W.
+    Beard, T. W. McLain, Small Unmanned Aircraft (2012), algorithm 8.
     """
     require(len(waypoints) >= 2, "route", f"{len(waypoints)} waypoints", "two or more")
     require(
@@ -443,55 +445,67 @@ def route(
     legs: list[Leg] = []
     first = 0
     last = len(waypoints) - 1
+    before = 0  # side of the circle before: 1 right, -1 left, 0 without a circle
     for k in [*sorted(number for number in loiters if number < last), last]:
+        side = -1 if k in left else 1
         if k > 0:
-            lines = _between_circles(waypoints[first : k + 1], radius, first, leaves=bool(legs))
+            lines = _between_circles(waypoints[first : k + 1], radius, first, (before, side))
             if legs and isinstance(circle := legs[-1], Arc):
                 legs[-1] = circle._replace(
                     end=lines[0].start if isinstance(lines[0], Line) else None
                 )
             legs += lines
-        legs.append(Arc(waypoints[k], radius, None, None if k == last else loiters[k]))
+        legs.append(Arc(waypoints[k], side * radius, None, None if k == last else loiters[k]))
         first = k
+        before = side
     return tuple(legs)
 
 
-def _between_circles(
-    waypoints: Sequence[Point], radius: float, first: int, *, leaves: bool
-) -> list[Leg]:
-    """Lines and fillets onto a clockwise circle round the last waypoint.
+def tangent(centres: tuple[Point, Point], radius: float, sides: tuple[int, int]) -> Line:
+    """The line from one circle to the next, each of a radius in m.
 
-    Where `leaves`, they begin at a circle round the first waypoint. `first`: number of the first
-    waypoint. The centre of a clockwise circle is on the right of the tangent.
+    Sides are 1 for a clockwise circle, -1 for a counter-clockwise one, 0 for a point. With the
+    bearing and the distance of the second centre from the first,
+
+        course = bearing - asin((side_2 - side_1) radius / distance),
+
+    and the line begins at side_1 radius to the left of the first centre. The distance is more than
+    abs(side_2 - side_1) radius.
+    """
+    distance = math.dist(*centres)
+    offset = (sides[1] - sides[0]) * radius
+    course = course_of(*centres) - math.asin(offset / distance)
+    start = _along(centres[0], course - math.pi / 2.0, sides[0] * radius)
+    return Line(start, _along(start, course, math.sqrt(distance**2 - offset**2)))
+
+
+def _between_circles(
+    waypoints: Sequence[Point], radius: float, first: int, sides: tuple[int, int]
+) -> list[Leg]:
+    """Lines and fillets from a circle round the first waypoint onto one round the last.
+
+    `sides` as of `tangent`; without a circle the first is 0. `first`: number of the first waypoint.
     """
     points = list(waypoints)
-    if leaves:
-        (centre, after), distance = points[:2], math.dist(*points[:2])
-        gap = f"{distance:g} m from the loiter before"
+    if sides[0]:
+        distance = math.dist(*points[:2])
+        crosses = len(points) == 2 and sides[0] != sides[1]
         require(
-            distance > radius,
+            distance > (2.0 if crosses else 1.0) * radius,
             f"route[{first + 1}]",
-            gap,
-            f"more than {radius:g} m, the radius of the circle",
+            f"{distance:g} m from the loiter before",
+            f"more than {2.0 * radius:g} m, of circles in opposite directions"
+            if crosses
+            else f"more than {radius:g} m, the radius of the circle",
         )
-        bearing = course_of(centre, after)
-        # The line leads to a circle of the same radius.
         if len(points) == 2:
-            start, end = (_along(point, bearing - math.pi / 2.0, radius) for point in points)
-            return [Line(start, end)]
-        points[0] = _along(
-            after, bearing + math.asin(radius / distance), -math.sqrt(distance**2 - radius**2)
-        )
+            return [tangent((points[0], points[1]), radius, sides)]
+        points[0] = tangent((points[0], points[1]), radius, (sides[0], 0)).start
     before, last = points[-2:]
-    distance = math.dist(before, last)
-    if distance > radius:
-        course = course_of(before, last) - math.asin(radius / distance)
+    if math.dist(before, last) > radius:
+        touch = tangent((before, last), radius, (0, sides[1])).end
         with suppress(ParameterError):
-            return filleted(
-                [*points[:-1], _along(before, course, math.sqrt(distance**2 - radius**2))],
-                radius,
-                first,
-            )
+            return filleted([*points[:-1], touch], radius, first)
     return filleted(points, radius, first)
 
 
