@@ -15,6 +15,7 @@ from rich.console import Console
 
 from flight_cli.output import new_table, parse_numbers, print_json, print_table, say
 from flight_cli.words import (
+    airframe_names,
     argument,
     json_option,
     option,
@@ -54,6 +55,7 @@ class Airframes:
         "an airframe file, a MATLAB file"
         " (.mat), or a text of AVL (system matrix, stability derivatives) or XFLR5.",
         metavar="[AIRFRAME]...",
+        autocompletion=airframe_names,
     )
     write: Path | None = write_option(
         "Write NAME.yaml and NAME_flight.yaml, an airframe that flies.", metavar="FOLDER"

@@ -26,7 +26,16 @@ from autopilot_bridge.params import ChannelMap, load_map
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_cli.log_options import log_namespace, warn_of_lacks_in
 from flight_cli.output import new_table, print_json, print_table, say
-from flight_cli.words import REQUIRED, argument, json_option, option, scenario_names, warn
+from flight_cli.words import (
+    REQUIRED,
+    airframe_names,
+    argument,
+    json_option,
+    map_names,
+    option,
+    scenario_names,
+    warn,
+)
 from flight_design.identification.response_identification import MIN_RATIO
 from flight_design.identification.sign_check import (
     SignCheck,
@@ -51,9 +60,14 @@ class Check:
     """
 
     map_name: str = argument(
-        "Name of a channel map, or path of one (.yaml).", default=REQUIRED, metavar="MAP"
+        "Name of a channel map, or path of one (.yaml).",
+        default=REQUIRED,
+        metavar="MAP",
+        autocompletion=map_names,
     )
-    airframe: str | None = option("Airframe; by default that of the scenario.")
+    airframe: str | None = option(
+        "Airframe; by default that of the scenario.", autocompletion=airframe_names
+    )
     scenario: str = option(
         "Scenario with the controller.", default="osprey_servo", autocompletion=scenario_names
     )

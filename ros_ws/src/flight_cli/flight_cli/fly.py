@@ -43,6 +43,7 @@ from flight_cli.settings import settings_option, with_settings
 from flight_cli.words import (
     argument,
     json_option,
+    map_names,
     option,
     rare_option,
     require_unused,
@@ -105,6 +106,7 @@ class Fly(RouteWords):
     bridge: str | None = option(
         "Fly an autopilot in place of the aircraft, by a channel map; a dry run without --send.",
         metavar="MAP",
+        autocompletion=map_names,
     )
     route: Path | None = option(
         f"Fly a route: {', '.join(ENDINGS)}. Guidance starts with it.", metavar="FILE"

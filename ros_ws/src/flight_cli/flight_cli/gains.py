@@ -47,6 +47,7 @@ from flight_cli.output import (
 )
 from flight_cli.words import (
     REQUIRED,
+    airframe_names,
     argument,
     json_option,
     option,
@@ -135,7 +136,9 @@ class Gains:
     """
 
     airframe: str = argument(
-        "Name of an airframe, or path of an airframe file (.yaml).", default=REQUIRED
+        "Name of an airframe, or path of an airframe file (.yaml).",
+        default=REQUIRED,
+        autocompletion=airframe_names,
     )
     uncertainty: float = option("Largest relative deviation of each entry of A and B.", default=0.3)
     scenario: str = option(

@@ -48,8 +48,10 @@ from flight_cli.output import (
     write_text,
 )
 from flight_cli.words import (
+    airframe_names,
     argument,
     json_option,
+    map_names,
     option,
     rare_option,
     require_unused,
@@ -108,7 +110,9 @@ class Identify:
     )
     speed: float | None = option("True airspeed to trim and fly at, m/s.")
     altitude: float | None = option("Altitude above sea level to trim and fly at, m.")
-    airframe: str | None = option("With a log: the nominal airframe, a name or a file (.yaml).")
+    airframe: str | None = option(
+        "With a log: the nominal airframe, a name or a file (.yaml).", autocompletion=airframe_names
+    )
     write: Path | None = write_option(
         "Scenario file, by default jsbsim_NAME.yaml, which must not exist. With a log: "
         "airframe file for the model, with a page. With --bridge: folder for what flies it."
@@ -140,7 +144,9 @@ class Identify:
         "Least delay margin of the loop with an observer, s: 0.03, or 0.015 of JSBSim."
     )
     bridge: str | None = option(
-        "Excite the aircraft behind a channel map, or read the log of such a flight.", metavar="MAP"
+        "Excite the aircraft behind a channel map, or read the log of such a flight.",
+        metavar="MAP",
+        autocompletion=map_names,
     )
     amplitude: float | None = rare_option(
         "With --bridge: amplitude of the excitation, a part of each input's limit; 0.2."

@@ -16,7 +16,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.report.run_folder import PROVENANCE, attachments_for
 from flight_cli.output import new_table, print_table, say
-from flight_cli.words import REQUIRED, argument, option, scenario_names, warn
+from flight_cli.words import REQUIRED, argument, map_names, option, scenario_names, warn
 from flight_core.files import display_path, dump_yaml, write_file, writing
 from flight_core.outcome import End, Outcome
 from flight_core.parameters import require
@@ -49,7 +49,10 @@ class Import:
         default=REQUIRED,
     )
     map_name: str | None = option(
-        "Channel map: its channels of y and u, trims, scales.", "--map", metavar="MAP"
+        "Channel map: its channels of y and u, trims, scales.",
+        "--map",
+        metavar="MAP",
+        autocompletion=map_names,
     )
     scenario: str | None = option(
         "Scenario of the module of export --px4 that flew, in place of --map: its ticks, for "

@@ -9,6 +9,7 @@ from difflib import get_close_matches
 from inspect import Parameter, Signature
 from itertools import takewhile, zip_longest
 from pathlib import Path
+from pkgutil import resolve_name
 from types import MappingProxyType
 from typing import Annotated, Any, Protocol, get_type_hints
 
@@ -127,12 +128,20 @@ def warn(text: str) -> None:
     print(text, file=sys.stderr)
 
 
-def scenario_names(incomplete: str) -> list[str]:
-    """The scenarios of the library that begin with a word, for the completion of the shell."""
-    from flight_analysis.closed_loop.scenario_library import LIBRARY  # noqa: PLC0415 - --help does without
+def _names_of(library: str) -> Callable[[str], list[str]]:
+    """The completion of the shell by the names in a library, MODULE:FOLDER."""
 
-    names = sorted(path.stem for path in LIBRARY.glob("*.yaml"))
-    return [name for name in names if name.startswith(incomplete)]
+    def complete(incomplete: str) -> list[str]:
+        from flight_core.files import names_in  # noqa: PLC0415 - --help does without
+
+        return [name for name in names_in(resolve_name(library)) if name.startswith(incomplete)]
+
+    return complete
+
+
+scenario_names = _names_of("flight_analysis.closed_loop.scenario_library:LIBRARY")
+airframe_names = _names_of("aircraft_sim.airframes.airframe:LIBRARY")
+map_names = _names_of("autopilot_bridge.params:LIBRARY")
 
 
 EXPECTED: Mapping[str, str] = MappingProxyType(
