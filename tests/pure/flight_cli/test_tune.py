@@ -203,7 +203,17 @@ def test_log_without_motion_names_the_doublets_to_fly(tmp_path: Path) -> None:
         r"; fly, 2 s apart, q: 3 doublets of 0.3 rad/s, 0.5 s each way, then p: "
     ):
         invoke(*words, catch_exceptions=False)
-    assert not (tmp_path / "module" / "src").exists()
+    assert not (tmp_path / "module").exists()
+
+
+def test_missing_log_leaves_no_folder(tmp_path: Path) -> None:
+    folder = tmp_path / "module"
+    with refusing("no.ulg: found no such file"):
+        invoke(
+            *("tune", str(tmp_path / "no.ulg"), "--px4", str(folder), "--scenario", str(PX4)),
+            catch_exceptions=False,
+        )
+    assert not folder.exists()
 
 
 def test_log_of_arduplane_becomes_a_task(tmp_path: Path) -> None:

@@ -25,6 +25,7 @@ from flight_analysis.linear_loop.loop_margins import LoopMargins, margins
 from flight_analysis.report.html import Page, TableGroup, TitleLine, page_html
 from flight_analysis.report.margin_figures import guarantee_text, margin_table
 from flight_analysis.report.plotting import SampleStore
+from flight_analysis.report.run_folder import remove_empty
 from flight_analysis.report.summary_rows import Column
 from flight_analysis.report.tables import MetricTable
 from flight_cli.output import (
@@ -157,7 +158,10 @@ class Tune:
         """Identify, select, bound, export, show."""
         autopilot, folder = self._target()
         console = Console()
-        tuned = self._tuned(console, autopilot, folder)
+        try:
+            tuned = self._tuned(console, autopilot, folder)
+        finally:
+            remove_empty(folder)
         page = folder / "tuning.html"
         scenario = folder / "scenario.yaml"
         write_text("--write", scenario, LICENCE + scenario_yaml(tuned.scenario))
