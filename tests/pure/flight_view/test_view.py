@@ -15,6 +15,7 @@ import socket
 import struct
 import subprocess
 import sys
+import threading
 import time
 import tracemalloc
 from collections.abc import AsyncIterator
@@ -270,6 +271,29 @@ def test_names_and_texts_of_log_bounded_and_printable(tmp_path: Path) -> None:
         "another aircraft in the namespace /other is not shown: --namespace /other"
     ]
     assert max(map(len, head["topics"][0]["channels"])) <= MAX_TEXT
+
+
+@pytest.mark.parametrize(("text", "raised"), [("after interpreter shutdown", 0), ("in use", 1)])
+def test_end_of_the_process_while_samples_are_counted_is_silent(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, raised: int
+) -> None:
+    with BagWriter(tmp_path / "run") as bag:
+        y = bag.add_topic("/y", JOINT_STATE, "")
+        bag.write(y, 1, 1, 0, vector(1, ["q"], [0.0]))
+    flight = Flight(tmp_path / "run")
+
+    def ends(*_: object) -> None:
+        # as concurrent.futures does once the interpreter shuts down
+        raise RuntimeError(f"cannot schedule new futures {text}")
+
+    errors: list[object] = []
+    monkeypatch.setattr(followed_flight, "read_run", ends)
+    monkeypatch.setattr(threading, "excepthook", errors.append)
+    while flight.update():
+        pass
+    flight.counted()
+    assert flight.state() == "ended"
+    assert len(errors) == raised
 
 
 def test_events_of_another_aircraft_are_not_shown(tmp_path: Path) -> None:

@@ -262,13 +262,19 @@ class Flight:
 
         The page reads a part of the samples; this reads the whole log.
         """
-        with suppress(ParameterError, OSError):
+        try:
             run = read_run(self.run, self._namespace, None, self._remaps)
             if self._given is not None:
                 run = run._replace(scenario=self._given)
             account = log_account(run)
             lacks = () if account is None else account.notes()
             self._lacks = [bounded(sentence) for sentence in (*run.tape.notes, *lacks)]
+        except (ParameterError, OSError):
+            return
+        except RuntimeError as error:
+            # the process ends meanwhile, and the reader has no thread of its own any more
+            if "shutdown" not in str(error):
+                raise
 
     def _rate_of(self, topic: str, type_name: str) -> float:
         if len(self._kinds) < MAX_CHANNELS:
