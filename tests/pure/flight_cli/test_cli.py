@@ -367,6 +367,22 @@ def test_shell_completes_after_each_option(words: str, expected: str, tmp_path: 
     assert expected in process.stdout.split(), process.stderr
 
 
+def test_failing_plugin_of_jax_is_one_sentence(tmp_path: Path) -> None:
+    """As that of a GPU on a host without one: JAX logs its traceback."""
+    plugin = tmp_path / "jax_plugins" / "xla_broken" / "__init__.py"
+    plugin.parent.mkdir(parents=True)
+    plugin.write_text("def initialize():\n    raise RuntimeError('no library')\n")
+    process = subprocess.run(
+        [sys.executable, "-c", "from flight_campaign.engines import require_jax; require_jax()"],
+        env={**os.environ, "PYTHONPATH": f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    sentence = "warning: a plugin of JAX is left out (no library): the other devices fly"
+    assert process.stderr.splitlines() == [sentence]
+
+
 def test_scenarios_are_listed_with_their_sentence_aircraft_and_law() -> None:
     listed = json.loads(invoke("scenarios", "--json").output)
     assert [row["name"] for row in listed] == sorted(path.stem for path in LIBRARY.glob("*.yaml"))

@@ -47,10 +47,10 @@ def require_jax(*, shared: bool = False) -> None:
     require_package("jax")
     if shared:
         os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
-    import jax  # noqa: PLC0415 - takes a second, which few commands need
+    from flight_campaign.batch import device  # noqa: PLC0415 - JAX takes a second, which few commands need
 
     try:
-        jax.devices()
+        device.is_cpu()  # JAX looks for its devices
     except (RuntimeError, AssertionError) as error:
         platforms = os.environ.get("JAX_PLATFORMS", "")
         reason = str(error).partition("\n")[0] or "no such device"

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The device of JAX that aircraft fly on, and what follows from its kind and its memory."""
 
+import logging
 import os
 from contextlib import AbstractContextManager, nullcontext
 from threading import Lock
@@ -19,6 +20,21 @@ VISIBLE = {"cuda": "CUDA_VISIBLE_DEVICES", "rocm": "HIP_VISIBLE_DEVICES"}
 """Variables of the environment that name the devices of a process, by a word of the platform."""
 
 _TURN = Lock()
+
+
+def _as_sentence(record: logging.LogRecord) -> bool:
+    """Make a sentence of a plugin that fails, as that of a GPU on a host without one.
+
+    JAX logs its traceback, and flies on the other devices.
+    """
+    if record.exc_info and (error := record.exc_info[1]):
+        record.msg = "warning: a plugin of JAX is left out (%s): the other devices fly"
+        record.args = (str(error).partition("\n")[0],)
+        record.exc_info = None
+    return True
+
+
+logging.getLogger("jax._src.xla_bridge").addFilter(_as_sentence)
 
 
 def is_cpu() -> bool:
