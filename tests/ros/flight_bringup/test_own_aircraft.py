@@ -109,6 +109,7 @@ def test_shells_of_page_run_to_the_last_command(
     until(follows, "a log with a command that y follows")
     recorder.send_signal(signal.SIGINT)
     assert recorder.wait(timeout=60) == 0
+    assert "incompatible QoS" not in texts()  # of the first subscription of the recorder
     # of the recorder
     assert "[ERROR]" not in (checkout / f"{len(nodes) - 1}.txt").read_text(encoding="utf-8")
     for command in after:
