@@ -129,6 +129,21 @@ def test_lines_between_circles_touch_both_on_their_sides(
             assert (ahead, right) == approx((0.0, circle.radius), abs=1e-6)
 
 
+@pytest.mark.parametrize("left", [(), (1, 2)])
+def test_drawn_circles_turn_to_their_side(left: tuple[int, ...]) -> None:
+    points = [(0.0, 0.0), (1000.0, 0.0), (1000.0, 1000.0)]
+    legs = path.route(points, R, 0.9 * R, {1: path.Loiter(turns=1.0)}, left)
+    start = points[0]
+    for leg in legs:
+        north, east = np.array(path.outline(leg, start)).T
+        assert (north[0], east[0]) == approx(start)
+        start = (north[-1], east[-1])
+        if isinstance(leg, Arc):
+            bearing = np.unwrap(np.arctan2(east - leg.centre[1], north - leg.centre[0]))
+            # at least a full turn, clockwise where the bearing from the centre grows
+            assert (bearing[-1] - bearing[0]) * (-1.0 if left else 1.0) > 6.28
+
+
 @pytest.mark.parametrize(
     ("sides", "distance"), [((1, 1), 5.0), ((1, -1), 3.0), ((-1, 1), 4.0), ((0, -1), 3.0)]
 )
