@@ -18,14 +18,15 @@ orb_metadata orb_vehicle_angular_velocity, orb_airspeed_validated, orb_vehicle_l
 	     orb_manual_control_setpoint, orb_rise_di_status, orb_vehicle_thrust_setpoint, orb_vehicle_torque_setpoint;
 float parameter_values[8];
 
-static void print(const char *text, va_list values)
+// PX4 cuts a line of its log after 126 characters, of which 43 are level, name of the module and colours.
+static void print(const char *text, va_list values, size_t size)
 {
-	char line[256];
-	vsnprintf(line, sizeof line, text, values);
+	char line[128];
+	vsnprintf(line, size, text, values);
 	printf("told %.2f %s\n", (double)(now_us - 1000000) * 1e-6, line);
 }
-void px4_log(const char *text, ...) { va_list values; va_start(values, text); print(text, values); va_end(values); }
-void mavlink_log(orb_advert_t *, const char *text, ...) { va_list values; va_start(values, text); print(text, values); va_end(values); }
+void px4_log(const char *text, ...) { va_list values; va_start(values, text); print(text, values, 84); va_end(values); }
+void mavlink_log(orb_advert_t *, const char *text, ...) { va_list values; va_start(values, text); print(text, values, 127); va_end(values); }
 bool uORB::SubscriptionCallbackWorkItem::registerCallback() { module_item = _item; return true; }
 extern "C" int rise_di_control_main(int argc, char *argv[]);
 
@@ -43,7 +44,7 @@ int main(int argc, char **argv)
 	unsigned not_numbers = 0;
 
 	for (int k = 0; k < 2000; k++) {
-		now_us += 4000;
+		now_us += strcmp(event, "slow") == 0 ? 5000 : 4000;
 		const double t = (double)(now_us - 1000000) * 1e-6;
 		const bool past = t > at;
 		const bool once = std::fabs(t - at) < 0.002;

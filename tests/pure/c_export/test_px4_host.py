@@ -143,7 +143,7 @@ def test_silent_spare_is_an_emergency_and_the_thrust_goes_on(program: Path) -> N
 @pytest.mark.parametrize(
     "event, text, instant",
     [
-        ("off", "flies: off", 4.0),
+        ("off", "does not fly: off", 4.0),
         ("age", "maximum age not within", 4.0),
         ("setpoint", "stale setpoint", 5.0),  # COM_OF_LOSS_T later
         ("rates", "stale rates", 4.04),
@@ -153,6 +153,23 @@ def test_falls_back_and_tells(program: Path, event: str, text: str, instant: flo
     flight = flown(program, event, "4")
     assert texts(flight, text)[0] == approx(instant, abs=0.01)
     assert flight.not_numbers == 0
+
+
+def test_setting_that_was_wrong_before_is_told_at_the_switch(program: Path) -> None:
+    """PX4's SIH at 200 Hz: the refusal stood before RDI_EN was 1, and nothing was told."""
+    flight = flown(program, "age", "1")
+    text = "RISE-DI does not fly: maximum age not within 0.01 to 1 s"
+    assert texts(flight, text) == [approx(2.0, abs=0.01)]
+
+
+def test_status_has_the_whole_reason(program: Path) -> None:
+    """PX4 cuts its lines at 127 characters."""
+    flight = flown(program, "slow")
+    reason = "rates slower than the controller: export it with --rate"
+    assert flight.told[-2][1] == f"refusal: {reason}"
+    assert texts(flight, f"RISE-DI does not fly: {reason} (rates 200 Hz)") == [
+        approx(2.0, abs=0.01)
+    ]
 
 
 @pytest.mark.parametrize("event", ["nan_torque", "nan_thrust", "nan_rates"])

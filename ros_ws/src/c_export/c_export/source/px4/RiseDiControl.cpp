@@ -174,11 +174,11 @@ void RiseDiControl::report(bool flew, bool was_alone, const rise_di_cycle &cycle
 		PX4_INFO("RISE-DI flies");
 
 	} else if (flew ? !flies : (cycle.enabled && refusal != RISE_DI_WAITS && refusal != _told)) {
-		mavlink_log_warning(&_mavlink_log_pub, "RISE-DI: fw_rate_control flies: %s (rates %.0f Hz)\t",
+		mavlink_log_warning(&_mavlink_log_pub, "RISE-DI does not fly: %s (rates %.0f Hz)\t",
 				    rise_di_refusal_text(refusal), (double)_rates.rate);
 	}
 
-	_told = refusal == RISE_DI_WAITS ? _told : refusal;
+	_told = !cycle.enabled ? RISE_DI_OFF : (refusal == RISE_DI_WAITS ? _told : refusal);
 
 	if (_rates.is_alone && !was_alone) {
 		mavlink_log_emergency(&_mavlink_log_pub, "RISE-DI: fw_rate_control is silent, no fall-back, land\t");
@@ -247,8 +247,9 @@ int RiseDiControl::task_spawn(int argc, char *argv[])
 
 int RiseDiControl::print_status()
 {
-	PX4_INFO("%s flies, %u take-overs, %u fall-backs, refusal: %s", _rates.refusal == RISE_DI_FLIES ? "RISE-DI" : "fw_rate_control",
-		 (unsigned)_takeovers, (unsigned)_fallbacks, rise_di_refusal_text(_rates.refusal));
+	PX4_INFO("RISE-DI %s, %u take-overs, %u fall-backs", _rates.refusal == RISE_DI_FLIES ? "flies" : "does not fly",
+		 (unsigned)_takeovers, (unsigned)_fallbacks);
+	PX4_INFO("refusal: %s", rise_di_refusal_text(_rates.refusal));
 	PX4_INFO("rates at %.1f Hz, fw_rate_control %s", (double)_rates.rate, _rates.is_silent ? "silent" : "alive");
 	return PX4_OK;
 }
