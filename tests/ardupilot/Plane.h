@@ -5,6 +5,11 @@
 
 #define HAL_LOGGING_ENABLED 1
 #define HAL_QUADPLANE_ENABLED 1
+#define HAL_BOARD_SITL 3
+#define CONFIG_HAL_BOARD HAL_BOARD_SITL
+#ifndef AP_SCRIPTING_ENABLED
+#define AP_SCRIPTING_ENABLED 1
+#endif
 
 struct Vector3f {
     float x, y, z;
@@ -49,7 +54,11 @@ struct SRV_Channels {
     static void set_output_scaled(SRV_Channel::Function function, float value);
 };
 struct RC_Channel {
-    enum class AUX_FUNC : uint16_t { SCRIPTING_1 = 300 };
+    enum class AUX_FUNC : uint16_t {
+#if AP_SCRIPTING_ENABLED
+        SCRIPTING_1 = 300
+#endif
+    };
     enum class AuxSwitchPos : uint8_t { LOW, MIDDLE, HIGH };
     AuxSwitchPos get_aux_switch_pos() const;
 };
@@ -72,17 +81,18 @@ class Plane
 public:
     void rise_di();
 
-private:
-    struct {
+    // private in ArduPlane: host.cpp sets them
+    struct AHRS {
         const Vector3f &get_gyro() const;
         bool airspeed_EAS(float &airspeed) const;
     } ahrs;
-    struct {
+    struct QuadPlane {
         bool in_vtol_mode() const;
         bool in_assisted_flight() const;
     } quadplane;
     Controller rollController, pitchController, yawController;
     Mode *control_mode;
-    Mode mode_manual, mode_training, mode_initializing;
+    Mode mode_manual, mode_training, mode_initializing, mode_autotune;
+    int airspeed; // AP_Airspeed: -Wshadow of ArduPlane is an error
     bool is_flying();
 };

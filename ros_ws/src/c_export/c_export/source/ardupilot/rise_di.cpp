@@ -4,6 +4,13 @@
 // A fast task of ArduPlane between stabilize and set_servos: rates and deflections to rise_di_rates.c and back. Its own rate
 // controllers run on as the spare. Deflections are hundredths of a degree, 4500 at the end stop.
 #include "Plane.h"
+#if CONFIG_HAL_BOARD == HAL_BOARD_SITL
+#include <fenv.h>
+#endif
+
+#if !AP_SCRIPTING_ENABLED
+#error "RCx_OPTION 300 needs AP_SCRIPTING_ENABLED 1: without it ArduPlane refuses the option and does not arm"
+#endif
 
 extern "C" {
 #include "rise_di_rates.h"
@@ -41,24 +48,40 @@ static bool is_enabled()
     return input != nullptr && input->get_aux_switch_pos() == RC_Channel::AuxSwitchPos::HIGH;
 }
 
+// The self-test divides by 0 and compares NaN. SITL ends at both: its traps are held.
+static void start(rise_di_rates &rates)
+{
+#if CONFIG_HAL_BOARD == HAL_BOARD_SITL
+    fenv_t traps;
+    feholdexcept(&traps);
+    rise_di_rates_start(&rates);
+    fesetenv(&traps);
+#else
+    rise_di_rates_start(&rates);
+#endif
+}
+
 static const char *text_of(bool flies, const rise_di_rates &rates)
 {
     return flies ? "RISE-DI flies" : rise_di_refusal_text(rates.refusal);
 }
 
-static void write_log(const rise_di_rates &rates)
+// y is that of the law, or, while the spare flies, that of this loop: TimeUS is its instant.
+static void write_log(const rise_di_rates &rates, const rise_di_cycle &cycle)
 {
 #if HAL_LOGGING_ENABLED
     const rise_di_controller &law = rates.controller;
+    const bool flies = rates.refusal == RISE_DI_FLIES;
     float y[3] {}, y_m[3] {}, u[3] {};
 
     for (int i = 0; i < RISE_DI_M; i++) {
-        y[i] = (float)law.y[i];
+        y[i] = (float)(flies ? law.y[i] : rates.y[i]);
         y_m[i] = (float)law.y_m[i];
         u[i] = (float)law.u[i];
     }
 
-    AP::logger().WriteStreaming("RDI", "TimeUS,Y0,Y1,Y2,M0,M1,M2,U0,U1,U2,N,Ref", "QfffffffffIB", rates.y_us,
+    AP::logger().WriteStreaming("RDI", "TimeUS,Y0,Y1,Y2,M0,M1,M2,U0,U1,U2,N,Ref", "QfffffffffIB",
+                                flies ? rates.y_us : cycle.rates_us - cycle.filter_us,
                                 (double)y[0], (double)y[1], (double)y[2], (double)y_m[0], (double)y_m[1], (double)y_m[2],
                                 (double)u[0], (double)u[1], (double)u[2], (unsigned)rates.number, (unsigned)rates.refusal);
 #endif
@@ -70,12 +93,13 @@ void Plane::rise_di()
     static bool begun = false;
 
     if (!begun) {
-        rise_di_rates_start(&rates);
+        start(rates);
         begun = true;
     }
 
     const Vector3f &gyro = ahrs.get_gyro();
     const bool manual = control_mode == &mode_manual || control_mode == &mode_training || control_mode == &mode_initializing;
+    const bool tunes = control_mode == &mode_autotune; // the spare, by its own response
     const float targets[3] {rollController.get_pid_info().target, pitchController.get_pid_info().target,
                             yawController.get_pid_info().target};
     rise_di_cycle cycle {};
@@ -87,7 +111,7 @@ void Plane::rise_di()
     cycle.spare_us = cycle.now_us;
     cycle.enabled = is_enabled();
     cycle.armed = hal.util->get_soft_armed();
-    cycle.has_rates = !manual;
+    cycle.has_rates = !manual && !tunes;
     cycle.landed = !is_flying();
 #if HAL_QUADPLANE_ENABLED
     cycle.has_rates = cycle.has_rates && !quadplane.in_vtol_mode() && !quadplane.in_assisted_flight();
@@ -99,8 +123,8 @@ void Plane::rise_di()
         cycle.spare[k] = SRV_Channels::get_output_scaled(surfaces[k]) / END;
     }
 
-    float airspeed = 0.0f;
-    cycle.airspeed = take_airspeed(ahrs, airspeed, 0) ? airspeed : 0.0f;
+    float speed = 0.0f;
+    cycle.airspeed = take_airspeed(ahrs, speed, 0) ? speed : 0.0f;
     cycle.max_age = RISE_DI_MAX_AGE;
     cycle.max_error = RISE_DI_MAX_ERROR;
 
@@ -118,5 +142,5 @@ void Plane::rise_di()
                       (double)rates.rate);
     }
 
-    write_log(rates);
+    write_log(rates, cycle);
 }
