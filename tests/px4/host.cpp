@@ -10,7 +10,6 @@
 #include <cstdlib>
 
 static hrt_abstime now_us = 1000000;
-static px4::ScheduledWorkItem *module_item;
 hrt_abstime hrt_absolute_time() { return now_us; }
 orb_metadata orb_vehicle_angular_velocity, orb_airspeed_validated, orb_vehicle_land_detected, orb_vehicle_control_mode,
 	     orb_parameter_update, orb_vehicle_rates_setpoint, orb_vehicle_thrust_setpoint_virtual_fw,
@@ -27,10 +26,14 @@ static void print(const char *text, va_list values, size_t size)
 }
 void px4_log(const char *text, ...) { va_list values; va_start(values, text); print(text, values, 84); va_end(values); }
 void mavlink_log(orb_advert_t *, const char *text, ...) { va_list values; va_start(values, text); print(text, values, 127); va_end(values); }
-bool uORB::SubscriptionCallbackWorkItem::registerCallback() { module_item = _item; return true; }
 extern "C" int rise_di_control_main(int argc, char *argv[]);
 
-template <class T> static void send(orb_metadata &topic, T value) { uORB::Publication<T>(&topic).publish(value); }
+// Returns what waits for the topic.
+template <class T> static px4::ScheduledWorkItem *send(orb_metadata &topic, T value)
+{
+	uORB::Publication<T>(&topic).publish(value);
+	return topic.callback;
+}
 
 int main(int argc, char **argv)
 {
@@ -58,25 +61,36 @@ int main(int argc, char **argv)
 
 		if (!(past && is("setpoint"))) { send(orb_vehicle_rates_setpoint, vehicle_rates_setpoint_s{now_us, 0.1f, 0.f, 0.f, {thrust, 0.f, 0.f}}); }
 
-		if (!(past && is("spare")) && !is("never")) {
+		const auto send_spare = [&] {
 			const float roll = once && is("nan_torque") ? NAN : 0.1f;
-			send(orb_vehicle_torque_setpoint_virtual_fw, vehicle_torque_setpoint_s{now_us, now_us, {roll, -0.2f, 0.05f}});
 			const float first = once && is("nan_thrust") ? NAN : thrust;
 			send(orb_vehicle_thrust_setpoint_virtual_fw, vehicle_thrust_setpoint_s{now_us, now_us, {first, 0.f, 0.f}});
-		}
+			return send(orb_vehicle_torque_setpoint_virtual_fw, vehicle_torque_setpoint_s{now_us, now_us, {roll, -0.2f, 0.05f}});
+		};
+
+		if (!(past && is("spare")) && !is("never") && !is("behind")) { send_spare(); }
 
 		if (!(past && is("rates"))) {
 			const float roll = once && is("nan_rates") ? NAN : 0.1f;
 			send(orb_vehicle_angular_velocity, vehicle_angular_velocity_s{now_us, now_us, {roll, 0.f, 0.f}});
 		}
 
-		module_item->Run();
+		orb_vehicle_angular_velocity.callback->Run();
+
+		if (is("behind")) { // by a task of another priority
+			px4::ScheduledWorkItem *const woken = send_spare();
+
+			if (woken != nullptr) { woken->Run(); }
+		}
+
 		vehicle_torque_setpoint_s torque{};
 		vehicle_thrust_setpoint_s sent{};
 		memcpy(&torque, orb_vehicle_torque_setpoint.data, sizeof torque);
 		memcpy(&sent, orb_vehicle_thrust_setpoint.data, sizeof sent);
 
 		for (int i = 0; i < 3; i++) { not_numbers += !std::isfinite(torque.xyz[i]) || !std::isfinite(sent.xyz[i]); }
+
+		if (torque.timestamp_sample != now_us && !(past && is("rates"))) { printf("told %.2f late torque\n", t); }
 
 		if (k == 1999) {
 			printf("published %u %u not_numbers %u thrust %.4f wanted %.4f torque %.4f\n", orb_vehicle_torque_setpoint.generation,

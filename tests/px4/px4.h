@@ -31,7 +31,8 @@ namespace math { template <class T> constexpr T min(T a, T b) { return a < b ? a
 namespace time_literals { constexpr hrt_abstime operator""_ms(unsigned long long t) { return t * 1000; }
 constexpr hrt_abstime operator""_s(unsigned long long t) { return t * 1000000; } }
 
-struct orb_metadata { unsigned char data[256]; unsigned generation; };
+namespace px4 { struct ScheduledWorkItem; }
+struct orb_metadata { unsigned char data[256]; unsigned generation; px4::ScheduledWorkItem *callback; };
 extern orb_metadata orb_vehicle_angular_velocity, orb_airspeed_validated, orb_vehicle_land_detected, orb_vehicle_control_mode,
        orb_parameter_update, orb_vehicle_rates_setpoint, orb_vehicle_thrust_setpoint_virtual_fw,
        orb_vehicle_torque_setpoint_virtual_fw, orb_vehicle_thrust_setpoint_virtual_mc,
@@ -108,14 +109,20 @@ struct Subscription {
 		return true;
 	}
 	template <class T> bool update(T *value) { return updated() && copy(value); }
-private:
+protected:
 	orb_metadata *_topic;
+
+private:
 	unsigned _seen{0};
 };
 struct SubscriptionCallbackWorkItem : Subscription {
 	SubscriptionCallbackWorkItem(px4::ScheduledWorkItem *item, orb_metadata *topic) : Subscription(topic), _item(item) {}
-	bool registerCallback();
-	void unregisterCallback() {}
+	bool registerCallback()
+	{
+		_topic->callback = _item;
+		return true;
+	}
+	void unregisterCallback() { _topic->callback = nullptr; }
 private:
 	px4::ScheduledWorkItem *_item;
 };

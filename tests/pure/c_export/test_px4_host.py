@@ -126,6 +126,13 @@ def test_takes_over_and_hands_on_the_thrust(program: Path) -> None:
     assert texts(flight, "refused while armed")
 
 
+def test_hands_on_the_spare_in_the_cycle_of_its_rates(program: Path) -> None:
+    """In SIH a tenth of the torques of mc_rate_control came behind the rates: a period late."""
+    flight = flown(program, "behind")
+    assert flight.published == CYCLES
+    assert texts(flight, "late torque") == []
+
+
 def test_publishes_nothing_where_the_spare_never_did(program: Path) -> None:
     """Another controller may publish the same topics: extras.txt was forgotten."""
     flight = flown(program, "never")

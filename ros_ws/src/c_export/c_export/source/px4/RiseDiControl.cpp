@@ -52,13 +52,13 @@ private:
 	void publish(bool flies);
 
 	uORB::SubscriptionCallbackWorkItem _velocity_sub{this, ORB_ID(vehicle_angular_velocity)};
+	uORB::SubscriptionCallbackWorkItem _spare_torque_sub{this, ORB_ID(vehicle_torque_setpoint_virtual_fw)}; // handed on without delay
 	uORB::Subscription _airspeed_sub{ORB_ID(airspeed_validated)};
 	uORB::Subscription _landed_sub{ORB_ID(vehicle_land_detected)};
 	uORB::Subscription _mode_sub{ORB_ID(vehicle_control_mode)};
 	uORB::Subscription _parameters_sub{ORB_ID(parameter_update)};
 	uORB::Subscription _setpoint_sub{ORB_ID(vehicle_rates_setpoint)};
 	uORB::Subscription _spare_thrust_sub{ORB_ID(vehicle_thrust_setpoint_virtual_fw)};
-	uORB::Subscription _spare_torque_sub{ORB_ID(vehicle_torque_setpoint_virtual_fw)};
 	uORB::Subscription _sticks_sub{ORB_ID(manual_control_setpoint)};
 	uORB::Publication<rise_di_status_s> _status_pub{ORB_ID(rise_di_status)};
 	uORB::Publication<vehicle_thrust_setpoint_s> _thrust_pub{ORB_ID(vehicle_thrust_setpoint)};
@@ -107,6 +107,7 @@ void RiseDiControl::Run()
 {
 	if (should_exit()) {
 		_velocity_sub.unregisterCallback();
+		_spare_torque_sub.unregisterCallback();
 		exit_and_cleanup();
 		return;
 	}
@@ -234,7 +235,7 @@ int RiseDiControl::task_spawn(int argc, char *argv[])
 {
 	RiseDiControl *instance = new RiseDiControl();
 
-	if (instance == nullptr || !instance->_velocity_sub.registerCallback()) {
+	if (instance == nullptr || !instance->_velocity_sub.registerCallback() || !instance->_spare_torque_sub.registerCallback()) {
 		delete instance;
 		return PX4_ERROR;
 	}
