@@ -38,7 +38,12 @@ from flight_design.identification.model_identification import (
     identify_model,
     model_yaml,
 )
-from flight_design.identification.model_quality import MAX_WHITENESS, correlation, whiteness
+from flight_design.identification.model_quality import (
+    MAX_WHITENESS,
+    correlation,
+    too_little_excitation,
+    whiteness,
+)
 from flight_log.bag import LogAttachments
 from flight_log.tape_writer import write_run
 
@@ -240,6 +245,22 @@ def test_flight_without_excitation_refused_with_channel_and_factor() -> None:
         r"[\d.]+ times the amplitude"
     )
     assert re.match(pattern, model.refusal)
+
+
+def test_effect_that_is_just_known_too_little_has_figures_that_say_so() -> None:
+    """A log of PX4 was refused as known to 10 % where 10 % is expected."""
+    effect = Entry(
+        matrix="B",
+        row="q",
+        column="elevator",
+        nominal=-8.0,
+        error=0.0,
+        deviation=0.1034,
+        unit=-8.0,
+    )
+    text = too_little_excitation([effect], [effect.row])
+    assert "known to 10.3 %, expected 10 %" in text
+    assert "needs 1.04 times the amplitude" in text
 
 
 def test_flight_without_noise_that_is_mostly_at_rest_has_deviations() -> None:

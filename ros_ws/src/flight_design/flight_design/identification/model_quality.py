@@ -120,10 +120,10 @@ def too_little_excitation(entries: Iterable[Entry], outputs: Iterable[str]) -> s
         return ""
     factor = excitation_factor(worst)
     return (
-        f"excitation of {worst.row}: found {worst.name} known to {100 * worst.deviation:.2g} %, "
+        f"excitation of {worst.row}: found {worst.name} known to {100 * worst.deviation:.3g} %, "
         "expected"
-        f" {100 * MAX_DEVIATION:.2g} %: {worst.row} needs {factor:.2g} times the amplitude, or "
-        f"{factor**2:.2g} times the time"
+        f" {100 * MAX_DEVIATION:.2g} %: {worst.row} needs {factor:.3g} times the amplitude, or "
+        f"{factor**2:.3g} times the time"
     )
 
 
