@@ -292,9 +292,10 @@ SET_BY_THE_FLIGHT = {
     *("aircraft.control_rate", "aircraft.duration", "aircraft.recorded"),
     *("reference_model.u_m_rate", "guidance.y_rate", "guidance.authority_rate"),
     *("controller.y_rate", "bridge.map", "bridge.dry_run", "bridge.first_y"),
+    *(f"reference_model.recorded.NAME.{key}" for key in ("source", "time", "value")),
     *("recorder.directory", "recorder.attach", "recorder.metadata_file", "recorder.scenario_file"),
 }
-"""Keys that `rise-di fly` and the launch files set, by the scenario and the options."""
+"""Keys that `rise-di fly`, a run and the launch files set, by the scenario and the options."""
 IN_NO_FILE = {
     "aircraft.commands",  # by the airframe of JSBSim: docs/topics.md has a line
     *("controller.feedforward.inputs", "controller.feedforward.deviation"),  # of learned models
