@@ -42,8 +42,14 @@ TERMS = 4
 BASIS = [Legendre.basis(i, [0, 1]) * (2 * i + 1) ** 0.5 for i in range(TERMS)]
 # exact to degree 23: for exponentials over a period, beyond rounding
 GAUSS, WEIGHTS = leggauss(12)
+FASTEST = 5.0  # of a rate times the period: up to there the nodes err by less than 1e-14
 NARROWEST = 1e-6  # part of a frequency: an interval below it counts as not proved
 MOST, BATCH = 20_000, 64  # intervals of a step, and how many at once
+COVERED = """\
+covered: deviations constant in time, in the linear loop with this period, delay and lags;
+    no mode grows by more than 1e-6 a tick
+not covered: limits and rates of the inputs, errors beyond the width of the softened sign,
+    other lags and delays, a late or missed tick, a schedule, deviations that change in time"""
 
 
 class Loop(NamedTuple):
@@ -293,11 +299,32 @@ def prove(part: Loop, steps: list[dict[str, Any]], size: float) -> int:
     return count
 
 
+def require_range(file: dict[str, Any], loop: Loop) -> None:
+    """Raise ValueError for numbers to which the text above does not apply."""
+    numbers = [
+        file["period"],
+        file["size"],
+        file["delay"] + 1e-300,
+        *np.array(file["lag"]) + 1e-300,
+    ]
+    if not min(numbers) > 0.0 or not np.isfinite(loop.big).all():
+        raise ValueError(
+            "found a negative or no number, expected period, size > 0, delay, lag >= 0"
+        )
+    lags = [lag for lag in file["lag"] if lag > 0.0]
+    rates = [*np.abs(np.linalg.eigvals(np.array(file["A"]))), *(1.0 / lag for lag in lags)]
+    if max(rates) * file["period"] > FASTEST:
+        raise ValueError(
+            f"found a motion of {max(rates):.3g} rad/s, too fast for the nodes of Gauss"
+        )
+
+
 def check(file: dict[str, Any]) -> int:
     """The number of bounds that prove a certificate. Raises ValueError for one that does not."""
     steps = {tuple(part["entries"]): part["steps"] for part in file["parts"]}
-    count = 0
-    for entries, part in parts_of(loop_of(file)):
+    loop, count = loop_of(file), 0
+    require_range(file, loop)
+    for entries, part in parts_of(loop):
         if not is_stable(part.big[: part.states, : part.states]):
             raise ValueError("the aircraft of the file, d = 0, is not stable")
         if entries and (
@@ -307,6 +334,24 @@ def check(file: dict[str, Any]) -> int:
                 raise ValueError(f"no proof for {[file['names'][i] for i in entries]}")
             count += prove(part, steps[entries], file["size"])
     return count
+
+
+def deviations(file: dict[str, Any]) -> list[str]:
+    """What may deviate by how much, from the numbers: a part of one entry, or of a row of B."""
+    texts = []
+    for name, column, *changes in zip(
+        file["names"], np.transpose(file["E"]), file["F"], file["G"], strict=True
+    ):
+        for letter, change in zip("AB", changes, strict=True):
+            for i in np.flatnonzero(column) if np.any(change) else ():
+                sizes = file["size"] * np.abs(column[i] * np.array(change))
+                (j, *others), values = np.flatnonzero(change), np.abs(file[letter][i])
+                if others or values[j] == 0.0:
+                    texts.append(f"{name} (row {i} of {letter}) {np.round(sizes, 6).tolist()}")
+                else:
+                    percent = np.floor(1e3 * sizes[j] / values[j] + 1e-6) / 10.0
+                    texts.append(f"{name} ({letter} {i}, {j}) {percent:g} %")
+    return texts
 
 
 def main() -> None:
@@ -320,9 +365,13 @@ def main() -> None:
             if hashlib.sha256(Path(header).read_bytes()).hexdigest() != file["constants"]:
                 raise ValueError(f"{header} holds other constants")
         count = check(file)
-    except (ValueError, KeyError, TypeError, OSError, np.linalg.LinAlgError) as error:
+    except (ValueError, KeyError, TypeError, IndexError, OSError, np.linalg.LinAlgError) as error:
         sys.exit(f"REFUSED: {error}")
-    print(f"PROVED by {count} bounds:", *file["claim"], sep="\n  ")
+    print(
+        f"PROVED by {count} bounds: stable for each deviation within", *deviations(file), sep="\n  "
+    )
+    print(f"period {file['period']:g} s, delay {file['delay']:g} s, lags {file['lag']} s")
+    print(COVERED)
 
 
 if __name__ == "__main__":

@@ -41,6 +41,12 @@ few = settings(
 REPOSITORY = Path(__file__).resolve().parents[1]
 
 
+@pytest.fixture(autouse=True)
+def _caches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Guarantees are kept in a folder of the test: reports and exports show those of the user."""
+    monkeypatch.setenv("XDG_CACHE_HOME", f"{tmp_path}-caches")
+
+
 def refusing(sentence: str) -> AbstractContextManager[pytest.ExceptionInfo[ParameterError]]:
     """Expect a ParameterError whose sentence has a match of the pattern."""
     return pytest.raises(ParameterError, match=sentence)

@@ -79,7 +79,8 @@ def test_checker_proves_a_guarantee(name: str, tmp_path: Path) -> None:
     assert done.stdout.startswith("PROVED")
     within = np.floor(1e3 * promise.stable) / 10.0
     assert linear.box is not None
-    assert f"{linear.box.names[-1]} {within:g}" in done.stdout
+    assert f"{linear.box.names[-1]} (B " in done.stdout
+    assert f") {within:g} %" in done.stdout
 
 
 def test_motion_of_the_checker_is_the_exact_loop(servo: Content) -> None:
@@ -181,9 +182,18 @@ def _not_finite(content: Content) -> None:
     content["A"][0][0] = float("nan")
 
 
+def _before_it_is_given(content: Content) -> None:
+    content["delay"] = -0.005
+
+
+def _actuators_too_fast_for_the_nodes(content: Content) -> None:
+    content["lag"] = [1e-4 for _ in content["lag"]]
+
+
 FALSE: tuple[Callable[[Content], None], ...] = (
     _larger, _steered_backwards, _faster_law, _later, _slower_actuators, _wider_entry,
     _one_step_less, _step_skipped, _one_part_less, _no_scaling, _not_finite,
+    _before_it_is_given, _actuators_too_fast_for_the_nodes,
 )  # fmt: skip
 
 
@@ -197,12 +207,6 @@ def test_false_certificate_with_its_own_digest_is_refused(
     done = run(signed(content), tmp_path)
     assert done.returncode == 1, done.stdout
     assert done.stderr.startswith("REFUSED"), done.stderr
-
-
-@pytest.fixture(autouse=True)
-def _caches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is computed is kept in a folder of the test."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "caches"))
 
 
 def test_command_writes_a_certificate_and_refuses_what_it_cannot_state(tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 """The controller of a scenario as C99 with its proof, as `rise-di export` writes it."""
 
 import hashlib
-import json
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -33,6 +32,7 @@ from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.linear_loop.certificate import certificate
 from flight_analysis.linear_loop.kept_guarantee import kept_guarantee
 from flight_analysis.linear_loop.loop_margins import is_literal, scenario_loop
+from flight_analysis.report.margin_figures import guarantee_text
 from flight_core.arguments import FilePath, as_number, as_path
 from flight_core.files import write_file, writing
 from flight_core.parameters import require
@@ -140,7 +140,7 @@ def export(
     stated = _certified(source, code / PARAMETERS)
     if stated is not None:
         with writing("c", folder, "a folder that can"):
-            write_file(folder / CERTIFICATE, stated)
+            write_file(folder / CERTIFICATE, stated[0])
         files.append(folder / CERTIFICATE)
     if not proof:
         return Exported(files, None, "")
@@ -155,7 +155,7 @@ def export(
     )
     text = proof_report(proved, title) + material.line
     if stated is not None:
-        text += f"{CERTIFICATE}: {json.loads(stated)['claim'][0]}\n"
+        text = stated[1] + text
     with writing("c", folder, "a folder that can"):
         write_file(folder / REPORT, text)
     return Exported([*files, folder / REPORT], proved, text)
@@ -202,19 +202,21 @@ def certificate_sources(airframe: FilePath, scenario: FilePath | Scenario) -> di
     return {name: hashlib.sha256(text.encode()).hexdigest() for name, text in texts.items()}
 
 
-def _certified(scenario: Scenario, constants: Path) -> str | None:
-    """The certificate of the guarantee that was computed for a loop; None without one."""
-    airframe = scenario.aircraft.airframe
+def _certified(scenario: Scenario, constants: Path) -> tuple[str, str] | None:
+    """The certificate of the guarantee that was computed for a loop, and what it states.
+
+    None without a guarantee.
+    """
     if scenario.aircraft.is_jsbsim or is_literal(scenario.controller):
         return None
     loop = scenario_loop(scenario, scenario.controller, 1)
     promise = kept_guarantee(loop)
     if promise is None or not promise.stable:
         return None
+    sources = certificate_sources(scenario.aircraft.airframe, scenario)
     digest = hashlib.sha256(constants.read_bytes()).hexdigest()
-    return certificate(
-        loop, promise, certificate_sources(airframe, scenario) | {"constants": digest}
-    )
+    stated = f"{CERTIFICATE}: {guarantee_text(promise)[0]}\n"
+    return certificate(loop, promise, sources | {"constants": digest}), stated
 
 
 def _write(

@@ -12,21 +12,9 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
 from flight_analysis.linear_loop.guarantee import Guarantee
 from flight_analysis.linear_loop.loop_margins import LinearLoop
 from flight_core.parameters import require
-
-COVERED = (
-    "covered: each aircraft of the box, constant in time, in the linear loop with these lags, this "
-    "delay and this period; no mode grows by more than 1e-6 a tick"
-)
-NOT_COVERED = (
-    "not covered: limits and rates of the inputs, errors beyond the width of the softened sign, "
-    "lags and delays other than these, a late or missed tick, a schedule, deviations that change "
-    "in time, disk margins"
-)
 
 
 def certificate(linear: LinearLoop, promise: Guarantee, sources: Mapping[str, str]) -> str:
@@ -47,12 +35,7 @@ def certificate(linear: LinearLoop, promise: Guarantee, sources: Mapping[str, st
     assert box is not None and promise.proof  # noqa: S101, PT018 - a guarantee has both
     nominal = linear.nominal
     largest = float(box.part.max())
-    within = np.floor(1e3 * promise.stable * box.part / largest) / 10.0
-    entries = ", ".join(
-        f"{name} {part:g}" for name, part in zip(box.names, within.tolist(), strict=True)
-    )
     content: dict[str, Any] = {
-        "claim": [f"stable for each deviation within, %: {entries}", COVERED, NOT_COVERED],
         **sources,
         "names": box.names,
         "size": promise.stable / largest,
