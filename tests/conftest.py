@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import tempfile
+from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from inspect import iscoroutinefunction, signature
 from pathlib import Path
@@ -41,9 +42,17 @@ few = settings(
 REPOSITORY = Path(__file__).resolve().parents[1]
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _empty_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Reports, exports and campaigns show the guarantees that the user computed: here none."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
 @pytest.fixture(autouse=True)
-def _caches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Guarantees are kept in a folder of the test: reports and exports show those of the user."""
+def _own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a test computes is kept in a folder of its own."""
     monkeypatch.setenv("XDG_CACHE_HOME", f"{tmp_path}-caches")
 
 
