@@ -301,13 +301,9 @@ def prove(part: Loop, steps: list[dict[str, Any]], size: float) -> int:
 
 def require_range(file: dict[str, Any], loop: Loop) -> None:
     """Raise ValueError for numbers to which the text above does not apply."""
-    numbers = [
-        file["period"],
-        file["size"],
-        file["delay"] + 1e-300,
-        *np.array(file["lag"]) + 1e-300,
-    ]
-    if not min(numbers) > 0.0 or not np.isfinite(loop.big).all():
+    given = file["period"] > 0.0 and file["size"] > 0.0
+    given = given and all(value >= 0.0 for value in (file["delay"], *file["lag"]))
+    if not given or not np.isfinite(loop.big).all():
         raise ValueError(
             "found a negative or no number, expected period, size > 0, delay, lag >= 0"
         )
@@ -356,6 +352,12 @@ def deviations(file: dict[str, Any]) -> list[str]:
 
 def main() -> None:
     """Check a certificate, and the constants of an exported controller beside it."""
+    if len(sys.argv) < 2:
+        print(
+            "expected: check_certificate.py certificate.json [rise_di_parameters.h]",
+            file=sys.stderr,
+        )
+        sys.exit(2)
     try:
         file = json.loads(Path(sys.argv[1]).read_text())
         text = json.dumps({key: file[key] for key in file if key != "digest"}, sort_keys=True)

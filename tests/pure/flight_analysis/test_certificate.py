@@ -182,6 +182,10 @@ def _not_finite(content: Content) -> None:
     content["A"][0][0] = float("nan")
 
 
+def _lag_that_is_no_number(content: Content) -> None:
+    content["lag"][0] = float("nan")  # would count as no actuator
+
+
 def _before_it_is_given(content: Content) -> None:
     content["delay"] = -0.005
 
@@ -193,7 +197,7 @@ def _actuators_too_fast_for_the_nodes(content: Content) -> None:
 FALSE: tuple[Callable[[Content], None], ...] = (
     _larger, _steered_backwards, _faster_law, _later, _slower_actuators, _wider_entry,
     _one_step_less, _step_skipped, _one_part_less, _no_scaling, _not_finite,
-    _before_it_is_given, _actuators_too_fast_for_the_nodes,
+    _lag_that_is_no_number, _before_it_is_given, _actuators_too_fast_for_the_nodes,
 )  # fmt: skip
 
 
@@ -242,3 +246,9 @@ def test_export_puts_the_certificate_beside_the_code_of_its_constants(tmp_path: 
     assert run(content, tmp_path, str(header)).returncode == 0
     header.write_text(header.read_text().replace("RISE_DI_M 4", "RISE_DI_M 5"))
     assert "holds other constants" in run(content, tmp_path, str(header)).stderr
+
+
+def test_checker_without_a_file_says_how_it_is_called() -> None:
+    done = subprocess.run([sys.executable, CHECKER], capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.startswith("expected: check_certificate.py certificate.json")
