@@ -21,7 +21,7 @@ from tests.recordings import EPOCH, MS, signal
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.report import comparison, figures, html, plotting
+from flight_analysis.report import comparison, figures, guided_figures, html, plotting
 from flight_analysis.report.display_units import DisplayUnit, display_units, state_units
 from flight_analysis.report.html import write_page
 from flight_analysis.report.plotting import Figure, PlotContext
@@ -237,6 +237,26 @@ def test_every_mode_but_engaged_is_interval_with_name() -> None:
         "waiting": (0.0, 0.1), "hold": (0.2, 0.3), "ramp": (0.3, 0.4), "trim": (0.4, 0.5),
         "inactive": (0.5, 0.59),
     }  # fmt: skip
+
+
+@pytest.mark.parametrize("columns", [1, 2])
+def test_legend_names_each_shade_and_message(columns: int) -> None:
+    modes = [mode for mode in Mode for _ in range(10)]
+    run = context(flight(60, internals=ticks(60, mode=modes)))._replace(messages=[0.1])
+    y = plotting.Curve(run.tape["y"], figures.PLANT)
+    figure = drawn(plotting.time_series_figure(run, {"y": y}, columns=columns))
+    shades = {shape.fillcolor for shape in figure.layout.shapes if shape.type == "rect"}
+    named = [trace for trace in figure.data if trace.showlegend]
+    assert shades == set(figures.MODE_COLOURS.values())
+    assert {trace.marker.color for trace in named if trace.mode == "markers"} >= shades
+    assert "message of the log" in {trace.name for trace in named}
+    # plotly stacks the entries of a legend where the curve alone has a group
+    assert {trace.legendgroup or "" for trace in figure.data} == {""}
+
+
+def test_modes_of_guidance_and_controller_differ_in_colour() -> None:
+    colours = [*figures.MODE_COLOURS.values(), *guided_figures.MODE_SHADES.values()]
+    assert len({*colours, figures.GUST}) == len(colours) + 1
 
 
 def test_spectrum_of_commanded_sine_has_peak_there() -> None:

@@ -463,9 +463,7 @@ def wind_figure(context: PlotContext) -> Figure | None:
     if not wind.names:
         return None
     units = dict.fromkeys(wind.names, DisplayUnit("m/s", 1.0))
-    return time_series_figure(
-        context._replace(units=units), {"wind": Curve(wind, WIND)}, height=110
-    )
+    return time_series_figure(context._replace(units=units), {"wind": Curve(wind, WIND)})
 
 
 def state_figure(

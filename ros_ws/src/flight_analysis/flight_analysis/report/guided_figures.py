@@ -7,7 +7,6 @@ They are ground track, altitude, airspeed and attitude over their commands, and 
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -15,7 +14,7 @@ from flight_analysis.closed_loop.guidance_replay import known_routes
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.metrics import mask_spans
 from flight_analysis.report.display_units import QUANTITY_UNITS, DisplayUnit
-from flight_analysis.report.figures import END_STOP, ERROR, MODE_COLOURS, PLANT, REFERENCE, WIND
+from flight_analysis.report.figures import END_STOP, ERROR, PLANT, REFERENCE, WIND
 from flight_analysis.report.guided import flown_speed
 from flight_analysis.report.plotting import (
     INTERVAL_OPACITY,
@@ -28,7 +27,6 @@ from flight_analysis.report.plotting import (
     set_layout,
     time_series_figure,
 )
-from flight_core.modes import Mode
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 from flight_guidance.fence.fence import Fence
@@ -41,9 +39,10 @@ TRACK_HEIGHT = 560  # pixels
 WIND_ARROWS = 8
 ARROW_PIXELS = 45.0  # of the strongest wind
 LEAST_WIND = 0.3  # m/s, below which no arrow is drawn
+# in the same figures as MODE_COLOURS, and other colours than these
 MODE_SHADES = {
-    GuidanceMode.DEAD_RECKONING: MODE_COLOURS[Mode.HOLD],
-    GuidanceMode.POSE_LOST: MODE_COLOURS[Mode.RAMP],
+    GuidanceMode.DEAD_RECKONING: "#0072b2",
+    GuidanceMode.POSE_LOST: "#cc79a7",
 }
 
 # least and largest command by channel, SI; infinite without a limit
@@ -99,9 +98,8 @@ def track_figure(
     """
     figure = tracks_figure({"flown": (tape, PLANT)}, routes)
     pose = tape["guidance"].group("pose")
-    east, north = (pose[name][[0, -1]] for name in ("east", "north"))
-    mark = {"color": PLANT, "size": 9, "symbol": ["circle-open", "square"]}
-    _add_labels(figure, "start and end", east, north, text=["start", "end"], marker=mark)
+    for name, instant, symbol in (("start", 0, "circle-open"), ("end", -1, "square")):
+        _add_mark(figure, name, pose["east"][instant], pose["north"][instant], PLANT, symbol)
     for route in routes:
         _add_numbers(figure, route)
     if fence is not None:
@@ -110,9 +108,12 @@ def track_figure(
     return set_layout(figure, labels=16)
 
 
-def _add_labels(figure: Figure, name: str, east: Any, north: Any, **style: Any) -> None:
-    style = {"textposition": "top center", "hoverinfo": "skip", "showlegend": False, **style}
-    figure.add_scatter(name, east, north, mode="markers+text", **style)
+def _add_mark(
+    figure: Figure, name: str, east: float, north: float, colour: str, symbol: str
+) -> None:
+    """Mark a position. Its name is in the legend, where it covers no number of a leg."""
+    mark = {"color": colour, "size": 9, "symbol": symbol}
+    figure.add_scatter(name, [east], [north], mode="markers", marker=mark, hoverinfo="skip")
 
 
 def _add_numbers(figure: Figure, route: Route) -> None:
@@ -120,8 +121,16 @@ def _add_numbers(figure: Figure, route: Route) -> None:
     north, east = (np.array(values) for values in zip(*places, strict=True))
     disc = {"color": PAPER, "size": 17, "line": {"color": REFERENCE, "width": 1.5}}
     numbers = [f"{number}" for number in range(len(places))]
-    _add_labels(
-        figure, "legs", east, north, text=numbers, marker=disc, textposition="middle center"
+    figure.add_scatter(
+        "legs",
+        east,
+        north,
+        mode="markers+text",
+        text=numbers,
+        marker=disc,
+        textposition="middle center",
+        hoverinfo="skip",
+        showlegend=False,
     )
 
 
@@ -137,8 +146,7 @@ def _add_fence(figure: Figure, fence: Fence) -> None:
         name = "keep out" if zone.exclude else "fence"
         figure.add_scatter(name, east, north, line=line, hoverinfo="skip")
     home_north, home_east = fence.home
-    mark = {"color": END_STOP, "size": 9, "symbol": "diamond"}
-    _add_labels(figure, "home", [home_east], [home_north], text=["home"], marker=mark)
+    _add_mark(figure, "home", home_east, home_north, END_STOP, "diamond")
 
 
 def tracks_figure(tracks: Mapping[str, tuple[Tape, str]], routes: Sequence[Route]) -> Figure:

@@ -36,7 +36,7 @@ MAX_STORED = 60_000
 # bits of a stored value, with the leading one: within 1 in 2^16, finer than a pixel and the 4
 # digits of a hover
 MANTISSA = 16
-COLUMN_WIDTH = 320  # pixels
+COLUMN_WIDTH = 260  # pixels: four columns fit the page
 MIN_GAP_PERIODS = 10.0  # a curve is broken at a gap of this many median periods
 INTERVAL_OPACITY = 0.25
 INTERVAL_LABEL = 11  # pixels
@@ -256,7 +256,8 @@ def time_series_figure(
                 in_legend = len(curves) > 1 and first_in_legend(figure, label)
                 trace |= {
                     "name": label,
-                    "legendgroup": label,
+                    # plotly stacks the entries of a legend with one group
+                    "legendgroup": label if len(curves) > 1 else "",
                     "showlegend": in_legend,
                     "hovertemplate": f"%{{y:.4g}} {unit}",
                 }
@@ -298,7 +299,7 @@ def set_layout(figure: Figure, labels: int = 6, below: int = 40) -> Figure:
         "paper_bgcolor": TRANSPARENT,
         "plot_bgcolor": TRANSPARENT,
         # beside the figure, where it covers no label
-        "modebar": {"bgcolor": TRANSPARENT, "orientation": "v"},
+        "modebar": {"bgcolor": TRANSPARENT, "color": ZERO, "activecolor": INK, "orientation": "v"},
         "hoverlabel": {"bgcolor": PAPER, "font": {"color": INK}},
         "margin": {"l": 80, "r": 36, "t": above, "b": below},
         "legend": {
@@ -420,16 +421,17 @@ def _shade_intervals(figure: Figure, intervals: Sequence[Interval], columns: int
                     "layer": "below",
                 }
             )  # fmt: skip
-    if columns > 1:
-        return  # too narrow for labels
+    has_labels = columns == 1  # two columns are too narrow for labels
     for interval in sorted(intervals, key=lambda interval: interval.start):
-        if interval.labelled:
+        if interval.labelled and has_labels:
             position = {"x": interval.start, "xanchor": "left", "y": 1.0, "yref": "paper"}
             text = {"text": interval.label, "font": {"size": INTERVAL_LABEL}}
             style = {"name": INTERVAL, "yanchor": "bottom", "showarrow": False}
             figure.layout["annotations"].append({**position, **text, **style})
     for label, colour in {
-        interval.label: interval.colour for interval in intervals if not interval.labelled
+        interval.label: interval.colour
+        for interval in intervals
+        if not (interval.labelled and has_labels)
     }.items():
         mark = {"symbol": "square", "size": 12, "color": colour, "opacity": 2 * INTERVAL_OPACITY}
         figure.add_scatter(label, [None], [None], mode="markers", marker=mark, showlegend=True)
@@ -442,5 +444,5 @@ def _mark_messages(figure: Figure, times: Sequence[float], columns: int) -> None
         figure.layout["shapes"].append(
             {**position, "x0": time, "x1": time, "layer": "below", "line": MESSAGE_LINE}
         )
-    if times and columns == 1:
+    if times:
         figure.add_scatter("message of the log", [None], [None], line=MESSAGE_LINE, showlegend=True)
