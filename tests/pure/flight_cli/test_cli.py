@@ -351,6 +351,10 @@ def test_refusal_names_the_option_as_it_is_typed(words: str, refusal: str) -> No
         ("campaign --runs there --engine th", "threads"),
         ("campaign --workers 2 --distribution co", "corners"),
         ("compare --turbulence-seed 3 --wind pu", "published"),
+        ("compare --laws r", "rise"),
+        ("compare osprey_servo --laws rise,p", "rise,pi"),
+        ("guide ho", "hold"),
+        ("guide altitude=1300 head", "heading="),
     ],
 )
 def test_shell_completes_after_each_option(words: str, expected: str, tmp_path: Path) -> None:

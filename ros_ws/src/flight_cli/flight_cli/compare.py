@@ -41,7 +41,15 @@ from flight_cli.output import (
     say,
     write_text,
 )
-from flight_cli.words import argument, option, rare_option, scenario_names, values_of, write_option
+from flight_cli.words import (
+    argument,
+    list_of,
+    option,
+    rare_option,
+    scenario_names,
+    values_of,
+    write_option,
+)
 from flight_core.files import display_path
 from flight_core.parameters import require
 from flight_design.gains import tuned_gains
@@ -155,7 +163,8 @@ class Compare:
     )
     laws: str | None = option(
         "Laws to compare, by name: rise,pi,l1; all by default. A scenario file in "
-        "place of a name: its controller."
+        "place of a name: its controller.",
+        autocompletion=list_of(LAWS),
     )
     tuning: str = option(
         f"What the gains were tuned on: {', '.join(gain_tuning.OBJECTIVES)}.",

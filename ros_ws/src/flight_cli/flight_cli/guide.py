@@ -15,6 +15,7 @@ from flight_cli.route_options import RouteWords
 from flight_cli.words import (
     REQUIRED,
     argument,
+    list_of,
     namespace_option,
     warn,
 )
@@ -54,6 +55,7 @@ class Guide(RouteWords):
         "without airspeeds.",
         default=REQUIRED,
         metavar="COMMAND...",
+        autocompletion=list_of((*SERVICES, LINK, *(f"{name}=" for name in TARGETS))),
     )
     namespace: str = namespace_option()
 

@@ -139,6 +139,17 @@ def _names_of(library: str) -> Callable[[str], list[str]]:
     return complete
 
 
+def list_of(names: Iterable[str]) -> Callable[[str], list[str]]:
+    """The completion of the shell of the last name in a list with commas, each name once."""
+
+    def complete(incomplete: str) -> list[str]:
+        before, comma, begun = incomplete.rpartition(",")
+        rest = [name for name in names if name not in before.split(",")]
+        return [f"{before}{comma}{name}" for name in rest if name.startswith(begun)]
+
+    return complete
+
+
 scenario_names = _names_of("flight_analysis.closed_loop.scenario_library:LIBRARY")
 airframe_names = _names_of("aircraft_sim.airframes.airframe:LIBRARY")
 map_names = _names_of("autopilot_bridge.params:LIBRARY")
