@@ -33,6 +33,7 @@ from flight_analysis.report.summary import summarise
 from flight_bringup.graph import ONE_PROCESS, RECORDER, parameter_overrides
 from flight_log import columns
 from flight_log.bag import BagWriter, LogAttachments
+from flight_log.log_messages import MAX_TEXT, bounded
 from flight_log.named_vectors import JOINT_STATE
 from flight_log.provenance import STACK, revision
 from flight_log.tape_reader import RecordedRun, read_run
@@ -217,3 +218,10 @@ def test_long_topic_kept_in_file_has_bits_of_one_in_memory(
     )
     assert tape["truth"].group("x").names == plain["truth"].group("x").names
     assert not tape["truth"].values.flags.owndata  # mapped
+
+
+def test_long_text_of_log_ends_with_mark_of_its_cut() -> None:
+    # a number cut in its digits reads as another number
+    assert bounded(f"omega = {'1' * MAX_TEXT}").endswith("11 ...")
+    assert len(bounded("1" * (MAX_TEXT + 1))) == MAX_TEXT
+    assert bounded("1" * MAX_TEXT) == "1" * MAX_TEXT

@@ -18,6 +18,7 @@ WARN = 30  # level of rcl_interfaces/msg/Log
 CONTROL = "control"  # name of the node that carries out the requests of a page
 PARAMETER = "parameter"
 MAX_TEXT = 400  # characters of a text from the log
+CUT = " ..."  # the end of a longer text
 MAX_VALUES = 16  # of a parameter: one a channel, not a matrix
 
 
@@ -105,5 +106,6 @@ def shown(value: Any) -> str:
 
 
 def bounded(text: str) -> str:
-    """A text from the log: printable and of bounded length."""
-    return printable(text)[:MAX_TEXT]
+    """A text from the log: printable and of bounded length, with a mark where it is cut."""
+    whole = printable(text)
+    return whole if len(whole) <= MAX_TEXT else f"{whole[: MAX_TEXT - len(CUT)]}{CUT}"
