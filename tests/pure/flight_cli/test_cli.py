@@ -324,7 +324,7 @@ def test_number_of_runs_is_no_folder(
         ("gains osprey --late 0.1", "--late: found no --guarantee, expected --guarantee beside it"),
         ("identify log --link-delay 1", "--link-delay: found 1.0, expected --bridge beside it"),
         ("campaign --score q", "--score: found 'q', expected a name and a number: q=0.02"),
-        ("fly --in-process --composed", "--in-process: found a flight over topics, in lockstep"),
+        ("fly --in-process --composed", "--in-process: found --composed too, expected one of the"),
         ("fly --in-process --line 2", "--line: found no --route, expected the file of a route"),
         ("fly --set runs=x", "--set: found 'runs=x', expected a parameter of the scenario"),
     ],

@@ -189,9 +189,11 @@ class Fly(RouteWords):
 
     def _require_one_way(self, *, stepping: bool) -> None:
         """Raise ParameterError for two ways to fly at once."""
-        over_topics = "a flight over topics, in lockstep"
-        ways = not (self.in_process and (self.lockstep or self.composed))
-        require(ways, "in_process", over_topics, "one of the two")
+        for name in ("lockstep", "composed"):
+            ways = not (self.in_process and getattr(self, name))
+            require(
+                ways, "in_process", f"--{name} too", f"one of the two: --{name} flies over topics"
+            )
         has_nodes = "a flight over topics, which has nodes"
         has_namespace = self.in_process and self.namespace
         require(not has_namespace, "--namespace", "a flight in one process", has_nodes)
