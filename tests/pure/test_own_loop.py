@@ -29,6 +29,7 @@ from flight_core.vectors import FloatArray, select
 SCENARIO = rise_di.find_scenario("osprey_servo", 3.0)
 CONTROLLER = SCENARIO.controller
 M = len(CONTROLLER.outputs)
+FLIGHT = "rise_di.flight_env:rise_di/Flight-v0"
 
 
 @pytest.fixture(scope="module")
@@ -177,14 +178,27 @@ def test_linear_systems_have_the_eigenvalues_and_margins_of_the_loop(name: str) 
 
 @pytest.mark.filterwarnings("ignore:.*we recommend using a symmetric and normalized space")
 def test_environment_passes_checks_of_gymnasium() -> None:
-    named = gymnasium.make("rise_di/Flight-v0", duration=1.0, uncertainty=0.3, render_mode="ansi")
+    named = gymnasium.make(FLIGHT, duration=1.0, uncertainty=0.3, render_mode="ansi")
     check_env(named.unwrapped)
 
 
+@pytest.mark.parametrize(
+    ("modules", "name"),
+    [
+        ("rise_di, gymnasium", FLIGHT),
+        ("gymnasium", FLIGHT),
+        ("gymnasium, rise_di", "rise_di/Flight-v0"),
+    ],
+)
+def test_environment_is_found_by_name(modules: str, name: str) -> None:
+    """With the module before the colon in any order of imports."""
+    code = f"import {modules}; print(gymnasium.make({name!r}).spec.id)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.stdout.strip() == "rise_di/Flight-v0", done.stderr
+
+
 def test_environment_has_a_name_bounds_facts_and_a_line_of_text() -> None:
-    env = gymnasium.make(
-        "rise_di/Flight-v0", scenario="osprey_gust", duration=0.05, render_mode="ansi"
-    )
+    env = gymnasium.make(FLIGHT, scenario="osprey_gust", duration=0.05, render_mode="ansi")
     observed, info = env.reset(seed=1)
     space: Any = env.observation_space
     assert np.isfinite(space.low).all()
@@ -207,7 +221,7 @@ def test_environment_has_a_name_bounds_facts_and_a_line_of_text() -> None:
 
 def test_aircraft_beyond_its_bounds_terminates_with_an_observation_within_them() -> None:
     flights = gymnasium.make_vec(
-        "rise_di/Flight-v0",
+        FLIGHT,
         num_envs=2,
         vectorization_mode="vector_entry_point",
         scenario="osprey_gust",
