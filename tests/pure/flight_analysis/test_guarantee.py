@@ -213,19 +213,41 @@ def test_guarantee_with_a_late_input_is_below_each_constant_delay() -> None:
     for delay in np.linspace(0.0, 0.01, 9):
         loop = linear.loop._replace(delay=linear.loop.delay + delay)
         assert (radii(linear._replace(loop=loop), d) <= LIMIT).all()
-    # the delay is halved like an entry: its ranges apart cost little, even near pi / T as here
-    assert promise.stable > promise.unstable.deviation / 1.1
+    # the D of what changes in time is one for all frequencies, which leaves a quarter
+    assert promise.stable > promise.unstable.deviation / 1.35
+
+
+@pytest.mark.parametrize("part", [0.9, 1.1])
+def test_guarantee_with_a_late_input_holds_for_a_delay_that_changes(part: float) -> None:
+    """y+ = y + k T (1 + d) (u or u before), each tick the one that leaves the larger state.
+
+    Beyond the constant delay that is unstable the same choice grows.
+    """
+    linear = integrator(60.0, 0.1)
+    promise = guarantee(linear, 0.01)
+    assert promise.unstable is not None
+    deviation = promise.stable if part < 1.0 else part * promise.unstable.deviation
+    gain = 0.6 * (1.0 + deviation)
+    ticks = (np.array([[1.0 - gain, 0.0], [1.0, 0.0]]), np.array([[1.0, -gain], [1.0, 0.0]]))
+    sizes = []
+    for angle in np.linspace(0.0, np.pi, 20):
+        state = np.array([np.cos(angle), np.sin(angle)])
+        for _ in range(400):
+            state = max((tick @ state for tick in ticks), key=lambda x: float(x @ x))
+        sizes.append(np.linalg.norm(state))
+    assert (max(sizes) < 1e-3) == (part < 1.0)
 
 
 def test_bound_from_zero_holds_where_a_delay_has_no_effect() -> None:
     """At 0 rad/s a constant delay changes nothing: the scaling of 0 is silent on its channels.
 
-    The limit of c172p, u up to 10 ms late, was 33 % beside 76 % found.
+    The limit of c172p, u up to 10 ms late, was 33 % beside 76 % found. With another delay at each
+    tick 73.6 % is found by a search over delays of 0 or 10 ms.
     """
     c172p = find_scenario("jsbsim_c172p")
     promise = guarantee(scenario_loop(c172p, c172p.controller, 1, 0.3), 0.01)
     assert promise.unstable is not None
-    assert promise.unstable.deviation / 1.1 < promise.stable < promise.unstable.deviation
+    assert promise.unstable.deviation / 1.4 < promise.stable < promise.unstable.deviation
 
 
 def test_no_corner_is_unstable_or_has_less_than_guaranteed() -> None:

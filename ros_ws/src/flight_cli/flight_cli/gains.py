@@ -222,7 +222,9 @@ class Gains:
         "With --guarantee: folder for the first unstable aircraft and one 1.2 times as far off."
     )
     late: float = rare_option(
-        "With --guarantee: u is late by an unknown time of 0 to this in each input, s.", default=0.0
+        "With --guarantee: u is late by 0 to this, s, by another time at each tick and in each "
+        "input.",
+        default=0.0,
     )
     certificate: Path | None = rare_option(
         "With --guarantee: file for its proof (JSON), which examples/check_certificate.py checks "

@@ -19,11 +19,13 @@ from flight_analysis.linear_loop.structured_value import (
     balanced,
     bound_at,
     interval_at,
+    tightened,
     tightened_at,
 )
 from flight_analysis.linear_loop.uncertain_loop import Channels, ComplexArray
 from flight_core.vectors import FloatArray
 
+LEVELLED = 8  # frequencies at which the ratios of the D of a late u are sought
 SLOW = 1e-3  # part of pi / T of a slow motion
 DIGITS = 5  # of D and G in a step
 
@@ -61,26 +63,27 @@ class Region(NamedTuple):
 def proof_of(part: Channels, size: float, disk: float, most: int) -> list[dict[str, Any]] | None:
     """The steps that prove the loop stable; None if `most` boxes are too few.
 
-    The proof holds for every abs(d_i) <= size, every delay of the part, and complex disks of a size
-    in the channels of disks. The loop of d = 0 is stable. None of the box has a mode on abs(z) =
-    RADIUS, so none leaves.
+    The proof holds for every abs(d_i) <= size, any delays of the part from tick to tick, and
+    complex disks of a size in the channels of disks. The loop of d = 0 is stable. None of the box
+    has a mode on abs(z) = RADIUS, so none leaves.
 
     A step takes the last box of a list, at first the whole one from 0 to pi / T. It halves the box
     along an entry, {"halve": i}, and appends both halves; or it proves the box from "low" to
     "high", rad/s, by "t" and "g", and appends what is left below and above.
     """
     highest = np.pi / part.period
-    half = np.r_[np.full(len(part.entries), size), np.ones(part.late)]
-    disks = np.full(len(part.D) - part.real, disk)
+    half = np.full(len(part.entries), size)
+    others = np.r_[np.ones(part.late), np.full(len(part.D) - part.uncertain - part.late, disk)]
+    part = _levelled(part, np.r_[half[part.parameters], others])
     regions = [Region(centre=np.zeros(len(half)), half=half, low=0.0, high=highest, scaling=None)]
     steps: list[dict[str, Any]] = []
     while regions and len(steps) < most:
         region = regions.pop()
         w = _frequency(region, highest)
-        around = part.centred(np.r_[region.centre[part.parameters], np.zeros(len(disks))])
-        scale = np.r_[region.half[part.parameters], disks]
+        around = part.centred(np.r_[region.centre[part.parameters], np.zeros(len(others))])
+        scale = np.r_[region.half[part.parameters], others]
         M = scale[:, None] * around.response(w, RADIUS)
-        bound, scaling = tightened_at(around, w, M, _start(M, region.scaling))
+        bound, scaling = tightened_at(around, w, M, _start(around, M, region.scaling))
         interval = interval_at(around, w, scaling, scale) if bound < 1.0 else None
         if interval is None and bound < 1.0 and w == 0.0:
             interval = _from_zero(around, scaling, scale)
@@ -112,7 +115,7 @@ def _from_zero(part: Channels, near: Scaling, scale: FloatArray) -> tuple[float,
     """
     slow = SLOW * np.pi / part.period
     M = scale[:, None] * part.response(slow, RADIUS)
-    _, scaling = tightened_at(part, slow, M, _start(M, near))
+    _, scaling = tightened_at(part, slow, M, _start(part, M, near))
     still = scale[:, None] * part.response(0.0, RADIUS)
     return interval_at(part, 0.0, scaling, scale) if bound_at(still, scaling) < 1.0 else None
 
@@ -124,9 +127,39 @@ def _frequency(region: Region, highest: float) -> float:
     return highest if region.high == highest else float(np.sqrt(region.low * region.high))
 
 
-def _start(M: ComplexArray, near: Scaling | None) -> Scaling:
+def _levelled(part: Channels, scale: FloatArray) -> Channels:
+    """The channels of a late u so scaled that at the worst frequency one factor of D serves them.
+
+    What changes from tick to tick has the same D at all frequencies, up to a common factor.
+    """
+    if not part.late:
+        return part
+    # the means of the entries over a period suffice for the ratios
+    k = len(part.entries)
+    rows = np.r_[0:k, part.uncertain : len(scale)]
+    worst, level = 0.0, np.zeros(part.late)
+    for w in np.pi / part.period * np.geomspace(1e-2, 1.0, LEVELLED):
+        M = (scale[:, None] * part.response(w, RADIUS))[np.ix_(rows, rows)]
+        bound, scaling = tightened(M, k, Scaling(balanced(M), np.zeros(len(M))), 0.0)
+        if bound > worst:
+            worst, level = bound, scaling.t[k : k + part.late]
+    late = slice(part.uncertain, part.uncertain + part.late)
+    size = np.exp(level - level.mean())
+    W, Z, D = part.W.copy(), part.Z.copy(), part.D.copy()
+    W[:, late] /= size
+    Z[late] *= size[:, None]
+    D[:, late] /= size
+    D[late] *= size[:, None]
+    return part._replace(W=W, Z=Z, D=D)
+
+
+def _start(part: Channels, M: ComplexArray, near: Scaling | None) -> Scaling:
     """The better one of the balanced D and of a D and a G known from nearby."""
-    first = Scaling(balanced(M), np.zeros(len(M)))
+    t = balanced(M)
+    late = slice(part.uncertain, part.uncertain + part.late)
+    if part.late:
+        t[late] = t[late].mean()
+    first = Scaling(t, np.zeros(len(M)))
     return first if near is None or bound_at(M, first) < bound_at(M, near) else near
 
 
@@ -134,8 +167,8 @@ def _effects(part: Channels, M: ComplexArray, scaling: Scaling) -> FloatArray:
     """How far the bound of M falls with the half width of each parameter, up to a factor."""
     scale = np.exp(scaling.t)
     N = scale[:, None] * M / scale
-    centre = Centre(np.ones(len(N)), scaling.g[: part.real])
+    centre = Centre(np.ones(len(N)), scaling.g[: part.uncertain], np.eye(len(N)))
     level = max((1.0 + STALLED) * centre.bound(N), 1.0)
     P = np.linalg.inv(centre.inequality(N, level))
-    effects = np.diag(N @ P @ N.conj().T).real[: part.real]
+    effects = np.diag(N @ P @ N.conj().T).real[: part.uncertain]
     return np.bincount(part.parameters, effects).astype(np.float64)

@@ -57,7 +57,7 @@ class Guarantee(NamedTuple):
     inputs: tuple[str, ...]
     disk: FloatArray  # (m,) balanced disk margin that every aircraft of the box has, an input open
     disk_all: float  # with independent disks in all inputs at once
-    late: float = 0.0  # s: u is late by an unknown time of 0 to this
+    late: float = 0.0  # s: u is late by an unknown time of 0 to this, another one at each tick
     proof: Sequence[dict[str, Any]] = ()  # "entries" and "steps" of each part, see `proof_of`
 
     @property
@@ -69,8 +69,8 @@ class Guarantee(NamedTuple):
 def guarantee(linear: LinearLoop, late: float = 0.0) -> Guarantee:
     """The guarantee for the box of a loop, with u late in each input.
 
-    u is late by an unknown constant time of 0 to `late`, s. Raises ParameterError for a loop
-    without a box.
+    u is late by an unknown time of 0 to `late`, s, another one at each tick. Raises ParameterError
+    for a loop without a box.
     """
     box = linear.box
     require(box is not None, "uncertainty", "0", "an uncertainty above 0 for a guarantee")

@@ -77,8 +77,12 @@ def bound_at(M: ComplexArray, scaling: Scaling) -> FloatArray:
     return np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(H)[..., -1], 0.0)))
 
 
-def tightened(M: ComplexArray, real: int, start: Scaling, target: float) -> tuple[float, Scaling]:
+def tightened(
+    M: ComplexArray, real: int, start: Scaling, target: float, alike: int = 0
+) -> tuple[float, Scaling]:
     """A bound of M, (p, p), the first `real` channels real, with the D and G of a search.
+
+    The `alike` channels behind these have one factor of D.
 
     Below `target` D and G are in the middle of the set with the target. The method of centres on
     the linear matrix inequality
@@ -89,7 +93,11 @@ def tightened(M: ComplexArray, real: int, start: Scaling, target: float) -> tupl
     that falls. Source: S. Boyd, L. El Ghaoui, Linear Algebra and its Applications 188, 1993.
     """
     N = np.exp(start.t)[:, None] * M * np.exp(-start.t)
-    centre = Centre(np.ones(len(M)), np.clip(start.g[:real], -LARGEST_G / 2.0, LARGEST_G / 2.0))
+    g = np.clip(start.g[:real], -LARGEST_G / 2.0, LARGEST_G / 2.0)
+    free = np.arange(len(M))
+    free[real : real + alike] = real
+    free[real + alike :] -= max(alike - 1, 0)
+    centre = Centre(np.ones(len(M)), g, np.eye(int(free[-1]) + 1)[free])
     goal = target**2
     least = centre.bound(N)
     level = max(1.1 * least, goal)
@@ -118,7 +126,7 @@ def tightened_at(
     k = len(part.entries)
     rows = np.r_[0:k, part.uncertain : len(scaled)]
     few = Scaling(start.t[rows], start.g[rows])
-    _, means = tightened(scaled[np.ix_(rows, rows)], part.real - k, few, 1.0)
+    _, means = tightened(scaled[np.ix_(rows, rows)], k, few, 1.0, part.late)
     second = slice(k, part.uncertain)
     sizes = np.abs(scaled) ** 2 + TINY
     row = sizes[second, rows] @ np.exp(-2.0 * means.t)
@@ -130,7 +138,7 @@ def tightened_at(
     bound = float(bound_at(scaled, scaling))
     if bound < 1.0 or w * part.period < MEANS_UP_TO:
         return bound, scaling
-    return tightened(scaled, part.real, start, 1.0)
+    return tightened(scaled, part.uncertain, start, 1.0, part.late)
 
 
 class Centre(NamedTuple):
@@ -138,6 +146,7 @@ class Centre(NamedTuple):
 
     d: FloatArray  # (p,)
     g: FloatArray  # (real,)
+    free: FloatArray  # (p, f), d = free x: channels with one factor share a column
 
     def inequality(self, N: ComplexArray, level: float) -> ComplexArray:
         """F, (p, p)."""
@@ -167,8 +176,10 @@ class Centre(NamedTuple):
         gg = 2.0 * (Q * P.T - R * R.T).real[:real, :real]
         dd[np.diag_indices(len(N))] += 1.0 / self.d**2
         gg[np.diag_indices(real)] += 2.0 * (LARGEST_G**2 + self.g**2) / room**2
-        curvature = np.block([[dd, dg], [dg.T, gg]])
-        trace = np.r_[np.ones(len(N)), np.zeros(real)]
+        free = self.free
+        curvature = np.block([[free.T @ dd @ free, free.T @ dg], [dg.T @ free, gg]])
+        slope = np.r_[slope[: len(N)] @ free, slope[len(N) :]]
+        trace = np.r_[free.sum(axis=0), np.zeros(real)]
         down, along = np.linalg.solve(curvature, np.stack([slope, trace], axis=1)).T
         step = (trace @ down) / (trace @ along) * along - down
         decrement = float(np.sqrt(max(-slope @ step, 0.0)))
@@ -180,7 +191,8 @@ class Centre(NamedTuple):
 
     def moved(self, step: FloatArray) -> "Centre":
         """D and G after a step, (p + real,)."""
-        return Centre(self.d + step[: len(self.d)], self.g + step[len(self.d) :])
+        f = self.free.shape[1]
+        return Centre(self.d + self.free @ step[:f], self.g + step[f:], self.free)
 
     def inside(self, N: ComplexArray, level: float) -> bool:
         """Whether the inequality and the limits hold."""

@@ -10,12 +10,14 @@ The motion is exact in d but for the coefficients left out, an error of the orde
 rate)^4. Source of the lifted loop: T. Chen, B. Francis, "Optimal Sampled-Data Control Systems",
 chapter 10.
 
-u may be late by an unknown time of 0 to `late`, s: the input of a period changes by
+u may be late by an unknown time of 0 to `late`, s, another one at each tick and in each input; the
+newest u that has arrived acts. The input of a period changes by
 
     w_0 + w_1 ROOT (2 s - 1),  w_0 = -sum_j a_j v_j,  w_1 = sum_j ROOT b_j v_j
 
 with v_j = u_k-j - u_k-j-1. A shift by j + f periods, 0 <= f < 1, is a_i = 1 for i < j, a_j = f,
-b_j = f (1 - f), 0 beyond. Each coefficient is a real d around the middle of its range.
+b_j = f (1 - f), 0 beyond. Each coefficient is a real d around the middle of its range, which may
+change from tick to tick: the D of these channels is one for all frequencies, their G is 0.
 """
 
 from typing import NamedTuple
@@ -65,7 +67,7 @@ def plants_at(plant: LinearPlant, box: Box, d: FloatArray) -> LinearPlant:
 
 
 class Late(NamedTuple):
-    """l real channels of a delay: W_l w, Z_l zeta + V_l v.
+    """l channels of a delay: W_l w, Z_l zeta + V_l v.
 
     The channels of w_0 come first, j by j with m inputs.
     """
@@ -225,23 +227,17 @@ class Channels(NamedTuple):
     D: FloatArray
     entries: tuple[int, ...]  # places of the entries in the box
     period: float
-    late: int = 0  # real channels of a delay, behind those of the entries; then disks
+    late: int = 0  # channels of a delay, behind the real ones of the entries; then disks
 
     @property
     def uncertain(self) -> int:
-        """Number of channels of the entries, TERMS an entry."""
+        """Number of the real channels, TERMS an entry."""
         return TERMS * len(self.entries)
 
     @property
-    def real(self) -> int:
-        """Number of real channels."""
-        return self.uncertain + self.late
-
-    @property
     def parameters(self) -> IntArray:
-        """The number of the parameter of each real channel: entries, then those of a delay."""
-        k = len(self.entries)
-        return np.asarray(np.r_[np.tile(np.arange(k), TERMS), k + np.arange(self.late)])
+        """The number of the entry of each of their channels."""
+        return np.tile(np.arange(len(self.entries)), TERMS)
 
     def response(self, w: FloatArray | float, radius: float) -> ComplexArray:
         """M(z) at abs(z) = radius and the frequencies w, (F,) or (), rad/s: (F, p, p)."""
