@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pytest import approx
+from scipy.linalg import expm
 from tests.conftest import invoke, refusing
 
 from aircraft_sim.airframes.airframe import load_airframe
@@ -217,25 +218,43 @@ def test_guarantee_with_a_late_input_is_below_each_constant_delay() -> None:
     assert promise.stable > promise.unstable.deviation / 1.35
 
 
-@pytest.mark.parametrize("part", [0.9, 1.1])
-def test_guarantee_with_a_late_input_holds_for_a_delay_that_changes(part: float) -> None:
-    """y+ = y + k T (1 + d) (u or u before), each tick the one that leaves the larger state.
+def oscillator(law: tuple[float, float]) -> LinearLoop:
+    """U = law y around an oscillator of 200 rad/s with a damping of 0.05, off by up to 1 %."""
+    w = 200.0
+    A = np.array([[0.0, 1.0], [-w * w, -0.1 * w]])
+    plant = LinearPlant(A[None], np.array([[[0.0], [w * w]]]), np.eye(2))
+    none = np.zeros((0, 0))
+    gains = LinearLaw(none, np.zeros((0, 2)), np.zeros((1, 0)), np.array([law]))
+    box = Box(
+        names=("B[v,u]",),
+        part=np.array([0.01]),
+        E=np.array([[0.0], [1.0]]),
+        F=np.zeros((1, 2)),
+        G=np.array([[0.01 * w * w]]),
+    )
+    return integrator(1.0, 0.01)._replace(plant=plant, law=gains, box=box)
 
-    Beyond the constant delay that is unstable the same choice grows.
-    """
-    linear = integrator(60.0, 0.1)
-    promise = guarantee(linear, 0.01)
-    assert promise.unstable is not None
-    deviation = promise.stable if part < 1.0 else part * promise.unstable.deviation
-    gain = 0.6 * (1.0 + deviation)
-    ticks = (np.array([[1.0 - gain, 0.0], [1.0, 0.0]]), np.array([[1.0, -gain], [1.0, 0.0]]))
-    sizes = []
-    for angle in np.linspace(0.0, np.pi, 20):
-        state = np.array([np.cos(angle), np.sin(angle)])
-        for _ in range(400):
-            state = max((tick @ state for tick in ticks), key=lambda x: float(x @ x))
-        sizes.append(np.linalg.norm(state))
-    assert (max(sizes) < 1e-3) == (part < 1.0)
+
+def test_guarantee_with_a_late_input_holds_for_a_delay_that_changes() -> None:
+    """Each constant delay up to a period is stable, a sequence of 0 and a period is not."""
+    linear = oscillator((0.5446, 0.00031))
+    for delay in np.linspace(0.0, PERIOD, 21):
+        loop = linear.loop._replace(delay=delay)
+        assert radii(linear._replace(loop=loop), np.zeros((1, 1)))[0] < 0.995
+    # the motion over a tick, x and u before: with this u, and with that of the tick before
+    plant = linear.plant
+    step = expm(PERIOD * np.block([[plant.A[0], plant.B[0]], [np.zeros((1, 3))]]))
+    law = linear.law.D
+    this = np.block(
+        [[step[:2, :2] + step[:2, 2:] @ law, np.zeros((2, 1))], [law, np.zeros((1, 1))]]
+    )
+    before = np.block([[step[:2]], [law, np.zeros((1, 1))]])
+    sequence = (this, before, before, this, before, before, before)
+    growth = np.abs(np.linalg.eigvals(np.linalg.multi_dot(sequence))).max()
+    assert growth > 1.05
+    assert guarantee(linear, PERIOD).stable == 0.0
+    # a fifth of the gains leaves the box stable
+    assert guarantee(oscillator((0.1089, 0.000062)), PERIOD).holds
 
 
 def test_bound_from_zero_holds_where_a_delay_has_no_effect() -> None:
