@@ -332,7 +332,8 @@ def _loop_of_px4(
     if px4 is None:
         return rate, delay, ""
     require(delay is None, "px4", "--delay beside it", "one of the two")
-    return rate_loop(px4, rate)
+    loop = rate_loop(px4, rate)
+    return loop.rate, loop.delay, loop.origin
 
 
 def _write_page(path: Path, answer: Assessment) -> None:

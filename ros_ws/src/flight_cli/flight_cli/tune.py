@@ -51,6 +51,7 @@ from flight_design.identification.innovation_filters import (
     FlightData,
     measured_noise,
 )
+from flight_design.identification.likelihood import Unknown
 from flight_design.identification.log_import import Window
 from flight_design.identification.model_identification import (
     Identification,
@@ -64,7 +65,7 @@ from flight_design.identification.model_quality import (
     no_better,
 )
 from flight_design.identification.own_loop import OwnLoop, own_loop
-from flight_design.identification.rates_log import rates_of_log
+from flight_design.identification.rates_log import rates_of_log, scaled_torques
 from flight_log.px4_parameters import rate_loop
 from flight_log.vehicle_log import read_foreign_log
 from rise_di.c_code import export
@@ -199,16 +200,20 @@ class Tune:
         controller = scenario.rise_di()
         nominal = load_airframe(scenario.aircraft.airframe)
         log = read_foreign_log(self.log)
-        recorded, taken = rates_of_log(
-            log, scenario, nominal, autopilot, Window(self.start, self.stop)
-        )
-        for sentence in taken.notes:
-            warn(f"warning: {sentence}")
+        delay = controller.delay
+        cutoff = 0.0
         if autopilot == "px4":
             loop = rate_loop(self.log, controller.rate)
             scenario = scenario.vary(controller={"delay": loop.delay})
             say(console, loop.origin)
-        identification = _identified(console, scenario, nominal, recorded)
+            delay = loop.filters
+            cutoff = loop.cutoff
+        recorded, taken, earlier = rates_of_log(
+            log, scenario, nominal, autopilot, Window(self.start, self.stop), cutoff=cutoff
+        )
+        for sentence in (*taken.notes, *scaled_torques(taken.parameters)):
+            warn(f"warning: {sentence}")
+        identification = _identified(console, scenario, nominal, recorded, delay - earlier)
         airframe = _kept(nominal, identification)
         if airframe is None:
             raise ParameterError(_what_to_fly(identification, scenario, self.log))
@@ -260,17 +265,22 @@ class Tune:
 
 
 def _identified(
-    console: Console, scenario: Scenario, nominal: Airframe, recorded: FlightData
+    console: Console, scenario: Scenario, nominal: Airframe, recorded: FlightData, delay: float
 ) -> Identification:
-    """The model by a search on the log, with a bar."""
+    """The model by a search on the log, with u late by a delay, s, and a bar."""
     controller = scenario.rise_di()
-    lag = dict(zip(controller.inputs, controller.lag, strict=True))
-    actuation = Actuation(np.array([lag[name] for name in nominal.inputs]), controller.delay)
+    channels = scenario.aircraft.channels().inputs
+    lags = scenario.aircraft.actuators.lag or (0.0,) * len(channels)
+    lag = dict(zip(channels, lags, strict=True))
+    actuation = Actuation(np.array([lag[name] for name in nominal.inputs]), delay)
     pairing = ChannelPairing(controller.outputs, controller.inputs)
+    unknown = Unknown(hidden=False)
     with progress_bar(*COUNT_COLUMNS, quiet=console.quiet) as bar:
-        show: Callable[..., None] = partial(bar.update, bar.add_task("search"))
+        show: Callable[..., None] = partial(
+            bar.update, bar.add_task(f"search, u {1e3 * delay:.1f} ms late")
+        )
         identification = identify_model(
-            recorded, nominal, actuation, pairing, show, searches_again=True
+            recorded, nominal, actuation, pairing, show, unknown=unknown
         )
         show(completed=1, total=1)
     return identification
@@ -311,14 +321,19 @@ def _kept(nominal: Airframe, identification: Identification) -> Airframe | None:
     for part in identification.parts:
         if part.refusal and part.refusal != no_better(part.before, part.after):
             return None
-        used += [] if part.refusal else [*part.entries]
+        is_better = part.after.log_likelihood > part.before.log_likelihood
+        used += [*part.entries] if is_better else []
     return with_entries(nominal, used)
 
 
 def _uncertainty(identification: Identification) -> float:
-    """Twice the largest standard deviation of the best known effects, from LEAST to MOST."""
+    """Twice the largest standard deviation of the best known effects, from LEAST to MOST.
+
+    In parts of the value that was found.
+    """
     effects = best_known(identification.entries, identification.airframe.outputs)
-    return float(np.clip(2.0 * max(effect.deviation for effect in effects), LEAST, MOST))
+    parts = [effect.deviation * abs(effect.nominal / effect.value) for effect in effects]
+    return float(np.clip(2.0 * max(parts), LEAST, MOST))
 
 
 def _on_airframe(scenario: Scenario, airframe: Path, noise: FloatArray) -> Scenario:

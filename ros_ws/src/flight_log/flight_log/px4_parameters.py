@@ -35,11 +35,13 @@ LIKE_PART = 1.05  # of the rate of the law: a faster gyro is interpolated (rise_
 
 
 class RateLoop(NamedTuple):
-    """Rate of the law, Hz, pure delay from the rates to the torque, s, and what both come from."""
+    """The loop of a law in PX4."""
 
-    rate: float
-    delay: float
-    origin: str
+    rate: float  # of the law, Hz
+    delay: float  # from the rates to the torque, s
+    filters: float  # s, the part of the gyro's filters
+    cutoff: float  # of the low-pass of second order, Hz; 0: none
+    origin: str  # what they come from
 
 
 def rate_loop(path: Path, rate: float | None = None) -> RateLoop:
@@ -69,11 +71,12 @@ def rate_loop(path: Path, rate: float | None = None) -> RateLoop:
             width = values[f"{name}_BW"]
             delay += width / (2.0 * math.pi * frequency**2)
             words += f", notch {frequency:g} Hz"
+    filters = delay
     delay += 1.0 / design_rate
     if fastest > LIKE_PART * design_rate:
         delay += 1.0 / fastest
     origin = f"{path.name}: gyro at {fastest:g} Hz, {words}; delay {1e3 * delay:.3g} ms"
-    return RateLoop(design_rate, delay, origin)
+    return RateLoop(rate=design_rate, delay=delay, filters=filters, cutoff=cutoff, origin=origin)
 
 
 def _read(path: Path) -> dict[str, float]:

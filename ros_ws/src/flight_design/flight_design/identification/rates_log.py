@@ -5,10 +5,14 @@
 A torque of 1 is u at the upper end stop, as in the module of `rise-di export`.
 """
 
+import math
+import re
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
+from scipy import signal
 
 from aircraft_sim.airframes.airframe import Airframe
 from autopilot_bridge.params import ChannelMap, load_map
@@ -24,7 +28,19 @@ from flight_log.vehicle_tables import VehicleLog
 MAPS: Mapping[str, str] = MappingProxyType({"px4": "px4", "ardupilot": "ardupilot"})
 """The channel map with the topics of an autopilot."""
 SLOWEST, FASTEST = 0.6, 1.6  # of the trim speed, as c_export.autopilots clips the dynamic pressure
-PERIOD = 0.012  # s, of the identification at least: a search over more samples takes longer
+PERIOD = 0.008  # s, of the identification at least: a search over more samples takes longer
+# Hz: with a filter of this cut-off the noise of samples a PERIOD apart is white
+BROAD = 90.0
+OVER = 2.2  # of a cut-off, the least rate of a log from which its filter can be taken
+PERIODS = 6.0  # of a cut-off, after which the impulse response of its filter is below 1e-5
+
+
+class RatesLog(NamedTuple):
+    """The rates and the torque of a log."""
+
+    recorded: FlightData
+    taken: Imported
+    earlier: float  # s, by which y is earlier than that of the gyro's filter
 
 
 def rates_map(scenario: Scenario, autopilot: str) -> ChannelMap:
@@ -64,12 +80,14 @@ def rates_of_log(
     autopilot: str,
     window: Window,
     show: Callable[[list[Agreement]], None] = lambda _: None,
-) -> tuple[FlightData, Imported]:
+    cutoff: float = 0.0,
+) -> RatesLog:
     """Y and u of a log for the identification of an airframe, and what was imported.
 
         u = sign(D) end torque (V / V0)^2
 
-    with V clipped as in the module. u of ArduPlane is that of its servos. Raises ParameterError.
+    with V clipped as in the module. u of ArduPlane is that of its servos. `cutoff` is that of the
+    gyro's filter, Hz, 0 for none. Raises ParameterError.
     """
     channel_map = rates_map(scenario, autopilot)
     taken = imported(channel_map, log, window, show, servos=autopilot == "ardupilot")
@@ -85,7 +103,45 @@ def rates_of_log(
         "u": Signal(u.stamp_ns, tuple(airframe.inputs), values),
     }
     recorded = recording(Tape(signals, tape.start_ns), airframe)
-    return coarser(recorded, max(1, round(PERIOD / recorded.period))), taken
+    earlier = 0.0
+    if 0.0 < cutoff < BROAD < 1.0 / (OVER * recorded.period):
+        recorded, earlier = broadened(recorded, cutoff)
+    means = coarser(recorded, max(1, round(PERIOD / recorded.period)))
+    return RatesLog(means, taken, earlier)
+
+
+def scaled_torques(parameters: Mapping[str, float]) -> list[str]:
+    """A sentence for each surface of PX4 whose end stop is at another torque than 1."""
+    sentences = []
+    for name, value in sorted(parameters.items()):
+        if re.fullmatch(r"CA_SV_CS\d+_TRQ_[RPY]", name) and abs(value) not in (0.0, 1.0):
+            sentences.append(
+                f"{name} is {value:g}: its surface reaches the end stop at a torque of "
+                f"{abs(value):g}; set it to {math.copysign(1.0, value):g}, and log again"
+            )
+    return sentences
+
+
+def broadened(recorded: FlightData, cutoff: float) -> tuple[FlightData, float]:
+    """Y as of a low-pass at BROAD in place of one at `cutoff`, Hz, and how much earlier, s.
+
+        y' = F_BROAD(z) / F_cutoff(z) y,  F of Butterworth's, of second order
+
+    Behind a narrow filter the noise of y is coloured, and so are the innovations. The zeros of both
+    filters at z = -1 cancel. Samples that a lost one reaches are lost.
+    """
+    rate = 1.0 / recorded.period
+    narrow = signal.butter(2, cutoff, fs=rate)
+    broad = signal.butter(2, BROAD, fs=rate)
+    numerator = narrow[1] * broad[0][0] / narrow[0][0]
+    is_lost = np.asarray(~np.isfinite(recorded.y).all(axis=1))
+    begin = np.nanmean(recorded.y, axis=0)
+    y = np.where(is_lost[:, None], 0.0, recorded.y - begin)
+    y = begin + signal.lfilter(numerator, broad[1], y, axis=0)
+    reach = math.ceil(PERIODS * rate / BROAD)
+    y[np.convolve(is_lost, np.ones(reach))[: len(y)] > 0.0] = np.nan
+    late = [signal.group_delay(each, w=[0.0], fs=rate)[1].item() for each in (narrow, broad)]
+    return recorded._replace(y=y), (late[0] - late[1]) / rate
 
 
 def _pressure(log: VehicleLog, scenario: Scenario, u: Signal) -> FloatArray:
