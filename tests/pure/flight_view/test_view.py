@@ -755,6 +755,17 @@ def test_recording_run_is_chosen_first(recorded: Path, tmp_path: Path) -> None:
             assert runs_in_recording(tmp_path, "uav1") == []
 
 
+def test_run_in_recording_counts_once_beside_its_link(tmp_path: Path) -> None:
+    """The recorder of nodes that were started one by one links `latest` at its start."""
+    run = tmp_path / "20260101T000000Z-recording"
+    run.mkdir()
+    (run / "run_0.mcap").write_bytes(b"")
+    (tmp_path / "latest").symlink_to(run.name)
+    with (run / "run_0.mcap").open("rb") as recorder:
+        assert try_lock(recorder)
+        assert runs_in_recording(tmp_path) == [run]
+
+
 def test_aircraft_of_one_log_are_a_fleet(tmp_path: Path) -> None:
     """The places of both are topics of one answer.
 

@@ -30,7 +30,11 @@ DEFAULT_PORT = 8077
 def runs_in_recording(runs: Path, namespace: str | None = None) -> list[Path]:
     """The runs in recording, the newest first; with a namespace those that hold a topic of it."""
     if is_folder(runs):
-        folders = sorted((folder for folder in runs.iterdir() if is_folder(folder)), reverse=True)
+        # `latest` is a link to one of them.
+        folders = sorted(
+            (folder for folder in runs.iterdir() if is_folder(folder) and not folder.is_symlink()),
+            reverse=True,
+        )
     else:
         folders = []
     recording = []
