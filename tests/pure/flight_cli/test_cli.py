@@ -327,6 +327,9 @@ def test_number_of_runs_is_no_folder(
         ("fly --in-process --composed", "--in-process: found --composed too, expected one of the"),
         ("fly --in-process --line 2", "--line: found no --route, expected the file of a route"),
         ("fly --set runs=x", "--set: found 'runs=x', expected a parameter of the scenario"),
+        ("fly --set k_g=2", "--set: found 'k_g=2', expected the section too: controller.k_g=2"),
+        ("fly --set duration=7", "--set: found 'duration=7', expected the section too: flight."),
+        ("fly --set sign=x", "--set: found 'sign=x', expected the section too: controller.sign=x"),
     ],
 )
 def test_refusal_names_the_option_as_it_is_typed(words: str, refusal: str) -> None:

@@ -3,7 +3,7 @@
 """The option --set: parameters of a scenario by their keys."""
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario
@@ -18,10 +18,15 @@ def settings_option() -> Any:
     return option(text, "--set", metavar="KEY=VALUE")
 
 
-def parse_settings(settings: Sequence[str] | None, owner: str = "scenario") -> dict[str, Any]:
+def parse_settings(
+    settings: Sequence[str] | None,
+    owner: str = "scenario",
+    sections_with: Callable[[str], Sequence[str]] = lambda key: (),
+) -> dict[str, Any]:
     """The values by key, as controller.k_g.
 
-    `owner` is the only section, or the scenario. Raises ParameterError.
+    `owner` is the only section, or the scenario; `sections_with` a key are named where the section
+    is left out. Raises ParameterError.
     """
     changes: dict[str, Any] = {}
     for text in settings or ():
@@ -30,9 +35,15 @@ def parse_settings(settings: Sequence[str] | None, owner: str = "scenario") -> d
         section = key.partition(".")[0]
         sections = tuple(SCHEMAS) if owner == "scenario" else (owner,)
         fits = bool(equals) and section != key and section in sections
-        expected = f"a parameter of the {owner} and its value, as in controller.k_g=2.0"
-        near = f"; the section is {one_of(sections, section)}"
-        require(fits, "--set", repr(text), expected + near * (section not in sections))
+        near = [f"{each}.{text.strip()}" for each in sections_with(key)]
+        expected = (
+            f"the section too: {' or '.join(near)}"
+            if near
+            else f"a parameter of the {owner} and its value, as in controller.k_g=2.0"
+        )
+        known = f"; the section is {one_of(sections, section)}"
+        is_unknown = not near and section not in sections
+        require(fits, "--set", repr(text), expected + known * is_unknown)
         require(key not in changes, "--set", "a parameter twice", "each once")
         changes[key] = parse_yaml(value, f"--set {text!r}", "a value")
     return changes
@@ -41,7 +52,7 @@ def parse_settings(settings: Sequence[str] | None, owner: str = "scenario") -> d
 def with_settings(scenario: Scenario, settings: Sequence[str] | None) -> Scenario:
     """The scenario with the parameters of --set. Raises ParameterError."""
     sections: dict[str, dict[str, Any]] = defaultdict(dict)
-    for name, value in parse_settings(settings).items():
+    for name, value in parse_settings(settings, "scenario", scenario.sections_with).items():
         section, _, key = name.partition(".")
         sections[section][key] = value
     return scenario.vary(

@@ -128,10 +128,7 @@ class Scenario:
         """A section with changes, validated."""
         schema = SCHEMAS.get(name)
         if schema is None:
-            owners = [
-                key for key in SCHEMAS if name in getattr(getattr(self, key), "model_fields", ())
-            ]
-            if owners:
+            if owners := self.sections_with(name):
                 expected = f"it in a section: vary({owners[0]}={{{name!r}: ...}})"
             else:
                 expected = one_of(tuple(SCHEMAS), name)
@@ -143,6 +140,10 @@ class Scenario:
                 f"{name}: found {short_repr(changes)}, expected a mapping of its parameters"
             )
         return schema.validate_mapping({**self._values(name, changes), **changes}, name)
+
+    def sections_with(self, name: str) -> list[str]:
+        """The sections that have a parameter of this name."""
+        return [key for key in SCHEMAS if name in getattr(getattr(self, key), "model_fields", ())]
 
     def _values(self, name: str, changes: Mapping[str, Any]) -> dict[str, Any]:
         """The parameters of a section that changes are added to."""
