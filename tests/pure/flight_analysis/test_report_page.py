@@ -112,6 +112,18 @@ def test_the_page_draws_all_figures_without_errors(browser: Browser, page: Path)
     assert all(count > 0 for count in colours)
 
 
+def test_page_of_guided_flight_in_wind_prints_without_errors(
+    browser: Browser, tmp_path: Path
+) -> None:
+    """Its track has arrows, which are annotations without a text."""
+    scenario = find_scenario("osprey_route", 5.0)
+    write_page(tmp_path / "report.html", [recorded("route", scenario, simulate(scenario))])
+    open_page(browser, tmp_path / "report.html")
+    assert browser.run(f"{PLOTS}[0].layout.annotations.some(each => each.showarrow)")
+    browser.call("Page.printToPDF")
+    assert browser.console == []
+
+
 def test_zoom_shows_every_sample_in_all_figures(
     browser: Browser, page: Path, servo: RecordedFlight
 ) -> None:

@@ -197,7 +197,7 @@ function print() { // light colours, width of a sheet; synchronous, for the brow
     for (const [index, {x, y}] of current.entries()) Object.assign(data[index], {x, y});
     if (range && figure.inTime) for (const axis of axes(layout)) layout[axis].range = [...range];
     if (figure.inTime) layout.annotations = labelled(figure, layout, layout.xaxis.range, SHEET.width);
-    for (const text of [layout, ...(layout.annotations ?? [])]) text.font.size *= SHEET.height;
+    for (const {font} of [layout, ...(layout.annotations ?? [])]) if (font) font.size *= SHEET.height; // an arrow has none
     Object.assign(layout, {width: SHEET.width, height: SHEET.height * layout.height});
     figure.plot.style.height = "auto";
     Plotly.newPlot(figure.plot, data, layout, {staticPlot: true});
