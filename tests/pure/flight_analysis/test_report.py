@@ -120,6 +120,23 @@ def headings(page: str) -> list[str]:
     return [part.partition("</h2>")[0] for part in page.split("<h2>")[1:]]
 
 
+@pytest.mark.parametrize("columns", [2, 3, 4])
+def test_labels_of_a_column_fit_beside_its_neighbour(columns: int) -> None:
+    """The title of an axis and the longest labels, as -0.025, take 65 pixels at 12 pixels a line.
+
+    A sheet of 1100 pixels with its padding of 2 x 16 holds the figure.
+    """
+    figure = plotting.set_layout(Figure(columns, columns, 100))
+    left = [x["domain"][0] for x in figure.x]
+    right = [x["domain"][1] for x in figure.x]
+    margin = figure.layout["margin"]
+    wide = figure.least_width - margin["l"] - margin["r"]
+    assert (
+        min(wide * (after - before) for before, after in zip(right, left[1:], strict=False)) >= 65.0
+    )
+    assert figure.least_width <= 1100 - 2 * 16
+
+
 def test_a_simulated_flight_has_every_figure(
     tmp_path: Path, servo: Scenario, complete: Tape
 ) -> None:

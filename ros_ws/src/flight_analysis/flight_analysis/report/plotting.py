@@ -36,7 +36,9 @@ MAX_STORED = 60_000
 # bits of a stored value, with the leading one: within 1 in 2^16, finer than a pixel and the 4
 # digits of a hover
 MANTISSA = 16
-COLUMN_WIDTH = 260  # pixels: four columns fit the page
+MARGIN = {"l": 80, "r": 36}  # pixels, left and right of the subplots
+ACROSS = 0.3  # of a column: between two columns
+LABELS = 70  # pixels, of the labels and the title of an axis; four columns fit the page
 MIN_GAP_PERIODS = 10.0  # a curve is broken at a gap of this many median periods
 INTERVAL_OPACITY = 0.25
 INTERVAL_LABEL = 11  # pixels
@@ -195,9 +197,9 @@ class Figure:
     def __init__(self, count: int, columns: int, height: int, spacing: float | None = None) -> None:
         self.rows = -(-count // columns)
         self.height = height
+        across = ACROSS / columns
         # px, below which the labels of a column would cover its neighbour; the page then scrolls it
-        self.least_width = COLUMN_WIDTH * columns if columns > 1 else 0
-        across = 0.24 / columns
+        self.least_width = sum(MARGIN.values()) + round(LABELS / across) if columns > 1 else 0
         between = min(0.14, 24.0 / (self.rows * height)) if spacing is None else spacing
         wide = (1.0 - across * (columns - 1)) / columns
         high = (1.0 - between * (self.rows - 1)) / self.rows
@@ -301,7 +303,7 @@ def set_layout(figure: Figure, labels: int = 6, below: int = 40) -> Figure:
         # beside the figure, where it covers no label
         "modebar": {"bgcolor": TRANSPARENT, "color": ZERO, "activecolor": INK, "orientation": "v"},
         "hoverlabel": {"bgcolor": PAPER, "font": {"color": INK}},
-        "margin": {"l": 80, "r": 36, "t": above, "b": below},
+        "margin": MARGIN | {"t": above, "b": below},
         "legend": {
             "orientation": "h",
             "x": 0.0,
