@@ -190,20 +190,20 @@ def test_report_opens_with_track_of_numbered_legs_and_fence(
         (300.0, 100.0),
     )
     routes = guided_figures.flown_routes(flight.scenario, flight.tape)
-    traces = {
-        trace.name: trace
-        for trace in drawn(guided_figures.track_figure(flight.tape, routes, 25.0, fence)).data
-    }
-    assert list(traces["legs"].text) == list("01234567")
+    figure = guided_figures.track_figure(flight.tape, routes, 25.0, fence)
+    traces = {trace.name: trace for trace in drawn(figure).data}
+    is_number = [each.get("name") == guided_figures.LEG for each in figure.layout["annotations"]]
+    # the numbers lie over the arrows of the wind
+    assert is_number == [False] * 8 + [True] * 8
+    numbers = figure.layout["annotations"][8:]
+    assert [number["text"] for number in numbers] == list("01234567")
     fillet = routes[0].legs[1]
     assert isinstance(fillet, Arc)
-    number = traces["legs"].y[1], traces["legs"].x[1]
-    assert math.dist(number, fillet.centre) == approx(abs(fillet.radius))
+    place = numbers[1]["y"], numbers[1]["x"]
+    assert math.dist(place, fillet.centre) == approx(abs(fillet.radius))
     assert (traces["start"].y[0], traces["start"].x[0]) == approx((0.0, 0.0), abs=1.0)
     # a text beside a mark would cover the number of a leg there
-    assert [
-        name for name, trace in traces.items() if trace.text is not None and "text" in trace.mode
-    ] == ["legs"]
+    assert all(trace.text is None or "text" not in trace.mode for trace in traces.values())
     assert np.asarray(traces["fence"].y).tolist() == [0.0, 900.0, 900.0, 0.0]
     assert np.hypot(traces["keep out"].y - 400.0, traces["keep out"].x - 200.0) == approx(
         np.full(73, 50.0)

@@ -38,6 +38,7 @@ TRACK_POINTS = 2400
 TRACK_HEIGHT = 560  # pixels
 WIND_ARROWS = 8
 ARROW_PIXELS = 45.0  # of the strongest wind
+LEG = "leg"  # name of the annotation with the number of a leg
 LEAST_WIND = 0.3  # m/s, below which no arrow is drawn
 # in the same figures as MODE_COLOURS, and other colours than these
 MODE_SHADES = {
@@ -100,11 +101,11 @@ def track_figure(
     pose = tape["guidance"].group("pose")
     for name, instant, symbol in (("start", 0, "circle-open"), ("end", -1, "square")):
         _add_mark(figure, name, pose["east"][instant], pose["north"][instant], PLANT, symbol)
-    for route in routes:
-        _add_numbers(figure, route)
     if fence is not None:
         _add_fence(figure, fence)
     _add_wind(figure, tape, speed)
+    for route in routes:
+        _add_numbers(figure, route)
     return set_layout(figure, labels=16)
 
 
@@ -117,21 +118,11 @@ def _add_mark(
 
 
 def _add_numbers(figure: Figure, route: Route) -> None:
-    places = leg_places(route)
-    north, east = (np.array(values) for values in zip(*places, strict=True))
-    disc = {"color": PAPER, "size": 17, "line": {"color": REFERENCE, "width": 1.5}}
-    numbers = [f"{number}" for number in range(len(places))]
-    figure.add_scatter(
-        "legs",
-        east,
-        north,
-        mode="markers+text",
-        text=numbers,
-        marker=disc,
-        textposition="middle center",
-        hoverinfo="skip",
-        showlegend=False,
-    )
+    """Number the legs. The annotations added last lie over the arrows of the wind."""
+    for number, (north, east) in enumerate(leg_places(route)):
+        place = {"x": east, "y": north, "text": f"{number}", "showarrow": False}
+        box = {"bgcolor": PAPER, "bordercolor": REFERENCE, "borderwidth": 1.5, "borderpad": 2}
+        figure.layout["annotations"].append(place | box | {"name": LEG})
 
 
 def _add_fence(figure: Figure, fence: Fence) -> None:
