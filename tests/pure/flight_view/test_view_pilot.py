@@ -119,6 +119,20 @@ def test_all_values_are_above_the_fold_of_a_small_laptop(browser: Browser, route
     wide(browser, 1280)
 
 
+def test_height_of_waypoints_at_one_place_is_written_once(browser: Browser, routed: Path) -> None:
+    """The waypoints of osprey_route are 0, 0, 30, 30 and 0 m high; the last is at the first."""
+    with shown(browser, routed):
+        browser.run(TEXTS)
+        browser.run("document.querySelector('[data-camera=map]').click()")
+        written = texts(browser, "scene")
+    assert sorted(text for text in written if text in {"0 m", "30 m"}) == [
+        "0 m",
+        "0 m",
+        "30 m",
+        "30 m",
+    ]
+
+
 def test_header_holds_flies_home_and_deactivates(
     browser: Browser, routed: Path, route: Scenario
 ) -> None:

@@ -154,8 +154,9 @@ export function drawMission(ctx, see, labels, {waypoints = [], legs = []}, leg, 
   for (const [number, north, east] of legs) {
     labels.add(`${number}`, see([north, east]), colour("--ink"), {needed: number === leg, disc: number === leg ? colour : null});
   }
-  for (const [north, east, altitude] of waypoints) {
-    labels.add(`${(altitude * units.height.factor).toFixed(0)} ${units.height.unit}`, see([north, east]), colour("--quiet"));
+  const height = ([north, east, altitude]) => [`${(altitude * units.height.factor).toFixed(0)} ${units.height.unit}`, [north, east]];
+  for (const [text, place] of new Map(waypoints.map(height).map(one => [`${one}`, one])).values()) { // of waypoints at one place once
+    labels.add(text, see(place), colour("--quiet"));
   }
 }
 
