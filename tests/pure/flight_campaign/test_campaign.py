@@ -46,7 +46,7 @@ from flight_analysis.report.run_folder import REPORT, SUMMARY
 from flight_campaign import campaign, engines, equipment, single_flights
 from flight_campaign.batch import device
 from flight_campaign.campaign import CHUNKS, MonteCarlo, define, fly_chunk
-from flight_campaign.campaign_report import figure_rows, overview
+from flight_campaign.campaign_report import figure_rows, overview, score_meaning
 from flight_campaign.definition import Definition, Sweep
 from flight_campaign.influence import rank_correlations
 from flight_campaign.rows import Chunk, encode_chunk, entry_names, tally_of
@@ -73,6 +73,12 @@ def fly_campaign(folder: Path, of: Definition) -> MonteCarlo:
     campaign = MonteCarlo.begin(folder, of)
     assert sum(campaign.fly(engines.threads(2))) == of.aircraft * of.cases
     return campaign
+
+
+def test_meaning_of_the_score_has_the_units_of_the_tables() -> None:
+    """10 mrad/s is 0.573 deg/s."""
+    sentence = score_meaning(find_scenario("osprey_servo"), {"r": 0.05})
+    assert sentence.endswith("r 2.86 deg/s, 0.573 deg/s (p: 1.15) and 0.1 m/s")
 
 
 @given(VALUES, st.data())

@@ -45,10 +45,13 @@ from flight_campaign.statistics import (
     FIRST_MODEL,
     LOSS_OF_TRACK_SCORE,
     PER_DECADE,
+    SCORE_UNIT,
+    SCORE_UNIT_OF,
     FigureStatistics,
     Tally,
 )
 from flight_core.files import display_path, write_file, writing
+from flight_core.units import ANGULAR_RATE, SPEED
 from flight_core.vectors import FloatArray
 
 COARSE = PER_DECADE // 50  # bins of the statistics in one bin of a figure, 5 % wide
@@ -315,13 +318,12 @@ def score_meaning(scenario: Scenario, score_units: Mapping[str, float] | None = 
         )
     units = display_units(scenario)
     unit_texts = [
-        f"{name} {unit * units[name].factor:g} {units[name].unit}"
+        f"{name} {unit * units[name].factor:.3g} {units[name].unit}"
         for name, unit in (score_units or {}).items()
     ]
-    return (
-        "the sum over the channels of rms error in "
-        f"{', '.join([*unit_texts, '10 mrad/s (p: 20) and 0.1 m/s'])}"
-    )
+    usual, of_p = np.rad2deg([SCORE_UNIT[ANGULAR_RATE], SCORE_UNIT_OF["p"]])
+    unit_texts.append(f"{usual:.3g} deg/s (p: {of_p:.3g}) and {SCORE_UNIT[SPEED]:g} m/s")
+    return f"the sum over the channels of rms error in {', '.join(unit_texts)}"
 
 
 def _labels(definition: Definition) -> list[str]:
