@@ -43,6 +43,9 @@ from rise_di_controller.law.saturation import Limits
 from rise_di_controller.laws import AnyLaw
 from rise_di_controller.params import ControllerConfig
 
+# as the campaigns set it, also where they are not loaded
+jax.config.update("jax_enable_x64", True)  # type: ignore[no-untyped-call]
+
 AIRFRAME = load_airframe("osprey")
 SERVO = PROTOTYPE_SERVO.vary(
     flight={"duration": 2.0},
