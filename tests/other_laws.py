@@ -5,6 +5,7 @@
 They are those of docs/laws.md, and that of the example package.
 """
 
+import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -37,6 +38,11 @@ _BLOCKS = re.findall(r"```yaml\n(.*?)```", (REPOSITORY / "docs" / "laws.md").rea
 
 SECTIONS = {law["law"]: COMMON | law for law in map(yaml.safe_load, _BLOCKS)}
 SECTIONS["pid"] = _section((EXAMPLE / "osprey_pid.yaml").read_text())
+
+OWN_LAW = os.environ.get("RISE_DI_LAW")
+"""A scenario file of osprey_servo under an installed law: the tests of every law are its too."""
+if OWN_LAW:
+    SECTIONS["own"] = _section(Path(OWN_LAW).read_text())
 
 
 @contextmanager

@@ -81,6 +81,7 @@ def shortened(text: str) -> str:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.stem)
 def test_blocks_of_page_run_in_order(page: Path, tmp_path: Path) -> None:
+    (tmp_path / "examples").symlink_to(REPOSITORY / "examples")
     executed: list[str] = []  # the Python blocks of a page are one session
     for kind, text, reason in blocks(page):
         if kind == "sh" and not reason:

@@ -17,7 +17,7 @@ import pytest
 from numpy.testing import assert_allclose
 from tests.closed_loop import PROTOTYPE_SERVO
 from tests.conftest import REPOSITORY, refusing
-from tests.other_laws import COMMON, SECTIONS, example_installed
+from tests.other_laws import COMMON, OWN_LAW, SECTIONS, example_installed
 from tests.pure.flight_analysis.test_replay import BUSY, equal
 
 from aircraft_sim.airframes.airframe import load_airframe
@@ -86,13 +86,22 @@ def sections() -> dict[str, dict[str, Any]]:
         "l1": l1,
         "l1, feedforward": l1 | {"feedforward": leading["feedforward"]},
         "pid": SECTIONS["pid"],
+        "own": SECTIONS.get("own", {}),
         "lqg, observer": COMMON | extended | {"law": "lqg"},
         "rise_di, observer": observed,
         "pi, observer": pi | extended | {"K": gains.K.tolist(), "Lambda": gains.Lambda.tolist()},
     }
 
 
-NAMES = ("rise_di", "rise_di, implicit", "pi", "l1", "l1, feedforward", "pid")
+NAMES = (
+    "rise_di",
+    "rise_di, implicit",
+    "pi",
+    "l1",
+    "l1, feedforward",
+    "pid",
+    *(["own"] if OWN_LAW else []),
+)
 OBSERVED = ("lqg, observer", "rise_di, observer", "pi, observer")
 EVERY_LAW = pytest.mark.parametrize("name", [*NAMES, *OBSERVED])
 
@@ -266,6 +275,7 @@ RETUNED: dict[str, dict[str, Any]] = {
         "filter_time": [0.1] * 4,
     },
     "lqg": {},
+    "own": {"input_scale": [0.01, 0.02, 0.05, 0.1]},  # a parameter of every law
 }
 
 
