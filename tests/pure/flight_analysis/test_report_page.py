@@ -120,7 +120,17 @@ def test_page_of_guided_flight_in_wind_prints_without_errors(
     write_page(tmp_path / "report.html", [recorded("route", scenario, simulate(scenario))])
     open_page(browser, tmp_path / "report.html")
     assert browser.run(f"{PLOTS}[0].layout.annotations.some(each => each.showarrow)")
-    browser.call("Page.printToPDF")
+    browser.run("void dispatchEvent(new Event('beforeprint'))")
+    headings = browser.run(
+        f"{PLOTS}.map(plot => plot.closest('section').querySelector('h2').textContent)"
+    )
+    heights = dict(
+        zip(headings, browser.run(f"{PLOTS}.map(plot => plot.layout.height)"), strict=True)
+    )
+    # two on a sheet of letter, 11 in less margins of 12 mm, with 50 pixels of heading each; the
+    # squares of Nyquist's plot take more
+    del heights["Nyquist plot of the loop"]
+    assert max(heights.values()) <= (11 * 96 - 2 * 12 * 96 / 25.4) / 2 - 50
     assert browser.console == []
 
 

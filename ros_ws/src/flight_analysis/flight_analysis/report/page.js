@@ -2,7 +2,7 @@
 "use strict";
 
 const MARGIN = 0.5; // of the view, drawn on both sides of it for panning
-const SHEET = {width: 690, height: 0.72}; // pixels; scale of the height, so that two figures fit a sheet
+const SHEET = {width: 690, height: 0.61, text: 0.72}; // pixels; scales of height and text, so that two figures fit a sheet of A4 or letter
 const LETTER = 0.6; // of the size of a font, the width of a letter
 const BETWEEN = 6; // pixels between two labels
 const DEGREE = Math.PI / 180; // rad
@@ -197,7 +197,7 @@ function print() { // light colours, width of a sheet; synchronous, for the brow
     for (const [index, {x, y}] of current.entries()) Object.assign(data[index], {x, y});
     if (range && figure.inTime) for (const axis of axes(layout)) layout[axis].range = [...range];
     if (figure.inTime) layout.annotations = labelled(figure, layout, layout.xaxis.range, SHEET.width);
-    for (const {font} of [layout, ...(layout.annotations ?? [])]) if (font) font.size *= SHEET.height; // an arrow has none
+    for (const {font} of [layout, ...(layout.annotations ?? [])]) if (font) font.size *= SHEET.text; // an arrow has none
     Object.assign(layout, {width: SHEET.width, height: SHEET.height * layout.height});
     figure.plot.style.height = "auto";
     Plotly.newPlot(figure.plot, data, layout, {staticPlot: true});
