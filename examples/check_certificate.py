@@ -19,9 +19,9 @@ Then no d of the box has one outside: modes are continuous in d. A box c + half 
     lambda_max(N* N + j (g N - N* g)) < 1,    N = exp(t) half M_c(z) exp(-t)
 
 (M. Fan, A. Tits, J. Doyle, IEEE TAC 36(1), 1991). M_c is the transfer function from w to z around
-c. A part r of z beside N w, norm(r) <= b norm(w), adds at most 2 norm((N - j g)* r) + b^2. Along
-the frequency, level + x change is convex in its largest eigenvalue, and norms bound what is left.
-Each step of the file halves a box, or proves it from `low` to `high`, rad/s.
+c. A part r of z beside N w, norm(r) <= a norm(w), adds at most a / 2 N* N + 2 a + 2 norm(g r) + a^2
+to the matrix. Along the frequency its largest eigenvalue is convex in what is linear; norms bound
+what is left. Each step of the file halves a box, or proves it from `low` to `high`, rad/s.
 """
 
 import hashlib
@@ -44,7 +44,8 @@ BASIS = [Legendre.basis(i, [0, 1]) * (2 * i + 1) ** 0.5 for i in range(TERMS)]
 GAUSS, WEIGHTS = leggauss(12)
 FASTEST = 5.0  # of a rate times the period: up to there the nodes err by less than 1e-14
 NARROWEST = 1e-6  # part of a frequency: an interval below it counts as not proved
-MOST, BATCH = 20_000, 64  # intervals of a step, and how many at once
+MOST = 20_000  # intervals of a step
+NEAR = 1.25  # from a frequency to another for which the same t balances
 COVERED = """\
 covered: deviations constant in time, in the linear loop with this period, delay and lags;
     no mode grows by more than 1e-6 a tick
@@ -56,7 +57,6 @@ class Loop(NamedTuple):
     """[[A, W, V], [Z, D, V_z], [S, 0]]: states, channels, and the rest at the nodes of Gauss."""
 
     big: Array
-    node: Array  # of each row and column: the state, or the number of states + the entry
     K: Array  # squares of its norm from entry to entry
     states: int
     period: float
@@ -114,42 +114,35 @@ def loop_of(file: dict[str, Any]) -> Loop:
     ZD, WV = (np.einsum("is,s,sab->iab", values, weights, f) for f in (reads, ends))
     S = (root * (reads - np.einsum("is,iab->sab", values, ZD))).reshape(-1, states + channels)
     V = np.hstack(list(root * (ends - np.einsum("is,iab->sab", values, WV))))
-    by_w = np.array(reads)[:, :, states:].reshape(len(nodes), k, TERMS, k)
-    by_v = np.array(ends)[:, size:].reshape(len(nodes), TERMS, k, k)
     kernel = np.array([T * F @ over((1.0 + s) / 2.0)[0] @ E for s in GAUSS])
     K = np.einsum("s,skc->kc", WEIGHTS * (1.0 - GAUSS) / 4.0, kernel**2)
-    K = K - np.einsum("s,skic->kc", weights, by_w**2) - np.einsum("s,sikc->kc", weights, by_v**2)
-    K = K + np.einsum("ikjc->kc", ZD[:, :, states:].reshape(TERMS, k, TERMS, k) ** 2)
     X = over(1.0 - split)
     motion = X[0] @ second + T * X[1] @ drive @ new
     law_motion = np.hstack([law["B"] @ C, np.zeros((own, m + kept)), law["A"]])
     A = np.vstack([motion, inputs[:kept], law_motion])
     below = np.zeros((kept + own, channels + V.shape[1]))
     WV = np.vstack([np.hstack([*WV[:, :size], V[:size]]), below])
-    big = np.block(
-        [
-            [A, WV],
-            [np.vstack(list(ZD)), V[size:]],
-            [S, np.zeros((len(S), V.shape[1]))],
-        ]
-    )
-    node = np.r_[0:states, np.tile(states + np.arange(k), TERMS + len(nodes))]
-    return Loop(big, node, np.maximum(K, 0.0), states, T)
+    none = np.zeros((len(S), V.shape[1]))
+    big = np.block([[A, WV], [np.vstack(list(ZD)), V[size:]], [S, none]])
+    return Loop(big, K, states, T)
 
 
 def parts_of(loop: Loop) -> list[tuple[tuple[int, ...], Loop]]:
     """The strongly connected parts and their entries: the modes of the loop are those of these."""
-    total = loop.states + len(loop.K)
+    n, k = loop.states, len(loop.K)
+    total = n + k
+    # of each row and column: the state, or the number of states + the entry
+    node = np.r_[0:n, np.tile(np.arange(n, total), (len(loop.big) - n) // k)]
     reach = np.eye(total)
-    np.add.at(reach, (loop.node[:, None], loop.node[None]), np.abs(loop.big) > 0.0)
-    reach[loop.states :, loop.states :] += loop.K
+    np.add.at(reach, (node[:, None], node[None]), np.abs(loop.big) > 0.0)
+    reach[n:, n:] += loop.K
     for _ in range(int(np.ceil(np.log2(total)))):
         reach = (reach @ reach > 0.0).astype(float)
     parts = []
     for member in np.unique(reach * reach.T > 0.0, axis=0):
-        rows, entries = np.flatnonzero(member[loop.node]), np.flatnonzero(member[loop.states :])
+        rows, entries = np.flatnonzero(member[node]), np.flatnonzero(member[n:])
         big, K = loop.big[np.ix_(rows, rows)], loop.K[np.ix_(entries, entries)]
-        part = Loop(big, rows, K, int(member[: loop.states].sum()), loop.period)
+        part = Loop(big, K, int(member[:n].sum()), loop.period)
         parts.append((tuple(entries.tolist()), part))
     return parts
 
@@ -167,28 +160,36 @@ def is_stable(A: Array) -> bool:
     return bool(min(least) > 0.5)
 
 
-def norm(X: Array) -> Array:
+def norm(X: Array) -> float:
     """The Frobenius norm, at least the largest singular value."""
-    return np.asarray(np.sqrt((np.abs(X) ** 2).sum(axis=(-2, -1))))
+    return float(np.linalg.norm(X))
 
 
 def adjoint(X: Array) -> Array:
     """X*."""
-    return np.asarray(X.conj().swapaxes(-2, -1))
-
-
-class System(NamedTuple):
-    """A part around the middle of a box, scaled by D: from (state, w, v) to (state, y, rest)."""
-
-    big: Array
-    K: float
-    g: Array
+    return np.asarray(X.conj().T)
 
 
 def closed(big: Array, w: slice, c: Array) -> Array:
     """The system from w - c z in place of w, z = big[w] (x, w, v)."""
     z = np.linalg.solve(np.eye(len(c)) - big[w, w] * c, big[w])
     return np.asarray(big + big[:, w] @ (c[:, None] * z))
+
+
+class System(NamedTuple):
+    """A part around the middle of a box, scaled: x+ = A x + W w + V v, y = Z x + D w, rest S x."""
+
+    A: Array
+    W: Array
+    V: Array
+    Z: Array
+    D: Array
+    S: Array
+    g: Array
+    y_by_v: float  # norms of what acts within a period
+    gy_by_v: float
+    rest_by_w: float
+    rest_by_v: float
 
 
 def system_of(
@@ -198,74 +199,95 @@ def system_of(
     n, k, known = part.states, len(part.K), len(step["t"])
     p = TERMS * k
     w, rest, c = slice(n, n + p), slice(n + p, None), np.tile(middle, TERMS)
-    few = closed(part.big[: n + p, : n + p], w, c)
-    z = RADIUS * np.exp(1j * frequency * part.period)
-    M = few[w, :n] @ np.linalg.solve(z * np.eye(n) - few[:n, :n], few[:n, w]) + few[w, w]
-    sizes = np.abs(np.tile(half, TERMS)[:, None] * M) ** 2 + 1e-30
-    t = np.r_[step["t"], np.zeros(p - known)]
+    around = closed(part.big[: n + p], w, c)
+    (A, W, V), (Z, D, y) = (np.split(side, [n, n + p], axis=1) for side in (around[:n], around[w]))
+    wide = np.tile(half, TERMS)[:, None]
+    R = np.linalg.inv(RADIUS * np.exp(1j * frequency * part.period) * np.eye(n) - A)
+    sizes = np.abs(wide * (Z @ R @ W + D)) ** 2 + 1e-30
+    t, g = (np.r_[step[key], np.zeros(p - known)] for key in "tg")
     for i in range(known, p, k):
         to = np.exp(2.0 * t[:i]) @ sizes[:i, i : i + k]
         t[i : i + k] = np.log(to / (sizes[i : i + k, :i] @ np.exp(-2.0 * t[:i]))) / 4.0
-    # The rest at the nodes is scaled, then turned to as few values as it has.
-    most, last = np.abs(middle) + half, np.exp(t[-k:])
+    # v of an entry is scaled as its last coefficient, and is at most `most` times the rest of z.
+    scale, most, last = np.exp(t), np.abs(middle) + half, np.exp(t[-k:])
     nodes = (len(part.big) - n - p) // k
-    wide = np.tile(most * last, nodes)[:, None] * part.big[rest, : n + p]
-    tall = (part.big[: n + p, rest] / np.tile(last, nodes)).T
-    S, V = (np.array(np.linalg.qr(side, "r")) for side in (wide, tall))
-    big = np.block([[part.big[: n + p, : n + p], V.T], [S, np.zeros((len(S), len(V)))]])
-    big = closed(big, w, c)
-    big[w] *= (np.tile(half, TERMS) * np.exp(t))[:, None]
-    big[:, w] /= np.exp(t)
-    for i in np.tile(np.arange(n), 8):  # balanced states make the norms small
-        into, out = (np.sum(side**2) - big[i, i] ** 2 for side in (big[i], big[:, i]))
-        factor = (out / into) ** 0.25 if into > 0.0 and out > 0.0 else 1.0
-        big[i] *= factor
-        big[:, i] /= factor
-    K = float(np.sqrt((part.K * np.outer(most * last, 1.0 / last) ** 2).sum()))
-    return System(big, K, np.r_[step["g"], np.zeros(p - len(step["g"]))])
+    S = np.tile(most * last, nodes)[:, None] * part.big[rest, : n + p]
+    through = S[:, w] * c
+    S = S + through @ around[w, : n + p]
+    V, y = V / np.tile(last, nodes), y / np.tile(last, nodes)
+    rest_by_v = norm(np.sqrt(part.K) * np.outer(most * last, 1.0 / last)) + norm(through) * norm(y)
+    scaled = wide * scale[:, None]
+    W, Z, D, y = W / scale, scaled * Z, scaled * D / scale, scaled * y
+    # states of which what comes in is as large as what goes out make the norms small
+    into, out = ((np.abs(X) ** 2).sum(axis=a) + 1e-30 for X, a in ((R @ W, 1), (Z @ R, 0)))
+    f = (out / into) ** 0.25
+    return System(
+        A=f[:, None] * A / f,
+        W=f[:, None] * W,
+        V=np.array(np.linalg.qr((f[:, None] * V).T, "r")).T,
+        Z=Z / f,
+        D=D,
+        S=np.array(np.linalg.qr(S[:, :n] / f, "r")),
+        g=g,
+        y_by_v=norm(y),
+        gy_by_v=norm(g[:, None] * y),
+        rest_by_w=norm(S[:, w] / scale),
+        rest_by_v=rest_by_v,
+    )
 
 
-def bounds(system: System, n: int, period: float, w: Array, x: Array) -> Array:
-    """Bounds of lambda_max at all frequencies from w - x to w + x, inf where there is none."""
-    big, p = system.big, len(system.g)
-    z = RADIUS * np.exp(1j * w * period)[:, None, None]
-    pencil = z * np.eye(n) - big[:n, :n]
+def is_positive(X: Array) -> bool:
+    """Whether every eigenvalue is positive."""
+    try:
+        np.linalg.cholesky(X)
+    except np.linalg.LinAlgError:
+        return False
+    return True
+
+
+def is_proved(system: System, period: float, w: float, x: float) -> bool:
+    """Whether the box has no mode at any frequency from w - x to w + x."""
+    A, W, V, Z, D, S, g, y_by_v, gy_by_v, rest_by_w, rest_by_v = system
+    n, p = W.shape
+    z, delta = RADIUS * np.exp(1j * w * period), RADIUS * x * period
+    pencil = z * np.eye(n) - A
     R = np.linalg.inv(pencil)
-    left, right = big[n:, :n] @ R, R @ big[:n, n:]
-    M = big[n:, n:] + big[n:, :n] @ right
-    N, outer, inner = M[:, :p, :p], left[:, :p], right[:, :, :p]
-    H = adjoint(N - 1j * np.diag(system.g))
-    slope = -1j * period * z * (outer @ inner)
-    level = H @ N + adjoint(H @ N) - adjoint(N) @ N
-    change = x[:, None, None] * (H @ slope + adjoint(H @ slope))
-    ends = [np.linalg.eigvalsh(level + side * change)[:, -1] for side in (1.0, -1.0)]
-    # The inverse as computed is R (I - slip): its effect on M, with rounding entry by entry.
+    # The resolvent up to z + delta is R (I + Y - slip)^-1, Y = delta R. Slip is what R as computed
+    # leaves, with rounding entry by entry. (I + Y)^-1 = (I - Y) (I + Y^2) (I - Y^4)^-1.
     slip = np.abs(np.eye(n) - pencil @ R) + n * EPS * np.abs(pencil) @ np.abs(R)
-    error = norm(slip)
-    wrong = np.abs(left) @ slip @ np.abs(big[:n, n:])
-    wrong = wrong + (norm(left) * error**2 * norm(big[:n, n:]))[:, None, None]
-    # R at z + delta is R - delta R R + delta^2 R (R - delta R / (I + delta R) R) R.
-    delta = RADIUS * x * period
-    room = np.maximum(1.0 - delta * norm(R) - error, 1e-3)
-    square, cube = outer @ inner, outer @ R @ inner
-    turn, bend = delta * x * period / 2.0, delta**3 / room * norm(R @ inner)
-    curve = turn * norm(square) + delta**2 * norm(cube) + bend * norm(outer @ R)
-    H_curve = turn * norm(H @ square) + delta**2 * norm(H @ cube) + bend * norm(H @ outer @ R)
-    curve = curve + norm(wrong[:, :p, :p])
-    H_curve = H_curve + norm(np.abs(H) @ wrong[:, :p, :p])
-    linear = x * norm(slope) + curve
-    # The rest: v is at most `rest`, and adds to z what V_z v is through the loop.
-    reach = delta / room
-    loop_gain = system.K + norm(M[:, p:, p:]) + norm(wrong[:, p:, p:])
-    loop_gain = loop_gain + reach * norm(left[:, p:]) * norm(right[:, :, p:])
-    rest = norm(M[:, p:, :p]) + norm(wrong[:, p:, :p]) + reach * norm(left[:, p:]) * norm(inner)
-    rest = rest / np.maximum(1.0 - loop_gain, 1e-3)
-    into, by_v = np.abs(M[:, :p, p:]) + wrong[:, :p, p:], reach * norm(right[:, :, p:])
-    added = (norm(into) + norm(outer) * by_v) * rest
-    H_into = norm(H @ M[:, :p, p:]) + norm(np.abs(H) @ wrong[:, :p, p:])
-    H_added = (H_into + norm(H @ outer) * by_v) * rest + linear * added
-    total = np.maximum(*ends) + 2.0 * (H_curve + H_added) + (linear + added) ** 2
-    return np.where((room > 1e-3) & (loop_gain < 0.999), total, np.inf)
+    error, Y_2 = norm(slip), delta**2 * R @ R
+    room = max(1.0 - norm(Y_2 @ Y_2), 0.0)
+    inverse = (1.0 + delta * norm(R)) * (1.0 + norm(Y_2))
+    if not 10.0 * error * inverse < room:
+        return False
+    inverse = inverse / (room - 3.0 * error * inverse)
+    left, right = Z @ R, R @ W
+    wrong = slip @ np.array(np.linalg.qr(np.abs(W).T, "r")).T
+    wrong_right = error * norm(right) + norm(np.abs(R) @ wrong)
+    bend = delta * inverse * (wrong_right + delta * (norm(R @ right) + norm(R) * wrong_right))
+
+    def moved(side: Array) -> tuple[float, float]:
+        """The norm of what is linear in the frequency of `side W`, and of what is left."""
+        linear = delta * norm(side @ right)
+        wrong_side = norm(np.abs(side) @ wrong) + 2.0 * error**2 * norm(side) * norm(W)
+        return linear, x * period / 2.0 * linear + norm(side) * bend + wrong_side
+
+    # The rest: v is at most `rest`, and adds `added` to y.
+    x_by_v = inverse * (norm(R @ V) + 2.0 * inverse * error * norm(R) * norm(V))
+    loop_gain = rest_by_v + norm(S) * x_by_v
+    if not loop_gain < 0.9:
+        return False
+    rest = (norm(S @ right) + sum(moved(S @ R)) + rest_by_w) / (1.0 - loop_gain)
+    y_by_x = norm(left @ V) + norm(left) * (delta * x_by_v + 2.0 * error * norm(V))
+    added, g_added = (y_by_v + y_by_x) * rest, (gy_by_v + np.abs(g).max() * y_by_x) * rest
+    N = D + Z @ right
+    gram, skew = adjoint(N) @ N, 1j * g[:, None] * N
+    H_left = adjoint(N) @ left + 1j * g[:, None] * left
+    change = -1j * period * z * (H_left @ right)
+    change = x * (change + adjoint(change))
+    lost = ROUNDING + 2.0 * (added + g_added + moved(H_left)[1]) + (sum(moved(left)) + added) ** 2
+    room = (1.0 - lost) * np.eye(p) - (1.0 + added / 2.0) * gram - skew - adjoint(skew)
+    return is_positive(room - change) and is_positive(room + change)
 
 
 def prove(part: Loop, steps: list[dict[str, Any]], size: float) -> int:
@@ -278,20 +300,17 @@ def prove(part: Loop, steps: list[dict[str, Any]], size: float) -> int:
             side = np.where(np.arange(k) == step["halve"], half / 2.0, 0.0)
             boxes += [(middle + turn * side, half - side, low, high) for turn in (-1.0, 1.0)]
             continue
-        todo, most = [(step["low"], step["high"])], count + MOST
+        todo, most, balanced = [(step["low"], step["high"])], count + MOST, np.inf
         while todo:
-            now, todo = np.array(todo[-BATCH:]), todo[:-BATCH]
-            system = system_of(part, middle, half, step, float(now.mean()))
-            found = bounds(
-                system, part.states, part.period, now.mean(axis=1), np.ptp(now, axis=1) / 2
-            )
-            count += len(now)
-            narrow = np.ptp(now, axis=1) < NARROWEST * now.mean(axis=1)
-            failed = ~(found < 1.0 - ROUNDING)
-            if (failed & narrow).any() or count > most:
-                raise ValueError(f"step {number}: not proved at {now[failed].mean():.6g} rad/s")
-            for a, b in now[failed]:
-                todo += [(a, (a + b) / 2.0), ((a + b) / 2.0, b)]
+            begin, end = todo.pop()
+            w, x = (begin + end) / 2.0, 0.5000001 * (end - begin)
+            if not balanced / NEAR < w < NEAR * balanced:
+                system, balanced = system_of(part, middle, half, step, w), w
+            count += 1
+            if not is_proved(system, part.period, w, x):
+                if x < NARROWEST * w or count > most:
+                    raise ValueError(f"step {number}: not proved at {w:.6g} rad/s")
+                todo += [(begin, w), (w, end)]
         boxes += [(middle, half, low, step["low"])] if step["low"] > low else []
         boxes += [(middle, half, step["high"], high)] if step["high"] < high else []
     if boxes:
