@@ -223,6 +223,10 @@ def test_command_writes_a_certificate_and_refuses_what_it_cannot_state(tmp_path:
     for more, sentence in refusals.items():
         assert sentence in str(invoke(*words, *more).exception)
         assert not path.exists()
+    for place in (tmp_path, tmp_path / "none" / "certificate.json"):
+        refused = invoke(*words[:-1], str(place), "--guarantee")
+        sentence = f"certificate: found {place}, expected a file in a folder that can be written"
+        assert sentence in str(refused.exception)
     done = invoke(*words, "--guarantee")
     # 1: beta is below the slew of a gust, as without a certificate
     assert done.exit_code == 1, done.output

@@ -3,6 +3,7 @@
 """What `rise-di gains --check --guarantee` shows and writes."""
 
 import math
+import os
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from flight_analysis.linear_loop.loop_margins import LoopMargins
 from flight_analysis.report.margin_figures import decibels, guarantee_rows, guarantee_text
 from flight_cli.output import LICENCE, new_table, print_table, say, write_text
 from flight_core.arguments import as_number
-from flight_core.files import display_path, writing
+from flight_core.files import display_path, is_folder, writing
 from flight_core.parameters import require
 
 FARTHER = 1.2  # times the deviations of the first unstable aircraft: a loop that diverges
@@ -36,8 +37,11 @@ def require_guarantee(
         require(is_wanted or path is None, name, "no --guarantee", "--guarantee beside it")
     require(is_wanted or late == 0.0, "late", "no --guarantee", "--guarantee beside it")
     as_number(late, "late", 0.0, MAX_DELAY_MARGIN, "s")
-    in_time = late == 0.0 or files["certificate"] is None
-    require(in_time, "certificate", f"--late {late:g} beside it", "u in time")
+    path = files["certificate"]
+    require(late == 0.0 or path is None, "certificate", f"--late {late:g} beside it", "u in time")
+    # before the proof, which takes up to minutes
+    fits = path is None or (os.access(path.parent, os.W_OK) and not is_folder(path))
+    require(fits, "certificate", path, "a file in a folder that can be written")
 
 
 def write_unstable(
