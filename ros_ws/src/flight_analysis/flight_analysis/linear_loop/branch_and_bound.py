@@ -26,7 +26,6 @@ from flight_analysis.linear_loop.uncertain_loop import Channels, ComplexArray
 from flight_core.vectors import FloatArray
 
 LEVELLED = 8  # frequencies at which the ratios of the D of a late u are sought
-SLOW = 1e-3  # part of pi / T of a slow motion
 DIGITS = 5  # of D and G in a step
 
 
@@ -48,11 +47,6 @@ class Region(NamedTuple):
         narrowed = self._replace(half=half, scaling=scaling)
         return [narrowed._replace(centre=self.centre + side * step) for side in (-1.0, 1.0)]
 
-    def within(self, begin: float, end: float, narrowest: float) -> tuple[float, float]:
-        """The frequencies of an interval, to the ends of the region where rounding is left."""
-        low = self.low if begin - self.low <= narrowest else begin
-        return low, self.high if self.high - end <= narrowest else end
-
     def outside(self, begin: float, end: float, scaling: Scaling) -> list["Region"]:
         """The frequencies below and above an interval, rad/s."""
         below = self._replace(high=begin, scaling=scaling)
@@ -72,6 +66,7 @@ def proof_of(part: Channels, size: float, disk: float, most: int) -> list[dict[s
     "high", rad/s, by "t" and "g", and appends what is left below and above.
     """
     highest = np.pi / part.period
+    narrowest = NARROWEST * highest
     half = np.full(len(part.entries), size)
     others = np.r_[np.ones(part.late), np.full(len(part.D) - part.uncertain - part.late, disk)]
     part = _levelled(part, np.r_[half[part.parameters], others])
@@ -85,14 +80,15 @@ def proof_of(part: Channels, size: float, disk: float, most: int) -> list[dict[s
         M = scale[:, None] * around.response(w, RADIUS)
         bound, scaling = tightened_at(around, w, M, _start(around, M, region.scaling))
         interval = interval_at(around, w, scaling, scale) if bound < 1.0 else None
-        if interval is None and bound < 1.0 and w == 0.0:
-            interval = _from_zero(around, scaling, scale)
         if interval is None:
             entry = int(np.argmax(_effects(part, M, scaling)))
             steps.append({"halve": entry})
             regions += region.halves(entry, scaling)
         else:
-            low, high = region.within(*interval, NARROWEST * highest)
+            # to the ends of the region where rounding is left
+            begin, end = interval
+            low = region.low if begin - region.low <= narrowest else begin
+            high = region.high if region.high - end <= narrowest else end
             steps.append({"low": low, "high": high} | _as_step(scaling, len(part.entries)))
             regions += region.outside(low, high, scaling)
     return None if regions else steps
@@ -106,18 +102,6 @@ def _as_step(scaling: Scaling, entries: int) -> dict[str, list[float]]:
     t, g = (np.array([float(f"{x:.{DIGITS}g}") for x in values]) for values in scaling)
     count = len(t) if g[entries:].any() else entries
     return {"t": t[:count].tolist(), "g": g[:count].tolist()}
-
-
-def _from_zero(part: Channels, near: Scaling, scale: FloatArray) -> tuple[float, float] | None:
-    """The frequencies from 0 on at which a D and a G hold that fit a slow motion.
-
-    A delay has no effect at 0 rad/s, so that the D of 0 may hold nowhere above.
-    """
-    slow = SLOW * np.pi / part.period
-    M = scale[:, None] * part.response(slow, RADIUS)
-    _, scaling = tightened_at(part, slow, M, _start(part, M, near))
-    still = scale[:, None] * part.response(0.0, RADIUS)
-    return interval_at(part, 0.0, scaling, scale) if bound_at(still, scaling) < 1.0 else None
 
 
 def _frequency(region: Region, highest: float) -> float:

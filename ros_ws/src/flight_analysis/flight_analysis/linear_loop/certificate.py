@@ -10,7 +10,8 @@ out.
 import hashlib
 import json
 from collections.abc import Mapping
-from typing import Any
+
+import numpy as np
 
 from flight_analysis.linear_loop.guarantee import Guarantee
 from flight_analysis.linear_loop.loop_margins import LinearLoop
@@ -33,23 +34,15 @@ def certificate(linear: LinearLoop, promise: Guarantee, sources: Mapping[str, st
     require(promise.late == 0.0, "certificate", f"u up to {promise.late:g} s late", "u in time")
     box = linear.box
     assert box is not None and promise.proof  # noqa: S101, PT018 - a guarantee has both
-    nominal = linear.nominal
-    largest = float(box.part.max())
-    content: dict[str, Any] = {
+    content = {
         **sources,
-        "names": box.names,
-        "size": promise.stable / largest,
-        "A": nominal.A.tolist(),
-        "B": nominal.B.tolist(),
-        "C": nominal.C.tolist(),
-        "E": box.E.tolist(),
-        "F": box.F.tolist(),
-        "G": box.G.tolist(),
-        "law": {name: matrix.tolist() for name, matrix in linear.law._asdict().items()},
-        "lag": linear.loop.lag.tolist(),
-        "delay": linear.loop.delay,
-        "period": linear.loop.period,
+        **linear.nominal._asdict(),
+        **box._asdict(),
+        **linear.loop._asdict(),
+        "law": linear.law._asdict(),
+        "size": promise.stable / float(box.part.max()),
         "parts": promise.proof,
     }
-    digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
-    return json.dumps(content | {"digest": digest}) + "\n"
+    text = json.dumps(content, sort_keys=True, default=np.ndarray.tolist)
+    digest = hashlib.sha256(text.encode()).hexdigest()
+    return json.dumps(content | {"digest": digest}, default=np.ndarray.tolist) + "\n"

@@ -118,17 +118,12 @@ def _first_unstable(linear: LinearLoop, late: float) -> Unstable | None:
     box = linear.box
     assert box is not None  # noqa: S101 - for mypy
     largest = LARGEST / float(box.part.max())
-    least: Unstable | None = None
+    found = []
     for loop in _loops(linear, late):
         delayed = linear._replace(loop=loop)
         for part in parts_of(uncertain_loop(linear.nominal, linear.law, loop, box)):
-            for d in first_unstable(part, len(box.names), largest):
-                candidate = _confirmed(delayed, d)
-                if candidate is not None and (
-                    least is None or candidate.deviation < least.deviation
-                ):
-                    least = candidate
-    return least
+            found += [_confirmed(delayed, d) for d in first_unstable(part, len(box.names), largest)]
+    return min(filter(None, found), key=lambda one: one.deviation, default=None)
 
 
 def _disk(loop: UncertainLoop, inputs: tuple[int, ...], least: float) -> float:
