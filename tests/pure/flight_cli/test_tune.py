@@ -20,6 +20,7 @@ from tests.conftest import REPOSITORY, invoke, refusing
 from tests.vehicle_logs import write_dataflash, write_ulog
 
 from aircraft_sim.airframes.airframe import load_airframe
+from flight_analysis.closed_loop.scenario import scenario_yaml
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_cli.cli import application
 from flight_core.vectors import FloatArray
@@ -217,6 +218,17 @@ def test_log_without_motion_names_the_doublets_to_fly(tmp_path: Path) -> None:
     ):
         invoke(*words, catch_exceptions=False)
     assert not (tmp_path / "module").exists()
+
+
+def test_airframe_without_effect_of_wind_is_tuned_without_an_observer(tmp_path: Path) -> None:
+    """As of a multicopter: the observer would have no wind to estimate."""
+    airframe = (REPOSITORY / "examples/px4_airplane/rates_airframe.yaml").read_text("utf-8")
+    (tmp_path / "airframe.yaml").write_text(airframe.partition("gusts:")[0])
+    scenario = find_scenario(str(PX4)).vary(aircraft={"airframe": str(tmp_path / "airframe.yaml")})
+    (tmp_path / "rates.yaml").write_text(scenario_yaml(scenario))
+    words = ["tune", "no.ulg", "--px4", str(tmp_path / "module"), "--scenario"]
+    with refusing("found no gusts, expected --calm: an observer estimates the wind"):
+        invoke(*words, str(tmp_path / "rates.yaml"), catch_exceptions=False)
 
 
 def test_missing_log_leaves_no_folder(tmp_path: Path) -> None:

@@ -199,6 +199,8 @@ class Tune:
         scenario = find_scenario(self.scenario)
         controller = scenario.rise_di()
         nominal = load_airframe(scenario.aircraft.airframe)
+        expected = "--calm: an observer estimates the wind"
+        require(self.calm or bool(nominal.gusts), nominal.name, "no gusts", expected)
         log = read_foreign_log(self.log)
         delay = controller.delay
         cutoff = 0.0

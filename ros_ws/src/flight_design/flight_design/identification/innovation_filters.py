@@ -306,6 +306,9 @@ def wind_model(
     sigma^2 T (1 + 3 (T omega)^2) / (1 + (T omega)^2)^2 across it. The rotary gust in roll, rad/s,
     is that of `roll_gust`. Arguments: `speed` V0 and `span` in SI.
     """
+    if not axes:
+        # a multicopter hovers at a speed of 0
+        return np.zeros(0), np.zeros(0)
     spectrum = dryden(**MODERATE, sigma=0.0)
     along = np.array([axis == "longitudinal" for axis in AXES])
     time = spectrum.length / speed
