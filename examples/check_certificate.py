@@ -19,8 +19,8 @@ Then no d of the box has one outside: modes are continuous in d. A box c + half 
     lambda_max(N* N + j (g N - N* g)) < 1,    N = exp(t) half M_c(z) exp(-t)
 
 (M. Fan, A. Tits, J. Doyle, IEEE TAC 36(1), 1991). M_c is the transfer function from w to z around
-c. A part r of z beside N w, norm(r) <= a norm(w), adds at most a / 2 N* N + 2 a + 2 norm(g r) + a^2
-to the matrix. Along the frequency its largest eigenvalue is convex in what is linear; norms bound
+c. A part r of z beside N w, norm(r) <= a norm(w), adds at most 2 norm((N - j g)* r) + a^2 to
+the matrix. Along the frequency its largest eigenvalue is convex in what is linear; norms bound
 what is left. Each step of the file halves a box, or proves it from `low` to `high`, rad/s.
 """
 
@@ -185,8 +185,9 @@ class System(NamedTuple):
     Z: Array
     D: Array
     S: Array
+    S_w: Array  # products of what x and w add to the rest
     g: Array
-    y_by_v: float  # norms of what acts within a period
+    y_by_v: list[float]  # norms of what acts within a period, by coefficient
     gy_by_v: float
     rest_by_w: float
     rest_by_v: float
@@ -221,17 +222,19 @@ def system_of(
     # states of which what comes in is as large as what goes out make the norms small
     into, out = ((np.abs(X) ** 2).sum(axis=a) + 1e-30 for X, a in ((R @ W, 1), (Z @ R, 0)))
     f = (out / into) ** 0.25
+    by_x, by_w = S[:, :n] / f, S[:, w] / scale
     return System(
         A=f[:, None] * A / f,
         W=f[:, None] * W,
         V=np.array(np.linalg.qr((f[:, None] * V).T, "r")).T,
         Z=Z / f,
         D=D,
-        S=np.array(np.linalg.qr(S[:, :n] / f, "r")),
+        S=np.array(np.linalg.qr(by_x, "r")),
+        S_w=by_x.T @ by_w,
         g=g,
-        y_by_v=norm(y),
+        y_by_v=[norm(rows) for rows in np.split(y, TERMS)],
         gy_by_v=norm(g[:, None] * y),
-        rest_by_w=norm(S[:, w] / scale),
+        rest_by_w=norm(by_w),
         rest_by_v=rest_by_v,
     )
 
@@ -247,7 +250,7 @@ def is_positive(X: Array) -> bool:
 
 def is_proved(system: System, period: float, w: float, x: float) -> bool:
     """Whether the box has no mode at any frequency from w - x to w + x."""
-    A, W, V, Z, D, S, g, y_by_v, gy_by_v, rest_by_w, rest_by_v = system
+    A, W, V, Z, D, S, S_w, g, y_by_v, gy_by_v, rest_by_w, rest_by_v = system
     n, p = W.shape
     z, delta = RADIUS * np.exp(1j * w * period), RADIUS * x * period
     pencil = z * np.eye(n) - A
@@ -277,16 +280,19 @@ def is_proved(system: System, period: float, w: float, x: float) -> bool:
     loop_gain = rest_by_v + norm(S) * x_by_v
     if not loop_gain < 0.9:
         return False
-    rest = (norm(S @ right) + sum(moved(S @ R)) + rest_by_w) / (1.0 - loop_gain)
+    square = norm(S @ right) ** 2 + 2.0 * float((S_w * right.real).sum()) + rest_by_w**2
+    rest = (square**0.5 + sum(moved(S @ R))) / (1.0 - loop_gain)
     y_by_x = norm(left @ V) + norm(left) * (delta * x_by_v + 2.0 * error * norm(V))
-    added, g_added = (y_by_v + y_by_x) * rest, (gy_by_v + np.abs(g).max() * y_by_x) * rest
     N = D + Z @ right
+    added = (norm(np.array(y_by_v)) + y_by_x) * rest
+    N_y = sum(norm(rows) * y for rows, y in zip(np.split(N, TERMS), y_by_v, strict=True))
+    H_added = (N_y + gy_by_v + (norm(N) + np.abs(g).max()) * y_by_x) * rest
     gram, skew = adjoint(N) @ N, 1j * g[:, None] * N
     H_left = adjoint(N) @ left + 1j * g[:, None] * left
     change = -1j * period * z * (H_left @ right)
     change = x * (change + adjoint(change))
-    lost = ROUNDING + 2.0 * (added + g_added + moved(H_left)[1]) + (sum(moved(left)) + added) ** 2
-    room = (1.0 - lost) * np.eye(p) - (1.0 + added / 2.0) * gram - skew - adjoint(skew)
+    lost = ROUNDING + 2.0 * (H_added + moved(H_left)[1]) + (sum(moved(left)) + added) ** 2
+    room = (1.0 - lost) * np.eye(p) - gram - skew - adjoint(skew)
     return is_positive(room - change) and is_positive(room + change)
 
 
