@@ -135,9 +135,12 @@ def px4_log(path: Path, size: tuple[float, ...], length: float) -> Path:
 
 
 def ardupilot_log(path: Path, length: float) -> Path:
-    """A DataFlash log at 200 Hz: servos 1 and 2 are aileron and elevator, 1000 to 2000 us."""
+    """A DataFlash log: servos 1 and 2 are aileron and elevator, 1000 to 2000 us.
+
+    ArduPlane logs the gyro at the rate of its loop, 200 Hz, and the servos at 25 Hz.
+    """
     gains = Gains((0.25, 0.2), (0.3, 0.2), (0.5, 0.5))
-    flight = flown(PLANE, gains, (0.3, 0.6), (0.01, 0.01), length)
+    flight = flown(PLANE, gains, (0.3, 0.6), (0.01, 0.01), length, 20.0)
     pulses = 1500.0 + 500.0 * flight.torque[:, [1, 0]]
     stamps = flight.stamp_us
     gyro = np.column_stack([flight.y[:, 1], flight.y[:, 0], np.zeros(len(stamps))])
@@ -146,9 +149,9 @@ def ardupilot_log(path: Path, length: float) -> Path:
         "MODE": (("Mode", "ModeNum"), [(1, (5.0, 5.0))]),
         "IMU": (("GyrX", "GyrY", "GyrZ"), list(zip(stamps, gyro, strict=True))),
         "CTUN": (("As", "E2T"), speed),
-        "RCOU": (("C1", "C2"), list(zip(stamps, pulses, strict=True))),
+        "RCOU": (("C1", "C2"), list(zip(stamps, pulses, strict=True))[::8]),
     }
-    parameters = {"SCALING_SPEED": 23.9}
+    parameters = {"SCALING_SPEED": 23.9, "INS_GYRO_FILTER": 20.0}
     for number, function in ((1, 4.0), (2, 19.0)):
         limits = {"MIN": 1000.0, "MAX": 2000.0, "TRIM": 1500.0, "REVERSED": 0.0}
         parameters |= {f"SERVO{number}_{name}": value for name, value in limits.items()}

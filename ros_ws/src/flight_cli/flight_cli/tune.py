@@ -66,7 +66,7 @@ from flight_design.identification.model_quality import (
 )
 from flight_design.identification.own_loop import OwnLoop, own_loop
 from flight_design.identification.rates_log import rates_of_log, scaled_torques
-from flight_log.px4_parameters import rate_loop
+from flight_log.px4_parameters import low_pass_delay, rate_loop
 from flight_log.vehicle_log import read_foreign_log
 from rise_di.c_code import export
 
@@ -202,17 +202,15 @@ class Tune:
         expected = "--calm: an observer estimates the wind"
         require(self.calm or bool(nominal.gusts), nominal.name, "no gusts", expected)
         log = read_foreign_log(self.log)
-        delay = controller.delay
-        cutoff = 0.0
+        recorded, taken, cutoff, earlier = rates_of_log(
+            log, scenario, nominal, autopilot, Window(self.start, self.stop)
+        )
+        delay = low_pass_delay(cutoff) or controller.delay
         if autopilot == "px4":
             loop = rate_loop(self.log, controller.rate)
             scenario = scenario.vary(controller={"delay": loop.delay})
             say(console, loop.origin)
             delay = loop.filters
-            cutoff = loop.cutoff
-        recorded, taken, earlier = rates_of_log(
-            log, scenario, nominal, autopilot, Window(self.start, self.stop), cutoff=cutoff
-        )
         for sentence in (*taken.notes, *scaled_torques(taken.parameters)):
             warn(f"warning: {sentence}")
         identification = _identified(console, scenario, nominal, recorded, delay - earlier)
@@ -282,7 +280,13 @@ def _identified(
             bar.update, bar.add_task(f"search, u {1e3 * delay:.1f} ms late")
         )
         identification = identify_model(
-            recorded, nominal, actuation, pairing, show, unknown=unknown
+            recorded,
+            nominal,
+            actuation,
+            pairing,
+            show,
+            unknown=unknown,
+            searches_again=True,
         )
         show(completed=1, total=1)
     return identification

@@ -40,7 +40,6 @@ class RateLoop(NamedTuple):
     rate: float  # of the law, Hz
     delay: float  # from the rates to the torque, s
     filters: float  # s, the part of the gyro's filters
-    cutoff: float  # of the low-pass of second order, Hz; 0: none
     origin: str  # what they come from
 
 
@@ -63,7 +62,7 @@ def rate_loop(path: Path, rate: float | None = None) -> RateLoop:
         f"at most IMU_GYRO_RATEMAX, {fastest:g} Hz",
     )
     cutoff = values["IMU_GYRO_CUTOFF"]
-    delay = 1.0 / (math.sqrt(2.0) * math.pi * cutoff) if cutoff > 0.0 else 0.0
+    delay = low_pass_delay(cutoff)
     words = f"cut-off {cutoff:g} Hz" if cutoff > 0.0 else "no cut-off"
     for name in ("IMU_GYRO_NF0", "IMU_GYRO_NF1"):
         frequency = values[f"{name}_FRQ"]
@@ -76,7 +75,12 @@ def rate_loop(path: Path, rate: float | None = None) -> RateLoop:
     if fastest > LIKE_PART * design_rate:
         delay += 1.0 / fastest
     origin = f"{path.name}: gyro at {fastest:g} Hz, {words}; delay {1e3 * delay:.3g} ms"
-    return RateLoop(rate=design_rate, delay=delay, filters=filters, cutoff=cutoff, origin=origin)
+    return RateLoop(rate=design_rate, delay=delay, filters=filters, origin=origin)
+
+
+def low_pass_delay(cutoff: float) -> float:
+    """The delay of a Butterworth low-pass of second order, 1 / (sqrt(2) pi f), s; 0 Hz: none."""
+    return 1.0 / (math.sqrt(2.0) * math.pi * cutoff) if cutoff > 0.0 else 0.0
 
 
 def _read(path: Path) -> dict[str, float]:

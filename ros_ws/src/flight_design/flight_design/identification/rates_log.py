@@ -27,8 +27,13 @@ from flight_log.vehicle_tables import VehicleLog
 
 MAPS: Mapping[str, str] = MappingProxyType({"px4": "px4", "ardupilot": "ardupilot"})
 """The channel map with the topics of an autopilot."""
+CUTOFFS: Mapping[str, str] = MappingProxyType(
+    {"px4": "IMU_GYRO_CUTOFF", "ardupilot": "INS_GYRO_FILTER"}
+)
+"""The parameter with the cut-off of the gyro's low-pass."""
 SLOWEST, FASTEST = 0.6, 1.6  # of the trim speed, as c_export.autopilots clips the dynamic pressure
 PERIOD = 0.008  # s, of the identification at least: a search over more samples takes longer
+SPARSE = 1.5  # periods of the law, above which a log does not have each of its u
 # Hz: with a filter of this cut-off the noise of samples a PERIOD apart is white
 BROAD = 90.0
 OVER = 2.2  # of a cut-off, the least rate of a log from which its filter can be taken
@@ -40,7 +45,8 @@ class RatesLog(NamedTuple):
 
     recorded: FlightData
     taken: Imported
-    earlier: float  # s, by which y is earlier than that of the gyro's filter
+    cutoff: float  # of the gyro's low-pass of second order, Hz; 0 where the log names none
+    earlier: float  # s, by which y is earlier than behind that filter
 
 
 def rates_map(scenario: Scenario, autopilot: str) -> ChannelMap:
@@ -80,14 +86,12 @@ def rates_of_log(
     autopilot: str,
     window: Window,
     show: Callable[[list[Agreement]], None] = lambda _: None,
-    cutoff: float = 0.0,
 ) -> RatesLog:
     """Y and u of a log for the identification of an airframe, and what was imported.
 
         u = sign(D) end torque (V / V0)^2
 
-    with V clipped as in the module. u of ArduPlane is that of its servos. `cutoff` is that of the
-    gyro's filter, Hz, 0 for none. Raises ParameterError.
+    with V clipped as in the module. u of ArduPlane is that of its servos. Raises ParameterError.
     """
     channel_map = rates_map(scenario, autopilot)
     taken = imported(channel_map, log, window, show, servos=autopilot == "ardupilot")
@@ -103,11 +107,16 @@ def rates_of_log(
         "u": Signal(u.stamp_ns, tuple(airframe.inputs), values),
     }
     recorded = recording(Tape(signals, tape.start_ns), airframe)
+    if recorded.period > SPARSE / scenario.controller.rate:
+        # the loop changes u between two samples: its mean, where it is linear
+        following = np.vstack([recorded.u[1:], recorded.u[-1:]])
+        recorded = recorded._replace(u=(recorded.u + following) / 2.0)
+    cutoff = taken.parameters.get(CUTOFFS[autopilot], 0.0)
     earlier = 0.0
     if 0.0 < cutoff < BROAD < 1.0 / (OVER * recorded.period):
         recorded, earlier = broadened(recorded, cutoff)
     means = coarser(recorded, max(1, round(PERIOD / recorded.period)))
-    return RatesLog(means, taken, earlier)
+    return RatesLog(recorded=means, taken=taken, cutoff=cutoff, earlier=earlier)
 
 
 def scaled_torques(parameters: Mapping[str, float]) -> list[str]:
