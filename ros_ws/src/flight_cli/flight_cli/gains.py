@@ -39,6 +39,7 @@ from flight_cli.gains_guarantee import (
 from flight_cli.output import (
     LICENCE,
     new_table,
+    parse_lags,
     parse_numbers,
     print_json,
     print_table,
@@ -293,7 +294,7 @@ class Gains:
             self.airframe,
             self.scenario,
             **values_of(self, *STUDY, *SELECTION),
-            lag=None if self.lag is None else _parse_lags(self.lag),
+            lag=None if self.lag is None else parse_lags(self.lag),
             inputs=self.inputs or (),
             speeds=() if self.speeds is None else parse_numbers(self.speeds) or self.speeds,
             progress=progress,
@@ -379,13 +380,6 @@ def _show_trade(console: Console, selection: Selection) -> None:
         margins = f"{row.phase_margin:g}", f"{row.reached:.0f}", _milliseconds(row.delay_margin)
         table.add_row(*margins, *errors, f"{float(np.sum(row.rms / units)):.2f}")
     print_table(console, table)
-
-
-def _parse_lags(text: str) -> list[float]:
-    """Lags from "0.02,0.1", or from one value for all. Raises ParameterError."""
-    values = parse_numbers(text)
-    require(bool(values), "--lag", repr(text), "seconds separated by commas")
-    return values
 
 
 def _show_conditions(console: Console, study: Study, answers: dict[str, Assessment]) -> None:

@@ -215,6 +215,13 @@ def parse_numbers(text: str) -> list[float]:
         return []
 
 
+def parse_lags(text: str) -> list[float]:
+    """Lags from "0.02,0.1", or from one value for all. Raises ParameterError."""
+    values = parse_numbers(text)
+    require(bool(values), "--lag", repr(text), "seconds separated by commas")
+    return values
+
+
 def say(console: Console, text: str, style: str = "") -> None:
     """Print a text as it is, also where it is longer than a line."""
     console.print(text, style=style, highlight=False, soft_wrap=True)

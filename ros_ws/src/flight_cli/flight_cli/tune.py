@@ -33,6 +33,7 @@ from flight_cli.output import (
     LICENCE,
     entry_table,
     new_table,
+    parse_lags,
     print_table,
     progress_bar,
     say,
@@ -43,7 +44,7 @@ from flight_core.files import display_path, writing
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import period_ns
 from flight_core.vectors import FloatArray
-from flight_design.gains.gain_design import check_gains, select_gains
+from flight_design.gains.gain_design import check_gains, lags_by_input, select_gains
 from flight_design.gains.gain_selection import Selection
 from flight_design.gains.ideal_control import ChannelPairing
 from flight_design.identification.innovation_filters import (
@@ -144,6 +145,10 @@ class Tune:
     )
     px4: Path | None = option("Folder for a module of PX4, what it was made of, and a page.")
     ardupilot: Path | None = option("Folder for a task of ArduPlane, in place of --px4.")
+    lag: str | None = option(
+        "Lags of the servos in s, in the airframe's order: 0.02,0.1; by default those of the "
+        "aircraft in the scenario."
+    )
     start: float | None = option("Begin, s since the begin of the log.", "--from")
     stop: float | None = option("End, s since the begin of the log.", "--until")
     calm: bool = option(
@@ -199,6 +204,7 @@ class Tune:
         scenario = find_scenario(self.scenario)
         controller = scenario.rise_di()
         nominal = load_airframe(scenario.aircraft.airframe)
+        lags = self._lags(scenario, nominal)
         expected = "--calm: an observer estimates the wind"
         require(self.calm or bool(nominal.gusts), nominal.name, "no gusts", expected)
         log = read_foreign_log(self.log)
@@ -213,7 +219,8 @@ class Tune:
             delay = loop.filters
         for sentence in (*taken.notes, *scaled_torques(taken.parameters)):
             warn(f"warning: {sentence}")
-        identification = _identified(console, scenario, nominal, recorded, delay - earlier)
+        actuation = Actuation(lags, delay - earlier)
+        identification = _identified(console, scenario, nominal, recorded, actuation)
         airframe = _kept(nominal, identification)
         if airframe is None:
             raise ParameterError(_what_to_fly(identification, scenario, self.log))
@@ -241,6 +248,14 @@ class Tune:
             by_own=by_own,
         )
 
+    def _lags(self, scenario: Scenario, nominal: Airframe) -> FloatArray:
+        """The lags of the servos in the airframe's order, s. Raises ParameterError."""
+        channels = scenario.aircraft.channels().inputs
+        lags = dict(zip(channels, scenario.aircraft.actuators.lag, strict=False))
+        if self.lag is not None:
+            lags = lags_by_input(parse_lags(self.lag), nominal)
+        return np.array([lags.get(name, 0.0) for name in nominal.inputs])
+
     def _selection(
         self, console: Console, airframe: Airframe, flight: Scenario, uncertainty: float
     ) -> Selection:
@@ -265,19 +280,19 @@ class Tune:
 
 
 def _identified(
-    console: Console, scenario: Scenario, nominal: Airframe, recorded: FlightData, delay: float
+    console: Console,
+    scenario: Scenario,
+    nominal: Airframe,
+    recorded: FlightData,
+    actuation: Actuation,
 ) -> Identification:
-    """The model by a search on the log, with u late by a delay, s, and a bar."""
+    """The model by a search on the log, with a bar."""
     controller = scenario.rise_di()
-    channels = scenario.aircraft.channels().inputs
-    lags = scenario.aircraft.actuators.lag or (0.0,) * len(channels)
-    lag = dict(zip(channels, lags, strict=True))
-    actuation = Actuation(np.array([lag[name] for name in nominal.inputs]), delay)
     pairing = ChannelPairing(controller.outputs, controller.inputs)
     unknown = Unknown(hidden=False)
     with progress_bar(*COUNT_COLUMNS, quiet=console.quiet) as bar:
         show: Callable[..., None] = partial(
-            bar.update, bar.add_task(f"search, u {1e3 * delay:.1f} ms late")
+            bar.update, bar.add_task(f"search, u {1e3 * actuation.delay:.1f} ms late")
         )
         identification = identify_model(
             recorded,

@@ -142,7 +142,14 @@ class Scenario:
         return schema.validate_mapping({**self._values(name, changes), **changes}, name)
 
     def sections_with(self, name: str) -> list[str]:
-        """The sections that have a parameter of this name."""
+        """The sections that have a parameter of this name.
+
+        Args:
+            name: Name of a parameter, as k_g.
+
+        Returns:
+            Names of sections, none for an unknown parameter.
+        """
         return [key for key in SCHEMAS if name in getattr(getattr(self, key), "model_fields", ())]
 
     def _values(self, name: str, changes: Mapping[str, Any]) -> dict[str, Any]:
