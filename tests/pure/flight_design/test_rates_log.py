@@ -51,13 +51,13 @@ def test_broadened_rates_are_earlier_by_the_phase_of_both_filters() -> None:
     omega = 2.0 * np.pi * 0.5
     t = np.arange(5000) / RATE
     late = filtered(np.sin(omega * t)[:, None], 40.0)
-    found, earlier = broadened(recorded(late), 40.0)
+    found, advance = broadened(recorded(late), 40.0)
     basis = np.column_stack([np.sin(omega * t), np.cos(omega * t)])[1000:]
     phases = []
     for y in (late, found.y):
         sine, cosine = np.linalg.lstsq(basis, y[1000:, 0], rcond=None)[0]
         phases.append(np.arctan2(cosine, sine))
-    assert (phases[1] - phases[0]) / omega == approx(earlier, abs=2e-5)
+    assert (phases[1] - phases[0]) / omega == approx(advance, abs=2e-5)
 
 
 def test_samples_that_a_lost_one_reaches_are_lost() -> None:

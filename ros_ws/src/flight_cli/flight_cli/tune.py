@@ -56,6 +56,7 @@ from flight_design.identification.likelihood import Unknown
 from flight_design.identification.log_import import Window
 from flight_design.identification.model_identification import (
     Identification,
+    Part,
     identify_model,
     model_yaml,
     with_entries,
@@ -208,7 +209,7 @@ class Tune:
         expected = "--calm: an observer estimates the wind"
         require(self.calm or bool(nominal.gusts), nominal.name, "no gusts", expected)
         log = read_foreign_log(self.log)
-        recorded, taken, cutoff, earlier = rates_of_log(
+        recorded, taken, cutoff, advance = rates_of_log(
             log, scenario, nominal, autopilot, Window(self.start, self.stop)
         )
         delay = low_pass_delay(cutoff) or controller.delay
@@ -219,16 +220,19 @@ class Tune:
             delay = loop.filters
         for sentence in (*taken.notes, *scaled_torques(taken.parameters)):
             warn(f"warning: {sentence}")
-        actuation = Actuation(lags, delay - earlier)
+        actuation = Actuation(lags, delay - advance)
         identification = _identified(console, scenario, nominal, recorded, actuation)
         airframe = _kept(nominal, identification)
         if airframe is None:
             raise ParameterError(_what_to_fly(identification, scenario, self.log))
-        identification = identification._replace(airframe=airframe)
+        for part in filter(_refusal, identification.parts):
+            warn(f"warning: {', '.join(part.outputs)}: {_refusal(part)}")
+        uncertainty = _uncertainty(identification)
+        taken_parts = tuple(filter(_is_better, identification.parts))
+        identification = identification._replace(airframe=airframe, parts=taken_parts)
         path = folder / "airframe.yaml"
         write_text("--write", path, model_yaml(identification, self.log.name))
         noise = measured_noise(recorded.y, np.ones(recorded.y.shape[1]))
-        uncertainty = _uncertainty(identification)
         flight = _on_airframe(scenario, path, noise)
         selection = self._selection(console, airframe, flight, uncertainty)
         chosen = flight.vary(controller=selection.chosen)
@@ -289,7 +293,7 @@ def _identified(
     """The model by a search on the log, with a bar."""
     controller = scenario.rise_di()
     pairing = ChannelPairing(controller.outputs, controller.inputs)
-    unknown = Unknown(hidden=False)
+    unknown = Unknown(has_hidden_rows=False)
     with progress_bar(*COUNT_COLUMNS, quiet=console.quiet) as bar:
         show: Callable[..., None] = partial(
             bar.update, bar.add_task(f"search, u {1e3 * actuation.delay:.1f} ms late")
@@ -342,9 +346,21 @@ def _kept(nominal: Airframe, identification: Identification) -> Airframe | None:
     for part in identification.parts:
         if part.refusal and part.refusal != no_better(part.before, part.after):
             return None
-        is_better = part.after.log_likelihood > part.before.log_likelihood
-        used += [*part.entries] if is_better else []
+        used += [*part.entries] if _is_better(part) else []
     return with_entries(nominal, used)
+
+
+def _is_better(part: Part) -> bool:
+    """Whether the model of a part explains the held-out samples better than the nominal one."""
+    return part.after.log_likelihood > part.before.log_likelihood
+
+
+def _refusal(part: Part) -> str:
+    """What speaks against a part that is kept, and what flies; empty for nothing."""
+    if not part.refusal:
+        return ""
+    kept = "is taken, as the likelier one" if _is_better(part) else "stays nominal"
+    return f"{part.refusal}; the model {kept}"
 
 
 def _uncertainty(identification: Identification) -> float:

@@ -123,7 +123,7 @@ def _first_unstable(linear: LinearLoop, late: float) -> Unstable | None:
         delayed = linear._replace(loop=loop)
         for part in parts_of(uncertain_loop(linear.nominal, linear.law, loop, box)):
             found += [_confirmed(delayed, d) for d in first_unstable(part, len(box.names), largest)]
-    return min(filter(None, found), key=lambda one: one.deviation, default=None)
+    return min(filter(None, found), key=lambda unstable: unstable.deviation, default=None)
 
 
 def _disk(loop: UncertainLoop, inputs: tuple[int, ...], least: float) -> float:

@@ -110,8 +110,9 @@ class Models(NamedTuple):
 class Unknown(NamedTuple):
     """Standard deviations of what else is identified, 0 where known.
 
-    The fields are the deviations of B, and the noise of the disturbances. Rows of `hidden` states,
-    such as alpha, are known where they follow from mass and lift, and y has the rates alone.
+    The fields are the deviations of B, and the noise of the disturbances. The rows of hidden
+    states, such as alpha, are known where they follow from mass and lift, and y has the rates
+    alone.
     """
 
     delay: float = 0.0  # s, of u
@@ -119,7 +120,7 @@ class Unknown(NamedTuple):
     effect: float = PRIOR  # 1, of an entry of B before the flight
     error: float = PRIOR  # 1, of an entry of A
     drift: float = DRIFT  # sizes/s per root s, of the disturbances
-    hidden: bool = True  # whether the rows of states that are no output are identified
+    has_hidden_rows: bool = True  # whether those of states that are no output are identified
 
     @property
     def factor(self) -> float:
@@ -228,7 +229,7 @@ class Likelihood:
         length = span_length(recorded)
         self._spans = [slice(first, first + length) for first in range(0, len(recorded.t), length)]
         self._units = units(self._model, coupled=coupled)
-        if not unknown.hidden:
+        if not unknown.has_hidden_rows:
             is_output = np.any(self._model.C, axis=0).astype(float)[:, None]
             units_A, units_B = self._units
             self._units = units_A * is_output, units_B * is_output

@@ -46,7 +46,7 @@ class RatesLog(NamedTuple):
     recorded: FlightData
     taken: Imported
     cutoff: float  # of the gyro's low-pass of second order, Hz; 0 where the log names none
-    earlier: float  # s, by which y is earlier than behind that filter
+    advance: float  # s, by which y is earlier than behind that filter
 
 
 def rates_map(scenario: Scenario, autopilot: str) -> ChannelMap:
@@ -112,11 +112,11 @@ def rates_of_log(
         following = np.vstack([recorded.u[1:], recorded.u[-1:]])
         recorded = recorded._replace(u=(recorded.u + following) / 2.0)
     cutoff = taken.parameters.get(CUTOFFS[autopilot], 0.0)
-    earlier = 0.0
+    advance = 0.0
     if 0.0 < cutoff < BROAD < 1.0 / (OVER * recorded.period):
-        recorded, earlier = broadened(recorded, cutoff)
+        recorded, advance = broadened(recorded, cutoff)
     means = coarser(recorded, max(1, round(PERIOD / recorded.period)))
-    return RatesLog(recorded=means, taken=taken, cutoff=cutoff, earlier=earlier)
+    return RatesLog(recorded=means, taken=taken, cutoff=cutoff, advance=advance)
 
 
 def scaled_torques(parameters: Mapping[str, float]) -> list[str]:
@@ -149,8 +149,8 @@ def broadened(recorded: FlightData, cutoff: float) -> tuple[FlightData, float]:
     y = begin + signal.lfilter(numerator, broad[1], y, axis=0)
     reach = math.ceil(PERIODS * rate / BROAD)
     y[np.convolve(is_lost, np.ones(reach))[: len(y)] > 0.0] = np.nan
-    late = [signal.group_delay(each, w=[0.0], fs=rate)[1].item() for each in (narrow, broad)]
-    return recorded._replace(y=y), (late[0] - late[1]) / rate
+    delays = [signal.group_delay(low_pass, w=[0.0], fs=rate)[1] for low_pass in (narrow, broad)]
+    return recorded._replace(y=y), (delays[0] - delays[1]).item() / rate
 
 
 def _pressure(log: VehicleLog, scenario: Scenario, u: Signal) -> FloatArray:

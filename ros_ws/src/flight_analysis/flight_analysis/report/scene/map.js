@@ -155,7 +155,7 @@ export function drawMission(ctx, see, labels, {waypoints = [], legs = []}, leg, 
     labels.add(`${number}`, see([north, east]), colour("--ink"), {needed: number === leg, disc: number === leg ? colour : null});
   }
   const height = ([north, east, altitude]) => [`${(altitude * units.height.factor).toFixed(0)} ${units.height.unit}`, [north, east]];
-  for (const [text, place] of new Map(waypoints.map(height).map(one => [`${one}`, one])).values()) { // of waypoints at one place once
+  for (const [text, place] of new Map(waypoints.map(height).map(label => [`${label}`, label])).values()) { // of waypoints at one place once
     labels.add(text, see(place), colour("--quiet"));
   }
 }
