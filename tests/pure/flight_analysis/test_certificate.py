@@ -18,9 +18,8 @@ from tests.conftest import REPOSITORY, invoke
 
 import rise_di
 from flight_analysis.closed_loop.scenario_library import find_scenario
-from flight_analysis.linear_loop.certificate import certificate
+from flight_analysis.linear_loop.certificate import certificate, keep
 from flight_analysis.linear_loop.guarantee import guarantee
-from flight_analysis.linear_loop.kept_guarantee import keep
 from flight_analysis.linear_loop.loop_margins import LinearLoop, scenario_loop
 from flight_analysis.linear_loop.uncertain_loop import plants_at
 from rise_di_controller.law.linear_loop import closed_loop
@@ -242,7 +241,7 @@ def test_export_puts_the_certificate_beside_the_code_of_its_constants(tmp_path: 
     exported = rise_di.export("osprey_servo", code, proof=False)
     assert not any(path.name == "certificate.json" for path in exported.files)
     linear = loop_of("osprey_servo")
-    keep(linear, guarantee(linear))
+    keep(guarantee(linear))
     exported = rise_di.export("osprey_servo", code, proof=False)
     assert code / "certificate.json" in exported.files
     content = json.loads((code / "certificate.json").read_text())

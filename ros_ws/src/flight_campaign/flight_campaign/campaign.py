@@ -21,8 +21,8 @@ from aircraft_sim.uncertainty import (
     sampled_matrices,
 )
 from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario
+from flight_analysis.linear_loop.certificate import kept_guarantee
 from flight_analysis.linear_loop.guarantee import Guarantee
-from flight_analysis.linear_loop.kept_guarantee import kept_guarantee
 from flight_analysis.linear_loop.loop_margins import LoopMargins, margins, scenario_loop
 from flight_campaign import equipment, single_flights
 from flight_campaign.batch.campaign_course import Course, build_course

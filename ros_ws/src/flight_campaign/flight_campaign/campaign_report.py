@@ -28,7 +28,6 @@ from flight_analysis.report.figures import COLOURS
 from flight_analysis.report.html import Page, Section, TableGroup, TitleLine, page_html
 from flight_analysis.report.margin_figures import (
     LEAST_MARGINS,
-    guarantee_as_json,
     least_margins,
     margins_as_json,
 )
@@ -113,7 +112,7 @@ def write_results(campaign: MonteCarlo) -> tuple[dict[str, Any], MetricTable]:
                     **tally.summary(),
                     "fly_again": _write_worst(campaign, case, tally),
                     "margins": None if loop_margins is None else margins_as_json(loop_margins),
-                    "guarantee": None if promise is None else guarantee_as_json(promise),
+                    "guarantee": None if promise is None else promise.as_json(),
                     "influence": _influence(campaign, case, tally),
                 }
             )

@@ -17,15 +17,13 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from flight_analysis.linear_loop.certificate import certificate
+from flight_analysis.linear_loop.certificate import certificate, keep
 from flight_analysis.linear_loop.guarantee import Guarantee, guarantee
-from flight_analysis.linear_loop.kept_guarantee import keep
 from flight_analysis.report.display_units import display_unit
 from flight_analysis.report.html import write_loop_page
 from flight_analysis.report.margin_figures import (
     MARGIN_COLUMNS,
     MARGIN_LEGEND,
-    guarantee_as_json,
     margin_rows,
     margins_as_json,
     modes_text,
@@ -281,7 +279,7 @@ class Gains:
         progress("bounding every aircraft of the box")
         loop = answer.loop_with_box()
         promise = guarantee(loop, self.late)
-        keep(loop, promise)
+        keep(promise)
         if self.certificate is not None:
             sources = certificate_sources(self.airframe, self.scenario)
             write_text("certificate", self.certificate, certificate(loop, promise, sources))
@@ -550,7 +548,7 @@ def _as_json(result: _GainsAnswer, seed: int) -> dict[str, Any]:
         "slew": dict(zip(inputs, study.slew.tolist(), strict=True)),
         "slew_calm": dict(zip(inputs, study.slew_undisturbed.tolist(), strict=True)),
         **{name: _assessment_as_json(study, answer) for name, answer in result.answers.items()},
-        **({} if promise is None else {"guarantee": guarantee_as_json(promise)}),
+        **({} if promise is None else {"guarantee": promise.as_json()}),
     }
 
 

@@ -29,8 +29,7 @@ from c_export.proof import (
 )
 from flight_analysis.closed_loop.scenario import Scenario, scenario_yaml
 from flight_analysis.closed_loop.scenario_library import find_scenario
-from flight_analysis.linear_loop.certificate import certificate
-from flight_analysis.linear_loop.kept_guarantee import kept_guarantee
+from flight_analysis.linear_loop.certificate import certificate, kept_guarantee
 from flight_analysis.linear_loop.loop_margins import is_literal, scenario_loop
 from flight_analysis.report.margin_figures import guarantee_text
 from flight_core.arguments import FilePath, as_number, as_path

@@ -12,6 +12,5 @@
 | `structured_value` | bounds the structured singular value |
 | `branch_and_bound` | proves a bound over parts of the box |
 | `guarantee` | the largest box for which stability and a disk are proved |
-| `kept_guarantee` | keeps a guarantee for the pages of later flights |
-| `certificate` | a guarantee as a file that is checked without this stack |
+| `certificate` | a guarantee as a file: checked without this stack, shown by later flights |
 """

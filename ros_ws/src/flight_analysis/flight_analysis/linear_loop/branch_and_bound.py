@@ -16,8 +16,6 @@ from flight_analysis.linear_loop.structured_value import (
     STALLED,
     Centre,
     Scaling,
-    balanced,
-    bound_at,
     interval_at,
     tightened,
     tightened_at,
@@ -36,21 +34,19 @@ class Region(NamedTuple):
     half: FloatArray
     low: float  # rad/s
     high: float
-    scaling: Scaling | None  # of a larger box or of a neighbouring frequency
 
-    def halves(self, i: int, scaling: Scaling) -> list["Region"]:
+    def halves(self, i: int) -> list["Region"]:
         """Both halves along a parameter."""
         half = self.half.copy()
         half[i] /= 2.0
         step = np.zeros(len(half))
         step[i] = half[i]
-        narrowed = self._replace(half=half, scaling=scaling)
-        return [narrowed._replace(centre=self.centre + side * step) for side in (-1.0, 1.0)]
+        return [self._replace(centre=self.centre + c * step, half=half) for c in (-1.0, 1.0)]
 
-    def outside(self, begin: float, end: float, scaling: Scaling) -> list["Region"]:
+    def outside(self, begin: float, end: float) -> list["Region"]:
         """The frequencies below and above an interval, rad/s."""
-        below = self._replace(high=begin, scaling=scaling)
-        above = self._replace(low=end, scaling=scaling)
+        below = self._replace(high=begin)
+        above = self._replace(low=end)
         return [side for side in (below, above) if side.high > side.low]
 
 
@@ -70,27 +66,27 @@ def proof_of(part: Channels, size: float, disk: float, most: int) -> list[dict[s
     half = np.full(len(part.entries), size)
     others = np.r_[np.ones(part.late), np.full(len(part.D) - part.uncertain - part.late, disk)]
     part = _levelled(part, np.r_[half[part.parameters], others])
-    regions = [Region(centre=np.zeros(len(half)), half=half, low=0.0, high=highest, scaling=None)]
+    regions = [Region(centre=np.zeros(len(half)), half=half, low=0.0, high=highest)]
     steps: list[dict[str, Any]] = []
     while regions and len(steps) < most:
         region = regions.pop()
         w = _frequency(region, highest)
-        around = part.centred(np.r_[region.centre[part.parameters], np.zeros(len(others))])
+        around = part.at(region.centre)
         scale = np.r_[region.half[part.parameters], others]
         M = scale[:, None] * around.response(w, RADIUS)
-        bound, scaling = tightened_at(around, w, M, _start(around, M, region.scaling))
+        bound, scaling = tightened_at(around, w, M)
         interval = interval_at(around, w, scaling, scale) if bound < 1.0 else None
         if interval is None:
             entry = int(np.argmax(_effects(part, M, scaling)))
             steps.append({"halve": entry})
-            regions += region.halves(entry, scaling)
+            regions += region.halves(entry)
         else:
             # to the ends of the region where rounding is left
             begin, end = interval
             low = region.low if begin - region.low <= narrowest else begin
             high = region.high if region.high - end <= narrowest else end
             steps.append({"low": low, "high": high} | _as_step(scaling, len(part.entries)))
-            regions += region.outside(low, high, scaling)
+            regions += region.outside(low, high)
     return None if regions else steps
 
 
@@ -99,9 +95,9 @@ def _as_step(scaling: Scaling, entries: int) -> dict[str, list[float]]:
 
     Those of the means alone where the others follow from them, as in `tightened_at`.
     """
-    t, g = (np.array([float(f"{x:.{DIGITS}g}") for x in values]) for values in scaling)
-    count = len(t) if g[entries:].any() else entries
-    return {"t": t[:count].tolist(), "g": g[:count].tolist()}
+    count = len(scaling.t) if scaling.g[entries:].any() else entries
+    t, g = ([float(f"{x:.{DIGITS}g}") for x in values[:count]] for values in scaling)
+    return {"t": t, "g": g}
 
 
 def _frequency(region: Region, highest: float) -> float:
@@ -124,27 +120,13 @@ def _levelled(part: Channels, scale: FloatArray) -> Channels:
     worst, level = 0.0, np.zeros(part.late)
     for w in np.pi / part.period * np.geomspace(1e-2, 1.0, LEVELLED):
         M = (scale[:, None] * part.response(w, RADIUS))[np.ix_(rows, rows)]
-        bound, scaling = tightened(M, k, Scaling(balanced(M), np.zeros(len(M))), 0.0)
+        bound, scaling = tightened(M, k, 0.0)
         if bound > worst:
             worst, level = bound, scaling.t[k : k + part.late]
-    late = slice(part.uncertain, part.uncertain + part.late)
-    size = np.exp(level - level.mean())
-    W, Z, D = part.W.copy(), part.Z.copy(), part.D.copy()
-    W[:, late] /= size
-    Z[late] *= size[:, None]
-    D[:, late] /= size
-    D[late] *= size[:, None]
-    return part._replace(W=W, Z=Z, D=D)
-
-
-def _start(part: Channels, M: ComplexArray, near: Scaling | None) -> Scaling:
-    """The better one of the balanced D and of a D and a G known from nearby."""
-    t = balanced(M)
-    late = slice(part.uncertain, part.uncertain + part.late)
-    if part.late:
-        t[late] = t[late].mean()
-    first = Scaling(t, np.zeros(len(M)))
-    return first if near is None or bound_at(M, first) < bound_at(M, near) else near
+    size = np.ones(len(scale))
+    size[part.uncertain : part.uncertain + part.late] = np.exp(level - level.mean())
+    rows = size[:, None]
+    return part._replace(W=part.W / size, Z=rows * part.Z, D=rows * part.D / size)
 
 
 def _effects(part: Channels, M: ComplexArray, scaling: Scaling) -> FloatArray:

@@ -1,21 +1,30 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A guarantee as a file that is checked without this stack: examples/check_certificate.py.
+"""A guarantee as a file: for a check without this stack, and for the pages of later flights.
 
-The file has the sampled loop in numbers, the box of its entries, and the steps of the proof. The
-checker computes the motion over a period again, and bounds what the Legendre coefficients leave
-out.
+examples/check_certificate.py reads a certificate. It has the sampled loop in numbers, the box of
+its entries, and the steps of the proof. The checker computes the motion over a period again, and
+bounds what the Legendre coefficients leave out.
+
+A report shows the guarantee that was computed for its loop, and computes none. These are kept in
+the folder rise-di/guarantees in $XDG_CACHE_HOME, or in ~/.cache, by the digest of the loop.
 """
 
 import hashlib
 import json
+import os
 from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from flight_analysis.linear_loop.guarantee import Guarantee
+from flight_analysis.linear_loop.guarantee import Guarantee, Unstable
 from flight_analysis.linear_loop.loop_margins import LinearLoop
+from flight_core.files import write_file
 from flight_core.parameters import require
+
+BOUND = 4  # counts the ways by which this stack has bounded a loop
 
 
 def certificate(linear: LinearLoop, promise: Guarantee, sources: Mapping[str, str]) -> str:
@@ -46,3 +55,32 @@ def certificate(linear: LinearLoop, promise: Guarantee, sources: Mapping[str, st
     text = json.dumps(content, sort_keys=True, default=np.ndarray.tolist)
     digest = hashlib.sha256(text.encode()).hexdigest()
     return json.dumps(content | {"digest": digest}, default=np.ndarray.tolist) + "\n"
+
+
+def keep(promise: Guarantee) -> None:
+    """Keep a guarantee with u in time. A folder that cannot be written keeps none."""
+    if promise.late:
+        return
+    path = _path(promise.loop)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_file(path, json.dumps(promise.as_json() | {"proof": promise.proof}))
+    except OSError:
+        return
+
+
+def kept_guarantee(linear: LinearLoop) -> Guarantee | None:
+    """The guarantee that was computed for a loop; None without one, or for a damaged file."""
+    try:
+        content: dict[str, Any] = json.loads(_path(linear.digest).read_bytes())
+        first = content["unstable"]
+        content["unstable"] = None if first is None else Unstable(**first)
+        return Guarantee(**{field: content[field] for field in Guarantee._fields})
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _path(loop: str) -> Path:
+    """The file of the guarantee of a loop, by its digest."""
+    caches = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(caches) / "rise-di" / "guarantees" / f"{loop}.{BOUND}.json"

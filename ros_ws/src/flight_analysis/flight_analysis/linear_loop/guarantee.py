@@ -13,9 +13,9 @@ import numpy as np
 
 from flight_analysis.linear_loop.branch_and_bound import proof_of
 from flight_analysis.linear_loop.loop_margins import LinearLoop
+from flight_analysis.linear_loop.structured_value import RADIUS
 from flight_analysis.linear_loop.uncertain_loop import (
     Channels,
-    UncertainLoop,
     parts_of,
     plants_at,
     uncertain_loop,
@@ -30,9 +30,9 @@ WIDEST_DISK = 2.0  # a disk of 2 leaves 180 deg
 EXACT = 1.002  # factor on the deviations of an unstable aircraft until the exact loop confirms it
 CONFIRMED = 10  # such factors that are tried
 
-# gaps between what is proved and what was found, from the finest; each is tried with the boxes
-GAPS = (0.005, 0.01, 0.02, 0.04, 0.08, 0.16, 0.32, 0.64, 1.28, 2.56)
-FIRST_GAP = GAPS.index(0.08)
+# gaps between what is proved and what was found: the first that is proved, then finer ones
+GAPS = (0.08, 0.16, 0.32, 0.64, 1.28, 2.56)
+FINER_GAPS = (0.04, 0.02, 0.01, 0.005)
 BOXES = 1500  # up to the first gap
 FEWER_BOXES = 300  # at the others, and of disks
 # part of the deviations that is proved beyond those that are stated: it covers the coefficients
@@ -54,9 +54,10 @@ class Guarantee(NamedTuple):
     uncertainty: float  # largest relative deviation in the box
     stable: float  # every aircraft within this deviation is stable, at most 1
     unstable: Unstable | None  # the first one found; None up to LARGEST
-    inputs: tuple[str, ...]
-    disk: FloatArray  # (m,) balanced disk margin that every aircraft of the box has, an input open
+    # balanced disk margin that every aircraft of the box has, by input, the others closed
+    disk: dict[str, float]
     disk_all: float  # with independent disks in all inputs at once
+    loop: str  # digest of the loop
     late: float = 0.0  # s: u is late by an unknown time of 0 to this, another one at each tick
     proof: Sequence[dict[str, Any]] = ()  # "entries" and "steps" of each part, see `proof_of`
 
@@ -64,6 +65,14 @@ class Guarantee(NamedTuple):
     def holds(self) -> bool:
         """Whether every aircraft of the box is stable."""
         return self.stable >= self.uncertainty
+
+    def as_json(self) -> dict[str, Any]:
+        """All but the proof."""
+        content = self._asdict() | {"holds": self.holds}
+        del content["proof"]
+        if self.unstable is not None:
+            content["unstable"] = self.unstable._asdict()
+        return content
 
 
 def guarantee(linear: LinearLoop, late: float = 0.0) -> Guarantee:
@@ -76,17 +85,16 @@ def guarantee(linear: LinearLoop, late: float = 0.0) -> Guarantee:
     require(box is not None, "uncertainty", "0", "an uncertainty above 0 for a guarantee")
     assert box is not None  # noqa: S101 - for mypy
     largest = float(np.max(box.part))
-    m = len(linear.inputs)
     none = Guarantee(
         uncertainty=largest,
         stable=0.0,
         unstable=None,
-        inputs=linear.inputs,
-        disk=np.zeros(m),
+        disk=dict.fromkeys(linear.inputs, 0.0),
         disk_all=0.0,
+        loop=linear.digest,
         late=late,
     )
-    if not is_stable(linear.nominal, linear.law, linear.loop, np.zeros(m)):
+    if not is_stable(linear.nominal, linear.law, linear.loop, np.zeros(len(linear.inputs))):
         return none
     uncertain = uncertain_loop(linear.nominal, linear.law, linear.loop, box, late)
     first = _first_unstable(linear, late)
@@ -97,14 +105,14 @@ def guarantee(linear: LinearLoop, late: float = 0.0) -> Guarantee:
         return promise
     loops = _loops(linear, late)
     worst = [worst_in_box(linear.nominal, linear.law, loop, box).worst for loop in loops]
-    every = tuple(range(m))
-    disk_all = _disk(uncertain, every, min(float(least.disk_all) for least in worst))
-    # disks in all inputs at once cover a disk in one
-    disks = []
-    for i in every:
+    places = tuple(range(len(linear.inputs)))
+    disk_all = _disk(uncertain, places, min(float(least.disk_all) for least in worst))
+    disks = {}
+    for i, name in enumerate(linear.inputs):
         least_found = min(float(least.disk[i]) for least in worst)
-        disks.append(_disk(uncertain, (i,), least_found))
-    return promise._replace(disk=np.maximum(disks, disk_all), disk_all=disk_all)
+        # disks in all inputs at once cover a disk in one
+        disks[name] = max(_disk(uncertain, (i,), least_found), disk_all)
+    return promise._replace(disk=disks, disk_all=disk_all)
 
 
 def _loops(linear: LinearLoop, late: float) -> list[LoopTiming]:
@@ -126,7 +134,7 @@ def _first_unstable(linear: LinearLoop, late: float) -> Unstable | None:
     return min(filter(None, found), key=lambda unstable: unstable.deviation, default=None)
 
 
-def _disk(loop: UncertainLoop, inputs: tuple[int, ...], least: float) -> float:
+def _disk(loop: Channels, inputs: tuple[int, ...], least: float) -> float:
     """The disk margin of every aircraft of the box, with the least one found."""
     return _proved(parts_of(loop, inputs), min(least, WIDEST_DISK), disks=True)[0]
 
@@ -139,18 +147,14 @@ def _proved(
     The size is of the deviations, or of the disks beside the whole box; 0 where none is proved.
     With `exact` least itself may be proved.
     """
-    proof = _proof(parts, least, BOXES, disks=disks) if exact else None
-    if proof is not None:
-        return least, proof
-    for place, gap in enumerate(GAPS[FIRST_GAP:], FIRST_GAP):
-        most = FEWER_BOXES if disks or place > FIRST_GAP else BOXES
-        proof = _proof(parts, least / (1.0 + gap), most, disks=disks)
+    for proved in (*(0.0,) * exact, *GAPS):
+        most = FEWER_BOXES if disks or proved > GAPS[0] else BOXES
+        proof = _proof(parts, least / (1.0 + proved), most, disks=disks)
         if proof is not None:
             break
     else:
         return 0.0, []
-    proved = gap
-    for finer in reversed(GAPS[:place] if place == FIRST_GAP else ()):
+    for finer in FINER_GAPS if proved == GAPS[0] else ():
         if sum(len(part["steps"]) for part in proof) > FEWER_BOXES:
             break
         tighter = _proof(parts, least / (1.0 + finer), FEWER_BOXES, disks=disks)
@@ -182,10 +186,10 @@ def _confirmed(linear: LinearLoop, d: FloatArray) -> Unstable | None:
     still = np.zeros(len(linear.inputs))
     for _ in range(CONFIRMED):
         aircraft = plants_at(linear.nominal, box, d)
-        if not is_stable(aircraft, linear.law, linear.loop, still):
-            matrix = closed_loop(aircraft, linear.law, linear.loop, still)
-            z = np.linalg.eigvals(matrix)
-            turn = abs(np.angle(z[int(np.argmax(np.abs(z)))]))
+        z = np.linalg.eigvals(closed_loop(aircraft, linear.law, linear.loop, still))
+        worst = z[int(np.argmax(np.abs(z)))]
+        if abs(worst) > RADIUS:
+            turn = abs(np.angle(worst))
             parts = d * box.part
             entries = {
                 name: float(part) for name, part in zip(box.names, parts, strict=True) if part

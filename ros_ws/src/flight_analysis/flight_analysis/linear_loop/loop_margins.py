@@ -5,6 +5,7 @@
 They are taken on the nominal and on uncertain aircraft.
 """
 
+import hashlib
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -37,6 +38,9 @@ BARE = (
 )
 
 
+DIGITS = 10  # of numbers in a digest: two ways to the same loop differ by rounding
+
+
 class LinearLoop(NamedTuple):
     """The loop of a controller around a model of its aircraft; channels in the law's order."""
 
@@ -51,6 +55,21 @@ class LinearLoop(NamedTuple):
     def nominal(self) -> LinearPlant:
         """The nominal aircraft."""
         return LinearPlant(self.plant.A[0], self.plant.B[0], self.plant.C)
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the numbers of the nominal loop and of its box, to DIGITS digits.
+
+        The box counts by its shape: a guarantee finds the size.
+        """
+        loop = self.loop
+        arrays = [*self.nominal, *self.law, loop.lag, loop.delay, loop.period]
+        if self.box is not None:
+            size = self.box.part.max()
+            arrays += [self.box.part / size, self.box.E, self.box.F / size, self.box.G / size]
+        values = np.concatenate([np.ravel(np.asarray(array)) for array in arrays]) + 0.0  # no -0
+        text = " ".join(f"{value:.{DIGITS - 1}e}" for value in values.tolist())
+        return hashlib.sha256(text.encode()).hexdigest()
 
 
 class LoopMargins(NamedTuple):

@@ -77,9 +77,7 @@ def bound_at(M: ComplexArray, scaling: Scaling) -> FloatArray:
     return np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(H)[..., -1], 0.0)))
 
 
-def tightened(
-    M: ComplexArray, real: int, start: Scaling, target: float, alike: int = 0
-) -> tuple[float, Scaling]:
+def tightened(M: ComplexArray, real: int, target: float, alike: int = 0) -> tuple[float, Scaling]:
     """A bound of M, (p, p), the first `real` channels real, with the D and G of a search.
 
     The `alike` channels behind these have one factor of D.
@@ -92,12 +90,14 @@ def tightened(
     minimises -log det F - log det D - sum log(LARGEST_G^2 - g^2) by Newton's method, for a level
     that falls. Source: S. Boyd, L. El Ghaoui, Linear Algebra and its Applications 188, 1993.
     """
-    N = np.exp(start.t)[:, None] * M * np.exp(-start.t)
-    g = np.clip(start.g[:real], -LARGEST_G / 2.0, LARGEST_G / 2.0)
+    t = balanced(M)
+    if alike:
+        t[real : real + alike] = t[real : real + alike].mean()
+    N = np.exp(t)[:, None] * M * np.exp(-t)
     free = np.arange(len(M))
     free[real : real + alike] = real
     free[real + alike :] -= max(alike - 1, 0)
-    centre = Centre(np.ones(len(M)), g, np.eye(int(free[-1]) + 1)[free])
+    centre = Centre(np.ones(len(M)), np.zeros(real), np.eye(int(free[-1]) + 1)[free])
     goal = target**2
     least = centre.bound(N)
     level = max(1.1 * least, goal)
@@ -112,12 +112,10 @@ def tightened(
             break
         level = max(least + FALL * (level - least), goal)
     g = np.r_[centre.g / centre.d[:real], np.zeros(len(M) - real)]
-    return float(np.sqrt(max(least, 0.0))), Scaling(start.t + 0.5 * np.log(centre.d), g)
+    return float(np.sqrt(max(least, 0.0))), Scaling(t + 0.5 * np.log(centre.d), g)
 
 
-def tightened_at(
-    part: Channels, w: float, scaled: ComplexArray, start: Scaling
-) -> tuple[float, Scaling]:
+def tightened_at(part: Channels, w: float, scaled: ComplexArray) -> tuple[float, Scaling]:
     """A bound of a scaled M(w) of a part as by `tightened` to 1.
 
     D and G of the means over a period are taken where these suffice. The D of the second
@@ -125,8 +123,7 @@ def tightened_at(
     """
     k = len(part.entries)
     rows = np.r_[0:k, part.uncertain : len(scaled)]
-    few = Scaling(start.t[rows], start.g[rows])
-    _, means = tightened(scaled[np.ix_(rows, rows)], k, few, 1.0, part.late)
+    _, means = tightened(scaled[np.ix_(rows, rows)], k, 1.0, part.late)
     second = slice(k, part.uncertain)
     sizes = np.abs(scaled) ** 2 + TINY
     row = sizes[second, rows] @ np.exp(-2.0 * means.t)
@@ -138,7 +135,7 @@ def tightened_at(
     bound = float(bound_at(scaled, scaling))
     if bound < 1.0 or w * part.period < MEANS_UP_TO:
         return bound, scaling
-    return tightened(scaled, part.uncertain, start, 1.0, part.late)
+    return tightened(scaled, part.uncertain, 1.0, part.late)
 
 
 class Centre(NamedTuple):

@@ -33,15 +33,12 @@ from rise_di_controller.law.linear_loop import (
     LoopTiming,
     SampledPlant,
     sampled_plant,
-    zero_order_hold,
 )
 
 ComplexArray = NDArray[np.complex128]
 IntArray = NDArray[np.intp]
 
 TERMS = 2  # Legendre coefficients of a signal within a period
-# singular value below which a direction of normalised vectors counts as none
-NO_DIRECTION = 1e-9
 # part of the sizes of row and column below which an entry of M counts as 0
 NO_COUPLING = 1e-13
 PATTERN_PARTS = (1e-3, 1e-2, 0.06, 0.25)  # of pi / T: where the pattern of M is taken
@@ -66,36 +63,70 @@ def plants_at(plant: LinearPlant, box: Box, d: FloatArray) -> LinearPlant:
     return LinearPlant(plant.A + effect @ box.F, plant.B + effect @ box.G, plant.C)
 
 
-class Late(NamedTuple):
-    """l channels of a delay: W_l w, Z_l zeta + V_l v.
+class Channels(NamedTuple):
+    """A loop, or a part, as zeta+ = A zeta + W w, z = Z zeta + D w.
 
-    The channels of w_0 come first, j by j with m inputs.
+    The real channels of the entries come first, TERMS each, then those of a delay, then disks in
+    inputs. A disk adds v to u and reads u + v / 2: S - I / 2 from v.
     """
 
-    W: FloatArray  # (q, l)
-    D: FloatArray  # (p, l) to the channels of the entries
-    Z: FloatArray  # (l, q)
-    V: FloatArray  # (l, m)
+    A: FloatArray
+    W: FloatArray
+    Z: FloatArray
+    D: FloatArray
+    entries: tuple[int, ...]  # places of the entries in the box
+    period: float
+    late: int = 0  # channels of a delay: those of w_0 first, j by j with m inputs, then of w_1
 
+    @property
+    def uncertain(self) -> int:
+        """Number of the real channels, TERMS an entry."""
+        return TERMS * len(self.entries)
 
-class UncertainLoop(NamedTuple):
-    """The loop with the channels of k entries pulled out, TERMS k columns of W, and of m inputs."""
+    @property
+    def parameters(self) -> IntArray:
+        """The number of the entry of each of their channels."""
+        return np.tile(np.arange(len(self.entries)), TERMS)
 
-    A: FloatArray  # (q, q)
-    W: FloatArray  # (q, p)
-    Z: FloatArray  # (p, q)
-    D: FloatArray  # (p, p)
-    U: FloatArray  # (q, m)
-    V: FloatArray  # (p, m)
-    K: FloatArray  # (m, q)
-    period: float  # s
-    late: Late | None = None  # the channels of an unknown delay; None without one
+    @property
+    def disks(self) -> slice:
+        """The channels of disks."""
+        return slice(self.uncertain + self.late, None)
+
+    def some(self, channels: IntArray) -> "Channels":
+        """Some channels of the same loop."""
+        D = self.D[np.ix_(channels, channels)]
+        return self._replace(W=self.W[:, channels], Z=self.Z[channels], D=D)
+
+    def response(self, w: FloatArray | float, radius: float) -> ComplexArray:
+        """M(z) at abs(z) = radius and the frequencies w, (F,) or (), rad/s: (F, p, p)."""
+        z = radius * np.exp(1j * np.asarray(w) * self.period)
+        motion = z[..., None, None] * np.eye(len(self.A)) - self.A
+        return np.asarray(self.Z @ np.linalg.solve(motion, self.W.astype(complex)) + self.D)
+
+    def at(self, d: FloatArray) -> "Channels":
+        """The channels around the aircraft of deviations d, (..., k) of this part."""
+        c = np.zeros((*d.shape[:-1], len(self.D)))
+        c[..., : self.uncertain] = np.tile(d, TERMS)
+        return self.centred(c)
+
+    def centred(self, c: FloatArray) -> "Channels":
+        """The channels around w = diag(c) z, (..., p), in place of w = 0. Leading axes batch."""
+        columns = c[..., None, :]
+        inverse = np.linalg.inv(np.eye(len(self.D)) - self.D * columns)
+        Z = inverse @ self.Z
+        return self._replace(
+            A=self.A + (self.W * columns) @ Z,
+            W=self.W @ np.linalg.inv(np.eye(len(self.D)) - c[..., None] * self.D),
+            Z=Z,
+            D=inverse @ self.D,
+        )
 
 
 def uncertain_loop(
     plant: LinearPlant, law: LinearLaw, loop: LoopTiming, box: Box, late: float = 0.0
-) -> UncertainLoop:
-    """The loop of a plant, A (n, n), with the entries of a box pulled out.
+) -> Channels:
+    """The loop of a plant, A (n, n), with the entries of a box and a disk in each input pulled out.
 
     u is late by an unknown time of 0 to `late`, s.
     """
@@ -114,17 +145,11 @@ def uncertain_loop(
     pulled = LinearPlant(A, B, C)
     by_tick = sampled_plant(pulled, loop, still)
 
-    # The motion over a period by w, constant or rising, as the zero-order hold of a chain.
-    steps = np.zeros((size + k, size + k))  # the states, then s from 0 to 1 over the period
-    steps[:size, :size] = A
-    steps[:n, size:] = box.E
-    drive = np.zeros((size + k, 2 * k))
-    drive[:n, :k] = box.E
-    drive[size:, k:] = np.eye(k) / loop.period
-    _, motion = zero_order_hold(steps, drive, loop.period)
-    constant = motion[:size, :k]
-    rising = motion[:size, k:]
-    drives = np.hstack([constant, ROOT * (2.0 * rising - constant)])
+    # The motion over a period by w, constant or rising, which no actuator delays.
+    moved = LinearPlant(A, np.vstack([box.E, np.zeros((TERMS * k, k))]), C)
+    direct = LoopTiming(np.zeros(k), 0.0, loop.period)
+    by_w = [sampled_plant(moved, direct, np.zeros(k), rising=rising) for rising in (False, True)]
+    drives = np.hstack([sampled.B[:size] for sampled in by_w])
 
     # The integrals are read at the end of a period, and are no states of the loop.
     rows = np.r_[0:n, size : len(by_tick.A)]
@@ -133,19 +158,17 @@ def uncertain_loop(
     Q = _coefficients(by_tick.A, n, k)[:, rows]
     Qu = _coefficients(by_tick.B, n, k)
     C = by_tick.C[:, rows]
-    states = len(law.A)
-    none = np.zeros((states, TERMS * k))
-    W = np.zeros((len(rows), TERMS * k))
-    W[:n] = drives[:n]
+    W = np.zeros((len(rows) + len(law.A), TERMS * k + m))
+    W[:n, : TERMS * k] = drives[:n]
+    W[: len(rows), TERMS * k :] = Pu
     # The law closes the loop.
-    exact = UncertainLoop(
+    u = np.hstack([law.D @ C, law.C])
+    exact = Channels(
         A=np.block([[P + Pu @ law.D @ C, Pu @ law.C], [law.B @ C, law.A]]),
-        W=np.vstack([W, none]),
-        Z=np.hstack([Q + Qu @ law.D @ C, Qu @ law.C]),
-        D=_coefficients(drives, n, k),
-        U=np.vstack([Pu, np.zeros((states, m))]),
-        V=Qu,
-        K=np.hstack([law.D @ C, law.C]),
+        W=W,
+        Z=np.vstack([np.hstack([Q + Qu @ law.D @ C, Qu @ law.C]), u]),
+        D=_blocks(_coefficients(drives, n, k), Qu),
+        entries=tuple(range(k)),
         period=loop.period,
     )
     # A delay is channels more.
@@ -165,15 +188,20 @@ def _coefficients(matrix: FloatArray, n: int, k: int) -> FloatArray:
     return np.concatenate([once, ROOT * (once - 2.0 * twice)])
 
 
-def _with_late(
-    exact: UncertainLoop, late: float, ramps: SampledPlant, n: int, k: int
-) -> UncertainLoop:
+def _blocks(D: FloatArray, V: FloatArray) -> FloatArray:
+    """D of channels with disks in all inputs behind them, V from disks to channels."""
+    m = V.shape[1]
+    return np.block([[D, V], [np.zeros((m, len(D))), np.eye(m) / 2.0]])
+
+
+def _with_late(exact: Channels, late: float, ramps: SampledPlant, n: int, k: int) -> Channels:
     """A loop, n states of the aircraft and k entries, with the channels of a delay.
 
     The middle of the ranges is the delay of the loop. The channels come from the motion by w_1. The
     states of w_1 of earlier ticks, c of them, and u of earlier ticks follow its own.
     """
-    m, q = exact.K.shape
+    E, U, K = exact.W[:, : exact.uncertain], exact.W[:, exact.disks], exact.Z[exact.disks]
+    m, q = K.shape
     size = n + TERMS * k
     rows = np.r_[0:n, size : len(ramps.A)]
     effect = ramps.A[: size + m, size + m :]
@@ -182,7 +210,7 @@ def _with_late(
     parts = np.minimum(late / exact.period - np.arange(ticks), 1.0)
     width = ticks * m  # u of earlier ticks, the newest first
     # The states after the loop's own: u of earlier ticks, which a late u needs.
-    now = np.hstack([exact.K, np.zeros((m, c + width))])
+    now = np.hstack([K, np.zeros((m, c + width))])
     before = np.eye(width, q + c + width, q + c)
     shifted = np.vstack([now, before[:-m]])
     # The channels of a delay read the step of u from a tick to the next, by their half ranges.
@@ -193,11 +221,12 @@ def _with_late(
     V[:m] = np.diag(sizes[0, :m])
     V[width : width + m] = np.diag(sizes[1, :m])
     # A channel acts as a constant u, or as a ramp over the period.
-    held = np.vstack([exact.U, np.zeros((c + width, m))])
+    held = np.vstack([U, np.zeros((c + width, m))])
     ramp = np.zeros((q + c + width, m))
     ramp[np.r_[0 : n + m, q : q + c]] = ramps.B[rows]
     W = np.hstack([-held] * ticks + [ramp] * ticks)
-    D = np.hstack([-exact.V] * ticks + [_coefficients(ramps.B, n, k)] * ticks)
+    to_z = exact.D[: exact.uncertain]
+    D = np.hstack([-to_z[:, exact.disks]] * ticks + [_coefficients(ramps.B, n, k)] * ticks)
     # The loop with the states more, its delay in the middle of the ranges.
     A = np.zeros((q + c + width, q + c + width))
     A[:q, :q] = exact.A
@@ -206,120 +235,39 @@ def _with_late(
     A[q + c :] = shifted
     U = held + W @ V
     U[q + c : q + c + m] += np.eye(m)
-    reach = np.hstack([exact.Z, _coefficients(effect, n, k), np.zeros((len(exact.Z), width))])
+    reach = [exact.Z[:-m], _coefficients(effect, n, k), np.zeros((exact.uncertain, width))]
+    none = np.zeros((2 * width, exact.uncertain + 2 * width))
+    through = np.vstack([np.hstack([to_z[:, : exact.uncertain], D]), none])
     return exact._replace(
         A=A + W @ Z,
-        W=np.vstack([exact.W, np.zeros((c + width, exact.W.shape[1]))]),
-        Z=reach + D @ Z,
-        U=U,
-        V=exact.V + D @ V,
-        K=now,
-        late=Late(W, D, Z, V),
-    )
-
-
-class Channels(NamedTuple):
-    """A part of a loop as zeta+ = A zeta + W w, z = Z zeta + D w; the k real channels first."""
-
-    A: FloatArray
-    W: FloatArray
-    Z: FloatArray
-    D: FloatArray
-    entries: tuple[int, ...]  # places of the entries in the box
-    period: float
-    late: int = 0  # channels of a delay, behind the real ones of the entries; then disks
-
-    @property
-    def uncertain(self) -> int:
-        """Number of the real channels, TERMS an entry."""
-        return TERMS * len(self.entries)
-
-    @property
-    def parameters(self) -> IntArray:
-        """The number of the entry of each of their channels."""
-        return np.tile(np.arange(len(self.entries)), TERMS)
-
-    def response(self, w: FloatArray | float, radius: float) -> ComplexArray:
-        """M(z) at abs(z) = radius and the frequencies w, (F,) or (), rad/s: (F, p, p)."""
-        z = radius * np.exp(1j * np.asarray(w) * self.period)
-        motion = z[..., None, None] * np.eye(len(self.A)) - self.A
-        return np.asarray(self.Z @ np.linalg.solve(motion, self.W.astype(complex)) + self.D)
-
-    def closed(self, d: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """State matrices of the loops of deviations d, (N, k) of this part.
-
-        The second and third are the matrices left and right of a change of d.
-        """
-        wide = np.tile(d, TERMS)
-        p = self.uncertain
-        inverse = np.linalg.inv(np.eye(p) - self.D[:p, :p] * wide[:, None, :])
-        right = inverse @ self.Z[:p]
-        left = self.W[:, :p] @ np.linalg.inv(np.eye(p) - wide[:, :, None] * self.D[:p, :p])
-        return self.A + (self.W[:, :p] * wide[:, None, :]) @ right, left, right
-
-    def centred(self, c: FloatArray) -> "Channels":
-        """The channels around w = diag(c) z, (p,), in place of w = 0."""
-        inverse = np.linalg.inv(np.eye(len(c)) - self.D * c)
-        Z = inverse @ self.Z
-        return self._replace(
-            A=self.A + (self.W * c) @ Z,
-            W=self.W @ np.linalg.inv(np.eye(len(c)) - c[:, None] * self.D),
-            Z=Z,
-            D=inverse @ self.D,
-        )
-
-
-def every_channel(loop: UncertainLoop, inputs: tuple[int, ...] = ()) -> Channels:
-    """All entries of the box as channels, and disks in some inputs.
-
-    A disk adds v to u and reads u + v / 2: S - I / 2 from v.
-    """
-    channels = list(inputs)
-    q, p = loop.W.shape
-    m = len(loop.K)
-    c = len(channels)
-    late = loop.late or Late(np.zeros((q, 0)), np.zeros((p, 0)), np.zeros((0, q)), np.zeros((0, m)))
-    width = late.W.shape[1]
-    D = np.zeros((p + width + c, p + width + c))
-    D[:p, :p] = loop.D
-    D[:p, p : p + width] = late.D
-    D[:p, p + width :] = loop.V[:, channels]
-    D[p : p + width, p + width :] = late.V[:, channels]
-    D[p + width :, p + width :] = np.eye(c) / 2.0
-    return Channels(
-        A=loop.A,
-        W=np.hstack([loop.W, late.W, loop.U[:, channels]]),
-        Z=np.vstack([loop.Z, late.Z, loop.K[channels]]),
-        D=D,
-        entries=tuple(range(p // TERMS)),
-        period=loop.period,
-        late=width,
+        W=np.hstack([np.vstack([E, np.zeros((c + width, E.shape[1]))]), W, U]),
+        Z=np.vstack([np.hstack(reach) + D @ Z, Z, now]),
+        D=_blocks(through, np.vstack([to_z[:, exact.disks] + D @ V, V])),
+        late=2 * width,
     )
 
 
 def sensitivity_slopes(
-    loop: UncertainLoop, d: FloatArray, w: FloatArray
+    loop: Channels, d: FloatArray, w: FloatArray
 ) -> tuple[ComplexArray, ComplexArray]:
     """S, (F, m, m), of the aircraft of deviations d, (k,), and its slopes along d, (F, k, m, m).
 
-    They are taken at frequencies w, rad/s.
+    They are taken at frequencies w, rad/s. The loop has disks in all inputs, and u is in time.
     """
-    A, left, right = every_channel(loop).closed(d[None])
-    wide = np.tile(d, TERMS)
-    through = np.linalg.solve(np.eye(len(wide)) - loop.D * wide, loop.V)
-    U = loop.U + (loop.W * wide) @ through
+    around = loop.at(d)
+    p, k = loop.uncertain, len(d)
     z = np.exp(1j * w * loop.period)
-    k, m = len(d), U.shape[1]
-    motion = z[:, None, None] * np.eye(len(U)) - A[0]
-    X = np.linalg.solve(motion, np.hstack([left[0], U]).astype(complex))
-    into = loop.K @ X[:, :, :-m]  # (F, m, TERMS k)
-    out = right[0] @ X[:, :, -m:] + through  # (F, TERMS k, m)
+    motion = z[:, None, None] * np.eye(len(around.A)) - around.A
+    X = np.linalg.solve(motion, around.W.astype(complex))
+    into = around.Z[p:] @ X[:, :, :p]  # (F, m, p)
+    out = around.Z[:p] @ X[:, :, p:] + around.D[:p, p:]  # (F, p, m)
+    m = out.shape[-1]
     each = np.einsum("Fic,Fcj->Fcij", into, out)
-    S = np.eye(m) + loop.K @ X[:, :, -m:]
+    S = np.eye(m) + around.Z[p:] @ X[:, :, p:]
     return np.asarray(S), np.asarray(each.reshape(len(w), TERMS, k, m, m).sum(axis=1))
 
 
-def parts_of(loop: UncertainLoop, inputs: tuple[int, ...] = ()) -> list[Channels]:
+def parts_of(loop: Channels, inputs: tuple[int, ...] = ()) -> list[Channels]:
     """The strongly connected parts of the loop, reduced.
 
     With disks in some inputs only parts with such inputs count. The structured singular value of a
@@ -328,9 +276,10 @@ def parts_of(loop: UncertainLoop, inputs: tuple[int, ...] = ()) -> list[Channels
     from scipy.sparse import csr_array  # noqa: PLC0415 - a flight starts without it
     from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
 
-    every = every_channel(loop, inputs)
+    p = loop.disks.start
+    every = loop.some(np.r_[0:p, p + np.array(inputs, dtype=int)])
     k = len(every.entries)
-    m = len(loop.K)
+    m = len(loop.D) - p
     c = len(inputs)
     # The pattern of the couplings at some frequencies, an entry or a delay a node.
     late = np.tile(k + np.arange(m), every.late // m)
@@ -359,37 +308,12 @@ def _reduced(every: Channels, channels: IntArray) -> Channels:
 
     Such states are kept constants, integrals, and the rest of the loop.
     """
-    A = every.A
-    W = every.W[:, channels]
-    Z = every.Z[channels]
-    coupled = np.abs(A) > NO_COUPLING
-    is_moved = (np.abs(W) > NO_COUPLING).any(axis=1)
-    is_shown = (np.abs(Z) > NO_COUPLING).any(axis=0)
-    for _ in range(len(A)):
+    part = every.some(channels)
+    coupled = np.abs(part.A) > NO_COUPLING
+    is_moved = (np.abs(part.W) > NO_COUPLING).any(axis=1)
+    is_shown = (np.abs(part.Z) > NO_COUPLING).any(axis=0)
+    for _ in range(len(coupled)):
         is_moved |= coupled[:, is_moved].any(axis=1)
         is_shown |= coupled[is_shown].any(axis=0)
     both = is_moved & is_shown
-    A = A[np.ix_(both, both)]
-    W = W[both]
-    Z = Z[:, both]
-    for _ in range(2):
-        Q = _reached(A, W)
-        W_turned = (Q.T @ W).T
-        A = (Q.T @ A @ Q).T
-        W = (Z @ Q).T
-        Z = W_turned
-    return every._replace(A=A, W=W, Z=Z, D=every.D[np.ix_(channels, channels)])
-
-
-def _reached(A: FloatArray, W: FloatArray) -> FloatArray:
-    """An orthonormal basis of the states that W reaches through A."""
-    Q = np.zeros((len(A), 0))
-    directions = W / np.maximum(np.linalg.norm(W, axis=0), 1e-300)
-    while directions.shape[1]:
-        for _ in range(2):  # twice: rounding
-            directions = directions - Q @ (Q.T @ directions)
-        left, values, _ = np.linalg.svd(directions, full_matrices=False)
-        directions = left[:, values > NO_DIRECTION]
-        Q = np.hstack([Q, directions])
-        directions = A @ directions
-    return Q
+    return part._replace(A=part.A[np.ix_(both, both)], W=part.W[both], Z=part.Z[:, both])

@@ -26,8 +26,6 @@ from flight_analysis.linear_loop.uncertain_loop import (
     Box,
     Channels,
     ComplexArray,
-    UncertainLoop,
-    every_channel,
     plants_at,
     sensitivity_slopes,
     uncertain_loop,
@@ -136,7 +134,7 @@ def _flipped(part: Channels, corner: FloatArray, frequency: float, largest: floa
         k = len(corner)
         trial = np.where(np.eye(k, dtype=bool), -corner, corner)
         both = np.concatenate([corner[None], trial])
-        radii = _near(np.linalg.eigvals(part.closed(size * both)[0]), frequency, part.period)
+        radii = _near(np.linalg.eigvals(part.at(size * both).A), frequency, part.period)
         radius = radii.max(axis=-1)
         if np.argmax(radius) == 0:
             break
@@ -155,35 +153,30 @@ def _limit(part: Channels, corner: FloatArray, frequency: float, largest: float)
     """The size along a corner at which a mode near a frequency leaves; infinite for none."""
 
     def unstable(size: FloatArray) -> NDArray[np.bool_]:
-        z = np.linalg.eigvals(part.closed(size[:, None] * corner)[0])
+        z = np.linalg.eigvals(part.at(size[:, None] * corner).A)
         largest_near = _near(z, frequency, part.period).max(axis=-1)
         return np.asarray(largest_near > 1.0 + SPECTRAL_RADIUS_TOLERANCE)
 
-    sizes = np.linspace(0.0, largest, 9)[1:]
-    outside = unstable(sizes)
-    if not outside.any():
-        return np.inf
-    high = sizes[int(np.argmax(outside))]
-    low = high - sizes[0]
+    low, high = 0.0, largest
     while high - low > RESOLUTION / 2.0:
-        inner = np.linspace(low, high, 6)[1:-1]
-        outside = unstable(inner)
-        place = int(np.argmax(outside)) if outside.any() else len(inner)
-        steps = np.r_[low, inner, high]
-        low = steps[place]
-        high = steps[place + 1]
-    return float(high)
+        sizes = np.linspace(low, high, 9)
+        outside = unstable(sizes[1:])
+        if not outside.any():
+            return np.inf
+        place = int(np.argmax(outside))
+        low, high = sizes[place : place + 2].tolist()
+    return high
 
 
 def _growth(part: Channels, d: FloatArray, frequency: float) -> FloatArray:
     """Slopes d abs(z) / d d_i of the largest mode near a frequency, (N, k), at some deviations."""
-    A, left, right = part.closed(d)
-    z, X = np.linalg.eig(A)
+    around = part.at(d)
+    z, X = np.linalg.eig(around.A)
     Y = np.linalg.inv(X)
     rows = np.arange(len(d))
     worst = np.argmax(_near(z, frequency, part.period), axis=-1)
-    into = Y[rows, worst][:, None, :] @ left
-    out = right @ X[rows, :, worst][:, :, None]
+    into = Y[rows, worst][:, None, :] @ around.W
+    out = around.Z @ X[rows, :, worst][:, :, None]
     change = into[:, 0] * out[:, :, 0] / z[rows, worst][:, None]
     return np.asarray(change.real.reshape(len(d), -1, len(part.entries)).sum(axis=1))
 
@@ -265,7 +258,7 @@ def _slopes(
     law: LinearLaw,
     loop: LoopTiming,
     box: Box,
-    uncertain: UncertainLoop,
+    uncertain: Channels,
     d: FloatArray,
 ) -> FloatArray:
     """The slopes of `_figures` along the deviations at d, (4 m + 3, k), each up to a factor.
@@ -337,21 +330,21 @@ def _crossed(
     return np.asarray(w[place] + share * step), np.asarray(rate)
 
 
-def _damping_slope(uncertain: UncertainLoop, d: FloatArray) -> FloatArray:
+def _damping_slope(uncertain: Channels, d: FloatArray) -> FloatArray:
     """The slope of the least damping of a slow mode along the deviations at d, (k,).
 
     The slope has an unknown factor: zeta = -cos(angle(log z)).
     """
-    every = every_channel(uncertain)
-    A, left, right = every.closed(d[None])
-    z, X = np.linalg.eig(A[0])
+    around = uncertain.at(d)
+    z, X = np.linalg.eig(around.A)
     turn = np.log(np.where(np.abs(z) > VANISHED, z, VANISHED).astype(complex))
     slow = (turn.imag > NO_MODE) & (np.abs(turn) < SLOW_TURN)
     if not slow.any():
         return np.zeros(len(d))
     damping = np.where(slow, -turn.real / np.maximum(np.abs(turn), NO_MODE), np.inf)
     mode = int(np.argmin(damping))
-    into = np.linalg.solve(X.T, np.eye(len(z))[mode]) @ left[0]
-    change = into * (right[0] @ X[:, mode]) / z[mode]  # of log z, by channel
-    angle = (change / turn[mode]).imag.reshape(-1, len(d)).sum(axis=0)
+    into = np.linalg.solve(X.T, np.eye(len(z))[mode]) @ around.W
+    change = into * (around.Z @ X[:, mode]) / z[mode]  # of log z
+    by_channel = (change / turn[mode]).imag[: uncertain.uncertain]
+    angle = by_channel.reshape(-1, len(d)).sum(axis=0)
     return np.asarray(np.sin(np.angle(turn[mode])) * angle)

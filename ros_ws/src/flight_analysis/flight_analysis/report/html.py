@@ -17,7 +17,7 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.linear_loop.kept_guarantee import kept_guarantee
+from flight_analysis.linear_loop.certificate import kept_guarantee
 from flight_analysis.linear_loop.loop_margins import LinearLoop, loop_margins
 from flight_analysis.report import (
     comparison,

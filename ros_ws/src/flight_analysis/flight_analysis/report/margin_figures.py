@@ -248,24 +248,11 @@ def guarantee_text(promise: Guarantee) -> list[str]:
 def guarantee_rows(promise: Guarantee, margins: LoopMargins) -> list[tuple[str, float, float]]:
     """Input, guaranteed disk margin, and the least disk margin found, ALL_INPUTS last."""
     worst = margins.worst
-    least_disks = [math.nan] * (len(promise.inputs) + 1)
+    least_disks = [math.nan] * (len(promise.disk) + 1)
     if worst is not None:
         least_disks = [*worst.disk.tolist(), float(worst.disk_all)]
-    disks = [*promise.disk.tolist(), promise.disk_all]
-    return list(zip((*promise.inputs, ALL_INPUTS), disks, least_disks, strict=True))
-
-
-def guarantee_as_json(promise: Guarantee) -> dict[str, Any]:
-    """A guarantee: deviations as parts of an entry, frequencies in rad/s."""
-    return {
-        "uncertainty": promise.uncertainty,
-        "late": promise.late,
-        "holds": promise.holds,
-        "stable": promise.stable,
-        "unstable": None if promise.unstable is None else promise.unstable._asdict(),
-        "disk": dict(zip(promise.inputs, promise.disk.tolist(), strict=True)),
-        "disk_all": promise.disk_all,
-    }
+    disks = promise.disk | {ALL_INPUTS: promise.disk_all}
+    return list(zip(disks.keys(), disks.values(), least_disks, strict=True))
 
 
 # Bode and Nyquist plots
