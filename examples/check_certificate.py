@@ -340,8 +340,19 @@ def require_range(file: dict[str, Any], loop: Loop) -> None:
         )
 
 
+def digest_of(file: dict[str, Any]) -> str:
+    """SHA-256 of the loop in 10 digits, for a box whose largest part is 1."""
+    size, law = np.max(file["part"]), [file["law"][key] for key in "ABCD"]
+    loop = [*(file[key] for key in "ABC"), *law, *(file[key] for key in ("lag", "delay", "period"))]
+    box = [np.array(file["part"]) / size, file["E"], *(np.array(file[key]) / size for key in "FG")]
+    values = np.concatenate([np.ravel(array) for array in loop + box]) + 0.0
+    return hashlib.sha256(" ".join(f"{value:.9e}" for value in values).encode()).hexdigest()
+
+
 def check(file: dict[str, Any]) -> int:
     """The number of bounds that prove a certificate. Raises ValueError for one that does not."""
+    if digest_of(file) != file["loop"]:
+        raise ValueError("the loop is not the one that its name says")
     steps = {tuple(part["entries"]): part["steps"] for part in file["parts"]}
     loop, count = loop_of(file), 0
     require_range(file, loop)
@@ -397,6 +408,7 @@ def main() -> None:
     print(
         f"PROVED by {count} bounds: stable for each deviation within", *deviations(file), sep="\n  "
     )
+    print(f"certificate {file['loop'][:12]}")
     print(f"period {file['period']:g} s, delay {file['delay']:g} s, lags {file['lag']} s")
     print(COVERED)
 

@@ -51,8 +51,9 @@ def servo() -> Content:
 
 
 def signed(content: Content) -> Content:
-    """The content with the digest that it has."""
+    """The content with the name and the digest that it has."""
     rest = {key: value for key, value in content.items() if key != "digest"}
+    rest["loop"] = _checker().digest_of(rest)
     text = json.dumps(rest, sort_keys=True)
     return rest | {"digest": hashlib.sha256(text.encode()).hexdigest()}
 
@@ -212,6 +213,23 @@ def test_false_certificate_with_its_own_digest_is_refused(
     assert done.stderr.startswith("REFUSED"), done.stderr
 
 
+def test_certificate_with_the_name_of_another_loop_is_refused(
+    servo: Content, tmp_path: Path
+) -> None:
+    """The name that a report or a replay shows is that of these numbers."""
+    assert servo["loop"] == loop_of("osprey_servo").digest
+    named = signed(servo | {"delay": servo["delay"] - 0.001})
+    assert named["loop"] != servo["loop"]
+    text = json.dumps(
+        {key: named[key] for key in named if key != "digest"} | {"loop": servo["loop"]},
+        sort_keys=True,
+    )
+    other = json.loads(text) | {"digest": hashlib.sha256(text.encode()).hexdigest()}
+    refused = run(other, tmp_path)
+    assert refused.returncode == 1
+    assert "the loop is not the one that its name says" in refused.stderr
+
+
 def test_command_writes_a_certificate_and_refuses_what_it_cannot_state(tmp_path: Path) -> None:
     path = tmp_path / "certificate.json"
     words = ["gains", "osprey", "--check", "--samples", "1", "--certificate", str(path)]
@@ -233,6 +251,15 @@ def test_command_writes_a_certificate_and_refuses_what_it_cannot_state(tmp_path:
     content = json.loads(path.read_text())
     assert content == signed(content)
     assert {"scenario", "airframe", "constants"} <= set(content)
+    name = f"(certificate {content['loop'][:12]})"
+    assert name in " ".join(done.output.split())
+    flight = rise_di.fly(
+        rise_di.find_scenario("osprey_servo", duration=0.5), runs=tmp_path / "runs"
+    )
+    assert name in flight.report.read_text()
+    assert name in invoke("replay", str(flight.mcap)).output
+    # u with other gains is another loop
+    assert "certificate" not in invoke("replay", str(flight.mcap), "--set", "k_s=1").output
 
 
 def test_export_puts_the_certificate_beside_the_code_of_its_constants(tmp_path: Path) -> None:

@@ -28,7 +28,11 @@ from flight_analysis.closed_loop.replay import (
 )
 from flight_analysis.closed_loop.replay import replay as recompute
 from flight_analysis.closed_loop.replay_ticks import vary
+from flight_analysis.linear_loop.certificate import kept_guarantee
+from flight_analysis.linear_loop.guarantee import Guarantee
 from flight_analysis.metrics import error_metrics
+from flight_analysis.report.flown_models import flown_loops
+from flight_analysis.report.model_spans import parameter_spans
 from flight_analysis.report.run_folder import log_account
 from flight_analysis.report.sample_counts import WHOLE
 from flight_cli.log_options import REMAP, log_namespace, log_scenario, remaps_of, scenario_file
@@ -38,7 +42,7 @@ from flight_cli.words import argument, json_option, option
 from flight_core.outcome import STATUS_SHORTFALL
 from flight_core.parameters import require
 from flight_core.text import printable
-from flight_log.tape_reader import read_run
+from flight_log.tape_reader import RecordedRun, read_run
 
 DIFFERS = 1
 
@@ -93,6 +97,7 @@ class Replay:
             ticks=max(len(result.number), expected_ticks or 0),
             open_loop=others is not None,
             guided=guidance_replay,
+            promise=_guarantee_of(recorded_run) if others is None and result.equal() else None,
         )
         lacks = () if account is None else account.notes()
         notes = (*recorded_run.tape.notes, *lacks, *answer.notes())
@@ -114,6 +119,7 @@ class Shown(NamedTuple):
     ticks: int  # flown; the log may lack some
     open_loop: bool  # with other parameters
     guided: GuidanceReplay | None
+    promise: Guarantee | None  # that was computed for the loop of the flight
 
     def notes(self) -> list[str]:
         """Notes of the computation, and a note on ticks with other parameters than the log."""
@@ -130,6 +136,16 @@ class Shown(NamedTuple):
                 f"{len(rows)} ticks, {begin}, flew with other parameters than the log holds: {why}"
             )
         return notes
+
+
+def _guarantee_of(run: RecordedRun) -> Guarantee | None:
+    """The guarantee that was computed for the loop of a flight.
+
+    None without one, without a linear model, or where the parameters changed in flight.
+    """
+    has_changed = len({span.digest for span in parameter_spans(run.tape)}) > 1
+    loops = [] if has_changed else flown_loops(run.tape, recorded_scenario(run), ())
+    return kept_guarantee(loops[0].loop) if loops else None
 
 
 def _show_guidance(replay_of_guidance: GuidanceReplay) -> None:
@@ -165,6 +181,8 @@ def _guidance_as_json(replay_of_guidance: GuidanceReplay) -> dict[str, Any]:
 
 
 def _show(answer: Shown, notes: Sequence[str]) -> None:
+    from flight_analysis.report.margin_figures import guarantee_text  # noqa: PLC0415 - loads plots
+
     console = Console(soft_wrap=True, highlight=False)
     result = answer.result
     first = result.first()
@@ -194,6 +212,8 @@ def _show(answer: Shown, notes: Sequence[str]) -> None:
         console.print(f"note: {note}")
     if answer.guided is not None:
         _show_guidance(answer.guided)
+    if answer.promise is not None:
+        console.print(guarantee_text(answer.promise)[0])
 
 
 def _count_by_group(result: ReplayResult) -> dict[str, int]:
@@ -248,6 +268,7 @@ def _as_json(answer: Shown, notes: Sequence[str], settings: list[str]) -> dict[s
         "notes": list(notes),
         "expected": answer.ticks,
         "guidance": None if replay_of_guidance is None else _guidance_as_json(replay_of_guidance),
+        "guarantee": None if answer.promise is None else answer.promise.as_json(),
     }
 
 

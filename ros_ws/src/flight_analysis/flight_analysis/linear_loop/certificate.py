@@ -49,6 +49,7 @@ def certificate(linear: LinearLoop, promise: Guarantee, sources: Mapping[str, st
         **box._asdict(),
         **linear.loop._asdict(),
         "law": linear.law._asdict(),
+        "loop": promise.loop,
         "size": promise.stable / float(box.part.max()),
         "parts": promise.proof,
     }

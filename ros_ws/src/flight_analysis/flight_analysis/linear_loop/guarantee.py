@@ -38,6 +38,7 @@ FEWER_BOXES = 300  # at the others, and of disks
 # part of the deviations that is proved beyond those that are stated: it covers the coefficients
 # that are left out, and what a check by intervals loses
 SLACK = 1e-3
+NAMED = 12  # digits of a digest that name a certificate
 
 
 class Unstable(NamedTuple):
@@ -65,6 +66,11 @@ class Guarantee(NamedTuple):
     def holds(self) -> bool:
         """Whether every aircraft of the box is stable."""
         return self.stable >= self.uncertainty
+
+    @property
+    def certificate(self) -> str:
+        """The name of its certificate; "" without one: a late u, or nothing proved."""
+        return self.loop[:NAMED] if self.stable and not self.late else ""
 
     def as_json(self) -> dict[str, Any]:
         """All but the proof."""

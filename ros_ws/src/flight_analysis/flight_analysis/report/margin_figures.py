@@ -228,7 +228,8 @@ def guarantee_text(promise: Guarantee) -> list[str]:
     """A guarantee in sentences."""
     stable = math.floor(1e3 * promise.stable) / 10.0
     late = f", u up to {1e3 * promise.late:g} ms late" if promise.late else ""
-    lines = [f"guarantee: stable for every aircraft within {stable:.1f} %{late}"]
+    name = f" (certificate {promise.certificate})" if promise.certificate else ""
+    lines = [f"guarantee: stable for every aircraft within {stable:.1f} %{late}{name}"]
     if promise.unstable is None:
         lines.append("no unstable aircraft found within 99 %")
     else:
