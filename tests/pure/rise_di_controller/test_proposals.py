@@ -218,7 +218,7 @@ def test_proposal_that_loses_the_race_during_its_certificate_is_refused() -> Non
     flight.step(1)
     flight.controller.retune(START.model_copy(update={"hold": 1.0}))
     flight.step()
-    assert flight.sentences[0].endswith("they changed meanwhile")
+    assert flight.sentences[0].endswith("they changed meanwhile; proposed: model")
 
 
 def test_input_without_effect_is_held_though_the_law_fell_back_meanwhile(
@@ -241,10 +241,12 @@ def test_input_without_effect_is_held_though_the_law_fell_back_meanwhile(
     )
     flight.receive(flown=parameters.digest())  # a model alone: the law fell back because of one
     flight.receive(change, flown=parameters.digest() + 1)
-    assert [sentence.endswith("they changed meanwhile") for sentence in flight.sentences[-2:]] == [
-        True,
-        True,
+    # a refusal says what was found all the same: an input without effect stays one
+    ends = [
+        sentence.endswith("they changed meanwhile; proposed: model")
+        for sentence in flight.sentences[-2:]
     ]
+    assert ends == [True, True]
     flight.receive(change, flown=parameters.digest())
     flight.step()
     assert flight.sentences[-1] == "flies model"
@@ -261,7 +263,9 @@ def test_second_and_late_proposals_are_refused() -> None:
     flight.receive()
     flight.receive(stamp_ns=END_NS - nanoseconds(31.0))  # of a learner that was stopped
     flight.receive(stamp_ns=END_NS + 1)  # of another clock
-    assert [sentence.partition(", expected ")[2] for sentence in flight.sentences] == [
+    assert [
+        sentence.partition(", expected ")[2].partition(";")[0] for sentence in flight.sentences
+    ] == [
         "one at a time",
         "",
         "one that ends at least 1 s after that of the last proposal",
@@ -340,9 +344,8 @@ def test_stale_law_takes_no_model() -> None:
     flight.now_ns += nanoseconds(START.max_age) + 1
     flight.controller.tick(flight.now_ns)
     flight.step()
-    assert flight.sentences == [
-        "refused: found the mode HOLD, expected a model only while the law is engaged"
-    ]
+    refusal = "found the mode HOLD, expected a model only while the law is engaged"
+    assert flight.sentences == [f"refused: {refusal}; proposed: model"]
     assert flight.controller.digest == START.digest()
 
 
@@ -363,7 +366,8 @@ def test_deactivated_law_goes_back_to_start_and_takes_models_of_its_next_engagem
     flight.now_ns += nanoseconds(3.0)
     flight.engage()
     flight.receive(stamp_ns=released_ns - 1)
-    assert flight.sentences[-1] == "refused: found a window that ends 3 s ago, expected 0 to 3 s"
+    late = "refused: found a window that ends 3 s ago, expected 0 to 3 s; proposed: model"
+    assert flight.sentences[-1] == late
     flight.receive()
     flight.step()
     assert flight.sentences[-1] == "flies model"
@@ -446,7 +450,7 @@ def test_law_of_the_start_flies_where_all_parts_oscillate() -> None:
     flight.step()
     sentence = (
         "refused: proposal: found no model, expected one of other outputs than q, p, r, "
-        "V, by learn.without"
+        "V, by learn.without; proposed: model"
     )
     assert flight.sentences == [sentence]
     flight.now_ns += 10 * NANOSECONDS
@@ -480,9 +484,10 @@ def test_parameters_that_diverged_are_not_taken_again_in_the_engagement(
     diverge(flight, monkeypatch, "q")
     flight.receive()
     flight.step()
+    refusal = "found parameters that diverged in this engagement, expected others"
     assert flight.sentences[1:] == [
         "falls back to the law of the start: q diverges",
-        "refused: found parameters that diverged in this engagement, expected others",
+        f"refused: {refusal}; proposed: model",
     ]
     assert [event.kind for event in flight.events] == [
         EventKind.FLIES,

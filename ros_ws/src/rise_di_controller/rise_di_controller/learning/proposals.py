@@ -202,7 +202,7 @@ class Learning:
         if not (self._simulated or proposal.change or proposal.sentence):
             return  # a test without a change: nothing to certify or to say
         if refusal := self._refusal(proposal, now_ns, controller):
-            self._refuse(refusal, now_ns)
+            self._refuse(refusal, proposal, now_ns)
         elif self._simulated:
             self._received[proposal.stamp_ns] = proposal
         else:
@@ -382,7 +382,7 @@ class Learning:
         else:
             return None
         self._certificate = None
-        self._refuse(refusal, now_ns)
+        self._refuse(refusal, proposal, now_ns)
         return None
 
     def _unfit(self, proposal: Proposal, controller: Controller) -> str:
@@ -414,8 +414,10 @@ class Learning:
         controller.retune(new)
         self._announce(Event(now_ns, kind, change, sentence))
 
-    def _refuse(self, refusal: str, now_ns: int) -> None:
-        self._announce(Event(now_ns, EventKind.REFUSED, {}, f"refused: {refusal}"))
+    def _refuse(self, refusal: str, proposal: Proposal, now_ns: int) -> None:
+        # the sentence says which input has no effect, and that stays true
+        proposed = f"; proposed: {proposal.sentence}" if proposal.sentence else ""
+        self._announce(Event(now_ns, EventKind.REFUSED, {}, f"refused: {refusal}{proposed}"))
 
 
 def _certificate(
