@@ -9,9 +9,13 @@ import numpy as np
 import pytest
 
 from aircraft_sim.airframes.airframe import Airframe
+from aircraft_sim.jsbsim.jsbsim_aircraft import FlightCondition
+from aircraft_sim.jsbsim.jsbsim_linearization import linearize
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
+from flight_core.rates import nanoseconds
 from flight_design.identification.innovation_filters import Actuation, FlightData, recording
+from flight_design.identification.sketch import ROUGH
 from flight_design.learning.change_test import LOSS, change_test
 from flight_design.learning.part_checks import change_sentence
 from rise_di_controller.learning.learned_channels import with_channels_of
@@ -73,6 +77,38 @@ def test_loss_within_what_a_model_may_err_is_no_change(
     flown = airframe.with_matrices(airframe.matrix_a(), B, np.ones((len(B), len(airframe.gusts))))
     _, lat = change_test(recorded, flown, ACTUATION)
     assert lat.is_found is found
+
+
+@pytest.mark.parametrize(
+    "fault, dead", [("", ""), ("aileron lost 4", "aileron"), ("rudder stuck 4", "rudder")]
+)
+def test_surface_of_jsbsim_is_dead_beside_the_disturbances_of_its_learner(
+    fault: str, dead: str
+) -> None:
+    """The model is JSBSim's own linearisation, and the air moderate turbulence.
+
+    The disturbances that stand for what a sketch leaves out hide no lost surface.
+    """
+    linear = linearize(FlightCondition("c172p", 46.3, 1219.2, nanoseconds(0.005))).airframe
+    scenario = find_scenario("jsbsim_c172p").vary(
+        aircraft={
+            "rate": 100.0,
+            "sensors": {"noise": [0.002, 0.1, 0.002, 0.002]},
+            "turbulence": {"altitude": 100.0, "wind": 7.7},
+            "actuators": {"faults": [fault] if fault else []},
+        },
+        reference_model={
+            "rate": 100.0,
+            "pulses": {"p": {"start": [3.0, 5.0], "stop": [4.0, 6.0], "value": [0.2, -0.2]}},
+        },
+        flight={"duration": 8.0},
+    )
+    controller = scenario.rise_di()
+    lag = dict(zip(controller.inputs, controller.lag, strict=True))
+    actuation = Actuation(np.array([lag[name] for name in linear.inputs]), 0.0)
+    recorded = recording(simulate(scenario), linear)
+    (change,) = change_test(recorded, linear, actuation, drift=ROUGH.drift)
+    assert (change.is_found, change.dead) == (bool(dead), dead)
 
 
 def law_of(controller: RiseDiConfig) -> tuple[np.ndarray, ...]:

@@ -12,6 +12,7 @@ from aircraft_sim.airframes.airframe import Airframe
 from control_laws.nominal_model import NominalModel
 from flight_core.vectors import FloatArray
 from flight_design.identification.innovation_filters import (
+    DRIFT,
     Actuation,
     Block,
     FlightData,
@@ -70,6 +71,7 @@ def change_test(
     flown: Airframe,
     actuation: Actuation,
     delays: Mapping[tuple[str, ...], FloatArray] | None = None,
+    drift: float = DRIFT,
 ) -> tuple[Change, ...]:
     """The parts of the aircraft with the gain of log-likelihood G by a loss of effect.
 
@@ -86,15 +88,14 @@ def change_test(
 
     The input j is dead if kappa_j <= NONE - 1 has a J lower than the first J by more than MAX_GAIN,
     and at most DEAD_WITHIN above the second. Arguments: `delays` of u by the outputs of a part, s,
-    by default the delay of `actuation`.
+    by default the delay of `actuation`; `drift` is the noise of the disturbances, as in `Unknown`.
     """
     changes = []
     flown = in_rolling_air(flown)
     for block in blocks(filter_model(flown, actuation, recorded)):
         outputs = tuple(flown.outputs[i] for i in block.outputs)
-        effects = Effects(
-            recorded, flown, actuation, block, (delays or {}).get(outputs, actuation.delay)
-        )
+        delay = (delays or {}).get(outputs, actuation.delay)
+        effects = Effects(recorded, flown, actuation, block, delay, drift)
         inputs = effects.names.inputs
         gain = 0.0
         dead = ""
@@ -135,10 +136,12 @@ class Effects(Search):
         actuation: Actuation,
         block: Block,
         delay: float | FloatArray,
+        drift: float = DRIFT,
     ) -> None:
-        """`delay` of u, s."""
+        """`delay` of u, s, and the noise of the disturbances."""
         model = filter_model(flown, actuation, recorded)
-        super().__init__(recorded, model, block, flown, delay, Unknown(angle=ANGLE), factor=1)
+        unknown = Unknown(angle=ANGLE, drift=drift)
+        super().__init__(recorded, model, block, flown, delay, unknown, factor=1)
         self._flown = super().with_errors(np.zeros((1, len(self.prior))))
         self._angles = np.flatnonzero(~model.C[np.ix_(block.outputs, block.states)].any(axis=0))
         self.believe(np.ones(self.count))

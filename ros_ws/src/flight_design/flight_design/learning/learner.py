@@ -118,9 +118,8 @@ class Learner:
         sampling and lags. `design_of_rough` designs for a model with errors: the rough model flies
         so from the start, and later in parts without a learned model; None: the law of the start.
 
-        `rough` has the deviation of B in the rough model, and the noise of the disturbances. With
-        more noise than DRIFT the aircraft is not tested for a change: the disturbances stand for a
-        change, and for a dead input. `quick` as for `identify`.
+        `rough` has the deviation of B in the rough model, and the noise of the disturbances, of a
+        test for a change too. `quick` as for `identify`.
         """
         settings = controller.learn
         assert settings is not None  # noqa: S101 - `scenario_learner.learner` makes no other
@@ -489,8 +488,7 @@ class Learner:
         begin_ns = end_ns - nanoseconds(RECORD)
         learned = {part: known for part, known in self._known.items() if part not in self._changed}
         if (
-            self._is_sketch
-            or not learned
+            not learned
             or self._record.length < RECORD
             or self._record.oscillated(end_ns - nanoseconds(RETRY))
         ):
@@ -501,7 +499,8 @@ class Learner:
         if len(recent.t) < len(whole.t) or not has_moved:
             return []
         delays = {part: np.array(known.delays) for part, known in learned.items()}
-        changes = change_test(recent, self._at_speed(self._model, ratio), self._actuation, delays)
+        model = self._at_speed(self._model, ratio)
+        changes = change_test(recent, model, self._actuation, delays, self._believed.drift)
         has_fallen = self._record.fell_back(begin_ns, self._proposals)
         found = []
         for change in changes:
