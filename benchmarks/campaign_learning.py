@@ -29,7 +29,7 @@ from flight_campaign.campaign import define
 from flight_campaign.statistics import score, score_units
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS, period_ns
-from flight_design.gains.gain_design import observed
+from flight_design.gains.gain_design import selected_observer
 from flight_design.learning.scenario_learner import quick_learner
 from rise_di_controller.learning.proposals import Event, EventKind
 from rise_di_controller.rise_di_config import RiseDiConfig
@@ -48,7 +48,8 @@ class _Knowing:
         plain = start.model_copy(update={"learn": None})
         true = scenario.aircraft.sampled_airframe()
         try:
-            design = observed(plain, scenario, true, start.observer.margin, uncertain=False)[0]
+            margin = start.observer.margin
+            design = selected_observer(plain, scenario, true, margin, uncertain=False).controller
         except ParameterError as error:
             self._next = LearnerResult(None, str(error))
         else:

@@ -31,7 +31,7 @@ from flight_core.outcome import COMPLETED
 from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
-from flight_design.gains.gain_design import observed
+from flight_design.gains.gain_design import selected_observer
 from flight_design.learning.scenario_learner import learner
 from rise_di_controller.law.linear_loop import LinearPlant, LoopTiming, is_stable, linear_law
 from rise_di_controller.learning.proposals import Event
@@ -250,7 +250,7 @@ def designed(
     None where no relaxation has the margins.
     """
     try:
-        return observed(start, scenario, model, MARGIN, uncertain=uncertain)[0]
+        return selected_observer(start, scenario, model, MARGIN, uncertain=uncertain).controller
     except ParameterError:
         return None
 

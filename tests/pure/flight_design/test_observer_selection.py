@@ -26,7 +26,7 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 from flight_design.gains import observer_search
-from flight_design.gains.gain_design import STABLE, observed
+from flight_design.gains.gain_design import STABLE, selected_observer
 from flight_design.gains.nominal import activity_units
 from flight_design.gains.observer_gains import gains_by_rule
 from flight_design.gains.observer_search import WORST_OF
@@ -252,9 +252,9 @@ def test_aircraft_that_no_gains_hold_do_not_count() -> None:
         damping=0.05,
         worst_phase=math.radians(5.0),
     )
-    controller, origin = observed(scenario.rise_di(), scenario, airframe, 0.01, loose)
-    assert controller.observer is not None
-    assert f"{diverging} of {WORST_OF} uncertain aircraft do not count" in origin
+    selected = selected_observer(scenario.rise_di(), scenario, airframe, 0.01, loose)
+    assert selected.controller.observer is not None
+    assert f"{diverging} of {WORST_OF} uncertain aircraft do not count" in selected.origin
     assert 0 < diverging < WORST_OF / 2
 
 
@@ -268,7 +268,7 @@ def test_gains_of_a_file_make_the_observer_of_the_example(tmp_path: Path) -> Non
     begin = scenario.rise_di(), scenario, airframe, 0.01, STABLE
 
     def designed(path: Path) -> Any:
-        return observed(*begin, uncertain=False, weights=path)[0].observer
+        return selected_observer(*begin, uncertain=False, weights=path).controller.observer
 
     observer = designed(file)
     assert shipped is not None

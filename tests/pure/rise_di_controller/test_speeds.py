@@ -26,7 +26,7 @@ from flight_analysis.linear_loop.loop_margins import law_order
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
 from flight_core.vectors import StampedVector
-from flight_design.gains.gain_design import observed
+from flight_design.gains.gain_design import selected_observer
 from flight_design.gains.observer_search import SelectedObserver
 from flight_design.identification.model_quality import best_known
 from flight_design.learning.designs import Goal
@@ -51,7 +51,10 @@ SHIPPED = find_scenario("osprey_observer").vary(
 @pytest.fixture(scope="module")
 def scheduled() -> RiseDiConfig:
     """From 0.7 to 1.4 of the trim speed."""
-    return observed(SHIPPED.rise_di(), SHIPPED, OSPREY, 0.03, uncertain=False, speeds=(0.7, 1.4))[0]
+    speeds = (0.7, 1.4)
+    return selected_observer(
+        SHIPPED.rise_di(), SHIPPED, OSPREY, 0.03, uncertain=False, speeds=speeds
+    ).controller
 
 
 def margin(controller: RiseDiConfig, ratio: float) -> float:

@@ -64,7 +64,7 @@ from flight_core.outcome import FlightEnded
 from flight_core.parameters import ParameterError, require, require_channels
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
-from flight_design.gains.gain_design import observed
+from flight_design.gains.gain_design import selected_observer
 from flight_design.gains.ideal_control import ChannelPairing
 from flight_design.gains.relaxation import lacking as what_lacks
 from flight_design.gains.requirement import PHASE_MARGIN, Requirement, requirement
@@ -390,10 +390,10 @@ class _Reflight(NamedTuple):
 
 def _refly(scenario: Scenario, tape: Tape, model: Airframe, margin: float) -> _Reflight:
     """The scenario of a log, flown in this process under feedforward and observer of a model."""
-    controller, origin = observed(scenario.rise_di(), scenario, model, margin)
-    again = simulate(replace(scenario, controller=controller))
+    selected = selected_observer(scenario.rise_di(), scenario, model, margin)
+    again = simulate(replace(scenario, controller=selected.controller))
     return _Reflight(
-        origin, manoeuvre_result(tape).rms, manoeuvre_result(again).rms, str(again.outcome)
+        selected.origin, manoeuvre_result(tape).rms, manoeuvre_result(again).rms, str(again.outcome)
     )
 
 

@@ -160,7 +160,7 @@ def select_gains(
     if not observer:
         return selection
     needed = _beside_observer(setting.requirement, as_read=weights is not None and accept)
-    controller, origin = observed(
+    beside = selected_observer(
         selection.chosen,
         flight,
         known_model,
@@ -170,7 +170,7 @@ def select_gains(
         weights=weights,
         progress=progress,
     )
-    return replace(selection, chosen=controller, origin=origin)
+    return replace(selection, chosen=beside.controller, origin=beside.origin)
 
 
 def _beside_observer(required: Requirement, *, as_read: bool) -> Requirement:
@@ -422,33 +422,6 @@ def lags_by_input(lag: ArrayLike, airframe: Airframe) -> dict[str, float]:
     )
     require(min(values) >= 0.0, "lag", lag, expected)
     return dict(zip(names, values, strict=True))
-
-
-def observed(
-    controller: RiseDiConfig,
-    scenario: Scenario,
-    model: Airframe,
-    margin: float,
-    requirement: Requirement = OBSERVER_REQUIREMENT,
-    *,
-    uncertain: bool = True,
-    speeds: tuple[float, float] | None = None,
-    weights: FilePath | None = None,
-    progress: Callable[[str], None] = lambda _: None,
-) -> tuple[RiseDiConfig, str]:
-    """The controller of `selected_observer`, and a sentence on its gains."""
-    selected = selected_observer(
-        controller,
-        scenario,
-        model,
-        margin,
-        requirement,
-        uncertain=uncertain,
-        speeds=speeds,
-        weights=weights,
-        progress=progress,
-    )
-    return selected.controller, selected.origin
 
 
 def selected_observer(
