@@ -39,6 +39,7 @@ from flight_cli.output import (
     COUNT_COLUMNS,
     INTERRUPTED,
     SHOWN_COLUMN,
+    named_numbers,
     new_table,
     parse_numbers,
     print_json,
@@ -187,7 +188,7 @@ class Campaign:
         quick_learner(scenario)  # refuses what the aircraft could not learn with
         spread = scenario.aircraft.uncertainty.spread()
         if self.entry is not None:
-            entries = _named_numbers("entry", self.entry, "A[q,alpha]=0.6")
+            entries = named_numbers("entry", self.entry, "A[q,alpha]=0.6")
             spread = spread._replace(entries=entries)
         if self.distribution is not None:
             spread = spread._replace(distribution=self.distribution)
@@ -200,7 +201,7 @@ class Campaign:
             None if self.sweep is None else _parse_sweep(self.sweep),
             self.wind,
             spread,
-            None if self.score is None else _named_numbers("score", self.score, "q=0.02"),
+            None if self.score is None else named_numbers("score", self.score, "q=0.02"),
         )
         return MonteCarlo.begin(new_run(scenario, self.runs, "campaign-"), definition)
 
@@ -222,24 +223,6 @@ def _show_cases(
         if figures["influence"]["entries"]:
             show_table(console, influence_table(definition.label(case), figures))
     show_table(console, results)
-
-
-def _named_numbers(option: str, texts: Sequence[str], example: str) -> dict[str, float]:
-    """Numbers by name from texts as NAME=NUMBER."""
-    numbers = {}
-    for text in texts:
-        name, _, value = text.rpartition("=")
-        parsed = parse_numbers(value)
-        is_single = bool(name) and "=" not in name and len(parsed) == 1
-        again = f"; --{option} again for each further one" if "=" in name else ""
-        require(
-            is_single and name not in numbers,
-            option,
-            repr(text),
-            f"a name and a number: {example}{again}",
-        )
-        numbers[name] = parsed[0]
-    return numbers
 
 
 def _parse_sweep(text: str) -> Sweep:

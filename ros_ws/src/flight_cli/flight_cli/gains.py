@@ -15,9 +15,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
-from flight_analysis.linear_loop.certificate import certificate, keep
+from flight_analysis.linear_loop.certificate import keep
 from flight_analysis.linear_loop.guarantee import Guarantee, guarantee
 from flight_analysis.report.display_units import display_unit
 from flight_analysis.report.html import write_loop_page
@@ -32,10 +33,12 @@ from flight_campaign.statistics import SCORE_UNIT, score_units
 from flight_cli.gains_guarantee import (
     require_guarantee,
     show_guarantee,
+    write_certificate,
     write_unstable,
 )
 from flight_cli.output import (
     LICENCE,
+    named_numbers,
     new_table,
     parse_lags,
     parse_numbers,
@@ -69,7 +72,6 @@ from flight_design.gains.relaxation import lacking
 from flight_design.gains.requirement import PHASE_MARGIN
 from flight_design.gains.trade import trade
 from flight_log.px4_parameters import rate_loop
-from rise_di.c_code import certificate_sources
 from rise_di_controller.params import ControllerConfig
 
 CONDITION_FAILS = 1
@@ -208,6 +210,10 @@ class Gains:
     check: bool = option(
         "Check the gain set of the scenario instead of selecting one.", default=False
     )
+    entry: list[str] | None = rare_option(
+        "With --check: an entry with a deviation of its own, once for each: 'A[q,alpha]=0.6', or "
+        "'1/lag[elevator]=0.3' of an actuator."
+    )
     page: Path | None = rare_option(
         "HTML file for the margins with Bode and Nyquist plots: of the engineering "
         "gains, or with --check."
@@ -243,6 +249,7 @@ class Gains:
             check=self.check,
             is_wanted=self.guaranteed,
             late=self.late,
+            entries=self.entry or (),
             files={"worst": self.worst, "certificate": self.certificate},
         )
         rate, delay, origin = _loop_of_px4(self.px4, self.rate, self.delay)
@@ -273,16 +280,17 @@ class Gains:
         own_loop = all(value is None for value in values_of(self, *LOOP).values())
         expected = "the scenario's own rate, lag, delay and inputs"
         require(own_loop, "--check", "another loop beside it", expected)
-        answer = check_gains(self.airframe, self.scenario, **values_of(self, *STUDY))
+        entries = named_numbers("entry", self.entry or (), "1/lag[elevator]=0.3")
+        answer = check_gains(
+            self.airframe, self.scenario, **values_of(self, *STUDY), entries=entries
+        )
         if not self.guaranteed:
             return _GainsAnswer({"scenario": answer})
         progress("bounding every aircraft of the box")
         loop = answer.loop_with_box()
         promise = guarantee(loop, self.late)
         keep(promise)
-        if self.certificate is not None:
-            sources = certificate_sources(self.airframe, self.scenario)
-            write_text("certificate", self.certificate, certificate(loop, promise, sources))
+        write_certificate(self.certificate, loop, promise, self.airframe, self.scenario)
         lines = write_unstable(self.worst, promise, self.airframe, self.scenario)
         return _GainsAnswer({"scenario": answer}, promise=promise, unstable=lines)
 
@@ -311,7 +319,7 @@ class Gains:
         """Print tables, the trade of a selection, origins and the paths of the files."""
         selection = result.selection
         _show_conditions(console, result.study, result.answers)
-        show_guarantee(console, result.promise, result.first.margins)
+        show_guarantee(console, result.promise, result.first)
         lines = [origin]
         if selection is not None:
             lines.insert(0, selection.origin)
@@ -385,7 +393,9 @@ def _show_conditions(console: Console, study: Study, answers: dict[str, Assessme
     first = next(iter(answers.values()))
     outputs = first.controller.outputs
     samples = len(study.A) - 1
-    aircraft = f"{study.airframe.name}, A and B +-{100 * study.uncertainty:g} % ({samples} samples)"
+    parts = {"A and B": study.uncertainty, **study.spread.entries}
+    box = ", ".join(f"{name} +-{100 * part:g} %" for name, part in parts.items())
+    aircraft = f"{study.airframe.name}, {escape(box)} ({samples} samples)"
     print_table(
         console,
         _gain_table(answers, aircraft) if first.theorem else _own_gains(first.controller, aircraft),
@@ -543,6 +553,7 @@ def _as_json(result: _GainsAnswer, seed: int) -> dict[str, Any]:
     return {
         "airframe": study.airframe.name,
         "uncertainty": study.uncertainty,
+        "entries": dict(study.spread.entries),
         "samples": len(study.A) - 1,
         "seed": seed,
         "slew": dict(zip(inputs, study.slew.tolist(), strict=True)),

@@ -4,7 +4,7 @@
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,34 +14,57 @@ from aircraft_sim.airframes.airframe import load_airframe
 from aircraft_sim.uncertainty import as_yaml, with_entries
 from flight_analysis.closed_loop.scenario import scenario_yaml
 from flight_analysis.closed_loop.scenario_library import find_scenario
+from flight_analysis.linear_loop.certificate import certificate
 from flight_analysis.linear_loop.delay_margin import MAX_DELAY_MARGIN
 from flight_analysis.linear_loop.guarantee import LARGEST, Guarantee
 from flight_analysis.linear_loop.input_margins import disk_gain, disk_phase
-from flight_analysis.linear_loop.loop_margins import LoopMargins
+from flight_analysis.linear_loop.loop_margins import LinearLoop
 from flight_analysis.report.margin_figures import decibels, guarantee_rows, guarantee_text
+from flight_campaign.equipment import published, scenario_with_equipment
 from flight_cli.output import LICENCE, new_table, print_table, say, write_text
 from flight_core.arguments import as_number
 from flight_core.files import display_path, is_folder, writing
 from flight_core.parameters import require
+from flight_design.gains.gain_selection import GainAssessment
+from rise_di.c_code import certificate_sources
+from rise_di_controller.params import ControllerConfig
 
 FARTHER = 1.2  # times the deviations of the first unstable aircraft: a loop that diverges
 FORMS = (".3f", ".1f", ".1f", ".3f")  # of the columns of a guarantee
 
 
 def require_guarantee(
-    *, check: bool, is_wanted: bool, late: float, files: Mapping[str, Path | None]
+    *,
+    check: bool,
+    is_wanted: bool,
+    late: float,
+    entries: Sequence[str],
+    files: Mapping[str, Path | None],
 ) -> None:
     """Raise ParameterError for a guarantee without --check, or its settings without a guarantee."""
     require(check or not is_wanted, "--guarantee", "no --check", "--check beside it")
+    require(check or not entries, "entry", "no --check", "--check beside it")
     for name, path in files.items():
         require(is_wanted or path is None, name, "no --guarantee", "--guarantee beside it")
     require(is_wanted or late == 0.0, "late", "no --guarantee", "--guarantee beside it")
     as_number(late, "late", 0.0, MAX_DELAY_MARGIN, "s")
     path = files["certificate"]
     require(late == 0.0 or path is None, "certificate", f"--late {late:g} beside it", "u in time")
+    # the checker's bounds are too coarse for most actuators
+    lags = [text for text in entries if text.startswith("1/")]
+    require(not lags or path is None, "certificate", f"{', '.join(lags)} beside it", "exact lags")
     # before the proof, which takes up to minutes
     fits = path is None or (os.access(path.parent, os.W_OK) and not is_folder(path))
     require(fits, "certificate", path, "a file in a folder that can be written")
+
+
+def write_certificate(
+    path: Path | None, loop: LinearLoop, promise: Guarantee, airframe: str, scenario: str
+) -> None:
+    """Write the certificate of a guarantee, if a path is named."""
+    if path is not None:
+        sources = certificate_sources(airframe, scenario)
+        write_text("certificate", path, certificate(loop, promise, sources))
 
 
 def write_unstable(
@@ -57,9 +80,14 @@ def write_unstable(
     base = find_scenario(scenario)
     frame = load_airframe(airframe)
     require(promise.unstable is not None, "worst", "no unstable aircraft", "a loop that has one")
+    assert promise.unstable is not None  # noqa: S101 - for mypy
     fits = not base.aircraft.is_jsbsim and load_airframe(base.aircraft.airframe).name == frame.name
     require(fits, "worst", airframe, f"the aircraft of {base.name}, {base.aircraft.airframe}")
-    assert promise.unstable is not None  # noqa: S101 - for mypy
+    names = zip(base.controller.inputs, base.controller.lag, strict=True)
+    declared = {f"1/lag[{name}]": lag for name, lag in names}
+    own = [f"1/{name}" for name in published(base)]
+    others = [name for name in promise.unstable.entries if name in {*declared} - {*own}]
+    require(not others, "worst", ", ".join(others), f"lags of the actuators of {base.name} alone")
     with writing("--worst", folder, "a folder that can"):
         folder.mkdir(parents=True, exist_ok=True)
     first = promise.unstable.deviation
@@ -67,8 +95,15 @@ def write_unstable(
     for factor, prefix in ((1.0, ""), (min(FARTHER, LARGEST / first), "farther_")):
         entries = {name: factor * value for name, value in promise.unstable.entries.items()}
         path = folder / f"{prefix}airframe.yaml"
-        write_text("worst", path, LICENCE + as_yaml(with_entries(frame, entries)))
+        matrices = {name: value for name, value in entries.items() if name not in declared}
+        write_text("worst", path, LICENCE + as_yaml(with_entries(frame, matrices)))
+        lags = {
+            name.removeprefix("1/"): declared[name] / (1.0 + value)
+            for name, value in entries.items()
+            if name in declared
+        }
         varied = base.vary(aircraft={"airframe": str(path.absolute())})
+        varied = scenario_with_equipment(varied, lags)
         flight = folder / f"{prefix}scenario.yaml"
         write_text("worst", flight, scenario_yaml(varied))
         deviation = factor * first
@@ -82,13 +117,17 @@ def write_unstable(
 
 
 def show_guarantee(
-    console: Console, promise: Guarantee | None, margins: LoopMargins | None
+    console: Console, promise: Guarantee | None, checked: GainAssessment[ControllerConfig]
 ) -> None:
     """The guarantee in sentences, and a table of the disk margins."""
     if promise is None:
         return
     for line in guarantee_text(promise):
         say(console, line)
+    study = checked.study
+    if {*study.spread.entries.values()} - {study.uncertainty}:
+        say(console, "percentages: of the largest deviation, with the others in proportion")
+    margins = checked.margins
     if not promise.holds or margins is None or margins.worst is None:
         return
     heads = ("input", "disk", "phase\ndeg", "gain\ndB", "worst found,\ndisk")

@@ -215,6 +215,24 @@ def parse_numbers(text: str) -> list[float]:
         return []
 
 
+def named_numbers(option: str, texts: Sequence[str], example: str) -> dict[str, float]:
+    """Numbers by name from texts as NAME=NUMBER."""
+    numbers = {}
+    for text in texts:
+        name, _, value = text.rpartition("=")
+        parsed = parse_numbers(value)
+        is_single = bool(name) and "=" not in name and len(parsed) == 1
+        again = f"; --{option} again for each further one" if "=" in name else ""
+        require(
+            is_single and name not in numbers,
+            option,
+            repr(text),
+            f"a name and a number: {example}{again}",
+        )
+        numbers[name] = parsed[0]
+    return numbers
+
+
 def parse_lags(text: str) -> list[float]:
     """Lags from "0.02,0.1", or from one value for all. Raises ParameterError."""
     values = parse_numbers(text)

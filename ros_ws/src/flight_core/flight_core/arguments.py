@@ -4,6 +4,7 @@
 
 import math
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TypeVar
 
@@ -62,6 +63,15 @@ def as_numbers(value: object, key: str, expected: str) -> tuple[float, ...]:
     numbers = kind_of(float | tuple[float, ...]).read(value, key, problems)
     require(not problems.sentences(), key, short_repr(value), expected)
     return numbers if isinstance(numbers, tuple) else (float(numbers),)
+
+
+def as_numbers_by_name(values: object, key: str, example: str) -> dict[str, float]:
+    """Finite numbers by name from a mapping. Raises ParameterError for a different value."""
+    if not isinstance(values, Mapping):
+        raise ParameterError(f"{key}: found {values!r}, expected numbers by name, as in {example}")
+    return {
+        str(name): as_number(value, f"{key}.{name}", -math.inf) for name, value in values.items()
+    }
 
 
 def as_names(value: object, key: str, expected: str) -> tuple[str, ...]:

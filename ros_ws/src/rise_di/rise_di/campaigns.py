@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Monte Carlo campaigns, as `rise-di campaign` flies them on the cores of this machine."""
 
-import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -18,7 +17,7 @@ from flight_campaign.campaign import MonteCarlo, define
 from flight_campaign.campaign_report import write_results
 from flight_campaign.definition import Definition, Sweep
 from flight_campaign.single_flights import flies_alone
-from flight_core.arguments import FilePath, as_count, as_number, as_path
+from flight_core.arguments import FilePath, as_count, as_numbers_by_name, as_path
 from flight_core.parameters import ParameterError, require
 from flight_design.learning.scenario_learner import quick_learner
 
@@ -114,10 +113,12 @@ def fly_campaign(
     source = find_scenario(scenario, duration)
     spread = source.aircraft.uncertainty.spread()
     if entries is not None:
-        spread = spread._replace(entries=_numbers(entries, "entries", '{"A[q,alpha]": 0.6}'))
+        spread = spread._replace(
+            entries=as_numbers_by_name(entries, "entries", '{"A[q,alpha]": 0.6}')
+        )
     if distribution is not None:
         spread = spread._replace(distribution=distribution)
-    units = None if score is None else _numbers(score, "score", '{"q": 0.02}')
+    units = None if score is None else as_numbers_by_name(score, "score", '{"q": 0.02}')
     definition = define(
         source, aircraft, uncertainty, seed, chunk, _sweep(sweep), wind, spread, units
     )
@@ -170,15 +171,6 @@ def _progress(progress: Progress | None) -> Progress:
         "a function of the flights so far and of all flights",
     )
     return progress or (lambda flown, total: None)
-
-
-def _numbers(values: Mapping[str, float], key: str, example: str) -> dict[str, float]:
-    """Numbers by name. Raises ParameterError for another value."""
-    if not isinstance(values, Mapping):
-        raise ParameterError(f"{key}: found {values!r}, expected numbers by name, as in {example}")
-    return {
-        str(name): as_number(value, f"{key}.{name}", -math.inf) for name, value in values.items()
-    }
 
 
 def _sweep(sweep: Mapping[str, ArrayLike] | None) -> Sweep | None:

@@ -6,19 +6,27 @@ They are taken on the nominal and on uncertain aircraft.
 """
 
 import hashlib
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from aircraft_sim import random_streams
 from aircraft_sim.airframes.airframe import Airframe, load_airframe
-from aircraft_sim.uncertainty import UNIFORM, Spread, drawn_places, nominal_and_sampled
+from aircraft_sim.uncertainty import (
+    UNIFORM,
+    Spread,
+    deviations,
+    drawn_places,
+    nominal_and_sampled,
+)
 from flight_analysis.closed_loop.scenario import Scenario, as_scenario
 from flight_analysis.linear_loop.delay_margin import MAX_DELAY_MARGIN, delay_margin
 from flight_analysis.linear_loop.input_margins import Margins, SlowModes, input_margins, slow_modes
 from flight_analysis.linear_loop.uncertain_loop import Box, plants_at
 from flight_analysis.linear_loop.worst_case import worst_in_box
 from flight_core.arguments import as_count, as_number
-from flight_core.parameters import ParameterError
+from flight_core.parameters import ParameterError, require
 from flight_core.vectors import FloatArray
 from rise_di_controller.law.law import Sign
 from rise_di_controller.law.linear_loop import (
@@ -32,6 +40,10 @@ from rise_di_controller.law.linear_loop import (
 )
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di_config import RiseDiConfig
+
+LEAST_LAG = 2.0
+"""Periods: at (1 + d) / lag with d up to 0.8 the two Legendre coefficients of a period then leave
+out less of d than the thousandth that a guarantee proves beyond what it states."""
 
 BARE = (
     "; each output integrates its inputs, without drag and phugoid: the margins cover Omega alone"
@@ -100,7 +112,8 @@ def margins(
     A search finds the least. Every entry of A and B of an uncertain aircraft is off by up to
     `uncertainty`, or as `spread` says, the rows of angles excepted. Samples count for the number of
     stable aircraft alone: the least margins are at corners, where none falls. The controller gives
-    lags and delay. The uncertainty of the scenario itself is left out.
+    lags and delay, exact unless `spread` has an entry 1/lag[INPUT]. The uncertainty of the scenario
+    itself is left out.
 
     Args:
         scenario: The flight: aircraft and controller.
@@ -113,8 +126,8 @@ def margins(
         Margins of the nominal aircraft and the worst found; delay margins in s.
 
     Raises:
-        ParameterError: The law has the literal sign, or the aircraft is of JSBSim and the
-            controller has no model.
+        ParameterError: The law has the literal sign, the aircraft is of JSBSim and the controller
+            has no model, or an entry is unknown.
 
     Examples:
         >>> rise_di.margins(rise_di.find_scenario("osprey_servo")).delay > 0.03
@@ -219,12 +232,12 @@ def scenario_loop(
     Raises as `margins`.
     """
     airframe = _model(scenario, controller)
-    A, B = nominal_and_sampled(airframe, uncertainty, aircraft, seed, spread)
+    matrices, _ = of_matrices_and_lags(spread, controller)
+    A, B = nominal_and_sampled(airframe, uncertainty, aircraft, seed, matrices)
     T = distribution(airframe, controller)  # B of each effector is drawn
     airframe_of_law = through_allocation(airframe, controller)
     linear = linear_loop(controller, airframe_of_law, A, B @ T)
-    box = box_of(airframe, controller, uncertainty, spread)
-    return linear._replace(box=box) if box.part.any() else linear
+    return with_box(linear, airframe, controller, uncertainty, seed, spread)
 
 
 def linear_loop(
@@ -251,6 +264,95 @@ def linear_loop(
         law=linear_law(controller.tuned_law(), len(rows), loop.period),
         loop=loop,
     )
+
+
+def with_box(
+    linear: LinearLoop,
+    airframe: Airframe,
+    controller: ControllerConfig,
+    uncertainty: float,
+    seed: int,
+    spread: Spread,
+) -> LinearLoop:
+    """The loop of the nominal and sampled aircraft of a seed, with the box of these.
+
+    The box is None where nothing deviates. A lag that deviates is an entry of the plant, and 0 in
+    the loop:
+
+        x_dot = A x + B u_a,  u_a_dot = (1 + d) / lag (u - u_a),  states x and u_a
+
+    Raises ParameterError as `of_matrices_and_lags`.
+    """
+    box = box_of(airframe, controller, uncertainty, spread)
+    _, parts = of_matrices_and_lags(spread, controller)
+    if parts:
+        linear, box = with_lags_pulled_out(linear, box, parts, seed, spread)
+    return linear._replace(box=box) if box.part.any() else linear
+
+
+def of_matrices_and_lags(
+    spread: Spread, controller: ControllerConfig
+) -> tuple[Spread, dict[int, float]]:
+    """The entries of A and B, and the relative deviation of 1 / lag by input of the law.
+
+    An entry of a lag is 1/lag[INPUT]. Raises ParameterError for an unknown entry that is none of A
+    or B, a lag below LEAST_LAG periods, and a part outside [0, 1).
+    """
+    least = LEAST_LAG / controller.rate
+    known = {
+        f"1/lag[{name}]": i
+        for i, name in enumerate(controller.inputs)
+        if controller.lag[i] >= least * (1.0 - 1e-9)
+    }
+    matrices = {}
+    lags = {}
+    for name, part in spread.entries.items():
+        if name.startswith(("A[", "B[")):
+            matrices[name] = part
+            continue
+        expected = (
+            f"a lag of {least:g} s or more: {', '.join(known) or 'none'}; or an entry of A or B, "
+            "as A[q,q]"
+        )
+        require(name in known, "entry", name, expected)
+        require(0.0 <= part < 1.0, name, part, "a part of 1 / lag, 0 <= part < 1")
+        lags[known[name]] = part
+    return spread._replace(entries=matrices), lags
+
+
+def with_lags_pulled_out(
+    linear: LinearLoop, box: Box, parts: Mapping[int, float], seed: int, spread: Spread
+) -> tuple[LinearLoop, Box]:
+    """The loop and its box with the actuators of some inputs as states of the plant."""
+    places = [*parts]
+    count, n, m = linear.plant.B.shape
+    size = len(places)
+    rate = 1.0 / linear.loop.lag[places]
+    part = np.array([*parts.values()])
+    uniform = random_streams.uniform(0, count - 1, m, random_streams.EQUIPMENT, seed)[:, places]
+    d = np.vstack([np.zeros(size), deviations(uniform, spread.distribution)])
+    # u_a of the inputs S' u, and the other inputs
+    S = np.eye(m)[:, places]
+    others = np.eye(m) - S @ S.T
+    rates = (rate * (1.0 + part * d))[:, :, None] * np.eye(size)
+    none = np.zeros((count, size, n))
+    plant = LinearPlant(
+        np.block([[linear.plant.A, linear.plant.B @ S], [none, -rates]]),
+        np.concatenate([linear.plant.B @ others, rates @ S.T], axis=1),
+        np.hstack([linear.plant.C, np.zeros((len(linear.plant.C), size))]),
+    )
+    changes = np.diag(part * rate)
+    E = np.pad(box.E, ((0, size), (0, size)))
+    E[n:, len(box.names) :] = np.eye(size)
+    wider = Box(
+        names=(*box.names, *(f"1/lag[{linear.inputs[i]}]" for i in places)),
+        part=np.append(box.part, part),
+        E=E,
+        F=np.block([[box.F, box.G @ S], [none[0], -changes]]),
+        G=np.vstack([box.G @ others, changes @ S.T]),
+    )
+    loop = linear.loop._replace(lag=others @ linear.loop.lag)
+    return linear._replace(plant=plant, loop=loop), wider
 
 
 def box_of(

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Gains for an airframe in the loop of a scenario, as `rise-di gains` selects and checks them."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -11,12 +11,25 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from aircraft_sim.airframes.airframe import Airframe, load_airframe
+from aircraft_sim.uncertainty import UNIFORM, Spread
 from control_laws.nominal_model import NominalModel
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.linear_loop.delay_margin import MAX_DELAY_MARGIN
-from flight_analysis.linear_loop.loop_margins import distribution, loop_of, through_allocation
-from flight_core.arguments import FilePath, as_count, as_names, as_number, as_numbers
+from flight_analysis.linear_loop.loop_margins import (
+    distribution,
+    loop_of,
+    of_matrices_and_lags,
+    through_allocation,
+)
+from flight_core.arguments import (
+    FilePath,
+    as_count,
+    as_names,
+    as_number,
+    as_numbers,
+    as_numbers_by_name,
+)
 from flight_core.parameters import require
 from flight_core.vectors import FloatArray
 from flight_design.gains import gain_selection, ideal_control, tuned_gains
@@ -210,6 +223,7 @@ def check_gains(
     gamma_2: float = 0.0,
     samples: int = 100,
     seed: int = 1,
+    entries: Mapping[str, float] = UNIFORM.entries,
 ) -> GainAssessment[ControllerConfig]:
     """Every condition on the gains of a scenario under any law, and the margins of the loop.
 
@@ -220,6 +234,8 @@ def check_gains(
         gamma_2: gamma_2 of Lemma 1 in 1/s, an assumption.
         samples: Number of uncertain airframes for the bounds of the theorem, at most 10,000.
         seed: Seed of the uncertain airframes.
+        entries: Deviations by entry, {"A[q,alpha]": 0.6}; {"1/lag[elevator]": 0.3} is that of an
+            actuator, whose lag is exact otherwise.
 
     Returns:
         The controller, the conditions and the margins.
@@ -234,7 +250,8 @@ def check_gains(
     flight = find_scenario(scenario)
     frame = load_airframe(airframe)
     gamma_2 = as_number(gamma_2, "gamma_2", 0.0, unit="1/s")
-    studied = study(frame, flight, flight.controller, uncertainty, samples, seed)
+    spread = Spread(as_numbers_by_name(entries, "entries", '{"1/lag[elevator]": 0.3}'))
+    studied = study(frame, flight, flight.controller, uncertainty, samples, seed, spread)
     return gain_selection.assess_scenario(flight, studied, gamma_2)
 
 
@@ -245,11 +262,13 @@ def study(
     uncertainty: float,
     samples: int,
     seed: int,
+    spread: Spread = UNIFORM,
 ) -> Study:
     """The airframe as the law of a controller sees it, and uncertain airframes around.
 
     They fly along the commands and gusts of a scenario. Raises ParameterError.
     """
+    matrices, _ = of_matrices_and_lags(spread, controller)
     effective = through_allocation(airframe, controller)
     behind = None
     if effective is not airframe:
@@ -261,7 +280,8 @@ def study(
         as_count(samples, "samples", 0, MAX_SAMPLES),
         as_count(seed, "seed", 0),
         behind,
-    )
+        matrices,
+    )._replace(spread=spread)
 
 
 def _loop(

@@ -24,12 +24,12 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.linear_loop.loop_margins import (
     LinearLoop,
     LoopMargins,
-    box_of,
     is_literal,
     law_order,
     linear_loop,
     loop_margins,
     loop_of,
+    with_box,
 )
 from flight_core.parameters import LARGEST, require
 from flight_core.vectors import FloatArray
@@ -160,10 +160,8 @@ class GainAssessment(NamedTuple, Generic[Controller]):
 def loop_with_box(study: Study, controller: ControllerConfig) -> LinearLoop:
     """The linear loop of a controller around the aircraft of a study, with the box of these."""
     loop = linear_loop(controller, study.airframe, study.A, study.B)
-    if study.uncertainty == 0.0:
-        return loop
     airframe = study.airframe if study.effected is None else study.effected.airframe
-    return loop._replace(box=box_of(airframe, controller, study.uncertainty))
+    return with_box(loop, airframe, controller, study.uncertainty, study.seed, study.spread)
 
 
 @dataclass(frozen=True)

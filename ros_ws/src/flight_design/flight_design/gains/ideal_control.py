@@ -13,7 +13,7 @@ from aircraft_sim.atmosphere.disturbance import Gusts
 from aircraft_sim.plant import dynamics
 from aircraft_sim.plant.dynamics import Aircraft
 from aircraft_sim.sections import Gust
-from aircraft_sim.uncertainty import nominal_and_sampled
+from aircraft_sim.uncertainty import UNIFORM, Spread, nominal_and_sampled
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_core.integrators import rk4
 from flight_core.parameters import require
@@ -68,6 +68,8 @@ class Study(NamedTuple):
     stable: NDArray[np.bool_]  # (N,) whether no zero lies in the right half plane
     uncertainty: float
     effected: Effected | None = None  # None: the entries of `airframe` are uncertain
+    seed: int = 1
+    spread: Spread = UNIFORM  # with the lags too
 
     @property
     def Omega(self) -> FloatArray:  # noqa: N802 - the paper's name
@@ -123,6 +125,7 @@ def study_airframe(
     samples: int = 100,
     seed: int = 1,
     effected: Effected | None = None,
+    spread: Spread = UNIFORM,
 ) -> Study:
     """Rates of the ideal control along a manoeuvre.
 
@@ -142,7 +145,7 @@ def study_airframe(
     airframe has a zero in the right half plane: then Assumption 3 does not hold.
     """
     drawn_airframe = airframe if effected is None else effected.airframe
-    A, B = nominal_and_sampled(drawn_airframe, uncertainty, samples, seed)
+    A, B = nominal_and_sampled(drawn_airframe, uncertainty, samples, seed, spread)
     if effected is not None:
         B = np.asarray(B @ effected.T)
     zeros = [fastest_zero(*pair, airframe.matrix_c()) for pair in zip(A, B, strict=True)]
@@ -170,6 +173,8 @@ def study_airframe(
         stable=stable,
         uncertainty=uncertainty,
         effected=effected,
+        seed=seed,
+        spread=spread,
     )
 
 
