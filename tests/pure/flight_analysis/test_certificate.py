@@ -14,9 +14,11 @@ from typing import Any
 import numpy as np
 import pytest
 from pytest import approx
-from tests.conftest import REPOSITORY, invoke
+from tests.conftest import REPOSITORY, invoke, refusing
 
 import rise_di
+from aircraft_sim.airframes.airframe import load_airframe
+from aircraft_sim.uncertainty import as_yaml
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.linear_loop.certificate import certificate, keep
 from flight_analysis.linear_loop.guarantee import guarantee
@@ -260,6 +262,57 @@ def test_command_writes_a_certificate_and_refuses_what_it_cannot_state(tmp_path:
     assert name in invoke("replay", str(flight.mcap)).output
     # u with other gains is another loop
     assert "certificate" not in invoke("replay", str(flight.mcap), "--set", "k_s=1").output
+
+
+ONE_CHANNEL = """\
+name: one
+source: an unstable short period
+speed: 60.0
+states: {alpha: rad, q: rad/s}
+inputs:
+  elevator: {unit: deg, positive: nose up}
+outputs: [q]
+A: [[-0.9, 0.97], [2.6, -1.4]]
+B: [[0.0005], [0.06]]
+gusts:
+  vertical: {alpha: 0.9, q: -2.6}
+"""
+
+
+def test_section_that_gains_wrote_has_margins_and_a_certificate(tmp_path: Path) -> None:
+    """The conditions are those of its selection, to the six digits of the section."""
+    frame, section = tmp_path / "one.yaml", tmp_path / "gains.yaml"
+    path = tmp_path / "certificate.json"
+    frame.write_text(ONE_CHANNEL)
+    written = invoke("gains", str(frame), "--samples", "4", "--write", str(section))
+    assert written.exit_code == 0, written.output
+    selected = rise_di.select_gains(frame, samples=4).engineering
+    again = rise_di.check_gains(frame, section, samples=4)
+    for part in ("theorem", "loop"):
+        found = [condition.value for condition in getattr(again, part)]
+        assert found == approx([condition.value for condition in getattr(selected, part)], rel=1e-4)
+    words = ["gains", str(frame), "--check", "--scenario", str(section), "--samples", "4"]
+    words += ["--guarantee"]
+    refused = invoke(*words, "--worst", str(tmp_path / "worst"))
+    assert "worst: found no aircraft in" in str(refused.exception)
+    done = invoke(*words, "--certificate", str(path))
+    assert done.exit_code == 0, done.output
+    assert "has a controller alone: commands and gusts of osprey_servo" in done.stderr
+    content = json.loads(path.read_text())
+    assert run(content, tmp_path).stdout.startswith("PROVED")
+    # there is no scenario yet, nor the constants of an export
+    assert not {"scenario", "constants"} & content.keys()
+    text = as_yaml(load_airframe(frame))
+    assert content["airframe"] == hashlib.sha256(text.encode()).hexdigest()
+
+
+def test_file_with_some_sections_is_no_section_alone(tmp_path: Path) -> None:
+    path = tmp_path / "scenario.yaml"
+    sections = {"/**/controller": {"rate": 100.0}, "/**/flight": {"duration": 1.0}}
+    tree = {name: {"ros__parameters": values} for name, values in sections.items()}
+    path.write_text(json.dumps(tree))
+    with refusing("scenario.yaml: aircraft: found no such section"):
+        rise_di.check_gains("osprey", path)
 
 
 def test_export_puts_the_certificate_beside_the_code_of_its_constants(tmp_path: Path) -> None:

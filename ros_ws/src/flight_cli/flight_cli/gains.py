@@ -143,7 +143,7 @@ class Gains:
     )
     uncertainty: float = option("Largest relative deviation of each entry of A and B.", default=0.3)
     scenario: str = option(
-        "Scenario with the commands, the gusts and the loop.",
+        "Scenario with the commands, the gusts and the loop; with --check also what --write wrote.",
         default="osprey_servo",
         autocompletion=scenario_names,
     )
@@ -248,6 +248,7 @@ class Gains:
         require_guarantee(
             check=self.check,
             is_wanted=self.guaranteed,
+            scenario=self.scenario,
             late=self.late,
             entries=self.entry or (),
             files={"worst": self.worst, "certificate": self.certificate},

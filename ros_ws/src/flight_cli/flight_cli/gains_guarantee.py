@@ -22,9 +22,11 @@ from flight_analysis.linear_loop.loop_margins import LinearLoop
 from flight_analysis.report.margin_figures import decibels, guarantee_rows, guarantee_text
 from flight_campaign.equipment import published, scenario_with_equipment
 from flight_cli.output import LICENCE, new_table, print_table, say, write_text
+from flight_cli.words import warn
 from flight_core.arguments import as_number
 from flight_core.files import display_path, is_folder, writing
 from flight_core.parameters import require
+from flight_design.gains.first_scenario import COMMANDED, controller_alone
 from flight_design.gains.gain_selection import GainAssessment
 from rise_di.c_code import certificate_sources
 from rise_di_controller.params import ControllerConfig
@@ -37,6 +39,7 @@ def require_guarantee(
     *,
     check: bool,
     is_wanted: bool,
+    scenario: str,
     late: float,
     entries: Sequence[str],
     files: Mapping[str, Path | None],
@@ -48,6 +51,10 @@ def require_guarantee(
         require(is_wanted or path is None, name, "no --guarantee", "--guarantee beside it")
     require(is_wanted or late == 0.0, "late", "no --guarantee", "--guarantee beside it")
     as_number(late, "late", 0.0, MAX_DELAY_MARGIN, "s")
+    if check and controller_alone(scenario) is not None:
+        worst = files["worst"]
+        require(worst is None, "worst", f"no aircraft in {scenario}", "a scenario that flies one")
+        warn(f"note: {scenario} has a controller alone: commands and gusts of {COMMANDED}")
     path = files["certificate"]
     require(late == 0.0 or path is None, "certificate", f"--late {late:g} beside it", "u in time")
     # the checker's bounds are too coarse for most actuators

@@ -37,6 +37,7 @@ from flight_core.files import write_file, writing
 from flight_core.parameters import require
 from flight_core.rates import period_ns, seconds
 from flight_core.text import printable
+from flight_design.gains.first_scenario import controller_alone
 from flight_design.learning.scenario_learner import with_last_model
 from flight_log.tape_reader import RecordedRun, read_run
 from rise_di_controller.guard.guard import SAMPLE_BUFFER_SIZE
@@ -186,18 +187,20 @@ def certificate_sources(airframe: FilePath, scenario: FilePath | Scenario) -> di
     """SHA-256 of scenario, airframe and exported constants, of the loop of a certificate.
 
     The constants are those of rise_di_parameters.h as `export` writes it by default; none of a law
-    without C code.
+    without C code. A section controller alone has the airframe alone.
     """
-    flight = find_scenario(scenario)
-    texts = {"scenario": scenario_yaml(flight), "airframe": as_yaml(load_airframe(airframe))}
-    if isinstance(flight.controller, RiseDiConfig):
-        texts["constants"] = header(
-            exportable(flight.controller),
-            printable(flight.name),
-            flight.reference_model,
-            float32=False,
-            samples=SAMPLE_BUFFER_SIZE,
-        )
+    texts = {"airframe": as_yaml(load_airframe(airframe))}
+    if controller_alone(scenario) is None:
+        flight = find_scenario(scenario)
+        texts["scenario"] = scenario_yaml(flight)
+        if isinstance(flight.controller, RiseDiConfig):
+            texts["constants"] = header(
+                exportable(flight.controller),
+                printable(flight.name),
+                flight.reference_model,
+                float32=False,
+                samples=SAMPLE_BUFFER_SIZE,
+            )
     return {name: hashlib.sha256(text.encode()).hexdigest() for name, text in texts.items()}
 
 

@@ -4,9 +4,11 @@
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 from flight_analysis.closed_loop.scenario import (
+    SCHEMAS,
     Scenario,
     parse_scenario_sections,
     scenario_of,
@@ -14,11 +16,12 @@ from flight_analysis.closed_loop.scenario import (
 from flight_analysis.closed_loop.scenario_library import LIBRARY, find_scenario
 from flight_core.arguments import FilePath
 from flight_core.files import comment, find_file, read_file
-from flight_core.scenario_file import A_SCENARIO
+from flight_core.scenario_file import A_SCENARIO, parse_sections
 from flight_core.units import GRAVITY
 from flight_design.gains import gain_yaml
 from flight_design.gains.gain_selection import SOFTENING
-from rise_di_controller.laws import DEFAULT
+from rise_di_controller.laws import DEFAULT, AnyLaw
+from rise_di_controller.params import ControllerConfig
 
 LICENCE = "# SPDX-FileCopyrightText: RISE-DI contributors\n# SPDX-License-Identifier: Apache-2.0\n"
 
@@ -42,6 +45,7 @@ PULSE = 1.0  # s, of a rate
 TURNS_TIME = 9.0  # s, of the four pulses
 SPEED_PULSE = 20.0  # s, of an airspeed or a climb
 LAST = 20.0  # s, after the last command: for a gust and the way back
+COMMANDED = "osprey_servo"  # commands and gusts of gains without a scenario of their own
 GAINS = {"k_g", "k_d", "Lambda", "beta", "omega", "input_scale", "D"}  # that are selected
 
 
@@ -184,6 +188,33 @@ def scenario_to_design(scenario: FilePath | Scenario) -> Scenario:
         return find_scenario(scenario)
     ones = unit_gains([0.0] * len(outputs), 0.0)
     return scenario_of(path.stem, path, {**sections, "controller": {**ones, **controller}})
+
+
+def scenario_to_check(scenario: FilePath | Scenario) -> Scenario:
+    """A scenario, or that of the commands of a file with the section controller alone.
+
+    COMMANDED has the commands, gusts and rate limits then, and need not fly the controller. Raises
+    ParameterError.
+    """
+    controller = controller_alone(scenario)
+    if controller is None:
+        return find_scenario(scenario)
+    return replace(find_scenario(COMMANDED), controller=controller)
+
+
+def controller_alone(scenario: FilePath | Scenario) -> ControllerConfig | None:
+    """The controller of a file with this section alone, as `gain_yaml.selection_yaml` writes it.
+
+    None for a scenario and for another file. Raises ParameterError.
+    """
+    if isinstance(scenario, Scenario):
+        return None
+    path = find_file(scenario, LIBRARY, "scenario", A_SCENARIO)
+    content = read_file(path, str(path), A_SCENARIO)
+    sections = parse_sections(content, path, (), tuple(SCHEMAS))
+    if sections.keys() != {"controller"}:
+        return None
+    return AnyLaw.validate_mapping(sections["controller"], "controller")
 
 
 COMMENTS = {

@@ -34,7 +34,7 @@ from flight_core.parameters import require
 from flight_core.vectors import FloatArray
 from flight_design.gains import gain_selection, ideal_control, tuned_gains
 from flight_design.gains.effectors import LAW_INPUT, Effectors, design_allocation
-from flight_design.gains.first_scenario import scenario_to_design
+from flight_design.gains.first_scenario import scenario_to_check, scenario_to_design
 from flight_design.gains.gain_selection import GainAssessment, LoopSetting, Selection
 from flight_design.gains.ideal_control import Effected, Study
 from flight_design.gains.nominal import unit_sizes
@@ -229,7 +229,8 @@ def check_gains(
 
     Args:
         airframe: Name in the library, path of an airframe file (.yaml), or an Airframe.
-        scenario: Name, path of a scenario file (.yaml), or a Scenario.
+        scenario: Name, path of a scenario file (.yaml), or a Scenario; or path of a file with the
+            section controller alone: commands, gusts and rate limits are those of osprey_servo.
         uncertainty: Largest relative deviation of each entry of A and B, 0 to 1.
         gamma_2: gamma_2 of Lemma 1 in 1/s, an assumption.
         samples: Number of uncertain airframes for the bounds of the theorem, at most 10,000.
@@ -247,7 +248,7 @@ def check_gains(
         >>> rise_di.check_gains("osprey", samples=1).delay_margin > 0.03
         True
     """
-    flight = find_scenario(scenario)
+    flight = scenario_to_check(scenario)
     frame = load_airframe(airframe)
     gamma_2 = as_number(gamma_2, "gamma_2", 0.0, unit="1/s")
     spread = Spread(as_numbers_by_name(entries, "entries", '{"1/lag[elevator]": 0.3}'))
