@@ -16,12 +16,14 @@ from aircraft_sim.uncertainty import UNIFORM, Spread
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.linear_loop.guarantee import Guarantee, guarantee
 from flight_analysis.linear_loop.loop_margins import (
+    LEAST_LAG,
     LinearLoop,
     loop_margins,
     margins,
     scenario_loop,
     with_lags_pulled_out,
 )
+from flight_analysis.linear_loop.uncertain_loop import every_channel, uncertain_loop
 from flight_core.vectors import FloatArray
 from rise_di_controller.law.linear_loop import LinearPlant, LoopTiming
 
@@ -62,6 +64,21 @@ def test_lag_of_integrator_may_rise_to_the_closed_form(gain: float, lag: float) 
     assert 0.99 * limit < promise.stable < limit * (1.0 + 1e-5)
     assert promise.unstable is not None
     assert promise.unstable.entries["1/lag[u]"] == approx(-limit, rel=1e-2)
+
+
+@pytest.mark.parametrize(("periods", "holds"), [(LEAST_LAG, True), (1.0, False)])
+def test_two_coefficients_hold_a_lag_of_two_periods(periods: float, holds: bool) -> None:
+    """The pole of an actuator is exp(-T (1 + d) / lag): d is off by less than its thousandth."""
+    linear = uncertain(behind_actuator(0.0, periods * PERIOD), 1.0)
+    assert linear.box is not None
+    loop = uncertain_loop(linear.nominal, linear.law, linear.loop, linear.box)
+    off = []
+    for d in (-0.9, -0.5, 0.5, 0.8):
+        poles = np.linalg.eigvals(every_channel(loop).closed(np.array([[0.0, d]]))[0][0]).real
+        exact = np.exp(-(1.0 + d) / periods)
+        pole = poles[np.argmin(np.abs(poles - exact))]
+        off.append(abs((-periods * np.log(pole) - 1.0) / d - 1.0))
+    assert (max(off) < 1e-3) == holds
 
 
 def test_late_input_behind_an_uncertain_actuator() -> None:
