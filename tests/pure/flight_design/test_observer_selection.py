@@ -7,7 +7,7 @@ A, and the command.
 """
 
 import math
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -123,12 +123,34 @@ def _plant(controller: RiseDiConfig) -> tuple[FloatArray, FloatArray, FloatArray
 def test_search_finds_the_same_gains_from_faster_and_from_slower_ones(begin: float) -> None:
     model = model_for(OSPREY, SERVO.controller, NOISE)
     gains = gains_by_rule(model, tuple(OSPREY.gusts), OSPREY.speed)
+    start = by_rule(0.045)._replace(relaxation=np.full(4, begin))
     selection = with_aircraft_observer(
-        SERVO.rise_di(), OSPREY, [gains], NOISE, 0.03, begin=np.full(4, begin)
+        SERVO.rise_di(), OSPREY, [gains], NOISE, 0.03, earlier_design=start
     )
     # the logarithms of four channels: 3 % each
     assert selection.cost == pytest.approx(by_rule().cost, abs=0.12)
     assert selection.delay_margin >= 0.03
+
+
+def test_search_stays_at_the_earlier_loop_where_no_change_errs_less() -> None:
+    """An elevator with 0.9 of its effect: the loop of the file has its margins, and errs more."""
+    B = OSPREY.matrix_b().copy()
+    B[:, 0] *= 0.9
+    same_wind = np.ones_like(OSPREY.matrix_gusts())
+    model = OSPREY.with_matrices(OSPREY.matrix_a(), B, same_wind)
+    gains = gains_by_rule(
+        model_for(model, SERVO.controller, NOISE), tuple(OSPREY.gusts), OSPREY.speed
+    )
+    design = partial(
+        with_aircraft_observer, SERVO.rise_di(), model, [gains], NOISE, 0.03, uncertain=False
+    )
+    held = design(earlier_design=by_rule(), is_free=[False] * 4)
+    free = design(earlier_design=by_rule())
+    assert held.controller.observer == by_rule().controller.observer
+    assert held.controller.feedforward == free.controller.feedforward
+    assert held.controller.feedforward != by_rule().controller.feedforward
+    assert free.cost < held.cost
+    assert design(earlier_design=free).controller == free.controller
 
 
 def test_delay_beyond_margin_makes_flight_oscillate_and_one_within_it_does_not() -> None:

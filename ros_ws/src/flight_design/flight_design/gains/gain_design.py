@@ -470,8 +470,8 @@ def selected_observer(
     each; gains of a file and those beside a sketch are only relaxed, where the margins need it.
     `uncertain` counts the phase margin of uncertain aircraft too, `sketched` takes the gains for a
     model from a sketch, and `speeds` are two ratios to the trim speed, with models there. `margin`,
-    `is_free`, `activity` and `progress` as for `with_aircraft_observer`; the search begins at the
-    gains and the relaxation of the design `earlier_design`.
+    `is_free`, `activity`, `progress` and `earlier_design` as for `with_aircraft_observer`; channels
+    that are not free keep the gains of the latter.
     """
     seen = through_allocation(model, controller)
     noise, vanes = _noise(controller, scenario, seen)
@@ -481,7 +481,7 @@ def selected_observer(
     else:
         gains = read_gains(Path(weights), nominal.total_lag, len(model.gusts), len(model.states))
         candidates = [(gains, f"gains of {Path(weights).name}")]
-    if earlier_design is not None:
+    if earlier_design is not None and not all(is_free or ()):
         candidates = [candidates[earlier_design.place]]
     sets, origins = zip(*candidates, strict=True)
     selected = with_aircraft_observer(
@@ -495,7 +495,7 @@ def selected_observer(
         uncertain=uncertain,
         speeds=speeds,
         keeps_gains=sketched or weights is not None,
-        begin=None if earlier_design is None else earlier_design.relaxation,
+        earlier_design=earlier_design,
         is_free=is_free,
         activity=activity,
         progress=progress,

@@ -144,7 +144,8 @@ class ObserverSearch(NamedTuple):
     # None: the gains stay, but where the margins need slower ones
     air: Air | None = None
     activity_unit: FloatArray | float = math.inf  # (m,) of mean abs(u_dot) in the cost, SI
-    begin: FloatArray | None = None  # (m,) relaxation at which the search begins; None: 1
+    # the design whose loop the search begins at; None: at a relaxation of 1
+    earlier_design: SelectedObserver | None = None
     is_free: Sequence[bool] | None = None  # (m,) whether it may change; None: in every channel
 
     @property
@@ -225,12 +226,17 @@ class ObserverSearch(NamedTuple):
         )
 
     def _loops(self, place: Place) -> _Loops:
-        """The loops of a place."""
-        begin = np.ones(len(place)) if self.begin is None else self.begin
+        """The loops of a place: at the begin that of the earlier design, with this feedforward."""
+        earlier = self.earlier_design
+        begin = np.ones(len(place)) if earlier is None else earlier.relaxation
         relaxation = begin * STEP ** np.array(place, dtype=np.float64)
-        controller = _parameters(
-            self.base, self.model, self.gains, self.design(relaxation), relaxation, self.vanes
-        )
+        if earlier is not None and not any(place):
+            changes = {"feedforward": self.base.feedforward, "schedule": None}
+            controller = earlier.controller.model_copy(update=changes)
+        else:
+            controller = _parameters(
+                self.base, self.model, self.gains, self.design(relaxation), relaxation, self.vanes
+            )
         around = [(self.nominal, law) for law in _laws(controller)]
         for speed in self.others:
             at_speed = speed.flown(controller, relaxation)

@@ -102,7 +102,7 @@ def with_aircraft_observer(
     uncertain: bool = True,
     speeds: tuple[float, float] | None = None,
     keeps_gains: bool = False,
-    begin: FloatArray | None = None,
+    earlier_design: SelectedObserver | None = None,
     is_free: Sequence[bool] | None = None,
     activity: float = 1.0,
     progress: Callable[[str], None] = lambda _: None,
@@ -119,8 +119,9 @@ def with_aircraft_observer(
     where the airframe is `uncertain`; those with a zero on the right do not count: no gains hold
     all outputs there. `speeds` are two ratios to the trim speed: the controller has a schedule
     then, and the margins at these speeds too. With `keeps_gains` the gains are only relaxed, where
-    the margins need it. The search begins at the relaxation `begin`, (m,), and changes it in the
-    channels that are free. `activity` is the weight of the activity of u beside the error.
+    the margins need it. The search begins at the loop of the `earlier_design`, with the new
+    feedforward, and changes the relaxation of the channels that are free: this loop stays where no
+    change has less error. `activity` is the weight of the activity of u beside the error.
     `progress` gets a sentence a loop. Raises ParameterError for an airframe with another D or
     without a wind, one that a feedforward refuses, and for margins that no relaxation reaches.
     """
@@ -149,7 +150,7 @@ def with_aircraft_observer(
             others=[designs.at_speed(ratio, gains) for ratio in speeds or ()],
             air=None if keeps_gains else _air(airframe, model, vanes),
             activity_unit=activity_unit,
-            begin=begin,
+            earlier_design=earlier_design,
             is_free=is_free,
         )
         searches.append(search)

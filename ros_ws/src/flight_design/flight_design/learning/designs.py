@@ -31,9 +31,8 @@ class Goal(NamedTuple):
 
     margin: FloatArray  # (m,) delay margin of each input, s
     needed: Requirement
-    # the design of the airframe file, whose gains a part keeps; None: every gain set is searched
-    beside: SelectedObserver | None = None
-    is_free: Sequence[bool] | None = None  # (m,) the channels that leave it; None: all
+    beside: SelectedObserver | None = None  # the design of the file, where the search begins
+    is_free: Sequence[bool] | None = None  # (m,) the channels that leave its gains; None: all
 
 
 def margin_of(controller: RiseDiConfig) -> float:
@@ -114,8 +113,7 @@ def goal(
         margin = np.full(len(outputs), asked)
     # 0.1 ms, as few digits as the file of a scenario
     late = [round(latest[name] + DELAY_LEFT, 4) if name in latest else 0.0 for name in start.inputs]
-    keeps_gains = is_free is not None and not all(is_free)
-    return Goal(np.maximum(margin, late), needed, file if keeps_gains else None, is_free)
+    return Goal(np.maximum(margin, late), needed, file, is_free)
 
 
 def with_deviations(designed: RiseDiConfig, deviation: Mapping[str, float]) -> RiseDiConfig:
