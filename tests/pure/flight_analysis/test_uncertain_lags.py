@@ -23,7 +23,7 @@ from flight_analysis.linear_loop.loop_margins import (
     scenario_loop,
     with_lags_pulled_out,
 )
-from flight_analysis.linear_loop.uncertain_loop import every_channel, uncertain_loop
+from flight_analysis.linear_loop.uncertain_loop import uncertain_loop
 from flight_core.vectors import FloatArray
 from rise_di_controller.law.linear_loop import LinearPlant, LoopTiming
 
@@ -74,7 +74,7 @@ def test_two_coefficients_hold_a_lag_of_two_periods(periods: float, holds: bool)
     loop = uncertain_loop(linear.nominal, linear.law, linear.loop, linear.box)
     off = []
     for d in (-0.9, -0.5, 0.5, 0.8):
-        poles = np.linalg.eigvals(every_channel(loop).closed(np.array([[0.0, d]]))[0][0]).real
+        poles = np.linalg.eigvals(loop.at(np.array([0.0, d])).A).real
         exact = np.exp(-(1.0 + d) / periods)
         pole = poles[np.argmin(np.abs(poles - exact))]
         off.append(abs((-periods * np.log(pole) - 1.0) / d - 1.0))

@@ -36,11 +36,12 @@ def certificate(linear: LinearLoop, promise: Guarantee, sources: Mapping[str, st
         sources: SHA-256 of what the loop is of, by name.
 
     Raises:
-        ParameterError: Nothing is proved, or u may be late: the coefficients of a late u have no
-            bound of what they leave out.
+        ParameterError: Nothing is proved, a lag is in the box, or u may be late: the coefficients
+            of a late u have no bound of what they leave out.
     """
     require(promise.stable > 0.0, "certificate", "no stable box", "a loop with a guarantee")
     require(promise.late == 0.0, "certificate", f"u up to {promise.late:g} s late", "u in time")
+    require(promise.has_exact_lags, "certificate", "a lag in the box", "exact lags")
     box = linear.box
     assert box is not None and promise.proof  # noqa: S101, PT018 - a guarantee has both
     content = {

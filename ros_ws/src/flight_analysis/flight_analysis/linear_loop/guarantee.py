@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flight_analysis.linear_loop.branch_and_bound import proof_of
-from flight_analysis.linear_loop.loop_margins import LinearLoop
+from flight_analysis.linear_loop.loop_margins import LAG_ENTRY, LinearLoop
 from flight_analysis.linear_loop.structured_value import RADIUS
 from flight_analysis.linear_loop.uncertain_loop import (
     Channels,
@@ -60,6 +60,7 @@ class Guarantee(NamedTuple):
     disk_all: float  # with independent disks in all inputs at once
     loop: str  # digest of the loop
     late: float = 0.0  # s: u is late by an unknown time of 0 to this, another one at each tick
+    has_exact_lags: bool = True  # whether no lag of an actuator is in the box
     proof: Sequence[dict[str, Any]] = ()  # "entries" and "steps" of each part, see `proof_of`
 
     @property
@@ -69,8 +70,8 @@ class Guarantee(NamedTuple):
 
     @property
     def certificate(self) -> str:
-        """The name of its certificate; "" without one: a late u, or nothing proved."""
-        return self.loop[:NAMED] if self.stable and not self.late else ""
+        """The name of its certificate; "" without one: a late u, a lag, or nothing proved."""
+        return self.loop[:NAMED] if self.stable and not self.late and self.has_exact_lags else ""
 
     def as_json(self) -> dict[str, Any]:
         """All but the proof."""
@@ -99,6 +100,7 @@ def guarantee(linear: LinearLoop, late: float = 0.0) -> Guarantee:
         disk_all=0.0,
         loop=linear.digest,
         late=late,
+        has_exact_lags=not any(name.startswith(LAG_ENTRY) for name in box.names),
     )
     if not is_stable(linear.nominal, linear.law, linear.loop, np.zeros(len(linear.inputs))):
         return none

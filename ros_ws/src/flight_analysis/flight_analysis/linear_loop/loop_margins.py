@@ -41,6 +41,7 @@ from rise_di_controller.law.linear_loop import (
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di_config import RiseDiConfig
 
+LAG_ENTRY = "1/lag"  # begins the name of an entry of an actuator
 LEAST_LAG = 2.0
 """Periods: at (1 + d) / lag with d up to 0.8 the two Legendre coefficients of a period then leave
 out less of d than the thousandth that a guarantee proves beyond what it states."""
@@ -300,7 +301,7 @@ def of_matrices_and_lags(
     """
     least = LEAST_LAG / controller.rate
     known = {
-        f"1/lag[{name}]": i
+        f"{LAG_ENTRY}[{name}]": i
         for i, name in enumerate(controller.inputs)
         if controller.lag[i] >= least * (1.0 - 1e-9)
     }
@@ -345,7 +346,7 @@ def with_lags_pulled_out(
     E = np.pad(box.E, ((0, size), (0, size)))
     E[n:, len(box.names) :] = np.eye(size)
     wider = Box(
-        names=(*box.names, *(f"1/lag[{linear.inputs[i]}]" for i in places)),
+        names=(*box.names, *(f"{LAG_ENTRY}[{linear.inputs[i]}]" for i in places)),
         part=np.append(box.part, part),
         E=E,
         F=np.block([[box.F, box.G @ S], [none[0], -changes]]),
