@@ -78,6 +78,8 @@ def proof_of(part: Channels, size: float, disk: float, most: int) -> list[dict[s
         interval = interval_at(around, w, scaling, scale) if bound < 1.0 else None
         if interval is None:
             entry = int(np.argmax(_effects(part, M, scaling)))
+            if region.half[entry] < NARROWEST * size:
+                return None  # around a mode on the circle, which rounding may hide
             steps.append({"halve": entry})
             regions += region.halves(entry)
         else:
