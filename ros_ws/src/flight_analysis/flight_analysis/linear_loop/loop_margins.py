@@ -453,7 +453,14 @@ def loop_of(controller: ControllerConfig) -> LoopTiming:
 
 
 def law_order(airframe: Airframe, controller: ControllerConfig) -> tuple[list[int], list[int]]:
-    """Indices of the law's outputs and inputs in the order of an airframe."""
+    """Indices of the law's outputs and inputs in the order of an airframe.
+
+    Raises ParameterError for an airframe without these.
+    """
+    for key, known in (("outputs", airframe.outputs), ("inputs", tuple(airframe.inputs))):
+        names = getattr(controller, key)
+        expected = f"those of {airframe.name}: {', '.join(known)}"
+        require(set(names) <= set(known), f"controller.{key}", ", ".join(names), expected)
     columns = [list(airframe.inputs).index(name) for name in controller.inputs]
     return [airframe.outputs.index(name) for name in controller.outputs], columns
 
