@@ -206,7 +206,7 @@ def saturation_notes(tape: Tape) -> list[str]:
         if worst >= SATURATED:
             notes.append(
                 f"{name} went from limit to limit in {100.0 * worst:.0f} % of {WINDOW:g} s: it has "
-                "no effect, or too little"
+                "no effect, too little, or its loop is unstable"
             )
     return notes
 
