@@ -521,7 +521,9 @@ def _heading(linear: Linearization, selection: Selection, stall: float | None) -
         air = "moderate turbulence. It learns A and B in flight: docs/learning.md"
     else:
         air = "a gust from above"
+    observes = selection.chosen.observer is not None and not learns
     options = f"{' --guidance' * (stall is not None)}{' --learn' * learns}"
+    options += " --observer" * observes
     trims = zip(condition.inputs(), linear.trim.commands.tolist(), strict=False)
     effects = zip(
         condition.paired_outputs(),
