@@ -80,7 +80,9 @@ def unproven(part: Part, name: str, *, flies: bool) -> str:
     the aircraft. A sketch does not fly, and no such disadvantage is enough.
     """
     limit = LIKELIER if flies else -LIKELIER
-    if part.advantage > limit and part.advantage != 0.0:  # 0: there was no model before
+    if part.advantage == 0.0:
+        return f"{' and '.join(part.outputs)}: a first model, which later seconds have to prove"
+    if part.advantage > limit:
         return ""
     return (
         f"{' and '.join(part.outputs)}: found an advantage over the airframe {name} of "
