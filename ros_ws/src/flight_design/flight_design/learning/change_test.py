@@ -44,8 +44,9 @@ FLOW = 0.03
 # 1, standard deviation of a change of effect, in both hypotheses: half of it and none are as
 # probable
 FACTOR = 1.0
+REVERSED = -2.0  # 1, the least change of effect: the input acts the other way
 DEAD = -1.0  # 1
-MOST = 2.0  # bounds of a change of effect
+MOST = 2.0  # 1, the largest change of effect
 NONE = MAX_DEVIATION  # 1, of an effect: what is known no better is none
 # of log-likelihood: so close to the best loss an input without effect explains the flight as well
 DEAD_WITHIN = 4.0
@@ -77,7 +78,7 @@ def change_test(
 
         B[:, j] = (1 + kappa_j) B_flown[:, j]
         J(kappa) = N/2 sum_i log mean e_i^2 + 1/2 sum log det S + |kappa / FACTOR|^2 / 2
-        G = min J(kappa_j >= -LOSS) - min J(kappa_j >= -1)
+        G = min J(kappa_j >= -LOSS) - min J(kappa_j >= -2)
 
     with e the normalised innovations and S their covariance, as in `Search.fit`. A fault of an
     effector changes a column by a factor, so a part has as many unknowns as inputs. A is known.
@@ -86,9 +87,10 @@ def change_test(
     (Ann. Math. Statist. 9(1), 1938): an input with a loss of LOSS exceeds G = 12 with a probability
     of 5e-7, and a lesser loss more seldom.
 
-    The input j is dead if kappa_j <= NONE - 1 has a J lower than the first J by more than MAX_GAIN,
-    and at most DEAD_WITHIN above the second. Arguments: `delays` of u by the outputs of a part, s,
-    by default the delay of `actuation`; `drift` is the noise of the disturbances, as in `Unknown`.
+    The input j is dead if abs(kappa_j + 1) <= NONE has a J lower than the first J by more than
+    MAX_GAIN, and at most DEAD_WITHIN above the second. Arguments: `delays` of u by the outputs of a
+    part, s, by default the delay of `actuation`; `drift` is the noise of the disturbances, as in
+    `Unknown`.
     """
     changes = []
     flown = in_rolling_air(flown)
@@ -151,7 +153,7 @@ class Effects(Search):
             np.concatenate([np.full(self.count, of_inputs), values[entries:]])
             for of_inputs, values in (
                 (FACTOR, self.prior),
-                (DEAD, self._lower),
+                (REVERSED, self._lower),
                 (MOST, self._upper),
             )
         )
@@ -173,7 +175,7 @@ class Effects(Search):
             A=A, B=self._flown.B * (1.0 + thetas[:, None, : self.count]), wind=wind
         )
 
-    def most_probable(self, lower: float = DEAD) -> Least:
+    def most_probable(self, lower: float = REVERSED) -> Least:
         """The least J of kappa >= `lower`.
 
         A loss looks like gusts to the flown model. So the search begins with the winds of this
@@ -190,7 +192,7 @@ class Effects(Search):
     def least(
         self,
         theta: FloatArray | None = None,
-        lower: float = DEAD,
+        lower: float = REVERSED,
         dead: int | None = None,
         levels: NDArray[np.int64] | None = None,
     ) -> Least:
@@ -201,6 +203,7 @@ class Effects(Search):
         self._lower[: self.count] = lower
         self._upper[: self.count] = MOST
         if dead is not None:
+            self._lower[dead] = DEAD - NONE
             self._upper[dead] = DEAD + NONE
         theta = np.clip(
             np.zeros(len(self.prior)) if theta is None else theta, self._lower, self._upper
