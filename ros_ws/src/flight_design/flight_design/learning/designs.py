@@ -70,14 +70,16 @@ def goal(
     model: Airframe,
     parts: Collection[tuple[str, ...]],
     latest: Mapping[str, float],
+    dead: Collection[str] = (),
 ) -> Goal:
     """The goal of a design for a model of which some parts are learned.
 
     A part keeps the delay margin that the loop of the file keeps around the model, at least
     LEAST_MARGIN and at most that of the start; without a file that of the start; or the margin
     that is asked for, `learn.margin`. Each input keeps at least DELAY_LEFT beyond its latest
-    delay, s, by name. With a file the sensitivity is at most 2, or that of the loop of the file;
-    phase and gain follow from it (Astrom, Murray, "Feedback Systems", 10.5).
+    delay, s, by name. A `dead` output flies without this design, and asks for nothing. With a file
+    the sensitivity is at most 2, or that of the loop of the file; phase and gain follow from it
+    (Astrom, Murray, "Feedback Systems", 10.5).
     """
     outputs = start.outputs
     margin = np.full(len(outputs), margin_of(start))
@@ -88,7 +90,8 @@ def goal(
         undelayed = linear.loop._replace(delay=0.0)
         learned = {output for part in parts for output in part}
         is_free = [output in learned for output in outputs]
-        for part in (*parts, tuple(output for output in outputs if output not in learned)):
+        others = tuple(output for output in outputs if output not in {*learned, *dead})
+        for part in (*parts, others):
             share = np.array([float(output in part) for output in outputs])
             if not part:
                 continue
@@ -111,9 +114,20 @@ def goal(
     asked = None if start.learn is None else start.learn.margin
     if asked is not None:
         margin = np.full(len(outputs), asked)
+    margin = np.where([output in dead for output in outputs], 0.0, margin)
     # 0.1 ms, as few digits as the file of a scenario
     late = [round(latest[name] + DELAY_LEFT, 4) if name in latest else 0.0 for name in start.inputs]
     return Goal(np.maximum(margin, late), needed, file, is_free)
+
+
+def with_own_margin(controller: RiseDiConfig, model: Airframe, most: float) -> RiseDiConfig:
+    """A controller that states the delay margin of its own loop around a model, at most `most`."""
+    linear = linear_loop(controller, model, model.matrix_a()[None], model.matrix_b()[None])
+    undelayed = linear.loop._replace(delay=0.0)
+    kept = delay_margin(linear.nominal, linear.law, undelayed) - RESOLUTION
+    assert controller.observer is not None  # noqa: S101 - a design has one
+    observer = controller.observer.model_copy(update={"margin": min(max(kept, 0.0), most)})
+    return controller.model_copy(update={"observer": observer})
 
 
 def with_deviations(designed: RiseDiConfig, deviation: Mapping[str, float]) -> RiseDiConfig:

@@ -8,7 +8,7 @@ controller refuses parameters by the checks at load.
 """
 
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from itertools import chain
 from typing import NamedTuple
 
@@ -30,7 +30,15 @@ from flight_design.identification.model_identification import (
     with_entries,
 )
 from flight_design.learning.change_test import ANGLE, RECORD, Change, change_test
-from flight_design.learning.designs import Goal, goal, is_late, price, with_deviations
+from flight_design.learning.designs import (
+    Goal,
+    goal,
+    is_late,
+    margin_of,
+    price,
+    with_deviations,
+    with_own_margin,
+)
 from flight_design.learning.flight_record import SPREAD, FlightRecord, Sample, about, steady_end
 from flight_design.learning.part_checks import (
     DELAY_DEVIATION,
@@ -535,7 +543,8 @@ class Learner:
             designed = file.controller
         elif flying:
             latest = dict(chain.from_iterable(value.latest.items() for value in known.values()))
-            aim = goal(start, file, model, list(known), latest)
+            without = set(chain.from_iterable(dead))
+            aim = goal(start, file, model, list(known), latest, without)
             try:
                 selected = self._design(without_learning, model, aim)
             except ParameterError as error:
@@ -544,7 +553,7 @@ class Learner:
                 worst = 1e3 * max(latest.values())
                 raise ParameterError(f"u is up to {worst:.0f} ms late: {error}") from None
             designed = selected.controller
-            price_text = self._price(selected, model, list(known), latest)
+            price_text = self._price(selected, model, list(known), latest, without)
         if flying:
             deviation = chain.from_iterable(part.deviation.items() for part in known.values())
             designed = with_deviations(designed, dict(deviation))
@@ -554,6 +563,9 @@ class Learner:
             [output not in flying for output in start.outputs],
             [name in dead.values() for name in start.inputs],
         )
+        if dead and proposed.observer is not None:
+            # the parts of the law of the start have a margin of their own
+            proposed = with_own_margin(proposed, model, margin_of(start))
         checked = RiseDiConfig.validate_mapping(
             proposed.model_dump() | {"learn": self._start.model_dump()["learn"]}, "proposal"
         )
@@ -565,6 +577,7 @@ class Learner:
         model: Airframe,
         parts: list[PartName],
         latest: Mapping[str, float],
+        dead: Collection[str],
     ) -> str:
         """What `learn.margin` costs beside the margin of the file's loop; "" without either."""
         start = self._controller
@@ -574,7 +587,7 @@ class Learner:
         plain = start.model_copy(update={"learn": settings.model_copy(update={"margin": None})})
         without_learning = start.model_copy(update={"learn": None})
         file = self._design_of_rough(without_learning)
-        kept = goal(plain, file, model, parts, latest)
+        kept = goal(plain, file, model, parts, latest, dead)
         try:
             beside = self._design(without_learning, model, kept)
         except ParameterError:  # what was asked for flies: there is nothing to compare with
