@@ -111,6 +111,16 @@ def test_surface_of_jsbsim_is_dead_beside_the_disturbances_of_its_learner(
     assert (change.is_found, change.dead) == (bool(dead), dead)
 
 
+def test_reversed_aileron_is_no_dead_one(damaged: tuple[FlightData, Airframe]) -> None:
+    """A model with the aileron the other way round: it has -100 % of that effect, and moves p."""
+    recorded, airframe = damaged
+    B = airframe.matrix_b() * np.array([1.0, 1.0, -0.5, 1.0])
+    flown = airframe.with_matrices(airframe.matrix_a(), B, np.ones((len(B), len(airframe.gusts))))
+    _, lat = change_test(recorded, flown, ACTUATION)
+    assert (lat.is_found, lat.dead) == (True, "")
+    assert lat.left["aileron"] == pytest.approx(-1.0, abs=LOSS / 2.0)
+
+
 def law_of(controller: RiseDiConfig) -> tuple[np.ndarray, ...]:
     law = controller.law_params()
     effect = law.D * law.input_scale

@@ -28,6 +28,7 @@ from flight_analysis.closed_loop.replay_ticks import vary
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario, save_scenario
 from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.linear_loop.loop_margins import linear_loop, loop_margins
 from flight_bringup.fly import fly_in_process
 from flight_core.modes import Mode
 from flight_core.outcome import COMPLETED
@@ -518,6 +519,21 @@ def test_part_flies_without_a_dead_input_at_once(monkeypatch: pytest.MonkeyPatch
     effects = authority(proposal.controller, scenario().rise_di()).tolist()
     assert dict(zip(names, effects, strict=True))["up.r"] == 0.0
     assert made.model is None
+
+
+def test_part_without_an_input_states_the_margin_of_its_own_loop(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """P and r fly by the law of the start, which keeps another delay margin than the design."""
+    made, flown = learned_part(monkeypatch, DEAD_RUDDER)
+    proposed = made.propose(flown).controller
+    assert proposed is not None
+    assert proposed.observer is not None
+    frame = made._model
+    loop = linear_loop(proposed, frame, frame.matrix_a()[None], frame.matrix_b()[None])
+    undelayed = loop._replace(loop=loop.loop._replace(delay=0.0))
+    own = loop_margins(undelayed).delay
+    assert proposed.observer.margin == pytest.approx(min(own - 3e-4, 0.03), abs=1e-6)
 
 
 def test_dead_input_is_told_where_no_controller_without_it_is_stable(
