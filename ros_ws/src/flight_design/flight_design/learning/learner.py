@@ -54,6 +54,7 @@ from flight_design.learning.part_checks import (
     uncoupled,
     unproven,
     weaker,
+    without_effect,
 )
 from rise_di_controller.learning.learned_channels import (
     outputs_without,
@@ -241,7 +242,7 @@ class Learner:
             length > SHORTEST - self._record.period, "record", f"{length:.3g} s", f"{SHORTEST:g} s"
         )
         self.identification = self._identified()
-        sentences = _without_effect(self._dead) if lost else []
+        sentences = without_effect(self._dead) if lost else []
         verdict = self._verdict(self.identification, lost=lost)
         self._tried = verdict.tried
         self._tried_ns = end_ns
@@ -274,7 +275,7 @@ class Learner:
             self._changed |= set(dead)
             losses = [f"{name} has no effect" for name in dead.values()]
             return LearnerResult(None, "; ".join([*losses, *weaker_parts, f"refused: {error}"]))
-        sentences = [*_without_effect(dead), *weaker_parts, price_text]
+        sentences = [*without_effect(dead), *weaker_parts, price_text]
         return LearnerResult(self._last, "; ".join(filter(None, sentences)))
 
     def _verdict(self, identified: Identification, *, lost: bool) -> Verdict:
@@ -593,12 +594,3 @@ class Learner:
         except ParameterError:  # what was asked for flies: there is nothing to compare with
             return ""
         return price(selected, settings.margin, beside, float(kept.margin.min()))
-
-
-def _without_effect(dead: Mapping[PartName, str]) -> list[str]:
-    """The sentences about parts that fly without an input."""
-    return [
-        f"{name} has no effect: {' and '.join(part)} without it, by the law of the start"
-        for part, name in dead.items()
-        if name
-    ]

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The model of a part beside what flies: reasons against the model, and sentences about it."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
@@ -155,3 +155,12 @@ def effect_sentence(part: Part) -> str:
         f"{entry.name} {100 * entry.error:+.0f} +- {100 * entry.deviation:.0f} %" for entry in known
     )
     return text if all(entry.nominal for entry in part.entries) else f"{text}, with coupling"
+
+
+def without_effect(dead: Mapping[tuple[str, ...], str]) -> list[str]:
+    """The sentences about parts that fly without an input."""
+    return [
+        f"{name} has no effect: {' and '.join(part)} without it, by the law of the start"
+        for part, name in dead.items()
+        if name
+    ]
