@@ -401,6 +401,12 @@ def test_scenarios_are_listed_with_their_sentence_aircraft_and_law() -> None:
     assert "osprey_route" not in answer.output
 
 
+def test_help_shows_the_names_of_entries_whole() -> None:
+    """Brackets are markup to Rich: A[q,alpha] was shown as A."""
+    words = " ".join(invoke("gains", "--help").output.replace("│", " ").split())
+    assert "'A[q,alpha]=0.6', or '1/lag[elevator]=0.3' of an" in words
+
+
 def test_every_command_of_help_has_help_of_own(tmp_path: Path) -> None:
     for name in COMMANDS:
         answer = invoke(name, "--help", prog_name="rise-di")

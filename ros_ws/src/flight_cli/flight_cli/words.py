@@ -14,6 +14,7 @@ from types import MappingProxyType
 from typing import Annotated, Any, Protocol, get_type_hints
 
 import typer
+from rich.markup import escape
 from typer.core import TyperCommand
 
 from flight_core.parameters import ParameterError, require
@@ -48,8 +49,11 @@ class Executable(Protocol):
 
 def option(text: str, *names: str, default: Any = None, **rules: Any) -> Any:
     """An option of a command, with help; without `names` by the name of the field."""
+    shown = escape(text)  # A[q,alpha] is no markup
     return _field(
-        lambda name: typer.Option(*(names or (f"--{name.replace('_', '-')}",)), help=text, **rules),
+        lambda name: typer.Option(
+            *(names or (f"--{name.replace('_', '-')}",)), help=shown, **rules
+        ),
         default,
     )
 
@@ -61,7 +65,7 @@ def rare_option(text: str, *names: str, default: Any = None, **rules: Any) -> An
 
 def argument(text: str, default: Any = None, **rules: Any) -> Any:
     """An argument of a command, with help."""
-    return _field(lambda _: typer.Argument(help=text, **rules), default)
+    return _field(lambda _: typer.Argument(help=escape(text), **rules), default)
 
 
 def write_option(text: str, default: Any = None, **rules: Any) -> Any:
