@@ -34,6 +34,7 @@ class Region(NamedTuple):
     half: FloatArray
     low: float  # rad/s
     high: float
+    scaling: Scaling | None = None  # of a larger box or of a neighbouring frequency
 
     def halves(self, i: int) -> list["Region"]:
         """Both halves along a parameter."""
@@ -74,8 +75,9 @@ def proof_of(part: Channels, size: float, disk: float, most: int) -> list[dict[s
         around = part.at(region.centre)
         scale = np.r_[region.half[part.parameters], others]
         M = scale[:, None] * around.response(w, RADIUS)
-        bound, scaling = tightened_at(around, w, M)
+        bound, scaling = tightened_at(around, w, M, region.scaling)
         interval = interval_at(around, w, scaling, scale) if bound < 1.0 else None
+        region = region._replace(scaling=scaling)
         if interval is None:
             entry = int(np.argmax(_effects(part, M, scaling)))
             if region.half[entry] < NARROWEST * size:

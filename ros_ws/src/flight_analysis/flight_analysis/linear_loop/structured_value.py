@@ -77,10 +77,13 @@ def bound_at(M: ComplexArray, scaling: Scaling) -> FloatArray:
     return np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(H)[..., -1], 0.0)))
 
 
-def tightened(M: ComplexArray, real: int, target: float, alike: int = 0) -> tuple[float, Scaling]:
+def tightened(
+    M: ComplexArray, real: int, target: float, alike: int = 0, near: Scaling | None = None
+) -> tuple[float, Scaling]:
     """A bound of M, (p, p), the first `real` channels real, with the D and G of a search.
 
-    The `alike` channels behind these have one factor of D.
+    The `alike` channels behind these have one factor of D. The search begins at the balanced D, or
+    at the D and G of a matrix `near` M if their bound is less.
 
     Below `target` D and G are in the middle of the set with the target. The method of centres on
     the linear matrix inequality
@@ -93,11 +96,14 @@ def tightened(M: ComplexArray, real: int, target: float, alike: int = 0) -> tupl
     t = balanced(M)
     if alike:
         t[real : real + alike] = t[real : real + alike].mean()
+    g = np.zeros(len(M))
+    if near is not None and bound_at(M, near) <= bound_at(M, Scaling(t, g)):
+        t, g = near.t, np.clip(near.g, -LARGEST_G / 2.0, LARGEST_G / 2.0)
     N = np.exp(t)[:, None] * M * np.exp(-t)
     free = np.arange(len(M))
     free[real : real + alike] = real
     free[real + alike :] -= max(alike - 1, 0)
-    centre = Centre(np.ones(len(M)), np.zeros(real), np.eye(int(free[-1]) + 1)[free])
+    centre = Centre(np.ones(len(M)), g[:real], np.eye(int(free[-1]) + 1)[free])
     goal = target**2
     least = centre.bound(N)
     level = max(1.1 * least, goal)
@@ -115,7 +121,9 @@ def tightened(M: ComplexArray, real: int, target: float, alike: int = 0) -> tupl
     return float(np.sqrt(max(least, 0.0))), Scaling(t + 0.5 * np.log(centre.d), g)
 
 
-def tightened_at(part: Channels, w: float, scaled: ComplexArray) -> tuple[float, Scaling]:
+def tightened_at(
+    part: Channels, w: float, scaled: ComplexArray, near: Scaling | None
+) -> tuple[float, Scaling]:
     """A bound of a scaled M(w) of a part as by `tightened` to 1.
 
     D and G of the means over a period are taken where these suffice. The D of the second
@@ -123,7 +131,8 @@ def tightened_at(part: Channels, w: float, scaled: ComplexArray) -> tuple[float,
     """
     k = len(part.entries)
     rows = np.r_[0:k, part.uncertain : len(scaled)]
-    _, means = tightened(scaled[np.ix_(rows, rows)], k, 1.0, part.late)
+    few = None if near is None else Scaling(near.t[rows], near.g[rows])
+    _, means = tightened(scaled[np.ix_(rows, rows)], k, 1.0, part.late, few)
     second = slice(k, part.uncertain)
     sizes = np.abs(scaled) ** 2 + TINY
     row = sizes[second, rows] @ np.exp(-2.0 * means.t)
@@ -135,7 +144,7 @@ def tightened_at(part: Channels, w: float, scaled: ComplexArray) -> tuple[float,
     bound = float(bound_at(scaled, scaling))
     if bound < 1.0 or w * part.period < MEANS_UP_TO:
         return bound, scaling
-    return tightened(scaled, part.uncertain, 1.0, part.late)
+    return tightened(scaled, part.uncertain, 1.0, part.late, near)
 
 
 class Centre(NamedTuple):
