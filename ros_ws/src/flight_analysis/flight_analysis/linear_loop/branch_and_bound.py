@@ -42,7 +42,8 @@ class Region(NamedTuple):
         half[i] /= 2.0
         step = np.zeros(len(half))
         step[i] = half[i]
-        return [self._replace(centre=self.centre + c * step, half=half) for c in (-1.0, 1.0)]
+        narrowed = self._replace(half=half)
+        return [narrowed._replace(centre=self.centre + side * step) for side in (-1.0, 1.0)]
 
     def outside(self, begin: float, end: float) -> list["Region"]:
         """The frequencies below and above an interval, rad/s."""
