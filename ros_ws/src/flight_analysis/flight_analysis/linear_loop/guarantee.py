@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flight_analysis.linear_loop.branch_and_bound import proof_of
-from flight_analysis.linear_loop.loop_margins import LAG_ENTRY, LinearLoop
+from flight_analysis.linear_loop.loop_margins import LAG_ENTRY, MOST_OF_LAG, LinearLoop
 from flight_analysis.linear_loop.structured_value import RADIUS
 from flight_analysis.linear_loop.uncertain_loop import (
     Channels,
@@ -92,6 +92,7 @@ def guarantee(linear: LinearLoop, late: float = 0.0) -> Guarantee:
     require(box is not None, "uncertainty", "0", "an uncertainty above 0 for a guarantee")
     assert box is not None  # noqa: S101 - for mypy
     largest = float(np.max(box.part))
+    is_lag = np.array([name.startswith(LAG_ENTRY) for name in box.names])
     none = Guarantee(
         uncertainty=largest,
         stable=0.0,
@@ -100,14 +101,17 @@ def guarantee(linear: LinearLoop, late: float = 0.0) -> Guarantee:
         disk_all=0.0,
         loop=linear.digest,
         late=late,
-        has_exact_lags=not any(name.startswith(LAG_ENTRY) for name in box.names),
+        has_exact_lags=not is_lag.any(),
     )
     if not is_stable(linear.nominal, linear.law, linear.loop, np.zeros(len(linear.inputs))):
         return none
     uncertain = uncertain_loop(linear.nominal, linear.law, linear.loop, box, late)
     first = _first_unstable(linear, late)
     size = (1.0 if first is None else first.deviation) / largest
-    proved, proof = _proved(parts_of(uncertain), size, disks=False, exact=first is None)
+    # of lags more than that is not proved
+    most = MOST_OF_LAG / float(box.part[is_lag].max()) if is_lag.any() else np.inf
+    exact = first is None or most < size
+    proved, proof = _proved(parts_of(uncertain), min(size, most), disks=False, exact=exact)
     promise = none._replace(stable=largest * proved, unstable=first, proof=proof)
     if not promise.holds:
         return promise

@@ -42,9 +42,11 @@ from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 LAG_ENTRY = "1/lag"  # begins the name of an entry of an actuator
-LEAST_LAG = 2.0
-"""Periods: at (1 + d) / lag with d up to 0.8 the two Legendre coefficients of a period then leave
-out less of d than the thousandth that a guarantee proves beyond what it states."""
+LEAST_LAG = 2.0  # periods
+MOST_OF_LAG = 0.8
+"""The largest deviation d of 1 / lag that is proved: with a lag of LEAST_LAG the two Legendre
+coefficients of a period leave out less of it than the thousandth that a guarantee proves beyond
+what it states, and more above."""
 
 BARE = (
     "; each output integrates its inputs, without drag and phugoid: the margins cover Omega alone"
