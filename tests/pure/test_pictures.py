@@ -8,7 +8,6 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
-import yaml
 from benchmarks import diagrams
 from benchmarks.pictures import DEFAULT, FIGURES, IMAGES, PICTURES, TITLE
 from PIL import Image
@@ -20,15 +19,6 @@ from flight_analysis.report.summary import summarise
 
 DOCS = REPOSITORY / "docs"
 LARGEST = 150_000  # bytes of a picture: a repository keeps each version
-WITHOUT = {
-    "arduplane.md": "its bridge is drawn in autopilots.md",
-    "export.md": "code and bits",
-    "fleets.md": "the live page of one aircraft is that of several",
-    "security.md": "rules",
-    "symbols.md": "a table",
-    "theory-learning.md": "equations; learning.md has the picture",
-}
-"""Pages of "Do" and "Understand" without a picture, and why."""
 
 
 def texts(drawing: Path) -> list[str]:
@@ -86,15 +76,3 @@ def test_first_picture_is_of_the_flight_beside_it() -> None:
 def test_drawing_is_of_todays_tables(name: str, tmp_path: Path) -> None:
     diagrams.save_drawing(getattr(diagrams, name)(), tmp_path / "now.svg", name)
     assert texts(tmp_path / "now.svg") == texts(IMAGES / f"{name}.svg")
-
-
-def test_pages_that_do_and_explain_have_a_picture() -> None:
-    text = re.sub(r"!![\w/:.]+", "", (REPOSITORY / "mkdocs.yml").read_text())
-    sections = {
-        heading: pages
-        for entry in yaml.safe_load(text)["nav"]
-        if isinstance(entry, dict)
-        for heading, pages in entry.items()
-    }
-    pages = [*sections["Do"], *sections["Understand"]]
-    assert {page for page in pages if not shown_in(DOCS / page)} == {*WITHOUT}
