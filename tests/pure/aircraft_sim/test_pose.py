@@ -173,8 +173,11 @@ def test_steady_wind_moves_position_and_nothing_else(scenario: Any) -> None:
     short = scenario.vary(flight={"duration": 3.0}, aircraft=QUIET)
     still = simulate(short)
     windy = simulate(short.vary(aircraft={"wind": [-4.0, 3.0]}))
-    for topic in ("y", "u", "truth"):
+    for topic in ("y", "u"):
         assert still[topic].values.tobytes() == windy[topic].values.tobytes()
+    for name in still["truth"].names:
+        if not name.startswith("pose."):
+            assert (still["truth"][name] == windy["truth"][name]).all()
     before = guided(still["pose"])
     after = guided(windy["pose"])
     t = still.time("pose")
@@ -258,6 +261,8 @@ def test_poor_pose_is_late_rare_and_off_as_specified() -> None:
         arrived += [(number * 10_000_000, sample) for sample in simulator.poses()]
         if number % 20 == 0:
             errors = dict(zip(simulator.truth_names, simulator.truth(), strict=True))
+            told = [errors[f"pose.{name}"] for name in POSE]
+            assert told == simulator.pose().tolist()
     assert {now - sample.stamp_ns for now, sample in arrived} == {100_000_000}
     assert [sample.stamp_ns for _, sample in arrived[:3]] == [0, 200_000_000, 400_000_000]
     off = np.array([sample.value - truth[sample.stamp_ns] for _, sample in arrived])

@@ -4,8 +4,10 @@
 
 import numpy as np
 import pytest
+from tests.closed_loop import calm_osprey
 from tests.conftest import refusing
 
+import rise_di
 from flight_analysis.report.guided import (
     Outside,
     altitude_excess,
@@ -66,6 +68,40 @@ def test_time_outside_counts_while_guidance_flies() -> None:
     assert time_outside(flown(600.0, 490.0, 480.0, engaged=1), SECTION) == Outside(0.0, 0.0)
     assert time_outside(flown(600.0, 490.0), SECTION.model_copy(update={"fence": {}})) is None
     assert time_outside(Tape({}, 0), SECTION) is None
+
+
+def test_true_pose_tells_where_the_simulation_knows_it() -> None:
+    """The measured pose is 30 m off, whoever moved it; the aircraft is where it is."""
+    measured = flown(490.0, 490.0, 490.0)
+    north = 520.0 * np.ones(3)
+    height = np.zeros(3)
+    truth = Signal(
+        measured["pose"].stamp_ns,
+        ("t", "pose.north", "pose.east", "pose.altitude"),
+        np.column_stack([np.arange(3.0), north, height, height - 15.0]),
+    )
+    tape = Tape(dict(measured.signals) | {"truth": truth}, 0)
+    assert time_outside(tape, SECTION) == Outside(2.0, 20.0)
+    floor = SECTION.model_copy(update={"altitude_floor": -10.0})
+    assert altitude_excess(tape, floor) == Outside(2.0, 5.0)
+    zone = ZoneConfig(north=(480.0, 500.0, 500.0, 480.0), east=(-10.0, -10.0, 10.0, 10.0))
+    landing = SECTION.model_copy(update={"touchdown": zone})
+    assert touched_beside(tape, landing) == pytest.approx(20.0)
+    assert touched_beside(measured, landing) == 0.0
+
+
+def test_aircraft_with_a_pose_that_is_off_leaves_its_lane() -> None:
+    """Guidance holds the measured line, 40 m beside the true one, in a lane 60 m wide."""
+    lane = ZoneConfig(north=(-50.0, 900.0, 900.0, -50.0), east=(-30.0, -30.0, 30.0, 30.0))
+    route = {"north": [0.0, 800.0, 1600.0], "east": [0.0] * 3, "altitude": [0.0] * 3}
+    scenario = calm_osprey(15.0, route=route)
+    assert scenario.guidance is not None
+    section = scenario.guidance.model_copy(update={"fence": {"lane": lane}})
+    assert time_outside(rise_di.simulate(scenario), section) == Outside(0.0, 0.0)
+    off = rise_di.simulate(scenario.vary(aircraft={"pose": {"bias": {"east": 40.0}}}))
+    outing = time_outside(off, section)
+    assert outing is not None
+    assert outing.farthest_m > 5.0
 
 
 def test_time_outside_of_altitudes() -> None:

@@ -98,6 +98,7 @@ class Simulator:
         self.truth_names = (
             "t",
             *self._model.truth_names,
+            *(f"pose.{name}" for name in POSE),
             *(f"noise.{name}" for name in self.outputs),
         )
         if self._pose_sensors is not None:
@@ -251,4 +252,6 @@ class Simulator:
         """The true values at the instant of the last sample, in the order of `truth_names`."""
         t_ns = self._number * self.period_ns
         pose_errors = () if self._pose_sensors is None else (self._pose_error,)
-        return np.concatenate([[seconds(t_ns)], self._model.truth(t_ns), self._error, *pose_errors])
+        return np.concatenate(
+            [[seconds(t_ns)], self._model.truth(t_ns), self.pose(), self._error, *pose_errors]
+        )

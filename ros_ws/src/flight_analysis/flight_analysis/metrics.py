@@ -111,6 +111,21 @@ class InputMetrics(NamedTuple):
     rate: float
 
 
+def best_pose(tape: Tape) -> Signal | None:
+    """Return the true pose if the simulation has logged it, else the measured pose, if any.
+
+    The channels are `flight_core.channels.POSE`. A sensor that is off, or a pose that somebody else
+    publishes, moves the measured pose and not the aircraft.
+    """
+    if "truth" in tape and len(tape["truth"].stamp_ns):
+        pose = tape["truth"].group("pose")
+        if pose.names:
+            return pose
+    if "pose" in tape and len(tape["pose"].stamp_ns):
+        return tape["pose"]
+    return None
+
+
 def tracking_error(tape: Tape) -> Signal:
     """Measured error e = y - y_m at every y inside the time range of y_m, shape (N, m).
 

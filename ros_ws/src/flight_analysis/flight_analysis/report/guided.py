@@ -13,7 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flight_analysis.closed_loop.guidance_replay import known_routes
-from flight_analysis.metrics import SETTLING_DWELL, error_metrics, sample_times, settling_time
+from flight_analysis.metrics import (
+    SETTLING_DWELL,
+    best_pose,
+    error_metrics,
+    sample_times,
+    settling_time,
+)
 from flight_core.outcome import End
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
@@ -210,13 +216,14 @@ def orbit_missed_by(tape: Tape, section: GuidanceConfig) -> float:
 
 
 def touched_beside(tape: Tape, section: GuidanceConfig) -> float:
-    """Distance from the touch-down zone at the end of the flight, m.
+    """Return the distance from the touch-down zone at the end of the flight, m.
 
-    0 inside, and without a zone.
+    It is 0 inside of the zone, and without a zone.
     """
-    if section.touchdown is None or "pose" not in tape or not len(tape["pose"].stamp_ns):
+    pose = best_pose(tape)
+    if section.touchdown is None or pose is None:
         return 0.0
-    place = (tape["pose"]["north"][-1:], tape["pose"]["east"][-1:])
+    place = (pose["north"][-1:], pose["east"][-1:])
     return max(-float(clearance((section.touchdown.zone(),), *place)[0]), 0.0)
 
 
@@ -225,7 +232,7 @@ SCREEN = 15.24
 
 
 class Touch(NamedTuple):
-    """How a landing ended, by `pose`."""
+    """How a landing ended, by the true pose where the log has it."""
 
     sink: float  # m/s
     sideways: float  # m/s, across the heading
@@ -244,9 +251,10 @@ def landing_touch(tape: Tape, section: GuidanceConfig | None) -> Touch | None:
     if section is None or section.landing is None or tape.outcome.end is not End.LANDED:
         return None
     landing = section.landing_on(section.plan(section.waypoints()))
-    if landing is None or "pose" not in tape or not len(tape["pose"].stamp_ns):
+    signal = best_pose(tape)
+    if landing is None or signal is None:
         return None
-    pose = {name: tape["pose"][name] for name in tape["pose"].names}
+    pose = {name: signal[name] for name in signal.names}
     end = {name: float(values[-1]) for name, values in pose.items()}
     line = np.array([math.cos(landing.course), math.sin(landing.course)])
     place = np.array([end["north"] - landing.place[0], end["east"] - landing.place[1]])
@@ -254,7 +262,7 @@ def landing_touch(tape: Tape, section: GuidanceConfig | None) -> Touch | None:
     above = np.flatnonzero(pose["altitude"] > landing.ground + SCREEN)
     low = None
     if len(above):
-        row = np.searchsorted(tape["guidance"].stamp_ns, tape["pose"].stamp_ns[above[-1]])
+        row = np.searchsorted(tape["guidance"].stamp_ns, signal.stamp_ns[above[-1]])
         low = float(speed[min(int(row), len(speed) - 1)])
     across = end["v_east"] * math.cos(end["psi"]) - end["v_north"] * math.sin(end["psi"])
     return Touch(
@@ -276,9 +284,9 @@ class Outside(NamedTuple):
 
 
 def time_outside(tape: Tape, section: GuidanceConfig | None) -> Outside | None:
-    """Time outside of the fence by `pose`, as of the first step of guidance.
+    """Return the time outside of the fence from the first step of guidance on.
 
-    None without a fence, or without a pose then.
+    Returns None without a fence, and without a pose then.
     """
     fence = None if section is None else section.fence_zones()
     pose = _guided_pose(tape)
@@ -288,9 +296,10 @@ def time_outside(tape: Tape, section: GuidanceConfig | None) -> Outside | None:
 
 
 def altitude_excess(tape: Tape, section: GuidanceConfig | None) -> Outside | None:
-    """Time above the ceiling and below the altitude floor by `pose`.
+    """Return the time above the ceiling and below the altitude floor.
 
-    Time counts as of the first step of guidance. None without limits, or without a pose then.
+    It counts from the first step of guidance on. Returns None without limits, and without a pose
+    then.
     """
     pose = _guided_pose(tape)
     if section is None or (section.ceiling is None and section.altitude_floor is None):
@@ -303,10 +312,10 @@ def altitude_excess(tape: Tape, section: GuidanceConfig | None) -> Outside | Non
 
 
 def _guided_pose(tape: Tape) -> Signal | None:
-    """`pose` as of the first step of guidance; None without either."""
-    if "pose" not in tape or "guidance" not in tape or not len(tape["guidance"].stamp_ns):
+    """Return the pose from the first step of guidance on, or None without either."""
+    pose = best_pose(tape)
+    if pose is None or "guidance" not in tape or not len(tape["guidance"].stamp_ns):
         return None
-    pose = tape["pose"]
     is_guided = pose.stamp_ns >= tape["guidance"].stamp_ns[0]
     if is_guided.any():
         return Signal(pose.stamp_ns[is_guided], pose.names, pose.values[is_guided])
