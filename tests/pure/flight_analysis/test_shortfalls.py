@@ -109,12 +109,90 @@ def test_effector_without_a_task_may_be_stuck() -> None:
     assert rise_di.simulate(with_faults(calm, "aileron stuck 5")).outcome == COMPLETED
 
 
-def test_engine_that_fails_on_another_simulator_is_told() -> None:
-    """Without a model of the aircraft the airspeed may be off by 5 % of the trim speed."""
-    c172p = find_scenario("jsbsim_c172p", duration=40.0)
-    (shortfall,) = rise_di.simulate(with_faults(c172p, "throttle failed 5")).outcome.shortfalls
+@pytest.mark.parametrize("fault", ["throttle failed 5", "elevator stuck 5"])
+def test_airspeed_of_another_simulator_is_told(fault: str) -> None:
+    """The stuck elevator leaves the pulses of q unflown, and the aircraft 150 m lower."""
+    c172p = find_scenario("jsbsim_c172p", duration=30.0)
+    (shortfall,) = rise_di.simulate(with_faults(c172p, fault)).outcome.shortfalls
     assert (shortfall.aim, shortfall.figures["output"]) == (Aim.ERROR, "V")
     assert rise_di.simulate(c172p).outcome == COMPLETED
+
+
+def test_airspeed_in_turbulence_of_another_simulator_is_allowed_for() -> None:
+    """Turbulence of sigma = 2 m/s moves V by as much: the engine is too slow for it."""
+    turbulence = {"altitude": 1219.2, "sigma": 2.0, "seed": 4}
+    rough = find_scenario("jsbsim_c172p", duration=20.0).vary(aircraft={"turbulence": turbulence})
+    outcome = rise_di.simulate(rough).outcome
+    assert outcome.status == 0
+    (allowance,) = outcome.allowances
+    assert (allowance.figures["output"], allowance.figures["is_noise"]) == ("V", False)
+    assert str(outcome).startswith("completed, V off by 1.")
+    assert str(outcome).endswith(" m/s rms, allowed for wind")
+
+
+NOISY = {"p of 0.3": (2, 0.3), "p of 1.5": (2, 1.5), "q of 0.3": (0, 0.3), "r of 0.3": (3, 0.3)}
+
+
+@pytest.mark.parametrize(("output", "noise"), NOISY.values(), ids=NOISY)
+def test_aircraft_that_shakes_by_its_noise_is_told(output: int, noise: float) -> None:
+    """The actuators cannot follow the law: 9 to 47 rad/s rms asked of 5.2 rad/s."""
+    noises = list(servo().aircraft.sensors.noise)
+    noises[output] = noise
+    outcome = rise_di.simulate(servo().vary(aircraft={"sensors": {"noise": noises}})).outcome
+    assert outcome.status == 4
+    assert {shortfall.aim for shortfall in outcome.shortfalls} == {Aim.ERROR}
+
+
+def test_noise_beyond_that_of_the_file_is_a_fault() -> None:
+    """Somebody sets the noise of p in flight: the log has it, the sensor is not declared to."""
+    noises = list(servo().aircraft.sensors.noise)
+    noises[2] = 0.15
+    louder = servo().vary(aircraft={"sensors": {"noise": noises}})
+    tape = rise_di.simulate(louder)
+    assert tape.outcome.status == 0
+    assert judge(COMPLETED, tape, servo(), WHOLE).status == 4
+
+
+STORMS: dict[str, dict[str, object]] = {
+    "gust of 40 m/s": {"gusts": {"vertical": {"start": 10.0, "speed": 40.0, "length": 15.0}}},
+    "train of gusts": {
+        "gusts": {"lateral": {"start": 3.0, "speed": 8.0, "length": 15.0, "every": 1.3}}
+    },
+    "sine on q": {"sines": {"q": {"amplitude": 10.0, "frequency": 12.0}}},
+    "sine on p": {"sines": {"p": {"amplitude": 60.0, "frequency": 6.0}}},
+}
+
+
+@pytest.mark.parametrize("storm", STORMS.values(), ids=STORMS)
+def test_aircraft_that_a_storm_shakes_is_told(storm: dict[str, object]) -> None:
+    """By more than 3 deg/s rms, twice what severe turbulence leaves."""
+    outcome = rise_di.simulate(servo().vary(aircraft=storm)).outcome
+    assert {shortfall.aim for shortfall in outcome.shortfalls} == {Aim.ERROR}
+
+
+def test_severe_turbulence_is_allowed_for_and_said() -> None:
+    """45 kt at 20 ft by MIL-F-8785C."""
+    turbulence = {"altitude": 100.0, "wind": 23.0, "seed": 1}
+    outcome = rise_di.simulate(servo().vary(aircraft={"turbulence": turbulence})).outcome
+    assert outcome.status == 0
+    assert outcome.allowances
+    assert all(allowance.sentence.endswith("allowed for wind") for allowance in outcome.allowances)
+
+
+def test_noise_of_a_measured_error_counts_twice() -> None:
+    """Without the truth 0.1 rad/s, twice the rms of the noise, and what the commands leave."""
+    calm = servo().vary(reference_model={"pulses": {}}, aircraft={"gusts": {}})
+    tape = rise_di.simulate(calm)
+    noise = 0.005 * np.random.default_rng(2).standard_normal(len(tape["y"].stamp_ns))
+    statuses = {}
+    for offset in (0.105, 0.115):
+        y = tape["y"].values.copy()
+        y[:, 2] = offset + noise
+        signals = dict(tape.signals) | {"y": Signal(tape["y"].stamp_ns, tape["y"].names, y)}
+        del signals["truth"]
+        outcome = judge(COMPLETED, replace(tape, signals=signals), calm, WHOLE)
+        statuses[offset] = outcome.status
+    assert statuses == {0.105: 0, 0.115: 4}
 
 
 Sample = Callable[[float, StampedVector], StampedVector | None]
@@ -181,11 +259,58 @@ def test_bounds_of_y_that_keep_the_law_from_flying_are_told() -> None:
     assert outcome.status == 4
 
 
-def test_law_that_was_not_asked_to_fly_is_no_shortfall() -> None:
-    """A dry run behind an autopilot: the controller is inactive."""
-    ticks = Signal(np.arange(3, dtype=np.int64), ("mode",), np.full((3, 1), float(Mode.INACTIVE)))
-    tape = replace(healthy(), signals=dict(healthy().signals) | {"internals": ticks})
-    assert judge(COMPLETED, tape, servo(), WHOLE) == COMPLETED
+def with_modes(mode: Mode, first: int, stop: int) -> Tape:
+    """Return the healthy flight with these ticks in a mode."""
+    internals = healthy()["internals"]
+    values = internals.values.copy()
+    values[first:stop, internals.names.index("mode")] = mode
+    signals = dict(healthy().signals)
+    signals["internals"] = Signal(internals.stamp_ns, internals.names, values)
+    return replace(healthy(), signals=signals)
+
+
+def off_by_1_rad_per_s(tape: Tape, first: int, stop: int) -> Tape:
+    """Return a flight whose true p is off at these samples."""
+    truth = tape["truth"]
+    values = truth.values.copy()
+    values[first:stop, truth.names.index("x.p")] += 1.0
+    signals = dict(tape.signals) | {"truth": Signal(truth.stamp_ns, truth.names, values)}
+    return replace(tape, signals=signals)
+
+
+@pytest.mark.parametrize("switch", ["autostart", "start_active"])
+def test_law_that_was_not_asked_to_fly_is_no_shortfall(switch: str) -> None:
+    """A dry run: whoever activates the controller decides when it flies."""
+    asleep = with_modes(Mode.INACTIVE, 0, 2001)
+    manual = servo().vary(controller={switch: False})
+    assert judge(COMPLETED, asleep, manual, WHOLE) == COMPLETED
+    paused = off_by_1_rad_per_s(with_modes(Mode.INACTIVE, 800, 1200), 800, 1200)
+    assert judge(COMPLETED, paused, manual, WHOLE) == COMPLETED
+
+
+@pytest.mark.parametrize("first", [0, 50, 1700])
+def test_law_that_somebody_deactivates_is_told(first: int) -> None:
+    """The scenario starts it active: the commands were to be flown from the first u to the end."""
+    (shortfall,) = judge(
+        COMPLETED, with_modes(Mode.INACTIVE, first, 2001), servo(), WHOLE
+    ).shortfalls
+    assert shortfall.aim is Aim.ENGAGEMENT
+    assert shortfall.figures["share"] == pytest.approx(first / 2001.0)
+
+
+def test_error_while_somebody_has_deactivated_the_law_is_told() -> None:
+    """1 s is no tenth of the flight; the aircraft was off all the same."""
+    paused = off_by_1_rad_per_s(with_modes(Mode.INACTIVE, 800, 900), 800, 900)
+    (shortfall,) = judge(COMPLETED, paused, servo(), WHOLE).shortfalls
+    assert (shortfall.aim, shortfall.figures["output"]) == (Aim.ERROR, "p")
+
+
+def test_error_before_the_law_engaged_is_none_of_the_law() -> None:
+    """It engages 1.5 s after its first u."""
+    late = off_by_1_rad_per_s(with_modes(Mode.TRIM, 0, 150), 0, 150)
+    assert judge(COMPLETED, late, servo(), WHOLE) == COMPLETED
+    after = off_by_1_rad_per_s(with_modes(Mode.TRIM, 0, 150), 150, 300)
+    assert judge(COMPLETED, after, servo(), WHOLE).status == 4
 
 
 def test_late_loop_is_told_with_its_cycle() -> None:
@@ -288,22 +413,6 @@ def test_law_that_is_too_weak_for_its_commands_is_told() -> None:
     scale = np.array(servo().controller.input_scale) / 1000.0
     weak = servo().vary(controller={"input_scale": scale.tolist()})
     assert rise_di.simulate(weak).outcome.status == 4
-
-
-def test_error_of_an_inactive_controller_is_no_shortfall() -> None:
-    """A user deactivates the controller for 4 s, and the aircraft drifts off."""
-    internals = healthy()["internals"]
-    values = internals.values.copy()
-    values[800:1200, internals.names.index("mode")] = Mode.INACTIVE
-    truth = healthy()["truth"]
-    off = truth.values.copy()
-    off[800:1200, truth.names.index("x.p")] += 1.0
-    signals = dict(healthy().signals)
-    signals["truth"] = Signal(truth.stamp_ns, truth.names, off)
-    assert judge(COMPLETED, replace(healthy(), signals=signals), servo(), WHOLE).status == 4
-    signals["internals"] = Signal(internals.stamp_ns, internals.names, values)
-    outcome = judge(COMPLETED, replace(healthy(), signals=signals), servo(), WHOLE)
-    assert outcome == COMPLETED
 
 
 def test_truth_of_another_simulator_tells_no_wind() -> None:

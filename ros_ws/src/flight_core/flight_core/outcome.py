@@ -40,6 +40,7 @@ class Aim(StrEnum):
     """What a flight can fall short of."""
 
     ENGAGEMENT = "engagement"  # the law flies while it is asked to
+    REFERENCE = "reference"  # y_m is that of the scenario
     ERROR = "error"  # the linear loop allows the error of an output
     STALL = "stall"  # the airspeed stays above the stall speed
     GROUND = "ground"  # the aircraft stays above the ground
@@ -61,6 +62,14 @@ class Shortfall:
     figures: Mapping[str, Any] = field(default_factory=dict)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Allowance:
+    """An error that is none of the law: noise or wind leaves it to the linear loop too."""
+
+    sentence: str
+    figures: Mapping[str, Any] = field(default_factory=dict)
+
+
 @dataclass(frozen=True)
 class Outcome:
     """The outcome of a flight.
@@ -76,6 +85,7 @@ class Outcome:
     end: End
     reason: str = ""  # a sentence, where the end alone does not say it
     shortfalls: tuple[Shortfall, ...] = ()
+    allowances: tuple[Allowance, ...] = ()
 
     @property
     def has_reached_end(self) -> bool:
@@ -92,11 +102,13 @@ class Outcome:
         return STATUS_SHORTFALL if self.shortfalls or self.end is End.UNKNOWN else 0
 
     def __str__(self) -> str:
-        """The end, the reason and the shortfalls as a sentence."""
+        """Return the end, the reason, the shortfalls and the allowances as a sentence."""
         begin = self.reason or self.end.value
         if self.end in {End.NEVER_FLEW, End.UNKNOWN} and self.reason:
             begin = f"{self.end}: {self.reason}"
-        return ", ".join([begin, *(each.sentence for each in self.shortfalls)])
+        shortfalls = (each.sentence for each in self.shortfalls)
+        allowances = (each.sentence for each in self.allowances)
+        return ", ".join([begin, *shortfalls, *allowances])
 
     def as_json(self) -> dict[str, Any]:
         """The record for `summary.json`, with sentence and exit status."""
@@ -106,6 +118,10 @@ class Outcome:
             "shortfalls": [
                 {"aim": each.aim.value, "sentence": each.sentence, "figures": dict(each.figures)}
                 for each in self.shortfalls
+            ],
+            "allowances": [
+                {"sentence": each.sentence, "figures": dict(each.figures)}
+                for each in self.allowances
             ],
             "sentence": str(self),
             "status": self.status,

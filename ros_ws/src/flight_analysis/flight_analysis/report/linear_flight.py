@@ -7,6 +7,11 @@
 y_m, the noise of the sensors and d come from the log; d is the part of x_dot without x and u.
 Limits of u, faults of the effectors and the state-dependent part of f are left out. The error of a
 flight is 0.8 to 1.3 times this error in the scenarios of the package.
+
+The loop is linear, so e is a sum of three: what the commands leave, what the noise leaves and what
+the wind leaves. A log must not excuse itself, so noise counts as far as the sensor is declared to
+have it, and as the actuators can follow the law's answer to it. Gravity acts along the path of y_m:
+an aircraft that pitches where nobody asked it to is not excused by its own pitch.
 """
 
 from typing import NamedTuple
@@ -51,6 +56,12 @@ NOISE_TIME = 1.0
 """s, over which the mean error of a sensor is a bias or a drift: white noise at 100 Hz loses a
 hundredth of its variance."""
 
+DECLARED = 4.0
+"""Standard deviations of a sensor's noise that count: one normal sample in 16,000 is beyond."""
+
+NOISE_PEAK = 3.0
+"""Standard deviations of the inputs by noise that the actuators have to follow: 99.7 % of them."""
+
 
 class Knowledge(NamedTuple):
     """What is known of a flight."""
@@ -65,22 +76,45 @@ class ErrorPair(NamedTuple):
     t: FloatArray  # (N,) flight time, s
     names: tuple[str, ...]
     e: FloatArray  # (N, m) of the flight, SI
-    linear: FloatArray  # (N, m) of the linear loop, 0 where no linear loop is stable
     y_m: FloatArray  # (N, m)
-    wind_error: FloatArray  # (N, m) of the linear loop without commands: by noise and wind
+    linear: "LinearErrors"
     is_flown: NDArray[np.bool_]  # (N,) the law was to fly, and the log has the error
     not_numbers: int  # ticks with an error that is not finite
     noise: FloatArray  # (m,) rms of the noise in e: 0 of a true error
     knowledge: Knowledge
 
 
-def error_pair(
-    tape: Tape, controller: ControllerConfig, aircraft: AircraftConfig | None
-) -> ErrorPair | None:
-    """The errors of a flight and of the linear loop.
+class LinearErrors(NamedTuple):
+    """Absolute errors of the linear loop, (N, m), SI; 0 where no linear loop is stable.
 
-    None without an error, and of a law without feedback. `aircraft`: of the simulation; None of an
-    unknown plant.
+    With a drift each is the larger one of the aircraft before and after it.
+    """
+
+    whole: FloatArray
+    command: FloatArray  # by the commands alone
+    noise: FloatArray  # by the noise alone
+    wind: FloatArray  # by the wind alone
+
+
+class Reach(NamedTuple):
+    """What the actuators allow each input of the law, (m,), in its unit; inf without a limit."""
+
+    travel: FloatArray
+    rate: FloatArray  # per s
+
+
+def error_pair(
+    tape: Tape,
+    controller: ControllerConfig,
+    aircraft: AircraftConfig | None,
+    *,
+    may_pause: bool = True,
+) -> ErrorPair | None:
+    """Return the errors of a flight and of the linear loop.
+
+    Returns None without an error, and for a law without feedback. `aircraft` is that of the
+    simulation, or None for an unknown plant. If the law `may_pause`, the ticks in which it is
+    inactive do not count.
     """
     kind, error = best_error(tape)
     names = tuple(name for name in controller.outputs if name in error.names)
@@ -100,12 +134,9 @@ def error_pair(
         t=ticks,
         names=names,
         e=e,
-        linear=_linear_error(tape, controller, aircraft, airframes, ticks, y_m, e[0]),
         y_m=y_m,
-        wind_error=_linear_error(
-            tape, controller, aircraft, airframes, ticks, 0.0 * y_m, 0.0 * e[0]
-        ),
-        is_flown=_active(tape, ticks) & _sampled(seconds_of, ticks) & is_finite,
+        linear=_linear_errors(tape, controller, aircraft, airframes, ticks, y_m, e[0]),
+        is_flown=_flown(tape, ticks, may_pause=may_pause) & _sampled(seconds_of, ticks) & is_finite,
         not_numbers=int(np.count_nonzero(~is_finite)),
         noise=np.array([0.0 if is_true else floor.get(name, 0.0) for name in names]),
         knowledge=knowledge,
@@ -144,7 +175,7 @@ def _has_wind(tape: Tape, aircraft: AircraftConfig | None) -> bool:
     return bool(_airframes(tape, aircraft)) or {"x.theta", WIND} <= set(tape["truth"].names)
 
 
-def _linear_error(
+def _linear_errors(
     tape: Tape,
     controller: ControllerConfig,
     aircraft: AircraftConfig | None,
@@ -152,30 +183,82 @@ def _linear_error(
     ticks: FloatArray,
     y_m: FloatArray,
     e_0: FloatArray,
-) -> FloatArray:
-    """The error of the linear loop around the aircraft, (N, m).
-
-    From the drift on the larger error of the loops before and after counts.
-    """
+) -> LinearErrors:
+    """Fly the linear loop around the aircraft, and around the drifted one if there is one."""
     config = controller
     if is_literal(controller):
         # the literal sign is the limit of the implicit one
         config = controller.model_copy(update={"sign": "implicit"})
-    loops = [_known_loop(config, airframe) for airframe in airframes] or [_bare_loop(config)]
-    largest = np.zeros_like(y_m)
-    for number, (plant, law, loop) in enumerate(loops):
+    noise = _noise(tape, controller, aircraft, ticks)
+    still = np.zeros_like(y_m)
+    largest = LinearErrors(still, still, still, still)
+    for number, airframe in enumerate(airframes or [None]):
+        parts = _bare_loop(config) if airframe is None else _known_loop(config, airframe)
+        plant, law, loop = parts
         matrix = closed_loop(plant, law, loop, np.zeros(len(loop.lag)))
         if spectral_radius(matrix) > 1.0 + SPECTRAL_RADIUS_TOLERANCE:
             continue
-        if airframes:
-            d = _disturbance(tape, aircraft, ticks, len(plant.A))
+        if airframe is None:
+            wind = _slope_of_wind(tape, controller, ticks)
+            along_path = _gravity_along_path(tape, controller, ticks, y_m)
         else:
-            d = _disturbance_of_speed(tape, controller, ticks)
-        error = np.abs(_flight(tape, controller, (plant, law, loop), ticks, d, y_m, e_0))
+            wind = _disturbance(tape, aircraft, ticks, len(plant.A))
+            along_path = np.zeros_like(wind)
+        by_command = _flight(tape, controller, parts, ticks, along_path, still, y_m, e_0)
+        by_noise = _flight(tape, None, parts, ticks, 0.0 * wind, noise, still, 0.0 * e_0)
+        by_wind = _flight(tape, None, parts, ticks, wind, still, still, 0.0 * e_0)
+        reach = _reach(controller, aircraft)
+        held_noise = _share_within(reach, by_noise.u, loop.period) * by_noise.e
+        errors = [
+            np.abs(error)
+            for error in (
+                by_command.e + held_noise + by_wind.e,
+                by_command.e,
+                held_noise,
+                by_wind.e,
+            )
+        ]
         if number and aircraft is not None and aircraft.drift is not None:
-            error[ticks < aircraft.drift.start] = 0.0
-        largest = np.maximum(largest, error)
+            for error in errors:
+                error[ticks < aircraft.drift.start] = 0.0
+        largest = LinearErrors(*map(np.maximum, largest, errors))
     return largest
+
+
+def _reach(controller: ControllerConfig, aircraft: AircraftConfig | None) -> Reach:
+    """Return how far and how fast the actuators can follow each input of the law.
+
+    An input that an allocation distributes ends where its first effector does.
+    """
+    m = len(controller.inputs)
+    if aircraft is None:
+        return Reach(np.full(m, np.inf), np.full(m, np.inf))
+    names = tuple(aircraft.channels().inputs)
+    allocation = controller.allocation
+    if allocation is None or set(names) == set(controller.inputs):
+        parts = np.array([[float(name == each) for each in controller.inputs] for name in names])
+    else:
+        T = np.abs(np.reshape(allocation.T, (len(allocation.effectors), m)))
+        parts = T[[allocation.effectors.index(name) for name in names]]
+    actuators = aircraft.actuators
+    travel = np.full(len(names), np.inf)
+    if actuators.lower and actuators.upper:
+        travel = np.minimum(-np.array(actuators.lower), np.array(actuators.upper))
+    rate = np.array(actuators.rate) if actuators.rate else np.full(len(names), np.inf)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return Reach(np.min(travel[:, None] / parts, axis=0), np.min(rate[:, None] / parts, axis=0))
+
+
+def _share_within(reach: Reach, u: FloatArray, period: float) -> FloatArray:
+    """Return the part of u, (N, m), that the actuators can follow, (m,), at most 1.
+
+    NOISE_PEAK standard deviations have to lie within travel and rate.
+    """
+    if len(u) < 2:
+        return np.ones(u.shape[1])
+    size = NOISE_PEAK * np.sqrt(np.mean(u**2, axis=0))
+    rate = NOISE_PEAK * np.sqrt(np.mean(np.diff(u, axis=0) ** 2, axis=0)) / period
+    return np.asarray(1.0 / np.maximum(np.maximum(size / reach.travel, rate / reach.rate), 1.0))
 
 
 def _known_loop(
@@ -201,16 +284,27 @@ def _bare_loop(controller: ControllerConfig) -> tuple[LinearPlant, LinearLaw, Lo
     return LinearPlant(np.zeros((m, m)), np.diag(Omega), np.eye(m)), law, loop
 
 
+class _LinearFlight(NamedTuple):
+    """The linear loop at the ticks."""
+
+    e: FloatArray  # (N, m)
+    u: FloatArray  # (N, m)
+
+
 def _flight(
     tape: Tape,
-    controller: ControllerConfig,
+    probed: ControllerConfig | None,
     parts: tuple[LinearPlant, LinearLaw, LoopTiming],
     ticks: FloatArray,
     d: FloatArray,
+    noise: FloatArray,
     y_m: FloatArray,
     e_0: FloatArray,
-) -> FloatArray:
-    """The error e of the linear loop at the ticks, (N, m), x_dot = A x + B u + d; d: (N, n)."""
+) -> _LinearFlight:
+    """Fly the linear loop, x_dot = A x + B u + d; d: (N, n), noise: (N, m).
+
+    `probed` is the controller if its probe acts.
+    """
     plant, law, loop = parts
     n, m = plant.B.shape
     by_tick = sampled_plant(plant, loop, np.zeros(m))
@@ -219,23 +313,23 @@ def _flight(
     drive[:, :n] = d @ step.T
     # vanes add columns to y, which see the motion alone
     vanes = len(by_tick.C) - m
-    noise = _noise(tape, controller, ticks)
     shift = np.concatenate([noise - y_m, np.zeros((len(ticks), vanes))], axis=1)
-    probe = controller.guard().probe
+    probe = None if probed is None else probed.guard().probe
     x = np.zeros(len(by_tick.A))
     x[:n] = np.linalg.pinv(plant.C[:m]) @ (e_0 + y_m[0])
     z = np.zeros(law.A.shape[-1])
     e = np.zeros((len(ticks), m))
+    u = np.zeros((len(ticks), m))
     for k, t in enumerate(ticks):
         y = by_tick.C @ x
         e[k] = y[:m] - y_m[k]
         measured = y + shift[k]
-        u = law.C @ z + law.D @ measured
+        u[k] = law.C @ z + law.D @ measured
         z = law.A @ z + law.B @ measured
         if probe is not None:
-            u = u + probe.at(tape.start_ns + round(t * NANOSECONDS))
-        x = by_tick.A @ x + by_tick.B @ u + drive[k]
-    return e
+            u[k] += probe.at(tape.start_ns + round(t * NANOSECONDS))
+        x = by_tick.A @ x + by_tick.B @ u[k] + drive[k]
+    return _LinearFlight(e, u)
 
 
 def _at(tape: Tape, topic: str, name: str, ticks: FloatArray) -> FloatArray:
@@ -255,22 +349,42 @@ def _between(tape: Tape, signal: Signal, values: FloatArray, ticks: FloatArray) 
     return np.interp(ticks, t, values[is_finite])
 
 
-def _noise(tape: Tape, controller: ControllerConfig, ticks: FloatArray) -> FloatArray:
-    """The errors of the sensors in the log less the mean over NOISE_TIME, (N, m).
+def _noise(
+    tape: Tape, controller: ControllerConfig, aircraft: AircraftConfig | None, ticks: FloatArray
+) -> FloatArray:
+    """Return the errors of the sensors in the log less their mean over NOISE_TIME, (N, m).
 
     They have the units of y, and are 0 where the log has none. A bias and a drift are no noise: the
-    law follows them, and the aircraft is off by as much.
+    law follows them, and the aircraft is off by as much. What is beyond the sensor's declaration is
+    a fault and no noise either.
     """
     from scipy.ndimage import uniform_filter1d  # noqa: PLC0415 - loads SciPy, which few flights need
 
     count = max(round(NOISE_TIME * controller.rate), 1)
     noise = np.zeros((len(ticks), len(controller.outputs)))
     truth = tape.signals.get("truth")
+    if truth is None or aircraft is None:
+        return noise
+    declared = dict(zip(aircraft.channels().outputs, _declared_noise(aircraft), strict=True))
     for i, name in enumerate(controller.outputs):
-        if truth is not None and f"noise.{name}" in truth.names:
+        if f"noise.{name}" in truth.names:
             errors = _at(tape, "truth", f"noise.{name}", ticks)
-            noise[:, i] = errors - uniform_filter1d(errors, count, mode="nearest")
+            errors -= uniform_filter1d(errors, count, mode="nearest")
+            noise[:, i] = np.clip(errors, -declared[name], declared[name])
     return noise
+
+
+def _declared_noise(aircraft: AircraftConfig) -> list[float]:
+    """Return the largest error of each output that its sensor is declared to have, SI.
+
+    DECLARED sqrt(noise^2 + drift^2 rate NOISE_TIME) + quantisation
+    """
+    sensors = aircraft.sensor_arrays()
+    steps = aircraft.rate * NOISE_TIME
+    drift = np.zeros_like(sensors.noise) if sensors.drift is None else sensors.drift
+    quantum = np.zeros_like(sensors.noise) if sensors.quantum is None else sensors.quantum
+    largest = DECLARED * np.sqrt(sensors.noise**2 + drift**2 * steps) + quantum
+    return [float(value) for value in largest[: len(aircraft.channels().outputs)]]
 
 
 def _disturbance(
@@ -289,33 +403,61 @@ def _disturbance(
     return d
 
 
-def _disturbance_of_speed(
-    tape: Tape, controller: ControllerConfig, ticks: FloatArray
-) -> FloatArray:
-    """The disturbance d of y_dot = Omega u + d, (N, m), by `truth` of JSBSim.
+def _slope_of_wind(tape: Tape, controller: ControllerConfig, ticks: FloatArray) -> FloatArray:
+    """Return the disturbance of y_dot = Omega u + d by the wind of JSBSim, (N, m).
 
-    Weight along the flight path and wind act on the airspeed. d is 0 for the rates, and where the
-    log has neither.
+        V_dot = -W_dot
 
-        V_dot = -g sin(theta) - W_dot
+    It is 0 for the rates, and without a wind in the log.
     """
     d = np.zeros((len(ticks), len(controller.outputs)))
-    truth = tape.signals.get("truth")
-    if truth is None or AIRSPEED not in controller.outputs:
-        return d
-    if not {"x.theta", WIND} <= set(truth.names):
-        return d
-    wind = _at(tape, "truth", WIND, ticks)
-    theta = _at(tape, "truth", "x.theta", ticks)
-    slope = np.gradient(wind, ticks) if len(ticks) > 1 else np.zeros_like(wind)
-    d[:, controller.outputs.index(AIRSPEED)] = -GRAVITY * np.sin(theta) - slope
+    if _has_path(tape, controller) and len(ticks) > 1:
+        wind = _at(tape, "truth", WIND, ticks)
+        d[:, controller.outputs.index(AIRSPEED)] = -np.gradient(wind, ticks)
     return d
 
 
-def _active(tape: Tape, ticks: FloatArray) -> NDArray[np.bool_]:
-    """Mask of the ticks from the first engagement on without those of an inactive controller.
+def _gravity_along_path(
+    tape: Tape, controller: ControllerConfig, ticks: FloatArray, y_m: FloatArray
+) -> FloatArray:
+    """Return the disturbance of y_dot = Omega u + d by the weight along the path of y_m, (N, m).
 
-    No tick counts without `internals`.
+        theta_dot = q_m cos(phi) - r_m sin(phi),   V_dot = -g sin(theta)
+
+    theta is a deviation from trim that begins as in the log. An aircraft without rudder has no r_m,
+    and turns by its r. A law with an integral of e keeps the
+    true theta within a hundredth of a radian of it, whatever the gusts. Phi is that of the log.
+    """
+    d = np.zeros((len(ticks), len(controller.outputs)))
+    names = controller.outputs
+    if not _has_path(tape, controller):
+        return d
+    q, r = (
+        y_m[:, names.index(name)] if name in names else _at(tape, "truth", f"x.{name}", ticks)
+        for name in ("q", "r")
+    )
+    phi = _at(tape, "truth", "x.phi", ticks)
+    theta_dot = q * np.cos(phi) - r * np.sin(phi)
+    theta = float(_at(tape, "truth", "x.theta", ticks[:1])[0]) + np.concatenate(
+        [[0.0], np.cumsum(theta_dot[:-1] * np.diff(ticks))]
+    )
+    d[:, names.index(AIRSPEED)] = -GRAVITY * np.sin(theta)
+    return d
+
+
+def _has_path(tape: Tape, controller: ControllerConfig) -> bool:
+    """Return whether the log has the attitude and the wind of JSBSim, for an output V."""
+    truth = tape.signals.get("truth")
+    if truth is None or AIRSPEED not in controller.outputs:
+        return False
+    return {"x.theta", "x.phi", WIND} <= set(truth.names)
+
+
+def _flown(tape: Tape, ticks: FloatArray, *, may_pause: bool) -> NDArray[np.bool_]:
+    """Return the mask of the ticks from the first engagement on.
+
+    If the law `may_pause`, those of an inactive controller are left out. No tick counts without
+    `internals`.
     """
     if "internals" not in tape:
         return np.zeros(len(ticks), dtype=bool)
@@ -325,8 +467,8 @@ def _active(tape: Tape, ticks: FloatArray) -> NDArray[np.bool_]:
     if not is_engaged.any():
         return np.zeros(len(ticks), dtype=bool)
     before = np.maximum(np.searchsorted(t, ticks, side="right") - 1, 0)
-    is_active: NDArray[np.bool_] = mode[before] != Mode.INACTIVE
-    return is_active & (ticks >= float(t[np.argmax(is_engaged)]))
+    is_begun: NDArray[np.bool_] = ticks >= float(t[np.argmax(is_engaged)])
+    return is_begun & (mode[before] != Mode.INACTIVE) if may_pause else is_begun
 
 
 def _sampled(t: FloatArray, ticks: FloatArray) -> NDArray[np.bool_]:

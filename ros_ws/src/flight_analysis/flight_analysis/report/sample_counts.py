@@ -110,7 +110,7 @@ def topic_accounts(
             if unsent_at_end := _unsent_rest(tape, name, step_ns, span.end_ns):
                 topics[name] = topics[name]._replace(unsent=topics[name].unsent + unsent_at_end)
                 late[name] = seconds(span.end_ns)
-            if not _is_of_stack(tape, name):
+            if not is_sent_by_stack(tape, name):
                 topics[name] = _of_foreign(topics[name])
     failsafe = 0
     if "internals" in tape and "mode" in tape["internals"].names:
@@ -132,7 +132,7 @@ def _expected(
     expected = {}
     delays = {"y": sensors.delay, "pose": pose.delay}
     for name, step_ns in periods.items():
-        is_of_stack = _is_of_stack(tape, name)
+        is_of_stack = is_sent_by_stack(tape, name)
         first_ns = tape.start_ns
         if name in tape and (name in TICKS or not span.from_start):
             first_ns = int(tape[name].stamp_ns[0])
@@ -145,13 +145,13 @@ def _expected(
     if not span.simulated:  # the controller is inactive until the bridge engages
         return expected
     engaged_time = seconds(span.end_ns - tape.start_ns)
-    if _is_of_stack(tape, "u"):
+    if is_sent_by_stack(tape, "u"):
         ticks, engaged_time = _ticks(tape, scenario, span.end_ns)
         expected |= dict.fromkeys(TICKS, ticks)
     if scenario.guidance is not None:
         step_ns = period_ns(scenario.guidance.rate, "guidance.rate")
         for name in GUIDED:
-            if name not in tape or _is_of_stack(tape, name):
+            if name not in tape or is_sent_by_stack(tape, name):
                 rate = NANOSECONDS / _period(tape, name, step_ns)
                 before_pose = math.ceil(pose.delay * rate)
                 expected[name] = max(math.floor(engaged_time * rate) - 2 - before_pose, 0)
@@ -167,12 +167,12 @@ def _periods(tape: Tape, scenario: Scenario, *, simulated: bool) -> dict[str, in
     if not simulated:
         return {"y_m": _period(tape, "y_m", y_m_ns)}
     y_ns = period_ns(scenario.aircraft.rate, "aircraft.rate")
-    has_truth = _is_of_stack(tape, "truth")
+    has_truth = is_sent_by_stack(tape, "truth")
     recorded = {"y", "y_m", *tape.signals, *tape.recording}
     if has_truth:
         recorded.add("truth")
     nominal_ns = {"y": y_ns, "truth": y_ns, "pose": scenario.aircraft.pose_every() * y_ns}
-    if not _is_of_stack(tape, "u"):
+    if not is_sent_by_stack(tape, "u"):
         nominal_ns["u"] = period_ns(scenario.controller.rate, "controller.rate")
     return {
         name: _period(tape, name, step_ns)
@@ -181,7 +181,7 @@ def _periods(tape: Tape, scenario: Scenario, *, simulated: bool) -> dict[str, in
     }
 
 
-def _is_of_stack(tape: Tape, name: str) -> bool:
+def is_sent_by_stack(tape: Tape, name: str) -> bool:
     """Whether a node of the stack sent a topic, by the names of the processes.
 
     A flight in one process has no names. A foreign controller has no `internals`.
@@ -197,7 +197,7 @@ def _is_of_stack(tape: Tape, name: str) -> bool:
 
 def is_simulated(tape: Tape) -> bool:
     """Whether the simulated aircraft of the stack flew, in the wind of the scenario."""
-    return tape.scenario is not None or "truth" in tape or _is_of_stack(tape, "y")
+    return tape.scenario is not None or "truth" in tape or is_sent_by_stack(tape, "y")
 
 
 def _period(tape: Tape, name: str, nominal_ns: int) -> int:
@@ -206,7 +206,7 @@ def _period(tape: Tape, name: str, nominal_ns: int) -> int:
     In the host's time a node of the stack has the period of the parameters. By /clock a node leaves
     out the instants between two messages of the clock.
     """
-    is_of_stack = _is_of_stack(tape, name)
+    is_of_stack = is_sent_by_stack(tape, name)
     if is_of_stack and not tape.is_by_clock:
         return nominal_ns
     recorded_ns = nominal_ns
@@ -335,7 +335,7 @@ def _ticks(tape: Tape, scenario: Scenario, end_ns: int) -> tuple[int, float]:
     if not len(log.stamp_ns):
         return instants, seconds(instants * step_ns)
     count = instants
-    if "y" in tape and not _is_of_stack(tape, "y"):
+    if "y" in tape and not is_sent_by_stack(tape, "y"):
         count = min(instants, _instants_with_y(tape, log, step_ns))
     number = log["number"]
     senders = () if log.sender is None else np.unique(log.sender)

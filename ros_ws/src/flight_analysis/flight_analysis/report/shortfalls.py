@@ -4,7 +4,8 @@
 
 A flight succeeds where
 
-- the law was engaged in ENGAGED of the active ticks,
+- the law was engaged in ENGAGED of the ticks in which it was asked to fly,
+- y_m was that of the scenario (`flown_reference`),
 - the error of each output is allowed by the linear loop (`tracking`),
 - the airspeed stayed above the stall speed, and the aircraft above the ground and between the
   altitudes of guidance,
@@ -20,8 +21,9 @@ import numpy as np
 
 from aircraft_sim.params import AircraftConfig
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.metrics import mask_spans
+from flight_analysis.metrics import best_pose, mask_spans
 from flight_analysis.report.account import Account
+from flight_analysis.report.flown_reference import reference_shortfalls
 from flight_analysis.report.guided import (
     altitude_excess,
     flown_legs,
@@ -30,16 +32,18 @@ from flight_analysis.report.guided import (
     touched_beside,
     unflown_legs,
 )
-from flight_analysis.report.tracking import tracking_shortfalls
+from flight_analysis.report.sample_counts import is_simulated
+from flight_analysis.report.tracking import tracking_verdict
 from flight_core.modes import Mode
-from flight_core.outcome import Aim, End, Outcome, Shortfall, never_flew
+from flight_core.outcome import Aim, Allowance, End, Outcome, Shortfall, never_flew
+from flight_core.rates import seconds
 from flight_core.tape import Tape
 from flight_guidance.params import GuidanceConfig
 from rise_di_controller.params import ControllerConfig
 
 ENGAGED = 0.9
-"""Least share of the active ticks with the law engaged: with u held or at trim for longer, no
-figure is of the law."""
+"""Least share of the ticks with the law engaged: with u held or at trim for longer, no figure is of
+the law."""
 
 
 def judge(
@@ -60,34 +64,54 @@ def judge(
             "guidance took no step; see the ages of pose and y against guidance.max_age"
         )
     if not outcome.has_reached_end and outcome.end is not End.UNKNOWN:
-        return replace(outcome, shortfalls=())
+        return replace(outcome, shortfalls=(), allowances=())
     aircraft: AircraftConfig | None = None
     section: GuidanceConfig | None = None
     if scenario is not None:
         controller = scenario.controller
         aircraft = scenario.aircraft
         section = scenario.guidance
-    shortfalls = _engagement(tape)
+    may_pause = _may_pause(tape, scenario)
+    allowances: tuple[Allowance, ...] = ()
+    shortfalls = _engagement(tape, may_pause=may_pause)
+    if scenario is not None:
+        shortfalls += reference_shortfalls(tape, scenario)
     if controller is not None:
-        shortfalls += tracking_shortfalls(tape, controller, aircraft)
+        verdict = tracking_verdict(tape, controller, aircraft, may_pause=may_pause)
+        shortfalls += verdict.shortfalls
+        allowances = tuple(verdict.allowances)
     shortfalls += _height(tape, aircraft, section)
     if section is not None:
         shortfalls += _guided(tape, section, has_landed=outcome.end is End.LANDED)
     if account.lacks:
         sentence = f"log incomplete: {'; '.join(account.lacks)}"
         shortfalls.append(Shortfall(aim=Aim.LOG, sentence=sentence))
-    return replace(outcome, shortfalls=tuple(shortfalls))
+    return replace(outcome, shortfalls=tuple(shortfalls), allowances=allowances)
 
 
-def _engagement(tape: Tape) -> list[Shortfall]:
-    """The share of the active ticks with the law engaged."""
+def _may_pause(tape: Tape, scenario: Scenario | None) -> bool:
+    """Return whether somebody else decides when the law flies.
+
+    Behind a bridge the autopilot does, with `start_active: false` the user. In any other simulated
+    flight the law has to fly from its first u to the end, whoever deactivates it.
+    """
+    if scenario is None or not is_simulated(tape):
+        return True
+    return not (scenario.controller.autostart and scenario.controller.start_active)
+
+
+def _engagement(tape: Tape, *, may_pause: bool) -> list[Shortfall]:
+    """Return a shortfall if the law was engaged in too few of the ticks."""
     if "internals" not in tape or "mode" not in tape["internals"].names:
         return []
     mode = tape["internals"]["mode"]
-    active_modes = mode[mode != Mode.INACTIVE]
-    if not len(active_modes):
+    if may_pause:
+        mode = mode[mode != Mode.INACTIVE]
+    elif "u" in tape and len(tape["u"].stamp_ns):
+        mode = mode[tape["internals"].stamp_ns >= tape["u"].stamp_ns[0]]
+    if not len(mode):
         return []
-    share = float(np.mean(active_modes == Mode.ENGAGED))
+    share = float(np.mean(mode == Mode.ENGAGED))
     if share >= ENGAGED:
         return []
     sentence = f"the law engaged in {100.0 * share:.0f} % of the ticks"
@@ -97,15 +121,16 @@ def _engagement(tape: Tape) -> list[Shortfall]:
 def _height(
     tape: Tape, aircraft: AircraftConfig | None, section: GuidanceConfig | None
 ) -> list[Shortfall]:
-    """The time below the ground of the scenario, by `pose`."""
+    """Return the time below the ground of the scenario as a shortfall, if there was any."""
     ground = None if aircraft is None or aircraft.is_jsbsim else aircraft.ground()
     if ground is None and section is not None and not (aircraft and aircraft.is_jsbsim):
         landing = section.landing_on(section.plan(section.waypoints())) if section.landing else None
         ground = None if landing is None else landing.ground
-    if ground is None or "pose" not in tape or len(tape["pose"].stamp_ns) < 2:
+    pose = best_pose(tape)
+    if ground is None or pose is None or len(pose.stamp_ns) < 2:
         return []
-    height = tape["pose"]["altitude"] - ground
-    below_s = float(np.sum(np.diff(tape.time("pose"))[height[:-1] < 0.0]))
+    height = pose["altitude"] - ground
+    below_s = seconds(int(np.sum(np.diff(pose.stamp_ns)[height[:-1] < 0.0])))
     if not below_s:
         return []
     deepest = -float(np.min(height))

@@ -45,6 +45,7 @@ from flight_analysis.report.display_units import (
     in_order,
 )
 from flight_analysis.report.flown_models import FlownController
+from flight_analysis.report.flown_reference import reference_notes
 from flight_analysis.report.guided import guidance_notices, guidance_summary
 from flight_analysis.report.model_spans import errors_by_model
 from flight_analysis.report.sample_counts import WHOLE, ends_last, is_simulated
@@ -222,6 +223,7 @@ def summarise(
             *late_u(scenario, age),
             *(note for note in tape.notes if note != busy),
             *saturation_notes(tape),
+            *reference_notes(tape, scenario),
             *mode_notes(tape, flight_account.over(*FIGURES["ticks"])),
             *vane_notes(tape),
             *guidance_notices(tape, scenario.guidance),

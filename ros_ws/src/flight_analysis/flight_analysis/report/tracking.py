@@ -4,13 +4,15 @@
 
 The rms error over WINDOW, and over END at the end, may be
 
-    FACTOR rms(e) + floor,  of an output with a command of its own at most
-    COMMAND_PART rms(y_m) + FACTOR rms(e without commands) + floor
+    FACTOR rms(e by commands) + excuse + floor,  of an output with a command of its own at most
+    COMMAND_PART rms(y_m) + excuse + floor,      and never above FACTOR rms(e) + floor
 
-with e of the linear loop by `linear_flight.error_pair`. The floor is
+with e of the linear loop by `linear_flight.error_pair`. The excuse is what noise and wind leave,
+FACTOR times, and at most MOST: beyond, an aircraft that shakes is no success, whatever shakes it.
+The floor is
 
 - HARMLESS of the least errors of a divergence, 0.02 rad/s and 0.2 m/s, and the noise of a measured
-  error;
+  error, at most MOST;
 - SPEED_PART of the trim speed where the model of the aircraft is unknown, and with it the drag;
 - the least errors of a divergence, 0.1 rad/s and 1 m/s, where the wind is unknown.
 
@@ -26,7 +28,7 @@ from aircraft_sim.params import AircraftConfig
 from flight_analysis.report.display_units import STATES, DisplayUnit, display_unit
 from flight_analysis.report.linear_flight import AIRSPEED, ErrorPair, error_pair
 from flight_core.modes import Mode
-from flight_core.outcome import Aim, Shortfall
+from flight_core.outcome import Aim, Allowance, Shortfall
 from flight_core.rates import seconds
 from flight_core.tape import Signal, Tape
 from flight_core.units import SPEED, quantity
@@ -46,8 +48,16 @@ has a command of its own where no other one of its kind has twice as much."""
 END = 1.0
 """s, length of the end of a flight: an error that grows is larger there than over WINDOW."""
 
-SPEED_PART = 0.05
-"""Of the trim speed. Beyond, `flight_guidance.steering.protection` keeps V by the climb."""
+MOST = {"V": 2.0}
+"""m/s. Turbulence of sigma = 2 m/s, moderate by MIL-F-8785C, leaves 1.8 m/s rms of V to a Cessna,
+whose engine is too slow for gusts."""
+
+MOST_RATE = 0.05
+"""rad/s, 3 deg/s. Severe turbulence, 45 kt at 20 ft by MIL-F-8785C, leaves 0.024 rad/s to the
+osprey, and twice that is allowed."""
+
+SPEED_PART = 0.01
+"""Of the trim speed: what the drag of an unknown polar leaves while V changes by a few m/s."""
 
 SATURATED = 0.5  # of the ticks: a stable loop of the osprey has 0.14 at most in moderate gusts
 SIDE = 0.1  # of the ticks, on either side
@@ -61,25 +71,42 @@ class Excess(NamedTuple):
     stop: float  # s
     rms: float
     allowed: float
+    excuse: float  # part of what is allowed: for noise and wind
+    is_noise: bool  # noise leaves more of it than wind
 
 
-def tracking_shortfalls(
-    tape: Tape, controller: ControllerConfig, aircraft: AircraftConfig | None
-) -> list[Shortfall]:
-    """The outputs with a larger error than allowed, with the worst part of the flight."""
+class TrackingVerdict(NamedTuple):
+    """What the errors of a flight say."""
+
+    shortfalls: list[Shortfall]
+    allowances: list[Allowance]
+
+
+def tracking_verdict(
+    tape: Tape,
+    controller: ControllerConfig,
+    aircraft: AircraftConfig | None,
+    *,
+    may_pause: bool = True,
+) -> TrackingVerdict:
+    """Return the outputs with a larger error than allowed, and those that noise or wind excuses.
+
+    Each comes with the worst part of the flight. If the law `may_pause`, the ticks in which it is
+    inactive do not count.
+    """
+    nothing = TrackingVerdict([], [])
     if not {"y", "y_m"} <= set(tape.signals):
-        return []
-    pair = error_pair(tape, controller, aircraft)
-    if pair is None:
-        return []
-    if not _has_engaged(tape):
-        return []
+        return nothing
+    pair = error_pair(tape, controller, aircraft, may_pause=may_pause)
+    if pair is None or not _has_engaged(tape):
+        return nothing
     if not pair.is_flown.any():
         sentence = "no error in the log while the law was engaged"
-        return [Shortfall(aim=Aim.LOG, sentence=sentence)]
+        return TrackingVerdict([Shortfall(aim=Aim.LOG, sentence=sentence)], [])
     speed = 0.0 if aircraft is None else aircraft.channels().speed
     units = {} if aircraft is None else aircraft.channels().outputs
     shortfalls = []
+    allowances = []
     if pair.not_numbers:
         sentence = f"{pair.not_numbers} ticks with an error that is not a number"
         shortfalls.append(Shortfall(aim=Aim.LOG, sentence=sentence))
@@ -88,10 +115,23 @@ def tracking_shortfalls(
         group = [
             k for k, output in enumerate(pair.names) if (output == AIRSPEED) is (name == AIRSPEED)
         ]
-        worst = _worst(pair, i, group, _floor(pair, i, speed, unit))
-        if worst is not None:
+        limits = _Limits(floor=_floor(pair, i, speed, unit), most=_most(unit))
+        excesses = _excesses(pair, i, group, limits)
+        worst = max(excesses, key=lambda excess: excess.rms / excess.allowed)
+        if worst.rms > worst.allowed:
             shortfalls.append(_shortfall(worst, pair, i, display_unit(unit)))
-    return shortfalls
+            continue
+        excused = max(excesses, key=lambda excess: excess.rms - excess.allowed + excess.excuse)
+        if excused.rms > excused.allowed - excused.excuse:
+            allowances.append(_allowance(excused, display_unit(unit)))
+    return TrackingVerdict(shortfalls, allowances)
+
+
+class _Limits(NamedTuple):
+    """What an output may be off by beside the linear loop, SI."""
+
+    floor: float
+    most: float  # of noise and wind
 
 
 def _has_engaged(tape: Tape) -> bool:
@@ -107,11 +147,16 @@ def _floor(pair: ErrorPair, i: int, speed: float, unit: str) -> float:
         smallest = HARMLESS * smallest
     if pair.names[i] == AIRSPEED and not pair.knowledge.has_model:
         smallest = max(smallest, SPEED_PART * speed)
-    return smallest + FACTOR * float(pair.noise[i])
+    return smallest + min(FACTOR * float(pair.noise[i]), _most(unit))
 
 
-def _worst(pair: ErrorPair, i: int, group: list[int], floor: float) -> Excess | None:
-    """The part of a flight with the largest error over the allowed error; None within.
+def _most(unit: str) -> float:
+    """Return the largest excuse for noise and wind of an output of this unit, SI."""
+    return MOST[AIRSPEED] if quantity(unit).dimension == SPEED else MOST_RATE
+
+
+def _excesses(pair: ErrorPair, i: int, group: list[int], limits: _Limits) -> list[Excess]:
+    """Return the worst part of each span of a flight, and its end.
 
     `group`: the airspeed, or the rates.
     """
@@ -120,16 +165,14 @@ def _worst(pair: ErrorPair, i: int, group: list[int], floor: float) -> Excess | 
     longest = max(stop - start for start, stop in spans)
     shortest = min(_ticks(pair, END), longest)
     spans = [(start, stop) for start, stop in spans if stop - start >= shortest]
-    excesses = [_largest_excess(pair, i, group, floor, span) for span in spans]
+    excesses = [_largest_excess(pair, i, group, limits, span) for span in spans]
     start, stop = spans[-1]
     end = (max(start, stop - _ticks(pair, END)), stop)
-    excesses.append(_largest_excess(pair, i, group, floor, end))
-    violations = [excess for excess in excesses if excess.rms > excess.allowed]
-    return max(violations, key=lambda excess: excess.rms / excess.allowed, default=None)
+    return [*excesses, _largest_excess(pair, i, group, limits, end)]
 
 
 def _largest_excess(
-    pair: ErrorPair, i: int, group: list[int], floor: float, span: tuple[int, int]
+    pair: ErrorPair, i: int, group: list[int], limits: _Limits, span: tuple[int, int]
 ) -> Excess:
     """The part of WINDOW in a span of ticks with the largest rms over the allowed error.
 
@@ -144,10 +187,13 @@ def _largest_excess(
 
     command = rms(pair.y_m)
     others = np.max([rms(pair.y_m, output) for output in group], axis=0)
-    has_command = (command >= 0.5 * others) & (command > 2.0 * floor)
-    by_command = COMMAND_PART * command + FACTOR * rms(pair.wind_error)
-    linear = FACTOR * rms(pair.linear)
-    allowed = np.where(has_command, np.minimum(linear, by_command), linear) + floor
+    has_command = (command >= 0.5 * others) & (command > 2.0 * limits.floor)
+    by_noise = rms(pair.linear.noise)
+    by_wind = rms(pair.linear.wind)
+    excuse = np.minimum(FACTOR * np.hypot(by_noise, by_wind), limits.most)
+    by_command = FACTOR * rms(pair.linear.command)
+    by_command = np.where(has_command, np.minimum(by_command, COMMAND_PART * command), by_command)
+    allowed = np.minimum(by_command + excuse, FACTOR * rms(pair.linear.whole)) + limits.floor
     error = rms(pair.e)
     k = int(np.argmax(error / allowed))
     return Excess(
@@ -156,6 +202,8 @@ def _largest_excess(
         stop=float(pair.t[start + k + count - 1]),
         rms=float(error[k]),
         allowed=float(allowed[k]),
+        excuse=float(max(allowed[k] - by_command[k] - limits.floor, 0.0)),
+        is_noise=bool(by_noise[k] > by_wind[k]),
     )
 
 
@@ -183,6 +231,14 @@ def _shortfall(excess: Excess, pair: ErrorPair, i: int, unit: DisplayUnit) -> Sh
     if samples:
         sentence += f", a cycle of {samples * (pair.t[1] - pair.t[0]):.2g} s"
     return Shortfall(aim=Aim.ERROR, sentence=sentence, figures=excess._asdict())
+
+
+def _allowance(excess: Excess, unit: DisplayUnit) -> Allowance:
+    """Return the allowance for an error that is one of noise or wind."""
+    rms = excess.rms * unit.factor
+    cause = "sensor noise" if excess.is_noise else "wind"
+    sentence = f"{excess.output} off by {rms:.2g} {unit.unit} rms, allowed for {cause}"
+    return Allowance(sentence=sentence, figures=excess._asdict())
 
 
 def saturation_notes(tape: Tape) -> list[str]:

@@ -1,0 +1,203 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Whether the y_m of a flight is that of the scenario.
+
+The error e = y - y_m says nothing about a reference model that hangs, or that flies other
+commands: y follows whatever y_m is. So y_m is computed again, by the code of the node, from the
+commands of the scenario, and from the u_m of the log once there is one:
+
+    x_m+ = Phi x_m + Gamma [u_m(t), u_m(t + T/2), u_m(t + T)],  y_m = C x_m      (2)
+
+Every bit must be equal, but for ROUNDING. In real time the log does not say before which step a u_m
+arrived. It acted from the step on after which y_m has the right bits, if there is one within its
+age limit.
+"""
+
+import copy
+from collections.abc import Sequence
+from contextlib import suppress
+from enum import Enum
+from typing import NamedTuple
+
+import numpy as np
+
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.report.display_units import STATES, display_unit
+from flight_analysis.report.sample_counts import is_sent_by_stack
+from flight_core.channels import ATTITUDE
+from flight_core.outcome import Aim, Shortfall
+from flight_core.rates import NANOSECONDS, nanoseconds
+from flight_core.tape import Tape
+from flight_core.vectors import ChannelError, FloatArray
+from flight_log.clock import SINCE_EPOCH_NS
+from reference_model.params import ReferenceModelConfig
+from reference_model.reference import Reference
+from rise_di_controller.learning.divergence import HARMLESS, LEAST, LEAST_RATE
+
+ROUNDING = 1e-9
+"""rad/s, m/s. Another build of NumPy may round the sine of a command otherwise; errors that mean
+something are a million times larger."""
+
+FITTING = 0.5
+"""Part of the samples that must be right for an instant to count as t = 0 of a node that was
+started by itself."""
+
+
+class NotCompared(Enum):
+    """Why y_m is not compared with the scenario."""
+
+    FOREIGN = "y_m is of another reference model than that of the stack"
+    NO_START = "the log does not hold the start of the reference model"
+
+    def note(self) -> str:
+        """Return the sentence for the report."""
+        return f"y_m is not compared with the commands of the scenario: {self.value}"
+
+
+class ReferenceErrors(NamedTuple):
+    """How far y_m is from that of the scenario."""
+
+    t: FloatArray  # (N,) flight time, s
+    outputs: tuple[str, ...]
+    error: FloatArray  # (N, m) y_m of the log less y_m of the scenario, SI
+    allowed: FloatArray  # (m,) SI
+
+
+class _Command(NamedTuple):
+    """A u_m of the log."""
+
+    t_ns: int  # flight time of its stamp
+    u_m: FloatArray
+    attitude: FloatArray | None
+
+
+def reference_errors(tape: Tape, scenario: Scenario) -> ReferenceErrors | NotCompared | None:
+    """Compute y_m again, and return how far that of the log is from it.
+
+    Returns None for a log without y_m.
+    """
+    if "y_m" not in tape or not len(tape["y_m"].stamp_ns):
+        return None
+    outputs = scenario.reference_model.outputs
+    if not set(outputs) <= set(tape["y_m"].names):
+        return None
+    if not is_sent_by_stack(tape, "y_m"):
+        return NotCompared.FOREIGN
+    y_m = np.stack([tape["y_m"][name] for name in outputs], axis=1)
+    stamp_ns = tape["y_m"].stamp_ns
+    starts = [tape.start_ns] if _is_planned(tape) else [tape.start_ns, int(stamp_ns[0])]
+    errors = []
+    for start_ns in dict.fromkeys(starts):
+        commands = _commands(tape, outputs, start_ns)
+        expected = _computed(scenario.reference_model, stamp_ns - start_ns, y_m, commands)
+        errors.append(y_m - expected)
+    error = min(errors, key=lambda each: float(np.sum(each**2)))
+    is_right = (np.abs(error) <= ROUNDING).all(axis=1)
+    if not _is_planned(tape) and np.mean(is_right) < FITTING:
+        return NotCompared.NO_START
+    # In real time a lost message hides for a moment which u_m acted.
+    is_exact = "u_m" not in tape or tape.start_ns < SINCE_EPOCH_NS
+    harmless = [HARMLESS * LEAST.get(name, LEAST_RATE) for name in outputs]
+    allowed = np.full(len(outputs), ROUNDING) if is_exact else np.array(harmless)
+    return ReferenceErrors(
+        t=(stamp_ns - tape.start_ns) / NANOSECONDS, outputs=outputs, error=error, allowed=allowed
+    )
+
+
+def reference_shortfalls(tape: Tape, scenario: Scenario) -> list[Shortfall]:
+    """Return a shortfall for the y_m that is farthest from that of the scenario, if one is."""
+    errors = reference_errors(tape, scenario)
+    if not isinstance(errors, ReferenceErrors):
+        return []
+    # The comparison is false for NaN too.
+    is_off = ~(np.abs(errors.error) <= errors.allowed)
+    if not is_off.any():
+        return []
+    largest = np.nan_to_num(np.abs(errors.error), nan=np.inf)
+    row, i = np.unravel_index(np.argmax(largest / errors.allowed), largest.shape)
+    rows = np.flatnonzero(is_off.any(axis=1))
+    name = errors.outputs[i]
+    units = scenario.aircraft.channels().outputs
+    unit = display_unit(units.get(name, STATES.get(name, "rad/s")))
+    size = float(largest[row, i])
+    start = float(errors.t[rows[0]])
+    stop = float(errors.t[rows[-1]])
+    sentence = (
+        f"y_m is not that of the scenario from t = {start:.1f} to {stop:.1f} s: {name} of y_m off "
+        f"by {size * unit.factor:.2g} {unit.unit} at most"
+    )
+    figures = {"output": name, "start": start, "stop": stop, "largest": size}
+    return [Shortfall(aim=Aim.REFERENCE, sentence=sentence, figures=figures)]
+
+
+def reference_notes(tape: Tape, scenario: Scenario) -> list[str]:
+    """Return the note on a y_m that cannot be compared with the scenario."""
+    if _is_planned(tape) and is_sent_by_stack(tape, "y_m"):
+        return []
+    errors = reference_errors(tape, scenario)
+    return [errors.note()] if isinstance(errors, NotCompared) else []
+
+
+def _is_planned(tape: Tape) -> bool:
+    """Return whether all nodes of the flight began at the same t = 0."""
+    return tape.scenario is not None or tape.duration is not None
+
+
+def _commands(tape: Tape, outputs: Sequence[str], start_ns: int) -> list[_Command]:
+    """Return the u_m of the log in the order of their stamps."""
+    if "u_m" not in tape or not set(outputs) <= set(tape["u_m"].names):
+        return []
+    log = tape["u_m"]
+    u_m = np.stack([log[name] for name in outputs], axis=1)
+    attitudes: Sequence[FloatArray | None] = [None] * len(u_m)
+    if set(ATTITUDE) <= set(log.names):
+        attitudes = list(np.stack([log[name] for name in ATTITUDE], axis=1))
+    return [
+        _Command(int(stamp) - start_ns, row, attitude)
+        for stamp, row, attitude in zip(log.stamp_ns, u_m, attitudes, strict=True)
+    ]
+
+
+def _computed(
+    parameters: ReferenceModelConfig,
+    t_ns: np.ndarray[tuple[int], np.dtype[np.int64]],
+    y_m: FloatArray,
+    commands: Sequence[_Command],
+) -> FloatArray:
+    """Return y_m of the reference model at the instants t_ns, (N, m).
+
+    `y_m` of the log, (N, m), only tells between which two samples a u_m arrived.
+    """
+    reference = Reference(parameters)
+    max_age_ns = nanoseconds(parameters.live.max_age)
+    numbers = np.maximum(np.round(t_ns / reference.period_ns), 0).astype(np.int64).tolist()
+    expected = np.zeros_like(y_m)
+    taken = 0  # commands up to this one have been taken, or are too old
+    before_ns = 0
+    for k, number in enumerate(numbers):
+        arrived = taken
+        while arrived < len(commands) and commands[arrived].t_ns <= before_ns:
+            arrived += 1
+        best = None
+        for count in range(arrived, taken - 1, -1):
+            if count > taken and commands[count - 1].t_ns < before_ns - max_age_ns:
+                break
+            trial = copy.copy(reference) if arrived > taken else reference
+            if count > taken:
+                _take(trial, commands[count - 1])
+            sample = trial.sample(number)
+            error = float(np.max(np.abs(y_m[k] - sample)))
+            if best is None or error < best[0]:
+                best = (error, count, trial, sample)
+            if error <= ROUNDING:
+                break
+        assert best is not None  # noqa: S101 - the loop runs at least once
+        _, taken, reference, expected[k] = best
+        before_ns = number * reference.period_ns
+    return expected
+
+
+def _take(reference: Reference, command: _Command) -> None:
+    """Hand a u_m to the reference model, which may refuse it as the node does."""
+    with suppress(ChannelError):
+        reference.take(command.t_ns, command.u_m, command.attitude)

@@ -1,0 +1,228 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A flight whose y_m is not that of its scenario has flown other commands, however well it did."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from types import MappingProxyType
+
+import numpy as np
+import pytest
+from tests.closed_loop import calm_osprey
+
+import rise_di
+from flight_analysis.closed_loop import stations
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
+from flight_analysis.report.flown_reference import (
+    NotCompared,
+    ReferenceErrors,
+    reference_errors,
+    reference_notes,
+    reference_shortfalls,
+)
+from flight_core.outcome import COMPLETED, Aim
+from flight_core.tape import Process, Signal, Tape
+from flight_core.vectors import FloatArray
+from reference_model.params import ReferenceModelConfig
+from reference_model.reference import Reference
+
+EPOCH_NS = 1_760_000_000_000_000_000  # a day of 2025: a flight in real time
+
+
+@cache
+def servo() -> Scenario:
+    """Return osprey_servo at 100 Hz up to the commands of p."""
+    return find_scenario("osprey_servo").vary(
+        flight={"duration": 20.0},
+        aircraft={"rate": 100.0, "step": 0.005},
+        reference_model={"rate": 100.0},
+    )
+
+
+@cache
+def guided() -> Scenario:
+    """Return a route with a turn, whose u_m comes from guidance."""
+    route = {"north": [0.0, 200.0, 500.0], "east": [0.0, 0.0, 300.0], "altitude": [0.0, 0.0, 10.0]}
+    return calm_osprey(15.0, route=route)
+
+
+@cache
+def flown(name: str) -> Tape:
+    return rise_di.simulate({"servo": servo, "guided": guided}[name]())
+
+
+@pytest.mark.parametrize("name", ["servo", "guided"])
+def test_y_m_of_a_healthy_flight_is_computed_again_to_the_bit(name: str) -> None:
+    tape = flown(name)
+    assert isinstance(tape.scenario, Scenario)
+    errors = reference_errors(tape, tape.scenario)
+    assert isinstance(errors, ReferenceErrors)
+    assert not errors.error.any()
+    assert reference_notes(tape, tape.scenario) == []
+
+
+Fault = Callable[[int, list[FloatArray]], FloatArray]
+"""The y_m that is published at a sample, by all that were computed up to then."""
+
+
+def changed(change: Callable[[FloatArray], FloatArray], first: int = 0) -> Fault:
+    return lambda number, computed: change(computed[-1]) if number >= first else computed[-1]
+
+
+FAULTS: MappingProxyType[str, Fault] = MappingProxyType(
+    {
+        "stuck from 11 s on": lambda number, computed: computed[min(number, 1100)],
+        "zero": changed(lambda y_m: 0.0 * y_m),
+        "p reversed": changed(lambda y_m: y_m * [1.0, 1.0, -1.0, 1.0]),
+        "q up by 0.2 rad/s": changed(lambda y_m: y_m + np.array([0.2, 0.0, 0.0, 0.0]), 1200),
+        "a hundredth too small": changed(lambda y_m: 0.99 * y_m),
+        "V of the last second lost": changed(lambda y_m: y_m * [1.0, 0.0, 1.0, 1.0], 1900),
+        "50 ms late": lambda number, computed: computed[max(number - 5, 0)],
+        "channels swapped": changed(lambda y_m: y_m[[3, 1, 2, 0]]),
+        "not a number": changed(lambda y_m: y_m * [1.0, 1.0, 1.0, np.nan], 1990),
+    }
+)
+
+
+def fly_with(fault: Fault, scenario: Scenario, monkeypatch: pytest.MonkeyPatch) -> Tape:
+    """Fly a scenario whose reference model publishes other values than it computes."""
+
+    class Faulty(Reference):
+        def __init__(self, parameters: ReferenceModelConfig) -> None:
+            super().__init__(parameters)
+            self._computed: list[FloatArray] = []
+
+        def sample(self, number: int) -> FloatArray:
+            self._computed.append(super().sample(number))
+            return fault(number, self._computed)
+
+    monkeypatch.setattr(stations, "Reference", Faulty)
+    return rise_di.simulate(scenario)
+
+
+@pytest.mark.parametrize("fault", FAULTS.values(), ids=FAULTS)
+def test_fault_of_the_reference_model_is_told(
+    fault: Fault, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The law tracks y_m, so most of these leave no error."""
+    outcome = fly_with(fault, servo(), monkeypatch).outcome
+    assert outcome.status in {3, 4}
+    if outcome.status == 4:
+        told = [each for each in outcome.shortfalls if each.aim is Aim.REFERENCE]
+        assert len(told) == 1
+        assert told[0].sentence.startswith("y_m is not that of the scenario from t = ")
+
+
+def test_fault_of_the_reference_model_is_told_where_guidance_commands(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Guidance answers to the turn that is missing, so u_m differs; y_m is no answer to it."""
+    half = changed(lambda y_m: y_m * [1.0, 1.0, 0.5, 1.0], 300)
+    outcome = fly_with(half, guided(), monkeypatch).outcome
+    assert Aim.REFERENCE in {shortfall.aim for shortfall in outcome.shortfalls}
+
+
+def test_flight_of_other_commands_is_told() -> None:
+    """The file that judges has another pulse than the file that flew."""
+    pulses = {name: each.model_dump() for name, each in servo().reference_model.pulses.items()}
+    pulses["p"]["value"] = [0.39, *pulses["p"]["value"][1:]]
+    other = servo().vary(reference_model={"pulses": pulses})
+    (shortfall,) = reference_shortfalls(flown("servo"), other)
+    # the filter of p has a gain of 1 and overshoots by 0.2 %
+    assert shortfall.figures["largest"] == pytest.approx(0.01, rel=0.01)
+    assert shortfall.figures["start"] == pytest.approx(12.0, abs=0.02)
+
+
+def in_real_time(late: Callable[[int], int], *, lost: slice | None = None) -> Tape:
+    """Return the guided flight as of nodes in real time, where a u_m arrives some samples late."""
+    tape = flown("guided")
+    scenario = guided()
+    reference = Reference(scenario.reference_model)
+    u_m = tape["u_m"]
+    outputs = scenario.reference_model.outputs
+    arrivals: dict[int, list[int]] = {}
+    last = 0
+    for k, stamp_ns in enumerate(u_m.stamp_ns.tolist()):
+        # a reliable topic keeps the order
+        last = max(stamp_ns // reference.period_ns + late(k), last)
+        arrivals.setdefault(last, []).append(k)
+    rows = []
+    for number in range(len(tape["y_m"].stamp_ns)):
+        rows.append(reference.sample(number))
+        for k in arrivals.get(number, ()):
+            row = u_m.values[k]
+            command = np.array([row[u_m.names.index(name)] for name in outputs])
+            attitude = np.array([row[u_m.names.index(name)] for name in ("phi", "theta")])
+            reference.take(int(u_m.stamp_ns[k]), command, attitude)
+    y_m = Signal(tape["y_m"].stamp_ns + EPOCH_NS, outputs, np.array(rows))
+    heard = np.ones(len(u_m.stamp_ns), dtype=bool)
+    if lost is not None:
+        heard[lost] = False
+    sent = Signal(u_m.stamp_ns + EPOCH_NS, u_m.names, u_m.values).where(heard)
+    return replace(
+        tape,
+        signals={"y_m": y_m, "u_m": sent},
+        start_ns=EPOCH_NS,
+        processes={"/reference_model#7": Process(None, 0, 0, len(rows))},
+    )
+
+
+def test_u_m_may_arrive_late_in_real_time() -> None:
+    """Each u_m acts 0 to 3 samples after its stamp, and no bit is left unexplained."""
+    delays = np.random.default_rng(1).integers(0, 4, 10_000)
+    errors = reference_errors(in_real_time(lambda k: int(delays[k])), guided())
+    assert isinstance(errors, ReferenceErrors)
+    assert not errors.error.any()
+
+
+def test_u_m_that_the_log_lost_is_no_fault_of_the_reference_model() -> None:
+    """The u_m with the largest step is missing: y_m is off for a moment, less than is harmless."""
+    p = flown("guided")["u_m"]["p"]
+    k = int(np.argmax(np.abs(np.diff(p)))) + 1
+    tape = in_real_time(lambda k: 1, lost=slice(k, k + 1))
+    errors = reference_errors(tape, guided())
+    assert isinstance(errors, ReferenceErrors)
+    assert errors.error.any()
+    assert reference_shortfalls(tape, guided()) == []
+
+
+def test_u_m_that_acts_after_its_age_limit_is_told() -> None:
+    """A reference model that flies commands of half a second ago is no late network."""
+    tape = in_real_time(lambda k: 50)
+    (shortfall,) = reference_shortfalls(tape, guided())
+    assert shortfall.aim is Aim.REFERENCE
+
+
+def test_reference_model_of_a_user_is_not_compared_and_that_is_said() -> None:
+    tape = replace(
+        flown("servo"), scenario=None, processes={"/my_reference": Process(None, 0, 0, 2001)}
+    )
+    assert reference_errors(tape, servo()) is NotCompared.FOREIGN
+    assert reference_shortfalls(tape, servo()) == []
+    (note,) = reference_notes(tape, servo())
+    assert note.startswith("y_m is not compared with the commands of the scenario: ")
+
+
+def test_reference_model_that_was_started_by_itself_begins_at_its_first_sample() -> None:
+    """No message says when t = 0 was: y_m does, unless the log begins later."""
+    tape = flown("servo")
+    y_m = tape["y_m"]
+    alone = replace(
+        tape,
+        scenario=None,
+        signals=dict(tape.signals) | {"y_m": replace(y_m, stamp_ns=y_m.stamp_ns + 3_000_000_000)},
+        processes={"/reference_model#7": Process(None, 0, 0, 2001)},
+    )
+    errors = reference_errors(alone, servo())
+    assert isinstance(errors, ReferenceErrors)
+    assert not errors.error.any()
+    late = y_m.where(y_m.stamp_ns >= 2_500_000_000)
+    signals = dict(tape.signals) | {"y_m": late}
+    cut = replace(alone, signals=signals, start_ns=2_500_000_000)
+    assert reference_errors(cut, servo()) is NotCompared.NO_START
+
+
+def test_healthy_flights_have_no_shortfall() -> None:
+    assert flown("servo").outcome == COMPLETED
