@@ -13,6 +13,7 @@ from flight_core.outcome import (
     INTERRUPTED,
     UNKNOWN,
     Aim,
+    Allowance,
     End,
     FlightEnded,
     LostContact,
@@ -24,6 +25,16 @@ from flight_core.outcome import (
     read_outcome,
 )
 
+OFF = tuple(
+    Shortfall(
+        aim=Aim.ERROR,
+        sentence=f"{name} off by {times} deg/s rms, 1 allowed, from t = 3.0 to 13.0 s",
+        brief=f"{name} off by {times} deg/s rms, 1 allowed",
+        times=times,
+    )
+    for name, times in (("q", 2.0), ("p", 7.0), ("r", 3.0))
+)
+WINDY = Allowance(sentence="r off by 1.5 deg/s rms, allowed for wind")
 SHORT = Shortfall(aim=Aim.FENCE, sentence="outside of the fence for 2.0 s, 20 m at most")
 
 STATUSES = {
@@ -69,14 +80,44 @@ def test_foreign_record_is_unknown(content: object) -> None:
     [
         (COMPLETED, "completed"),
         (INTERRUPTED, "interrupted"),
-        (Outcome(End.COMPLETED, "", (SHORT,)), f"completed, {SHORT.sentence}"),
-        (Outcome(End.LANDED, "osprey landed", (SHORT,)), f"osprey landed, {SHORT.sentence}"),
+        (Outcome(End.COMPLETED, "", (SHORT,)), f"completed; {SHORT.sentence}"),
+        (Outcome(End.LANDED, "osprey landed", (SHORT,)), f"osprey landed; {SHORT.sentence}"),
+        (
+            Outcome(End.COMPLETED, "", OFF),
+            f"completed, 3 shortfalls; worst: {OFF[1].sentence}",
+        ),
+        (
+            Outcome(End.COMPLETED, "", (*OFF, SHORT)),
+            f"completed, 4 shortfalls; worst: {SHORT.sentence}",
+        ),
+        (Outcome(End.COMPLETED, "", (), (WINDY,)), f"completed; {WINDY.sentence}"),
+        (
+            Outcome(End.COMPLETED, "", (), (WINDY,) * 3),
+            "completed; 3 errors allowed for noise or wind",
+        ),
         (ended_early("aircraft was killed"), "aircraft was killed"),
         (never_flew("no y"), "never flew: no y"),
     ],
 )
-def test_sentence_says_the_end_and_each_shortfall(outcome: Outcome, sentence: str) -> None:
+def test_headline_says_the_end_and_the_worst(outcome: Outcome, sentence: str) -> None:
     assert str(outcome) == outcome.as_json()["sentence"] == sentence
+
+
+@given(
+    reason=st.text(max_size=400),
+    shortfalls=st.lists(st.sampled_from((*OFF, SHORT)), max_size=9),
+    allowances=st.lists(st.just(WINDY), max_size=4),
+    end=st.sampled_from(End),
+)
+def test_headline_fits_a_line_and_the_details_have_the_rest(
+    reason: str, shortfalls: list[Shortfall], allowances: list[Allowance], end: End
+) -> None:
+    outcome = Outcome(end, reason, tuple(shortfalls), tuple(allowances))
+    assert len(str(outcome)) <= 120
+    told = "\n".join([str(outcome), *outcome.details])
+    assert all(each.sentence in told for each in shortfalls)
+    assert all(each.sentence in told for each in allowances)
+    assert reason in told or end.value in str(outcome)
 
 
 def test_node_ends_with_a_status_of_its_own() -> None:

@@ -37,7 +37,13 @@ from flight_bringup.graph import (
     second_stage,
 )
 from flight_cli.fleet import fly_fleet_file, open_fleet
-from flight_cli.output import flight_progress, print_json, show_flight
+from flight_cli.output import (
+    flight_progress,
+    print_json,
+    show_errors,
+    show_flight,
+    show_outcome,
+)
 from flight_cli.route_options import RouteWords, parse_origin
 from flight_cli.settings import settings_option, with_settings
 from flight_cli.words import (
@@ -126,6 +132,9 @@ class Fly(RouteWords):
         default="",
     )
     runs: Path = rare_option("Folder that the run's folder is made in.", default=Path("runs"))
+    verbose: bool = option(
+        "Print all tables and notes, as rise-di report does.", "--verbose", "-v", default=False
+    )
     as_json: bool = json_option()
 
     def execute(self) -> None:
@@ -167,7 +176,8 @@ class Fly(RouteWords):
                 )
             if outcome.end is End.COMPLETED:
                 progress(scenario.flight.duration, str(outcome))
-        raise typer.Exit(_report(scenario, run, outcome, as_json=self.as_json))
+        status = _report(scenario, run, outcome, as_json=self.as_json, verbose=self.verbose)
+        raise typer.Exit(status)
 
     def _scenario(self) -> Scenario:
         """The scenario with settings, route and fence.
@@ -265,7 +275,9 @@ def _warn_of_browser() -> None:
         )
 
 
-def _report(scenario: Scenario, run: Path, outcome: Outcome, *, as_json: bool) -> int:
+def _report(
+    scenario: Scenario, run: Path, outcome: Outcome, *, as_json: bool, verbose: bool
+) -> int:
     """Write and print the report of a flight. Returns the exit status."""
     unwritten = ""
     try:
@@ -287,8 +299,13 @@ def _report(scenario: Scenario, run: Path, outcome: Outcome, *, as_json: bool) -
     if as_json:
         print_json(result.flight.summary)
     else:
-        show_flight(Console(), result.flight)
-        print(f"outcome: {outcome_record['sentence']}\nlog:     {display_path(result.mcap)}")
+        console = Console()
+        if verbose:
+            show_flight(console, result.flight)
+        show_outcome(console, outcome_record)
+        if not verbose:
+            show_errors(console, result.flight)
+        print(f"log:     {display_path(result.mcap)}")
         if not unwritten:
             print(f"report:  {display_path(result.report)}")
     if unwritten:

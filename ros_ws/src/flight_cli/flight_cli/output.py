@@ -4,7 +4,7 @@
 
 import json
 import sys
-from collections.abc import Callable, Container, Iterable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -44,15 +44,33 @@ LICENCE = (
 LATEST = Path("runs/latest")  # the run of a command that is given none
 
 
-def show_flight(console: Console, flight: RecordedFlight) -> None:
-    """Print the tables of a flight."""
+def show_outcome(console: Console, outcome: Mapping[str, Any]) -> None:
+    """Print the headline of an outcome, and below it what does not stand in it."""
+    style = "bold" if outcome["status"] == 0 else "bold red"
+    say(console, f"outcome: {outcome['sentence']}", style=style)
+    for detail in outcome["details"]:
+        say(console, f"  - {detail}")
+
+
+def show_errors(console: Console, flight: RecordedFlight) -> None:
+    """Print the first table of a flight: the errors, or those that an imported log has."""
+    first, *_ = _tables(flight)
+    print_table(console, grouped_table(first.caption, first.columns, first.rows))
+
+
+def _tables(flight: RecordedFlight) -> "Sequence[PageTable]":
     from flight_analysis.report import tables  # noqa: PLC0415 - loads the figures of pages
 
+    tables_of = tables.imported_tables if flight.scenario is None else tables.metric_tables
+    return tables_of(flight.summary, flight.units)
+
+
+def show_flight(console: Console, flight: RecordedFlight) -> None:
+    """Print the tables of a flight."""
     summary = flight.summary
     if busy := (summary["account"] or {}).get("busy"):
         say(console, busy, style="bold")
-    tables_of = tables.imported_tables if flight.scenario is None else tables.metric_tables
-    for table in tables_of(summary, flight.units):
+    for table in _tables(flight):
         show_table(console, table)
     if flight.controllers and flight.scenario is not None:
         _show_margins(console, flight, flight.scenario)

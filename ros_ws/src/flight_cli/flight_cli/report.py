@@ -24,6 +24,7 @@ from flight_cli.output import (
     print_table,
     say,
     show_flight,
+    show_outcome,
     stdout_for,
 )
 from flight_cli.repair import repair_log
@@ -109,8 +110,9 @@ def _show(flights: Sequence[RecordedFlight]) -> None:
     if len(flights) > 1:
         show_comparison(Console(), flights)
         return
-    show_flight(Console(), flights[0])
-    print(f"outcome: {flights[0].summary['outcome']['sentence']}")
+    console = Console()
+    show_flight(console, flights[0])
+    show_outcome(console, flights[0].summary["outcome"])
 
 
 def show_comparison(console: Console, flights: Sequence[RecordedFlight]) -> None:

@@ -24,6 +24,14 @@ SEVEREST = (0, STATUS_SHORTFALL, STATUS_ENDED_EARLY, STATUS_INTERRUPTED)
 """Exit statuses of flights; that of several flights is the last one of theirs."""
 
 
+HEADLINE = 120  # characters at most: a line of a terminal
+
+
+def _shortened(text: str) -> str:
+    """Return a text that fits into a headline."""
+    return text if len(text) <= HEADLINE else f"{text[: HEADLINE - 4].rstrip()} ..."
+
+
 class End(StrEnum):
     """How a flight ended."""
 
@@ -37,28 +45,34 @@ class End(StrEnum):
 
 
 class Aim(StrEnum):
-    """What a flight can fall short of."""
+    """What a flight can fall short of, the gravest first: it explains those that follow."""
 
     ENGAGEMENT = "engagement"  # the law flies while it is asked to
     REFERENCE = "reference"  # y_m is that of the scenario
-    ERROR = "error"  # the linear loop allows the error of an output
-    STALL = "stall"  # the airspeed stays above the stall speed
     GROUND = "ground"  # the aircraft stays above the ground
-    ALTITUDE = "altitude"  # between the least and the largest altitude
+    STALL = "stall"  # the airspeed stays above the stall speed
     FENCE = "fence"  # inside
-    ROUTE = "route"  # every leg is flown
-    ORBIT = "orbit"  # the last orbit is joined
+    ALTITUDE = "altitude"  # between the least and the largest altitude
+    ERROR = "error"  # the linear loop allows the error of an output
     TOUCHDOWN = "touchdown"  # in the zone of the landing
     GUIDANCE = "guidance"  # each step gives commands
+    ROUTE = "route"  # every leg is flown
+    ORBIT = "orbit"  # the last orbit is joined
     LOG = "log"  # it holds the whole flight
 
 
 @dataclass(frozen=True, kw_only=True)
 class Shortfall:
-    """A shortfall of a flight as a sentence and in figures, SI."""
+    """A shortfall of a flight as a sentence and in figures, SI.
+
+    `brief` is the sentence in a headline, if the whole one is too long for it. `times` is how many
+    times over what is allowed the figure is, to find the worst of an aim.
+    """
 
     aim: Aim
     sentence: str
+    brief: str = ""
+    times: float = 1.0
     figures: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -74,7 +88,8 @@ class Allowance:
 class Outcome:
     """The outcome of a flight.
 
-    `str` is a sentence: "completed, outside of the fence for 2.0 s, 20 m at most".
+    `str` is a headline of at most HEADLINE characters: how it ended, how many shortfalls it has,
+    and the worst with its figure. `details` are the sentences that do not stand in it.
 
     Examples:
         >>> tape = rise_di.simulate(rise_di.find_scenario("osprey_servo", duration=0.1))
@@ -102,16 +117,45 @@ class Outcome:
         return STATUS_SHORTFALL if self.shortfalls or self.end is End.UNKNOWN else 0
 
     def __str__(self) -> str:
-        """Return the end, the reason, the shortfalls and the allowances as a sentence."""
-        begin = self.reason or self.end.value
+        """Return the headline."""
+        number = len(self.shortfalls)
+        if not number:
+            allowed = [each.sentence for each in self.allowances]
+            whole = "; ".join([self._begin(), *allowed])
+            if allowed and len(whole) > HEADLINE:
+                whole = f"{self._begin()}; {len(allowed)} errors allowed for noise or wind"
+            return _shortened(whole)
+        order = list(Aim)
+        worst = min(self.shortfalls, key=lambda each: (order.index(each.aim), -each.times))
+        count = "" if number == 1 else f", {number} shortfalls"
+        label = "" if number == 1 else "worst: "
+        sentences = (worst.sentence, worst.brief or worst.sentence)
+        for begin in (self._begin(), self.end.value):
+            for sentence in sentences:
+                headline = f"{begin}{count}; {label}{sentence}"
+                if len(headline) <= HEADLINE:
+                    return headline
+        return _shortened(headline)
+
+    def _begin(self) -> str:
+        """Return how the flight ended, and why."""
         if self.end in {End.NEVER_FLEW, End.UNKNOWN} and self.reason:
-            begin = f"{self.end}: {self.reason}"
-        shortfalls = (each.sentence for each in self.shortfalls)
-        allowances = (each.sentence for each in self.allowances)
-        return ", ".join([begin, *shortfalls, *allowances])
+            return f"{self.end}: {self.reason}"
+        return self.reason or self.end.value
+
+    @property
+    def details(self) -> tuple[str, ...]:
+        """The sentences that do not stand in the headline."""
+        headline = str(self)
+        sentences = (
+            self._begin(),
+            *(each.sentence for each in self.shortfalls),
+            *(each.sentence for each in self.allowances),
+        )
+        return tuple(sentence for sentence in sentences if sentence not in headline)
 
     def as_json(self) -> dict[str, Any]:
-        """The record for `summary.json`, with sentence and exit status."""
+        """Return the record for `summary.json`, with headline, details and exit status."""
         return {
             "end": self.end.value,
             "reason": self.reason,
@@ -124,6 +168,7 @@ class Outcome:
                 for each in self.allowances
             ],
             "sentence": str(self),
+            "details": list(self.details),
             "status": self.status,
         }
 

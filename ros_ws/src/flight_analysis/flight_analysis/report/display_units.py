@@ -70,6 +70,29 @@ def in_radians(units: Mapping[str, DisplayUnit]) -> dict[str, DisplayUnit]:
     }
 
 
+def plain_number(value: float, digits: int = 2) -> str:
+    """Return a number with so many significant digits, and never with an exponent.
+
+    Examples:
+        >>> plain_number(123.4), plain_number(0.0123, 1), plain_number(2.0)
+        ('120', '0.01', '2')
+    """
+    if value == 0.0 or not math.isfinite(value):
+        return f"{value:g}"
+    places = digits - 1 - math.floor(math.log10(abs(value)))
+    text = f"{round(value, places):.{max(places, 0)}f}"
+    return text.rstrip("0").rstrip(".") if "." in text else text
+
+
+def unlike_numbers(first: float, second: float) -> tuple[str, str]:
+    """Return two numbers with as many digits as it takes to tell them apart, from 2 to 6."""
+    for digits in range(2, 7):
+        texts = (plain_number(first, digits), plain_number(second, digits))
+        if texts[0] != texts[1]:
+            break
+    return texts
+
+
 STATES = {
     **dict.fromkeys(("alpha", "beta", "phi", "theta", "psi"), "rad"),
     **dict.fromkeys(("p", "q", "r"), "rad/s"),

@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.report.display_units import STATES, display_unit
+from flight_analysis.report.display_units import STATES, display_unit, plain_number
 from flight_analysis.report.sample_counts import is_sent_by_stack
 from flight_core.channels import ATTITUDE
 from flight_core.outcome import Aim, Shortfall
@@ -122,12 +122,11 @@ def reference_shortfalls(tape: Tape, scenario: Scenario) -> list[Shortfall]:
     size = float(largest[row, i])
     start = float(errors.t[rows[0]])
     stop = float(errors.t[rows[-1]])
-    sentence = (
-        f"y_m is not that of the scenario from t = {start:.1f} to {stop:.1f} s: {name} of y_m off "
-        f"by {size * unit.factor:.2g} {unit.unit} at most"
-    )
+    size_shown = f"{plain_number(size * unit.factor)} {unit.unit}"
+    brief = f"y_m is not that of the scenario: {name} off by {size_shown}"
+    sentence = f"{brief} at most, from t = {start:.1f} to {stop:.1f} s"
     figures = {"output": name, "start": start, "stop": stop, "largest": size}
-    return [Shortfall(aim=Aim.REFERENCE, sentence=sentence, figures=figures)]
+    return [Shortfall(aim=Aim.REFERENCE, sentence=sentence, brief=brief, figures=figures)]
 
 
 def reference_notes(tape: Tape, scenario: Scenario) -> list[str]:

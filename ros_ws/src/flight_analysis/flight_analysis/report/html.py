@@ -58,11 +58,12 @@ MOST_MESSAGES = 500  # messages of a log on a page
 class TitleLine(NamedTuple):
     """A line under the title: colour, label and outcome of a flight, and text.
 
-    Any part may be empty.
+    Any part may be empty. The `details` of the outcome stand below it.
     """
 
     text: str
     outcome: str = ""
+    details: Sequence[str] = ()
     is_success: bool = False
     label: str = ""
     colour: str = ""
@@ -236,7 +237,9 @@ def _parameter_table(scenario: Scenario) -> tables.MetricTable:
 def _outcome_line(text: str, flight: RecordedFlight) -> TitleLine:
     """A line with the outcome of a flight."""
     outcome = flight.summary["outcome"]
-    return TitleLine(text, outcome["sentence"], is_success=outcome["status"] == 0)
+    return TitleLine(
+        text, outcome["sentence"], outcome["details"], is_success=outcome["status"] == 0
+    )
 
 
 def _comparison_page(flights: Sequence[RecordedFlight]) -> Page:

@@ -83,9 +83,13 @@ def judge(
     shortfalls += _height(tape, aircraft, section)
     if section is not None:
         shortfalls += _guided(tape, section, has_landed=outcome.end is End.LANDED)
-    if account.lacks:
-        sentence = f"log incomplete: {'; '.join(account.lacks)}"
-        shortfalls.append(Shortfall(aim=Aim.LOG, sentence=sentence))
+    for lack in account.lacks:
+        topic = lack.partition(",")[0]
+        shortfalls.append(
+            Shortfall(
+                aim=Aim.LOG, sentence=f"log incomplete: {lack}", brief=f"log incomplete: {topic}"
+            )
+        )
     return replace(outcome, shortfalls=tuple(shortfalls), allowances=allowances)
 
 

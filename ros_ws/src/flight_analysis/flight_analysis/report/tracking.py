@@ -25,7 +25,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aircraft_sim.params import AircraftConfig
-from flight_analysis.report.display_units import STATES, DisplayUnit, display_unit
+from flight_analysis.report.display_units import (
+    STATES,
+    DisplayUnit,
+    display_unit,
+    plain_number,
+    unlike_numbers,
+)
 from flight_analysis.report.linear_flight import AIRSPEED, ErrorPair, error_pair
 from flight_core.modes import Mode
 from flight_core.outcome import Aim, Allowance, Shortfall
@@ -220,24 +226,27 @@ def _sums(values: FloatArray, count: int) -> FloatArray:
 
 def _shortfall(excess: Excess, pair: ErrorPair, i: int, unit: DisplayUnit) -> Shortfall:
     """The shortfall of an excess, with the period of a limit cycle."""
-    rms = excess.rms * unit.factor
-    allowed = excess.allowed * unit.factor
-    sentence = (
-        f"{excess.output} off by {rms:.2g} {unit.unit} rms from t = {excess.start:.1f} to "
-        f"{excess.stop:.1f} s, {allowed:.2g} allowed"
-    )
+    rms, allowed = unlike_numbers(excess.rms * unit.factor, excess.allowed * unit.factor)
+    brief = f"{excess.output} off by {rms} {unit.unit} rms, {allowed} allowed"
+    sentence = f"{brief}, from t = {excess.start:.1f} to {excess.stop:.1f} s"
     rows = (pair.t >= excess.start) & (pair.t <= excess.stop)
     samples = period(pair.e[rows, i])
     if samples:
         sentence += f", a cycle of {samples * (pair.t[1] - pair.t[0]):.2g} s"
-    return Shortfall(aim=Aim.ERROR, sentence=sentence, figures=excess._asdict())
+    return Shortfall(
+        aim=Aim.ERROR,
+        sentence=sentence,
+        brief=brief,
+        times=excess.rms / excess.allowed,
+        figures=excess._asdict(),
+    )
 
 
 def _allowance(excess: Excess, unit: DisplayUnit) -> Allowance:
     """Return the allowance for an error that is one of noise or wind."""
-    rms = excess.rms * unit.factor
+    rms = plain_number(excess.rms * unit.factor)
     cause = "sensor noise" if excess.is_noise else "wind"
-    sentence = f"{excess.output} off by {rms:.2g} {unit.unit} rms, allowed for {cause}"
+    sentence = f"{excess.output} off by {rms} {unit.unit} rms, allowed for {cause}"
     return Allowance(sentence=sentence, figures=excess._asdict())
 
 
