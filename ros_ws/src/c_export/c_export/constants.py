@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from flight_core.arithmetic import INVERSE_PI, MAX_ANGLE, PI_HIGH, PI_LOW, SINE_COEFFICIENTS
+from flight_core.known_keys import require_known
 from flight_core.parameters import require
 from flight_core.rates import period_ns, seconds
 from flight_core.vectors import FloatArray
@@ -103,10 +104,37 @@ class Sizes(NamedTuple):
     schedule: bool
 
 
-def exportable(controller: ControllerConfig) -> RiseDiConfig:
-    """The controller, under RISE-DI.
+IN_C = frozenset(
+    {
+        *("rate", "law", "outputs", "inputs", "D", "input_scale", "lag", "delay", "y_max"),
+        *("max_age", "hold", "ramp", "on_deactivate", "lower", "upper", "slew"),
+        *("k_g", "k_d", "Lambda", "beta", "omega", "sign", "softening"),
+        *(f"allocation.{key}" for key in ("effectors", "T", "effect", "lower", "upper", "slew")),
+        "allocation.priority",
+        *(f"feedforward.{key}" for key in ("states", "A", "B", "gravity", "lead")),
+        *(f"observer.{key}" for key in ("rate", "states", "Phi", "Gamma", "L", "F", "part")),
+        *(f"observer.{key}" for key in ("within", "fade", "margin")),
+        *("schedule.speed", "schedule.time"),
+    }
+)
+"""Keys of a controller that the constants of the C code hold."""
 
-    Raises ParameterError for a different law, and for models that are learned or off.
+IDLE_IN_C = frozenset(
+    {
+        # How the node runs: the caller of the C code configures and activates it.
+        *("lockstep", "y_rate", "autostart", "start_active"),
+        # Only a learner reads how well the model is known.
+        "feedforward.deviation",
+    }
+)
+"""Keys of a controller without effect on the C code."""
+
+
+def exportable(controller: ControllerConfig) -> RiseDiConfig:
+    """Return the controller, under RISE-DI.
+
+    Raises ParameterError for a different law, and for a key that has a value and that the C code
+    does not know, as models that are learned or off.
     """
     require(
         isinstance(controller, RiseDiConfig),
@@ -116,40 +144,15 @@ def exportable(controller: ControllerConfig) -> RiseDiConfig:
     )
     assert isinstance(controller, RiseDiConfig)  # noqa: S101 - for the type checker
     require(
-        not controller.vanes,
-        "controller.observer.vanes",
-        "a section",
-        "none: the C code has the observer of y alone",
-    )
-    require(
-        controller.probe is None,
-        "controller.probe",
-        "a section",
-        "none: the C code has no probe",
-    )
-    require(
         controller.learn is None,
         "controller.learn",
         "a section",
         "none: C code replaces no model in flight; --run RUN exports the last model of a flight",
     )
-    at_trim = controller.schedule is None or not controller.schedule.models
-    require(
-        at_trim,
-        "controller.schedule",
-        "models at other speeds",
-        "none: the C code has those of the trim speed",
-    )
+    require_known(controller, IN_C | IDLE_IN_C, "controller", "the C code does not have it")
     flies = controller.observer is None or controller.observer.part > 0.0
     require(
         flies, "controller.observer.part", 0.0, "more than 0, or no feedforward and no observer"
-    )
-    some = controller.feedforward is not None and controller.feedforward.inputs is not None
-    require(
-        not some,
-        "controller.feedforward.inputs",
-        "a list",
-        "none: the C code has a feedforward of all inputs",
     )
     return controller
 

@@ -23,6 +23,7 @@ from flight_campaign.batch.campaign_course import HOLD, build_course
 from flight_campaign.statistics import LOSS_OF_TRACK_SCORE, score_units
 from flight_core.arguments import as_count, as_number
 from flight_core.installation import require_package
+from flight_core.known_keys import unknown_keys
 from flight_core.outcome import End, FlightEnded, Outcome
 from flight_core.parameters import require
 from flight_core.plausible import largest
@@ -77,21 +78,35 @@ def _without_models(scenario: Scenario) -> Scenario:
     )
 
 
-def _is_newest_last(scenario: Scenario) -> bool:
-    """Whether the last sample of a tick is the newest y in every tick.
+BY_TICK = frozenset(
+    {
+        *("airframe", "rate", "step", "inertial_coupling", "kinematics", "wind"),
+        *(f"gusts.*.{key}" for key in ("start", "speed", "length", "every")),
+        *(f"turbulence.{key}" for key in ("altitude", "wind", "sigma", "rotary", "seed")),
+        *(f"bias.*.{key}" for key in ("start", "value", "rise")),
+        *(f"sines.*.{key}" for key in ("amplitude", "frequency", "phase")),
+        *(f"actuators.{key}" for key in ("lag", "lower", "upper", "rate", "dead_zone", "faults")),
+        "actuators.delay",
+        *(f"sensors.{key}" for key in ("bias", "drift", "noise", "quantisation", "seed")),
+        *(f"uncertainty.{key}" for key in ("A", "B", "seed", "number", "entries", "parts")),
+        *("uncertainty.distribution", "uncertainty.wind"),
+        *(f"start.{key}" for key in ("north", "east", "heading")),
+        *(f"pose.{key}" for key in ("rate", "delay", "bias", "drift", "noise", "seed")),
+        *("max_age", "hold", "ramp"),
+        *("start_time", "lockstep", "control_rate", "duration", "recorded"),
+    }
+)
+"""Keys of the aircraft with which its flight, and the sample at a tick, do not depend on whether
+the samples before that tick were measured."""
 
-    Earlier samples need no measurement then.
+
+def _is_newest_last(scenario: Scenario) -> bool:
+    """Return whether the last sample of a tick is the newest y in every tick.
+
+    Earlier samples need no measurement then. With any key outside BY_TICK each sample is measured.
     """
     aircraft = scenario.aircraft
-    plain = aircraft.sensors.delay == 0.0 and aircraft.sensors.dropout == 0.0
-    return (
-        plain
-        and not scenario.controller.vanes
-        and aircraft.drift is None
-        and aircraft.over_airspeed is None
-        and aircraft.relative_wind() is None
-        and not aircraft.is_jsbsim
-    )
+    return not unknown_keys(aircraft, BY_TICK) and not scenario.controller.vanes
 
 
 def _actions(values: ArrayLike, shape: tuple[int, ...]) -> FloatArray:

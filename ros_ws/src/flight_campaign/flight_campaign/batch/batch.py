@@ -31,9 +31,8 @@ from flight_campaign.batch.batch_loop import (
 )
 from flight_campaign.batch.batch_matrices import FleetMatrices, remainder_rows
 from flight_campaign.batch.batch_schedule import Schedule
-from flight_campaign.batch.campaign_course import Course, Segments
+from flight_campaign.batch.campaign_course import Course, Segments, require_flyable
 from flight_campaign.batch.device import schedule_of_device
-from flight_core.parameters import require
 from flight_core.rates import seconds
 from flight_core.vectors import Array, FloatArray
 from rise_di_controller.law.control_law import ControlLaw
@@ -43,15 +42,14 @@ jax.config.update("jax_enable_x64", True)  # float64 as everywhere else in the s
 
 
 def vehicle(scenario: Scenario) -> Vehicle:
-    """The shared properties of all aircraft of a scenario."""
+    """Return what all aircraft of a scenario share. Raises ParameterError as `require_flyable`."""
+    require_flyable(scenario)
     plant = scenario.aircraft.plant()
     channels = scenario.aircraft.channels()
     aircraft = plant.aircraft
     errors = scenario.aircraft.sensor_arrays()
     order = [list(channels.outputs).index(name) for name in scenario.controller.outputs]
     quantum = None if errors.quantum is None else errors.quantum[order]
-    expected = "none: a campaign flies without it"
-    require(scenario.controller.probe is None, "controller.probe", "a section", expected)
     guard = scenario.controller.guard()
     states, remainder = _reduced(aircraft)
     effectors = list(channels.inputs)

@@ -19,12 +19,15 @@ from aircraft_sim.plant import plant as plant_model
 from aircraft_sim.plant.plant import PlantParams
 from aircraft_sim.sensors import Sensors
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_core.known_keys import keys_of, require_known
 from flight_core.parameters import require
 from flight_core.rates import divide, nanoseconds, period_ns, seconds
 from flight_core.vectors import FloatArray
 from reference_model.reference import Reference
 from rise_di_controller.extensions import feedforward
 from rise_di_controller.extensions.feedforward import Nominal
+from rise_di_controller.params import ControllerConfig
+from rise_di_controller.rise_di_config import RiseDiConfig
 
 HOLD, ENGAGE, STEP = range(3)
 """Action of a controller at a tick: it holds u without a new y, it engages, or it takes a step of
@@ -72,8 +75,80 @@ class Course(NamedTuple):
     steps: int  # of the integration from tick to tick
 
 
+FLOWN = frozenset(
+    {
+        *("airframe", "rate", "step", "inertial_coupling", "kinematics"),
+        *(f"gusts.*.{key}" for key in ("start", "speed", "length", "every")),
+        *(f"turbulence.{key}" for key in ("altitude", "wind", "sigma", "rotary", "seed")),
+        *(f"bias.*.{key}" for key in ("start", "value", "rise")),
+        *(f"sines.*.{key}" for key in ("amplitude", "frequency", "phase")),
+        *(f"drift.{key}" for key in ("start", "duration", "A", "B", "seed", "number")),
+        *(f"actuators.{key}" for key in ("lag", "lower", "upper", "rate", "dead_zone", "faults")),
+        "actuators.delay",
+        *(f"sensors.{key}" for key in ("bias", "drift", "noise", "quantisation", "delay")),
+        *(f"sensors.{key}" for key in ("dropout", "seed")),
+        *(f"vanes.{key}" for key in ("channels", "frozen_at", "dropout")),
+        *(f"uncertainty.{key}" for key in ("entries", "parts", "distribution", "wind")),
+    }
+)
+"""Keys of the aircraft that a campaign flies as the simulator does; `build_course` refuses some of
+their values."""
+
+IDLE = frozenset(
+    {
+        # Every aircraft of a campaign has a draw of its own.
+        *(f"uncertainty.{key}" for key in ("A", "B", "seed", "number")),
+        # No law, no command and no figure depends on the place: guidance flies one at a time.
+        *(f"start.{key}" for key in ("north", "east", "heading")),
+        "wind",
+        *(f"pose.{key}" for key in ("rate", "delay", "bias", "drift", "noise", "seed")),
+        # A u comes with every tick, so that none times out.
+        *("max_age", "hold", "ramp"),
+        # How the node runs.
+        *("start_time", "lockstep", "control_rate", "duration", "recorded"),
+    }
+)
+"""Keys of the aircraft without effect in a campaign."""
+
+FLOWN_CONTROLLER = frozenset(
+    {
+        *("rate", "law", "outputs", "inputs", "D", "input_scale", "lag", "delay"),
+        *("lower", "upper", "slew"),
+        *(f"allocation.{key}" for key in ("effectors", "T", "effect", "lower", "upper", "slew")),
+        "allocation.priority",
+        *(f"feedforward.{key}" for key in ("states", "A", "B", "gravity", "lead", "inputs")),
+        *(f"observer.{key}" for key in ("rate", "states", "Phi", "Gamma", "L", "F", "part")),
+        *(f"observer.{key}" for key in ("within", "fade", "margin")),
+        *(f"observer.vanes.{key}" for key in ("channels", "H", "L", "least", "time")),
+    }
+)
+"""Keys of a controller under any law that a campaign flies."""
+
+FLOWN_RISE_DI = frozenset(
+    {"k_g", "k_d", "Lambda", "beta", "omega", "sign", "softening", "schedule.speed"}
+    | {"schedule.time"}
+)
+"""Keys of RISE-DI that a campaign flies. The keys of another law reach its step unread."""
+
+IDLE_CONTROLLER = frozenset(
+    {
+        # y is never older than max_age, which `build_course` sees to, and the law stays active.
+        *("max_age", "hold", "ramp", "on_deactivate"),
+        # How the node runs.
+        *("lockstep", "y_rate"),
+        # Only a learner reads how well the model is known.
+        "feedforward.deviation",
+    }
+)
+"""Keys of a controller without effect in a campaign."""
+
+
 def require_flyable(scenario: Scenario) -> None:
-    """Raise ParameterError for an aircraft or a controller beyond a campaign."""
+    """Raise ParameterError for an aircraft or a controller beyond a campaign.
+
+    A campaign flies the keys of FLOWN and FLOWN_CONTROLLER. Any other key that has a value and is
+    not idle is refused by its name.
+    """
     aircraft = scenario.aircraft
     controller = scenario.controller
     require(
@@ -82,30 +157,21 @@ def require_flyable(scenario: Scenario) -> None:
         aircraft.airframe,
         "an airframe with matrices: JSBSim flies one at a time",
     )
-    learns_nothing = getattr(controller, "learn", None) is None
-    require(
-        learns_nothing,
-        "controller.learn",
-        "a section",
-        "none: only rise-di fly and rise-di campaign learn",
+    require_known(
+        aircraft, FLOWN | IDLE, "aircraft", "a campaign does not fly it, rise-di fly does"
     )
-    at_trim = controller.guard().over_speed is None
-    require(
-        at_trim,
-        "controller.schedule",
-        "models at other speeds",
-        "none: the aircraft of a campaign fly at their trim speed",
-    )
-    for key in ("shear", "microburst"):
-        expected = "none: in a campaign the wind is the same everywhere"
-        require(getattr(aircraft, key) is None, f"aircraft.{key}", "a section", expected)
     expected = "linear or euler: a campaign flies no multicopter"
-    require(aircraft.kinematics != "thrust", "aircraft.kinematics", "thrust", expected)
-    require(
-        aircraft.over_airspeed is None,
-        "aircraft.over_airspeed",
-        aircraft.over_airspeed,
-        "none: the aircraft of a campaign keep their trim speed",
+    flies = aircraft.kinematics in {"linear", "euler"}
+    require(flies, "aircraft.kinematics", aircraft.kinematics, expected)
+    if isinstance(controller, RiseDiConfig):
+        of_law = FLOWN_RISE_DI
+    else:
+        of_law = keys_of(type(controller)) - keys_of(ControllerConfig)
+    require_known(
+        controller,
+        FLOWN_CONTROLLER | of_law | IDLE_CONTROLLER,
+        "controller",
+        "a campaign does not fly it, rise-di fly does",
     )
 
 
