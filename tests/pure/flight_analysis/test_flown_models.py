@@ -77,7 +77,7 @@ def test_margins_are_of_each_model_around_file_and_true_aircraft(
     learns: Scenario, flight: Tape, controllers: tuple[FlownController, ...], tmp_path: Path
 ) -> None:
     """The true aircraft by another way: its matrices in a file, around which the parameters fly."""
-    loops = flown_loops(flight, learns, controllers)
+    loops = flown_loops(flight, learns, controllers).loops
     assert [(each.name, each.aircraft) for each in loops] == [
         ("start", FILE),
         ("start", TRUE),

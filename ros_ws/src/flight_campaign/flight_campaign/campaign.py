@@ -338,8 +338,13 @@ class MonteCarlo:
             return None
 
     def guarantee(self, case: int) -> Guarantee | None:
-        """The guarantee that was computed for the loop of a case; None without one."""
+        """Return the guarantee that was computed for the loop of a case.
+
+        None without one, and where lags or delays are drawn, which the guarantee takes as exact.
+        """
         definition = self.definition
+        if any(equipment.is_of_loop(entry) for entry in definition.entries):
+            return None
         scenario = definition.scenario(case)
         part = definition.uncertainty
         spread = definition.spread

@@ -29,6 +29,11 @@ def is_of_equipment(entry: str) -> bool:
     return entry.partition("[")[0] in KINDS
 
 
+def is_of_loop(entry: str) -> bool:
+    """Return whether an entry is a lag or the delay, which the linear loop has."""
+    return is_of_equipment(entry) and not entry.startswith("noise")
+
+
 def matrix_entries(entries: Mapping[str, float]) -> dict[str, float]:
     """The entries of A and B alone."""
     return {name: part for name, part in entries.items() if not is_of_equipment(name)}

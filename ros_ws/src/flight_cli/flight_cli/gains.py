@@ -18,8 +18,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from flight_analysis.linear_loop.certificate import keep
-from flight_analysis.linear_loop.guarantee import Guarantee, guarantee
+from flight_analysis.linear_loop.guarantee import Guarantee
 from flight_analysis.report.display_units import display_unit
 from flight_analysis.report.html import write_loop_page
 from flight_analysis.report.margin_figures import (
@@ -31,6 +30,7 @@ from flight_analysis.report.margin_figures import (
 )
 from flight_campaign.statistics import SCORE_UNIT, score_units
 from flight_cli.gains_guarantee import (
+    proved,
     require_guarantee,
     show_guarantee,
     write_certificate,
@@ -289,8 +289,7 @@ class Gains:
             return _GainsAnswer({"scenario": answer})
         progress("bounding every aircraft of the box")
         loop = answer.loop_with_box()
-        promise = guarantee(loop, self.late)
-        keep(promise)
+        promise = proved(loop, self.late)
         write_certificate(self.certificate, loop, promise, self.airframe, self.scenario)
         lines = write_unstable(self.worst, promise, self.airframe, self.scenario)
         return _GainsAnswer({"scenario": answer}, promise=promise, unstable=lines)
@@ -581,6 +580,7 @@ def _assessment_as_json(study: Study, answer: Assessment) -> dict[str, Any]:
         "margins": None if answer.margins is None else margins_as_json(answer.margins),
         "bounds": bounds,
         "conditions": conditions,
+        "differences": study.differences,
     }
 
 

@@ -14,11 +14,12 @@ from aircraft_sim.airframes.airframe import load_airframe
 from aircraft_sim.uncertainty import as_yaml, with_entries
 from flight_analysis.closed_loop.scenario import scenario_yaml
 from flight_analysis.closed_loop.scenario_library import find_scenario
-from flight_analysis.linear_loop.certificate import certificate
+from flight_analysis.linear_loop.certificate import certificate, keep, unstated
 from flight_analysis.linear_loop.delay_margin import MAX_DELAY_MARGIN
-from flight_analysis.linear_loop.guarantee import LARGEST, Guarantee
+from flight_analysis.linear_loop.guarantee import LARGEST, Guarantee, guarantee
 from flight_analysis.linear_loop.input_margins import disk_gain, disk_phase
 from flight_analysis.linear_loop.loop_margins import LinearLoop
+from flight_analysis.linear_loop.told import Standing
 from flight_analysis.report.margin_figures import decibels, guarantee_rows, guarantee_text
 from flight_campaign.equipment import published, scenario_with_equipment
 from flight_cli.output import LICENCE, new_table, print_table, say, write_text
@@ -54,7 +55,8 @@ def require_guarantee(
     if check and controller_alone(scenario) is not None:
         worst = files["worst"]
         require(worst is None, "worst", f"no aircraft in {scenario}", "a scenario that flies one")
-        warn(f"note: {scenario} has a controller alone: commands and gusts of {COMMANDED}")
+        others = f"commands and gusts of {COMMANDED}, lags and delay as it was told"
+        warn(f"note: {scenario} has a controller alone: {others}")
     path = files["certificate"]
     require(late == 0.0 or path is None, "certificate", f"--late {late:g} beside it", "u in time")
     # the checker's bounds are too coarse for most actuators
@@ -65,11 +67,27 @@ def require_guarantee(
     require(fits, "certificate", path, "a file in a folder that can be written")
 
 
+def proved(loop: LinearLoop, late: float) -> Guarantee:
+    """Return the guarantee of a loop, which is kept for the pages of its flights.
+
+    Raises ParameterError before the proof for an aircraft that no linear loop has.
+    """
+    for each in loop.differences:
+        expected = "the aircraft of a linear loop for a guarantee"
+        require(each.standing is Standing.TAKEN, "--guarantee", each.fact, expected)
+    promise = guarantee(loop, late)
+    keep(promise)
+    return promise
+
+
 def write_certificate(
     path: Path | None, loop: LinearLoop, promise: Guarantee, airframe: str, scenario: str
 ) -> None:
     """Write the certificate of a guarantee, if a path is named."""
     if path is not None:
+        facts = "; ".join(each.fact for each in loop.differences)
+        found = f"no stable box ({facts})" if facts else "no stable box"
+        require(promise.stable > 0.0, "--certificate", found, "a loop with a guarantee")
         sources = certificate_sources(airframe, scenario)
         write_text("certificate", path, certificate(loop, promise, sources))
 
@@ -126,12 +144,16 @@ def write_unstable(
 def show_guarantee(
     console: Console, promise: Guarantee | None, checked: GainAssessment[ControllerConfig]
 ) -> None:
-    """The guarantee in sentences, and a table of the disk margins."""
+    """Show how the aircraft differs, the guarantee, and a table of the disk margins."""
+    for difference in checked.study.differences:
+        say(console, difference)
     if promise is None:
         return
     for line in guarantee_text(promise):
         say(console, line)
     study = checked.study
+    for reason in unstated(checked.loop_with_box(), promise):
+        say(console, reason)
     if {*study.spread.entries.values()} - {study.uncertainty}:
         say(console, "percentages: of the largest deviation, with the others in proportion")
     margins = checked.margins

@@ -85,10 +85,9 @@ def _show_margins(console: Console, flight: RecordedFlight, scenario: Scenario) 
     """Print the margins under the parameters that flew, where these changed in flight."""
     from flight_analysis.report import margin_figures  # noqa: PLC0415 - loads SciPy
 
-    loops = flown_loops(flight.tape, scenario, flight.controllers)
-    if not loops:
-        return
-    show_table(console, margin_figures.flown_margin_table(loops))
+    flown = flown_loops(flight.tape, scenario, flight.controllers, flight.later_aircraft)
+    if flown.loops:
+        show_table(console, margin_figures.flown_margin_table(flown))
 
 
 def show_table(console: Console, table: "PageTable") -> None:

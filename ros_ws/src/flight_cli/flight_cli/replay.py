@@ -10,7 +10,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from csv import writer as csv_writer
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,6 +23,7 @@ from flight_analysis.closed_loop.guidance_replay import GuidanceReplay, replay_g
 from flight_analysis.closed_loop.replay import (
     ReplayDifference,
     ReplayResult,
+    later_aircraft,
     recorded_parameters,
     recorded_scenario,
 )
@@ -91,13 +92,15 @@ class Replay:
             _write_csv(self.csv, result, parameters.inputs)
         account = log_account(recorded_run)
         expected_ticks = None if account is None else account.topics["internals"].expected
+        promise, differences = (None, ()) if others is not None else _claims_of(recorded_run)
         answer = Shown(
             result,
             parameters.inputs,
             ticks=max(len(result.number), expected_ticks or 0),
             open_loop=others is not None,
             guided=guidance_replay,
-            promise=_guarantee_of(recorded_run) if others is None and result.equal() else None,
+            promise=promise if result.equal() else None,
+            differences=differences if result.equal() else (),
         )
         lacks = () if account is None else account.notes()
         notes = (*recorded_run.tape.notes, *lacks, *answer.notes())
@@ -120,6 +123,7 @@ class Shown(NamedTuple):
     open_loop: bool  # with other parameters
     guided: GuidanceReplay | None
     promise: Guarantee | None  # that was computed for the loop of the flight
+    differences: tuple[str, ...] = ()  # of the aircraft from what the controller was told
 
     def notes(self) -> list[str]:
         """Notes of the computation, and a note on ticks with other parameters than the log."""
@@ -138,14 +142,21 @@ class Shown(NamedTuple):
         return notes
 
 
-def _guarantee_of(run: RecordedRun) -> Guarantee | None:
-    """The guarantee that was computed for the loop of a flight.
+def _claims_of(run: RecordedRun) -> tuple[Guarantee | None, tuple[str, ...]]:
+    """Return the guarantee of the loop of a flight, and how its aircraft differs.
 
-    None without one, without a linear model, or where the parameters changed in flight.
+    The guarantee is None without one, without a linear model, where the parameters changed in
+    flight, and where it does not hold for the aircraft that flew.
     """
-    has_changed = len({span.digest for span in parameter_spans(run.tape)}) > 1
-    loops = [] if has_changed else flown_loops(run.tape, recorded_scenario(run), ())
-    return kept_guarantee(loops[0].loop) if loops else None
+    if len({span.digest for span in parameter_spans(run.tape)}) > 1:
+        return None, ()
+    tape = run.tape
+    if run.age_of_u is not None:
+        tape = replace(tape, signals={**tape.signals, "age_of_u": run.age_of_u})
+    scenario = recorded_scenario(run)
+    flown = flown_loops(tape, scenario, (), later_aircraft(run, scenario))
+    promise = kept_guarantee(flown.loops[0].loop) if flown.loops else None
+    return promise, flown.sentences
 
 
 def _show_guidance(replay_of_guidance: GuidanceReplay) -> None:
@@ -212,6 +223,8 @@ def _show(answer: Shown, notes: Sequence[str]) -> None:
         console.print(f"note: {note}")
     if answer.guided is not None:
         _show_guidance(answer.guided)
+    for sentence in answer.differences:
+        console.print(sentence)
     if answer.promise is not None:
         console.print(guarantee_text(answer.promise)[0])
 
@@ -268,6 +281,7 @@ def _as_json(answer: Shown, notes: Sequence[str], settings: list[str]) -> dict[s
         "notes": list(notes),
         "expected": answer.ticks,
         "guidance": None if replay_of_guidance is None else _guidance_as_json(replay_of_guidance),
+        "differences": list(answer.differences),
         "guarantee": None if answer.promise is None else answer.promise.as_json(),
     }
 

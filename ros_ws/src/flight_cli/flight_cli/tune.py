@@ -44,7 +44,8 @@ from flight_core.files import display_path, writing
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import period_ns
 from flight_core.vectors import FloatArray
-from flight_design.gains.gain_design import check_gains, lags_by_input, select_gains
+from flight_design.gains.effectors import lags_by_input
+from flight_design.gains.gain_design import check_gains, select_gains
 from flight_design.gains.gain_selection import Selection
 from flight_design.gains.ideal_control import ChannelPairing
 from flight_design.identification.innovation_filters import (
@@ -237,7 +238,9 @@ class Tune:
         selection = self._selection(console, airframe, flight, uncertainty)
         chosen = flight.vary(controller=selection.chosen)
         with console.status("bounding every aircraft within the errors"):
-            answer = check_gains(airframe, chosen, uncertainty=uncertainty, samples=SAMPLES)
+            answer = check_gains(
+                airframe, chosen, uncertainty=uncertainty, samples=SAMPLES, as_told=True
+            )
             promise = guarantee(answer.loop_with_box())
         own = own_loop(taken.parameters, chosen, autopilot)
         law, by_own = _predicted(chosen, airframe, own, uncertainty)

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from flight_bringup.processes import end_with_parent
@@ -173,14 +174,17 @@ def _serve_with_control(
     flights: Sequence[Flight], ports: Sequence[int], namespace: str, *, real: bool
 ) -> None:
     from flight_analysis.linear_loop.loop_margins import delay_margins  # noqa: PLC0415 - loads scipy, which a page without control lacks
+    from flight_analysis.linear_loop.told import FlightFacts  # noqa: PLC0415 - as above
     from flight_view.control import Control, new_key  # noqa: PLC0415 - as above
 
     require_ros_environment()
     from flight_view.control_client import ControlClient  # noqa: PLC0415 - loads rclpy, which a page without control lacks
 
+    # the aircraft of a bridge is not the one in the scenario
+    assess = partial(delay_margins, flight=FlightFacts(is_simulated=not real))
     with ControlClient(namespace) as client:
         key = new_key()
-        control = Control(flights[0], client, key, real=real, assess=delay_margins)
+        control = Control(flights[0], client, key, real=real, assess=assess)
         _announce(f"control key: {key}")
         try:
             serve(flights, ports, _announce, control)

@@ -25,8 +25,9 @@ from flight_core.outcome import End
 from flight_core.parameters import require
 from flight_core.tape import Tape
 from flight_design.gains import first_flight, gain_yaml
+from flight_design.gains.effectors import lags_by_input
 from flight_design.gains.first_scenario import LICENCE
-from flight_design.gains.gain_design import lags_by_input, select_gains
+from flight_design.gains.gain_design import select_gains
 
 SIZES = (1.0, 0.5, 0.25, 0.125)  # of the commands: the first that flies clear of the end stops
 CLEAR = 0.9  # part of an end stop that u reaches at most

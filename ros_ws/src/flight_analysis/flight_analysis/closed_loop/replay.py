@@ -6,22 +6,25 @@ The inputs come from the log, and every tick is compared bit by bit.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from aircraft_sim.params import AircraftConfig
 from flight_analysis.closed_loop.replay_ticks import Change, ParametersInForce, Ticks
 from flight_analysis.closed_loop.scenario import Scenario, parse_scenario, parse_scenario_sections
 from flight_core.arguments import FilePath
 from flight_core.arithmetic import ARITHMETIC
 from flight_core.fields import short_repr
-from flight_core.parameters import require
+from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Process, Signal, Tape
 from flight_core.vectors import FloatArray
 from flight_log.log_content import StoredFile
+from flight_log.log_messages import PARAMETER
 from flight_log.provenance import recorded_arithmetic
 from flight_log.stored_messages import parameter_changes
 from flight_log.tape_reader import RecordedRun, read_run
@@ -342,6 +345,26 @@ def recorded_changes(run: RecordedRun, parameters: ControllerConfig) -> Sequence
         name: field for name, field in type(parameters).model_fields.items() if name not in OF_NODE
     }
     return parameter_changes(run.path, f"{run.namespace}/controller", fields)
+
+
+def later_aircraft(run: RecordedRun, scenario: Scenario) -> tuple[AircraftConfig, ...]:
+    """Return the simulated aircraft after each change of its parameters in flight, in order."""
+    node = f"{run.namespace}/aircraft"
+    is_changed = any(
+        each.kind == PARAMETER and each.text.startswith("aircraft:") for each in run.messages
+    )
+    if run.path is None or not is_changed:
+        return ()
+    later = []
+    changes: dict[str, Any] = {}
+    for change in parameter_changes(run.path, node, dict.fromkeys(AircraftConfig.tunable())):
+        changes |= change
+        # The keys of a gust come one by one: it is one with the last of them.
+        with suppress(ParameterError):
+            later.append(
+                AircraftConfig.validate_mapping(scenario.aircraft.changed(changes), "aircraft")
+            )
+    return tuple(later)
 
 
 def _coverage_notes(ticks: Ticks, checked: NDArray[np.bool_]) -> Iterator[str]:

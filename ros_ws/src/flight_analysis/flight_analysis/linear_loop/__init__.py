@@ -6,6 +6,7 @@
 |---|---|
 | `delay_margin` | the delay at the limit of stability |
 | `input_margins` | phase, gain, sensitivity, disks and damping of an aircraft, or of many |
+| `told` | what the controller was told of its aircraft, beside the aircraft that flies |
 | `loop_margins` | the loop of a scenario, and all margins of it |
 | `uncertain_loop` | the box of uncertain aircraft as a loop with a block of deviations |
 | `worst_case` | searches the worst aircraft of a box |

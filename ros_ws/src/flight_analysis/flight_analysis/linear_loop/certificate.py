@@ -12,6 +12,7 @@ the folder rise-di/guarantees in $XDG_CACHE_HOME, or in ~/.cache, by the digest 
 
 import hashlib
 import json
+import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,6 +22,7 @@ import numpy as np
 
 from flight_analysis.linear_loop.guarantee import Guarantee, Unstable
 from flight_analysis.linear_loop.loop_margins import LinearLoop
+from flight_analysis.linear_loop.told import Standing
 from flight_core.files import write_file
 from flight_core.parameters import require
 
@@ -72,7 +74,39 @@ def keep(promise: Guarantee) -> None:
 
 
 def kept_guarantee(linear: LinearLoop) -> Guarantee | None:
-    """The guarantee that was computed for a loop; None without one, or for a damaged file."""
+    """Return the guarantee that was computed for a loop and that holds for its aircraft.
+
+    None without one, for a damaged file, and where `unstated` has a reason.
+    """
+    promise = _kept(linear)
+    return None if promise is None or unstated(linear, promise) else promise
+
+
+def unstated(linear: LinearLoop, promise: Guarantee) -> tuple[str, ...]:
+    """Return why a guarantee is not stated of the aircraft that flies; empty if it holds there.
+
+    It is of a linear loop, so it does not speak of what the loop leaves out, and of the aircraft
+    within its box.
+    """
+    reasons = [each.sentence for each in linear.differences if each.standing is not Standing.TAKEN]
+    return (*reasons, *_beyond_box(linear, promise))
+
+
+def beyond_kept(linear: LinearLoop) -> tuple[str, ...]:
+    """Return the sentence of an aircraft beyond the guarantee that was computed for its loop."""
+    promise = _kept(linear)
+    return () if promise is None else _beyond_box(linear, promise)
+
+
+def _beyond_box(linear: LinearLoop, promise: Guarantee) -> tuple[str, ...]:
+    if linear.off <= promise.stable:
+        return ()
+    ends = math.floor(1e3 * promise.stable) / 10.0
+    off = f"the aircraft is {100.0 * linear.off:.1f} % off"
+    return (f"aircraft.uncertainty: {off}, the guarantee ends at {ends:.1f} %: none is stated",)
+
+
+def _kept(linear: LinearLoop) -> Guarantee | None:
     try:
         content: dict[str, Any] = json.loads(_path(linear.digest).read_bytes())
         first = content["unstable"]

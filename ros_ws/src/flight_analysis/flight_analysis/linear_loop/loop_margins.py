@@ -6,7 +6,7 @@ They are taken on the nominal and on uncertain aircraft.
 """
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,6 +23,8 @@ from aircraft_sim.uncertainty import (
 from flight_analysis.closed_loop.scenario import Scenario, as_scenario
 from flight_analysis.linear_loop.delay_margin import MAX_DELAY_MARGIN, delay_margin
 from flight_analysis.linear_loop.input_margins import Margins, SlowModes, input_margins, slow_modes
+from flight_analysis.linear_loop.told import PLANNED, Comparison, Difference, FlightFacts, compare
+from flight_analysis.linear_loop.told import loop_of as loop_of  # noqa: PLC0414 - where it is looked for
 from flight_analysis.linear_loop.uncertain_loop import Box, plants_at
 from flight_analysis.linear_loop.worst_case import worst_in_box
 from flight_core.arguments import as_count, as_number
@@ -53,6 +55,7 @@ BARE = (
 )
 
 
+ROUNDING = 1e-9  # relative deviation of an entry that is none
 DIGITS = 10  # of numbers in a digest: two ways to the same loop differ by rounding
 
 
@@ -65,6 +68,10 @@ class LinearLoop(NamedTuple):
     law: LinearLaw
     loop: LoopTiming
     box: Box | None = None  # of the uncertain aircraft; None without any
+    # how the aircraft that flies differs from what the controller was told
+    differences: tuple[Difference, ...] = ()
+    # largest deviation of its A and B from the airframe file, in the measure of the box
+    off: float = 0.0
 
     @property
     def nominal(self) -> LinearPlant:
@@ -114,9 +121,9 @@ def margins(
 
     A search finds the least. Every entry of A and B of an uncertain aircraft is off by up to
     `uncertainty`, or as `spread` says, the rows of angles excepted. Samples count for the number of
-    stable aircraft alone: the least margins are at corners, where none falls. The controller gives
-    lags and delay, exact unless `spread` has an entry 1/lag[INPUT]. The uncertainty of the scenario
-    itself is left out.
+    stable aircraft alone: the least margins are at corners, where none falls. Lags and delay are
+    those of the aircraft where the controller was told others, exact unless `spread` has an entry
+    1/lag[INPUT]. The uncertainty of the scenario itself is left out.
 
     Args:
         scenario: The flight: aircraft and controller.
@@ -229,29 +236,66 @@ def scenario_loop(
     uncertainty: float = 0.3,
     seed: int = 1,
     spread: Spread = UNIFORM,
+    flight: FlightFacts = PLANNED,
 ) -> LinearLoop:
     """The loop of a controller around the nominal and uncertain aircraft of a scenario.
 
+    Lags and delay are those that fly: of the aircraft in the scenario, or as a flight shows.
     Raises as `margins`.
     """
     airframe = _model(scenario, controller)
-    matrices, _ = of_matrices_and_lags(spread, controller)
+    comparison = compare(scenario, controller, flight)
+    matrices, _ = of_matrices_and_lags(spread, comparison.timing, controller.inputs)
     A, B = nominal_and_sampled(airframe, uncertainty, aircraft, seed, matrices)
     T = distribution(airframe, controller)  # B of each effector is drawn
     airframe_of_law = through_allocation(airframe, controller)
-    linear = linear_loop(controller, airframe_of_law, A, B @ T)
-    return with_box(linear, airframe, controller, uncertainty, seed, spread)
+    linear = linear_loop(controller, airframe_of_law, A, B @ T, comparison.timing)
+    linear = with_box(linear, airframe, controller, uncertainty, seed, spread)
+    if flight.is_simulated:
+        return as_compared(linear, scenario, comparison)
+    return linear._replace(differences=comparison.differences)
+
+
+def as_compared(linear: LinearLoop, scenario: Scenario, comparison: Comparison) -> LinearLoop:
+    """Return the loop with how the aircraft of a scenario differs from what it is taken for."""
+    return _with_deviation(linear._replace(differences=comparison.differences), scenario)
+
+
+def _with_deviation(linear: LinearLoop, scenario: Scenario) -> LinearLoop:
+    """Return the loop with the deviation of the aircraft that the scenario draws.
+
+    0 for the airframe as in its file, infinite where an entry deviates that is exact in the box.
+    """
+    if linear.box is None or scenario.aircraft.is_jsbsim:
+        return linear
+    frames = scenario.aircraft.nominal_airframe(), scenario.aircraft.sampled_airframe()
+    (A, B), (A_flown, B_flown) = ((each.matrix_a(), each.matrix_b()) for each in frames)
+    published = {"A": A, "B": B}
+    flown = {"A": A_flown, "B": B_flown}
+    parts = dict(zip(linear.box.names, linear.box.part.tolist(), strict=True))
+    off = 0.0
+    for name, (matrix, i, j) in drawn_places(frames[0]).items():
+        deviation = abs(flown[matrix][i, j] / published[matrix][i, j] - 1.0)
+        if deviation > ROUNDING:
+            part = parts.get(name, 0.0)
+            off = max(off, deviation / part if part else np.inf)
+    return linear._replace(off=float(off * linear.box.part.max()))
 
 
 def linear_loop(
-    controller: ControllerConfig, airframe: Airframe, A: FloatArray, B: FloatArray
+    controller: ControllerConfig,
+    airframe: Airframe,
+    A: FloatArray,
+    B: FloatArray,
+    timing: LoopTiming | None = None,
 ) -> LinearLoop:
     """The loop of a controller around N aircraft, A (N, n, n) and B (N, n, m).
 
-    An airframe has the states and channels. Raises ParameterError for the literal sign.
+    An airframe has the states and channels. `timing` None: as the controller was told. Raises
+    ParameterError for the literal sign.
     """
     rows, columns = law_order(airframe, controller)
-    loop = loop_of(controller)
+    loop = loop_of(controller) if timing is None else timing
     # y_dot = Omega u has no angles: the observer of y alone
     if not set(controller.vanes) <= set(airframe.states):
         controller = controller.without_vanes()
@@ -287,25 +331,25 @@ def with_box(
     Raises ParameterError as `of_matrices_and_lags`.
     """
     box = box_of(airframe, controller, uncertainty, spread)
-    _, parts = of_matrices_and_lags(spread, controller)
+    _, parts = of_matrices_and_lags(spread, linear.loop, controller.inputs)
     if parts:
         linear, box = with_lags_pulled_out(linear, box, parts, seed, spread)
     return linear._replace(box=box) if box.part.any() else linear
 
 
 def of_matrices_and_lags(
-    spread: Spread, controller: ControllerConfig
+    spread: Spread, timing: LoopTiming, inputs: Sequence[str]
 ) -> tuple[Spread, dict[int, float]]:
     """The entries of A and B, and the relative deviation of 1 / lag by input of the law.
 
     An entry of a lag is 1/lag[INPUT]. Raises ParameterError for an unknown entry that is none of A
     or B, a lag below LEAST_LAG periods, and a part outside [0, 1).
     """
-    least = LEAST_LAG / controller.rate
+    least = LEAST_LAG * timing.period
     known = {
         f"{LAG_ENTRY}[{name}]": i
-        for i, name in enumerate(controller.inputs)
-        if controller.lag[i] >= least * (1.0 - 1e-9)
+        for i, name in enumerate(inputs)
+        if timing.lag[i] >= least * (1.0 - 1e-9)
     }
     matrices = {}
     lags = {}
@@ -421,7 +465,9 @@ def _has_effectors(airframe: Airframe, controller: ControllerConfig) -> bool:
     return controller.allocation is not None and set(airframe.inputs) != set(controller.inputs)
 
 
-def delay_margins(scenario: Scenario, controller: ControllerConfig) -> dict[str, Any]:
+def delay_margins(
+    scenario: Scenario, controller: ControllerConfig, flight: FlightFacts = PLANNED
+) -> dict[str, Any]:
     """Delay margins of the nominal linear loop, s.
 
     u is late in every channel, or in a single channel, by output. The least margin that is allowed
@@ -430,7 +476,7 @@ def delay_margins(scenario: Scenario, controller: ControllerConfig) -> dict[str,
     """
     if scenario.aircraft.is_jsbsim or is_literal(controller):
         return {}
-    loop = scenario_loop(scenario, controller)
+    loop = scenario_loop(scenario, controller, flight=flight)
     each = {
         name: delay_margin(loop.nominal, loop.law, loop.loop, share)
         for name, share in zip(controller.outputs, np.eye(len(controller.outputs)), strict=True)
@@ -445,13 +491,6 @@ def delay_margins(scenario: Scenario, controller: ControllerConfig) -> dict[str,
 def is_literal(controller: ControllerConfig) -> bool:
     """Whether a controller samples the literal sign: no linear loop."""
     return isinstance(controller, RiseDiConfig) and controller.sampled_sign()[0] is Sign.LITERAL
-
-
-def loop_of(controller: ControllerConfig) -> LoopTiming:
-    """The loop of a controller."""
-    return LoopTiming(
-        np.array(controller.lag, dtype=np.float64), controller.delay, 1.0 / controller.rate
-    )
 
 
 def law_order(airframe: Airframe, controller: ControllerConfig) -> tuple[list[int], list[int]]:

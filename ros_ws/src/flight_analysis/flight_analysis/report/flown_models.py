@@ -12,8 +12,10 @@ from typing import NamedTuple
 import numpy as np
 
 from aircraft_sim.airframes.airframe import Airframe, load_airframe
+from aircraft_sim.params import AircraftConfig
 from flight_analysis.closed_loop.replay_ticks import Change, vary
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.linear_loop.certificate import beyond_kept
 from flight_analysis.linear_loop.loop_margins import (
     LinearLoop,
     distribution,
@@ -21,10 +23,14 @@ from flight_analysis.linear_loop.loop_margins import (
     scenario_loop,
     through_allocation,
 )
+from flight_analysis.linear_loop.told import FlightFacts, Standing
 from flight_analysis.report.model_spans import parameter_spans
 from flight_analysis.report.sample_counts import is_simulated
+from flight_analysis.report.timing import age_metrics
 from flight_core.parameters import ParameterError
+from flight_core.rates import NANOSECONDS
 from flight_core.tape import Tape
+from rise_di_controller.law.linear_loop import LoopTiming
 from rise_di_controller.params import ControllerConfig
 
 ENTRY = re.compile(r"([AB])\[(.+), (.+)\]")  # as in the topic `learned`
@@ -76,22 +82,87 @@ def flown_controllers(
     )
 
 
+class FlownLoops(NamedTuple):
+    """The linear loops of a flight, and what is to be said of them."""
+
+    loops: list[FlownLoop]  # none without a linear model, or where what flew is not known
+    sentences: tuple[str, ...]  # how what flew differs from what the controller was told
+
+
+UNKNOWN_AIRCRAFT = (
+    "the aircraft is not simulated: its lags, delay and end stops are taken as the controller was "
+    "told"
+)
+
+
 def flown_loops(
-    tape: Tape, scenario: Scenario, controllers: Sequence[FlownController]
-) -> list[FlownLoop]:
-    """The linear loops of a flight; none without a linear model."""
+    tape: Tape,
+    scenario: Scenario,
+    controllers: Sequence[FlownController],
+    later: Sequence[AircraftConfig] = (),
+) -> FlownLoops:
+    """Return the linear loops of a flight.
+
+    Lags and delay are those that flew. `later` has the aircraft after each change in flight.
+    """
     loops = []
+    sentences: list[str] = []
     airframe = true_airframe(tape, scenario)
     parameter_sets = [(each.name, each.times, each.controller) for each in controllers]
     for name, times, controller in parameter_sets or [("", "", scenario.controller)]:
+        facts = facts_of(tape, scenario.controller, controllers, later)
         try:
-            around_file = scenario_loop(scenario, controller)
-            loops.append(FlownLoop(name, times, FILE, around_file))
-            if airframe is not None:
-                loops.append(FlownLoop(name, times, TRUE, _loop_around(airframe, controller)))
+            around_file = scenario_loop(scenario, controller, flight=facts)
         except ParameterError:
             continue
-    return loops
+        sentences += [each.sentence for each in around_file.differences]
+        if any(each.standing is Standing.NO_LOOP for each in around_file.differences):
+            continue
+        sentences += beyond_kept(around_file)
+        loops.append(FlownLoop(name, times, FILE, around_file))
+        if airframe is not None:
+            true = _loop_around(airframe, controller, around_file.loop)
+            loops.append(FlownLoop(name, times, TRUE, true))
+    if loops and not is_simulated(tape):
+        sentences.append(UNKNOWN_AIRCRAFT)
+    return FlownLoops(loops, tuple(dict.fromkeys(sentences)))
+
+
+def facts_of(
+    tape: Tape,
+    start: ControllerConfig,
+    controllers: Sequence[FlownController],
+    later: Sequence[AircraftConfig] = (),
+) -> FlightFacts:
+    """Return what the log of a flight tells beside its scenario."""
+    known = {start.digest(), *(each.controller.digest() for each in controllers)}
+    age = age_metrics(tape)
+    return FlightFacts(
+        is_simulated=is_simulated(tape),
+        tick=_period_of_ticks(tape),
+        y_period=None if is_simulated(tape) else _period_of(tape, "y"),
+        age=None if age is None or not np.isfinite(age.mean) else age.mean,
+        later=tuple(later),
+        has_parameters=all(span.digest in known for span in parameter_spans(tape)),
+    )
+
+
+def _period_of_ticks(tape: Tape) -> float | None:
+    """Return the median time from a tick to the next, s; None for fewer than two in the log."""
+    if "internals" not in tape or "number" not in tape["internals"].names:
+        return None
+    steps = np.diff(tape["internals"]["number"])
+    is_next = steps > 0.0
+    if not is_next.any():
+        return None
+    return float(np.median(np.diff(tape.time("internals"))[is_next] / steps[is_next]))
+
+
+def _period_of(tape: Tape, topic: str) -> float | None:
+    """Return the median time between two samples of a topic, s; None for fewer than two."""
+    if topic not in tape or len(tape[topic].stamp_ns) < 2:
+        return None
+    return float(np.median(np.diff(tape[topic].stamp_ns))) / NANOSECONDS
 
 
 def true_airframe(tape: Tape, scenario: Scenario) -> Airframe | None:
@@ -104,10 +175,12 @@ def true_airframe(tape: Tape, scenario: Scenario) -> Airframe | None:
     return aircraft.sampled_airframe()
 
 
-def _loop_around(airframe: Airframe, controller: ControllerConfig) -> LinearLoop:
+def _loop_around(
+    airframe: Airframe, controller: ControllerConfig, timing: LoopTiming
+) -> LinearLoop:
     airframe_of_law = through_allocation(airframe, controller)
     B = airframe.matrix_b() @ distribution(airframe, controller)
-    return linear_loop(controller, airframe_of_law, airframe.matrix_a()[None], B[None])
+    return linear_loop(controller, airframe_of_law, airframe.matrix_a()[None], B[None], timing)
 
 
 def learned_lines(tape: Tape, scenario: Scenario) -> dict[str, dict[str, float]]:

@@ -35,7 +35,14 @@ from flight_analysis.report.display_units import (
     format_value,
     state_units,
 )
-from flight_analysis.report.flown_models import FILE, TRUE, FlownLoop, flown_loops, learned_lines
+from flight_analysis.report.flown_models import (
+    FILE,
+    TRUE,
+    FlownLoop,
+    FlownLoops,
+    flown_loops,
+    learned_lines,
+)
 from flight_analysis.report.learned_figure import learned_figure
 from flight_analysis.report.parameter_rows import parameter_rows
 from flight_analysis.report.plotting import Curve, Figure, SampleStore, pack, time_series_figure
@@ -137,7 +144,8 @@ def _write(path: Path, page: Page) -> None:
 
 def write_loop_page(path: Path, title: str, loop: LinearLoop) -> None:
     """Write a page of a linear loop that need not have flown: margins, Bode and Nyquist plot."""
-    table = margin_figures.margin_table(loop_margins(loop), kept_guarantee(loop))
+    differences = [each.sentence for each in loop.differences]
+    table = margin_figures.margin_table(loop_margins(loop), kept_guarantee(loop), differences)
     sections = _loop_sections({"": loop})
     _write(
         path,
@@ -196,9 +204,9 @@ def _flight_page(flight: RecordedFlight, scenario: Scenario) -> Page:
     units = flight.units
     gusts = flight.gusts
     context = figures.plot_context([flight])
-    loops = flown_loops(flight.tape, scenario, flight.controllers)
+    flown = flown_loops(flight.tape, scenario, flight.controllers, flight.later_aircraft)
     events = tables.events(flight.tape, gusts, scenario)
-    margins = _margin_tables(loops)
+    margins = _margin_tables(flown)
     shown, in_radians = (
         [*tables.flight_tables(flight.summary, each, events), *margins]
         for each in (units, display_units.in_radians({**QUANTITY_UNITS, **units}))
@@ -210,9 +218,12 @@ def _flight_page(flight: RecordedFlight, scenario: Scenario) -> Page:
         tables=[
             TableGroup(shown, in_radians=in_radians),
         ],
-        sections=[*_sections(flight, scenario, context), *_loop_sections(_drawn_loops(loops))],
+        sections=[
+            *_sections(flight, scenario, context),
+            *_loop_sections(_drawn_loops(flown.loops)),
+        ],
         samples=context.samples,
-        notes=flight.summary["notes"],
+        notes=[*flight.summary["notes"], *([] if flown.loops else flown.sentences)],
         replay=replay_of(flight, context),
         messages=_message_lines(flight),
         parameters=_parameter_table(scenario),
@@ -393,14 +404,15 @@ def _sections(
     ]
 
 
-def _margin_tables(loops: Sequence[FlownLoop]) -> list[tables.MetricTable]:
+def _margin_tables(flown: FlownLoops) -> list[tables.MetricTable]:
     """The margins of a single loop by input, the least margins of several loops."""
-    if not loops:
+    if not flown.loops:
         return []
-    if len(loops) > 1:
-        return [margin_figures.flown_margin_table(loops)]
-    loop = loops[0].loop
-    return [margin_figures.margin_table(loop_margins(loop), kept_guarantee(loop))]
+    if len(flown.loops) > 1:
+        return [margin_figures.flown_margin_table(flown)]
+    loop = flown.loops[0].loop
+    margins = loop_margins(loop)
+    return [margin_figures.margin_table(margins, kept_guarantee(loop), flown.sentences)]
 
 
 def _drawn_loops(loops: Sequence[FlownLoop]) -> dict[str, LinearLoop]:

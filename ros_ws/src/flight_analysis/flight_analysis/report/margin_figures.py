@@ -16,7 +16,7 @@ from flight_analysis.linear_loop.input_margins import Margins, disk_gain, disk_p
 from flight_analysis.linear_loop.loop_margins import LinearLoop, LoopMargins, loop_margins
 from flight_analysis.report.display_units import NO_VALUE
 from flight_analysis.report.figures import COLOURS
-from flight_analysis.report.flown_models import FlownLoop
+from flight_analysis.report.flown_models import FlownLoops
 from flight_analysis.report.plotting import Figure, add_line, axis, first_in_legend, set_layout
 from flight_analysis.report.summary_rows import Column
 from flight_analysis.report.tables import MetricTable
@@ -156,9 +156,14 @@ def modes_text(margins: LoopMargins) -> str:
     return f"slow modes and their damping: {modes or f'all above {SHOWN_DAMPING:g}'}{least}"
 
 
-def margin_table(margins: LoopMargins, promise: Guarantee | None = None) -> MetricTable:
-    """The margins of a flight's loop, and the guarantee that was computed for it."""
-    sentences = [MARGIN_LEGEND, modes_text(margins)]
+def margin_table(
+    margins: LoopMargins, promise: Guarantee | None = None, differences: Sequence[str] = ()
+) -> MetricTable:
+    """Return the margins of a flight's loop, and the guarantee that was computed for it.
+
+    `differences`: sentences on how the aircraft differs from what the controller was told.
+    """
+    sentences = [*differences, MARGIN_LEGEND, modes_text(margins)]
     sentences += [] if promise is None else guarantee_text(promise)
     return MetricTable(
         "Margins of the linear loop",
@@ -168,7 +173,7 @@ def margin_table(margins: LoopMargins, promise: Guarantee | None = None) -> Metr
     )
 
 
-def flown_margin_table(loops: Sequence[FlownLoop]) -> MetricTable:
+def flown_margin_table(flown: FlownLoops) -> MetricTable:
     """The least margins of the loops of a flight, a row each."""
     columns = [
         Column("flown", "from to (s)"),
@@ -182,13 +187,14 @@ def flown_margin_table(loops: Sequence[FlownLoop]) -> MetricTable:
     ]
     rows = [
         [loop.name or "law", loop.times, loop.aircraft, *least_margins(loop_margins(loop.loop))]
-        for loop in loops
+        for loop in flown.loops
     ]
     legend = (
         "the least margins of the inputs, one open and all others closed; disk and delay: all "
         "inputs at once; damping: of slow modes. aircraft: that of the file, and the true one as "
         "simulated before a drift"
     )
+    legend = ". ".join([*flown.sentences, legend])
     return MetricTable(
         "Margins of the linear loop, by the parameters that flew", columns, rows, legend
     )
@@ -226,6 +232,8 @@ def _aircraft_as_json(margins: Margins, inputs: Sequence[str]) -> dict[str, Any]
 
 def guarantee_text(promise: Guarantee) -> list[str]:
     """A guarantee in sentences."""
+    if promise.stable == 0.0:
+        return ["guarantee: none, not even the aircraft of the file is proved stable"]
     stable = math.floor(1e3 * promise.stable) / 10.0
     late = f", u up to {1e3 * promise.late:g} ms late" if promise.late else ""
     name = f" (certificate {promise.certificate})" if promise.certificate else ""

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 from aircraft_sim.jsbsim.jsbsim_files import model_files
 from aircraft_sim.uncertainty import as_yaml
-from flight_analysis.closed_loop.replay import recorded_changes
+from flight_analysis.closed_loop.replay import later_aircraft, recorded_changes
 from flight_analysis.closed_loop.scenario import (
     ParameterOverrides,
     Scenario,
@@ -249,6 +249,7 @@ def _flight(recorded: RecordedRun, run: Path, outcome: Outcome | None) -> Record
         tape=tape,
         summary=summary,
         controllers=controllers,
+        later_aircraft=later_aircraft(recorded, scenario),
         messages=recorded.messages,
     )
 

@@ -11,9 +11,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from aircraft_sim.params import AircraftConfig
 from flight_analysis import metrics
 from flight_analysis.closed_loop.scenario import Scenario, as_scenario
 from flight_analysis.linear_loop.delay_margin import delay_margin
+from flight_analysis.linear_loop.told import FlightFacts
 from flight_analysis.metrics import (
     CALM,
     TRUE_ERROR,
@@ -110,6 +112,7 @@ class RecordedFlight(NamedTuple):
     si_units: Mapping[str, str] = {}  # by channel, of an imported flight
     # the parameters that flew, where they changed in flight
     controllers: tuple[FlownController, ...] = ()
+    later_aircraft: tuple[AircraftConfig, ...] = ()  # after each change in flight
     messages: tuple[LogMessage, ...] = ()
 
     @property
@@ -295,8 +298,9 @@ def late_u(scenario: Scenario, age: AgeMetrics | None) -> list[str]:
         return []
     from flight_analysis.linear_loop.loop_margins import scenario_loop  # noqa: PLC0415 - loads SciPy, which few flights need
 
+    told = FlightFacts(is_simulated=False)  # the margin is beyond the delay that the gains know
     try:
-        linear = scenario_loop(scenario, controller)
+        linear = scenario_loop(scenario, controller, flight=told)
     except ParameterError:  # no linear model
         return []
     margin = delay_margin(linear.nominal, linear.law, linear.loop)

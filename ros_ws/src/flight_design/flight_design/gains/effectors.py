@@ -9,8 +9,11 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from aircraft_sim.airframes.airframe import Airframe
+from flight_analysis.linear_loop.told import lag_through
+from flight_core.arguments import as_numbers
 from flight_core.parameters import require
 from flight_core.vectors import FloatArray
 from rise_di_controller.extensions.model_sections import AllocationConfig
@@ -80,7 +83,7 @@ def design_allocation(
         },
         "allocation",
     )
-    lag = np.maximum((Omega * T.T) @ effectors.lag, 0.0)
+    lag = lag_through(Omega, T, effectors.lag)
     lower, upper = (
         _alone(T, sides)
         for sides in ((effectors.upper, effectors.lower), (effectors.lower, effectors.upper))
@@ -151,3 +154,18 @@ def _rounded(matrix: FloatArray) -> list[float]:
         float(f"{value:.{DIGITS}g}")
         for value in np.where(np.abs(matrix) > small, matrix, 0.0).ravel()
     ]
+
+
+def lags_by_input(lag: ArrayLike, airframe: Airframe) -> dict[str, float]:
+    """Lags by input, s. Raises ParameterError."""
+    names = list(airframe.inputs)
+    values = as_numbers(lag, "lag", expected := "seconds, 0 or more")
+    values = values * len(names) if len(values) == 1 else values
+    require(
+        len(values) == len(names),
+        "lag",
+        f"{len(values)} values",
+        f"one for all or one for each of {', '.join(names)}",
+    )
+    require(min(values) >= 0.0, "lag", lag, expected)
+    return dict(zip(names, values, strict=True))

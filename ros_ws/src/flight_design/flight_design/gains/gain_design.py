@@ -22,6 +22,7 @@ from flight_analysis.linear_loop.loop_margins import (
     of_matrices_and_lags,
     through_allocation,
 )
+from flight_analysis.linear_loop.told import compare
 from flight_core.arguments import (
     FilePath,
     as_count,
@@ -33,10 +34,14 @@ from flight_core.arguments import (
 from flight_core.parameters import require
 from flight_core.vectors import FloatArray
 from flight_design.gains import gain_selection, ideal_control, tuned_gains
-from flight_design.gains.effectors import LAW_INPUT, Effectors, design_allocation
-from flight_design.gains.first_scenario import scenario_to_check, scenario_to_design
+from flight_design.gains.effectors import LAW_INPUT, Effectors, design_allocation, lags_by_input
+from flight_design.gains.first_scenario import (
+    controller_alone,
+    scenario_to_check,
+    scenario_to_design,
+)
 from flight_design.gains.gain_selection import GainAssessment, LoopSetting, Selection
-from flight_design.gains.ideal_control import Effected, Study
+from flight_design.gains.ideal_control import Effected, Flown, Study
 from flight_design.gains.nominal import unit_sizes
 from flight_design.gains.observer_gains import (
     ObserverGains,
@@ -224,8 +229,11 @@ def check_gains(
     samples: int = 100,
     seed: int = 1,
     entries: Mapping[str, float] = UNIFORM.entries,
+    as_told: bool = False,
 ) -> GainAssessment[ControllerConfig]:
     """Every condition on the gains of a scenario under any law, and the margins of the loop.
+
+    Lags and delay are those of the aircraft in the scenario where the controller was told others.
 
     Args:
         airframe: Name in the library, path of an airframe file (.yaml), or an Airframe.
@@ -237,6 +245,8 @@ def check_gains(
         seed: Seed of the uncertain airframes.
         entries: Deviations by entry, {"A[q,alpha]": 0.6}; {"1/lag[elevator]": 0.3} is that of an
             actuator, whose lag is exact otherwise.
+        as_told: Whether lags and delay are those of the controller: of an aircraft of your own, for
+            which the one in the scenario stands in.
 
     Returns:
         The controller, the conditions and the margins.
@@ -252,7 +262,10 @@ def check_gains(
     frame = load_airframe(airframe)
     gamma_2 = as_number(gamma_2, "gamma_2", 0.0, unit="1/s")
     spread = Spread(as_numbers_by_name(entries, "entries", '{"1/lag[elevator]": 0.3}'))
-    studied = study(frame, flight, flight.controller, uncertainty, samples, seed, spread)
+    flown = None
+    if not as_told and controller_alone(scenario) is None:
+        flown = Flown(flight, compare(flight, flight.controller))
+    studied = study(frame, flight, flight.controller, uncertainty, samples, seed, spread, flown)
     return gain_selection.assess_scenario(flight, studied, gamma_2)
 
 
@@ -264,12 +277,15 @@ def study(
     samples: int,
     seed: int,
     spread: Spread = UNIFORM,
+    flown: Flown | None = None,
 ) -> Study:
     """The airframe as the law of a controller sees it, and uncertain airframes around.
 
-    They fly along the commands and gusts of a scenario. Raises ParameterError.
+    They fly along the commands and gusts of a scenario. With `flown` lags and delay are those of an
+    aircraft, else as the controller was told. Raises ParameterError.
     """
-    matrices, _ = of_matrices_and_lags(spread, controller)
+    timing = loop_of(controller) if flown is None else flown.comparison.timing
+    matrices, _ = of_matrices_and_lags(spread, timing, controller.inputs)
     effective = through_allocation(airframe, controller)
     behind = None
     if effective is not airframe:
@@ -282,7 +298,7 @@ def study(
         as_count(seed, "seed", 0),
         behind,
         matrices,
-    )._replace(spread=spread)
+    )._replace(spread=spread, flown=flown)
 
 
 def _loop(
@@ -428,21 +444,6 @@ def _allocated(loop: LoopSetting, scenario: Scenario, airframe: Airframe) -> Loo
         lag=dict(zip(law.names, law.lag.tolist(), strict=True)),
         rate_limit={name: limit for name, limit in slew.items() if np.isfinite(limit)},
     )
-
-
-def lags_by_input(lag: ArrayLike, airframe: Airframe) -> dict[str, float]:
-    """Lags by input, s. Raises ParameterError."""
-    names = list(airframe.inputs)
-    values = as_numbers(lag, "lag", expected := "seconds, 0 or more")
-    values = values * len(names) if len(values) == 1 else values
-    require(
-        len(values) == len(names),
-        "lag",
-        f"{len(values)} values",
-        f"one for all or one for each of {', '.join(names)}",
-    )
-    require(min(values) >= 0.0, "lag", lag, expected)
-    return dict(zip(names, values, strict=True))
 
 
 def selected_observer(

@@ -24,11 +24,11 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.linear_loop.loop_margins import (
     LinearLoop,
     LoopMargins,
+    as_compared,
     is_literal,
     law_order,
     linear_loop,
     loop_margins,
-    loop_of,
     with_box,
 )
 from flight_core.parameters import LARGEST, require
@@ -159,9 +159,13 @@ class GainAssessment(NamedTuple, Generic[Controller]):
 
 def loop_with_box(study: Study, controller: ControllerConfig) -> LinearLoop:
     """The linear loop of a controller around the aircraft of a study, with the box of these."""
-    loop = linear_loop(controller, study.airframe, study.A, study.B)
+    timing = study.timing_of(controller)
+    loop = linear_loop(controller, study.airframe, study.A, study.B, timing)
     airframe = study.airframe if study.effected is None else study.effected.airframe
-    return with_box(loop, airframe, controller, study.uncertainty, study.seed, study.spread)
+    boxed = with_box(loop, airframe, controller, study.uncertainty, study.seed, study.spread)
+    if study.flown is None:
+        return boxed
+    return as_compared(boxed, study.flown.scenario, study.flown.comparison)
 
 
 @dataclass(frozen=True)
@@ -455,7 +459,7 @@ def assess_gains(
     if not (isinstance(controller, RiseDiConfig) and controller.sampled_sign()[0] is Sign.IMPLICIT):
         observer = controller.observer
         requirement = above_zeros(setting.requirement, loop.nominal)
-        least = 1.0 / controller.rate if observer is None else observer.margin - controller.delay
+        least = 1.0 / controller.rate if observer is None else observer.margin - loop.loop.delay
         if observer is not None:
             phase = min(requirement.phase, OBSERVER_REQUIREMENT.phase)
             requirement = requirement._replace(phase=phase)
@@ -511,7 +515,7 @@ def _rise_di_conditions(
     rate_limit = _by_name(setting.rate_limit, controller.inputs, math.inf)
     limits = tuple(values / params.input_scale for values in (study.slew[columns], rate_limit))
     conditions = gain_conditions.check_loop(
-        params, loop_of(controller), responses[0], responses.max(axis=0), *limits
+        params, study.timing_of(controller), responses[0], responses.max(axis=0), *limits
     )
     return theorem, conditions, bounds
 
@@ -533,7 +537,8 @@ def stable_speed_ratio(study: Study, controller: ControllerConfig) -> float:
     else is that of the trim. The answer is rounded down to SPEED_STEP, and infinite where the
     linear loop is stable up to MAX_SPEED_RATIO. Raises ParameterError for the literal sign.
     """
-    loop = linear_loop(controller, study.airframe, study.A[:1], study.B[:1])
+    timing = study.timing_of(controller)
+    loop = linear_loop(controller, study.airframe, study.A[:1], study.B[:1], timing)
     steps = round(1.0 / SPEED_STEP)
     surfaces = np.array([name != "V" for name in controller.outputs])
     no_delay = np.zeros(len(loop.inputs))

@@ -15,6 +15,7 @@ from aircraft_sim.plant.dynamics import Aircraft
 from aircraft_sim.sections import Gust
 from aircraft_sim.uncertainty import UNIFORM, Spread, nominal_and_sampled
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.linear_loop.told import Comparison, loop_of
 from flight_core.integrators import rk4
 from flight_core.parameters import require
 from flight_core.vectors import Array, FloatArray
@@ -23,6 +24,8 @@ from reference_model import model
 from reference_model.command import command
 from reference_model.params import SIGNALS, ReferenceModelConfig
 from rise_di_controller.extensions.feedforward import ZERO_REAL_PART
+from rise_di_controller.law.linear_loop import LoopTiming
+from rise_di_controller.params import ControllerConfig
 
 STEP = 0.01
 """s, step of the ideal control. It resolves a gust of one second and hidden modes up to 10 1/s to
@@ -51,6 +54,13 @@ class Effected(NamedTuple):
     T: FloatArray  # (p, m)
 
 
+class Flown(NamedTuple):
+    """The flight of a study: what its aircraft has, beside what the controller was told."""
+
+    scenario: Scenario
+    comparison: Comparison
+
+
 class Study(NamedTuple):
     """The nominal airframe, then N - 1 uncertain airframes, along a manoeuvre.
 
@@ -70,6 +80,17 @@ class Study(NamedTuple):
     effected: Effected | None = None  # None: the entries of `airframe` are uncertain
     seed: int = 1
     spread: Spread = UNIFORM  # with the lags too
+    flown: Flown | None = None  # None: a loop that flies no aircraft yet
+
+    def timing_of(self, controller: ControllerConfig) -> LoopTiming:
+        """Return lags, delay and period of the loop that flies, else as the controller was told."""
+        return loop_of(controller) if self.flown is None else self.flown.comparison.timing
+
+    @property
+    def differences(self) -> list[str]:
+        """How the aircraft that flies differs from what the controller was told, sentences."""
+        flown = self.flown
+        return [] if flown is None else [each.sentence for each in flown.comparison.differences]
 
     @property
     def Omega(self) -> FloatArray:  # noqa: N802 - the paper's name

@@ -1,0 +1,328 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What the controller was told of its aircraft, beside the aircraft that flies.
+
+A linear loop has the lags and the delay of the section `controller`. The section `aircraft` has
+those that fly, and a log what was measured. `compare` says where they differ, and gives the timing
+of the loop that flies. Margins and guarantees are of that loop. A fact that no linear loop holds,
+as a fault, leaves a guarantee unstated.
+"""
+
+from dataclasses import replace
+from enum import Enum, auto
+from typing import NamedTuple
+
+import numpy as np
+
+from aircraft_sim.airframes.airframe import load_airframe
+from aircraft_sim.params import AircraftConfig
+from flight_analysis.closed_loop.scenario import (
+    STOP_TOLERANCE,
+    Scenario,
+    limits_beyond_stops,
+    opposite_signs,
+)
+from flight_core.fields import short_repr
+from flight_core.known_keys import unknown_keys
+from flight_core.vectors import FloatArray
+from rise_di_controller.law.linear_loop import LoopTiming
+from rise_di_controller.params import ControllerConfig
+
+SMALLEST = 1e-6  # s: a microsecond costs no margin that is printed
+SAME_PERIOD = 0.01  # relative: clocks of hosts differ by 1e-4, and a missed tick is none of half
+WAITS = 2.0  # periods of the aircraft: y waits for a tick for up to one, u for the aircraft too
+
+IN_LOOP = frozenset(
+    {
+        *("airframe", "speed", "altitude", "commands", "rate", "step"),
+        *(f"actuators.{key}" for key in ("lag", "delay", "lower", "upper", "rate")),
+        *("sensors.delay", "vanes.channels"),
+        *(f"uncertainty.{key}" for key in ("A", "B", "seed", "number", "entries", "parts")),
+        *("uncertainty.distribution", "uncertainty.wind"),
+    }
+)
+"""Keys of the aircraft that a linear loop has, or that are compared with the controller."""
+
+OUTSIDE_LOOP = frozenset(
+    {
+        # What acts from outside moves no mode of a linear loop.
+        *(f"gusts.*.{key}" for key in ("start", "speed", "length", "every")),
+        *(f"turbulence.{key}" for key in ("altitude", "wind", "sigma", "rotary", "seed")),
+        *(f"bias.*.{key}" for key in ("start", "value", "rise")),
+        *(f"sines.*.{key}" for key in ("amplitude", "frequency", "phase")),
+        *(f"shear.{key}" for key in ("law", "ground", "reference", "roughness", "exponent")),
+        *(f"shear.{key}" for key in ("height", "north", "east")),
+        *(f"microburst.{key}" for key in ("ground", "north", "east", "radius", "speed", "height")),
+        "wind",
+        *(f"sensors.{key}" for key in ("bias", "drift", "noise", "seed")),
+        # The inner loop does not read the place.
+        *(f"start.{key}" for key in ("north", "east", "heading")),
+        *(f"pose.{key}" for key in ("rate", "delay", "bias", "drift", "noise", "seed")),
+        # Products of small rates and angles are of the second order about trim.
+        *("inertial_coupling", "kinematics"),
+        # They act where u is missing.
+        *("max_age", "hold", "ramp"),
+        # How the node runs.
+        *("start_time", "lockstep", "control_rate", "duration", "recorded"),
+    }
+)
+"""Keys of the aircraft that do not change its linear loop about trim."""
+
+
+class Standing(Enum):
+    """What a difference means for margins and guarantee."""
+
+    TAKEN = auto()  # the loop has the value of the aircraft
+    LEFT_OUT = auto()  # no linear loop has it: the margins are without, no guarantee is stated
+    NO_LOOP = auto()  # what flew is not known: neither is stated
+
+
+MEANING = {
+    Standing.TAKEN: "margins and guarantee are those of the aircraft",
+    Standing.LEFT_OUT: "the margins are without it, and no guarantee is stated",
+    Standing.NO_LOOP: "neither margins nor a guarantee are stated",
+}
+
+
+class Difference(NamedTuple):
+    """A fact of the aircraft that is not what the controller was told."""
+
+    fact: str  # key, value of the aircraft, value of the controller
+    standing: Standing
+
+    @property
+    def sentence(self) -> str:
+        """The fact, and what it means."""
+        return f"{self.fact}; {MEANING[self.standing]}"
+
+
+class FlightFacts(NamedTuple):
+    """What is known of a flight beside its scenario; None where a log does not tell."""
+
+    is_simulated: bool = True  # whether the aircraft of the scenario flew
+    tick: float | None = None  # s, median period of the ticks
+    y_period: float | None = None  # s, median period of y
+    age: float | None = None  # s, mean age of u at the aircraft
+    # the aircraft after each change in flight
+    later: tuple[AircraftConfig, ...] = ()
+    has_parameters: bool = True  # whether the parameters that flew are those of the file
+
+
+PLANNED = FlightFacts()
+"""A flight of the scenario as it stands."""
+
+
+class Comparison(NamedTuple):
+    """The loop that flies, and how it differs from the one that the controller was told."""
+
+    timing: LoopTiming
+    differences: tuple[Difference, ...]
+
+
+def loop_of(controller: ControllerConfig) -> LoopTiming:
+    """Return the timing of the loop that the controller was told."""
+    lag = np.array(controller.lag, dtype=np.float64)
+    return LoopTiming(lag, controller.delay, 1.0 / controller.rate)
+
+
+def compare(
+    scenario: Scenario, controller: ControllerConfig, flight: FlightFacts = PLANNED
+) -> Comparison:
+    """Compare what a controller was told with the aircraft that flies it.
+
+    Where the two agree, the timing is that of the controller to the last bit.
+    """
+    timing = loop_of(controller)
+    differences = [*_of_log(controller, flight)]
+    if flight.is_simulated:
+        lag, others = _compare_lags(scenario, controller)
+        timing = timing._replace(lag=lag)
+        flown = [scenario, *(replace(scenario, aircraft=each) for each in flight.later)]
+        for each in flown:
+            others += _beyond_loop(each, controller)
+        differences += others
+    delay, late = _compare_delays(scenario, controller, flight)
+    differences += late
+    return Comparison(timing._replace(delay=delay), tuple(dict.fromkeys(differences)))
+
+
+def lag_through(effect: FloatArray, T: FloatArray, lag: FloatArray) -> FloatArray:
+    """Return the lags of the inputs v of a law behind u = T v, (m,), s.
+
+        lag_i = sum_j effect_ij T_ji lag_j / sum_j effect_ij T_ji,  exact to first order in the lags
+
+    Arguments: `effect` (m, p) of the p effectors on the outputs, T (p, m), lag (p,) in s. Where the
+    effectors have no effect the longest lag counts.
+    """
+    share = effect * T.T
+    total = share.sum(axis=1)
+    mean = np.maximum(share @ lag, 0.0) / np.where(total > 0.0, total, 1.0)
+    return np.where(total > 0.0, mean, np.max(lag, initial=0.0))
+
+
+def flown_lag(aircraft: AircraftConfig, controller: ControllerConfig) -> FloatArray:
+    """Return the lags of the aircraft's actuators in the inputs of the law, (m,), s."""
+    names = tuple(aircraft.channels().inputs)
+    lags = dict(zip(names, aircraft.actuators.lag or (0.0,) * len(names), strict=True))
+    lag = np.array([lags[name] for name in controller.effectors])
+    allocation = controller.allocation
+    if allocation is None:
+        return lag
+    T = np.reshape(allocation.T, (len(lag), -1))
+    if aircraft.is_jsbsim:
+        return lag_through(np.reshape(allocation.effect, (-1, len(lag))), T, lag)
+    return lag_through(_effect(aircraft, controller), T, lag)
+
+
+def _compare_lags(
+    scenario: Scenario, controller: ControllerConfig
+) -> tuple[FloatArray, list[Difference]]:
+    """Compare the lags: (those that fly, the differences).
+
+    A model of JSBSim has actuators of its own, whose lag is not among the keys of the aircraft: the
+    controller may be told of more than these, and of no less.
+    """
+    lag = np.array(controller.lag, dtype=np.float64)
+    flown = flown_lag(scenario.aircraft, controller)
+    differences = []
+    for i, name in enumerate(controller.inputs):
+        least, most = flown[i], np.inf if scenario.aircraft.is_jsbsim else flown[i]
+        if _is_within(lag[i], least, most):
+            continue
+        fact = (
+            f"aircraft.actuators.lag: the aircraft has {flown[i]:.6g} s in {name}, "
+            f"controller.lag {lag[i]:.6g} s"
+        )
+        lag[i] = flown[i]
+        differences.append(Difference(fact, Standing.TAKEN))
+    return lag, differences
+
+
+def _compare_delays(
+    scenario: Scenario, controller: ControllerConfig, flight: FlightFacts
+) -> tuple[float, list[Difference]]:
+    """Compare the delays beyond sampling: (the one that flies, the differences).
+
+    y and u each wait for the next instant of the other side, in simulation up to a period of the
+    aircraft. A controller may be told any delay in that range, and the longest is taken for one
+    outside of it. An aircraft of one's own has a transport that nothing tells. A law steps with
+    each y, so that a y less frequent than the ticks is one and a half of its periods late in place
+    of one and a half ticks.
+    """
+    aircraft = scenario.aircraft
+    told_delay = controller.delay
+    least, most, parts = 0.0, np.inf, []
+    if flight.is_simulated:
+        least = aircraft.sensors.delay + aircraft.actuators.delay
+        most = least + WAITS / aircraft.rate
+        parts.append("aircraft.sensors.delay, actuators.delay")
+    rare = 1.5 * ((flight.y_period or 0.0) - 1.0 / controller.rate)
+    if rare > SAME_PERIOD / controller.rate:
+        least, most = least + rare, most + rare
+        parts.append(f"y every {1e3 * (flight.y_period or 0.0):.3g} ms")
+    differences = []
+    delay = told_delay
+    if not _is_within(told_delay, least, most):
+        delay = most if np.isfinite(most) else least
+        span = f"{least:.6g} s to {most:.6g} s" if np.isfinite(most) else f"{least:.6g} s or more"
+        fact = f"{', '.join(parts)}: {span} in flight, controller.delay {told_delay:.6g} s"
+        differences.append(Difference(fact, Standing.TAKEN))
+    # u is held for a tick: a mean within one is no other delay
+    if flight.age is not None and flight.age - delay >= 1.0 / controller.rate:
+        delay = flight.age
+        fact = f"age of u: {flight.age:.3g} s in the log, controller.delay {told_delay:.6g} s"
+        differences.append(Difference(fact, Standing.TAKEN))
+    return float(delay), differences
+
+
+def _is_within(value: float, least: float, most: float) -> bool:
+    """Return whether a value is in a range, up to the digits of a file and SMALLEST."""
+    slack = max(SMALLEST, STOP_TOLERANCE * abs(value))
+    return bool(least - slack <= value <= most + slack)
+
+
+def _of_log(controller: ControllerConfig, flight: FlightFacts) -> list[Difference]:
+    """Compare the period and the parameters of the controller with those of the log."""
+    differences = []
+    period = 1.0 / controller.rate
+    if flight.tick is not None and abs(flight.tick - period) > SAME_PERIOD * period:
+        fact = (
+            f"ticks every {1e3 * flight.tick:.3g} ms in the log, controller.rate: every "
+            f"{1e3 * period:.3g} ms"
+        )
+        differences.append(Difference(fact, Standing.NO_LOOP))
+    if not flight.has_parameters:
+        fact = "parameters of the controller: those that flew are not those of the file"
+        differences.append(Difference(fact, Standing.NO_LOOP))
+    return differences
+
+
+def _beyond_loop(scenario: Scenario, controller: ControllerConfig) -> list[Difference]:
+    """Compare end stops, rate limits and signs, and name what no linear loop has."""
+    aircraft = scenario.aircraft
+    known = IN_LOOP | OUTSIDE_LOOP
+    if not controller.vanes:
+        known |= {"vanes.frozen_at", "vanes.dropout"}
+    differences = [
+        Difference(
+            f"aircraft.{each.name}: the aircraft has {short_repr(each.value)}, the loop none",
+            Standing.LEFT_OUT,
+        )
+        for each in unknown_keys(aircraft, known)
+    ]
+    flies = replace(scenario, controller=controller)
+    beyond = (*limits_beyond_stops(flies), *_slew_beyond_rates(flies))
+    differences += [Difference(sentence, Standing.LEFT_OUT) for sentence in beyond]
+    # The loop has B of the airframe, and D of the law.
+    signs = (*opposite_signs(flies), *_other_effect(flies))
+    differences += [Difference(sentence, Standing.TAKEN) for sentence in signs]
+    return differences
+
+
+def _other_effect(scenario: Scenario) -> list[str]:
+    """Return a sentence for each output whose row of allocation.effect is not that of C B.
+
+    Rows are compared up to a factor, which input_scale has.
+    """
+    controller = scenario.controller
+    allocation = controller.allocation
+    if allocation is None or scenario.aircraft.is_jsbsim:
+        return []
+    effects = np.reshape(allocation.effect, (-1, len(allocation.effectors)))
+    sentences = []
+    for name, effect, row in zip(
+        controller.outputs, effects, _effect(scenario.aircraft, controller), strict=True
+    ):
+        factor = effect @ row / max(effect @ effect, np.finfo(float).tiny)
+        off = np.abs(row - factor * effect).max()
+        if factor <= 0.0 or off > STOP_TOLERANCE * np.abs(row).max():
+            values = ", ".join(f"{value:.4g}" for value in row)
+            told_values = ", ".join(f"{value:.4g}" for value in factor * effect)
+            sentences.append(
+                f"effect of the effectors on {name}: the aircraft has {values}, "
+                f"controller.allocation.effect {told_values}"
+            )
+    return sentences
+
+
+def _effect(aircraft: AircraftConfig, controller: ControllerConfig) -> FloatArray:
+    """Return C B of the airframe file by output of the law and effector, (m, p)."""
+    airframe = load_airframe(aircraft.airframe)
+    rows = [airframe.outputs.index(name) for name in controller.outputs]
+    columns = [list(airframe.inputs).index(name) for name in controller.effectors]
+    return np.asarray((airframe.matrix_c() @ airframe.matrix_b())[np.ix_(rows, columns)])
+
+
+def _slew_beyond_rates(scenario: Scenario) -> list[str]:
+    """Return a sentence for each rate limit of the controller above that of the actuator."""
+    controller = scenario.controller
+    names = tuple(scenario.aircraft.channels().inputs)
+    rates = dict(zip(names, scenario.aircraft.actuators.rate or (), strict=False))
+    slews = controller.effector_limits().rate
+    section = "controller" if controller.allocation is None else "controller.allocation"
+    return [
+        f"{section}.slew of {name}: found {slew:g}, expected aircraft.actuators.rate, "
+        f"{rates[name]:g}, or less"
+        for name, slew in zip(controller.effectors, slews.tolist(), strict=True)
+        if name in rates and np.isfinite(slew) and slew > rates[name] * (1.0 + STOP_TOLERANCE)
+    ]
