@@ -16,7 +16,7 @@ import pytest
 import yaml
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
-from tests.nodes.world import INPUTS, World, world_of
+from tests.nodes.world import INPUTS, OUTPUTS, World, world_of
 from tests.other_laws import SECTIONS, example_installed
 from tests.recordings import scenario_file
 from tests.ros.flight_bringup.test_lockstep import ROUGH
@@ -26,12 +26,14 @@ from flight_analysis.closed_loop.scenario import Scenario, load_scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.graph import ONE_PROCESS, parameter_overrides
+from flight_core.channels import POSE
 from flight_core.outcome import FlightEnded
+from flight_core.rates import NANOSECONDS
 from flight_guidance.guidance_state import Lateral
 from flight_guidance.node import GuidanceNode
 from flight_ros.event_loop import require_input
 from flight_ros.flight_node import FlightNode
-from flight_ros.messages import Encoder
+from flight_ros.messages import Encoder, instant
 from flight_ros.topics import LIVELINESS
 from reference_model.node import ReferenceModelNode
 from rise_di_controller.node import ControllerNode
@@ -127,6 +129,50 @@ def test_guided_flight_in_lockstep_is_that_of_one_process_and_goes_home_without_
     # One at each instant but the first: y takes 10 ms.
     assert len([sample for sample in world.vectors("/u_m") if sample.channels]) == 100
     assert len(world.sent["/odometry"]) == 20  # 2 s at 10 Hz
+
+
+STRANGERS = (
+    b"",
+    b"\x00\x01",
+    Encoder((), "").encode(0, np.zeros(0)),
+    Encoder((), "/stranger").encode(10 * NANOSECONDS, np.zeros(0)),
+    Encoder(OUTPUTS, "/stranger").encode(0, np.ones(4)),
+    Encoder(INPUTS, "/controller").encode(0, np.ones(4)),
+    Encoder(OUTPUTS, "/aircraft").encode(0, np.ones(4)),
+    Encoder(POSE, "/aircraft").encode(0, np.ones(len(POSE))),
+    Encoder(OUTPUTS, "/reference_model").encode(0, np.ones(4)),
+    Encoder(("phi", *OUTPUTS), "/guidance").encode(0, np.ones(5)),
+    bytes(20_000),
+    instant(1_700_000_000 * NANOSECONDS),
+)
+
+
+@pytest.mark.parametrize(
+    "name, topic",
+    [
+        ("osprey_gust", "/y"),
+        ("osprey_gust", "/y_m"),
+        ("osprey_gust", "/u"),
+        ("osprey_gust", "/clock"),
+        ("osprey_route", "/y"),
+        ("osprey_route", "/pose"),
+        ("osprey_route", "/u_m"),
+    ],
+)
+def test_messages_of_a_stranger_change_no_bit_of_a_lockstep_flight(
+    name: str, topic: str, tmp_path: Path
+) -> None:
+    scenario = varied(tmp_path, name, flight={"duration": 0.5})
+    with lockstep(scenario, tmp_path) as (world, nodes):
+        (kind,) = {each.msg_type for each in world.subscriptions if each.topic_name == topic}
+        rounds = 0
+        while any(node.advance() for node in nodes):
+            rounds += 1
+            for raw in STRANGERS if rounds > 20 else ():
+                # The flight has begun. A stranger has sent few messages, or many.
+                world.deliver(topic, kind, raw, 1 if rounds % 2 else 10**6)
+        world.sent[topic] = [sent for sent in world.sent[topic] if sent[1] not in STRANGERS]
+        require_equal(world, scenario)
 
 
 def test_flight_that_waits_for_a_refused_sample_ends_with_the_reason(

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from tests.joint_states import JOINT_STATE, STORE, vector
 
-from flight_core.publisher_lock import PublisherLock
+from flight_core.publisher_lock import LockstepLock, PublisherLock
 from flight_core.vectors import ChannelError, StampedVector
 from flight_ros import messages
 from flight_ros.messages import MAX_SIZE, Decoder, Encoder, NamedDecoder, require_size
@@ -30,13 +30,19 @@ class Topic(PolledSubscription):
         self.topic = Y
         self.name = "/y"
         self.messages: list[bytes] = []
+        self.numbers: list[int] = []
         self.lines: list[tuple[str, str]] = []
 
     def take(self, most: int | None = None) -> list[ReceivedMessage]:
         """The messages, without metadata."""
         taken = self.messages[:most]
         self.messages = self.messages[most or len(self.messages) :]
-        return [ReceivedMessage(message, 0, 0, 0) for message in taken]
+        numbers = self.numbers or [0] * len(taken)
+        self.numbers = self.numbers[len(taken) :]
+        return [
+            ReceivedMessage(message, 0, 0, number)
+            for message, number in zip(taken, numbers, strict=True)
+        ]
 
     def get_logger(self) -> Any:
         """Itself."""
@@ -52,17 +58,18 @@ class Topic(PolledSubscription):
 
 
 class Setup:
-    """A receiver with what it decoded and took."""
+    """A receiver with what it decoded and took. `locked` None is the lock of a lockstep flight."""
 
     def __init__(
-        self, *, locked: bool = True, max_age: int | None = None, max_size: int | None = None
+        self, *, locked: bool | None = True, max_age: int | None = None, max_size: int | None = None
     ) -> None:
         self.topic = Topic()
         self.refusals = Refusals(self.topic)
         self.decoded: list[bytes] = []
         self.taken: list[StampedVector] = []
         self._decoder = Decoder(NAMES)
-        lock = PublisherLock(lambda: (MAX_AGE, TAKEOVER)) if locked else None
+        locks = {True: PublisherLock(lambda: (MAX_AGE, TAKEOVER)), None: LockstepLock()}
+        lock = locks.get(locked)
         max_age_ns = None if max_age is None else lambda: max_age
         self.receiver = Receiver(
             self.topic,
@@ -126,7 +133,7 @@ def test_long_message_is_not_decoded(size: int, sender: str) -> None:
     assert setup.poll(of_size(size, sender)) == [False]
     assert setup.receiver.receive() == []
     setup.topic.messages.append(of_size(size, sender))
-    assert setup.receiver.receive() == [None]  # in lockstep
+    assert setup.receiver.receive() == []  # in lockstep
     assert setup.decoded == []
     assert setup.refusals.counts == {"y: size": 2}
     # one line, for it is the same topic and reason
@@ -262,12 +269,82 @@ def test_stamps_are_limited_both_ways(stamp_ns: int, reason: str) -> None:
     assert setup.refusals.counts == ({f"y: {reason}": 1} if reason else {})
 
 
+def lockstep(setup: Setup, *messages: tuple[bytes, int]) -> list[int | None]:
+    """The stamps of the instants that messages with these numbers are; None has no sample."""
+    setup.topic.messages += [raw for raw, _ in messages]
+    setup.topic.numbers += [number for _, number in messages]
+    return [sample and sample.stamp_ns for sample in setup.receiver.receive()]
+
+
+EMPTY = Encoder((), "/aircraft#1").encode(0, np.zeros(0))
+STRANGERS = {
+    "no bytes": (b"", 1, "malformed"),
+    "two bytes": (b"\x00\x01", 1, "malformed"),
+    "a header without a sender": (message()[:12], 1, "malformed"),
+    "a foreign sample": (message("/foreign"), 1, "sender"),
+    "foreign bytes": (message("/foreign")[:40], 1, "sender"),
+    "no channels and no sender": (Encoder((), "").encode(0, np.zeros(0)), 1, "sender"),
+    "another encoding": (b"\x00\x07" + message()[2:], 1, "malformed"),
+    "a long message": (of_size(MAX_SIZE + 1), 1, "size"),
+    "a sample under the name of the flight": (message(), 1, "sender"),
+    "no channels under the name of the flight": (EMPTY, 70, "sender"),
+    "bytes under the name of the flight": (message()[:60], 1, "sender"),
+}
+
+
+@pytest.mark.parametrize("raw, number, reason", STRANGERS.values(), ids=STRANGERS)
+def test_message_of_a_stranger_is_no_instant_of_a_lockstep_flight(
+    raw: bytes, number: int, reason: str
+) -> None:
+    """Each message of the flight's publisher is an instant, and each other one is nothing."""
+    setup = Setup(locked=None, max_age=MAX_AGE)
+    own = [(message(stamp_ns=10 * k), 7 + k) for k in range(4)]
+    assert lockstep(setup, own[0], (raw, number), own[1]) == [0, 10]
+    assert lockstep(setup, (raw, number)) == []
+    assert lockstep(setup, own[2], own[3]) == [20, 30]
+    assert setup.refusals.counts == {f"y: {reason}": 2}
+
+
+@pytest.mark.parametrize(
+    "raw",
+    [b"", message()[:50], message("/foreign", stamp_ns=2 * MAX_AGE), message("/foreign", q=np.nan)],
+)
+def test_invalid_message_before_a_lockstep_flight_is_no_instant(raw: bytes) -> None:
+    setup = Setup(locked=None, max_age=MAX_AGE)
+    assert lockstep(setup, (raw, 3), (EMPTY, 1), (message(stamp_ns=10), 2)) == [None, 10]
+
+
+def test_refused_content_of_the_flights_publisher_is_an_instant_without_a_sample() -> None:
+    setup = Setup(locked=None, max_age=MAX_AGE)
+    refused = message(stamp_ns=10, q=np.nan)
+    found = lockstep(setup, (message(), 1), (refused, 2), (message(stamp_ns=20), 3))
+    assert found == [0, None, 20]
+    assert setup.refusals.counts == {"y: finite": 1}
+
+
+def test_polled_topic_of_a_lockstep_flight_is_locked_by_a_message_without_channels() -> None:
+    """As u: the controller says at each instant that there is none yet."""
+    setup = Setup(locked=None, max_age=MAX_AGE)
+    foreign = [message("/foreign"), Encoder((), "").encode(0, np.zeros(0))]
+    assert setup.poll(EMPTY, *foreign, message(), *foreign) == [
+        True,
+        False,
+        False,
+        True,
+        *[False] * 2,
+    ]
+    later = message("/foreign", stamp_ns=10**9)
+    assert setup.poll(later, now_ns=10**9) == [False]  # it never times out
+    assert len(setup.taken) == 1
+
+
 def test_received_sample_is_accepted_as_polled() -> None:
     """Lockstep: all messages are decoded, then accepted at their instants."""
     setup = Setup(max_age=MAX_AGE)
     setup.topic.messages += [message(), b"", message("/foreign"), message(stamp_ns=500)]
     samples = setup.receiver.receive()
-    assert [sample is None for sample in samples] == [False, True, False, False]
+    # bytes and the foreign sample are no instant
+    assert [sample is None for sample in samples] == [False, False]
     for sample in samples:
         if sample is not None:
             setup.receiver.accept(sample, 0)

@@ -16,7 +16,7 @@ from aircraft_sim.params import AircraftConfig
 from aircraft_sim.pose import every
 from aircraft_sim.simulator import Simulator
 from flight_core import channels
-from flight_core.publisher_lock import PublisherLock
+from flight_core.publisher_lock import LockstepLock
 from flight_core.rates import nanoseconds, period_ns, seconds
 from flight_core.text import bounded
 from flight_core.vectors import FloatArray, StampedVector
@@ -46,7 +46,7 @@ class AircraftNode(FlightNode[AircraftConfig]):
         self._u = np.zeros(len(self._simulator.inputs))  # the newest
         held_ns = nanoseconds(self.parameters.max_age + self.parameters.hold)
         self._applied = AppliedInput(len(self._u), held_ns, nanoseconds(self.parameters.ramp))
-        self._publisher_lock = PublisherLock(self._timeouts_ns)
+        self._publisher_lock = self.publisher_lock(self._timeouts_ns)
         self._timeout_logged = False
         # ns, since the last diagnostics, by the own clock: a u has the stamp of its y.
         self._ages_of_u: list[int] = []
@@ -67,6 +67,7 @@ class AircraftNode(FlightNode[AircraftConfig]):
             self._end_ns = nanoseconds(self.parameters.duration) or None
             self._empty_encoder = self.encoder(())
             self._recorded_subscription = self.subscribe(RECORDED)
+            self._recorded_lock = LockstepLock()
             self._publish_clock = self.advertise(CLOCK)
 
     def period_ns(self) -> int:
@@ -147,8 +148,8 @@ class AircraftNode(FlightNode[AircraftConfig]):
         if not self.parameters.recorded:
             return False
         subscription = self._recorded_subscription
-        for stamp_ns in self.refusals.stamps(subscription, subscription.take()):
-            self._recorded_ns = stamp_ns
+        stamps = self.refusals.stamps(subscription, subscription.take(), self._recorded_lock)
+        self._recorded_ns = stamps[-1] if stamps else self._recorded_ns
         return self._number * self.period_ns() >= self._recorded_ns + WINDOW * self.period_ns()
 
     def awaited_topic(self) -> str:
@@ -162,8 +163,11 @@ class AircraftNode(FlightNode[AircraftConfig]):
         """
         publisher = self._publisher_lock.publisher
         u = self._u
-        # In lockstep there is one u for each y.
-        valid = self._u_receiver.poll(now_ns, 1 if self.parameters.lockstep else None)
+        # In lockstep there is one u for each y, and what is refused is none.
+        most = 1 if self.parameters.lockstep else None
+        valid = self._u_receiver.poll(now_ns, most)
+        while most and valid == [False]:
+            valid = self._u_receiver.poll(now_ns, most)
         if transfer := self._publisher_lock.publisher != publisher:
             self.get_logger().info(bounded(f"receiving u from {self._publisher_lock.publisher}"))
             if publisher is None and not self.parameters.lockstep:

@@ -13,6 +13,7 @@ from flight_core.vectors import ChannelError
 SHARED_NS = NANOSECONDS
 """A name counts as shared for this long after the last witness: longer than the age limits of y and
 u, so the failsafe begins."""
+FOREVER_NS = 2**63  # longer than any flight
 SENDER = "sender"  # the reason of a ChannelError for a sample of a conflicting publisher
 
 
@@ -114,3 +115,36 @@ class PublisherLock:
             raise ChannelError(
                 SENDER, f"two publishers send under the name {sender}: none is taken"
             )
+
+
+class LockstepLock(PublisherLock):
+    """Locks a topic of a lockstep flight to the publisher of its first message, for good.
+
+    There each message is an instant, so a message of anybody else must not count. No message is
+    lost in lockstep, so the numbers of one publisher go on by one: another number belongs to a
+    second publisher under the same name, and only that message is refused. A topic whose messages
+    name no sender has the sender "".
+    """
+
+    def __init__(self) -> None:
+        super().__init__(lambda: (FOREVER_NS, FOREVER_NS))
+
+    def require_alone(self, sender: str, sequence: int, now_ns: int) -> None:
+        """Raise ChannelError, reason "sender", unless the message is the next one by its number."""
+        expected = self._sequence + 1
+        if self.publisher is None:
+            self._sequence = 0  # of a message that was refused
+        elif self._sequence and sequence not in {0, expected}:
+            raise ChannelError(
+                SENDER,
+                f"message {sequence} under the name {sender or 'of the flight'} ignored: expected "
+                f"message {expected}, so a second publisher sends",
+            )
+        self._sequence = sequence or self._sequence
+
+    def refresh(self, sender: str, now_ns: int) -> bool:
+        """Lock to the publisher of a message. Return whether the publisher has changed."""
+        has_changed = sender != self.publisher
+        self.publisher = sender
+        self._received_ns = now_ns
+        return has_changed

@@ -22,7 +22,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from flight_core import channels
 from flight_core.modes import Mode
 from flight_core.parameters import ParameterError, require
-from flight_core.publisher_lock import PublisherLock, require_sender
+from flight_core.publisher_lock import LockstepLock, require_sender
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns, seconds
 from flight_core.vectors import ChannelError, StampedVector, select
 from flight_guidance.guidance import Guidance, GuidanceOutput
@@ -262,7 +262,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         decode: Callable[[bytes], StampedVector | None],
         take: Callable[[StampedVector, int], None],
     ) -> Receiver[StampedVector]:
-        lock = PublisherLock(self._timeouts_ns)
+        lock = self.publisher_lock(self._timeouts_ns)
         return self.receive(topic, decode, take, max_age_ns=self._max_age_ns, lock=lock)
 
     def _decode_pose(self, raw: bytes) -> StampedVector:
@@ -327,7 +327,8 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
             Decoder(AUTHORITY_CHANNELS).decode,
             self._take_authority,
             max_age_ns=None if self.parameters.lockstep else self._max_age_ns,
-            lock=None,  # that of `internals`: of the controller that flies
+            # In real time that of `internals`: of the controller that flies.
+            lock=LockstepLock() if self.parameters.lockstep else None,
             qos=LOCKSTEP if self.parameters.lockstep else NEWEST_SAMPLES,
         )
 

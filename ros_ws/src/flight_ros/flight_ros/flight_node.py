@@ -18,7 +18,7 @@ from rclpy.qos import QoSProfile
 
 from flight_core.outcome import LostContact
 from flight_core.parameters import NodeConfig, ParameterError, flatten, require
-from flight_core.publisher_lock import PublisherLock
+from flight_core.publisher_lock import LockstepLock, PublisherLock
 from flight_core.rates import NANOSECONDS, nanoseconds, seconds
 from flight_core.text import bounded
 from flight_ros.clocks import PeerClocks
@@ -220,6 +220,10 @@ class FlightNode(Node, Generic[P]):
         )
         self.receivers.append(receiver)
         return receiver
+
+    def publisher_lock(self, timeouts_ns: Callable[[], tuple[int, int]]) -> PublisherLock:
+        """Create the lock of a topic. In lockstep it holds for good, without the timeouts."""
+        return LockstepLock() if self.parameters.lockstep else PublisherLock(timeouts_ns)
 
     def encoder(self, names: Sequence[str]) -> Encoder:
         """Encoder of the samples of the node."""

@@ -13,7 +13,7 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 from rclpy.node import Node
 
-from flight_core.publisher_lock import SENDER, PublisherLock
+from flight_core.publisher_lock import SENDER, LockstepLock, PublisherLock
 from flight_core.rates import NANOSECONDS
 from flight_core.vectors import ChannelError, require_not_future, require_not_old
 from flight_ros.messages import MAX_SIZE, require_size, sender_of, stamp_of
@@ -101,9 +101,27 @@ class Refusals:
                 self.add(source, error.reason, str(error))
         return pairs
 
-    def stamps(self, source: Source, messages: Iterable[ReceivedMessage]) -> list[int]:
-        """The stamps at the begin of messages, ns. A message without a stamp is refused."""
-        return [stamp_ns for stamp_ns, _ in self.decoded(source, messages, stamp_of)]
+    def stamps(
+        self,
+        source: Source,
+        messages: Iterable[ReceivedMessage],
+        lock: LockstepLock | None = None,
+    ) -> list[int]:
+        """Return the stamps at the begin of messages, ns.
+
+        Refuse a message without a stamp, and with a `lock` those of a second publisher.
+        """
+        stamps = []
+        for stamp_ns, received in self.decoded(source, messages, stamp_of):
+            if lock is not None:
+                try:
+                    lock.require_alone("", received.sequence, 0)
+                except ChannelError as error:
+                    self.add(source, error.reason, str(error))
+                    continue
+                lock.refresh("", 0)
+            stamps.append(stamp_ns)
+        return stamps
 
     def since(self, subscription: PolledSubscription, begin_ns: int) -> str:
         """The last refusal of a topic since an instant of the monotonic clock.
@@ -185,24 +203,38 @@ class Receiver(Generic[S]):
         `sequence`: as of `PublisherLock.require_alone`.
         """
         try:
-            require_size(raw, self._max_size)
-            if self.lock is not None:
-                if (sender := sender_of(raw)) is None:
-                    raise ChannelError("malformed", "a message without a header in plain CDR")
-                self.lock.check(sender, now_ns)
-                if (
-                    not self._grows
-                    and len(raw) > GROWTH * self._longest
-                    and self.lock.holds(sender, now_ns)
-                ):
-                    require_size(raw, GROWTH * self._longest)
+            sender = self._require_publisher(raw, now_ns)
+            if isinstance(self.lock, LockstepLock):
+                self._require_next(raw, now_ns, sender, sequence)
+                sequence = 0
             if (sample := self._decode(raw)) is not None:
                 self._accept(sample, now_ns, sequence)
                 self._longest = max(self._longest, len(raw))
+            elif isinstance(self.lock, LockstepLock):
+                self.lock.refresh(sender, now_ns)
         except ChannelError as error:
             self._refusals.add(self.subscription, error.reason, str(error))
             return False
         return True
+
+    def _require_publisher(self, raw: bytes, now_ns: int) -> str:
+        """Return the sender of a message; "" where the topic has no lock.
+
+        Raise ChannelError for a message that is too long, or of a conflicting publisher.
+        """
+        require_size(raw, self._max_size)
+        if self.lock is None:
+            return ""
+        if (sender := sender_of(raw)) is None:
+            raise ChannelError("malformed", "a message without a header in plain CDR")
+        self.lock.check(sender, now_ns)
+        if (
+            not self._grows
+            and 0 < GROWTH * self._longest < len(raw)
+            and self.lock.holds(sender, now_ns)
+        ):
+            require_size(raw, GROWTH * self._longest)
+        return sender
 
     def slowness(self, max_age_ns: int) -> str:
         """Why samples at their rate exceed an age limit at times, as a sentence.
@@ -227,19 +259,42 @@ class Receiver(Generic[S]):
         return f"{slow}: {mend}" if fit < FEWEST else ""
 
     def receive(self) -> list[S | None]:
-        """Lockstep: decode the messages since the last call, for `accept`.
+        """Lockstep: decode the messages of the flight's publisher, for `accept`.
 
-        None: without channels, or refused.
+        None is an instant without a sample: the publisher sent no channels, or content that is
+        refused. A message of anybody else has no effect, because each message is an instant.
         """
         samples: list[S | None] = []
         for received in self.subscription.take():
             try:
-                require_size(received.message, self._max_size)
-                samples.append(self._decode(received.message))
+                sender = self._require_publisher(received.message, 0)
+                self._require_next(received.message, 0, sender, received.sequence)
             except ChannelError as error:
                 self._refusals.add(self.subscription, error.reason, str(error))
-                samples.append(None)
+                continue
+            try:
+                sample = self._decode(received.message)
+            except ChannelError as error:
+                self._refusals.add(self.subscription, error.reason, str(error))
+                # Before the first valid message nobody knows whose a message is.
+                if self.lock is None or self.lock.publisher is None:
+                    continue
+                sample = None
+            if self.lock is not None:
+                self.lock.refresh(sender, 0)
+            samples.append(sample)
         return samples
+
+    def _require_next(self, raw: bytes, now_ns: int, sender: str, sequence: int) -> None:
+        """Lockstep: refuse a message that is not the next one of the flight's publisher.
+
+        The first message has a stamp of the flight.
+        """
+        if self.lock is None:
+            return
+        if self.lock.publisher is None:
+            self._require_stamp(stamp_of(raw), now_ns, sender)
+        self.lock.require_alone(sender, sequence, now_ns)
 
     def accept(self, sample: S, now_ns: int) -> None:
         """Check and take a decoded sample."""
@@ -251,18 +306,21 @@ class Receiver(Generic[S]):
     def _accept(self, sample: S, now_ns: int, sequence: int = 0) -> None:
         if self.lock is not None:
             self.lock.check(sample.sender, now_ns)
-        if self._max_age_ns is not None:
-            max_age_ns = self._max_age_ns()
-            try:
-                require_not_future(sample.stamp_ns, now_ns, max_age_ns)
-                require_not_old(sample.stamp_ns, now_ns, max_age_ns)
-            except ChannelError as error:
-                raise ChannelError(
-                    error.reason, f"{error}{self._refusals.clock_of(sample.sender)}"
-                ) from None
+        self._require_stamp(sample.stamp_ns, now_ns, sample.sender)
         if self.lock is not None:
             self.lock.require_alone(sample.sender, sequence, now_ns)
         self._take(sample, now_ns)
         self._stamps_ns.append(sample.stamp_ns)
         if self.lock is not None:
             self.lock.refresh(sample.sender, now_ns)
+
+    def _require_stamp(self, stamp_ns: int, now_ns: int, sender: str) -> None:
+        """Raise ChannelError for a stamp further from the present than the age limit, if any."""
+        if self._max_age_ns is None:
+            return
+        max_age_ns = self._max_age_ns()
+        try:
+            require_not_future(stamp_ns, now_ns, max_age_ns)
+            require_not_old(stamp_ns, now_ns, max_age_ns)
+        except ChannelError as error:
+            raise ChannelError(error.reason, f"{error}{self._refusals.clock_of(sender)}") from None

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from flight_core.channels import ATTITUDE
-from flight_core.publisher_lock import PublisherLock
+from flight_core.publisher_lock import LockstepLock
 from flight_core.rates import nanoseconds, period_ns
 from flight_core.vectors import ChannelError, FloatArray
 from flight_ros.flight_node import FlightNode
@@ -53,8 +53,9 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
             self._clock_ns = -1
             self._next: FloatArray | None = None
             self._clock_subscription = self.subscribe(CLOCK)
+            self._clock_lock = LockstepLock()
         if self._u_m_ns or not self.parameters.lockstep:
-            lock = PublisherLock(self._timeouts_ns)
+            lock = self.publisher_lock(self._timeouts_ns)
             self._u_m = self.receive(
                 U_M, self._decode_u_m, self._take_u_m, lock=lock, max_age_ns=self._max_age_ns
             )
@@ -116,7 +117,7 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
 
     def advance(self) -> bool:
         subscription = self._clock_subscription
-        stamps = self.refusals.stamps(subscription, subscription.take())
+        stamps = self.refusals.stamps(subscription, subscription.take(), self._clock_lock)
         self._clock_ns = max([self._clock_ns, *stamps])
         advanced = False
         while True:

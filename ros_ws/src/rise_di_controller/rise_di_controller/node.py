@@ -13,7 +13,6 @@ from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallba
 
 from flight_core.channels import without_effect
 from flight_core.modes import Mode
-from flight_core.publisher_lock import PublisherLock
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns, seconds
 from flight_core.text import bounded
 from flight_core.vectors import ChannelError, StampedVector
@@ -86,7 +85,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
                 Decoder(names).decode,
                 take,
                 max_age_ns=self._max_age_ns,
-                lock=self._new_lock(),
+                lock=self.publisher_lock(self._timeouts_ns),
             )
             for topic, (names, take) in ((Y, y_input), (Y_M, y_m_input))
         )
@@ -235,10 +234,6 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
     def _max_age_ns(self) -> int:
         return nanoseconds(self.parameters.max_age)
 
-    def _new_lock(self) -> PublisherLock | None:
-        """None in lockstep, where each sample of y is an instant, of any publisher."""
-        return None if self.parameters.lockstep else PublisherLock(self._timeouts_ns)
-
     def _timeouts_ns(self) -> tuple[int, int]:
         """Ages above which a publisher has timed out, ns.
 
@@ -313,7 +308,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
             self._decode_proposal,
             self._take_proposal,
             max_age_ns=None,  # `Learning` bounds it
-            lock=None if parameters.lockstep else PublisherLock(lambda: timeouts_ns),
+            lock=self.publisher_lock(lambda: timeouts_ns),
             qos=LOCKSTEP if parameters.lockstep else PROPOSALS,
             max_size=MAX_REPORT_SIZE,
         )

@@ -17,7 +17,6 @@ from flight_analysis.closed_loop.learning_loop import Identifications, LearnerRe
 from flight_analysis.closed_loop.scenario import load_scenario
 from flight_core.modes import Mode
 from flight_core.parameters import ParameterError
-from flight_core.publisher_lock import PublisherLock
 from flight_core.rates import NANOSECONDS, nanoseconds
 from flight_core.vectors import StampedVector
 from flight_design.learning.params import LearnerConfig
@@ -66,7 +65,7 @@ class LearnerNode(FlightNode[LearnerConfig]):
             Decoder(names).decode,
             self._take,
             max_age_ns=None,  # the samples wait for a search
-            lock=None if lockstep else PublisherLock(self._timeouts_ns),
+            lock=self.publisher_lock(self._timeouts_ns),
             qos=LOCKSTEP if lockstep else RECORD_FOREIGN,
         )
         self._publish, self._publish_learned = self.advertise(PROPOSAL), self.advertise(LEARNED)
