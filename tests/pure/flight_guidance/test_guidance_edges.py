@@ -15,6 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pytest import approx
 from tests.closed_loop import calm_osprey as calm
+from tests.conftest import REPOSITORY
 
 from flight_analysis.closed_loop.guidance_replay import replay_guidance
 from flight_analysis.closed_loop.scenario import Scenario
@@ -343,3 +344,61 @@ def test_pose_with_nan_refused() -> None:
     pose: FloatArray = np.full(len(POSE), np.nan)
     with pytest.raises(ChannelError, match="a value of nan"):
         made.take_pose(StampedVector(0, pose), 0)
+
+
+AUTHORITIES = (0.0, 1e-9, 0.3, 10.0, UNKNOWN)  # rad/s^2 and m/s^2
+HEXAROTOR = REPOSITORY / "examples" / "hexarotor" / "hexarotor_square.yaml"
+
+
+def _fly(made: Guidance, k: int, altitude: float = 0.0, north: float = 0.0) -> Any:
+    """A step of a slow motion, for airplane and multicopter."""
+    t_ns = k * made.period_ns
+    pose = dict.fromkeys(POSE, 1e-6 * k) | {"north": north, "altitude": altitude, "v_north": 3.0}
+    made.take_pose(StampedVector(t_ns, np.array([pose[name] for name in POSE])), t_ns)
+    made.take_y(StampedVector(t_ns, np.full(len(made._params.outputs), 1e-6 * k)), t_ns)
+    return made.step(t_ns, t_ns)
+
+
+def _section(kind: str, **changes: Any) -> GuidanceConfig:
+    section = find_scenario(str(HEXAROTOR) if kind == "multicopter" else "osprey_route").guidance
+    assert section is not None
+    values = section.model_dump(exclude_unset=True) | changes
+    return GuidanceConfig.validate_mapping(values, "guidance")
+
+
+@pytest.mark.parametrize("kind", ["multicopter", "airplane"])
+@pytest.mark.parametrize("authority", AUTHORITIES)
+def test_aircraft_flies_home_whatever_authority_is_learned(kind: str, authority: float) -> None:
+    """Also by itself once the link is lost, where an exception would fail each step."""
+    made = Guidance(_section(kind, home={"link_timeout": 0.5}))
+    for k in range(5):
+        _fly(made, k)
+    made.take_authority(dict.fromkeys(AUTHORITY, authority))
+    assert made.home()
+    assert made.hold()
+    assert all(_fly(made, k) is not None for k in range(5, 100))
+    assert made.failed == 0
+    assert made.state is not None
+    assert made.state.target.altitude == 0.0
+
+
+@pytest.mark.parametrize("kind", ["multicopter", "airplane"])
+@pytest.mark.parametrize("service", ["home", "hold", "lost link"])
+@pytest.mark.parametrize("altitude, expected", [(900.0, 120.0), (-300.0, -20.0), (50.0, 50.0)])
+def test_aircraft_beyond_its_altitudes_goes_to_the_nearest_permitted_one(
+    kind: str, service: str, altitude: float, expected: float
+) -> None:
+    """As after an updraught: the altitude of now is no command that guidance may take."""
+    changes: dict[str, Any] = {"ceiling": 120.0, "altitude_floor": -20.0}
+    changes["home"] = {"link_timeout": 0.5}
+    made = Guidance(_section(kind, **changes))
+    made.keep_link()
+    for k in range(5):
+        _fly(made, k, altitude)
+    if service != "lost link":
+        assert getattr(made, service)()
+    steps = range(5, 100 if service == "lost link" else 10)
+    assert all(_fly(made, k, altitude) is not None for k in steps)
+    assert made.failed == 0
+    assert made.state is not None
+    assert made.state.target.altitude == expected

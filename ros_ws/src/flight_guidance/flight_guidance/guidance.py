@@ -211,16 +211,16 @@ class Guidance:
         if self.mode is not GuidanceMode.ENGAGED or self._pose is None or self._y is None:
             return False
         hold_of_kind = modes.hold_now if self._params.multicopter is None else multicopter.hold
-        self.take_target(hold_of_kind(self.pose(), tuple(self._y.value.tolist()), self._params))
+        commands = hold_of_kind(self.pose(), tuple(self._y.value.tolist()), self._params)
+        self.take_target(targets.permitted(commands, self._params))
         return True
 
     def home(self) -> bool:
         """Fly home and orbit there; False while guidance does not fly."""
         if self.mode is not GuidanceMode.ENGAGED or self._pose is None:
             return False
-        self.take_target(
-            targets.home(self.pose(), targets.within_reach(self._params, self._authority))
-        )
+        params = targets.within_reach(self._params, self._authority)
+        self.take_target(targets.permitted(targets.home(self.pose(), params), params))
         return True
 
     def skip(self) -> bool:

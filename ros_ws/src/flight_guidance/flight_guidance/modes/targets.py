@@ -23,12 +23,13 @@ from flight_guidance.steering.path import Route
 def within_reach(params: GuidanceParams, authority: Authority) -> GuidanceParams:
     """The parameters with limits by a model learned in flight, where less than their own.
 
+    The rules are those of an airplane: the limits of a multicopter are its own.
     Climb and sink by the throttle, the roll rate by the aileron, by the rules of the parameters.
     Reversals of the bank fit into the period of path following, and orbits have the radius for the
     bank. Where p has no aileron, or ignores its command, the largest bank is YAWED_BANK. Without a
     throttle there is no climb, and the sink stays: pitch then flies the airspeed at the floor.
     """
-    if authority == Authority():
+    if authority == Authority() or params.multicopter is not None:
         return params
     rolls = min(authority.p, authority.roll) >= reach.LEAST
     dead = tuple(name for name in ("q", "p") if getattr(authority, name) < reach.LEAST)
@@ -213,6 +214,18 @@ def permitted_speed(speed: Scalar, params: GuidanceParams) -> Scalar:
     """An airspeed within the limits, m/s."""
     xp = array_namespace(speed)
     return xp.minimum(xp.maximum(speed, params.limits.floor), params.limits.largest_speed)
+
+
+def permitted(commands: Mapping[str, float], params: GuidanceParams) -> dict[str, float]:
+    """Return commands of a pose, each inside of what `read_target` takes.
+
+    An aircraft may be above its highest altitude when it holds or flies home: it goes there.
+    """
+    limits = params.limits
+    inside = {name: min(max(value, -LARGEST), LARGEST) for name, value in commands.items()}
+    if "altitude" in inside:
+        inside["altitude"] = min(max(inside["altitude"], limits.lowest), limits.highest)
+    return inside
 
 
 def home(pose: Mapping[str, float], params: GuidanceParams) -> dict[str, float]:
