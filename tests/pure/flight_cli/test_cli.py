@@ -18,6 +18,7 @@ from tests.conftest import REPOSITORY, invoke
 from flight_analysis.closed_loop.replay import recorded_scenario
 from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario
 from flight_analysis.closed_loop.scenario_library import LIBRARY, find_scenario
+from flight_cli import cli
 from flight_cli.cli import COMMANDS, application
 from rise_di_controller.rise_di_config import RiseDiConfig
 
@@ -474,3 +475,29 @@ def test_keys_of_the_first_page_are_keys_of_a_scenario() -> None:
         section, _, name = key.partition(".")
         models = [SCHEMAS[section], RiseDiConfig] if section == "controller" else [SCHEMAS[section]]
         assert any(name in model.model_fields for model in models), key  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    "words, nice",
+    [
+        ("watch", True),
+        ("watch runs/latest --text", True),
+        ("watch --control", False),
+        ("watch runs/latest --namespace uav1 --control", False),
+        ("watch --real", False),
+        ("fly osprey_servo", False),
+        ("guide home", False),
+    ],
+)
+def test_page_that_commands_a_flight_runs_at_normal_priority(
+    words: str, nice: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[str] = []
+    monkeypatch.setattr(cli.os, "nice", lambda by: calls.append("nice"))
+    monkeypatch.setattr(cli.os, "sched_setscheduler", lambda *_: calls.append("batch"))
+    monkeypatch.setattr(cli, "application", lambda words: lambda prog_name: None)
+    monkeypatch.setattr(cli.signal, "signal", lambda *_: None)
+    monkeypatch.setattr(cli.sys, "unraisablehook", None)
+    monkeypatch.setattr(cli.sys, "argv", ["rise-di", *words.split()])
+    cli.main()
+    assert calls == (["nice", "batch"] if nice else [])

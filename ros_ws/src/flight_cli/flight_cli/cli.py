@@ -15,7 +15,7 @@ import gc
 import os
 import sys
 from collections import ChainMap
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from keyword import iskeyword
 from pkgutil import resolve_name
@@ -30,6 +30,7 @@ FAILED = 1
 BAD_INPUT = 2
 INTERRUPTED = 130
 NICE = 10  # of a command that may run beside a flight
+CONTROLS = frozenset({"--control", "--real"})  # options of a page that commands the flight
 # New objects before a collection, 700 by default: a flight keeps what it makes.
 GARBAGE_THRESHOLD = 100_000
 REPEATED_AFTER = 0.01  # s, of an interrupt that Python ignores
@@ -132,11 +133,18 @@ def _repeat_interrupt(ignored: "sys.UnraisableHookArgs") -> None:
         sys.__unraisablehook__(ignored)
 
 
+def _looks_on(words: Sequence[str]) -> bool:
+    """Return whether a command only looks at a flight, which then goes first.
+
+    A page that deactivates and holds is not nice: it has to answer when the host is busy.
+    """
+    return words[:1] == ["watch"] and CONTROLS.isdisjoint(words)
+
+
 def main() -> None:
     """Entry point: bad input is one sentence and exit status 2, Ctrl-C is quiet."""
     gc.set_threshold(GARBAGE_THRESHOLD)
-    # A page is nice already while it loads: a flight beside it goes first.
-    if sys.argv[1:2] == ["watch"]:
+    if _looks_on(sys.argv[1:]):
         with suppress(OSError):
             os.nice(NICE)
             # A batch process interrupts no node when it wakes up.
