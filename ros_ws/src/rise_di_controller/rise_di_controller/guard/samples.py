@@ -182,7 +182,8 @@ def step(
         return state._replace(
             last=sample, change=largest, far=sample, agreeing=0
         ), SampleChange.NEAR
-    agrees = state.agreeing > 0 and _comparison(state.far, sample, state.change, limits)[0]
+    # Without a lost sample before, `far` has the values of `last` at its stamp or later: far, too.
+    agrees = _comparison(state.far, sample, state.change, limits)[0]
     agreeing = state.agreeing + 1 if agrees else 1
     if agreeing < AGREEING:
         return state._replace(far=sample, agreeing=agreeing), SampleChange.FAR
