@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Guard of the law: alignment of y_m, engagement, failsafe, saturation, anti-windup and the log."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -145,6 +146,42 @@ def test_y_of_at_most_a_period_after_newest_y_m_is_used() -> None:
     output = controller.tick(30 * MS)
     assert output is not None
     assert output.stamp_ns == 20 * MS
+
+
+# by tick: age of the y in ms, whether it comes, and whether the controller is active
+BUSY: dict[str, Callable[[int], tuple[int, bool, bool]]] = {
+    "a late y after a failsafe": lambda k: (8 if k < 50 else 95, not 50 <= k < 80, True),
+    "the delay grows and shrinks": lambda k: (8 + 3 * (k % 30), not 50 <= k < 80, True),
+    "a y ahead of the clock, then behind": lambda k: (-90 if k < 50 else 90, k % 40 > 15, True),
+    "deactivated meanwhile": lambda k: (8 if k < 50 else 60, True, not 40 <= k < 70),
+    "inactive before it engages": lambda k: (8 if k < 30 else 90, True, k > 30),
+    "each y is late": lambda k: (99, k % 33 < 16, True),
+}
+
+
+@pytest.mark.parametrize("case", BUSY)
+def test_stamp_of_u_is_that_of_its_y_and_never_goes_back(case: str) -> None:
+    """A receiver and the report take the stamps of a topic for a clock, also after a failsafe."""
+    controller = Controller(PARAMS)
+    stamps: list[int] = []
+    used: list[int] = []
+    sent: set[int] = set()
+    for k in range(200):
+        now = 1000 + 10 * k
+        age, comes, active = BUSY[case](k)
+        controller.take_y_m(sample(now), now * MS)
+        if comes and now - age > max(sent, default=0):
+            sent.add(now - age)
+            controller.take_y(sample(now - age, 0.01 * (k % 7)), now * MS)
+        if (output := controller.tick(now * MS, active=active)) is not None:
+            stamps.append(output.stamp_ns)
+            assert abs(now * MS - output.stamp_ns) <= AGE * MS
+            if controller.mode is Mode.ENGAGED:
+                used.append(output.stamp_ns)
+    assert (np.diff(stamps) >= 0).all()
+    assert {*used} <= {ms * MS for ms in sent}
+    assert len(used) > 60
+    assert len({*stamps}) > 0.8 * len(stamps)  # in a failsafe it goes on
 
 
 def test_new_sample_is_step_of_law() -> None:

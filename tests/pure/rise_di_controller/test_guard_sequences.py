@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Any sequence of samples, losses, overruns and activations.
 
-The tests are of when the guard engages, how far u moves, and when u is at trim.
+The tests are of when the guard engages, how far u moves, when u is at trim, and that no stamp of u
+goes back.
 """
 
 import numpy as np
@@ -54,6 +55,7 @@ class Sequence(RuleBasedStateMachine):
         self.y: StampedVector | None = None
         self.y_m: list[StampedVector] = []
         self.begin_ns, self.begin_u, self.hold = 0, np.zeros(4), 0.0
+        self.stamp_ns = 0  # of the last u
 
     @rule(active=st.booleans(), policy=st.sampled_from([*PARAMS]))
     def activate(self, active: bool, policy: str) -> None:
@@ -83,13 +85,18 @@ class Sequence(RuleBasedStateMachine):
     @rule(count=st.integers(1, 12), offset=STAMPS, y=VALUES, y_m=VALUES)
     def fly(self, count: int, offset: int, y: float, y_m: float) -> None:
         """Run ticks, each with a new y and a new y_m of one stamp, after which no y_m is."""
-        for _ in range(count):
+        for k in range(count):
             stamp_ns = self.now_ns + offset
             self.y = StampedVector(stamp_ns, np.full(4, y))
             self.y_m = [sample for sample in self.y_m if sample.stamp_ns < stamp_ns]
             self._keep_y_m(StampedVector(stamp_ns, np.full(4, y_m)))
+            # A y from before the last u waits, at most for the lead of that u and its own age.
+            has_waited = k * self.guard.period_ns >= 2 * AGE
+            waits = self.state.mode is not Mode.ENGAGED and stamp_ns < self.stamp_ns
             self.tick()
-            assert (self.state.mode is Mode.ENGAGED) == (self.active and abs(offset) <= AGE)
+            is_fresh = self.active and abs(offset) <= AGE
+            assert (self.state.mode is Mode.ENGAGED) == (is_fresh and not waits)
+            assert not (is_fresh and has_waited and waits)
 
     @rule(count=st.integers(1, 12))
     def wait(self, count: int) -> None:
@@ -107,6 +114,9 @@ class Sequence(RuleBasedStateMachine):
         self.state, inputs = guard.tick(
             before, self.now_ns, self.y, self.y_m, self.guard, LAW, self.active
         )
+        if inputs is not None:
+            assert inputs.stamp_ns >= self.stamp_ns
+            self.stamp_ns = inputs.stamp_ns
         if self.state.mode is Mode.ENGAGED:
             self._check_law(before, 0.0 if inputs is None else inputs.dt)
         elif self.state.law is None:

@@ -391,6 +391,9 @@ def run_recording(run: RecordedRun) -> tuple[list[RiseDiConfig], Recording, int]
             if log["dt"][k] == 0.0 and recorder.mode is Mode.ENGAGED:
                 recorder.restart()
             sample = (int(log.stamp_ns[k]), groups["y"][k], groups["y_m"][k], offset_ns)
+        elif log.stamp_ns[k] == recorder.state.stamp_ns:
+            # A stamp that rests tells of a y from before it, which engaged nothing.
+            sample = (int(log.stamp_ns[k]) - 1, groups["y"][k], groups["y_m"][k], 0)
         recorder.guard_tick(int(now_ns[k]), sample, active=log["mode"][k] != Mode.INACTIVE)
         equal += recorder.state.command.tobytes() == groups[command][k].tobytes()
     return sets, recorder.recording(f"the log {printable(str(run.path))}"), equal

@@ -73,7 +73,7 @@ Y = Topic(
 Y_M = Topic("y_m", VECTOR, "reference_model -> controller, log", "the same")
 U = Topic(
     "u", VECTOR, "controller -> aircraft, bridge, log",
-    "elevator, aileron, rudder (rad), thrust (1); stamp = that of its y",
+    "elevator, aileron, rudder (rad), thrust (1); stamp = [that of its y](#time)",
 )  # fmt: skip
 U_M = Topic(
     "u_m", VECTOR, "guidance, external -> reference_model, log",

@@ -744,8 +744,8 @@ static void log_inputs(rise_di_output *output, int64_t stamp_ns, const rise_di_r
     output->dt = dt;
 }
 
-/* A tick without fresh inputs, or of a deactivated controller. */
-static bool failsafe(rise_di_controller *c, int64_t now_ns, bool active, rise_di_output *output) {
+/* A tick without fresh inputs, or of a deactivated controller, with the stamp of u. */
+static bool failsafe(rise_di_controller *c, int64_t stamp_ns, int64_t now_ns, bool active, rise_di_output *output) {
     const rise_di_parameters *p = c->parameters;
     const bool was_active = c->mode != RISE_DI_INACTIVE;
     if (c->has_law) {
@@ -778,7 +778,7 @@ static bool failsafe(rise_di_controller *c, int64_t now_ns, bool active, rise_di
             c->effectors[j] = is_equal(scale, ONE) ? c->effectors_failsafe[j] : (scale * c->effectors_failsafe[j]);
         }
 #endif
-        log_inputs(output, now_ns, c->y, c->y_m, ZERO, ZERO);
+        log_inputs(output, stamp_ns, c->y, c->y_m, ZERO, ZERO);
     } else {
         c->mode = active ? RISE_DI_WAITING : RISE_DI_INACTIVE;
     }
@@ -903,26 +903,34 @@ static bool any(const rise_di_real *values) {
     return result;
 }
 
+/* The stamp of a u without a y: that of the last u, and the time since then. */
+static int64_t going_on(const rise_di_controller *c, int64_t now_ns) {
+    return c->stamp_ns + (int64_t)elapsed_ns(now_ns, c->tick_ns);
+}
+
 bool rise_di_guard_tick(rise_di_controller *controller, int64_t now_ns, const rise_di_sample *y, const rise_di_samples *y_m,
                         bool active, rise_di_output *output) {
     rise_di_controller *c = controller;
     rise_di_real reference[RISE_DI_M];
     rise_di_real dt = ZERO;
     bool fresh = false;
+    bool late = false;
     bool published = true;
     fill(reference, RISE_DI_M, ZERO);
     if ((y != (const rise_di_sample *)0) && (y_m->count > 0) && (c->parameters != (const rise_di_parameters *)0)) {
         const int64_t max_age_ns = c->parameters->max_age_ns;
         fresh = is_fresh(now_ns, y->stamp_ns, max_age_ns) && is_fresh(now_ns, sample_at(y_m, 0)->stamp_ns, max_age_ns) &&
                 align(c->parameters, y_m, y->stamp_ns, reference) && are_numbers(y->value, reference);
+        /* A y from before the last u is late, and the law waits for the next one. */
+        late = fresh && (c->mode != RISE_DI_ENGAGED) && (y->stamp_ns < c->stamp_ns);
     }
     if (c->parameters == (const rise_di_parameters *)0) {
         published = false;
     } else if ((!active) && fresh && (!c->has_law) && (!any(c->u))) {
         c->mode = RISE_DI_INACTIVE;
-        log_inputs(output, now_ns, y->value, reference, ZERO, ZERO);
-    } else if ((!active) || (!fresh)) {
-        published = failsafe(c, now_ns, active, output);
+        log_inputs(output, late ? c->stamp_ns : y->stamp_ns, y->value, reference, ZERO, ZERO);
+    } else if ((!active) || (!fresh) || late) {
+        published = failsafe(c, late ? c->stamp_ns : going_on(c, now_ns), now_ns, active, output);
     } else {
         if ((!c->has_law) || (c->mode != RISE_DI_ENGAGED) || has_gap(c, y->stamp_ns)) {
             engage(c, y, reference);
@@ -943,6 +951,10 @@ bool rise_di_guard_tick(rise_di_controller *controller, int64_t now_ns, const ri
             copy(reference, c->y_m, RISE_DI_M);
             log_inputs(output, y->stamp_ns, y->value, reference, (newest_ns < y->stamp_ns) ? -behind : ahead, dt);
         }
+    }
+    if (published) {
+        c->stamp_ns = output->stamp_ns;
+        c->tick_ns = now_ns;
     }
     return published;
 }
@@ -1012,6 +1024,8 @@ bool rise_di_start(rise_di_controller *controller, const rise_di_parameters *par
     controller->mode = RISE_DI_WAITING;
     controller->has_law = false;
     controller->y_stamp_ns = 0;
+    controller->stamp_ns = INT64_MIN; /* every y is later */
+    controller->tick_ns = 0;
     controller->failsafe_start_ns = 0;
     controller->hold_ns = 0;
     controller->ramp_ns = 0;

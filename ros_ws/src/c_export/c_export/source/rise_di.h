@@ -182,6 +182,8 @@ typedef struct {
     bool has_law;                    /* whether the law has engaged since the start */
     rise_di_law law;
     int64_t y_stamp_ns;              /* stamp of y of the last step */
+    int64_t stamp_ns;                /* of the last u */
+    int64_t tick_ns;                 /* instant of the tick that gave the last u */
     rise_di_real y[RISE_DI_M];       /* of the last step */
     rise_di_real y_m[RISE_DI_M];     /* at the stamp of y */
     rise_di_real u[RISE_DI_M];       /* commanded, after saturation, units of u from trim */
@@ -213,7 +215,7 @@ typedef struct {
 
 /* Inputs of a tick, for a log, and the stamp of u. */
 typedef struct {
-    int64_t stamp_ns;            /* of y, and so of u; the instant of the tick where no y is used */
+    int64_t stamp_ns;            /* of u: that of its y; without one it goes on with the clock */
     rise_di_real y[RISE_DI_M];
     rise_di_real y_m[RISE_DI_M]; /* at the stamp of y */
     rise_di_real y_m_offset;     /* stamp of the newest y_m minus stamp of y, s */

@@ -112,7 +112,7 @@ class Ticks:
         self.m = len(parameters.inputs)
         self.p = len(parameters.effectors)
         self._allocation = parameters.guard().allocation
-        # Stamps may decrease: a late y is older than a failsafe tick before it.
+        # Stamps of an earlier version may decrease: a late y was older than the failsafe before it.
         now_ns = signal.stamp_ns + np.round(signal["age"] * NANOSECONDS).astype(np.int64)
         order, self.starts = _tick_order(now_ns, signal["number"])
         self.stamp_ns = signal.stamp_ns[order]
@@ -160,7 +160,13 @@ class Ticks:
         effectors = row.get(internals.EFFECTOR)
         if computed is not None and not self.flies[k]:
             return computed._replace(
-                mode=mode, law=law_state, u=u, u_free=row["u_free"], effectors=effectors
+                mode=mode,
+                law=law_state,
+                u=u,
+                u_free=row["u_free"],
+                effectors=effectors,
+                stamp_ns=int(self.stamp_ns[k]),
+                tick_ns=int(self.now_ns[k]),
             )
         feedforward_state = None if computed is None else computed.feedforward
         if limits.nominal is not None and self._engages[k]:
@@ -178,6 +184,8 @@ class Ticks:
             u_failsafe=u,
             u_ff=row["u_ff"],
             feedforward=feedforward_state,
+            stamp_ns=int(self.stamp_ns[k]),
+            tick_ns=int(self.now_ns[k]),
         )
         vanes = VaneReadings(row["vane"], row["vane_m"]) if limits.vanes else None
         return logged._replace(effectors=effectors, effectors_failsafe=effectors, vanes=vanes)
@@ -192,7 +200,11 @@ class Ticks:
         stamp_ns = int(self.stamp_ns[k])
         y = None
         y_m = []
-        if self.flies[k]:
+        if not self.flies[k] and stamp_ns == state.stamp_ns:
+            # A stamp that rests tells of a y from before it, which engaged nothing.
+            y = StampedVector(stamp_ns - 1, self._y[k])
+            y_m = [StampedVector(stamp_ns - 1, self._groups["y_m"][k])]
+        elif self.flies[k]:
             y = StampedVector(stamp_ns, self._y[k])
             y_m = [StampedVector(stamp_ns, self._groups["y_m"][k])]
             if (offset_ns := int(self._offset_ns[k])) > 0:

@@ -81,6 +81,10 @@ class GuardParams(NamedTuple):
 LEAST_DT = 0.2
 
 
+# The stamp of the last u where there is none yet: every y is later.
+BEFORE_ALL_NS = -(2**63)
+
+
 class VaneReadings(NamedTuple):
     """Readings of the k vanes at the last step."""
 
@@ -111,6 +115,8 @@ class ControllerState(NamedTuple):
     effectors: FloatArray | None = None
     effectors_failsafe: FloatArray | None = None  # at the start of the failsafe
     vanes: VaneReadings | None = None  # None without vanes
+    stamp_ns: int = BEFORE_ALL_NS  # of the last u
+    tick_ns: int = 0  # instant of the tick that gave the last u
 
     @property
     def command(self) -> FloatArray:
@@ -124,7 +130,7 @@ class TickInputs(NamedTuple):
     The tick recomputed from these inputs gives u to the last bit.
     """
 
-    stamp_ns: int  # of y, and so of u; the instant of the tick where no y is used
+    stamp_ns: int  # of u: that of its y; without one it goes on with the clock
     y: FloatArray
     y_m: FloatArray  # interpolated to the stamp of y
     y_m_offset: float  # stamp of the newest y_m minus stamp of y, s
@@ -229,6 +235,8 @@ def tick(
     engages again. `ControlLaw.missed` predicts over every whole period without a y before the step.
     The law adds to u_trim, or to u_trim + u_ff with a feedforward. Without a new y nothing changes.
     Stale inputs start the failsafe: HOLD (nothing is integrated), then RAMP to trim, then TRIM.
+    The stamp of u is that of its y. In a failsafe it goes on from there with the clock, as that of
+    the y that did not come; a y from before the last u engages nothing, so no stamp goes back.
     Where `active` is false the mode is INACTIVE, and u is held or ramps to trim; with fresh inputs
     u is published at trim before the first engagement too. Returns None for the inputs where
     nothing is to be published.
@@ -243,26 +251,41 @@ def tick(
         vane = _readings(y.value[m:], state.vanes)
         y = y._replace(value=y.value[:m])
     reference = None if y is None else _fresh_reference(now_ns, y, y_m, guard)
-    if (
-        not active
-        and state.law is None
-        and y is not None
-        and reference is not None
-        and not state.u.any()
-    ):
-        return state._replace(mode=Mode.INACTIVE), TickInputs(
-            stamp_ns=now_ns, y=y.value, y_m=reference, y_m_offset=0.0, dt=0.0
+    # A y from before the last u is late, and the law waits for the next one.
+    is_late = y is not None and state.mode is not Mode.ENGAGED and y.stamp_ns < state.stamp_ns
+    if y is None or reference is None:
+        after, inputs = _failsafe(state, _going_on(state, now_ns), now_ns, guard, active)
+    elif not active and state.law is None and not state.u.any():
+        after = state._replace(mode=Mode.INACTIVE)
+        inputs = TickInputs(
+            stamp_ns=max(y.stamp_ns, state.stamp_ns),
+            y=y.value,
+            y_m=reference,
+            y_m_offset=0.0,
+            dt=0.0,
         )
-    if not active or y is None or reference is None:
-        return _failsafe(state, now_ns, guard, active)
-    inputs = TickInputs(
-        stamp_ns=y.stamp_ns,
-        y=y.value,
-        y_m=reference,
-        y_m_offset=seconds(y_m[-1].stamp_ns - y.stamp_ns),
-        dt=0.0,
-    )
-    return _with_sample(state, y, inputs, vane, guard, law, u_ff_recorded, vane_m_recorded)
+    elif not active or is_late:
+        stamp_ns = state.stamp_ns if is_late else _going_on(state, now_ns)
+        after, inputs = _failsafe(state, stamp_ns, now_ns, guard, active)
+    else:
+        inputs = TickInputs(
+            stamp_ns=y.stamp_ns,
+            y=y.value,
+            y_m=reference,
+            y_m_offset=seconds(y_m[-1].stamp_ns - y.stamp_ns),
+            dt=0.0,
+        )
+        after, inputs = _with_sample(
+            state, y, inputs, vane, guard, law, u_ff_recorded, vane_m_recorded
+        )
+    if inputs is None:
+        return after, None
+    return after._replace(stamp_ns=inputs.stamp_ns, tick_ns=now_ns), inputs
+
+
+def _going_on(state: ControllerState, now_ns: int) -> int:
+    """Return the stamp of a u without a y, ns: that of the last u, and the time since then."""
+    return state.stamp_ns + max(now_ns - state.tick_ns, 0)
 
 
 def _with_sample(
@@ -507,9 +530,9 @@ def _within_effectors(
 
 
 def _failsafe(
-    state: ControllerState, now_ns: int, guard: GuardParams, active: bool
+    state: ControllerState, stamp_ns: int, now_ns: int, guard: GuardParams, active: bool
 ) -> tuple[ControllerState, TickInputs | None]:
-    """A tick without fresh inputs, or of a deactivated controller."""
+    """A tick without fresh inputs, or of a deactivated controller. `stamp_ns` is that of u."""
     y = state.y
     y_m = state.y_m
     if y is None or y_m is None:
@@ -538,5 +561,5 @@ def _failsafe(
     if effectors is not None and scale != 1.0:
         effectors = scale * effectors
     return state._replace(mode=mode, u=u, u_free=u, effectors=effectors), TickInputs(
-        stamp_ns=now_ns, y=y.value, y_m=y_m, y_m_offset=0.0, dt=0.0
+        stamp_ns=stamp_ns, y=y.value, y_m=y_m, y_m_offset=0.0, dt=0.0
     )
