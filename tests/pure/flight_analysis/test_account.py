@@ -355,7 +355,7 @@ def stamps(*parts: range) -> Iterator[Any]:
 
 def test_stray_messages_are_no_step_of_clock() -> None:
     """A second publisher with old stamps beside the first; a step is of successive messages."""
-    first, second = stamps(range(1000, 1200), range(200))
+    first, second = stamps(range(1000, 1200), range(1, 201))
     stamp_ns = np.stack([first, second], axis=1).ravel()
     clock = StampClock()
     keep, count = clock.usable(stamp_ns, np.repeat(first, 2), more=False, end=True)

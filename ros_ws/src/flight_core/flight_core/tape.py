@@ -140,6 +140,8 @@ class Recording(NamedTuple):
     left_out: int = 0  # messages after the step
     # messages that are missing by the numbers of the publisher; None without numbers
     lost: int | None = None
+    # the last stamps before pauses in which the reception paused, too: no step of the clock
+    pauses_ns: tuple[int, ...] = ()
 
 
 class Process(NamedTuple):

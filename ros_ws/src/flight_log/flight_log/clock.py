@@ -41,6 +41,7 @@ class StampClock:
         self._last_offset_ns = 0
         self._offset_ns = -(2**62)  # the largest lead of a stamp over the time of the recording
         self._is_history = False  # whether the last samples were recorded in a burst
+        self._pauses_ns: set[int] = set()  # last stamps before pauses of the reception, too
 
     def usable(
         self,
@@ -58,7 +59,8 @@ class StampClock:
         of the publisher's number before each message, (K,). A number falls together with both times
         in a part of the log out of order. A jump forth beside lost messages is a gap.
         """
-        unset = (stamp_ns == 0) & ((self._last_ns or 0) > STEP_NS)
+        latest = np.maximum.accumulate(np.append(self._last_ns or 0, stamp_ns))[:-1]
+        unset = (stamp_ns == 0) & (latest > STEP_NS)
         if self._step_ns:
             return self._taken(stamp_ns, self._after_step(stamp_ns), len(stamp_ns), 0)
         places = np.flatnonzero(~unset)
@@ -72,6 +74,9 @@ class StampClock:
         numbers = np.ones(len(stamps), dtype=np.int64) if steps is None else steps[places]
         back = (jumps < -STEP_NS) & ((numbers >= 0) | (np.abs(leads) > STEP_NS))
         forth = (jumps > STEP_NS) & ((leads > STEP_NS) | ~has_time) & (numbers <= 1)
+        # What pauses with the reception is the publisher or the host, not the clock.
+        pauses = (jumps > LEAP_NS) & (leads <= LEAP_NS) & has_time
+        self._pauses_ns.update((stamps - jumps)[pauses].tolist())
         # Places where the messages of a clock begin.
         starts = np.flatnonzero(back | forth)
         edges = [0, *starts[starts > 0].tolist(), len(stamps)]
@@ -87,7 +92,15 @@ class StampClock:
                 if jump_ns < -STRAY_NS or is_ahead:
                     keep[places[first:after]] = False
                 continue
-            if (jump_ns < -STEP_NS and back[first]) or is_ahead:
+            if jump_ns < -STEP_NS and back[first] and jump_ns >= -STRAY_NS:
+                lateness = self._catches_up(stamps[first:], offsets[first:])
+                if lateness is None and more:
+                    # The next messages tell.
+                    return self._taken(stamp_ns, keep[: places[first]], int(places[first]))
+                is_late = lateness is not None and lateness and bool(has_time[first])
+            else:
+                is_late = False
+            if (jump_ns < -STEP_NS and back[first] and not is_late) or is_ahead:
                 self._step_ns = jump_ns
                 self._step_at_ns = self._last_ns or 0
                 after_step = int(places[first])
@@ -106,6 +119,18 @@ class StampClock:
             if stamps[after - 1] - stamps[first] > STEP_NS:
                 self._is_history = _in_burst(stamps[first:after], offsets[first:after])
         return self._taken(stamp_ns, keep, len(stamp_ns))
+
+    def _catches_up(self, stamp_ns: NDArray[np.int64], offset_ns: NDArray[np.int64]) -> bool | None:
+        """Whether samples behind a step back are late ones: a clock that was set stays behind.
+
+        A late sample has an older stamp than the one before, and the reception goes on. Within
+        STRAY_NS of reception the samples are as late as before. None: too few messages to tell.
+        """
+        log_ns = stamp_ns - offset_ns
+        within = log_ns <= log_ns[0] + STRAY_NS
+        if np.any(offset_ns[within] >= self._last_offset_ns - STEP_NS):
+            return True
+        return None if within.all() else False
 
     def _jump_to(self, stamp_ns: int, offset_ns: int, *, has_time: bool) -> tuple[int, bool]:
         """The time from the usable part to a stamp, ns; and whether the stamp leads its clock.
@@ -149,6 +174,7 @@ class StampClock:
             step_ns=self._step_ns,
             step_at_ns=self._step_at_ns,
             left_out=self._left_out,
+            pauses_ns=tuple(sorted(self._pauses_ns)),
         )
 
 
@@ -239,7 +265,8 @@ def _candidates(
     """Leaps of the stamps against a second measure of time.
 
     The measure is the flight time in `truth`. Without one it is a constant period, where the
-    numbers of the messages have no gap.
+    numbers of the messages have no gap and the reception did not pause as long: a host that was
+    busy or suspended leaves out time, and its clock goes on.
     """
     name = next((name for name in ("truth", "y_m", "y") if name in signals), "")
     if not name:
@@ -257,6 +284,8 @@ def _candidates(
     else:
         return
     lead_ns = elapsed_ns - flown_ns
+    if "t" not in signals[name].names and name in recording:
+        lead_ns[np.isin(stamp_ns[:-1], recording[name].pauses_ns)] = 0
     for k in np.flatnonzero((lead_ns > LEAP_NS) & (lead_ns < 2**62)):
         yield Leap(int(stamp_ns[k]), int(lead_ns[k]))
 

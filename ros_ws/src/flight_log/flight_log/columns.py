@@ -36,6 +36,11 @@ class Columns:
         self._sender: list[NDArray[np.int16]] = []  # of each sample
         self._stamp_ns, self._store = self._new(expected)
 
+    @property
+    def senders(self) -> list[str]:
+        """The publishers by their numbers."""
+        return [*self._senders]
+
     def _new(self, capacity: int) -> tuple[NDArray[np.int64], "_MemoryColumns | _FileColumns"]:
         kind = _FileColumns if 8 * self._width * capacity > IN_MEMORY else _MemoryColumns
         return np.empty(capacity, np.int64), kind(self._width, capacity)

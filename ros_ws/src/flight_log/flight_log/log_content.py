@@ -4,10 +4,9 @@
 
 import re
 import shlex
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping
 from itertools import pairwise
-from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,9 +27,9 @@ from flight_log.bag import (
     SIMULATED_TIME,
     stack_topic,
 )
-from flight_log.clock import SINCE_EPOCH_NS, StampClock
+from flight_log.clock import LATE_NS, SINCE_EPOCH_NS, StampClock
 from flight_log.columns import Columns
-from flight_log.flight_processes import UNNAMED, SampleSpan
+from flight_log.flight_processes import SampleSpan
 from flight_log.latency import TOPICS as TIMED_TOPICS
 from flight_log.latency import Times
 from flight_log.learning_messages import DIAGNOSTIC_ARRAY
@@ -43,6 +42,7 @@ from flight_log.named_vectors import (
     decode_routes,
     decoder,
     full_name,
+    rows_by_sender,
     stamps_of,
 )
 from flight_log.open_log import (
@@ -77,6 +77,9 @@ SCENARIO_NAME = re.compile(r"(?!metadata\.yaml)[\w-][\w .()-]{0,99}\.yaml")
 to another folder."""
 
 
+MOST_PUBLISHERS = 64  # of a topic, that are counted each for itself
+
+
 class StoredFile(NamedTuple):
     """A file inside the log."""
 
@@ -84,60 +87,114 @@ class StoredFile(NamedTuple):
     content: bytes
 
 
-class TopicSamples:
-    """Samples of a topic, decoded in batches. The samples with equal names are the signal."""
+class _Publisher:
+    """Messages of a topic with one sender, up to a batch, and the clock of their stamps."""
 
-    def __init__(self, decode: Decoder, expected: int) -> None:
-        self._decode = decode
-        self._expected = expected
+    def __init__(self) -> None:
         # Tables of messages of one length, with their log times and the steps of their numbers.
-        self._batch: list[tuple[Table, NDArray[np.int64], NDArray[np.int64]]] = []
-        self._batched = 0  # messages
-        self._clock = StampClock()
-        self._number: int | None = None  # of the last message, by the publisher
-        self._numbered = False
-        self._restarted = False
+        self.batch: list[tuple[Table, NDArray[np.int64], NDArray[np.int64]]] = []
+        self.batched = 0  # messages
+        self.clock = StampClock()
+        self.name: str | None = None  # None without a sample
+        self.zeros = 0  # samples with a zero stamp that `signal` leaves out
+        self.refused = 0  # damaged, or not finite
+        self.kept: Counter[tuple[str, ...]] = Counter()  # samples by their names
+        self.messages = 0
+        # Least and largest lead of a stamp over the reception; None without a time of it.
+        self.leads_ns: tuple[int, int] | None = None
+        self._number: int | None = None  # of the last message
+        self._numbered = self._restarted = False
         self._lost = 0
-        self._unset = 0  # samples with a zero stamp that `signal` left out
-        self._samples: dict[tuple[str, ...], Columns] = {}  # by names
-        self.spans: dict[str, SampleSpan] = {}  # by publisher
-        self._refused = 0
 
     def add(self, table: Table, log_ns: NDArray[np.int64], sequence: NDArray[np.int64]) -> None:
-        """Add messages of one length, a row each, with log times and the publisher's numbers."""
+        """Add messages of one length."""
         steps = np.diff(sequence, prepend=sequence[:1] if self._number is None else self._number)
         self._lost += int((steps[steps > 1] - 1).sum())
         self._numbered = self._numbered or bool(sequence.any())
         self._number = int(sequence[-1])
-        # Another publisher, or a restarted one.
+        # A restarted publisher under the same name.
         self._restarted = self._restarted or bool(np.any(steps < 0))
-        fits = not self._batch or self._batch[0][0].shape[1] == table.shape[1]
-        if self._batched >= BATCH or not fits:
-            self._decode_batch(more=fits)
-        self._batch.append((table, log_ns, steps))
-        self._batched += len(table)
+        self.messages += len(table)
+        self.batch.append((table, log_ns, steps))
+        self.batched += len(table)
 
-    def _decode_batch(self, *, more: bool = False, end: bool = False) -> None:
-        if not self._batch:
+    def lead(self, table: Table, log_ns: NDArray[np.int64]) -> None:
+        """Note how far the stamps of messages are ahead of their reception."""
+        leads_ns = stamps_of(table)[log_ns != 0] - log_ns[log_ns != 0]
+        if len(leads_ns):
+            least, largest = self.leads_ns or (2**62, -(2**62))
+            self.leads_ns = min(least, int(leads_ns.min())), max(largest, int(leads_ns.max()))
+
+    def has_clock_of(self, other: "_Publisher") -> bool:
+        """Whether every stamp is by the clock of another publisher, as far as the log tells."""
+        if self is other or self.leads_ns is None or other.leads_ns is None:
+            return True
+        (least, largest), (least_of_other, largest_of_other) = self.leads_ns, other.leads_ns
+        return least_of_other - LATE_NS <= least and largest <= largest_of_other + LATE_NS
+
+    def recording(self) -> Recording:
+        """The stamps in the order of the recording."""
+        is_counted = self._numbered and not self._restarted
+        return self.clock.recording(self.zeros)._replace(lost=self._lost if is_counted else None)
+
+
+class TopicSamples:
+    """Samples of a topic, decoded in batches. The samples with equal names are the signal.
+
+    Clock, numbers and damages are counted for each sender, so that the messages of a stranger
+    count for no other one.
+    """
+
+    def __init__(self, decode: Decoder, expected: int) -> None:
+        self._decode = decode
+        self._expected = expected
+        self._publishers: dict[bytes, _Publisher] = {}  # by the bytes of their names
+        self._samples: dict[tuple[str, ...], Columns] = {}  # by names
+        self.spans: dict[str, SampleSpan] = {}  # by publisher
+
+    def add(self, table: Table, log_ns: NDArray[np.int64], sequence: NDArray[np.int64]) -> None:
+        """Add messages of one length, a row each, with log times and the publisher's numbers."""
+        for sender, rows in rows_by_sender(table):
+            # Many names are of a hostile log.
+            known = sender in self._publishers or len(self._publishers) < MOST_PUBLISHERS
+            publisher = self._publishers.setdefault(sender if known else b"", _Publisher())
+            part = table if rows is None else table[rows]
+            fits = not publisher.batch or publisher.batch[0][0].shape[1] == part.shape[1]
+            if publisher.batched >= BATCH or not fits:
+                self._decode_batch(publisher, more=fits)
+            if rows is None:
+                publisher.add(part, log_ns, sequence)
+            else:
+                publisher.add(part, log_ns[rows], sequence[rows])
+
+    def _decode_batch(
+        self, publisher: _Publisher, *, more: bool = False, end: bool = False
+    ) -> None:
+        if not publisher.batch:
             return
-        table, log_ns, steps = (np.concatenate(arrays) for arrays in zip(*self._batch, strict=True))
-        self._batch = []
-        self._batched = 0
+        table, log_ns, steps = (
+            np.concatenate(arrays) for arrays in zip(*publisher.batch, strict=True)
+        )
+        publisher.batch = []
+        publisher.batched = 0
         if table.shape[1] >= STAMP.stop:
-            keep, count = self._clock.usable(stamps_of(table), log_ns, steps, more=more, end=end)
+            keep, count = publisher.clock.usable(
+                stamps_of(table), log_ns, steps, more=more, end=end
+            )
             if count < len(table):
-                self._batch = [(table[count:], log_ns[count:], steps[count:])]
-                self._batched = len(table) - count
+                publisher.batch = [(table[count:], log_ns[count:], steps[count:])]
+                publisher.batched = len(table) - count
+            publisher.lead(table[:count][keep], log_ns[:count][keep])
             table = table[:count] if keep.all() else table[:count][keep]
         if not len(table):
             return
         decoded = self._decode(table)
-        self._refused += decoded.unreadable
+        publisher.refused += decoded.unreadable
         for sample_names, stamps, unordered, sender in decoded.samples:
             if unordered.shape[1] == len({*sample_names}) == len(sample_names):
                 names, values = self._ordered(sample_names, unordered)
                 finite = np.isfinite(values).all(axis=1)
-                self._refused += int(np.count_nonzero(~finite))
+                publisher.refused += int(np.count_nonzero(~finite))
                 stamp_ns, values = (
                     (stamps, values) if finite.all() else (stamps[finite], values[finite])
                 )
@@ -147,13 +204,15 @@ class TopicSamples:
                 self.spans[sender] = (
                     span.joined(self.spans[sender]) if sender in self.spans else span
                 )
+                publisher.name = sender
+                publisher.kept[names] += len(stamp_ns)
                 if names not in self._samples:
                     # Samples with other names are few, or those of a hostile log.
                     expected = 0 if self._samples else self._expected
                     self._samples[names] = Columns(len(names), max(expected, len(values)))
                 self._samples[names].append(stamp_ns, values, sender)
             else:
-                self._refused += len(stamps)
+                publisher.refused += len(stamps)
 
     def _ordered(
         self, names: tuple[str, ...], values: NDArray[np.float64]
@@ -173,25 +232,22 @@ class TopicSamples:
         Equal stamps may follow one another in RESTING topics, so that a stamp of 0 may be flight
         time. A plan needs no stamp.
         """
-        self._decode_batch(end=True)
+        for publisher in self._publishers.values():
+            while publisher.batch:
+                self._decode_batch(publisher, end=True)
         if not self._samples:
             return None
         names = self._names()
-        signal = self._samples[names].signal(tuple(map(printable, names)))
-        stamps = signal.stamp_ns
-        zero = stamps == 0
-        zeros = int(np.count_nonzero(zero))
-        usual = len(stamps) - 1 if name in RESTING else 1
-        # A recorder may take each message twice.
-        if zeros > usual:
-            usual = int(np.unique(stamps[~zero], return_counts=True)[1].max(initial=usual))
-        if (
-            name not in UNSTAMPED
-            and zeros
-            and (zeros > max(usual, 1) or stamps.max() > SINCE_EPOCH_NS)
-        ):
-            self._unset = zeros
-            signal = signal.where(~zero)
+        columns = self._samples[names]
+        signal = columns.signal(tuple(map(printable, names)))
+        keep = ~self._unset_zeros(name, signal, columns)
+        # The nodes refuse a stamp far from their clock, and so the publisher of such a sample.
+        most = self._most()
+        for publisher in self._publishers.values():
+            if publisher.name in columns.senders and not publisher.has_clock_of(most):
+                keep &= signal.sender != columns.senders.index(publisher.name)
+        if not keep.all():
+            signal = signal.where(keep)
             if not len(signal.stamp_ns):
                 return None
         if np.any(signal.stamp_ns[1:] < signal.stamp_ns[:-1]):
@@ -205,40 +261,89 @@ class TopicSamples:
             signal = Signal(stamps[keep], signal.names, values[keep], sender)
         return signal
 
+    def _unset_zeros(self, name: str, signal: Signal, columns: Columns) -> NDArray[np.bool_]:
+        """Mask of the samples whose zero stamp was not set, shape (N,), noted for each sender."""
+        unset = np.zeros(len(signal.stamp_ns), dtype=np.bool_)
+        if name in UNSTAMPED or not np.any(signal.stamp_ns == 0):
+            return unset
+        for number, sender in enumerate(columns.senders):
+            of_sender = slice(None) if signal.sender is None else signal.sender == number
+            stamps = signal.stamp_ns[of_sender]
+            zero = stamps == 0
+            zeros = int(np.count_nonzero(zero))
+            usual = len(stamps) - 1 if name in RESTING else 1
+            # A recorder may take each message twice.
+            if zeros > usual:
+                usual = int(np.unique(stamps[~zero], return_counts=True)[1].max(initial=usual))
+            if zeros and (zeros > max(usual, 1) or stamps.max() > SINCE_EPOCH_NS):
+                unset[of_sender] = zero
+                for publisher in self._publishers.values():
+                    if publisher.name == sender:
+                        publisher.zeros = zeros
+        return unset
+
+    def _most(self) -> _Publisher:
+        """The publisher with the most samples."""
+        return max(self._publishers.values(), key=lambda publisher: publisher.kept.total())
+
     def _names(self) -> tuple[str, ...]:
-        """The names of the first sample, or of the majority where samples have further names."""
-        first = next(iter(self._samples))
-        return max((names for names in self._samples if set(first) <= set(names)), key=self._count)
+        """The names of the samples of the publisher with the most of them.
 
-    def _count(self, names: tuple[str, ...]) -> int:
-        return self._samples[names].count
-
-    def conflict(self, name: str) -> str:
-        """The note on simultaneous publishers, of which the nodes accept the first.
-
-        Empty for successive publishers.
+        They are the first ones, or those of the majority where samples have further names.
         """
-        spans = sorted(self.spans.items(), key=itemgetter(1))
-        if all(before[1][1] < after[1][0] for before, after in pairwise(spans)):
-            return ""
-        publishers = ", ".join(publisher or UNNAMED for publisher in sorted(self.spans))
-        return (
-            f"{name}: samples of {publishers}: the figures are of the first, and of the next once "
-            "that is silent, as the nodes admit them"
+        most = self._most()
+        first = next(iter(most.kept))
+        return max(
+            (names for names in most.kept if set(first) <= set(names)), key=most.kept.__getitem__
         )
 
-    def recording(self) -> Recording:
-        """The stamps in the order of the recording; after `signal`."""
-        return self._clock.recording(self._unset)._replace(
-            lost=self._lost if self._numbered and not self._restarted else None
+    def of_flight(self, signal: Signal | None) -> list[_Publisher]:
+        """The publishers of the samples of a signal that the nodes admit; without one all."""
+        publishers = [*self._publishers.values()]
+        if signal is None or not self._samples:
+            return publishers
+        columns = self._samples[self._names()]
+        numbers = [0] if signal.sender is None else np.unique(signal.sender).tolist()
+        names = {columns.senders[number] for number in numbers}
+        return [publisher for publisher in publishers if publisher.name in names]
+
+    def strangers(self, signal: Signal | None) -> list[str]:
+        """The names of further publishers, "" for one without a name."""
+        of_flight = self.of_flight(signal)
+        return [
+            sender[:-1].decode(errors="replace") if publisher.name is None else publisher.name
+            for sender, publisher in self._publishers.items()
+            if publisher not in of_flight
+        ]
+
+    def overlap(self) -> bool:
+        """Whether publishers with samples sent at the same time."""
+        spans = sorted(self.spans.values())
+        return any(before[1] >= after[0] for before, after in pairwise(spans))
+
+    def recording(self, signal: Signal | None = None) -> Recording:
+        """The stamps of the flight's publishers in the order of the recording; after `signal`."""
+        recordings = [publisher.recording() for publisher in self.of_flight(signal)]
+        if len(recordings) == 1:
+            return recordings[0]
+        step = next((one for one in recordings if one.step_ns), Recording(0))
+        return Recording(
+            found=sum(one.found for one in recordings),
+            unset=sum(one.unset for one in recordings),
+            repeated=sum(one.repeated for one in recordings),
+            step_ns=step.step_ns,
+            step_at_ns=step.step_at_ns,
+            left_out=sum(one.left_out for one in recordings),
+            lost=None,
+            pauses_ns=tuple(sorted({at_ns for one in recordings for at_ns in one.pauses_ns})),
         )
 
-    def refused(self) -> int:
-        """How many samples were refused: damaged, not finite, or of other channels."""
-        return (
-            self._refused
-            + sum(map(self._count, self._samples))
-            - (self._count(self._names()) if self._samples else 0)
+    def refused(self, signal: Signal | None = None) -> int:
+        """How many samples of the flight are damaged, not finite, or of other channels."""
+        names = self._names() if self._samples else ()
+        return sum(
+            publisher.refused + publisher.kept.total() - publisher.kept[names]
+            for publisher in self.of_flight(signal)
         )
 
 

@@ -7,10 +7,11 @@ only. The decoder learns the byte layout from a message and decodes the messages
 together.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cache
 from itertools import groupby
-from typing import Any, NamedTuple
+from types import MappingProxyType
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +35,11 @@ WAYPOINT = ("number", "north", "east", "altitude")
 """Channels of a sample of a route: the number of the waypoint in its message, and m."""
 
 STAMP = slice(4, 12)  # int32 seconds and uint32 nanoseconds, after the 4 bytes of the encapsulation
+SENDER_PLACE = STAMP.stop + 4  # of header.frame_id, behind its length
+# plain CDR, by the first two bytes
+BYTE_ORDERS: Mapping[bytes, Literal["big", "little"]] = MappingProxyType(
+    {b"\x00\x00": "big", b"\x00\x01": "little"}
+)
 MAX_FLIGHT_TIME = 1e9  # s. A larger value is not a flight time.
 
 
@@ -111,6 +117,36 @@ def stamps_of(table: Table) -> NDArray[np.int64]:
     """The stamps at the begin of messages, ns, shape (N,)."""
     stamps = np.ascontiguousarray(table[:, STAMP])
     return stamps.view("<i4")[:, 0].astype(np.int64) * NANOSECONDS + stamps.view("<u4")[:, 1]
+
+
+def rows_by_sender(table: Table) -> list[tuple[bytes, NDArray[np.int64] | None]]:
+    """The senders in the headers of messages, as bytes, with their rows; None for all rows.
+
+    A message without a header in plain CDR has the sender b"".
+    """
+    count = len(table)
+    first = _sender(table[0])
+    header = np.delete(table[:, : SENDER_PLACE + len(first)], STAMP, axis=1)
+    if first and (header == header[0]).all():
+        return [(first, None)]
+    senders = [_sender(row) for row in table]
+    if len({*senders}) == 1:
+        return [(first, None)]
+    rows: dict[bytes, list[int]] = {}
+    for row in range(count):
+        rows.setdefault(senders[row], []).append(row)
+    return [(sender, np.array(places)) for sender, places in rows.items()]
+
+
+def _sender(row: NDArray[np.uint8]) -> bytes:
+    """The bytes of header.frame_id, with the final zero."""
+    header = bytes(row[:SENDER_PLACE])
+    order = BYTE_ORDERS.get(header[:2])
+    if len(header) < SENDER_PLACE or order is None:
+        return b""
+    length = int.from_bytes(header[STAMP.stop :], order)
+    sender = bytes(row[SENDER_PLACE : SENDER_PLACE + length])
+    return sender if len(sender) == length and sender.endswith(b"\x00") else b""
 
 
 def flight_start_ns(stamp_ns: int, t: float) -> int | None:

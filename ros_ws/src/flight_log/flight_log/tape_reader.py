@@ -5,6 +5,7 @@
 Bags of this stack and of `ros2 bag record` are read, also truncated.
 """
 
+from collections import defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -18,7 +19,7 @@ from flight_core.parameters import ParameterError, require
 from flight_core.rates import seconds
 from flight_core.scenario_file import A_SCENARIO
 from flight_core.tape import Signal, Tape, refusal_note
-from flight_core.text import printable
+from flight_core.text import bounded, printable
 from flight_log.age_of_u import age_of_u
 from flight_log.bag import (
     IMPORTED,
@@ -32,6 +33,7 @@ from flight_log.flight_processes import (
     INSTANCE,
     READY,
     ROSOUT,
+    UNNAMED,
     SampleSpan,
     admitted,
     flight_processes,
@@ -39,7 +41,7 @@ from flight_log.flight_processes import (
 )
 from flight_log.latency import TOPICS as TIMED_TOPICS
 from flight_log.latency import latency
-from flight_log.log_content import ROUTE, LogContent, StoredFile, read_content
+from flight_log.log_content import ROUTE, LogContent, StoredFile, TopicSamples, read_content
 from flight_log.log_messages import LogMessage, log_messages
 from flight_log.named_vectors import (
     JOINT_STATE,
@@ -202,8 +204,12 @@ def _tape(
         name: log.topics[topic] for topic, name in names_within(aircraft, log.topics).items()
     }
     topics = {name: log.topics[topic] for topic, name in names.items()}
-    recordings = {printable(name): samples.recording() for name, samples in samples_by_name.items()}
     signals = {printable(name): admitted(signal) for name, signal in filled.items()}
+    of_flight = {name: signals.get(printable(name)) for name in samples_by_name}
+    recordings = {
+        printable(name): samples.recording(of_flight[name])
+        for name, samples in samples_by_name.items()
+    }
     recording = {name: clock for name, clock in recordings.items() if clock.found}
     leaps: list[Leap] = []
     # The import numbers the samples that it found: a gap is one of the log, not of its clock.
@@ -211,15 +217,17 @@ def _tape(
         signals, recording, leaps = without_leaps(signals, recording)
     start_ns = _start_ns(signals)
     end = seconds(max(int(signal.stamp_ns[-1]) for signal in signals.values()) - start_ns)
-    counts = {printable(name): samples.refused() for name, samples in samples_by_name.items()}
+    counts = {
+        printable(name): samples.refused(of_flight[name])
+        for name, samples in samples_by_name.items()
+    }
     refusals = {name: count for name, count in counts.items() if count}
-    conflicts = (topics[name].conflict(name) for name in filled if name in AIRCRAFT_TOPICS)
     notes = [
         *log.notes_at(end),
         *(leap_note(leap, start_ns) for leap in leaps),
         *(refusal_note(name, count) for name, count in refusals.items()),
         *(recording_note(name, clock, start_ns) for name, clock in recording.items()),
-        *conflicts,
+        *_publisher_notes({name: topics[name] for name in filled}, of_flight),
     ]
     outcome = read_outcome(log.metadata.get(OUTCOME))
     spans = _spans((name, topics[name].spans) for name in filled)
@@ -235,6 +243,41 @@ def _tape(
         refused=refusals,
         is_by_clock=SIMULATED_TIME in log.metadata or _is_before_epoch(start_ns, spans),
     )
+
+
+def _publisher_notes(
+    topics: Mapping[str, TopicSamples], of_flight: Mapping[str, Signal | None]
+) -> list[str]:
+    """The notes on further publishers of topics: of samples at one time, and of other messages.
+
+    A note is of all topics with the same publishers.
+    """
+    conflicts = defaultdict[tuple[str, ...], list[str]](list)
+    strangers = defaultdict[tuple[str, ...], list[str]](list)
+    for name, samples in topics.items():
+        if name in AIRCRAFT_TOPICS and samples.overlap():
+            conflicts[tuple(sorted(samples.spans))].append(name)
+        silent = [one for one in samples.strangers(of_flight[name]) if one not in samples.spans]
+        if silent:
+            strangers[tuple(sorted({*silent}))].append(name)
+    return [
+        *(
+            f"{', '.join(names)}: samples of {_publishers(senders)}: the figures are of the first, "
+            "and of the next once that is silent, as the nodes admit them"
+            for senders, names in conflicts.items()
+        ),
+        *(
+            f"{', '.join(names)}: messages of {_publishers(senders)} without a sample of the flight"
+            for senders, names in strangers.items()
+        ),
+    ]
+
+
+def _publishers(senders: Sequence[str]) -> str:
+    """The names of publishers for a sentence."""
+    surplus = len(senders) - NAMED
+    more = f" and {surplus} more publishers" if surplus > 0 else ""
+    return ", ".join(bounded(sender) or UNNAMED for sender in senders[:NAMED]) + more
 
 
 def _is_before_epoch(start_ns: int, spans: Mapping[str, SampleSpan]) -> bool:
