@@ -6,6 +6,8 @@ A topic alone is excused by what its own sensor drops, and a silence is named.
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from numpy.typing import NDArray
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
+from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.account import account
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
@@ -116,3 +119,53 @@ def test_topic_that_ends_a_second_early_is_named(name: str, end: float, named: b
     assert [lack.endswith(f"ends at t = {end:.3f} of 600.000 s") for lack in sentences] == [
         True
     ] * named
+
+
+@cache
+def flown(share: float, rate: float) -> tuple[Scenario, Tape]:
+    """A flight whose sensor drops a share of y."""
+    flight = scenario(rate=rate, step=0.01 if rate == 100.0 else 0.002, sensors={"dropout": share})
+    flight = flight.vary(flight={"duration": 20.0})
+    return flight, simulate(flight)
+
+
+SHARES = pytest.mark.parametrize(
+    "share, rate", [(0.05, 100.0), (0.3, 100.0), (0.5, 100.0), (0.8, 100.0), (0.5, 500.0)]
+)
+
+
+@SHARES
+def test_flight_whose_sensor_drops_samples_has_a_whole_log(share: float, rate: float) -> None:
+    """Each u that was sent is in the log: none is due without a new y."""
+    flight, tape = flown(share, rate)
+    assert account(tape, flight).lacks == ()
+
+
+@SHARES
+@pytest.mark.parametrize("lost", [0.05, 0.3, 0.6])
+@pytest.mark.parametrize("name", ["u", "internals"])
+def test_declared_dropout_excuses_no_lost_u(
+    share: float, rate: float, lost: float, name: str
+) -> None:
+    flight, tape = flown(share, rate)
+    signal = tape[name]
+    keep = np.random.default_rng(2).random(len(signal.stamp_ns)) >= lost
+    keep[[0, -1]] = True
+    lossy = replace(tape, signals={**tape.signals, name: signal.where(keep)})
+    (sentence,) = account(lossy, flight).lacks
+    assert sentence.startswith(f"{name} {np.count_nonzero(keep)} of ")
+    expected = int(sentence.split()[3])
+    assert expected == pytest.approx(len(signal.stamp_ns), rel=0.01)
+
+
+@pytest.mark.parametrize("share", [0.3, 0.5])
+def test_y_that_is_lost_beyond_the_declared_dropout_is_named(share: float) -> None:
+    """A log without a stretch of y and of u does not excuse itself: y has a number of its own."""
+    flight, tape = flown(share, 100.0)
+    signals = {}
+    for name in ("y", "u", "internals"):
+        t = tape.time(name)
+        signals[name] = tape[name].where((t < 8.0) | (t > 12.0))
+    lacks = account(replace(tape, signals={**tape.signals, **signals}), flight).lacks
+    assert any(lack.startswith("y ") for lack in lacks)
+    assert any(lack.startswith("u ") for lack in lacks)

@@ -144,18 +144,26 @@ def _expected(
         expected[name] = count
     if not span.simulated:  # the controller is inactive until the bridge engages
         return expected
-    engaged_time = seconds(span.end_ns - tape.start_ns)
+    guided_time = seconds(span.end_ns - tape.start_ns)
     if is_sent_by_stack(tape, "u"):
         ticks, engaged_time = _ticks(tape, scenario, span.end_ns)
         expected |= dict.fromkeys(TICKS, ticks)
+        # In lockstep and in one process guidance flies in every mode of the controller.
+        if is_real_time(tape):
+            guided_time = engaged_time
     if scenario.guidance is not None:
         step_ns = period_ns(scenario.guidance.rate, "guidance.rate")
         for name in GUIDED:
             if name not in tape or is_sent_by_stack(tape, name):
                 rate = NANOSECONDS / _period(tape, name, step_ns)
                 before_pose = math.ceil(pose.delay * rate)
-                expected[name] = max(math.floor(engaged_time * rate) - 2 - before_pose, 0)
+                expected[name] = max(math.floor(guided_time * rate) - 2 - before_pose, 0)
     return expected
+
+
+def is_real_time(tape: Tape) -> bool:
+    """Whether the nodes flew by a clock: that of the host since the epoch, or /clock."""
+    return tape.is_by_clock or tape.start_ns > SINCE_EPOCH_NS
 
 
 def _periods(tape: Tape, scenario: Scenario, *, simulated: bool) -> dict[str, int]:
@@ -335,7 +343,8 @@ def _ticks(tape: Tape, scenario: Scenario, end_ns: int) -> tuple[int, float]:
     if not len(log.stamp_ns):
         return instants, seconds(instants * step_ns)
     count = instants
-    if "y" in tape and not is_sent_by_stack(tape, "y"):
+    drops = scenario.aircraft.sensors.dropout > 0.0
+    if "y" in tape and (drops or not is_sent_by_stack(tape, "y")):
         count = min(instants, _instants_with_y(tape, log, step_ns))
     number = log["number"]
     senders = () if log.sender is None else np.unique(log.sender)
@@ -357,8 +366,8 @@ def _ticks(tape: Tape, scenario: Scenario, end_ns: int) -> tuple[int, float]:
 def _instants_with_y(tape: Tape, internals: Signal, step_ns: int) -> int:
     """The number of ticks with a new y or in a failsafe.
 
-    A foreign aircraft has a rate of y of its own, and the controller publishes u with a new y
-    alone.
+    A foreign aircraft has a rate of y of its own, and a sensor may be declared to drop samples: the
+    controller publishes u with a new y alone. What the log lacks of y is a lack of y.
     """
     age_ns = internals["age"] * NANOSECONDS
     first_tick_ns = internals.stamp_ns[0] + age_ns[0]
