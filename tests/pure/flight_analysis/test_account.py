@@ -487,6 +487,47 @@ def test_process_has_ready_time_of_its_own_start() -> None:
     assert flight_processes({"": SampleSpan(0, 1, 2)}, [], "") == {}  # in one process
 
 
+def test_processes_of_a_lockstep_flight_have_their_samples_and_no_time_of_day(
+    whole: Path, figures: dict[str, Any]
+) -> None:
+    """Nodes in lockstep have no process id. Nothing is said of a recorder, which sends nothing."""
+    ready = [("/recorder", EPOCH), ("/controller", EPOCH), ("/aircraft", EPOCH)]
+    spans = {
+        "/controller": SampleSpan(0, 2 * NANOSECONDS, 402),
+        "/aircraft": SampleSpan(0, 2 * NANOSECONDS, 1001),
+        "/stray": SampleSpan(0, 1, 3),
+    }
+    processes = flight_processes(spans, ready, "")
+    assert processes["/controller"] == Process(EPOCH, 0, 2 * NANOSECONDS, 402)
+    assert processes["/recorder"] == Process(EPOCH, None, None)
+    flight = read_flight(whole)
+    tape = replace(flight.tape, processes=processes)
+    found = account(tape, find_scenario("osprey_gust")).processes
+    assert {name: (each.ready, each.samples) for name, each in found.items()} == {
+        "/controller": (None, 402),
+        "/aircraft": (None, 1001),
+        "/stray": (None, 3),
+    }
+    content = {name: each._asdict() for name, each in found.items()}
+    summary = figures | {"account": figures["account"] | {"processes": content}}
+    (table,) = (
+        each for each in flight_tables(summary, flight.units, []) if each.caption == "Processes"
+    )
+    heads = [column[:2] for column in table.columns]
+    assert heads == [("output", head) for head in ("first (s)", "last (s)", "samples")]
+    assert [*table.rows[1][1:]] == ["0.000", "2.000", "402"]
+    assert figures["latency"] is None
+
+
+def test_recorder_in_the_hosts_time_has_no_number_of_samples() -> None:
+    """It sends none: a zero would say that nothing was sent that should be."""
+    ready = [("/recorder", EPOCH), ("/controller", EPOCH)]
+    spans = {"/controller#7": SampleSpan(EPOCH, EPOCH + NANOSECONDS, 200)}
+    processes = flight_processes(spans, ready, "")
+    assert processes["/recorder"].samples is None
+    assert processes["/controller#7"].samples == 200
+
+
 def test_summary_counts_commands_of_flight(figures: dict[str, Any]) -> None:
     """The first edge of the scenario is at 2.0 s, the end of the flight."""
     edges = command_edges(find_scenario("osprey_gust"))

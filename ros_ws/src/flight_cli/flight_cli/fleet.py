@@ -150,9 +150,9 @@ def foreign_samples(summaries: Mapping[str, Mapping[str, Any]]) -> list[str]:
     total = 0
     for name, summary in summaries.items():
         processes = (summary["account"] or {}).get("processes", {})
-        total += sum(process["samples"] for process in processes.values())
+        total += sum(process["samples"] or 0 for process in processes.values())
         foreign = sum(
-            process["samples"]
+            process["samples"] or 0
             for node, process in processes.items()
             if node.rpartition("/")[0] != f"/{name}"
         )

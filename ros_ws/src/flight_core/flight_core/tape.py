@@ -150,7 +150,7 @@ class Process(NamedTuple):
     ready_ns: int | None  # its event loop began
     first_ns: int | None  # stamps of its first and last sample
     last_ns: int | None
-    samples: int = 0  # on the topics of the aircraft
+    samples: int | None = None  # on the topics of the aircraft
 
 
 @dataclass(frozen=True)

@@ -65,14 +65,15 @@ def flight_processes(
     """The processes by name, "/controller#4711", by the `spans` of the publishers.
 
     A node that was restarted is several processes. A process was ready at the last such time of its
-    node before its first sample. A node without samples, as the recorder, has no process id. Beside
-    nodes of the stack every publisher counts, as `ros2 topic pub`, which gives no name.
+    node before its first sample. A node without samples, as the recorder, has no process id. In
+    lockstep no node has one. Beside nodes of the stack every publisher counts, as `ros2 topic pub`,
+    which gives no name.
     """
-    has_stack = any(INSTANCE.fullmatch(name) for name in spans)
     waiting: dict[str, list[int]] = {}
     for node, time_ns in ready:
         if node.rpartition("/")[0] == namespace:
             waiting.setdefault(node, []).append(time_ns)
+    has_stack = any(INSTANCE.fullmatch(name) or name in waiting for name in spans)
     processes = {}
     for name, (first_ns, last_ns, samples) in sorted(spans.items(), key=lambda span: span[1]):
         if (instance := INSTANCE.fullmatch(name)) is not None:
@@ -86,7 +87,8 @@ def flight_processes(
                 time_ns for time_ns in waiting.get(instance[1], []) if time_ns not in before
             ]
         elif has_stack:
-            processes[name or UNNAMED] = Process(None, first_ns, last_ns, samples)
+            ready_ns = max(waiting.pop(name, []), default=None)
+            processes[name or UNNAMED] = Process(ready_ns, first_ns, last_ns, samples)
     return processes | {
         node: Process(times[-1], None, None) for node, times in waiting.items() if times
     }

@@ -36,7 +36,7 @@ class ProcessAccount(NamedTuple):
     ready: float | None  # its event loop began
     first: float | None  # stamps of its first and last output
     last: float | None
-    samples: int = 0  # on the topics of the aircraft
+    samples: int | None = None  # on the topics of the aircraft
 
 
 class Commands(NamedTuple):
@@ -182,14 +182,15 @@ def _span(tape: Tape, planned_ns: int | None, outcome: Outcome, *, simulated: bo
 def _processes(tape: Tape) -> dict[str, ProcessAccount]:
     """The processes in flight time.
 
-    In lockstep the stamps are no times of day, and when a process was ready is not known.
+    In lockstep the stamps are no times of day, and when a process was ready is not known: one that
+    also sent nothing, as the recorder, is left out.
     """
 
     def flight_time(stamp_ns: int | None) -> float | None:
         return None if stamp_ns is None else seconds(stamp_ns - tape.start_ns)
 
     since_epoch = tape.start_ns > SINCE_EPOCH_NS
-    return {
+    processes = {
         name: ProcessAccount(
             flight_time(ready_ns) if since_epoch else None,
             flight_time(first),
@@ -198,6 +199,8 @@ def _processes(tape: Tape) -> dict[str, ProcessAccount]:
         )
         for name, (ready_ns, first, last, samples) in tape.processes.items()
     }
+    unknown = ProcessAccount(None, None, None)
+    return {name: process for name, process in processes.items() if process != unknown}
 
 
 def _too_busy(parts: Sequence[str]) -> str:

@@ -27,6 +27,7 @@ from flight_analysis.report.account import Account, account
 from flight_analysis.report.flight_outcome import NEVER_ENGAGED, outcome_of_log, until_last_tick
 from flight_analysis.report.flown_models import FlownController, flown_controllers
 from flight_analysis.report.model_spans import parameter_spans
+from flight_analysis.report.sample_counts import is_real_time
 from flight_analysis.report.summary import (
     RecordedFlight,
     empty_summary,
@@ -218,8 +219,10 @@ def _flight(recorded: RecordedRun, run: Path, outcome: Outcome | None) -> Record
             si_units=recorded.metadata.get(CHANNEL_UNITS, {}),
         )
     scenario = _scenario_in(recorded, run)
-    # The times of messages are signals of the log.
-    timed = {"latency": recorded.latency, "age_of_u": recorded.age_of_u}
+    # The times of messages are signals of the log. In lockstep and in one process the nodes wait
+    # for each other, however long the host takes.
+    latency = recorded.latency if is_real_time(recorded.tape) else None
+    timed = {"latency": latency, "age_of_u": recorded.age_of_u}
     signals = {name: signal for name, signal in timed.items() if signal is not None}
     log = replace(recorded.tape, signals={**recorded.tape.signals, **signals})
     engagements = recorded.engagements

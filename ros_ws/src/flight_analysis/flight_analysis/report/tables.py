@@ -294,12 +294,15 @@ def _tick_table(summary: Mapping[str, Any]) -> MetricTable:
 def _process_table(summary: Mapping[str, Any]) -> MetricTable:
     flight_account = account_of_json(summary)
     processes = {} if flight_account is None else flight_account.processes
+    # In lockstep nobody knows when a process was ready.
+    is_timed = any(process.ready is not None for process in processes.values())
     columns = [
-        Column("", "ready (s)"),
+        *((Column("", "ready (s)"),) if is_timed else ()),
         *(Column("output", head) for head in ("first (s)", "last (s)", "samples")),
     ]
     rows = []
-    for name, (*times, samples) in processes.items():
+    for name, process in processes.items():
+        times = (process.ready, process.first, process.last)[not is_timed :]
         cells = ["" if time is None else f"{time:.3f}" for time in times]
-        rows.append([name, *cells, f"{samples}"])
+        rows.append([name, *cells, "" if process.samples is None else f"{process.samples}"])
     return MetricTable("Processes", columns, rows)
