@@ -5,6 +5,7 @@
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 from importlib.metadata import version
@@ -493,11 +494,11 @@ def test_page_that_commands_a_flight_runs_at_normal_priority(
     words: str, nice: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls: list[str] = []
-    monkeypatch.setattr(cli.os, "nice", lambda by: calls.append("nice"))
-    monkeypatch.setattr(cli.os, "sched_setscheduler", lambda *_: calls.append("batch"))
+    monkeypatch.setattr(os, "nice", lambda by: calls.append("nice"))
+    monkeypatch.setattr(os, "sched_setscheduler", lambda *_: calls.append("batch"))
     monkeypatch.setattr(cli, "application", lambda words: lambda prog_name: None)
-    monkeypatch.setattr(cli.signal, "signal", lambda *_: None)
-    monkeypatch.setattr(cli.sys, "unraisablehook", None)
-    monkeypatch.setattr(cli.sys, "argv", ["rise-di", *words.split()])
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    monkeypatch.setattr(sys, "unraisablehook", None)
+    monkeypatch.setattr(sys, "argv", ["rise-di", *words.split()])
     cli.main()
     assert calls == (["nice", "batch"] if nice else [])

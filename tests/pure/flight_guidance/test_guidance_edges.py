@@ -347,7 +347,7 @@ def test_pose_with_nan_refused() -> None:
 
 
 AUTHORITIES = (0.0, 1e-9, 0.3, 10.0, UNKNOWN)  # rad/s^2 and m/s^2
-HEXAROTOR = REPOSITORY / "examples" / "hexarotor" / "hexarotor_square.yaml"
+MULTICOPTER = REPOSITORY / "examples" / "hexarotor" / "hexarotor_square.yaml"
 
 
 def _fly(made: Guidance, k: int, altitude: float = 0.0, north: float = 0.0) -> Any:
@@ -360,7 +360,7 @@ def _fly(made: Guidance, k: int, altitude: float = 0.0, north: float = 0.0) -> A
 
 
 def _section(kind: str, **changes: Any) -> GuidanceConfig:
-    section = find_scenario(str(HEXAROTOR) if kind == "multicopter" else "osprey_route").guidance
+    section = find_scenario(str(MULTICOPTER) if kind == "multicopter" else "osprey_route").guidance
     assert section is not None
     values = section.model_dump(exclude_unset=True) | changes
     return GuidanceConfig.validate_mapping(values, "guidance")
