@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from flight_analysis.closed_loop.scenario import Scenario, require_guidable
 from flight_analysis.closed_loop.scenario_library import find_scenario, with_route
 from flight_analysis.report.run_folder import new_run
+from flight_analysis.report.separation import SEPARATION
 from flight_bringup.fly import POLL_PERIOD, Steps, as_file, follow
 from flight_bringup.graph import FIRST_STAGE, LEAD, absolute_namespace, second_stage
 from flight_bringup.interrupt import DeferredInterrupt, handle_signals
@@ -90,6 +91,10 @@ class FleetConfig(Config):
         description="latitude and longitude of north = east = 0, degrees; by default the home "
         "of each route",
     )
+    separation: NonNegative = Field(
+        default=SEPARATION,
+        description="least distance of two aircraft, m; less is a shortfall; 0: not judged",
+    )
     aircraft: Annotated[dict[str, AircraftOfFleet | None], Field(min_length=1)] = Field(
         description="the aircraft by name"
     )
@@ -116,6 +121,7 @@ class Fleet:
     lockstep: bool = False
     composed: bool = False
     use_sim_time: bool = False
+    separation: float = SEPARATION  # m
 
     def participants(self) -> int:
         """The DDS participants of a flight: the command, and the processes."""
@@ -170,6 +176,7 @@ def read_fleet(
         lockstep=config.lockstep,
         composed=config.composed,
         use_sim_time=by_clock,
+        separation=config.separation,
     )
     cheaper = "" if config.composed else "; composed: true takes one an aircraft"
     participants = f"{fleet.participants()} participants of the middleware"

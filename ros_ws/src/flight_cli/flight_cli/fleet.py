@@ -16,6 +16,7 @@ from flight_analysis.report.run_folder import (
     write_empty_summary,
     write_report,
 )
+from flight_analysis.report.separation import Track, place_of, separation_shortfalls
 from flight_analysis.report.summary import taken_over
 from flight_bringup.fleet import Fleet, MemberFlight, fly_fleet, read_fleet
 from flight_cli.output import CLOCK_COLUMNS, NAME_COLUMN, clock, new_table, print_json, progress_bar
@@ -57,6 +58,7 @@ def fly_fleet_file(fleet: Fleet, runs: Sequence[Path], *, as_json: bool) -> int:
         with suppress(KeyboardInterrupt):
             for each in flights:
                 reported[each.member.name] = _report(each)
+            reported |= _separated(fleet, flights, reported)
     results = {each.member.name: _unreported(each) for each in flights} | reported
     if as_json:
         print_json({name: result.summary for name, result in results.items()})
@@ -70,11 +72,27 @@ def fly_fleet_file(fleet: Fleet, runs: Sequence[Path], *, as_json: bool) -> int:
 class _AircraftResult(NamedTuple):
     """The summary of an aircraft, and the fraction of its ticks with the controller ENGAGED.
 
-    None without ticks.
+    None without ticks. `track`: where it was, None without a place.
     """
 
     summary: dict[str, Any]
     engaged: float | None
+    track: Track | None = None
+
+
+def _separated(
+    fleet: Fleet, flights: Sequence[MemberFlight], reported: Mapping[str, _AircraftResult]
+) -> dict[str, _AircraftResult]:
+    """Write the reports of the aircraft again that came nearer to another one than is asked."""
+    tracks = {name: result.track for name, result in reported.items() if result.track is not None}
+    shortfalls = separation_shortfalls(tracks, fleet.separation)
+    return {
+        each.member.name: _report(
+            replace(each, outcome=replace(each.outcome, shortfalls=(shortfalls[each.member.name],)))
+        )
+        for each in flights
+        if each.member.name in shortfalls
+    }
 
 
 def _unreported(flight: MemberFlight) -> _AircraftResult:
@@ -105,9 +123,14 @@ def _report(member_flight: MemberFlight) -> _AircraftResult:
             return _unreported(replace(member_flight, outcome=outcome))
         return _AircraftResult(summary, None)
     internals = flight.tape.signals.get("internals")
+    guidance = member_flight.member.scenario.guidance
+    place = place_of(flight.tape)
     return _AircraftResult(
         flight.summary,
         None if internals is None else float(np.mean(internals["mode"] == Mode.ENGAGED)),
+        None
+        if place is None or not len(place.stamp_ns)
+        else Track(flight.tape.start_ns, place, None if guidance is None else guidance.origin),
     )
 
 
@@ -119,7 +142,7 @@ def _show(
     table = new_table(f"Fleet {name}", headings, ("aircraft", "outcome"), ("outcome",))
     lines = []
     for each in flights:
-        summary, engaged_share = results[each.member.name]
+        summary, engaged_share, _ = results[each.member.name]
         ticks = summary["ticks"]
         table.add_row(
             each.member.name,

@@ -50,6 +50,7 @@ class Aim(StrEnum):
     ENGAGEMENT = "engagement"  # the law flies while it is asked to
     REFERENCE = "reference"  # y_m is that of the scenario
     GROUND = "ground"  # the aircraft stays above the ground
+    SEPARATION = "separation"  # from the other aircraft of a fleet
     STALL = "stall"  # the airspeed stays above the stall speed
     FENCE = "fence"  # inside
     ALTITUDE = "altitude"  # between the least and the largest altitude
@@ -215,7 +216,19 @@ def read_outcome(record: object) -> Outcome:
         reason = bounded(str(record["reason"]))
     except (KeyError, ValueError):
         return UNKNOWN
-    return UNKNOWN if end is End.UNKNOWN else Outcome(end, reason)
+    return UNKNOWN if end is End.UNKNOWN else Outcome(end, reason, _of_fleet(record))
+
+
+def _of_fleet(record: Mapping[str, Any]) -> tuple[Shortfall, ...]:
+    """The shortfalls of a record that do not follow from the log of one aircraft."""
+    shortfalls = []
+    for each in record.get("shortfalls") or ():
+        if isinstance(each, Mapping) and each.get("aim") == Aim.SEPARATION:
+            sentence = bounded(str(each.get("sentence", "")))
+            figures = each.get("figures")
+            figures = dict(figures) if isinstance(figures, Mapping) else {}
+            shortfalls.append(Shortfall(aim=Aim.SEPARATION, sentence=sentence, figures=figures))
+    return tuple(shortfalls)
 
 
 def parsed_outcome(text: str) -> Outcome:

@@ -37,7 +37,7 @@ from flight_analysis.report.summary import (
 )
 from flight_core.arguments import FilePath
 from flight_core.files import dump_yaml, link_latest, read_file, write_file, writing
-from flight_core.outcome import COMPLETED, End, Outcome, parsed_outcome, read_outcome
+from flight_core.outcome import End, Outcome, parsed_outcome, read_outcome
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS
 from flight_core.scenario_file import A_SCENARIO
@@ -227,7 +227,11 @@ def _flight(recorded: RecordedRun, run: Path, outcome: Outcome | None) -> Record
     log = replace(recorded.tape, signals={**recorded.tape.signals, **signals})
     engagements = recorded.engagements
     outcome = outcome or _previous_outcome(recorded, folder, scenario)
-    if outcome == COMPLETED and not {"u", "internals"} & set(log.signals) and engagements is None:
+    if (
+        outcome.end is End.COMPLETED
+        and not {"u", "internals"} & set(log.signals)
+        and engagements is None
+    ):
         outcome = NEVER_ENGAGED
     if "guidance" in log:
         require_channels(log["guidance"].names)
@@ -421,11 +425,14 @@ def _previous_outcome(recorded: RecordedRun, folder: Path | None, scenario: Scen
     """
     tape = recorded.tape
     outcome = tape.outcome
-    if outcome.end is End.UNKNOWN and folder is not None:
+    if folder is not None:
         with suppress(OSError, ValueError, TypeError, KeyError):
             summary = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))
             if summary["flight"] == _identity(recorded):
-                outcome = read_outcome(summary["outcome"])
+                before = read_outcome(summary["outcome"])
+                # What the log of one aircraft does not tell stays.
+                outcome = replace(outcome, shortfalls=before.shortfalls)
+                outcome = before if outcome.end is End.UNKNOWN else outcome
     has_folder = folder is not None and (folder / f"{folder.name}_0.mcap").is_file()
     if outcome.end is End.UNKNOWN and folder is not None and has_folder:
         with suppress(ParameterError):

@@ -90,7 +90,9 @@ def judge(
                 aim=Aim.LOG, sentence=f"log incomplete: {lack}", brief=f"log incomplete: {topic}"
             )
         )
-    return replace(outcome, shortfalls=tuple(shortfalls), allowances=allowances)
+    # The log of one aircraft does not tell of the others.
+    of_fleet = (each for each in outcome.shortfalls if each.aim is Aim.SEPARATION)
+    return replace(outcome, shortfalls=(*of_fleet, *shortfalls), allowances=allowances)
 
 
 def _may_pause(tape: Tape, scenario: Scenario | None) -> bool:

@@ -1,0 +1,110 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The separation of the aircraft of a fleet: how near they came to each other."""
+
+from collections.abc import Mapping
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+
+from flight_core.outcome import Aim, Shortfall
+from flight_core.rates import seconds
+from flight_core.tape import Signal, Tape
+from flight_core.vectors import FloatArray
+
+SEPARATION = 22.0
+"""Least distance of two aircraft by default, m: the sum of the spans of two Cessna 172 of 11.0 m
+(Cessna 172S specifications), the widest shipped aircraft."""
+
+PLACE = ("north", "east", "altitude")  # m
+
+
+class Track(NamedTuple):
+    """Where an aircraft was: stamps, and PLACE in a map that the aircraft share."""
+
+    start_ns: int  # stamp of its t = 0
+    place: Signal
+    origin: tuple[float, ...] | None = None  # of the map
+
+
+class Approach(NamedTuple):
+    """The least distance of two aircraft, m, and its stamp."""
+
+    distance: float
+    at_ns: int
+
+
+def place_of(tape: Tape) -> Signal | None:
+    """Return where an aircraft was, the true place where the log has it; None without a place."""
+    for topic in ("truth", "pose"):
+        if topic in tape and set(PLACE) <= set(tape[topic].names):
+            signal = tape[topic]
+            values = np.column_stack([signal[name] for name in PLACE])
+            return Signal(signal.stamp_ns, PLACE, values)
+    return None
+
+
+def approach(first: Signal, second: Signal) -> Approach | None:
+    """Return how near two aircraft came; None without a common time.
+
+    Between two samples each moves in a straight line. With d_0 and d_1 the distances of the ends of
+    a part and v = d_1 - d_0 the nearest point is at the fraction -d_0 v / v^2, within the part.
+    """
+    begin_ns = max(int(first.stamp_ns[0]), int(second.stamp_ns[0]))
+    end_ns = min(int(first.stamp_ns[-1]), int(second.stamp_ns[-1]))
+    if begin_ns > end_ns:
+        return None
+    stamps = np.union1d(first.stamp_ns, second.stamp_ns)
+    stamps = np.union1d(
+        stamps[(stamps >= begin_ns) & (stamps <= end_ns)], np.array([begin_ns, end_ns])
+    )
+    # From one instant on, since float64 does not resolve 1 ns in a time of day.
+    t = (stamps - begin_ns).astype(float)
+    d = _at(first, t, begin_ns) - _at(second, t, begin_ns)
+    v = np.diff(d, axis=0)
+    square = np.sum(v * v, axis=1)
+    projection = -np.sum(d[:-1] * v, axis=1)
+    part = np.clip(np.divide(projection, square, out=np.zeros_like(square), where=square > 0), 0, 1)
+    nearest = np.append(np.linalg.norm(d[:-1] + part[:, None] * v, axis=1), np.linalg.norm(d[-1]))
+    k = int(np.argmin(nearest))
+    at_ns = int(stamps[k]) + (round(part[k] * float(t[k + 1] - t[k])) if k < len(part) else 0)
+    return Approach(float(nearest[k]), at_ns)
+
+
+def _at(signal: Signal, t: FloatArray, begin_ns: int) -> FloatArray:
+    """The places at times in ns since an instant, shape (N, 3)."""
+    own = (signal.stamp_ns - begin_ns).astype(float)
+    return np.column_stack([np.interp(t, own, signal[name]) for name in PLACE])
+
+
+def separation_shortfalls(tracks: Mapping[str, Track], least: float) -> dict[str, Shortfall]:
+    """Return the shortfall of each aircraft that came nearer to another one than `least`, m.
+
+    Aircraft on maps with different origins are not compared.
+    """
+    near: dict[str, dict[str, Approach]] = {}
+    for (one, track), (other, further) in combinations(tracks.items(), 2):
+        found = None
+        if track.origin == further.origin:
+            found = approach(track.place, further.place)
+        if found is not None and found.distance < least:
+            near.setdefault(one, {})[other] = found
+            near.setdefault(other, {})[one] = found
+    shortfalls = {}
+    for name, approaches in near.items():
+        other, (distance, at_ns) = min(approaches.items(), key=lambda pair: pair[1])
+        time = seconds(at_ns - tracks[name].start_ns)
+        more = f", nearer than that to {len(approaches)} aircraft" if len(approaches) > 1 else ""
+        shortfalls[name] = Shortfall(
+            aim=Aim.SEPARATION,
+            sentence=f"{distance:.3g} m from {other} at t = {time:.2f} s, {least:g} m asked{more}",
+            figures={
+                "other": other,
+                "distance": distance,
+                "time": time,
+                "least": least,
+                "count": len(approaches),
+            },
+        )
+    return shortfalls
