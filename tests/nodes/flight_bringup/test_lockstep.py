@@ -131,12 +131,12 @@ def test_guided_flight_in_lockstep_is_that_of_one_process_and_goes_home_without_
     assert len(world.sent["/odometry"]) == 20  # 2 s at 10 Hz
 
 
-STRANGERS = (
+FOREIGN = (
     b"",
     b"\x00\x01",
     Encoder((), "").encode(0, np.zeros(0)),
-    Encoder((), "/stranger").encode(10 * NANOSECONDS, np.zeros(0)),
-    Encoder(OUTPUTS, "/stranger").encode(0, np.ones(4)),
+    Encoder((), "/foreign").encode(10 * NANOSECONDS, np.zeros(0)),
+    Encoder(OUTPUTS, "/foreign").encode(0, np.ones(4)),
     Encoder(INPUTS, "/controller").encode(0, np.ones(4)),
     Encoder(OUTPUTS, "/aircraft").encode(0, np.ones(4)),
     Encoder(POSE, "/aircraft").encode(0, np.ones(len(POSE))),
@@ -159,7 +159,7 @@ STRANGERS = (
         ("osprey_route", "/u_m"),
     ],
 )
-def test_messages_of_a_stranger_change_no_bit_of_a_lockstep_flight(
+def test_messages_of_a_foreign_publisher_change_no_bit_of_a_lockstep_flight(
     name: str, topic: str, tmp_path: Path
 ) -> None:
     scenario = varied(tmp_path, name, flight={"duration": 0.5})
@@ -168,10 +168,10 @@ def test_messages_of_a_stranger_change_no_bit_of_a_lockstep_flight(
         rounds = 0
         while any(node.advance() for node in nodes):
             rounds += 1
-            for raw in STRANGERS if rounds > 20 else ():
-                # The flight has begun. A stranger has sent few messages, or many.
+            for raw in FOREIGN if rounds > 20 else ():
+                # The flight has begun. The foreign publisher has sent few messages, or many.
                 world.deliver(topic, kind, raw, 1 if rounds % 2 else 10**6)
-        world.sent[topic] = [sent for sent in world.sent[topic] if sent[1] not in STRANGERS]
+        world.sent[topic] = [sent for sent in world.sent[topic] if sent[1] not in FOREIGN]
         require_equal(world, scenario)
 
 

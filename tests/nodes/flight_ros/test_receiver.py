@@ -277,7 +277,7 @@ def lockstep(setup: Setup, *messages: tuple[bytes, int]) -> list[int | None]:
 
 
 EMPTY = Encoder((), "/aircraft#1").encode(0, np.zeros(0))
-STRANGERS = {
+NO_INSTANTS = {
     "no bytes": (b"", 1, "malformed"),
     "two bytes": (b"\x00\x01", 1, "malformed"),
     "a header without a sender": (message()[:12], 1, "malformed"),
@@ -292,8 +292,8 @@ STRANGERS = {
 }
 
 
-@pytest.mark.parametrize("raw, number, reason", STRANGERS.values(), ids=STRANGERS)
-def test_message_of_a_stranger_is_no_instant_of_a_lockstep_flight(
+@pytest.mark.parametrize("raw, number, reason", NO_INSTANTS.values(), ids=NO_INSTANTS)
+def test_message_of_a_foreign_publisher_is_no_instant_of_a_lockstep_flight(
     raw: bytes, number: int, reason: str
 ) -> None:
     """Each message of the flight's publisher is an instant, and each other one is nothing."""

@@ -61,8 +61,8 @@ def written(folder: Path, messages: Sequence[Sent]) -> Tape:
     return read_run(folder / "run").tape
 
 
-def strange(topic: str, now_ns: int, number: int) -> list[bytes]:
-    """Messages of strangers: bytes, other channels, old, zero and future stamps, no number."""
+def foreign(topic: str, now_ns: int, number: int) -> list[bytes]:
+    """Messages of foreign publishers: bytes, other channels, old, zero and future stamps."""
     nan = [float("nan")] * 4
     return [
         b"\x00",
@@ -82,7 +82,7 @@ def strange(topic: str, now_ns: int, number: int) -> list[bytes]:
 @pytest.mark.parametrize("since_ns", [0, EPOCH], ids=["flight time", "time of day"])
 @pytest.mark.parametrize("begin", [0.0, 3.0], ids=["from the start", "amid"])
 @pytest.mark.parametrize("topics", [("y",), ("u",), ("y", "y_m", "u")])
-def test_messages_of_strangers_count_for_no_topic_of_the_flight(
+def test_messages_of_foreign_publishers_count_for_no_topic_of_the_flight(
     since_ns: int, begin: float, topics: tuple[str, ...], tmp_path: Path
 ) -> None:
     own = flight(since_ns=since_ns)
@@ -91,7 +91,7 @@ def test_messages_of_strangers_count_for_no_topic_of_the_flight(
         Sent(topic, data, since_ns + first + k * 7 * MS, since_ns + first, k + 1)
         for topic in topics
         for k in range(300)
-        for data in strange(topic, since_ns + first + k * 7 * MS, k)[k % 11 : k % 11 + 1]
+        for data in foreign(topic, since_ns + first + k * 7 * MS, k)[k % 11 : k % 11 + 1]
     ]
     tape = written(tmp_path / "both", [*own, *others])
     alone = written(tmp_path / "alone", own)
@@ -106,7 +106,7 @@ def test_messages_of_strangers_count_for_no_topic_of_the_flight(
 
 
 def test_own_messages_without_a_usable_stamp_still_count(tmp_path: Path) -> None:
-    """Beside a stranger: the fault is the publisher's own."""
+    """Beside a foreign publisher: the fault is the publisher's own."""
     own = flight()
     damaged = [
         sent._replace(data=vector(0, NAMES, [0.0] * 4, OWN["y"]))

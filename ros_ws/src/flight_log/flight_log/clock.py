@@ -75,8 +75,8 @@ class StampClock:
         back = (jumps < -STEP_NS) & ((numbers >= 0) | (np.abs(leads) > STEP_NS))
         forth = (jumps > STEP_NS) & ((leads > STEP_NS) | ~has_time) & (numbers <= 1)
         # What pauses with the reception is the publisher or the host, not the clock.
-        pauses = (jumps > LEAP_NS) & (leads <= LEAP_NS) & has_time
-        self._pauses_ns.update((stamps - jumps)[pauses].tolist())
+        with_reception = (jumps > LEAP_NS) & (leads <= LEAP_NS) & has_time
+        self._pauses_ns.update((stamps - jumps)[with_reception].tolist())
         # Places where the messages of a clock begin.
         starts = np.flatnonzero(back | forth)
         edges = [0, *starts[starts > 0].tolist(), len(stamps)]
@@ -92,15 +92,13 @@ class StampClock:
                 if jump_ns < -STRAY_NS or is_ahead:
                     keep[places[first:after]] = False
                 continue
-            if jump_ns < -STEP_NS and back[first] and jump_ns >= -STRAY_NS:
-                lateness = self._catches_up(stamps[first:], offsets[first:])
-                if lateness is None and more:
-                    # The next messages tell.
+            is_back = jump_ns < -STEP_NS and bool(back[first])
+            if is_back and has_time[first]:
+                is_late = self._catches_up(stamps[first:], offsets[first:])
+                if is_late is None and more:  # the next messages tell
                     return self._taken(stamp_ns, keep[: places[first]], int(places[first]))
-                is_late = lateness is not None and lateness and bool(has_time[first])
-            else:
-                is_late = False
-            if (jump_ns < -STEP_NS and back[first] and not is_late) or is_ahead:
+                is_back = not is_late
+            if is_back or is_ahead:
                 self._step_ns = jump_ns
                 self._step_at_ns = self._last_ns or 0
                 after_step = int(places[first])
@@ -108,24 +106,26 @@ class StampClock:
                 return self._taken(stamp_ns, keep, len(stamp_ns), after_step)
             # The messages before are too few to be the begin of the clock.
             if self._last_ns is None:
-                away_ns = stamps[first] - stamps[:first]
-                lead_ns = offsets[first] - offsets[:first]
-                keep[places[:first]] &= (away_ns >= -STEP_NS) & (
-                    (away_ns <= STRAY_NS) | (lead_ns <= LATE_NS)
-                )
-            self._last_ns = int(stamps[after - 1])
-            self._last_offset_ns = int(offsets[after - 1])
-            self._offset_ns = max(self._offset_ns, int(offsets[first:after].max()))
-            if stamps[after - 1] - stamps[first] > STEP_NS:
-                self._is_history = _in_burst(stamps[first:after], offsets[first:after])
+                keep[places[:first]] &= _begins(stamps[: first + 1], offsets[: first + 1])
+            self._follow(stamps[first:after], offsets[first:after])
         return self._taken(stamp_ns, keep, len(stamp_ns))
+
+    def _follow(self, stamp_ns: NDArray[np.int64], offset_ns: NDArray[np.int64]) -> None:
+        """Take successive messages of the clock."""
+        self._last_ns = int(stamp_ns[-1])
+        self._last_offset_ns = int(offset_ns[-1])
+        self._offset_ns = max(self._offset_ns, int(offset_ns.max()))
+        if stamp_ns[-1] - stamp_ns[0] > STEP_NS:
+            self._is_history = _in_burst(stamp_ns, offset_ns)
 
     def _catches_up(self, stamp_ns: NDArray[np.int64], offset_ns: NDArray[np.int64]) -> bool | None:
         """Whether samples behind a step back are late ones: a clock that was set stays behind.
 
-        A late sample has an older stamp than the one before, and the reception goes on. Within
-        STRAY_NS of reception the samples are as late as before. None: too few messages to tell.
+        A late sample is at most STRAY_NS older than the one before, and within STRAY_NS of the
+        reception the samples are as late as before. None: too few messages to tell.
         """
+        if self._last_ns is None or stamp_ns[0] < self._last_ns - STRAY_NS:
+            return False
         log_ns = stamp_ns - offset_ns
         within = log_ns <= log_ns[0] + STRAY_NS
         if np.any(offset_ns[within] >= self._last_offset_ns - STEP_NS):
@@ -176,6 +176,14 @@ class StampClock:
             left_out=self._left_out,
             pauses_ns=tuple(sorted(self._pauses_ns)),
         )
+
+
+def _begins(stamp_ns: NDArray[np.int64], offset_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Mask of the samples that may come before the last one, (N - 1,) of N, by the same clock."""
+    away_ns = stamp_ns[-1] - stamp_ns[:-1]
+    lead_ns = offset_ns[-1] - offset_ns[:-1]
+    is_near = (away_ns <= STRAY_NS) | (lead_ns <= LATE_NS)
+    return np.asarray((away_ns >= -STEP_NS) & is_near)
 
 
 def _in_burst(stamp_ns: NDArray[np.int64], offset_ns: NDArray[np.int64]) -> bool:

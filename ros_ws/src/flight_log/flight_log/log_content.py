@@ -141,8 +141,8 @@ class _Publisher:
 class TopicSamples:
     """Samples of a topic, decoded in batches. The samples with equal names are the signal.
 
-    Clock, numbers and damages are counted for each sender, so that the messages of a stranger
-    count for no other one.
+    Clock, numbers and damages are counted for each sender, so that those of a foreign
+    publisher count for no other one.
     """
 
     def __init__(self, decode: Decoder, expected: int) -> None:
@@ -307,7 +307,7 @@ class TopicSamples:
         names = {columns.senders[number] for number in numbers}
         return [publisher for publisher in publishers if publisher.name in names]
 
-    def strangers(self, signal: Signal | None) -> list[str]:
+    def further_publishers(self, signal: Signal | None) -> list[str]:
         """The names of further publishers, "" for one without a name."""
         of_flight = self.of_flight(signal)
         return [
@@ -326,16 +326,16 @@ class TopicSamples:
         recordings = [publisher.recording() for publisher in self.of_flight(signal)]
         if len(recordings) == 1:
             return recordings[0]
-        step = next((one for one in recordings if one.step_ns), Recording(0))
+        step = next((each for each in recordings if each.step_ns), Recording(0))
         return Recording(
-            found=sum(one.found for one in recordings),
-            unset=sum(one.unset for one in recordings),
-            repeated=sum(one.repeated for one in recordings),
+            found=sum(each.found for each in recordings),
+            unset=sum(each.unset for each in recordings),
+            repeated=sum(each.repeated for each in recordings),
             step_ns=step.step_ns,
             step_at_ns=step.step_at_ns,
-            left_out=sum(one.left_out for one in recordings),
+            left_out=sum(each.left_out for each in recordings),
             lost=None,
-            pauses_ns=tuple(sorted({at_ns for one in recordings for at_ns in one.pauses_ns})),
+            pauses_ns=tuple(sorted(set().union(*(each.pauses_ns for each in recordings)))),
         )
 
     def refused(self, signal: Signal | None = None) -> int:

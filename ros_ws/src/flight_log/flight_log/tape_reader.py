@@ -253,13 +253,14 @@ def _publisher_notes(
     A note is of all topics with the same publishers.
     """
     conflicts = defaultdict[tuple[str, ...], list[str]](list)
-    strangers = defaultdict[tuple[str, ...], list[str]](list)
+    foreign = defaultdict[tuple[str, ...], list[str]](list)
     for name, samples in topics.items():
         if name in AIRCRAFT_TOPICS and samples.overlap():
             conflicts[tuple(sorted(samples.spans))].append(name)
-        silent = [one for one in samples.strangers(of_flight[name]) if one not in samples.spans]
+        senders = samples.further_publishers(of_flight[name])
+        silent = [sender for sender in senders if sender not in samples.spans]
         if silent:
-            strangers[tuple(sorted({*silent}))].append(name)
+            foreign[tuple(sorted({*silent}))].append(name)
     return [
         *(
             f"{', '.join(names)}: samples of {_publishers(senders)}: the figures are of the first, "
@@ -268,7 +269,7 @@ def _publisher_notes(
         ),
         *(
             f"{', '.join(names)}: messages of {_publishers(senders)} without a sample of the flight"
-            for senders, names in strangers.items()
+            for senders, names in foreign.items()
         ),
     ]
 

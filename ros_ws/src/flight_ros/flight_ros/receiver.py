@@ -276,7 +276,7 @@ class Receiver(Generic[S]):
                 sample = self._decode(received.message)
             except ChannelError as error:
                 self._refusals.add(self.subscription, error.reason, str(error))
-                # Before the first valid message nobody knows whose a message is.
+                # Before the first valid message it is not known whose a message is.
                 if self.lock is None or self.lock.publisher is None:
                     continue
                 sample = None

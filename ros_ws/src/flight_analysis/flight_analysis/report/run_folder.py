@@ -219,19 +219,11 @@ def _flight(recorded: RecordedRun, run: Path, outcome: Outcome | None) -> Record
             si_units=recorded.metadata.get(CHANNEL_UNITS, {}),
         )
     scenario = _scenario_in(recorded, run)
-    # The times of messages are signals of the log. In lockstep and in one process the nodes wait
-    # for each other, however long the host takes.
-    latency = recorded.latency if is_real_time(recorded.tape) else None
-    timed = {"latency": latency, "age_of_u": recorded.age_of_u}
-    signals = {name: signal for name, signal in timed.items() if signal is not None}
-    log = replace(recorded.tape, signals={**recorded.tape.signals, **signals})
+    log = _with_times_of_messages(recorded)
     engagements = recorded.engagements
     outcome = outcome or _previous_outcome(recorded, folder, scenario)
-    if (
-        outcome.end is End.COMPLETED
-        and not {"u", "internals"} & set(log.signals)
-        and engagements is None
-    ):
+    never_engaged = engagements is None and not {"u", "internals"} & set(log.signals)
+    if outcome.end is End.COMPLETED and never_engaged:
         outcome = NEVER_ENGAGED
     if "guidance" in log:
         require_channels(log["guidance"].names)
@@ -259,6 +251,18 @@ def _flight(recorded: RecordedRun, run: Path, outcome: Outcome | None) -> Record
         later_aircraft=later_aircraft(recorded, scenario),
         messages=recorded.messages,
     )
+
+
+def _with_times_of_messages(recorded: RecordedRun) -> Tape:
+    """The tape with the times of messages as signals.
+
+    In lockstep and in one process the nodes wait for each other, however long the host takes: there
+    is no time from y to u.
+    """
+    latency = recorded.latency if is_real_time(recorded.tape) else None
+    timed = {"latency": latency, "age_of_u": recorded.age_of_u}
+    signals = {name: signal for name, signal in timed.items() if signal is not None}
+    return replace(recorded.tape, signals={**recorded.tape.signals, **signals})
 
 
 def _controllers(

@@ -84,13 +84,12 @@ def separation_shortfalls(tracks: Mapping[str, Track], least: float) -> dict[str
     Aircraft on maps with different origins are not compared.
     """
     near: dict[str, dict[str, Approach]] = {}
-    for (one, track), (other, further) in combinations(tracks.items(), 2):
-        found = None
-        if track.origin == further.origin:
-            found = approach(track.place, further.place)
+    for names in combinations(tracks, 2):
+        first, second = (tracks[name] for name in names)
+        found = approach(first.place, second.place) if first.origin == second.origin else None
         if found is not None and found.distance < least:
-            near.setdefault(one, {})[other] = found
-            near.setdefault(other, {})[one] = found
+            for name, companion in (names, names[::-1]):
+                near.setdefault(name, {})[companion] = found
     shortfalls = {}
     for name, approaches in near.items():
         other, (distance, at_ns) = min(approaches.items(), key=lambda pair: pair[1])

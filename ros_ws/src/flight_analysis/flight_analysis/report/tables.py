@@ -294,7 +294,7 @@ def _tick_table(summary: Mapping[str, Any]) -> MetricTable:
 def _process_table(summary: Mapping[str, Any]) -> MetricTable:
     flight_account = account_of_json(summary)
     processes = {} if flight_account is None else flight_account.processes
-    # In lockstep nobody knows when a process was ready.
+    # In lockstep it is not known when a process was ready.
     is_timed = any(process.ready is not None for process in processes.values())
     columns = [
         *((Column("", "ready (s)"),) if is_timed else ()),
