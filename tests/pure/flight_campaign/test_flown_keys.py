@@ -89,7 +89,10 @@ def test_every_key_is_in_one_set(schema: type[Config], sets: tuple[set[str], ...
 def test_a_campaign_refuses_what_it_does_not_fly(
     section: str, values: dict[str, Any], name: str
 ) -> None:
-    with refusing(rf"^{section}\.{name}.*: found .*, expected .*: a campaign does not fly it"):
+    sentence = (
+        rf"^{section}\.{name}.*: found .*, expected .*: flights of many at once do not have it"
+    )
+    with refusing(sentence):
         require_flyable(SERVO.vary(**{section: values}))
 
 

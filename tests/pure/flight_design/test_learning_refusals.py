@@ -33,7 +33,7 @@ def learning() -> dict[str, Any]:
 REFUSALS: dict[str, tuple[Callable[[], Any], str]] = {
     "`rise-di compare`": (
         lambda: tuning.build_benchmark(find_scenario("osprey_learn")),
-        r"controller\.learn: found a section, expected none: only rise-di fly and",
+        r"controller\.learn: found a section, expected none: flights of many at once do not",
     ),
     "`rise-di export` without `--run RUN`": (
         lambda: exportable(find_scenario("osprey_learn").rise_di()),

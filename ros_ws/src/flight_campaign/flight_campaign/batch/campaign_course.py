@@ -143,6 +143,9 @@ IDLE_CONTROLLER = frozenset(
 """Keys of a controller without effect in a campaign."""
 
 
+ONE_AT_A_TIME = "flights of many at once do not have it, those of rise-di fly do"
+
+
 def require_flyable(scenario: Scenario) -> None:
     """Raise ParameterError for an aircraft or a controller beyond a campaign.
 
@@ -157,9 +160,7 @@ def require_flyable(scenario: Scenario) -> None:
         aircraft.airframe,
         "an airframe with matrices: JSBSim flies one at a time",
     )
-    require_known(
-        aircraft, FLOWN | IDLE, "aircraft", "a campaign does not fly it, rise-di fly does"
-    )
+    require_known(aircraft, FLOWN | IDLE, "aircraft", ONE_AT_A_TIME)
     expected = "linear or euler: a campaign flies no multicopter"
     flies = aircraft.kinematics in {"linear", "euler"}
     require(flies, "aircraft.kinematics", aircraft.kinematics, expected)
@@ -171,7 +172,7 @@ def require_flyable(scenario: Scenario) -> None:
         controller,
         FLOWN_CONTROLLER | of_law | IDLE_CONTROLLER,
         "controller",
-        "a campaign does not fly it, rise-di fly does",
+        ONE_AT_A_TIME,
     )
 
 
