@@ -119,7 +119,8 @@ def test_maps_of_different_origins_are_not_compared() -> None:
 def test_true_place_goes_before_the_measured_one() -> None:
     measured = path(lambda t: (*north(t)[:2], 180.0))
     true = path(north)
-    both = Tape({"pose": measured, "truth": true})
+    names = tuple(f"pose.{name}" for name in true.names)
+    both = Tape({"pose": measured, "truth": Signal(true.stamp_ns, names, true.values)})
     found = place_of(both)
     assert found is not None
     assert np.array_equal(found.values, true.values)

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from flight_analysis.metrics import best_pose
 from flight_core.outcome import Aim, Shortfall
 from flight_core.rates import seconds
 from flight_core.tape import Signal, Tape
@@ -37,12 +38,10 @@ class Approach(NamedTuple):
 
 def place_of(tape: Tape) -> Signal | None:
     """Return where an aircraft was, the true place where the log has it; None without a place."""
-    for topic in ("truth", "pose"):
-        if topic in tape and set(PLACE) <= set(tape[topic].names):
-            signal = tape[topic]
-            values = np.column_stack([signal[name] for name in PLACE])
-            return Signal(signal.stamp_ns, PLACE, values)
-    return None
+    pose = best_pose(tape)
+    if pose is None or not set(PLACE) <= set(pose.names):
+        return None
+    return Signal(pose.stamp_ns, PLACE, np.column_stack([pose[name] for name in PLACE]))
 
 
 def approach(first: Signal, second: Signal) -> Approach | None:

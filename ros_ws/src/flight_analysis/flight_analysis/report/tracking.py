@@ -62,7 +62,7 @@ MOST_RATE = 0.05
 """rad/s, 3 deg/s. Severe turbulence, 45 kt at 20 ft by MIL-F-8785C, leaves 0.024 rad/s to the
 osprey, and twice that is allowed."""
 
-SPEED_PART = 0.005
+SPEED_PART = 0.0075
 """Of the trim speed: what the drag of an unknown polar leaves while V changes by a few m/s."""
 
 SATURATED = 0.5  # of the ticks: a stable loop of the osprey has 0.14 at most in moderate gusts
