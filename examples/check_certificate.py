@@ -26,7 +26,10 @@ what is left. Each step of the file halves a box, or proves it from `low` to `hi
 
 import hashlib
 import json
+import os
+import re
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -44,13 +47,73 @@ BASIS = [Legendre.basis(i, [0, 1]) * (2 * i + 1) ** 0.5 for i in range(TERMS)]
 GAUSS, WEIGHTS = leggauss(12)
 FASTEST = 5.0  # of a rate times the period: up to there the nodes err by less than 1e-14
 NARROWEST = 1e-6  # part of a frequency: an interval below it counts as not proved
-MOST = 20_000  # intervals of a step
+MOST = 50_000  # bounds of a file
 NEAR = 1.25  # from a frequency to another for which the same t balances
+EQUAL = 1e-9  # part up to which two numbers that say the same may differ by rounding
+FLOAT32 = 1e-6  # the same for constants in single precision
 COVERED = """\
 covered: deviations constant in time, in the linear loop with this period, delay and lags;
     no mode grows by more than 1e-6 a tick
-not covered: limits and rates of the inputs, errors beyond the width of the softened sign,
-    other lags and delays, a late or missed tick, a schedule, deviations that change in time"""
+not covered: entries that are 0, limits and rates of the inputs, errors beyond the width of the
+    softened sign, filters of sensors, actuators of another order, limits and fade-in of an
+    observer, motion beyond the linear equations, other lags and delays, a late or missed tick, a
+    schedule, deviations that change in time"""
+
+# The file. Everything that it may hold is stated here, with the range of each number.
+LONGEST = 32_000_000  # bytes
+LEAST = 1e-100  # magnitude of a number that is not 0: products of three do not vanish
+NAME, HEX, TEXT = "a name", "64 digits of SHA-256", "a text"
+TEXTS = {NAME: r"[!-~]{1,64}", HEX: r"[0-9a-f]{64}", TEXT: r"(?s).{1,1000000}"}
+
+
+class Numbers(NamedTuple):
+    """Finite numbers from `low` to `high`, in lists of the sizes `shape`."""
+
+    shape: tuple[str, ...] = ()
+    low: float = -1e9
+    high: float = 1e9
+
+
+class Names(NamedTuple):
+    """A list of different names, whose number is the size `size`."""
+
+    size: str
+    most: int
+
+
+FIELDS: dict[str, Any] = {
+    "airframe": HEX,
+    "scenario": HEX,
+    "constants": TEXT,
+    "states": Names("n", 64),
+    "outputs": Names("o", 32),
+    "inputs": Names("m", 32),
+    "effectors": Names("p", 64),
+    "names": Names("k", 512),
+    "A": Numbers(("n", "n")),
+    "B": Numbers(("n", "m")),
+    "C": Numbers(("o", "n")),
+    "T": Numbers(("p", "m")),
+    "E": Numbers(("n", "k")),
+    "F": Numbers(("k", "n")),
+    "G": Numbers(("k", "m")),
+    "part": Numbers(("k",), 0.0, 1.0),
+    "lag": Numbers(("m",), 0.0, 100.0),
+    "delay": Numbers((), 0.0, 1.0),
+    "period": Numbers((), 1e-4, 1.0),
+    "size": Numbers((), 1e-9, 1e6),
+    "law": {
+        "A": Numbers(("q", "q")),
+        "B": Numbers(("q", "o")),
+        "C": Numbers(("m", "q")),
+        "D": Numbers(("m", "o")),
+    },
+    "loop": HEX,
+    "digest": HEX,
+}
+OPTIONAL = {"airframe", "scenario", "constants"}
+MOST_OF = {"q": 512, "steps": 50_000, "ticks": 100}
+STEP = {"low": (0.0, 1e5), "high": (0.0, 1e5), "t": (-100.0, 100.0), "g": (-1e9, 1e9)}
 
 
 class Loop(NamedTuple):
@@ -60,6 +123,166 @@ class Loop(NamedTuple):
     K: Array  # squares of its norm from entry to entry
     states: int
     period: float
+
+
+def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """The members of an object. Raises ValueError if a name stands twice."""
+    members = dict(pairs)
+    if len(members) != len(pairs):
+        names = [name for name, _ in pairs]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        raise ValueError(f"found {shown(twice)} twice in an object, expected each member once")
+    return members
+
+
+def shown(value: Any) -> str:
+    """A value of a file in printable ASCII, cut short."""
+    text = ascii(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def require(holds: bool, where: str, found: Any, expected: str) -> None:
+    """Raise ValueError in one sentence unless a condition holds."""
+    if not holds:
+        raise ValueError(f"{where}: found {shown(found)}, expected {expected}")
+
+
+def integer(digits: str) -> int:
+    """A whole number. Raises ValueError for one of more digits than any number here has."""
+    require(len(digits) <= 20, "a number", len(digits), "at most 20 digits")
+    return int(digits)
+
+
+def no_number(word: str) -> float:
+    """Raise ValueError for the words NaN and Infinity, which are no JSON."""
+    raise ValueError(f"found {word}, expected finite numbers")
+
+
+def numbers(value: Any, where: str, kind: Numbers, sizes: dict[str, int]) -> Array:
+    """The array of a field. A size that is not known yet becomes known. Raises ValueError."""
+
+    def flat(part: Any, shape: tuple[str, ...]) -> list[float]:
+        if not shape:
+            is_number = type(part) in {int, float} and kind.low <= part <= kind.high
+            is_number = is_number and (part == 0 or abs(part) >= LEAST)
+            require(is_number, where, part, f"a number from {kind.low:g} to {kind.high:g}")
+            return [float(part)]
+        require(type(part) is list, where, part, "a list")
+        size = sizes.setdefault(shape[0], min(len(part), MOST_OF.get(shape[0], 0)))
+        require(len(part) == size, where, len(part), f"{size} values")
+        return [number for inner in part for number in flat(inner, shape[1:])]
+
+    return np.array(flat(value, kind.shape)).reshape([sizes[size] for size in kind.shape])
+
+
+def matches(value: Any, kind: str) -> bool:
+    """Whether a value is a text of a kind."""
+    return type(value) is str and re.fullmatch(TEXTS[kind], value) is not None
+
+
+def members(value: Any, where: str, known: Sequence[str], optional: set[str]) -> dict[str, Any]:
+    """An object that has these members and no other. Raises ValueError."""
+    require(type(value) is dict, where, value, "an object")
+    unknown = sorted(set(value) - {*known})
+    require(not unknown, where, unknown, f"{', '.join(known)} alone")
+    require({*known} - optional <= set(value), where, [*value], f"{', '.join(known)}")
+    return dict(value)
+
+
+def fields_of(value: Any, where: str, known: dict[str, Any], sizes: dict[str, int]) -> Any:
+    """The fields of an object by their kinds, arrays in place of lists. Raises ValueError."""
+    content = {}
+    for name, kind in known.items():
+        if name not in value:
+            continue
+        part, place = value[name], f"{where}{name}"
+        if isinstance(kind, dict):
+            inner = members(part, place, [*kind], set())
+            content[name] = fields_of(inner, f"{place}.", kind, sizes)
+        elif isinstance(kind, Numbers):
+            content[name] = numbers(part, place, kind, sizes)
+        elif isinstance(kind, Names):
+            require(type(part) is list and 0 < len(part) <= kind.most, place, part, "some names")
+            for text in part:
+                require(matches(text, NAME), place, text, f"{NAME} of printable ASCII")
+            require(len({*part}) == len(part), place, part, "names that differ")
+            content[name], sizes[kind.size] = part, len(part)
+        else:
+            require(matches(part, kind), place, part, kind)
+            content[name] = part
+    return content
+
+
+def parts_from(value: Any, entries: int, period: float) -> dict[tuple[int, ...], list[Any]]:
+    """The steps of each part by its entries. Raises ValueError."""
+    require(type(value) is list, "parts", value, "a list")
+    parts: dict[tuple[int, ...], list[Any]] = {}
+    taken: set[int] = set()
+    total = 0
+    for number, part in enumerate(value):
+        where = f"parts {number}"
+        members(part, where, ["entries", "steps"], set())
+        places, steps = part["entries"], part["steps"]
+        known = type(places) is list and all(type(i) is int and 0 <= i < entries for i in places)
+        rises = known and places == sorted({*places})
+        require(rises and len(places) > 0, f"{where} entries", places, "rising numbers of entries")
+        require(not taken & {*places}, f"{where} entries", places, "entries of no other part")
+        taken |= {*places}
+        require(type(steps) is list, f"{where} steps", steps, "a list")
+        total += len(steps)
+        require(total <= MOST_OF["steps"], where, total, f"up to {MOST_OF['steps']} steps")
+        for i, step in enumerate(steps):
+            check_step(step, f"{where} step {i}", len(places), np.pi / period)
+        parts[tuple(places)] = steps
+    return parts
+
+
+def check_step(step: Any, where: str, entries: int, highest: float) -> None:
+    """Raise ValueError unless a step has the members, sizes and ranges of one of the two kinds."""
+    if type(step) is dict and "halve" in step:
+        members(step, where, ["halve"], set())
+        place = step["halve"]
+        is_entry = type(place) is int and 0 <= place < entries
+        require(is_entry, f"{where} halve", place, f"a number of an entry, 0 to {entries - 1}")
+        return
+    members(step, where, [*STEP], set())
+    count = len(step["t"]) if type(step["t"]) is list else 0
+    sizes = {"c": count}
+    for name, (low, high) in STEP.items():
+        shape = ("c",) if name in {"t", "g"} else ()
+        numbers(step[name], f"{where} {name}", Numbers(shape, low, high), sizes)
+    fits = count in {entries, 2 * entries, 3 * entries, TERMS * entries}
+    require(fits, f"{where} t", count, f"1 to {TERMS} times {entries} values")
+    rises = step["low"] < step["high"] <= highest
+    require(rises, where, [step["low"], step["high"]], "0 <= low < high <= pi / period")
+
+
+def read(path: Path) -> dict[str, Any]:
+    """The content of a certificate: known members alone, each of its type, size and range.
+
+    Raises ValueError for anything else, and OSError for a file that cannot be read.
+    """
+    text = path.read_bytes()
+    require(len(text) <= LONGEST, "the file", len(text), f"up to {LONGEST} bytes")
+    try:
+        content = json.loads(
+            text.decode("utf-8"),
+            object_pairs_hook=once,
+            parse_constant=no_number,
+            parse_int=integer,
+        )
+    except RecursionError:
+        raise ValueError("found lists in lists without an end, expected a certificate") from None
+    members(content, "the file", [*FIELDS, "parts"], OPTIONAL)
+    sizes: dict[str, int] = {}
+    file: dict[str, Any] = fields_of(content, "", FIELDS, sizes)
+    ticks = float(file["delay"] / file["period"])
+    require(ticks <= MOST_OF["ticks"], "delay", ticks, f"up to {MOST_OF['ticks']} periods")
+    file["parts"] = parts_from(content["parts"], len(file["names"]), float(file["period"]))
+    rest = json.dumps({key: content[key] for key in content if key != "digest"}, sort_keys=True)
+    if hashlib.sha256(rest.encode()).hexdigest() != file["digest"]:
+        raise ValueError("the digest is not that of the content")
+    return file
 
 
 def exponential(M: Array) -> Array:
@@ -74,9 +297,8 @@ def exponential(M: Array) -> Array:
 
 def loop_of(file: dict[str, Any]) -> Loop:
     """The motion over a period from the numbers of a certificate."""
-    A, B, C, E, F, G, lag = (np.array(file[key], float) for key in [*"ABCEFG", "lag"])
-    law = {key: np.array(value, float) for key, value in file["law"].items()}
-    T, (n, m), k = file["period"], B.shape, E.shape[1]
+    A, B, C, E, F, G, lag = (file[key] for key in [*"ABCEFG", "lag"])
+    law, T, (n, m), k = file["law"], float(file["period"]), B.shape, E.shape[1]
     size, has_lag = n + m, lag > 0.0
     rate = np.diag(1.0 / np.where(has_lag, lag, 1.0))
     drive = np.vstack([B * ~has_lag, rate * has_lag])
@@ -240,12 +462,11 @@ def system_of(
 
 
 def is_positive(X: Array) -> bool:
-    """Whether every eigenvalue is positive."""
+    """Whether every eigenvalue is positive: a finite matrix that has a finite Cholesky factor."""
     try:
-        np.linalg.cholesky(X)
+        return bool(np.isfinite(X).all() and np.isfinite(np.linalg.cholesky(X)).all())
     except np.linalg.LinAlgError:
         return False
-    return True
 
 
 def is_proved(system: System, period: float, w: float, x: float) -> bool:
@@ -296,17 +517,24 @@ def is_proved(system: System, period: float, w: float, x: float) -> bool:
     return is_positive(room - change) and is_positive(room + change)
 
 
-def prove(part: Loop, steps: list[dict[str, Any]], size: float) -> int:
-    """Replay the steps from the whole box, 0 to pi / T; the number of bounds. Raises ValueError."""
-    k, count = len(part.K), 0
+def prove(part: Loop, steps: list[dict[str, Any]], size: float, count: int) -> int:
+    """Replay the steps from the whole box, 0 to pi / T, after `count` bounds.
+
+    Returns the number of bounds with these. Raises ValueError.
+    """
+    k = len(part.K)
     boxes = [(np.zeros(k), np.full(k, size), 0.0, np.pi / part.period)]
     for number, step in enumerate(steps):
+        if not boxes:
+            raise ValueError(f"step {number}: the box is proved before it")
         middle, half, low, high = boxes.pop()
         if "halve" in step:
             side = np.where(np.arange(k) == step["halve"], half / 2.0, 0.0)
             boxes += [(middle + turn * side, half - side, low, high) for turn in (-1.0, 1.0)]
             continue
-        todo, most, balanced = [(step["low"], step["high"])], count + MOST, np.inf
+        if not low <= step["low"] < step["high"] <= high:
+            raise ValueError(f"step {number}: not within {low:.6g} to {high:.6g} rad/s, its box")
+        todo, balanced = [(step["low"], step["high"])], np.inf
         while todo:
             begin, end = todo.pop()
             w, x = (begin + end) / 2.0, 0.5000001 * (end - begin)
@@ -314,7 +542,7 @@ def prove(part: Loop, steps: list[dict[str, Any]], size: float) -> int:
                 system, balanced = system_of(part, middle, half, step, w), w
             count += 1
             if not is_proved(system, part.period, w, x):
-                if x < NARROWEST * w or count > most:
+                if not (x >= NARROWEST * w and count <= MOST):
                     raise ValueError(f"step {number}: not proved at {w:.6g} rad/s")
                 todo += [(begin, w), (w, end)]
         boxes += [(middle, half, low, step["low"])] if step["low"] > low else []
@@ -324,20 +552,130 @@ def prove(part: Loop, steps: list[dict[str, Any]], size: float) -> int:
     return count
 
 
-def require_range(file: dict[str, Any], loop: Loop) -> None:
-    """Raise ValueError for numbers to which the text above does not apply."""
-    given = file["period"] > 0.0 and file["size"] > 0.0
-    given = given and all(value >= 0.0 for value in (file["delay"], *file["lag"]))
-    if not given or not np.isfinite(loop.big).all():
-        raise ValueError(
-            "found a negative or no number, expected period, size > 0, delay, lag >= 0"
+def require_range(file: dict[str, Any]) -> None:
+    """Raise ValueError for a motion to which the text above does not apply."""
+    lags = file["lag"][file["lag"] > 0.0]
+    fastest = np.max(np.r_[np.abs(np.linalg.eigvals(file["A"])), 1.0 / lags])
+    if not fastest * file["period"] <= FASTEST:
+        raise ValueError(f"found a motion of {fastest:.3g} rad/s, too fast for the nodes of Gauss")
+
+
+def is_equal(found: Array, expected: Array, part: float = EQUAL) -> bool:
+    """Whether two arrays are the same up to a part of their largest number."""
+    if found.shape != expected.shape:
+        return False
+    largest, apart = (np.max(np.abs(x), initial=0.0) for x in (expected, found - expected))
+    return bool(apart <= part * largest)
+
+
+def exact_entries(file: dict[str, Any]) -> list[str]:
+    """The entries of A and B that are the same number in every aircraft.
+
+    Raises ValueError unless an entry NAME of `names` is one number of the aircraft: A[i,j] that
+    is off by `part` of itself, or B[i,j] of an effector, whose row of T multiplies it.
+    """
+    states, effectors, T = file["states"], file["effectors"], file["T"]
+    rest = {"A": file["A"].copy(), "B": file["B"].copy()}
+    places: dict[str, tuple[str, int, int]] = {}
+    for i, state in enumerate(states):
+        for letter, columns in (("A", states), ("B", effectors)):
+            places |= {
+                f"{letter}[{state},{name}]": (letter, i, j) for j, name in enumerate(columns)
+            }
+    for k, name in enumerate(file["names"]):
+        require(name in places, "names", name, "A[STATE,STATE] or B[STATE,EFFECTOR] of the file")
+        letter, i, j = places[name]
+        part, unit = file["part"][k], np.zeros(len(states))
+        unit[i] = 1.0
+        along = np.eye(len(states))[j] if letter == "A" else T[j]
+        changes = {"A": file["F"][k], "B": file["G"][k]}
+        value = changes[letter] @ along / (part * (along @ along)) if part and along.any() else 0.0
+        fits = np.array_equal(file["E"][:, k], unit) and bool(value) == bool(part)
+        fits = fits and is_equal(changes[letter], part * value * along)
+        fits = fits and not changes["B" if letter == "A" else "A"].any()
+        require(fits, name, changes[letter].tolist(), f"{part:g} of this entry of the file alone")
+        rest[letter][i] -= value * along
+    # what is left of each entry is 0, or the whole entry
+    exact, own = [], effectors == file["inputs"]
+    require(not own or np.array_equal(T, np.eye(len(T))), "T", T.tolist(), "1 and 0: its inputs")
+    for letter, columns in (("A", states), ("B", file["inputs"])):
+        size, left = np.abs(file[letter]), np.abs(rest[letter])
+        if letter == "B" and not own:
+            # a row is a sum over effectors, of which each may deviate
+            require(bool((left <= EQUAL * size.max(axis=1)[:, None]).all()), "B", "a rest", "none")
+            continue
+        for i, j in np.argwhere(left > EQUAL * size):
+            name, one = f"{letter}[{states[i]},{columns[j]}]", rest[letter][i, j]
+            require(one == file[letter][i, j], name, float(one), "nothing or all exact")
+            exact.append(name)
+    return exact
+
+
+def law_of(constants: str, inputs: int, size: int) -> tuple[dict[str, Any], float]:
+    """The law of rise_di_parameters.h near e = 0, and how exact its numbers are.
+
+    I += T (e + e_1) / 2,  Pi += T beta e / eps, or e_hat / (T omega) of the implicit sign,
+    u = -scale D (K (e - e_0 + Lambda I) + Pi) - F zc,  zc = z + L (e - H z),  z+ = Phi zc + Gamma u
+
+    with the states e_0, e_1, I, Pi, and those of an observer, z, u_o and the fade-in, which has
+    ended. Raises ValueError for a text without these constants, or with other sizes.
+    """
+    define = dict(re.findall(r"#define (RISE_DI_\w+) (.*)", constants))
+    begin = constants.find("#define RISE_DI_PARAMETERS {")
+    text = constants[begin : constants.find("\n\n", begin)] if begin >= 0 else ""
+    found = dict(re.findall(r"/\* ([\w.]+) \*/ ([^\\\n]*)", text))
+    try:
+        known = {
+            name: np.array([float(x.strip(" {}").rstrip("F")) for x in row.split(",") if x.strip()])
+            for name, row in found.items()
+        }
+        K, Lambda, beta, D, scale, omega, eps = (
+            known[name] for name in ("K", "Lambda", "beta", "D", "input_scale", "omega", "eps")
         )
-    lags = [lag for lag in file["lag"] if lag > 0.0]
-    rates = [*np.abs(np.linalg.eigvals(np.array(file["A"]))), *(1.0 / lag for lag in lags)]
-    if max(rates) * file["period"] > FASTEST:
-        raise ValueError(
-            f"found a motion of {max(rates):.3g} rad/s, too fast for the nodes of Gauss"
+        T, sign, m = known["period_ns"][0] / 1e9, known["sign"][0], len(K)
+        s = round(len(known.get("Phi", ())) ** 0.5)
+        one = EQUAL if define["RISE_DI_FLOAT32"].startswith("0 ") else FLOAT32
+        tail = s + m + 1 if s else 0
+        require((m, 4 * m + tail) == (inputs, size), "constants", m, "the inputs of the law")
+        require(sign in {1, 2}, "constants sign", sign, "1 or 2, which are linear near e = 0")
+        e_0, e_1, I_1, Pi, z, _, e = np.split(
+            np.eye(4 * m + tail + m), np.cumsum([m, m, m, m, s, tail - s])
         )
+        I_2 = I_1 + T / 2.0 * (e + e_1)
+        if sign == 2:
+            step = (T * beta / eps)[:, None] * e
+        else:
+            slope = (omega * K)[:, None] * (e - e_1 + Lambda[:, None] * (I_2 - I_1))
+            step = (2.0 * e - e_1 - T * slope) / (T * omega)[:, None]
+        rows = [e_0, e, I_2, Pi + step]
+        u = -(scale * D)[:, None] * (K[:, None] * (e - e_0 + Lambda[:, None] * I_2) + rows[3])
+        if s:
+            Phi, Gamma, H, L, F = (
+                known[name].reshape(shape)
+                for name, shape in (
+                    ("Phi", (s, s)), ("Gamma", (s, m)), ("H", (m, s)), ("L", (s, m)), ("F", (m, s)),
+                )
+            )  # fmt: skip
+            zc = z + L @ (e - H @ z)
+            u = u - F @ zc
+            rows += [Phi @ zc + Gamma @ u, -F @ zc, 0.0 * e[:1]]
+    except (KeyError, IndexError) as error:
+        raise ValueError(f"constants: found no {error}, expected rise_di_parameters.h") from None
+    M = np.vstack(rows)
+    law: dict[str, Any] = {"A": M[:, :size], "B": M[:, size:], "C": u[:, :size], "D": u[:, size:]}
+    law["period"] = np.array(T)
+    for key, macro in (("outputs", "RISE_DI_OUTPUTS"), ("inputs", "RISE_DI_INPUTS")):
+        law[key] = re.findall(r'"([^"]*)"', define.get(macro, ""))
+    return law, one
+
+
+def check_constants(file: dict[str, Any]) -> None:
+    """Raise ValueError unless the law is that of the constants beside it."""
+    law, one = law_of(file["constants"], len(file["inputs"]), len(file["law"]["A"]))
+    same = all(file[key] == law[key] for key in ("outputs", "inputs"))
+    same = same and is_equal(file["period"], law["period"])
+    if not (same and all(is_equal(file["law"][key], law[key], one) for key in "ABCD")):
+        raise ValueError("the law is not that of the constants beside it")
 
 
 def digest_of(file: dict[str, Any]) -> str:
@@ -351,11 +689,16 @@ def digest_of(file: dict[str, Any]) -> str:
 
 def check(file: dict[str, Any]) -> int:
     """The number of bounds that prove a certificate. Raises ValueError for one that does not."""
+    require(file["part"].max() > 0.0, "part", 0.0, "an entry that may deviate")
     if digest_of(file) != file["loop"]:
         raise ValueError("the loop is not the one that its name says")
-    steps = {tuple(part["entries"]): part["steps"] for part in file["parts"]}
-    loop, count = loop_of(file), 0
-    require_range(file, loop)
+    if "constants" in file:
+        check_constants(file)
+    exact_entries(file)
+    require_range(file)
+    loop, count, steps = loop_of(file), 0, dict(file["parts"])
+    if not np.isfinite(loop.big).all():
+        raise ValueError("the motion over a period is not finite")
     for entries, part in parts_of(loop):
         if not is_stable(part.big[: part.states, : part.states]):
             raise ValueError("the aircraft of the file, d = 0, is not stable")
@@ -364,54 +707,60 @@ def check(file: dict[str, Any]) -> int:
         ):
             if entries not in steps:
                 raise ValueError(f"no proof for {[file['names'][i] for i in entries]}")
-            count += prove(part, steps[entries], file["size"])
+            count = prove(part, steps.pop(entries), float(file["size"]), count)
+    require(not steps, "parts", [*steps], "the parts of the loop alone")
     return count
 
 
-def deviations(file: dict[str, Any]) -> list[str]:
-    """What may deviate by how much, from the numbers: a part of one entry, or of a row of B."""
-    texts = []
-    for name, column, *changes in zip(
-        file["names"], np.transpose(file["E"]), file["F"], file["G"], strict=True
-    ):
-        for letter, change in zip("AB", changes, strict=True):
-            for i in np.flatnonzero(column) if np.any(change) else ():
-                sizes = file["size"] * np.abs(column[i] * np.array(change))
-                (j, *others), values = np.flatnonzero(change), np.abs(file[letter][i])
-                if others or values[j] == 0.0:
-                    texts.append(f"{name} (row {i} of {letter}) {np.round(sizes, 6).tolist()}")
-                else:
-                    percent = np.floor(1e3 * sizes[j] / values[j] + 1e-6) / 10.0
-                    texts.append(f"{name} ({letter} {i}, {j}) {percent:g} %")
-    return texts
+def report_of(file: dict[str, Any], count: int) -> str:
+    """What a proved certificate says."""
+    lines = [f"PROVED by {count} bounds: stable for each deviation within"]
+    for name, part in zip(file["names"], file["part"], strict=True):
+        if part:
+            # a position beside the name: row and column from 0
+            letter, row, column = re.split(r"[\[,]", name[:-1])
+            side = file["states"] if letter == "A" else file["effectors"]
+            place = f"{letter} {file['states'].index(row)}, {side.index(column)}"
+            percent = np.floor(1e3 * file["size"] * part + 1e-6) / 10.0
+            lines.append(f"  {name} ({place}) {percent:g} %")
+    lines.append(f"exact in every aircraft: {', '.join(exact_entries(file)) or 'no entry'}, and 0")
+    lines.append(f"certificate {file['loop'][:12]}")
+    law = "of the constants in the file" if "constants" in file else "of no exported constants"
+    lines.append(f"law: {law}")
+    lags = ", ".join(f"{lag:g}" for lag in file["lag"])
+    lines.append(f"period {file['period']:g} s, delay {file['delay']:g} s, lags [{lags}] s")
+    return "\n".join([*lines, COVERED])
 
 
-def main() -> None:
-    """Check a certificate, and the constants of an exported controller beside it."""
-    if len(sys.argv) < 2:
-        print(
-            "expected: check_certificate.py certificate.json [rise_di_parameters.h]",
-            file=sys.stderr,
-        )
-        sys.exit(2)
+def main() -> int:
+    """Check a certificate, and the constants of an exported controller beside it.
+
+    Returns the exit status: 0 proved, 1 refused, 2 a call or a file that cannot be read.
+    """
+    if len(sys.argv) not in {2, 3}:
+        call = "check_certificate.py certificate.json [rise_di_parameters.h]"
+        print(f"expected: {call}", file=sys.stderr)
+        return 2
     try:
-        file = json.loads(Path(sys.argv[1]).read_text())
-        text = json.dumps({key: file[key] for key in file if key != "digest"}, sort_keys=True)
-        if hashlib.sha256(text.encode()).hexdigest() != file["digest"]:
-            raise ValueError("the digest is not that of the content")
+        file = read(Path(sys.argv[1]))
         for header in sys.argv[2:]:
-            if hashlib.sha256(Path(header).read_bytes()).hexdigest() != file["constants"]:
+            if Path(header).read_bytes().decode() != file.get("constants"):
                 raise ValueError(f"{header} holds other constants")
-        count = check(file)
-    except (ValueError, KeyError, TypeError, IndexError, OSError, np.linalg.LinAlgError) as error:
-        sys.exit(f"REFUSED: {error}")
-    print(
-        f"PROVED by {count} bounds: stable for each deviation within", *deviations(file), sep="\n  "
-    )
-    print(f"certificate {file['loop'][:12]}")
-    print(f"period {file['period']:g} s, delay {file['delay']:g} s, lags {file['lag']} s")
-    print(COVERED)
+        with np.errstate(all="ignore"):
+            text = report_of(file, check(file))
+    except (ValueError, np.linalg.LinAlgError) as error:
+        print(f"REFUSED: {error}", file=sys.stderr)
+        return 1
+    except OSError as error:
+        print(f"REFUSED: {error}", file=sys.stderr)
+        return 2
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        # the reader has closed: nothing is left to say, and the status is that of the proof
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

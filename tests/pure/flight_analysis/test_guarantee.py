@@ -69,9 +69,13 @@ def integrator(k: float, part: float) -> LinearLoop:
         E=np.eye(1),
         F=np.zeros((1, 1)),
         G=np.array([[part]]),
+        effectors=("u",),
+        T=np.eye(1),
     )
     return LinearLoop(
         model="",
+        states=("y",),
+        outputs=("y",),
         inputs=("u",),
         plant=plant,
         law=law,
@@ -226,8 +230,12 @@ def oscillator(law: tuple[float, float]) -> LinearLoop:
         E=np.array([[0.0], [1.0]]),
         F=np.zeros((1, 2)),
         G=np.array([[0.01 * w * w]]),
+        effectors=("u",),
+        T=np.eye(1),
     )
-    return integrator(1.0, 0.01)._replace(plant=plant, law=gains, box=box)
+    return integrator(1.0, 0.01)._replace(
+        states=("x", "v"), outputs=("x", "v"), plant=plant, law=gains, box=box
+    )
 
 
 def test_guarantee_with_a_late_input_holds_for_a_delay_that_changes() -> None:
@@ -306,6 +314,8 @@ def test_search_over_two_entries_is_brute_force() -> None:
         E=np.ones((1, 2)),
         F=np.array([[-0.6], [0.0]]),
         G=np.array([[0.0], [0.3]]),
+        effectors=("u",),
+        T=np.eye(1),
     )
     plant = LinearPlant(np.array([[-2.0]]), np.ones((1, 1)), np.eye(1))
     search = worst_in_box(plant, linear.law, linear.loop, box)

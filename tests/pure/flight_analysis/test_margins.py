@@ -141,7 +141,13 @@ def test_least_delay_margin_beside_a_nominal_loop_that_tolerates_every_delay() -
     plant = LinearPlant(np.zeros((2, 1, 1)), gains, np.eye(1))
     margins = loop_margins(
         LinearLoop(
-            model="two", inputs=("u",), plant=plant, law=proportional(np.eye(1)), loop=NO_LAG
+            model="two",
+            states=("y",),
+            outputs=("y",),
+            inputs=("u",),
+            plant=plant,
+            law=proportional(np.eye(1)),
+            loop=NO_LAG,
         )
     )
     assert margins.delay == math.inf  # beyond MAX_DELAY_MARGIN

@@ -246,7 +246,13 @@ def test_linear_error_of_a_ramp_is_the_closed_form() -> None:
     law = LinearLaw(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.array([[-k]]))
     plant = LinearPlant(np.zeros((1, 1, 1)), np.ones((1, 1, 1)), np.eye(1))
     of = LinearLoop(
-        model="", inputs=("u",), plant=plant, law=law, loop=LoopTiming(np.zeros(1), 0.0, period)
+        model="",
+        states=("y",),
+        outputs=("y",),
+        inputs=("u",),
+        plant=plant,
+        law=law,
+        loop=LoopTiming(np.zeros(1), 0.0, period),
     )
     u_dot = np.full((round(duration / ideal_control.STEP) + 1, 1), a)
     t = np.arange(0.0, duration, period)

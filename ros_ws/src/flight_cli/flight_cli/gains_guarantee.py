@@ -88,8 +88,8 @@ def write_certificate(
         facts = "; ".join(each.fact for each in loop.differences)
         found = f"no stable box ({facts})" if facts else "no stable box"
         require(promise.stable > 0.0, "--certificate", found, "a loop with a guarantee")
-        sources = certificate_sources(airframe, scenario)
-        write_text("certificate", path, certificate(loop, promise, sources))
+        sources = certificate_sources(load_airframe(airframe), scenario)
+        write_text("certificate", path, certificate(loop, promise, sources.texts))
 
 
 def write_unstable(

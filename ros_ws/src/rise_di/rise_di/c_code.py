@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from aircraft_sim.airframes.airframe import load_airframe
+from aircraft_sim.airframes.airframe import Airframe, load_airframe
 from aircraft_sim.uncertainty import as_yaml
 from c_export.autopilots import SAMPLES, SHELLS, write_module
 from c_export.constants import exportable, header
@@ -34,7 +34,7 @@ from flight_analysis.linear_loop.loop_margins import is_literal, scenario_loop
 from flight_analysis.report.margin_figures import guarantee_text
 from flight_core.arguments import FilePath, as_number, as_path
 from flight_core.files import write_file, writing
-from flight_core.parameters import require
+from flight_core.parameters import ParameterError, require
 from flight_core.rates import period_ns, seconds
 from flight_core.text import printable
 from flight_design.gains.first_scenario import controller_alone
@@ -183,25 +183,40 @@ def at_rate(scenario: Scenario, rate: float) -> Scenario:
     )
 
 
-def certificate_sources(airframe: FilePath, scenario: FilePath | Scenario) -> dict[str, str]:
-    """SHA-256 of scenario, airframe and exported constants, of the loop of a certificate.
+class CertificateSources(NamedTuple):
+    """What the loop of a certificate is of."""
 
-    The constants are those of rise_di_parameters.h as `export` writes it by default; none of a law
-    without C code. A section controller alone has the airframe alone.
+    texts: dict[str, str]  # SHA-256 of "airframe" and "scenario", and the text of "constants"
+    without: str = ""  # why there are no constants, a sentence
+
+
+def certificate_sources(airframe: Airframe, scenario: FilePath | Scenario) -> CertificateSources:
+    """Find what the loop of a certificate is of.
+
+    The constants are the text of rise_di_parameters.h as `export` writes it by default. A law that
+    C cannot express has none, nor has a section controller alone, which has no scenario either.
     """
-    texts = {"airframe": as_yaml(load_airframe(airframe))}
-    if controller_alone(scenario) is None:
-        flight = find_scenario(scenario)
-        texts["scenario"] = scenario_yaml(flight)
-        if isinstance(flight.controller, RiseDiConfig):
-            texts["constants"] = header(
-                exportable(flight.controller),
-                printable(flight.name),
-                flight.reference_model,
-                float32=False,
-                samples=SAMPLE_BUFFER_SIZE,
-            )
-    return {name: hashlib.sha256(text.encode()).hexdigest() for name, text in texts.items()}
+    texts = {"airframe": _sha256(as_yaml(airframe))}
+    if controller_alone(scenario) is not None:
+        return CertificateSources(texts, "a section controller alone has no reference model")
+    flight = find_scenario(scenario)
+    texts["scenario"] = _sha256(scenario_yaml(flight))
+    try:
+        controller = exportable(flight.controller)
+    except ParameterError as error:
+        return CertificateSources(texts, str(error))
+    texts["constants"] = header(
+        controller,
+        printable(flight.name),
+        flight.reference_model,
+        float32=False,
+        samples=SAMPLE_BUFFER_SIZE,
+    )
+    return CertificateSources(texts)
+
+
+def _sha256(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _certified(scenario: Scenario, constants: Path) -> tuple[str, str] | None:
@@ -215,10 +230,10 @@ def _certified(scenario: Scenario, constants: Path) -> tuple[str, str] | None:
     promise = kept_guarantee(loop)
     if promise is None or not promise.stable:
         return None
-    sources = certificate_sources(scenario.aircraft.airframe, scenario)
-    digest = hashlib.sha256(constants.read_bytes()).hexdigest()
+    frame = load_airframe(scenario.aircraft.airframe)
+    sources = certificate_sources(frame, scenario).texts | {"constants": constants.read_text()}
     stated = f"{CERTIFICATE}: {guarantee_text(promise)[0]}\n"
-    return certificate(loop, promise, sources | {"constants": digest}), stated
+    return certificate(loop, promise, sources), stated
 
 
 def _write(

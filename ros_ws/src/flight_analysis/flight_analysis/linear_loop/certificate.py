@@ -35,7 +35,8 @@ def certificate(linear: LinearLoop, promise: Guarantee, sources: Mapping[str, st
     Args:
         linear: The loop, with the box of the guarantee, of any size.
         promise: Its guarantee, u in time.
-        sources: SHA-256 of what the loop is of, by name.
+        sources: What the loop is of, by name: SHA-256 of the airframe and of the scenario, and the
+            text of the exported constants.
 
     Raises:
         ParameterError: Nothing is proved, a lag is in the box, or u may be late: the coefficients
@@ -48,6 +49,9 @@ def certificate(linear: LinearLoop, promise: Guarantee, sources: Mapping[str, st
     assert box is not None and promise.proof  # noqa: S101, PT018 - a guarantee has both
     content = {
         **sources,
+        "states": linear.states,
+        "outputs": linear.outputs,
+        "inputs": linear.inputs,
         **linear.nominal._asdict(),
         **box._asdict(),
         **linear.loop._asdict(),

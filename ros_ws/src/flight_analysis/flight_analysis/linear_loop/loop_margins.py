@@ -63,6 +63,8 @@ class LinearLoop(NamedTuple):
     """The loop of a controller around a model of its aircraft; channels in the law's order."""
 
     model: str  # what the plant is the model of
+    states: tuple[str, ...]  # of the aircraft; behind these, if any, actuators whose lag deviates
+    outputs: tuple[str, ...]  # that the law reads, vanes last
     inputs: tuple[str, ...]
     plant: LinearPlant  # of N aircraft, the nominal one first: A (N, n, n), B (N, n, m)
     law: LinearLaw
@@ -306,6 +308,8 @@ def linear_loop(
     model = f"model: {airframe.name}{'' if A.any() else BARE}"
     return LinearLoop(
         model=model,
+        states=tuple(airframe.states),
+        outputs=(*controller.outputs, *controller.vanes),
         inputs=controller.inputs,
         plant=plant,
         law=linear_law(controller.tuned_law(), len(rows), loop.period),
@@ -391,7 +395,7 @@ def with_lags_pulled_out(
     changes = np.diag(part * rate)
     E = np.pad(box.E, ((0, size), (0, size)))
     E[n:, len(box.names) :] = np.eye(size)
-    wider = Box(
+    wider = box._replace(
         names=(*box.names, *(f"{LAG_ENTRY}[{linear.inputs[i]}]" for i in places)),
         part=np.append(box.part, part),
         E=E,
@@ -428,7 +432,12 @@ def box_of(
             F[entry, j] = size
         else:
             G[entry] = size * T[j]
-    return Box(names=tuple(places), part=part, E=E, F=F, G=G)
+    effectors = list(airframe.inputs)
+    if not _has_effectors(airframe, controller):
+        # the effectors are the inputs of the law, in its order
+        order = [effectors.index(name) for name in controller.inputs]
+        effectors, T = list(controller.inputs), T[order]
+    return Box(names=tuple(places), part=part, E=E, F=F, G=G, effectors=tuple(effectors), T=T)
 
 
 def _some(plant: LinearPlant, names: slice) -> LinearPlant:

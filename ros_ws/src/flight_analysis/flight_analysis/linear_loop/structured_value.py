@@ -201,14 +201,15 @@ class Centre(NamedTuple):
         return Centre(self.d + self.free @ step[:f], self.g + step[f:], self.free)
 
     def inside(self, N: ComplexArray, level: float) -> bool:
-        """Whether the inequality and the limits hold."""
-        if self.d.min() <= 0.0 or np.abs(self.g).max(initial=0.0) >= LARGEST_G:
+        """Whether the inequality and the limits hold, all of it finite."""
+        if not (self.d.min() > 0.0 and np.abs(self.g).max(initial=0.0) < LARGEST_G):
             return False
+        F = self.inequality(N, level)
         try:
-            np.linalg.cholesky(self.inequality(N, level))
+            # the factor of a matrix with a NaN raises nothing
+            return bool(np.isfinite(F).all() and np.isfinite(np.linalg.cholesky(F)).all())
         except np.linalg.LinAlgError:
             return False
-        return True
 
 
 def crossings(part: Channels, scaling: Scaling, scale: FloatArray) -> FloatArray:
@@ -254,7 +255,8 @@ def interval_at(
     from_low = np.geomspace(10.0**-DECADES, 1.0, CHECKED * DECADES, endpoint=False)
     parts = np.r_[from_low, np.linspace(0.0, 1.0, CHECKED + 2)[1:-1]]
     inside = np.unique(np.r_[w, low + (high - low) * parts])
-    fails = inside[bound_at(scale[:, None] * part.response(inside, RADIUS), scaling) >= 1.0]
+    holds = bound_at(scale[:, None] * part.response(inside, RADIUS), scaling) < 1.0
+    fails = inside[~holds]
     below = float(np.max(fails[fails <= w], initial=-1.0))
     above = float(np.min(fails[fails > w], initial=2.0 * highest))
     held = inside[(inside > below) & (inside < above)]

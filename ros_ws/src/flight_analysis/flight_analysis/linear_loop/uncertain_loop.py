@@ -47,7 +47,8 @@ PATTERN_PARTS = (1e-3, 1e-2, 0.06, 0.25)  # of pi / T: where the pattern of M is
 class Box(NamedTuple):
     """The k uncertain entries of a plant, d_i in [-1, 1].
 
-    d_i changes A by E_i d_i F_i, and B by E_i d_i G_i.
+    d_i changes A by E_i d_i F_i, and B by E_i d_i G_i. A name is A[STATE,STATE], or
+    B[STATE,EFFECTOR] with T from the inputs of the law to the p effectors.
     """
 
     names: tuple[str, ...]
@@ -55,6 +56,8 @@ class Box(NamedTuple):
     E: FloatArray  # (n, k)
     F: FloatArray  # (k, n)
     G: FloatArray  # (k, m)
+    effectors: tuple[str, ...]
+    T: FloatArray  # (p, m)
 
 
 def plants_at(plant: LinearPlant, box: Box, d: FloatArray) -> LinearPlant:
