@@ -47,8 +47,8 @@ LAG_ENTRY = "1/lag"  # begins the name of an entry of an actuator
 LEAST_LAG = 2.0  # periods
 MOST_OF_LAG = 0.8
 """The largest deviation d of 1 / lag that is proved: with a lag of LEAST_LAG the two Legendre
-coefficients of a period leave out less of it than the thousandth that a guarantee proves beyond
-what it states, and more above."""
+coefficients of a period leave out less of it than a thousandth, half of what is proved beyond
+what is stated, and more above."""
 
 BARE = (
     "; each output integrates its inputs, without drag and phugoid: the margins cover Omega alone"
@@ -245,7 +245,7 @@ def scenario_loop(
     Lags and delay are those that fly: of the aircraft in the scenario, or as a flight shows.
     Raises as `margins`.
     """
-    airframe = _model(scenario, controller)
+    airframe = scenario_model(scenario, controller)
     comparison = compare(scenario, controller, flight)
     matrices, _ = of_matrices_and_lags(spread, comparison.timing, controller.inputs)
     A, B = nominal_and_sampled(airframe, uncertainty, aircraft, seed, matrices)
@@ -515,7 +515,7 @@ def law_order(airframe: Airframe, controller: ControllerConfig) -> tuple[list[in
     return [airframe.outputs.index(name) for name in controller.outputs], columns
 
 
-def _model(scenario: Scenario, controller: ControllerConfig) -> Airframe:
+def scenario_model(scenario: Scenario, controller: ControllerConfig) -> Airframe:
     """The airframe of a scenario, or y_dot = Omega u for an aircraft of JSBSim.
 
     The law has the inputs, and the controller gives Omega. Omega comes from the feedforward, or

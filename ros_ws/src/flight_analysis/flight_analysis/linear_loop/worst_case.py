@@ -41,7 +41,10 @@ from rise_di_controller.law.linear_loop import (
 SEED = 1  # of the corners at which a search starts
 STARTS = 24
 ROUNDS = 12
-POLISHED = 4  # corners whose entries are flipped one by one
+POLISHED = 4  # corners from which each flip of an entry is tried
+CLIMBERS = 24  # further corners at which climbs start
+LONGEST_CLIMB = 40  # flips
+FALL = 0.005  # part of the least size found, below which a smaller one is sought
 RESOLUTION = 1e-4  # of the size of an unstable deviation
 NEAR = 2.5  # factor of a frequency within which a mode counts
 SLOWEST = 0.05  # rad/s, below which a mode counts as one of 0 rad/s
@@ -102,7 +105,8 @@ def _oscillation(part: Channels, frequency: float, largest: float) -> tuple[floa
 
     The size is infinite where there is none. From STARTS corners: up to the size at which a mode
     near the frequency leaves abs(z) < 1, then to the corner to which abs(z) grows, until the size
-    no longer falls.
+    no longer falls. Then climbs from more corners at a smaller size, as long as one of them ends at
+    an unstable aircraft.
     """
     rng = np.random.default_rng(SEED)
     k = len(part.entries)
@@ -120,26 +124,70 @@ def _oscillation(part: Channels, frequency: float, largest: float) -> tuple[floa
             break
         corners = np.array(sorted(fresh))
     ranked = sorted(size_by_corner, key=lambda corner: (size_by_corner[corner], corner))
-    if not np.isfinite(size_by_corner[ranked[0]]):
-        return np.inf, np.array(ranked[0])
-    flipped = [_flipped(part, np.array(c), frequency, largest) for c in ranked[:POLISHED]]
-    best = min(flipped, key=lambda corner: _limit(part, corner, frequency, largest))
-    return _limit(part, best, frequency, largest), best
+    least = size_by_corner[ranked[0]]
+    fresh_corners = np.where(rng.random((CLIMBERS, k)) < 0.5, -1.0, 1.0)
+    starts = np.concatenate([np.array(ranked[:POLISHED]), fresh_corners])
+    return _nearer(part, frequency, min(least, largest), starts, (least, np.array(ranked[0])))
 
 
-def _flipped(part: Channels, corner: FloatArray, frequency: float, largest: float) -> FloatArray:
-    """The corner after flips of one entry each, as long as the loop is the more unstable for it."""
-    for _ in range(ROUNDS):
-        size = min(_limit(part, corner, frequency, largest), largest)
-        k = len(corner)
-        trial = np.where(np.eye(k, dtype=bool), -corner, corner)
-        both = np.concatenate([corner[None], trial])
-        radii = _near(np.linalg.eigvals(part.at(size * both).A), frequency, part.period)
-        radius = radii.max(axis=-1)
-        if np.argmax(radius) == 0:
+def _nearer(
+    part: Channels,
+    frequency: float,
+    level: float,
+    starts: FloatArray,
+    found: tuple[float, FloatArray],
+) -> tuple[float, FloatArray]:
+    """The least size and its corner, after climbs from some corners a little below each level.
+
+    As long as a climb ends at an unstable aircraft, its size is the next level.
+    """
+    while True:
+        corner, radius = _climbed(part, starts, frequency, (1.0 - FALL) * level)
+        if radius <= 1.0 + SPECTRAL_RADIUS_TOLERANCE:
+            return found
+        level = _limit(part, corner, frequency, (1.0 - FALL) * level)
+        found = level, corner
+        starts = np.concatenate([corner[None], starts])
+
+
+def _climbed(
+    part: Channels, starts: FloatArray, frequency: float, size: float
+) -> tuple[FloatArray, float]:
+    """The corner with the largest mode near a frequency after climbs at a size, and its abs(z).
+
+    A climb flips one entry at a time as long as abs(z) grows: at first that of the steepest slope,
+    then, of the POLISHED best corners, the one by which it grows most.
+    """
+    corners = starts.copy()
+    radii = _radii(part, size * corners, frequency)
+    climbing = np.arange(len(corners))
+    for _ in range(LONGEST_CLIMB):
+        around = corners[climbing]
+        steepest = np.argmin(_growth(part, size * around, frequency) * around, axis=1)
+        around[np.arange(len(around)), steepest] *= -1.0
+        reached = _radii(part, size * around, frequency)
+        rises = reached > radii[climbing]
+        climbing = climbing[rises]
+        corners[climbing], radii[climbing] = around[rises], reached[rises]
+        if not len(climbing):
             break
-        corner = both[int(np.argmax(radius))]
-    return corner
+    corners = corners[np.argsort(-radii)[:POLISHED]]
+    flips = np.where(np.eye(corners.shape[1], dtype=bool), -1.0, 1.0)
+    flips = np.concatenate([np.ones_like(flips[:1]), flips])
+    for _ in range(LONGEST_CLIMB):
+        trial = corners[:, None] * flips
+        grown = _radii(part, size * trial, frequency)
+        steepest = np.argmax(grown, axis=1)
+        if not steepest.any():
+            break
+        corners = trial[np.arange(len(corners)), steepest]
+    best = int(np.argmax(grown[:, 0]))
+    return corners[best], float(grown[best, 0])
+
+
+def _radii(part: Channels, d: FloatArray, frequency: float) -> FloatArray:
+    """The largest abs(z) of a mode near a frequency, (...), at deviations d, (..., k)."""
+    return np.asarray(_near(np.linalg.eigvals(part.at(d).A), frequency, part.period).max(axis=-1))
 
 
 def _near(z: NDArray[Any], frequency: float, period: float) -> FloatArray:
