@@ -20,15 +20,13 @@ import numpy as np
 import yaml
 
 from aircraft_sim.airframes.airframe import Airframe, load_airframe
-from aircraft_sim.uncertainty import Spread, as_yaml, drawn_places, with_entries
+from aircraft_sim.uncertainty import as_yaml, with_entries
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.linear_loop.guarantee import Unstable, guarantee
 from flight_analysis.linear_loop.loop_margins import (
     LinearLoop,
-    box_of,
-    linear_loop,
     scenario_loop,
 )
 from flight_analysis.linear_loop.uncertain_loop import plants_at
@@ -36,8 +34,6 @@ from flight_analysis.linear_loop.worst_case import worst_in_box
 from flight_analysis.report.account import account
 from flight_analysis.report.shortfalls import judge
 from flight_design.gains.gain_design import select_gains
-from flight_design.identification.likelihood import PRIOR
-from flight_design.learning.scenario_learner import learner
 from rise_di_controller.law.linear_loop import SPECTRAL_RADIUS_TOLERANCE, closed_loop
 
 UNCERTAINTY = 0.3
@@ -46,7 +42,6 @@ FARTHER = 1.2  # factor on the deviations of the first unstable aircraft, for on
 LARGEST = 0.99
 BATCH = 500  # aircraft at once: their matrices stay in the cache
 F4C = "f4c"
-LEARNED = "learned"  # the last model of osprey_learn
 PAGE = Path(__file__).parents[1] / "docs" / "tutorials" / "theorem.md"
 HEADINGS = (
     "scenario",
@@ -66,42 +61,13 @@ HEADINGS = (
 
 
 def loop_of(name: str) -> tuple[LinearLoop, Scenario | None]:
-    """The loop with its box, and the scenario that flies; None for LEARNED and for the F-4C."""
+    """The loop with its box, and the scenario that flies; None for the F-4C."""
     if name == F4C:
         text = PAGE.read_text().split("cat > f4c.yaml <<'EOF'\n")[1].split("EOF")[0]
         frame = Airframe.validate_mapping(yaml.safe_load(text), F4C)
         return select_gains(frame, samples=20).engineering.loop_with_box(), None
-    if name == LEARNED:
-        return learned_loop(find_scenario("osprey_learn")), None
     scenario = find_scenario(name)
     return scenario_loop(scenario, scenario.controller, 1, UNCERTAINTY), scenario
-
-
-def learned_loop(scenario: Scenario) -> LinearLoop:
-    """The loop of the last model of a flight that learns.
-
-    It is the loop around that model, with two of its standard deviations a side for the box; those
-    before a flight where the flight shows none.
-    """
-    tape = simulate(scenario, learn=learner(scenario))
-    controller = scenario.controller
-    for change in tape.changes:
-        controller = type(controller).validate_mapping(controller.changed(change), "controller")
-    frame = load_airframe(scenario.aircraft.airframe)
-    matrices = {"A": frame.matrix_a(), "B": frame.matrix_b()}
-    last = tape["learned"].values[-1]
-    stated = dict(zip(tape["learned"].names, last.tolist(), strict=True))
-    errors = {}
-    deviations = {}
-    for name, (matrix, i, j) in drawn_places(frame).items():
-        spaced = name.replace(",", ", ")
-        if f"value.{spaced}" in stated:
-            value = stated[f"value.{spaced}"]
-            errors[name] = value / matrices[matrix][i, j] - 1.0
-            deviations[name] = 2.0 * abs(stated[f"deviation.{spaced}"] / value)
-    model = with_entries(frame, errors)
-    loop = linear_loop(controller, model, model.matrix_a()[None], model.matrix_b()[None])
-    return loop._replace(box=box_of(model, controller, 2.0 * PRIOR, Spread(deviations)))
 
 
 def flight(scenario: Scenario, first: Unstable) -> str:

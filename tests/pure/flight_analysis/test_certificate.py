@@ -336,6 +336,57 @@ def test_export_puts_the_certificate_beside_the_code_of_its_constants(tmp_path: 
     assert "holds other constants" in run(content, tmp_path, str(header)).stderr
 
 
+def test_command_certifies_an_aircraft_of_jsbsim_or_refuses_before_the_work(
+    tmp_path: Path,
+) -> None:
+    """The loop is y_dot = Omega u: four entries of B, and the name of the loop of the scenario."""
+    path = tmp_path / "certificate.json"
+    words = ["gains", "jsbsim:c172p", "--check", "--scenario", "jsbsim_c172p", "--samples", "1"]
+    refused = invoke(*words, "--guarantee", "--worst", str(tmp_path / "worst"))
+    assert "worst: found jsbsim:c172p, expected an aircraft of an airframe" in str(
+        refused.exception
+    )
+    words += ["--guarantee", "--certificate", str(path)]
+    done = invoke(*words)
+    content = json.loads(path.read_text())
+    assert content["loop"] == loop_of("jsbsim_c172p").digest, done.output
+    assert content["names"][0] == "B[q,elevator]"
+    assert run(content, tmp_path).stdout.startswith("PROVED")
+    with refusing("of jsbsim_c172p, as jsbsim:c172p has"):
+        rise_di.check_gains("osprey", "jsbsim_c172p")
+
+
+def test_law_without_c_code_has_a_certificate_without_constants(tmp_path: Path) -> None:
+    """Vanes are no condition of the proof, only of the C code."""
+    path = tmp_path / "certificate.json"
+    words = ["gains", "osprey", "--check", "--scenario", "osprey_vanes", "--samples", "1"]
+    done = invoke(*words, "--guarantee", "--certificate", str(path))
+    said = " ".join(done.output.split())
+    assert "certificate without constants: controller.observer.vanes: found a section" in said
+    proved = run(json.loads(path.read_text()), tmp_path)
+    assert proved.stdout.startswith("PROVED"), proved.stderr
+    assert "law: of no exported constants" in proved.stdout
+
+
+def test_closed_pipe_is_no_traceback(servo: Content, tmp_path: Path) -> None:
+    path = tmp_path / "certificate.json"
+    path.write_text(json.dumps(servo))
+    command = [sys.executable, str(CHECKER), str(path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as checker:
+        assert checker.stdout is not None
+        assert checker.stderr is not None
+        checker.stdout.close()
+        assert checker.stderr.read() == b""
+    assert checker.returncode == 0
+
+
+def test_file_that_cannot_be_read_is_status_2(tmp_path: Path) -> None:
+    command = [sys.executable, str(CHECKER), str(tmp_path / "none.json")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.startswith("REFUSED")
+
+
 def test_checker_without_a_file_says_how_it_is_called() -> None:
     done = subprocess.run([sys.executable, CHECKER], capture_output=True, text=True, check=False)
     assert done.returncode == 2

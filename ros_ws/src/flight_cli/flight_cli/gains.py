@@ -110,7 +110,7 @@ class _GainsAnswer(NamedTuple):
     answers: dict[str, Assessment]
     selection: Selection | None = None
     promise: Guarantee | None = None
-    unstable: Sequence[str] = ()  # sentences about the aircraft that were written
+    written: Sequence[str] = ()  # sentences about the files of a guarantee
 
     @property
     def first(self) -> Assessment:
@@ -137,7 +137,7 @@ class Gains:
     """
 
     airframe: str = argument(
-        "Name of an airframe, or path of an airframe file (.yaml).",
+        "Name or file (.yaml) of an airframe; with --check also jsbsim:NAME of the scenario.",
         default=REQUIRED,
         autocompletion=airframe_names,
     )
@@ -248,6 +248,7 @@ class Gains:
         require_guarantee(
             check=self.check,
             is_wanted=self.guaranteed,
+            airframe=self.airframe,
             scenario=self.scenario,
             late=self.late,
             entries=self.entry or (),
@@ -290,9 +291,9 @@ class Gains:
         progress("bounding every aircraft of the box")
         loop = answer.loop_with_box()
         promise = proved(loop, self.late)
-        write_certificate(self.certificate, loop, promise, self.airframe, self.scenario)
-        lines = write_unstable(self.worst, promise, self.airframe, self.scenario)
-        return _GainsAnswer({"scenario": answer}, promise=promise, unstable=lines)
+        lines = write_certificate(self.certificate, loop, promise, self.airframe, self.scenario)
+        lines += write_unstable(self.worst, promise, self.airframe, self.scenario)
+        return _GainsAnswer({"scenario": answer}, promise=promise, written=lines)
 
     def _selected(self, progress: Callable[[str], None]) -> _GainsAnswer:
         """Gains by Theorem 1 and by the procedure, or those beside an observer."""
@@ -325,7 +326,7 @@ class Gains:
             lines.insert(0, selection.origin)
             if not self.observer and selection.engineering.has_requirement:
                 _show_trade(console, selection)
-        lines += result.unstable
+        lines += result.written
         files = {"gains": self.write, "page": self.page, "certificate": self.certificate}
         lines += [f"{key}: {display_path(path)}" for key, path in files.items() if path is not None]
         for line in filter(None, lines):

@@ -27,7 +27,12 @@ from flight_cli.words import warn
 from flight_core.arguments import as_number
 from flight_core.files import display_path, is_folder, writing
 from flight_core.parameters import require
-from flight_design.gains.first_scenario import COMMANDED, controller_alone
+from flight_design.gains.first_scenario import (
+    COMMANDED,
+    airframe_to_check,
+    controller_alone,
+    scenario_to_check,
+)
 from flight_design.gains.gain_selection import GainAssessment
 from rise_di.c_code import certificate_sources
 from rise_di_controller.params import ControllerConfig
@@ -40,6 +45,7 @@ def require_guarantee(
     *,
     check: bool,
     is_wanted: bool,
+    airframe: str,
     scenario: str,
     late: float,
     entries: Sequence[str],
@@ -63,6 +69,7 @@ def require_guarantee(
     lags = [text for text in entries if text.startswith("1/")]
     require(not lags or path is None, "certificate", f"{', '.join(lags)} beside it", "exact lags")
     # before the proof, which takes up to minutes
+    _require_worst(files["worst"], airframe, scenario)
     fits = path is None or (os.access(path.parent, os.W_OK) and not is_folder(path))
     require(fits, "certificate", path, "a file in a folder that can be written")
 
@@ -82,14 +89,31 @@ def proved(loop: LinearLoop, late: float) -> Guarantee:
 
 def write_certificate(
     path: Path | None, loop: LinearLoop, promise: Guarantee, airframe: str, scenario: str
-) -> None:
-    """Write the certificate of a guarantee, if a path is named."""
-    if path is not None:
-        facts = "; ".join(each.fact for each in loop.differences)
-        found = f"no stable box ({facts})" if facts else "no stable box"
-        require(promise.stable > 0.0, "--certificate", found, "a loop with a guarantee")
-        sources = certificate_sources(load_airframe(airframe), scenario)
-        write_text("certificate", path, certificate(loop, promise, sources.texts))
+) -> list[str]:
+    """Write the certificate of a guarantee, if a path is named.
+
+    Returns a sentence if the law has no C constants from which a checker computes it.
+    """
+    if path is None:
+        return []
+    facts = "; ".join(each.fact for each in loop.differences)
+    found = f"no stable box ({facts})" if facts else "no stable box"
+    require(promise.stable > 0.0, "--certificate", found, "a loop with a guarantee")
+    frame = airframe_to_check(airframe, scenario_to_check(scenario))
+    sources = certificate_sources(frame, scenario)
+    write_text("certificate", path, certificate(loop, promise, sources.texts))
+    return [f"certificate without constants: {sources.without}"] if sources.without else []
+
+
+def _require_worst(folder: Path | None, airframe: str, scenario: str) -> None:
+    """Raise ParameterError unless a scenario flies the airframe of which it is to fly variants."""
+    if folder is None:
+        return
+    base = find_scenario(scenario)
+    expected = f"the aircraft of {base.name}, {base.aircraft.airframe}"
+    require(not base.aircraft.is_jsbsim, "worst", airframe, "an aircraft of an airframe file")
+    same = load_airframe(base.aircraft.airframe).name == load_airframe(airframe).name
+    require(same, "worst", airframe, expected)
 
 
 def write_unstable(
@@ -106,8 +130,6 @@ def write_unstable(
     frame = load_airframe(airframe)
     require(promise.unstable is not None, "worst", "no unstable aircraft", "a loop that has one")
     assert promise.unstable is not None  # noqa: S101 - for mypy
-    fits = not base.aircraft.is_jsbsim and load_airframe(base.aircraft.airframe).name == frame.name
-    require(fits, "worst", airframe, f"the aircraft of {base.name}, {base.aircraft.airframe}")
     names = zip(base.controller.inputs, base.controller.lag, strict=True)
     declared = {f"1/lag[{name}]": lag for name, lag in names}
     own = [f"1/{name}" for name in published(base)]

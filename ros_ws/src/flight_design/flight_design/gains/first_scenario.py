@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
+from aircraft_sim.airframes.airframe import Airframe, load_airframe
 from flight_analysis.closed_loop.scenario import (
     SCHEMAS,
     Scenario,
@@ -14,8 +15,10 @@ from flight_analysis.closed_loop.scenario import (
     scenario_of,
 )
 from flight_analysis.closed_loop.scenario_library import LIBRARY, find_scenario
+from flight_analysis.linear_loop.loop_margins import scenario_model, through_allocation
 from flight_core.arguments import FilePath
 from flight_core.files import comment, find_file, read_file
+from flight_core.parameters import require
 from flight_core.scenario_file import A_SCENARIO, parse_sections
 from flight_core.units import GRAVITY
 from flight_design.gains import gain_yaml
@@ -200,6 +203,25 @@ def scenario_to_check(scenario: FilePath | Scenario) -> Scenario:
     if controller is None:
         return find_scenario(scenario)
     return replace(find_scenario(COMMANDED), controller=controller)
+
+
+def airframe_to_check(airframe: FilePath | Airframe, flight: Scenario) -> Airframe:
+    """Return an airframe, or the linear model of the aircraft of JSBSim that a scenario flies.
+
+    Raises ParameterError for an airframe with other channels than the law of the scenario.
+    """
+    flown = flight.aircraft
+    law = flight.controller
+    is_flown = flown.is_jsbsim and str(airframe) == flown.airframe
+    frame = scenario_model(flight, law) if is_flown else load_airframe(airframe)
+    own = f", as {flown.airframe} has" if flown.is_jsbsim else ""
+    inputs = tuple(through_allocation(frame, law).inputs)
+    channels = {"outputs": (law.outputs, frame.outputs), "inputs": (law.inputs, inputs)}
+    for key, (names, present) in channels.items():
+        fits = {*names} == {*present} if key == "outputs" else {*names} <= {*present}
+        expected = f"the {key} {', '.join(names)} of {flight.name}{own}"
+        require(fits, f"airframe {frame.name}", ", ".join(present), expected)
+    return frame
 
 
 def controller_alone(scenario: FilePath | Scenario) -> ControllerConfig | None:

@@ -36,6 +36,7 @@ from flight_core.vectors import FloatArray
 from flight_design.gains import gain_selection, ideal_control, tuned_gains
 from flight_design.gains.effectors import LAW_INPUT, Effectors, design_allocation, lags_by_input
 from flight_design.gains.first_scenario import (
+    airframe_to_check,
     controller_alone,
     scenario_to_check,
     scenario_to_design,
@@ -236,7 +237,8 @@ def check_gains(
     Lags and delay are those of the aircraft in the scenario where the controller was told others.
 
     Args:
-        airframe: Name in the library, path of an airframe file (.yaml), or an Airframe.
+        airframe: Name in the library, path of an airframe file (.yaml), or an Airframe; or the
+            aircraft of JSBSim that the scenario flies, as jsbsim:c172p, for y_dot = Omega u.
         scenario: Name, path of a scenario file (.yaml), or a Scenario; or path of a file with the
             section controller alone: commands, gusts and rate limits are those of osprey_servo.
         uncertainty: Largest relative deviation of each entry of A and B, 0 to 1.
@@ -259,7 +261,7 @@ def check_gains(
         True
     """
     flight = scenario_to_check(scenario)
-    frame = load_airframe(airframe)
+    frame = airframe_to_check(airframe, flight)
     gamma_2 = as_number(gamma_2, "gamma_2", 0.0, unit="1/s")
     spread = Spread(as_numbers_by_name(entries, "entries", '{"1/lag[elevator]": 0.3}'))
     flown = None
