@@ -305,6 +305,17 @@ def test_first_unstable_aircraft_is_the_nearest_that_a_search_found() -> None:
     assert radii(linear, (d / linear.box.part)[None])[0] > LIMIT
 
 
+def test_guarantee_says_what_is_exact_in_every_aircraft() -> None:
+    """The rows of the angles and gravity are exact, and no more is said than is proved."""
+    text = guarantee_text(guarantee(boxed("osprey_servo")))
+    assert "the linear loop is stable for every aircraft within 74." in text[0]
+    kinematic = "A[V,theta], A[theta,q], A[beta,phi], A[phi,p], A[phi,r]"
+    assert text[1].endswith(f"{kinematic}, lags, delay, period, each entry that is 0")
+    assert "no mode grows by more than 1e-6 a tick" in text[1]
+    late = guarantee_text(guarantee(integrator(60.0, 0.1), 0.01))
+    assert "(no certificate: up to what two coefficients of a period leave out)" in late[0]
+
+
 def test_factor_with_a_nan_is_not_inside() -> None:
     """A Cholesky factor of NaN raises nothing, and no comparison with NaN is true."""
     N = np.diag([0.1 + 0.0j, 0.1])

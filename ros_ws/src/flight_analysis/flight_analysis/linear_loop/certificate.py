@@ -26,7 +26,7 @@ from flight_analysis.linear_loop.told import Standing
 from flight_core.files import write_file
 from flight_core.parameters import require
 
-BOUND = 4  # counts the ways by which this stack has bounded a loop
+BOUND = 5  # counts the ways by which this stack has bounded a loop
 
 
 def certificate(linear: LinearLoop, promise: Guarantee, sources: Mapping[str, str]) -> str:
@@ -115,6 +115,7 @@ def _kept(linear: LinearLoop) -> Guarantee | None:
         content: dict[str, Any] = json.loads(_path(linear.digest).read_bytes())
         first = content["unstable"]
         content["unstable"] = None if first is None else Unstable(**first)
+        content["exact"] = tuple(content["exact"])
         return Guarantee(**{field: content[field] for field in Guarantee._fields})
     except (OSError, ValueError, KeyError, TypeError):
         return None

@@ -15,6 +15,7 @@ from flight_analysis.linear_loop.branch_and_bound import proof_of
 from flight_analysis.linear_loop.loop_margins import LAG_ENTRY, MOST_OF_LAG, LinearLoop
 from flight_analysis.linear_loop.structured_value import RADIUS
 from flight_analysis.linear_loop.uncertain_loop import (
+    Box,
     Channels,
     parts_of,
     plants_at,
@@ -61,6 +62,7 @@ class Guarantee(NamedTuple):
     loop: str  # digest of the loop
     late: float = 0.0  # s: u is late by an unknown time of 0 to this, another one at each tick
     has_exact_lags: bool = True  # whether no lag of an actuator is in the box
+    exact: tuple[str, ...] = ()  # entries of A and B, not 0, that are no part of the box
     proof: Sequence[dict[str, Any]] = ()  # "entries" and "steps" of each part, see `proof_of`
 
     @property
@@ -102,6 +104,7 @@ def guarantee(linear: LinearLoop, late: float = 0.0) -> Guarantee:
         loop=linear.digest,
         late=late,
         has_exact_lags=not is_lag.any(),
+        exact=_exact_entries(linear, box),
     )
     if not is_stable(linear.nominal, linear.law, linear.loop, np.zeros(len(linear.inputs))):
         return none
@@ -125,6 +128,18 @@ def guarantee(linear: LinearLoop, late: float = 0.0) -> Guarantee:
         # disks in all inputs at once cover a disk in one
         disks[name] = max(_disk(uncertain, (i,), least_found), disk_all)
     return promise._replace(disk=disks, disk_all=disk_all)
+
+
+def _exact_entries(linear: LinearLoop, box: Box) -> tuple[str, ...]:
+    """The entries of A and B of the aircraft that are not 0 and the same in every aircraft."""
+    states = linear.states
+    moved = (box.E != 0.0).astype(float) @ (box.F != 0.0)
+    rows, columns = np.nonzero((linear.nominal.A != 0.0) & (moved == 0.0))
+    # behind the states there may be actuators, whose rows are their lags
+    places = [place for place in zip(rows, columns, strict=True) if max(place) < len(states)]
+    left_out = [name for name, part in zip(box.names, box.part, strict=True) if not part]
+    names = [*left_out, *(f"A[{states[i]},{states[j]}]" for i, j in places)]
+    return tuple(dict.fromkeys(names))
 
 
 def _loops(linear: LinearLoop, late: float) -> list[LoopTiming]:

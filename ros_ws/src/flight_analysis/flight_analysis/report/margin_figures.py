@@ -231,13 +231,21 @@ def _aircraft_as_json(margins: Margins, inputs: Sequence[str]) -> dict[str, Any]
 
 
 def guarantee_text(promise: Guarantee) -> list[str]:
-    """A guarantee in sentences."""
+    """Say a guarantee in sentences, with what it means by stable and what it holds as exact."""
     if promise.stable == 0.0:
         return ["guarantee: none, not even the aircraft of the file is proved stable"]
     stable = math.floor(1e3 * promise.stable) / 10.0
     late = f", u up to {1e3 * promise.late:g} ms late" if promise.late else ""
-    name = f" (certificate {promise.certificate})" if promise.certificate else ""
-    lines = [f"guarantee: stable for every aircraft within {stable:.1f} %{late}{name}"]
+    name = "no certificate: up to what two coefficients of a period leave out"
+    if promise.certificate:
+        name = f"certificate {promise.certificate}"
+    lags = "lags, " if promise.has_exact_lags else ""
+    exact = ", ".join((*promise.exact, f"{lags}delay, period, each entry that is 0"))
+    within = f"the linear loop is stable for every aircraft within {stable:.1f} %{late}"
+    lines = [
+        f"guarantee: {within} ({name})",
+        f"stable: no mode grows by more than 1e-6 a tick; exact in every aircraft: {exact}",
+    ]
     if promise.unstable is None:
         lines.append("no unstable aircraft found within 99 %")
     else:
