@@ -54,9 +54,9 @@ has a command of its own where no other one of its kind has twice as much."""
 END = 1.0
 """s, length of the end of a flight: an error that grows is larger there than over WINDOW."""
 
-MOST = {"V": 2.0}
-"""m/s. Turbulence of sigma = 2 m/s, moderate by MIL-F-8785C, leaves 1.8 m/s rms of V to a Cessna,
-whose engine is too slow for gusts."""
+MOST = {"V": 6.0}
+"""m/s. Severe turbulence of MIL-F-8785C, sigma = 3.05 m/s at 4000 ft, leaves 3 m/s rms of V over a
+second to a Cessna, whose engine is too slow for gusts, and twice that is allowed."""
 
 MOST_RATE = 0.05
 """rad/s, 3 deg/s. Severe turbulence, 45 kt at 20 ft by MIL-F-8785C, leaves 0.024 rad/s to the
