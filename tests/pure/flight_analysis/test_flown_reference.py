@@ -112,7 +112,7 @@ def test_fault_of_the_reference_model_is_told(
     if outcome.status == 4:
         told = [each for each in outcome.shortfalls if each.aim is Aim.REFERENCE]
         assert len(told) == 1
-        assert told[0].sentence.startswith("y_m is not that of the scenario from t = ")
+        assert told[0].sentence.startswith("y_m is not that of the scenario: ")
 
 
 def test_fault_of_the_reference_model_is_told_where_guidance_commands(
