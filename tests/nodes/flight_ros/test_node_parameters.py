@@ -4,6 +4,7 @@
 
 import sys
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -34,14 +35,17 @@ def test_node_without_parameters_names_a_missing_one(name: str) -> None:
     assert str(refused.value).startswith(
         f"{name}: found no parameters, expected a section for /{name} in a file"
     )
-    assert "missing, expected" in str(refused.value)
+    assert f"file of --params-file: {name}: missing " in str(refused.value)
 
 
 @pytest.mark.parametrize(
     "arguments, sentence",
     [
         (["-p", "k_g:=-1.0"], "controller.k_g: found -1.0, expected greater than 0"),
-        (["-p", "max_agee:=1.0"], "controller.max_agee: unknown key, expected max_age perhaps"),
+        (
+            ["-p", "controller:max_agee:=1.0"],
+            "controller.max_agee: unknown key, expected max_age perhaps",
+        ),
         (
             ["-r", "__node:=rise"],
             "rise: found no parameters, expected a section for /rise in a file of --params-file",
@@ -61,6 +65,38 @@ def test_an_invalid_parameter_is_one_sentence(
         world.make(ControllerNode)
     assert str(refused.value).startswith(sentence)
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("given", ["-p", "/**", "/*", "/**/*"])
+def test_parameter_for_all_nodes_is_left_alone_by_a_node_that_has_no_such(
+    given: str, osprey_gust: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As SetParameter of a launch file gives it to every node; the controller takes it."""
+    file = tmp_path / "all.yaml"
+    file.write_text(f"{given}:\n  ros__parameters: {{k_g: 2.0, other: {{depth: 1}}}}\n")
+    words = ["--params-file", str(osprey_gust.path), "-p", f"recorder:directory:={tmp_path}/run"]
+    by_option = ["-p", "k_g:=2.0", "-p", "other.depth:=1"]
+    words += by_option if given == "-p" else ["--params-file", str(file)]
+    monkeypatch.setattr(sys, "argv", ["node", "--ros-args", *words])
+    with world_of(*words) as world:
+        recorder = world.make(RecorderNode)
+        controller = world.make(ControllerNode)
+        assert controller.parameters.model_dump()["k_g"] == 2.0
+        assert not recorder.has_parameter("k_g")
+        assert not controller.has_parameter("other.depth")
+        assert recorder.parameters.rate == osprey_gust.recorder.rate
+
+
+def test_all_missing_parameters_are_in_one_sentence(tmp_path: Path) -> None:
+    """What no aircraft shares has no default, and nothing else is asked for."""
+    file = tmp_path / "mine.yaml"
+    file.write_text("/**/controller:\n  ros__parameters: {rate: 100.0, max_age: 0.2}\n")
+    needed = "outputs, inputs, D, input_scale, lag, k_g, k_d, Lambda, beta"
+    with (
+        world_of("--params-file", str(file)) as world,
+        refusing(rf"^controller: missing {needed}, expected a value for each$"),
+    ):
+        world.make(ControllerNode)
 
 
 @pytest.mark.parametrize("name", ["aircraft", "reference_model"])

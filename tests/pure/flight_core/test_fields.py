@@ -106,7 +106,10 @@ class Outer(Config):
         ({"inner": {}}, "set.inner.a: missing, expected the rate, Hz"),
         (
             {"inner": {"aa": 1.0}},
-            "set.inner.aa: unknown key, expected a perhaps, or another of a, b (and 1 more)",
+            (
+                "set.inner.aa: unknown key, expected a perhaps, or another of a, b; "
+                "set.inner.a: missing, expected the rate, Hz"
+            ),
         ),
         (
             {"inner": {"a": 0}, "scale": 0},

@@ -85,7 +85,7 @@ BAD = {
     (
         "/**/recorder",
         "/**/recoder",
-    ): "bad.yaml: recoder: found a section, expected only flight, aircraft,",
+    ): "bad.yaml: recoder: found a section, expected recorder perhaps, or another of",
     (
         "/**/recorder:\n  ros__parameters:",
         "/**/recorder:\n  parameters:",

@@ -121,8 +121,8 @@ def test_text_reads_back_with_units_beside_the_keys() -> None:
     assert "#\n# first\n# second\n" in text
     assert "gusts" not in text
     assert f"duration: {commands.duration}  # s\n" in text
-    # every section is there: the first complaint is about the values of the controller
-    with pytest.raises(ParameterError, match=r"controller"):
+    # every section is there: the first complaint is about a value of the aircraft
+    with pytest.raises(ParameterError, match=r"^aircraft\.step: missing"):
         parse_scenario(text.encode(), Path("first.yaml"))
 
 
@@ -136,7 +136,7 @@ def test_scenario_without_gains_has_those_of_the_scenario_with_gains(tmp_path: P
     assert len(bare) < len(text)
     path = tmp_path / "bare.yaml"
     path.write_text(bare, "utf-8")
-    with refusing(r"^controller\.D: missing"):
+    with refusing(r"^controller: missing D, input_scale, k_g, k_d, Lambda, beta, expected"):
         find_scenario(str(path))
     airframe = str(example.parent / "rates_airframe.yaml")
     selections = [select_gains(airframe, name, samples=1) for name in (str(path), str(example))]

@@ -28,6 +28,7 @@ from flight_core.fields import Field
 from flight_core.files import read_yaml
 from flight_core.outcome import COMPLETED, INTERRUPTED, Outcome, never_flew
 from flight_core.parameters import Config, NonNegative, Number, ParameterError, Positive, require
+from flight_core.scenario_file import PARAMETERS
 from flight_guidance.routes.route_file import Origin, read_route
 
 if TYPE_CHECKING:
@@ -42,11 +43,13 @@ Overrides = dict[str, dict[str, object]]
 def is_fleet(name: FilePath) -> bool:
     """Whether the path names the file of a fleet, with aircraft by name.
 
-    A scenario has sections of nodes.
+    A scenario has sections of nodes, with `ros__parameters` in each.
     """
     with suppress(ParameterError):
         content = read_yaml(Path(name), str(name), A_FLEET)
-        return isinstance(content, Mapping) and "aircraft" in content
+        aircraft = content.get("aircraft", {}) if isinstance(content, Mapping) else {}
+        is_section = isinstance(aircraft, Mapping) and PARAMETERS in aircraft
+        return isinstance(content, Mapping) and "aircraft" in content and not is_section
     return False
 
 
@@ -251,7 +254,7 @@ class _Flight:
         self.progress(0.0, "starting")
         try:
             self.processes = FlightProcesses(
-                as_file(self.member.scenario, self.run),
+                as_file(self.member.scenario, self.run, absolute_namespace(self.member.name)),
                 self.run,
                 self.monitor,
                 lockstep=fleet.lockstep,

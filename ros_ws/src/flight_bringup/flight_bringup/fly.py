@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from flight_analysis.closed_loop.learning_loop import Learn
 from flight_analysis.closed_loop.scenario import Scenario, load_scenario
-from flight_analysis.closed_loop.scenario_library import find_scenario, save_scenario, with_recorded
+from flight_analysis.closed_loop.scenario_library import as_flown, find_scenario, save_scenario
 from flight_analysis.closed_loop.simulate import fly
 from flight_analysis.report.display_units import display_units
 from flight_analysis.report.run_folder import FlightResult, attachments_for, new_run, write_report
@@ -393,11 +393,11 @@ def _is_its_file(scenario: Scenario) -> bool:
         return False
 
 
-def as_file(scenario: Scenario, run: Path) -> Scenario:
+def as_file(scenario: Scenario, run: Path, namespace: str = "") -> Scenario:
     """The scenario with a file that holds it: its own, or a new one in the folder of the run.
 
-    Raises ParameterError.
+    Nodes in the namespace read the same from it, as of `as_flown`. Raises ParameterError.
     """
     if _is_its_file(scenario):
-        return with_recorded(scenario, run)
+        return as_flown(scenario, run, namespace)
     return save_scenario(scenario, run / f"{scenario.name}.yaml")

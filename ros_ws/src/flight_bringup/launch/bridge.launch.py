@@ -20,7 +20,7 @@ from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch_ros.actions import Node
 
 from autopilot_bridge.params import maps
-from flight_analysis.closed_loop.scenario_library import find_scenario, with_recorded
+from flight_analysis.closed_loop.scenario_library import as_flown, find_scenario
 from flight_analysis.report.run_folder import new_run
 from flight_bringup.graph import (
     CONTROLLER,
@@ -96,7 +96,7 @@ def _fly(context: LaunchContext) -> list[Action]:
     stores = recorded or not scenario.reference_model.recorded
     require(stores, "recorder", "false", "true: a run stores the values of recorded commands")
     run = new_run(scenario, Path(argument(context, "runs"))) if recorded else Path()
-    scenario = with_recorded(scenario, run)
+    scenario = as_flown(scenario, run)
     end_with_launch(context)
 
     def node(spec: NodeSpec, start_time: float = math.inf) -> Node:

@@ -16,7 +16,7 @@ from launch.action import Action
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch_ros.actions import Node
 
-from flight_analysis.closed_loop.scenario_library import find_scenario, with_recorded
+from flight_analysis.closed_loop.scenario_library import as_flown, find_scenario
 from flight_analysis.report.run_folder import new_run
 from flight_bringup.graph import (
     AIRCRAFT,
@@ -102,7 +102,7 @@ def _fly(context: LaunchContext) -> list[Action]:
         )
         return by_rise_di(context, argument(context, "scenario"))
     run = new_run(scenario, Path(argument(context, "runs")))
-    scenario = with_recorded(scenario, run)
+    scenario = as_flown(scenario, run)
     end_with_launch(context)
     first = (CONTROLLER,) if by_rosbag2 else FIRST_STAGE
 

@@ -15,9 +15,9 @@ from rich.console import Console
 from flight_analysis.closed_loop.learning_loop import Learn
 from flight_analysis.closed_loop.scenario import Scenario, limits_beyond_stops, opposite_signs
 from flight_analysis.closed_loop.scenario_library import (
+    as_flown,
     find_scenario,
     save_scenario,
-    with_recorded,
     with_route,
 )
 from flight_analysis.report.run_folder import (
@@ -157,7 +157,7 @@ class Fly(RouteWords):
         if self.route or self.fence or self.settings or self.learn:
             scenario = save_scenario(scenario, run / f"{scenario.name}.yaml")
         else:
-            scenario = with_recorded(scenario, run)
+            scenario = as_flown(scenario, run, namespace)
         self._watch(run)
         with flight_progress(scenario.flight.duration, quiet=self.as_json) as (progress, announce):
             if self.in_process:
@@ -169,7 +169,8 @@ class Fly(RouteWords):
                     progress,
                     lockstep=stepping,
                     one_process=self.composed,
-                    use_sim_time=self.use_sim_time,
+                    use_sim_time=self.use_sim_time
+                    or (scenario.flight.use_sim_time and not stepping),
                     autopilot=autopilot,
                     namespace=namespace,
                     announce=announce,

@@ -42,11 +42,35 @@ class Problems:
 
     def __init__(self) -> None:
         self.unknown: list[str] = []  # keys
+        # by set: the missing keys with what is expected of each
+        self.missing: dict[str, dict[str, str]] = {}
         self.others: list[str] = []
 
     def sentences(self) -> list[str]:
         """Unknown keys first: a mistyped key is before the key missing because of the mistake."""
-        return self.unknown + self.others
+        return self.unknown + self.missing_sentences() + self.others
+
+    def missing_sentences(self) -> list[str]:
+        """A sentence for each set that lacks keys. It names all of them."""
+        sentences = []
+        for where, keys in self.missing.items():
+            (name, meaning), *more = keys.items()
+            if more:
+                sentences.append(f"{where}: missing {', '.join(keys)}, expected a value for each")
+            else:
+                sentences.append(f"{where}.{name}: missing, expected {meaning}")
+        return sentences
+
+    def summary(self) -> str:
+        """The first sentence and those about missing keys, and how many more there are."""
+        sentences = self.sentences()
+        told = list(dict.fromkeys([sentences[0], *self.missing_sentences()]))
+        more = len(sentences) - len(told)
+        return "; ".join(told) + (f" (and {more} more)" if more else "")
+
+    def lack(self, where: str, name: str, meaning: str) -> None:
+        """Add a key that a set lacks."""
+        self.missing.setdefault(where, {})[name] = meaning
 
     def refuse(self, key: str, value: object, expected: str) -> None:
         """Add a sentence: the value found for a key, and the expected value."""
@@ -231,6 +255,7 @@ def _union(kinds: Sequence[Kind]) -> Kind:
                 if not trial.sentences():
                     return converted
         problems.unknown += trial.unknown
+        problems.missing |= trial.missing
         problems.others += trial.others
         return None
 

@@ -93,7 +93,7 @@ class Config:
         """Build the set from a nested mapping; `where` names the set in errors, e.g. "controller".
 
         Without `check` relations between the values of the set are left to the caller. Raises
-        ParameterError with a sentence for the first key not permitted.
+        ParameterError with a sentence for the first key not permitted, and for every missing key.
         """
         problems = Problems()
         try:
@@ -102,8 +102,7 @@ class Config:
             numbers = f"numbers too large or too small ({error.args[-1]})"
             raise ParameterError(f"{where}: found {numbers}, expected those of a flight") from None
         if parameters is None:
-            first, *others = problems.sentences()
-            raise ParameterError(first + (f" (and {len(others)} more)" if others else ""))
+            raise ParameterError(problems.summary())
         return parameters
 
     @classmethod
@@ -120,9 +119,7 @@ class Config:
             if name in values:
                 content[name] = field.kind.read(values[name], f"{key}.{name}", problems)
             elif field.default is REQUIRED:
-                problems.others.append(
-                    f"{key}.{name}: missing, expected {field.description or 'a value'}"
-                )
+                problems.lack(key, name, field.description or "a value")
             else:
                 content[name] = (
                     dict(field.default) if isinstance(field.default, dict) else field.default
@@ -145,6 +142,11 @@ class Config:
             problems.others.append(f"{key}.{error}")
             return None
         return parameters
+
+    @classmethod
+    def keys_beside(cls, values: Mapping[str, Any]) -> Set[str]:
+        """The keys that the set may have beside these values."""
+        return cls.model_fields.keys()
 
     def changed(self, changes: Mapping[str, Any]) -> dict[str, Any]:
         """The values with changes by dotted name, not validated.

@@ -1,59 +1,215 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Scenario files: a ROS parameter file with a section per node, read without ROS.
+"""Scenario files: a ROS parameter file with a section per node, read without ROS by rcl's rules.
 
 /**/controller:
   ros__parameters:
     rate: 100.0    # Hz
+
+Rcl joins the sections that match the full name of a node, in the order of the file: a later value
+replaces an earlier one. `**` in a name stands for any number of names, `*` for one. A section for
+all nodes gives a node the parameters that this node knows.
 """
 
+import difflib
+import re
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from flight_core.files import limited, parse_yaml
-from flight_core.parameters import require
+from flight_core.parameters import Config, ParameterError, one_of, require
 
 Sections = dict[str, dict[str, Any]]
 
 A_SCENARIO = "a scenario file"
 
+PARAMETERS = "ros__parameters"
+SIM_TIME = "use_sim_time"
+ROS_PARAMETERS = (SIM_TIME, "start_type_description_service", "qos_overrides")
+"""Parameters that ROS gives every node."""
+
+WILDCARDS: Mapping[str, str] = {"**": "(/[^/]+)*", "*": "/[^/]+"}
+MISTYPED = 0.8  # similarity of a foreign section to one that is lacking: recoder, recorder
+
 
 def parse_sections(
-    content: bytes, path: Path, expected: tuple[str, ...], optional: tuple[str, ...] = ()
+    content: bytes,
+    path: Path,
+    schemas: Mapping[str, type[Config]],
+    optional: tuple[str, ...] = (),
+    namespace: str | None = None,
 ) -> Sections:
     """Sections of a scenario file by node name, e.g. {"controller": {"rate": 100.0, ...}}.
 
-    A section in `optional` may be absent, or an empty mapping: every parameter by default. Raises
-    ParameterError with the path for content that is no scenario file or too long, has a duplicate
-    key, or lacks or adds a section.
+    Sections of nodes that are not among `schemas` are left alone. A section in `optional` may be
+    absent, or an empty mapping: every parameter by default. Parameters of ROS are left out, but a
+    node by /clock makes `use_sim_time` of the section `flight` true. `namespace` belongs to the
+    nodes, "" is the root; for None it is whatever one the file names.
+
+    Raises ParameterError with the path for content that is no scenario file or too long, has a
+    duplicate key, lacks a section, or names nodes of two namespaces where `namespace` is None.
     """
-    tree = parse_yaml(limited(content, str(path), A_SCENARIO), str(path), A_SCENARIO)
-    require(
-        isinstance(tree, dict),
-        str(path),
-        f"{type(tree).__name__}",
-        f"a mapping with {', '.join(expected)}",
-    )
+    found = _all_sections(content, path)
+    expected = [name for name in schemas if name not in optional]
     sections: Sections = {}
-    for key, section in tree.items():
-        name = str(key).removeprefix("/**/").removeprefix("/")
-        known = (*expected, *optional)
-        require(name in known, f"{path.name}: {name}", "a section", f"only {', '.join(known)}")
-        values = section.get("ros__parameters") if isinstance(section, dict) else None
+    is_simulated = False
+    for name, schema in schemas.items():
+        matching = [pattern for pattern in found if _matches(pattern, name, namespace)]
+        own = [pattern for pattern in matching if _is_of(pattern, name)]
+        if namespace is None:
+            _require_one_namespace(own, name, path)
+        if not own:
+            _require_not_mistyped(found, name, schemas, path)
+            require(
+                name in optional,
+                f"{path.name}: {name}",
+                "no such section",
+                f"one for each of {', '.join(expected)}",
+            )
+            continue
+        everything: dict[str, Any] = {}
+        for pattern in matching:
+            _join(everything, found[pattern])
+        known = schema.keys_beside(everything)
+        values: dict[str, Any] = {}
+        for pattern in matching:
+            given = found[pattern]
+            if pattern not in own:
+                given = {key: value for key, value in given.items() if key in known}
+            _join(values, given)
+        for key in ROS_PARAMETERS:
+            if key not in schema.model_fields:
+                values.pop(key, None)
         require(
-            isinstance(values, dict)
-            and (bool(values) or name in optional)
-            and set(section) == {"ros__parameters"},
+            bool(values) or name in optional,
             f"{path.name}: {name}",
-            "no parameters under ros__parameters",
+            f"no parameters under {PARAMETERS}",
             "a mapping of them there, as in every ROS parameter file",
         )
-        sections[name] = dict(values or {})
-    for name in expected:
-        require(
-            name in sections,
-            f"{path.name}: {name}",
-            "no such section",
-            f"one for each of {', '.join(expected)}",
-        )
+        is_simulated |= everything.get(SIM_TIME) is True
+        sections[name] = values
+    if is_simulated and "flight" in sections:
+        sections["flight"][SIM_TIME] = True
     return sections
+
+
+def names_node(content: bytes, path: Path, name: str, key: str, namespace: str) -> bool:
+    """Whether a section for this node, not one for all nodes, has the parameter `key`.
+
+    Raises ParameterError for content that is no ROS parameter file.
+    """
+    return any(
+        _is_of(pattern, name) and _matches(pattern, name, namespace) and key in values
+        for pattern, values in _all_sections(content, path).items()
+    )
+
+
+def gives_all(content: bytes, path: Path, key: str) -> bool:
+    """Whether a section for all nodes has the parameter `key`. Raises as `names_node` does."""
+    return any(
+        pattern.rpartition("/")[2] in WILDCARDS and key in values
+        for pattern, values in _all_sections(content, path).items()
+    )
+
+
+def _all_sections(content: bytes, path: Path) -> dict[str, dict[Any, Any]]:
+    """The parameters in a file by the full names of nodes, in order."""
+    tree = parse_yaml(limited(content, str(path), A_SCENARIO), str(path), A_SCENARIO)
+    require(isinstance(tree, dict), str(path), f"{type(tree).__name__}", "a mapping with sections")
+    return {
+        pattern: _nested(values)
+        for top, section in tree.items()
+        for pattern, values in _node_sections(top, section, path)
+    }
+
+
+def _node_sections(
+    top: object, section: object, path: Path, namespace: str = ""
+) -> Iterator[tuple[str, Mapping[Any, Any]]]:
+    """The full names of nodes and their parameters: namespaces may be nested."""
+    pattern = f"{namespace}/{str(top).strip('/')}"
+    parts: Mapping[Any, Any] = section if isinstance(section, dict) else {}
+    values = parts.get(PARAMETERS)
+    is_section = isinstance(values, dict) and len(parts) == 1
+    is_namespace = PARAMETERS not in parts and all(map(_is_mapping, parts.values()))
+    require(
+        is_section or (bool(parts) and is_namespace),
+        f"{path.name}: {pattern.removeprefix('/**/').removeprefix('/').partition('/')[0]}",
+        f"no parameters under {PARAMETERS}",
+        "a mapping of them there, as in every ROS parameter file",
+    )
+    if isinstance(values, dict):
+        yield pattern, values
+        return
+    for key, part in parts.items():
+        yield from _node_sections(key, part, path, pattern)
+
+
+def _is_mapping(value: object) -> bool:
+    return isinstance(value, dict)
+
+
+def _matches(pattern: str, name: str, namespace: str | None) -> bool:
+    """Whether a section is for the node; where the namespace is None, in some namespace."""
+    *_, last = pattern.split("/")
+    if namespace is None:
+        return last == name or last in WILDCARDS
+    words = pattern.split("/")[1:]
+    regex = "".join(WILDCARDS.get(word, f"/{re.escape(word)}") for word in words)
+    return re.fullmatch(regex, f"/{namespace.strip('/')}/{name}".replace("//", "/")) is not None
+
+
+def _is_of(pattern: str, name: str) -> bool:
+    return pattern.rpartition("/")[2] == name
+
+
+def _require_one_namespace(own: list[str], name: str, path: Path) -> None:
+    places = [pattern.rpartition("/")[0] for pattern in own if "*" not in pattern]
+    spaces = list(dict.fromkeys(place for place in places if place))
+    require(
+        len(spaces) < 2,
+        f"{path.name}: {name}",
+        f"sections in {' and in '.join(spaces)}",
+        "those of one namespace",
+    )
+
+
+def _require_not_mistyped(
+    found: Mapping[str, object], name: str, schemas: Mapping[str, object], path: Path
+) -> None:
+    """Refuse a section whose name resembles the one that is lacking."""
+    foreign = [pattern.rpartition("/")[2] for pattern in found]
+    foreign = [other for other in foreign if other not in schemas]
+    near = difflib.get_close_matches(name, foreign, n=1, cutoff=MISTYPED)
+    if near:
+        raise ParameterError(
+            f"{path.name}: {near[0]}: found a section, expected {one_of(list(schemas), near[0])}"
+        )
+
+
+def _nested(values: Mapping[Any, Any]) -> dict[Any, Any]:
+    """Parameters with groups for dotted names."""
+    tree: dict[Any, Any] = {}
+    for key, value in values.items():
+        name, dot, rest = key.partition(".") if isinstance(key, str) else (key, "", "")
+        inner = {rest: value} if dot and rest and name else value
+        outer = name if dot and rest and name else key
+        _join(tree, {outer: _nested(inner) if isinstance(inner, Mapping) else inner})
+    return tree
+
+
+def _join(values: dict[Any, Any], further: Mapping[Any, Any]) -> None:
+    """Join further parameters, which replace those of their names."""
+    for key, value in further.items():
+        before = values.get(key)
+        if isinstance(before, dict) and isinstance(value, Mapping):
+            _join(before, value)
+        else:
+            values[key] = _copy(value)
+
+
+def _copy(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _copy(item) for key, item in value.items()}
+    return value

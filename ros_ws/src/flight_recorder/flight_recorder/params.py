@@ -13,7 +13,10 @@ OptionalNames = tuple[str, ...]
 class RecorderConfig(NodeConfig):
     """Parameters of the recorder's node."""
 
-    rate: Annotated[float, Field(ge=5, le=1000)] = Field(description="rate of writing, Hz")
+    # that of the laws: what one tick sends is written in one go
+    rate: Annotated[float, Field(ge=5, le=1000)] = Field(
+        default=100.0, description="rate of writing, Hz"
+    )
     directory: str = Field(
         default="", description="folder of the bag; empty: runs/<UTC stamp>-recording"
     )

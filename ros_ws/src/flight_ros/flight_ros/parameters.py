@@ -17,13 +17,13 @@ from rclpy.parameter import Parameter
 
 from flight_core.fields import short_repr
 from flight_core.files import require_no_octal
-from flight_core.parameters import NodeConfig, ParameterError, flatten, nest, require
+from flight_core.parameters import NodeConfig, ParameterError, flatten, nest, one_of, require
+from flight_core.scenario_file import ROS_PARAMETERS, gives_all, names_node
+from flight_core.text import bounded
 
 P = TypeVar("P", bound=NodeConfig)
 AT_RESTART = "a change at a restart only"
 """What is expected of the parameters `learned`, from all but the node itself."""
-
-ROS_PARAMETERS = ("use_sim_time", "start_type_description_service", "qos_overrides")
 
 
 def read_parameters(node: Node, schema: type[P]) -> P:
@@ -33,7 +33,7 @@ def read_parameters(node: Node, schema: type[P]) -> P:
     the set is declared with its description, read-only unless it is tunable. Raises ParameterError.
     """
     _require_no_octal(sys.argv)
-    overrides = nest(_overrides(node))
+    overrides = _without_global(node, nest(_overrides(node)), schema)
     try:
         parameters = schema.validate_mapping(overrides, node.get_name())
     except ParameterError as error:
@@ -72,6 +72,48 @@ def read_parameters(node: Node, schema: type[P]) -> P:
                 ParameterDescriptor(description=descriptions.get(name, ""), dynamic_typing=True),
             )
     return parameters
+
+
+def _without_global(
+    node: Node, overrides: dict[str, Any], schema: type[NodeConfig]
+) -> dict[str, Any]:
+    """The overrides without the parameters for all nodes that this node does not know.
+
+    The node undeclares these, as a node of ROS declares none of them. A parameter from a section
+    for this node stays, and is refused if it is unknown.
+    """
+    known = schema.keys_beside(overrides)
+    foreign = [key for key in overrides if key not in known and _is_global(node, key, sys.argv)]
+    for key in foreign:
+        names = [key, *(f"{key}.{name}" for name in node.get_parameters_by_prefix(key))]
+        for name in filter(node.has_parameter, names):
+            node.undeclare_parameter(name)
+    if foreign:
+        expected = f"expected {one_of(sorted(known), foreign[0])}"
+        node.get_logger().warning(
+            bounded(f"left alone: {', '.join(foreign)}, a parameter of all nodes; {expected}")
+        )
+    return {key: value for key, value in overrides.items() if key not in foreign}
+
+
+def _is_global(node: Node, key: str, arguments: Sequence[str]) -> bool:
+    """Whether a parameter was given to all nodes and in no section for this one."""
+    name = node.get_name()
+    is_given = False
+    for option, value in pairwise(arguments):
+        if option == "--params-file":
+            path = Path(value)
+            content = path.read_bytes()
+            if names_node(content, path, name, key, node.get_namespace()):
+                return False
+            is_given |= gives_all(content, path, key)
+        elif option in {"-p", "--param"}:
+            words = value.partition(":=")[0].split(":")
+            if words[-1].split(".")[0] == key:
+                if len(words) > 1:
+                    return False
+                is_given = True
+    return is_given
 
 
 def _require_no_octal(arguments: Sequence[str]) -> None:

@@ -73,19 +73,26 @@ class ControllerSection(NodeConfig):
         description="the change of u that changes y_dot by one: 1 / abs(Omega_ii)"
     )
     lag: NonNegatives = Field(description="time constants of the actuators, s; 0: none")
-    delay: NonNegative = Field(description="delay from y to the actuators beside sampling, s")
+    # y at 500 Hz is at most 2 ms old at a tick, and u waits 1 ms for an aircraft on the same host
+    delay: NonNegative = Field(
+        default=0.003,
+        description="delay from y to the actuators beside sampling, s: that of topics on one host",
+    )
     y_max: Positives | None = Field(
         default=None,
         description="the largest abs(y), abs(y_m); none: p, q, r 2000 deg/s, V 340 m/s, else 1e6",
     )
+    # ten ticks at 100 Hz: a busy host stalls for less, and a command takes longer to rise
     max_age: Annotated[float, Field(gt=0, le=1e6)] = Field(
-        description="the age above which y or y_m is stale, s"
+        default=0.1, description="the age above which y or y_m is stale, s"
     )
+    # a short loss of y costs no command; an aircraft is seldom upset within half a second
     hold: Annotated[float, Field(ge=0, le=1e6)] = Field(
-        description="failsafe: how long u is held, s"
+        default=0.5, description="failsafe: how long u is held, s"
     )
+    # slow beside the modes of an aircraft, so that the return to trim excites none
     ramp: Annotated[float, Field(ge=0, le=1e6)] = Field(
-        description="failsafe: how long the ramp to trim takes, s"
+        default=2.0, description="failsafe: how long the ramp to trim takes, s"
     )
     lower: Numbers | None = Field(default=None, description="lower limits of u from trim")
     upper: Numbers | None = Field(default=None, description="upper limits of u from trim")

@@ -9,7 +9,8 @@ A package registers a law by an entry point in setup.py; see docs/laws.md:
     entry_points={"rise_di_controller.laws": ["pi = control_laws.pi:PiConfig"]}
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
+from contextlib import suppress
 from functools import cache
 from importlib.metadata import EntryPoints, entry_points
 from typing import Any
@@ -92,6 +93,13 @@ class AnyLaw(ControllerConfig):
 
     The key `law` names the law, RISE-DI by default.
     """
+
+    @classmethod
+    def keys_beside(cls, values: Mapping[str, Any]) -> Set[str]:
+        """The keys of the law that the values name; those of every law where it has none."""
+        with suppress(ParameterError):
+            return schema(values.get("law", DEFAULT)).model_fields.keys()
+        return ControllerConfig.model_fields.keys()
 
     @classmethod
     def validate_mapping(cls, values: Mapping[str, Any], where: str) -> ControllerConfig:  # type: ignore[override]

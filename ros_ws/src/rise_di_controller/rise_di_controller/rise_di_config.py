@@ -2,14 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameters of RISE-DI: validation, and conversion to the arrays of the law."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from itertools import pairwise
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 
-from flight_core.fields import Field
+from flight_core.fields import Field, Problems
 from flight_core.parameters import (
     Config,
     Numbers,
@@ -164,14 +164,20 @@ class RiseDiConfig(ControllerConfig):
     beta: Positives = Field(
         description="the diagonal of beta (21) in scaled inputs, units of y / s^2"
     )
+    # An input_scale of 1 / abs(Omega_ii) makes it 1; `read` gives one to each output.
     omega: Positives = Field(
-        description="abs(Omega_ii) in scaled inputs, or an over-estimate (implicit sign)"
+        default=(),
+        description="abs(Omega_ii) in scaled inputs, or an over-estimate (implicit sign); by "
+        "default 1 an output",
     )
+    # the lag decides which of the two is stable
     sign: Literal["auto", "literal", "implicit", "soft"] = Field(
-        description="how the sign of (21) is sampled; auto: implicit or soft"
+        default="auto", description="how the sign of (21) is sampled; auto: implicit or soft"
     )
+    # three times the width at which the loop of the sign and the lags is on the edge
     softening: Positive | Positives = Field(
-        description="width of the softened sign in total lags; stable above 1, 3 is usual"
+        default=3.0,
+        description="width of the softened sign in total lags; stable above 1, 3 is usual",
     )
 
     schedule: ScheduleConfig | None = Field(
@@ -181,6 +187,16 @@ class RiseDiConfig(ControllerConfig):
     learn: LearnConfig | None = Field(
         default=None, description="extension: A and B are identified in flight"
     )
+
+    @classmethod
+    def read(
+        cls, values: Mapping[Any, Any], key: str, problems: Problems, *, check: bool = True
+    ) -> Self | None:
+        """Give omega, where it is left out, the value 1 for each output."""
+        outputs = values.get("outputs")
+        if "omega" not in values and isinstance(outputs, (list, tuple)):
+            values = {**values, "omega": [1.0] * len(outputs)}
+        return super().read(values, key, problems, check=check)
 
     @classmethod
     def tunable(cls) -> frozenset[str]:

@@ -29,8 +29,6 @@ from rise_di_controller.laws import AnyLaw
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di_config import RiseDiConfig
 
-# Hz, of a scenario without the section `recorder`: that of the shipped scenarios
-RECORDER_RATE = 100.0
 STOP_TOLERANCE = 1e-3  # relative: files hold limits and end stops with few digits
 
 ParameterOverrides = dict[str, str | float | bool | list[str] | list[float]]
@@ -44,6 +42,10 @@ class FlightConfig(Config):
     lockstep: bool = Field(
         default=False,
         description="fly as fast as the machine allows, in lockstep, instead of real time",
+    )
+    use_sim_time: bool = Field(
+        default=False,
+        description="fly by the /clock of a simulator, also where any section of a node says so",
     )
 
 
@@ -72,7 +74,7 @@ class Scenario:
 
         The sections are flight, aircraft, reference_model, controller and, if any, recorder and
         guidance. The value of a section is a mapping of parameters, or a parameter set. Lists may
-        be arrays. Without `recorder` the recorder writes at RECORDER_RATE.
+        be arrays. Without `recorder` it has its defaults.
 
         Args:
             name: Name of the scenario.
@@ -84,7 +86,7 @@ class Scenario:
         Raises:
             ParameterError: A section or a value is invalid.
         """
-        required = [key for key in SCHEMAS if key not in OPTIONAL and key != "recorder"]
+        required = [key for key in SCHEMAS if key not in OPTIONAL]
         missing = [key for key in required if key not in sections]
         unknown = [key for key in sections if key not in SCHEMAS]
         expected = (
@@ -97,9 +99,7 @@ class Scenario:
             key: part.model_dump() if isinstance(part, Config) else part
             for key, part in sections.items()
         }
-        return scenario_of(
-            name, Path(f"{name}.yaml"), {"recorder": {"rate": RECORDER_RATE}} | values
-        )
+        return scenario_of(name, Path(f"{name}.yaml"), values)
 
     def vary(self, **sections: Mapping[str, Any] | Config) -> "Scenario":
         """A copy with some parameters replaced, as in scenario.vary(controller={"rate": 200.0}).
@@ -220,7 +220,8 @@ SCHEMAS: dict[str, type[Config]] = {
     "recorder": RecorderConfig,
     "guidance": GuidanceConfig,
 }
-OPTIONAL = ("guidance",)
+OPTIONAL = ("recorder", "guidance")
+"""Sections that a file may leave out: the recorder by its defaults, and no guidance."""
 
 
 def load_scenario(path: FilePath, *, with_route: bool = True) -> Scenario:
@@ -252,24 +253,25 @@ def parse_scenario(content: bytes, path: Path) -> Scenario:
 def scenario_of(name: str, path: Path, sections: Mapping[str, Mapping[str, Any]]) -> Scenario:
     """The scenario of these sections, validated. Raises ParameterError."""
     parameters: dict[str, Any] = {
-        key: schema.validate_mapping(sections[key], key)
+        key: schema.validate_mapping(sections.get(key, {}), key)
         for key, schema in SCHEMAS.items()
-        if key not in OPTIONAL
+        if key != "guidance"
     }
     scenario = Scenario(name=name, path=path, **parameters)
     check_together(scenario)
-    return scenario.vary(**{key: sections[key] for key in OPTIONAL if key in sections})
+    # Its numbers by rule follow from the further sections.
+    return scenario.vary(guidance=sections["guidance"]) if "guidance" in sections else scenario
 
 
-def parse_scenario_sections(content: bytes, path: Path) -> Sections:
+def parse_scenario_sections(content: bytes, path: Path, namespace: str | None = None) -> Sections:
     """The sections in the content of a scenario file, not validated yet. Raises ParameterError.
+
+    `namespace` belongs to the nodes, as in `parse_sections`.
 
     A path of an airframe or of a recorded command that is none from the working folder is one from
     the folder of the scenario, or that file itself lies there.
     """
-    sections = parse_sections(
-        content, path, tuple(name for name in SCHEMAS if name not in OPTIONAL), OPTIONAL
-    )
+    sections = parse_sections(content, path, SCHEMAS, OPTIONAL, namespace)
     recorded = sections["reference_model"].get("recorded")
     signals = recorded.values() if isinstance(recorded, Mapping) else ()
     files = [(sections["aircraft"], "airframe", ".yaml"), *((part, "file", "") for part in signals)]

@@ -8,9 +8,15 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from flight_analysis.closed_loop.scenario import Scenario, load_scenario, scenario_yaml
+from flight_analysis.closed_loop.scenario import (
+    Scenario,
+    load_scenario,
+    parse_scenario_sections,
+    scenario_yaml,
+)
 from flight_core.arguments import FilePath
-from flight_core.files import find_file, names_in, write_file, writing
+from flight_core.files import find_file, names_in, read_file, write_file, writing
+from flight_core.parameters import ParameterError
 from flight_core.scenario_file import A_SCENARIO
 from flight_guidance.feasibility import speeds
 from flight_guidance.routes.route_file import Waypoint
@@ -89,15 +95,28 @@ def with_route(
     return scenario.vary(guidance={"route": route, "program": {}, **fence})
 
 
-def with_recorded(scenario: Scenario, run: Path) -> Scenario:
-    """The scenario with the values of its recorded commands in a file of the folder `run`.
+def as_flown(scenario: Scenario, run: Path, namespace: str = "") -> Scenario:
+    """The scenario with a file from which the nodes in a namespace read the same.
 
-    The log stores this file, so that the flight needs no other one to be flown again. A scenario
-    without recorded commands stays as given. Raises ParameterError where it cannot be written.
+    It is its own file, or a new one in the folder `run`: with the values of recorded commands, so
+    that the log needs no other file to be flown again, or with sections for any namespace where
+    the file's are for another, as /uav7/controller. Raises ParameterError where it cannot be
+    written.
     """
-    if not scenario.reference_model.recorded:
+    if not scenario.reference_model.recorded and _reaches_nodes(scenario.path, namespace):
         return scenario
     return save_scenario(scenario, run / f"{scenario.name}.yaml")
+
+
+def _reaches_nodes(path: Path, namespace: str) -> bool:
+    """Whether the nodes in a namespace get every section of a scenario file."""
+    content = read_file(path, str(path), A_SCENARIO)
+    try:
+        return parse_scenario_sections(content, path, namespace) == parse_scenario_sections(
+            content, path
+        )
+    except ParameterError:
+        return False
 
 
 def save_scenario(scenario: Scenario, path: Path) -> Scenario:

@@ -233,7 +233,7 @@ def controller_alone(scenario: FilePath | Scenario) -> ControllerConfig | None:
         return None
     path = find_file(scenario, LIBRARY, "scenario", A_SCENARIO)
     content = read_file(path, str(path), A_SCENARIO)
-    sections = parse_sections(content, path, (), tuple(SCHEMAS))
+    sections = parse_sections(content, path, SCHEMAS, tuple(SCHEMAS))
     if sections.keys() != {"controller"}:
         return None
     return AnyLaw.validate_mapping(sections["controller"], "controller")
