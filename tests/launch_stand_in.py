@@ -150,15 +150,26 @@ class LogInfo(Action):
     msg: str
 
 
+class PushLaunchConfigurations(Action): ...
+
+
+class PopLaunchConfigurations(Action): ...
+
+
 @dataclass(eq=False, kw_only=True)
-class Shutdown(Action):
-    reason: str
+class EmitEvent(Action):
+    event: Event
 
 
 @dataclass(eq=False, kw_only=True)
 class TimerAction(Action):
     period: float  # s
     actions: Sequence[Action]
+    is_canceled: bool = False
+
+    def cancel(self) -> None:
+        """Call nothing any more."""
+        self.is_canceled = True
 
 
 @dataclass(eq=False, kw_only=True)
@@ -188,8 +199,14 @@ class Node(Action):
     namespace: Any = None
     exec_name: str | None = None
     parameters: Sequence[Any] = field(default_factory=list)
+    ros_arguments: Sequence[str] = ()
     output: str = "log"
     on_exit: Callable[[Any, LaunchContext], Any] | None = None
+
+
+@dataclass(kw_only=True)
+class ShutdownProcess(Event):
+    process_matcher: Callable[[Any], bool]
 
 
 @dataclass
@@ -203,15 +220,17 @@ MODULES: dict[str, tuple[Any, ...]] = {
     "launch.action": (Action,),
     "launch.actions": (
         DeclareLaunchArgument,
+        EmitEvent,
         ExecuteProcess,
         LogInfo,
         OpaqueFunction,
+        PopLaunchConfigurations,
+        PushLaunchConfigurations,
         RegisterEventHandler,
-        Shutdown,
         TimerAction,
     ),
     "launch.events": (),
-    "launch.events.process": (ProcessExited,),
+    "launch.events.process": (ProcessExited, ShutdownProcess),
     "launch.substitutions": (LaunchConfiguration,),
     "launch_ros": (),
     "launch_ros.actions": (Node,),

@@ -117,18 +117,27 @@ def discovered(actions: Sequence[Any], context: LaunchContext) -> list[Any]:
 
 def begun(name: str, pushed: str = "", **given: object) -> tuple[list[Any], LaunchContext]:
     """The first actions of a launch, and its context."""
+    context = LaunchContext()
+    return included(name, context, pushed, **given), context
+
+
+def included(name: str, context: LaunchContext, pushed: str = "", /, **given: object) -> list[Any]:
+    """The first actions of a launch file that another one includes, with its arguments alone."""
     entities = described(name)
     declared = {
         argument.name: argument.default_value
         for argument in every(stand_in.DeclareLaunchArgument, entities)
     }
     assert given.keys() <= declared.keys()
-    context = LaunchContext(**{key: value for key, value in declared.items() if value is not None})
+    context.launch_configurations.clear()
+    context.launch_configurations.update(
+        {key: value for key, value in declared.items() if value is not None}
+    )
     context.launch_configurations.update({key: str(value) for key, value in given.items()})
     if pushed:
         context.launch_configurations["ros_namespace"] = pushed
     (preparation,) = every(OpaqueFunction, entities)
-    return list(preparation.function(context) or ()), context
+    return list(preparation.function(context) or ())
 
 
 def nodes(actions: Sequence[Any]) -> dict[str, Node]:
@@ -166,8 +175,29 @@ def all_ready(actions: Sequence[Any], context: LaunchContext, namespace: str = "
     return follow
 
 
-def ends(actions: Sequence[Any]) -> bool:
-    return bool(every(stand_in.Shutdown, actions))
+def ends(actions: Sequence[Any], *processes: Any) -> bool:
+    """Whether actions stop the processes, and a process of another launch goes on."""
+    matchers = [
+        action.event.process_matcher
+        for action in every(stand_in.EmitEvent, actions)
+        if isinstance(action.event, stand_in.ShutdownProcess)
+    ]
+    other = ExecuteProcess(cmd=[])
+    assert not any(matches(other) for matches in matchers)
+    return any(all(map(matches, processes)) for matches in matchers)
+
+
+def restored(actions: Sequence[Any], context: LaunchContext) -> dict[str, Any]:
+    """The launch configurations that hold for a process among actions."""
+    kinds = [type(action) for action in actions]
+    push = kinds.index(stand_in.PushLaunchConfigurations)
+    assert stand_in.PopLaunchConfigurations in kinds[push:]
+    before = dict(context.launch_configurations)
+    actions[push + 1].execute(context)
+    configurations = dict(context.launch_configurations)
+    context.launch_configurations.clear()
+    context.launch_configurations.update(before)
+    return configurations
 
 
 def every(kind: type[T], actions: Sequence[Any]) -> list[T]:
@@ -224,7 +254,8 @@ def test_every_argument_described_and_default_is_one_of_choices(path: Path) -> N
 def test_fleet_is_a_process_and_its_end_ends_launch(tmp_path: Path) -> None:
     file = tmp_path / "fleet.yaml"
     file.write_text("{composed: true, aircraft: {uav1: {}}}")
-    (fleet,), context = started("fleet", fleet=file, duration="3.0", watch="true")
+    actions, context = started("fleet", fleet=file, duration="3.0", watch="true")
+    (fleet,) = every(ExecuteProcess, actions)
     assert [str(word) for word in fleet.cmd[1:]] == [
         "fly",
         str(file),
@@ -234,7 +265,11 @@ def test_fleet_is_a_process_and_its_end_ends_launch(tmp_path: Path) -> None:
         "3.0",
         "--watch",
     ]
-    assert ends(fleet.on_exit(ProcessExited("fleet", 0), context))
+    assert fleet.on_exit is not None
+    assert ends(fleet.on_exit(ProcessExited("fleet", 0), context), fleet)
+    actions, context = started("fleet", fleet=file)
+    (fleet,) = every(ExecuteProcess, actions)
+    assert fleet.on_exit is not None
     with pytest.raises(RuntimeError, match="rise-di fly ended with status 3"):
         fleet.on_exit(ProcessExited("fleet", 3), context)
     file.write_text("aircraft: {1a: {}}")
@@ -255,10 +290,14 @@ def test_nodes_start_in_order_with_parameters_that_they_have(case: Case) -> None
     follow = all_ready(actions, context)
     assert tuple(nodes(actions)) == first
     assert tuple(nodes(follow)) == then
-    assert context.launch_configurations["launch-prefix"].endswith("setpriv --pdeathsig TERM")
+    for stage in (actions, follow):
+        prefix = restored(stage, context)["launch-prefix"]
+        assert prefix.endswith("setpriv --pdeathsig TERM")
+    assert "launch-prefix" not in context.launch_configurations  # of whoever includes the file
     for executable, node in {**nodes(actions), **nodes(follow)}.items():
         assert (INSTALLED / node.package / "lib" / node.package / executable).is_file()
-        assert node.namespace == stand_in.LaunchConfiguration("namespace")
+        assert node.namespace == ""
+        assert node.ros_arguments == ["--log-level", "info"]
         assert node.exec_name == executable
         file, given_to_node = node.parameters
         section = (
@@ -269,22 +308,28 @@ def test_nodes_start_in_order_with_parameters_that_they_have(case: Case) -> None
         NODES[executable].validate_mapping(section | given_to_node, executable)
 
 
-def test_end_of_any_node_ends_launch_with_error(case: Case, tmp_path: Path) -> None:
-    actions, context, first, _ = case
+@pytest.mark.parametrize("status", [0, 3, -9])
+@pytest.mark.parametrize("number", range(5))
+def test_end_of_any_node_ends_launch_with_error(
+    number: int, status: int, case: Case, tmp_path: Path
+) -> None:
+    actions, context, first, then = case
     left = [file.read_text() for file in tmp_path.glob("runs/*/outcome")]
     assert left == ([INTERRUPTED.text()] if "recorder" in first else [])  # the outcome of Ctrl-C
-    for executable, node in {**nodes(actions), **nodes(all_ready(actions, context))}.items():
-        assert node.on_exit is not None
-        for status in (0, 3, -9):
-            context.is_shutdown = False
-            with pytest.raises(RuntimeError, match=f"{executable}-1 ended before the flight did"):
-                node.on_exit(ProcessExited(f"{executable}-1", status), context)
-            if "recorder" in first:
-                text = next(tmp_path.glob("runs/*/outcome")).read_text()
-                sentence = ended_early(f"{executable}-1 ended before the flight did")
-                assert parsed_outcome(text) == sentence
-            context.is_shutdown = True
-            assert node.on_exit(ProcessExited(f"{executable}-1", status), context) is None
+    processes = {**nodes(actions), **nodes(all_ready(actions, context))}
+    if number >= len(processes):
+        pytest.skip(f"this launch file starts {len(first + then)} nodes")
+    executable, node = [*processes.items()][number]
+    assert node.on_exit is not None
+    with pytest.raises(RuntimeError, match=f"{executable}-1 ended before the flight did"):
+        node.on_exit(ProcessExited(f"{executable}-1", status), context)
+    if "recorder" in first:
+        text = next(tmp_path.glob("runs/*/outcome")).read_text()
+        sentence = ended_early(f"{executable}-1 ended before the flight did")
+        assert parsed_outcome(text) == sentence
+    for other in processes.values():  # which the flight, or the launch, has stopped
+        assert other.on_exit is not None
+        assert not other.on_exit(ProcessExited("other-1", 0), context)
 
 
 def test_landing_of_the_aircraft_ends_launch_without_error(case: Case, tmp_path: Path) -> None:
@@ -296,9 +341,7 @@ def test_landing_of_the_aircraft_ends_launch_without_error(case: Case, tmp_path:
     on_exit = started["aircraft"].on_exit
     assert on_exit is not None
     done = on_exit(ProcessExited("aircraft-1", STATUS_LANDED), context)
-    assert ends(done)
-    (leave,) = every(OpaqueFunction, done)
-    leave.function(context)
+    assert ends(done, *started.values())
     left = [parsed_outcome(file.read_text()).end for file in tmp_path.glob("runs/*/outcome")]
     assert left == ([End.LANDED] if "recorder" in first else [])
 
@@ -401,17 +444,118 @@ def test_flight_begins_once_all_are_matched_and_ends_once_log_holds_it(tmp_path:
     # Half a second in which `start` reaches the nodes.
     assert start == pytest.approx(time.time() + 0.5, abs=0.4)
     assert not flown_to(context, follow, start + 4.9)
+    assert not any(timer.is_canceled for timer in timers)
+    flight = flown_to(context, follow, start + 5.0)
+    assert ends(flight, *nodes(actions).values(), *nodes(follow).values())
+    assert all(timer.is_canceled for timer in timers)  # the launch waits for nothing more
+    (give_up,) = every(OpaqueFunction, timers[-1].actions)
+    assert give_up.function(context) is None
+    text = (next(tmp_path.glob("*-osprey_servo")) / "outcome").read_text(encoding="utf-8")
+    assert parsed_outcome(text) == COMPLETED
+
+
+def test_log_that_stops_ends_the_flight_early(tmp_path: Path) -> None:
+    actions, context = started("fly", duration=5, runs=tmp_path)
+    follow = all_ready(actions, context)
+    timers = every(TimerAction, all_matched(follow, context, FLYING))
+    ((_, message),) = context.ros_node.published
+    assert not flown_to(context, follow, stamp_of(message) / NANOSECONDS + 4.9)
     (give_up,) = every(OpaqueFunction, timers[-1].actions)
     with pytest.raises(
         RuntimeError, match=r"^ended early: the log holds y, y_m and u up to t = 4\.900 of 5 s$"
     ):
         give_up.function(context)
-    flight = flown_to(context, follow, start + 5.0)
-    assert ends(flight)
-    (leave,) = every(OpaqueFunction, flight)
-    leave.function(context)
-    text = (next(tmp_path.glob("*-osprey_servo")) / "outcome").read_text(encoding="utf-8")
-    assert parsed_outcome(text) == COMPLETED
+
+
+# every argument twice, as two includes in one launch file have them
+TWO: dict[str, tuple[dict[str, object], dict[str, object]]] = {
+    "fly": (
+        {"namespace": "uav1", "duration": 9, "recorder": "rosbag2", "log_level": "warn"},
+        {"namespace": "uav2", "duration": 5, "recorder": "true", "log_level": "debug"},
+    ),
+    "bridge": (
+        {"map": "ardupilot", "namespace": "uav1", "recorder": "true", "duration": 3},
+        {"map": "ardupilot_mavlink", "namespace": "uav2", "recorder": "true", "duration": ""},
+    ),
+    "replay": (
+        {"namespace": "uav1", "controller": "true", "topics": "/y,/y_m", "rate": "2.0"},
+        {"namespace": "uav2", "controller": "true", "topics": "/truth", "rate": "1.0"},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", TWO)
+def test_each_of_two_includes_has_its_own_arguments(
+    name: str, short: Path, osprey_gust: Scenario, tmp_path: Path
+) -> None:
+    """Launch calls what comes later when another include has replaced the configurations."""
+    more: dict[str, object] = {"scenario": osprey_gust.path}
+    more |= {"run": short} if name == "replay" else {}
+    one, other = ({**more, **given, "runs": tmp_path / "runs"} for given in TWO[name])
+    context = LaunchContext()
+    actions = included(name, context, **one)
+    second = included(name, context, **other)
+    context.launch_configurations.clear()  # the groups have ended
+    for entities, given in ((actions, one), (second, other)):
+        first_stage = discovered(entities, context)
+        follow = all_ready(first_stage, context, f"/{given['namespace']}")
+        assert nodes(first_stage)
+        for stage in (first_stage, follow):
+            configurations = restored(stage, context)
+            assert {key: configurations[key] for key in given} == {
+                key: str(value) for key, value in given.items()
+            }
+            for node in nodes(stage).values():
+                assert node.namespace == given["namespace"]
+                assert list(node.ros_arguments)[-1] == given.get("log_level", "info")
+        if name == "replay":
+            assert options(player(follow))["topics"] == given["topics"]
+
+
+def test_end_of_a_flight_stops_its_own_nodes_and_its_failure_waits_for_the_others(
+    tmp_path: Path,
+) -> None:
+    actions, context = started("fly", duration=5, runs=tmp_path, namespace="uav1")
+    second = included("fly", context, duration=9, runs=tmp_path, namespace="uav2")
+    second = discovered(second, context)
+    failed = nodes(actions)["controller"]
+    assert failed.on_exit is not None
+    done = failed.on_exit(ProcessExited("controller-1", 1), context)
+    assert ends(done, *nodes(actions).values())
+    assert not ends(done, *nodes(second).values())
+    assert all(timer.is_canceled for timer in every(TimerAction, actions))
+    assert not any(timer.is_canceled for timer in every(TimerAction, second))
+    follow = all_ready(second, context, "/uav2")
+    aircraft = nodes(follow)["aircraft"]
+    assert aircraft.on_exit is not None
+    with pytest.raises(RuntimeError, match="controller-1 ended before the flight did"):
+        aircraft.on_exit(ProcessExited("aircraft-2", STATUS_LANDED), context)
+    ended = {parsed_outcome(file.read_text()).end for file in tmp_path.glob("*/outcome")}
+    assert ended == {End.ENDED_EARLY, End.LANDED}
+
+
+def test_flight_around_an_aircraft_and_a_reference_model_of_ones_own(tmp_path: Path) -> None:
+    further = tmp_path / "mine.yaml"
+    further.write_text("/uav1/controller: {ros__parameters: {k_g: 2.5, delay: 0.01}}\n")
+    actions, context = begun(
+        "fly",
+        runs=tmp_path,
+        namespace="uav1",
+        aircraft="false",
+        reference_model="false",
+        params_file=further,
+    )
+    context.ros_node.publishers |= {"/uav1/y": 1, "/uav1/y_m": 1}  # of one's own nodes
+    actions = discovered(actions, context)
+    assert nodes(actions).keys() == {"recorder", "controller"}
+    follow = all_ready(actions, context, "/uav1")
+    assert not nodes(follow)
+    file = Path(nodes(actions)["controller"].parameters[0])
+    sections = parse_scenario_sections(file.read_bytes(), file)
+    assert (sections["controller"]["k_g"], sections["controller"]["delay"]) == (2.5, 0.01)
+    assert Path(overrides(nodes(actions)["recorder"])["scenario_file"]) == file  # what flies
+    with refusing("aircraft: found false in lockstep, expected true"):
+        started("fly", runs=tmp_path, aircraft="false", lockstep="true")
 
 
 def test_rosbag2_is_not_for_lockstep(tmp_path: Path) -> None:

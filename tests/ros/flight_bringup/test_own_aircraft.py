@@ -46,7 +46,7 @@ def checkout(tmp_path: Path) -> Path:
     """
     for name in (".venv", "ros_ws"):
         (tmp_path / name).symlink_to(REPOSITORY / name)
-    (program,) = re.findall(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
+    program, *_ = re.findall(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
     (tmp_path / "my_aircraft.py").write_text(program)
     return tmp_path
 

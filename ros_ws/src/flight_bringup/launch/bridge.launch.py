@@ -33,11 +33,12 @@ from flight_bringup.graph import (
     second_stage,
 )
 from flight_bringup.launch.stages import (
+    Flight,
     argument,
     boolean_argument,
-    end_with_launch,
     end_with_log,
     flight_node,
+    log_level_argument,
     namespace_argument,
     recorder_argument,
     rosbag2,
@@ -78,6 +79,7 @@ def generate_launch_description() -> LaunchDescription:
                 "namespace of all nodes, one an aircraft; topics that a map names in full are "
                 "not in it"
             ),
+            log_level_argument(),
             OpaqueFunction(function=_fly),
         ]
     )
@@ -95,35 +97,35 @@ def _fly(context: LaunchContext) -> list[Action]:
     recorded = recorder != "false"
     stores = recorded or not scenario.reference_model.recorded
     require(stores, "recorder", "false", "true: a run stores the values of recorded commands")
-    run = new_run(scenario, Path(argument(context, "runs"))) if recorded else Path()
-    scenario = as_flown(scenario, run)
-    end_with_launch(context)
+    flight = Flight(context)
+    if recorded:
+        flight.run = new_run(scenario, Path(argument(context, "runs")))
+        scenario = as_flown(scenario, flight.run, flight.namespace)
+    run = flight.run
 
     def node(spec: NodeSpec, start_time: float = math.inf) -> Node:
         overrides = parameter_overrides(
             spec, scenario, run, start_time, lockstep=False, autopilot=autopilot
         )
-        return flight_node(spec, scenario, overrides, run)
+        return flight_node(spec, scenario, overrides, flight)
 
     def follow(lead: float, start_time: float) -> Sequence[Action]:
         span = scenario.flight.duration
         if duration:
             end = end_with_log(
-                context, run, lead, start_time + span, span, by_rosbag2=recorder == "rosbag2"
+                flight, lead, start_time + span, span, by_rosbag2=recorder == "rosbag2"
             )
         else:
             end = []
         return [*end, *(node(spec, start_time) for spec in second_stage(scenario, bridge=True))]
 
-    page = watch_page(context, run) if recorded else []
+    page = watch_page(flight) if recorded else []
     first = FIRST_STAGE if recorder == "true" else (CONTROLLER,)
     beside: list[Action] = []
     if recorder == "rosbag2":
         overrides = parameter_overrides(
             RECORDER, scenario, run, math.inf, lockstep=False, autopilot=autopilot
         )
-        beside.append(rosbag2(context, scenario, overrides))
-    stages = start_in_stages(
-        context, run, {spec: node(spec) for spec in first}, follow, beside=beside
-    )
+        beside.append(rosbag2(flight, scenario, overrides))
+    stages = start_in_stages(flight, {spec: node(spec) for spec in first}, follow, beside=beside)
     return page + stages

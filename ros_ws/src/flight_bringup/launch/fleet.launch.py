@@ -13,6 +13,7 @@ from launch.actions import DeclareLaunchArgument, OpaqueFunction
 
 from flight_bringup.fleet import read_fleet
 from flight_bringup.launch.stages import (
+    Flight,
     argument,
     by_rise_di,
     runs_argument,
@@ -43,4 +44,4 @@ def generate_launch_description() -> LaunchDescription:
 def _fly(context: LaunchContext) -> list[Action]:
     file = argument(context, "fleet")
     read_fleet(Path(file))  # a mistake in the file is one sentence, before anything starts
-    return by_rise_di(context, file)
+    return by_rise_di(Flight(context), file)

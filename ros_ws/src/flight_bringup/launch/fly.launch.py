@@ -5,7 +5,7 @@
 The same graph and the same scenario file as `rise-di fly`. The flight begins once each node is
 ready and matched. It ends once the log holds the scenario's duration, in lockstep when the aircraft
 completes it. It ends early with exit status 1 when a node ends, is not ready, or when no u reaches
-the aircraft.
+the aircraft. Included in another launch file, it ends its own nodes alone.
 """
 
 from collections.abc import Sequence
@@ -16,7 +16,12 @@ from launch.action import Action
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch_ros.actions import Node
 
-from flight_analysis.closed_loop.scenario_library import as_flown, find_scenario
+from flight_analysis.closed_loop.scenario_library import (
+    as_flown,
+    find_scenario,
+    save_scenario,
+    with_parameters,
+)
 from flight_analysis.report.run_folder import new_run
 from flight_bringup.graph import (
     AIRCRAFT,
@@ -24,19 +29,21 @@ from flight_bringup.graph import (
     FIRST_STAGE,
     ON_START,
     RECORDER,
+    REFERENCE_MODEL,
     NodeSpec,
     parameter_overrides,
     second_stage,
 )
 from flight_bringup.launch.stages import (
     BOOLEAN,
+    Flight,
     argument,
     begin_when_matched,
+    boolean_argument,
     by_rise_di,
-    complete,
-    end_with_launch,
     end_with_log,
     flight_node,
+    log_level_argument,
     namespace_argument,
     on_state,
     recorder_argument,
@@ -49,8 +56,12 @@ from flight_bringup.launch.stages import (
     watch_page,
 )
 from flight_core.parameters import require
+from flight_core.topics import published_by
 from flight_ros.topics import NodeState
 from launch import LaunchContext, LaunchDescription
+
+# Nodes that a flight may take from its user, and what they publish.
+OPTIONAL = {AIRCRAFT: "y", REFERENCE_MODEL: "y_m"}
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -74,6 +85,18 @@ def generate_launch_description() -> LaunchDescription:
             runs_argument(),
             watch_argument(),
             namespace_argument(),
+            *(
+                boolean_argument(
+                    spec.executable, True, f"false: a node of your own publishes {topic}"
+                )
+                for spec, topic in OPTIONAL.items()
+            ),
+            DeclareLaunchArgument(
+                "params_file",
+                default_value="",
+                description="parameter file whose values replace those of the scenario",
+            ),
+            log_level_argument(),
             sim_time_argument(),
             OpaqueFunction(function=_fly),
         ]
@@ -84,6 +107,11 @@ def _fly(context: LaunchContext) -> list[Action]:
     scenario = find_scenario(
         argument(context, "scenario"), yaml.safe_load(argument(context, "duration"))
     )
+    flight = Flight(context)
+    further = argument(context, "params_file")
+    if further:
+        scenario = with_parameters(scenario, Path(further), flight.namespace)
+    others = [spec for spec in OPTIONAL if argument(context, spec.executable) == "false"]
     value = argument(context, "lockstep")
     lockstep = value == "true" or (value == "" and scenario.flight.lockstep)
     by_rosbag2 = argument(context, "recorder") == "rosbag2"
@@ -93,47 +121,58 @@ def _fly(context: LaunchContext) -> list[Action]:
         "rosbag2 in lockstep",
         "true: the aircraft waits for the stack's recorder",
     )
-    if argument(context, "use_sim_time") == "true":
+    for spec in others:
+        require(not lockstep, spec.executable, "false in lockstep", "true: the nodes of the stack")
+    if argument(context, "use_sim_time") == "true" or scenario.flight.use_sim_time:
+        own = " and ".join([spec.executable for spec in others] + ["params_file"] * bool(further))
+        require(not own, "use_sim_time", f"true beside {own} of your own", "nodes by `ros2 run`")
         require(
             not (lockstep or by_rosbag2),
             "use_sim_time",
             f"true {'in lockstep' if lockstep else 'with rosbag2'}",
             "a flight in real time, recorded by the stack",
         )
-        return by_rise_di(context, argument(context, "scenario"))
-    run = new_run(scenario, Path(argument(context, "runs")))
-    scenario = as_flown(scenario, run)
-    end_with_launch(context)
+        return by_rise_di(flight, argument(context, "scenario"))
+    flight.run = run = new_run(scenario, Path(argument(context, "runs")))
+    if further:
+        scenario = save_scenario(scenario, run / f"{scenario.name}.yaml")
+    else:
+        scenario = as_flown(scenario, run, flight.namespace)
     first = (CONTROLLER,) if by_rosbag2 else FIRST_STAGE
+    then = tuple(spec for spec in second_stage(scenario) if spec not in others)
 
     def node(spec: NodeSpec, start_time: float = ON_START) -> Node:
         overrides = parameter_overrides(spec, scenario, run, start_time, lockstep=lockstep)
-        return flight_node(spec, scenario, overrides, run)
+        return flight_node(spec, scenario, overrides, flight)
 
     def follow(lead: float, start_time: float) -> Sequence[Action]:
-        nodes = second_stage(scenario)
         duration = scenario.flight.duration
         begins = not lockstep and scenario.controller.autostart and scenario.controller.start_active
         if lockstep:
-            end: list[Action] = [
-                on_state(context, AIRCRAFT, NodeState.COMPLETED, lambda: complete(run))
-            ]
+            end: list[Action] = [on_state(flight, AIRCRAFT, NodeState.COMPLETED, flight.complete)]
         elif begins:
             end = begin_when_matched(
-                context, run, (*first, *nodes), duration, by_rosbag2=by_rosbag2
+                flight,
+                (*first, *then),
+                duration,
+                by_rosbag2=by_rosbag2,
+                flies=AIRCRAFT not in others,
             )
         else:
             # A user activates the controller, or no user does.
-            end = end_with_log(
-                context, run, lead, start_time + duration, duration, by_rosbag2=by_rosbag2
-            )
-        return [*end, *(node(spec, ON_START if begins else start_time) for spec in nodes)]
+            end = end_with_log(flight, lead, start_time + duration, duration, by_rosbag2=by_rosbag2)
+        return [*end, *(node(spec, ON_START if begins else start_time) for spec in then)]
 
     recorders: list[Action] = []
     if by_rosbag2:
         overrides = parameter_overrides(RECORDER, scenario, run, ON_START, lockstep=False)
-        recorders.append(rosbag2(context, scenario, overrides))
+        recorders.append(rosbag2(flight, scenario, overrides))
+    published = {topic for spec in (*first, *then) for topic in published_by(spec.executable)}
     stages = start_in_stages(
-        context, run, {spec: node(spec) for spec in first}, follow, beside=recorders
+        flight,
+        {spec: node(spec) for spec in first},
+        follow,
+        beside=recorders,
+        publishes=published,
     )
-    return watch_page(context, run) + stages
+    return watch_page(flight) + stages

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from launch.action import Action
-from launch.actions import DeclareLaunchArgument, ExecuteProcess, LogInfo, OpaqueFunction, Shutdown
+from launch.actions import DeclareLaunchArgument, ExecuteProcess, LogInfo, OpaqueFunction
 from launch.events.process import ProcessExited
 from launch_ros.substitutions import ExecutableInPackage
 
@@ -32,12 +32,12 @@ from flight_bringup.graph import (
     replayed_topics,
 )
 from flight_bringup.launch.stages import (
+    Flight,
     argument,
     boolean_argument,
-    complete,
-    end_with_launch,
     fail_on_exit,
     flight_node,
+    log_level_argument,
     namespace_argument,
     runs_argument,
     scenario_argument,
@@ -93,6 +93,7 @@ def generate_launch_description() -> LaunchDescription:
                 "namespace of all nodes; it must be that of the flight in the log, whose topics "
                 "keep their full names"
             ),
+            log_level_argument(),
             OpaqueFunction(function=_play),
         ]
     )
@@ -120,49 +121,46 @@ def _play(context: LaunchContext) -> list[Action]:
     topics = argument(context, "topics") or ",".join(
         replayed_topics(recorded, nodes, namespace, autopilot)
     )
-    end_with_launch(context)
+    flight = Flight(context)
     scenario = None
-    run = Path()
     if nodes:
         name = argument(context, "scenario")
         scenario = find_scenario(name) if name else extract_scenario(log, namespace or None)
         if RECORDER in nodes:
-            run = new_run(scenario, Path(argument(context, "runs")))
-    player = _player(context, topics, run, recorded=RECORDER in nodes)
+            flight.run = new_run(scenario, Path(argument(context, "runs")))
+    player = _player(flight, topics)
     if scenario is None:
-        return [player]
+        return flight.in_scope([player])
     # With nodes, the player is the second stage: it begins once all are ready.
     first_stage = {}
     for spec in nodes:
         overrides = parameter_overrides(
-            spec, scenario, run, 0.0, lockstep=lockstep, autopilot=autopilot
+            spec, scenario, flight.run, 0.0, lockstep=lockstep, autopilot=autopilot
         )
-        first_stage[spec] = flight_node(spec, scenario, overrides, run)
+        first_stage[spec] = flight_node(spec, scenario, overrides, flight)
     second_stage = [LogInfo(msg=f"playing {topics}"), player]
     played = {topic.rpartition("/")[2] for topic in topics.split(",")}
     for spec in nodes:
         played.update(published_by(spec.executable))
     return start_in_stages(
-        context, run, first_stage, lambda lead, start_time: second_stage, publishes=played
+        flight, first_stage, lambda lead, start_time: second_stage, publishes=played
     )
 
 
-def _player(context: LaunchContext, topics: str, run: Path, *, recorded: bool) -> ExecuteProcess:
-    """`rise-di play` with the arguments of the launch; its end is that of the launch."""
+def _player(flight: Flight, topics: str) -> ExecuteProcess:
+    """`rise-di play` with the arguments of the launch; its end is that of the playback."""
 
     def end(event: ProcessExited, context: LaunchContext) -> Sequence[Action] | None:
         if event.returncode != 0:
-            fail_on_exit(event, context, run)
-        if recorded:
-            return complete(run, "playback completed")
-        return [Shutdown(reason="playback completed")]
+            return fail_on_exit(event, context, flight)
+        return flight.complete("playback completed")
 
-    lockstep = argument(context, "lockstep") == "true"
+    lockstep = flight.argument("lockstep") == "true"
     options = ["--topics", topics, "--stamps", "recorded" if lockstep else "now"]
     for name in ("rate", "start"):
-        options += [f"--{name}", argument(context, name)]
-    if argument(context, "loop") == "true":
+        options += [f"--{name}", flight.argument(name)]
+    if flight.argument("loop") == "true":
         options.append("--loop")
     rise_di = ExecutableInPackage(package="flight_cli", executable="rise-di")
-    command = [rise_di, "play", argument(context, "run"), *options]
+    command = [rise_di, "play", flight.argument("run"), *options]
     return ExecuteProcess(cmd=command, name="play", output="screen", on_exit=end)

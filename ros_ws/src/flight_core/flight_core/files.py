@@ -113,6 +113,10 @@ for _class in (_Loader, _Dumper):
             _tag, re.compile(rf"(?:{_pattern.pattern})\Z"), list("-+.0123456789")
         )
 _Loader.add_constructor(INT_TAG, _integer)
+# launch_ros writes the lists of parameters so; rcl reads them as lists
+_Loader.add_constructor(
+    "tag:yaml.org,2002:python/tuple", lambda loader, node: loader.construct_sequence(node)
+)
 
 
 def dump_yaml(value: object, *, flow: bool | None = None) -> str:

@@ -39,13 +39,16 @@ def parse_sections(
     schemas: Mapping[str, type[Config]],
     optional: tuple[str, ...] = (),
     namespace: str | None = None,
+    *,
+    with_general: bool = False,
 ) -> Sections:
     """Sections of a scenario file by node name, e.g. {"controller": {"rate": 100.0, ...}}.
 
     Sections of nodes that are not among `schemas` are left alone. A section in `optional` may be
     absent, or an empty mapping: every parameter by default. Parameters of ROS are left out, but a
     node by /clock makes `use_sim_time` of the section `flight` true. `namespace` belongs to the
-    nodes, "" is the root; for None it is whatever one the file names.
+    nodes, "" is the root; for None it is whatever one the file names. Parameters for all nodes make
+    a section where there is none `with_general`, for a file that comes beside a scenario.
 
     Raises ParameterError with the path for content that is no scenario file or too long, has a
     duplicate key, lacks a section, or names nodes of two namespaces where `namespace` is None.
@@ -59,7 +62,7 @@ def parse_sections(
         own = [pattern for pattern in matching if _is_of(pattern, name)]
         if namespace is None:
             _require_one_namespace(own, name, path)
-        if not own:
+        if not own and not (with_general and matching):
             _require_not_mistyped(found, name, schemas, path)
             require(
                 name in optional,
@@ -70,14 +73,14 @@ def parse_sections(
             continue
         everything: dict[str, Any] = {}
         for pattern in matching:
-            _join(everything, found[pattern])
+            join_parameters(everything, found[pattern])
         known = schema.keys_beside(everything)
         values: dict[str, Any] = {}
         for pattern in matching:
             given = found[pattern]
             if pattern not in own:
                 given = {key: value for key, value in given.items() if key in known}
-            _join(values, given)
+            join_parameters(values, given)
         for key in ROS_PARAMETERS:
             if key not in schema.model_fields:
                 values.pop(key, None)
@@ -195,16 +198,16 @@ def _nested(values: Mapping[Any, Any]) -> dict[Any, Any]:
         name, dot, rest = key.partition(".") if isinstance(key, str) else (key, "", "")
         inner = {rest: value} if dot and rest and name else value
         outer = name if dot and rest and name else key
-        _join(tree, {outer: _nested(inner) if isinstance(inner, Mapping) else inner})
+        join_parameters(tree, {outer: _nested(inner) if isinstance(inner, Mapping) else inner})
     return tree
 
 
-def _join(values: dict[Any, Any], further: Mapping[Any, Any]) -> None:
+def join_parameters(values: dict[Any, Any], further: Mapping[Any, Any]) -> None:
     """Join further parameters, which replace those of their names."""
     for key, value in further.items():
         before = values.get(key)
         if isinstance(before, dict) and isinstance(value, Mapping):
-            _join(before, value)
+            join_parameters(before, value)
         else:
             values[key] = _copy(value)
 

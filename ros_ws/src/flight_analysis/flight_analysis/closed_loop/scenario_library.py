@@ -9,6 +9,7 @@ from types import MappingProxyType
 from typing import Any
 
 from flight_analysis.closed_loop.scenario import (
+    SCHEMAS,
     Scenario,
     load_scenario,
     parse_scenario_sections,
@@ -17,7 +18,7 @@ from flight_analysis.closed_loop.scenario import (
 from flight_core.arguments import FilePath
 from flight_core.files import find_file, names_in, read_file, write_file, writing
 from flight_core.parameters import ParameterError
-from flight_core.scenario_file import A_SCENARIO
+from flight_core.scenario_file import A_SCENARIO, join_parameters, parse_sections
 from flight_guidance.feasibility import speeds
 from flight_guidance.routes.route_file import Waypoint
 
@@ -106,6 +107,25 @@ def as_flown(scenario: Scenario, run: Path, namespace: str = "") -> Scenario:
     if not scenario.reference_model.recorded and _reaches_nodes(scenario.path, namespace):
         return scenario
     return save_scenario(scenario, run / f"{scenario.name}.yaml")
+
+
+def with_parameters(scenario: Scenario, path: Path, namespace: str) -> Scenario:
+    """The scenario with what a parameter file says further to the nodes in a namespace.
+
+    Values replace those of their names. Raises ParameterError.
+    """
+    content = read_file(path, str(path), "a ROS parameter file")
+    further = parse_sections(content, path, SCHEMAS, tuple(SCHEMAS), namespace, with_general=True)
+    sections = {}
+    for name, changes in further.items():
+        section = getattr(scenario, name)
+        if section is not None:
+            values = section.model_dump()
+            join_parameters(values, changes)
+            sections[name] = values
+        elif name in parse_sections(content, path, SCHEMAS, tuple(SCHEMAS), namespace):
+            sections[name] = changes
+    return scenario.vary(**sections)
 
 
 def _reaches_nodes(path: Path, namespace: str) -> bool:

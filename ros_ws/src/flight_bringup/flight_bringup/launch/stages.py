@@ -13,21 +13,24 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, ClassVar
+from weakref import WeakKeyDictionary
 
 import psutil
 from diagnostic_msgs.msg import KeyValue
 from launch.action import Action
 from launch.actions import (
     DeclareLaunchArgument,
+    EmitEvent,
     ExecuteProcess,
     LogInfo,
     OpaqueFunction,
+    PopLaunchConfigurations,
+    PushLaunchConfigurations,
     RegisterEventHandler,
-    Shutdown,
     TimerAction,
 )
-from launch.events.process import ProcessExited
+from launch.events.process import ProcessExited, ShutdownProcess
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.ros_adapters import get_ros_node
@@ -95,6 +98,112 @@ class FlownEvent(Event):
 
     name = "flight_bringup.FlownEvent"
 
+    def __init__(self, flight: "Flight") -> None:
+        self.flight = flight
+
+
+class Flight:
+    """A flight of a launch: the arguments in its scope, its processes, its end.
+
+    A launch file may include several, in groups that have ended by the time a node starts. So the
+    launch configurations are taken once, and hold for whatever the flight starts later: arguments,
+    and what PushRosNamespace, SetParameter and SetRemap of the group say. At its end a flight stops
+    its own processes alone. A launch with nothing else to do then ends by itself.
+    """
+
+    _of_launch: ClassVar[WeakKeyDictionary[LaunchContext, list["Flight"]]] = WeakKeyDictionary()
+
+    def __init__(self, context: LaunchContext) -> None:
+        self.context = context
+        self.run = Path()  # the folder of the run; Path() without a recorder
+        self.configurations = dict(context.launch_configurations)
+        # Launch leaves processes running after an end by anything but SIGINT.
+        self.configurations.setdefault("launch-prefix", shlex.join(end_with_parent()))
+        self.namespace = _namespace(context)
+        self._processes: list[Action] = []
+        self._timers: list[TimerAction] = []
+        self._is_stopped = False
+        self._failure = ""
+        self._of_launch.setdefault(context, []).append(self)
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the flight has ended, or the launch has."""
+        return self._is_stopped or bool(self.context.is_shutdown)
+
+    def argument(self, name: str) -> str:
+        """The value of an argument in the scope of the flight."""
+        return str(self.configurations[name])
+
+    def in_scope(self, actions: Sequence[Action]) -> list[Action]:
+        """The actions with the launch configurations of the flight; its end stops the processes."""
+        self._processes += [each for each in actions if isinstance(each, (ExecuteProcess, Node))]
+        restore = _Restore(self.configurations)
+        return [PushLaunchConfigurations(), restore, *actions, PopLaunchConfigurations()]
+
+    def after(
+        self, period: float, function: Callable[[LaunchContext], Sequence[Action] | None]
+    ) -> TimerAction:
+        """Call a function after a period, s, unless the flight has ended before."""
+
+        def call(context: LaunchContext) -> list[Action] | None:
+            return None if self.is_over else [*(function(context) or ())]
+
+        timer = TimerAction(period=period, actions=[OpaqueFunction(function=call)])
+        self._timers.append(timer)
+        return timer
+
+    def complete(
+        self, reason: str = "flight completed", outcome: Outcome = COMPLETED
+    ) -> list[Action]:
+        """The actions at the end of a flight that reached its end.
+
+        The recorder closes the log with the outcome.
+        """
+        leave_outcome(self.run, outcome)
+        report = f"; now: ros2 run flight_cli rise-di report {shlex.quote(str(self.run))}"
+        return [LogInfo(msg=reason + (report if self.run.name else "")), *self._stop()]
+
+    def fail(self, outcome: Outcome) -> list[Action]:
+        """End the flight early, with the outcome in the folder of the run.
+
+        The last flight of a launch to end raises RuntimeError, so that the launch ends with exit
+        status 1; before that the other flights go on.
+        """
+        leave_outcome(self.run, outcome)
+        self._failure = str(outcome)
+        return [LogInfo(msg=str(outcome)), *self._stop()]
+
+    def _stop(self) -> list[Action]:
+        """Stop what the flight has started.
+
+        Raises RuntimeError where no other flight goes on and one of them has failed.
+        """
+        self._is_stopped = True
+        for timer in self._timers:
+            timer.cancel()
+        flights = self._of_launch[self.context]
+        failures = [flight._failure for flight in flights if flight._failure]
+        if failures and all(flight._is_stopped for flight in flights):
+            raise RuntimeError("; ".join(failures))
+        return [EmitEvent(event=ShutdownProcess(process_matcher=self._has))]
+
+    def _has(self, process: Action) -> bool:
+        return any(process is each for each in self._processes)
+
+
+class _Restore(Action):
+    """Restore the launch configurations of a scope that has ended."""
+
+    def __init__(self, configurations: Mapping[str, Any]) -> None:
+        super().__init__()
+        self.configurations = configurations
+
+    def execute(self, context: LaunchContext) -> None:
+        """Replace those of the launch, which the caller has pushed."""
+        context.launch_configurations.clear()
+        context.launch_configurations.update(self.configurations)
+
 
 def scenario_argument(default: str, otherwise: str = "") -> DeclareLaunchArgument:
     """The argument `scenario`; `otherwise` describes an empty argument."""
@@ -137,17 +246,16 @@ def watch_argument() -> DeclareLaunchArgument:
     return boolean_argument("watch", False, "serve the live page of the flight: docs/live-view.md")
 
 
-def watch_page(context: LaunchContext, run: Path) -> list[Action]:
+def watch_page(flight: Flight) -> list[Action]:
     """The process of the live page of a run, on demand.
 
     The flight does not depend on this process.
     """
-    if argument(context, "watch") != "true":
+    if flight.argument("watch") != "true":
         return []
     rise_di = ExecutableInPackage(package="flight_cli", executable="rise-di")
-    return [
-        ExecuteProcess(cmd=[rise_di, "watch", str(run), "--wait"], name="watch", output="screen")
-    ]
+    words = [rise_di, "watch", str(flight.run), "--wait"]
+    return flight.in_scope([ExecuteProcess(cmd=words, name="watch", output="screen")])
 
 
 def namespace_argument(
@@ -157,6 +265,16 @@ def namespace_argument(
     return DeclareLaunchArgument("namespace", default_value="", description=description)
 
 
+def log_level_argument() -> DeclareLaunchArgument:
+    """The argument `log_level`."""
+    return DeclareLaunchArgument(
+        "log_level",
+        default_value="info",
+        choices=["debug", "info", "warn", "error", "fatal"],
+        description="from which level on the nodes log",
+    )
+
+
 def sim_time_argument() -> DeclareLaunchArgument:
     """The argument `use_sim_time`."""
     return boolean_argument(
@@ -164,27 +282,29 @@ def sim_time_argument() -> DeclareLaunchArgument:
     )
 
 
-def by_rise_di(context: LaunchContext, file: str) -> list[Action]:
+def by_rise_di(flight: Flight, file: str) -> list[Action]:
     """`rise-di fly` of a scenario or of a fleet, with the arguments of the launch.
 
-    The launch ends with it, with exit status 1 where a flight was not completed.
+    Its exit status decides on that of the launch, 1 where a flight was not completed.
     """
 
     def end(event: ProcessExited, context: LaunchContext) -> Sequence[Action]:
-        if event.returncode != 0 and not context.is_shutdown:
-            raise RuntimeError(f"rise-di fly ended with status {event.returncode}")
-        return [Shutdown(reason="flight completed")]
+        if event.returncode != 0 and not flight.is_over:
+            return flight.fail(ended_early(f"rise-di fly ended with status {event.returncode}"))
+        return flight.complete()
 
-    end_with_launch(context)
-    options = ["--runs", argument(context, "runs")]
-    options += ["--use-sim-time"] * (argument(context, "use_sim_time") == "true")
-    for name in ("duration", "namespace"):
-        if value := context.launch_configurations.get(name):
-            options += [f"--{name}", value]
-    options += ["--watch"] * (argument(context, "watch") == "true")
+    options = ["--runs", flight.argument("runs")]
+    options += ["--use-sim-time"] * (flight.argument("use_sim_time") == "true")
+    for name, value in (
+        ("duration", flight.argument("duration")),
+        ("namespace", flight.namespace),
+    ):
+        options += [f"--{name}", value] if value else []
+    options += ["--watch"] * (flight.argument("watch") == "true")
     rise_di = ExecutableInPackage(package="flight_cli", executable="rise-di")
     words = [rise_di, "fly", file, *options]
-    return [ExecuteProcess(cmd=words, name="flight", output="screen", on_exit=end)]
+    process = ExecuteProcess(cmd=words, name="flight", output="screen", on_exit=end)
+    return flight.in_scope([process])
 
 
 def argument(context: LaunchContext, name: str) -> str:
@@ -192,18 +312,10 @@ def argument(context: LaunchContext, name: str) -> str:
     return str(LaunchConfiguration(name).perform(context))
 
 
-def end_with_launch(context: LaunchContext) -> None:
-    """Let every process end with this process.
-
-    Launch leaves processes running after an end by anything but SIGINT.
-    """
-    context.launch_configurations.setdefault("launch-prefix", shlex.join(end_with_parent()))
-
-
 def flight_node(
-    spec: NodeSpec, scenario: Scenario, overrides: ParameterOverrides, run: Path
+    spec: NodeSpec, scenario: Scenario, overrides: ParameterOverrides, flight: Flight
 ) -> Node:
-    """A node of a flight into the folder `run`.
+    """A node of a flight.
 
     The node gets a section of the scenario and parameter overrides.
     """
@@ -211,16 +323,15 @@ def flight_node(
         package=spec.package,
         executable=spec.executable,
         exec_name=spec.executable,  # otherwise the log names each process by its prefix
-        namespace=LaunchConfiguration("namespace"),
+        namespace=flight.argument("namespace"),
         parameters=[str(scenario.path), overrides],
+        ros_arguments=["--log-level", flight.argument("log_level")],
         output="screen",
-        on_exit=say_on_exit if spec is LEARNER else partial(fail_on_exit, run=run),
+        on_exit=partial(say_on_exit if spec is LEARNER else fail_on_exit, flight=flight),
     )
 
 
-def rosbag2(
-    context: LaunchContext, scenario: Scenario, overrides: ParameterOverrides
-) -> ExecuteProcess:
+def rosbag2(flight: Flight, scenario: Scenario, overrides: ParameterOverrides) -> ExecuteProcess:
     """`ros2 bag record` in the place of the stack's recorder, with the same topics.
 
     `overrides` belong to the recorder. The attachments of the recorder become a separate log in the
@@ -237,7 +348,7 @@ def rosbag2(
     further = overrides.get("topics", scenario.recorder.topics)
     topics = [*(topic.name for topic in FLIGHT), *further]
     names = dict.fromkeys(
-        name if name.startswith("/") else f"{_namespace(context)}/{name}" for name in topics
+        name if name.startswith("/") else f"{flight.namespace}/{name}" for name in topics
     )
     command = [
         "ros2",
@@ -251,47 +362,41 @@ def rosbag2(
         *names,
     ]
     return ExecuteProcess(
-        cmd=command, name="recorder", output="screen", on_exit=partial(fail_on_exit, run=run)
+        cmd=command, name="recorder", output="screen", on_exit=partial(fail_on_exit, flight=flight)
     )
 
 
 def fail_on_exit(
-    event: ProcessExited, context: LaunchContext, run: Path
+    event: ProcessExited, context: LaunchContext, flight: Flight
 ) -> Sequence[Action] | None:
-    """End the launch when a process ends before the flight.
+    """End the flight when a process ends before it.
 
-    The outcome goes to the folder `run`. The exit status of a landing is 0, else it is 1.
+    The exit status of a landing completes it.
     """
-    if context.is_shutdown:
+    if flight.is_over:
         return None
     if event.returncode != STATUS_LANDED:
-        end_with(run, ended_early(f"{event.process_name} ended before the flight did"))
-    return complete(run, "the aircraft has landed", Outcome(End.LANDED))
+        return flight.fail(ended_early(f"{event.process_name} ended before the flight did"))
+    return flight.complete("the aircraft has landed", Outcome(End.LANDED))
 
 
-def end_with(run: Path, outcome: Outcome) -> NoReturn:
-    """End the launch with exit status 1, with the outcome in the folder `run`."""
-    leave_outcome(run, outcome)
-    raise RuntimeError(str(outcome))
-
-
-def say_on_exit(event: ProcessExited, context: LaunchContext) -> list[Action]:
+def say_on_exit(event: ProcessExited, context: LaunchContext, flight: Flight) -> list[Action]:
     """Say that the learner has ended before the flight."""
     sentence = (
         f"{event.process_name} ended before the flight did: the law flies on with the model "
         "that it has"
     )
-    return [] if context.is_shutdown else [LogInfo(msg=sentence)]
+    return [] if flight.is_over else [LogInfo(msg=sentence)]
 
 
 def on_state(
-    context: LaunchContext, spec: NodeSpec, state: NodeState, then: Callable[[], Sequence[Action]]
+    flight: Flight, spec: NodeSpec, state: NodeState, then: Callable[[], Sequence[Action]]
 ) -> RegisterEventHandler:
     """Run the actions of `then` once, when a node of this launch publishes a state.
 
     A later state counts, too.
     """
-    node = f"{_namespace(context)}/{spec.executable}"
+    node = f"{flight.namespace}/{spec.executable}"
     states = [*NodeState]
     states_from = {*states[states.index(state) :]}
 
@@ -300,85 +405,80 @@ def on_state(
             isinstance(event, NodeStateEvent) and event.node == node and event.state in states_from
         )
 
+    def act(context: LaunchContext) -> list[Action]:
+        return [] if flight.is_over else [*then()]
+
     return RegisterEventHandler(
-        EventHandler(
-            matcher=matches,
-            entities=[OpaqueFunction(function=lambda context: [*then()])],
-            handle_once=True,
-        )
+        EventHandler(matcher=matches, entities=[OpaqueFunction(function=act)], handle_once=True)
     )
 
 
 def start_in_stages(
-    context: LaunchContext,
-    run: Path,
+    flight: Flight,
     first: Mapping[NodeSpec, Node],
     second: Callable[[float, float], Sequence[Action]],
     *,
     beside: Sequence[Action] = (),
     publishes: Collection[str] = LOOP_INPUTS,
 ) -> list[Action]:
-    """Start the first stage of a flight into the folder `run`, and `beside`.
+    """Start the first stage of a flight, and `beside`.
 
     Once the nodes are ready, run the actions of `second`. The arguments of `second` are the time
     until t = 0 and the system time of t = 0, s. A node that is not ready after READY_TIMEOUT ends
-    the launch with exit status 1, and so does another flight: a publisher of a topic among
-    `publishes`, before any node starts.
+    the flight early, and so does another flight: a publisher of a topic among `publishes`, before
+    any node starts.
     """
-    _subscribe_states(context)
-    leave_outcome(run, INTERRUPTED)  # until another outcome replaces it
+    _subscribe_states(flight)
+    leave_outcome(flight.run, INTERRUPTED)  # until another outcome replaces it
     begin = time.monotonic() + DISCOVERY_TIME
     waiting = dict.fromkeys(first)  # in order
 
     def ready(spec: NodeSpec) -> Sequence[Action]:
         del waiting[spec]
         lead = start_lead(time.monotonic() - begin)
-        return () if waiting else second(lead, start_instant(lead, time.time()))
+        if waiting:
+            return ()
+        return flight.in_scope(second(lead, start_instant(lead, time.time())))
 
-    def require_ready(context: LaunchContext) -> None:
-        if waiting and not context.is_shutdown:
-            names = ", ".join(spec.executable for spec in waiting)
-            end_with(run, never_flew(f"{names} not ready after {READY_TIMEOUT:g} s"))
+    def require_ready(context: LaunchContext) -> Sequence[Action] | None:
+        if not waiting:
+            return None
+        names = ", ".join(spec.executable for spec in waiting)
+        return flight.fail(never_flew(f"{names} not ready after {READY_TIMEOUT:g} s"))
 
     def start(context: LaunchContext) -> list[Action]:
-        if context.is_shutdown:
-            return []
-        topics = [f"{_namespace(context)}/{topic}" for topic in LOOP_INPUTS if topic in publishes]
+        topics = [f"{flight.namespace}/{topic}" for topic in LOOP_INPUTS if topic in publishes]
         try:
             require_no_publishers(get_ros_node(context), topics, FREE_DOMAIN)
         except ParameterError as error:
-            end_with(run, never_flew(str(error)))
-        return [*first.values(), *beside, _after(READY_TIMEOUT, require_ready)]
+            return flight.fail(never_flew(str(error)))
+        nodes = flight.in_scope([*first.values(), *beside])
+        return [*nodes, flight.after(READY_TIMEOUT, require_ready)]
 
     handlers = [
-        on_state(context, spec, NodeState.READY, lambda spec=spec: ready(spec)) for spec in first
+        on_state(flight, spec, NodeState.READY, lambda spec=spec: ready(spec)) for spec in first
     ]
-    return [*handlers, _after(DISCOVERY_TIME, start)]
+    return [*handlers, flight.after(DISCOVERY_TIME, start)]
 
 
 def begin_when_matched(
-    context: LaunchContext,
-    run: Path,
-    nodes: Sequence[NodeSpec],
-    duration: float,
-    *,
-    by_rosbag2: bool,
+    flight: Flight, nodes: Sequence[NodeSpec], duration: float, *, by_rosbag2: bool, flies: bool
 ) -> list[Action]:
     """Begin the flight once each node is ready and each input has a publisher.
 
     t = 0 goes to the topic `start`. End the flight once the log holds y, y_m and u to the end; with
-    rosbag2 once u has the stamp of the end. A node that does not get so far, and an aircraft that
-    takes no u, end the launch with exit status 1.
+    rosbag2 once u has the stamp of the end. A node that does not get so far ends the flight early,
+    and so does an aircraft that takes no u where it `flies` as a node of the stack.
     """
-    begin = _Begin(context, run, nodes, duration)
+    begin = _Begin(flight, nodes, duration, flies=flies)
     return [
-        _complete_at(context, run, begin.held, by_rosbag2=by_rosbag2),
+        _complete_at(flight, begin.held, by_rosbag2=by_rosbag2),
         *(
-            on_state(context, spec, NodeState.MATCHED, partial(begin.matched, spec))
+            on_state(flight, spec, NodeState.MATCHED, partial(begin.matched, spec))
             for spec in nodes
         ),
-        on_state(context, AIRCRAFT, NodeState.FLYING, begin.fly),
-        _after(READY_TIMEOUT, begin.require_matched),
+        on_state(flight, AIRCRAFT, NodeState.FLYING, begin.fly),
+        flight.after(READY_TIMEOUT, begin.require_matched),
     ]
 
 
@@ -386,16 +486,16 @@ class _Begin:
     """The begin of a flight by the topic `start`, and the ends of a flight that does not begin."""
 
     def __init__(
-        self, context: LaunchContext, run: Path, nodes: Sequence[NodeSpec], duration: float
+        self, flight: Flight, nodes: Sequence[NodeSpec], duration: float, *, flies: bool
     ) -> None:
-        self._run = run
+        self._flight = flight
         self._duration = duration
         self._waiting = dict.fromkeys(nodes)
-        self._flies = False
+        self._flies = not flies  # another aircraft does not say that it has taken u
         self._start_ns = 0  # of t = 0; 0 before it is sent
         self._held_ns = -1  # the stamp up to which the log holds y, y_m and u
-        topic = f"{_namespace(context)}/{START.name}"
-        node = get_ros_node(context)
+        topic = f"{flight.namespace}/{START.name}"
+        node = get_ros_node(flight.context)
         self._publish = node.create_publisher(START.type, topic, offered(START)).publish
 
     def matched(self, spec: NodeSpec) -> Sequence[Action]:
@@ -406,8 +506,8 @@ class _Begin:
         self._start_ns = nanoseconds(start_instant(LEAD, time.time()))
         self._publish(instant(self._start_ns))
         return [
-            _after(LEAD + FIRST_U, self._require_flight),
-            _after(LEAD + self._duration + 2.0 * LOG_TIMEOUT, self._give_up),
+            self._flight.after(LEAD + FIRST_U, self._require_flight),
+            self._flight.after(LEAD + self._duration + 2.0 * LOG_TIMEOUT, self._give_up),
         ]
 
     def fly(self) -> Sequence[Action]:
@@ -420,38 +520,28 @@ class _Begin:
         self._held_ns = stamp_ns
         return self._start_ns > 0 and stamp_ns >= self._start_ns + nanoseconds(self._duration)
 
-    def require_matched(self, context: LaunchContext) -> None:
-        """End the launch for a node that waits too long."""
-        if self._waiting and not context.is_shutdown:
-            names = ", ".join(spec.executable for spec in self._waiting)
-            reason = "not ready, or with an input without a publisher, after"
-            end_with(self._run, never_flew(f"{names} {reason} {READY_TIMEOUT:g} s"))
+    def require_matched(self, context: LaunchContext) -> Sequence[Action] | None:
+        """End the flight for a node that waits too long."""
+        if not self._waiting:
+            return None
+        names = ", ".join(spec.executable for spec in self._waiting)
+        reason = "not ready, or with an input without a publisher, after"
+        return self._flight.fail(never_flew(f"{names} {reason} {READY_TIMEOUT:g} s"))
 
-    def _require_flight(self, context: LaunchContext) -> None:
-        if not self._flies and not context.is_shutdown:
-            reason = "y did not reach the controller, or u did not reach the aircraft"
-            lines = "the lines of the nodes say what they wait for"
-            end_with(self._run, never_flew(f"{reason}; {lines}"))
+    def _require_flight(self, context: LaunchContext) -> Sequence[Action] | None:
+        if self._flies:
+            return None
+        reason = "y did not reach the controller, or u did not reach the aircraft"
+        lines = "the lines of the nodes say what they wait for"
+        return self._flight.fail(never_flew(f"{reason}; {lines}"))
 
-    def _give_up(self, context: LaunchContext) -> None:
-        if not context.is_shutdown:
-            held = (self._held_ns - self._start_ns) / NANOSECONDS
-            end_with(self._run, log_ends_at(held, self._duration))
-
-
-def _after(period: float, function: Callable[[LaunchContext], list[Action] | None]) -> TimerAction:
-    """Call a function after a period, s."""
-    return TimerAction(period=period, actions=[OpaqueFunction(function=function)])
+    def _give_up(self, context: LaunchContext) -> Sequence[Action]:
+        held = (self._held_ns - self._start_ns) / NANOSECONDS
+        return self._flight.fail(log_ends_at(held, self._duration))
 
 
 def end_with_log(
-    context: LaunchContext,
-    run: Path,
-    lead: float,
-    end_time: float,
-    duration: float,
-    *,
-    by_rosbag2: bool,
+    flight: Flight, lead: float, end_time: float, duration: float, *, by_rosbag2: bool
 ) -> list[Action]:
     """End a flight once the log holds y, y_m and u to the system time `end_time`, s.
 
@@ -464,56 +554,48 @@ def end_with_log(
         last[0] = time.monotonic()
         return min(stamp_ns, time.time_ns()) >= nanoseconds(end_time)
 
-    def end(context: LaunchContext) -> list[Action]:
-        if context.is_shutdown:
-            return []
-        moves = time.monotonic() < last[0] + LOG_TIMEOUT
-        return [TimerAction(period=LOG_TIMEOUT, actions=complete(run))] if moves else complete(run)
+    def end(context: LaunchContext) -> Sequence[Action]:
+        if time.monotonic() < last[0] + LOG_TIMEOUT:
+            return [flight.after(LOG_TIMEOUT, lambda context: flight.complete())]
+        return flight.complete()
 
-    return [_after(lead + duration, end), _complete_at(context, run, held, by_rosbag2=by_rosbag2)]
+    return [
+        flight.after(lead + duration, end),
+        _complete_at(flight, held, by_rosbag2=by_rosbag2),
+    ]
 
 
 def _complete_at(
-    context: LaunchContext, run: Path, held: Callable[[int], bool], *, by_rosbag2: bool
+    flight: Flight, held: Callable[[int], bool], *, by_rosbag2: bool
 ) -> RegisterEventHandler:
     """Complete the flight once the stamp up to which the log is whole satisfies `held`.
 
     The log holds y, y_m and u up to it; with rosbag2 the stamp is that of u.
     """
+    context = flight.context
 
     def receive(message: Any) -> None:
         stamp = message.header.stamp if by_rosbag2 else message
-        if held(stamp.sec * NANOSECONDS + stamp.nanosec) and not context.is_shutdown:
-            context.asyncio_loop.call_soon_threadsafe(context.emit_event_sync, FlownEvent())
+        if held(stamp.sec * NANOSECONDS + stamp.nanosec) and not flight.is_over:
+            context.asyncio_loop.call_soon_threadsafe(context.emit_event_sync, FlownEvent(flight))
 
     topic, qos = (U, NEWEST_SAMPLES) if by_rosbag2 else (RECORDED, LOCKSTEP)
     get_ros_node(context).create_subscription(
-        topic.type, f"{_namespace(context)}/{topic.name}", receive, qos
+        topic.type, f"{flight.namespace}/{topic.name}", receive, qos
     )
+
+    def end(context: LaunchContext) -> list[Action]:
+        return [] if flight.is_over else flight.complete()
+
     on_progress = EventHandler(
-        matcher=lambda event: isinstance(event, FlownEvent),
-        entities=[OpaqueFunction(function=lambda context: complete(run))],
+        matcher=lambda event: isinstance(event, FlownEvent) and event.flight is flight,
+        entities=[OpaqueFunction(function=end)],
         handle_once=True,
     )
     return RegisterEventHandler(on_progress)
 
 
-def complete(
-    run: Path, reason: str = "flight completed", outcome: Outcome = COMPLETED
-) -> list[Action]:
-    """The actions at the end of a flight that reached its end.
-
-    The recorder closes the log with the outcome.
-    """
-    leave = OpaqueFunction(function=lambda context: leave_outcome(run, outcome))
-    return [
-        leave,
-        LogInfo(msg=f"{reason}; now: ros2 run flight_cli rise-di report {shlex.quote(str(run))}"),
-        Shutdown(reason=reason),
-    ]
-
-
-def _subscribe_states(context: LaunchContext) -> None:
+def _subscribe_states(flight: Flight) -> None:
     """Emit a NodeStateEvent for every published state of a node of this launch.
 
     See launch_ros.actions.LifecycleNode.
@@ -521,15 +603,16 @@ def _subscribe_states(context: LaunchContext) -> None:
 
     def receive(message: KeyValue) -> None:
         node, _, pid = message.key.rpartition("#")
-        if pid.isdecimal() and _is_descendant(int(pid)) and not context.is_shutdown:
+        if pid.isdecimal() and _is_descendant(int(pid)) and not flight.is_over:
             context.asyncio_loop.call_soon_threadsafe(
                 context.emit_event_sync, NodeStateEvent(node, message.value)
             )
 
+    context = flight.context
     transport.prepare()  # before the first rclpy.init of this process
     ros_node = get_ros_node(context)
     ros_node.create_subscription(
-        NODE_STATE.type, f"{_namespace(context)}/{NODE_STATE.name}", receive, STATES
+        NODE_STATE.type, f"{flight.namespace}/{NODE_STATE.name}", receive, STATES
     )
     # At shutdown launch_ros waits for its executor before it stops the nodes: up to 1 s, without a
     # timer.
@@ -539,9 +622,8 @@ def _subscribe_states(context: LaunchContext) -> None:
 def _namespace(context: LaunchContext) -> str:
     """The absolute namespace of the nodes, as launch_ros.actions.Node has it; "" for the root."""
     base = context.launch_configurations.get("ros_namespace")
-    return str(
-        make_namespace_absolute(prefix_namespace(base, argument(context, "namespace")))
-    ).rstrip("/")
+    own = context.launch_configurations.get("namespace", "")
+    return str(make_namespace_absolute(prefix_namespace(base, own))).rstrip("/")
 
 
 def _is_descendant(pid: int) -> bool:
