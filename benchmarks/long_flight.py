@@ -64,7 +64,7 @@ IN_VIEW = """(() => {
 MODES = {
     "in lockstep": ["--lockstep"],
     "in lockstep in one process": ["--lockstep", "--composed"],
-    "in real time": [],
+    "in real time": ["--real-time"],
 }
 
 

@@ -451,7 +451,7 @@ def seconds_to_first_u() -> float:
     with open_node("subscriber") as node, tempfile.TemporaryDirectory() as runs:
         subscription = PolledSubscription(node, U, RECORD, raw=True)
         begin = time.time()
-        command = [RISE_DI, "fly", SCENARIO, "--duration", "30", "--runs", str(runs)]
+        command = [RISE_DI, "fly", SCENARIO, "--real-time", "--duration", "30", "--runs", str(runs)]
         flight = subprocess.Popen(  # noqa: S603 - this stack
             command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
         )

@@ -230,7 +230,7 @@ def flying(
         "--runs",
         str(runs),
         "--json",
-        *options,
+        *(options or ("--real-time",)),
     ]
     runs_before = set(runs.iterdir())
     with subprocess.Popen(  # noqa: S603

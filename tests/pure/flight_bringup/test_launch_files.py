@@ -261,6 +261,7 @@ def test_fleet_is_a_process_and_its_end_ends_launch(tmp_path: Path) -> None:
         str(file),
         "--runs",
         "runs",
+        "--real-time",
         "--duration",
         "3.0",
         "--watch",

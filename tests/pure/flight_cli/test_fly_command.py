@@ -14,6 +14,7 @@ from tests.conftest import invoke
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.report import run_folder
+from flight_bringup.fleet import Fleet
 from flight_bringup.fly import fly_in_process
 from flight_cli import fly, watch
 from flight_core.outcome import STATUS_ENDED_EARLY, STATUS_SHORTFALL, Outcome, never_flew
@@ -107,3 +108,114 @@ def test_small_host_is_warned_of_a_browser_beside_the_flight(
     words = ["fly", "osprey_servo", "--watch", "--in-process", "--duration", "0.5"]
     result = invoke(*words, "--runs", str(tmp_path))
     assert (f"this host has {cores} cores: a browser" in result.stderr) is is_warned
+
+
+@pytest.fixture
+def modes(monkeypatch: pytest.MonkeyPatch) -> list[tuple[bool, bool]]:
+    """Whether each flight was in lockstep and in one process; nothing flies over topics."""
+    flights: list[tuple[bool, bool]] = []
+
+    def fly_topics(
+        scenario: Scenario, run: Path, progress: Any, *, lockstep: bool, one_process: bool, **_: Any
+    ) -> Outcome:
+        flights.append((lockstep, one_process))
+        return fly_in_process(scenario, run, progress)
+
+    monkeypatch.setattr(fly, "_require_flyable", lambda *_, **__: None)
+    monkeypatch.setattr(fly, "fly_over_topics", fly_topics)
+    return flights
+
+
+LOCKSTEP = (True, True)
+REAL_TIME = (False, False)
+
+
+@pytest.mark.parametrize(
+    ("cores", "words", "mode", "is_told"),
+    [
+        (2.0, (), REAL_TIME, False),
+        (0.5, (), LOCKSTEP, True),
+        (0.5, ("--real-time",), REAL_TIME, False),
+        (0.5, ("--lockstep",), (True, False), False),
+        (0.5, ("--set", "flight.lockstep=true"), (True, False), False),
+        # One process gets one share of a busy host.
+        (0.5, ("--composed",), LOCKSTEP, True),
+        (1.0, ("--composed",), (False, True), False),
+        (0.5, ("--composed", "--real-time"), (False, True), False),
+        # A simulator and a user have a time of their own.
+        (0.5, ("--use-sim-time",), REAL_TIME, False),
+        (0.5, ("--set", "controller.start_active=false"), REAL_TIME, False),
+    ],
+)
+def test_flight_without_a_mode_is_in_real_time_where_the_host_can(
+    cores: float,
+    words: tuple[str, ...],
+    mode: tuple[bool, bool],
+    is_told: bool,
+    modes: list[tuple[bool, bool]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(fly, "cores_given", lambda processes: cores)
+    result = invoke(
+        "fly", "osprey_gust", *words, "--duration", "0.5", "--runs", str(tmp_path), "--json"
+    )
+    assert modes == [mode]
+    sentences = [line for line in result.stderr.splitlines() if "this host" in line]
+    assert len(sentences) == is_told
+    if is_told:
+        assert "cores that a flight in real time needs: flying in lockstep" in sentences[0]
+        assert "--real-time" in sentences[0], "how to insist"
+
+
+@pytest.mark.parametrize("words", [("--lockstep",), ("--in-process",), ("--use-sim-time",)])
+def test_two_times_at_once_are_refused(words: tuple[str, ...], tmp_path: Path) -> None:
+    result = invoke("fly", "osprey_gust", "--real-time", *words, "--runs", str(tmp_path))
+    assert isinstance(result.exception, ParameterError)
+    assert str(result.exception).startswith("--real-time: found ")
+
+
+FLEET = "scenario: osprey_gust\nduration: 1.0\n"
+
+
+@pytest.mark.parametrize(
+    ("content", "cores", "words", "processes", "mode"),
+    [
+        ("aircraft: {one: {}, two: {}}", 3.0, (), [8], REAL_TIME),
+        ("aircraft: {one: {}, two: {}}", 2.0, (), [8], LOCKSTEP),
+        ("aircraft: {one: {}, two: {}}", 2.0, ("--real-time",), [], REAL_TIME),
+        ("composed: true\naircraft: {one: {}, two: {}}", 2.0, (), [2], (False, True)),
+        ("lockstep: true\naircraft: {one: {}, two: {}}", 0.1, (), [], (True, False)),
+        ("use_sim_time: true\naircraft: {one: {}}", 0.1, (), [], REAL_TIME),
+        # A later t = 0 needs a common time, which lockstep does not have.
+        ("aircraft: {one: {}, two: {delay: 1.0}}", 2.0, (), [8], REAL_TIME),
+    ],
+)
+def test_all_processes_of_a_fleet_count(
+    content: str,
+    cores: float,
+    words: tuple[str, ...],
+    processes: list[int],
+    mode: tuple[bool, bool],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[int] = []
+    flown: list[Fleet] = []
+
+    def give(count: int) -> float:
+        asked.append(count)
+        return cores
+
+    def fly_fleet(fleet: Fleet, runs: list[Path], *, as_json: bool) -> int:
+        flown.append(fleet)
+        return 0
+
+    monkeypatch.setattr(fly, "cores_given", give)
+    monkeypatch.setattr(fly, "fly_fleet_file", fly_fleet)
+    path = tmp_path / "fleet.yaml"
+    path.write_text(FLEET + content)
+    result = invoke("fly", str(path), *words, "--runs", str(tmp_path))
+    assert result.exit_code == 0
+    assert asked == processes
+    assert [(fleet.lockstep, fleet.composed) for fleet in flown] == [mode]

@@ -50,7 +50,9 @@ def test_flight_in_real_time_replayed_with_parameter_changes_outages_and_busy_ho
     start: Start, tmp_path: Path, peer_node: Peer
 ) -> None:
     # ended below
-    flight = start("flight_cli.cli", "fly", str(scenario_file(tmp_path, 1e4, "osprey_gust")))
+    flight = start(
+        "flight_cli.cli", "fly", str(scenario_file(tmp_path, 1e4, "osprey_gust")), "--real-time"
+    )
 
     def modes() -> list[int]:
         return peer_node.modes()[-1:]

@@ -47,7 +47,7 @@ def test_killed_aircraft_leaves_other_untouched_and_interrupt_ends_all(
     start: Start, tmp_path: Path
 ) -> None:
     (tmp_path / "fleet.yaml").write_text("{composed: true, aircraft: {one: {}, two: {}}}")
-    fleet = start("flight_cli.cli", "fly", "fleet.yaml")
+    fleet = start("flight_cli.cli", "fly", "fleet.yaml", "--real-time")
 
     def engaged(name: str) -> bool:
         return any(

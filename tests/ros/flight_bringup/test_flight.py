@@ -26,7 +26,7 @@ Engaged = tuple[Process, list[psutil.Process]]
 @pytest.fixture
 def engaged(start: Start, tmp_path: Path) -> Engaged:
     """A flight whose controller has engaged, and its four processes."""
-    flight = start("flight_cli.cli", "fly", "osprey_gust")
+    flight = start("flight_cli.cli", "fly", "osprey_gust", "--real-time")
     flight.until(lambda: is_engaged(tmp_path), "a flight that has engaged")
     return flight, flight.children()
 
@@ -46,7 +46,14 @@ def test_flights_in_two_namespaces_do_not_mix_and_end_by_interrupts(
     flight, nodes = engaged
     assert len(nodes) == 4
     second_flight = start(
-        "flight_cli.cli", "fly", "osprey_gust", "--namespace", "uav2", "--runs", "beside/runs"
+        "flight_cli.cli",
+        "fly",
+        "osprey_gust",
+        "--real-time",
+        "--namespace",
+        "uav2",
+        "--runs",
+        "beside/runs",
     )
     second_flight.until(
         lambda: is_engaged(tmp_path / "beside"), "a flight beside it that has engaged"
@@ -87,6 +94,7 @@ def test_lost_terminal_ends_flight_with_log_and_report(tmp_path: Path) -> None:
         "flight_cli.cli",
         "fly",
         "osprey_gust",
+        "--real-time",
     ]
     flight = subprocess.Popen(
         words, cwd=tmp_path, stdin=of_flight, stdout=of_flight, stderr=of_flight
@@ -107,7 +115,7 @@ def test_lost_terminal_ends_flight_with_log_and_report(tmp_path: Path) -> None:
 def test_an_early_interrupt_causes_no_traceback(start: Start) -> None:
     # Seconds of processor time; an earlier interrupt stops the interpreter itself.
     for seconds in (0.3, 0.6):
-        flight = start("flight_cli.cli", "fly", "osprey_gust")
+        flight = start("flight_cli.cli", "fly", "osprey_gust", "--real-time")
         processor_times = psutil.Process(flight.popen.pid).cpu_times
 
         def is_due(processor_times: Any = processor_times, seconds: float = seconds) -> bool:
@@ -126,13 +134,20 @@ def test_second_flight_is_refused_and_killed_node_ends_flight_and_killed_command
 ) -> None:
     flight, nodes = engaged
     second_flight = start(
-        "flight_cli.cli", "fly", "osprey_gust", "--namespace", "uav2", "--runs", "beside/runs"
+        "flight_cli.cli",
+        "fly",
+        "osprey_gust",
+        "--real-time",
+        "--namespace",
+        "uav2",
+        "--runs",
+        "beside/runs",
     )
     second_flight.until(
         lambda: is_engaged(tmp_path / "beside"), "a flight beside it that has engaged"
     )
     nodes_beside = second_flight.children()
-    third_flight = start("flight_cli.cli", "fly", "osprey_gust")
+    third_flight = start("flight_cli.cli", "fly", "osprey_gust", "--real-time")
     assert third_flight.end() == 2
     assert (
         "a domain of its own for each flight: set ROS_DOMAIN_ID, or a namespace of its own"

@@ -63,7 +63,7 @@ def test_flight_over_topics_recorded_and_as_accurate_as_in_one_process(
     # are in no topic, so that one flight beyond the bounds proves nothing.
     delays = []
     for _ in range(4):
-        start("flight_cli.cli", "fly", str(short_scenario)).succeed()
+        start("flight_cli.cli", "fly", str(short_scenario), "--real-time").succeed()
         run = (tmp_path / "runs" / "latest").resolve()
         tape = read_run(run).tape
         ticks = json.loads((run / "summary.json").read_text())["ticks"]

@@ -80,7 +80,14 @@ def test_law_flies_on_without_its_learner_and_takes_another(start: Start, tmp_pa
     # on a busy host the design of the airframe file, 2 s of a core at low priority, takes a minute
     killed_scenario = scenario(tmp_path, updates=[1.0, 2.5], window=600.0)
     command = start(
-        "flight_cli.cli", "fly", str(killed_scenario.path), "--duration", "240", "--runs", "runs"
+        "flight_cli.cli",
+        "fly",
+        str(killed_scenario.path),
+        "--real-time",
+        "--duration",
+        "240",
+        "--runs",
+        "runs",
     )
     command.wait_for("flies the airframe osprey as it is, until a model is learned")
     learning = command.child("flight_design.main")

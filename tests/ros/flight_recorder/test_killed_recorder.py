@@ -100,7 +100,9 @@ def test_8_killed_recorders_lose_at_most_three_tenths_of_second(
 def test_log_of_killed_recorder_reported_and_repairable(
     start: Start, osprey_gust: Scenario, tmp_path: Path
 ) -> None:
-    flight = start("flight_cli.cli", "fly", str(osprey_gust.path), "--duration", "30")
+    flight = start(
+        "flight_cli.cli", "fly", str(osprey_gust.path), "--real-time", "--duration", "30"
+    )
     flight.wait_for_log(tmp_path / "runs", 150_000)
     node = flight.child("flight_recorder.main")
     killed_ns = time.time_ns()

@@ -86,7 +86,9 @@ def test_flight_commanded_from_page_recorded_and_replayed(
     start: Start, tmp_path: Path, peer_node: Peer
 ) -> None:
     # ended below
-    flight = start("flight_cli.cli", "fly", str(scenario_file(tmp_path, 1e4, "osprey_gust")))
+    flight = start(
+        "flight_cli.cli", "fly", str(scenario_file(tmp_path, 1e4, "osprey_gust")), "--real-time"
+    )
     flight.wait_for_log(tmp_path / "runs", 50_000)
     run = next(
         path for path in (tmp_path / "runs").iterdir() if path.is_dir() and not path.is_symlink()

@@ -43,5 +43,7 @@ def generate_launch_description() -> LaunchDescription:
 
 def _fly(context: LaunchContext) -> list[Action]:
     file = argument(context, "fleet")
-    read_fleet(Path(file))  # a mistake in the file is one sentence, before anything starts
-    return by_rise_di(Flight(context), file)
+    # A mistake in the file is one sentence, before anything starts.
+    fleet = read_fleet(Path(file))
+    has_own_time = fleet.lockstep or fleet.use_sim_time
+    return by_rise_di(Flight(context), file, has_own_time=has_own_time)

@@ -4,7 +4,7 @@
 
 import os
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
@@ -27,7 +27,7 @@ from flight_analysis.report.run_folder import (
     write_empty_summary,
     write_report,
 )
-from flight_bringup.fleet import is_fleet, new_runs
+from flight_bringup.fleet import Fleet, is_fleet, new_runs
 from flight_bringup.fly import fly_in_process, fly_over_topics
 from flight_bringup.graph import (
     Autopilot,
@@ -36,6 +36,7 @@ from flight_bringup.graph import (
     require_limits,
     second_stage,
 )
+from flight_bringup.host import cores_given, shortage
 from flight_cli.fleet import fly_fleet_file, open_fleet
 from flight_cli.output import (
     flight_progress,
@@ -82,12 +83,13 @@ OF_AIRCRAFT = (
 
 @dataclass(frozen=True, kw_only=True)
 class Fly(RouteWords):
-    """Fly a scenario or a fleet over ROS 2 topics, in real time.
+    """Fly a scenario or a fleet over ROS 2 topics.
 
-    The nodes of each aircraft are processes. Exit status: 0 completed or landed, 2 bad input, 3
-    ended early or never flew, 4 completed or landed and short of something, which the outcome names
-    with its figure: the errors, the law engaged, speed, height, fence, route, touch-down zone, log;
-    130 interrupted. Of a fleet it is the severest of its aircraft.
+    In real time, with a process a node. If this host has too little to give for that, in lockstep
+    and one process an aircraft, and a sentence says so. Exit status: 0 completed or landed, 2 bad
+    input, 3 ended early or never flew, 4 completed or landed and short of something, which the
+    outcome names with its figure: the errors, the law engaged, speed, height, fence, route,
+    touch-down zone, log; 130 interrupted. Of a fleet it is the severest of its aircraft.
     """
 
     context: typer.Context
@@ -102,8 +104,13 @@ class Fly(RouteWords):
     lockstep: bool = option(
         "Fly in lockstep over topics, as fast as possible, repeatable to the byte.", default=False
     )
+    real_time: bool = option(
+        "Fly in real time, also on a host that has too little to give for it.", default=False
+    )
     composed: bool = rare_option(
-        "Fly with all nodes in one process: a third of the processor time.", default=False
+        "Fly with all nodes in one process: a third of the processor time, but a single share of a "
+        "busy host, which in real time is worse than four.",
+        default=False,
     )
     use_sim_time: bool = rare_option(
         "Fly by the /clock of a simulator, at any speed of it, in place of real time.",
@@ -151,6 +158,10 @@ class Fly(RouteWords):
         if autopilot is None:
             for sentence in limits_beyond_stops(scenario) + opposite_signs(scenario):
                 warn(f"warning: {sentence}")
+        composed = self.composed
+        if self._may_choose(scenario) and not stepping:
+            stepping = _falls_back(shortage([scenario], cores_given, composed=composed))
+            composed = composed or stepping
         learn = _learner(scenario)
         run = new_run(scenario, self.runs)
         self.context.call_on_close(partial(remove_empty, run))
@@ -159,6 +170,7 @@ class Fly(RouteWords):
         else:
             scenario = as_flown(scenario, run, namespace)
         self._watch(run)
+        by_clock = self.use_sim_time or (scenario.flight.use_sim_time and not stepping)
         with flight_progress(scenario.flight.duration, quiet=self.as_json) as (progress, announce):
             if self.in_process:
                 outcome = fly_in_process(scenario, run, progress, learn, announce)
@@ -168,9 +180,8 @@ class Fly(RouteWords):
                     run,
                     progress,
                     lockstep=stepping,
-                    one_process=self.composed,
-                    use_sim_time=self.use_sim_time
-                    or (scenario.flight.use_sim_time and not stepping),
+                    one_process=composed,
+                    use_sim_time=by_clock,
                     autopilot=autopilot,
                     namespace=namespace,
                     announce=announce,
@@ -198,8 +209,22 @@ class Fly(RouteWords):
             require(unset, f"--{name}", "no --route", "the file of a route: --route FILE")
         return scenario if files is None else self._with_files(scenario)
 
+    def _may_choose(self, scenario: Scenario) -> bool:
+        """Return whether the host decides between real time and lockstep.
+
+        An autopilot, a simulator and a user who activates the controller have a time of their own.
+        """
+        by_clock = self.use_sim_time or scenario.flight.use_sim_time
+        has_own_time = by_clock or self.bridge is not None
+        controller = scenario.controller
+        begins = controller.autostart and controller.start_active
+        return begins and not (self.real_time or self.in_process or has_own_time)
+
     def _require_one_way(self, *, stepping: bool) -> None:
         """Raise ParameterError for two ways to fly at once."""
+        other = self.in_process or self.use_sim_time or stepping
+        contradiction = "a flight in lockstep, in one process or by /clock"
+        require(not (self.real_time and other), "--real-time", contradiction, "one of the two")
         for name in ("lockstep", "composed"):
             ways = not (self.in_process and getattr(self, name))
             require(
@@ -251,6 +276,15 @@ class Fly(RouteWords):
     def _fly_fleet(self) -> NoReturn:
         """Fly a fleet, with the page of all aircraft, and exit with the severest status."""
         fleet = open_fleet(self.scenario, self.duration, use_sim_time=self.use_sim_time)
+        has_own_time = fleet.lockstep or fleet.use_sim_time
+        require(
+            not (self.real_time and has_own_time),
+            "--real-time",
+            "a fleet in lockstep or by /clock",
+            "one of the two",
+        )
+        if not (self.real_time or has_own_time):
+            fleet = _as_host_allows(fleet)
         runs = new_runs(fleet, self.runs)
         self.context.call_on_close(partial(remove_empty, *runs))
         self._watch(*runs, fleet=True)
@@ -264,6 +298,28 @@ class Fly(RouteWords):
 
         print(*self.context.with_resource(watched(*runs, fleet=fleet)), sep="\n", file=sys.stderr)
         _warn_of_browser()
+
+
+def _falls_back(lack: str, *, can_step: bool = True) -> bool:
+    """Return whether a flight leaves real time for what the host lacks, and tell the user.
+
+    If it cannot fly in lockstep, it stays in real time and the sentence is a warning.
+    """
+    if lack and can_step:
+        warn(f"this host {lack}: flying in lockstep; --real-time flies in real time all the same")
+    elif lack:
+        warn(f"warning: this host {lack}, and aircraft with a delay do not fly in lockstep")
+    return bool(lack) and can_step
+
+
+def _as_host_allows(fleet: Fleet) -> Fleet:
+    """Return the fleet as the host can fly it: in real time, or in lockstep and composed."""
+    scenarios = [member.scenario for member in fleet.members]
+    lack = shortage(scenarios, cores_given, composed=fleet.composed)
+    has_common_time = any(member.delay > 0.0 for member in fleet.members)
+    if _falls_back(lack, can_step=not has_common_time):
+        return replace(fleet, lockstep=True, composed=True)
+    return fleet
 
 
 def _warn_of_browser() -> None:

@@ -282,10 +282,12 @@ def sim_time_argument() -> DeclareLaunchArgument:
     )
 
 
-def by_rise_di(flight: Flight, file: str) -> list[Action]:
+def by_rise_di(flight: Flight, file: str, *, has_own_time: bool = False) -> list[Action]:
     """`rise-di fly` of a scenario or of a fleet, with the arguments of the launch.
 
-    Its exit status decides on that of the launch, 1 where a flight was not completed.
+    It keeps to real time, because a launch file flies beside other nodes, unless the fleet
+    `has_own_time`. Its exit status decides on that of the launch, 1 where a flight was not
+    completed.
     """
 
     def end(event: ProcessExited, context: LaunchContext) -> Sequence[Action]:
@@ -293,8 +295,10 @@ def by_rise_di(flight: Flight, file: str) -> list[Action]:
             return flight.fail(ended_early(f"rise-di fly ended with status {event.returncode}"))
         return flight.complete()
 
+    by_clock = flight.argument("use_sim_time") == "true"
     options = ["--runs", flight.argument("runs")]
-    options += ["--use-sim-time"] * (flight.argument("use_sim_time") == "true")
+    options += ["--use-sim-time"] * by_clock
+    options += ["--real-time"] * (not (by_clock or has_own_time))
     for name, value in (
         ("duration", flight.argument("duration")),
         ("namespace", flight.namespace),

@@ -1,0 +1,102 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What a host gives to a flight in real time.
+
+As many processes spin as will fly, and each says which share of a core it got. The load of a host
+does not tell this, nor how late a sleeping process wakes: both look alike on a host that can fly
+and on one that cannot.
+"""
+
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.report.display_units import unlike_numbers
+from flight_bringup.graph import FIRST_STAGE, LEARNER, second_stage
+from flight_core.parameters import require
+
+LOOK = 0.5  # s, that the processes spin: a hundred slices of the scheduler
+
+CORES_A_NODE = 0.35
+"""Cores that a node in a process of its own needs. The four of osprey_servo take 1.3 on two idle
+cores."""
+
+CORES_A_PROCESS = 0.6
+"""Cores that all nodes of an aircraft in one process need: they take 0.35, but on a host without
+that much to spare one process gets a single share and the flight loses most of its samples."""
+
+SPINNER = """\
+import sys, time
+sys.stdout.write(".")
+sys.stdout.flush()
+sys.stdin.read(1)
+begin, used = time.monotonic(), time.process_time()
+while time.monotonic() < begin + float(sys.argv[1]):
+    pass
+print((time.process_time() - used) / (time.monotonic() - begin))
+"""
+"""It says that it has started, waits for a byte, spins, and prints its share of a core."""
+
+CoresGiven = Callable[[int], float]
+"""How many cores the host gives to a number of processes together."""
+
+
+def processes_of(scenario: Scenario, *, composed: bool) -> int:
+    """Return how many processes of a flight compute all the time.
+
+    The learner does not count: it searches now and then, and a late model harms no flight.
+    """
+    if composed:
+        return 1
+    nodes = (*FIRST_STAGE, *second_stage(scenario))
+    return sum(node is not LEARNER for node in nodes)
+
+
+def shortage(
+    scenarios: Sequence[Scenario], cores_given: CoresGiven, *, composed: bool = False
+) -> str:
+    """Return what the host lacks for these flights at once, in real time; empty if nothing.
+
+    The text goes on behind "this host": "gives 0.5 of the 1.4 cores that a flight in real time
+    needs".
+    """
+    processes = sum(processes_of(scenario, composed=composed) for scenario in scenarios)
+    needed = processes * (CORES_A_PROCESS if composed else CORES_A_NODE)
+    given = cores_given(processes)
+    if given >= needed:
+        return ""
+    shown = unlike_numbers(given, needed)
+    return f"gives {shown[0]} of the {shown[1]} cores that a flight in real time needs"
+
+
+def cores_given(processes: int) -> float:
+    """Return how many cores the host gives to processes that spin side by side for LOOK.
+
+    Raises ParameterError if they cannot be started.
+    """
+    command = [sys.executable, "-I", "-S", "-c", SPINNER, str(LOOK)]
+    shares = []
+    with ExitStack() as stack:
+        spinners = [
+            stack.enter_context(
+                subprocess.Popen(  # noqa: S603 - our own interpreter
+                    command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+                )
+            )
+            for _ in range(processes)
+        ]
+        for spinner in spinners:
+            if spinner.stdout is not None:
+                spinner.stdout.read(1)
+        # All have started: their spans are the same.
+        for spinner in spinners:
+            if spinner.stdin is not None:
+                spinner.stdin.write(".")
+                spinner.stdin.flush()
+        for spinner in spinners:
+            line = "" if spinner.stdout is None else spinner.stdout.read()
+            require(bool(line.strip()), "this host", "no answer of a process", "a share of a core")
+            shares.append(float(line))
+    return sum(shares)
