@@ -20,6 +20,8 @@
 PYTHON ?= python3
 SCENARIO ?= osprey_servo
 UV_VERSION := 0.13.8
+# The exit status of a flight in real time on a host that became too busy, which rise-di fly has said: docs/outcomes.md.
+HOST := 7
 SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
 
@@ -46,7 +48,7 @@ endif
 .PHONY: fly test test-fast test-sitl mutants check docs pictures pages evidence source-proof foxglove autopilot messages wheel setup setup-all lock clean
 
 fly: setup
-	@$(BIN)/rise-di fly $(SCENARIO) $(ARGS)
+	@$(BIN)/rise-di fly $(SCENARIO) $(ARGS) || { status=$$?; [ $$status -eq $(HOST) ] || exit $$status; }
 
 # The workers fill the processors: threads of OpenBLAS would only wait for each other.
 test test-fast: export OPENBLAS_NUM_THREADS = 1

@@ -43,6 +43,7 @@ STATUSES = {
     End.ENDED_EARLY: (3, 3),
     End.NEVER_FLEW: (3, 3),
     End.INTERRUPTED: (130, 130),
+    End.HOST: (7, 4),
     End.IMPORTED: (0, 4),
     End.UNKNOWN: (4, 4),
 }

@@ -89,7 +89,8 @@ class Fly(RouteWords):
     and one process an aircraft, and a sentence says so. Exit status: 0 completed or landed, 2 bad
     input, 3 ended early or never flew, 4 completed or landed and short of something, which the
     outcome names with its figure: the errors, the law engaged, speed, height, fence, route,
-    touch-down zone, log; 130 interrupted. Of a fleet it is the severest of its aircraft.
+    touch-down zone, log; 7 the host became too busy for real time, and nothing else is wrong; 130
+    interrupted. Of a fleet it is the severest of its aircraft.
     """
 
     context: typer.Context

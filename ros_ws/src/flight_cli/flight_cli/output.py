@@ -30,6 +30,7 @@ from flight_analysis.report.flown_models import flown_loops
 from flight_analysis.report.summary import RecordedFlight, command_results, finite_or_null
 from flight_analysis.report.summary_rows import Column
 from flight_core.files import write_file, writing
+from flight_core.outcome import STATUS_HOST
 from flight_core.parameters import require
 
 if TYPE_CHECKING:
@@ -46,7 +47,7 @@ LATEST = Path("runs/latest")  # the run of a command that is given none
 
 def show_outcome(console: Console, outcome: Mapping[str, Any]) -> None:
     """Print the headline of an outcome, and below it what does not stand in it."""
-    style = "bold" if outcome["status"] == 0 else "bold red"
+    style = {0: "bold", STATUS_HOST: "bold yellow"}.get(outcome["status"], "bold red")
     say(console, f"outcome: {outcome['sentence']}", style=style)
     for detail in outcome["details"]:
         say(console, f"  - {detail}")

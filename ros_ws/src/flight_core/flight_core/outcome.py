@@ -18,9 +18,10 @@ STATUS_ENDED_EARLY = 3  # also of a node
 STATUS_SHORTFALL = 4  # the flight reached its end, and falls short of something
 STATUS_LANDED = 5  # of the node of an aircraft alone, which ends with the landing
 STATUS_LOST_CONTACT = 6  # of a node alone: another node has ended, and that is the cause
+STATUS_HOST = 7  # the host was too busy for a flight in real time, and nothing else is wrong
 STATUS_INTERRUPTED = 130
 
-SEVEREST = (0, STATUS_SHORTFALL, STATUS_ENDED_EARLY, STATUS_INTERRUPTED)
+SEVEREST = (0, STATUS_HOST, STATUS_SHORTFALL, STATUS_ENDED_EARLY, STATUS_INTERRUPTED)
 """Exit statuses of flights; that of several flights is the last one of theirs."""
 
 
@@ -40,6 +41,7 @@ class End(StrEnum):
     ENDED_EARLY = "ended early"
     NEVER_FLEW = "never flew"
     INTERRUPTED = "interrupted"  # by the user
+    HOST = "host"  # the host starved a flight in real time: it is no finding about the law
     IMPORTED = "imported"  # a log that another program wrote
     UNKNOWN = "unknown"
 
@@ -110,11 +112,16 @@ class Outcome:
 
     @property
     def status(self) -> int:
-        """The exit status: 0 for a flight without a shortfall that reached the end."""
+        """The exit status: 0 for a flight without a shortfall that reached the end.
+
+        A shortfall of a starved flight lies outside of the starved spans, so it counts.
+        """
         if self.end is End.INTERRUPTED:
             return STATUS_INTERRUPTED
         if self.end in {End.ENDED_EARLY, End.NEVER_FLEW}:
             return STATUS_ENDED_EARLY
+        if self.end is End.HOST and not self.shortfalls:
+            return STATUS_HOST
         return STATUS_SHORTFALL if self.shortfalls or self.end is End.UNKNOWN else 0
 
     def __str__(self) -> str:
@@ -190,6 +197,11 @@ UNKNOWN = Outcome(End.UNKNOWN, "neither the run nor the log has one")
 def never_flew(reason: str) -> Outcome:
     """The outcome of a flight without a begin."""
     return Outcome(End.NEVER_FLEW, bounded(reason))
+
+
+def host_starved(reason: str) -> Outcome:
+    """The outcome of a flight in real time on a host that is too busy for it."""
+    return Outcome(End.HOST, bounded(reason))
 
 
 def ended_early(reason: str) -> Outcome:

@@ -7,6 +7,8 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.metrics import TRUE_ERROR, best_error
 from flight_analysis.report.sample_counts import (
@@ -20,9 +22,10 @@ from flight_analysis.report.sample_counts import (
     TopicAccount,
     topic_accounts,
 )
+from flight_analysis.report.starvation import Starvation, starvation
 from flight_core.outcome import COMPLETED, End, Outcome
 from flight_core.rates import nanoseconds, seconds
-from flight_core.tape import Signal, Tape
+from flight_core.tape import Recording, Signal, Tape
 from flight_log.clock import LEAPS, SINCE_EPOCH_NS
 
 REPEATS = 0.01  # largest share of equal stamps of a topic whose stamps are all different
@@ -60,6 +63,13 @@ class Account(NamedTuple):
     commands: Commands | None = None
     # s, flight time of the first u of a flight that flew less than half of its time
     late: float | None = None
+    starved: tuple[tuple[float, float], ...] = ()  # s, spans in which the host starved the nodes
+    host_lacks: tuple[str, ...] = ()  # those of `lacks` that are the host's
+
+    @property
+    def starvation(self) -> Starvation:
+        """The spans in which the host starved the nodes."""
+        return Starvation(self.starved)
 
     def over(self, *topics: str) -> str:
         """The part of these topics that a figure is taken over; empty for whole topics."""
@@ -141,11 +151,15 @@ def account(
         topic.expected and not topic.found and not topic.unset for topic in guided
     )
     first = _late_first_u(tape, topics, scenario) if span.from_start else None
-    lacks = [
-        lack
-        for name, topic in topics.items()
-        if (lack := _lack(name, topic, end, late.get(name, 0.0), late_u=first is not None))
-    ]
+    starved = Starvation() if scenario is None else starvation(tape, scenario, topics, end)
+    lacks = []
+    host_lacks = []
+    for name, topic in topics.items():
+        last = late.get(name, 0.0)
+        lack = _lack(name, topic, end, last, late_u=first is not None)
+        lacks += [lack] if lack else []
+        if lack and _is_of_host(tape, name, topic, starved, end - last):
+            host_lacks.append(lack)
     busy = [
         f"{topic.unsent} of {topic.expected} {name} were never sent"
         for name, topic in topics.items()
@@ -162,6 +176,8 @@ def account(
         unguided=unguided,
         processes=_processes(tape),
         late=first if first is not None and first > end / 2.0 else None,
+        starved=starved.spans,
+        host_lacks=tuple(host_lacks),
     )
 
 
@@ -297,6 +313,24 @@ def _lack(name: str, topic: TopicAccount, end: float, late: float, *, late_u: bo
     if topic.expected is None:
         return f"{name}: {', '.join(facts)}"
     return ", ".join([f"{name} {topic.found} of {topic.expected} samples", *facts])
+
+
+def _is_of_host(
+    tape: Tape, name: str, topic: TopicAccount, starved: Starvation, end: float
+) -> bool:
+    """Whether the host alone is the cause of what a topic lacks.
+
+    No message was lost and no stamp is wrong, so what is missing was never sent. The topic goes on
+    to the `end`, s, and a late begin lies in a starved span.
+    """
+    is_whole = tape.recording.get(name, Recording(0)).lost == 0
+    has_stamps = not (topic.step or topic.unset or topic.left_out or topic.repeated)
+    if not (starved.spans and is_whole and has_stamps and topic.is_of_stack):
+        return False
+    if topic.first is None or topic.last is None or topic.last < end - SILENCE:
+        return False
+    before = np.array([topic.first - SILENCE / 2.0])
+    return topic.first <= SILENCE or bool(starved.holds(before)[0])
 
 
 def account_of_json(summary: Mapping[str, Any]) -> Account | None:

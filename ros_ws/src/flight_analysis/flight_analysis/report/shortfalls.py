@@ -12,6 +12,9 @@ A flight succeeds where
 - the aircraft stayed inside the fence, flew every leg of the route and joined the last orbit,
 - a landing ended in the touch-down zone,
 - and the log holds the whole flight.
+
+Where the host starved a flight in real time, the flight says nothing about the law. What it falls
+short of for that alone is no shortfall: its end is HOST.
 """
 
 import math
@@ -33,13 +36,16 @@ from flight_analysis.report.guided import (
     unflown_legs,
 )
 from flight_analysis.report.sample_counts import is_simulated
-from flight_analysis.report.tracking import tracking_verdict
+from flight_analysis.report.starvation import Starvation
+from flight_analysis.report.tracking import TrackingVerdict, tracking_verdict
 from flight_core.modes import Mode
-from flight_core.outcome import Aim, Allowance, End, Outcome, Shortfall, never_flew
+from flight_core.outcome import Aim, End, Outcome, Shortfall, host_starved, never_flew
 from flight_core.rates import seconds
 from flight_core.tape import Tape
 from flight_guidance.params import GuidanceConfig
 from rise_di_controller.params import ControllerConfig
+
+FED = Starvation()  # of a host that gave a flight what it needs
 
 ENGAGED = 0.9
 """Least share of the ticks with the law engaged: with u held or at trim for longer, no figure is of
@@ -57,6 +63,10 @@ def judge(
 
     `controller`: of a flight without a scenario; None: the errors are not judged.
     """
+    starved = account.starvation
+    seems_unflown = outcome.end is End.NEVER_FLEW or account.late is not None
+    if seems_unflown and starved.length > account.end / 2.0:
+        return _never_flown_by_host(starved, account.end)
     if outcome.end is End.COMPLETED and account.late is not None:
         return never_flew(f"the first u came at t = {account.late:.3f} of {account.end:.3f} s")
     if outcome.end is End.COMPLETED and account.unguided:
@@ -72,27 +82,44 @@ def judge(
         aircraft = scenario.aircraft
         section = scenario.guidance
     may_pause = _may_pause(tape, scenario)
-    allowances: tuple[Allowance, ...] = ()
-    shortfalls = _engagement(tape, may_pause=may_pause)
-    if scenario is not None:
-        shortfalls += reference_shortfalls(tape, scenario)
+    verdict = TrackingVerdict([], [])
     if controller is not None:
-        verdict = tracking_verdict(tape, controller, aircraft, may_pause=may_pause)
-        shortfalls += verdict.shortfalls
-        allowances = tuple(verdict.allowances)
-    shortfalls += _height(tape, aircraft, section)
+        verdict = tracking_verdict(tape, controller, aircraft, may_pause=may_pause, starved=starved)
+    engagement = _engagement(tape, may_pause=may_pause, starved=starved)
+    has_paused = bool(_engagement(tape, may_pause=may_pause)) and not engagement
+    of_path = _height(tape, aircraft, section)
     if section is not None:
-        shortfalls += _guided(tape, section, has_landed=outcome.end is End.LANDED)
-    for lack in account.lacks:
-        topic = lack.partition(",")[0]
-        shortfalls.append(
-            Shortfall(
-                aim=Aim.LOG, sentence=f"log incomplete: {lack}", brief=f"log incomplete: {topic}"
-            )
-        )
-    # The log of one aircraft does not tell of the others.
-    of_fleet = (each for each in outcome.shortfalls if each.aim is Aim.SEPARATION)
-    return replace(outcome, shortfalls=(*of_fleet, *shortfalls), allowances=allowances)
+        of_path += _guided(tape, section, has_landed=outcome.end is End.LANDED)
+    # The path of an aircraft adds up all that the host withheld.
+    says_nothing_of_path = starved.length > (1.0 - ENGAGED) * account.end
+    shortfalls = [
+        # The log of one aircraft does not tell of the others.
+        *(each for each in outcome.shortfalls if each.aim is Aim.SEPARATION),
+        *engagement,
+        *([] if scenario is None else reference_shortfalls(tape, scenario)),
+        *verdict.shortfalls,
+        *([] if says_nothing_of_path else of_path),
+        *(_incomplete(lack) for lack in account.lacks if lack not in account.host_lacks),
+    ]
+    judged = replace(outcome, shortfalls=tuple(shortfalls), allowances=tuple(verdict.allowances))
+    is_excused = has_paused or verdict.is_excused or (says_nothing_of_path and bool(of_path))
+    if not (is_excused or account.host_lacks):
+        return judged
+    silent = f"{starved.length:.0f} of {account.end:.0f} s say nothing about the law"
+    return replace(judged, end=End.HOST, reason=f"this host was too busy for real time: {silent}")
+
+
+def _incomplete(lack: str) -> Shortfall:
+    """Return what the log lacks as a shortfall."""
+    brief = f"log incomplete: {lack.partition(',')[0]}"
+    return Shortfall(aim=Aim.LOG, sentence=f"log incomplete: {lack}", brief=brief)
+
+
+def _never_flown_by_host(starved: Starvation, end: float) -> Outcome:
+    """Return the outcome of a flight of `end` s that could not begin for its host."""
+    return host_starved(
+        f"never flew: this host was too busy for real time in {starved.length:.0f} of {end:.0f} s"
+    )
 
 
 def _may_pause(tape: Tape, scenario: Scenario | None) -> bool:
@@ -106,15 +133,20 @@ def _may_pause(tape: Tape, scenario: Scenario | None) -> bool:
     return not (scenario.controller.autostart and scenario.controller.start_active)
 
 
-def _engagement(tape: Tape, *, may_pause: bool) -> list[Shortfall]:
-    """Return a shortfall if the law was engaged in too few of the ticks."""
+def _engagement(tape: Tape, *, may_pause: bool, starved: Starvation = FED) -> list[Shortfall]:
+    """Return a shortfall if the law was engaged in too few of the ticks.
+
+    Those in spans in which the host `starved` the flight do not count.
+    """
     if "internals" not in tape or "mode" not in tape["internals"].names:
         return []
     mode = tape["internals"]["mode"]
+    is_asked = ~starved.holds(tape.time("internals"))
     if may_pause:
-        mode = mode[mode != Mode.INACTIVE]
+        is_asked &= mode != Mode.INACTIVE
     elif "u" in tape and len(tape["u"].stamp_ns):
-        mode = mode[tape["internals"].stamp_ns >= tape["u"].stamp_ns[0]]
+        is_asked &= tape["internals"].stamp_ns >= tape["u"].stamp_ns[0]
+    mode = mode[is_asked]
     if not len(mode):
         return []
     share = float(np.mean(mode == Mode.ENGAGED))

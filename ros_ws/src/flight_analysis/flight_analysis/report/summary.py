@@ -52,6 +52,7 @@ from flight_analysis.report.guided import guidance_notices, guidance_summary
 from flight_analysis.report.model_spans import errors_by_model
 from flight_analysis.report.sample_counts import WHOLE, ends_last, is_simulated
 from flight_analysis.report.shortfalls import judge
+from flight_analysis.report.starvation import BUSY
 from flight_analysis.report.timing import (
     AgeMetrics,
     LatencyMetrics,
@@ -348,7 +349,6 @@ def command_results(summary: Mapping[str, Any]) -> str:
 
 
 STANDS_STILL = 5.0  # s, after which a vane at the end of a flight is named
-BUSY = 0.05  # share of the ticks without a new y of a host that is too busy
 
 
 def _with_late_ticks(

@@ -33,6 +33,7 @@ from flight_analysis.report.display_units import (
     unlike_numbers,
 )
 from flight_analysis.report.linear_flight import AIRSPEED, ErrorPair, error_pair
+from flight_analysis.report.starvation import Starvation
 from flight_core.modes import Mode
 from flight_core.outcome import Aim, Allowance, Shortfall
 from flight_core.rates import seconds
@@ -86,6 +87,7 @@ class TrackingVerdict(NamedTuple):
 
     shortfalls: list[Shortfall]
     allowances: list[Allowance]
+    is_excused: bool = False  # an output is off where the host starved the flight, and only there
 
 
 def tracking_verdict(
@@ -94,11 +96,13 @@ def tracking_verdict(
     aircraft: AircraftConfig | None,
     *,
     may_pause: bool = True,
+    starved: Starvation | None = None,
 ) -> TrackingVerdict:
     """Return the outputs with a larger error than allowed, and those that noise or wind excuses.
 
     Each comes with the worst part of the flight. If the law `may_pause`, the ticks in which it is
-    inactive do not count.
+    inactive do not count. Nothing is said about the law in the spans in which the host `starved`
+    the flight.
     """
     nothing = TrackingVerdict([], [])
     if not {"y", "y_m"} <= set(tape.signals):
@@ -106,6 +110,17 @@ def tracking_verdict(
     pair = error_pair(tape, controller, aircraft, may_pause=may_pause)
     if pair is None or not _has_engaged(tape):
         return nothing
+    verdict = _verdict(pair, aircraft)
+    if starved is None or not starved.spans or not verdict.shortfalls:
+        return verdict
+    fed = pair._replace(is_flown=pair.is_flown & ~starved.holds(pair.t))
+    remaining = _verdict(fed, aircraft) if fed.is_flown.any() else nothing
+    is_excused = len(remaining.shortfalls) < len(verdict.shortfalls)
+    return remaining._replace(is_excused=is_excused)
+
+
+def _verdict(pair: ErrorPair, aircraft: AircraftConfig | None) -> TrackingVerdict:
+    """Return what the errors of the flown ticks say."""
     if not pair.is_flown.any():
         sentence = "no error in the log while the law was engaged"
         return TrackingVerdict([Shortfall(aim=Aim.LOG, sentence=sentence)], [])

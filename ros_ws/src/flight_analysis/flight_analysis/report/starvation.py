@@ -1,0 +1,121 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The spans of a flight in real time in which the host starved the nodes.
+
+A node of the stack sends a sample at each instant of its rate, and numbers its messages. If an
+instant has no sample and no number is missing, the node did not send: the host did not let it run.
+The errors of the flight say nothing about that, and are not asked.
+
+A law that computes for too long leaves out ticks too, so ticks count only where another node has
+left out samples as well. Where a publisher is replaced, or messages were lost, a gap is no proof.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.metrics import mask_spans
+from flight_analysis.report.sample_counts import TopicAccount, is_real_time, is_sent_by_stack
+from flight_core.tape import Recording, Tape
+from flight_core.vectors import FloatArray
+
+BUSY = 0.05  # share of the ticks that a host leaves out that is too busy
+
+WINDOW = 1.0  # s, over which BUSY is taken: a single missing sample is no starvation
+
+RECOVERY = 5.0
+"""s, after a starved part, that its errors need to decay: the airspeed of the osprey settles within
+them."""
+
+
+class Starvation(NamedTuple):
+    """The spans of a flight that say nothing about the law, s of flight time, in order."""
+
+    spans: tuple[tuple[float, float], ...] = ()
+
+    @property
+    def length(self) -> float:
+        """How long the spans are together, s."""
+        return math.fsum(stop - start for start, stop in self.spans)
+
+    def holds(self, t: FloatArray) -> NDArray[np.bool_]:
+        """Return the mask of the instants t, (N,), that lie within a span."""
+        inside = np.zeros(len(t), dtype=bool)
+        for start, stop in self.spans:
+            inside |= (t >= start) & (t <= stop)
+        return inside
+
+
+def starvation(
+    tape: Tape, scenario: Scenario, topics: Mapping[str, TopicAccount], end: float
+) -> Starvation:
+    """Return the spans of a flight of `end` s in which its host starved the nodes.
+
+    A flight in lockstep, in one process or by the clock of a simulator has none.
+    """
+    if not is_real_time(tape) or tape.is_by_clock or end <= 0.0:
+        return Starvation()
+    step = 1.0 / scenario.controller.rate
+    count = math.ceil(end / step)
+    drops = scenario.aircraft.sensors.dropout > 0.0
+    rates = {
+        # A sensor may drop samples of y, and truth has an instant for each of them.
+        "truth" if drops else "y": scenario.aircraft.rate,
+        "y_m": scenario.reference_model.rate,
+    }
+    is_missing = np.zeros(count, dtype=bool)
+    for name, rate in rates.items():
+        if name in topics and topics[name].is_of_stack:
+            is_missing |= _missing(tape, name, max(step, 1.0 / rate), step, count)
+    length = max(round(WINDOW / step), 1)
+    is_starved = _windowed(is_missing, length) >= 1.0
+    if not drops:
+        is_missing |= _missing(tape, "internals", step, step, count)
+    is_starved &= _windowed(is_missing, length) >= BUSY * length
+    # Each such instant is the middle of a part of WINDOW that was starved.
+    t: FloatArray = step * np.arange(count, dtype=np.float64)
+    spans: list[tuple[float, float]] = []
+    for start, stop in mask_spans(t, is_starved):
+        begin = max(start - WINDOW / 2.0, 0.0)
+        last = min(stop + WINDOW / 2.0 + RECOVERY, end)
+        if spans and begin <= spans[-1][1]:
+            spans[-1] = (spans[-1][0], last)
+        else:
+            spans.append((begin, last))
+    return Starvation(tuple(spans))
+
+
+def _missing(tape: Tape, name: str, period: float, step: float, count: int) -> NDArray[np.bool_]:
+    """Return the mask of the instants k step, (count,), that a node left out of a topic.
+
+    `period`: of the samples, at least a step, s.
+    """
+    is_missing = np.zeros(count, dtype=bool)
+    signal = tape.signals.get(name)
+    has_all = tape.recording.get(name, Recording(0)).lost == 0
+    if signal is None or not has_all or not is_sent_by_stack(tape, name):
+        return is_missing
+    t = tape.time(name)
+    if name == "internals":
+        t = t + signal["age"]  # the instant of the tick
+    for k in np.flatnonzero(np.diff(t) >= 1.5 * period):
+        is_replaced = signal.sender is not None and signal.sender[k] != signal.sender[k + 1]
+        if is_replaced:
+            continue
+        left_out = t[k] + period * np.arange(1, round((t[k + 1] - t[k]) / period))
+        instants = np.floor(left_out / step).astype(int)
+        is_missing[instants[(instants >= 0) & (instants < count)]] = True
+    return is_missing
+
+
+def _windowed(is_missing: NDArray[np.bool_], length: int) -> FloatArray:
+    """Return how many instants are missing within a window around each, (N,)."""
+    total = np.concatenate([[0.0], np.cumsum(is_missing)])
+    k = np.arange(len(is_missing))
+    first = np.maximum(k - length // 2, 0)
+    last = np.minimum(first + length, len(is_missing))
+    return np.asarray(total[last] - total[first])
