@@ -188,7 +188,8 @@ class Fly(RouteWords):
                     announce=announce,
                 )
             if outcome.end is End.COMPLETED:
-                progress(scenario.flight.duration, str(outcome))
+                # Whether it is a success is for the report to say, which is not written yet.
+                progress(scenario.flight.duration, "flown")
         status = _report(scenario, run, outcome, as_json=self.as_json, verbose=self.verbose)
         raise typer.Exit(status)
 

@@ -56,6 +56,7 @@ from flight_analysis.report.summary import (
 )
 from flight_analysis.report.summary_rows import INPUT_COLUMNS, Column
 from flight_core.files import replacing
+from flight_core.outcome import STATUS_HOST
 from flight_core.vectors import FloatArray
 
 HERE = Path(__file__).parent
@@ -72,6 +73,7 @@ class TitleLine(NamedTuple):
     outcome: str = ""
     details: Sequence[str] = ()
     is_success: bool = False
+    is_of_host: bool = False  # amber: nothing is wrong with the aircraft
     label: str = ""
     colour: str = ""
 
@@ -249,7 +251,11 @@ def _outcome_line(text: str, flight: RecordedFlight) -> TitleLine:
     """A line with the outcome of a flight."""
     outcome = flight.summary["outcome"]
     return TitleLine(
-        text, outcome["sentence"], outcome["details"], is_success=outcome["status"] == 0
+        text,
+        outcome["sentence"],
+        outcome["details"],
+        is_success=outcome["status"] == 0,
+        is_of_host=outcome["status"] == STATUS_HOST,
     )
 
 
