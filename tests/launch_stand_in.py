@@ -196,6 +196,7 @@ class ExecuteProcess(Action):
 class Node(Action):
     executable: str
     package: str
+    name: str | None = None
     namespace: Any = None
     exec_name: str | None = None
     parameters: Sequence[Any] = field(default_factory=list)

@@ -60,7 +60,7 @@ NODES: dict[str, type[Config]] = {
     name: schema for name, schema in SCHEMAS.items() if name != "flight"
 }
 NODES["bridge"] = BridgeConfig
-SHARED = "flight_bringup.launch.stages"
+SHARED = ("flight_bringup.launch.stages", "flight_bringup.launch.flight")
 PID = 0  # of a process of this launch
 T = TypeVar("T")
 Case = tuple[list[Any], LaunchContext, tuple[str, ...], tuple[str, ...]]
@@ -74,9 +74,11 @@ def launch(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         monkeypatch.delenv(name)
     for name, module in stand_in.modules().items():
         monkeypatch.setitem(sys.modules, name, module)
-    monkeypatch.delitem(sys.modules, SHARED, raising=False)
+    for name in SHARED:
+        monkeypatch.delitem(sys.modules, name, raising=False)
     yield
-    sys.modules.pop(SHARED, None)
+    for name in SHARED:
+        sys.modules.pop(name, None)
 
 
 @pytest.fixture(scope="module", autouse=True)

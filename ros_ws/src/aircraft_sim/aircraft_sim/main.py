@@ -4,10 +4,12 @@
 
 from flight_ros.startup import start_nodes
 
+PARAMETERS = ("aircraft", "aircraft_sim.params:AircraftConfig")
+
 
 def main() -> None:
     """Start the node."""
-    start_nodes("aircraft_sim.node:AircraftNode")
+    start_nodes("aircraft_sim.node:AircraftNode", parameters=PARAMETERS)
 
 
 if __name__ == "__main__":

@@ -32,9 +32,8 @@ from flight_bringup.graph import (
     require_limits,
     second_stage,
 )
+from flight_bringup.launch.flight import Flight, argument
 from flight_bringup.launch.stages import (
-    Flight,
-    argument,
     boolean_argument,
     end_with_log,
     flight_node,

@@ -12,9 +12,8 @@ from launch.action import Action
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 
 from flight_bringup.fleet import read_fleet
+from flight_bringup.launch.flight import Flight, argument
 from flight_bringup.launch.stages import (
-    Flight,
-    argument,
     by_rise_di,
     runs_argument,
     sim_time_argument,

@@ -34,10 +34,9 @@ from flight_bringup.graph import (
     parameter_overrides,
     second_stage,
 )
+from flight_bringup.launch.flight import Flight, argument
 from flight_bringup.launch.stages import (
     BOOLEAN,
-    Flight,
-    argument,
     begin_when_matched,
     boolean_argument,
     by_rise_di,
@@ -115,23 +114,10 @@ def _fly(context: LaunchContext) -> list[Action]:
     value = argument(context, "lockstep")
     lockstep = value == "true" or (value == "" and scenario.flight.lockstep)
     by_rosbag2 = argument(context, "recorder") == "rosbag2"
-    require(
-        not (by_rosbag2 and lockstep),
-        "recorder",
-        "rosbag2 in lockstep",
-        "true: the aircraft waits for the stack's recorder",
-    )
-    for spec in others:
-        require(not lockstep, spec.executable, "false in lockstep", "true: the nodes of the stack")
-    if argument(context, "use_sim_time") == "true" or scenario.flight.use_sim_time:
-        own = " and ".join([spec.executable for spec in others] + ["params_file"] * bool(further))
-        require(not own, "use_sim_time", f"true beside {own} of your own", "nodes by `ros2 run`")
-        require(
-            not (lockstep or by_rosbag2),
-            "use_sim_time",
-            f"true {'in lockstep' if lockstep else 'with rosbag2'}",
-            "a flight in real time, recorded by the stack",
-        )
+    is_simulated = argument(context, "use_sim_time") == "true" or scenario.flight.use_sim_time
+    own = [*(spec.executable for spec in others), *(["params_file"] * bool(further))]
+    _require_possible(own, lockstep=lockstep, by_rosbag2=by_rosbag2, is_simulated=is_simulated)
+    if is_simulated:
         return by_rise_di(flight, argument(context, "scenario"))
     flight.run = run = new_run(scenario, Path(argument(context, "runs")))
     if further:
@@ -176,3 +162,29 @@ def _fly(context: LaunchContext) -> list[Action]:
         publishes=published,
     )
     return watch_page(flight) + stages
+
+
+def _require_possible(
+    own: Sequence[str], *, lockstep: bool, by_rosbag2: bool, is_simulated: bool
+) -> None:
+    """Raise ParameterError for arguments that exclude each other.
+
+    `own` are those that give a flight nodes or values of its user.
+    """
+    require(
+        not (by_rosbag2 and lockstep),
+        "recorder",
+        "rosbag2 in lockstep",
+        "true: the aircraft waits for the stack's recorder",
+    )
+    for name in set(own) - {"params_file"}:
+        require(not lockstep, name, "false in lockstep", "true: the nodes of the stack")
+    if is_simulated:
+        beside = f"true beside {' and '.join(own)} of your own"
+        require(not own, "use_sim_time", beside, "nodes by `ros2 run`")
+        require(
+            not (lockstep or by_rosbag2),
+            "use_sim_time",
+            f"true {'in lockstep' if lockstep else 'with rosbag2'}",
+            "a flight in real time, recorded by the stack",
+        )

@@ -31,9 +31,8 @@ from flight_bringup.graph import (
     parameter_overrides,
     replayed_topics,
 )
+from flight_bringup.launch.flight import Flight, argument
 from flight_bringup.launch.stages import (
-    Flight,
-    argument,
     boolean_argument,
     fail_on_exit,
     flight_node,

@@ -9,12 +9,15 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from flight_analysis.closed_loop.scenario_library import find_scenario
+from flight_analysis.closed_loop.replay import is_controller_alone, recorded_parameters
+from flight_analysis.closed_loop.scenario_library import LIBRARY, find_scenario
 from flight_analysis.report.run_folder import log_account
 from flight_cli.words import option, scenario_names, warn
+from flight_core.files import find_file
 from flight_core.parameters import ParameterError, require
+from flight_core.scenario_file import A_SCENARIO
 from flight_log.bag import COMPARED, IMPORTED
-from flight_log.tape_reader import RecordedRun, read_run
+from flight_log.tape_reader import RecordedRun, read_run, stored_scenario
 
 REMAP = "A topic of remapped nodes, as in y:=/sensors/y; may be repeated."
 
@@ -44,11 +47,18 @@ def remaps_of(words: list[str] | None) -> dict[str, str]:
 
 
 def scenario_file(name: str | None) -> Path | None:
-    """The file of a scenario by name or path; None without a name.
+    """The file of a scenario by name or path, or one of a controller alone; None without a name.
 
     Raises ParameterError for an invalid scenario.
     """
-    return None if name is None else find_scenario(name).path
+    if name is None:
+        return None
+    path = find_file(name, LIBRARY, "scenario", A_SCENARIO)
+    stored = stored_scenario(path)
+    if is_controller_alone(stored):
+        recorded_parameters(stored)
+        return path
+    return find_scenario(name).path
 
 
 def warn_of_lacks(recorded_run: RecordedRun) -> None:

@@ -23,6 +23,7 @@ from flight_analysis.closed_loop.guidance_replay import GuidanceReplay, replay_g
 from flight_analysis.closed_loop.replay import (
     ReplayDifference,
     ReplayResult,
+    is_controller_alone,
     later_aircraft,
     recorded_parameters,
     recorded_scenario,
@@ -77,7 +78,8 @@ class Replay:
         with Console(stderr=True, quiet=self.as_json).status(f"computing {name} again"):
             recorded_run = read_run(self.run, self.namespace, source, remaps_of(self.remap))
             recorded_run.require()
-            parameters = recorded_parameters(recorded_run.scenario_file())
+            stored = recorded_run.scenario_file()
+            parameters = recorded_parameters(stored, recorded_run.namespace)
             others = vary(parameters, controller_changes) if controller_changes else None
             result = recompute(recorded_run, parameters, others)
             guidance_replay = None
@@ -153,6 +155,8 @@ def _claims_of(run: RecordedRun) -> tuple[Guarantee | None, tuple[str, ...]]:
     tape = run.tape
     if run.age_of_u is not None:
         tape = replace(tape, signals={**tape.signals, "age_of_u": run.age_of_u})
+    if is_controller_alone(run.scenario_file()):
+        return None, ()
     scenario = recorded_scenario(run)
     flown = flown_loops(tape, scenario, (), later_aircraft(run, scenario))
     promise = kept_guarantee(flown.loops[0].loop) if flown.loops else None

@@ -101,6 +101,10 @@ def _integer(loader: _Loader, node: yaml.ScalarNode) -> int:
     return int(loader.construct_scalar(node), 0)
 
 
+def _sequence(loader: _Loader, node: yaml.SequenceNode) -> list[Any]:
+    return loader.construct_sequence(node, deep=True)
+
+
 for _class in (_Loader, _Dumper):
     _class.yaml_implicit_resolvers = {
         first: [*rows] for first, rows in _class.yaml_implicit_resolvers.items()
@@ -114,9 +118,7 @@ for _class in (_Loader, _Dumper):
         )
 _Loader.add_constructor(INT_TAG, _integer)
 # launch_ros writes the lists of parameters so; rcl reads them as lists
-_Loader.add_constructor(
-    "tag:yaml.org,2002:python/tuple", lambda loader, node: loader.construct_sequence(node)
-)
+_Loader.add_constructor("tag:yaml.org,2002:python/tuple", _sequence)
 
 
 def dump_yaml(value: object, *, flow: bool | None = None) -> str:

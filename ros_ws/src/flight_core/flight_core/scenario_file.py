@@ -116,6 +116,11 @@ def gives_all(content: bytes, path: Path, key: str) -> bool:
     )
 
 
+def has_general(content: bytes, path: Path) -> bool:
+    """Whether there is a section for all nodes. Raises as `names_node` does."""
+    return any(pattern.rpartition("/")[2] in WILDCARDS for pattern in _all_sections(content, path))
+
+
 def _all_sections(content: bytes, path: Path) -> dict[str, dict[Any, Any]]:
     """The parameters in a file by the full names of nodes, in order."""
     tree = parse_yaml(limited(content, str(path), A_SCENARIO), str(path), A_SCENARIO)

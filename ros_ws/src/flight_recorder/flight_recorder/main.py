@@ -4,12 +4,14 @@
 
 from flight_ros.startup import start_nodes
 
+PARAMETERS = ("recorder", "flight_recorder.params:RecorderConfig")
+
 
 def main() -> None:
     """Run the recorder."""
     # Not early: a matched recorder receives the history of every publisher. The history delays a
     # flight by 10 to 35 ms, and by 20 to 70 ms while the recorder also loads its modules.
-    start_nodes("flight_recorder.node:RecorderNode", early=False, lower_by=3)
+    start_nodes("flight_recorder.node:RecorderNode", early=False, lower_by=3, parameters=PARAMETERS)
 
 
 if __name__ == "__main__":

@@ -25,21 +25,34 @@ if TYPE_CHECKING:
     from flight_ros.rclpy_private import Participant
 
 USAGE = """usage: {program} --ros-args --params-file SCENARIO.yaml [-p NAME:=VALUE ...] [-r __ns:=/NAMESPACE] [-r NAME:=TOPIC]
+       {program} --print-parameters > MINE.yaml
 
-A node of a flight. SCENARIO.yaml has a section for each node, by its name; -p replaces a parameter of it. The parameters are in
+A node of a flight. --print-parameters prints the keys of the node with their meanings, to be filled in. SCENARIO.yaml has a section for each node, by its name; -p replaces a parameter of it. The parameters are in
 docs/reference/parameters.md, the topics in docs/topics.md. `rise-di fly` starts all nodes of a scenario."""  # noqa: E501 - a text as it is written
+
+PRINT_PARAMETERS = "--print-parameters"
 
 BAD_ENVIRONMENT = 2  # exit status, as of invalid parameters
 
 
-def start_nodes(*nodes: str, early: bool = True, lower_by: int = 0) -> None:
+def start_nodes(
+    *nodes: str, early: bool = True, lower_by: int = 0, parameters: tuple[str, str] | None = None
+) -> None:
     """Run nodes, each "module:class", by `flight_ros.event_loop.run`.
+
+    `--print-parameters` prints the parameter file of a node, to be filled in: `parameters` are its
+    name and the "module:class" of its set.
 
     A signal during the start ends with exit status 0 too. `early`: create a DDS participant before
     the imports. `lower_by`: levels of real-time priority, more for nodes of a longer period.
     """
     if {"--help", "-h"} & {*sys.argv[1:]}:
         print(USAGE.format(program=os.path.basename(sys.argv[0])))  # noqa: PTH119 - pathlib takes as long to import as the rest
+        return
+    if PRINT_PARAMETERS in sys.argv and parameters is not None:
+        name, schema = parameters
+        template = resolve_name("flight_core.parameter_template:parameter_template")
+        print(template(name, resolve_name(schema)), end="")
         return
     try:
         require_ros_environment()

@@ -4,10 +4,12 @@
 
 from flight_ros.startup import start_nodes
 
+PARAMETERS = ("reference_model", "reference_model.params:ReferenceModelConfig")
+
 
 def main() -> None:
     """Start the reference model node."""
-    start_nodes("reference_model.node:ReferenceModelNode")
+    start_nodes("reference_model.node:ReferenceModelNode", parameters=PARAMETERS)
 
 
 if __name__ == "__main__":

@@ -4,10 +4,12 @@
 
 from flight_ros.startup import start_nodes
 
+PARAMETERS = ("controller", "rise_di_controller.rise_di_config:RiseDiConfig")
+
 
 def main() -> None:
     """Start the controller node."""
-    start_nodes("rise_di_controller.node:ControllerNode", lower_by=1)
+    start_nodes("rise_di_controller.node:ControllerNode", lower_by=1, parameters=PARAMETERS)
 
 
 if __name__ == "__main__":

@@ -15,12 +15,13 @@ from numpy.typing import NDArray
 
 from aircraft_sim.params import AircraftConfig
 from flight_analysis.closed_loop.replay_ticks import Change, ParametersInForce, Ticks
-from flight_analysis.closed_loop.scenario import Scenario, parse_scenario, parse_scenario_sections
+from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario, parse_scenario
 from flight_core.arguments import FilePath
 from flight_core.arithmetic import ARITHMETIC
 from flight_core.fields import short_repr
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS
+from flight_core.scenario_file import parse_sections
 from flight_core.tape import Process, Signal, Tape
 from flight_core.vectors import FloatArray
 from flight_log.log_content import StoredFile
@@ -128,13 +129,30 @@ class ReplayResult(NamedTuple):
         )
 
 
-def recorded_parameters(scenario: StoredFile) -> ControllerConfig:
-    """The parameters of the controller in the scenario of a log.
+def recorded_parameters(scenario: StoredFile, namespace: str | None = None) -> ControllerConfig:
+    """The parameters of the controller in the scenario of a log, or in a parameter file.
 
-    Further sections are not validated. Raises ParameterError.
+    A file of the controller in this namespace is enough: further sections are not read. Raises
+    ParameterError.
     """
-    sections = parse_scenario_sections(scenario.content, Path(scenario.name))
+    path = Path(scenario.name)
+    needed = {"controller": AnyLaw}
+    try:
+        sections = parse_sections(scenario.content, path, needed, (), namespace)
+    except ParameterError:  # of a log whose namespace is another than in the file
+        sections = parse_sections(scenario.content, path, needed)
     return AnyLaw.validate_mapping(sections["controller"], "controller")
+
+
+def is_controller_alone(scenario: StoredFile) -> bool:
+    """Whether a file has a section for the controller, and none for an aircraft of the stack.
+
+    Raises ParameterError.
+    """
+    names = ("controller", "aircraft")
+    schemas = {name: SCHEMAS[name] for name in names}
+    found = parse_sections(scenario.content, Path(scenario.name), schemas, names)
+    return found.keys() == {"controller"}
 
 
 def recorded_scenario(run: RecordedRun | StoredFile | FilePath) -> Scenario:
@@ -326,7 +344,7 @@ def _recorded(
             changes = run.changes
         return run, as_controller(parameters, "parameters"), changes
     if parameters is None:
-        controller = recorded_parameters(run.scenario_file())
+        controller = recorded_parameters(run.scenario_file(), run.namespace)
     else:
         controller = as_controller(parameters, "parameters")
     if changes is None:

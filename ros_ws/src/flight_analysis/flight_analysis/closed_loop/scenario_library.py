@@ -18,7 +18,12 @@ from flight_analysis.closed_loop.scenario import (
 from flight_core.arguments import FilePath
 from flight_core.files import find_file, names_in, read_file, write_file, writing
 from flight_core.parameters import ParameterError
-from flight_core.scenario_file import A_SCENARIO, join_parameters, parse_sections
+from flight_core.scenario_file import (
+    A_SCENARIO,
+    has_general,
+    join_parameters,
+    parse_sections,
+)
 from flight_guidance.feasibility import speeds
 from flight_guidance.routes.route_file import Waypoint
 
@@ -129,8 +134,13 @@ def with_parameters(scenario: Scenario, path: Path, namespace: str) -> Scenario:
 
 
 def _reaches_nodes(path: Path, namespace: str) -> bool:
-    """Whether the nodes in a namespace get every section of a scenario file."""
+    """Whether the nodes in a namespace get every section of a scenario file, and no other.
+
+    Overrides of a node join a section for all nodes, which rcl puts before that of the node.
+    """
     content = read_file(path, str(path), A_SCENARIO)
+    if has_general(content, path):
+        return False
     try:
         return parse_scenario_sections(content, path, namespace) == parse_scenario_sections(
             content, path

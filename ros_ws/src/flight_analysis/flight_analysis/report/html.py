@@ -162,7 +162,7 @@ def write_loop_page(path: Path, title: str, loop: LinearLoop) -> None:
 
 
 def _imported_page(flight: RecordedFlight) -> Page:
-    """What an autopilot logged of y, u and the pose."""
+    """What was logged of y, u and the pose of an aircraft without a section in the log."""
     tape = flight.tape
     source = flight.summary["source"]
     context = figures.plot_context([flight])
@@ -173,10 +173,12 @@ def _imported_page(flight: RecordedFlight) -> Page:
         pose = time_series_figure(
             context._replace(units=QUANTITY_UNITS), {"pose": Curve(tape["pose"], colour)}, columns=2
         )
-    text = (
-        f"{format_seconds(flight.summary['duration'])} of {source['log']}, {source['kind']}, "
-        f"by the map {source['map']}."
-    )
+    by_map = f", by the map {source['map']}" if "map" in source else ""
+    length = format_seconds(flight.summary["duration"])
+    text = f"{length} of {source['log']}, {source['kind']}{by_map}."
+    outputs = {"y": Curve(tape["y"], colour)}
+    if "y_m" in tape:
+        outputs["y_m"] = Curve(tape["y_m"], figures.REFERENCE)
     return Page(
         title=f"Flight {flight.name}",
         lines=[TitleLine(text)],
@@ -185,7 +187,7 @@ def _imported_page(flight: RecordedFlight) -> Page:
             Section(
                 "Output y",
                 "about trim",
-                time_series_figure(context, {"y": Curve(tape["y"], colour)}),
+                time_series_figure(context, outputs),
             ),
             Section("Input u", "about trim", figures.input_figure(context)),
             Section("Pose", "", pose),

@@ -16,7 +16,12 @@ from typing import Any, NamedTuple
 
 from aircraft_sim.jsbsim.jsbsim_files import model_files
 from aircraft_sim.uncertainty import as_yaml
-from flight_analysis.closed_loop.replay import later_aircraft, recorded_changes
+from flight_analysis.closed_loop.replay import (
+    is_controller_alone,
+    later_aircraft,
+    recorded_changes,
+    recorded_parameters,
+)
 from flight_analysis.closed_loop.scenario import (
     ParameterOverrides,
     Scenario,
@@ -34,8 +39,10 @@ from flight_analysis.report.summary import (
     engagement_notes,
     summarise,
     summarise_imported,
+    summarise_own,
 )
 from flight_core.arguments import FilePath
+from flight_core.channels import RATES_AND_SPEED
 from flight_core.files import dump_yaml, link_latest, read_file, write_file, writing
 from flight_core.outcome import End, Outcome, parsed_outcome, read_outcome
 from flight_core.parameters import ParameterError, require
@@ -218,6 +225,8 @@ def _flight(recorded: RecordedRun, run: Path, outcome: Outcome | None) -> Record
             summary=summary,
             si_units=recorded.metadata.get(CHANNEL_UNITS, {}),
         )
+    if is_controller_alone(recorded.scenario_file()):
+        return _own_flight(recorded, name, outcome or recorded.tape.outcome)
     scenario = _scenario_in(recorded, run)
     log = _with_times_of_messages(recorded)
     engagements = recorded.engagements
@@ -250,6 +259,18 @@ def _flight(recorded: RecordedRun, run: Path, outcome: Outcome | None) -> Record
         controllers=controllers,
         later_aircraft=later_aircraft(recorded, scenario),
         messages=recorded.messages,
+    )
+
+
+def _own_flight(recorded: RecordedRun, name: str, outcome: Outcome) -> RecordedFlight:
+    """A flight of an aircraft of one's own, of which the section of the controller is known."""
+    recorded.require("y", "u")
+    controller = recorded_parameters(recorded.scenario_file(), recorded.namespace)
+    summary = summarise_own(recorded.tape, controller.law, name, outcome)
+    summary["flight"] = _identity(recorded)
+    units = {channel: "m/s" if channel == "V" else "rad/s" for channel in RATES_AND_SPEED}
+    return RecordedFlight(
+        name=name, scenario=None, tape=recorded.tape, summary=summary, si_units=units
     )
 
 

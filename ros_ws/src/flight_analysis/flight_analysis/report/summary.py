@@ -7,6 +7,7 @@ The tables have units and columns.
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,6 +33,7 @@ from flight_analysis.metrics import (
     settling_bands,
     settling_times,
     sign_switches,
+    tracking_error,
 )
 from flight_analysis.report.account import (
     Account,
@@ -285,6 +287,21 @@ def summarise_imported(tape: Tape, source: Mapping[str, str]) -> dict[str, Any]:
         "notes": [*filter(None, [source.get(COMPARED)]), *flight_account.notes(), *tape.notes],
     }
     return {key: finite_or_null(value) for key, value in summary.items()}
+
+
+def summarise_own(tape: Tape, law: str, log: str, outcome: Outcome) -> dict[str, Any]:
+    """The metrics of a flight of an aircraft of which the log has no section.
+
+    The errors are those of the measured y; nothing is judged by a model of the aircraft.
+    """
+    source = {"log": log, "kind": f"an aircraft of its own under the law {law}"}
+    summary = summarise_imported(tape, source) | {"outcome": outcome.as_json()}
+    if not {"y", "y_m"} <= tape.signals.keys():
+        return summary
+    errors = replace(tape, signals={**tape.signals, "e": tracking_error(tape)})
+    by_channel = inputs_by_part(errors, (), topic="e")
+    deviations = {name: {"whole": parts["whole"]._asdict()} for name, parts in by_channel.items()}
+    return summary | {key: finite_or_null(value) for key, value in {"e": deviations}.items()}
 
 
 def late_u(scenario: Scenario, age: AgeMetrics | None) -> list[str]:

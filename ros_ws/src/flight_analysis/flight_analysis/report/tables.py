@@ -226,9 +226,16 @@ def imported_tables(
 ) -> list[MetricTable]:
     """Tables of y and u, and of the topics, of an imported flight."""
     tables = []
-    for title, key in (("Outputs", "outputs"), ("Inputs", "inputs")):
+    titles = {
+        "e": "Measured errors",
+        "outputs": "Outputs about trim",
+        "inputs": "Inputs about trim",
+    }
+    for key, title in titles.items():
+        if key not in summary:
+            continue
         columns = columns_of(INPUT_COLUMNS, summary[key])
-        caption = f"{title} about trim, {format_seconds(summary['duration'])}"
+        caption = f"{title}, {format_seconds(summary['duration'])}"
         tables.append(
             MetricTable(caption, columns, table_rows(summary[key], columns, units), IMPORTED_LEGEND)
         )

@@ -7,49 +7,40 @@ A stage waits for the `node_state` "ready" of the stage before.
 
 import math
 import os
-import shlex
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
-from weakref import WeakKeyDictionary
+from typing import Any
 
 import psutil
 from diagnostic_msgs.msg import KeyValue
 from launch.action import Action
 from launch.actions import (
     DeclareLaunchArgument,
-    EmitEvent,
     ExecuteProcess,
     LogInfo,
     OpaqueFunction,
-    PopLaunchConfigurations,
-    PushLaunchConfigurations,
     RegisterEventHandler,
-    TimerAction,
 )
-from launch.events.process import ProcessExited, ShutdownProcess
-from launch.substitutions import LaunchConfiguration
+from launch.events.process import ProcessExited
 from launch_ros.actions import Node
 from launch_ros.ros_adapters import get_ros_node
 from launch_ros.substitutions import ExecutableInPackage
-from launch_ros.utilities import make_namespace_absolute, prefix_namespace
 
 from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario
 from flight_analysis.closed_loop.scenario_library import scenarios
 from flight_bringup.graph import AIRCRAFT, LEAD, LEARNER, NodeSpec, start_instant, start_lead
+from flight_bringup.launch.flight import Flight
 from flight_bringup.monitor import DISCOVERY_TIME, FREE_DOMAIN, LOOP_INPUTS
 from flight_bringup.processes import (
     FIRST_U,
     LOG_TIMEOUT,
     READY_TIMEOUT,
-    end_with_parent,
     leave_outcome,
 )
 from flight_core.outcome import (
-    COMPLETED,
     INTERRUPTED,
     STATUS_LANDED,
     End,
@@ -100,109 +91,6 @@ class FlownEvent(Event):
 
     def __init__(self, flight: "Flight") -> None:
         self.flight = flight
-
-
-class Flight:
-    """A flight of a launch: the arguments in its scope, its processes, its end.
-
-    A launch file may include several, in groups that have ended by the time a node starts. So the
-    launch configurations are taken once, and hold for whatever the flight starts later: arguments,
-    and what PushRosNamespace, SetParameter and SetRemap of the group say. At its end a flight stops
-    its own processes alone. A launch with nothing else to do then ends by itself.
-    """
-
-    _of_launch: ClassVar[WeakKeyDictionary[LaunchContext, list["Flight"]]] = WeakKeyDictionary()
-
-    def __init__(self, context: LaunchContext) -> None:
-        self.context = context
-        self.run = Path()  # the folder of the run; Path() without a recorder
-        self.configurations = dict(context.launch_configurations)
-        # Launch leaves processes running after an end by anything but SIGINT.
-        self.configurations.setdefault("launch-prefix", shlex.join(end_with_parent()))
-        self.namespace = _namespace(context)
-        self._processes: list[Action] = []
-        self._timers: list[TimerAction] = []
-        self._is_stopped = False
-        self._failure = ""
-        self._of_launch.setdefault(context, []).append(self)
-
-    @property
-    def is_over(self) -> bool:
-        """Whether the flight has ended, or the launch has."""
-        return self._is_stopped or bool(self.context.is_shutdown)
-
-    def argument(self, name: str) -> str:
-        """The value of an argument in the scope of the flight."""
-        return str(self.configurations[name])
-
-    def in_scope(self, actions: Sequence[Action]) -> list[Action]:
-        """The actions with the launch configurations of the flight; its end stops the processes."""
-        self._processes += [each for each in actions if isinstance(each, (ExecuteProcess, Node))]
-        restore = _Restore(self.configurations)
-        return [PushLaunchConfigurations(), restore, *actions, PopLaunchConfigurations()]
-
-    def after(
-        self, period: float, function: Callable[[LaunchContext], Sequence[Action] | None]
-    ) -> TimerAction:
-        """Call a function after a period, s, unless the flight has ended before."""
-
-        def call(context: LaunchContext) -> list[Action] | None:
-            return None if self.is_over else [*(function(context) or ())]
-
-        timer = TimerAction(period=period, actions=[OpaqueFunction(function=call)])
-        self._timers.append(timer)
-        return timer
-
-    def complete(
-        self, reason: str = "flight completed", outcome: Outcome = COMPLETED
-    ) -> list[Action]:
-        """The actions at the end of a flight that reached its end.
-
-        The recorder closes the log with the outcome.
-        """
-        leave_outcome(self.run, outcome)
-        report = f"; now: ros2 run flight_cli rise-di report {shlex.quote(str(self.run))}"
-        return [LogInfo(msg=reason + (report if self.run.name else "")), *self._stop()]
-
-    def fail(self, outcome: Outcome) -> list[Action]:
-        """End the flight early, with the outcome in the folder of the run.
-
-        The last flight of a launch to end raises RuntimeError, so that the launch ends with exit
-        status 1; before that the other flights go on.
-        """
-        leave_outcome(self.run, outcome)
-        self._failure = str(outcome)
-        return [LogInfo(msg=str(outcome)), *self._stop()]
-
-    def _stop(self) -> list[Action]:
-        """Stop what the flight has started.
-
-        Raises RuntimeError where no other flight goes on and one of them has failed.
-        """
-        self._is_stopped = True
-        for timer in self._timers:
-            timer.cancel()
-        flights = self._of_launch[self.context]
-        failures = [flight._failure for flight in flights if flight._failure]
-        if failures and all(flight._is_stopped for flight in flights):
-            raise RuntimeError("; ".join(failures))
-        return [EmitEvent(event=ShutdownProcess(process_matcher=self._has))]
-
-    def _has(self, process: Action) -> bool:
-        return any(process is each for each in self._processes)
-
-
-class _Restore(Action):
-    """Restore the launch configurations of a scope that has ended."""
-
-    def __init__(self, configurations: Mapping[str, Any]) -> None:
-        super().__init__()
-        self.configurations = configurations
-
-    def execute(self, context: LaunchContext) -> None:
-        """Replace those of the launch, which the caller has pushed."""
-        context.launch_configurations.clear()
-        context.launch_configurations.update(self.configurations)
 
 
 def scenario_argument(default: str, otherwise: str = "") -> DeclareLaunchArgument:
@@ -311,11 +199,6 @@ def by_rise_di(flight: Flight, file: str, *, has_own_time: bool = False) -> list
     return flight.in_scope([process])
 
 
-def argument(context: LaunchContext, name: str) -> str:
-    """The value of an argument."""
-    return str(LaunchConfiguration(name).perform(context))
-
-
 def flight_node(
     spec: NodeSpec, scenario: Scenario, overrides: ParameterOverrides, flight: Flight
 ) -> Node:
@@ -326,6 +209,7 @@ def flight_node(
     return Node(
         package=spec.package,
         executable=spec.executable,
+        name=spec.executable,  # its own name: the overrides then go to this node, after its section
         exec_name=spec.executable,  # otherwise the log names each process by its prefix
         namespace=flight.argument("namespace"),
         parameters=[str(scenario.path), overrides],
@@ -621,13 +505,6 @@ def _subscribe_states(flight: Flight) -> None:
     # At shutdown launch_ros waits for its executor before it stops the nodes: up to 1 s, without a
     # timer.
     ros_node.create_timer(SHUTDOWN_DELAY, lambda: None)
-
-
-def _namespace(context: LaunchContext) -> str:
-    """The absolute namespace of the nodes, as launch_ros.actions.Node has it; "" for the root."""
-    base = context.launch_configurations.get("ros_namespace")
-    own = context.launch_configurations.get("namespace", "")
-    return str(make_namespace_absolute(prefix_namespace(base, own))).rstrip("/")
 
 
 def _is_descendant(pid: int) -> bool:
