@@ -294,6 +294,7 @@ SET_BY_THE_FLIGHT = {
     *("controller.y_rate", "bridge.map", "bridge.dry_run", "bridge.first_y"),
     *(f"reference_model.recorded.NAME.{key}" for key in ("source", "time", "value")),
     *("recorder.directory", "recorder.attach", "recorder.metadata_file", "recorder.scenario_file"),
+    "flight.use_sim_time",
 }
 """Keys that `rise-di fly`, a run and the launch files set, by the scenario and the options."""
 IN_NO_FILE = {
