@@ -293,7 +293,7 @@ def test_section_that_gains_wrote_has_margins_and_a_certificate(tmp_path: Path) 
     assert written.exit_code == 0, written.output
     selected = rise_di.select_gains(frame, samples=4).engineering
     again = rise_di.check_gains(frame, section, samples=4)
-    for part in ("theorem", "loop"):
+    for part in ("theorem", "rules", "loop"):
         found = [condition.value for condition in getattr(again, part)]
         assert found == approx([condition.value for condition in getattr(selected, part)], rel=1e-4)
     words = ["gains", str(frame), "--check", "--scenario", str(section), "--samples", "4"]

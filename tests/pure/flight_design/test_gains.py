@@ -195,7 +195,7 @@ def test_engineering_gains_of_osprey_are_close_to_those_tuned_by_hand(
     assert_allclose(widths[2:], 2.75 * params.K[2:] / 4.0 / params.Lambda[2:])
     slew = selected.study.slew[[0, 2, 3, 1]] / params.input_scale
     assert_allclose(params.beta, 1.25 * slew)
-    assert not gain_conditions.failing(selected.engineering.loop)
+    assert not gain_conditions.failing((*selected.engineering.loop, *selected.engineering.rules))
     # q alone limits the delay: 45 ms with a softening of 3 in all channels, where r and V had 32
     # and 26 deg of phase
     assert selected.engineering.delay_margin is not None
@@ -208,10 +208,12 @@ def test_gains_of_theorem_1_are_unstable_on_osprey_with_servos(
     literal = selected.theorem
     assert not gain_conditions.failing(literal.theorem)
     assert literal.delay_margin == 0.0
-    assert {"lag product of q", "lag product of p", "linear stability", "delay margin"} <= set(
-        failing_in_loop(literal)
-    )
-    assert "k_g, step 2" in names(selected.engineering.failing, literal.controller.outputs)
+    outputs = literal.controller.outputs
+    assert {"linear stability", "delay margin"} <= set(failing_in_loop(literal))
+    broken = names(gain_conditions.failing(literal.rules), outputs)
+    assert {"lag product of q", "lag product of p"} <= set(broken)
+    assert not literal.loop_holds
+    assert "k_g, step 2" in names(gain_conditions.failing(selected.engineering.theorem), outputs)
 
 
 def test_beta_stays_below_rate_of_actuators(osprey: Study) -> None:
@@ -219,7 +221,8 @@ def test_beta_stays_below_rate_of_actuators(osprey: Study) -> None:
     params = slow.controller.law_params()
     # the slew of the ideal thrust is 1.14 1/s
     assert params.beta[3] * params.input_scale[3] == approx(0.7 * 1.2)
-    assert failing_in_loop(slow) == ["beta above slew of V"]
+    broken = gain_conditions.failing(slow.rules)
+    assert names(broken, slow.controller.outputs) == ["beta above slew of V"]
 
 
 def osprey_channels(
@@ -375,7 +378,7 @@ def test_softened_sign_narrower_than_lag_of_loop_is_unstable() -> None:
     wide, narrow = (scalar(1.0, factor * 0.035) for factor in (1.7, 0.5))
     assert delay_margin(plant, linear(wide), loop) > 0.0
     assert delay_margin(plant, linear(narrow), loop) == 0.0
-    conditions = gain_conditions.check_loop(narrow, loop, *(np.ones(1),) * 3, np.full(1, np.inf))
+    conditions = gain_conditions.check_rules(narrow, loop, np.ones(1), np.ones(1))
     assert names(gain_conditions.failing(conditions), ("y",)) == ["softening of y"]
 
 
@@ -418,6 +421,36 @@ def test_the_command_writes_gains_that_load(tmp_path: Path) -> None:
     assert AnyLaw.validate_mapping(section, "controller").outputs == ("q", "p", "r", "V")
     assert output["engineering"]["controller"]["k_g"] == approx(section["k_g"], rel=1e-5)
     assert output["theorem"]["delay_margin"] == 0.0
+
+
+def test_check_of_the_default_flight_succeeds_by_its_loop_and_tells_the_theorem_apart() -> None:
+    """No gains behind servos meet (29) and step 2, and the loop is as good as its margins."""
+    words = ("gains", "osprey", "--check", "--samples", "4")
+    told = rise_di(*words)
+    assert told.exit_code == 0, told.output
+    loop, theorem = told.output.index("the loop is stable"), told.output.index("Theorem 1:")
+    assert loop < theorem
+    assert "osprey_servo: the loop is stable, with the margins asked of it" in told.output
+    assert "They are sufficient only, and decide nothing" in told.output
+    verdicts = json.loads(rise_di(*words, "--json").stdout)["scenario"]["verdicts"]
+    assert verdicts["loop"]["holds"]
+    assert not verdicts["theorem"]["holds"]
+
+
+def test_check_fails_by_a_loop_without_its_margins_although_the_theorem_holds(
+    tmp_path: Path,
+) -> None:
+    """Behind the servos of the osprey the gains of Theorem 1 make the loop grow."""
+    gains, flight = tmp_path / "gains.yaml", tmp_path / "theorem_gains.yaml"
+    ideal = ("--lag", "0", "--delay", "0", "--theorem", "--accept")
+    written = rise_di("gains", "osprey", "--samples", "2", *ideal, "--write", str(gains))
+    assert written.exit_code == 0, written.output
+    section = yaml.safe_load(gains.read_text())["/**/controller"]["ros__parameters"]
+    lags = {"sign": "soft", "lag": [0.02, 0.02, 0.02, 0.1]}
+    flight.write_text(yaml.safe_dump({"/**/controller": {"ros__parameters": section | lags}}))
+    answer = rise_di("gains", "osprey", "--check", "--samples", "2", "--scenario", str(flight))
+    assert answer.exit_code == 1, answer.output
+    assert "theorem_gains: the loop is unstable" in answer.output
 
 
 def test_y_that_is_slower_than_law_counts_as_delay_and_may_be_three_messages_old() -> None:

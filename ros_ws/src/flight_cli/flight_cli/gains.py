@@ -109,8 +109,14 @@ class _GainsAnswer(NamedTuple):
 
     answers: dict[str, Assessment]
     selection: Selection | None = None
+    checked: str = ""  # the scenario of a check
     promise: Guarantee | None = None
     written: Sequence[str] = ()  # sentences about the files of a guarantee
+
+    @property
+    def titles(self) -> dict[str, Assessment]:
+        """The gain sets by the names that are shown: of a check that of the scenario."""
+        return {self.checked: self.first} if self.checked else self.answers
 
     @property
     def first(self) -> Assessment:
@@ -129,11 +135,13 @@ class _GainsAnswer(NamedTuple):
 class Gains:
     """Select gains by Theorem 1 and by the engineering procedure.
 
-    Every condition on both is shown. With --check, show the conditions and margins of the
-    scenario's controller instead: of any law, with the law's own gains.
+    Every condition on both is shown. With --check, show the margins and conditions of the
+    scenario's controller instead: of any law, with the law's own gains. The verdict on the loop
+    then decides the exit status. That on Theorem 1 does not, because its conditions are sufficient
+    only.
 
-    Exit status: 0; 1 if a condition of the loop fails with --check, or an aircraft within
-    --uncertainty may be unstable with --guarantee; 2 bad input.
+    Exit status: 0; 1 with --check unless the loop is stable with the margins that it needs, or an
+    aircraft within --uncertainty may be unstable with --guarantee; 2 bad input.
     """
 
     airframe: str = argument(
@@ -262,8 +270,7 @@ class Gains:
             print_json(_as_json(result, self.seed))
         else:
             self._show(Console(), result, origin)
-        unproved = result.promise is not None and not result.promise.holds
-        if unproved or (self.check and failing(result.last.loop)):
+        if self.check and not loop_verdict(result.first, result.promise).holds:
             raise typer.Exit(CONDITION_FAILS)
 
     def _result(self) -> _GainsAnswer:
@@ -286,14 +293,15 @@ class Gains:
         answer = check_gains(
             self.airframe, self.scenario, **values_of(self, *STUDY), entries=entries
         )
+        name = Path(self.scenario).stem
         if not self.guaranteed:
-            return _GainsAnswer({"scenario": answer})
+            return _GainsAnswer({"scenario": answer}, checked=name)
         progress("bounding every aircraft of the box")
         loop = answer.loop_with_box()
         promise = proved(loop, self.late)
         lines = write_certificate(self.certificate, loop, promise, self.airframe, self.scenario)
         lines += write_unstable(self.worst, promise, self.airframe, self.scenario)
-        return _GainsAnswer({"scenario": answer}, promise=promise, written=lines)
+        return _GainsAnswer({"scenario": answer}, checked=name, promise=promise, written=lines)
 
     def _selected(self, progress: Callable[[str], None]) -> _GainsAnswer:
         """Gains by Theorem 1 and by the procedure, or those beside an observer."""
@@ -319,8 +327,9 @@ class Gains:
     def _show(self, console: Console, result: _GainsAnswer, origin: str) -> None:
         """Print tables, the trade of a selection, origins and the paths of the files."""
         selection = result.selection
-        _show_conditions(console, result.study, result.answers)
+        _show_margins(console, result.study, result.titles)
         show_guarantee(console, result.promise, result.first)
+        _show_verdicts(console, result)
         lines = [origin]
         if selection is not None:
             lines.insert(0, selection.origin)
@@ -389,10 +398,9 @@ def _show_trade(console: Console, selection: Selection) -> None:
     print_table(console, table)
 
 
-def _show_conditions(console: Console, study: Study, answers: dict[str, Assessment]) -> None:
-    """Print gains, margins and conditions."""
+def _show_margins(console: Console, study: Study, answers: dict[str, Assessment]) -> None:
+    """Print gains and margins."""
     first = next(iter(answers.values()))
-    outputs = first.controller.outputs
     samples = len(study.A) - 1
     parts = {"A and B": study.uncertainty, **study.spread.entries}
     box = ", ".join(f"{name} +-{100 * part:g} %" for name, part in parts.items())
@@ -416,28 +424,104 @@ def _show_conditions(console: Console, study: Study, answers: dict[str, Assessme
         say(console, f"{name}: {_format_delay_margin(study, answer)}")
     say(console, MARGIN_LEGEND, style="dim")
 
-    for part, heading in (("theorem", "Theorem 1"), ("loop", "The loop")):
-        if not getattr(first, part):
-            continue
-        print_table(console, _condition_table(answers, part, heading))
+
+def _show_verdicts(console: Console, result: _GainsAnswer) -> None:
+    """Print the conditions part by part, each with its verdict: the loop's decides."""
+    answers = result.titles
+    study, first = result.study, result.first
+    for part, heading in HEADINGS.items():
+        if getattr(first, part):
+            print_table(console, _condition_table(answers, part, heading))
+        for name, answer in answers.items():
+            verdict = VERDICTS[part](answer, result.promise)
+            if verdict.sentence:
+                style = "bold" if part == "loop" else ""
+                say(console, f"{name}: {verdict.sentence}", style=style)
     if first.theorem and (marginal := marginal_sentence([airframe_facts(study.airframe)])):
         say(console, marginal)
     if first.bounds is None:
         estimate = ""
     else:
         estimate = f"; ~ is an estimate: gamma_2 = {first.bounds.gamma_2[0]:g} 1/s is an assumption"
-    say(console, f"margin: a condition holds above 1 and fails (!) below{estimate}")
+    say(console, f"margin: a condition holds above 1 and fails (!) below{estimate}", style="dim")
     for word, meaning in MEANINGS.items() if first.bounds is not None else ():
-        say(console, f"{word}: {meaning}")
-    for name, answer in answers.items():
-        failed = answer.failing
-        say(
-            console,
-            f"{name}: "
-            f"{'every condition holds' if not failed else f'{len(failed)} conditions fail'}",
+        say(console, f"{word}: {meaning}", style="dim")
+
+
+class Verdict(NamedTuple):
+    """What a part of the conditions comes to; an empty sentence for a part without conditions."""
+
+    holds: bool
+    sentence: str
+
+
+def loop_verdict(answer: Assessment, promise: Guarantee | None) -> Verdict:
+    """Return whether a loop is stable with the margins and the guarantee that are asked of it."""
+    is_guaranteed = promise is None or promise.holds
+    holds = answer.loop_holds and is_guaranteed
+    margins = answer.margins
+    if margins is None:
+        return Verdict(False, "the loop is not judged, because the literal sign has no linear loop")
+    if not margins.nominal.stable:
+        return Verdict(False, "the loop is unstable")
+    if not answer.is_stable:
+        text = f"{margins.stable} of {margins.aircraft} uncertain aircraft"
+        return Verdict(False, f"the loop is stable, but only {text} are")
+    clauses = []
+    if short := failing(answer.loop):
+        outputs = answer.controller.outputs
+        falls = "; ".join(condition.sentence(outputs) for condition in short)
+        clauses.append(f"but it lacks what is asked of it ({falls})")
+    elif answer.has_requirement:
+        phase = math.degrees(margins.nominal.phase.min())
+        clauses.append(
+            f"with the margins asked of it: at least {phase:.0f} deg of phase in each input, and "
+            f"a delay margin of {_milliseconds(margins.delay)}"
         )
-        for condition in failed if len(answers) == 1 else ():
-            say(console, f"  {condition.sentence(outputs)}")
+    if promise is not None:
+        within = f"within {100.0 * promise.uncertainty:g} %"
+        clauses.append(
+            f"as every aircraft {within} is, which is guaranteed"
+            if is_guaranteed
+            else f"but an aircraft {within} may be unstable"
+        )
+    return Verdict(holds, ", ".join(("the loop is stable", *clauses)))
+
+
+def rules_verdict(answer: Assessment, _: Guarantee | None) -> Verdict:
+    """Return how many rules of the engineering procedure a gain set keeps."""
+    rules = answer.rules
+    if not rules:
+        return Verdict(True, "")
+    kept = len(rules) - len(failing(rules))
+    return Verdict(
+        kept == len(rules),
+        f"{kept} of {len(rules)} rules are kept. They are where the search for gains begins, and "
+        "decide nothing",
+    )
+
+
+def theorem_verdict(answer: Assessment, _: Guarantee | None) -> Verdict:
+    """Return how many of the sufficient conditions of Theorem 1 a gain set meets."""
+    conditions = answer.theorem
+    if not conditions:
+        return Verdict(True, "")
+    met = len(conditions) - len(failing(conditions))
+    return Verdict(
+        met == len(conditions),
+        f"{met} of {len(conditions)} conditions of Theorem 1 are met. They are sufficient only, "
+        "and decide nothing: the paper's proof is in continuous time, and no loop with servos "
+        "meets its assumptions",
+    )
+
+
+HEADINGS = {
+    "loop": "The loop: these conditions decide",
+    "rules": "Rules of the engineering procedure",
+    "theorem": "Theorem 1: sufficient conditions, of a loop without servos in continuous time",
+}
+VERDICTS = {"loop": loop_verdict, "rules": rules_verdict, "theorem": theorem_verdict}
+"""The parts of the conditions on a gain set, in the order in which they are shown."""
 
 
 def _condition_table(answers: dict[str, Assessment], part: str, title: str) -> Table:
@@ -559,21 +643,34 @@ def _as_json(result: _GainsAnswer, seed: int) -> dict[str, Any]:
         "seed": seed,
         "slew": dict(zip(inputs, study.slew.tolist(), strict=True)),
         "slew_calm": dict(zip(inputs, study.slew_undisturbed.tolist(), strict=True)),
-        **{name: _assessment_as_json(study, answer) for name, answer in result.answers.items()},
+        **({"checked": result.checked} if result.checked else {}),
+        **{
+            name: _assessment_as_json(study, answer, promise)
+            for name, answer in result.answers.items()
+        },
         **({} if promise is None else {"guarantee": promise.as_json()}),
     }
 
 
-def _assessment_as_json(study: Study, answer: Assessment) -> dict[str, Any]:
+def _assessment_as_json(
+    study: Study, answer: Assessment, promise: Guarantee | None
+) -> dict[str, Any]:
     outputs = answer.controller.outputs
     bounds = None
     if answer.bounds is not None:
         bounds = {key: getattr(answer.bounds, key).tolist() for key in ("U", "N_d", "gamma_2")} | {
             "rho": answer.bounds.rho
         }
-    conditions = [_condition_as_json("theorem", condition, outputs) for condition in answer.theorem]
-    conditions += [_condition_as_json("loop", condition, outputs) for condition in answer.loop]
+    conditions = [
+        _condition_as_json(part, condition, outputs)
+        for part in HEADINGS
+        for condition in getattr(answer, part)
+    ]
+    verdicts = {part: verdict(answer, promise) for part, verdict in VERDICTS.items()}
     return {
+        "verdicts": {
+            part: verdict._asdict() for part, verdict in verdicts.items() if verdict.sentence
+        },
         "controller": answer.controller.model_dump(exclude_none=True),
         "delay_margin": answer.delay_margin,
         "channel_margins": answer.channel_margins,

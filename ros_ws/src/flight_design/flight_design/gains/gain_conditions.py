@@ -8,7 +8,8 @@ The procedures are Theorem 1 and the engineering procedure.
 The theorem's conditions are sufficient, not necessary, and they contain no actuator.
 `theorem_gains` meets them all; behind servos its result is unstable. `engineering_gains` starts
 from the lag of the loop. `check_theorem` evaluates the theorem's conditions on a gain set,
-`check_loop` those of the loop. `rise_di_controller.law.linear_loop` has the linear loop and its
+`check_rules` the rules of the engineering procedure, `check_loop` what the linear margins of the
+loop leave out. `rise_di_controller.law.linear_loop` has the linear loop and its
 delay margin.
 
 The crossover lag product of a channel is its bandwidth times the lag of its loop, in rad. It is the
@@ -326,57 +327,76 @@ def N_d(Omega: FloatArray, v_dot: FloatArray) -> FloatArray:
     return np.asarray(-v_dot @ (factors.D[:, None] * factors.U).T)
 
 
-def check_loop(
-    params: LawParams,
-    loop: LoopTiming,
-    response: FloatArray,
-    largest: FloatArray,
-    slew: FloatArray,
-    rate_limit: FloatArray,
+def check_rules(
+    params: LawParams, loop: LoopTiming, response: FloatArray, slew: FloatArray
 ) -> tuple[GainCondition, ...]:
-    """Conditions of the loop on a gain set, channel by channel.
+    """Return the rules of the engineering procedure on a gain set, channel by channel.
 
         lag product:      K_i response_i total_i <= 0.8
             rad: the lag costs at most 46 degrees of phase
         Lambda below K:   Lambda_i <= 0.5 K_i response_i
         beta above slew:  beta_i >= slew_i                   shown in inputs of unit response
-        beta below rate:  beta_i <= 0.7 rate_limit_i         if there is a limit; the same
-        softening:        eps_i K_i / beta_i >= total_i
-            softened sign: else the linear loop is unstable
+        softening:        eps_i K_i / beta_i >= total_i      softened sign
+
+    The search for gains begins at these rules. They estimate what the margins of the loop measure,
+    so a loop whose margins suffice may break them.
+
+    Arguments: response_i = abs(Omega_ii) in the inputs of the law, nominal; slew in those same
+    inputs, units of y / s^2; all of shape (m,).
+    """
+    bandwidth = params.K * response
+    most = np.full(len(loop.total), MAX_CROSSOVER_LAG_PRODUCT)
+    # beta in the same inputs for every gain set
+    rules = (
+        *_by_channel("lag product", bandwidth * loop.total, most, at_least=False),
+        *_by_channel(
+            "Lambda below K", params.Lambda, MAX_LAMBDA_TO_BANDWIDTH * bandwidth, at_least=False
+        ),
+        *_by_channel("beta above slew", params.beta * response, slew * response, at_least=True),
+    )
+    if params.sign is not Sign.SOFT:
+        return rules
+    width = params.eps * params.K / params.beta
+    return (*rules, *_by_channel("softening", width, loop.total, at_least=True))
+
+
+def check_loop(
+    params: LawParams,
+    loop: LoopTiming,
+    response: FloatArray,
+    largest: FloatArray,
+    rate_limit: FloatArray,
+) -> tuple[GainCondition, ...]:
+    """Return the conditions of the loop that its linear margins do not have, channel by channel.
+
+        beta below rate:  beta_i <= 0.7 rate_limit_i         else a limit cycle; unit response
         implicit: lag:    lag_i + delay <= period / 2        implicit sign: else it chatters
         implicit: omega:  omega_i >= largest_i               the same
 
     Arguments: response_i = abs(Omega_ii) in the inputs of the law, nominal, and `largest` its upper
-    bound; slew and rate_limit in those same inputs, units of y / s^2, infinite without a limit; all
-    of shape (m,).
+    bound; rate_limit in those same inputs, units of y / s^2, infinite without a limit; all of shape
+    (m,).
     """
-    conditions: list[GainCondition] = []
-    total = loop.total
-
-    def add(name: str, values: FloatArray, bound: FloatArray, *, at_least: bool) -> None:
-        pairs = enumerate(zip(values, bound, strict=True))
-        finite = ((i, float(a), float(b)) for i, (a, b) in pairs if math.isfinite(b))
-        conditions.extend(
-            GainCondition(name=name, channel=i, value=a, bound=b, at_least=at_least)
-            for i, a, b in finite
-        )
-
-    bandwidth = params.K * response
-    most = np.full(len(total), MAX_CROSSOVER_LAG_PRODUCT)
-    add("lag product", bandwidth * total, most, at_least=False)
-    add("Lambda below K", params.Lambda, MAX_LAMBDA_TO_BANDWIDTH * bandwidth, at_least=False)
-    beta = params.beta * response  # in the same inputs for every gain set
-    add("beta above slew", beta, slew * response, at_least=True)
     fastest = MAX_BETA_TO_RATE_LIMIT * rate_limit * response
-    add("beta below rate", beta, fastest, at_least=False)
-    if params.sign is Sign.SOFT:
-        add("softening", params.eps * params.K / params.beta, total, at_least=True)
-    elif params.sign is Sign.IMPLICIT:
-        add(
-            "implicit: lag",
-            loop.lag + loop.delay,
-            np.full(len(total), loop.period / 2.0),
-            at_least=False,
+    conditions = _by_channel("beta below rate", params.beta * response, fastest, at_least=False)
+    if params.sign is not Sign.IMPLICIT:
+        return conditions
+    half = np.full(len(loop.total), loop.period / 2.0)
+    return (
+        *conditions,
+        *_by_channel("implicit: lag", loop.lag + loop.delay, half, at_least=False),
+        *_by_channel("implicit: omega", params.omega, largest, at_least=True),
+    )
+
+
+def _by_channel(
+    name: str, values: FloatArray, bounds: FloatArray, *, at_least: bool
+) -> tuple[GainCondition, ...]:
+    """Return a condition for each channel whose bound is finite."""
+    return tuple(
+        GainCondition(
+            name=name, channel=i, value=float(value), bound=float(bound), at_least=at_least
         )
-        add("implicit: omega", params.omega, largest, at_least=True)
-    return tuple(conditions)
+        for i, (value, bound) in enumerate(zip(values, bounds, strict=True))
+        if math.isfinite(bound)
+    )

@@ -83,6 +83,8 @@ INPUT_LIMITS = ("lower", "upper", "slew")
 SPEED_STEP = 0.05
 MAX_SPEED_RATIO = 3.0
 
+STABILITY = "linear stability"  # the condition: the part of the aircraft whose loop is stable
+
 Controller = TypeVar("Controller", bound=ControllerConfig)
 
 
@@ -105,10 +107,15 @@ class LoopSetting(NamedTuple):
 
 
 class GainAssessment(NamedTuple, Generic[Controller]):
-    """A controller, every condition on its gains, and the margins of its loop."""
+    """A controller, every condition on its gains, and the margins of its loop.
+
+    The conditions of the loop decide whether it flies. The rules are estimates of its margins, and
+    those of the theorem are sufficient, for a loop without servos.
+    """
 
     controller: Controller
     theorem: tuple[GainCondition, ...]  # empty for a law other than RISE-DI
+    rules: tuple[GainCondition, ...]  # of the engineering procedure; empty without it
     loop: tuple[GainCondition, ...]
     bounds: Bounds | None  # None for a law other than RISE-DI
     margins: LoopMargins | None  # None for the literal sign
@@ -152,9 +159,18 @@ class GainAssessment(NamedTuple, Generic[Controller]):
         )
 
     @property
-    def failing(self) -> tuple[GainCondition, ...]:
-        """Every condition that does not hold."""
-        return gain_conditions.failing((*self.theorem, *self.loop))
+    def is_stable(self) -> bool:
+        """Whether the linear loop is stable for the nominal aircraft and every sample.
+
+        False for the literal sign, of which nothing is shown.
+        """
+        named = (condition for condition in self.loop if condition.name == STABILITY)
+        return self.margins is not None and all(condition.holds for condition in named)
+
+    @property
+    def loop_holds(self) -> bool:
+        """Whether the loop is stable and has all that is asked of it."""
+        return self.is_stable and not gain_conditions.failing(self.loop)
 
 
 def loop_with_box(study: Study, controller: ControllerConfig) -> LinearLoop:
@@ -418,9 +434,10 @@ def assess_gains(
 
     Rate, lag and delay are the controller's; gamma_2 and rate limits are the setting's.
 
-    Theorem: see `_theorem`. Loop: `check_loop` without an observer, the fraction of the samples for
-    which the linear loop is stable, and its delay margin on the nominal airframe, which should be
-    at least one period, a missed tick, or what an observer requires beyond the delay, and the
+    Theorem: see `_rise_di_conditions`. Rules: `check_rules` without an observer.
+    Loop: `check_loop` without an observer, the fraction of the samples for which the linear loop is
+    stable, and its delay margin on the nominal airframe, which should be at least one period, a
+    missed tick, or what an observer requires beyond the delay, and the
     margins of the setting's requirement, 35 degrees of phase with an observer. With the implicit
     sign the linear loop is the one inside the width of the sign, dt^2 omega beta. Its margin is
     then the delay at which chatter begins, and at most half a period. A law other than RISE-DI has
@@ -430,14 +447,16 @@ def assess_gains(
     channels = ChannelPairing(controller.outputs, controller.inputs)
     D = signs_of_pairing(study.Omega[np.ix_(rows, columns)], channels, controller.D)
     theorem: tuple[GainCondition, ...] = ()
+    rules: tuple[GainCondition, ...] = ()
     loop_conditions: tuple[GainCondition, ...] = ()
     bounds = None
     if isinstance(controller, RiseDiConfig):
-        theorem, loop_conditions, bounds = _rise_di_conditions(study, controller, setting, D)
+        theorem, rules, loop_conditions, bounds = _rise_di_conditions(study, controller, setting, D)
     if is_literal(controller):
         return GainAssessment(
             controller=controller,
             theorem=theorem,
+            rules=rules,
             loop=loop_conditions,
             bounds=bounds,
             margins=None,
@@ -446,7 +465,7 @@ def assess_gains(
     loop = loop_with_box(study, controller)
     margins = loop_margins(loop)
     stable = (margins.stable + float(margins.nominal.stable)) / len(study.A)
-    loop_conditions += (GainCondition("linear stability", None, stable, 1.0),)
+    loop_conditions += (GainCondition(STABILITY, None, stable, 1.0),)
     if not (isinstance(controller, RiseDiConfig) and controller.sampled_sign()[0] is Sign.IMPLICIT):
         observer = controller.observer
         requirement = above_zeros(setting.requirement, loop.nominal)
@@ -461,6 +480,7 @@ def assess_gains(
     return GainAssessment(
         controller=controller,
         theorem=theorem,
+        rules=rules,
         loop=loop_conditions,
         bounds=bounds,
         margins=margins,
@@ -470,8 +490,8 @@ def assess_gains(
 
 def _rise_di_conditions(
     study: Study, controller: RiseDiConfig, setting: LoopSetting, D: FloatArray
-) -> tuple[tuple[GainCondition, ...], tuple[GainCondition, ...], Bounds]:
-    """The conditions of Theorem 1, those of `check_loop`, and the bounds of the theorem.
+) -> tuple[tuple[GainCondition, ...], tuple[GainCondition, ...], tuple[GainCondition, ...], Bounds]:
+    """The conditions of Theorem 1, `check_rules`, `check_loop`, and the bounds of the theorem.
 
     "D" and "zero dynamics" are the fractions of the samples for which they hold. The bounds of
     (29), (30), steps 2 and 3 are the largest over the samples for which both hold. "V2_dot" is the
@@ -501,14 +521,16 @@ def _rise_di_conditions(
     )
     # the engineering rules are those of a law that has no other feedback beside it
     if controller.observer is not None:
-        return theorem, (), bounds
+        return theorem, (), (), bounds
     responses = np.abs(np.einsum("Nii->Ni", C @ Bs))[counts] * params.input_scale
     rate_limit = _by_name(setting.rate_limit, controller.inputs, math.inf)
-    limits = tuple(values / params.input_scale for values in (study.slew[columns], rate_limit))
+    slew, fastest = (values / params.input_scale for values in (study.slew[columns], rate_limit))
+    timing = study.timing_of(controller)
+    rules = gain_conditions.check_rules(params, timing, responses[0], slew)
     conditions = gain_conditions.check_loop(
-        params, study.timing_of(controller), responses[0], responses.max(axis=0), *limits
+        params, timing, responses[0], responses.max(axis=0), fastest
     )
-    return theorem, conditions, bounds
+    return theorem, rules, conditions, bounds
 
 
 def response(study: Study, controller: ControllerConfig) -> FloatArray:
