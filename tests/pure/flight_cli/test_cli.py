@@ -21,6 +21,7 @@ from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario
 from flight_analysis.closed_loop.scenario_library import LIBRARY, find_scenario
 from flight_cli import cli
 from flight_cli.cli import COMMANDS, application
+from flight_cli.scenarios import first_sentences
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 pytestmark = pytest.mark.slow
@@ -225,10 +226,14 @@ def test_commands_are_few_and_so_are_options_beside_the_panel_of_rare_ones() -> 
 
 
 def test_option_is_a_name_in_small_letters_joined_by_hyphens() -> None:
-    """--set alone takes keys; Ixx and the like are the letters of the field."""
+    """--set alone takes keys; Ixx and the like are the letters of the field.
+
+    Two have a letter too, as in other tools.
+    """
     for name in COMMANDS:
         spellings = [spelling for each in options_of(name) for spelling in each.opts]
-        assert [text for text in spellings if not re.fullmatch(r"--[a-zI][a-z0-9-]*", text)] == []
+        letters = {text for text in spellings if not re.fullmatch(r"--[a-zI][a-z0-9-]*", text)}
+        assert letters <= {"-q", "-v"}
 
 
 def test_what_a_command_writes_is_its_output() -> None:
@@ -306,6 +311,69 @@ def test_other_option_is_refused_with_its_mend(words: str, mend: str) -> None:
     error = invoke(*words.split()).exception
     option = next(word for word in words.split() if word.startswith("--")).partition("=")[0]
     assert str(error) == f"{option} is no option of rise-di {words.split(maxsplit=1)[0]}: {mend}"
+
+
+@pytest.mark.parametrize(
+    "words, refusal",
+    [
+        ("flyy", "flyy is no command of rise-di: did you mean fly?"),
+        ("scenario", "scenario is no command of rise-di: did you mean scenarios?"),
+        ("xyzzy", "xyzzy is no command of rise-di: rise-di --help lists them"),
+        ("--verison", "--verison is no option of rise-di: did you mean --version?"),
+        ("fly -x", "-x is no option of rise-di fly: rise-di fly --help lists them"),
+        ("fly --duration", "rise-di fly: option '--duration' requires an argument; rise-di fly"),
+        ("fly a b", "rise-di fly: got unexpected extra argument"),
+        ("export", "rise-di export: missing argument 'scenario'; rise-di export --help shows"),
+        ("fly -q -v", "--quiet beside it, expected one of the two"),
+    ],
+)
+def test_every_refusal_of_words_is_one_line_in_one_form(
+    words: str, refusal: str, tmp_path: Path
+) -> None:
+    process = rise_di(*words.split(), cwd=tmp_path)
+    assert process.returncode == 2
+    assert process.stderr.startswith("error: ")
+    assert refusal in process.stderr
+    assert len(process.stderr.splitlines()) == 1
+    assert process.stdout == ""
+
+
+@pytest.mark.parametrize(
+    "words, same", [("-h", "--help"), ("help", "--help"), ("fly -h", "fly --help")]
+)
+def test_help_is_found_by_each_usual_word(words: str, same: str, tmp_path: Path) -> None:
+    asked, expected = (rise_di(*text.split(), cwd=tmp_path) for text in (words, same))
+    assert (asked.returncode, asked.stdout) == (0, expected.stdout)
+    if words == "fly -h":
+        assert rise_di("help", "fly", cwd=tmp_path).stdout == expected.stdout
+
+
+def test_quiet_flight_prints_its_headline_alone(tmp_path: Path) -> None:
+    words = ("fly", "osprey_gust", "--in-process", "--duration", "4", "-q")
+    process = rise_di(*words, cwd=tmp_path)
+    assert process.stdout == "completed\n", process.stderr
+    assert process.stderr == ""
+
+
+@pytest.mark.parametrize(
+    "comment, expected",
+    [
+        (["A gust of 1.5 m/s,", "then a turn.", "More."], "A gust of 1.5 m/s, then a turn."),
+        (["One line without a stop"], "One line without a stop"),
+        (["One. And another", "that goes on.", "More."], "One. And another that goes on."),
+        (["No stop", "", "Another paragraph."], "No stop"),
+        ([], ""),
+    ],
+)
+def test_sentences_of_a_scenario_are_whole(comment: list[str], expected: str) -> None:
+    head = ["SPDX-License-Identifier: Apache-2.0", "", *comment]
+    text = "\n".join([*(f"# {line}".rstrip() for line in head), "/**/flight:", "  # no head."])
+    assert first_sentences(text) == expected
+
+
+def test_no_sentence_of_a_shipped_scenario_breaks_off() -> None:
+    listed = json.loads(invoke("scenarios", "--json").output)
+    assert [row["name"] for row in listed if not row["flies"].endswith(".")] == []
 
 
 @pytest.mark.parametrize("words", ["campaign osprey_servo --runs 10", "fly --runs=3"])

@@ -24,7 +24,7 @@ from typing import Annotated
 
 import typer
 
-from flight_cli.words import RiseDiCommand, as_function
+from flight_cli.words import RiseDiCommand, RiseDiGroup, as_function, without_help_word
 
 FAILED = 1
 BAD_INPUT = 2
@@ -108,7 +108,13 @@ def application(words: Collection[str]) -> typer.Typer:
 
     Further commands have name and help alone.
     """
-    app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
+    app = typer.Typer(
+        cls=RiseDiGroup,
+        no_args_is_help=True,
+        pretty_exceptions_enable=False,
+        context_settings={"help_option_names": ["--help", "-h"]},
+        epilog="rise-di help COMMAND and rise-di COMMAND -h show the options of a command.",
+    )
     app.callback()(_options)
     for group, commands in GROUPS.items():
         for name, sentence in commands.items():
@@ -150,7 +156,7 @@ def main() -> None:
             # A batch process interrupts no node when it wakes up.
             os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     words = [
-        *sys.argv[1:2],
+        *without_help_word(sys.argv[1:])[:1],
         *os.environ.get("_TYPER_COMPLETE_ARGS", os.environ.get("COMP_WORDS", "")).split(),
     ]
     try:

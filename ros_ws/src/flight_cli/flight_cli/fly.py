@@ -78,6 +78,7 @@ OF_AIRCRAFT = (
     "fence",
     "namespace",
     "learn",
+    "quiet",
 )
 
 
@@ -140,8 +141,11 @@ class Fly(RouteWords):
         default="",
     )
     runs: Path = rare_option("Folder that the run's folder is made in.", default=Path("runs"))
-    verbose: bool = option(
+    verbose: bool = rare_option(
         "Print all tables and notes, as rise-di report does.", "--verbose", "-v", default=False
+    )
+    quiet: bool = rare_option(
+        "Print the headline of the outcome alone.", "--quiet", "-q", default=False
     )
     as_json: bool = json_option()
 
@@ -152,6 +156,7 @@ class Fly(RouteWords):
             require_unused(self, OF_AIRCRAFT, expected, "a fleet beside it")
             self._fly_fleet()
         scenario = self._scenario()
+        self._require_one_length()
         namespace = absolute_namespace(self.namespace)
         stepping = self.lockstep or scenario.flight.lockstep
         autopilot = self._autopilot(stepping=stepping)
@@ -172,7 +177,8 @@ class Fly(RouteWords):
             scenario = as_flown(scenario, run, namespace)
         self._watch(run)
         by_clock = self.use_sim_time or (scenario.flight.use_sim_time and not stepping)
-        with flight_progress(scenario.flight.duration, quiet=self.as_json) as (progress, announce):
+        is_quiet = self.as_json or self.quiet
+        with flight_progress(scenario.flight.duration, quiet=is_quiet) as (progress, announce):
             if self.in_process:
                 outcome = fly_in_process(scenario, run, progress, learn, announce)
             else:
@@ -190,7 +196,14 @@ class Fly(RouteWords):
             if outcome.end is End.COMPLETED:
                 # Whether it is a success is for the report to say, which is not written yet.
                 progress(scenario.flight.duration, "flown")
-        status = _report(scenario, run, outcome, as_json=self.as_json, verbose=self.verbose)
+        status = _report(
+            scenario,
+            run,
+            outcome,
+            as_json=self.as_json,
+            verbose=self.verbose,
+            quiet=self.quiet,
+        )
         raise typer.Exit(status)
 
     def _scenario(self) -> Scenario:
@@ -221,6 +234,11 @@ class Fly(RouteWords):
         controller = scenario.controller
         begins = controller.autostart and controller.start_active
         return begins and not (self.real_time or self.in_process or has_own_time)
+
+    def _require_one_length(self) -> None:
+        """Raise ParameterError for two lengths of the answer at once."""
+        if self.quiet:
+            require_unused(self, ["verbose", "as_json"], "one of the two", "--quiet beside it")
 
     def _require_one_way(self, *, stepping: bool) -> None:
         """Raise ParameterError for two ways to fly at once."""
@@ -335,7 +353,13 @@ def _warn_of_browser() -> None:
 
 
 def _report(
-    scenario: Scenario, run: Path, outcome: Outcome, *, as_json: bool, verbose: bool
+    scenario: Scenario,
+    run: Path,
+    outcome: Outcome,
+    *,
+    as_json: bool,
+    verbose: bool,
+    quiet: bool,
 ) -> int:
     """Write and print the report of a flight. Returns the exit status."""
     unwritten = ""
@@ -357,6 +381,8 @@ def _report(
     outcome_record = result.flight.summary["outcome"]
     if as_json:
         print_json(result.flight.summary)
+    elif quiet:
+        print(outcome_record["sentence"])
     else:
         console = Console()
         if verbose:

@@ -3,12 +3,29 @@
 """`rise-di scenarios`: the scenarios by name."""
 
 from dataclasses import dataclass
+from itertools import dropwhile, takewhile
 
 from rich.console import Console
 
 from flight_analysis.closed_loop.scenario_library import LIBRARY, find_scenario
 from flight_cli.output import new_table, print_json
 from flight_cli.words import argument, json_option, scenario_names
+
+
+def first_sentences(text: str) -> str:
+    """Return the first sentences of the comment at the head of a file.
+
+    They end with the first line that ends with a full stop, or with the paragraph.
+    """
+    head = takewhile(lambda line: line.startswith("#") or not line.strip(), text.splitlines())
+    comment = (line.removeprefix("#").strip() for line in head)
+    written = dropwhile(lambda line: not line or line.startswith("SPDX"), comment)
+    lines: list[str] = []
+    for line in takewhile(bool, written):
+        lines.append(line)
+        if line.endswith("."):
+            break
+    return " ".join(lines)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,12 +47,13 @@ class Scenarios:
         rows = []
         for name in self.names or sorted(path.stem for path in LIBRARY.glob("*.yaml")):
             scenario = find_scenario(name)
-            comment = (
-                line.removeprefix("#").strip()
-                for line in scenario.path.read_text(encoding="utf-8").splitlines()
-            )
-            sentence = next((line for line in comment if line and not line.startswith("SPDX")), "")
-            row = {"name": scenario.name, "flies": sentence, "aircraft": scenario.aircraft.airframe}
+            text = scenario.path.read_text(encoding="utf-8")
+            sentences = first_sentences(text)
+            row = {
+                "name": scenario.name,
+                "flies": sentences,
+                "aircraft": scenario.aircraft.airframe,
+            }
             rows.append(row | {"law": scenario.controller.law})
         if self.as_json:
             print_json(rows)

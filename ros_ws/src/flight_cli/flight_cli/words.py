@@ -15,12 +15,14 @@ from typing import Annotated, Any, Protocol, get_type_hints
 
 import typer
 from rich.markup import escape
-from typer.core import TyperCommand
+from typer.core import TyperCommand, TyperGroup
+from typer.exceptions import TyperException
 
 from flight_core.parameters import ParameterError, require
 
 DECLARE = "declare"  # key of what declares a field to Typer
 ALIKE = 0.85  # of a misspelt option: --run is near to --runs, --seed not to --send
+ALIKE_COMMANDS = 0.6  # of a misspelt command, which flies nothing by mistake
 REQUIRED = MISSING
 """The default of a field without a default."""
 
@@ -177,11 +179,29 @@ EXPECTED: Mapping[str, str] = MappingProxyType(
 """What a value of the command line has to be, by the type of pydantic's error."""
 
 
-def refused_value(error: typer.BadParameter) -> Exception:
-    """The refusal of a value as a sentence; the error itself where Typer wrote its own sentence."""
+def refused_words(error: Any, command: str, names: Sequence[str]) -> ParameterError:
+    """Return the refusal of words of a command as a sentence: ours, or else that of Typer."""
+    if isinstance(error, typer.BadParameter):
+        return refused_value(error, command)
+    option = getattr(error, "option_name", "")
+    if option and "requires" not in error.format_message():
+        near = get_close_matches(option, names, n=1, cutoff=ALIKE)
+        mend = f"did you mean {near[0]}?" if near else f"{command} --help lists them"
+        return ParameterError(f"{option} is no option of {command}: {mend}")
+    return _typers_sentence(error, command)
+
+
+def _typers_sentence(error: Any, command: str) -> ParameterError:
+    """Return what Typer says of words, in the form of the other refusals."""
+    text = error.format_message().strip().rstrip(".")
+    return ParameterError(f"{command}: {text[:1].lower()}{text[1:]}; {command} --help shows more")
+
+
+def refused_value(error: typer.BadParameter, command: str) -> ParameterError:
+    """The refusal of a value as a sentence: ours, or else that of Typer."""
     cause: Any = error.__cause__
     if cause is None or not hasattr(cause, "errors") or error.param is None:
-        return error
+        return _typers_sentence(error, command)
     first = cause.errors(include_url=False)[0]
     message = str(first["msg"]).removeprefix("Value error, ").removeprefix("Input should be ")
     _, is_choice, choices = message.rstrip(".").partition(" is not one of ")
@@ -214,8 +234,8 @@ class RiseDiCommand(TyperCommand):
                 )
         try:
             return super().parse_args(ctx, args)
-        except typer.BadParameter as error:
-            raise refused_value(error) from None
+        except TyperException as error:
+            raise refused_words(error, f"rise-di {self.name}", names) from None
 
     def _mend(self, name: str, names: Sequence[str]) -> str:
         """What to type in place of an unknown option."""
@@ -241,3 +261,32 @@ class RiseDiCommand(TyperCommand):
             if not words.get(key, "").startswith("--"):
                 raise
             raise ParameterError(f"{words[key]}{colon}{reason}") from None
+
+
+def without_help_word(words: Sequence[str]) -> list[str]:
+    """Return the words with the option --help in place of a first word help."""
+    return [*words[1:2], "--help"] if [*words[:1]] == ["help"] else [*words]
+
+
+class RiseDiGroup(TyperGroup):
+    """The commands, whose refusals have the form of those of an option."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse the words. Raises ParameterError for an unknown option before the command."""
+        if not args:
+            return super().parse_args(ctx, args)
+        args = without_help_word(args)
+        names = [name for each in self.get_params(ctx) for name in each.opts]
+        try:
+            return super().parse_args(ctx, args)
+        except TyperException as error:
+            raise refused_words(error, "rise-di", names) from None
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Return the command of a word. Raises ParameterError for a word that is none."""
+        word = args[0]
+        if word not in self.commands and not ctx.resilient_parsing:
+            near = get_close_matches(word, self.commands, n=1, cutoff=ALIKE_COMMANDS)
+            mend = f"did you mean {near[0]}?" if near else "rise-di --help lists them"
+            raise ParameterError(f"{word} is no command of rise-di: {mend}")
+        return super().resolve_command(ctx, args)

@@ -22,6 +22,12 @@ EMPTY = "an empty file"
 BEGUN = "the first bytes of an MCAP file"
 UNREADABLE = "a file that cannot be read"
 
+ULOG = "a ULog of PX4"
+DATAFLASH = "a DataFlash log of ArduPilot"
+TLOG = "a tlog of MAVLink"
+IMPORTABLE = frozenset({ULOG, DATAFLASH, TLOG})
+"""Kinds of logs of autopilots, of which `rise-di import` makes a bag."""
+
 PACKED = (ZSTD, LZ4)
 """Kinds that may hold a log."""
 
@@ -34,9 +40,9 @@ MAGICS = MappingProxyType(
         b"SQLite format 3\0": SQLITE,
         ZSTD_MAGIC: ZSTD,
         LZ4_MAGIC: LZ4,
-        b"ULog\x01\x12\x35": "a ULog of PX4",  # PX4 guide, ULog file format
+        b"ULog\x01\x12\x35": ULOG,  # PX4 guide, ULog file format
         # A packet with the identity FMT (ArduPilot, AP_Logger/LogStructure.h).
-        b"\xa3\x95\x80": "a DataFlash log of ArduPilot",
+        b"\xa3\x95\x80": DATAFLASH,
         b"FMT, 128, 89,": "a DataFlash log of ArduPilot as text",
         b"H Product:Blackbox": "a blackbox log of Betaflight or INAV",
         b"#ROSBAG V": "a bag of ROS 1",
@@ -103,7 +109,7 @@ def kind_of_head(head: bytes) -> str:
     kinds = {
         "a file of zeros": not any(head),
         "a tar archive": head[TAR_PLACE : TAR_PLACE + len(TAR)] == TAR,
-        "a tlog of MAVLink": tlog_start(head) is not None,
+        TLOG: tlog_start(head) is not None,
         "a stream of MAVLink": head[:1] in MAVLINK,
     }
     return next((kind for kind, fits in kinds.items() if fits), "") or _text_kind(head)

@@ -24,6 +24,7 @@ from flight_log.bag import stack_topic
 from flight_log.file_kinds import (
     BEGUN,
     EMPTY,
+    IMPORTABLE,
     LZ4,
     MCAP,
     PACKED,
@@ -61,7 +62,10 @@ def log_files(run: Path) -> list[Path]:
     is_log = any(kind in (MCAP, *PACKED) for kind in kinds)
     is_begun = is_folder(run) and bool({EMPTY, BEGUN} & {*kinds})
     if SQLITE in kinds or not (is_log or is_begun):
-        raise ParameterError(f"{run}: found {_what_is_there(run, files, kinds)}, expected {A_RUN}")
+        importable = is_file(run) and {*kinds} & IMPORTABLE
+        mend = f"; rise-di import {run} makes one of it" if importable else ""
+        found = _what_is_there(run, files, kinds)
+        raise ParameterError(f"{run}: found {found}, expected {A_RUN}{mend}")
     return files
 
 
