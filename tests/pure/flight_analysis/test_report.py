@@ -28,7 +28,7 @@ from flight_analysis.report.plotting import Figure, PlotContext
 from flight_analysis.report.spectra import spectra
 from flight_analysis.report.summary import RecordedFlight, summarise, transients
 from flight_analysis.report.summary_rows import TIMING_COLUMNS, timing_rows
-from flight_analysis.report.tables import events
+from flight_analysis.report.tables import events, metric_tables
 from flight_analysis.report.timing import AgeMetrics, LatencyMetrics, TickMetrics
 from flight_core.modes import Mode
 from flight_core.outcome import COMPLETED, Outcome, ended_early
@@ -465,6 +465,37 @@ def test_channels_of_page_and_tables_are_in_order_of_the_controller(servo: Scena
     assert titles(figures.error_figure(context_of_one)) == labels
     integrals = ["∫e q (deg)", "∫e p (deg)", "∫e r (deg)", "∫e V (m)"]
     assert titles(figures.integral_figure(context_of_one))[::2] == integrals
+
+
+def test_noise_floor_bounds_what_a_measured_error_tells_and_not_a_true_one(
+    servo: Scenario,
+) -> None:
+    """The true error is y - y_m of the simulation, without the noise of the sensors."""
+    tape = simulate(servo.vary(flight={"duration": 1.0}))
+    without_truth = {name: each for name, each in tape.signals.items() if name != "truth"}
+    behind_sensors = replace(tape, signals=without_truth)
+    for one, expected in (
+        (recorded("true", servo, tape), "the true error does not contain it"),
+        (recorded("measured", servo, behind_sensors), "a smaller measured error cannot be"),
+    ):
+        table = next(
+            each
+            for each in metric_tables(one.summary, one.units)
+            if each.caption.startswith("Tracking error")
+        )
+        assert expected in table.legend
+        assert ("cannot be distinguished" in table.legend) == (one.name == "measured")
+
+
+def test_jitter_says_what_it_is(servo: Scenario) -> None:
+    one = recorded("run", servo, simulate(servo.vary(flight={"duration": 1.0})))
+    ticks = next(
+        table
+        for table in metric_tables(one.summary, one.units)
+        if table.caption.startswith("Ticks of the controller")
+    )
+    assert any("jitter" in row[0] for row in ticks.rows)
+    assert "jitter: how far the time between two ticks is" in ticks.legend
 
 
 def test_states_have_units_and_angles_are_in_degrees(servo: Scenario) -> None:

@@ -82,7 +82,13 @@ def test_two_runs_are_compared(
         "osprey_gust",
         "osprey_servo",
     ]
-    assert (runs[0].parent / "comparison.html").is_file()
+    first = runs[0].parent / "comparison.html"
+    page = first.read_bytes()
+    Report(runs=[*runs]).execute()
+    # The page of an earlier comparison stays.
+    assert first.read_bytes() == page
+    assert capsys.readouterr().out.splitlines()[-1].endswith("comparison-2.html")
+    assert first.with_name("comparison-2.html").is_file()
 
 
 @pytest.mark.parametrize("option", ["html", "csv"])

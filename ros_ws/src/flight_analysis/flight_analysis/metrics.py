@@ -200,7 +200,9 @@ def _columns(signal: Signal, names: Sequence[str]) -> FloatArray:
 
 
 def noise_floor(tape: Tape) -> dict[str, float]:
-    """Noise floor of y by channel, SI: a smaller error cannot be distinguished from noise.
+    """Noise floor of y by channel, SI.
+
+    A smaller measured error cannot be distinguished from noise. A true error can be smaller.
 
     The floor is the rms of "noise.channel" of `truth` on the tape, else the estimate of white noise
     from second differences d_k = y_(k+1) - 2 y_k + y_(k-1): rms = median(abs(d)) / (0.6745

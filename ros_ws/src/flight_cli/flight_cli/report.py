@@ -49,7 +49,7 @@ class Report:
         "Folder of a run, by default runs/latest; several are compared with the first."
     )
     html: Path | None = rare_option(
-        "Page of a comparison; by default comparison.html beside run 1.", "--page"
+        "Page of a comparison; by default a new comparison.html beside run 1.", "--page"
     )
     output: Path | None = rare_option(
         "Folder for the report of one run, by default that of its log: for archives."

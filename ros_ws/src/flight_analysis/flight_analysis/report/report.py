@@ -7,6 +7,7 @@ The outputs are the page of a run or of a comparison, and the data for further p
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from itertools import chain, count
 from pathlib import Path
 from typing import NamedTuple
 
@@ -63,8 +64,8 @@ def report(
 
     Args:
         runs: Folders of runs, or MCAP files.
-        html: Page of a comparison; None: comparison.html beside the first run. With one run: its
-            page alone.
+        html: Page of a comparison; None: comparison.html beside the first run, or where that
+            exists comparison-2.html and so on. With one run: its page alone.
         output: Folder for the report of one run; None: the folder of the log.
         png: File for y over y_m, e and u as one figure.
         csv: File for all signals, one row an instant, one column a channel.
@@ -126,13 +127,19 @@ def report(
     else:
         flights = [read_one(folder) for folder in folders]
         _require_comparable(folders, flights)
-        page = folders[0].absolute().parent / "comparison.html" if html is None else Path(html)
+        page = _unused_page(folders[0].absolute().parent) if html is None else Path(html)
         if html is None:
             files.insert(0, File("html", page, write_page))
     for file in files:
         with writing(file.key, file.path, A_FILE):
             file.write(file.path, flights)
     return Report(page, flights)
+
+
+def _unused_page(folder: Path) -> Path:
+    """Return comparison.html in a folder, or comparison-2.html and so on where that exists."""
+    names = chain(["comparison.html"], (f"comparison-{number}.html" for number in count(2)))
+    return next(page for name in names if not (page := folder / name).exists())
 
 
 def _require_comparable(folders: Sequence[Path], flights: Sequence[RecordedFlight]) -> None:

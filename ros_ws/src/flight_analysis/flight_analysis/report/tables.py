@@ -10,7 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.metrics import MIN_BAND_NOISE_FLOORS, SETTLING_BAND, SETTLING_DWELL, Windows
+from flight_analysis.metrics import (
+    MIN_BAND_NOISE_FLOORS,
+    SETTLING_BAND,
+    SETTLING_DWELL,
+    TRUE_ERROR,
+    Windows,
+)
 from flight_analysis.report import figures
 from flight_analysis.report.account import account_of_json
 from flight_analysis.report.display_units import (
@@ -48,12 +54,13 @@ ERROR_LEGEND = (
     f" until the error stays for {SETTLING_DWELL:g} s within {SETTLING_BAND:.0%} of the largest "
     f"y_m, or within {MIN_BAND_NOISE_FLOORS:g} noise floors if it is measured; the slowest"
 )
-NOISE_FLOOR_LEGEND = (
-    ". noise floor: of y; a smaller error cannot be distinguished from noise or rounding"
-)
+NOISE_FLOOR_LEGEND = "noise floor: the rms that noise and rounding leave in y"
+UNDISTINGUISHED = "; a smaller measured error cannot be distinguished from noise or rounding"
+TRUE_BELOW = "; the true error does not contain it, and may be smaller"
 IMPORTED_LEGEND = (
     "trim: the median; rate: mean abs of the derivative, in the unit of the row per second"
 )
+TICK_LEGEND = "jitter: how far the time between two ticks is from a whole number of periods"
 INPUT_LEGEND = "u about trim; rate: mean abs(u_dot), in the unit of the row per second"
 GUIDANCE_LEGEND = (
     "a segment has the same modes, commands and leg of the route. overshoot: the largest error "
@@ -261,7 +268,9 @@ def _error_table(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -
     for channel, row in zip(summary["errors"], rows, strict=True):
         row.extend(slowest_settling(summary, channel, kind) for kind in settling)
     caption = f"Tracking error ({summary['error']}), {time_flown(summary)}"
-    legend = f"{summary_legend(summary)}. {ERROR_LEGEND}{NOISE_FLOOR_LEGEND}"
+    is_true = summary["error"].startswith(TRUE_ERROR)
+    floor = NOISE_FLOOR_LEGEND + (TRUE_BELOW if is_true else UNDISTINGUISHED)
+    legend = f"{summary_legend(summary)}. {ERROR_LEGEND}. {floor}"
     return MetricTable(
         caption, (*columns, *(SETTLING_COLUMNS[kind] for kind in settling)), rows, legend
     )
@@ -295,7 +304,8 @@ def _tick_table(summary: Mapping[str, Any]) -> MetricTable:
     for topic, label, text in timing_rows(summary):
         part = "" if topic == "ticks" else taken_over(summary, topic)
         rows.append((f"{label}{part}", text))
-    return MetricTable(caption, [Column("", "")], rows)
+    legend = TICK_LEGEND if any("jitter" in label for label, _ in rows) else ""
+    return MetricTable(caption, [Column("", "")], rows, legend)
 
 
 def _process_table(summary: Mapping[str, Any]) -> MetricTable:
