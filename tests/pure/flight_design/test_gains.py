@@ -212,7 +212,7 @@ def test_gains_of_theorem_1_are_unstable_on_osprey_with_servos(
     assert {"linear stability", "delay margin"} <= set(failing_in_loop(literal))
     broken = names(gain_conditions.failing(literal.rules), outputs)
     assert {"lag product of q", "lag product of p"} <= set(broken)
-    assert not literal.loop_holds
+    assert not literal.is_stable
     assert "k_g, step 2" in names(gain_conditions.failing(selected.engineering.theorem), outputs)
 
 

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di gains`: select gains by Theorem 1 and by the engineering procedure.
-
-The gains of a scenario are checked, too.
-"""
+"""`rise-di gains`: select gains by Theorem 1 and by the procedure, or check those of a scenario."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -36,6 +33,14 @@ from flight_cli.gains_guarantee import (
     write_certificate,
     write_unstable,
 )
+from flight_cli.gains_verdicts import (
+    HEADINGS,
+    VERDICTS,
+    condition_as_json,
+    condition_name,
+    loop_verdict,
+    milliseconds,
+)
 from flight_cli.output import (
     LICENCE,
     named_numbers,
@@ -64,7 +69,7 @@ from flight_core.parameters import ParameterError, require
 from flight_core.units import quantity
 from flight_design.gains import gain_selection, gain_yaml
 from flight_design.gains.airframe_properties import airframe_facts, marginal_sentence
-from flight_design.gains.gain_conditions import GainCondition, failing
+from flight_design.gains.gain_conditions import GainCondition
 from flight_design.gains.gain_design import check_gains, select_gains
 from flight_design.gains.gain_selection import GainAssessment, Selection
 from flight_design.gains.ideal_control import Study
@@ -137,8 +142,7 @@ class Gains:
 
     Every condition on both is shown. With --check, show the margins and conditions of the
     scenario's controller instead: of any law, with the law's own gains. The verdict on the loop
-    then decides the exit status. That on Theorem 1 does not, because its conditions are sufficient
-    only.
+    then decides the exit status; Theorem 1 is sufficient only.
 
     Exit status: 0; 1 with --check unless the loop is stable with the margins that it needs, or an
     aircraft within --uncertainty may be unstable with --guarantee; 2 bad input.
@@ -393,7 +397,7 @@ def _show_trade(console: Console, selection: Selection) -> None:
             f"{rms * unit.factor:.3g}"
             for rms, unit in zip(row.rms.tolist(), unit_texts, strict=True)
         )
-        margins = f"{row.phase_margin:g}", f"{row.reached:.0f}", _milliseconds(row.delay_margin)
+        margins = f"{row.phase_margin:g}", f"{row.reached:.0f}", milliseconds(row.delay_margin)
         table.add_row(*margins, *errors, f"{float(np.sum(row.rms / units)):.2f}")
     print_table(console, table)
 
@@ -428,16 +432,15 @@ def _show_margins(console: Console, study: Study, answers: dict[str, Assessment]
 def _show_verdicts(console: Console, result: _GainsAnswer) -> None:
     """Print the conditions part by part, each with its verdict: the loop's decides."""
     answers = result.titles
-    study, first = result.study, result.first
+    first = result.first
     for part, heading in HEADINGS.items():
         if getattr(first, part):
             print_table(console, _condition_table(answers, part, heading))
         for name, answer in answers.items():
             verdict = VERDICTS[part](answer, result.promise)
             if verdict.sentence:
-                style = "bold" if part == "loop" else ""
-                say(console, f"{name}: {verdict.sentence}", style=style)
-    if first.theorem and (marginal := marginal_sentence([airframe_facts(study.airframe)])):
+                say(console, f"{name}: {verdict.sentence}", "bold" if part == "loop" else "")
+    if first.theorem and (marginal := marginal_sentence([airframe_facts(first.study.airframe)])):
         say(console, marginal)
     if first.bounds is None:
         estimate = ""
@@ -446,82 +449,6 @@ def _show_verdicts(console: Console, result: _GainsAnswer) -> None:
     say(console, f"margin: a condition holds above 1 and fails (!) below{estimate}", style="dim")
     for word, meaning in MEANINGS.items() if first.bounds is not None else ():
         say(console, f"{word}: {meaning}", style="dim")
-
-
-class Verdict(NamedTuple):
-    """What a part of the conditions comes to; an empty sentence for a part without conditions."""
-
-    holds: bool
-    sentence: str
-
-
-def loop_verdict(answer: Assessment, promise: Guarantee | None) -> Verdict:
-    """Return whether a loop is stable with the margins and the guarantee that are asked of it."""
-    is_guaranteed = promise is None or promise.holds
-    holds = answer.loop_holds and is_guaranteed
-    margins = answer.margins
-    if margins is None:
-        return Verdict(False, "the loop is not judged, because the literal sign has no linear loop")
-    if not margins.nominal.stable:
-        return Verdict(False, "the loop is unstable")
-    if not answer.is_stable:
-        text = f"{margins.stable} of {margins.aircraft} uncertain aircraft"
-        return Verdict(False, f"the loop is stable, but only {text} are")
-    clauses = []
-    if short := failing(answer.loop):
-        outputs = answer.controller.outputs
-        falls = "; ".join(condition.sentence(outputs) for condition in short)
-        clauses.append(f"but it lacks what is asked of it ({falls})")
-    elif answer.has_requirement:
-        phase = math.degrees(margins.nominal.phase.min())
-        clauses.append(
-            f"with the margins asked of it: at least {phase:.0f} deg of phase in each input, and "
-            f"a delay margin of {_milliseconds(margins.delay)}"
-        )
-    if promise is not None:
-        within = f"within {100.0 * promise.uncertainty:g} %"
-        clauses.append(
-            f"as every aircraft {within} is, which is guaranteed"
-            if is_guaranteed
-            else f"but an aircraft {within} may be unstable"
-        )
-    return Verdict(holds, ", ".join(("the loop is stable", *clauses)))
-
-
-def rules_verdict(answer: Assessment, _: Guarantee | None) -> Verdict:
-    """Return how many rules of the engineering procedure a gain set keeps."""
-    rules = answer.rules
-    if not rules:
-        return Verdict(True, "")
-    kept = len(rules) - len(failing(rules))
-    return Verdict(
-        kept == len(rules),
-        f"{kept} of {len(rules)} rules are kept. They are where the search for gains begins, and "
-        "decide nothing",
-    )
-
-
-def theorem_verdict(answer: Assessment, _: Guarantee | None) -> Verdict:
-    """Return how many of the sufficient conditions of Theorem 1 a gain set meets."""
-    conditions = answer.theorem
-    if not conditions:
-        return Verdict(True, "")
-    met = len(conditions) - len(failing(conditions))
-    return Verdict(
-        met == len(conditions),
-        f"{met} of {len(conditions)} conditions of Theorem 1 are met. They are sufficient only, "
-        "and decide nothing: the paper's proof is in continuous time, and no loop with servos "
-        "meets its assumptions",
-    )
-
-
-HEADINGS = {
-    "loop": "The loop: these conditions decide",
-    "rules": "Rules of the engineering procedure",
-    "theorem": "Theorem 1: sufficient conditions, of a loop without servos in continuous time",
-}
-VERDICTS = {"loop": loop_verdict, "rules": rules_verdict, "theorem": theorem_verdict}
-"""The parts of the conditions on a gain set, in the order in which they are shown."""
 
 
 def _condition_table(answers: dict[str, Assessment], part: str, title: str) -> Table:
@@ -533,7 +460,7 @@ def _condition_table(answers: dict[str, Assessment], part: str, title: str) -> T
     outputs = next(iter(answers.values())).controller.outputs
     for conditions in zip(*(getattr(answer, part) for answer in answers.values()), strict=True):
         cells = chain.from_iterable(map(_cells, conditions))
-        table.add_row(_condition_name(conditions, outputs), *cells)
+        table.add_row(condition_name(conditions, outputs), *cells)
     return table
 
 
@@ -576,22 +503,15 @@ def _own_gains(controller: ControllerConfig, aircraft: str) -> Table:
     return table
 
 
-def _condition_name(row: tuple[GainCondition, ...], outputs: tuple[str, ...]) -> str:
-    """Name of a row, with the channel if it is the same in every gain set."""
-    where = {None if condition.channel is None else outputs[condition.channel] for condition in row}
-    channel = where.pop() if len(where) == 1 else None
-    return row[0].name + (f" of {channel}" if channel else "") + (" ~" if row[0].estimate else "")
-
-
 def _format_delay_margin(study: Study, answer: Assessment) -> str:
     if answer.delay_margin is None:
         return "no linear loop (literal sign)"
     if answer.delay_margin == 0.0:
         return "predicted delay margin none: the linear loop is unstable with this lag"
     each = zip(answer.controller.outputs, answer.channel_margins, strict=True)
-    single_margins = ", ".join(f"{output} {_milliseconds(margin)}" for output, margin in each)
+    single_margins = ", ".join(f"{output} {milliseconds(margin)}" for output, margin in each)
     margin = (
-        f"predicted delay margin {_milliseconds(answer.delay_margin)}; in one channel "
+        f"predicted delay margin {milliseconds(answer.delay_margin)}; in one channel "
         f"alone: {single_margins}"
     )
     return f"{margin}; {speed_of_margin(study, answer)}"
@@ -618,10 +538,6 @@ def _stable_speed_ratio(study: Study, answer: Assessment) -> float | None:
     return ratio if math.isfinite(ratio) else None
 
 
-def _milliseconds(margin: float) -> str:
-    return f"{1e3 * margin:.0f} ms" if math.isfinite(margin) else "over 500 ms"
-
-
 def _cells(condition: GainCondition) -> tuple[str, str]:
     margin = "" if math.isnan(condition.margin) else f"{condition.margin:.2g}"
     side = SIDES[condition.side]
@@ -643,7 +559,7 @@ def _as_json(result: _GainsAnswer, seed: int) -> dict[str, Any]:
         "seed": seed,
         "slew": dict(zip(inputs, study.slew.tolist(), strict=True)),
         "slew_calm": dict(zip(inputs, study.slew_undisturbed.tolist(), strict=True)),
-        **({"checked": result.checked} if result.checked else {}),
+        "checked": result.checked or None,
         **{
             name: _assessment_as_json(study, answer, promise)
             for name, answer in result.answers.items()
@@ -662,7 +578,7 @@ def _assessment_as_json(
             "rho": answer.bounds.rho
         }
     conditions = [
-        _condition_as_json(part, condition, outputs)
+        condition_as_json(part, condition, outputs)
         for part in HEADINGS
         for condition in getattr(answer, part)
     ]
@@ -679,19 +595,4 @@ def _assessment_as_json(
         "bounds": bounds,
         "conditions": conditions,
         "differences": study.differences,
-    }
-
-
-def _condition_as_json(
-    part: str, condition: GainCondition, outputs: tuple[str, ...]
-) -> dict[str, Any]:
-    return {
-        "name": condition.name,
-        "part": part,
-        "channel": None if condition.channel is None else outputs[condition.channel],
-        "found": condition.value,
-        condition.side.replace(" ", "_"): condition.bound,
-        "margin": condition.margin,
-        "holds": condition.holds,
-        "estimate": condition.estimate,
     }

@@ -107,11 +107,7 @@ class LoopSetting(NamedTuple):
 
 
 class GainAssessment(NamedTuple, Generic[Controller]):
-    """A controller, every condition on its gains, and the margins of its loop.
-
-    The conditions of the loop decide whether it flies. The rules are estimates of its margins, and
-    those of the theorem are sufficient, for a loop without servos.
-    """
+    """A controller, every condition on its gains, and the margins of its loop."""
 
     controller: Controller
     theorem: tuple[GainCondition, ...]  # empty for a law other than RISE-DI
@@ -160,17 +156,9 @@ class GainAssessment(NamedTuple, Generic[Controller]):
 
     @property
     def is_stable(self) -> bool:
-        """Whether the linear loop is stable for the nominal aircraft and every sample.
-
-        False for the literal sign, of which nothing is shown.
-        """
+        """Whether the loop is stable for every aircraft; False for the literal sign."""
         named = (condition for condition in self.loop if condition.name == STABILITY)
         return self.margins is not None and all(condition.holds for condition in named)
-
-    @property
-    def loop_holds(self) -> bool:
-        """Whether the loop is stable and has all that is asked of it."""
-        return self.is_stable and not gain_conditions.failing(self.loop)
 
 
 def loop_with_box(study: Study, controller: ControllerConfig) -> LinearLoop:

@@ -1,0 +1,114 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What the conditions on a gain set come to: the loop decides, rules and theorem do not."""
+
+import math
+from typing import Any, NamedTuple
+
+from flight_analysis.linear_loop.guarantee import Guarantee
+from flight_design.gains.gain_conditions import GainCondition, failing
+from flight_design.gains.gain_selection import GainAssessment
+
+
+def milliseconds(margin: float) -> str:
+    """Return a delay margin, s, as a text."""
+    return f"{1e3 * margin:.0f} ms" if math.isfinite(margin) else "over 500 ms"
+
+
+class Verdict(NamedTuple):
+    """What a part of the conditions comes to; an empty sentence for a part without conditions."""
+
+    holds: bool
+    sentence: str
+
+
+def loop_verdict(answer: GainAssessment[Any], promise: Guarantee | None) -> Verdict:
+    """Return whether a loop is stable with the margins and the guarantee that are asked of it."""
+    is_guaranteed = promise is None or promise.holds
+    holds = answer.is_stable and not failing(answer.loop) and is_guaranteed
+    margins = answer.margins
+    if margins is None:
+        return Verdict(False, "the loop is not judged, because the literal sign has no linear loop")
+    if not margins.nominal.stable:
+        return Verdict(False, "the loop is unstable")
+    if not answer.is_stable:
+        text = f"{margins.stable} of {margins.aircraft} uncertain aircraft"
+        return Verdict(False, f"the loop is stable, but only {text} are")
+    clauses = []
+    if short := failing(answer.loop):
+        outputs = answer.controller.outputs
+        falls = "; ".join(condition.sentence(outputs) for condition in short)
+        clauses.append(f"but it lacks what is asked of it ({falls})")
+    elif answer.has_requirement:
+        phase = math.degrees(margins.nominal.phase.min())
+        clauses.append(
+            f"with the margins asked of it: at least {phase:.0f} deg of phase in each input, and "
+            f"a delay margin of {milliseconds(margins.delay)}"
+        )
+    if promise is not None:
+        within = f"within {100.0 * promise.uncertainty:g} %"
+        clauses.append(
+            f"as every aircraft {within} is, which is guaranteed"
+            if is_guaranteed
+            else f"but an aircraft {within} may be unstable"
+        )
+    return Verdict(holds, ", ".join(("the loop is stable", *clauses)))
+
+
+def rules_verdict(answer: GainAssessment[Any], _: Guarantee | None) -> Verdict:
+    """Return how many rules of the engineering procedure a gain set keeps."""
+    rules = answer.rules
+    if not rules:
+        return Verdict(True, "")
+    kept = len(rules) - len(failing(rules))
+    return Verdict(
+        kept == len(rules),
+        f"{kept} of {len(rules)} rules are kept. They are where the search for gains begins, and "
+        "decide nothing",
+    )
+
+
+def theorem_verdict(answer: GainAssessment[Any], _: Guarantee | None) -> Verdict:
+    """Return how many of the sufficient conditions of Theorem 1 a gain set meets."""
+    conditions = answer.theorem
+    if not conditions:
+        return Verdict(True, "")
+    met = len(conditions) - len(failing(conditions))
+    return Verdict(
+        met == len(conditions),
+        f"{met} of {len(conditions)} conditions of Theorem 1 are met. They are sufficient only, "
+        "and decide nothing: the paper's proof is in continuous time, and no loop with servos "
+        "meets its assumptions",
+    )
+
+
+HEADINGS = {
+    "loop": "The loop: these conditions decide",
+    "rules": "Rules of the engineering procedure",
+    "theorem": "Theorem 1: sufficient conditions, of a loop without servos in continuous time",
+}
+VERDICTS = {"loop": loop_verdict, "rules": rules_verdict, "theorem": theorem_verdict}
+"""The parts of the conditions on a gain set, in the order in which they are shown."""
+
+
+def condition_name(row: tuple[GainCondition, ...], outputs: tuple[str, ...]) -> str:
+    """Name of a row, with the channel if it is the same in every gain set."""
+    where = {None if condition.channel is None else outputs[condition.channel] for condition in row}
+    channel = where.pop() if len(where) == 1 else None
+    return row[0].name + (f" of {channel}" if channel else "") + (" ~" if row[0].estimate else "")
+
+
+def condition_as_json(
+    part: str, condition: GainCondition, outputs: tuple[str, ...]
+) -> dict[str, Any]:
+    """Return a condition of a part as JSON."""
+    return {
+        "name": condition.name,
+        "part": part,
+        "channel": None if condition.channel is None else outputs[condition.channel],
+        "found": condition.value,
+        condition.side.replace(" ", "_"): condition.bound,
+        "margin": condition.margin,
+        "holds": condition.holds,
+        "estimate": condition.estimate,
+    }
