@@ -64,6 +64,8 @@ def ros2(words: list[str]) -> None:
     """The executable is in a package of this workspace, the launch file there has the arguments."""
     if words[0] == "run":
         assert f'"{words[2]} = ' in (SOURCES / words[1] / "setup.py").read_text()
+    elif words[0] == "launch" and words[1].endswith(".launch.py"):
+        assert words[2:] == [], "a launch file of the reader's own has arguments of its own"
     elif words[0] == "launch":
         with patch.dict(sys.modules, launch_stand_in.modules()):
             launch = runpy.run_path(str(SOURCES / words[1] / "launch" / words[2]))[

@@ -341,7 +341,7 @@ def test_stale_pose_levels_wings_and_guidance_engages_again(flight: Flight) -> N
 def test_guidance_alone_needs_parameters_of_run(tmp_path: Path) -> None:
     """What follows from other sections of a scenario is in the parameters of a run alone."""
     file = find_scenario("osprey_route").path
-    refusal = r"`parameters.yaml` of a run has them"
+    refusal = "guidance: missing natural_frequency, speed, expected a value for each"
     with (
         world_of("--params-file", str(file)) as world,
         refusing(refusal),

@@ -107,4 +107,5 @@ def test_law_of_another_package_flies_in_lockstep_as_without_ros_and_replayed(
     assert tape["u"].values.any(axis=0).all()
     require_equal_bits(recorded, tape)
     replay = invoke("replay", runs[0])
-    assert (replay.exit_code, replay.stdout) == (0, "201 ticks, every bit equal\n")
+    assert replay.exit_code == 0
+    assert replay.stdout.startswith("201 ticks, every bit equal\naircraft.sensors.dropout: ")

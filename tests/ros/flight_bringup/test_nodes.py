@@ -46,7 +46,8 @@ def test_node_that_cannot_start_ends_with_status_2_and_one_sentence(start: Start
         assert node.end() == 2
         assert any(line.startswith(f"error: {sentence}") for line in node.lines), node.output
         assert "Traceback" not in node.output
-    for package, executable in NODES.items():
+    # the recorder has a default for each parameter
+    for package, executable in NODES.items() - {("flight_recorder", "recorder")}:
         script = REPOSITORY / "ros_ws" / "install" / package / "lib" / package / executable
         process = subprocess.run(
             [script], capture_output=True, text=True, timeout=HANG, check=False

@@ -136,7 +136,7 @@ class Fly(RouteWords):
     )
     send: bool = option("Send commands to the autopilot once the bridge is engaged.", default=False)
     watch: bool = option("Serve the live page of the flight while it lasts.", default=False)
-    namespace: str = option(
+    namespace: str = rare_option(
         "Namespace of all nodes, as uav1: one for each aircraft that flies in this domain.",
         default="",
     )

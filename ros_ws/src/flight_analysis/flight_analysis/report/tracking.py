@@ -8,8 +8,8 @@ The rms error over WINDOW, and over END at the end, may be
     COMMAND_PART rms(y_m) + excuse + floor,      and never above FACTOR rms(e) + floor
 
 with e of the linear loop by `linear_flight.error_pair`. The excuse is what noise and wind leave,
-FACTOR times, and at most MOST: beyond, an aircraft that shakes is no success, whatever shakes it.
-The floor is
+FACTOR times, and at most MOST over WINDOW: beyond, an aircraft that shakes is no success, whatever
+shakes it. The floor is
 
 - HARMLESS of the least errors of a divergence, 0.02 rad/s and 0.2 m/s, and the noise of a measured
   error, at most MOST;
@@ -19,6 +19,7 @@ The floor is
 `rise_di_controller.learning.divergence` keeps a learned model below the least errors.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -211,7 +212,9 @@ def _largest_excess(
     has_command = (command >= 0.5 * others) & (command > 2.0 * limits.floor)
     by_noise = rms(pair.linear.noise)
     by_wind = rms(pair.linear.wind)
-    excuse = np.minimum(FACTOR * np.hypot(by_noise, by_wind), limits.most)
+    # A gust that is harmless over WINDOW is as much larger over less.
+    most = limits.most * math.sqrt(_ticks(pair, WINDOW) / count)
+    excuse = np.minimum(FACTOR * np.hypot(by_noise, by_wind), most)
     by_command = FACTOR * rms(pair.linear.command)
     by_command = np.where(has_command, np.minimum(by_command, COMMAND_PART * command), by_command)
     allowed = np.minimum(by_command + excuse, FACTOR * rms(pair.linear.whole)) + limits.floor
