@@ -128,7 +128,7 @@ def test_fly_is_by_the_clock_of_a_simulator(ends: bool, start: Start, tmp_path: 
     apart = ("--ros-args", "-r", "y:=/apart/y", "-r", "u:=/apart/u")
     simulator = start("simulator", "2", *apart)
     rates = ("--set", "aircraft.rate=100", "--set", "reference_model.rate=100")
-    words = ("--use-sim-time", "--composed", *rates)
+    words = ("--use-sim-time", "--composed", "-v", *rates)
     duration = "60" if ends else "2"
     flight = start("flight_cli.cli", "fly", "osprey_servo", "--duration", duration, *words)
     if ends:
