@@ -93,7 +93,7 @@ def test_what_the_trim_speed_alone_has_is_refused() -> None:
     with refusing(r"^aircraft\.over_airspeed: found a drift beside it"):
         SCENARIO.vary(aircraft={"drift": {"start": 1.0, "A": 0.1}})
     with refusing(
-        r"^aircraft\.over_airspeed: found thrust, expected none: the aircraft of a campaign"
+        r"^aircraft\.over_airspeed: found 'thrust', expected none: flights of many at once do not"
     ):
         build_course(SCENARIO)
     assert initial_state(PLANT).x == approx(np.zeros(8))

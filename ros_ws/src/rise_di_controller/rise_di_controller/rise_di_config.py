@@ -192,7 +192,17 @@ class RiseDiConfig(ControllerConfig):
     def read(
         cls, values: Mapping[Any, Any], key: str, problems: Problems, *, check: bool = True
     ) -> Self | None:
-        """Give omega, where it is left out, the value 1 for each output."""
+        """Give omega, if it is left out, the value 1 for each output.
+
+        Args:
+            values: The nested mapping.
+            key: Name of the set in errors.
+            problems: Takes a sentence for each value that is not permitted.
+            check: Whether relations between the values are checked.
+
+        Returns:
+            The set, or None with a sentence in `problems`.
+        """
         outputs = values.get("outputs")
         if "omega" not in values and isinstance(outputs, (list, tuple)):
             values = {**values, "omega": [1.0] * len(outputs)}

@@ -59,8 +59,8 @@ def learner(scenario: Scenario, *, real_time: bool = False, quick: bool = False)
 
     Examples:
         >>> scenario = rise_di.find_scenario("osprey_learn", duration=0.1)
-        >>> str(rise_di.simulate(scenario, learn=rise_di.learner(scenario)).outcome)
-        'completed'
+        >>> rise_di.simulate(scenario, learn=rise_di.learner(scenario)).outcome.status
+        0
     """
     controller = scenario.controller
     aircraft = scenario.aircraft
