@@ -252,8 +252,7 @@ def test_command_writes_a_certificate_and_refuses_what_it_cannot_state(tmp_path:
         sentence = f"certificate: found {place}, expected a file in a folder that can be written"
         assert sentence in str(refused.exception)
     done = invoke(*words, "--guarantee")
-    # 1: beta is below the slew of a gust, as without a certificate
-    assert done.exit_code == 1, done.output
+    assert done.exit_code == 0, done.output
     assert "certificate.json" in done.output
     content = json.loads(path.read_text())
     assert content == signed(content)
