@@ -118,7 +118,7 @@ def test_interrupt_of_reports_shows_what_was_flown(
     result = invoke(*arguments)
     assert result.exit_code == 130
     outcomes = {
-        name: summary["outcome"]["sentence"] for name, summary in json.loads(result.output).items()
+        name: summary["outcome"]["sentence"] for name, summary in json.loads(result.stdout).items()
     }
     assert outcomes["one"] == "never flew: no sample"
     assert outcomes["two"] == "completed, no report: rise-di report writes it"

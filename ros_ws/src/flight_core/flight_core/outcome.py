@@ -103,7 +103,8 @@ class Outcome:
     end: End
     reason: str = ""  # a sentence, where the end alone does not say it
     shortfalls: tuple[Shortfall, ...] = ()
-    allowances: tuple[Allowance, ...] = ()
+    # no part of how a flight ended
+    allowances: tuple[Allowance, ...] = field(default=(), compare=False)
 
     @property
     def has_reached_end(self) -> bool:

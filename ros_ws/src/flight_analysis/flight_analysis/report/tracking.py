@@ -178,7 +178,7 @@ def _most(unit: str) -> float:
 
 
 def _excesses(pair: ErrorPair, i: int, group: list[int], limits: _Limits) -> list[Excess]:
-    """Return the worst part of each span of a flight, and its end.
+    """Return the worst parts of each span of a flight, and of its end.
 
     `group`: the airspeed, or the rates.
     """
@@ -187,18 +187,20 @@ def _excesses(pair: ErrorPair, i: int, group: list[int], limits: _Limits) -> lis
     longest = max(stop - start for start, stop in spans)
     shortest = min(_ticks(pair, END), longest)
     spans = [(start, stop) for start, stop in spans if stop - start >= shortest]
-    excesses = [_largest_excess(pair, i, group, limits, span) for span in spans]
     start, stop = spans[-1]
     end = (max(start, stop - _ticks(pair, END)), stop)
-    return [*excesses, _largest_excess(pair, i, group, limits, end)]
+    excesses = []
+    for span in (*spans, end):
+        excesses += _largest_excesses(pair, i, group, limits, span)
+    return excesses
 
 
-def _largest_excess(
+def _largest_excesses(
     pair: ErrorPair, i: int, group: list[int], limits: _Limits, span: tuple[int, int]
-) -> Excess:
-    """The part of WINDOW in a span of ticks with the largest rms over the allowed error.
+) -> list[Excess]:
+    """Return the part of WINDOW in a span of ticks with the largest rms over the allowed error.
 
-    A shorter span is a single part.
+    The part that needs the largest excuse follows. A shorter span is a single part.
     """
     start, stop = span
     count = min(_ticks(pair, WINDOW), stop - start)
@@ -219,16 +221,18 @@ def _largest_excess(
     by_command = np.where(has_command, np.minimum(by_command, COMMAND_PART * command), by_command)
     allowed = np.minimum(by_command + excuse, FACTOR * rms(pair.linear.whole)) + limits.floor
     error = rms(pair.e)
-    k = int(np.argmax(error / allowed))
-    return Excess(
-        output=pair.names[i],
-        start=float(pair.t[start + k]),
-        stop=float(pair.t[start + k + count - 1]),
-        rms=float(error[k]),
-        allowed=float(allowed[k]),
-        excuse=float(max(allowed[k] - by_command[k] - limits.floor, 0.0)),
-        is_noise=bool(by_noise[k] > by_wind[k]),
-    )
+    return [
+        Excess(
+            output=pair.names[i],
+            start=float(pair.t[start + k]),
+            stop=float(pair.t[start + k + count - 1]),
+            rms=float(error[k]),
+            allowed=float(allowed[k]),
+            excuse=float(max(allowed[k] - by_command[k] - limits.floor, 0.0)),
+            is_noise=bool(by_noise[k] > by_wind[k]),
+        )
+        for k in (int(np.argmax(error / allowed)), int(np.argmax(error - by_command)))
+    ]
 
 
 def _ticks(pair: ErrorPair, length: float) -> int:
