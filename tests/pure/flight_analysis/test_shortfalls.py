@@ -179,6 +179,23 @@ def test_severe_turbulence_is_allowed_for_and_said() -> None:
     assert all(allowance.sentence.endswith("allowed for wind") for allowance in outcome.allowances)
 
 
+def test_wind_that_the_end_stops_cannot_hold_is_no_excuse() -> None:
+    """The same turbulence, and an elevator that has a degree: q is off by 3.2 deg/s rms."""
+    actuators = servo().aircraft.actuators
+    degree = [0.02, *actuators.upper[1:]]
+    short = {"lower": [-limit for limit in degree], "upper": degree}
+    outcome = rise_di.simulate(
+        servo().vary(
+            aircraft={
+                "turbulence": {"altitude": 100.0, "wind": 23.0, "seed": 1},
+                "actuators": actuators.model_dump() | short,
+            }
+        )
+    ).outcome
+    assert [shortfall.aim for shortfall in outcome.shortfalls] == [Aim.ERROR]
+    assert "q off by" in outcome.shortfalls[0].sentence
+
+
 def test_noise_of_a_measured_error_counts_twice() -> None:
     """Without the truth 0.1 rad/s, twice the rms of the noise, and what the commands leave."""
     calm = servo().vary(reference_model={"pulses": {}}, aircraft={"gusts": {}})

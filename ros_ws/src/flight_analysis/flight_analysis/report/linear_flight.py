@@ -10,8 +10,9 @@ flight is 0.8 to 1.3 times this error in the scenarios of the package.
 
 The loop is linear, so e is a sum of three: what the commands leave, what the noise leaves and what
 the wind leaves. A log must not excuse itself, so noise counts as far as the sensor is declared to
-have it, and as the actuators can follow the law's answer to it. Gravity acts along the path of y_m:
-an aircraft that pitches where nobody asked it to is not excused by its own pitch.
+have it, and as the actuators can follow the law's answer to it, and wind as far as their end stops
+can hold it. Gravity acts along the path of y_m: an aircraft that pitches where nobody asked it to
+is not excused by its own pitch.
 """
 
 from typing import NamedTuple
@@ -209,13 +210,14 @@ def _linear_errors(
         by_wind = _flight(tape, None, parts, ticks, wind, still, still, 0.0 * e_0)
         reach = _reach(controller, aircraft)
         held_noise = _share_within(reach, by_noise.u, loop.period) * by_noise.e
+        held_wind = _share_within_travel(reach, by_wind.u) * by_wind.e
         errors = [
             np.abs(error)
             for error in (
-                by_command.e + held_noise + by_wind.e,
+                by_command.e + held_noise + held_wind,
                 by_command.e,
                 held_noise,
-                by_wind.e,
+                held_wind,
             )
         ]
         if number and aircraft is not None and aircraft.drift is not None:
@@ -259,6 +261,14 @@ def _share_within(reach: Reach, u: FloatArray, period: float) -> FloatArray:
     size = NOISE_PEAK * np.sqrt(np.mean(u**2, axis=0))
     rate = NOISE_PEAK * np.sqrt(np.mean(np.diff(u, axis=0) ** 2, axis=0)) / period
     return np.asarray(1.0 / np.maximum(np.maximum(size / reach.travel, rate / reach.rate), 1.0))
+
+
+def _share_within_travel(reach: Reach, u: FloatArray) -> FloatArray:
+    """Return the part of u, (N, m), that lies within the travel of the actuators, (m,), at most 1.
+
+    A gust has a peak, not a deviation, and a slow engine cannot follow it: the rate is left out.
+    """
+    return np.asarray(1.0 / np.maximum(np.abs(u).max(axis=0, initial=0.0) / reach.travel, 1.0))
 
 
 def _known_loop(
