@@ -414,6 +414,8 @@ def test_refusal_names_the_option_as_it_is_typed(words: str, refusal: str) -> No
         ("fly osprey_s", "osprey_servo"),
         ("fly osprey_servo --ru", "--runs"),
         ("fly --duration 5 osprey_s", "osprey_servo"),
+        ("fly osprey_servo --set controller.k_", "controller.k_g="),
+        ("fly --set aircraft.sensors.no", "aircraft.sensors.noise="),
         ("campaign --wo", "--workers"),
         ("gains os", "osprey"),
         ("airframes osprey x", "x8_elevons"),

@@ -3,6 +3,7 @@
 """`rise-di report`: one run or several, as page, figure, table and JSON."""
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from flight_analysis.report.run_folder import new_run, read_flight, write_report
 from flight_analysis.report.summary import empty_summary
 from flight_bringup.fly import fly_in_process
 from flight_cli.report import Report
+from flight_cli.runs import Runs
 from flight_core.outcome import COMPLETED, ended_early
 from flight_log.engagements import Engagement
 from flight_log.tape_reader import read_run
@@ -44,6 +46,58 @@ def test_one_run_as_figure_tables_and_json(
     assert png.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
     assert csv.read_bytes()[:8] == b"stamp_ns"
     assert parquet.read_bytes()[:4] == b"PAR1"
+
+
+def test_runs_are_listed_with_their_outcome_and_a_killed_one_with_its_mend(
+    runs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for run in runs:
+        shutil.copytree(run, tmp_path / run.name)
+    (tmp_path / runs[1].name / "summary.json").unlink()  # killed before its report
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "latest").symlink_to(runs[0].name)
+    Runs(folder=tmp_path, as_json=True).execute()
+    rows = json.loads(capsys.readouterr().out)
+    assert [Path(row["run"]).name for row in rows] == sorted(
+        (run.name for run in runs), reverse=True
+    )
+    by_name = {Path(row["run"]).name: row for row in rows}
+    whole = by_name[runs[0].name]
+    assert (whole["scenario"], whole["outcome"]) == ("osprey_gust", "completed")
+    assert whole["duration"] == pytest.approx(2.0, abs=0.01)
+    assert "rise-di report" in by_name[runs[1].name]["outcome"]
+    Runs(folder=tmp_path).execute()
+    assert "osprey_gust" in capsys.readouterr().out
+    Runs(folder=tmp_path / "notes").execute()
+    assert "rise-di fly records one" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "terminal, display, words, is_opened",
+    [
+        (True, ":0", {}, True),
+        (True, "", {}, False),
+        (False, ":0", {}, False),
+        (True, ":0", {"as_json": True}, False),
+        (True, ":0", {"opens": False}, False),
+        (False, "", {"opens": True}, True),
+    ],
+)
+def test_report_opens_by_itself_for_somebody_at_a_desktop(
+    terminal: bool,
+    display: str,
+    words: dict[str, bool],
+    is_opened: bool,
+    run: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    pages: list[str] = []
+    monkeypatch.setattr("webbrowser.open", pages.append)
+    monkeypatch.setattr("sys.stdout.isatty", lambda: terminal, raising=False)
+    monkeypatch.setenv("DISPLAY", display)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    Report(runs=[run], **words).execute()  # type: ignore[arg-type]
+    assert pages == [(run / "report.html").absolute().as_uri()] * is_opened
 
 
 def test_engagement_shorter_than_sample_leaves_figures_of_flight(

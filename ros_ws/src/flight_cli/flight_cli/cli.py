@@ -47,6 +47,7 @@ GROUPS = MappingProxyType(
             "check the network.",
         },
         "Look": {
+            "runs": "List the recorded flights, the newest first, and how each ended.",
             "report": "Write the report page of a run again, compare several, export figures "
             "and data, repair a log.",
             "watch": "See a flight on a page, in the terminal or in Foxglove, live or recorded.",

@@ -3,6 +3,7 @@
 """What the commands share: tables, JSON, paths, exit statuses."""
 
 import json
+import os
 import sys
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, redirect_stdout
@@ -43,6 +44,12 @@ LICENCE = (
     "# SPDX-FileCopyrightText: RISE-DI contributors\n# SPDX-License-Identifier: Apache-2.0\n#\n"
 )
 LATEST = Path("runs/latest")  # the run of a command that is given none
+
+
+def has_desktop() -> bool:
+    """Return whether somebody at a terminal can see a browser on this machine."""
+    has_display = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
+    return sys.stdout.isatty() and (has_display or sys.platform in {"darwin", "win32"})
 
 
 def show_outcome(console: Console, outcome: Mapping[str, Any]) -> None:

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`rise-di report`: tables, report page, figures and data of recorded runs."""
 
+import webbrowser
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +20,7 @@ from flight_cli.log_options import REMAP, log_namespace, log_scenario, remaps_of
 from flight_cli.output import (
     LATEST,
     STDOUT,
+    has_desktop,
     new_table,
     print_json,
     print_table,
@@ -75,6 +77,10 @@ class Report:
         "default each output.",
         default="",
     )
+    opens: bool | None = rare_option(
+        "Open the page in the browser; by default on a desktop, from a terminal.",
+        "--open/--no-open",
+    )
     as_json: bool = json_option()
 
     def execute(self) -> None:
@@ -100,6 +106,9 @@ class Report:
             else:
                 _show(flights)
                 print(f"report:  {display_path(page)}")
+        is_looked_at = has_desktop() and not self.as_json and self.csv != STDOUT
+        if is_looked_at if self.opens is None else self.opens:
+            webbrowser.open(page.absolute().as_uri())
         statuses = [flight.summary["outcome"]["status"] for flight in flights]
         if status := max(statuses, key=SEVEREST.index):
             raise typer.Exit(status)

@@ -7,15 +7,28 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario
+from flight_analysis.closed_loop.scenario_library import LIBRARY, find_scenario
 from flight_cli.words import option
 from flight_core.files import parse_yaml
-from flight_core.parameters import Config, nest, one_of, require
+from flight_core.parameters import Config, flatten, nest, one_of, require
 
 
 def settings_option() -> Any:
     """The option --set of parameters by key."""
     text = "A parameter to change, as in controller.k_g=2.0; may be repeated."
-    return option(text, "--set", metavar="KEY=VALUE")
+    return option(text, "--set", metavar="KEY=VALUE", autocompletion=setting_names)
+
+
+def setting_names(incomplete: str) -> list[str]:
+    """Complete a key of --set: those of the shipped scenarios, as the shell asks for them."""
+    keys: set[str] = set()
+    for path in LIBRARY.glob("*.yaml"):
+        scenario = find_scenario(path.stem)
+        for name in SCHEMAS:
+            section = getattr(scenario, name)
+            if section is not None:
+                keys.update(key for key, _ in flatten(section.model_dump(), f"{name}."))
+    return sorted(f"{key}=" for key in keys if key.startswith(incomplete))
 
 
 def parse_settings(
