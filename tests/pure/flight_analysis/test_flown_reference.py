@@ -135,12 +135,18 @@ def test_flight_of_other_commands_is_told() -> None:
     assert shortfall.figures["start"] == pytest.approx(12.0, abs=0.02)
 
 
-def in_real_time(late: Callable[[int], int], *, lost: slice | None = None) -> Tape:
-    """Return the guided flight as of nodes in real time, where a u_m arrives some samples late."""
+def in_real_time(
+    late: Callable[[int], int], *, lost: slice | None = None, part: float = 1.0
+) -> Tape:
+    """Return the guided flight as of nodes in real time, where a u_m arrives some samples late.
+
+    `part` of its u_m is sent.
+    """
     tape = flown("guided")
     scenario = guided()
     reference = Reference(scenario.reference_model)
-    u_m = tape["u_m"]
+    whole = tape["u_m"]
+    u_m = Signal(whole.stamp_ns, whole.names, part * whole.values)
     outputs = scenario.reference_model.outputs
     arrivals: dict[int, list[int]] = {}
     last = 0
@@ -173,6 +179,14 @@ def test_u_m_may_arrive_late_in_real_time() -> None:
     """Each u_m acts 0 to 3 samples after its stamp, and no bit is left unexplained."""
     delays = np.random.default_rng(1).integers(0, 4, 10_000)
     errors = reference_errors(in_real_time(lambda k: int(delays[k])), guided())
+    assert isinstance(errors, ReferenceErrors)
+    assert not errors.error.any()
+
+
+def test_u_m_that_hardly_changes_does_not_hide_when_it_acted() -> None:
+    """A u_m of 1e-6 that is taken a step too early is wrong by more than 1e-9 only steps later."""
+    delays = np.random.default_rng(2).integers(0, 4, 10_000)
+    errors = reference_errors(in_real_time(lambda k: int(delays[k]), part=1e-5), guided())
     assert isinstance(errors, ReferenceErrors)
     assert not errors.error.any()
 

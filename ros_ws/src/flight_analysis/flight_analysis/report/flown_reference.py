@@ -10,7 +10,8 @@ commands of the scenario, and from the u_m of the log once there is one:
 
 Every bit must be equal, but for ROUNDING. In real time the log does not say before which step a u_m
 arrived. It acted from the step on after which y_m has the right bits, if there is one within its
-age limit. If the log lost a y_m or a u_m, an error below the harmless ones is not told.
+age limit; where several steps give the right bits, all are followed until one is wrong. If the log
+lost a y_m or a u_m, an error below the harmless ones is not told.
 """
 
 import copy
@@ -46,6 +47,10 @@ FITTING = 0.5
 started by itself."""
 
 
+MOST_PATHS = 16
+"""Orders of the u_m that are followed at once: guidance sends ten within their age limit."""
+
+
 class NotCompared(Enum):
     """Why y_m is not compared with the scenario."""
 
@@ -72,6 +77,13 @@ class _Command(NamedTuple):
     t_ns: int  # flight time of its stamp
     u_m: FloatArray
     attitude: FloatArray | None
+
+
+class _Path(NamedTuple):
+    """An order in which the u_m of the log may have acted."""
+
+    reference: Reference
+    taken: int  # the u_m up to this one have been taken, or are too old
 
 
 def reference_errors(tape: Tape, scenario: Scenario) -> ReferenceErrors | NotCompared | None:
@@ -175,33 +187,58 @@ def _computed(
 
     `y_m` of the log, (N, m), only tells between which two samples a u_m arrived.
     """
-    reference = Reference(parameters)
+    paths = [_Path(Reference(parameters), 0)]
     max_age_ns = nanoseconds(parameters.live.max_age)
-    numbers = np.maximum(np.round(t_ns / reference.period_ns), 0).astype(np.int64).tolist()
+    period_ns = paths[0].reference.period_ns
+    numbers = np.maximum(np.round(t_ns / period_ns), 0).astype(np.int64).tolist()
     expected = np.zeros_like(y_m)
-    taken = 0  # commands up to this one have been taken, or are too old
     before_ns = 0
     for k, number in enumerate(numbers):
-        arrived = taken
-        while arrived < len(commands) and commands[arrived].t_ns <= before_ns + AHEAD_NS:
-            arrived += 1
-        best = None
-        for count in range(arrived, taken - 1, -1):
-            if count > taken and commands[count - 1].t_ns < before_ns - max_age_ns:
-                break
-            trial = copy.copy(reference) if arrived > taken else reference
-            if count > taken:
-                _take(trial, commands[count - 1])
-            sample = trial.sample(number)
-            error = float(np.max(np.abs(y_m[k] - sample)))
-            if best is None or error < best[0]:
-                best = (error, count, trial, sample)
-            if error <= ROUNDING:
-                break
-        assert best is not None  # noqa: S101 - the loop runs at least once
-        _, taken, reference, expected[k] = best
-        before_ns = number * reference.period_ns
+        trials = []
+        for path in paths:
+            for trial in _next_paths(path, commands, before_ns, max_age_ns):
+                sample = trial.reference.sample(number)
+                error = float(np.max(np.abs(y_m[k] - sample)))
+                # min: an error that is not a number becomes the largest
+                trials.append((min(np.inf, error), sample, trial))
+        trials.sort(key=lambda each: each[0])
+        least, expected[k], _ = trials[0]
+        # A wrong path has right bits only as long as the u_m that it took too early hardly differs.
+        bound = ROUNDING if 0.0 < least <= ROUNDING else least
+        paths = _distinct([trial for error, _, trial in trials if error <= bound])[:MOST_PATHS]
+        before_ns = number * period_ns
     return expected
+
+
+def _next_paths(
+    path: _Path, commands: Sequence[_Command], before_ns: int, max_age_ns: int
+) -> list[_Path]:
+    """Return the paths from one: each u_m that may have arrived is the newest, or none is."""
+    arrived = path.taken
+    while arrived < len(commands) and commands[arrived].t_ns <= before_ns + AHEAD_NS:
+        arrived += 1
+    if arrived == path.taken:
+        return [path]
+    paths = []
+    for count in range(arrived, path.taken, -1):
+        if commands[count - 1].t_ns < before_ns - max_age_ns:
+            break
+        reference = copy.copy(path.reference)
+        _take(reference, commands[count - 1])
+        paths.append(_Path(reference, count))
+    return [*paths, path]
+
+
+def _distinct(paths: Sequence[_Path]) -> list[_Path]:
+    """Leave out the paths that have become the same as an earlier one."""
+    if len(paths) == 1:
+        return list(paths)
+    by_state = {}
+    for path in paths:
+        reference = path.reference
+        state = (path.taken, reference.x_m.tobytes(), reference.rate().tobytes())
+        by_state.setdefault(state, path)
+    return list(by_state.values())
 
 
 def _take(reference: Reference, command: _Command) -> None:
