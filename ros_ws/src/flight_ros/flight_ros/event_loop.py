@@ -11,7 +11,6 @@ import time
 import traceback
 from collections import deque
 from collections.abc import Callable, Sequence
-from itertools import chain
 from types import FrameType
 from typing import Any
 
@@ -194,10 +193,37 @@ def _start(nodes: Sequence[FlightNode[Any]]) -> SingleThreadedExecutor:
     return executor
 
 
+class _AwaitedInputs:
+    """What the nodes of a lockstep flight need next.
+
+    A message that a node takes only later does not wake it up: a wait for all messages
+    would return at once, again and again, until the node takes it.
+    """
+
+    def __init__(self, nodes: Sequence[FlightNode[Any]]) -> None:
+        self._nodes = nodes
+        self._wait_sets: dict[tuple[str, ...], WaitSet] = {}
+
+    def wait(self, duration: float) -> bool:
+        """Wait for one of them, at most `duration` s. Return whether there is one."""
+        topics = tuple(node.awaited_topic() for node in self._nodes)
+        if not any(topics):
+            time.sleep(duration)
+            return False
+        if topics not in self._wait_sets:
+            entities = [
+                subscription.entity
+                for node, topic in zip(self._nodes, topics, strict=True)
+                for subscription in node.polled_subscriptions
+                if subscription.name == topic
+            ]
+            self._wait_sets[topics] = WaitSet(entities, self._nodes[0].context)
+        return self._wait_sets[topics].wait(nanoseconds(duration))
+
+
 def _run_lockstep(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> None:
     executor = _start(nodes)
-    subscriptions = chain.from_iterable(node.polled_subscriptions for node in nodes)
-    wait_set = WaitSet([subscription.entity for subscription in subscriptions], nodes[0].context)
+    inputs = _AwaitedInputs(nodes)
     now_ns = advance_ns = serve_ns = report_ns = time.monotonic_ns()
     has_begun = False
     while not stop.is_requested:
@@ -206,7 +232,7 @@ def _run_lockstep(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> None:
         if any(advances):
             has_begun = True
             advance_ns = now_ns
-        elif not wait_set.wait(nanoseconds(IDLE_POLL_PERIOD)):
+        elif not inputs.wait(IDLE_POLL_PERIOD):
             serve_ns = 0  # no message: check the liveliness of the peers now
         now_ns = time.monotonic_ns()
         if now_ns >= serve_ns:

@@ -22,7 +22,6 @@ from flight_core.vectors import StampedVector
 from flight_design.learning.params import LearnerConfig
 from flight_design.learning.scenario_learner import learner
 from flight_ros import reports
-from flight_ros.event_loop import IDLE_POLL_PERIOD
 from flight_ros.flight_node import FlightNode
 from flight_ros.messages import Decoder
 from flight_ros.reports import Report
@@ -90,8 +89,6 @@ class LearnerNode(FlightNode[LearnerConfig]):
         self._advance(now_ns)
 
     def advance(self) -> bool:
-        if self._search is not None:
-            self._search.join(IDLE_POLL_PERIOD)  # samples wait, so the event loop would not
         return self._advance(0)
 
     def awaited_topic(self) -> str:
