@@ -269,9 +269,9 @@ def require_input(nodes: Sequence[FlightNode[Any]], advance_ns: int, has_begun: 
 
 
 class RealTime:
-    """A node in real time: its ticks and its reports. `spin`: busy-wait before a deadline."""
+    """A node in real time: its ticks and its reports."""
 
-    def __init__(self, node: FlightNode[Any], start_ns: int, *, spin: bool) -> None:
+    def __init__(self, node: FlightNode[Any], start_ns: int) -> None:
         host = node.host
         if (age := host.time_ns() - start_ns) > MAX_START_AGE_NS:
             key = f"{node.get_name()}.start_time"
@@ -282,7 +282,7 @@ class RealTime:
         node.time_offset_ns = start_ns - begin_ns
         self.node = node
         self._start_ns = start_ns
-        self.ticker = Ticker(node.period_ns(), begin_ns, host, spin=spin and host is time)
+        self.ticker = Ticker(node.period_ns(), begin_ns, host)
         if (lead := start_ns - host.time_ns()) > nanoseconds(60):
             node.get_logger().warning(f"start_time is {seconds(lead):.0f} s ahead; waiting for it")
         self._report_ns = time.monotonic_ns()
@@ -344,10 +344,7 @@ def _run_real_time(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> None:
     """
     executor = _start(nodes)
     starts = _start_instants(nodes, executor, stop)
-    loops = [
-        RealTime(node, start_ns, spin=len(nodes) == 1)
-        for node, start_ns in zip(nodes, starts, strict=False)
-    ]
+    loops = [RealTime(node, start_ns) for node, start_ns in zip(nodes, starts, strict=False)]
     serve_ns = time.monotonic_ns()
     period_ns = nanoseconds(IDLE_POLL_PERIOD if len(nodes) == 1 else SERVICE_POLL_PERIOD)
     disable_timer_slack()
