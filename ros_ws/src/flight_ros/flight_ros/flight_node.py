@@ -11,6 +11,7 @@ from typing import Any, Generic, TypeVar
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from rclpy.duration import Duration
+from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
@@ -166,6 +167,15 @@ class FlightNode(Node, Generic[P]):
         """
 
     # Used by a subclass
+
+    def create_publisher(self, *args: Any, **kwargs: Any) -> Publisher:
+        """Create a publisher as rclpy does, without its callbacks for peers that do not match.
+
+        `EndpointMonitor` reports these peers, and an executor would ask for two events of each
+        publisher whenever it looks for a request.
+        """
+        quiet = PublisherEventCallbacks(use_default_callbacks=False)
+        return super().create_publisher(*args, event_callbacks=quiet, **kwargs)
 
     def next_period_ns(self) -> int:
         """The next whole period of the system clock, ns."""

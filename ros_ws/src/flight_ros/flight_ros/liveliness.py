@@ -52,6 +52,7 @@ class LivelinessMonitor:
                 event_callbacks=SubscriptionEventCallbacks(
                     liveliness=partial(self._on_liveliness, peer),
                     matched=partial(self._on_matched, peer),
+                    use_default_callbacks=False,
                 ),
             )
             for peer in ROLES

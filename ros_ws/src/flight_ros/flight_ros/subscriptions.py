@@ -9,6 +9,7 @@ no callbacks, and a clock that is set back has no effect.
 from typing import Any, NamedTuple
 
 from rclpy.callback_groups import CallbackGroup
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
@@ -39,13 +40,23 @@ class ReceivedMessage(NamedTuple):
 
 
 class PolledSubscription:
-    """A subscription that is polled by `take`; a `raw` message is its bytes, CDR."""
+    """A subscription that is polled by `take`; a `raw` message is its bytes, CDR.
+
+    It has no callbacks of rclpy for publishers that do not match: `EndpointMonitor` reports them,
+    and an executor would ask for each of these events whenever it looks for a request.
+    """
 
     def __init__(self, node: Node, topic: Topic, qos: QoSProfile, *, raw: bool = False) -> None:
         self.topic = topic
         self.qos = qos
         self.entity = node.create_subscription(
-            topic.type, topic.name, lambda _: None, qos, callback_group=_NeverExecuted(), raw=raw
+            topic.type,
+            topic.name,
+            lambda _: None,
+            qos,
+            callback_group=_NeverExecuted(),
+            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
+            raw=raw,
         )
         self.name = str(self.entity.topic_name)  # the full name
 
