@@ -164,13 +164,18 @@ def main() -> None:
         app = application(words)
         signal.signal(signal.SIGINT, signal.default_int_handler)
         sys.unraisablehook = _repeat_interrupt
-        from flight_core.parameters import ParameterError  # noqa: PLC0415 - --help does without
+        # --help does without both
+        from flight_core.outcome import FlightEnded  # noqa: PLC0415
+        from flight_core.parameters import ParameterError  # noqa: PLC0415
 
         try:
             app(prog_name="rise-di")
         except ParameterError as error:
             print(f"error: {error}", file=sys.stderr)
             sys.exit(BAD_INPUT)
+        except FlightEnded as error:
+            print(f"error: {error}", file=sys.stderr)
+            sys.exit(error.status)
     except ModuleNotFoundError as error:
         from flight_core.installation import missing  # noqa: PLC0415 - as above
 

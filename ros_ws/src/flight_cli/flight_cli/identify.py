@@ -244,6 +244,11 @@ class Identify:
         path = self._scenario_path(name)
         console = Console(quiet=self.as_json)
         identified_aircraft = self._identified_aircraft(name, self.speed, self.altitude, console)
+        lacking = ""
+        if not self.accept and not identified_aircraft.failure:
+            # As long as all before it: what comes after the tables would be taken for the end.
+            with console.status("what would meet the margins"):
+                lacking = what_lacks(identified_aircraft.selection)
         write_text("write", path, identified_aircraft.text)
         if self.as_json:
             print_json(identified_as_json(identified_aircraft, path))
@@ -254,7 +259,7 @@ class Identify:
             title = identified_aircraft.condition.title
             warn(f"error: {title} does not fly: {identified_aircraft.failure}")
             raise typer.Exit(CANNOT_FLY)
-        if lacking := "" if self.accept else what_lacks(identified_aircraft.selection):
+        if lacking:
             refusal = f"{display_path(path)}, which says so in its first line; --accept takes it"
             raise ParameterError(f"identify: {lacking}; the gains are in {refusal}")
 

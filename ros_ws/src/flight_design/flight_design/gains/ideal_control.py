@@ -17,9 +17,14 @@ from aircraft_sim.uncertainty import UNIFORM, Spread, nominal_and_sampled
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.linear_loop.told import Comparison, loop_of
 from flight_core.integrators import rk4
+from flight_core.outcome import FlightEnded
 from flight_core.parameters import require
 from flight_core.vectors import Array, FloatArray
-from flight_design.gains.airframe_properties import fastest_zero, output_coordinates
+from flight_design.gains.airframe_properties import (
+    fastest_zero,
+    invariant_zeros,
+    output_coordinates,
+)
 from reference_model import model
 from reference_model.command import command
 from reference_model.params import SIGNALS, ReferenceModelConfig
@@ -28,6 +33,9 @@ from rise_di_controller.law.linear_loop import LoopTiming
 from rise_di_controller.params import ControllerConfig
 
 STEP = 0.01
+STABLE_STEP = -2.785
+"""Least product of a real pole and the step with which Runge-Kutta's fourth-order method is stable.
+Source: E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, section IV.2."""
 """s, step of the ideal control. It resolves a gust of one second and hidden modes up to 10 1/s to
 1e-6 of their size."""
 
@@ -75,7 +83,8 @@ class Study(NamedTuple):
     u_dot: FloatArray  # (T, N, m) rate of the ideal control, units of u / s
     slew: FloatArray  # (m,) largest abs(u_dot) of the nominal airframe
     slew_undisturbed: FloatArray  # (m,) the same without gusts
-    stable: NDArray[np.bool_]  # (N,) whether no zero lies in the right half plane
+    # (N,) whether no zero lies in the right half plane, and no state overflows
+    stable: NDArray[np.bool_]
     uncertainty: float
     effected: Effected | None = None  # None: the entries of `airframe` are uncertain
     seed: int = 1
@@ -163,7 +172,9 @@ def study_airframe(
     Runge-Kutta in steps of 0.01 s; u*_dot is evaluated at the steps; only f_dot and u_m_dot are
     differences, central and over 1e-5 s. f is that of the nominal airframe. The entries of
     `effected` are drawn, if any. Raises ParameterError if Omega is singular or if the nominal
-    airframe has a zero in the right half plane: then Assumption 3 does not hold.
+    airframe has a zero in the right half plane: then Assumption 3 does not hold. Raises FlightEnded
+    if the ideal flight of the nominal airframe diverges; an uncertain one that does counts as
+    unstable.
     """
     drawn_airframe = airframe if effected is None else effected.airframe
     A, B = nominal_and_sampled(drawn_airframe, uncertainty, samples, seed, spread)
@@ -180,7 +191,24 @@ def study_airframe(
     # The last column is the nominal airframe without gusts: their speed is 0 there.
     A = np.concatenate([A, A[:1]])
     B = np.concatenate([B, B[:1]])
-    u_dot = _ideal_rates(_ideal_plant(airframe, manoeuvre, A, B), _references(manoeuvre, airframe))
+    # One that overflows is refused, or counted below, in words of its own.
+    with np.errstate(over="ignore", invalid="ignore"):
+        u_dot = _ideal_rates(
+            _ideal_plant(airframe, manoeuvre, A, B), _references(manoeuvre, airframe)
+        )
+    is_finite = np.isfinite(u_dot).all(axis=(0, 2))
+    if not is_finite[[0, -1]].all():
+        fastest = invariant_zeros(A[0], B[0], airframe.matrix_c()).real[0]
+        cause = (
+            f"a zero at {fastest:.3g} 1/s is too fast for steps of {STEP:g} s"
+            if fastest * STEP < STABLE_STEP
+            else "the motion beside the outputs diverges"
+        )
+        raise FlightEnded(
+            f"{airframe.name} at {airframe.speed:g} m/s: no gains are found, because {cause} while "
+            "y is held on y_m; at another speed it may not be"
+        )
+    stable &= is_finite[:-1]
     undisturbed, slew = (np.max(np.abs(u_dot[:, column]), axis=0) for column in (-1, 0))
     return Study(
         airframe=airframe,
