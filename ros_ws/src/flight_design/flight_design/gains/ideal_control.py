@@ -33,11 +33,12 @@ from rise_di_controller.law.linear_loop import LoopTiming
 from rise_di_controller.params import ControllerConfig
 
 STEP = 0.01
+"""s, step of the ideal control. It resolves a gust of one second and hidden modes up to 10 1/s to
+1e-6 of their size."""
+
 STABLE_STEP = -2.785
 """Least product of a real pole and the step with which Runge-Kutta's fourth-order method is stable.
 Source: E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, section IV.2."""
-"""s, step of the ideal control. It resolves a gust of one second and hidden modes up to 10 1/s to
-1e-6 of their size."""
 
 
 class Manoeuvre(NamedTuple):
