@@ -470,6 +470,35 @@ def test_jump_of_plan_names_the_id_of_an_item(tmp_path: Path) -> None:
     ] == [*(0, 1, 2, 1, 2, 5)]
 
 
+@pytest.mark.parametrize(
+    "frame, further, refusal",
+    [
+        (3, {"coordinate": [47.4, 8.52, 50]}, ""),
+        (3, {"coordinate": [47.40000001, 8.52, 50.0]}, ""),
+        (3, {"coordinate": [47.402, 8.52, 50]}, "expected the same place in both"),
+        (3, {"coordinate": [47.4, 8.52, 80]}, "expected the same place in both"),
+        (3, {"AltitudeMode": 1, "Altitude": 50, "AMSLAltAboveTerrain": None}, ""),
+        (0, {"AltitudeMode": 1, "Altitude": 50}, ""),  # above the sea before version 4
+        (0, {"AltitudeMode": 3, "Altitude": 20, "AMSLAltAboveTerrain": 50}, ""),
+        (3, {"AltitudeMode": 2, "Altitude": 50}, "found AltitudeMode 2 beside frame 3"),
+        (0, {"AltitudeMode": 4, "Altitude": 50}, "found AltitudeMode 4 beside frame 0"),
+        (3, {"AltitudeMode": 1, "Altitude": 450}, "found Altitude 450 beside 50"),
+    ],
+)
+def test_item_of_a_plan_states_one_place(
+    frame: int, further: dict[str, Any], refusal: str, tmp_path: Path
+) -> None:
+    """What a program writes beside the params is the same place, or none is flown."""
+    items = [mission_item(47.4 + 0.01 * k, 8.52, 50.0, frame) for k in range(2)]
+    items[0] |= further
+    content = plan(items, home=(47.4, 8.5, 0.0))
+    if refusal:
+        with refusing(refusal):
+            flown(tmp_path / "r.plan", content)
+    else:
+        assert len(flown(tmp_path / "r.plan", content)) == 2
+
+
 def test_waypoints_at_one_place_are_one(tmp_path: Path) -> None:
     path = tmp_path / "r.yaml"
     path.write_text(
@@ -501,6 +530,7 @@ def test_waypoints_at_one_place_are_one(tmp_path: Path) -> None:
     "command, sentence",
     [
         (179, "not flown: DO_SET_HOME (item 2)"),
+        (82, "NAV_SPLINE_WAYPOINT is flown as a corner with a fillet, and not as a spline"),
         (
             179,
             "heights above the home stay above the first home, and not above that of DO_SET_HOME",

@@ -52,6 +52,7 @@ COMMANDS = {
     5004: "NAV_FENCE_CIRCLE_EXCLUSION",
 }
 MEANINGS = {
+    82: "NAV_SPLINE_WAYPOINT is flown as a corner with a fillet, and not as a spline",
     179: "heights above the home stay above the first home, and not above that of DO_SET_HOME",
     601: "DO_JUMP_TAG repeats items, which are flown once here",
 }

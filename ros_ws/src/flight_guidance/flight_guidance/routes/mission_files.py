@@ -8,6 +8,7 @@ Sources: QGroundControl guide, Plan File Format; MAVLink guide, File Formats.
 import codecs
 import re
 from collections.abc import Iterator, Sequence
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from flight_core.fields import short_repr
@@ -74,6 +75,7 @@ def _plan_item(entry: Any, number: int, key: str) -> Item:
     )
     fits = numbers and len(params) == 7 and isinstance(frame, int) and isinstance(command, int)
     require(fits, key, short_repr(entry), "frame, command and seven params")
+    _require_one_place(entry, params, frame, key)
     return Item(
         name=named(command, number),
         frame=frame,
@@ -82,6 +84,46 @@ def _plan_item(entry: Any, number: int, key: str) -> Item:
         number=jump,
         goes_on=flag(entry, "autoContinue", True, key),
     )
+
+
+SAME_ANGLE = 1e-6  # deg, 0.1 m: programs write six digits or more
+SAME_ALTITUDE = 0.01  # m
+FRAMES_OF_MODES = MappingProxyType({2: (0, 5), 3: (0, 5), 4: (10, 11)})
+"""By AltitudeMode of QGroundControl: above the sea, above the sea by a model of the terrain, above
+the terrain. 0 and 1 had another meaning before version 4."""
+
+
+def _require_one_place(entry: Any, params: Sequence[Any], frame: int, key: str) -> None:
+    """Refuse an item whose further members state another place than its params and its frame.
+
+    QGroundControl reads the params. Other programs write `coordinate` beside them, or change one
+    of the two.
+    """
+    latitude, longitude, altitude = params[4:7]
+    coordinate = member(entry, "coordinate")
+    if is_position(coordinate) and None not in (latitude, longitude):
+        near = [SAME_ANGLE, SAME_ANGLE, SAME_ALTITUDE]
+        same = all(
+            stated is None or value is None or abs(stated - value) <= most
+            for stated, value, most in zip(coordinate, params[4:7], near, strict=False)
+        )
+        found = f"coordinate {short_repr(coordinate)} beside {short_repr(params[4:7])} in params"
+        require(same, key, found, "the same place in both")
+    mode = member(entry, "AltitudeMode")
+    fits = frame in FRAMES_OF_MODES.get(mode, (frame,)) if isinstance(mode, int) else True
+    require(fits, key, f"AltitudeMode {mode} beside frame {frame}", "the same reference in both")
+    stated = [
+        value
+        for name in ("Altitude", "AMSLAltAboveTerrain")
+        if isinstance(value := member(entry, name), int | float)
+    ]
+    same = (
+        not stated
+        or altitude is None
+        or any(abs(value - altitude) <= SAME_ALTITUDE for value in stated)
+    )
+    found = f"Altitude {' and '.join(f'{value:g}' for value in stated)} beside {altitude} in params"
+    require(same, key, found, "the same altitude in both")
 
 
 FIRST_FENCE = (
