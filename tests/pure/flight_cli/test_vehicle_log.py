@@ -28,6 +28,7 @@ from typer.testing import Result
 from autopilot_bridge.params import ChannelMap
 from flight_cli.log_options import warn_of_lacks_in
 from flight_core import isolated
+from flight_core.rates import seconds
 from flight_core.vectors import FloatArray
 from flight_design.identification.log_import import require_map_of_import
 from flight_design.identification.response_identification import MIN_RATIO
@@ -907,6 +908,38 @@ def test_log_of_px4_before_2017_is_named(flight: Flight, tmp_path: Path) -> None
     write_dataflash(tmp_path / "old.px4log", {"IMU": (("GyroX", "GyroY", "GyroZ"), rows)}, {}, "")
     with refusing(r"found a log of PX4 before 2017 .*, expected a ULog"):
         read_vehicle_log(tmp_path / "old.px4log")
+
+
+def test_second_flight_of_a_log_is_told_and_taken_by_its_window(
+    flight: Flight, tmp_path: Path
+) -> None:
+    """The second is shorter: half of the first, after 10 s on the ground."""
+    ground, half = on_ground(flight), len(flight.stamp_us) // 2
+    pause_us = flight.stamp_us[-1] + 10_000
+    both = Flight(
+        [
+            *flight.stamp_us,
+            *(stamp - ground.stamp_us[0] + pause_us for stamp in ground.stamp_us),
+            *(
+                stamp - flight.stamp_us[0] + pause_us + round(1e6 * GROUND)
+                for stamp in flight.stamp_us[:half]
+            ),
+        ],
+        np.concatenate([flight.y, ground.y, flight.y[:half]]),
+        np.concatenate([flight.u, ground.u, flight.u[:half]]),
+    )
+    path = dataflash(tmp_path / "both.bin", both)
+    result = imported(path, tmp_path / "bag")
+    told = re.search(r"the log has 2 flights, .*: (\d+\.\d) to (\d+\.\d) s", result.stderr)
+    assert told
+    first, last = map(float, told.groups())
+    assert last - first == approx(half / RATE, abs=0.5)
+    window = ("--from", f"{first}", "--until", f"{last}")
+    second = imported(path, tmp_path / "second", *window)
+    assert second.exit_code == 0
+    assert "flights" not in second.stderr
+    y = read_run(tmp_path / "second").tape["y"]
+    assert seconds(int(y.stamp_ns[-1] - y.stamp_ns[0])) == approx(last - first, abs=0.1)
 
 
 def test_loss_of_airspeed_is_told_with_the_instant(flight: Flight, tmp_path: Path) -> None:

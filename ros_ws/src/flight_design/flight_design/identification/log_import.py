@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """y, u and pose of a channel map, from the log of an autopilot that the stack did not fly."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -123,9 +123,10 @@ def _imported(
     stamps = log.tables[sources[channel_map.instant].message].stamp_ns
     speed = _speed(channel_map, log, sources, stamps, servos)
     has_sticks = log.format is not None and log.vehicle == PLANE
-    first, last = _flight(log, stamps, speed, window, needs_manual=has_sticks and not servos)
+    taken, others = _flight(log, stamps, speed, window, needs_manual=has_sticks and not servos)
+    first, last = taken
     parameters = log.parameters_at(first)
-    notes = change_sentences(log.parameters, int(stamps[0]), first, last)
+    notes = [others, *change_sentences(log.parameters, int(stamps[0]), first, last)]
     if speed is not None and (is_lost := ~np.isfinite(speed) & (stamps >= first)).any():
         instant = seconds(int(stamps[is_lost.argmax()] - stamps[0]))
         notes.append(
@@ -148,8 +149,8 @@ def _imported(
         }
         notes.append(require_agreement(channel_map.name, rows_compared))
     except ParameterError as error:
-        raise ParameterError("; ".join([str(error), *notes])) from None
-    tape = _tape(channel_map, log, sources, readers, (first, last))
+        raise ParameterError("; ".join([str(error), *filter(None, notes)])) from None
+    tape = _tape(channel_map, log, sources, readers, taken)
     return Imported(tape, parameters, tuple(filter(None, notes)))
 
 
@@ -351,8 +352,8 @@ def _torque(log: VehicleLog, name: str, row: InputRow, servos: bool) -> _Reader:
 
 def _flight(
     log: VehicleLog, stamps: Stamps, speed: FloatArray | None, window: Window, *, needs_manual: bool
-) -> tuple[int, int]:
-    """First and last instant that are taken.
+) -> tuple[tuple[int, int], str]:
+    """Return the first and last instant that are taken, and a sentence on further flights.
 
     The window is taken, or the longest stretch in the air, for sticks in MANUAL.
     """
@@ -400,15 +401,15 @@ def _flight(
             )
         keep &= log.at(mode, stamps) == log.manual
         require(bool(keep.any()), "the log", f"no flight in MANUAL {where}", expected)
-    first, last = _longest_run(stamps, keep)
-    length = 1e-9 * (last - first)
+    runs = _runs(stamps, keep)
+    taken = max(runs, key=_length)
     require(
-        length >= LEAST,
+        _length(taken) >= LEAST,
         "the log",
-        f"{length:.1f} s of flight {where}",
+        f"{_length(taken):.1f} s of flight {where}",
         f"{LEAST:g} s or more in one stretch",
     )
-    return first, last
+    return taken, _other_flights(runs, taken, start_ns)
 
 
 def _bridged(stamps: Stamps, keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -418,14 +419,31 @@ def _bridged(stamps: Stamps, keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return keep | (after - before <= nanoseconds(BRIDGED))
 
 
-def _longest_run(stamps: Stamps, keep: NDArray[np.bool_]) -> tuple[int, int]:
-    """First and last instant of the longest stretch that is kept, mask (N,)."""
+def _runs(stamps: Stamps, keep: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return first and last instant of each stretch that is kept, mask (N,)."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], keep, [False]]).astype(np.int8)))
-    runs = [
+    return [
         (int(stamps[first]), int(stamps[end - 1]))
         for first, end in zip(edges[::2], edges[1::2], strict=True)
     ]
-    return max(runs, key=lambda run: run[1] - run[0])
+
+
+def _length(run: tuple[int, int]) -> float:
+    """Return the length of a stretch, s."""
+    return seconds(run[1] - run[0])
+
+
+def _other_flights(runs: Sequence[tuple[int, int]], taken: tuple[int, int], start_ns: int) -> str:
+    """Return a sentence on the flights of a log that are not taken; "" if there is one flight."""
+    others = [
+        f"{seconds(first - start_ns):.1f} to {seconds(last - start_ns):.1f} s"
+        for first, last in runs
+        if (first, last) != taken and _length((first, last)) >= LEAST
+    ]
+    if not others:
+        return ""
+    window = "take another by --from and --until"
+    return f"the log has {len(others) + 1} flights, {window}: {', '.join(others)}"
 
 
 def _complete(stamp_ns: Stamps, values: FloatArray, is_damaged: bool) -> tuple[Stamps, FloatArray]:
