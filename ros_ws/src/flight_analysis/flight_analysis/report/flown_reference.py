@@ -233,7 +233,7 @@ def _distinct(paths: Sequence[_Path]) -> list[_Path]:
     """Leave out the paths that have become the same as an earlier one."""
     if len(paths) == 1:
         return list(paths)
-    by_state = {}
+    by_state: dict[tuple[int, bytes, bytes], _Path] = {}
     for path in paths:
         reference = path.reference
         state = (path.taken, reference.x_m.tobytes(), reference.rate().tobytes())

@@ -197,7 +197,7 @@ def study_airframe(
         u_dot = _ideal_rates(
             _ideal_plant(airframe, manoeuvre, A, B), _references(manoeuvre, airframe)
         )
-    is_finite = np.isfinite(u_dot).all(axis=(0, 2))
+    is_finite = np.asarray(np.isfinite(u_dot).all(axis=(0, 2)))
     if not is_finite[[0, -1]].all():
         fastest = invariant_zeros(A[0], B[0], airframe.matrix_c()).real[0]
         cause = (
