@@ -29,7 +29,7 @@ class MulticopterModel(StateSpaceModel):
     with n = `thrust_axis` of the attitude, which follows Euler's equations. The damping of the
     climb counts in every direction. States phi and theta of the airframe, as A has them, act on
     no pose. The middle of a step gives n and the rates.
-    """  # noqa: D400, D415 - what follows is an equation
+    """  # noqa: D415 - what follows is an equation
 
     def __init__(self, parameters: AircraftConfig) -> None:
         states = [*parameters.sampled_airframe().states]

@@ -60,7 +60,7 @@ def measure(number: int, y: FloatArray, drift: RandomWalk, params: Sensors) -> M
 
     The error of a quantised sample is the measured value less y. Ideal sensors give y to the last
     bit.
-    """  # noqa: D400, D415 - what follows is an equation
+    """  # noqa: D415 - what follows is an equation
     added, drift = error(number, drift, params)
     y_measured = y + added
     if params.quantum is not None:

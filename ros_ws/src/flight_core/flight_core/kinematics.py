@@ -53,7 +53,7 @@ def body_rates(
     """P and q for these rates of the attitude beside r, the inverse of `euler_rates`:
 
     q = (theta_dot + r sin(phi)) / cos(phi),  p = phi_dot - tan(theta) (q sin(phi) + r cos(phi))
-    """  # noqa: D400, D415 - what follows is an equation
+    """  # noqa: D415 - what follows is an equation
     xp = array_namespace(phi)
     phi = tilt(phi)
     q = (theta_dot + r * xp.sin(phi)) / xp.cos(phi)

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The controller without ROS, for node and simulation.
+"""The controller without ROS, for the node and for simulation.
 
-The controller buffers y and y_m, steps the guarded law, and returns u and a log.
+It buffers y and y_m, steps the guarded law, and returns u and a log.
 """
 
 from collections import deque
@@ -32,21 +32,21 @@ class ControlOutput(NamedTuple):
     u: FloatArray  # (p,) in the order of the parameters' effectors
     inputs: guard.TickInputs
     log: Callable[[], FloatArray]
-    effects: FloatArray | None = None  # (m,) of the inputs, where a test was due: `EffectTest.most`
+    effects: FloatArray | None = None  # (m,) of the inputs, if a test was due: `EffectTest.most`
 
     @property
     def internals(self) -> FloatArray:
         """Values for the log in the order of `Controller.names`.
 
-        They are computed on access, so u is published first.
+        They are computed on access, so that u can be published first.
         """
         return self.log()
 
 
 class Prepared(NamedTuple):
-    """What a controller makes of parameters before they are in force.
+    """What a controller needs of new parameters before they take effect.
 
-    To prepare takes a third of the time of a change in flight.
+    Preparing it takes a third of the time of a change in flight.
     """
 
     parameters: ControllerConfig
@@ -57,7 +57,7 @@ class Prepared(NamedTuple):
 
 
 def preparing(parameters: ControllerConfig) -> Generator[None, None, Prepared]:
-    """`prepared` in parts of at most about 1 ms."""
+    """Prepare parameters as `prepared` does, in parts of at most about 1 ms."""
     law = parameters.tuned_law()
     yield
     limits = parameters.guard()
@@ -72,7 +72,7 @@ def preparing(parameters: ControllerConfig) -> Generator[None, None, Prepared]:
 
 
 def prepared(parameters: ControllerConfig) -> Prepared:
-    """The parameters with what a controller makes of them."""
+    """Prepare parameters for a controller."""
     parts = preparing(parameters)
     while True:
         try:
@@ -94,8 +94,8 @@ class Controller:
     Examples:
         >>> controller = rise_di.Controller(rise_di.find_scenario("osprey_servo").controller)
         >>> sample = rise_di.StampedVector(10_000_000, np.zeros(4))
-        >>> controller.take_y(sample, 10_000_000) + controller.take_y_m(sample, 10_000_000)
-        ''
+        >>> controller.take_y(sample, 10_000_000), controller.take_y_m(sample, 10_000_000)
+        ('', '')
         >>> controller.tick(10_000_000).u.tolist()
         [0.0, 0.0, 0.0, 0.0]
     """
@@ -135,7 +135,7 @@ class Controller:
 
     @property
     def has_internals(self) -> bool:
-        """Whether the law has a state to log: from the first engagement on."""
+        """Whether the law has a state to log, which it has from the first engagement on."""
         return self._state.law is not None
 
     @property
@@ -150,16 +150,16 @@ class Controller:
 
     @property
     def has_learned_model(self) -> bool:
-        """Whether feedforward and observer differ from the start.
+        """Whether feedforward and observer differ from those at the start.
 
-        A learner proposes the models.
+        A learner proposes the new ones.
         """
         return not self._first_law
 
     def restart(self) -> None:
-        """Engage the law again with the next fresh y and y_m, from the u of then.
+        """Engage the law again with the next fresh y and y_m, starting from the u that flies then.
 
-        The transfer is bumpless. A failsafe goes on.
+        The transfer is bumpless. A failsafe that is under way continues.
         """
         if self._state.mode is Mode.ENGAGED:
             self._state = self._state._replace(mode=Mode.WAITING)
@@ -167,13 +167,13 @@ class Controller:
     def retune(self, parameters: "ControllerConfig | Prepared") -> None:
         """Replace the parameters between two ticks without a jump of u (bumpless transfer).
 
-        Equal parameters change nothing.
+        If the parameters are equal, nothing changes.
 
         Args:
-            parameters: The new parameters, or the parameters as prepared outside of a tick.
+            parameters: The new parameters, or the same prepared outside of a tick.
 
         Raises:
-            ParameterError: The state would differ: a different law, or an observer added.
+            ParameterError: The state would differ: another law, or an observer that is added.
         """
         new = parameters if isinstance(parameters, Prepared) else prepared(parameters)
         if new.digest == self._digest:
@@ -199,10 +199,10 @@ class Controller:
         self._learned = _with_feedforward(new.parameters)
 
     def still_vanes(self) -> tuple[str, ...]:
-        """The vanes left out by the observer: still vanes.
+        """Return the names of the vanes that the observer leaves out because they stand still.
 
-        An engagement measures the motion from 0. Until a vane has moved, or the time of the average
-        has passed, the last report holds.
+        Each engagement measures the motion afresh, from 0. Until a vane has moved, or the time of
+        the average has passed, the last report about it stays valid.
         """
         return tuple(
             name
@@ -217,7 +217,7 @@ class Controller:
         return EffectTest(self._guard.probe, gain, parameters.probe.false_alarm)
 
     def _tested(self, inputs: guard.TickInputs) -> FloatArray | None:
-        """The effects of the inputs after a tick, where a test was due."""
+        """Return the effects of the inputs after a tick, or None if no test was due."""
         if self._effects is None:
             return None
         if self.mode is not Mode.ENGAGED or inputs.dt == 0.0:
@@ -239,7 +239,7 @@ class Controller:
         self._vanes_still = np.where(counts, measures == 0.0, self._vanes_still)
 
     def diverging(self) -> tuple[str, ...]:
-        """The outputs that diverge under a model learned in flight."""
+        """Return the outputs that diverge under a model learned in flight."""
         if self._first_law:
             return ()
         diverging = divergence.diverging(self._errors, self._least, self._learned)
@@ -250,9 +250,9 @@ class Controller:
         )
 
     def oscillations(self) -> dict[str, float]:
-        """Periods, s, of the outputs that oscillate under a model learned in flight.
+        """Return the period, s, of each output that oscillates under a model learned in flight.
 
-        They oscillate more than before.
+        Only outputs that oscillate more than they did before count.
         """
         if self._first_law or not self._oscillations.periods.any():
             return {}
@@ -269,20 +269,20 @@ class Controller:
     def take_y(self, sample: StampedVector, now_ns: int) -> str:
         """Buffer a sample of y, in the law's order.
 
-        Lost is a sample that no aircraft can give (`samples`): it counts as not arrived. After a
-        loss for the change of y no older stamp is taken. A sample whose jump is confirmed engages
-        the law again.
+        A sample that no aircraft can give (`samples`) is lost: it counts as one that never arrived.
+        Once a sample is lost because y changed too fast, no older stamp is taken any more. If later
+        samples confirm a jump, the law engages again.
 
         Args:
-            sample: The sample, shape (m,), with vanes longer, SI, deviations from trim.
+            sample: The sample, shape (m,), longer if there are vanes, SI, deviations from trim.
             now_ns: The clock, ns.
 
         Returns:
-            Why the sample is lost, a sentence; empty for a sample taken.
+            Why the sample is lost, as a sentence; empty if it is taken.
 
         Raises:
             ChannelError: Reason "future": the stamp is more than the age limit ahead of the clock.
-                Reason "order": the stamp is not later than that of the last sample, lost ones too.
+                Reason "order": the stamp is not later than that of the last sample, lost or taken.
         """
         m = len(self._parameters.outputs)
         outputs = sample._replace(value=sample.value[:m])
@@ -305,14 +305,14 @@ class Controller:
         return ""
 
     def take_y_m(self, sample: StampedVector, now_ns: int) -> str:
-        """Buffer a sample of y_m, (m,), as `take_y` does; y_m may jump.
+        """Buffer a sample of y_m, (m,), as `take_y` does, except that y_m may jump.
 
         Args:
             sample: The sample, shape (m,), SI, deviations from trim.
             now_ns: The clock, ns.
 
         Returns:
-            Why the sample is lost, a sentence; empty for a sample taken.
+            Why the sample is lost, as a sentence; empty if it is taken.
 
         Raises:
             ChannelError: Reason "future": the stamp is more than the age limit ahead of the clock.
@@ -324,9 +324,9 @@ class Controller:
         return ""
 
     def _lost(self, last: StampedVector | None, sample: StampedVector, now_ns: int) -> str:
-        """Why a sample of m values is beyond the bounds; empty for one inside.
+        """Say why a sample of m values is beyond the bounds; return "" if it is inside.
 
-        Raises ChannelError.
+        Raises ChannelError if its stamp is in the future or not newer than the last.
         """
         require_not_future(sample.stamp_ns, now_ns, self._guard.max_age_ns)
         if last is not None:
@@ -334,16 +334,16 @@ class Controller:
         return samples.bound_violation(sample.value, self._parameters.outputs, self._guard.samples)
 
     def restarted(self) -> str:
-        """Why the law has engaged again by itself since the last call, as a sentence.
+        """Say why the law has engaged again by itself since the last call, as a sentence.
 
-        Empty without an engagement.
+        Returns "" if it has not.
         """
         sentence = self._restarted
         self._restarted = ""
         return sentence
 
     def tick(self, now_ns: int, late_ns: int = 0, *, active: bool = True) -> ControlOutput | None:
-        """A tick at `now_ns`, `late_ns` after the deadline.
+        """Advance the controller by a tick at `now_ns`, which is `late_ns` after its deadline.
 
         Args:
             now_ns: Instant of the tick, ns.
@@ -351,7 +351,7 @@ class Controller:
             active: Whether the controller may send u.
 
         Returns:
-            u and the internals, SI; None where nothing is to be published.
+            u and the internals, SI, or None if there is nothing to publish.
         """
         y = self._newest_paired_y()
         last = self._state.y
@@ -361,7 +361,7 @@ class Controller:
         )
         if inputs is None:
             return None
-        # a step has another dt
+        # a step has a dt above 0, an engagement has 0
         if was_engaged and self._state.mode is Mode.ENGAGED and inputs.dt == 0.0:
             gap_ns = 0 if last is None else inputs.stamp_ns - last.stamp_ns
             self._restarted = (
@@ -393,7 +393,7 @@ class Controller:
         )
 
     def watch(self, e: FloatArray, dt: float) -> None:
-        """Take the error of a tick, for `diverging` and `oscillations`.
+        """Take the error of a tick, which `diverging` and `oscillations` judge.
 
         Args:
             e: y - y_m, shape (m,), SI.
@@ -404,7 +404,7 @@ class Controller:
             self._oscillations.take(e, dt, None if self._first_law else self._learned)
 
     def resume(self, state: guard.ControllerState) -> None:
-        """Go on from the state of a flight that a campaign has stepped with the same parameters.
+        """Continue from the state of a flight that a campaign has stepped with the same parameters.
 
         Args:
             state: State of the guard and of the law after the last tick.
@@ -412,27 +412,28 @@ class Controller:
         self._state = state
 
     def overrun(self, last_ns: int, now_ns: int) -> tuple[int, ...]:
-        """Instants of further ticks before the tick at `now_ns`.
+        """Return the instants of extra ticks that must come before the tick at `now_ns`.
 
-        There are some where the last tick is longer ago than the age limit.
+        They are needed if the last tick is longer ago than the age limit.
 
-        The aircraft has started a failsafe for u meanwhile. Two ticks without fresh inputs bring u
-        of the controller to the failsafe u of the aircraft: the re-engagement is bumpless.
+        The aircraft has meanwhile started a failsafe of its own for u. Two ticks without fresh
+        inputs bring the controller's u to the same failsafe value, so that the re-engagement is
+        bumpless.
 
         Args:
             last_ns: Instant of the last tick, ns.
             now_ns: Instant of the tick, ns.
 
         Returns:
-            The instants, ns; empty without an overrun.
+            The instants, ns; empty if there was no overrun.
         """
         begin_ns = last_ns + self._guard.max_age_ns
         return (begin_ns + self.period_ns, now_ns) if now_ns > begin_ns else ()
 
     def _newest_paired_y(self) -> StampedVector | None:
-        """The newest y up to a period after the newest y_m.
+        """Return the newest y that is at most a period newer than the newest y_m.
 
-        With a late y_m an earlier y is used, and no failsafe starts.
+        If y_m comes late, an earlier y is used and no failsafe starts.
         """
         newest = self._y[-1] if self._y else None
         if not self._y_m:
@@ -441,7 +442,7 @@ class Controller:
         return next((sample for sample in reversed(self._y) if sample.stamp_ns <= known_ns), newest)
 
     def ages(self, now_ns: int) -> dict[str, float]:
-        """Ages of the newest received y and y_m, s; an input never received is absent.
+        """Return the ages of the newest y and y_m, s; an input that never came is absent.
 
         Args:
             now_ns: The clock, ns.
@@ -457,13 +458,13 @@ class Controller:
         }
 
     def stale(self, now_ns: int) -> tuple[str, ...]:
-        """Names of the stale inputs: y or y_m never received or older than the age limit.
+        """Name the stale inputs: y or y_m, if never received or older than the age limit.
 
         Args:
             now_ns: The clock, ns.
 
         Returns:
-            The names; empty where y and y_m are fresh.
+            The names; empty if y and y_m are fresh.
         """
         ages = self.ages(now_ns)
         limit = seconds(self._guard.max_age_ns)
@@ -471,9 +472,9 @@ class Controller:
 
 
 def _with_feedforward(parameters: ControllerConfig) -> NDArray[np.bool_]:
-    """Mask of the channels with a feedforward, (m,).
+    """Return the mask of the channels with a feedforward, (m,).
 
-    A learner leaves out the channels under the law of the start.
+    A learner leaves out the channels that fly the law of the start.
     """
     some = None if parameters.feedforward is None else parameters.feedforward.inputs
     return np.array([some is None or name in some for name in parameters.inputs])

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The section `controller` of a scenario under any control law.
+"""The section `controller` of a scenario, as it is under any control law.
 
 Its fields make the arrays of guard, feedforward and observer.
 """
@@ -50,74 +50,75 @@ OF_NODE = frozenset({"lockstep", "y_rate", "autostart", "start_active"})
 class ControllerSection(NodeConfig):
     """The fields of the section `controller`, and the arrays that they make.
 
-    `params.ControllerConfig` has the checks, a subclass of that the parameters of a law.
+    `params.ControllerConfig` checks them, and a subclass of it adds the parameters of a law.
     """
 
     needs: ClassVar[str] = ""
-    """What the law needs beside y and y_m, as words; the controller refuses a law that needs
+    """What the law needs beside y and y_m, in words. The controller refuses a law that needs
     anything."""
 
-    rate: Annotated[float, Field(ge=1, le=1000)] = Field(description="the rate of the law, Hz")
+    rate: Annotated[float, Field(ge=1, le=1000)] = Field(description="rate of the law, Hz")
     y_rate: Annotated[float, Field(ge=0, le=1000)] = Field(
-        default=0.0, description="in lockstep: rate of y, Hz"
+        default=0.0, description="rate of y in lockstep, Hz"
     )
     law: str = Field(default="rise_di", description="the law, by its registered name")
     outputs: Names = Field(
-        description="the channels of y; in RISE-DI the last has the smallest gain (22)"
+        description="channels of y; RISE-DI gives the last one the smallest gain (22)"
     )
     inputs: Names = Field(
-        description="the channels of u, paired with the outputs; with an allocation those of v"
+        description="channels of u, each paired with an output; with an allocation, channels of v"
     )
-    D: Signs = Field(description="the diagonal of D (11), +1 or -1")
+    D: Signs = Field(description="diagonal of D (11), +1 or -1")
     input_scale: Positives = Field(
-        description="the change of u that changes y_dot by one: 1 / abs(Omega_ii)"
+        description="change of u that changes y_dot by one: 1 / abs(Omega_ii)"
     )
-    lag: NonNegatives = Field(description="time constants of the actuators, s; 0: none")
+    lag: NonNegatives = Field(description="time constants of the actuators, s; 0 for none")
     # y at 500 Hz is at most 2 ms old at a tick, and u waits 1 ms for an aircraft on the same host
     delay: NonNegative = Field(
         default=0.003,
-        description="delay from y to the actuators beside sampling, s: that of topics on one host",
+        description="delay from y to the actuators beside sampling, s; default: topics on one host",
     )
     y_max: Positives | None = Field(
         default=None,
-        description="the largest abs(y), abs(y_m); none: p, q, r 2000 deg/s, V 340 m/s, else 1e6",
+        description="largest abs(y) and abs(y_m); none: p, q, r 2000 deg/s, V 340 m/s, else 1e6",
     )
-    # ten ticks at 100 Hz: a busy host stalls for less, and a command takes longer to rise
+    # ten ticks at 100 Hz: a busy host stalls for less, and a command takes longer than that to rise
     max_age: Annotated[float, Field(gt=0, le=1e6)] = Field(
-        default=0.1, description="the age above which y or y_m is stale, s"
+        default=0.1, description="age above which y or y_m is stale, s"
     )
-    # a short loss of y costs no command; an aircraft is seldom upset within half a second
+    # a short loss of y costs no command, and an aircraft is seldom upset within half a second
     hold: Annotated[float, Field(ge=0, le=1e6)] = Field(
-        default=0.5, description="failsafe: how long u is held, s"
+        default=0.5, description="how long the failsafe holds u, s"
     )
-    # slow beside the modes of an aircraft, so that the return to trim excites none
+    # slow compared with the modes of an aircraft, so that the return to trim excites none of them
     ramp: Annotated[float, Field(ge=0, le=1e6)] = Field(
-        default=2.0, description="failsafe: how long the ramp to trim takes, s"
+        default=2.0, description="how long the failsafe then takes to bring u to trim, s"
     )
-    lower: Numbers | None = Field(default=None, description="lower limits of u from trim")
-    upper: Numbers | None = Field(default=None, description="upper limits of u from trim")
+    lower: Numbers | None = Field(default=None, description="lower limits of u, from trim")
+    upper: Numbers | None = Field(default=None, description="upper limits of u, from trim")
     slew: Positives | None = Field(default=None, description="limits of abs(u_dot), units of u / s")
     on_deactivate: Literal["trim", "hold"] = Field(
         default="trim", description="u after deactivation: ramped to trim or held"
     )
-    autostart: bool = Field(default=True, description="configure the node at start")
+    autostart: bool = Field(default=True, description="whether the node configures itself at start")
     start_active: bool = Field(
         default=True,
-        description="activate it too; else u is at trim",
+        description="whether it also activates itself; if not, u stays at trim",
     )
     allocation: AllocationConfig | None = Field(
-        default=None, description="extension: distributes the inputs of the law to effectors"
+        default=None, description="extension that distributes the inputs of the law over effectors"
     )
     feedforward: FeedforwardConfig | None = Field(
-        default=None, description="extension: adds the input of a nominal model along y_m"
+        default=None,
+        description="extension that adds the input with which a nominal model follows y_m",
     )
     observer: ObserverConfig | None = Field(
         default=None,
-        description="extension: corrects the trim by estimates of wind and model error",
+        description="extension that corrects the trim by estimates of wind and model error",
     )
     probe: ProbeConfig | None = Field(
         default=None,
-        description="extension: a small sine on each input while engaged, to find a stuck surface",
+        description="extension that adds a small sine to each input, to find a stuck surface",
     )
 
     def _model_states(self) -> tuple[str, ...]:
@@ -125,18 +126,18 @@ class ControllerSection(NodeConfig):
 
     @property
     def vanes(self) -> tuple[str, ...]:
-        """The channels of y for the observer alone."""
+        """Channels of y that only the observer uses."""
         if self.observer is None or self.observer.vanes is None:
             return ()
         return self.observer.vanes.channels
 
     @property
     def measured(self) -> tuple[str, ...]:
-        """The channels of y for the controller: the outputs, then the vanes."""
+        """Channels of y that the controller takes: the outputs, then the vanes."""
         return (*self.outputs, *self.vanes)
 
     def without_vanes(self) -> Self:
-        """The parameters with the observer of y alone."""
+        """Return the parameters with an observer that uses y alone."""
         if self.observer is None or not self.vanes:
             return self
         return self.model_copy(
@@ -144,19 +145,19 @@ class ControllerSection(NodeConfig):
         )
 
     def control_law(self) -> ControlLaw:
-        """The law."""
+        """Return the law."""
         raise NotImplementedError
 
     def law_params(self) -> Any:
-        """The law's parameters as arrays."""
+        """Return the law's parameters as arrays."""
         raise NotImplementedError
 
     def summary(self) -> str:
-        """What flies, as a sentence for the log."""
+        """Describe what flies, as a sentence for the log."""
         return f"law {self.law}"
 
     def tuned_law(self) -> TunedLaw:
-        """The law with its parameters, extended by the observer where there is one."""
+        """Return the law with its parameters, extended by the observer if there is one."""
         law = self.control_law()
         params = self.law_params()
         nominal = self.nominal()
@@ -188,14 +189,14 @@ class ControllerSection(NodeConfig):
         )
 
     def models(self) -> tuple[Any, ...]:
-        """The sections with a model of the aircraft, for a learner to replace."""
+        """Return the sections with a model of the aircraft, which a learner may replace."""
         return self.feedforward, self.observer
 
     def logged_groups(self, law: ControlLaw | None = None) -> dict[str, tuple[str, ...]]:
-        """Groups of channels of `internals` and the names in each.
+        """Group the channels of `internals`, and list the names in each group.
 
         Args:
-            law: The law of `tuned_law`, if known; None: computed.
+            law: The law of `tuned_law`, if you have it; otherwise it is computed.
 
         Returns:
             Names of the channels by group.
@@ -213,38 +214,38 @@ class ControllerSection(NodeConfig):
 
     @property
     def effectors(self) -> tuple[str, ...]:
-        """The channels of u as published.
+        """Channels of u as published.
 
-        They are the effectors of an allocation, else the inputs of the law.
+        They are the effectors of an allocation, or the inputs of the law if there is none.
         """
         return self.inputs if self.allocation is None else self.allocation.effectors
 
     def effector_limits(self) -> Limits:
-        """The limits of u as published, in the order of `effectors`."""
+        """Return the limits of u as published, in the order of `effectors`."""
         guard = self.guard()
         return guard.limits if guard.allocation is None else guard.allocation.limits
 
     def given_up(self) -> FloatArray:
-        """1 for an output without a model to the end of the engagement, else 0, (m,).
+        """Return 1 for each output that has no model until the engagement ends, else 0, (m,).
 
-        Empty without a learner.
+        The array is empty if the controller does not learn.
         """
         return np.zeros(0)
 
     def history_ticks(self) -> int:
-        """Ticks of the last y and u from which an observer that is replaced in flight starts."""
+        """Return the number of past ticks from which an observer starts if replaced in flight."""
         return 0
 
     def nominal(self) -> Nominal | None:
-        """The arrays of the feedforward, None where there is none."""
+        """Return the arrays of the feedforward, or None if there is none."""
         if self.feedforward is None:
             return None
         return self.feedforward.nominal(self.outputs, self.inputs, self.D)
 
     def _flown_nominal(self) -> Nominal | None:
-        """The nominal model along y_m.
+        """Return the nominal model that follows y_m.
 
-        Beside an observer of part 0 no input is added: only a learner needs the states.
+        Beside an observer of part 0 it adds no input; only a learner needs its states.
         """
         nominal = self.nominal()
         if nominal is None or self.observer is None or self.observer.part > 0.0:
@@ -252,13 +253,13 @@ class ControllerSection(NodeConfig):
         return nominal._replace(acts=np.zeros(len(self.inputs))) if self.history_ticks() else None
 
     def digest(self) -> int:
-        """Hash of the parameters of the law and its guard, 0 to 2^48 - 1, exact as a float64.
+        """Compute a hash of the parameters of law and guard, 0 to 2^48 - 1, exact as a float64.
 
-        BLAKE2b of names and values. It changes with any bit of any gain. Parameters that concern
-        only the node are left out.
+        It is a BLAKE2b of names and values, so it changes with any bit of any gain. Parameters that
+        concern only the node are left out.
         """
         content = self.model_dump(exclude=OF_NODE)
-        # logs of versions that had no other law have no name either
+        # logs of versions that had no other law do not name it either
         if content["law"] == "rise_di":
             del content["law"]
         return int.from_bytes(
@@ -266,10 +267,10 @@ class ControllerSection(NodeConfig):
         )
 
     def probe_gain(self) -> FloatArray:
-        """abs(y_i / u_i) at the frequency of each sine, (m,), 0 without a sine.
+        """Compute abs(y_i / u_i) at the frequency of each sine, (m,), 0 where there is no sine.
 
-        Of the nominal model C (j omega - A)^-1 B, or of 1 / (input_scale omega) without one, behind
-        the lag of the actuator.
+        The model is C (j omega - A)^-1 B if there is a nominal one, and 1 / (input_scale omega) if
+        not. The lag of the actuator comes before it.
         """
         gain = np.zeros(len(self.outputs))
         if self.probe is None:
@@ -287,7 +288,7 @@ class ControllerSection(NodeConfig):
         return gain
 
     def _probe(self) -> Probe | None:
-        """The sines: an amplitude of y through the gain of the model; None where there is none."""
+        """Size each sine to move y by its amplitude under the model; None without a probe."""
         if self.probe is None:
             return None
         gain = self.probe_gain()
@@ -299,7 +300,7 @@ class ControllerSection(NodeConfig):
         )
 
     def _limits(self) -> Limits:
-        """The limits of u, infinite where there is none."""
+        """Return the limits of u, infinite where there is none."""
         unlimited = (np.inf,) * len(self.inputs)
         return Limits(
             -np.array(unlimited) if self.lower is None else np.array(self.lower),
@@ -308,13 +309,13 @@ class ControllerSection(NodeConfig):
         )
 
     def _authority(self) -> FloatArray:
-        """y_dot by the full inputs, (m,), units of y / s."""
+        """Compute the y_dot that full inputs give, (m,), units of y / s."""
         limits = self._limits()
         full = np.minimum(np.maximum(-limits.lower, limits.upper), samples.UNLIMITED)
         return np.asarray(full / np.array(self.input_scale))
 
     def guard(self) -> GuardParams:
-        """Times, limits and nominal model of the guard."""
+        """Collect times, limits and nominal model for the guard."""
         return GuardParams(
             period_ns=period_ns(self.rate, "rate"),
             max_age_ns=nanoseconds(self.max_age),

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The controller's log: a named vector per tick.
+"""The controller's log: a named vector at each tick.
 
-With the parameters the log is enough to recompute u.
+Together with the parameters, it is enough to recompute u.
 """
 
 from collections.abc import Mapping, Sequence
@@ -35,7 +35,7 @@ RESERVED = frozenset(
         GIVEN_UP,
     }
 ) - {"e"}
-"""Names reserved by the log, not for the state of a law. e is y - y_m."""
+"""Names that the log reserves, so that no law can use them in its state. e is y - y_m."""
 
 
 class Saturation(IntEnum):
@@ -54,14 +54,14 @@ def groups(
     effectors: Sequence[str] = (),
     vanes: Sequence[str] = (),
 ) -> dict[str, tuple[str, ...]]:
-    """Groups of channels of `internals` and the names per group, in the order of the log.
+    """Group the channels of `internals` and list the names in each group, in the order of the log.
 
-    By output: y, y_m, e = y - y_m, then the state of the law, for RISE-DI e_0 (e at engagement),
-    integral_e (units of y times s) and Pi (scaled input). By input: u before (u_free) and after
-    saturation (u), u_trim, limited (Saturation), u_ff (feedforward). Of an observer: estimates z,
-    by input u_o, and sigma, the fade-in. Of vanes: mean, mean square around it, 1 for a vane in
-    use, the reading, and the reading in the reference motion. Of an allocation: effector, as
-    commanded.
+    Each output has y, y_m, e = y - y_m, then the state of the law; for RISE-DI that is e_0 (e at
+    engagement), integral_e (units of y times s) and Pi (scaled input). Each input has u before
+    (u_free) and after saturation (u), u_trim, limited (Saturation) and u_ff (feedforward). An
+    observer adds its estimates z, u_o for each input, and sigma, the fade-in. Vanes add their mean,
+    the mean square around it, 1 if the vane is in use, the reading, and the reading in the
+    reference motion. An allocation adds effector, as commanded.
     """
     state_groups = [
         name for name in field_names(law) if name not in ("e", *OBSERVER_GROUPS, *VANE_STATE)
@@ -76,11 +76,11 @@ def groups(
 
 
 def names(grouped: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
-    """Channel names of `internals`: the scalars, then "group.name".
+    """List the channel names of `internals`: the scalars, then "group.name".
 
-    Scalars: mode (flight_core.modes.Mode), dt (s), y_m_offset (s), late (s, delay of the tick after
-    its deadline), age (s, of y at the tick), number (counts the samples from 1 since the start: a
-    gap is a lost sample), parameters (ControllerConfig.digest).
+    The scalars are mode (flight_core.modes.Mode), dt (s), y_m_offset (s), late (s, delay of the
+    tick after its deadline), age (s, of y at the tick), number (counts the samples from 1 since the
+    start, so a gap is a lost sample) and parameters (ControllerConfig.digest).
     """
     channels = list(SCALARS)
     for group, members in grouped.items():
@@ -98,11 +98,11 @@ def values(
     parameters: int,
     given_up: FloatArray,
 ) -> FloatArray:
-    """Values of `internals` in the order of `names`. Raises ValueError for a state never engaged.
+    """Return the values of `internals` in the order of `names`.
 
-    `given_up` is 1 for an output without a model to the end of the engagement, (m,), and empty
-    without a learner. With an allocation an input is limited by MAGNITUDE where it, or any
-    effector, is at an end.
+    `given_up` is 1 for an output without a model until the engagement ends, (m,), and empty without
+    a learner. With an allocation, an input counts as limited by MAGNITUDE if it or any effector is
+    at a stop. Raises ValueError if the law was never engaged.
     """
     if state.law is None:
         raise ValueError(

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The control laws of the controller, by name.
 
-They are RISE-DI, and the laws registered by installed packages.
+They are RISE-DI, and the laws that installed packages register.
 
 A package registers a law by an entry point in setup.py; see docs/laws.md:
 
@@ -29,7 +29,7 @@ def _registered() -> EntryPoints:
 
 
 def names() -> tuple[str, ...]:
-    """Names of the laws, sorted.
+    """Return the names of the laws, sorted.
 
     Returns:
         The names that `controller.law` of a scenario takes.
@@ -42,7 +42,7 @@ def names() -> tuple[str, ...]:
 
 
 def schema(name: object) -> type[ControllerConfig]:
-    """The parameters of a law.
+    """Return the class of the parameters of a law.
 
     Args:
         name: Name of a law, as in `laws`.
@@ -91,12 +91,12 @@ def schema(name: object) -> type[ControllerConfig]:
 class AnyLaw(ControllerConfig):
     """The section `controller` of a scenario.
 
-    The key `law` names the law, RISE-DI by default.
+    Its key `law` names the law, RISE-DI by default.
     """
 
     @classmethod
     def keys_beside(cls, values: Mapping[str, Any]) -> Set[str]:
-        """The keys of the law that the values name; those of every law where it has none."""
+        """Return the keys of the law that the values name, or those of every law if none."""
         with suppress(ParameterError):
             return schema(values.get("law", DEFAULT)).model_fields.keys()
         return ControllerConfig.model_fields.keys()

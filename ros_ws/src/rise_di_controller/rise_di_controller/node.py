@@ -53,10 +53,10 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 LONG_MAX_AGE = 1.0  # s, from which a failsafe is named as late
 SLOW_PERIOD_NS = 60 * NANOSECONDS  # between two lines on a rate too low for max_age
 BEHIND_NS = 1_000_000
-"""From the instants of y and y_m at 500 Hz, whole 2 ms of the system clock, to a tick: both have
-arrived, and their nodes have finished their ticks of up to 1 ms. Ticks at a random part of the
-period delay u by up to 2 ms more, and those at the instants of y and y_m wait for a processor of
-two."""
+"""Time from the instants of y and y_m, every 2 ms of the system clock at 500 Hz, to a tick. By then
+both have arrived, and their nodes have finished their own ticks of up to 1 ms. Ticks at a random
+phase would delay u by up to 2 ms more, and ticks at the instants of y and y_m would wait for one of
+two processors."""
 
 
 class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
@@ -65,7 +65,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
     u has the stamp of y.
 
     In lockstep the number of samples of y gives the time. A tick waits for the y and the y_m of its
-    instant. It publishes exactly one u, without channels where the controller has no output.
+    instant and publishes exactly one u, which has no channels if the controller has no output.
     """
 
     def __init__(self) -> None:
@@ -74,7 +74,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         answer_invalid_transitions(self)
         self._active = False
         self._is_shut_down = False
-        # a standby that was never activated publishes no u beside another's
+        # a standby that was never activated publishes no u beside that of the active node
         self._publishes = self.parameters.autostart
         self._controller = Controller(self.parameters)
         y_input = self.parameters.measured, self._taking(self._controller.take_y)
@@ -120,7 +120,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Reset the law. The parameters were validated when they were set."""
-        # keeps u, so that a node that is configured again transfers without a bump
+        # this keeps u, so that a node that is configured again transfers without a bump
         self._controller.restart()
         self.get_logger().info(self.parameters.summary())
         self._warn_long_max_age(self.parameters)
@@ -160,9 +160,9 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         return self._y.subscription, self._y_m.subscription
 
     def start_ns(self) -> int:
-        """BEHIND_NS after a whole period of the system clock.
+        """Start BEHIND_NS after a whole period of the system clock.
 
-        Half a period where this is less.
+        If half a period is less, start half a period after it.
         """
         return self.next_period_ns() + min(BEHIND_NS, self.period_ns() // 2)
 
@@ -189,9 +189,9 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
     def _taking(
         self, take: Callable[[StampedVector, int], str]
     ) -> Callable[[StampedVector, int], None]:
-        """`take`, with a ChannelError for a sample that is lost.
+        """Wrap `take` so that it raises ChannelError for a sample that is lost.
 
-        So the receiver counts and logs the loss.
+        The receiver then counts and logs the loss.
         """
 
         def taking(sample: StampedVector, now_ns: int) -> None:
@@ -201,7 +201,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         return taking
 
     def _tell_restart(self) -> None:
-        """Log and count that the law has engaged again by itself, a line in 2 s at most."""
+        """Log and count that the law has engaged again by itself, at most once in 2 s."""
         if restarted := self._controller.restarted():
             self._restarts += 1
             self.get_logger().warning(
@@ -221,7 +221,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
             self.get_logger().info("every probed input answers again")
 
     def _tell_vanes(self) -> None:
-        """Log a vane at the begin and the end of a standstill."""
+        """Log when a vane begins or ends to stand still."""
         before = self._still_vanes
         self._still_vanes = self._controller.still_vanes()
         if before == self._still_vanes:
@@ -235,18 +235,17 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         return nanoseconds(self.parameters.max_age)
 
     def _timeouts_ns(self) -> tuple[int, int]:
-        """Ages above which a publisher has timed out, ns.
+        """Return the ages above which a publisher has timed out, ns.
 
-        The first is for the same node in a new process, the second for a different node.
-
-        Another one may take over once the failsafe has brought u to trim.
+        The first age is for the same node in a new process, the second for a different node: that
+        one may take over only once the failsafe has brought u to trim.
         """
         return self._max_age_ns(), self._max_age_ns() + nanoseconds(
             self.parameters.hold + self.parameters.ramp
         )
 
     def _step(self, now_ns: int, late_ns: int) -> bool:
-        """One tick of the controller; whether it had an output to publish."""
+        """Run one tick of the controller, and say whether it had an output to publish."""
         before = self._controller.mode
         output = self._controller.tick(now_ns, late_ns, active=self._active)
         if self._learning is not None and output is not None and self._controller.has_internals:
@@ -257,7 +256,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         self._tell_restart()
         if output is None or not self._publishes:
             return False
-        # A tick that was stopped half-way does not publish its old u: the aircraft has started its
+        # If a tick was suspended halfway, do not publish its old u: the aircraft has started its
         # failsafe, and u would jump.
         if self.parameters.lockstep or self.now_ns() - now_ns <= self._max_age_ns():
             self._publish_u(self._u_encoder.encode(output.stamp_ns, output.u))
@@ -292,12 +291,12 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
     # With a learner
 
     def _new_learning(self) -> Learning | None:
-        """The proposals of a learner, for parameters that learn; None for others."""
+        """Make the side that takes a learner's proposals; None if the controller does not learn."""
         self._decoded = self._waits_for_proposal = False
         parameters = self.parameters
         if not isinstance(parameters, RiseDiConfig) or parameters.learn is None:
             return None
-        # The first identification of a learner that was started again comes after the first of
+        # A learner that is started again identifies for the first time after the first of
         # `updates`.
         timeouts_ns = (
             nanoseconds(parameters.learn.updates[0]),
@@ -329,7 +328,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
             self.adopt(parameters)
 
     def _publish_authority(self, now_ns: int) -> None:
-        """Tell guidance what the inputs can do, by the model that flies.
+        """Tell guidance what the inputs can do according to the model that flies.
 
         Without a learner nothing is told.
         """
@@ -339,9 +338,9 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
             )
 
     def _has_proposal(self, now_ns: int) -> bool:
-        """Lockstep: whether the proposal for which the step of an instant waits has arrived.
+        """In lockstep, say whether the proposal for which the step of an instant waits has arrived.
 
-        True where none is due.
+        True if none is due.
         """
         if self._learning is None:
             return True

@@ -2,9 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameters of the controller under any control law.
 
-They are validated here. `controller_section` has the fields, and the arrays that they make.
+They are validated here; `controller_section` has the fields and the arrays that they make.
 
-The parameters of a law are a subclass; `AnyLaw.validate_mapping` finds it by the name of the law.
+The parameters of a law are a subclass, which `AnyLaw.validate_mapping` finds by the name of the
+law.
 """
 
 from collections.abc import Iterator, Sequence
@@ -46,22 +47,22 @@ from rise_di_controller.law.linear_loop import (
     spectral_radius,
 )
 
-# parts of the delay margin at which the nominal loop with an observer has to be stable
+# fractions of the delay margin at which the nominal loop with an observer must be stable
 MARGIN_PARTS = (0.0, 0.5, 1.0)
 
 MAX_DELAY_PERIODS = 100
-"""The linear loop has m states a period of the delay: 100 of four channels take 3 s of processor
-time, 1000 half a minute."""
+"""The linear loop has m states for each period of the delay: with four channels, 100 periods take
+3 s of processor time and 1000 half a minute."""
 
 MAX_STABLE_STEP = 2.5
 """Largest product of dt and the fastest zero. A Runge-Kutta step is stable up to 2.78; dt is the
-longest that the law takes."""
+longest step that the law takes."""
 
 
 class ControllerConfig(ControllerSection):
     """Parameters of the controller node that every control law has.
 
-    A subclass has the parameters of a law, as fields.
+    A subclass adds the parameters of a law as fields.
 
     Args:
         values: Values by name of the parameter.
@@ -76,7 +77,7 @@ class ControllerConfig(ControllerSection):
 
     @classmethod
     def tunable(cls) -> frozenset[str]:
-        """Parameters that may change in flight: those of the law and the guard.
+        """Return the parameters that may change in flight: those of the law and the guard.
 
         Names of channels and signs may not.
         """
@@ -88,9 +89,9 @@ class ControllerConfig(ControllerSection):
             pass
 
     def checks(self) -> Iterator[None]:
-        """The relations between the values, checked in parts of at most about 1 ms.
+        """Check the relations between the values, in parts of at most about 1 ms.
 
-        A controller flies meanwhile. Raises ParameterError.
+        The parts are so short because a controller flies meanwhile. Raises ParameterError.
         """
         period = period_ns(self.rate, "rate")
         if self.lockstep:
@@ -136,14 +137,17 @@ class ControllerConfig(ControllerSection):
             yield from self._check_observer(self.observer, nominal)
 
     def _check_names(self) -> None:
-        """No channel and no state has two places: a log could not tell these apart."""
+        """Refuse a channel or state that has two places: a log could not tell them apart."""
         require_distinct("outputs", self.outputs)
         require_distinct("inputs", self.inputs)
         for key, section in (("feedforward", self.feedforward), ("observer", self.observer)):
             require_distinct(f"{key}.states", () if section is None else section.states)
 
     def _check_state(self) -> None:
-        """The log holds each array of the law's state by output, beside groups of its own."""
+        """Refuse a state of the law that the log cannot hold.
+
+        Each array must have one value per output, and a name that the log does not use.
+        """
         zero = np.zeros(len(self.outputs))
         state = self.control_law().engage(
             Measurements(y=zero, y_m=zero, y_m_dot=zero, u_trim=zero, u_before=zero),
@@ -206,7 +210,7 @@ class ControllerConfig(ControllerSection):
         )
 
     def _check_observer(self, observer: ObserverConfig, nominal: Nominal) -> Iterator[None]:
-        """Sizes, stable filter and feedback, and the delay margin of the nominal loop.
+        """Check sizes, stability of filter and feedback, and the delay margin of the nominal loop.
 
         The delay margin certifies what flies.
         """
@@ -229,7 +233,7 @@ class ControllerConfig(ControllerSection):
         )
         Phi, Gamma, H, L, F = observer.matrices(nominal)
         matrices = {"L": Phi @ (np.eye(len(Phi)) - L @ H)}
-        if F.any(axis=1).all():  # channels without it fly the law alone, which the loop below has
+        if F.any(axis=1).all():  # channels without F fly the law alone: the loop below
             matrices["F"] = Phi - Gamma @ F
         for key, matrix in matrices.items():
             radius = spectral_radius(matrix)
@@ -268,20 +272,20 @@ class ControllerConfig(ControllerSection):
                 yield
 
     def check_law(self) -> None:
-        """Checks of the law's own parameters against each other and the channels.
+        """Check the law's own parameters against each other and the channels.
 
         Raises ParameterError.
         """
 
 
 def _subsets(names: Sequence[str]) -> Iterator[tuple[str, ...]]:
-    """Every subset of the names, the small ones first."""
+    """Yield every subset of the names, the small ones first."""
     for count in range(len(names) + 1):
         yield from combinations(names, count)
 
 
 def as_controller(value: object, key: str) -> ControllerConfig:
-    """The value, parameters of a controller. Raises ParameterError for another value."""
+    """Return the value if it holds the parameters of a controller, or raise ParameterError."""
     return as_instance(
         value, ControllerConfig, key, "the parameters of a controller, as scenario.controller"
     )

@@ -37,14 +37,14 @@ from rise_di_controller.law.control_law import ControlLaw, TunedLaw
 from rise_di_controller.law.law import CONTROL_LAWS, LawParams, Sign, gain, total_lag
 from rise_di_controller.params import ControllerConfig
 
-# s, over which a new observer runs before it flies: its disturbances then hold what the law held
+# s, for which a new observer runs before it flies, so that its disturbances hold what the law held
 HISTORY = 5.0
 
 
 class SpeedConfig(Config):
     """The models of feedforward and observer at another airspeed.
 
-    SI units, matrices row by row as in these sections.
+    Values are in SI units, matrices row by row as in those sections.
     """
 
     ratio: Positive = Field(description="this airspeed over the trim speed")
@@ -60,19 +60,19 @@ class SpeedConfig(Config):
 class ScheduleConfig(Config):
     """The schedule of input_scale over dynamic pressure, an extension of the paper."""
 
-    speed: Positive = Field(description="the trim speed V0 at which input_scale holds, m/s")
+    speed: Positive = Field(description="trim speed V0, at which input_scale holds, m/s")
     time: Positive = Field(default=1.0, description="time constant at which input_scale follows, s")
     slow: SpeedConfig | None = Field(
         default=None,
-        description="beside an observer: models below the trim speed, interpolated between",
+        description="models below the trim speed, beside an observer; interpolated in between",
     )
     fast: SpeedConfig | None = Field(
-        default=None, description="beside an observer: models above the trim speed"
+        default=None, description="models above the trim speed, beside an observer"
     )
 
     @property
     def models(self) -> tuple[SpeedConfig, ...]:
-        """The models at other speeds: two, or none."""
+        """Models at other speeds: two, or none."""
         return () if self.slow is None or self.fast is None else (self.slow, self.fast)
 
 
@@ -80,27 +80,28 @@ class PriorConfig(Config):
     """The rough model with which learning begins."""
 
     file: str | None = Field(
-        default=None, description="its airframe file, by `rise-di learn`; none: the airframe"
+        default=None,
+        description="its airframe file, written by `rise-di learn`; none: that of the airframe",
     )
     off: Annotated[float, Field(ge=0.05, le=1.0)] | None = Field(
         default=None,
-        description="standard deviation of its entries over their values; none: 0.29, that of "
+        description="standard deviation of its entries over their values; none: 0.29, which is "
         "+-50 %",
     )
     sketch: bool = Field(
         default=False,
-        description="whether the rough model is the feedforward, a sketch by rule, as of an "
-        "aircraft of JSBSim, and not the airframe file",
+        description="whether the rough model is the feedforward, a sketch made by rule, as for an "
+        "aircraft of JSBSim, instead of the airframe file",
     )
 
 
-LEAST_MARGIN = 0.02  # s, delay margin of a learned model, two periods of a law at 100 Hz
+LEAST_MARGIN = 0.02  # s, delay margin that a learned model must keep: two periods at 100 Hz
 
 
 class LearnConfig(Config):
     """Learning in the air, an extension of the paper.
 
-    A and B are identified in flight, and the observer is designed again.
+    A and B are identified in flight, and the observer is designed again from them.
     """
 
     window: Annotated[float, Field(ge=6, le=600)] = Field(
@@ -108,7 +109,7 @@ class LearnConfig(Config):
     )
     updates: Positives = Field(
         default=(10.0, 15.0, 20.0, 30.0, 60.0),
-        description="when identifications begin, from the first tick, s; then one a window",
+        description="when identifications begin, s from the first tick; then once a window",
     )
     check: Annotated[float, Field(ge=1, le=600)] = Field(
         default=2.0, description="period of the test for a changed aircraft, s"
@@ -116,27 +117,28 @@ class LearnConfig(Config):
     prior: PriorConfig | None = Field(default=None, description="the rough model")
     margin: Annotated[float, Field(ge=0, le=0.5)] | None = Field(
         default=None,
-        description="delay margin of a learned model, s; else what the file's loop keeps around it",
+        description="least delay margin of a learned model, s; none: what the loop of the file "
+        "keeps around it",
     )
     without: tuple[str, ...] | None = Field(
         default=None,
-        description="outputs without a learned model",
+        description="outputs that never get a learned model",
     )
     latency: Annotated[float, Field(ge=0, le=60)] = Field(
         default=4.0,
-        description="in lockstep: from the end of a window to its model, s",
+        description="in lockstep, time from the end of a window to its model, s",
     )
 
     def least_margin(self, margin: float) -> float:
-        """The least delay margin of a learned model, s, beside that of the start.
+        """Return the delay margin that a learned model must keep, s, given that of the start.
 
-        The margin is `margin`, or at most LEAST_MARGIN, since the loop of the file may keep less
-        around the aircraft.
+        It is the configured margin. If none is configured, it is `margin`, but at most
+        LEAST_MARGIN, because the loop of the file may keep less around the aircraft.
         """
         return min(margin, LEAST_MARGIN) if self.margin is None else self.margin
 
     def spacing(self) -> float:
-        """The shortest time between two of `updates`, s; `window` for one."""
+        """Return the shortest time between two of `updates`, s; `window` if there is only one."""
         return min(
             (after - before for before, after in pairwise(self.updates)), default=self.window
         )
@@ -192,7 +194,7 @@ class RiseDiConfig(ControllerConfig):
     def read(
         cls, values: Mapping[Any, Any], key: str, problems: Problems, *, check: bool = True
     ) -> Self | None:
-        """Give omega, if it is left out, the value 1 for each output.
+        """Read the set, and give omega the value 1 for each output if it is left out.
 
         Args:
             values: The nested mapping.
@@ -210,18 +212,21 @@ class RiseDiConfig(ControllerConfig):
 
     @classmethod
     def tunable(cls) -> frozenset[str]:
-        """Also the scale of the inputs."""
+        """Add the scale of the inputs to the parameters that may change in flight."""
         return (super().tunable() | {"input_scale"}) - {"learn"}
 
     @classmethod
     def learned(cls) -> frozenset[str]:
-        """The models, by proposals of a learner. A change by an operator would skip the proof."""
+        """Return the models, which only proposals of a learner may change.
+
+        A change by an operator would skip the proof.
+        """
         return frozenset({"feedforward", "observer"})
 
     def check_law(self) -> None:
-        """A value per channel; k_d has no value for the last.
+        """Check that each key has a value per channel, except k_d, which has none for the last.
 
-        A schedule needs V, and no model of the trim besides.
+        A schedule needs the output V, and a learner needs an observer without vanes.
         """
         require_length("k_d", self.k_d, self.outputs[:-1])
         for key in ("Lambda", "beta", "omega"):
@@ -259,9 +264,9 @@ class RiseDiConfig(ControllerConfig):
             )
 
     def _check_schedule(self, schedule: ScheduleConfig) -> None:
-        """A schedule has V and further outputs, and models below and above the trim speed.
+        """Check that a schedule has V, another output, and models below and above the trim speed.
 
-        The models are of a feedforward and an observer.
+        These are models of both the feedforward and the observer.
         """
         followed = "V" in self.outputs and len(self.outputs) > 1
         require(
@@ -304,9 +309,9 @@ class RiseDiConfig(ControllerConfig):
         )
 
     def checks(self) -> Iterator[None]:
-        """Beside models at two more speeds, the checks of the controller at several speeds.
+        """Check the controller, and beside models at two more speeds check it at several speeds.
 
-        They are the trim speed, these speeds, and halfway to either.
+        These are the trim speed, the two speeds, and the points halfway to each.
         """
         if self.schedule is None or not self.schedule.models:
             yield from super().checks()
@@ -334,15 +339,15 @@ class RiseDiConfig(ControllerConfig):
                 ) from None
 
     def at_speed(self, ratio: float) -> Self:
-        """The parameters that fly at a part of the trim speed in steady flight.
+        """Return the parameters that fly at a fraction of the trim speed in steady flight.
 
-        They have the models of there and no schedule.
+        They have the models of that speed and no schedule.
 
         Args:
-            ratio: Airspeed as a part of the trim speed.
+            ratio: Airspeed as a fraction of the trim speed.
 
         Returns:
-            A copy with the models at the speed.
+            A copy with the models at that speed.
         """
         return self._at_speed(
             ratio, self._nominal_over_speed(self.known_nominal()), self.tuned_law().params.observer
@@ -362,7 +367,7 @@ class RiseDiConfig(ControllerConfig):
         return self.model_copy(update=sections | {"input_scale": input_scale, "schedule": None})
 
     def _with_models(self, models: SpeedConfig) -> Self:
-        """The parameters with `models` in place of the models of the trim speed.
+        """Return the parameters with `models` in place of the models of the trim speed.
 
         They have no schedule.
         """
@@ -384,7 +389,7 @@ class RiseDiConfig(ControllerConfig):
         matrices: Callable[["RiseDiConfig", FloatArray], FloatArray],
         model: Callable[[FloatArray, FloatArray], Any],
     ) -> OverSpeed:
-        """A model of the matrices at the trim speed and at the speeds of a schedule with models."""
+        """Interpolate a model from its matrices at the trim speed and the scheduled speeds."""
         assert self.schedule is not None  # noqa: S101 - for the type checker
         airspeed, (slow, fast) = self._airspeed(), self.schedule.models
         at_trim = matrices(self.model_copy(update={"schedule": None}), np.ones(len(self.outputs)))
@@ -393,9 +398,9 @@ class RiseDiConfig(ControllerConfig):
         return over_speed((slow.ratio, fast.ratio), (at_trim, at_slow, at_fast), airspeed, model)
 
     def _nominal_over_speed(self, at_trim: Nominal) -> OverSpeed:
-        """The model of the feedforward over the airspeed.
+        """Return the model of the feedforward over the airspeed.
 
-        Leads and inputs come from the model at the trim speed.
+        Its leads and inputs come from the model at the trim speed.
         """
 
         def matrices(config: RiseDiConfig, scale: FloatArray) -> FloatArray:
@@ -404,24 +409,24 @@ class RiseDiConfig(ControllerConfig):
         return self._over_speed(matrices, partial(nominal_of, at_trim))
 
     def models(self) -> tuple[Any, ...]:
-        """Also the models at further speeds."""
+        """Include the models at other speeds."""
         return (*super().models(), () if self.schedule is None else self.schedule.models)
 
     def guard(self) -> GuardParams:
-        """Also the models of the feedforward over the airspeed."""
+        """Include the models of the feedforward over the airspeed."""
         guard = super().guard()
         if guard.nominal is None or self.schedule is None or not self.schedule.models:
             return guard
         return guard._replace(over_speed=self._nominal_over_speed(guard.nominal))
 
     def known_nominal(self) -> Nominal:
-        """The arrays of the feedforward, where there is one."""
+        """Return the arrays of the feedforward, which must exist."""
         nominal = self.nominal()
         assert nominal is not None  # noqa: S101 - beside an observer
         return nominal
 
     def tuned_law(self) -> TunedLaw:
-        """The law with parameters, extended by the observer or the schedule, if any."""
+        """Return the law with parameters, extended by the observer or the schedule, if any."""
         law = super().tuned_law()
         if self.schedule is None:
             return law
@@ -441,10 +446,10 @@ class RiseDiConfig(ControllerConfig):
         )
 
     def logged_groups(self, law: ControlLaw | None = None) -> dict[str, tuple[str, ...]]:
-        """Also the outputs that are given up, of a controller that learns.
+        """Add the outputs that are given up, if the controller learns.
 
         Args:
-            law: As of `ControllerConfig.logged_groups`.
+            law: As in `ControllerConfig.logged_groups`.
 
         Returns:
             Names of the channels by group.
@@ -453,21 +458,21 @@ class RiseDiConfig(ControllerConfig):
         return grouped if self.learn is None else grouped | {internals.GIVEN_UP: self.outputs}
 
     def given_up(self) -> FloatArray:
-        """By `learn.without`."""
+        """Give up the outputs of `learn.without`."""
         if self.learn is None:
             return np.zeros(0)
         return np.array([float(name in (self.learn.without or ())) for name in self.outputs])
 
     def history_ticks(self) -> int:
-        """HISTORY where the models are learned."""
+        """Return the ticks of HISTORY if the models are learned, else 0."""
         return 0 if self.learn is None else round(HISTORY * self.rate)
 
     def control_law(self) -> ControlLaw:
-        """RISE-DI with the sampled sign."""
+        """Return RISE-DI with the sampled sign."""
         return CONTROL_LAWS[self.sampled_sign()[0]]
 
     def law_params(self) -> LawParams:
-        """The arrays of the law."""
+        """Return the arrays of the law."""
         K = gain(np.array(self.k_g), np.array(self.k_d, dtype=np.float64))
         return LawParams(
             K=K,
@@ -484,16 +489,16 @@ class RiseDiConfig(ControllerConfig):
         )
 
     def summary(self) -> str:
-        """How the sign is sampled, and the reason as a sentence.
+        """Say how the sign is sampled and why, as a sentence.
 
-        The sentence says whether input_scale is scheduled.
+        The sentence also says whether input_scale is scheduled.
         """
         return self.sampled_sign()[1] + (
             "" if self.schedule is None else "; input_scale follows the dynamic pressure"
         )
 
     def sampled_sign(self) -> tuple[Sign, str]:
-        """How the sign is sampled, and the reason as a sentence."""
+        """Choose how the sign is sampled, and give the reason as a sentence."""
         if self.sign != "auto":
             return Sign[self.sign.upper()], f"{self.sign} sign, as configured"
         lag = max(self.lag) + self.delay

@@ -64,7 +64,7 @@ def f(t: Any, x: Array, params: Aircraft, turbulence: Array | None = None) -> Ar
 
     `turbulence` is the wind along the G axes, shape (G,), m/s; None: no turbulence. x may hold N
     states in columns, (n, N).
-    """  # noqa: D400, D415 - what follows is an equation
+    """  # noqa: D415 - what follows is an equation
     return f_state(x, params) + f_time(t, wind(t, params, turbulence), params)
 
 
@@ -100,7 +100,7 @@ def kinematics(x: Array, params: EulerKinematics) -> Array:
 
     The first term is the loss of lift along the vertical in a bank. Source: B. L. Stevens, F. L.
     Lewis, Aircraft Control and Simulation, 2nd ed. (2003), eqs. (1.3-22), (2.4-5).
-    """  # noqa: D400, D415 - what follows is an equation
+    """  # noqa: D415 - what follows is an equation
     xp = array_namespace(x)
     phi, theta, p, q, r = params.select @ x
     sine = xp.sin(phi)

@@ -52,7 +52,7 @@ def discrete_gust(speed: float) -> tuple[float, float]:
         U = GUST_SPEED (H / 106.7 m)^(1/6),  H = GUST_TIME speed within GUST_LENGTHS
 
     Source: CS 25.341 (a), without the alleviation factor.
-    """  # noqa: D400, D415 - what follows is an equation
+    """  # noqa: D415 - what follows is an equation
     length = min(max(GUST_TIME * speed, GUST_LENGTHS[0]), GUST_LENGTHS[1])
     peak = GUST_SPEED * (length / GUST_LENGTHS[1]) ** (1.0 / 6.0)
     return peak, 2.0 * length / speed

@@ -87,7 +87,7 @@ def path_acceleration(
     over ground, so a wind changes nothing. On the inner side of an arc, e is limited to half of the
     radius. Source: PX4-Autopilot, src/lib/npfg/DirectionalGuidance.cpp, without the adaptation to
     wind.
-    """  # noqa: D400, D415 - what follows is an equation
+    """  # noqa: D415 - what follows is an equation
     e, track, kappa = error
     xp = array_namespace(e)
     x = xp.minimum(abs(e) / (forward(ground_speed) * params.period * params.damping), 1.0)

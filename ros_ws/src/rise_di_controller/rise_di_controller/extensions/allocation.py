@@ -4,9 +4,9 @@
 
 u = T v, effect u = v.
 
-The law, its gains and its theorem stay m x m in v. T is a right inverse of `effect`, so what one
-effector gives the others need not give. Every sum has a stated order, so u has the same bits on
-every host.
+The law, its gains and its theorem stay m x m in v. T is a right inverse of `effect`, so if one
+effector already gives a part of v, the others need not give it. Every sum has a stated order, so
+that u has the same bits on every host.
 """
 
 from collections.abc import Sequence
@@ -19,18 +19,18 @@ from flight_core.vectors import Array, FloatArray, array_namespace
 from rise_di_controller.law.saturation import LEAST_DIVISOR, Limits, bounds
 
 SWEEPS = 10
-"""Most sweeps over the effectors of an exchange."""
+"""Largest number of sweeps over the effectors in an exchange."""
 
 RELAXATION = 1.9
-"""Excess over a stop times this is exchanged: 1 is a projection on the stop. Of 500 demands that T
-v does not meet and some u inside the stops does, drawn on 3 to 8 effectors, ten sweeps meet 82 %
-with 1 and 99 % with 1.9."""
+"""An excess over a stop is exchanged this many times: 1 is a projection on the stop. Of 500 demands
+that T v does not meet although some u inside the stops does, drawn on 3 to 8 effectors, ten sweeps
+meet 82 % with 1 and 99 % with 1.9."""
 
 HALVINGS = 5
-"""Of the part of an input that cannot be met. Of 300 demands beyond the stops, the first input gets
-99 % of what a linear program finds for it with 5, 92 % with 3."""
+"""Bisections that find which part of an input can be met. Of 300 demands beyond the stops, the
+first input gets 99 % of what a linear program finds for it with 5 bisections, 92 % with 3."""
 
-SMALL = 1e-9  # of the diagonal of `exchange`: an effector that no other one replaces
+SMALL = 1e-9  # on the diagonal of `exchange`: less than this, and nothing replaces the effector
 
 
 class Allocation(NamedTuple):
@@ -46,7 +46,7 @@ class Allocation(NamedTuple):
 def allocation(
     T: FloatArray, effect: FloatArray, order: Sequence[int], limits: Limits
 ) -> Allocation:
-    """The parameters with `exchange`."""
+    """Compute the parameters, with `exchange`."""
     columns = [product(T, column) for column in effect.T]
     return Allocation(
         T=T,
@@ -60,17 +60,17 @@ def allocation(
 def allocate(
     v: FloatArray, u_before: FloatArray, dt: Array, params: Allocation
 ) -> tuple[FloatArray, FloatArray]:
-    """The u (p,) inside the limits for a demanded v (m,), and the v by this u.
+    """Find u (p,) inside the limits for a demanded v (m,), and return it with the v that it gives.
 
-    Without a limit they are T v and v, to the last bit.
+    If no limit acts, these are T v and v, to the last bit.
 
-    Where T v is beyond an end stop, `exchange w` passes what the effector lacks to the others, one
-    stop after the other. Where that is not enough, the inputs of the law are added in the order of
-    priority, each as far as the stops let it:
+    If T v is beyond an end stop, `exchange w` passes what the effector lacks on to the others, one
+    stop after the other. If that is not enough, the inputs of the law are added in the order of
+    priority, each as far as the stops allow:
 
         u += s (T_i v_i + exchange w),  s the largest in [0, 1] inside the end stops, from u = 0
 
-    From u_before towards this u the same holds inside the rates, with the change of v for v.
+    From u_before towards this u the same is done inside the rates, with the change of v for v.
 
     Source: pseudo-inverse with redistribution and priority, T. A. Johansen, T. I. Fossen, "Control
     allocation - a survey", Automatica 49(5), 2013, section 2; the exchange is the relaxation method
@@ -100,7 +100,7 @@ def allocate(
 
 
 def limits_of_effectors(v_free: Array, v: Array) -> Limits:
-    """The limits from v_free to the v of the effectors.
+    """Return limits that lead from v_free to the v that the effectors give.
 
     The anti-windup of a law takes these limits.
     """
@@ -120,9 +120,9 @@ def _towards(
     high: FloatArray,
     params: Allocation,
 ) -> FloatArray:
-    """U after the moves, each as far as the limits let it, from a start inside; u stays inside.
+    """Move u by each of the moves in turn, as far as the limits allow, starting from inside them.
 
-    HALVINGS find the part of a move, then the rest of the way is straight.
+    HALVINGS bisections find the part of a move that fits; the rest of the way is straight.
     """
     u = start
     for move in moves:
@@ -154,7 +154,7 @@ def _towards(
 def _exchanged(
     u: FloatArray, low: FloatArray, high: FloatArray, exchange: FloatArray
 ) -> FloatArray:
-    """U with the same effect, inside its limits where the sweeps find such a u."""
+    """Change u without changing its effect, inside its limits if the sweeps find such a u."""
     columns = exchange.T.tolist()
     ends = list(enumerate(zip(low.tolist(), high.tolist(), strict=True)))
     values_of_u = u.tolist()

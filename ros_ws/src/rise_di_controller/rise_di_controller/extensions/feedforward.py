@@ -2,10 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Feedforward by model inversion, an extension of the paper, off by default.
 
-The feedforward is the input of a nominal model along y_m.
+It is the input with which a nominal model of the aircraft would follow y_m.
 
-The feedforward uses y_m only, no state of the aircraft, and does not change the law. See
-docs/theory.md.
+It uses only y_m, not the state of the aircraft, and does not change the law. See docs/theory.md.
 """
 
 from typing import NamedTuple
@@ -24,13 +23,14 @@ ZERO_REAL_PART = 1e-6
 
 
 LONGEST_PART = 10
-"""periods, of a Runge-Kutta step of the nominal model; a tick after lost samples has several."""
+"""Most periods in a Runge-Kutta step of the nominal model. A tick after lost samples has several
+steps."""
 
 
 class Nominal(NamedTuple):
     """Nominal model of the aircraft: x_dot = A x + f(x) + B u, y = C x.
 
-    The model is in deviations from trim, SI and radians.
+    It holds for deviations from trim, in SI units and radians.
     """
 
     A: Array  # (n, n)
@@ -44,14 +44,14 @@ class Nominal(NamedTuple):
     # (m,) time from a tick until the input acts: half a period of hold, delay, actuator lag; s
     lead: Array
     sine_states: tuple[int, ...]  # indices of the states with a sine term
-    # (m,) 1 for the inputs with a feedforward, 0 for the others; None: all have one
+    # (m,) 1 for the inputs with a feedforward, 0 for all others; None if all have one
     acts: Array | None = None
 
 
 def nominal_model(
     A: Array, B: Array, C: Array, gravity: Array, lead: Array, acts: Array | None = None
 ) -> Nominal:
-    """The nominal model with the products for a tick. Omega = C B is regular."""
+    """Build the nominal model with the products that a tick needs. Omega = C B must be regular."""
     inverse = arithmetic.inverse(product(C, B))
     path = np.eye(len(A)) - product(product(B, inverse), C)
     angles = tuple(np.flatnonzero(gravity.any(axis=0)).tolist())
@@ -81,7 +81,7 @@ class FeedforwardState(NamedTuple):
 
 
 def initial_state(y_m: Array, nominal: Nominal) -> FeedforwardState:
-    """State at engagement: the outputs at y_m, shape (m,), the remaining states at 0, the trim."""
+    """Return the state at engagement: outputs at y_m, shape (m,), other states at 0, the trim."""
     xp = array_namespace(y_m)
     zeros = xp.zeros_like(y_m)
     zero = xp.zeros_like(y_m[0])
@@ -91,10 +91,10 @@ def initial_state(y_m: Array, nominal: Nominal) -> FeedforwardState:
 def with_new_model(
     state: FeedforwardState | None, y_m: Array, y_m_dot: Array, dt: Array, nominal: Nominal
 ) -> FeedforwardState:
-    """State for a new model in the same motion.
+    """Return the state for a new model in the same motion.
 
-    x and u_0 stay, where there are any, and the new model gives u. u_ff goes on at u - u_0.
-    Arguments: y_m_dot and dt of the last tick.
+    x and u_0 stay if there are any, and the new model gives u. u_ff continues at u - u_0. y_m_dot
+    and dt are those of the last tick.
     """
     start = initial_state(y_m, nominal)
     if state is not None and state.x.shape == start.x.shape:
@@ -103,40 +103,40 @@ def with_new_model(
 
 
 def ideal_input(x: Array, y_m_dot: Array, nominal: Nominal) -> Array:
-    """Input for the motion y_m_dot of the outputs of the nominal model, shape (m,).
+    """Compute the input that moves the outputs of the nominal model by y_m_dot, shape (m,).
 
-    u = Omega^-1 (y_m_dot - C (A x + f(x))).
+    u = Omega^-1 (y_m_dot - C (A x + f(x)))
     """
     drift = product(nominal.A, x) + product(nominal.gravity, sines(x, nominal))
     return product(nominal.inverse, y_m_dot - product(nominal.C, drift))
 
 
 def x_dot(t: Array, x: Array, forced: Array, nominal: Nominal) -> Array:
-    """Nominal model under the ideal input, shape (n,).
+    """Compute x_dot of the nominal model under the ideal input, shape (n,).
 
     x_dot = A x + f(x) + B ideal_input(x, y_m_dot), so C x_dot = y_m_dot.
 
-    As (I - B Omega^-1 C) (A x + f(x)) + forced, with forced = B Omega^-1 y_m_dot.
+    It is evaluated as (I - B Omega^-1 C) (A x + f(x)) + forced, with forced = B Omega^-1 y_m_dot.
     """
     return product(nominal.path_A, x) + product(nominal.path_gravity, sines(x, nominal)) + forced
 
 
 def sines(x: Array, nominal: Nominal) -> Array:
-    """Sine of the states with a sine term, 0 for the remaining states, shape (n,) or (n, N)."""
+    """Take the sine of the states with a sine term, 0 for all others, shape (n,) or (n, N)."""
     if not isinstance(x, np.ndarray):
         rows = [sine(row) if j in nominal.sine_states else 0.0 * row for j, row in enumerate(x)]
         return array_namespace(x).stack(rows)
     values = np.zeros_like(x)
     for j in nominal.sine_states:
-        # a Python float: a fifth of the time of an array
+        # a Python float takes a fifth of the time of an array
         values[j] = sine(x[j].item() if x.ndim == 1 else x[j])
     return values
 
 
 def step_count(span_ns: int, period_ns: int) -> int:
-    """Number of Runge-Kutta steps over the time between two ticks.
+    """Return the number of Runge-Kutta steps between two ticks.
 
-    A step has at most LONGEST_PART periods.
+    A step is at most LONGEST_PART periods long.
     """
     return max(-(-span_ns // (LONGEST_PART * period_ns)), 1)
 
@@ -144,20 +144,20 @@ def step_count(span_ns: int, period_ns: int) -> int:
 def step(
     state: FeedforwardState, y_m: Array, dt: Array, nominal: Nominal, parts: int = 1
 ) -> tuple[FeedforwardState, Array]:
-    """A tick: (state, y_m, dt) -> (state, u_ff - u_0), a term added to u of the law.
+    """Advance by a tick: (state, y_m, dt) -> (state, u_ff - u_0), which is added to u of the law.
 
-    y_m is linear over the last tick. The outputs of the nominal model follow y_m. The remaining
-    states (the zero dynamics) are integrated with the required input:
+    y_m is taken as linear over the last tick. The outputs of the nominal model follow it, and the
+    other states (the zero dynamics) are integrated under the input that this requires:
 
         y_m_dot = (y_m - C x_p) / dt                       C x_p = y_m a tick ago
         x       = Runge-Kutta steps of x_dot from x_p      C x = y_m, `parts` equal ones
         u       = ideal((x + x_p) / 2, y_m_dot)            in the middle of the tick, dt / 2 ago
         u_ff    = u + (dt / 2 + lead) (u - u_p) / ((dt + dt_p) / 2)
 
-    u_ff extrapolates the last two u linearly to the instant of action of this tick's input: an
-    actuator of first order moves by u at the command u + lag u_dot. The first two ticks after
-    engagement only determine the slope and add nothing. u_0 is u_ff of the second tick, so u does
-    not jump (bumpless transfer). dt > 0.
+    u_ff extrapolates the last two u linearly to the instant at which this tick's input acts: a
+    first-order actuator moves by u if it is commanded u + lag u_dot. The first two ticks after
+    engagement only determine the slope and add nothing. u_0 is u_ff of the second tick, so that u
+    does not jump (bumpless transfer). dt > 0.
 
     Shapes: y_m, u_ff (m,), dt (). Units: SI and radians; u in the units of B. Source: this project,
     after the feedforward of model inversion; see docs/theory.md.
@@ -177,15 +177,16 @@ def step(
 
 
 def of_active_inputs(u: Array, nominal: Nominal) -> Array:
-    """The input u of the inputs with a feedforward, 0 for the others, (m,)."""
+    """Keep the entries of u for the inputs with a feedforward, and set the others to 0, (m,)."""
     return u if nominal.acts is None else u * nominal.acts
 
 
 def nominal_zeros(nominal: Nominal) -> NDArray[np.complex128]:
-    """Eigenvalues of the zero dynamics, shape (n - m,), 1/s: the zeros of the nominal model.
+    """Compute the zeros of the nominal model, shape (n - m,), 1/s.
 
-    Eigenvalues of H' (I - B Omega^-1 C) (A + gravity) H, with H the columns of I for states not
-    outputs, and sin(x) linearised to x. NumPy arrays only.
+    They are the eigenvalues of its zero dynamics, H' (I - B Omega^-1 C) (A + gravity) H, where H
+    has the columns of I for the states that are not outputs, and sin(x) is linearised to x. NumPy
+    arrays only.
     """
     hidden = ~np.asarray(nominal.C).any(axis=0)
     matrix = nominal.path @ (nominal.A + nominal.gravity)

@@ -28,11 +28,11 @@ from rise_di_controller.extensions.observer import VaneParams
 from rise_di_controller.law.decomposition import DecompositionError, signs
 from rise_di_controller.law.saturation import Limits
 
-MAX_INVERSE_ERROR = 1e-6  # 1, of an entry of effect T: that of numbers with ten digits is 1e-9
+MAX_INVERSE_ERROR = 1e-6  # 1, of an entry of effect T; numbers with ten digits leave 1e-9
 
 
 def _require_sizes(section: Config, key: str, sizes: Mapping[str, tuple[int, int]]) -> None:
-    """Raise ParameterError for a matrix, row by row, with another number of entries."""
+    """Refuse a matrix, given row by row, whose number of entries is wrong."""
     for name, (rows, columns) in sizes.items():
         values = getattr(section, name)
         require(
@@ -44,7 +44,7 @@ def _require_sizes(section: Config, key: str, sizes: Mapping[str, tuple[int, int
 
 
 def require_same_signs(Omega: FloatArray, D: Sequence[int], where: str) -> None:
-    """Raise ParameterError for a C B without a D, or with another one."""
+    """Refuse a model whose C B has no D, or another D than the controller."""
     try:
         signs_of_model = [int(sign) for sign in signs(Omega)]
     except DecompositionError as error:
@@ -62,29 +62,29 @@ def require_same_signs(Omega: FloatArray, D: Sequence[int], where: str) -> None:
 class FeedforwardConfig(Config):
     """The nominal model of the feedforward, an extension of the paper.
 
-    SI units, matrices row by row.
+    Values are in SI units, matrices row by row.
     """
 
-    states: Names = Field(description="the states of the model, the outputs among them")
-    A: Numbers = Field(description="A, a row a state")
-    B: Numbers = Field(description="B, a row a state, the columns as controller.inputs")
+    states: Names = Field(description="states of the model, with the outputs among them")
+    A: Numbers = Field(description="A, one row per state")
+    B: Numbers = Field(description="B, one row per state, columns as in controller.inputs")
     gravity: Numbers | None = Field(
-        default=None, description="sine terms, x_dot += gravity sin(x), a row a state"
+        default=None, description="sine terms, x_dot += gravity sin(x), one row per state"
     )
     lead: NonNegatives = Field(
-        description="from a tick until its input acts, s: half a period, delay, lag"
+        description="time from a tick until its input acts, s: half a period, delay and lag"
     )
     inputs: Names | None = Field(
-        default=None, description="the inputs with a feedforward; all where absent"
+        default=None, description="inputs with a feedforward; none: all of them"
     )
     deviation: NonNegatives | None = Field(
-        default=None, description="standard deviations of B, for the limits of guidance"
+        default=None, description="standard deviations of B, from which guidance takes its limits"
     )
 
     def nominal(self, outputs: Sequence[str], inputs: Sequence[str], D: Sequence[int]) -> Nominal:
-        """The arrays of the feedforward.
+        """Return the arrays of the feedforward.
 
-        Raises ParameterError for sizes that do not match and for a C B whose D differs.
+        Raises ParameterError if sizes do not match or C B has another D.
         """
         n = len(self.states)
         m = len(outputs)
@@ -115,25 +115,25 @@ class FeedforwardConfig(Config):
 
 
 class VanesConfig(Config):
-    """Vanes of an observer: channels of y beside the outputs, for the observer alone.
+    """Vanes of an observer: channels of y beside the outputs, which only the observer uses.
 
-    SI, row by row.
+    Values are in SI units, row by row.
     """
 
     channels: Names = Field(
-        description="the channels of y, also states of the feedforward, as alpha"
+        description="channels of y that are also states of the feedforward, such as alpha"
     )
-    H: Numbers = Field(description="reading less that of the reference = H z, a row a vane")
+    H: Numbers = Field(description="H z = reading less that of the reference, one row per vane")
     L: Numbers = Field(
-        description="added to L: by vane a row an estimate, a column an output and the vane"
+        description="added to L for each vane: one row per estimate, columns for outputs and vane"
     )
     least: NonNegatives = Field(
-        description="rms motion of a reading below which the vane counts as frozen"
+        description="rms motion of a reading below which its vane counts as frozen"
     )
     time: Positive = Field(default=1.0, description="time over which the motion is averaged, s")
 
     def params(self, outputs: Sequence[str], states: Sequence[str], estimates: int) -> VaneParams:
-        """The arrays. Raises ParameterError for channels without a state, and for wrong sizes."""
+        """Return the arrays, or refuse a channel without a state or a wrong size."""
         k = len(self.channels)
         s = estimates
         m = len(outputs)
@@ -157,19 +157,19 @@ class VanesConfig(Config):
 class ObserverConfig(Config):
     """An observer of the nominal model, an extension of the paper.
 
-    The matrices are as designed; SI, row by row.
+    The matrices are taken as designed, in SI units, row by row.
     """
 
-    rate: Positive = Field(description="the rate of the law for which the matrices hold, Hz")
+    rate: Positive = Field(description="rate of the law for which the matrices hold, Hz")
     states: Names = Field(
-        description="names of the estimates: those of the feedforward's states first, as x.alpha"
+        description="names of the estimates: first the states of the feedforward, as x.alpha"
     )
     Phi: Numbers = Field(description="estimates one period later without input")
-    Gamma: Numbers = Field(description="effect of u, held over the period")
-    L: Numbers = Field(description="correction by the errors of the outputs")
-    F: Numbers = Field(description="u_o = -F z, a row an input, a column an estimate")
+    Gamma: Numbers = Field(description="effect on them of u held over the period")
+    L: Numbers = Field(description="correction of the estimates by the errors of the outputs")
+    F: Numbers = Field(description="u_o = -F z, one row per input, one column per estimate")
     part: Annotated[float, Field(ge=0, le=1)] = Field(
-        default=0.6, description="bound of u_o, part of the limits of u; 0: without u_o and u_ff"
+        default=0.6, description="bound of u_o over the limits of u; 0: neither u_o nor u_ff"
     )
     within: Positive = Field(
         default=0.1, description="least time in which u_o goes from 0 to its bound, s"
@@ -178,12 +178,12 @@ class ObserverConfig(Config):
         default=1.0, description="time in which u_o fades in after engagement, s"
     )
     margin: Annotated[float, Field(ge=0, le=0.5)] = Field(
-        default=0.03, description="least delay margin of the nominal loop, `delay` included, s"
+        default=0.03, description="least delay margin of the nominal loop, including `delay`, s"
     )
-    vanes: VanesConfig | None = Field(default=None, description="vanes beside y; none where absent")
+    vanes: VanesConfig | None = Field(default=None, description="vanes beside y")
 
     def matrices(self, nominal: Nominal) -> tuple[FloatArray, ...]:
-        """Phi, Gamma, H, L and F. Raises ParameterError for sizes that do not match."""
+        """Return Phi, Gamma, H, L and F, or raise ParameterError if their sizes do not match."""
         s, (n, m) = len(self.states), nominal.B.shape
         sizes = {"Phi": (s, s), "Gamma": (s, m), "L": (s, m), "F": (m, s)}
         _require_sizes(self, "observer", sizes)
@@ -192,7 +192,7 @@ class ObserverConfig(Config):
         return Phi, Gamma, H, L, np.reshape(self.F, (m, s))
 
     def at_rate(self, rate: float, nominal: Nominal) -> "ObserverConfig":
-        """The observer for another rate of the law, a = self.rate / rate periods of this one long.
+        """Convert the observer to another rate, whose periods are a = self.rate / rate as long.
 
         [Phi, Gamma; 0, I]' = [Phi, Gamma; 0, I]^a,  I - L' H = (I - L H)^a,  F' = F
         """
@@ -216,26 +216,26 @@ class ObserverConfig(Config):
 
 
 class AllocationConfig(Config):
-    """An allocation of the inputs of the law to as many effectors or more.
+    """An allocation of the inputs of the law to at least as many effectors.
 
-    An extension of the paper. SI, row by row.
+    It is an extension of the paper. Values are in SI units, row by row.
     """
 
-    effectors: Names = Field(description="the channels of u that are published")
-    T: Numbers = Field(description="u = T v: a row an effector, a column an input")
+    effectors: Names = Field(description="channels of u that are published")
+    T: Numbers = Field(description="u = T v, one row per effector, one column per input")
     effect: Numbers = Field(
-        description="v = effect u: a row an input, a column an effector; effect T = I"
+        description="v = effect u, one row per input, one column per effector; effect T = I"
     )
-    lower: Numbers = Field(description="lower end stops of the effectors from trim")
-    upper: Numbers = Field(description="upper end stops of the effectors from trim")
+    lower: Numbers = Field(description="lower end stops of the effectors, from trim")
+    upper: Numbers = Field(description="upper end stops of the effectors, from trim")
     slew: Positives | None = Field(default=None, description="limits of abs(u_dot), units of u / s")
     priority: Names | None = Field(
         default=None,
-        description="the inputs by how long they keep their effect; none: in order",
+        description="inputs, the one that keeps its effect longest first; none: in order",
     )
 
     def ordered(self, inputs: Sequence[str], order: Sequence[str]) -> "AllocationConfig":
-        """The allocation of `inputs` for the same inputs in another order."""
+        """Return the allocation of `inputs` for the same inputs in another order."""
         places = [list(inputs).index(name) for name in order]
         p = len(self.effectors)
         T = np.reshape(self.T, (p, -1))[:, places]
@@ -245,9 +245,9 @@ class AllocationConfig(Config):
         )
 
     def arrays(self, inputs: Sequence[str]) -> Allocation:
-        """The arrays of the allocation.
+        """Return the arrays of the allocation.
 
-        Raises ParameterError for sizes that do not match and for an effect T that is not I.
+        Raises ParameterError if sizes do not match or effect T is not I.
         """
         p = len(self.effectors)
         m = len(inputs)

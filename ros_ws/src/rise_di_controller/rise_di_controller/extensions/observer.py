@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Observer, an extension of the paper, off by default.
 
-Estimates of states, wind and disturbances correct the trim of a law.
+Its estimates of states, wind and disturbances correct the trim of a law.
 
-The observer extends any control law: the law's own equations do not change. The matrices are
-parameters, so nothing is solved here. See docs/theory.md.
+It extends any control law without changing the law's own equations. Its matrices are parameters, so
+nothing is solved here. See docs/theory.md.
 """
 
 from collections.abc import Sequence
@@ -21,27 +21,26 @@ from rise_di_controller.law.saturation import Limits, saturate
 
 
 class VaneParams(NamedTuple):
-    """Parameters of k vanes, sensors beside y for the observer alone.
+    """Parameters of k vanes, which are sensors beside y that only the observer uses.
 
-    A reading is H z beyond the reference motion.
+    H z predicts by how much a reading differs from that of the reference motion.
     """
 
     H: Array  # (k, s)
     # (k, s, m + 1) gains of a vane, added to L; the last column acts on the innovation of the vane
     L: Array
-    least: (
-        Array  # (k,) mean square of the motion of a reading below which the vane counts as frozen
-    )
+    # (k,) mean square of the motion of a reading below which the vane counts as frozen
+    least: Array
     time: Array  # () s, over which the motion is averaged
 
 
 class ObserverParams(NamedTuple):
-    """Parameters of the extended law and of the observer, s estimates.
+    """Parameters of the extended law and of an observer with s estimates.
 
-    A matrix may have the N aircraft as the last axis.
+    A matrix may have the N aircraft of a campaign as its last axis.
 
-    The model of the deviation from the reference, u held over a period: z+ = Phi z + Gamma (u -
-    u_trim), e = H z.
+    The model of the deviation from the reference, with u held over a period, is z+ = Phi z + Gamma
+    (u - u_trim), e = H z.
     """
 
     law: Any  # parameters of the extended law
@@ -87,29 +86,29 @@ class VaneObserverState(NamedTuple):
 
 
 def predict(z: Array, u: Array, params: ObserverParams) -> Array:
-    """Estimates a period later: Phi z + Gamma u, with u the deviation from u_trim."""
+    """Predict the estimates a period later: Phi z + Gamma u, with u the deviation from u_trim."""
     return product(params.Phi, z) + product(params.Gamma, u)
 
 
 def initial_estimates(e: Array, params: ObserverParams) -> Array:
-    """Estimates at engagement: H'e, the outputs at the errors and the rest 0."""
+    """Return the estimates at engagement, H'e: outputs at the errors, the rest at 0."""
     return product(params.H.swapaxes(0, 1), e)
 
 
 def estimates_after(
     history: tuple[PastTick, ...], change: Array, filters: Sequence[ObserverParams]
 ) -> Array:
-    """Estimates of the filter over the last ticks, predicted for the next tick.
+    """Run the filter over the last ticks, and return its estimates for the next tick.
 
         z = (I - Phi (I - L H))^-1 (mean(Phi L e) + mean(Gamma (u - change)))
             the steady state at the means
         z = z + L (e - H z),  z = Phi z + Gamma (u - change)                       over the ticks,
         that is z = (Phi - Phi L H) z + Phi L e + Gamma (u - change)
 
-    So the filter knows what the law held: to estimate it takes longer than the record. A tick
-    without a y has no correction. The products with e and u are taken of all ticks of a filter at
-    once, in a third of the time. Arguments: `history` with a y at least; `change` of the
-    feedforward since then, (m,); the `filters` of the ticks.
+    The filter then knows what the law held, which would take it longer than the record to estimate.
+    A tick without a y has no correction. For speed, the products with e and u are taken for all
+    ticks of a filter at once, which takes a third of the time. `history` must contain at least one
+    y, `change` is that of the feedforward since then, (m,), and `filters` are those of the ticks.
     """
     known = np.array([tick.e is not None for tick in history])
     e = np.array([np.zeros_like(change) if tick.e is None else tick.e for tick in history]).T
@@ -137,15 +136,15 @@ def estimates_after(
 def with_motion(
     state: VaneObserverState, reading: Array, dt: Array, params: VaneParams
 ) -> VaneObserverState:
-    """The state with the motion of the readings, and the vanes in use.
+    """Update the motion of the readings, and which vanes are in use.
 
         part    = min(dt / time, 1)
         mean   += part (reading - mean)
         square += part ((reading - mean)^2 - square)
         measures 1 where square > least, else 0
 
-    A frozen vane has electrical noise alone, of less than `least`. So has a vane in calm air,
-    without wind to tell.
+    A frozen vane shows only electrical noise, less than `least`. So does a vane in calm air, which
+    has no wind to tell about.
     """
     xp = array_namespace(reading)
     part = xp.minimum(dt / params.time, 1.0 + 0.0 * dt)
@@ -158,9 +157,9 @@ def with_motion(
 def by_vanes(
     z: Array, innovation: Array, deviation: Array, measures: Array, params: VaneParams
 ) -> Array:
-    """Correction by the vanes in use, (s,): sum of L_v [e - H z, deviation_v - H_v z].
+    """Compute the correction by the vanes in use, (s,): sum of L_v [e - H z, deviation_v - H_v z].
 
-    Arguments: the innovation of y, (m,); `deviation` of the readings from the reference motion,
+    `innovation` is that of y, (m,); `deviation` is that of the readings from the reference motion,
     (k,).
     """
     xp = array_namespace(z)
@@ -174,16 +173,16 @@ def by_vanes(
 
 
 def without_frozen(params: ObserverParams, frozen: Sequence[bool]) -> ObserverParams:
-    """Parameters for frozen vanes: never in use, and the rest in use from the first motion on."""
+    """Return parameters that never use frozen vanes, and use all others from the start."""
     if params.vanes is None:
         return params
     return params._replace(vanes=params.vanes._replace(least=np.where(frozen, np.inf, 0.0)))
 
 
 def filter_matrix(params: ObserverParams) -> FloatArray:
-    """Phi (I - L H - sum of L_v [H, H_v]), (s, s): the estimates from tick to tick.
+    """Compute Phi (I - L H - sum of L_v [H, H_v]), (s, s): the estimates from tick to tick.
 
-    Vanes with a finite `least` count.
+    Only vanes with a finite `least` count.
     """
     corrected = params.L @ params.H
     if params.vanes is not None:
@@ -195,7 +194,7 @@ def filter_matrix(params: ObserverParams) -> FloatArray:
 
 
 def correct(state: Any, measurements: Measurements, dt: Array, params: ObserverParams) -> Any:
-    """Correction by the measured error, and the contribution to the trim.
+    """Correct the estimates by the measured error, and set the contribution to the trim.
 
         z     = z + L (e - H z) + by_vanes
         sigma = min(1, sigma + dt fade_rate)
@@ -223,7 +222,7 @@ def correct(state: Any, measurements: Measurements, dt: Array, params: ObserverP
 def _at_engagement(
     law_state: Any, measurements: Measurements, params: ObserverParams, *, vanes: bool
 ) -> Any:
-    """The state at engagement: estimates from the first e, u_o = 0."""
+    """Return the state at engagement: estimates from the first e, u_o = 0."""
     e = measurements.y - measurements.y_m
     zero = array_namespace(e).zeros_like(e)
     state = ObserverState(law_state, initial_estimates(e, params), zero, zero[:1])
@@ -235,7 +234,7 @@ def _at_engagement(
 
 @lru_cache(maxsize=64)
 def with_observer(law: ControlLaw, *, vanes: bool = False) -> ControlLaw:
-    """A control law from the trim u_trim + u_o.
+    """Extend a control law so that it starts from the trim u_trim + u_o.
 
     The observer takes u after saturation (anti-windup), and the vanes.
 

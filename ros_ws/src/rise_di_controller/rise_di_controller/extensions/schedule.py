@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Schedule of input_scale over dynamic pressure, an extension of the paper, off by default.
 
-A control surface answers with the dynamic pressure: Omega grows with V^2, and the delay margin of
-fixed gains falls as much. The schedule keeps Omega input_scale near the value of the trim. The
-schedule extends a law with the parameter input_scale; the law's own equations do not change. The
-models of a feedforward and of an observer beside it are those of the airspeed too.
+The response to a control surface grows with the dynamic pressure: Omega grows with V^2, and the
+delay margin of fixed gains falls accordingly. The schedule keeps Omega input_scale near its value
+at trim. It extends a law that has the parameter input_scale, without changing the law's own
+equations. If there is a feedforward and an observer, they use the models of the airspeed too.
 """
 
 import math
@@ -26,7 +26,7 @@ SCALE_RANGE = (0.3, 3.0)
 """Least and largest factor of input_scale: from 1.83 to 0.58 of the trim speed."""
 
 
-# a unit of V / V0: the models change every 0.2 m/s at 25 m/s, so that most ticks find theirs made
+# per unit of V / V0: models change every 0.2 m/s at 25 m/s, so that most ticks find theirs made
 STEPS = 128
 
 
@@ -39,15 +39,15 @@ class OverSpeed(NamedTuple):
     airspeed: FloatArray  # (m,) 1 for the output V, else 0
 
     def at_scale(self, scale: FloatArray) -> Any:
-        """The model where the factors of input_scale are `scale`, (m,).
+        """Return the model at which the factors of input_scale are `scale`, (m,).
 
-        The factors are (V0 / V)^2 in every channel but V.
+        They are (V0 / V)^2 in every channel except V.
         """
         d = 1.0 / math.sqrt(((1.0 - self.airspeed) * scale).max()) - 1.0
         return self.model(round(min(max(d, self.least), self.most) * STEPS) / STEPS)
 
     def at_scales(self, scales: FloatArray) -> list[Any]:
-        """The models of T factors, (T, m), as from `at_scale`, at once."""
+        """Return the models for T factors, (T, m), as from `at_scale` but all at once."""
         d = 1.0 / np.sqrt(((1.0 - self.airspeed) * scales).max(axis=1)) - 1.0
         return [
             self.model(place)
@@ -61,11 +61,11 @@ def over_speed(
     airspeed: FloatArray,
     model: Callable[[FloatArray, FloatArray], Any],
 ) -> OverSpeed:
-    """The model of matrices trim + d (slope + d curvature).
+    """Interpolate a model over the airspeed: trim + d (slope + d curvature).
 
-    The matrices go through `values` at the trim speed and at two ratios to it. The first ratio is
-    below 1, the second above. What turns y_dot into u, as F of an observer and the inverse of
-    Omega, is over the factor of input_scale in `values`: `model` takes the matrices and these
+    The matrices pass through `values` at the trim speed and at two ratios to it, the first below 1
+    and the second above. Whatever turns y_dot into u, such as F of an observer or the inverse of
+    Omega, is divided by the factor of input_scale in `values`; `model` takes the matrices and these
     factors, (m,).
     """
     trim, slow, fast = values
@@ -101,17 +101,18 @@ class ScheduleState(NamedTuple):
 
 
 def airspeed_range(params: ScheduleParams) -> tuple[Array, Array]:
-    """Airspeeds where the factor is the largest and the least of SCALE_RANGE, m/s."""
+    """Return the airspeeds at which the factor is the largest and the least of SCALE_RANGE, m/s."""
     return params.speed / math.sqrt(SCALE_RANGE[1]), params.speed / math.sqrt(SCALE_RANGE[0])
 
 
 def target_scale(y: Array, params: ScheduleParams) -> Array:
-    """Factor of input_scale at the airspeed V0 + V of y, shape (m,).
+    """Compute the factor of input_scale at the airspeed V0 + V of y, shape (m,).
 
-    The factor is (V0 / (V0 + V))^2 within SCALE_RANGE, and 1 in channel V.
+    It is (V0 / (V0 + V))^2 within SCALE_RANGE, and 1 in channel V.
 
-    A ratio of dynamic pressures at equal density: for V in y as equivalent airspeed at any
-    altitude, for true airspeed near the altitude of the trim. A thrust does not follow the ratio.
+    This is a ratio of dynamic pressures at equal density. It holds at any altitude if V in y is
+    equivalent airspeed, and near the altitude of the trim if it is true airspeed. Thrust does not
+    follow the ratio.
     """
     xp = array_namespace(y)
     least, largest = airspeed_range(params)
@@ -121,14 +122,14 @@ def target_scale(y: Array, params: ScheduleParams) -> Array:
 
 
 def side_by_side(params: ObserverParams, scale: FloatArray) -> FloatArray:
-    """[Phi, Gamma, L, F'] of an observer with the factors `scale` of input_scale, (s, s + 3 m)."""
+    """Stack [Phi, Gamma, L, F'] of an observer, with F over the factors `scale`, (s, s + 3 m)."""
     return np.hstack([params.Phi, params.Gamma, params.L, (params.F / scale[:, None]).T])
 
 
 def observer_of(
     observer: ObserverParams, matrices: FloatArray, scale: FloatArray
 ) -> ObserverParams:
-    """An observer with other matrices, the inverse of `side_by_side`."""
+    """Give an observer other matrices, the inverse of `side_by_side`."""
     s, m = observer.Gamma.shape
     F = np.ascontiguousarray(matrices[:, s + 2 * m :].T) * scale[:, None]
     return observer._replace(
@@ -137,7 +138,7 @@ def observer_of(
 
 
 def nominal_side_by_side(nominal: Nominal, scale: FloatArray) -> FloatArray:
-    """The matrices of a feedforward side by side, with the factors `scale`.
+    """Stack the matrices of a feedforward side by side, with the factors `scale`.
 
     They are [A, gravity, B, path A, path gravity, inverse'], the last in n rows.
     """
@@ -150,7 +151,7 @@ def nominal_side_by_side(nominal: Nominal, scale: FloatArray) -> FloatArray:
 
 
 def nominal_of(nominal: Nominal, matrices: FloatArray, scale: FloatArray) -> Nominal:
-    """A nominal model of other matrices, the inverse of `nominal_side_by_side`."""
+    """Give a nominal model other matrices, the inverse of `nominal_side_by_side`."""
     n, m = nominal.B.shape
     ends = (0, n, 2 * n, 2 * n + m, 3 * n + m, 4 * n + m, 4 * n + 2 * m)
     A, gravity, B, path_A, path_gravity, inverse = (
@@ -163,9 +164,9 @@ def nominal_of(nominal: Nominal, matrices: FloatArray, scale: FloatArray) -> Nom
 
 
 def law_at(params: ScheduleParams, scale: Array) -> Any:
-    """Parameters of the extended law at an airspeed.
+    """Return the parameters of the extended law at an airspeed.
 
-    They have input_scale times `scale`, and with an observer the models there.
+    input_scale is multiplied by `scale`, and with an observer the models are those of the airspeed.
     """
     return _scaled(
         params.law if params.observer is None else params.observer.at_scale(scale), scale
@@ -173,14 +174,14 @@ def law_at(params: ScheduleParams, scale: Array) -> Any:
 
 
 def _scaled(params: Any, scale: Array) -> Any:
-    """Parameters of the extended law with input_scale times `scale`."""
+    """Multiply input_scale of the extended law by `scale`."""
     if isinstance(params, ObserverParams):
         return params._replace(law=_scaled(params.law, scale))
     return params._replace(input_scale=params.input_scale * scale)
 
 
 def observers_of(params: Any, scales: Sequence[Array | None]) -> list[ObserverParams]:
-    """The observers of some ticks, with the factors of input_scale there beside a schedule."""
+    """Return the observers of some ticks, at their factors of input_scale if scheduled."""
     if not isinstance(params, ScheduleParams):
         return [params] * len(scales)
     if params.observer is None:
@@ -190,15 +191,15 @@ def observers_of(params: Any, scales: Sequence[Array | None]) -> list[ObserverPa
 
 @lru_cache(maxsize=64)
 def with_schedule(law: ControlLaw) -> ControlLaw:
-    """A control law with input_scale scheduled over the dynamic pressure:
+    """Extend a control law by scheduling its input_scale over the dynamic pressure.
 
         scale += min(dt / time, 1) (target_scale(y) - scale)
         the law is retuned to input_scale scale (bumpless transfer), then takes the step
 
-    The retuning keeps u: the schedule acts on u_dot alone. Engagement starts at target_scale(y). An
-    observer keeps the estimates, of the same meaning at every speed, and u_o goes on to -F z at its
-    own rate.
-    """  # noqa: D400, D415 - what follows is an equation
+    The retuning keeps u, so the schedule acts only on u_dot. Engagement starts at target_scale(y).
+    An observer keeps its estimates, which mean the same at every speed, and u_o moves on to -F z at
+    its own rate.
+    """
 
     def followed(
         state: ScheduleState, y: Array, dt: Array, params: ScheduleParams

@@ -4,16 +4,16 @@
 
 The guard is pure, like the law, and fits every control law.
 
-- Saturation: magnitude and rate limits of u (`saturation.saturate`). Anti-windup is part of the law
-  (`ControlLaw.limited`).
-- Allocation: u to more effectors than the law has inputs, inside the limits of the effectors
-  (`allocation.allocate`).
-- Watchdog: an input older than `max_age` is stale (`tick`).
-- Failsafe for stale inputs: hold u, then ramp u to trim (modes HOLD, RAMP, TRIM).
-- Bumpless transfer: engagement and re-engagement start from the present u, with the law's state as
-  at the first engagement.
-- Finite: a sample with NaN or infinity is as none, and a law whose u or state would not be finite
-  engages again.
+- Saturation limits the magnitude and rate of u (`saturation.saturate`). Anti-windup is part of the
+  law (`ControlLaw.limited`).
+- Allocation distributes u over more effectors than the law has inputs, inside the limits of the
+  effectors (`allocation.allocate`).
+- The watchdog finds stale inputs, which are older than `max_age` (`tick`).
+- The failsafe for stale inputs holds u, then ramps it to trim (modes HOLD, RAMP, TRIM).
+- Bumpless transfer: every engagement starts from the present u, with the law's state as at the
+  first engagement.
+- Only finite values: a sample with NaN or infinity counts as none, and if u or the state of the law
+  would not be finite, the law engages again.
 """
 
 from collections.abc import Sequence
@@ -35,14 +35,15 @@ from rise_di_controller.guard.samples import SampleLimits
 from rise_di_controller.law.control_law import Measurements, TunedLaw, fields
 from rise_di_controller.law.saturation import Limits, saturate
 
-# Least distance of two samples for a slope, as a fraction of the extrapolation. Closer samples are
-# noisier: the extrapolation would amplify the noise of the difference more than 20 times.
+# Least distance of two samples that give a slope, as a fraction of the extrapolation. Closer
+# samples are noisier: extrapolating with them would amplify the noise of their difference more than
+# 20 times.
 MIN_SLOPE_SPAN = 0.05
 
 LARGEST_VANE = np.pi  # rad, where the motion of a vane ends
 
-# Samples kept of y and of y_m, so that y_m at the stamp of y is kept: 0.1 s at 1 kHz, more at lower
-# rates.
+# Samples that are kept of y and of y_m, so that y_m is known at the stamp of y: 0.1 s at 1 kHz,
+# more at lower rates.
 SAMPLE_BUFFER_SIZE = 100
 
 
@@ -68,16 +69,16 @@ class GuardParams(NamedTuple):
 
     @property
     def longest_ns(self) -> int:
-        """Longest time between two y of a step of the law; after more the law engages again.
+        """Longest time between two y that a step bridges; after more the law engages again.
 
-        The last tick with a y within the age limit may be a period before the tick of the next y.
-        A step integrates the whole time: with half of the ticks lost, an upper limit of 3 periods
-        increases the error by 15 % in q and 22 % in r.
+        The last tick with a y within the age limit can be a period before the tick of the next y. A
+        step integrates the whole time: with half of the ticks lost, a limit of 3 periods would
+        raise the error by 15 % in q and 22 % in r.
         """
         return self.max_age_ns + self.period_ns
 
 
-# periods. Least dt of a step: it keeps a burst of samples from exciting the sign term.
+# periods; least dt of a step, which keeps a burst of samples from exciting the sign term
 LEAST_DT = 0.2
 
 
@@ -120,17 +121,17 @@ class ControllerState(NamedTuple):
 
     @property
     def command(self) -> FloatArray:
-        """What is published: the effectors, or u without an allocation."""
+        """What is published: the effectors, or u if there is no allocation."""
         return self.u if self.effectors is None else self.effectors
 
 
 class TickInputs(NamedTuple):
     """Inputs of a tick, for the log.
 
-    The tick recomputed from these inputs gives u to the last bit.
+    If you compute the tick again from these inputs, you get u to the last bit.
     """
 
-    stamp_ns: int  # of u: that of its y; without one it goes on with the clock
+    stamp_ns: int  # of u: that of its y; without a y it continues with the clock
     y: FloatArray
     y_m: FloatArray  # interpolated to the stamp of y
     y_m_offset: float  # stamp of the newest y_m minus stamp of y, s
@@ -138,7 +139,7 @@ class TickInputs(NamedTuple):
 
 
 def initial_state(m: int, allocation: Allocation | None = None) -> ControllerState:
-    """The state before the first sample: u = 0."""
+    """Return the state before the first sample, with u = 0."""
     zero = np.zeros(m)
     effectors = None if allocation is None else np.zeros(len(allocation.T))
     return ControllerState(
@@ -157,16 +158,16 @@ def initial_state(m: int, allocation: Allocation | None = None) -> ControllerSta
 
 
 def align(samples: Sequence[StampedVector], stamp_ns: int, reach_ns: int) -> FloatArray | None:
-    """The signal at an instant, shape (m,).
+    """Return the signal at an instant, shape (m,).
 
-    None where neither interpolation nor extrapolation is possible.
+    Returns None if neither interpolation nor extrapolation is possible.
 
-    A sample with the stamp of the instant is returned unchanged. Between two samples the signal is
-    linear. Beyond the newest sample the signal is extrapolated by at most `reach_ns`, with the
-    slope to the newest sample at least MIN_SLOPE_SPAN `reach_ns` older. Without an older sample,
-    the newest sample is held.
+    If a sample has this very stamp, it is returned unchanged. Between two samples the signal is
+    linear. Beyond the newest sample it is extrapolated by at most `reach_ns`, with the slope from a
+    sample at least MIN_SLOPE_SPAN `reach_ns` older to the newest one. If there is no such sample,
+    the newest one is held.
 
-    Arguments: samples with increasing stamps.
+    The samples must have increasing stamps.
     """
     for sample in reversed(samples):
         if sample.stamp_ns == stamp_ns:
@@ -199,7 +200,7 @@ def _with_history(
     missed: int,
     guard: GuardParams,
 ) -> ControllerState:
-    """The state after a step of the law with the past ticks, missed ticks included."""
+    """Append the past ticks, missed ones included, to the history of a step of the law."""
     scale = getattr(stepped.law, "scale", None)
     nominal = np.float64(seconds(guard.period_ns))
     lost_ticks = (
@@ -228,22 +229,28 @@ def tick(
     u_ff_recorded: FloatArray | None = None,
     vane_m_recorded: FloatArray | None = None,
 ) -> tuple[ControllerState, TickInputs | None]:
-    """A tick of the controller: (state, now, y, y_m) -> (state, inputs of the tick), u in state.u.
+    """Advance the controller by a tick: (state, now, y, y_m) -> (state, inputs of the tick).
 
-    Fresh inputs engage or re-engage the law with u_trim = u (bumpless transfer). A new y is a step
-    of the law with the measured dt, at least LEAST_DT periods; after more than `longest_ns` the law
-    engages again. `ControlLaw.missed` predicts over every whole period without a y before the step.
-    The law adds to u_trim, or to u_trim + u_ff with a feedforward. Without a new y nothing changes.
-    Stale inputs start the failsafe: HOLD (nothing is integrated), then RAMP to trim, then TRIM.
-    The stamp of u is that of its y. In a failsafe it goes on from there with the clock, as that of
-    the y that did not come; a y from before the last u engages nothing, so no stamp goes back.
-    Where `active` is false the mode is INACTIVE, and u is held or ramps to trim; with fresh inputs
-    u is published at trim before the first engagement too. Returns None for the inputs where
-    nothing is to be published.
+    u is in the state that is returned.
 
-    Arguments: `y` the newest sample, `y_m` the last samples with increasing stamps, in the law's
-    order; readings of vanes follow the outputs in y. `u_ff_recorded` and `vane_m_recorded` replace
-    a feedforward of unknown state, in replay.
+    Fresh inputs engage or re-engage the law with u_trim = u (bumpless transfer). Each new y is then
+    a step of the law with the measured dt, which is at least LEAST_DT periods; if more than
+    `longest_ns` have passed, the law engages again instead. Before the step, `ControlLaw.missed`
+    predicts over every whole period that had no y. The law adds its output to u_trim, or to u_trim
+    + u_ff if there is a feedforward. Without a new y nothing changes.
+
+    Stale inputs start the failsafe: HOLD, in which nothing is integrated, then RAMP to trim, then
+    TRIM. The stamp of u is normally that of its y. In a failsafe it continues from there with the
+    clock, as the stamp of the y that did not come would. A y from before the last u does not engage
+    the law, so no stamp ever goes back.
+
+    If `active` is false, the mode is INACTIVE, and u is held or ramps to trim. With fresh inputs u
+    is published, at trim, even before the first engagement. The inputs are None if there is nothing
+    to publish.
+
+    `y` is the newest sample, and `y_m` holds the last samples with increasing stamps, in the law's
+    order; readings of vanes follow the outputs in y. In a replay, `u_ff_recorded` and
+    `vane_m_recorded` replace a feedforward whose state is not known.
     """
     vane = None
     if guard.vanes and y is not None:
@@ -251,7 +258,7 @@ def tick(
         vane = _readings(y.value[m:], state.vanes)
         y = y._replace(value=y.value[:m])
     reference = None if y is None else _fresh_reference(now_ns, y, y_m, guard)
-    # A y from before the last u is late, and the law waits for the next one.
+    # A y from before the last u is too late, so the law waits for the next one.
     is_late = y is not None and state.mode is not Mode.ENGAGED and y.stamp_ns < state.stamp_ns
     if y is None or reference is None:
         after, inputs = _failsafe(state, _going_on(state, now_ns), now_ns, guard, active)
@@ -284,7 +291,7 @@ def tick(
 
 
 def _going_on(state: ControllerState, now_ns: int) -> int:
-    """Return the stamp of a u without a y, ns: that of the last u, and the time since then."""
+    """Return the stamp of a u without a y, ns: that of the last u plus the time since then."""
     return state.stamp_ns + max(now_ns - state.tick_ns, 0)
 
 
@@ -298,7 +305,7 @@ def _with_sample(
     u_ff_recorded: FloatArray | None,
     vane_m_recorded: FloatArray | None,
 ) -> tuple[ControllerState, TickInputs | None]:
-    """A tick with fresh inputs: an engagement, a step of the law, or nothing without a new y."""
+    """Advance by a tick with fresh inputs: engage, step the law, or do nothing without a new y."""
     last = state.y
     if state.law is None or last is None or state.y_m is None or state.mode is not Mode.ENGAGED:
         return _engaged(state, y, inputs, vane, guard, law, vane_m_recorded), inputs
@@ -339,7 +346,7 @@ def _stepped(
     u_ff_recorded: FloatArray | None,
     vane_m_recorded: FloatArray | None,
 ) -> ControllerState:
-    """The state after a step of the law from the predicted `state`, with the feedforward."""
+    """Step the law, and the feedforward if there is one, from the predicted `state`."""
     assert state.y is not None  # noqa: S101 - for the type checker
     assert state.y_m is not None  # noqa: S101 - for the type checker
     span_ns = y.stamp_ns - state.y.stamp_ns
@@ -347,7 +354,7 @@ def _stepped(
     u_trim = _probed_trim(state, y.stamp_ns, guard)
     u_ff = state.u_ff
     ff_state = state.feedforward
-    # The feedforward moves the trim. In replay it may be that of the log.
+    # The feedforward moves the trim. In a replay it may come from the log.
     model = nominal_at_speed(guard, state.law)
     if model is not None and ff_state is not None:
         parts = feedforward.step_count(span_ns, guard.period_ns)
@@ -356,7 +363,7 @@ def _stepped(
     elif u_ff_recorded is not None:
         u_ff = u_ff_recorded
         u_trim = u_trim + u_ff
-    # The law from this trim, inside the limits.
+    # Step the law from this trim, inside the limits.
     vanes = _vanes(vane, ff_state, guard, vane_m_recorded)
     slope = (inputs.y_m - state.y_m) / dt
     vane_m = None if vanes is None else vanes.reference
@@ -386,23 +393,23 @@ def _stepped(
 
 
 def _predicted(law_state: Any, held: Measurements, missed: int, law: TunedLaw) -> Any:
-    """The state of the law after periods without a y, u held."""
+    """Predict the state of the law over periods without a y, with u held."""
     for _ in range(missed):
         law_state = law.control_law.missed(law_state, held, law.params)
     return law_state
 
 
 def _probed_trim(state: ControllerState, stamp_ns: int, guard: GuardParams) -> FloatArray:
-    """The trim of an engagement, with the probe at the stamp of y, (m,)."""
+    """Return the trim of an engagement plus the probe at the stamp of y, (m,)."""
     return state.u_trim if guard.probe is None else state.u_trim + guard.probe.at(stamp_ns)
 
 
 def _fresh_reference(
     now_ns: int, y: StampedVector, y_m: Sequence[StampedVector], guard: GuardParams
 ) -> FloatArray | None:
-    """The reference at the stamp of y, (m,).
+    """Return the reference at the stamp of y, (m,).
 
-    None where y or y_m is stale or not finite, or has no sample near that stamp.
+    Returns None if y or y_m is stale or not finite, or if y_m has no sample near that stamp.
     """
     if not y_m or max(abs(now_ns - sample.stamp_ns) for sample in (y, y_m[-1])) > guard.max_age_ns:
         return None
@@ -419,7 +426,7 @@ def _engaged(
     law: TunedLaw,
     vane_m_recorded: FloatArray | None,
 ) -> ControllerState:
-    """The state at an engagement: the law begins from the present u."""
+    """Engage the law, so that it begins from the present u."""
     reference = inputs.y_m
     zero = np.zeros_like(state.u)
     ff_state = (
@@ -430,7 +437,7 @@ def _engaged(
     )
     u_trim = state.u
     if guard.probe is not None:
-        u_trim = u_trim - guard.probe.at(y.stamp_ns)  # so that u goes on
+        u_trim = u_trim - guard.probe.at(y.stamp_ns)  # so that u continues without a jump
     return state._replace(
         mode=Mode.ENGAGED,
         law=law.control_law.engage(measurements, law.params),
@@ -446,7 +453,7 @@ def _engaged(
 
 
 def _is_finite(state: ControllerState) -> bool:
-    """Whether u and what the next u comes from are finite."""
+    """Whether u and everything that the next u comes from are finite."""
     arrays = [state.u, state.u_free, state.u_ff, *fields(state.law).values()]
     if state.effectors is not None:
         arrays.append(state.effectors)
@@ -456,18 +463,19 @@ def _is_finite(state: ControllerState) -> bool:
 
 
 def _readings(reading: FloatArray, before: VaneReadings | None) -> FloatArray:
-    """The readings of the vanes, (k,).
+    """Return the readings of the vanes, (k,).
 
-    A missing reading repeats the tick before, so the vane counts as still.
+    If a reading is missing, the one of the tick before is repeated, so that the vane counts as
+    still.
     """
     last = np.zeros_like(reading) if before is None else before.reading
     return np.where(np.abs(reading) <= LARGEST_VANE, reading, last)
 
 
 def nominal_at_speed(guard: GuardParams, law: Any) -> Nominal | None:
-    """The nominal model of the feedforward, at the speed of a schedule if any.
+    """Return the nominal model of the feedforward, at the airspeed of the schedule if there is one.
 
-    None without a feedforward.
+    Returns None without a feedforward.
     """
     if guard.nominal is None or guard.over_speed is None:
         return guard.nominal
@@ -481,9 +489,9 @@ def _vanes(
     guard: GuardParams,
     recorded: FloatArray | None,
 ) -> VaneReadings | None:
-    """The readings, and the states of the nominal model along y_m; None without vanes.
+    """Pair the readings of the vanes with those of the reference motion; None without vanes.
 
-    The states are the readings of the reference motion.
+    The states of the nominal model along y_m are what the vanes would read in the reference motion.
     """
     if reading is None:
         return None
@@ -498,17 +506,16 @@ def law_within_limits(
     guard: GuardParams,
     effectors: FloatArray | None,
 ) -> tuple[Any, FloatArray, FloatArray, FloatArray | None]:
-    """A step of the law inside the limits of the law and of the effectors.
+    """Step the law inside the limits of the law and of the effectors.
 
-    The results are the state, u before saturation, u, and the effectors.
-
-    Arguments: `effectors` (p,) of the last tick, None without an allocation.
+    Returns the state, u before saturation, u, and the effectors. The argument `effectors`, (p,),
+    holds those of the last tick and is None without an allocation.
     """
     after, u_free = law.control_law.step(state, measurements, dt, law.params)
     u, effector_values = _within_effectors(
         saturate(u_free, measurements.u_before, dt, guard.limits), effectors, dt, guard
     )
-    # otherwise `limited` gives the same and takes three times as long
+    # if u was not limited, `limited` would give the same and take three times as long
     if not np.array_equal(u, u_free):
         limits = guard.limits if guard.allocation is None else limits_of_effectors(u_free, u)
         after, u_free, u = law.control_law.limited(state, measurements, dt, law.params, limits)
@@ -519,9 +526,9 @@ def law_within_limits(
 def _within_effectors(
     u: FloatArray, before: FloatArray | None, dt: Array, guard: GuardParams
 ) -> tuple[FloatArray, FloatArray | None]:
-    """The u of the effectors for a u, and the effectors.
+    """Return the u that the effectors give for a demanded u, and the effectors.
 
-    Without an allocation they are u and None.
+    Without an allocation these are u itself and None.
     """
     if guard.allocation is None or before is None:
         return u, None
@@ -532,7 +539,7 @@ def _within_effectors(
 def _failsafe(
     state: ControllerState, stamp_ns: int, now_ns: int, guard: GuardParams, active: bool
 ) -> tuple[ControllerState, TickInputs | None]:
-    """A tick without fresh inputs, or of a deactivated controller. `stamp_ns` is that of u."""
+    """Advance by a tick without fresh inputs, or of a deactivated controller; u gets `stamp_ns`."""
     y = state.y
     y_m = state.y_m
     if y is None or y_m is None:

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Probe of the inputs while engaged, and the test of the answer.
+"""Probe of the inputs while engaged, and the test for their effect.
 
-A surface that is stuck in trim shows no error in calm air.
+Without it, a surface that is stuck in trim shows no error in calm air.
 
-Each probed input has a sine of its own frequency beside what the law commands. Over a window all
-sines are orthogonal, also to the frequencies between, where the disturbances are measured.
+Each probed input carries a sine of its own frequency on top of what the law commands. Over a window
+all sines are orthogonal, also to the frequencies in between, where the disturbances are measured.
 """
 
 from collections import deque
@@ -21,28 +21,28 @@ from flight_core.vectors import FloatArray
 
 RATES = frozenset({"p", "q", "r"})
 EFFECT = 0.02  # rad/s, of a body rate by default: ArduPlane's noise in calm air is 0.006 rms
-GAP = 4  # multiples of 1 / window between two sines: those between show the disturbances
-BIN_NS = NANOSECONDS // 20  # y and u are averaged over it
-TESTS = 12  # a window
-FILLED = 0.8  # of the bins of a window that a test needs
-DRIFT = 3  # degree of the polynomial for what is slower than the window, as a turn
-LEAST_SINE = 0.05  # of the amplitude: less of it is left in u at a limit
-LARGEST = 4.0  # Hz, of a sine: five bins a period
+GAP = 4  # multiples of 1 / window from one sine to the next: those in between show disturbances
+BIN_NS = NANOSECONDS // 20  # length of the bins over which y and u are averaged
+TESTS = 12  # tests in a window
+FILLED = 0.8  # fraction of the bins of a window that a test needs
+DRIFT = 3  # degree of the polynomial that fits what is slower than the window, such as a turn
+LEAST_SINE = 0.05  # fraction of the amplitude: at a limit, less of the sine than this is left in u
+LARGEST = 4.0  # Hz, highest frequency of a sine: five bins a period
 
 
 class ProbeConfig(Config):
-    """Probe of the inputs, an extension of the paper: finds a stuck surface without a command."""
+    """Probe of the inputs, an extension that finds a stuck surface without a command."""
 
     effect: NonNegatives | None = Field(
         default=None,
-        description="amplitude of each output by its sine; 0: not probed; none: 0.02 rad/s of "
+        description="amplitude of each output under its sine; 0: not probed; none: 0.02 rad/s for "
         "p, q, r, else 0",
     )
     lowest: Positive = Field(
-        default=1.5, description="lowest frequency of a sine, Hz: above the commands of guidance"
+        default=1.5, description="lowest frequency of a sine, Hz, above those of guidance commands"
     )
     window: Annotated[float, Field(ge=2, le=60)] = Field(
-        default=6.0, description="time over which the answer is measured, s"
+        default=6.0, description="time over which the response is measured, s"
     )
     false_alarm: Annotated[float, Field(ge=1e-9, le=0.05)] = Field(
         default=1e-3,
@@ -50,14 +50,14 @@ class ProbeConfig(Config):
     )
 
     def amplitudes(self, outputs: tuple[str, ...]) -> FloatArray:
-        """Amplitudes of the outputs, (m,), units of y."""
+        """Return the amplitudes of the outputs, (m,), units of y."""
         rates = tuple(EFFECT if name in RATES else 0.0 for name in outputs)
         return np.array(self.effect or rates)
 
     def harmonics(self, outputs: tuple[str, ...], input_scale: tuple[float, ...]) -> FloatArray:
-        """Multiples of 1 / window of the sines, (m,), 0 for an input that is not probed.
+        """Choose the multiple of 1 / window of each sine, (m,), 0 for an input that is not probed.
 
-        The weakest input has the lowest frequency, because it moves the aircraft the least.
+        The weakest input gets the lowest frequency, because it moves the aircraft the least.
         """
         probed = np.flatnonzero(self.amplitudes(outputs))
         first = max(round(self.lowest * self.window), GAP)
@@ -75,9 +75,9 @@ class Probe(NamedTuple):
     window_ns: int
 
     def at(self, stamp_ns: int) -> FloatArray:
-        """Amplitude sin(2 pi harmonic t / window) at a stamp, (m,).
+        """Evaluate amplitude sin(2 pi harmonic t / window) at a stamp, (m,).
 
-        Flight and replay have the same value.
+        Flight and replay get the same value.
         """
         part = (stamp_ns % self.window_ns) / self.window_ns
         return np.asarray(self.amplitude * np.sin(2.0 * np.pi * self.harmonic * part))
@@ -89,7 +89,7 @@ class EffectTest:
     Args:
         probe: The sines.
         gain: abs(y / u) of the model at the frequency of each sine, (m,).
-        false_alarm: Probability, see `most`.
+        false_alarm: Probability of a false alarm in a window, see `most`.
     """
 
     def __init__(self, probe: Probe, gain: FloatArray, false_alarm: float) -> None:
@@ -116,7 +116,7 @@ class EffectTest:
         self._samples: list[FloatArray] = []
 
     def take(self, stamp_ns: int, y: FloatArray, u: FloatArray) -> FloatArray | None:
-        """Take a tick: `most` where a test is due, else None."""
+        """Take a tick, and return `most` if a test is due, else None."""
         place = stamp_ns // BIN_NS
         result = None
         if place != self._bin:
@@ -137,19 +137,19 @@ class EffectTest:
         return len(self._means) >= FILLED * (self._means.maxlen or 0)
 
     def most(self) -> FloatArray:
-        """The largest effect of each input that fits the window, (m,), parts of the model's.
+        """Compute the largest effect of each input that the window allows, (m,).
 
-        UNKNOWN without a sine.
+        It is relative to the effect in the model, and UNKNOWN for an input without a sine.
 
             H = Y(f) / U(f),  R = Y - H (f / f') U  at the frequencies f' between the sines
             s^2 = mean abs(R)^2 / 2
             most = (abs(H) + q s / abs(U(f))) / gain
 
-        with Y and U the complex amplitudes by least squares, beside a cubic, and q the quantile of
-        Student's t of two degrees of freedom a frequency: for noise that is Gaussian and flat over
-        the frequencies, an input falls below its true effect with a probability of `false_alarm` at
-        most. The law answers the sine and the disturbances, so H is the quotient of y and the
-        command, each correlated with the sine.
+        Y and U are the complex amplitudes by least squares, fitted together with a cubic, and q is
+        the quantile of Student's t with two degrees of freedom per frequency. If the noise is
+        Gaussian and flat over the frequencies, the result falls below the true effect of an input
+        with a probability of at most `false_alarm`. The law responds to both the sine and the
+        disturbances, so H is the quotient of y and the command, each correlated with the sine.
         """
         window = np.array(self._means)
         t = (window[:, 0] - window[-1, 0]) / (self._probe.window_ns / NANOSECONDS)
@@ -163,7 +163,7 @@ class EffectTest:
         for i, place in zip(self._probed.tolist(), self._sines.tolist(), strict=True):
             size = abs(U[place, i])
             if size < LEAST_SINE * self._probe.amplitude[i]:
-                continue  # a u that rests at a limit tells nothing
+                continue  # a u that stays at a limit tells us nothing
             H = Y[place, i] / U[place, i]
             slope = self._harmonics[place] / self._harmonics[self._between]
             residual = Y[self._between, i] - H * slope * U[self._between, i]

@@ -22,14 +22,17 @@ def retune_state(
     new: TunedLaw,
     guards: tuple[GuardParams, GuardParams] | None = None,
 ) -> ControllerState:
-    """State for new parameters of the law, without a jump of u (bumpless transfer).
+    """Carry the state over to new parameters of the law, without a jump of u (bumpless transfer).
 
-    An observer with the same matrices continues. With a history of the last ticks a new observer
-    and a new feedforward go on in the same motion: z comes from the new filter over these ticks,
-    and u_o goes on where an observer acts. Without a history the observer starts again from the
-    present error, and u_o and u_ff become part of u_trim. A schedule has the models of the present
-    speed, and over the record those of every tick. Arguments: `guards`, old and new, with the
-    models of the feedforward.
+    | change | with a history of ticks | without one |
+    |---|---|---|
+    | same matrices of the observer | it continues | it continues |
+    | new observer | z from the new filter, u_o continues | starts from the present e |
+    | new feedforward | continues in the same motion | u_ff becomes part of u_trim |
+
+    An observer that starts from the present error also hands its u_o over to u_trim. A schedule
+    uses the models of the present speed, and those of each tick over the history. `guards` are the
+    old and the new guard, with the models of the feedforward.
     """
     y = state.y
     y_m = state.y_m
@@ -52,7 +55,7 @@ def retune_state(
         and isinstance(observing, ObserverState)
         and isinstance(observing.law, LawState)
     ):
-        # With a record of the last ticks the observer and the feedforward go on in the same motion.
+        # With a history, the observer and the feedforward continue in the same motion.
         change: Array = np.zeros_like(state.u)  # of u_ff
         if other_nominal:
             state, change = _with_nominal(state, y_m, after)
@@ -61,7 +64,7 @@ def retune_state(
             z = observer.estimates_after(state.history, change, filters)
             observing = _with_estimates(state, observing, z, change, observers)
     else:
-        # Without a record they begin again, and what they gave becomes a part of u_trim.
+        # Without one they begin again, and what they gave becomes part of u_trim.
         if other_model and not _same_model(*observers):
             z = observer.initial_estimates(y.value - y_m, observers[1])
             state = state._replace(u_trim=state.u_trim + observing.u_o)
@@ -85,13 +88,13 @@ def _with_estimates(
     change: Array,
     observers: tuple[ObserverParams, ...],
 ) -> ObserverState:
-    """The observer of new parameters in the same motion.
+    """Give the observer new parameters in the same motion.
 
-    The observer goes on from the estimates z and the change of u_ff, (m,).
+    It continues from the estimates z and the change of u_ff, (m,).
 
-    u_o goes on to -F z at its own rate. Of a channel without an observer before it takes the part
-    of the law: what the law has integrated beside an observer stays there, which would take it long
-    to integrate again.
+    u_o moves on to -F z at its own rate. In a channel that had no observer before, u_o starts from
+    the part of the law: what the law has integrated would otherwise stay there beside the observer,
+    which would take long to integrate it again.
     """
     law_part = state.u - state.u_trim - state.u_ff
     limits = observers[1].limits
@@ -107,7 +110,7 @@ def _with_estimates(
 def _with_nominal(
     state: ControllerState, y_m: FloatArray, nominal: Nominal | None
 ) -> tuple[ControllerState, Array]:
-    """The state with the feedforward of another model in the same motion.
+    """Give the state the feedforward of another model in the same motion.
 
     The second result is the change of u_ff, (m,).
     """

@@ -1,14 +1,15 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Which samples the controller takes.
+"""Decides which samples the controller takes.
 
-An impossible sample is lost, as a sample that did not arrive.
+An impossible sample is lost: it counts as a sample that did not arrive.
 
-- `beyond`: a value is beyond the bound of the output. No sensor gives such a value.
-- `step`: y changes faster than an aircraft can. The test compares y with the y before and has no
-  model, so a wrong model locks nothing out. An aircraft that really jumps loses two samples: the
+- `bound_violation`: a value is beyond the bound of its output. No sensor gives such a value.
+- `step`: y changes faster than an aircraft can. The test compares y with the y before it and uses
+  no model, so a wrong model locks nothing out. An aircraft that really jumps loses two samples: the
   controller takes the third in a row that agrees.
-- `step`: y stands still, every value to the bit, after changes with every sample.
+- `step`: y stands still, equal to the last bit in every value, after it has changed with every
+  sample.
 """
 
 from collections.abc import Sequence
@@ -22,35 +23,35 @@ from flight_core.rates import NANOSECONDS, seconds
 from flight_core.vectors import FloatArray, StampedVector
 
 TIMES = 5.0
-"""Largest possible change over the largest of the last minute. Noise changes by up to four standard
-deviations in a minute, so this is 20 deviations. In flights of seven of the scenarios no change was
-above a quarter of the limit."""
+"""How much larger a change may be than the largest one of the last minute. Noise changes by up to
+four standard deviations in a minute, so this allows 20. In flights of seven of the scenarios no
+change exceeded a quarter of the limit."""
 
-MEMORY = 60.0  # s, in which the largest change fades
-FIRST_NS = NANOSECONDS  # after the first sample, in which y shows how it changes
+MEMORY = 60.0  # s, over which the largest change fades
+FIRST_NS = NANOSECONDS  # after the first sample, during which y shows how it changes
 AUTHORITY = 2.0
-"""Possible change of y in a period over the change by the full inputs: wind moves an aircraft as
-much as its inputs do."""
+"""Possible change of y in a period over the change that full inputs cause: wind moves an aircraft
+as much as its inputs do."""
 
-UNLIMITED = 1.0  # SI, full input where it has no limit: 57 deg, or the weight as thrust
+UNLIMITED = 1.0  # SI, counts as the full input if it has no limit: 57 deg, or the weight as thrust
 
 LEAST = {"V": 1.0}
-"""Change that counts as possible, m/s a sample. An airspeed may come in whole knots."""
+"""Change that is always possible, m/s a sample. An airspeed may come in whole knots."""
 
 LEAST_RATE = 0.1
-"""The same of other outputs, rad/s a sample: 20 times the noise of a gyro, 0.005 rad/s."""
+"""The same for other outputs, rad/s a sample: 20 times the noise of a gyro, 0.005 rad/s."""
 AGREEING = 3  # samples in a row after a jump that agree
 
 STILL = 5
-"""Samples in a row, over as many periods, with every value as before, after which y is frozen."""
+"""Number of samples in a row, over as many periods, that must equal the last before y is frozen."""
 
 MOVING = 100
-"""Samples in a row with a change, which show that this y never stands still by itself.
+"""Number of changing samples in a row which show that this y never stands still by itself.
 
-Noise changes every sample. Of a sensor with steps, a share c of whose samples changes at rest, 100
-changes and 5 repeats have the probability c^100 (1 - c)^5, at most 1e-9, at c = 0.95. A y repeated
-by a bridge and a simulation without noise in trim have no 100 changes in a row, and are never
-frozen. A simulation settles by ever rarer changes of the last bit.
+Noise changes every sample. If a quantised sensor changes a share c of its samples at rest, 100
+changes followed by 5 repeats have the probability c^100 (1 - c)^5, at most 1e-9, at c = 0.95. A y
+that a bridge repeats, and a simulation without noise in trim, do not have 100 changes in a row and
+so never count as frozen. A simulation settles by ever rarer changes of the last bit.
 """
 
 
@@ -63,7 +64,7 @@ class SampleLimits(NamedTuple):
 
 
 class SampleChange(IntEnum):
-    """What a sample of y is beside the samples before."""
+    """How a sample of y relates to the samples before it."""
 
     NEAR = 0  # taken
     FAR = 1  # lost
@@ -81,25 +82,25 @@ class Stillness(NamedTuple):
 
 
 class SampleState(NamedTuple):
-    """What the controller knows of the samples of y before."""
+    """What the controller knows of the earlier samples of y."""
 
     begin_ns: int  # stamp of the first sample
     last: StampedVector  # the last sample taken
     change: FloatArray  # (m,) largest change in a period of the samples taken, fading, units of y
-    # The last sample that was compared; another one than `last` where that one is lost. Its stamp
-    # does not come again: a wrong sample that is sent three times is not three that agree.
+    # The last sample that was compared, which differs from `last` if it was lost. Its stamp does
+    # not come again: one wrong sample that is sent three times does not count as three that agree.
     far: StampedVector
-    agreeing: int  # samples in a row up to `far` that are lost, and agree with the one before
+    agreeing: int  # lost samples in a row up to `far`, each agreeing with the one before
     stillness: Stillness
 
 
 def sample_limits(
     names: Sequence[str], authority: FloatArray, largest: Sequence[float] | None, period_ns: int
 ) -> SampleLimits:
-    """The limits of outputs by name.
+    """Return the limits of outputs by name.
 
-    `authority`: y_dot by the full inputs, (m,), units of y / s; `largest`: of the parameters, else
-    plausible ones.
+    `authority` is the y_dot that full inputs give, (m,), units of y / s. `largest` holds the bounds
+    of the parameters; if it is None, plausible ones are used.
     """
     least = [LEAST.get(name, LEAST_RATE) for name in names]
     reach = np.maximum(AUTHORITY * authority * seconds(period_ns), least)
@@ -108,9 +109,9 @@ def sample_limits(
 
 
 def bound_violation(value: FloatArray, names: Sequence[str], limits: SampleLimits) -> str:
-    """The first of the m values beyond the bound, or NaN, as a sentence.
+    """Name the first of the m values that is NaN or beyond its bound, in a sentence.
 
-    Empty for values inside.
+    Returns "" if all values are inside.
     """
     is_inside = np.abs(value) <= limits.largest
     if is_inside.all():
@@ -123,20 +124,20 @@ def bound_violation(value: FloatArray, names: Sequence[str], limits: SampleLimit
 
 
 def jump(before: StampedVector, sample: StampedVector, names: Sequence[str]) -> str:
-    """The changes from a sample to another, as a sentence."""
+    """Describe the changes from one sample to another, in a sentence."""
     values = zip(names, before.value.tolist(), sample.value.tolist(), strict=True)
     moves = ", ".join(f"{name} from {old:g} to {new:g}" for name, old, new in values)
     return f"a jump of y in {seconds(sample.stamp_ns - before.stamp_ns):g} s: {moves}"
 
 
 def standstill(state: SampleState, sample: StampedVector) -> str:
-    """The standstill of y, as a sentence."""
+    """Describe the standstill of y, in a sentence."""
     span = seconds(sample.stamp_ns - state.stillness.since_ns)
     return f"y: found every value as before for {span:g} s, expected an aircraft that moves"
 
 
 def first_state(sample: StampedVector) -> SampleState:
-    """The state after the first sample."""
+    """Return the state after the first sample."""
     stillness = Stillness(sample.stamp_ns)
     return SampleState(
         begin_ns=sample.stamp_ns,
@@ -151,20 +152,21 @@ def first_state(sample: StampedVector) -> SampleState:
 def step(
     state: SampleState, sample: StampedVector, limits: SampleLimits
 ) -> tuple[SampleState, SampleChange]:
-    """The state after a sample of y with a later stamp, and what the sample is.
+    """Judge a sample of y with a later stamp, and return the new state with the judgement.
 
         change = abs(y - last) / periods,  periods = max(stamp - last stamp, period) / period
-        NEAR where change <= max(TIMES largest, reach) in all outputs; then largest = max(change,
+        NEAR if change <= max(TIMES largest, reach) in all outputs; then largest = max(change,
         faded largest)
 
-    The possible change grows with the time since the last sample taken: no sensor is locked out for
-    ever. After lost samples, largest takes the whole change, since y may be as noisy.
+    The change that is possible grows with the time since the last sample that was taken, so no
+    sensor is locked out for ever. After lost samples, `largest` takes the whole change, since y may
+    be that noisy.
 
-    The samples of the first FIRST_NS are NEAR, too. A gyro may start with garbage, so largest takes
-    no far change then, and of near changes at most reach.
+    The samples of the first FIRST_NS are NEAR, too. A gyro may start with garbage, so during that
+    time `largest` takes no far change, and of a near change at most `reach`.
 
-    FROZEN where every value is as before, for STILL samples and periods, after MOVING samples with
-    a change.
+    A sample is FROZEN if every value has been the same for STILL samples and periods, after MOVING
+    samples that changed.
     """
     stillness = _next_stillness(state.stillness, sample, state.last, limits)
     state = state._replace(stillness=stillness)
@@ -182,7 +184,7 @@ def step(
         return state._replace(
             last=sample, change=largest, far=sample, agreeing=0
         ), SampleChange.NEAR
-    # Without a lost sample before, `far` has the values of `last` at its stamp or later: far, too.
+    # If no sample was lost before, `far` has the values of `last` at its stamp or later: far, too.
     agrees = _comparison(state.far, sample, state.change, limits)[0]
     agreeing = state.agreeing + 1 if agrees else 1
     if agreeing < AGREEING:
@@ -193,7 +195,7 @@ def step(
 def _next_stillness(
     before: Stillness, sample: StampedVector, last: StampedVector, limits: SampleLimits
 ) -> Stillness:
-    """How y changes after a sample, beside the last sample taken."""
+    """Update how y changes, given a sample and the last sample taken."""
     if not np.array_equal(sample.value, last.value):
         is_moving = before.is_frozen or before.equal == 0
         changes = min(before.changes + 1, MOVING) if is_moving else 1
@@ -206,7 +208,7 @@ def _next_stillness(
 def _comparison(
     before: StampedVector, sample: StampedVector, largest: FloatArray, limits: SampleLimits
 ) -> tuple[bool, FloatArray]:
-    """Whether a sample is near the one before, and the change in a period, (m,)."""
+    """Tell whether a sample is near the one before, and its change in a period, (m,)."""
     periods = max((sample.stamp_ns - before.stamp_ns) / limits.period_ns, 1.0)
     change = np.abs(sample.value - before.value) / periods
     return bool((change <= np.maximum(TIMES * largest, limits.reach)).all()), change

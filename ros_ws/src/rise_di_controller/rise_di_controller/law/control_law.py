@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Protocol of a control law: pure functions over a state.
 
-Controller, replay and campaigns fly every law by the protocol.
+Controller, replay and campaigns fly every law through this protocol.
 
-A law with validated parameters is a subclass of `params.ControllerConfig`. The controller finds the
-subclass by name under the entry point group `laws.GROUP`. See docs/laws.md.
+A law with validated parameters is a subclass of `params.ControllerConfig`. The controller looks it
+up by name under the entry point group `laws.GROUP`. See docs/laws.md.
 """
 
 from collections.abc import Callable
@@ -19,9 +19,9 @@ from rise_di_controller.law.saturation import Limits
 class Measurements(NamedTuple):
     """Inputs of a law at a tick: SI units, deviations from trim, channels in the law's order.
 
-    A single aircraft has arrays of (m,). A campaign has N aircraft in the last axis, (m, N), or (m,
-    1) for shared values. The fields from `position` to `y_dot` are not on the topics. Campaigns
-       alone have these fields, for laws with more sensors.
+    Arrays have shape (m,) for a single aircraft. In a campaign the N aircraft are the last axis:
+    (m, N), or (m, 1) for a value that they share. The fields from `position` to `y_dot` are not on
+    the topics: only campaigns fill them in, for laws that need more sensors.
     """
 
     y: Array  # measured outputs
@@ -30,7 +30,7 @@ class Measurements(NamedTuple):
     u_trim: Array  # the law adds to this input: u at engagement, and the feedforward
     u_before: Array  # the last command, after saturation
     position: Array | None = None  # of the actuators
-    # (n, N) state: measured values of the outputs, true values of the remaining states
+    # (n, N) state: measured values of the outputs, true values of all other states
     x: Array | None = None
     x_air: Array | None = None  # (n, N) x with alpha and beta relative to the air
     y_dot: Array | None = None  # true derivative of C x, free of noise and delay
@@ -46,13 +46,14 @@ def _no_prediction(state: Any, measurements: Measurements, params: Any) -> Any:
 class ControlLaw(NamedTuple):
     """A control law as pure functions of state and parameters, with NumPy and JAX arrays.
 
-    The state is a NamedTuple of arrays, (m,) or (m, N). The log holds the fields by name, so replay
-    can continue from any tick. The parameters are any NamedTuple of arrays.
+    The state is a NamedTuple of arrays, (m,) or (m, N). The log records its fields by name, so that
+    a replay can continue from any tick. The parameters can be any NamedTuple of arrays.
 
-    `engage` makes the state at engagement: u has to be u_trim then. `step` is a tick of dt seconds
-    without limits. `limited` is the same tick inside limits, with the law's anti-windup: where no
-    limit acts, `limited` gives the bits of `step`. `retune` makes the state for new parameters,
-    without a jump of u. `missed` predicts the state over one period without a sample, u held.
+    `engage` makes the state at engagement; the first u must equal u_trim. `step` advances the law
+    by a tick of dt seconds without limits. `limited` advances it inside limits, with the law's own
+    anti-windup; if no limit acts, it must give the same bits as `step`. `retune` carries the state
+    over to new parameters without a jump of u. `missed` predicts the state over one period without
+    a sample, while u is held.
     """
 
     state: type[Any]
@@ -64,7 +65,7 @@ class ControlLaw(NamedTuple):
     retune: Callable[[Any, Any, Any], Any]  # (state, old params, new params) -> state
     # (state, measured, params) -> state
     missed: Callable[[Any, Measurements, Any], Any] = _no_prediction
-    # the law extended by this law; the state field `law` is the state of `inner`
+    # the law that this one extends; the state field `law` holds the state of `inner`
     inner: "ControlLaw | None" = None
 
 
@@ -87,7 +88,7 @@ class TunedLaw(NamedTuple):
 def without_limits(
     limited: Callable[[Any, Measurements, Array, Any, Limits], tuple[Any, Array, Array]],
 ) -> Callable[[Any, Measurements, Array, Any], tuple[Any, Array]]:
-    """The function `step` of a law from the function `limited`, with infinite limits.
+    """Derive the function `step` of a law from its function `limited`, with infinite limits.
 
     Args:
         limited: A tick inside limits: (state, measurements, dt, params, limits) -> (state, u before
@@ -113,7 +114,7 @@ def without_limits(
 
 
 def fields(state: Any) -> dict[str, Array]:
-    """The arrays of a law's state by name; arrays of an extended law first."""
+    """Return the arrays of a law's state by name; those of an extended law come first."""
     values: dict[str, Array] = {}
     for name, value in state._asdict().items():
         values |= fields(value) if hasattr(value, "_asdict") else {name: value}
@@ -121,7 +122,7 @@ def fields(state: Any) -> dict[str, Array]:
 
 
 def restored(law: ControlLaw, values: Any) -> Any:
-    """The state of a law from the arrays by name, the inverse of `fields`."""
+    """Rebuild the state of a law from its arrays by name, the inverse of `fields`."""
     inner = {} if law.inner is None else {"law": restored(law.inner, values)}
     return law.state(
         **inner, **{name: values[name] for name in law.state._fields if name not in inner}
@@ -130,7 +131,7 @@ def restored(law: ControlLaw, values: Any) -> Any:
 
 @lru_cache(maxsize=64)
 def field_names(law: ControlLaw) -> tuple[str, ...]:
-    """Names of the arrays of a law's state, in the order of `fields`."""
+    """Return the names of the arrays of a law's state, in the order of `fields`."""
     inner_names = () if law.inner is None else field_names(law.inner)
     return (
         *inner_names,

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """SDU decomposition Omega = C B = S D U, equations (10)-(11).
 
-The law has to know D alone of the aircraft.
+D is all that the law has to know of the aircraft.
 
-D depends on the order of the channels, on the pairing of inputs with outputs and on the signs of
-the inputs, so D is validated together with the channels. U measures the quality of the pairing:
-beta and K of channel i grow with abs(U_ij), j > i.
+D depends on the order of the channels, on which input is paired with which output and on the signs
+of the inputs, so it is validated together with the channels. U measures the quality of the pairing:
+the beta and K that channel i needs grow with abs(U_ij), j > i.
 """
 
 import math
@@ -28,8 +28,8 @@ the elimination, so a growth of 1e6 is allowed. Published and identified values 
 magnitude coarser."""
 
 MANY = 5
-"""Channels whose orders are all tried: (5!)^2 = 14,400 take a second, those of six a minute, and
-those of eight do not fit into memory."""
+"""Up to this number of channels all orders are tried: the (5!)^2 = 14,400 of five channels take a
+second, those of six a minute, and those of eight do not fit into memory."""
 
 # a round halves the spread of the exponents: 10 reduce a spread of 1e300 to less than a factor of 2
 _EQUILIBRATIONS = 10
@@ -40,9 +40,10 @@ Order = tuple[tuple[int, ...], tuple[int, ...]]
 
 
 class DecompositionError(ParameterError):
-    """A matrix without S D U.
+    """Raised if a matrix has no S D U.
 
-    `minor` is the number of the first minor zero or nearly so, None if not square.
+    `minor` is the number of the first leading minor that is zero or nearly so. It is None if the
+    matrix is not square.
     """
 
     def __init__(self, sentence: str, minor: int | None = None) -> None:
@@ -59,9 +60,9 @@ class SDU(NamedTuple):
 
 
 class Pairing(NamedTuple):
-    """A choice of channels with D = I: Omega[outputs][:, inputs] * signs.
+    """A choice of channels that makes D = I: Omega[outputs][:, inputs] * signs.
 
-    Channel k of the law is row and column k.
+    Channel k of the law is row k and column k.
     """
 
     outputs: tuple[int, ...]  # row of Omega by channel
@@ -71,7 +72,7 @@ class Pairing(NamedTuple):
 
 
 def decompose(Omega: ArrayLike) -> SDU:
-    """S, D and U of Omega, shape (m, m), by elimination without pivoting; unique.
+    """Compute S, D and U of Omega, shape (m, m), by elimination without pivoting; they are unique.
 
         Omega = L diag(p) W,  p_k = Delta_k / Delta_(k-1),  Delta_k the leading minors, Delta_0 = 1
         S = L diag(abs(p)) L',  D = sign(p),  U = D L^-T D W
@@ -101,7 +102,7 @@ def decompose(Omega: ArrayLike) -> SDU:
 
 
 def signs(Omega: FloatArray) -> FloatArray:
-    """D of Omega, shape (m,): D_k = sign(Delta_k / Delta_(k-1)).
+    """Compute D of Omega, shape (m,): D_k = sign(Delta_k / Delta_(k-1)).
 
     Raises DecompositionError as `decompose` does.
     """
@@ -109,21 +110,21 @@ def signs(Omega: FloatArray) -> FloatArray:
 
 
 def leading_minors(Omega: FloatArray) -> FloatArray:
-    """Determinants Delta_k of the first k rows and columns, k = 1 .. m, shape (m,).
+    """Compute the determinants Delta_k of the first k rows and columns, k = 1 .. m, shape (m,).
 
-    Minors of zero are allowed. Raises DecompositionError if Omega is not square or not finite.
+    Minors may be zero. Raises DecompositionError if Omega is not square or not finite.
     """
     matrix = _square(Omega)
     return np.array([np.linalg.det(matrix[:k, :k]) for k in range(1, len(matrix) + 1)])
 
 
 def unit_diagonal(Omega: FloatArray) -> FloatArray:
-    """Omega in inputs scaled to unit response, v_i = abs(Omega_ii) u_i, shape (m, m).
+    """Scale the inputs of Omega to unit response, v_i = abs(Omega_ii) u_i, shape (m, m).
 
-    An entry is Omega_ij / abs(Omega_jj).
+    Each entry becomes Omega_ij / abs(Omega_jj).
 
     Raises DecompositionError if Omega is not square or not finite, or if an output does not respond
-    to the paired input.
+    to the input it is paired with.
     """
     matrix = _square(Omega)
     diagonal = np.abs(np.diag(matrix))
@@ -137,30 +138,30 @@ def unit_diagonal(Omega: FloatArray) -> FloatArray:
 
 
 def coupling(Omega: FloatArray) -> float:
-    """Coupling max abs(U - I) of `unit_diagonal(Omega)`, in inputs of unit response.
+    """Compute the coupling max abs(U - I) of `unit_diagonal(Omega)`, in inputs of unit response.
 
-    A large value is a bad pairing.
+    A large value means a bad pairing.
 
-    Infinite where an output does not respond to the paired input. The coupling depends on the units
-    of y, not on the units or signs of u. Raises DecompositionError as `decompose` does.
+    It is infinite if an output does not respond to the input it is paired with. It depends on the
+    units of y, but not on the units or signs of u. Raises DecompositionError as `decompose` does.
     """
     signs(Omega)
     return _excess(decompose(unit_diagonal(Omega)).U) if np.diag(Omega).all() else math.inf
 
 
 def search(Omega: FloatArray, largest_U: float = math.inf) -> Pairing | None:
-    """The smallest change of the channels to D = I.
+    """Find the smallest change of the channels that makes D = I.
 
-    None where no tried order gives D = I.
+    Returns None if none of the orders that are tried gives D = I.
 
     Up to MANY channels, every order of the outputs is combined with every order of the inputs:
-    (m!)^2. Of more channels three orders are tried: the given one, the inputs by the largest
-    responses, and that of complete pivoting, so that a smaller change may exist, or one where None
-    is returned. A combination has a single choice of input signs, namely D, because a change of the
-    sign of input k changes D_k only. The preference is, in this order: most outputs with the same
-    input, most outputs in the same place, most inputs with the same sign, the smallest max abs(U -
-    I) in inputs of unit response. Orders with a zero on the diagonal, or with max abs(U - I) above
-    `largest_U`, are excluded.
+    (m!)^2. With more channels only three orders are tried: the given one, the inputs by their
+    largest responses, and the order of complete pivoting. A smaller change may then exist, even if
+    None is returned. Each combination leaves a single choice of input signs, namely D, because a
+    change of the sign of input k changes only D_k. Pairings are preferred in this order: most
+    outputs keep their input, most outputs keep their place, most inputs keep their sign, and max
+    abs(U - I) in inputs of unit response is smallest. Orders with a zero on the diagonal, or with
+    max abs(U - I) above `largest_U`, are excluded.
 
     Raises DecompositionError if Omega is not square or not finite.
     """
@@ -189,10 +190,10 @@ def search(Omega: FloatArray, largest_U: float = math.inf) -> Pairing | None:
 
 
 def _likely_orders(matrix: FloatArray) -> Iterable[Order]:
-    """The likely orders for D = I.
+    """List the orders that are likely to give D = I.
 
-    The orders are the given order, the inputs with the largest product of responses, and complete
-    pivoting.
+    They are the given order, the inputs with the largest product of responses, and the order of
+    complete pivoting.
     """
     from scipy.optimize import linear_sum_assignment  # noqa: PLC0415 - a sixth of a second, which few channels do not need
 

@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The control law, equations (20)-(22), as a pure step.
 
-The inputs are y and y_m only, without A, B, f or any acceleration.
+Its inputs are y and y_m only: it needs neither A, B and f nor any acceleration.
 
-`CONTROL_LAWS` has the law in the protocol of `control_law`, with anti-windup and retuning.
+`CONTROL_LAWS` offers the law through the protocol of `control_law`, with anti-windup and retuning.
 """
 
 from enum import IntEnum
@@ -14,7 +14,7 @@ from flight_core.vectors import Array, array_namespace
 from rise_di_controller.law.control_law import ControlLaw, Measurements, TunedLaw
 from rise_di_controller.law.saturation import LEAST_DIVISOR, Limits, saturate
 
-# lower bound of k_d (1/s), k_g (1/s) and beta (units of y / s^2): (21), (22) require them to be
+# lower bound of k_d (1/s), k_g (1/s) and beta (units of y / s^2), which (21) and (22) require to be
 # positive
 MIN_GAIN = 0.01
 
@@ -81,26 +81,26 @@ class LawState(NamedTuple):
 
 
 def gain(k_g: Array, k_d: Array) -> Array:
-    """Diagonal of K, equation (22): K = I + k_g I + diag(k_d, 0), shape (m,).
+    """Compute the diagonal of K, equation (22): K = I + k_g I + diag(k_d, 0), shape (m,).
 
-    k_g is () and k_d (m - 1,).
+    k_g has shape () and k_d shape (m - 1,).
     """
     xp = array_namespace(k_d)
     return 1.0 + k_g + xp.concat([k_d, xp.zeros(1, dtype=k_d.dtype)])
 
 
 def total_lag(lag: Array, delay: float, period: float) -> Array:
-    """Lag from y to the actuator positions, shape of `lag`, s.
+    """Compute the lag from y to the actuator positions, shape of `lag`, s.
 
-    The lag is actuator + 1.5 period (sampling and hold) + delay.
+    It is the sum of actuator lag, 1.5 periods (sampling and hold) and delay.
     """
     return lag + 1.5 * period + delay
 
 
 def engage(y: Array, y_m: Array) -> LawState:
-    """State at engagement: e_0 = y - y_m, integral_e = 0, Pi = 0.
+    """Return the state at engagement: e_0 = y - y_m, integral_e = 0, Pi = 0.
 
-    So u = 0 at engagement (bumpless transfer).
+    u is then 0 at engagement, so the transfer is bumpless.
 
     Args:
         y: Outputs, shape (m,), SI.
@@ -124,7 +124,7 @@ def engage(y: Array, y_m: Array) -> LawState:
 def step(
     state: LawState, y: Array, y_m: Array, dt: Array, params: LawParams
 ) -> tuple[LawState, Array]:
-    """A tick of the law: (state, y, y_m, dt) -> (state, u).
+    """Advance the law by a tick: (state, y, y_m, dt) -> (state, u).
 
     With e = y - y_m (3), e_p = e at the previous tick, dt the time between the two ticks:
 
@@ -135,9 +135,10 @@ def step(
         SOFT:      Pi += dt beta s first, s = clip(e / eps, -1, 1)
         u = -input_scale D (K (e - e_0 + Lambda integral_e) + Pi)         (20)
 
-    e_hat predicts e a tick ahead with an unchanged Pi, and s is the element of Sgn(e a tick ahead)
-    consistent with the prediction: backward Euler of (21), with an error of order dt^2 and without
-    chatter. SOFT is for loops with lag. u is the deviation from that at engagement; sgn(0) = 0.
+    e_hat predicts e one tick ahead if Pi does not change, and s is the element of Sgn(e one tick
+    ahead) that agrees with this prediction: backward Euler of (21), with an error of order dt^2 and
+    without chatter. SOFT is for loops with lag. u is the deviation from its value at engagement;
+    sgn(0) = 0.
 
     Source: (20)-(22) of Tanyer, Tatlicioglu, Zergeroglu; the sampling is this project's, see
     docs/theory.md.
@@ -184,11 +185,11 @@ def step(
 
 
 def control(before: LawState, after: LawState, params: LawParams) -> Array:
-    """Equation (20), shape (m,): u = -input_scale D (K (e - e_0 + Lambda integral_e) + Pi).
+    """Compute u of (20), shape (m,): u = -input_scale D (K (e - e_0 + Lambda integral_e) + Pi).
 
-    e and integral_e are the values after the tick. Pi is the value before the tick with the literal
-    sign (first used, then updated), and the value after the tick with the soft and implicit signs.
-    Units of u.
+    e and integral_e are the values after the tick. With the literal sign, Pi is the value before
+    the tick, because it is used first and updated afterwards; with the soft and implicit signs it
+    is the value after the tick. u has the units of input_scale.
     """
     Pi = before.Pi if params.sign is Sign.LITERAL else after.Pi
     return params.input_scale * (
@@ -206,21 +207,21 @@ def step_with_anti_windup(
     params: LawParams,
     limits: Limits,
 ) -> tuple[LawState, Array, Array]:
-    """A step of the law with anti-windup.
+    """Advance the law by a step with anti-windup.
 
-    The results are (law state, u before saturation, u commanded), u of shape (m,).
+    Returns (law state, u before saturation, u commanded), with u of shape (m,).
 
-    Conditional integration. Where u_trim + u exceeds a magnitude or rate limit, an outward
-    increment of integral_e or of Pi is reduced; an inward increment stays. The increment of
-    integral_e is dropped. The increment of Pi, the faster integral, is scaled to bring u to the
-    limit:
+    This is conditional integration. If u_trim + u exceeds a magnitude or rate limit, any increment
+    of integral_e or of Pi that pushes u further out is reduced; an increment that brings u back
+    stays. The increment of integral_e is dropped. The increment of Pi, the faster integral, is
+    scaled so that u ends at the limit:
 
         beyond = abs(u_trim + u - saturated)
         excess = max(beyond - abs(change of u by the increment of integral_e), 0)
         change = abs(change of u by the increment of Pi)
         Pi+    = Pi + max(change - excess, 0) / change (increment of Pi)
 
-    Without saturation every bit equals the law alone. Theorem 1 does not cover saturation.
+    Without saturation every bit equals that of the law alone. Theorem 1 does not cover saturation.
     """
     xp = array_namespace(y)
     after, u = step(state, y, y_m, dt, params)
@@ -246,13 +247,14 @@ def step_with_anti_windup(
 
 
 def retune(state: LawState, old: LawParams, new: LawParams) -> LawState:
-    """State for new parameters, without a jump of u (bumpless transfer).
+    """Return the state for new parameters, without a jump of u (bumpless transfer).
 
-    Pi absorbs the change of the linear term.
+    Pi absorbs the change of the linear term:
 
-    Pi+ = -D u / input_scale - K (e - e_0 + Lambda integral_e), with the new D, input_scale, K,
-    Lambda and u of the old parameters. The remaining states stay. Equation (23) continues from the
-    same u with the new gains.
+        Pi+ = -D u / input_scale - K (e - e_0 + Lambda integral_e)
+
+    D, input_scale, K and Lambda are the new ones; u is that of the old parameters. All other states
+    stay. Equation (23) continues from the same u with the new gains.
     """
     u = control(state, state, old)
     Pi = -new.D * u / new.input_scale - new.K * (
@@ -262,7 +264,7 @@ def retune(state: LawState, old: LawParams, new: LawParams) -> LawState:
 
 
 def shifted(state: LawState, u: Array, params: LawParams) -> LawState:
-    """State whose u of equation (20) is higher by u, (m,): Pi+ = Pi - D u / input_scale."""
+    """Raise the u of equation (20) by a given u, (m,): Pi+ = Pi - D u / input_scale."""
     return state._replace(Pi=state.Pi - params.D * u / params.input_scale)
 
 
@@ -296,5 +298,5 @@ CONTROL_LAWS = {sign: _control_law(sign) for sign in Sign}
 
 
 def tuned(params: LawParams) -> TunedLaw:
-    """RISE-DI with parameters."""
+    """Return RISE-DI with parameters."""
     return TunedLaw(CONTROL_LAWS[Sign.SOFT if params.sign is None else params.sign], params)

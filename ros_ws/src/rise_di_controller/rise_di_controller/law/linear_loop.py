@@ -49,7 +49,7 @@ class LoopTiming(NamedTuple):
 
     @property
     def total(self) -> FloatArray:
-        """Lag of the loop, shape (m,), s."""
+        """Total lag of the loop, shape (m,), s."""
         return np.asarray(total_lag(self.lag, self.delay, self.period))
 
 
@@ -66,13 +66,14 @@ class LinearLaw(NamedTuple):
 
 
 def linear_law(law: TunedLaw, m: int, period: float, candidates: int | None = None) -> LinearLaw:
-    """A law's step near e = 0 over m channels.
+    """Linearise a law's step near e = 0 over m channels.
 
-    A column is the response to SMALL in a value of the state or of y.
+    Each column is the response to a step of SMALL in one value of the state or of y.
 
-    An observer has faded in, and its vanes measure: a column each, after those of y. With
-    `candidates` N the parameters have N sets of gains as the last axis, and the matrices have them
-    as the first. Raises ParameterError for the literal sign: not linear anywhere.
+    An observer counts as faded in, and its vanes as moving: each vane adds a column after those of
+    y. With `candidates` N, the parameters hold N sets of gains in the last axis, and the matrices
+    hold them in the first. Raises ParameterError for the literal sign, which is not linear
+    anywhere.
     """
     control_law, params = law
     core = params
@@ -80,13 +81,14 @@ def linear_law(law: TunedLaw, m: int, period: float, candidates: int | None = No
         core = core.law
     literal = isinstance(core, LawParams) and core.sign is Sign.LITERAL
     require(not literal, "sign", "literal", "soft or implicit, which are linear near e = 0")
-    # The sets of gains stand in the last axis, or the columns of the matrix do.
+    # Put the sets of gains in the last axis; without sets, the columns of the matrix take its
+    # place.
     sets = () if candidates is None else (candidates,)
     at_once = candidates is None and _takes_columns(params)
     if at_once:
         params = _for_columns(params)
         sets = (1,)
-    # The equilibrium: at engagement, the observer faded in, the vanes measuring.
+    # The equilibrium at engagement, with the observer faded in and the vanes measuring.
     zero = np.zeros((m, *sets))
     vanes = getattr(params, "vanes", None)
     none = None if vanes is None else np.zeros((len(vanes.H), *sets))
@@ -104,7 +106,7 @@ def linear_law(law: TunedLaw, m: int, period: float, candidates: int | None = No
     }
     if "sigma" in at_rest:
         at_rest["sigma"] = np.ones((1, *sets))
-    # A step from a vector of state and y to a vector of state and u.
+    # A step as a map from the vector of state and y to the vector of state and u.
     ends = np.cumsum([len(value) for value in at_rest.values()])
     size = int(ends[-1]) if len(ends) else 0
 
@@ -114,7 +116,7 @@ def linear_law(law: TunedLaw, m: int, period: float, candidates: int | None = No
         state, u = control_law.step(restored(control_law, parts), now, np.float64(period), params)
         return np.concatenate([*fields(state).values(), u])
 
-    # The differences of a step, a column each.
+    # Differentiate the step, one column at a time.
     begin = np.concatenate([*at_rest.values(), np.zeros((wide, *sets))])
     equilibrium = step(begin[:size], begin[size:])
     if at_once:
@@ -133,14 +135,14 @@ def linear_law(law: TunedLaw, m: int, period: float, candidates: int | None = No
 
 
 def _takes_columns(params: Any) -> bool:
-    """Whether a law is known to take columns side by side: RISE-DI, also under an observer."""
+    """Whether the law is known to take columns side by side: RISE-DI, also under an observer."""
     if isinstance(params, ObserverParams) and params.vanes is None:
         params = params.law
     return isinstance(params, LawParams)
 
 
 def _for_columns(params: Any) -> Any:
-    """Parameters of a law for columns side by side: a vector (k,) becomes (k, 1)."""
+    """Reshape the parameters of a law for columns side by side: a vector (k,) becomes (k, 1)."""
     values = []
     for value in params:
         if hasattr(value, "_asdict"):
@@ -151,7 +153,7 @@ def _for_columns(params: Any) -> Any:
 
 
 def zero_order_hold(A: FloatArray, B: FloatArray, period: float) -> tuple[FloatArray, FloatArray]:
-    """exp(A period) and integral_0^period exp(A s) ds B: the input held over a period.
+    """Compute exp(A period) and integral_0^period exp(A s) ds B, for an input held over the period.
 
     Leading axes are batches. Source: C. Van Loan, IEEE TAC 23(3), 1978.
     """
@@ -165,7 +167,7 @@ def zero_order_hold(A: FloatArray, B: FloatArray, period: float) -> tuple[FloatA
 
 @lru_cache(maxsize=64)
 def _exponential(matrices: bytes, shape: tuple[int, ...]) -> FloatArray:
-    """Exp of matrices. Cached, since new gains in flight are checked with the same plant."""
+    """Compute exp of matrices; cached, because new gains in flight meet the same plant."""
     from scipy.linalg import expm  # noqa: PLC0415 - a controller without an observer starts without it
 
     exponential = np.asarray(expm(np.frombuffer(matrices).reshape(shape).copy()), dtype=np.float64)
@@ -187,13 +189,14 @@ class SampledPlant(NamedTuple):
 def sampled_plant(
     plant: LinearPlant, loop: LoopTiming, extra: FloatArray, *, rising: bool = False
 ) -> SampledPlant:
-    """The exact motion over a period, with k = n + m + kept m states.
+    """Compute the exact motion over a period, with k = n + m + kept m states.
 
-    The states are x, the actuators, and u of the `kept` earlier ticks that still acts.
+    The states are x, then the actuators, then u of the `kept` earlier ticks that still act.
 
     u of a tick is held for a period and reaches actuator i after delay + extra_i, s, shape (m,).
-    With `rising` u of a tick multiplies ROOT (2 s - 1), s from 0 to 1 over the period, in place of
+    With `rising`, u of a tick multiplies ROOT (2 s - 1), s from 0 to 1 over the period, instead of
     1: the second Legendre polynomial.
+
     Source: K. J. Astrom, B. Wittenmark, "Computer-Controlled Systems", section 2.3, for the
     sampling of a plant with delay.
     """
@@ -210,7 +213,7 @@ def sampled_plant(
     motion[..., n:, n:] = -np.diag(rate)
     drive[..., :n, :] = plant.B * ~has_lag
     drive[..., n:, :] = np.diag(rate * has_lag)
-    # Whole periods of the delay, and the rest of one.
+    # Split the delay into whole periods and a remainder.
     ticks = np.floor((loop.delay + extra) / loop.period + 1e-9).astype(int)
     part = np.maximum(loop.delay + extra - ticks * loop.period, 0.0)
     kept_ticks = int(ticks.max()) + 1  # earlier ticks whose u still acts, the newest first
@@ -221,10 +224,10 @@ def sampled_plant(
     C = np.zeros((*batch, len(plant.C), size))
     C[..., :n] = plant.C
     A[..., : n + m, : n + m], _ = zero_order_hold(motion, drive, loop.period)
-    # effect of u of this tick, then of earlier ticks
+    # the effect of u of this tick, then of each earlier tick
     inputs = np.zeros((*batch, n + m, m + kept_ticks * m))
-    # Within a period the u of a tick acts from the instant `split` before the end, the one before
-    # it until then.
+    # Within a period, the u that arrives during it acts from the instant `split` before the end;
+    # until then the u of the tick before it acts.
     for i in range(m):
         split = loop.period - part[i]
         transition, new = _driven(motion, drive, split, 0.0, loop.period if rising else None)
@@ -242,9 +245,9 @@ def sampled_plant(
 def _driven(
     motion: FloatArray, drive: FloatArray, time: float, begin: float, period: float | None
 ) -> tuple[FloatArray, FloatArray]:
-    """The transition over a time, s, and the motion by an input held.
+    """Return the transition over a time, s, and the motion that a held input causes in that time.
 
-    With a period the input is ROOT (2 s - 1), s rising from `begin` by time / period.
+    With a period, the input is ROOT (2 s - 1) instead, where s rises from `begin` by time / period.
     """
     transition, step = zero_order_hold(motion, drive, time)
     if period is None:
@@ -261,12 +264,12 @@ def _driven(
 def closed_loop(
     plant: LinearPlant, law: LinearLaw, loop: LoopTiming, extra: FloatArray
 ) -> FloatArray:
-    """A period of the sampled loop as a matrix, exact.
+    """Return the exact matrix that advances the sampled loop by one period.
 
     The loop is stable if no eigenvalue lies outside the unit circle.
 
-    The state is the state of `sampled_plant`, then the state of the law. Leading axes of plant and
-    law are batches.
+    The state is that of `sampled_plant`, followed by that of the law. Leading axes of plant and law
+    are batches.
     """
     A, B, C = sampled_plant(plant, loop, extra)
     k = A.shape[-1]
@@ -280,7 +283,7 @@ def closed_loop(
 
 
 def spectral_radius(matrix: FloatArray) -> float:
-    """Largest magnitude of an eigenvalue."""
+    """Return the largest magnitude of an eigenvalue."""
     return float(np.max(np.abs(np.linalg.eigvals(matrix)), initial=0.0))
 
 

@@ -7,13 +7,13 @@ from typing import NamedTuple
 from flight_core.vectors import Array, array_namespace
 
 LEAST_DIVISOR = 2.0**-126
-"""The least normal float32: a quotient by less could overflow."""
+"""The least normal float32: dividing by anything smaller could overflow."""
 
 
 class Limits(NamedTuple):
     """Saturation limits, as deviations from trim in units of u.
 
-    They are infinite where there is no limit.
+    A limit is infinite if there is none.
 
     Attributes:
         lower: Least u, shape (m,).
@@ -31,10 +31,10 @@ class Limits(NamedTuple):
 
 
 def saturate(u: Array, u_before: Array, dt: Array, limits: Limits) -> Array:
-    """Saturation of u, shape (m,): clipped to [lower, upper] and to u_before +- rate dt.
+    """Saturate u, shape (m,): clip it to [lower, upper] and to u_before +- rate dt.
 
-    Inside, u returns to the last bit. Where u_before is outside of new limits, u moves to the
-    limits at the rate.
+    If u lies inside the limits, it is returned to the last bit. If u_before lies outside new
+    limits, u moves towards them at the rate.
 
     Args:
         u: Command, shape (m,).
@@ -56,7 +56,7 @@ def saturate(u: Array, u_before: Array, dt: Array, limits: Limits) -> Array:
 
 
 def bounds(u_before: Array, dt: Array, limits: Limits) -> tuple[Array, Array]:
-    """The least and the largest u of `saturate`, shapes (m,)."""
+    """Return the least and the largest u of `saturate`, shapes (m,)."""
     xp = array_namespace(u_before)
     reach = limits.rate * dt
     low = xp.maximum(xp.minimum(limits.lower, u_before + reach), u_before - reach)
@@ -65,14 +65,14 @@ def bounds(u_before: Array, dt: Array, limits: Limits) -> tuple[Array, Array]:
 
 
 def limited_integral(before: Array, after: Array, change: Array, beyond: Array) -> Array:
-    """An integral after a tick, shape (m,), with anti-windup.
+    """Advance an integral by a tick with anti-windup, shape (m,).
 
-    An outward increment beyond a limit is reduced:
+    If the increment pushes u further beyond a limit, it is reduced:
 
         before + max(1 - beyond / change, 0) (after - before)
-            where change beyond > 0, otherwise `after`, to the last bit
+            if change beyond > 0, otherwise `after`, to the last bit
 
-    So u ends at the limit, and moves at the rate where a rate limit acts.
+    u then ends at the limit, or moves at the rate if a rate limit acts.
     Source: conditional integration, K. J. Astrom, T. Hagglund, "Advanced PID Control", 3.5; the
     reduced increment is this project's.
 

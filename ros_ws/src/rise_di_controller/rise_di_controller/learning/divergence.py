@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a law with a learned model diverges or oscillates.
+"""Tells whether a law with a learned model diverges or oscillates.
 
 The error is compared with the error under the law of the start.
 """
@@ -16,27 +16,27 @@ from flight_core.vectors import FloatArray
 # s, time constant of the mean square of e: a few periods of the slowest oscillation that servos
 # allow
 MEMORY = 1.0
-FACTOR = 3.0  # of the largest rms error before: gusts that come later are up to twice as strong
-LEAST = {"V": 1.0}  # m/s, rms error that does not count as a divergence
+FACTOR = 3.0  # on the largest rms error before: later gusts are up to twice as strong
+LEAST = {"V": 1.0}  # m/s, rms error that does not yet count as a divergence
 # rad/s, the same of other outputs: five times that of the law alone in moderate turbulence
 LEAST_RATE = 0.1
 
-# s, length of the record of e, and of the means in it: a loop with servos oscillates slower
+# s, length of the record of e, and of the means in it: no loop with servos oscillates faster
 WINDOW = 10.0
 STEP = 0.02
 TEST = 50  # means between two tests for an oscillation, 1 s
 # correlation of e with e a period later: 0.9 in a limit cycle, at most 0.5 in turbulence and gusts
 LIKENESS = 0.7
-# factor on the largest rms error over WINDOW before: below this the law of the start is not clearly
+# factor on the largest rms error over WINDOW before: below it the law of the start is not clearly
 # better
 GROWN = 1.5
-HARMLESS = 0.2  # of the rms errors that do not count as a divergence
+HARMLESS = 0.2  # fraction of the rms errors that do not yet count as a divergence
 
 
 class Errors(NamedTuple):
     """Mean squares of e = y - y_m, (m,).
 
-    They are the running mean, and the largest mean under the first law.
+    One is the running mean, the other the largest mean under the first law.
     """
 
     now: FloatArray
@@ -44,14 +44,14 @@ class Errors(NamedTuple):
 
 
 def least(outputs: tuple[str, ...]) -> FloatArray:
-    """Mean squares below a divergence, (m,)."""
+    """Return the mean squares below which nothing counts as a divergence, (m,)."""
     return np.array([LEAST.get(name, LEAST_RATE) for name in outputs]) ** 2
 
 
 def step(errors: Errors, e: FloatArray, dt: float, *, first_law: bool) -> Errors:
-    """A tick: now += (1 - exp(-dt / MEMORY)) (e^2 - now).
+    """Update by a tick: now += (1 - exp(-dt / MEMORY)) (e^2 - now).
 
-    `largest` is held unless the first law flies.
+    `largest` changes only while the first law flies.
     """
     now = errors.now - np.expm1(-dt / MEMORY) * (e**2 - errors.now)
     return Errors(now, np.maximum(errors.largest, now) if first_law else errors.largest)
@@ -60,22 +60,23 @@ def step(errors: Errors, e: FloatArray, dt: float, *, first_law: bool) -> Errors
 def diverging(
     errors: Errors, least: FloatArray, is_learned: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """Outputs, (m,), that diverge under a learned model.
+    """Return which outputs, (m,), diverge under a learned model.
 
-    Their rms error is above FACTOR times its largest under the first law, and above `least`.
+    An output diverges if its rms error is above FACTOR times its largest under the first law, and
+    above `least`.
 
-    Only outputs with a learned model count, mask (m,): further outputs fly the first law.
+    Only outputs with a learned model count, mask (m,), because the others still fly the first law.
     """
     return is_learned & (errors.now > np.maximum(FACTOR**2 * errors.largest, least))
 
 
 class Oscillations:
-    """The error e over the last WINDOW, and in which outputs it oscillates.
+    """The error e over the last WINDOW, and the outputs in which it oscillates.
 
-    Only more than under the first law counts.
+    An output counts only if it oscillates more than under the first law.
 
-    A limit cycle repeats itself: e is like e a period earlier, over the whole window. Wind and
-    single commands do not.
+    A limit cycle repeats itself: over the whole window e resembles e a period earlier. Under wind
+    and single commands it does not.
     """
 
     def __init__(self, least: FloatArray) -> None:
@@ -94,7 +95,7 @@ class Oscillations:
     def take(self, e: FloatArray, dt: float, is_learned: NDArray[np.bool_] | None) -> None:
         """Record a tick, and test once a second.
 
-        `is_learned`: outputs with a learned model, (m,); None under the first law.
+        `is_learned` masks the outputs with a learned model, (m,); it is None under the first law.
         """
         if (is_learned is None) is not self._first_law:
             self._first_law = is_learned is None
@@ -128,9 +129,9 @@ class Oscillations:
 
 
 def oscillating(y: FloatArray, least: FloatArray) -> NDArray[np.bool_]:
-    """Outputs, (m,), that oscillate over a record y, (N, m).
+    """Return which outputs, (m,), oscillate over a record y, (N, m).
 
-    They move by more than HARMLESS of `least`. Repeated commands count too.
+    They must move by more than HARMLESS of `least`. Repeated commands count too.
     """
     is_moving = np.var(y, axis=0) > HARMLESS**2 * least
     return np.array(
@@ -139,13 +140,13 @@ def oscillating(y: FloatArray, least: FloatArray) -> NDArray[np.bool_]:
 
 
 def period(x: FloatArray) -> int:
-    """The period of an oscillation that fills a record, (N,), in samples.
+    """Return the period of an oscillation that fills a record, (N,), in samples.
 
-    At most N / 4, and 0 without an oscillation.
+    It is at most N / 4, and 0 if there is no oscillation.
 
         r_k = N / (N - k) sum x_i x_(i+k) / sum x_i^2,  x less its mean
 
-    The period is that of the first peak above LIKENESS beyond the first negative r.
+    The period is the lag of the first peak above LIKENESS that comes after the first negative r.
     """
     n = len(x)
     lags = len(x) // 4

@@ -18,18 +18,19 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 def with_channels_of(
     start: RiseDiConfig, designed: RiseDiConfig, bare: Sequence[bool], dead: Sequence[bool]
 ) -> RiseDiConfig:
-    """A controller with the gains of `start` in some channels; not checked.
+    """Give a designed controller the gains of `start` in some channels; nothing is checked.
 
-    These channels are without feedforward and observer.
+    These channels get neither feedforward nor observer.
 
-    A gain K below that of the last channel is this one with a smaller input scale: the same loop. A
-    dead input gets the least input scale, so that the law holds it.
+    A gain K below that of the last channel is written as the gain of the last channel with a
+    smaller input scale, which is the same loop. A dead input gets the least input scale, so that
+    the law holds it still.
     """
     law = start.law_params()
     design = designed.law_params()
     last = design.K[-1]
     channels = np.array(bare)
-    # A K below the last one is this one with a smaller input scale.
+    # Write a K below the last one as the last one with a smaller input scale.
     K = np.where(channels, np.maximum(law.K, last + MIN_GAIN), design.K)
     K[-1] = last
     share = np.where(channels, law.K / K, 1.0)
@@ -70,7 +71,7 @@ def with_channels_of(
 
 
 def acting_inputs(parameters: RiseDiConfig) -> tuple[str, ...]:
-    """The inputs with a feedforward or an observer: those of the parts with a model."""
+    """Return the inputs with a feedforward or an observer: those of parts with a model."""
     feedforward = parameters.feedforward
     observer = parameters.observer
     inputs = parameters.inputs
@@ -87,22 +88,22 @@ def acting_inputs(parameters: RiseDiConfig) -> tuple[str, ...]:
 
 
 def authority_names(outputs: Sequence[str]) -> tuple[str, ...]:
-    """Channels of the topic `authority`."""
+    """Name the channels of the topic `authority`."""
     return tuple(f"{side}.{name}" for side in SIDES for name in outputs)
 
 
 def authority(parameters: RiseDiConfig, start: RiseDiConfig) -> FloatArray:
-    """Least change of the outputs by the paired inputs, (2m,), units/s.
+    """Compute the least change of each output by its paired input, (2m,), units/s.
 
-    From trim to the lower and the upper limit:
+    The first m values go from trim to the lower limits, the others to the upper limits:
 
         y_dot_i = abs(Omega_ii) exp(-2 s_i) abs(limit of u_i),
             Omega = C B of the model learned in flight
 
-    with s_i the standard deviation of Omega_ii over Omega_ii: two deviations less for a small s_i,
-    and above 0 for any. Beside models at further speeds it is the least over the speeds.
-    For an input without effect 0; UNKNOWN without a limit, and for an output under the law of the
-    start.
+    s_i is the standard deviation of Omega_ii over Omega_ii: for a small s_i this subtracts two
+    deviations, and it stays above 0 for any s_i. If there are models at other speeds, the least
+    over the speeds counts. The change is 0 for an input without effect, and UNKNOWN without a limit
+    or if the output flies the law of the start.
     """
     m = len(parameters.outputs)
     model = parameters.feedforward
@@ -131,9 +132,9 @@ def authority(parameters: RiseDiConfig, start: RiseDiConfig) -> FloatArray:
 def with_fallback(
     start: RiseDiConfig, parameters: RiseDiConfig, bare: Sequence[bool]
 ) -> RiseDiConfig:
-    """What flies, with the law of the start in further channels.
+    """Return what flies if more channels fall back to the law of the start.
 
-    The start itself where no channel keeps a model.
+    This is the start itself if no channel keeps a model.
     """
     acting = acting_inputs(parameters)
     is_first = parameters.models() == start.models()
@@ -148,7 +149,7 @@ def with_fallback(
 
 
 def outputs_without(parameters: ControllerConfig) -> tuple[str, ...]:
-    """Outputs without a model to the end of the engagement, by `learn.without`."""
+    """Return the outputs that have no model until the engagement ends, by `learn.without`."""
     learn = parameters.learn if isinstance(parameters, RiseDiConfig) else None
     return () if learn is None else learn.without or ()
 
@@ -156,9 +157,9 @@ def outputs_without(parameters: ControllerConfig) -> tuple[str, ...]:
 def without_models(
     start: RiseDiConfig, parameters: RiseDiConfig, outputs: Collection[str]
 ) -> RiseDiConfig:
-    """What flies, with the law of the start in some outputs.
+    """Return what flies if some outputs fall back to the law of the start.
 
-    The outputs keep this law to the end of the engagement, and are added to `learn.without`.
+    They keep this law until the engagement ends, and are added to `learn.without`.
     """
     fallen = with_fallback(start, parameters, [name in outputs for name in start.outputs])
     assert start.learn is not None  # noqa: S101 - a controller that learns
@@ -171,7 +172,7 @@ def without_models(
 
 
 def coupled(parameters: RiseDiConfig, names: Collection[str]) -> list[bool]:
-    """Mask of the outputs that the model of the feedforward couples with some of them, (m,)."""
+    """Mask the outputs that the model of the feedforward couples with the named ones, (m,)."""
     model = parameters.feedforward
     assert model is not None  # noqa: S101 - a learned model flies
     n = len(model.states)

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Models learned in flight, on the side of the controller.
 
-The module decides on the begin of identifications, the proposals to fly, and the fallback. Pure:
-for the node and for the loop in one process.
+This module decides when identifications begin, which proposals fly, and when to fall back. It has
+no side effects, so the node and the loop in one process both use it.
 """
 
 from collections import Counter, deque
@@ -42,15 +42,15 @@ DESIGNED = frozenset(
     }
 )
 """Parameters, or groups of them, that a proposal may change: what `rise-di gains --observer`
-designs, at every speed."""
+designs at every speed."""
 
 OPTIONAL = ("feedforward.inputs", "feedforward.gravity", "feedforward.deviation")
-"""Parameters of a design that it may lack: a part that was not learned had no feedforward, and has
-one with its model."""
+"""Parameters that a design may lack. A part that was not learned had no feedforward, and gets one
+with its model."""
 
 
 class EventKind(StrEnum):
-    """What an event of the learning is, also in the messages of the topic `learning`."""
+    """What happened in the learning, also in the messages of the topic `learning`."""
 
     FLIES = "flies"  # the controller has taken a proposal
     REFUSED = "refused"  # a proposal fails a check of the controller
@@ -74,7 +74,7 @@ class Proposal(NamedTuple):
 class Event(NamedTuple):
     """What became of a proposal, or a fallback.
 
-    The fields are a change of the parameters by dotted name, or none, and the reason.
+    It carries a change of the parameters by dotted name, which may be empty, and the reason.
     """
 
     stamp_ns: int
@@ -84,14 +84,14 @@ class Event(NamedTuple):
 
 
 UNVERIFIED = "until a model is learned"
-"""Ends the sentence of a proposal of the rough model before any record."""
+"""Ends the sentence of a proposal that flies the rough model before there is any record."""
 
 FALLBACKS = 2
-"""Fallbacks of a part in an engagement after which the part has no further model: the second model
-was certified, too."""
+"""After this number of fallbacks in an engagement a part gets no more models: the second model was
+certified, too, and still diverged."""
 
 AUTHORITY_TICKS = 10
-"""Ticks of the controller from one sample of `authority` to the next."""
+"""Ticks of the controller between two samples of `authority`."""
 
 
 class Fallback(NamedTuple):
@@ -102,9 +102,9 @@ class Fallback(NamedTuple):
     fallen: int  # digest of the parameters after
 
     def outlived_by(self, proposal: Proposal, digest: int) -> bool:
-        """Whether a proposal beside the parameters before holds an input more.
+        """Whether a proposal made beside the parameters before the fallback still holds after it.
 
-        This input has no effect, and nothing else changed.
+        It does if all that it adds is another input held still because it has no effect.
         """
         scale = proposal.change.get("input_scale")
         if (proposal.flown, digest) != (self.flown, self.fallen) or not isinstance(scale, Sequence):
@@ -113,10 +113,10 @@ class Fallback(NamedTuple):
 
 
 class Updates:
-    """When proposals are due: at the first tick, and at each of the times, counted from it.
+    """Decides when proposals are due: at the first tick, and at given times counted from it.
 
-    At the first tick the rough model is proposed as it is. Between the times, and after the last
-    one, the aircraft is tested every `learn.check`, but not so soon before the next of the times.
+    At the first tick the rough model is proposed as it is. Between those times, and after the last
+    of them, the aircraft is tested every `learn.check`, unless the next of them comes too soon.
     """
 
     def __init__(self, settings: LearnConfig) -> None:
@@ -127,7 +127,7 @@ class Updates:
         self._last_ns = 0  # the last that was due, from the first tick on
 
     def due(self, now_ns: int) -> bool:
-        """Whether an identification or a test begins at this tick, of ticks in order."""
+        """Whether an identification or a test begins at this tick; ticks must come in order."""
         self._first_ns = now_ns if self._first_ns is None else self._first_ns
         elapsed_ns = now_ns - self._first_ns
         is_planned = False
@@ -147,9 +147,9 @@ class Updates:
 class Learning:
     """The proposals of a flight and the fallback, stepped between two ticks of the controller.
 
-    In simulated time a proposal acts `learn.latency` after the end of its window, for which the
-    flight waits. Else it acts when it is certified: a part of the certificate a step, so that no
-    tick waits for it.
+    In simulated time a proposal acts `learn.latency` after the end of its window, and the flight
+    waits for it. In real time it acts as soon as it is certified; each step does a part of the
+    certificate, so that no tick has to wait.
     """
 
     def __init__(
@@ -176,13 +176,13 @@ class Learning:
         self._diverged = set[int]()  # digests of the parameters that diverged in this engagement
 
     def authority(self, controller: Controller) -> FloatArray:
-        """`authority` of what flies."""
+        """Return the `authority` of what flies."""
         parameters = controller.parameters
         assert isinstance(parameters, RiseDiConfig)  # noqa: S101 - a proposal is of the law of the start
         return authority(parameters, self.start)
 
     def ticked(self, controller: Controller, now_ns: int) -> bool:
-        """Note a tick; whether an identification begins there.
+        """Note a tick, and say whether an identification begins there.
 
         None begins while the law is deactivated.
         """
@@ -192,7 +192,7 @@ class Learning:
         return due
 
     def waits(self, now_ns: int) -> bool:
-        """In simulated time: whether the tick at `now_ns` waits for a proposal."""
+        """In simulated time, say whether the tick at `now_ns` waits for a proposal."""
         return any(
             self._acts_ns(end_ns) <= now_ns and end_ns not in self._received for end_ns in self._due
         )
@@ -210,11 +210,11 @@ class Learning:
             self._begin(proposal, controller, now_ns)
 
     def step(self, controller: Controller, now_ns: int) -> ControllerConfig | None:
-        """Certify, let the proposals act that are due, and fall back where the law diverges.
+        """Certify, let due proposals act, and fall back if the law diverges.
 
-        A deactivated law begins again with the parameters of the start: it may have been
-        deactivated because of its model. Returns the parameters that the controller has taken; None
-        where it keeps its own.
+        A deactivated law begins again with the parameters of the start, because its model may have
+        been the reason to deactivate it. Returns the parameters that the controller has taken, or
+        None if it keeps its own.
         """
         if controller.mode is Mode.INACTIVE:
             return self._begin_again(controller, now_ns)
@@ -235,9 +235,9 @@ class Learning:
     def _end_divergence(
         self, diverging: Collection[str], controller: Controller, now_ns: int
     ) -> RiseDiConfig:
-        """Take the law of the start in the parts of the model that diverge.
+        """Fall back to the law of the start in the parts of the model that diverge.
 
-        A part with FALLBACKS fallbacks keeps this law to the end of the engagement.
+        A part with FALLBACKS fallbacks keeps this law until the engagement ends.
         """
         parameters = controller.parameters
         assert isinstance(parameters, RiseDiConfig)  # noqa: S101 - for the type checker
@@ -262,9 +262,9 @@ class Learning:
     def _end_oscillations(
         self, periods: Mapping[str, float], controller: Controller, now_ns: int
     ) -> RiseDiConfig:
-        """Take the law of the start in the parts of the model whose outputs oscillate.
+        """Fall back to the law of the start in the parts of the model whose outputs oscillate.
 
-        These parts keep the law to the end of the engagement.
+        These parts keep it until the engagement ends.
         """
         parameters = controller.parameters
         assert isinstance(parameters, RiseDiConfig)  # noqa: S101 - for the type checker
@@ -288,7 +288,7 @@ class Learning:
         return fallen
 
     def _begin_again(self, controller: Controller, now_ns: int) -> ControllerConfig | None:
-        """Forget what is under way; the parameters of the start where a learned model flew."""
+        """Forget what is under way, and return the start's parameters if a learned model flew."""
         self._updates = Updates(self._settings)
         self._certificate = None
         self._last_ns = None
@@ -309,9 +309,9 @@ class Learning:
         return end_ns + nanoseconds(self._settings.latency)
 
     def _refusal(self, proposal: Proposal, now_ns: int, controller: Controller) -> str:
-        """Why a proposal is not certified at all; empty for one that may be.
+        """Say why a proposal is not even worth certifying; return "" if it may be.
 
-        Costs microseconds, whatever the proposal.
+        This costs microseconds, whatever the proposal.
         """
         window = f"a window that ends {seconds(now_ns - proposal.stamp_ns):.3g} s ago"
         if proposal.start != self._digest:
@@ -348,9 +348,9 @@ class Learning:
             self._announce(Event(now_ns, EventKind.NO_MODEL, {}, f"no model: {proposal.sentence}"))
 
     def _certify(self, controller: Controller, now_ns: int) -> ControllerConfig | None:
-        """A part of the certificate, in simulated time the whole.
+        """Do a part of the certificate, or all of it in simulated time.
 
-        Returns the parameters taken at the end.
+        Returns the parameters that are taken at the end.
         """
         if self._certificate is None:
             return None
@@ -386,12 +386,11 @@ class Learning:
         return None
 
     def _unfit(self, proposal: Proposal, controller: Controller) -> str:
-        """The refusal of a proposal that the law cannot take; else empty.
+        """Say why the law cannot take a proposal; return "" if it can.
 
-        The law is not engaged, or the proposal lost the race with a further change.
-
-        An input that has lost its effect has none after a fallback either, which its loss may have
-        caused.
+        Either the law is not engaged, or another change overtook the proposal. A proposal that only
+        holds an input without effect still counts after a fallback: the input has no effect then
+        either, and its loss may have caused the fallback.
         """
         if controller.mode is not Mode.ENGAGED:
             return (
@@ -423,7 +422,7 @@ class Learning:
 def _certificate(
     parameters: ControllerConfig, change: Mapping[str, Any], start: RiseDiConfig
 ) -> Generator[None, None, Prepared]:
-    """The parameters in force with a change, checked as at load.
+    """Apply a change to the parameters in force, and check them as when they are loaded.
 
     The checks come in parts of at most about 1 ms. Raises ParameterError.
     """
@@ -479,7 +478,7 @@ def _certificate(
 
 
 def _speeds(parameters: RiseDiConfig) -> str:
-    """The speeds of the models, and how the schedule follows; empty without a schedule."""
+    """Describe the speeds of the models, and how the schedule follows; "" without a schedule."""
     schedule = parameters.schedule
     if schedule is None:
         return ""
@@ -488,9 +487,9 @@ def _speeds(parameters: RiseDiConfig) -> str:
 
 
 def design_changes(old: ControllerConfig, new: ControllerConfig) -> dict[str, Any]:
-    """All of DESIGNED of a new set by dotted name.
+    """Return all of DESIGNED of a new set by dotted name.
 
-    None for what an old set, or what flies meanwhile, may have besides.
+    The value is None for whatever the old set, or what flies meanwhile, may have in addition.
     """
     before = _designed_values(old)
     after = _designed_values(new)
@@ -498,15 +497,15 @@ def design_changes(old: ControllerConfig, new: ControllerConfig) -> dict[str, An
 
 
 def _designed_values(parameters: ControllerConfig) -> dict[str, Any]:
-    """The values of DESIGNED by dotted name."""
+    """Return the values of DESIGNED by dotted name."""
     values = flatten(parameters.model_dump())
     return {name: value for name, value in values if name.split(".")[0] in DESIGNED}
 
 
 def changes(old: ControllerConfig, new: ControllerConfig) -> dict[str, Any]:
-    """What differs between two parameter sets, by dotted name.
+    """Return what differs between two parameter sets, by dotted name.
 
-    None for a parameter that is gone.
+    The value is None for a parameter that is gone.
     """
     before = dict(flatten(old.model_dump()))
     after = dict(flatten(new.model_dump()))
