@@ -17,9 +17,9 @@ T = TypeVar("T")
 
 
 def as_path(value: FilePath, key: str, expected: str) -> Path:
-    """The path of a text or a path-like object.
+    """Return a text or a path-like object as a path.
 
-    Raises ParameterError for a value of a different type and for an empty text.
+    Raises ParameterError if the value has another type or is an empty text.
     """
     text = os.fspath(value) if isinstance(value, str | os.PathLike) else b""
     require(isinstance(text, str) and text != "", key, short_repr(value), expected)
@@ -29,9 +29,9 @@ def as_path(value: FilePath, key: str, expected: str) -> Path:
 def as_number(
     value: object, key: str, least: float, most: float = math.inf, unit: str = ""
 ) -> float:
-    """A finite number from `least` to `most`.
+    """Return a finite number from `least` to `most`.
 
-    Raises ParameterError, with the unit, for a different value.
+    Raises ParameterError, with the unit, for any other value.
     """
     bounds = (
         f"{least:g} or more{', ' * bool(unit)}" if most == math.inf else f"{least:g} to {most:g} "
@@ -40,7 +40,7 @@ def as_number(
 
 
 def as_count(value: object, key: str, least: int, most: float = math.inf) -> int:
-    """An integer from `least` to `most`. Raises ParameterError for a different value."""
+    """Return an integer from `least` to `most`, or raise ParameterError."""
     bounds = f"of {least} or more" if most == math.inf else f"from {least} to {most:g}"
     return int(_bounded(int, value, key, least, most, f"an integer {bounds}"))
 
@@ -55,9 +55,9 @@ def _bounded(
 
 
 def as_numbers(value: object, key: str, expected: str) -> tuple[float, ...]:
-    """Finite numbers from a list, a tuple or an array, or from a single number.
+    """Return finite numbers from a list, a tuple or an array, or from a single number.
 
-    Raises ParameterError for a different value.
+    Raises ParameterError for any other value.
     """
     problems = Problems()
     numbers = kind_of(float | tuple[float, ...]).read(value, key, problems)
@@ -66,7 +66,7 @@ def as_numbers(value: object, key: str, expected: str) -> tuple[float, ...]:
 
 
 def as_numbers_by_name(values: object, key: str, example: str) -> dict[str, float]:
-    """Finite numbers by name from a mapping. Raises ParameterError for a different value."""
+    """Return finite numbers by name from a mapping, or raise ParameterError."""
     if not isinstance(values, Mapping):
         raise ParameterError(f"{key}: found {values!r}, expected numbers by name, as in {example}")
     return {
@@ -75,9 +75,9 @@ def as_numbers_by_name(values: object, key: str, example: str) -> dict[str, floa
 
 
 def as_names(value: object, key: str, expected: str) -> tuple[str, ...]:
-    """Names from a list, a tuple or an array, or from a text with commas.
+    """Return names from a list, a tuple or an array, or from a text with commas.
 
-    Raises ParameterError for other values.
+    Raises ParameterError for any other value.
     """
     if isinstance(value, str):
         value = value.split(",") if value else ()
@@ -88,7 +88,7 @@ def as_names(value: object, key: str, expected: str) -> tuple[str, ...]:
 
 
 def as_instance(value: object, kind: type[T], key: str, expected: str) -> T:
-    """The value, of a class. Raises ParameterError for a value of a different class."""
+    """Return the value if it is an instance of a class, or raise ParameterError."""
     if not isinstance(value, kind):
         raise ParameterError(f"{key}: found {short_repr(value)}, expected {expected}")
     return value

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Arithmetic of law, observer and feedforward with a stated order of operations.
 
-Every operation is rounded once to float64. So u does not depend on the BLAS or the libm of a host,
-and C code without libraries gives the same bits. NumPy is exact to the bit. XLA, the compiler of
-JAX, may contract a product and a sum into a fused multiply-add, with a single rounding: JAX is
-near.
+Every operation is rounded once to float64. u therefore does not depend on the BLAS or the libm of a
+host, and C code without libraries gives the same bits. With NumPy this is exact to the bit. XLA,
+the compiler of JAX, may contract a product and a sum into a fused multiply-add with a single
+rounding, so JAX only comes close.
 """
 
 import math
@@ -18,7 +18,7 @@ ARITHMETIC = "1"
 """Number of this arithmetic in the provenance of a log."""
 
 MAX_ANGLE = 1e6
-"""Largest angle of `sine`, rad: a larger angle counts as MAX_ANGLE."""
+"""Largest angle of `sine`, rad. A larger angle counts as MAX_ANGLE."""
 
 # 30 bits of pi: a product with an integer below 2^23 is exact
 PI_HIGH = math.floor(math.pi * 2.0**28) / 2.0**28
@@ -32,7 +32,7 @@ ROUNDING = 1.5 * 2.0**52
 
 
 def product(matrix: Array, vector: Array) -> Array:
-    """Sum of matrix[:, j] vector[j] over the columns j = 0, 1, ..., in this order.
+    """Sum matrix[:, j] vector[j] over the columns j = 0, 1, ..., in this order.
 
     Shapes: matrix (k, s) and vector (s,) or (s, N), or N matrices (k, s, N) and vectors (s, N), s >
     0. The result is (k,) or (k, N).
@@ -48,7 +48,7 @@ def product(matrix: Array, vector: Array) -> Array:
 
 
 def sine(x: Scalar) -> Scalar:
-    """Sine of an angle in rad, with an error below 5e-16 up to MAX_ANGLE.
+    """Compute the sine of an angle in rad, with an error below 5e-16 up to MAX_ANGLE.
 
     r = x - k pi, then the Taylor series up to r^19. k is the integer nearest to x / pi, pi is
     PI_HIGH + PI_LOW to 82 bits, and sin(x) is sin(r) for even k, -sin(r) for odd k. The remainder
@@ -67,12 +67,12 @@ def sine(x: Scalar) -> Scalar:
 
 
 def _rounded(x: Scalar) -> Scalar:
-    """The nearest integer, half to even. XLA would simplify the sum to x."""
+    """Round to the nearest integer, half to even; XLA would simplify the sum to x."""
     return (x + ROUNDING) - ROUNDING if isinstance(x, float) else array_namespace(x).round(x)
 
 
 def inverse(matrix: FloatArray) -> FloatArray:
-    """Inverse of a regular matrix (m, m), by Gauss-Jordan elimination.
+    """Invert a regular matrix (m, m) by Gauss-Jordan elimination.
 
     The pivot is the largest entry of each column.
     """

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Confinement of a process by the Linux kernel: no network, and files written in one folder alone.
+"""Confinement of a process by the Linux kernel: no network, and files only in one folder.
 
 Sources: unshare(2), landlock(7); include/uapi/linux/landlock.h.
 """
@@ -31,10 +31,10 @@ _LIBC = ctypes.CDLL(None, use_errno=True)
 
 
 def confine(folder: Path) -> list[str]:
-    """Take this process off the network, and let it change files beneath `folder` alone.
+    """Take this process off the network, and let it change files only beneath `folder`.
 
-    The process must have one thread. Returns a sentence for a measure without support by the
-    kernel.
+    The process must have a single thread. Returns a sentence for each measure that the kernel does
+    not support.
     """
     sentences = []
     if _LIBC.unshare(CLONE_NEWUSER | CLONE_NEWNET):
@@ -51,7 +51,7 @@ def confine(folder: Path) -> list[str]:
 
 
 def _write_beneath(folder: Path) -> bool:
-    """Restrict changes of files to `folder` and /dev/null; whether the kernel does."""
+    """Restrict changes of files to `folder` and /dev/null; return whether the kernel does so."""
     version = _LIBC.syscall(CREATE_RULESET, None, 0, VERSION_FLAG)
     if version < 1:
         return False

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A deadline for the end of a process, also while a call into a library holds the interpreter.
+"""A deadline for a process, which holds even while a call into a library keeps the interpreter.
 
-Neither a Python thread nor a signal handler of Python runs during such a call, and the default
-action of a signal loses the exit status. So a timer of the kernel starts a thread of the C library
-(POSIX timer_create, SIGEV_THREAD), which calls _exit(status).
+During such a call neither a Python thread nor a signal handler of Python runs, and the default
+action of a signal loses the exit status. A timer of the kernel therefore starts a thread of the C
+library (POSIX timer_create, SIGEV_THREAD), which calls _exit(status).
 """
 
 import ctypes
@@ -19,7 +19,7 @@ from flight_core.rates import NANOSECONDS
 
 SIGEV_THREAD = 2  # linux/bits/sigevent-consts.h
 SIGEVENT_SIZE = 64  # bytes, of struct sigevent
-TOLD_AT = 0.9  # of the deadline: the stacks then go to stderr
+TOLD_AT = 0.9  # fraction of the deadline at which the stacks go to stderr
 
 
 class _SignalEvent(ctypes.Structure):
@@ -46,8 +46,8 @@ class _TimerTimes(ctypes.Structure):
 class Deadline:
     """Ends the process with an exit status after `duration` s, unless it is cancelled.
 
-    As a context manager it is cancelled at the end of the block. Python's own clean-up is left
-    out: what must reach a file is closed before.
+    As a context manager it is cancelled at the end of the block. Python does not clean up when it
+    ends the process, so anything that must reach a file has to be closed before.
     """
 
     def __init__(self, duration: float, status: int) -> None:
@@ -79,12 +79,12 @@ class Deadline:
         self.cancel()
 
     def cancel(self) -> None:
-        """Let the process go on."""
+        """Let the process continue."""
         faulthandler.cancel_dump_traceback_later()
         _require(self._delete(self._timer))
 
 
 def _require(result: int) -> None:
-    """Raise OSError after a call of the C library that has failed."""
+    """Raise OSError if a call of the C library has failed."""
     if result != 0:
         raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))

@@ -28,7 +28,7 @@ MAX_DOMAIN = 232  # a higher domain has port numbers above 65535 (DDSI-RTPS 2.3,
 
 
 def require_ros_environment() -> None:
-    """Raise ParameterError with the mend where no node can start.
+    """Raise ParameterError, with the remedy, if no node can start here.
 
     Checks clock, logs, shared memory, loopback, domain and middleware.
     """
@@ -62,7 +62,7 @@ def _require_domain() -> None:
 
 
 def _require_middleware() -> None:
-    """By the index of the installed packages; an installation without an index passes."""
+    """Refuse a middleware that is not installed; an installation without an index passes."""
     name = os.environ.get("RMW_IMPLEMENTATION", "")
     prefixes = [
         *filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)),
@@ -79,13 +79,14 @@ def _require_middleware() -> None:
 
 
 def _require_shared_memory() -> None:
-    """Raise ParameterError for a full file system of shared memory.
+    """Refuse a full file system of shared memory.
 
-    Rclpy writes a page of it when it is loaded: on a full file system that is a bus error.
+    rclpy writes a page of it when it is loaded, which ends in a bus error if the file system is
+    full.
     """
     try:
         state = os.statvfs(SHARED_MEMORY)
-    except OSError:  # without the folder rclpy does without
+    except OSError:  # without the folder, rclpy uses no shared memory
         return
     free = state.f_bavail * state.f_frsize
     if state.f_blocks > 0 and free < LEAST_SHARED_MEMORY:
@@ -97,7 +98,7 @@ def _require_shared_memory() -> None:
 
 
 def _require_files() -> None:
-    """A node has some 50 files and sockets open."""
+    """Refuse a limit of open files below LEAST_FILES: a node has some 50 files and sockets open."""
     most = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
     if most < LEAST_FILES:
         _refuse(
@@ -106,7 +107,7 @@ def _require_files() -> None:
 
 
 def _require_log_settings() -> None:
-    """Of rcutils/logging.h. With another value each line of a log is an error on the terminal."""
+    """Refuse a setting of rcutils/logging.h with which each line of a log becomes an error."""
     for variable in (
         "RCUTILS_LOGGING_USE_STDOUT",
         "RCUTILS_LOGGING_BUFFERED_STREAM",
@@ -117,9 +118,9 @@ def _require_log_settings() -> None:
 
 
 def log_folder() -> Path | None:
-    """The folder for the logs of nodes, as rcl_logging_interface has it.
+    """Return the folder for the logs of nodes, as rcl_logging_interface chooses it.
 
-    None without any of its variables.
+    Returns None if none of its variables is set.
     """
     for variable, inside in (("ROS_LOG_DIR", ""), ("ROS_HOME", "log"), ("HOME", ".ros/log")):
         if value := os.environ.get(variable):
@@ -141,7 +142,7 @@ def _require_log_folder() -> None:
         os.close(os.open(probe, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
     except (OSError, ValueError) as error:
         if folder.is_dir() and isinstance(error, FileExistsError):
-            return  # of a killed process of the same number
+            return  # left by a killed process with the same number
         reason = error.strerror if isinstance(error, OSError) else str(error)
         _refuse(
             f"{folder}: cannot be written ({reason}), expected a folder for the logs of nodes "
@@ -153,7 +154,7 @@ def _require_log_folder() -> None:
 
 
 def _require_loopback() -> None:
-    """Nodes talk over 127.0.0.1 unless the user has a profile."""
+    """Refuse a host without loopback: nodes talk over 127.0.0.1 unless the user has a profile."""
     try:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             probe.bind(("127.0.0.1", 0))

@@ -4,10 +4,10 @@
 
 
 def failsafe_scale(silence_ns: int, hold_ns: int, ramp_ns: int) -> float:
-    """Factor s of the failsafe input u = s u_last, where u is the deviation from trim.
+    """Compute the factor s of the failsafe input u = s u_last, where u is the deviation from trim.
 
-    `silence_ns` is the time since the last input. s is 1 up to hold, then falls linearly to 0 over
-    ramp. Ramp 0 is a step.
+    `silence_ns` is the time since the last input. s is 1 until hold ends, then falls linearly to 0
+    over ramp. If ramp is 0, it falls in a step.
     """
     if silence_ns <= hold_ns:
         return 1.0

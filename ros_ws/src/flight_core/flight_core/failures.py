@@ -5,7 +5,7 @@
 import math
 
 DWELL = 10.0
-"""s without a failed step before a second sentence."""
+"""s without a failed step before another sentence is due."""
 
 
 class Failures:
@@ -16,7 +16,7 @@ class Failures:
         self._last = -math.inf
 
     def add(self, t: float) -> bool:
-        """Count a failed step at the flight time t, s; whether a sentence is due."""
+        """Count a failed step at the flight time t, s, and return whether a sentence is due."""
         is_first = t - self._last > DWELL
         self.count += 1
         self._last = t
@@ -24,5 +24,5 @@ class Failures:
 
 
 def sentence(error: Exception) -> str:
-    """The kind and the words of an error, on a single line."""
+    """Write the kind and the message of an error on a single line."""
     return " ".join(f"{type(error).__name__} {error}".split())

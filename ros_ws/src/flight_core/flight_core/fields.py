@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Values of a parameter set: permission by an annotation, and the sentence about a refused value.
+"""Values of a parameter set: an annotation says what is permitted, and refusals are sentences.
 
 Types are strict. An int is accepted as a float, a sequence as a tuple, an array or a scalar of
 NumPy as lists and numbers, and a path as a str; nothing else is converted. The annotations are
@@ -20,7 +20,7 @@ from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_ori
 
 
 class _ShortRepr(reprlib.Repr):
-    """repr of a value for an error sentence, of limited length."""
+    """repr of a value for an error sentence, with limited length."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -38,7 +38,7 @@ short_repr = _ShortRepr().repr
 
 
 class Problems:
-    """Sentences about values not permitted."""
+    """Sentences about values that are not permitted."""
 
     def __init__(self) -> None:
         self.unknown: list[str] = []  # keys
@@ -47,11 +47,14 @@ class Problems:
         self.others: list[str] = []
 
     def sentences(self) -> list[str]:
-        """Unknown keys first: a mistyped key is before the key missing because of the mistake."""
+        """List the sentences, unknown keys first.
+
+        A mistyped key then comes before the key that is missing because of it.
+        """
         return self.unknown + self.missing_sentences() + self.others
 
     def missing_sentences(self) -> list[str]:
-        """A sentence for each set that lacks keys. It names all of them."""
+        """Write a sentence for each set that lacks keys, which names all of them."""
         sentences = []
         for where, keys in self.missing.items():
             (name, meaning), *more = keys.items()
@@ -62,7 +65,7 @@ class Problems:
         return sentences
 
     def summary(self) -> str:
-        """The first sentence and those about missing keys, and how many more there are."""
+        """Return the first sentence and those about missing keys, and count the others."""
         sentences = self.sentences()
         told = list(dict.fromkeys([sentences[0], *self.missing_sentences()]))
         more = len(sentences) - len(told)
@@ -73,7 +76,7 @@ class Problems:
         self.missing.setdefault(where, {})[name] = meaning
 
     def refuse(self, key: str, value: object, expected: str) -> None:
-        """Add a sentence: the value found for a key, and the expected value."""
+        """Add a sentence with the value that was found for a key, and what is expected."""
         self.others.append(f"{key}: found {short_repr(value)}, expected {expected}")
 
 
@@ -88,7 +91,7 @@ class Kind(NamedTuple):
     takes_all: Callable[[Sequence[Any]], bool] = lambda _: False
 
     def read(self, value: object, key: str, problems: Problems) -> Any:
-        """The value for the set. A value not permitted adds a sentence to `problems`."""
+        """Return the value for the set; if it is not permitted, add a sentence to `problems`."""
         if hasattr(value, "dtype") and hasattr(value, "tolist"):  # an array or a scalar of NumPy
             value = value.tolist()
         if self.takes(value):
@@ -112,7 +115,7 @@ LIMITS: Mapping[str, tuple[Callable[[Any, Any], bool], str]] = MappingProxyType(
 
 
 def _number(kind: type[float], *, allow_inf_nan: bool = False, **limits: float) -> Kind:
-    """An int, or a float: infinite or NaN only with `allow_inf_nan`."""
+    """Permit an int, or a float, which may be infinite or NaN only with `allow_inf_nan`."""
     if unknown := limits.keys() - LIMITS.keys():
         raise TypeError(f"a number has no rule {', '.join(sorted(unknown))}")
     checks = [(*LIMITS[rule], limits[rule]) for rule in LIMITS if rule in limits]
@@ -165,7 +168,7 @@ def _string(*, min_length: int = 0, pattern: str = "") -> Kind:
 
 
 def _choice(choices: Sequence[object], expected: str = "") -> Kind:
-    """A value among choices, of the same type: 1 is neither True nor 1.0."""
+    """Permit a value among choices, of the same type: 1 is neither True nor 1.0."""
     words = expected or _either([repr(choice) for choice in choices])
     return Kind(
         words,
@@ -186,7 +189,7 @@ def _check_count(count: int, key: str, problems: Problems, least: float, most: f
 
 
 def _values(parts: Sequence[Any], *, min_length: float = 0, max_length: float = math.inf) -> Kind:
-    """A tuple: of any length with values of one kind, or with a value per kind."""
+    """Permit a tuple, either of any length with values of one kind, or with a value per kind."""
     is_repeated = parts[-1] is Ellipsis
     kinds = [kind_of(part) for part in parts if part is not Ellipsis]
     least, most = (min_length, max_length) if is_repeated else (len(kinds), len(kinds))
@@ -201,21 +204,21 @@ def _values(parts: Sequence[Any], *, min_length: float = 0, max_length: float = 
         )
 
     def takes(value: object) -> bool:
-        # YAML and ROS give no tuple
+        # YAML and ROS give lists, not tuples
         return isinstance(value, Sequence) and not isinstance(value, (str, bytes))
 
     return Kind("a list of values", takes, content)
 
 
 def _table(parts: Sequence[Any], *, min_length: float = 0, max_length: float = math.inf) -> Kind:
-    """A dict."""
+    """Permit a dict."""
     keys, values = map(kind_of, parts)
 
     def content(value: Mapping[Any, Any], key: str, problems: Problems) -> dict[Any, Any]:
         _check_count(len(value), key, problems, min_length, max_length)
         table = {}
         for label, item in value.items():
-            # JSON has texts alone as keys
+            # JSON has only strings as keys
             is_number = (
                 parts[0] is int and isinstance(label, str) and re.fullmatch(r"-?\d{1,18}", label)
             )
@@ -232,7 +235,7 @@ def _table(parts: Sequence[Any], *, min_length: float = 0, max_length: float = m
 
 
 def _group(schema: Any) -> Kind:
-    """A parameter set."""
+    """Permit a parameter set."""
     if not hasattr(schema, "model_fields"):
         raise TypeError(f"{schema} is no type of a parameter")
 
@@ -244,7 +247,7 @@ def _group(schema: Any) -> Kind:
 
 
 def _union(kinds: Sequence[Kind]) -> Kind:
-    """A value of the first fitting kind."""
+    """Permit a value of any of the kinds, and take it as the first that fits."""
 
     def content(value: Any, key: str, problems: Problems) -> Any:
         trial = Problems()
@@ -285,7 +288,7 @@ SIMPLE: Mapping[Any, Callable[..., Kind]] = MappingProxyType(
 
 
 def kind_of(annotation: Any, rules: Mapping[str, Any] = MappingProxyType({})) -> Kind:
-    """Values permitted by an annotation under rules, e.g. gt.
+    """Return which values an annotation permits under rules, such as gt.
 
     Raises TypeError for an unknown annotation or rule.
     """
@@ -308,7 +311,7 @@ REQUIRED: Any = object()
 
 
 class FieldInfo:
-    """Declaration of a field; in Annotated the rules alone."""
+    """Declaration of a field; in Annotated, only its rules."""
 
     annotation: Any = None
 

@@ -24,8 +24,8 @@ from flight_core.arguments import FilePath, as_path
 from flight_core.parameters import ParameterError, one_of, require
 from flight_core.text import printable
 
-# Exceptions of PyYAML: YAMLError for invalid syntax, the rest for an invalid scalar ("0b_",
-# "2001-99-99", "!!bool 2") or for too deep nesting.
+# Exceptions of PyYAML: YAMLError for invalid syntax, the others for an invalid scalar ("0b_",
+# "2001-99-99", "!!bool 2") or for nesting that is too deep.
 NOT_YAML = (
     yaml.YAMLError,
     ArithmeticError,
@@ -40,32 +40,32 @@ INT_TAG = "tag:yaml.org,2002:int"
 FLOAT_TAG = "tag:yaml.org,2002:float"
 
 MAX_FILE_BYTES = 1 << 19
-"""Bytes. A scenario has 4 kB, metadata.yaml of 500 topics less than this. PyYAML needs up to 0.2 kB
-and 5 us a byte."""
+"""Bytes. A scenario has 4 kB, and metadata.yaml of 500 topics less than this limit. PyYAML needs up
+to 0.2 kB and 5 us for each byte."""
 
 MAX_YAML_NODES = 100_000
-"""Values of a file after expansion of the aliases. A few lines of nested aliases can expand to
-billions of values."""
+"""Number of values in a file once its aliases are expanded. A few lines of nested aliases can
+expand to billions of values."""
 
 
 INTEGER = re.compile(r"[-+]?(0|[1-9][0-9]*)|0o[0-7]+|0x[0-9a-fA-F]+")
 FLOAT = re.compile(
     r"[-+]?(\.[0-9]+|(0|[1-9][0-9]*)(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)"
 )
-"""Numbers of the core schema of YAML 1.2.2, section 10.3.2, without leading zeros: 060 is 48 by
-YAML 1.1 and 60 by YAML 1.2. The same section has no 1:00, which is 60 by YAML 1.1, and no 1_000.
-These are strings here, so no number is guessed."""
+"""Numbers of the core schema of YAML 1.2.2, section 10.3.2, without leading zeros: YAML 1.1 reads
+060 as 48, YAML 1.2 as 60. That section does not have 1:00, which YAML 1.1 reads as 60, or 1_000.
+All of these are strings here, so that no number is guessed."""
 
 
 LEADING_ZERO = re.compile(r"[-+]?0[0-9]+")
 
 
 class _Loader(Composer, yaml.CSafeLoader):
-    """Reads numbers as YAML 1.2, and rejects duplicate keys.
+    """Reads numbers as YAML 1.2 does, and rejects duplicate keys.
 
-    An expansion of aliases to more than MAX_YAML_NODES values is rejected too. PyYAML keeps the
-    last of duplicate keys. libyaml parses, nine times as fast as Python. Python composes: where
-    nesting is deep, libyaml's binding exhausts the stack.
+    PyYAML would keep the last of duplicate keys. Aliases that expand to more than MAX_YAML_NODES
+    values are rejected too. libyaml parses, nine times as fast as Python. Python composes the
+    nodes, because libyaml's binding exhausts the stack if they are nested deeply.
     """
 
     def __init__(self, stream: str) -> None:
@@ -94,7 +94,7 @@ class _Loader(Composer, yaml.CSafeLoader):
 
 
 class _Dumper(yaml.SafeDumper):
-    """Quotes a string that `_Loader` would read as a number."""
+    """Quotes any string that `_Loader` would read as a number."""
 
 
 def _integer(loader: _Loader, node: yaml.ScalarNode) -> int:
@@ -117,22 +117,22 @@ for _class in (_Loader, _Dumper):
             _tag, re.compile(rf"(?:{_pattern.pattern})\Z"), list("-+.0123456789")
         )
 _Loader.add_constructor(INT_TAG, _integer)
-# launch_ros writes the lists of parameters so; rcl reads them as lists
+# launch_ros writes lists of parameters like this; rcl reads them as lists
 _Loader.add_constructor("tag:yaml.org,2002:python/tuple", _sequence)
 
 
 def dump_yaml(value: object, *, flow: bool | None = None) -> str:
-    """A value as YAML text for `parse_yaml`.
+    """Write a value as YAML text that `parse_yaml` can read.
 
-    Lists of scalars stand in one line; with flow False everything stands in blocks.
+    Lists of scalars stand in one line; if `flow` is False, everything stands in blocks.
     """
     return yaml.dump(value, Dumper=_Dumper, sort_keys=False, default_flow_style=flow, width=128)
 
 
 def _expanded_size(node: yaml.Node, sizes: dict[int, float]) -> float:
-    """Number of nodes after expansion of aliases; infinite for a recursive node.
+    """Count the nodes after expansion of aliases; the count is infinite for a recursive node.
 
-    `sizes` caches by identity.
+    `sizes` caches the counts by identity.
     """
     if isinstance(node, yaml.ScalarNode):
         return 1
@@ -146,15 +146,15 @@ def _expanded_size(node: yaml.Node, sizes: dict[int, float]) -> float:
 
 
 def comment(lines: Iterable[str]) -> str:
-    """Lines as comments of a YAML file.
+    """Write lines as comments of a YAML file.
 
-    Unprintable characters, such as line ends of a file's name, become escapes.
+    Unprintable characters, such as line ends in the name of a file, become escapes.
     """
     return "".join(f"# {printable(line)}".rstrip() + "\n" for line in lines)
 
 
 def is_file(path: Path) -> bool:
-    """Whether the path is a file; False also for an invalid path, e.g. too long a path."""
+    """Whether the path is a file; False also for an invalid path, such as one that is too long."""
     return os.path.isfile(path)  # noqa: PTH113 - Path.is_file raises OSError and ValueError
 
 
@@ -164,21 +164,21 @@ def is_folder(path: Path) -> bool:
 
 
 def names_in(library: Path) -> list[str]:
-    """Names of the YAML files in a folder, sorted."""
+    """List the names of the YAML files in a folder, sorted."""
     return sorted(path.stem for path in library.glob("*.yaml"))
 
 
 CHECKOUT = Path(__file__).resolve().parents[4]
-"""Root of the sources, with `examples`; some folder in an installation from a wheel."""
+"""Root of the sources, with `examples`; in an installation from a wheel, some other folder."""
 
-EXAMPLES = "examples/"  # a path that begins so is also one from the root of the sources
+EXAMPLES = "examples/"  # a path that begins like this may also start at the root of the sources
 
 
 def find_file(name: FilePath, library: Path, key: str, kind: str) -> Path:
-    """The file of a name in a library, or the path of a .yaml file.
+    """Find the file with a name in a library, or at the path of a .yaml file.
 
-    A path that begins with `examples/` is found from any working folder. `key` and `kind` are of
-    the sentence: "scenario", "a scenario file". Raises ParameterError with the names.
+    A path that begins with `examples/` is found from any working folder. `key` and `kind` go into
+    the sentence: "scenario", "a scenario file". Raises ParameterError with the known names.
     """
     known = names_in(library)
     path_text = f"the path of {kind} (.yaml)"
@@ -195,7 +195,7 @@ def find_file(name: FilePath, library: Path, key: str, kind: str) -> Path:
 
 
 def display_path(path: Path) -> str:
-    """A path, relative to the working folder where the path is below.
+    """Show a path, relative to the working folder if it lies below it.
 
     Unprintable characters become escapes.
     """
@@ -203,9 +203,9 @@ def display_path(path: Path) -> str:
 
 
 def open_nonblocking(path: str | Path) -> BinaryIO:
-    """Open a file for reading; a pipe without a writer reads as empty and does not block.
+    """Open a file for reading; a pipe without a writer reads as empty instead of blocking.
 
-    Raises OSError, ValueError.
+    Raises OSError or ValueError.
     """
     return open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))
 
@@ -214,7 +214,7 @@ def open_nonblocking(path: str | Path) -> BinaryIO:
 def writing(key: str, path: str | Path, expected: str) -> Iterator[None]:
     """Turn an OSError inside the block into a ParameterError.
 
-    Its sentence has `key`, the unwritable `path`, and `expected`. `key` may be empty.
+    Its sentence has `key`, which may be empty, the `path` that cannot be written, and `expected`.
     """
     try:
         yield
@@ -226,10 +226,10 @@ def writing(key: str, path: str | Path, expected: str) -> Iterator[None]:
 
 
 def read_file(path: Path, key: str, expected: str) -> bytes:
-    """Content of an input file of at most MAX_FILE_BYTES.
+    """Read an input file of at most MAX_FILE_BYTES.
 
-    `key` names the file in the sentence, `expected` the right content. Raises ParameterError for an
-    unreadable or longer file.
+    `key` names the file in the sentence, and `expected` says what it should contain. Raises
+    ParameterError if the file cannot be read or is longer.
     """
     try:
         with open_nonblocking(path) as stream:
@@ -241,21 +241,22 @@ def read_file(path: Path, key: str, expected: str) -> bytes:
 
 
 def limited(content: bytes, key: str, expected: str) -> bytes:
-    """The content, of at most MAX_FILE_BYTES. Raises ParameterError for more."""
+    """Return the content if it has at most MAX_FILE_BYTES, or raise ParameterError."""
     require(len(content) <= MAX_FILE_BYTES, key, f"more than {MAX_FILE_BYTES} bytes", expected)
     return content
 
 
 def read_yaml(path: Path, key: str, expected: str) -> Any:
-    """Content of a YAML file.
+    """Read a YAML file.
 
-    Raises ParameterError as `read_file`, and for what is not YAML or has a duplicate key.
+    Raises ParameterError as `read_file` does, and if the content is not YAML or has a duplicate
+    key.
     """
     return parse_yaml(read_file(path, key, expected), key, expected)
 
 
 def parse_yaml(content: bytes | str, key: str, expected: str) -> Any:
-    """Content of YAML text. Raises ParameterError as `read_yaml` does."""
+    """Parse YAML text. Raises ParameterError as `read_yaml` does."""
     try:
         text = content if isinstance(content, str) else content.decode("utf-8")
     except UnicodeDecodeError as error:
@@ -268,12 +269,12 @@ def parse_yaml(content: bytes | str, key: str, expected: str) -> Any:
 
 
 def require_no_octal(content: bytes | str, key: str) -> None:
-    """Raise ParameterError for YAML with a number that begins with 0.
+    """Refuse YAML with a number that begins with 0.
 
-    Rcl reads 0100 as 64, by strtoll with base 0.
+    rcl reads 0100 as 64, because it calls strtoll with base 0.
     """
     numbers = []
-    with suppress(*NOT_YAML):  # rcl has its own sentence for it
+    with suppress(*NOT_YAML):  # rcl reports it itself
         scalars = (
             token
             for token in yaml.scan(content, yaml.CSafeLoader)
@@ -291,12 +292,12 @@ def require_no_octal(content: bytes | str, key: str) -> None:
 def replacing(path: Path) -> Iterator[BinaryIO]:
     """Write a file atomically: the stream becomes the file at `path` once the block ends.
 
-    After an error the stream is removed. After a crash, a kill or a full disk the file has either
-    the new or the old content. The stream is a fresh file in the same folder, so nothing is written
-    through a link at `path`: the file replaces the link. Raises OSError, also for an existing
-    `path` that is no regular file, e.g. a folder or a device.
+    If the block fails, the stream is removed. After a crash, a kill or a full disk the file has
+    either the new or the old content. The stream is a fresh file in the same folder, so nothing is
+    written through a link at `path`: the file replaces the link. Raises OSError, also if `path`
+    exists and is no regular file but, for example, a folder or a device.
     """
-    with suppress(FileNotFoundError):  # also of a link to nothing
+    with suppress(FileNotFoundError):  # also raised for a link to nothing
         mode = path.stat().st_mode
         if not stat.S_ISREG(mode):
             raise (
@@ -319,9 +320,9 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
 
 
 def _umask() -> int:
-    """The permissions withheld from new files of this process.
+    """Return the permissions that this process withholds from new files.
 
-    Umask(2) returns the mask only while setting a new mask.
+    umask(2) returns the mask only while it sets a new one.
     """
     mask = os.umask(0o077)
     os.umask(mask)
@@ -335,7 +336,7 @@ def write_file(path: Path, content: str | bytes) -> None:
 
 
 def link_latest(run: Path) -> None:
-    """Point runs/latest at a run, atomically. Raises ParameterError where no link can be made."""
+    """Point runs/latest at a run, atomically. Raises ParameterError if no link can be made."""
     latest = run.parent / "latest"
     temporary = run.parent / f".latest-{os.getpid()}"
     with writing("", latest, "a link to the last run"):

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What installs a missing Python package.
+"""How to install a missing Python package.
 
-In a checkout it is make, elsewhere pip with an extra of what `rise-di` came from.
+In a checkout make does it, elsewhere pip with an extra of whatever `rise-di` came from.
 """
 
 import json
@@ -42,7 +42,7 @@ MESSAGE_SUFFIXES = ("_msgs", "_interfaces", "_srvs")
 
 
 def require_package(package: str, remark: str = "") -> None:
-    """Raise ParameterError where a Python package is not installed.
+    """Raise ParameterError if a Python package is not installed.
 
     The sentence ends with the remark.
     """
@@ -51,7 +51,7 @@ def require_package(package: str, remark: str = "") -> None:
 
 
 def missing(package: str) -> str:
-    """A sentence on a package that is not installed.
+    """Write a sentence about a package that is not installed.
 
     For example "the Python package jax is not installed: make setup-all".
     """
@@ -75,11 +75,11 @@ def missing(package: str) -> str:
 
 
 def _pip_command(extra: str) -> str:
-    """The command that installs an extra of the stack from where the stack came.
+    """Return the command that installs an extra of the stack from where the stack came.
 
-    That is a checkout, a wheel, a repository or an index. A checkout that is not released must not
-    send its user to an index, where a foreign package may have this name. Source: PEP 610,
-    direct_url.json, which an installation from an index does not have.
+    That is a checkout, a wheel, a repository or an index. An unreleased checkout must not send its
+    user to an index, where somebody else may have published a package of this name. Source: PEP
+    610, direct_url.json, which an installation from an index does not have.
     """
     try:
         origin = distribution("rise-di").read_text("direct_url.json")

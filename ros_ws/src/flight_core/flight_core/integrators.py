@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fixed-step integrators: step-size control could step over a gust."""
+"""Fixed-step integrators; a variable step could miss a gust."""
 
 from collections.abc import Callable
 from typing import Any
@@ -16,7 +16,7 @@ def rk4(
     params: Any,
     dt: Any,
 ) -> Array:
-    """A step of the classical fourth-order Runge-Kutta method, with u held over the step.
+    """Take a step of the classical fourth-order Runge-Kutta method, with u held over the step.
 
     x(t + dt) = x + dt/6 (k1 + 2 k2 + 2 k3 + k4), local error O(dt^5). Works on any array type.
     Source: Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, table 1.2.

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Process isolation: what reads foreign models and logs runs in a subprocess.
+"""Process isolation: code that reads foreign models and logs runs in a subprocess.
 
 The subprocess has limited time, memory, files and network.
 """
@@ -27,16 +27,16 @@ from flight_core.outcome import FlightEnded
 from flight_core.parameters import ParameterError
 
 RESULT = "result"  # the file of the result in the working folder
-# raised here as in the subprocess
+# raised here if the subprocess raises them
 ERRORS = MappingProxyType({"ended": FlightEnded, "refused": ParameterError})
-# times the processor time is waited for: so long may other work keep the processor from the
-# subprocess
+# How many times the processor time we wait: other work may keep the subprocess from the processor
+# for so long.
 WAIT = 20.0
 FILE_LIMIT = 1 << 30  # bytes of a file that the subprocess writes
 
 NUMPY = frozenset({"_frombuffer", "_reconstruct", "dtype", "ndarray", "scalar"})
-"""What a pickled array names. Unlike another name in a pickle, none of them runs code of the
-sender's choice."""
+"""Names that a pickled array contains. Unlike other names in a pickle, none of them runs code of
+the sender's choice."""
 
 
 class IsolatedCallError(RuntimeError):
@@ -54,17 +54,18 @@ def call(
     foreign: bool = True,
     records: ModuleType | None = None,
 ) -> Any:
-    """Return value of function(*arguments) in a fresh process, confined to an empty working folder.
+    """Call function(*arguments) in a fresh process, confined to an empty working folder.
 
-    The subprocess finds the function by module and name. Arguments must fit JSON; the return value
-    consists of plain values, arrays, and named tuples of the module `records`, by default that of
-    the function. FlightEnded and ParameterError of the function are raised here too.
+    The subprocess finds the function by module and name. Arguments must fit into JSON. The return
+    value consists of plain values, arrays, and named tuples of the module `records`, by default
+    that of the function. If the function raises FlightEnded or ParameterError, so does this call.
 
     The subprocess has `memory` bytes of data, FILE_LIMIT, and `timeout` seconds of processor time,
     or WAIT times as many of wall time: an endless computation is found on a busy machine too, and a
-    finite computation gets enough time. Where the kernel permits, it has no network and writes in
-    its folder alone; where not, a warning says so once, if `foreign`. Raises IsolatedCallError
-    where the process crashes (a segmentation fault, an exception) or returns nothing in that time.
+    finite one gets enough time. If the kernel permits, it has no network and writes only in its
+    folder; if not, a warning says so once, provided the data are `foreign`. Raises
+    IsolatedCallError if the process crashes (a segmentation fault, an exception) or returns nothing
+    in that time.
     """
     call_text = json.dumps([timeout, memory, function.__module__, function.__qualname__, arguments])
     with tempfile.TemporaryDirectory() as folder:
@@ -105,7 +106,7 @@ def call(
 class _Reader(pickle.Unpickler):
     """Reads plain values, arrays, and named tuples of a module.
 
-    Raises IsolatedCallError for another name.
+    Raises IsolatedCallError for any other name.
     """
 
     def __init__(self, stream: Any, module: str) -> None:
@@ -126,14 +127,14 @@ class _Reader(pickle.Unpickler):
 
 
 class _Writer(pickle.Pickler):
-    """Writes a mapping without changes as a dict: pickle refuses a MappingProxyType."""
+    """Writes a read-only mapping as a dict, because pickle refuses a MappingProxyType."""
 
     def reducer_override(self, value: object) -> Any:
         return (dict, (dict(value),)) if isinstance(value, MappingProxyType) else NotImplemented
 
 
 def main() -> None:
-    """Entry point of the subprocess: limits, then the call in JSON.
+    """Run the subprocess: set the limits, then make the call that comes as JSON.
 
     The result goes into the file RESULT.
     """
@@ -145,7 +146,7 @@ def main() -> None:
         (resource.RLIMIT_CORE, 0),
     )
     for limit, most in limits:
-        # the hard limit is that of the user, which no process may raise
+        # the user sets the hard limit, which no process may raise
         hard = resource.getrlimit(limit)[1]
         soft = most if hard == resource.RLIM_INFINITY else min(most, hard)
         resource.setrlimit(limit, (soft, hard))

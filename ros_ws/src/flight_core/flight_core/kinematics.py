@@ -19,7 +19,7 @@ MAX_TILT = math.radians(80.0)
 def euler_rates(
     phi: Scalar, theta: Scalar, p: Scalar, q: Scalar, r: Scalar
 ) -> tuple[Scalar, Scalar]:
-    """Rates of bank and pitch, rad/s.
+    """Compute the rates of bank and pitch, rad/s.
 
     phi_dot = p + tan(theta) (q sin(phi) + r cos(phi)), theta_dot = q cos(phi) - r sin(phi).
     """
@@ -29,7 +29,7 @@ def euler_rates(
 
 
 def heading_rate(phi: Scalar, theta: Scalar, q: Scalar, r: Scalar) -> Scalar:
-    """Rate of the heading, rad/s: psi_dot = (q sin(phi) + r cos(phi)) / cos(theta).
+    """Compute the rate of the heading, rad/s: psi_dot = (q sin(phi) + r cos(phi)) / cos(theta).
 
     Source: Stevens, Lewis, eq. (1.3-22).
     """
@@ -38,7 +38,7 @@ def heading_rate(phi: Scalar, theta: Scalar, q: Scalar, r: Scalar) -> Scalar:
 
 
 def turn_rate(phi: Scalar, theta: Scalar, theta_dot: Scalar, speed: Scalar) -> Scalar:
-    """Yaw rate r of a coordinated turn, rad/s, at the speed V in m/s.
+    """Compute the yaw rate r of a coordinated turn, rad/s, at the speed V in m/s.
 
     r = psi_dot cos(phi) cos(theta) - theta_dot sin(phi), psi_dot = g tan(phi) / V.
     """
@@ -50,10 +50,10 @@ def turn_rate(phi: Scalar, theta: Scalar, theta_dot: Scalar, speed: Scalar) -> S
 def body_rates(
     phi: Scalar, theta: Scalar, phi_dot: Scalar, theta_dot: Scalar, r: Scalar
 ) -> tuple[Scalar, Scalar]:
-    """P and q for these rates of the attitude beside r, the inverse of `euler_rates`:
+    """Compute p and q for given rates of the attitude and r, the inverse of `euler_rates`.
 
     q = (theta_dot + r sin(phi)) / cos(phi),  p = phi_dot - tan(theta) (q sin(phi) + r cos(phi))
-    """  # noqa: D415 - what follows is an equation
+    """
     xp = array_namespace(phi)
     phi = tilt(phi)
     q = (theta_dot + r * xp.sin(phi)) / xp.cos(phi)
@@ -61,7 +61,7 @@ def body_rates(
 
 
 def thrust_axis(phi: float, theta: float, psi: float) -> tuple[float, float, float]:
-    """Direction of a thrust against the z axis of the body: to the north, to the east and up, 1.
+    """Return the direction of a thrust against the body z axis: north, east and up, length 1.
 
     The third column of the rotation from the body to north, east and down, with the other sign
     ahead of the horizontal part. Source: Stevens, Lewis, eq. (1.3-20).
@@ -74,11 +74,11 @@ def thrust_axis(phi: float, theta: float, psi: float) -> tuple[float, float, flo
 
 
 def tilt(angle: Scalar) -> Scalar:
-    """An angle within +-MAX_TILT."""
+    """Limit an angle to +-MAX_TILT."""
     return clip(angle, MAX_TILT)
 
 
 def clip(value: Scalar, limit: Scalar) -> Scalar:
-    """A value within +-limit."""
+    """Limit a value to +-limit."""
     xp = array_namespace(value)
     return xp.minimum(xp.maximum(value, -limit), limit)

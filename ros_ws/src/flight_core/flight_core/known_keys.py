@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, get_args
 from flight_core.fields import REQUIRED, short_repr
 from flight_core.parameters import Config, ParameterError
 
-ANY = "*"  # stands for each name of a mapping
+ANY = "*"  # stands for any name of a mapping
 A_SECTION = "a section"  # the value of a section that is left out by default
 
 

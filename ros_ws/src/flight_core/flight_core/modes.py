@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Mode of the controller.
 
-The controller publishes it in `internals`; guidance, log and page read it.
+The controller publishes it in `internals`; guidance, the log and the page read it.
 """
 
 from enum import IntEnum

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Notes to the user of a process, once each.
+"""Notes to the user of a process, each given once.
 
-They go to the standard error where no logging is configured.
+They go to the standard error if no logging is configured.
 """
 
 import logging

@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The outcome of a flight as a record: end, reason and shortfalls.
 
-The sentence and the exit status come from the record. Nothing is read back from a sentence.
+The sentence and the exit status follow from the record, so that nothing has to be read back from a
+sentence.
 """
 
 import json
@@ -15,14 +16,14 @@ from flight_core.text import bounded
 
 STATUS_BAD_INPUT = 2  # also of a node
 STATUS_ENDED_EARLY = 3  # also of a node
-STATUS_SHORTFALL = 4  # the flight reached its end, and falls short of something
-STATUS_LANDED = 5  # of the node of an aircraft alone, which ends with the landing
-STATUS_LOST_CONTACT = 6  # of a node alone: another node has ended, and that is the cause
-STATUS_HOST = 7  # the host was too busy for a flight in real time, and nothing else is wrong
+STATUS_SHORTFALL = 4  # the flight reached its end, but falls short of something
+STATUS_LANDED = 5  # only of the node of an aircraft, which ends with the landing
+STATUS_LOST_CONTACT = 6  # only of a node: it ended because another node did
+STATUS_HOST = 7  # only the host was too busy for a flight in real time
 STATUS_INTERRUPTED = 130
 
 SEVEREST = (0, STATUS_HOST, STATUS_SHORTFALL, STATUS_ENDED_EARLY, STATUS_INTERRUPTED)
-"""Exit statuses of flights; that of several flights is the last one of theirs."""
+"""Exit statuses of flights, by severity; several flights together have the last one of theirs."""
 
 
 HEADLINE = 120  # characters at most: a line of a terminal
@@ -37,7 +38,7 @@ class End(StrEnum):
     """How a flight ended."""
 
     COMPLETED = "completed"  # at its duration
-    LANDED = "landed"  # on the wheels, softly
+    LANDED = "landed"  # softly, on its wheels
     ENDED_EARLY = "ended early"
     NEVER_FLEW = "never flew"
     INTERRUPTED = "interrupted"  # by the user
@@ -47,29 +48,29 @@ class End(StrEnum):
 
 
 class Aim(StrEnum):
-    """What a flight can fall short of, the gravest first: it explains those that follow."""
+    """What a flight can fall short of, the gravest first, because it explains those that follow."""
 
-    ENGAGEMENT = "engagement"  # the law flies while it is asked to
-    REFERENCE = "reference"  # y_m is that of the scenario
+    ENGAGEMENT = "engagement"  # the law flies while it should
+    REFERENCE = "reference"  # y_m is the one of the scenario
     GROUND = "ground"  # the aircraft stays above the ground
     SEPARATION = "separation"  # from the other aircraft of a fleet
     STALL = "stall"  # the airspeed stays above the stall speed
-    FENCE = "fence"  # inside
-    ALTITUDE = "altitude"  # between the least and the largest altitude
-    ERROR = "error"  # the linear loop allows the error of an output
-    TOUCHDOWN = "touchdown"  # in the zone of the landing
+    FENCE = "fence"  # the aircraft stays inside
+    ALTITUDE = "altitude"  # the aircraft stays between the least and the largest altitude
+    ERROR = "error"  # the error of an output is one that the linear loop allows
+    TOUCHDOWN = "touchdown"  # the aircraft lands in the zone of the landing
     GUIDANCE = "guidance"  # each step gives commands
     ROUTE = "route"  # every leg is flown
     ORBIT = "orbit"  # the last orbit is joined
-    LOG = "log"  # it holds the whole flight
+    LOG = "log"  # the log holds the whole flight
 
 
 @dataclass(frozen=True, kw_only=True)
 class Shortfall:
     """A shortfall of a flight as a sentence and in figures, SI.
 
-    `brief` is the sentence in a headline, if the whole one is too long for it. `times` is how many
-    times over what is allowed the figure is, to find the worst of an aim.
+    `brief` replaces the sentence in a headline if it is too long for one. `times` says by what
+    factor the figure exceeds what is allowed, so that the worst shortfall of an aim can be found.
     """
 
     aim: Aim
@@ -81,7 +82,7 @@ class Shortfall:
 
 @dataclass(frozen=True, kw_only=True)
 class Allowance:
-    """An error that is none of the law: noise or wind leaves it to the linear loop too."""
+    """An error that is not the law's fault: noise or wind causes it in the linear loop too."""
 
     sentence: str
     figures: Mapping[str, Any] = field(default_factory=dict)
@@ -91,8 +92,8 @@ class Allowance:
 class Outcome:
     """The outcome of a flight.
 
-    `str` is a headline of at most HEADLINE characters: how it ended, how many shortfalls it has,
-    and the worst with its figure. `details` are the sentences that do not stand in it.
+    `str` is a headline of at most HEADLINE characters: how the flight ended, how many shortfalls it
+    has, and the worst one with its figure. `details` are the sentences that did not fit.
 
     Examples:
         >>> tape = rise_di.simulate(rise_di.find_scenario("osprey_servo", duration=0.1))
@@ -101,9 +102,9 @@ class Outcome:
     """
 
     end: End
-    reason: str = ""  # a sentence, where the end alone does not say it
+    reason: str = ""  # a sentence, if the end alone does not say why
     shortfalls: tuple[Shortfall, ...] = ()
-    # no part of how a flight ended
+    # not a part of how the flight ended
     allowances: tuple[Allowance, ...] = field(default=(), compare=False)
 
     @property
@@ -113,9 +114,9 @@ class Outcome:
 
     @property
     def status(self) -> int:
-        """The exit status: 0 for a flight without a shortfall that reached the end.
+        """Exit status: 0 for a flight that reached its end without a shortfall.
 
-        A shortfall of a starved flight lies outside of the starved spans, so it counts.
+        A starved flight is judged outside of its starved spans, so its shortfalls count.
         """
         if self.end is End.INTERRUPTED:
             return STATUS_INTERRUPTED
@@ -154,7 +155,7 @@ class Outcome:
 
     @property
     def details(self) -> tuple[str, ...]:
-        """The sentences that do not stand in the headline."""
+        """Sentences that are not in the headline."""
         headline = str(self)
         sentences = (
             self._begin(),
@@ -182,11 +183,11 @@ class Outcome:
         }
 
     def record(self) -> dict[str, str]:
-        """The end and the reason, for the log: the shortfalls follow from the log itself."""
+        """Return the end and the reason, for the log; the shortfalls follow from the log itself."""
         return {"end": self.end.value, "reason": self.reason}
 
     def text(self) -> str:
-        """The `record` as JSON."""
+        """Write the `record` as JSON."""
         return json.dumps(self.record())
 
 
@@ -196,24 +197,24 @@ UNKNOWN = Outcome(End.UNKNOWN, "neither the run nor the log has one")
 
 
 def never_flew(reason: str) -> Outcome:
-    """The outcome of a flight without a begin."""
+    """Return the outcome of a flight that never began."""
     return Outcome(End.NEVER_FLEW, bounded(reason))
 
 
 def host_starved(reason: str) -> Outcome:
-    """The outcome of a flight in real time on a host that is too busy for it."""
+    """Return the outcome of a flight in real time on a host that was too busy for it."""
     return Outcome(End.HOST, bounded(reason))
 
 
 def ended_early(reason: str) -> Outcome:
-    """The outcome of a flight with an end before the duration."""
+    """Return the outcome of a flight that ended before its duration."""
     return Outcome(End.ENDED_EARLY, bounded(reason))
 
 
 def log_ends_at(end: float, duration: float) -> Outcome:
-    """The outcome of a flight of `duration` s whose log ends early.
+    """Return the outcome of a flight of `duration` s whose log ends early.
 
-    It holds y, y_m and u up to the flight time `end`, s; -inf: none.
+    The log holds y, y_m and u up to the flight time `end`, s, or not at all if `end` is -inf.
     """
     part = f"up to t = {end:.3f} of" if end >= 0.0 else "of"
     verb = "holds" if end >= 0.0 else "does not hold"
@@ -221,7 +222,7 @@ def log_ends_at(end: float, duration: float) -> Outcome:
 
 
 def read_outcome(record: object) -> Outcome:
-    """The outcome of a `record`, of a log or of `summary.json`; UNKNOWN for another object."""
+    """Read the outcome from a `record`, of a log or of `summary.json`; UNKNOWN if it is none."""
     if not isinstance(record, Mapping):
         return UNKNOWN
     try:
@@ -233,7 +234,7 @@ def read_outcome(record: object) -> Outcome:
 
 
 def _of_fleet(record: Mapping[str, Any]) -> tuple[Shortfall, ...]:
-    """The shortfalls of a record that do not follow from the log of one aircraft."""
+    """Read the shortfalls of a record that do not follow from the log of one aircraft."""
     shortfalls = []
     for each in record.get("shortfalls") or ():
         if isinstance(each, Mapping) and each.get("aim") == Aim.SEPARATION:
@@ -245,7 +246,7 @@ def _of_fleet(record: Mapping[str, Any]) -> tuple[Shortfall, ...]:
 
 
 def parsed_outcome(text: str) -> Outcome:
-    """The outcome of a record in JSON; UNKNOWN for another text."""
+    """Read the outcome from a record in JSON; UNKNOWN if the text is none."""
     try:
         return read_outcome(json.loads(text))
     except ValueError:
@@ -253,7 +254,7 @@ def parsed_outcome(text: str) -> Outcome:
 
 
 class FlightEnded(RuntimeError):  # noqa: N818 - the end of a flight is not a program error
-    """A flight ends before the duration, early or by a landing.
+    """Raised if a flight ends before its duration, early or by a landing.
 
     The message is a sentence for the user, printable and bounded.
     """
@@ -274,7 +275,7 @@ class FlightEnded(RuntimeError):  # noqa: N818 - the end of a flight is not a pr
 
 
 class LostContact(FlightEnded):
-    """A node ends after the end of another node."""
+    """Raised if a node ends because another node has ended."""
 
     @property
     def status(self) -> int:

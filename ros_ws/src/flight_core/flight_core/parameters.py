@@ -3,12 +3,12 @@
 """Validated parameter sets: a declaration per set, a sentence per error.
 
 A set is a frozen class of annotated fields. `validate_mapping` builds it from the nested mapping of
-a scenario file or of a ROS node. The first value not permitted becomes a `ParameterError` of one
-sentence: the key, what was found, what is expected.
+a scenario file or of a ROS node. The first value that is not permitted becomes a `ParameterError`
+of one sentence: the key, what was found, and what is expected.
 
-Declarations and methods have the names of pydantic 2. The stack does not use pydantic: Ubuntu 24.04
-has release 1.10, with a different interface and no strict types, and with pydantic 2 the parameters
-of a node took twice as long to import.
+Declarations and methods have the names of pydantic 2. The stack does not use pydantic itself:
+Ubuntu 24.04 has release 1.10, with a different interface and no strict types, and with pydantic 2
+the parameters of a node took twice as long to import.
 """
 
 import difflib
@@ -47,7 +47,7 @@ class Config:
     """
 
     model_fields: ClassVar[dict[str, FieldInfo]] = {}
-    """The fields by name, fields of bases first."""
+    """Fields by name, those of base classes first."""
 
     def __init_subclass__(cls) -> None:
         new_fields = {}
@@ -90,10 +90,11 @@ class Config:
 
     @classmethod
     def validate_mapping(cls, values: Mapping[str, Any], where: str, *, check: bool = True) -> Self:
-        """Build the set from a nested mapping; `where` names the set in errors, e.g. "controller".
+        """Build the set from a nested mapping; `where` names it in errors, as "controller".
 
-        Without `check` relations between the values of the set are left to the caller. Raises
-        ParameterError with a sentence for the first key not permitted, and for every missing key.
+        Without `check`, the caller must check relations between the values of the set. Raises
+        ParameterError with a sentence for the first key that is not permitted, and for every
+        missing key.
         """
         problems = Problems()
         try:
@@ -111,7 +112,7 @@ class Config:
     ) -> Self | None:
         """Build the set from a nested mapping.
 
-        None, and a sentence in `problems`, for a value not permitted.
+        Returns None and adds a sentence to `problems` if a value is not permitted.
         """
         count_before = len(problems.sentences())
         content = {}
@@ -145,13 +146,13 @@ class Config:
 
     @classmethod
     def keys_beside(cls, values: Mapping[str, Any]) -> Set[str]:
-        """The keys that the set may have beside these values."""
+        """Return the keys that the set may have beside these values."""
         return cls.model_fields.keys()
 
     def changed(self, changes: Mapping[str, Any]) -> dict[str, Any]:
-        """The values with changes by dotted name, not validated.
+        """Return the values with changes by dotted name, not validated.
 
-        None removes a parameter. Raises ParameterError.
+        A change to None removes a parameter. Raises ParameterError.
         """
         flat = dict(flatten(self.model_dump()))
         for name in changes:
@@ -166,7 +167,7 @@ class Config:
         """Check relations between the values. Raises ParameterError."""
 
     def model_copy(self, *, update: Mapping[str, Any]) -> Self:
-        """A copy with new values, without a check."""
+        """Copy the set with new values, without a check."""
         copy = type(self).__new__(type(self))
         values = {name: getattr(self, name) for name in self.model_fields}
         vars(copy).update(values | dict(update), _given=vars(self)["_given"] | update.keys())
@@ -181,9 +182,9 @@ class Config:
         exclude_defaults: bool = False,
         exclude_unset: bool = False,
     ) -> dict[str, Any]:
-        """The set as nested dicts, in mode json with lists in place of tuples.
+        """Return the set as nested dicts, with lists in place of tuples in mode json.
 
-        `exclude` has fields of this set alone.
+        `exclude` names fields of this set only, not of nested ones.
         """
 
         def plain(value: Any) -> Any:
@@ -214,7 +215,7 @@ class Config:
         return tree
 
     def model_dump_json(self, *, indent: int | None = None) -> str:
-        """The set as JSON."""
+        """Write the set as JSON."""
         separators = (",", ":") if indent is None else None
         return json.dumps(
             self.model_dump(mode="json"), indent=indent, separators=separators, ensure_ascii=False
@@ -224,7 +225,7 @@ class Config:
     def model_validate_json(cls, text: str) -> Self:
         """Build the set from JSON.
 
-        Raises ParameterError, and ValueError for a text that is not JSON.
+        Raises ParameterError, and ValueError if the text is not JSON.
         """
         try:
             values = json.loads(text)
@@ -245,19 +246,19 @@ class NodeConfig(Config):
 
     @classmethod
     def tunable(cls) -> frozenset[str]:
-        """Parameters that may change in flight: dotted names, or names of groups as a whole."""
+        """Return what may change in flight: dotted names, or names of whole groups."""
         return frozenset()
 
     @classmethod
     def learned(cls) -> frozenset[str]:
-        """Further parameters, which only the node itself changes in flight."""
+        """Return more parameters that change in flight, but only by the node itself."""
         return frozenset()
 
 
 SMALLEST = 1e-9
 LARGEST = 1e9
-"""Bounds of a quantity in SI units. A value beyond is an error of units, and overflows in products
-and quotients of the law."""
+"""Bounds of a quantity in SI units. A value beyond them is a mistake in units, and overflows in
+products and quotients of the law."""
 Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 Positive = Annotated[float, Field(gt=0, ge=SMALLEST, le=LARGEST)]
 NonNegative = Annotated[float, Field(ge=0, le=LARGEST)]
@@ -267,7 +268,7 @@ Positives = Annotated[tuple[Positive, ...], Field(min_length=1)]
 NonNegatives = Annotated[tuple[NonNegative, ...], Field(min_length=1)]
 """Type of a parameter: a list of at least one number, each 0 or more."""
 Name = Annotated[str, Field(pattern=r"[A-Za-z][A-Za-z0-9_.]*")]
-"""Type of the name of a channel, a state or an input: it goes into C code, pages and files of other
+"""Type of the name of a channel, a state or an input. It goes into C code, pages and files of other
 programs as it stands."""
 Names = Annotated[tuple[Name, ...], Field(min_length=1)]
 Signs = Annotated[tuple[Literal[1, -1], ...], Field(min_length=1)]
@@ -283,7 +284,7 @@ def require(condition: bool, key: str, actual: object, expected: str) -> None:
 
 
 def one_of(known: Sequence[str], name: str) -> str:
-    """What is expected in place of an unknown name: a known name, the similar one first."""
+    """Say what is expected in place of an unknown name, with the most similar name first."""
     near = difflib.get_close_matches(name, known, n=1)
     return (
         f"{near[0]} perhaps, or another of {', '.join(known)}"
@@ -315,7 +316,7 @@ def require_length(key: str, values: Sequence[object], names: Sequence[str]) -> 
 
 
 def require_distinct(key: str, names: Sequence[str]) -> None:
-    """Raise ParameterError for a name given twice."""
+    """Raise ParameterError if a name is given twice."""
     require(len(set(names)) == len(names), key, ", ".join(names), "different names")
 
 
@@ -330,7 +331,7 @@ def require_channels(key: str, names: Sequence[str], expected: Sequence[str], ow
 
 
 def flatten(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Nested mapping -> (dotted name, value) pairs, the parameter names of ROS 2.
+    """Yield the pairs (dotted name, value) of a nested mapping, as ROS 2 names parameters.
 
     None values are left out.
     """
@@ -342,9 +343,9 @@ def flatten(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str,
 
 
 def nest(flat: Mapping[str, Any]) -> dict[str, Any]:
-    """Dotted names -> nested mapping, the inverse of `flatten`.
+    """Build a nested mapping from dotted names, the inverse of `flatten`.
 
-    Raises ParameterError for a name of a value and of a group.
+    Raises ParameterError if a name belongs to both a value and a group.
     """
     tree: dict[str, Any] = {}
     for name, value in flat.items():

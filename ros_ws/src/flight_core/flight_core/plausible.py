@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The largest values of the outputs of an aircraft.
+"""The largest plausible values of the outputs of an aircraft.
 
-A sample beyond is wrong, and an aircraft beyond is lost.
+A sample beyond them is wrong, and an aircraft beyond them is lost.
 """
 
 from collections.abc import Sequence
@@ -18,11 +18,11 @@ LARGEST_RATE = radians(2000.0)
 
 # m/s from trim, the speed of sound at sea level: ICAO Doc 7488, standard atmosphere
 LARGEST_AIRSPEED = 340.0
-LARGEST = 1e6  # SI, of other outputs: no state of an aircraft in flight comes near
+LARGEST = 1e6  # SI, for other outputs: no state of an aircraft in flight comes near it
 
 BY_NAME = {"p": LARGEST_RATE, "q": LARGEST_RATE, "r": LARGEST_RATE, "V": LARGEST_AIRSPEED}
 
 
 def largest(names: Sequence[str]) -> FloatArray:
-    """The largest absolute values of outputs, deviations from trim, (m,), SI."""
+    """Return the largest absolute values of outputs, deviations from trim, (m,), SI."""
     return np.array([BY_NAME.get(name, LARGEST) for name in names])

@@ -11,8 +11,8 @@ from flight_core.rates import NANOSECONDS
 from flight_core.vectors import ChannelError
 
 SHARED_NS = NANOSECONDS
-"""A name counts as shared for this long after the last witness: longer than the age limits of y and
-u, so the failsafe begins."""
+"""A name counts as shared for this long after the last evidence. This exceeds the age limits of y
+and u, so that the failsafe begins."""
 FOREVER_NS = 2**63  # longer than any flight
 SENDER = "sender"  # the reason of a ChannelError for a sample of a conflicting publisher
 
@@ -24,29 +24,29 @@ def require_sender(sender: str, expected: str) -> None:
 
 
 class PublisherLock:
-    """Locks to the first publisher of a topic, until the samples time out.
+    """Locks to the first publisher of a topic, until its samples time out.
 
-    Then it locks to the next publisher. A restarted node, of the same name, may take over earlier
-    than a different node. Overruns of the receiving node do not count: the first sample after an
-    overrun may come from a different publisher.
+    Then it locks to the next publisher. A restarted node, which has the same name, may take over
+    earlier than a different node. If the receiving node overruns, the publisher is not blamed for
+    the silence, but the first sample after the overrun may come from a different publisher.
 
-    The middleware numbers the messages of a publisher. Numbers that go back tell of two publishers
-    under the name. Neither is admitted, because either may be forged.
+    The middleware numbers the messages of a publisher. If the numbers go back, two publishers use
+    the same name. Neither is admitted then, because either may be forged.
 
-    `timeouts_ns` returns two ages of the last sample, above which a publisher has timed out: for
-    the same node in a new process, and for a different node.
+    `timeouts_ns` returns two ages of the last sample above which a publisher has timed out: for the
+    same node in a new process, and for a different node.
     """
 
     def __init__(self, timeouts_ns: Callable[[], tuple[int, int]]) -> None:
         self._timeouts_ns = timeouts_ns
         self.publisher: str | None = None
         self._received_ns = 0
-        self._overrun_ns = 0  # since the last sample
+        self._overrun_ns = 0  # overruns of this node since the last sample
         self._sequence = 0  # of the last message of the locked publisher; 0 is unknown
         self._went_back_ns: int | None = None  # when the sequence last went back
 
     def age_ns(self, now_ns: int) -> int:
-        """Time since the last sample of the locked publisher."""
+        """Return the time since the last sample of the locked publisher."""
         return now_ns - self._received_ns
 
     def timed_out(self, now_ns: int, max_age_ns: int) -> bool:
@@ -54,20 +54,20 @@ class PublisherLock:
         return self.publisher is None or self.age_ns(now_ns) > max_age_ns
 
     def holds(self, sender: str, now_ns: int) -> bool:
-        """Whether this is the locked publisher, and it has not timed out.
+        """Whether this is the locked publisher and it has not timed out.
 
-        Its last sample is within the age limit of a restart.
+        That is so if its last sample is within the age limit of a restart.
         """
         return sender == self.publisher and not self.timed_out(now_ns, self._timeouts_ns()[0])
 
     def overran(self, duration_ns: int) -> None:
-        """Leave a time out of the publisher's silence: the node itself did not run."""
+        """Do not blame the publisher for a silence while the node itself did not run."""
         self._overrun_ns += duration_ns
 
     def check(self, sender: str, now_ns: int) -> None:
         """Raise ChannelError, reason "sender", for a sample of a second publisher.
 
-        It may take over once the locked publisher has timed out.
+        The second one may take over once the locked publisher has timed out.
         """
         if sender == self.publisher:
             return
@@ -85,7 +85,7 @@ class PublisherLock:
             )
 
     def refresh(self, sender: str, now_ns: int) -> bool:
-        """Lock to the publisher of a valid sample. Returns whether the publisher has changed."""
+        """Lock to the publisher of a valid sample, and return whether the publisher has changed."""
         has_changed = sender != self.publisher
         if has_changed:
             self._sequence = 0
@@ -96,11 +96,12 @@ class PublisherLock:
         return has_changed
 
     def require_alone(self, sender: str, sequence: int, now_ns: int) -> None:
-        """Raise ChannelError, reason "sender", where two publishers send under the locked name.
+        """Raise ChannelError, reason "sender", if two publishers send under the locked name.
 
-        That is so for SHARED_NS after the sequence went back. `sequence` is the number of the
-        message by the middleware; 0 is unknown. After a timeout a lower number is of a restarted
-        publisher. Called with samples of a valid stamp and content: a replay stops nothing.
+        They count as two for SHARED_NS after the sequence went back. `sequence` is the number that
+        the middleware gave the message; 0 means unknown. After a timeout, a lower number comes from
+        a restarted publisher. Call this only for samples with a valid stamp and content, so that a
+        replay of old messages stops nothing.
         """
         if sender != self.publisher:
             return
@@ -120,10 +121,10 @@ class PublisherLock:
 class LockstepLock(PublisherLock):
     """Locks a topic of a lockstep flight to the publisher of its first message, for good.
 
-    There each message is an instant, so a message of anybody else must not count. No message is
-    lost in lockstep, so the numbers of one publisher go on by one: another number belongs to a
-    second publisher under the same name, and only that message is refused. A topic whose messages
-    name no sender has the sender "".
+    In lockstep each message is an instant, so a message of anybody else must not count. No message
+    is lost, so the numbers of one publisher rise by one each time. Any other number belongs to a
+    second publisher under the same name, and only that message is refused. If the messages of a
+    topic name no sender, the sender is "".
     """
 
     def __init__(self) -> None:
@@ -133,7 +134,7 @@ class LockstepLock(PublisherLock):
         """Raise ChannelError, reason "sender", unless the message is the next one by its number."""
         expected = self._sequence + 1
         if self.publisher is None:
-            self._sequence = 0  # of a message that was refused
+            self._sequence = 0  # the number of a message that was refused may be here
         elif self._sequence and sequence not in {0, expected}:
             raise ChannelError(
                 SENDER,

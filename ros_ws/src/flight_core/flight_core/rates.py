@@ -8,19 +8,19 @@ NANOSECONDS = 1_000_000_000
 
 
 def seconds(time_ns: int) -> float:
-    """Nanoseconds as float seconds, rounded once: t = time_ns / 1e9."""
+    """Convert nanoseconds to float seconds, rounded once: t = time_ns / 1e9."""
     return time_ns / NANOSECONDS
 
 
 def nanoseconds(time: float) -> int:
-    """Seconds as the nearest whole number of nanoseconds."""
+    """Convert seconds to the nearest whole number of nanoseconds."""
     return round(time * NANOSECONDS)
 
 
 def period_ns(rate: float, key: str) -> int:
-    """Period of a rate in Hz.
+    """Return the period of a rate in Hz, ns.
 
-    Raises ParameterError naming `key` where 1e9 / rate is not a whole number of nanoseconds.
+    Raises ParameterError naming `key` unless 1e9 / rate is a whole number of nanoseconds.
     """
     period = nanoseconds(1.0 / rate)
     is_whole = abs(period * rate - NANOSECONDS) < 1e-3
@@ -29,11 +29,11 @@ def period_ns(rate: float, key: str) -> int:
 
 
 def divide(whole_ns: int, part_ns: int, key: str, whole_name: str) -> int:
-    """Number of parts in the whole.
+    """Return the number of parts in the whole.
 
-    Raises ParameterError naming `key` unless the number is an integer.
+    Raises ParameterError naming `key` unless it is an integer.
     """
-    # asked first: the sentence takes longer than the division
+    # ask first, because the sentence takes longer than the division
     if part_ns <= 0 or whole_ns % part_ns:
         expected = f"a whole fraction of {whole_name} ({seconds(whole_ns):g} s)"
         raise ParameterError(f"{key}: found {seconds(part_ns):g} s, expected {expected}")

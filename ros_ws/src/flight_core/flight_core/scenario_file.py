@@ -6,9 +6,9 @@
   ros__parameters:
     rate: 100.0    # Hz
 
-Rcl joins the sections that match the full name of a node, in the order of the file: a later value
-replaces an earlier one. `**` in a name stands for any number of names, `*` for one. A section for
-all nodes gives a node the parameters that this node knows.
+rcl joins the sections that match the full name of a node, in the order of the file, so that a later
+value replaces an earlier one. `**` in a name stands for any number of names, `*` for one. From a
+section for all nodes, a node takes the parameters that it knows.
 """
 
 import difflib
@@ -30,7 +30,7 @@ ROS_PARAMETERS = (SIM_TIME, "start_type_description_service", "qos_overrides")
 """Parameters that ROS gives every node."""
 
 WILDCARDS: Mapping[str, str] = {"**": "(/[^/]+)*", "*": "/[^/]+"}
-MISTYPED = 0.8  # similarity of a foreign section to one that is lacking: recoder, recorder
+MISTYPED = 0.8  # similarity at which a foreign section is a misspelt missing one: recoder, recorder
 
 
 def parse_sections(
@@ -42,16 +42,17 @@ def parse_sections(
     *,
     with_general: bool = False,
 ) -> Sections:
-    """Sections of a scenario file by node name, e.g. {"controller": {"rate": 100.0, ...}}.
+    """Return the sections of a scenario file by node name, as {"controller": {"rate": 100.0, ...}}.
 
     Sections of nodes that are not among `schemas` are left alone. A section in `optional` may be
-    absent, or an empty mapping: every parameter by default. Parameters of ROS are left out, but a
-    node by /clock makes `use_sim_time` of the section `flight` true. `namespace` belongs to the
-    nodes, "" is the root; for None it is whatever one the file names. Parameters for all nodes make
-    a section where there is none `with_general`, for a file that comes beside a scenario.
+    absent or an empty mapping; every parameter then has its default. Parameters of ROS itself are
+    left out, but if a node follows /clock, `use_sim_time` of the section `flight` becomes true.
+    `namespace` is that of the nodes, "" for the root; if it is None, any one that the file names
+    will do. With `with_general`, for a file that comes beside a scenario, parameters for all nodes
+    make up a section that the file does not have.
 
-    Raises ParameterError with the path for content that is no scenario file or too long, has a
-    duplicate key, lacks a section, or names nodes of two namespaces where `namespace` is None.
+    Raises ParameterError with the path if the content is no scenario file or too long, has a
+    duplicate key, lacks a section, or names nodes of two namespaces while `namespace` is None.
     """
     found = _all_sections(content, path)
     expected = [name for name in schemas if name not in optional]
@@ -100,7 +101,7 @@ def parse_sections(
 def names_node(content: bytes, path: Path, name: str, key: str, namespace: str) -> bool:
     """Whether a section for this node, not one for all nodes, has the parameter `key`.
 
-    Raises ParameterError for content that is no ROS parameter file.
+    Raises ParameterError if the content is no ROS parameter file.
     """
     return any(
         _is_of(pattern, name) and _matches(pattern, name, namespace) and key in values
@@ -122,7 +123,7 @@ def has_general(content: bytes, path: Path) -> bool:
 
 
 def _all_sections(content: bytes, path: Path) -> dict[str, dict[Any, Any]]:
-    """The parameters in a file by the full names of nodes, in order."""
+    """Read the parameters in a file by the full names of nodes, in order."""
     tree = parse_yaml(limited(content, str(path), A_SCENARIO), str(path), A_SCENARIO)
     require(isinstance(tree, dict), str(path), f"{type(tree).__name__}", "a mapping with sections")
     return {
@@ -135,7 +136,7 @@ def _all_sections(content: bytes, path: Path) -> dict[str, dict[Any, Any]]:
 def _node_sections(
     top: object, section: object, path: Path, namespace: str = ""
 ) -> Iterator[tuple[str, Mapping[Any, Any]]]:
-    """The full names of nodes and their parameters: namespaces may be nested."""
+    """Yield the full names of nodes and their parameters; namespaces may be nested."""
     pattern = f"{namespace}/{str(top).strip('/')}"
     parts: Mapping[Any, Any] = section if isinstance(section, dict) else {}
     values = parts.get(PARAMETERS)
@@ -159,7 +160,7 @@ def _is_mapping(value: object) -> bool:
 
 
 def _matches(pattern: str, name: str, namespace: str | None) -> bool:
-    """Whether a section is for the node; where the namespace is None, in some namespace."""
+    """Whether a section is for the node, in any namespace if `namespace` is None."""
     *_, last = pattern.split("/")
     if namespace is None:
         return last == name or last in WILDCARDS
@@ -197,7 +198,7 @@ def _require_not_mistyped(
 
 
 def _nested(values: Mapping[Any, Any]) -> dict[Any, Any]:
-    """Parameters with groups for dotted names."""
+    """Turn dotted names of parameters into groups."""
     tree: dict[Any, Any] = {}
     for key, value in values.items():
         name, dot, rest = key.partition(".") if isinstance(key, str) else (key, "", "")
@@ -208,7 +209,7 @@ def _nested(values: Mapping[Any, Any]) -> dict[Any, Any]:
 
 
 def join_parameters(values: dict[Any, Any], further: Mapping[Any, Any]) -> None:
-    """Join further parameters, which replace those of their names."""
+    """Merge more parameters into `values`; they replace those of the same name."""
     for key, value in further.items():
         before = values.get(key)
         if isinstance(before, dict) and isinstance(value, Mapping):

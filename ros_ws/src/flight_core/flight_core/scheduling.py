@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Requests of a node to Linux's scheduler, for less late ticks.
+"""Requests of a node to Linux's scheduler, so that fewer ticks are late.
 
-No privilege is needed. Where Linux refuses, ticks are as late as without the request.
+No privilege is needed. If Linux refuses, ticks are as late as without the request.
 """
 
 import ctypes
@@ -23,13 +23,13 @@ ATTRIBUTES = "=IIQiIQQQ"
 
 
 def lower_real_time_priority(levels: int) -> None:
-    """Lower the real-time priority (chrt) of every thread of this process, if any.
+    """Lower the real-time priority (chrt) of every thread of this process, if it has one.
 
-    It falls by `levels`; the lowest is 1. Threads started later inherit the priority. Processes of
-    equal priority do not preempt: compression in the recorder delays a tick of the law by
-    milliseconds, and a tick of the law, of up to 3 ms, the next y_m. Rate-monotonic priorities, the
-    lower the longer the period, are the optimal fixed priorities. Source: sched(7); C. L. Liu and
-    J. W. Layland, Journal of the ACM 20(1), 1973, theorem 2.
+    It falls by `levels`, but not below 1. Threads started later inherit it. Processes of equal
+    priority do not preempt each other: compression in the recorder would delay a tick of the law by
+    milliseconds, and a tick of the law, of up to 3 ms, the next y_m. Rate-monotonic priorities,
+    lower for longer periods, are the optimal fixed priorities. Source: sched(7); C. L. Liu and J.
+    W. Layland, Journal of the ACM 20(1), 1973, theorem 2.
     """
     if (policy := os.sched_getscheduler(0)) in REAL_TIME:
         _schedule_threads(
@@ -39,17 +39,17 @@ def lower_real_time_priority(levels: int) -> None:
 
 
 def leave_real_time_priority() -> None:
-    """Give every thread of this process with a real-time priority (chrt) the default policy.
+    """Give every thread of this process that has a real-time priority (chrt) the default policy.
 
-    For a command that starts and watches nodes of real-time priority: a wake-up or a garbage
-    collection of the command delays no tick.
+    A command that starts and watches nodes of real-time priority calls this, so that its wake-ups
+    and garbage collections delay no tick.
     """
     if os.sched_getscheduler(0) in REAL_TIME:
         _schedule_threads(os.SCHED_OTHER, 0)
 
 
 def _schedule_threads(policy: int, priority: int) -> None:
-    for path in THREADS.iterdir():  # the import of rclpy starts some
+    for path in THREADS.iterdir():  # importing rclpy starts some
         with suppress(ProcessLookupError):  # the thread has ended
             os.sched_setscheduler(int(path.name), policy, os.sched_param(priority))
 
@@ -67,8 +67,8 @@ def disable_timer_slack() -> None:
 def request_short_slices() -> None:
     """Ask for time slices of SLICE_NS for every thread of this process.
 
-    A waking thread goes before a running thread with a longer slice. The share of a core is
-    unchanged. Linux before 6.12 ignores the request. A policy chosen by the user (chrt) is kept.
+    A waking thread goes before a running thread with a longer slice. Its share of a core stays the
+    same. Linux before 6.12 ignores the request. If the user has chosen a policy (chrt), it is kept.
     Source: sched_setattr(2); the kernel's documentation, scheduler/sched-eevdf (latency-sensitive
     tasks).
     """

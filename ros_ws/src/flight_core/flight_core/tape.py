@@ -42,7 +42,7 @@ class Signal:
     sender: NDArray[np.int16] | None = None
 
     def __getitem__(self, name: str) -> FloatArray:
-        """Samples of a channel, shape (N,). Raises ParameterError with the list of channels."""
+        """Return the samples of a channel, (N,), or raise ParameterError with the channels."""
         if name not in self.names:
             raise ParameterError(
                 f"the log: found no channel {name} among {', '.join(self.names)}, expected one"
@@ -50,7 +50,7 @@ class Signal:
         return self.values[:, self.names.index(name)]
 
     def until(self, end_ns: int) -> "Signal":
-        """The samples up to and including an instant.
+        """Return the samples up to and including an instant.
 
         Args:
             end_ns: The last instant, ns.
@@ -63,7 +63,7 @@ class Signal:
         return Signal(self.stamp_ns[:count], self.names, self.values[:count], sender)
 
     def where(self, keep: NDArray[np.bool_]) -> "Signal":
-        """The samples of a mask, shape (N,).
+        """Return the samples of a mask, shape (N,).
 
         Args:
             keep: Mask, shape (N,), bool.
@@ -75,7 +75,7 @@ class Signal:
         return Signal(self.stamp_ns[keep], self.names, self.values[keep], sender)
 
     def after(self, earlier: "Signal | None") -> "Signal":
-        """The samples of an earlier part, if any, then these; the channels are the same.
+        """Prepend the samples of an earlier part, if there is one, with the same channels.
 
         Args:
             earlier: A signal with the same channels, or None.
@@ -89,7 +89,7 @@ class Signal:
         return Signal(stamp_ns, self.names, np.concatenate([earlier.values, self.values]))
 
     def within(self, windows: Sequence[tuple[int, int]]) -> "Signal":
-        """The samples inside windows (first, last instant), ns.
+        """Return the samples inside windows (first, last instant), ns.
 
         Args:
             windows: First and last instant of each window, ns.
@@ -106,7 +106,7 @@ class Signal:
         return self.where(keep)
 
     def group(self, prefix: str) -> "Signal":
-        """The channels "prefix.name", as a signal with channels "name".
+        """Return the channels "prefix.name" as a signal with channels "name".
 
         Args:
             prefix: The part of the names before the dot.
@@ -128,26 +128,26 @@ class Signal:
 class Recording(NamedTuple):
     """Stamps of the messages of a topic in the order of the recording.
 
-    The samples from a step of the clock of the stamps on, and the samples without a usable stamp,
-    are absent in the signal.
+    If the clock of the stamps steps, the signal lacks the samples from there on, as well as those
+    without a usable stamp.
     """
 
     found: int  # messages
-    unset: int = 0  # zero stamps, and stamps far from those around
+    unset: int = 0  # zero stamps, and stamps far from their neighbours
     repeated: int = 0  # stamps equal to the stamp of the message before
     step_ns: int = 0  # the first step of the clock: negative for a step back; 0 without a step
     step_at_ns: int = 0  # the last stamp before the step
     left_out: int = 0  # messages after the step
-    # messages that are missing by the numbers of the publisher; None without numbers
+    # messages missing in the numbers of the publisher; None without numbers
     lost: int | None = None
-    # the last stamps before pauses in which the reception paused, too: no step of the clock
+    # last stamps before pauses of the reception too, which are no steps of the clock
     pauses_ns: tuple[int, ...] = ()
 
 
 class Process(NamedTuple):
     """A process of a flight. Stamps in ns; None: unknown, or without samples."""
 
-    ready_ns: int | None  # its event loop began
+    ready_ns: int | None  # when its event loop began
     first_ns: int | None  # stamps of its first and last sample
     last_ns: int | None
     samples: int | None = None  # on the topics of the aircraft
@@ -157,11 +157,11 @@ class Process(NamedTuple):
 class Tape:
     """A flight: signals by topic name.
 
-    `start_ns` is the stamp of flight time t = 0, `outcome` from flight_core.outcome. Of a flight of
-    `simulate`: `scenario`, and `changes` of the controller's parameters in flight. Of a log:
-    `recording` by topic, `duration`, s, of a whole flight where the log has it, `processes` by
-    name, how many samples of a topic were `refused`, whether the flight was by the simulated time
-    of /clock, `is_by_clock`, and the `account` of `rise_di.read_run`.
+    `start_ns` is the stamp of flight time t = 0, and `outcome` comes from flight_core.outcome. A
+    flight of `simulate` also has its `scenario`, and the `changes` of the controller's parameters
+    in flight. A log has the `recording` by topic, the `duration` of the whole flight, s, if it is
+    known, the `processes` by name, how many samples of a topic were `refused`, whether the flight
+    followed the simulated time of /clock (`is_by_clock`), and the `account` of `rise_di.read_run`.
 
     Examples:
         >>> tape = rise_di.simulate(rise_di.find_scenario("osprey_servo", duration=0.1))
@@ -183,7 +183,7 @@ class Tape:
     is_by_clock: bool = False
 
     def __getitem__(self, topic: str) -> Signal:
-        """The signal of a topic. Raises ParameterError with the list of topics."""
+        """Return the signal of a topic, or raise ParameterError with the list of topics."""
         if topic not in self:
             raise ParameterError(
                 f"the log: found no topic {topic} among {', '.join(self.signals) or 'none'}, "
@@ -195,7 +195,7 @@ class Tape:
         return isinstance(topic, str) and topic in self.signals
 
     def time(self, topic: str) -> FloatArray:
-        """Flight times of the samples of a topic in s, shape (N,): t = (stamp - start) / 1e9.
+        """Return the flight times of the samples of a topic in s, (N,): t = (stamp - start) / 1e9.
 
         Args:
             topic: Name of the topic.
@@ -210,12 +210,12 @@ class Tape:
 
 
 def refusal_note(topic: str, count: int) -> str:
-    """The note on refused samples of a topic."""
+    """Write the note about refused samples of a topic."""
     return f"{topic}: {count} samples refused: damaged, not finite, or of other channels"
 
 
 def as_tape(value: object) -> Tape:
-    """The value, a Tape with samples. Raises ParameterError for another value."""
+    """Return the value if it is a Tape with samples, or raise ParameterError."""
     tape = as_instance(
         value,
         Tape,

@@ -1,15 +1,15 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Text from samples, logs and files before a user sees it.
+"""Makes text from samples, logs and files safe to show to a user.
 
-It has no terminal control code and a bounded length.
+The result has no terminal control code and a bounded length.
 """
 
 MAX_LENGTH = 1000  # characters of a sentence, however long the bad input is
 
 
 def printable(text: str) -> str:
-    """A text with unprintable characters written as escapes.
+    """Write a text with unprintable characters as escapes.
 
     Those are line ends and terminal control codes, for example.
     """
@@ -17,9 +17,9 @@ def printable(text: str) -> str:
 
 
 def bounded(text: str) -> str:
-    """A printable text of at most MAX_LENGTH characters and their escapes.
+    """Make a text printable and at most MAX_LENGTH characters long, not counting escapes.
 
-    The middle of a longer text is left out.
+    If it is longer, its middle is left out.
     """
     if len(text) > MAX_LENGTH:
         text = f"{text[: MAX_LENGTH // 2]} ... {text[5 - MAX_LENGTH // 2 :]}"
@@ -27,5 +27,5 @@ def bounded(text: str) -> str:
 
 
 def sentences(*parts: str) -> str:
-    """The parts that are not empty, as one text."""
+    """Join the parts that are not empty into one text."""
     return "; ".join(filter(None, parts))

@@ -2,15 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The topics of a flight.
 
-A row has name, message, publishers, subscribers, and what the log and the pages say of the topic.
-Transport, recorder and launch read this table. `python -m tools.topics` writes the table of
+Each row has name, message, publishers, subscribers, and what the log and the pages say of the
+topic. Transport, recorder and launch read this table. `python -m tools.topics` writes the table of
 docs/topics.md and the access control policy from it.
 """
 
 from importlib import import_module
 from typing import Any, NamedTuple
 
-EXTERNAL = "external"  # publishers and subscribers that are no nodes of the stack
+EXTERNAL = "external"  # publishers and subscribers that do not belong to the stack
 NODES = ("aircraft", "reference_model", "guidance", "controller", "learner", "recorder", "bridge")
 LOG = "log"  # as a subscriber: the recorder
 HISTORY = "2 s"  # what a publisher keeps for a late subscriber: the samples of two seconds,
@@ -33,28 +33,28 @@ class Topic(NamedTuple):
     ends: str = "->"
     meaning: str = ""  # channels, units and use: Markdown
     keeps: str = HISTORY
-    only_with: str = ""  # the node or section without which the topic is not recorded
+    only_with: str = ""  # the topic is recorded only with this node or section
 
     @property
     def publishers(self) -> list[str]:
-        """The names of the nodes that publish the topic."""
+        """Names of the nodes that publish the topic."""
         return _names(self.ends.partition("->")[0])
 
     @property
     def subscribers(self) -> list[str]:
-        """The names of the nodes that subscribe the topic, and LOG."""
+        """Names of the nodes that subscribe to the topic, and LOG."""
         return _names(self.ends.partition("->")[2])
 
     @property
     def foreign(self) -> bool:
-        """Whether programs of others publish the topic, at any quality of service."""
+        """Whether foreign programs publish the topic, at any quality of service."""
         return EXTERNAL in self.publishers
 
     @property
     def type(self) -> Any:
-        """The class of the messages.
+        """Class of the messages.
 
-        Raises ImportError or AttributeError where the package lacks the message.
+        Raises ImportError or AttributeError if the package lacks the message.
         """
         if not isinstance(self.message, str):
             return self.message
@@ -213,10 +213,10 @@ FLIGHT = tuple(topic for topic in TOPICS if LOG in topic.subscribers and not top
 
 
 def recorded_with(node: str) -> list[str]:
-    """The topics to record of a flight with a node or section beside those of every flight."""
+    """List the topics that are recorded only with a node or section."""
     return [topic.name for topic in TOPICS if topic.only_with == node]
 
 
 def published_by(node: str) -> list[str]:
-    """The topics of a node."""
+    """List the topics that a node publishes."""
     return [topic.name for topic in TOPICS if node in topic.publishers]

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Units of airframe files.
 
-Values are converted to SI once, at load; the code uses SI and radians.
+Values are converted to SI once, when they are loaded; the code uses SI and radians.
 """
 
 import re
@@ -70,8 +70,8 @@ BASE_UNITS: Mapping[str, Quantity] = MappingProxyType(
         "lbf": Quantity(POUND_FORCE, length=1, time=-2, mass=1),
     }
 )
-"""The units by name. Products, quotients and powers of these are units too: ft/s^2, slug*ft^2,
-deg/s.
+"""The units by name. Products, quotients and powers of these, such as ft/s^2, slug*ft^2 and deg/s,
+are units too.
 
 Source: B. N. Taylor, A. Thompson, Guide for the Use of the International System of Units, NIST SP
 811, 2008, appendix B.
@@ -80,9 +80,9 @@ Source: B. N. Taylor, A. Thompson, Guide for the Use of the International System
 
 @lru_cache(maxsize=256)
 def quantity(unit: str, key: str = "unit") -> Quantity:
-    """The SI value and the dimension of a unit, such as "ft/s^2".
+    """Return the SI value and the dimension of a unit, such as "ft/s^2".
 
-    Raises ParameterError with `key` for an unknown unit.
+    Raises ParameterError with `key` if the unit is not known.
     """
     total = Quantity(1.0)
     for part in re.findall(r"[*/]?[^*/]*", unit)[:-1] or [""]:
@@ -101,18 +101,18 @@ def quantity(unit: str, key: str = "unit") -> Quantity:
 
 
 def si_per_unit(unit: str) -> float:
-    """SI value of 1 of a unit, the factor of a value in that unit.
+    """Return the SI value of 1 of a unit, by which you multiply a value in that unit.
 
-    Raises ParameterError for an unknown unit.
+    Raises ParameterError if the unit is not known.
     """
     return quantity(unit).si
 
 
 def in_si(value: str | float, key: str, like: str) -> float:
-    """A number of SI, or a text of a number with a unit ("176 ft/s"), in SI.
+    """Convert a number in SI, or a text of a number with a unit ("176 ft/s"), to SI.
 
-    `like` is an SI unit of the same dimension. Raises ParameterError for a text without a finite
-    number, an unknown unit, and a unit of a different dimension.
+    `like` is an SI unit of the same dimension. Raises ParameterError if the text has no finite
+    number, an unknown unit, or a unit of another dimension.
     """
     match = re.fullmatch(
         r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)(?:\s*)(\D.*)?", str(value).strip()

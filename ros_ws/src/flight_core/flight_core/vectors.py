@@ -26,7 +26,7 @@ FUTURE = "future"  # the reason of a ChannelError for a stamp ahead of the clock
 
 
 class _NumPy1:
-    """NumPy 1 with `concat`, used by this stack and missing in NumPy 1."""
+    """NumPy 1 with `concat`, which this stack uses and NumPy 1 lacks."""
 
     concat = staticmethod(np.concatenate)
 
@@ -59,9 +59,9 @@ class _Floats:
 
 
 def array_namespace(array: Scalar) -> Any:
-    """The array namespace of an array by the array API standard; `_Floats` for a Python float.
+    """Return the array namespace of an array by the array API standard; `_Floats` for a float.
 
-    NumPy 1 arrays lack `__array_namespace__`.
+    Arrays of NumPy 1 lack `__array_namespace__`.
 
     Args:
         array: An array of NumPy or of JAX, or a float.
@@ -86,9 +86,9 @@ def array_namespace(array: Scalar) -> Any:
 
 
 def as_array(value: Any, key: str, expected: str) -> FloatArray:
-    """The value as an array of float64.
+    """Convert a value to an array of float64.
 
-    Raises ParameterError for what is no array of real numbers.
+    Raises ParameterError if it is no array of real numbers.
     """
     try:
         if not np.iscomplexobj(value):
@@ -113,7 +113,7 @@ class StampedVector(NamedTuple):
 
     stamp_ns: int
     value: FloatArray
-    sender: str = ""  # empty where the sample was not received
+    sender: str = ""  # empty if the sample was not received
 
 
 class ChannelError(ValueError):
@@ -141,7 +141,7 @@ def require_newer(stamp_ns: int, last_ns: int, what: str = "sample") -> None:
 def require_not_future(stamp_ns: int, now_ns: int, max_age_ns: int) -> None:
     """Raise ChannelError, reason "future", for a stamp too far ahead of the clock.
 
-    The limit is that of the age.
+    The limit is the age limit.
     """
     if stamp_ns > now_ns + max_age_ns:
         raise ChannelError(FUTURE, f"stamp {seconds(stamp_ns - now_ns):g} s ahead of the clock")
@@ -161,11 +161,11 @@ def require_not_old(stamp_ns: int, now_ns: int, max_age_ns: int) -> None:
 def select(
     channels: Sequence[str], names: Sequence[str], values: Sequence[float] | FloatArray
 ) -> FloatArray:
-    """Values of the channels, in the order of `channels`, shape (len(channels),).
+    """Return the values of the channels, in the order of `channels`, shape (len(channels),).
 
-    v_i = values[names.index(channels[i])]. Raises ChannelError with reason "length" (names and
-    values differ in number), "name" (a channel is missing or duplicated) or "finite" (a value of
-    the channels is NaN or infinite).
+    v_i = values[names.index(channels[i])]. Raises ChannelError with reason "length" if names and
+    values differ in number, "name" if a channel is missing or duplicated, or "finite" if a value of
+    the channels is NaN or infinite.
     """
     if len(names) != len(values):
         raise ChannelError("length", f"{len(names)} names for {len(values)} values")
@@ -173,16 +173,16 @@ def select(
         vector = np.array(values, dtype=np.float64)
     else:
         vector = np.asarray(values, dtype=np.float64)[_places(tuple(channels), tuple(names))]
-    # a third of the time of np.isfinite for a few channels
+    # for a few channels this takes a third of the time of np.isfinite
     if not all(map(math.isfinite, vector.tolist())):
         raise ChannelError("finite", f"{', '.join(channels)} = {vector.tolist()} is not finite")
     return vector
 
 
 def selection_matrix(channels: Sequence[str], names: Sequence[str]) -> FloatArray:
-    """The matrix that selects the channels by its product with values.
+    """Return the matrix whose product with values selects the channels.
 
-    1 where a row of `channels` and a column of `names` are the same channel, else 0.
+    An entry is 1 if its row of `channels` and its column of `names` are the same channel, else 0.
     """
     matrix = np.zeros((len(channels), len(names)))
     for row, channel in zip(matrix, channels, strict=True):
@@ -192,7 +192,7 @@ def selection_matrix(channels: Sequence[str], names: Sequence[str]) -> FloatArra
 
 @lru_cache(maxsize=256)
 def _places(channels: tuple[str, ...], names: tuple[str, ...]) -> NDArray[np.intp]:
-    """Places of the channels among the names. Raises ChannelError as `select` does."""
+    """Find the places of the channels among the names. Raises ChannelError as `select` does."""
     for name in channels:
         if names.count(name) != 1:
             raise ChannelError(

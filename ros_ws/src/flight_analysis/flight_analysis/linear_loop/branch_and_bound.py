@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Proof of stability for every aircraft of a box, where a bound of the whole box is too large.
+"""Proves stability for every aircraft of a box whose bound as a whole is too large.
 
 The box is halved along one parameter, and each half again, over the frequencies that are left.
 Source: M. P. Newlin, P. M. Young, International Journal of Robust and Nonlinear Control 7, 1997.
@@ -23,21 +23,21 @@ from flight_analysis.linear_loop.structured_value import (
 from flight_analysis.linear_loop.uncertain_loop import Channels, ComplexArray
 from flight_core.vectors import FloatArray
 
-LEVELLED = 8  # frequencies at which the ratios of the D of a late u are sought
-DIGITS = 5  # of D and G in a step
+LEVELLED = 8  # frequencies at which the ratios of D for the channels of a late u are sought
+DIGITS = 5  # significant digits of D and G in a step
 
 
 class Region(NamedTuple):
-    """abs(d - centre) <= half of each parameter, (r,), at the frequencies from low to high."""
+    """The aircraft with abs(d - centre) <= half, (r,), at the frequencies from low to high."""
 
     centre: FloatArray
     half: FloatArray
     low: float  # rad/s
     high: float
-    scaling: Scaling | None = None  # of a larger box or of a neighbouring frequency
+    scaling: Scaling | None = None  # D and G of a larger box or of a neighbouring frequency
 
     def halves(self, i: int) -> list["Region"]:
-        """Both halves along a parameter."""
+        """Return both halves along a parameter."""
         half = self.half.copy()
         half[i] /= 2.0
         step = np.zeros(len(half))
@@ -46,22 +46,24 @@ class Region(NamedTuple):
         return [narrowed._replace(centre=self.centre + side * step) for side in (-1.0, 1.0)]
 
     def outside(self, begin: float, end: float) -> list["Region"]:
-        """The frequencies below and above an interval, rad/s."""
+        """Return what is left of the frequencies below and above an interval, rad/s."""
         below = self._replace(high=begin)
         above = self._replace(low=end)
         return [side for side in (below, above) if side.high > side.low]
 
 
 def proof_of(part: Channels, size: float, disk: float, most: int) -> list[dict[str, Any]] | None:
-    """The steps that prove the loop stable; None if `most` boxes are too few.
+    """Find the steps that prove the loop stable; None if `most` steps are too few.
 
-    The proof holds for every abs(d_i) <= size, any delays of the part from tick to tick, and
-    complex disks of a size in the channels of disks. The loop of d = 0 is stable. None of the box
-    has a mode on abs(z) = RADIUS, so none leaves.
+    The proof holds for all abs(d_i) <= size, for any delays of the part from tick to tick, and for
+    complex disks of size `disk` in the channels of disks. It starts from d = 0, where the loop is
+    stable, and shows that no aircraft of the box has a mode on abs(z) = RADIUS. The eigenvalues
+    move continuously over the box, so none of them can leave the circle.
 
-    A step takes the last box of a list, at first the whole one from 0 to pi / T. It halves the box
-    along an entry, {"halve": i}, and appends both halves; or it proves the box from "low" to
-    "high", rad/s, by "t" and "g", and appends what is left below and above.
+    Each step takes the last box of a list, which at first holds the whole box from 0 to pi / T.
+    Either the step halves this box along an entry, {"halve": i}, and appends both halves; or it
+    proves the box from "low" to "high", rad/s, by "t" and "g", and appends what is left below and
+    above.
     """
     highest = np.pi / part.period
     narrowest = NARROWEST * highest
@@ -71,9 +73,12 @@ def proof_of(part: Channels, size: float, disk: float, most: int) -> list[dict[s
     regions = [Region(centre=np.zeros(len(half)), half=half, low=0.0, high=highest)]
     steps: list[dict[str, Any]] = []
     while regions and len(steps) < most:
+        # Depth first: the last region is the smallest, and its D and G are a good start for the
+        # next.
         region = regions.pop()
         w = _frequency(region, highest)
         around = part.at(region.centre)
+        # Bound mu of the deviations of this region, scaled to 1, at one frequency.
         scale = np.r_[region.half[part.parameters], others]
         M = scale[:, None] * around.response(w, RADIUS)
         bound, scaling = tightened_at(around, w, M, region.scaling)
@@ -82,11 +87,11 @@ def proof_of(part: Channels, size: float, disk: float, most: int) -> list[dict[s
         if interval is None:
             entry = int(np.argmax(_effects(part, M, scaling)))
             if region.half[entry] < NARROWEST * size:
-                return None  # around a mode on the circle, which rounding may hide
+                return None  # a mode lies on the circle, and rounding may hide it
             steps.append({"halve": entry})
             regions += region.halves(entry)
         else:
-            # to the ends of the region where rounding is left
+            # extend to the ends of the region if only rounding is left beyond
             begin, end = interval
             low = region.low if begin - region.low <= narrowest else begin
             high = region.high if region.high - end <= narrowest else end
@@ -96,9 +101,9 @@ def proof_of(part: Channels, size: float, disk: float, most: int) -> list[dict[s
 
 
 def _as_step(scaling: Scaling, entries: int) -> dict[str, list[float]]:
-    """D and G as `t` and `g`, rounded: any of them prove what they prove.
+    """Round D and G to `t` and `g` of a step; any D and G prove a bound, so this is safe.
 
-    Those of the means alone where the others follow from them, as in `tightened_at`.
+    Only those of the means are written if the others follow from them, as in `tightened_at`.
     """
     count = len(scaling.t) if scaling.g[entries:].any() else entries
     t, g = ([float(f"{x:.{DIGITS}g}") for x in values[:count]] for values in scaling)
@@ -106,20 +111,20 @@ def _as_step(scaling: Scaling, entries: int) -> dict[str, list[float]]:
 
 
 def _frequency(region: Region, highest: float) -> float:
-    """The frequency of a region to bound: the ends 0 and pi / T, where M is real, first."""
+    """Choose the frequency of a region to bound: first the ends 0 and pi / T, where M is real."""
     if region.low == 0.0:
         return 0.0
     return highest if region.high == highest else float(np.sqrt(region.low * region.high))
 
 
 def _levelled(part: Channels, scale: FloatArray) -> Channels:
-    """The channels of a late u so scaled that at the worst frequency one factor of D serves them.
+    """Scale the channels of a late u so that one factor of D serves them at the worst frequency.
 
-    What changes from tick to tick has the same D at all frequencies, up to a common factor.
+    What changes from tick to tick must have the same D at all frequencies, up to a common factor.
     """
     if not part.late:
         return part
-    # the means of the entries over a period suffice for the ratios
+    # the means of the entries over a period are enough for the ratios
     k = len(part.entries)
     rows = np.r_[0:k, part.uncertain : len(scale)]
     worst, level = 0.0, np.zeros(part.late)
@@ -135,7 +140,7 @@ def _levelled(part: Channels, scale: FloatArray) -> Channels:
 
 
 def _effects(part: Channels, M: ComplexArray, scaling: Scaling) -> FloatArray:
-    """How far the bound of M falls with the half width of each parameter, up to a factor."""
+    """Estimate how the bound of M falls with the half width of each parameter, up to a factor."""
     scale = np.exp(scaling.t)
     N = scale[:, None] * M / scale
     centre = Centre(np.ones(len(N)), scaling.g[: part.uncertain], np.eye(len(N)))

@@ -2,12 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """A guarantee as a file: for a check without this stack, and for the pages of later flights.
 
-examples/check_certificate.py reads a certificate. It has the sampled loop in numbers, the box of
-its entries, and the steps of the proof. The checker computes the motion over a period again, and
-bounds what the Legendre coefficients leave out.
+examples/check_certificate.py reads a certificate, which contains the sampled loop in numbers, the
+box of its entries, and the steps of the proof. The checker computes the motion over a period again,
+and bounds what the Legendre coefficients leave out.
 
-A report shows the guarantee that was computed for its loop, and computes none. These are kept in
-the folder rise-di/guarantees in $XDG_CACHE_HOME, or in ~/.cache, by the digest of the loop.
+A report shows the guarantee that was computed for its loop, but computes none itself. Guarantees
+are kept in the folder rise-di/guarantees in $XDG_CACHE_HOME, or in ~/.cache, by the digest of the
+loop.
 """
 
 import hashlib
@@ -26,21 +27,21 @@ from flight_analysis.linear_loop.told import Standing
 from flight_core.files import write_file
 from flight_core.parameters import require
 
-BOUND = 5  # counts the ways by which this stack has bounded a loop
+BOUND = 5  # version of the method by which this stack bounds a loop
 
 
 def certificate(linear: LinearLoop, promise: Guarantee, sources: Mapping[str, str]) -> str:
-    """The certificate of a guarantee, JSON.
+    """Write the certificate of a guarantee, as JSON.
 
     Args:
         linear: The loop, with the box of the guarantee, of any size.
-        promise: Its guarantee, u in time.
-        sources: What the loop is of, by name: SHA-256 of the airframe and of the scenario, and the
-            text of the exported constants.
+        promise: Its guarantee, with u in time.
+        sources: What the loop belongs to, by name: SHA-256 of the airframe and of the scenario, and
+            the text of the exported constants.
 
     Raises:
-        ParameterError: Nothing is proved, a lag is in the box, or u may be late: the coefficients
-            of a late u have no bound of what they leave out.
+        ParameterError: Nothing is proved, a lag is in the box, or u may be late: what the
+            coefficients of a late u leave out has no bound.
     """
     require(promise.stable > 0.0, "certificate", "no stable box", "a loop with a guarantee")
     require(promise.late == 0.0, "certificate", f"u up to {promise.late:g} s late", "u in time")
@@ -66,7 +67,7 @@ def certificate(linear: LinearLoop, promise: Guarantee, sources: Mapping[str, st
 
 
 def keep(promise: Guarantee) -> None:
-    """Keep a guarantee with u in time. A folder that cannot be written keeps none."""
+    """Keep a guarantee with u in time, unless its folder cannot be written."""
     if promise.late:
         return
     path = _path(promise.loop)
@@ -80,24 +81,24 @@ def keep(promise: Guarantee) -> None:
 def kept_guarantee(linear: LinearLoop) -> Guarantee | None:
     """Return the guarantee that was computed for a loop and that holds for its aircraft.
 
-    None without one, for a damaged file, and where `unstated` has a reason.
+    Returns None if there is none, if its file is damaged, or if `unstated` has a reason.
     """
     promise = _kept(linear)
     return None if promise is None or unstated(linear, promise) else promise
 
 
 def unstated(linear: LinearLoop, promise: Guarantee) -> tuple[str, ...]:
-    """Return why a guarantee is not stated of the aircraft that flies; empty if it holds there.
+    """Return why a guarantee cannot be stated for the aircraft that flies; empty if it can.
 
-    It is of a linear loop, so it does not speak of what the loop leaves out, and of the aircraft
-    within its box.
+    A guarantee holds for a linear loop and for the aircraft within its box, so it says nothing
+    about what the loop leaves out.
     """
     reasons = [each.sentence for each in linear.differences if each.standing is not Standing.TAKEN]
     return (*reasons, *_beyond_box(linear, promise))
 
 
 def beyond_kept(linear: LinearLoop) -> tuple[str, ...]:
-    """Return the sentence of an aircraft beyond the guarantee that was computed for its loop."""
+    """Return the sentence about an aircraft beyond the guarantee that was computed for its loop."""
     promise = _kept(linear)
     return () if promise is None else _beyond_box(linear, promise)
 
@@ -122,6 +123,6 @@ def _kept(linear: LinearLoop) -> Guarantee | None:
 
 
 def _path(loop: str) -> Path:
-    """The file of the guarantee of a loop, by its digest."""
+    """Return the file of the guarantee of a loop, by the digest of the loop."""
     caches = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(caches) / "rise-di" / "guarantees" / f"{loop}.{BOUND}.json"

@@ -13,7 +13,7 @@ MAX_DELAY_MARGIN = 0.5
 """s, upper end of the search for a delay margin. A loop that tolerates more is slower than any loop
 of this stack."""
 
-NEAR = 4  # of the resolution, first step of the search about the delay margin of a loop nearby
+NEAR = 4  # times the resolution: first step of a search that begins at the margin of a similar loop
 
 
 def delay_margin(
@@ -24,12 +24,13 @@ def delay_margin(
     longest: float = MAX_DELAY_MARGIN,
     near: float | None = None,
 ) -> float:
-    """Delay margin: pure delay beyond loop.delay, s, at the limit of stability of the loop.
+    """Find the delay margin: pure delay beyond loop.delay, s, at the limit of stability.
 
-    Input i is late by `share`_i, (m,), of the delay: all inputs by the same delay, or a part of
-    them. 0 if the loop is unstable without extra delay, infinite if the loop tolerates `longest`,
-    s. The search takes steps of half a period, then bisects down to 0.1 ms. With the margin of a
-    loop `near` this one, s, the search begins there, in a third of the time.
+    Input i is late by `share`_i, (m,), of the delay, so you can delay all inputs alike or only some
+    of them. The margin is 0 if the loop is unstable without extra delay, and infinite if the loop
+    tolerates `longest`, s. The search takes steps of half a period, then bisects down to 0.1 ms. If
+    you give the margin of a similar loop as `near`, s, the search begins there and takes a third of
+    the time.
     """
     delayed = np.broadcast_to(share, loop.lag.shape)
     stride = 1  # in parts of 0.1 ms or less

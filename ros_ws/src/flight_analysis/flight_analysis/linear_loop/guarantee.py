@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What holds for every aircraft of a box.
 
-The guarantee has the deviation up to which the loop is stable, and the remaining disk margins. The
-deviations are constant in time and the loop is linear: no saturation, no rate limit.
+A guarantee states the deviation up to which the loop is stable, and the disk margins that remain.
+Deviations are constant in time and the loop is linear, without saturation or rate limits.
 """
 
 from collections.abc import Sequence
@@ -26,20 +26,20 @@ from flight_core.parameters import require
 from flight_core.vectors import FloatArray
 from rise_di_controller.law.linear_loop import LoopTiming, closed_loop, is_stable
 
-LARGEST = 0.99  # part of an entry up to which an unstable aircraft is sought
-WIDEST_DISK = 2.0  # a disk of 2 leaves 180 deg
+LARGEST = 0.99  # relative deviation up to which an unstable aircraft is sought
+WIDEST_DISK = 2.0  # a disk of 2 means a phase margin of 90 deg and any gain
 EXACT = 1.002  # factor on the deviations of an unstable aircraft until the exact loop confirms it
-CONFIRMED = 10  # such factors that are tried
+CONFIRMED = 10  # number of such factors that are tried
 
-# gaps between what is proved and what was found: the first that is proved, then finer ones
+# gaps between what is proved and what was found; the first is tried first, then finer ones
 GAPS = (0.08, 0.16, 0.32, 0.64, 1.28, 2.56)
 FINER_GAPS = (0.04, 0.02, 0.01, 0.005)
-BOXES = 1500  # up to the first gap
-FEWER_BOXES = 300  # at the others, and of disks
-# part of the deviations that is proved beyond those that are stated: it covers the coefficients
-# that are left out, and what a check by intervals loses
+BOXES = 1500  # for the first gap
+FEWER_BOXES = 300  # for the other gaps, and for disks
+# How much larger deviations are proved than are stated, as a fraction: this covers the coefficients
+# that are left out, and what a check by intervals loses.
 SLACK = 2e-3
-NAMED = 12  # digits of a digest that name a certificate
+NAMED = 12  # digits of a digest, which name a certificate
 
 
 class Unstable(NamedTuple):
@@ -51,19 +51,20 @@ class Unstable(NamedTuple):
 
 
 class Guarantee(NamedTuple):
-    """What holds for every aircraft of a box; `stable` and `unstable` as parts of each entry."""
+    """What holds for every aircraft of a box, where sizes are fractions of each entry."""
 
     uncertainty: float  # largest relative deviation in the box
     stable: float  # every aircraft within this deviation is stable, at most 1
-    unstable: Unstable | None  # the first one found; None up to LARGEST
-    # balanced disk margin that every aircraft of the box has, by input, the others closed
+    unstable: Unstable | None  # the first one found; None if there is none up to LARGEST
+    # balanced disk margin at an input that every aircraft of the box has, other loops closed
     disk: dict[str, float]
     disk_all: float  # with independent disks in all inputs at once
     loop: str  # digest of the loop
-    late: float = 0.0  # s: u is late by an unknown time of 0 to this, another one at each tick
+    # s: u is late by an unknown time from 0 to this, which changes from tick to tick
+    late: float = 0.0
     has_exact_lags: bool = True  # whether no lag of an actuator is in the box
-    exact: tuple[str, ...] = ()  # entries of A and B, not 0, that are no part of the box
-    proof: Sequence[dict[str, Any]] = ()  # "entries" and "steps" of each part, see `proof_of`
+    exact: tuple[str, ...] = ()  # nonzero entries of A and B that are not part of the box
+    proof: Sequence[dict[str, Any]] = ()  # with "entries" and "steps" of each part, see `proof_of`
 
     @property
     def holds(self) -> bool:
@@ -72,11 +73,11 @@ class Guarantee(NamedTuple):
 
     @property
     def certificate(self) -> str:
-        """The name of its certificate; "" without one: a late u, a lag, or nothing proved."""
+        """Name of its certificate; "" for a late u, a lag in the box, or nothing proved."""
         return self.loop[:NAMED] if self.stable and not self.late and self.has_exact_lags else ""
 
     def as_json(self) -> dict[str, Any]:
-        """All but the proof."""
+        """Return everything except the proof."""
         content = self._asdict() | {"holds": self.holds}
         del content["proof"]
         if self.unstable is not None:
@@ -85,10 +86,10 @@ class Guarantee(NamedTuple):
 
 
 def guarantee(linear: LinearLoop, late: float = 0.0) -> Guarantee:
-    """The guarantee for the box of a loop, with u late in each input.
+    """Compute the guarantee for the box of a loop, with u late in each input.
 
-    u is late by an unknown time of 0 to `late`, s, another one at each tick. Raises ParameterError
-    for a loop without a box.
+    u is late by an unknown time from 0 to `late`, s, which changes from tick to tick. Raises
+    ParameterError if the loop has no box.
     """
     box = linear.box
     require(box is not None, "uncertainty", "0", "an uncertainty above 0 for a guarantee")
@@ -111,7 +112,7 @@ def guarantee(linear: LinearLoop, late: float = 0.0) -> Guarantee:
     uncertain = uncertain_loop(linear.nominal, linear.law, linear.loop, box, late)
     first = _first_unstable(linear, late)
     size = (1.0 if first is None else first.deviation) / largest
-    # of lags more than that is not proved
+    # nothing larger is proved for lags
     most = MOST_OF_LAG / float(box.part[is_lag].max()) if is_lag.any() else np.inf
     exact = first is None or most < size
     proved, proof = _proved(parts_of(uncertain), min(size, most), disks=False, exact=exact)
@@ -125,17 +126,17 @@ def guarantee(linear: LinearLoop, late: float = 0.0) -> Guarantee:
     disks = {}
     for i, name in enumerate(linear.inputs):
         least_found = min(float(least.disk[i]) for least in worst)
-        # disks in all inputs at once cover a disk in one
+        # disks in all inputs at once include a disk in one input
         disks[name] = max(_disk(uncertain, (i,), least_found), disk_all)
     return promise._replace(disk=disks, disk_all=disk_all)
 
 
 def _exact_entries(linear: LinearLoop, box: Box) -> tuple[str, ...]:
-    """The entries of A and B of the aircraft that are not 0 and the same in every aircraft."""
+    """List the nonzero entries of A and B that are the same in every aircraft of the box."""
     states = linear.states
     moved = (box.E != 0.0).astype(float) @ (box.F != 0.0)
     rows, columns = np.nonzero((linear.nominal.A != 0.0) & (moved == 0.0))
-    # behind the states there may be actuators, whose rows are their lags
+    # actuators may follow the states, and their rows hold their lags
     places = [place for place in zip(rows, columns, strict=True) if max(place) < len(states)]
     left_out = [name for name, part in zip(box.names, box.part, strict=True) if not part]
     names = [*left_out, *(f"A[{states[i]},{states[j]}]" for i, j in places)]
@@ -143,13 +144,13 @@ def _exact_entries(linear: LinearLoop, box: Box) -> tuple[str, ...]:
 
 
 def _loops(linear: LinearLoop, late: float) -> list[LoopTiming]:
-    """The loop with u in time, and with u late by the whole time."""
+    """Return the loop with u in time, and with u late by the whole time."""
     loop = linear.loop
     return [loop._replace(delay=loop.delay + extra) for extra in sorted({0.0, late})]
 
 
 def _first_unstable(linear: LinearLoop, late: float) -> Unstable | None:
-    """The first unstable aircraft found."""
+    """Search for an unstable aircraft, and return the first one found."""
     box = linear.box
     assert box is not None  # noqa: S101 - for mypy
     largest = LARGEST / float(box.part.max())
@@ -162,17 +163,17 @@ def _first_unstable(linear: LinearLoop, late: float) -> Unstable | None:
 
 
 def _disk(loop: Channels, inputs: tuple[int, ...], least: float) -> float:
-    """The disk margin of every aircraft of the box, with the least one found."""
+    """Return the disk margin that every aircraft of the box has, given the least one found."""
     return _proved(parts_of(loop, inputs), min(least, WIDEST_DISK), disks=True)[0]
 
 
 def _proved(
     parts: list[Channels], least: float, *, disks: bool, exact: bool = False
 ) -> tuple[float, list[dict[str, Any]]]:
-    """The largest size proved beside the least one found that is too large, and the proof.
+    """Prove the largest size possible below `least`, which was found to be too large.
 
-    The size is of the deviations, or of the disks beside the whole box; 0 where none is proved.
-    With `exact` least itself may be proved.
+    The size is that of the deviations, or that of the disks over the whole box; 0 if none is
+    proved. With `exact`, `least` itself may be proved. The proof comes second.
     """
     for proved in (*(0.0,) * exact, *GAPS):
         most = FEWER_BOXES if disks or proved > GAPS[0] else BOXES
@@ -194,7 +195,7 @@ def _proved(
 def _proof(
     parts: list[Channels], size: float, most: int, *, disks: bool
 ) -> list[dict[str, Any]] | None:
-    """The proof of each part, of a size SLACK larger; None if `most` boxes are not enough."""
+    """Prove each part for a size larger by SLACK; None if `most` boxes are not enough."""
     proof = []
     for part in parts:
         deviation, disk = (1.0, size) if disks else ((1.0 + SLACK) * size, 0.0)
@@ -207,7 +208,7 @@ def _proof(
 
 
 def _confirmed(linear: LinearLoop, d: FloatArray) -> Unstable | None:
-    """The aircraft of deviations d, a little larger where the exact loop asks for it."""
+    """Return the aircraft of deviations d, made a little larger if the exact loop requires it."""
     box = linear.box
     assert box is not None  # noqa: S101 - for mypy
     still = np.zeros(len(linear.inputs))

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Margins of the sampled linear loop of a law at the inputs of an aircraft.
 
-They are phase, gain, sensitivity, disk margin and damping.
+They are phase and gain margin, sensitivity, disk margin and damping.
 
-With P(z) from u to y, the sampled aircraft with actuators and delay, and K(z) from y to u, the law:
+P(z) is the sampled aircraft from u to y, with actuators and delay, and K(z) the law from y to u:
 
-    S(z) = (I - K P)^-1,    L_i(z) = 1 / S_ii(z) - 1  loop transfer function with input i alone open
+    S(z) = (I - K P)^-1,    L_i(z) = 1 / S_ii(z) - 1  loop transfer function, input i alone open
 
 on z = exp(j w T), 0 < w <= pi / T. Sources: K. J. Astrom, R. M. Murray, "Feedback Systems", chapter
 10, for phase, gain and sensitivity; P. Seiler, A. Packard, P. Gahinet, "An Introduction to Disk
@@ -34,12 +34,12 @@ IntArray = NDArray[np.intp]
 
 DECADES = 5
 PER_DECADE = 40
-"""Grid of frequencies below pi / T. The frequencies of the modes are added, and eight points around
-every peak."""
+"""Grid of frequencies below pi / T. The frequencies of the modes are added to it, and eight points
+around every peak."""
 
 SLOW = np.pi / 2.0
-"""rad, largest natural frequency times T of a slow mode: four ticks a cycle. A faster mode shows in
-gain margin and S."""
+"""rad, natural frequency times T up to which a mode counts as slow: four ticks a cycle. A faster
+mode shows in gain margin and S."""
 
 # rad, natural frequency times T below which an eigenvalue belongs to an integral or a kept constant
 NO_MODE = 1e-6
@@ -61,12 +61,12 @@ MAX_REFINED = 40
 class Margins(NamedTuple):
     """Margins at m inputs, shapes (..., m), and of the loop as a whole, (...).
 
-    An unstable loop has none: 0, 1, infinite S.
+    An unstable loop has no margins: they are 0 or 1, and S is infinite.
     """
 
     stable: NDArray[np.bool_]  # (...) whether no eigenvalue lies outside the unit circle
     phase: FloatArray  # (..., m) rad, infinite where abs(L_i) is never 1
-    crossover: FloatArray  # (..., m) rad/s of this phase margin, 0 without a crossover
+    crossover: FloatArray  # (..., m) rad/s, frequency of this phase margin, 0 without a crossover
     gain_decrease: (
         FloatArray  # (..., m) factor below 1 at which the loop turns unstable, 0 without a limit
     )
@@ -76,7 +76,7 @@ class Margins(NamedTuple):
     sensitivity_all: (
         FloatArray  # (...) largest singular value of S, scaled diagonally: all inputs at once
     )
-    disk_all: FloatArray  # (...) balanced disk margin, independent disks in the inputs at once
+    disk_all: FloatArray  # (...) balanced disk margin, with independent disks in all inputs at once
     damping: FloatArray  # (...) least damping ratio of a slow mode, 1 without a slow mode
 
     @property
@@ -86,7 +86,7 @@ class Margins(NamedTuple):
             return np.minimum(self.gain_increase, 1.0 / self.gain_decrease)
 
     def worst(self) -> "Margins":
-        """The worst of N aircraft figure by figure, from shapes (N, m) and (N,)."""
+        """Return the worst of N aircraft figure by figure, from shapes (N, m) and (N,)."""
         least = {name: np.asarray(value.min(axis=0)) for name, value in self._asdict().items()}
         most = {
             name: np.asarray(getattr(self, name).max(axis=0))
@@ -101,13 +101,13 @@ class Margins(NamedTuple):
 
 
 def disk_gain(disk: FloatArray) -> FloatArray:
-    """Gain margin of a balanced disk margin, a factor up and down: (2 + disk) / (2 - disk)."""
+    """Convert a balanced disk margin to a gain margin, up and down: (2 + disk) / (2 - disk)."""
     with np.errstate(divide="ignore"):
         return np.asarray((2.0 + disk) / np.maximum(2.0 - disk, 0.0))
 
 
 def disk_phase(disk: FloatArray) -> FloatArray:
-    """Phase margin of a balanced disk margin, rad: 2 atan(disk / 2)."""
+    """Convert a balanced disk margin to a phase margin, rad: 2 atan(disk / 2)."""
     return np.asarray(2.0 * np.arctan(disk / 2.0))
 
 
@@ -119,7 +119,7 @@ class SlowModes(NamedTuple):
 
 
 def slow_modes(plant: LinearPlant, law: LinearLaw, loop: LoopTiming) -> SlowModes:
-    """The slow modes of an aircraft: frequency abs(p) and damping -Re p / abs(p).
+    """Compute the slow modes of an aircraft: frequency abs(p) and damping -Re p / abs(p).
 
     p = log(eigenvalue) / T.
     """
@@ -137,7 +137,7 @@ def _slow_modes(eigenvalues: ComplexArray, period: float) -> SlowModes:
 def loop_transfer(
     plant: LinearPlant, law: LinearLaw, loop: LoopTiming, w: FloatArray
 ) -> ComplexArray:
-    """L_i of an aircraft at the frequencies w, (F,) rad/s up to pi / T, shape (F, m)."""
+    """Compute L_i of an aircraft at the frequencies w, (F,) rad/s up to pi / T, shape (F, m)."""
     form = schur_form(LinearPlant(plant.A[None], plant.B[None], plant.C), law, loop)
     S = _sensitivity(form, np.exp(1j * w * loop.period)[None])[0]
     return np.asarray(1.0 / np.einsum("...ii->...i", S) - 1.0)
@@ -146,18 +146,18 @@ def loop_transfer(
 def input_margins(
     plant: LinearPlant, law: LinearLaw, loop: LoopTiming, *, together: bool = True
 ) -> Margins:
-    """Margins of an aircraft, or of N aircraft.
+    """Compute the margins of an aircraft, or of N aircraft.
 
-    N aircraft have A (N, n, n) and B (N, n, m) of the plant, and a common law or a law for each
-    aircraft. Crossings of the grid of frequencies are refined to rounding, peaks to 1e-3 of the
-    height. The phase margin is the smallest abs(angle(-L_i)) at abs(L_i) = 1, the gain margins are
-    1 / abs(L_i) at real L_i < 0, next to 1 on either side. The disk margin is 1 / max_w abs(S_ii -
-    1/2) of an input, and with independent disks in the inputs at once
+    N aircraft have A (N, n, n) and B (N, n, m) of the plant, and either a common law or one law
+    each. Crossings found on the grid of frequencies are refined to rounding, peaks to 1e-3 of their
+    height. The phase margin is the smallest abs(angle(-L_i)) at abs(L_i) = 1. The gain margins are
+    the values of 1 / abs(L_i) at real L_i < 0 that are next to 1 on either side. The disk margin of
+    an input is 1 / max_w abs(S_ii - 1/2); with independent disks in all inputs at once it is
 
         1 / max_w min_D norm(D (S - I/2) D^-1, 2),  D diagonal
 
-    exact for m <= 3 and at most the disk margin for more inputs. Without `together` the figures of
-    all inputs at once are NaN, which saves a third of the time.
+    which is exact for m <= 3 and at most the disk margin for more inputs. Without `together`, the
+    figures of all inputs at once are NaN, which saves a third of the time.
     """
     shape = _batch_shape(plant, law)
     parts = [
@@ -173,10 +173,10 @@ def input_margins(
 
 
 def phase_margins(plant: LinearPlant, law: LinearLaw, loop: LoopTiming) -> FloatArray:
-    """The `phase` of `input_margins` alone, (..., m), to 1e-8.
+    """Compute only the `phase` of `input_margins`, (..., m), to 1e-8.
 
-    There is no search for gain margins and peaks. A loop with independent modes is a sum over the
-    modes.
+    There is no search for gain margins and peaks. If the modes of a loop are independent, it is
+    evaluated as a sum over them.
     """
     parts = []
     for aircraft, its_law in _batches(plant, law):
@@ -192,7 +192,7 @@ def phase_margins(plant: LinearPlant, law: LinearLaw, loop: LoopTiming) -> Float
 
 
 def _phases(form: "SchurForm", period: float) -> FloatArray:
-    """The phase margins of the aircraft of a batch, (N, m), rad."""
+    """Compute the phase margins of the aircraft of a batch, (N, m), rad."""
     w = _frequencies(form.eigenvalues, period)
     L = _loop_of_sensitivity(_sensitivity(form, np.exp(1j * w * period)))
     phase, _ = _phase_margins(form, w, L, period)
@@ -220,7 +220,7 @@ class SchurForm(NamedTuple):
 
 
 def _batches(plant: LinearPlant, law: LinearLaw) -> Iterator[tuple[LinearPlant, LinearLaw]]:
-    """An aircraft, or N, with a law each, in batches."""
+    """Split an aircraft, or N of them, each with its law, into batches."""
     shape = _batch_shape(plant, law)
     count = int(np.prod(shape))
 
@@ -239,7 +239,7 @@ def _batches(plant: LinearPlant, law: LinearLaw) -> Iterator[tuple[LinearPlant, 
 
 
 def schur_form(plant: LinearPlant, law: LinearLaw, loop: LoopTiming) -> SchurForm:
-    """The closed loops of N aircraft: A (N, n, n), B (N, n, m) under one law or N laws."""
+    """Bring the closed loops of N aircraft, A (N, n, n), B (N, n, m), into Schur form."""
     from scipy.linalg import schur  # noqa: PLC0415 - a controller without an observer starts without it
 
     A, B, K = _from_inputs_to_inputs(plant, law, loop)
@@ -251,16 +251,16 @@ def schur_form(plant: LinearPlant, law: LinearLaw, loop: LoopTiming) -> SchurFor
 def _modal_form(
     plant: LinearPlant, law: LinearLaw, loop: LoopTiming
 ) -> tuple[SchurForm, NDArray[np.bool_]]:
-    """As `schur_form` with a diagonal T, and whether the modes of a loop are independent.
+    """Return a form with a diagonal T, and whether the modes of each loop are independent.
 
-    They are independent where the condition of their vectors is at most MOST_CONDITION.
+    They count as independent if the condition of their eigenvectors is at most MOST_CONDITION.
     """
     A, B, K = _from_inputs_to_inputs(plant, law, loop)
     eigenvalues, modes = (part.astype(np.complex128) for part in np.linalg.eig(A))
     size = np.linalg.norm(modes, axis=(1, 2))
     try:
         inverse: ComplexArray = np.linalg.inv(modes).astype(np.complex128)
-    except np.linalg.LinAlgError:  # equal vectors to the bit
+    except np.linalg.LinAlgError:  # vectors that are equal to the bit
         inverse = np.full_like(modes, np.inf)
     with np.errstate(over="ignore"):
         independent = size * np.linalg.norm(inverse, axis=(1, 2)) <= MOST_CONDITION
@@ -271,9 +271,9 @@ def _modal_form(
 def _from_inputs_to_inputs(
     plant: LinearPlant, law: LinearLaw, loop: LoopTiming
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The closed loops of N aircraft from a disturbance d of the inputs to u.
+    """Return the closed loops of N aircraft from a disturbance d of the inputs to u.
 
-    z+ = A z + B d, u = K z.
+    z+ = A z + B d, u = K z
     """
     no_delay = np.zeros(len(loop.lag))
     N, _, m = plant.B.shape
@@ -284,9 +284,9 @@ def _from_inputs_to_inputs(
 
 
 def _sensitivity(form: SchurForm, z: ComplexArray) -> ComplexArray:
-    """S at the points z (N, F), shape (N, F, m, m), by back substitution.
+    """Compute S at the points z (N, F), shape (N, F, m, m), by back substitution.
 
-    The points of a part are solved at once. With a diagonal T, S is a sum over the modes.
+    Points are solved many at a time. If T is diagonal, S is a sum over the modes.
     """
     (N, k, m), F = form.R.shape, z.shape[1]
     if form.T.ndim == z.ndim:
@@ -307,7 +307,7 @@ def _sensitivity(form: SchurForm, z: ComplexArray) -> ComplexArray:
 
 
 def _margins(form: SchurForm, period: float, *, together: bool) -> Margins:
-    """Margins of the aircraft of a batch."""
+    """Compute the margins of the aircraft of a batch."""
     stable = _stable(form)
     m = form.R.shape[-1]
     w, S = on_grid(form, period)
@@ -346,21 +346,21 @@ def _stable(form: SchurForm) -> NDArray[np.bool_]:
 
 
 def on_grid(form: SchurForm, period: float) -> tuple[FloatArray, ComplexArray]:
-    """The grids of the aircraft, (N, F), rad/s, and S on them, balanced, (N, F, m, m)."""
+    """Return the grids of the aircraft, (N, F), rad/s, and the balanced S on them, (N, F, m, m)."""
     w = _frequencies(form.eigenvalues, period)
     return w, _balanced(_sensitivity(form, np.exp(1j * w * period)))
 
 
 def _loop_of_sensitivity(S: ComplexArray) -> ComplexArray:
-    """L_i = 1 / S_ii - 1, (N, F, m)."""
+    """Compute L_i = 1 / S_ii - 1, (N, F, m)."""
     with np.errstate(divide="ignore"):
         return np.asarray(1.0 / np.einsum("NFii->NFi", S) - 1.0)
 
 
 def _frequencies(eigenvalues: ComplexArray, period: float) -> FloatArray:
-    """Grids of the aircraft, (N, F), rad/s, ascending.
+    """Return the grids of the aircraft, (N, F), rad/s, ascending.
 
-    They are a common grid, and the frequencies of the modes.
+    Each is a common grid plus the frequencies of the modes.
     """
     highest = np.pi / period
     turns = np.log(np.where(np.abs(eigenvalues) > VANISHED, eigenvalues, VANISHED)) / period
@@ -371,9 +371,9 @@ def _frequencies(eigenvalues: ComplexArray, period: float) -> FloatArray:
 
 
 def _around_peaks(S: ComplexArray, w: FloatArray) -> FloatArray:
-    """Four points on either side of each peak, (N, G).
+    """Place four points on either side of each peak, (N, G).
 
-    S_ii, S_ii - 1/2 and norms over the inputs, S balanced, have the peaks.
+    The peaks are those of S_ii, of S_ii - 1/2 and of norms over the inputs, with S balanced.
     """
     diagonal = np.einsum("NFii->NFi", S)
     half = S - np.eye(S.shape[-1]) / 2.0
@@ -397,7 +397,7 @@ def _around_peaks(S: ComplexArray, w: FloatArray) -> FloatArray:
 
 
 def _crossings(values: FloatArray) -> tuple[IntArray, IntArray, IntArray]:
-    """Aircraft, place and input of the changes of sign along the second axis of (N, F, m)."""
+    """Find aircraft, place and input of the changes of sign along the second axis of (N, F, m)."""
     return np.nonzero(np.signbit(values[:, :-1]) != np.signbit(values[:, 1:]))  # type: ignore[return-value]
 
 
@@ -409,12 +409,12 @@ def _refined(
     period: float,
     residual: Callable[[ComplexArray], FloatArray],
 ) -> tuple[FloatArray, ComplexArray]:
-    """Frequencies of residual(L_i) = 0 in the intervals of some crossings, and L_i there.
+    """Refine crossings to the frequencies where residual(L_i) = 0, and return L_i there as well.
 
-    The method is regula falsi, Illinois.
+    The method is regula falsi with the Illinois modification.
     """
     aircraft, place, channel = places
-    # the rows and columns of the input of the crossing alone
+    # only the row and column of the input that crosses
     forms = SchurForm(
         form.T[aircraft], form.R[aircraft, :, channel, None], form.L[aircraft, None, channel]
     )
@@ -434,7 +434,8 @@ def _refined(
         L = 1.0 / S[:, 0, 0] - 1.0
         value = residual(L)
         side = np.where(np.signbit(value) == np.signbit(at_high), 1.0, -1.0)
-        share = np.where(side == before, 0.5, 1.0)  # an end kept twice has the value halved
+        # the value at an end that is kept twice is halved
+        share = np.where(side == before, 0.5, 1.0)
         low = np.where(side > 0.0, low, middle)
         high = np.where(side > 0.0, middle, high)
         at_low = np.where(side > 0.0, share * at_low, value)
@@ -445,13 +446,13 @@ def _refined(
 
 def _log_gain(L: ComplexArray) -> FloatArray:
     with np.errstate(divide="ignore"):
-        return np.maximum(np.log(np.abs(L)), -700.0)  # L = 0 where no feedback acts
+        return np.maximum(np.log(np.abs(L)), -700.0)  # L = 0 if no feedback acts
 
 
 def _phase_margins(
     form: SchurForm, w: FloatArray, L: ComplexArray, period: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Smallest abs(angle(-L_i)) at abs(L_i) = 1 and the frequency, (N, m)."""
+    """Find the smallest abs(angle(-L_i)) at abs(L_i) = 1, and its frequency, (N, m)."""
     gains = _log_gain(L)
     places = _crossings(gains)
     frequency, crossing = _refined(form, w, places, gains, period, _log_gain)
@@ -467,14 +468,14 @@ def _phase_margins(
 def _gain_margins(
     form: SchurForm, w: FloatArray, L: ComplexArray, period: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Factors next to 1 below and above for L_i = -1, (N, m).
+    """Find the factors next to 1, below and above, with which L_i = -1, (N, m).
 
-    L_i is real at w = 0 and at pi / T too.
+    L_i is also real at w = 0 and at pi / T.
     """
     imaginary = np.imag(L) / (1.0 + np.abs(L))
-    imaginary[:, -1] = 0.0  # rounding apart
+    imaginary[:, -1] = 0.0  # real there, apart from rounding
     places = _crossings(imaginary)
-    inside = places[1] < L.shape[1] - 2  # the last point is looked at by itself
+    inside = places[1] < L.shape[1] - 2  # the last point is treated separately
     places = (places[0][inside], places[1][inside], places[2][inside])
     _, crossing = _refined(
         form, w, places, imaginary, period, lambda L: np.imag(L) / (1.0 + np.abs(L))
@@ -493,7 +494,7 @@ def _gain_margins(
 
 
 def _narrow(decrease: FloatArray, increase: FloatArray, place: tuple[int, int], L: float) -> None:
-    """Take 1 / abs(L) of a real L < 0 as a limit of the gain."""
+    """Narrow the limits of the gain by 1 / abs(L) of a real L < 0."""
     if L < 0.0:
         factor = -1.0 / L
         if factor > 1.0:
@@ -506,7 +507,7 @@ def _narrow(decrease: FloatArray, increase: FloatArray, place: tuple[int, int], 
 
 
 def _balanced(matrices: ComplexArray) -> ComplexArray:
-    """D M D^-1, (..., m, m), with about equal norms of row i and column i without the diagonal.
+    """Balance matrices: D M D^-1, (..., m, m), with similar norms of row i and column i.
 
     The method is Osborne's iteration.
     """
@@ -526,17 +527,18 @@ def _balanced(matrices: ComplexArray) -> ComplexArray:
 
 
 def norm_bound(matrices: ComplexArray) -> FloatArray:
-    """sqrt(norm(M, 1) norm(M, inf)) >= norm(M, 2), over the last two axes."""
+    """Compute sqrt(norm(M, 1) norm(M, inf)) >= norm(M, 2), over the last two axes."""
     sizes = np.abs(matrices)
     return np.asarray(np.sqrt(sizes.sum(axis=-1).max(axis=-1) * sizes.sum(axis=-2).max(axis=-1)))
 
 
 def scaled_norm(matrices: ComplexArray) -> FloatArray:
-    """min_D norm(D M D^-1, 2) over diagonal D > 0, M (P, m, m), shape (P,).
+    """Compute min_D norm(D M D^-1, 2) over diagonal D > 0, M (P, m, m), shape (P,).
 
-    The result bounds the structured singular value. Osborne's iteration, then descent along d log
-    norm / d log D_i = abs(u_i)^2 - abs(v_i)^2, u and v the singular vectors. Any D gives an upper
-    bound: an early end is conservative. Source: A. Packard, J. Doyle, Automatica 29(1), 1993.
+    The result bounds the structured singular value. Osborne's iteration comes first, then a descent
+    along d log norm / d log D_i = abs(u_i)^2 - abs(v_i)^2 with the singular vectors u and v. Any D
+    gives an upper bound, so ending early is conservative. Source: A. Packard, J. Doyle, Automatica
+    29(1), 1993.
     """
     M = _balanced(matrices)
     best = np.full(len(M), np.inf)
@@ -549,13 +551,13 @@ def scaled_norm(matrices: ComplexArray) -> FloatArray:
 
 
 def _largest_norm(balanced: ComplexArray) -> FloatArray:
-    """Largest `scaled_norm` over the second axis of (N, F, m, m).
+    """Return the largest `scaled_norm` over the second axis of (N, F, m, m).
 
-    The peak of an upper bound is refined to convergence.
+    Only the peak of an upper bound is refined, until it converges.
     """
     bounds = norm_bound(balanced)
     rows = np.arange(len(balanced))
-    # a diagonal entry, unchanged by D
+    # a diagonal entry, which D does not change
     least = np.abs(np.einsum("NFii->NFi", balanced)).max(axis=(1, 2))
     near = bounds > least[:, None]
     bounds[near] = np.linalg.norm(balanced[near], ord=2, axis=(1, 2))

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Margins of the linear loop of a scenario under the law of the controller.
 
-They are taken on the nominal and on uncertain aircraft.
+They are computed for the nominal and for uncertain aircraft.
 """
 
 import hashlib
@@ -46,16 +46,16 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 LAG_ENTRY = "1/lag"  # begins the name of an entry of an actuator
 LEAST_LAG = 2.0  # periods
 MOST_OF_LAG = 0.8
-"""The largest deviation d of 1 / lag that is proved: with a lag of LEAST_LAG the two Legendre
-coefficients of a period leave out less of it than a thousandth, half of what is proved beyond
-what is stated, and more above."""
+"""The largest deviation d of 1 / lag for which a proof holds. With a lag of LEAST_LAG, the two
+Legendre coefficients of a period leave out less than a thousandth of it, which is half of what is
+proved beyond what is stated; for larger deviations they leave out more."""
 
 BARE = (
     "; each output integrates its inputs, without drag and phugoid: the margins cover Omega alone"
 )
 
 
-ROUNDING = 1e-9  # relative deviation of an entry that is none
+ROUNDING = 1e-9  # relative deviation of an entry that counts as none
 DIGITS = 10  # of numbers in a digest: two ways to the same loop differ by rounding
 
 
@@ -63,13 +63,13 @@ class LinearLoop(NamedTuple):
     """The loop of a controller around a model of its aircraft; channels in the law's order."""
 
     model: str  # what the plant is the model of
-    states: tuple[str, ...]  # of the aircraft; behind these, if any, actuators whose lag deviates
+    states: tuple[str, ...]  # of the aircraft, followed by those actuators whose lag deviates
     outputs: tuple[str, ...]  # that the law reads, vanes last
     inputs: tuple[str, ...]
     plant: LinearPlant  # of N aircraft, the nominal one first: A (N, n, n), B (N, n, m)
     law: LinearLaw
     loop: LoopTiming
-    box: Box | None = None  # of the uncertain aircraft; None without any
+    box: Box | None = None  # of the uncertain aircraft; None if there are none
     # how the aircraft that flies differs from what the controller was told
     differences: tuple[Difference, ...] = ()
     # largest deviation of its A and B from the airframe file, in the measure of the box
@@ -77,14 +77,14 @@ class LinearLoop(NamedTuple):
 
     @property
     def nominal(self) -> LinearPlant:
-        """The nominal aircraft."""
+        """Nominal aircraft."""
         return LinearPlant(self.plant.A[0], self.plant.B[0], self.plant.C)
 
     @property
     def digest(self) -> str:
         """SHA-256 of the numbers of the nominal loop and of its box, to DIGITS digits.
 
-        The box counts by its shape: a guarantee finds the size.
+        Of the box only the shape counts, because a guarantee finds the size.
         """
         loop = self.loop
         arrays = [*self.nominal, *self.law, loop.lag, loop.delay, loop.period]
@@ -103,12 +103,12 @@ class LoopMargins(NamedTuple):
     nominal: Margins
     modes: SlowModes  # of the nominal aircraft
     delay: float  # s, delay margin of the nominal aircraft, u late in all inputs
-    channel_delay: tuple[float, ...]  # s, u late in one input alone
-    # least of the uncertain aircraft, figure by figure; None without any
+    channel_delay: tuple[float, ...]  # s, with u late in one input only
+    # least margins of the uncertain aircraft, figure by figure; None if there are none
     worst: Margins | None = None
     worst_delay: float | None = None  # s
     aircraft: int = 0  # number of uncertain aircraft
-    stable: int = 0  # number of those that are stable
+    stable: int = 0  # number of them that are stable
     by_search: bool = False  # whether `worst` is that of a search over the box, not of samples
 
 
@@ -119,13 +119,13 @@ def margins(
     seed: int = 1,
     spread: Spread = UNIFORM,
 ) -> LoopMargins:
-    """Margins of a scenario's loop, and the least among uncertain aircraft.
+    """Compute the margins of a scenario's loop, and the least margins among uncertain aircraft.
 
-    A search finds the least. Every entry of A and B of an uncertain aircraft is off by up to
-    `uncertainty`, or as `spread` says, the rows of angles excepted. Samples count for the number of
-    stable aircraft alone: the least margins are at corners, where none falls. Lags and delay are
-    those of the aircraft where the controller was told others, exact unless `spread` has an entry
-    1/lag[INPUT]. The uncertainty of the scenario itself is left out.
+    A search finds the least margins. Every entry of A and B of an uncertain aircraft is off by up
+    to `uncertainty`, or as `spread` says, except in the rows of angles. Drawn samples only serve to
+    count the stable aircraft, because the least margins lie at corners, where no sample falls. Lags
+    and delay are those of the aircraft, even if the controller was told others; they are exact
+    unless `spread` has an entry 1/lag[INPUT]. The uncertainty of the scenario itself is left out.
 
     Args:
         scenario: The flight: aircraft and controller.
@@ -155,7 +155,7 @@ def margins(
 
 
 def loop_margins(linear: LinearLoop) -> LoopMargins:
-    """The margins of a loop: of the nominal aircraft, and the worst of the uncertain aircraft."""
+    """Compute the margins of the nominal aircraft, and the worst of the uncertain ones."""
     if linear.box is not None and len(linear.plant.A) > 1:
         return _assessed_by_search(linear, linear.box)
     together = input_margins(linear.plant, linear.law, linear.loop)
@@ -186,7 +186,7 @@ def loop_margins(linear: LinearLoop) -> LoopMargins:
 
 
 def _assessed_by_search(linear: LinearLoop, box: Box) -> LoopMargins:
-    """The margins with the worst of the box by search; the samples count for stability alone."""
+    """Search the box for the worst margins; the samples only count for stability."""
     nominal = loop_margins(linear._replace(plant=_some(linear.plant, slice(1)), box=None))
     samples = closed_loop(
         _some(linear.plant, slice(1, None)), linear.law, linear.loop, np.zeros(len(linear.inputs))
@@ -204,10 +204,10 @@ def _assessed_by_search(linear: LinearLoop, box: Box) -> LoopMargins:
 
 
 def _least_delay(linear: LinearLoop, nominal: float) -> float:
-    """The smallest delay margin of the aircraft of a loop, at most the nominal delay margin, s.
+    """Find the smallest delay margin of the aircraft of a loop, at most the nominal one, s.
 
-    The aircraft are tried together with a delay in steps of half a period, or of 1/12 of a longer
-    nominal margin.
+    All aircraft are tried together with a delay that rises in steps of half a period, or of 1/12 of
+    the nominal margin if that is longer.
     """
     longest = min(nominal, MAX_DELAY_MARGIN)
     uncertain = linear.plant
@@ -240,10 +240,10 @@ def scenario_loop(
     spread: Spread = UNIFORM,
     flight: FlightFacts = PLANNED,
 ) -> LinearLoop:
-    """The loop of a controller around the nominal and uncertain aircraft of a scenario.
+    """Build the loop of a controller around the nominal and uncertain aircraft of a scenario.
 
-    Lags and delay are those that fly: of the aircraft in the scenario, or as a flight shows.
-    Raises as `margins`.
+    Lags and delay are those that fly: of the aircraft in the scenario, or as a flight shows them.
+    Raises as `margins` does.
     """
     airframe = scenario_model(scenario, controller)
     comparison = compare(scenario, controller, flight)
@@ -259,14 +259,15 @@ def scenario_loop(
 
 
 def as_compared(linear: LinearLoop, scenario: Scenario, comparison: Comparison) -> LinearLoop:
-    """Return the loop with how the aircraft of a scenario differs from what it is taken for."""
+    """Return the loop with how the aircraft differs from what the controller was told."""
     return _with_deviation(linear._replace(differences=comparison.differences), scenario)
 
 
 def _with_deviation(linear: LinearLoop, scenario: Scenario) -> LinearLoop:
     """Return the loop with the deviation of the aircraft that the scenario draws.
 
-    0 for the airframe as in its file, infinite where an entry deviates that is exact in the box.
+    The deviation is 0 for the airframe as in its file, and infinite if an entry deviates that is
+    exact in the box.
     """
     if linear.box is None or scenario.aircraft.is_jsbsim:
         return linear
@@ -291,14 +292,14 @@ def linear_loop(
     B: FloatArray,
     timing: LoopTiming | None = None,
 ) -> LinearLoop:
-    """The loop of a controller around N aircraft, A (N, n, n) and B (N, n, m).
+    """Build the loop of a controller around N aircraft, A (N, n, n) and B (N, n, m).
 
-    An airframe has the states and channels. `timing` None: as the controller was told. Raises
-    ParameterError for the literal sign.
+    The airframe gives the states and channels. If `timing` is None, it is what the controller was
+    told. Raises ParameterError for the literal sign.
     """
     rows, columns = law_order(airframe, controller)
     loop = loop_of(controller) if timing is None else timing
-    # y_dot = Omega u has no angles: the observer of y alone
+    # y_dot = Omega u has no angles, so use the observer of y alone
     if not set(controller.vanes) <= set(airframe.states):
         controller = controller.without_vanes()
     states = np.array(list(airframe.states))
@@ -325,14 +326,14 @@ def with_box(
     seed: int,
     spread: Spread,
 ) -> LinearLoop:
-    """The loop of the nominal and sampled aircraft of a seed, with the box of these.
+    """Return the loop of the nominal aircraft and those of a seed, with the box around them.
 
-    The box is None where nothing deviates. A lag that deviates is an entry of the plant, and 0 in
+    The box is None if nothing deviates. A lag that deviates becomes an entry of the plant, and 0 in
     the loop:
 
         x_dot = A x + B u_a,  u_a_dot = (1 + d) / lag (u - u_a),  states x and u_a
 
-    Raises ParameterError as `of_matrices_and_lags`.
+    Raises ParameterError as `of_matrices_and_lags` does.
     """
     box = box_of(airframe, controller, uncertainty, spread)
     _, parts = of_matrices_and_lags(spread, linear.loop, controller.inputs)
@@ -344,10 +345,10 @@ def with_box(
 def of_matrices_and_lags(
     spread: Spread, timing: LoopTiming, inputs: Sequence[str]
 ) -> tuple[Spread, dict[int, float]]:
-    """The entries of A and B, and the relative deviation of 1 / lag by input of the law.
+    """Separate the entries of A and B from the relative deviations of 1 / lag by input of the law.
 
-    An entry of a lag is 1/lag[INPUT]. Raises ParameterError for an unknown entry that is none of A
-    or B, a lag below LEAST_LAG periods, and a part outside [0, 1).
+    An entry of a lag is 1/lag[INPUT]. Raises ParameterError for an unknown entry, a lag below
+    LEAST_LAG periods, and a deviation outside [0, 1).
     """
     least = LEAST_LAG * timing.period
     known = {
@@ -374,7 +375,7 @@ def of_matrices_and_lags(
 def with_lags_pulled_out(
     linear: LinearLoop, box: Box, parts: Mapping[int, float], seed: int, spread: Spread
 ) -> tuple[LinearLoop, Box]:
-    """The loop and its box with the actuators of some inputs as states of the plant."""
+    """Return the loop and its box with the actuators of some inputs as states of the plant."""
     places = [*parts]
     count, n, m = linear.plant.B.shape
     size = len(places)
@@ -382,7 +383,7 @@ def with_lags_pulled_out(
     part = np.array([*parts.values()])
     uniform = random_streams.uniform(0, count - 1, m, random_streams.EQUIPMENT, seed)[:, places]
     d = np.vstack([np.zeros(size), deviations(uniform, spread.distribution)])
-    # u_a of the inputs S' u, and the other inputs
+    # u_a of the inputs S' u, then the other inputs
     S = np.eye(m)[:, places]
     others = np.eye(m) - S @ S.T
     rates = (rate * (1.0 + part * d))[:, :, None] * np.eye(size)
@@ -412,9 +413,10 @@ def box_of(
     uncertainty: float,
     spread: Spread = UNIFORM,
 ) -> Box:
-    """The box of the aircraft that `nominal_and_sampled` draws around an airframe file.
+    """Return the box of the aircraft that `nominal_and_sampled` draws around an airframe file.
 
-    The channels are in the law's order. Behind an allocation B of every effector is uncertain.
+    Its channels are in the law's order. If there is an allocation, B of every effector is
+    uncertain.
     """
     airframe_of_law = through_allocation(airframe, controller)
     T = distribution(airframe, controller)[:, law_order(airframe_of_law, controller)[1]]
@@ -434,7 +436,7 @@ def box_of(
             G[entry] = size * T[j]
     effectors = list(airframe.inputs)
     if not _has_effectors(airframe, controller):
-        # the effectors are the inputs of the law, in its order
+        # here the effectors are the inputs of the law, in its order
         order = [effectors.index(name) for name in controller.inputs]
         effectors, T = list(controller.inputs), T[order]
     return Box(names=tuple(places), part=part, E=E, F=F, G=G, effectors=tuple(effectors), T=T)
@@ -445,9 +447,9 @@ def _some(plant: LinearPlant, names: slice) -> LinearPlant:
 
 
 def through_allocation(airframe: Airframe, controller: ControllerConfig) -> Airframe:
-    """The airframe as the law of a controller sees it: with the inputs v, u = T v.
+    """Return the airframe as the law of a controller sees it: with the inputs v, u = T v.
 
-    Without an allocation the airframe stays.
+    Without an allocation the airframe stays as it is.
     """
     if not _has_effectors(airframe, controller):
         return airframe
@@ -455,9 +457,9 @@ def through_allocation(airframe: Airframe, controller: ControllerConfig) -> Airf
 
 
 def distribution(airframe: Airframe, controller: ControllerConfig) -> FloatArray:
-    """T (p, m) with the rows in the order of the inputs of an airframe.
+    """Return T (p, m) with its rows in the order of the inputs of an airframe.
 
-    I without an allocation of these.
+    It is I if no allocation distributes these inputs.
     """
     allocation = controller.allocation
     if allocation is None or not _has_effectors(airframe, controller):
@@ -469,7 +471,7 @@ def distribution(airframe: Airframe, controller: ControllerConfig) -> FloatArray
 def _has_effectors(airframe: Airframe, controller: ControllerConfig) -> bool:
     """Whether an allocation stands between the law and the inputs of an airframe.
 
-    The model of an aircraft of JSBSim has the inputs of the law.
+    The model of an aircraft of JSBSim already has the inputs of the law.
     """
     return controller.allocation is not None and set(airframe.inputs) != set(controller.inputs)
 
@@ -477,11 +479,11 @@ def _has_effectors(airframe: Airframe, controller: ControllerConfig) -> bool:
 def delay_margins(
     scenario: Scenario, controller: ControllerConfig, flight: FlightFacts = PLANNED
 ) -> dict[str, Any]:
-    """Delay margins of the nominal linear loop, s.
+    """Compute the delay margins of the nominal linear loop, s.
 
-    u is late in every channel, or in a single channel, by output. The least margin that is allowed
-    is there too. Empty without a linear loop: an aircraft of JSBSim, the literal sign. 0 where the
-    loop is unstable with its own lag.
+    u is late either in every channel or in a single one, named by its output. The least margin that
+    is allowed is included. The result is empty if there is no linear loop (an aircraft of JSBSim,
+    the literal sign). A margin is 0 if the loop is unstable with its own lag.
     """
     if scenario.aircraft.is_jsbsim or is_literal(controller):
         return {}
@@ -498,14 +500,14 @@ def delay_margins(
 
 
 def is_literal(controller: ControllerConfig) -> bool:
-    """Whether a controller samples the literal sign: no linear loop."""
+    """Whether a controller samples the literal sign, which has no linear loop."""
     return isinstance(controller, RiseDiConfig) and controller.sampled_sign()[0] is Sign.LITERAL
 
 
 def law_order(airframe: Airframe, controller: ControllerConfig) -> tuple[list[int], list[int]]:
-    """Indices of the law's outputs and inputs in the order of an airframe.
+    """Return the indices of the law's outputs and inputs in the order of an airframe.
 
-    Raises ParameterError for an airframe without these.
+    Raises ParameterError if the airframe lacks any of them.
     """
     for key, known in (("outputs", airframe.outputs), ("inputs", tuple(airframe.inputs))):
         names = getattr(controller, key)
@@ -516,15 +518,15 @@ def law_order(airframe: Airframe, controller: ControllerConfig) -> tuple[list[in
 
 
 def scenario_model(scenario: Scenario, controller: ControllerConfig) -> Airframe:
-    """The airframe of a scenario, or y_dot = Omega u for an aircraft of JSBSim.
+    """Return the airframe of a scenario, or y_dot = Omega u for an aircraft of JSBSim.
 
-    The law has the inputs, and the controller gives Omega. Omega comes from the feedforward, or
-    from abs(Omega_ii) = omega / input_scale of RISE-DI, an upper bound.
+    The latter has the inputs of the law, and the controller gives Omega: from the feedforward, or
+    from abs(Omega_ii) = omega / input_scale of RISE-DI, which is an upper bound.
     """
     aircraft = scenario.aircraft
     if not aircraft.is_jsbsim:
         return load_airframe(aircraft.airframe)
-    # The controller has A and B of its feedforward, or a bound of Omega.
+    # The controller knows A and B of its feedforward, or a bound of Omega.
     if controller.feedforward is not None and set(controller.feedforward.states) == set(
         controller.outputs
     ):

@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Upper bound of the structured singular value of a loop, over intervals of frequency.
 
-mu(M) is 1 / the size of the least Delta = diag(delta_i) with det(I - M Delta) = 0, delta_i real or
-complex. For any D = diag(exp(t)) and G = diag(g), g_i = 0 at complex channels,
+mu(M) is 1 / the size of the least Delta = diag(delta_i) for which det(I - M Delta) = 0, with
+delta_i real or complex. For any D = diag(exp(t)) and G = diag(g), with g_i = 0 at complex channels,
 
     mu(M)^2 <= lambda_max(N* N + j (G N - N* G)),    N = D M D^-1
 
-Every D and G gives a valid bound: an early end of the search costs tightness alone. Source: M. K.
+Every D and G gives a valid bound, so ending the search early only costs tightness. Source: M. K.
 H. Fan, A. L. Tits, J. C. Doyle, IEEE Transactions on Automatic Control 36(1), 1991.
 """
 
@@ -19,26 +19,26 @@ from flight_analysis.linear_loop.uncertain_loop import Channels, ComplexArray
 from flight_core.vectors import FloatArray
 from rise_di_controller.law.linear_loop import SPECTRAL_RADIUS_TOLERANCE
 
-RADIUS = 1.0 + SPECTRAL_RADIUS_TOLERANCE  # abs(z) of the limit of stability
+RADIUS = 1.0 + SPECTRAL_RADIUS_TOLERANCE  # abs(z) at the limit of stability
 
 # rounds of the search for D and G
 BALANCE_ROUNDS = 6
 LARGEST_G = 1e3
 LEVELS = 40
 CENTRING = 6
-LENGTHS = tuple(0.6**k for k in range(20))  # of Newton's step
-CENTRED = 0.5  # decrement at a centre
-FALL = 0.3  # of the way from the level to the bound that is left
-STALLED = 1e-3  # part of the bound by which the level is above it at the end
+LENGTHS = tuple(0.6**k for k in range(20))  # lengths of Newton's step that are tried
+CENTRED = 0.5  # decrement of Newton's method at which a point counts as the centre
+FALL = 0.3  # fraction of the way from the level to the bound that is left after a fall
+STALLED = 1e-3  # how far the level may stay above the bound at the end, as a fraction of the bound
 
-NARROWEST = 1e-8  # part of pi / T: less than LARGEST_G leaves around a frequency of a real M
-MEANS_UP_TO = 0.3  # rad a period: up to there the second coefficients count for less than 0.1 %
+NARROWEST = 1e-8  # of pi / T: less than what LARGEST_G leaves around a frequency at which M is real
+MEANS_UP_TO = 0.3  # rad a period: below this the second coefficients count for less than 0.1 %
 TINY = 1e-30
-# abs(log abs(z)) below which an eigenvalue of the pencil counts as on the circle: what is found
-# too much costs a shorter interval
+# abs(log abs(z)) below which an eigenvalue of the pencil counts as on the circle: a spurious one
+# only costs a shorter interval
 ON_CIRCLE = 1e-7
-# points of an interval at which the bound is computed again, and of each of its decades: rounding
-# hides a crossing beside an integrator, where the pencil has eigenvalues of high multiplicity
+# number of points of an interval, and of each of its decades, at which the bound is checked again:
+# rounding hides a crossing beside an integrator, where the pencil has multiple eigenvalues
 CHECKED = 8
 DECADES = 6
 
@@ -51,7 +51,7 @@ class Scaling(NamedTuple):
 
 
 def balanced(M: ComplexArray) -> FloatArray:
-    """Find log D, (p,), that makes row and column of a channel about equally large.
+    """Find log D, (p,), that makes row and column of each channel about equally large.
 
     The method is Osborne's iteration.
     """
@@ -69,7 +69,7 @@ def balanced(M: ComplexArray) -> FloatArray:
 
 
 def bound_at(M: ComplexArray, scaling: Scaling) -> FloatArray:
-    """The bound of some matrices (..., p, p) by a D and a G."""
+    """Evaluate the bound of matrices (..., p, p) for given D and G."""
     N = np.exp(scaling.t)[:, None] * M * np.exp(-scaling.t)
     skew = 1j * scaling.g[:, None] * N
     adjoint = np.conj(np.swapaxes(N, -1, -2))
@@ -80,18 +80,18 @@ def bound_at(M: ComplexArray, scaling: Scaling) -> FloatArray:
 def tightened(
     M: ComplexArray, real: int, target: float, alike: int = 0, near: Scaling | None = None
 ) -> tuple[float, Scaling]:
-    """A bound of M, (p, p), the first `real` channels real, with the D and G of a search.
+    """Tighten the bound of M, (p, p), by a search for D and G; the first `real` channels are real.
 
-    The `alike` channels behind these have one factor of D. The search begins at the balanced D, or
-    at the D and G of a matrix `near` M if their bound is less.
+    The next `alike` channels share one factor of D. The search begins at the balanced D, or at the
+    D and G of a matrix `near` M if their bound is smaller.
 
-    Below `target` D and G are in the middle of the set with the target. The method of centres on
-    the linear matrix inequality
+    Once the bound is below `target`, D and G lie in the middle of the set that reaches the target.
+    The method of centres on the linear matrix inequality
 
         F = level D - N* D N - j (G N - N* G) > 0,  trace D = p,  D > 0,  abs(g_i) < LARGEST_G
 
-    minimises -log det F - log det D - sum log(LARGEST_G^2 - g^2) by Newton's method, for a level
-    that falls. Source: S. Boyd, L. El Ghaoui, Linear Algebra and its Applications 188, 1993.
+    minimises -log det F - log det D - sum log(LARGEST_G^2 - g^2) by Newton's method while the level
+    falls. Source: S. Boyd, L. El Ghaoui, Linear Algebra and its Applications 188, 1993.
     """
     t = balanced(M)
     if alike:
@@ -124,9 +124,9 @@ def tightened(
 def tightened_at(
     part: Channels, w: float, scaled: ComplexArray, near: Scaling | None
 ) -> tuple[float, Scaling]:
-    """A bound of a scaled M(w) of a part as by `tightened` to 1.
+    """Bound a scaled M(w) of a part, as `tightened` does for the target 1.
 
-    D and G of the means over a period are taken where these suffice. The D of the second
+    If D and G of the means over a period are enough, they are taken. The D of the second
     coefficients then balances rows and columns.
     """
     k = len(part.entries)
@@ -148,25 +148,25 @@ def tightened_at(
 
 
 class Centre(NamedTuple):
-    """D and G of the inequality."""
+    """D and G of the inequality, while its centre is sought."""
 
     d: FloatArray  # (p,)
     g: FloatArray  # (real,)
-    free: FloatArray  # (p, f), d = free x: channels with one factor share a column
+    free: FloatArray  # (p, f), d = free x: channels that share a factor share a column
 
     def inequality(self, N: ComplexArray, level: float) -> ComplexArray:
-        """F, (p, p)."""
+        """Compute F, (p, p)."""
         skew = 1j * np.r_[self.g, np.zeros(len(N) - len(self.g))][:, None] * N
         right = (N.conj().T * self.d) @ N + skew + skew.conj().T
         return np.asarray(level * np.diag(self.d) - right)
 
     def bound(self, N: ComplexArray) -> float:
-        """The least level of these D and G."""
+        """Return the least level for this D and G."""
         root = np.sqrt(self.d)
         return -float(np.linalg.eigvalsh(self.inequality(N, 0.0) / root[:, None] / root)[0])
 
     def stepped(self, N: ComplexArray, level: float) -> tuple["Centre", float]:
-        """The D and G of a Newton step, and the decrement of Newton's method, 0 at the centre."""
+        """Take a Newton step of D and G, and return its decrement too, which is 0 at the centre."""
         real = len(self.g)
         P = np.linalg.inv(self.inequality(N, level))
         R = N @ P
@@ -193,29 +193,29 @@ class Centre(NamedTuple):
             longer = self.moved(length * step)
             if longer.inside(N, level):
                 return longer, decrement
-        return self, 0.0  # rounding
+        return self, 0.0  # no length helps: only rounding is left
 
     def moved(self, step: FloatArray) -> "Centre":
-        """D and G after a step, (p + real,)."""
+        """Move D and G by a step, (p + real,)."""
         f = self.free.shape[1]
         return Centre(self.d + self.free @ step[:f], self.g + step[f:], self.free)
 
     def inside(self, N: ComplexArray, level: float) -> bool:
-        """Whether the inequality and the limits hold, all of it finite."""
+        """Whether the inequality and the limits hold, and everything is finite."""
         if not (self.d.min() > 0.0 and np.abs(self.g).max(initial=0.0) < LARGEST_G):
             return False
         F = self.inequality(N, level)
         try:
-            # the factor of a matrix with a NaN raises nothing
+            # cholesky does not raise for a matrix with a NaN
             return bool(np.isfinite(F).all() and np.isfinite(np.linalg.cholesky(F)).all())
         except np.linalg.LinAlgError:
             return False
 
 
 def crossings(part: Channels, scaling: Scaling, scale: FloatArray) -> FloatArray:
-    """Frequencies, rad/s, ascending, at which diag(scale) M(z) passes the bound 1 by a D and a G.
+    """Find where diag(scale) M(z) crosses the bound 1 of a D and a G: frequencies, rad/s.
 
-    lambda_max(N* N + j (G N - N* G)) = 1 on abs(z) = RADIUS exactly where a pencil of twice the
+    lambda_max(N* N + j (G N - N* G)) = 1 on abs(z) = RADIUS exactly where a pencil with twice the
     states has an eigenvalue there. Source: S. Boyd, V. Balakrishnan, P. Kabamba, Mathematics of
     Control, Signals, and Systems 2, 1989, for the largest singular value.
     """
@@ -244,9 +244,9 @@ def crossings(part: Channels, scaling: Scaling, scale: FloatArray) -> FloatArray
 def interval_at(
     part: Channels, w: float, scaling: Scaling, scale: FloatArray
 ) -> tuple[float, float] | None:
-    """The frequencies around w at which a D and a G of w hold diag(scale) M below 1, rad/s.
+    """Find the frequencies around w for which D and G of w keep diag(scale) M below 1, rad/s.
 
-    None where there are none.
+    Returns None if there are none.
     """
     highest = np.pi / part.period
     ends = crossings(part, scaling, scale)

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the controller was told of its aircraft, beside the aircraft that flies.
+"""What the controller was told of its aircraft, compared with the aircraft that flies.
 
-A linear loop has the lags and the delay of the section `controller`. The section `aircraft` has
-those that fly, and a log what was measured. `compare` says where they differ, and gives the timing
-of the loop that flies. Margins and guarantees are of that loop. A fact that no linear loop holds,
-as a fault, leaves a guarantee unstated.
+A linear loop takes lags and delay from the section `controller`. The section `aircraft` has those
+that fly, and a log those that were measured. `compare` says where they differ, and gives the timing
+of the loop that flies, to which margins and guarantees refer. If something acts that no linear loop
+contains, such as a fault, the guarantee is not stated.
 """
 
 from dataclasses import replace
@@ -28,9 +28,10 @@ from flight_core.vectors import FloatArray
 from rise_di_controller.law.linear_loop import LoopTiming
 from rise_di_controller.params import ControllerConfig
 
-SMALLEST = 1e-6  # s: a microsecond costs no margin that is printed
-SAME_PERIOD = 0.01  # relative: clocks of hosts differ by 1e-4, and a missed tick is none of half
-WAITS = 2.0  # periods of the aircraft: y waits for a tick for up to one, u for the aircraft too
+SMALLEST = 1e-6  # s: a microsecond changes no printed margin
+SAME_PERIOD = 0.01  # relative: clocks of hosts differ by only 1e-4, a missed tick by much more
+# periods of the aircraft: y waits up to one for a tick, and u up to one for the aircraft
+WAITS = 2.0
 
 IN_LOOP = frozenset(
     {
@@ -41,7 +42,7 @@ IN_LOOP = frozenset(
         *("uncertainty.distribution", "uncertainty.wind"),
     }
 )
-"""Keys of the aircraft that a linear loop has, or that are compared with the controller."""
+"""Keys of the aircraft that a linear loop contains, or that are compared with the controller."""
 
 OUTSIDE_LOOP = frozenset(
     {
@@ -60,9 +61,9 @@ OUTSIDE_LOOP = frozenset(
         *(f"pose.{key}" for key in ("rate", "delay", "bias", "drift", "noise", "seed")),
         # Products of small rates and angles are of the second order about trim.
         *("inertial_coupling", "kinematics"),
-        # They act where u is missing.
+        # These act only if u is missing.
         *("max_age", "hold", "ramp"),
-        # How the node runs.
+        # These say how the node runs.
         *("start_time", "lockstep", "control_rate", "duration", "recorded"),
     }
 )
@@ -72,9 +73,10 @@ OUTSIDE_LOOP = frozenset(
 class Standing(Enum):
     """What a difference means for margins and guarantee."""
 
-    TAKEN = auto()  # the loop has the value of the aircraft
-    LEFT_OUT = auto()  # no linear loop has it: the margins are without, no guarantee is stated
-    NO_LOOP = auto()  # what flew is not known: neither is stated
+    TAKEN = auto()  # the loop uses the value of the aircraft
+    # no linear loop contains it: margins leave it out, and no guarantee is stated
+    LEFT_OUT = auto()
+    NO_LOOP = auto()  # nobody knows what flew: neither margins nor guarantee are stated
 
 
 MEANING = {
@@ -85,19 +87,19 @@ MEANING = {
 
 
 class Difference(NamedTuple):
-    """A fact of the aircraft that is not what the controller was told."""
+    """A fact about the aircraft that differs from what the controller was told."""
 
     fact: str  # key, value of the aircraft, value of the controller
     standing: Standing
 
     @property
     def sentence(self) -> str:
-        """The fact, and what it means."""
+        """Fact, and what it means."""
         return f"{self.fact}; {MEANING[self.standing]}"
 
 
 class FlightFacts(NamedTuple):
-    """What is known of a flight beside its scenario; None where a log does not tell."""
+    """What is known of a flight beside its scenario; None if a log does not tell."""
 
     is_simulated: bool = True  # whether the aircraft of the scenario flew
     tick: float | None = None  # s, median period of the ticks
@@ -105,7 +107,7 @@ class FlightFacts(NamedTuple):
     age: float | None = None  # s, mean age of u at the aircraft
     # the aircraft after each change in flight
     later: tuple[AircraftConfig, ...] = ()
-    has_parameters: bool = True  # whether the parameters that flew are those of the file
+    has_parameters: bool = True  # whether the parameters of the file are those that flew
 
 
 PLANNED = FlightFacts()
@@ -128,9 +130,9 @@ def loop_of(controller: ControllerConfig) -> LoopTiming:
 def compare(
     scenario: Scenario, controller: ControllerConfig, flight: FlightFacts = PLANNED
 ) -> Comparison:
-    """Compare what a controller was told with the aircraft that flies it.
+    """Compare what a controller was told with the aircraft that flies.
 
-    Where the two agree, the timing is that of the controller to the last bit.
+    If the two agree, the timing is that of the controller to the last bit.
     """
     timing = loop_of(controller)
     differences = [*_of_log(controller, flight)]
@@ -151,8 +153,8 @@ def lag_through(effect: FloatArray, T: FloatArray, lag: FloatArray) -> FloatArra
 
         lag_i = sum_j effect_ij T_ji lag_j / sum_j effect_ij T_ji,  exact to first order in the lags
 
-    Arguments: `effect` (m, p) of the p effectors on the outputs, T (p, m), lag (p,) in s. Where the
-    effectors have no effect the longest lag counts.
+    `effect` (m, p) is that of the p effectors on the outputs, T has shape (p, m), and lag (p,) is
+    in s. If the effectors have no effect, the longest lag counts.
     """
     share = effect * T.T
     total = share.sum(axis=1)
@@ -177,10 +179,10 @@ def flown_lag(aircraft: AircraftConfig, controller: ControllerConfig) -> FloatAr
 def _compare_lags(
     scenario: Scenario, controller: ControllerConfig
 ) -> tuple[FloatArray, list[Difference]]:
-    """Compare the lags: (those that fly, the differences).
+    """Compare the lags, and return those that fly with the differences.
 
-    A model of JSBSim has actuators of its own, whose lag is not among the keys of the aircraft: the
-    controller may be told of more than these, and of no less.
+    A model of JSBSim has actuators of its own, whose lag is not among the keys of the aircraft. The
+    controller may therefore be told of more lag than the keys have, but not of less.
     """
     lag = np.array(controller.lag, dtype=np.float64)
     flown = flown_lag(scenario.aircraft, controller)
@@ -201,13 +203,13 @@ def _compare_lags(
 def _compare_delays(
     scenario: Scenario, controller: ControllerConfig, flight: FlightFacts
 ) -> tuple[float, list[Difference]]:
-    """Compare the delays beyond sampling: (the one that flies, the differences).
+    """Compare the delays beyond sampling, and return the one that flies with the differences.
 
     y and u each wait for the next instant of the other side, in simulation up to a period of the
-    aircraft. A controller may be told any delay in that range, and the longest is taken for one
-    outside of it. An aircraft of one's own has a transport that nothing tells. A law steps with
-    each y, so that a y less frequent than the ticks is one and a half of its periods late in place
-    of one and a half ticks.
+    aircraft. A controller may be told any delay in that range; if it is told another one, the
+    longest is assumed. If you fly an aircraft of your own, its transport delay is unknown. The law
+    steps with each y, so if y comes less often than the ticks, it is late by one and a half of its
+    own periods instead of one and a half ticks.
     """
     aircraft = scenario.aircraft
     told_delay = controller.delay
@@ -227,7 +229,7 @@ def _compare_delays(
         span = f"{least:.6g} s to {most:.6g} s" if np.isfinite(most) else f"{least:.6g} s or more"
         fact = f"{', '.join(parts)}: {span} in flight, controller.delay {told_delay:.6g} s"
         differences.append(Difference(fact, Standing.TAKEN))
-    # u is held for a tick: a mean within one is no other delay
+    # u is held for a tick, so a mean within one does not show another delay
     if flight.age is not None and flight.age - delay >= 1.0 / controller.rate:
         delay = flight.age
         fact = f"age of u: {flight.age:.3g} s in the log, controller.delay {told_delay:.6g} s"
@@ -258,7 +260,7 @@ def _of_log(controller: ControllerConfig, flight: FlightFacts) -> list[Differenc
 
 
 def _beyond_loop(scenario: Scenario, controller: ControllerConfig) -> list[Difference]:
-    """Compare end stops, rate limits and signs, and name what no linear loop has."""
+    """Compare end stops, rate limits and signs, and name what no linear loop contains."""
     aircraft = scenario.aircraft
     known = IN_LOOP | OUTSIDE_LOOP
     if not controller.vanes:
@@ -273,7 +275,7 @@ def _beyond_loop(scenario: Scenario, controller: ControllerConfig) -> list[Diffe
     flies = replace(scenario, controller=controller)
     beyond = (*limits_beyond_stops(flies), *_slew_beyond_rates(flies))
     differences += [Difference(sentence, Standing.LEFT_OUT) for sentence in beyond]
-    # The loop has B of the airframe, and D of the law.
+    # The loop takes B from the airframe and D from the law.
     signs = (*opposite_signs(flies), *_other_effect(flies))
     differences += [Difference(sentence, Standing.TAKEN) for sentence in signs]
     return differences
@@ -282,7 +284,7 @@ def _beyond_loop(scenario: Scenario, controller: ControllerConfig) -> list[Diffe
 def _other_effect(scenario: Scenario) -> list[str]:
     """Return a sentence for each output whose row of allocation.effect is not that of C B.
 
-    Rows are compared up to a factor, which input_scale has.
+    Rows are compared up to a factor, because input_scale has it.
     """
     controller = scenario.controller
     allocation = controller.allocation

@@ -5,19 +5,20 @@
     A + E diag(d) F,  B + E diag(d) G,  abs(d_i) <= 1
     zeta+ = A zeta + W w + U v,  z = Z zeta + D w + V v,  u = K zeta,  w = d z
 
-z holds the first TERMS Legendre coefficients of F x + G u over a period, w those of the deviation.
-The motion is exact in d but for the coefficients left out, an error of the order of (period
-rate)^4. Source of the lifted loop: T. Chen, B. Francis, "Optimal Sampled-Data Control Systems",
-chapter 10.
+z holds the first TERMS Legendre coefficients of F x + G u over a period, and w those of the
+deviation. The motion is exact in d except for the coefficients that are left out, an error of the
+order of (period rate)^4. Source of the lifted loop: T. Chen, B. Francis, "Optimal Sampled-Data
+Control Systems", chapter 10.
 
-u may be late by an unknown time of 0 to `late`, s, another one at each tick and in each input; the
-newest u that has arrived acts. The input of a period changes by
+u may be late by an unknown time from 0 to `late`, s, which differs from tick to tick and from input
+to input; the newest u that has arrived acts. The input of a period then changes by
 
     w_0 + w_1 ROOT (2 s - 1),  w_0 = -sum_j a_j v_j,  w_1 = sum_j ROOT b_j v_j
 
-with v_j = u_k-j - u_k-j-1. A shift by j + f periods, 0 <= f < 1, is a_i = 1 for i < j, a_j = f,
-b_j = f (1 - f), 0 beyond. Each coefficient is a real d around the middle of its range, which may
-change from tick to tick: the D of these channels is one for all frequencies, their G is 0.
+with v_j = u_k-j - u_k-j-1. For a shift by j + f periods, 0 <= f < 1, a_i = 1 for i < j, a_j = f,
+b_j = f (1 - f), and all further coefficients are 0. Each coefficient is a real d around the middle
+of its range, and may change from tick to tick: these channels have one D for all frequencies, and G
+= 0.
 """
 
 from typing import NamedTuple
@@ -39,16 +40,16 @@ ComplexArray = NDArray[np.complex128]
 IntArray = NDArray[np.intp]
 
 TERMS = 2  # Legendre coefficients of a signal within a period
-# part of the sizes of row and column below which an entry of M counts as 0
+# fraction of the sizes of row and column below which an entry of M counts as 0
 NO_COUPLING = 1e-13
-PATTERN_PARTS = (1e-3, 1e-2, 0.06, 0.25)  # of pi / T: where the pattern of M is taken
+PATTERN_PARTS = (1e-3, 1e-2, 0.06, 0.25)  # of pi / T: where the pattern of M is sampled
 
 
 class Box(NamedTuple):
     """The k uncertain entries of a plant, d_i in [-1, 1].
 
-    d_i changes A by E_i d_i F_i, and B by E_i d_i G_i. A name is A[STATE,STATE], or
-    B[STATE,EFFECTOR] with T from the inputs of the law to the p effectors.
+    d_i changes A by E_i d_i F_i, and B by E_i d_i G_i. An entry is named A[STATE,STATE] or
+    B[STATE,EFFECTOR]; T leads from the inputs of the law to the p effectors.
     """
 
     names: tuple[str, ...]
@@ -61,16 +62,16 @@ class Box(NamedTuple):
 
 
 def plants_at(plant: LinearPlant, box: Box, d: FloatArray) -> LinearPlant:
-    """The plants of some deviations d, (..., k)."""
+    """Return the plants with deviations d, (..., k)."""
     effect = box.E * d[..., None, :]
     return LinearPlant(plant.A + effect @ box.F, plant.B + effect @ box.G, plant.C)
 
 
 class Channels(NamedTuple):
-    """A loop, or a part, as zeta+ = A zeta + W w, z = Z zeta + D w.
+    """A loop, or a part of one, as zeta+ = A zeta + W w, z = Z zeta + D w.
 
-    The real channels of the entries come first, TERMS each, then those of a delay, then disks in
-    inputs. A disk adds v to u and reads u + v / 2: S - I / 2 from v.
+    The real channels of the entries come first, TERMS for each, then those of a delay, then disks
+    in inputs. A disk adds v to u and reads u + v / 2, which is S - I / 2 from v.
     """
 
     A: FloatArray
@@ -79,42 +80,43 @@ class Channels(NamedTuple):
     D: FloatArray
     entries: tuple[int, ...]  # places of the entries in the box
     period: float
-    late: int = 0  # channels of a delay: those of w_0 first, j by j with m inputs, then of w_1
+    # channels of a delay: first those of w_0, for each j with m inputs, then those of w_1
+    late: int = 0
 
     @property
     def uncertain(self) -> int:
-        """Number of the real channels, TERMS an entry."""
+        """Number of the real channels, TERMS for each entry."""
         return TERMS * len(self.entries)
 
     @property
     def parameters(self) -> IntArray:
-        """The number of the entry of each of their channels."""
+        """Number of the entry to which each of these channels belongs."""
         return np.tile(np.arange(len(self.entries)), TERMS)
 
     @property
     def disks(self) -> slice:
-        """The channels of disks."""
+        """Channels of disks."""
         return slice(self.uncertain + self.late, None)
 
     def some(self, channels: IntArray) -> "Channels":
-        """Some channels of the same loop."""
+        """Select some channels of the same loop."""
         D = self.D[np.ix_(channels, channels)]
         return self._replace(W=self.W[:, channels], Z=self.Z[channels], D=D)
 
     def response(self, w: FloatArray | float, radius: float) -> ComplexArray:
-        """M(z) at abs(z) = radius and the frequencies w, (F,) or (), rad/s: (F, p, p)."""
+        """Compute M(z) at abs(z) = radius and the frequencies w, (F,) or (), rad/s: (F, p, p)."""
         z = radius * np.exp(1j * np.asarray(w) * self.period)
         motion = z[..., None, None] * np.eye(len(self.A)) - self.A
         return np.asarray(self.Z @ np.linalg.solve(motion, self.W.astype(complex)) + self.D)
 
     def at(self, d: FloatArray) -> "Channels":
-        """The channels around the aircraft of deviations d, (..., k) of this part."""
+        """Move the channels to the aircraft with deviations d, (..., k) of this part."""
         c = np.zeros((*d.shape[:-1], len(self.D)))
         c[..., : self.uncertain] = np.tile(d, TERMS)
         return self.centred(c)
 
     def centred(self, c: FloatArray) -> "Channels":
-        """The channels around w = diag(c) z, (..., p), in place of w = 0. Leading axes batch."""
+        """Move the channels to w = diag(c) z, (..., p), instead of w = 0. Leading axes batch."""
         columns = c[..., None, :]
         inverse = np.linalg.inv(np.eye(len(self.D)) - self.D * columns)
         Z = inverse @ self.Z
@@ -129,15 +131,15 @@ class Channels(NamedTuple):
 def uncertain_loop(
     plant: LinearPlant, law: LinearLaw, loop: LoopTiming, box: Box, late: float = 0.0
 ) -> Channels:
-    """The loop of a plant, A (n, n), with the entries of a box and a disk in each input pulled out.
+    """Build the loop of a plant, A (n, n), with box entries and input disks pulled out.
 
-    u is late by an unknown time of 0 to `late`, s.
+    u is late by an unknown time from 0 to `late`, s.
     """
     n, m = plant.B.shape
     k = len(box.names)
     size = n + TERMS * k
-    # The aircraft with two integrals of each z = F x + G u behind its states: the means over a
-    # period.
+    # Append two integrals of each z = F x + G u to the states of the aircraft: they give the means
+    # over a period.
     A = np.zeros((size, size))
     A[:n, :n] = plant.A
     A[n : n + k, :n] = box.F / loop.period
@@ -148,13 +150,13 @@ def uncertain_loop(
     pulled = LinearPlant(A, B, C)
     by_tick = sampled_plant(pulled, loop, still)
 
-    # The motion over a period by w, constant or rising, which no actuator delays.
+    # The motion over a period caused by w, constant or rising; no actuator delays it.
     moved = LinearPlant(A, np.vstack([box.E, np.zeros((TERMS * k, k))]), C)
     direct = LoopTiming(np.zeros(k), 0.0, loop.period)
     by_w = [sampled_plant(moved, direct, np.zeros(k), rising=rising) for rising in (False, True)]
     drives = np.hstack([sampled.B[:size] for sampled in by_w])
 
-    # The integrals are read at the end of a period, and are no states of the loop.
+    # The integrals are read at the end of a period, so they are no states of the loop.
     rows = np.r_[0:n, size : len(by_tick.A)]
     P = by_tick.A[np.ix_(rows, rows)]
     Pu = by_tick.B[rows]
@@ -164,7 +166,7 @@ def uncertain_loop(
     W = np.zeros((len(rows) + len(law.A), TERMS * k + m))
     W[:n, : TERMS * k] = drives[:n]
     W[: len(rows), TERMS * k :] = Pu
-    # The law closes the loop.
+    # Close the loop by the law.
     u = np.hstack([law.D @ C, law.C])
     exact = Channels(
         A=np.block([[P + Pu @ law.D @ C, Pu @ law.C], [law.B @ C, law.A]]),
@@ -174,7 +176,7 @@ def uncertain_loop(
         entries=tuple(range(k)),
         period=loop.period,
     )
-    # A delay is channels more.
+    # A delay adds channels.
     if late == 0.0:
         return exact
     ramps = sampled_plant(pulled, loop, still, rising=True)
@@ -182,9 +184,9 @@ def uncertain_loop(
 
 
 def _coefficients(matrix: FloatArray, n: int, k: int) -> FloatArray:
-    """The Legendre coefficients of k channels.
+    """Return the Legendre coefficients of k channels.
 
-    They come from the integrals of z behind n states, and the integrals of these.
+    They follow from the integrals of z, which come after n states, and the integrals of these.
     """
     once = matrix[n : n + k]
     twice = matrix[n + k : n + 2 * k]
@@ -192,16 +194,17 @@ def _coefficients(matrix: FloatArray, n: int, k: int) -> FloatArray:
 
 
 def _blocks(D: FloatArray, V: FloatArray) -> FloatArray:
-    """D of channels with disks in all inputs behind them, V from disks to channels."""
+    """Build D of channels that disks in all inputs follow, with V from disks to channels."""
     m = V.shape[1]
     return np.block([[D, V], [np.zeros((m, len(D))), np.eye(m) / 2.0]])
 
 
 def _with_late(exact: Channels, late: float, ramps: SampledPlant, n: int, k: int) -> Channels:
-    """A loop, n states of the aircraft and k entries, with the channels of a delay.
+    """Add the channels of a delay to a loop with n states of the aircraft and k entries.
 
-    The middle of the ranges is the delay of the loop. The channels come from the motion by w_1. The
-    states of w_1 of earlier ticks, c of them, and u of earlier ticks follow its own.
+    The delay of the loop becomes the middle of the ranges. The channels follow from the motion
+    caused by w_1. The states of w_1 of earlier ticks, c of them, and u of earlier ticks are
+    appended to those of the loop.
     """
     E, U, K = exact.W[:, : exact.uncertain], exact.W[:, exact.disks], exact.Z[exact.disks]
     m, q = K.shape
@@ -212,25 +215,25 @@ def _with_late(exact: Channels, late: float, ramps: SampledPlant, n: int, k: int
     ticks = int(np.ceil(late / exact.period - 1e-9))
     parts = np.minimum(late / exact.period - np.arange(ticks), 1.0)
     width = ticks * m  # u of earlier ticks, the newest first
-    # The states after the loop's own: u of earlier ticks, which a late u needs.
+    # Append u of earlier ticks, which a late u needs, to the loop's own states.
     now = np.hstack([K, np.zeros((m, c + width))])
     before = np.eye(width, q + c + width, q + c)
     shifted = np.vstack([now, before[:-m]])
-    # The channels of a delay read the step of u from a tick to the next, by their half ranges.
+    # The channels of a delay read the change of u from tick to tick, scaled by their half ranges.
     halves = np.minimum(parts, 0.5)
     sizes = np.repeat([parts / 2.0, ROOT / 2.0 * halves * (1.0 - halves)], m, axis=1)
     Z = np.vstack([size[:, None] * (shifted - before) for size in sizes])
     V = np.zeros((2 * width, m))
     V[:m] = np.diag(sizes[0, :m])
     V[width : width + m] = np.diag(sizes[1, :m])
-    # A channel acts as a constant u, or as a ramp over the period.
+    # Each channel acts as a constant u, or as a ramp over the period.
     held = np.vstack([U, np.zeros((c + width, m))])
     ramp = np.zeros((q + c + width, m))
     ramp[np.r_[0 : n + m, q : q + c]] = ramps.B[rows]
     W = np.hstack([-held] * ticks + [ramp] * ticks)
     to_z = exact.D[: exact.uncertain]
     D = np.hstack([-to_z[:, exact.disks]] * ticks + [_coefficients(ramps.B, n, k)] * ticks)
-    # The loop with the states more, its delay in the middle of the ranges.
+    # The loop with the additional states, with its delay in the middle of the ranges.
     A = np.zeros((q + c + width, q + c + width))
     A[:q, :q] = exact.A
     A[: n + m, q : q + c] = effect[rows[: n + m]]
@@ -253,9 +256,10 @@ def _with_late(exact: Channels, late: float, ramps: SampledPlant, n: int, k: int
 def sensitivity_slopes(
     loop: Channels, d: FloatArray, w: FloatArray
 ) -> tuple[ComplexArray, ComplexArray]:
-    """S, (F, m, m), of the aircraft of deviations d, (k,), and its slopes along d, (F, k, m, m).
+    """Compute S, (F, m, m), of the aircraft with deviations d, (k,), and its slopes, (F, k, m, m).
 
-    They are taken at frequencies w, rad/s. The loop has disks in all inputs, and u is in time.
+    They are evaluated at the frequencies w, rad/s. The loop must have disks in all inputs, and u in
+    time.
     """
     around = loop.at(d)
     p, k = loop.uncertain, len(d)
@@ -271,10 +275,10 @@ def sensitivity_slopes(
 
 
 def parts_of(loop: Channels, inputs: tuple[int, ...] = ()) -> list[Channels]:
-    """The strongly connected parts of the loop, reduced.
+    """Split the loop into its strongly connected parts, and reduce them.
 
-    With disks in some inputs only parts with such inputs count. The structured singular value of a
-    block triangular matrix is the largest of the blocks.
+    With disks in some inputs, only parts with such inputs count. The structured singular value of a
+    block triangular matrix is the largest of those of its blocks.
     """
     from scipy.sparse import csr_array  # noqa: PLC0415 - a flight starts without it
     from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
@@ -284,7 +288,7 @@ def parts_of(loop: Channels, inputs: tuple[int, ...] = ()) -> list[Channels]:
     k = len(every.entries)
     m = len(loop.D) - p
     c = len(inputs)
-    # The pattern of the couplings at some frequencies, an entry or a delay a node.
+    # The pattern of the couplings at some frequencies; each entry or delay is a node.
     late = np.tile(k + np.arange(m), every.late // m)
     at = np.pi / loop.period * np.array(PATTERN_PARTS)
     sizes = np.abs(every.response(at, 1.0 + 1e-6)).max(axis=0)
@@ -293,7 +297,7 @@ def parts_of(loop: Channels, inputs: tuple[int, ...] = ()) -> list[Channels]:
     pattern = np.zeros((k + m + c, k + m + c), dtype=bool)
     np.logical_or.at(pattern, (node[:, None], node[None]), wide)
     count, label = connected_components(csr_array(pattern), directed=True, connection="strong")
-    # A part without a loop of its own bounds nothing.
+    # A part without a loop of its own has no bound to give.
     parts = []
     for number in range(count):
         nodes = np.flatnonzero(label == number)
@@ -307,9 +311,9 @@ def parts_of(loop: Channels, inputs: tuple[int, ...] = ()) -> list[Channels]:
 
 
 def _reduced(every: Channels, channels: IntArray) -> Channels:
-    """Some channels without the states that no w of these moves or no z of these shows.
+    """Keep some channels, without the states that none of their w moves or none of their z shows.
 
-    Such states are kept constants, integrals, and the rest of the loop.
+    Such states are constants that are kept, integrals, and the rest of the loop.
     """
     part = every.some(channels)
     coupled = np.abs(part.A) > NO_COUPLING

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The worst aircraft of a box, by search: the first unstable one, and the least margins.
+"""Searches a box for the worst aircraft: the first unstable one, and the least margins.
 
-A search walks over the corners of the box: each entry goes to the side to which the figure falls,
-by its gradient through the loop with the entries pulled out.
+The search walks over the corners of the box. Each entry moves to the side to which the figure
+falls, by its gradient through the loop with the entries pulled out.
 """
 
 from typing import Any, NamedTuple
@@ -38,23 +38,24 @@ from rise_di_controller.law.linear_loop import (
     LoopTiming,
 )
 
-SEED = 1  # of the corners at which a search starts
+SEED = 1  # of the random corners at which a search starts
 STARTS = 24
 ROUNDS = 12
 POLISHED = 4  # corners from which each flip of an entry is tried
-CLIMBERS = 24  # further corners at which climbs start
+CLIMBERS = 24  # more corners at which climbs start
 LONGEST_CLIMB = 40  # flips
-FALL = 0.005  # part of the least size found, below which a smaller one is sought
+FALL = 0.005  # fraction by which the next size to try lies below the least one found
 RESOLUTION = 1e-4  # of the size of an unstable deviation
-NEAR = 2.5  # factor of a frequency within which a mode counts
-SLOWEST = 0.05  # rad/s, below which a mode counts as one of 0 rad/s
-REAL = 1e-9  # part of an eigenvalue up to which its imaginary part counts as rounding
+NEAR = 2.5  # a mode counts as near a frequency within this factor of it
+SLOWEST = 0.05  # rad/s, below which a mode counts as one at 0 rad/s
+REAL = 1e-9  # fraction of an eigenvalue up to which its imaginary part counts as rounding
 
 
 def first_unstable(part: Channels, entries: int, largest: float) -> list[FloatArray]:
-    """Deviations, (entries,), of unstable aircraft of a part, up to a largest size.
+    """Find deviations, (entries,), of unstable aircraft of a part, up to a largest size.
 
-    The size falls: by a divergence at 0 rad/s, then by modes at the frequencies up to pi / T.
+    Each one found is smaller than the one before: first by a divergence at 0 rad/s, then by modes
+    at the frequencies up to pi / T.
     """
     highest = np.pi / part.period
     count = int(np.ceil(np.log(highest / SLOWEST) / (2.0 * np.log(NEAR))))
@@ -72,11 +73,11 @@ def first_unstable(part: Channels, entries: int, largest: float) -> list[FloatAr
 
 
 def _divergence(part: Channels) -> tuple[float, FloatArray]:
-    """The least size found at which an eigenvalue leaves at z = 1, and the corner.
+    """Find the least size at which an eigenvalue leaves the circle at z = 1, and its corner.
 
-    The size is infinite where there is none. det(I - size M diag(s)) = 0 at the largest real
-    eigenvalue 1 / size of M diag(s). Each s goes to the side to which the eigenvalue rises, from
-    STARTS corners. The coefficients beyond the means of a period are left out.
+    The size is infinite if there is none. det(I - size M diag(s)) = 0 at the largest real
+    eigenvalue 1 / size of M diag(s). From STARTS corners, each s moves to the side to which this
+    eigenvalue rises. Coefficients beyond the means of a period are left out.
     """
     k = len(part.entries)
     M = part.response(0.0, 1.0 + SPECTRAL_RADIUS_TOLERANCE)[:k, :k].real
@@ -94,19 +95,20 @@ def _divergence(part: Channels) -> tuple[float, FloatArray]:
         best = np.where(rises, upward[rows, most], best)
         if not rises.any():
             break
-        slopes = np.linalg.pinv(X)[rows, most] * X[rows, :, most]  # of log, up to the factor s
+        # of its logarithm, up to the factor s
+        slopes = np.linalg.pinv(X)[rows, most] * X[rows, :, most]
         corners = np.where((slopes.real < 0.0) & rises[:, None], -corners, corners)
     first = int(np.argmax(best))
     return (1.0 / best[first] if best[first] > 0.0 else np.inf), best_corners[first]
 
 
 def _oscillation(part: Channels, frequency: float, largest: float) -> tuple[float, FloatArray]:
-    """The least size of an unstable deviation found near a frequency, rad/s, and the corner.
+    """Find the least size of an unstable deviation near a frequency, rad/s, and its corner.
 
-    The size is infinite where there is none. From STARTS corners: up to the size at which a mode
-    near the frequency leaves abs(z) < 1, then to the corner to which abs(z) grows, until the size
-    no longer falls. Then climbs from more corners at a smaller size, as long as one of them ends at
-    an unstable aircraft.
+    The size is infinite if none is found. From each of STARTS corners, the search grows the size
+    until a mode near the frequency leaves abs(z) < 1, then moves to the corner to which abs(z)
+    grows, until the size no longer falls. Then it climbs from more corners at a smaller size, as
+    long as one of them ends at an unstable aircraft.
     """
     rng = np.random.default_rng(SEED)
     k = len(part.entries)
@@ -137,9 +139,9 @@ def _nearer(
     starts: FloatArray,
     found: tuple[float, FloatArray],
 ) -> tuple[float, FloatArray]:
-    """The least size and its corner, after climbs from some corners a little below each level.
+    """Lower the size by climbs from some corners a little below it, and return it with its corner.
 
-    As long as a climb ends at an unstable aircraft, its size is the next level.
+    As long as a climb ends at an unstable aircraft, the size of that aircraft is the next level.
     """
     while True:
         corner, radius = _climbed(part, starts, frequency, (1.0 - FALL) * level)
@@ -153,10 +155,11 @@ def _nearer(
 def _climbed(
     part: Channels, starts: FloatArray, frequency: float, size: float
 ) -> tuple[FloatArray, float]:
-    """The corner with the largest mode near a frequency after climbs at a size, and its abs(z).
+    """Climb from corners at a given size to the largest mode near a frequency.
 
-    A climb flips one entry at a time as long as abs(z) grows: at first that of the steepest slope,
-    then, of the POLISHED best corners, the one by which it grows most.
+    Returns its corner and abs(z). A climb flips one entry at a time as long as abs(z) grows: at
+    first the one with the steepest slope, then, from the POLISHED best corners, the one that raises
+    abs(z) most.
     """
     corners = starts.copy()
     radii = _radii(part, size * corners, frequency)
@@ -186,19 +189,19 @@ def _climbed(
 
 
 def _radii(part: Channels, d: FloatArray, frequency: float) -> FloatArray:
-    """The largest abs(z) of a mode near a frequency, (...), at deviations d, (..., k)."""
+    """Return the largest abs(z) of a mode near a frequency, (...), at deviations d, (..., k)."""
     return np.asarray(_near(np.linalg.eigvals(part.at(d).A), frequency, part.period).max(axis=-1))
 
 
 def _near(z: NDArray[Any], frequency: float, period: float) -> FloatArray:
-    """abs(z) of the modes near a frequency, 0 of the others."""
+    """Return abs(z) of the modes near a frequency, and 0 for the others."""
     w = np.abs(np.angle(z)) / period
     near = (w > frequency / NEAR) & (w <= frequency * NEAR * (1.0 + REAL))
     return np.asarray(np.where(near, np.abs(z), 0.0))
 
 
 def _limit(part: Channels, corner: FloatArray, frequency: float, largest: float) -> float:
-    """The size along a corner at which a mode near a frequency leaves; infinite for none."""
+    """Find the size along a corner at which a mode near a frequency leaves, or infinity."""
 
     def unstable(size: FloatArray) -> NDArray[np.bool_]:
         z = np.linalg.eigvals(part.at(size[:, None] * corner).A)
@@ -217,7 +220,7 @@ def _limit(part: Channels, corner: FloatArray, frequency: float, largest: float)
 
 
 def _growth(part: Channels, d: FloatArray, frequency: float) -> FloatArray:
-    """Slopes d abs(z) / d d_i of the largest mode near a frequency, (N, k), at some deviations."""
+    """Compute the slopes d abs(z) / d d_i of the largest mode near a frequency, (N, k), at d."""
     around = part.at(d)
     z, X = np.linalg.eig(around.A)
     Y = np.linalg.inv(X)
@@ -231,8 +234,8 @@ def _growth(part: Channels, d: FloatArray, frequency: float) -> FloatArray:
 
 # The least margins of a box
 
-BEGUN = 16  # corners drawn at the begin, beside those of the slopes at the nominal aircraft
-FOLLOWED = 2  # corners at which a figure is least, from which the walk goes on
+BEGUN = 16  # random corners at the start, beside those from the slopes at the nominal aircraft
+FOLLOWED = 2  # corners with the least value of a figure, from which the walk continues
 WALKED = 6  # rounds of the walk over the corners
 
 
@@ -246,10 +249,10 @@ class WorstCase(NamedTuple):
 
 
 def worst_in_box(plant: LinearPlant, law: LinearLaw, loop: LoopTiming, box: Box) -> WorstCase:
-    """The least margins over the corners of a box around a plant, A (n, n), by search.
+    """Search the corners of a box around a plant, A (n, n), for the least margins.
 
-    Each figure goes from the corner at which it is least to the corner to which its slope points,
-    until no figure moves. The values are those of `input_margins`.
+    Each figure moves from the corner at which it is least to the corner to which its slope points,
+    until no figure moves any more. The values are those of `input_margins`.
     """
     rng = np.random.default_rng(SEED)
     k = len(box.names)
@@ -281,12 +284,12 @@ def worst_in_box(plant: LinearPlant, law: LinearLaw, loop: LoopTiming, box: Box)
 
 
 def _corners(slopes: FloatArray) -> FloatArray:
-    """The corners to which figures of these slopes fall."""
+    """Return the corners towards which figures with these slopes fall."""
     return np.asarray(np.where(slopes > 0.0, -1.0, 1.0))
 
 
 def _figures(margins: Margins) -> FloatArray:
-    """The figures of N aircraft, (N, 4 m + 3): the less the worse, in the order of `_slopes`."""
+    """Stack the figures of N aircraft, (N, 4 m + 3), as `_slopes` does: smaller is worse."""
     all_inputs = (1.0 / margins.sensitivity_all, margins.disk_all, margins.damping)
     return np.concatenate(
         [
@@ -309,11 +312,11 @@ def _slopes(
     uncertain: Channels,
     d: FloatArray,
 ) -> FloatArray:
-    """The slopes of `_figures` along the deviations at d, (4 m + 3, k), each up to a factor.
+    """Compute the slopes of `_figures` along deviations at d, (4 m + 3, k), up to a factor.
 
-    With a = d log L / d d_i and b = d log L / d w the phase changes by Im a - Im b Re a / Re b at
-    abs(L) = 1, the log of the gain by Re a - Re b Im a / Im b at real L; a peak of abs(S - c) by
-    its slope at constant frequency.
+    With a = d log L / d d_i and b = d log L / d w, the phase changes by Im a - Im b Re a / Re b at
+    abs(L) = 1, and the log of the gain by Re a - Re b Im a / Im b at real L. A peak of abs(S - c)
+    changes by its slope at constant frequency.
     """
     at = plants_at(plant, box, d[None])
     form = schur_form(at, law, loop)
@@ -322,7 +325,7 @@ def _slopes(
     diagonal = np.einsum("Fii->Fi", S)
     L = 1.0 / diagonal - 1.0
     log_gain = np.log(np.abs(L))
-    # The frequencies of the margins: crossings, then peaks, of each input and of all.
+    # Find the frequencies of the margins: crossings, then peaks, of each input and of all at once.
     phase_distance = np.abs(np.angle(-L))
     half = S - np.eye(m) / 2.0
     phase_at, phase_rate = _crossed(w, L, log_gain, phase_distance[:-1])
@@ -362,9 +365,9 @@ def _slopes(
 def _crossed(
     w: FloatArray, L: ComplexArray, values: FloatArray, distance: FloatArray
 ) -> tuple[FloatArray, ComplexArray]:
-    """Frequencies of the nearest zero of `values`, (F, m), by input, and d log L / d w, (m,).
+    """Find the nearest zero of `values`, (F, m), for each input: frequency and d log L / d w, (m,).
 
-    Without a zero the lowest frequency stands.
+    If there is no zero, the lowest frequency is returned.
     """
     columns = np.arange(values.shape[1])
     crosses = np.signbit(values[:-1]) != np.signbit(values[1:])
@@ -379,9 +382,9 @@ def _crossed(
 
 
 def _damping_slope(uncertain: Channels, d: FloatArray) -> FloatArray:
-    """The slope of the least damping of a slow mode along the deviations at d, (k,).
+    """Compute the slope of the least damping of a slow mode along the deviations at d, (k,).
 
-    The slope has an unknown factor: zeta = -cos(angle(log z)).
+    It is known only up to a factor. zeta = -cos(angle(log z)).
     """
     around = uncertain.at(d)
     z, X = np.linalg.eig(around.A)
@@ -392,7 +395,7 @@ def _damping_slope(uncertain: Channels, d: FloatArray) -> FloatArray:
     damping = np.where(slow, -turn.real / np.maximum(np.abs(turn), NO_MODE), np.inf)
     mode = int(np.argmin(damping))
     into = np.linalg.solve(X.T, np.eye(len(z))[mode]) @ around.W
-    change = into * (around.Z @ X[:, mode]) / z[mode]  # of log z
+    change = into * (around.Z @ X[:, mode]) / z[mode]  # slope of log z
     by_channel = (change / turn[mode]).imag[: uncertain.uncertain]
     angle = by_channel.reshape(-1, len(d)).sum(axis=0)
     return np.asarray(np.sin(np.angle(turn[mode])) * angle)

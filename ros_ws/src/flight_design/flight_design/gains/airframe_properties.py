@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The theorem's assumptions on an airframe, checked on the matrices.
 
-The table has Remark 1 and Assumptions 1 and 3. Assumption 2 (f is C1, f and f_dot bounded) has no
-check here: the file's schema bounds gusts and sine terms, which are C1 and have bounded rates for
+The table has Remark 1 and Assumptions 1 and 3. Assumption 2 (f is C1, f and f_dot bounded) needs no
+check: the file's schema bounds gusts and sine terms, which are C1 and have bounded rates for
 bounded angular rates.
 """
 
@@ -35,19 +35,19 @@ from rise_di_controller.law.decomposition import (
 ComplexArray = NDArray[np.complex128]
 
 MAX_FINITE_ZERO = 1e4
-"""1/s. The pencil has double zeros at infinity. Rounding may make these finite, but not less than
+"""1/s. The pencil has double zeros at infinity. Rounding may make them finite, but not less than
 about 1e7, the inverse root of 2e-16. The largest finite zero in the library is 7.2."""
 
 RANK_TOLERANCE = 1e-9
-"""Singular values below this fraction of the largest one are zero: rounding gives 1e-15, published
-data have five digits."""
+"""Singular values below this fraction of the largest one count as zero: rounding leaves 1e-15, and
+published data have five digits."""
 
 
 class ZeroDynamics(StrEnum):
     """Location of the invariant zeros, the criterion of Assumption 3."""
 
     STABLE = "stable"  # all in the open left half plane
-    # some on the imaginary axis, outside too: angles that integrate the rates need an outer loop
+    # some on the imaginary axis, outside the theorem too: such angles need an outer loop
     MARGINAL = "marginal"
     UNSTABLE = "unstable"  # one in the right half plane: outside the theorem
 
@@ -67,7 +67,7 @@ class AirframeFacts(NamedTuple):
     coupling: float | None  # max abs(U - I) in inputs of unit response, None if D is None
     outputs: tuple[str, ...]
     inputs: tuple[str, ...]
-    # `search`: a change to D = I, None where no order that was tried has one
+    # from `search`: a change to D = I, None if no order that was tried has one
     pairing: Pairing | None
     zero_dynamics: ZeroDynamics
     controllable: bool  # Assumption 1
@@ -78,7 +78,8 @@ class AirframeFacts(NamedTuple):
     def in_theorem(self) -> bool:
         """Whether the checks hold.
 
-        They are Assumption 1, D exists (10)-(11), and no zero in the right half plane.
+        They are Assumption 1, that D exists (10)-(11), and that no zero lies in the right half
+        plane.
         """
         return (
             self.controllable
@@ -88,7 +89,7 @@ class AirframeFacts(NamedTuple):
 
     @property
     def remedy(self) -> str:
-        """Change for D = I, as text.
+        """Change that makes D = I, as text.
 
         Examples are "none needed", "flip rudder", "pair p-rudder, r-aileron, flip rudder", "none".
         """
@@ -107,12 +108,12 @@ class AirframeFacts(NamedTuple):
 
 
 def airframe_facts(airframe: FilePath | Airframe) -> AirframeFacts:
-    """Poles, zeros, Omega = C B with D, and Assumptions 1 and 3 of an airframe; SI.
+    """Compute poles, zeros, Omega = C B with D, and Assumptions 1 and 3 of an airframe, in SI.
 
     The airframe may be a name or a file. Source: Assumptions 1 and 3, equations (10)-(11) and
-    Remark 1 of Tanyer, Tatlicioglu, Zergeroglu. Zeros are of the linear part (A, B, C): f is left
-    out. A published A may contain gravity. More inputs than outputs count as m inputs of the law
-    through the pseudo-inverse of C B, in SI.
+    Remark 1 of Tanyer, Tatlicioglu, Zergeroglu. Zeros are those of the linear part (A, B, C),
+    without f, but a published A may contain gravity. If there are more inputs than outputs, the
+    pseudo-inverse of C B, in SI, makes them m inputs of the law.
 
     Args:
         airframe: Name in the library, path of an airframe file (.yaml), or an Airframe.
@@ -167,7 +168,7 @@ def airframe_facts(airframe: FilePath | Airframe) -> AirframeFacts:
 
 
 def library() -> list[AirframeFacts]:
-    """Facts of every airframe of the library, by name.
+    """Return the facts about every airframe of the library, by name.
 
     Raises ParameterError for an invalid file.
     """
@@ -175,11 +176,11 @@ def library() -> list[AirframeFacts]:
 
 
 def invariant_zeros(A: FloatArray, B: FloatArray, C: FloatArray) -> ComplexArray:
-    """Finite s, 1/s, at which Rosenbrock's pencil [[A - s I, B], [C, 0]] loses rank, by real part.
+    """Find the finite s, 1/s, at which Rosenbrock's pencil [[A - s I, B], [C, 0]] loses rank.
 
-    Shapes: A (n, n), B (n, m), C (m, n); n - m zeros if C B is nonsingular. These are the poles of
-    the zero dynamics, the motion of the aircraft with y = 0. Source: H. H. Rosenbrock, "State-Space
-    and Multivariable Theory", 1970.
+    They come sorted by real part. Shapes: A (n, n), B (n, m), C (m, n); there are n - m zeros if C
+    B is nonsingular. They are the poles of the zero dynamics, which is the motion of the aircraft
+    with y = 0. Source: H. H. Rosenbrock, "State-Space and Multivariable Theory", 1970.
     """
     n, m = B.shape
     pencil = np.block([[A, B], [C, np.zeros((m, m))]])
@@ -190,19 +191,19 @@ def invariant_zeros(A: FloatArray, B: FloatArray, C: FloatArray) -> ComplexArray
 
 
 def fastest_zero(A: FloatArray, B: FloatArray, C: FloatArray) -> float:
-    """The largest real part of the zeros, 1/s; minus infinity without a zero.
+    """Return the largest real part of the zeros, 1/s; minus infinity if there are none.
 
-    With one above 0 the aircraft diverges while y is held.
+    If it is above 0, the aircraft diverges while y is held.
     """
     return float(np.max(invariant_zeros(A, B, C).real, initial=-np.inf))
 
 
 def output_coordinates(C: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """P (n, m), N (n, n - m) and H (n, n - m) with x = P y + N eta, eta = H' x.
+    """Return P (n, m), N (n, n - m) and H (n, n - m) with x = P y + N eta, eta = H' x.
 
-    y are the outputs, and eta the n - m remaining states. C (m, n) of full rank, else
-    ParameterError. The states of eta are those that C contains least, by a QR decomposition with
-    pivoting. C that selects states gives P = C', N = H.
+    y are the outputs, and eta the n - m other states. C (m, n) must have full rank, or
+    ParameterError is raised. eta consists of the states that C contains least, by a QR
+    decomposition with pivoting. If C selects states, P = C' and N = H.
     """
     m, n = C.shape
     _, R, pivots = qr(C, pivoting=True)
@@ -218,7 +219,7 @@ def output_coordinates(C: FloatArray) -> tuple[FloatArray, FloatArray, FloatArra
 
 
 def marginal_sentence(facts: Sequence[AirframeFacts]) -> str:
-    """Which zeros on the imaginary axis Assumption 3 does not cover; "" for none."""
+    """Say which zeros on the imaginary axis Assumption 3 does not cover; "" if there are none."""
     states = list(dict.fromkeys(chain.from_iterable(airframe.integrated for airframe in facts)))
     names = [airframe.name for airframe in facts if airframe.zero_dynamics is ZeroDynamics.MARGINAL]
     if not names:
@@ -235,9 +236,9 @@ def marginal_sentence(facts: Sequence[AirframeFacts]) -> str:
 
 
 def zero_dynamics(zeros: ComplexArray) -> ZeroDynamics:
-    """Half plane of the zeros, 1/s, shape (n - m,), for (5)-(9).
+    """Say in which half plane the zeros lie, 1/s, shape (n - m,), for (5)-(9).
 
-    Within ZERO_REAL_PART they are on the imaginary axis.
+    Within ZERO_REAL_PART they count as on the imaginary axis.
     """
     rightmost = float(np.max(zeros.real, initial=-np.inf))
     if rightmost > ZERO_REAL_PART:
@@ -246,9 +247,9 @@ def zero_dynamics(zeros: ComplexArray) -> ZeroDynamics:
 
 
 def controllable(A: FloatArray, B: FloatArray) -> bool:
-    """Assumption 1 by the test of Popov, Belevitch and Hautus.
+    """Whether Assumption 1 holds, by the test of Popov, Belevitch and Hautus.
 
-    rank [A - s I, B] = n at every eigenvalue s of A. Shapes: A (n, n), B (n, m).
+    The test is rank [A - s I, B] = n at every eigenvalue s of A. Shapes: A (n, n), B (n, m).
     """
     n = len(A)
     modes = (np.hstack([A - s * np.eye(n), B]) for s in eigvals(A))

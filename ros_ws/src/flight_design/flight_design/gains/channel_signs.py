@@ -23,13 +23,13 @@ def signs_of_pairing(
     D: Sequence[int] | None = None,
     input_signs: Sequence[int] | None = None,
 ) -> FloatArray:
-    """D of a pairing of channels, shape (m,).
+    """Return D of a pairing of channels, shape (m,).
 
-    Raises ParameterError with the contradiction to Omega and a choice that fits. Omega = C B in the
-    order of the channels, (m, m), with the airframe's signs of the inputs. `input_signs` are -1 for
-    an input whose sign is flipped between law and airframe; this flips D_k and nothing else. The
-    checks, in this order: the pairing has a D and max abs(U - I) at most 10; the input signs fit
-    the D given; D fits.
+    Omega = C B is in the order of the channels, (m, m), with the airframe's signs of the inputs.
+    `input_signs` has -1 for an input whose sign is flipped between law and airframe, which flips
+    D_k and nothing else. The checks come in this order: the pairing has a D, and max abs(U - I) is
+    at most 10; the input signs fit the D that is given; D fits Omega. Raises ParameterError that
+    names the contradiction to Omega and a choice that fits.
     """
     m = len(Omega)
     flips = np.ones(m) if input_signs is None else np.array(input_signs, dtype=np.float64)

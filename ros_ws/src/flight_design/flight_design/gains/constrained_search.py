@@ -1,10 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A search for factors on gains: the least cost of a loop that lacks nothing of a requirement.
+"""A search for factors on gains with the least cost of a loop that meets a requirement.
 
-A place is a tuple of whole exponents of STEP, k factors of m channels, so that a search is
-deterministic. The search is a pattern search: R. Hooke, T. A. Jeeves, Journal of the ACM 8(2),
-1961.
+A place is a tuple of whole exponents of STEP, k factors of m channels, so that the search is
+deterministic. It is a pattern search: R. Hooke, T. A. Jeeves, Journal of the ACM 8(2), 1961.
 """
 
 import math
@@ -19,29 +18,29 @@ Place = tuple[int, ...]
 IntArray = NDArray[np.int64]
 
 STEP = 1.05  # factor of an exponent of 1
-GAIN = 0.01  # least fall of cost or shortage that counts: a hundredth, or a hundredth of a goal
-REACH = 16  # exponents, the longest move from a place with a shortage: a factor of 2.2
+GAIN = 0.01  # least fall of cost or shortage that counts: a hundredth, also of a goal
+REACH = 16  # exponents, longest move from a place with a shortage: a factor of 2.2
 
 
 class Moves(NamedTuple):
     """The moves of a search, each the changes of the k exponents of a channel."""
 
-    mending: Sequence[tuple[int, ...]]  # of those that may reduce a shortage
-    cheaper: Sequence[tuple[int, ...]]  # of those that may lower the cost
-    begin: int = 1  # exponents, the first reach
+    mending: Sequence[tuple[int, ...]]  # moves that may reduce a shortage
+    cheaper: Sequence[tuple[int, ...]]  # moves that may lower the cost
+    begin: int = 1  # exponents, reach of the first moves
     is_joint: bool = False  # whether all channels may move at once while something is short
 
 
 class Trial(NamedTuple, Generic[Content]):
-    """A place, and what the loop there lacks and costs."""
+    """A place, with what the loop there lacks and costs."""
 
     place: Place
     shortage: float  # sum over the goals of 1 - found / needed where this is above 0
-    cost: float  # a logarithm: the change counts; infinite with a shortage
+    cost: float  # a logarithm, so that differences are ratios; infinite if there is a shortage
     content: Content
 
     def is_better(self, trial: "Trial[Content]") -> bool:
-        """Whether the shortage is less, or the cost where nothing is short, by GAIN."""
+        """Whether the shortage is less, or the cost if nothing is short, by GAIN."""
         if self.shortage == 0.0 or trial.shortage == 0.0:
             return self.shortage < trial.shortage or self.cost < trial.cost - GAIN
         return self.shortage < trial.shortage - GAIN * min(trial.shortage, 1.0)
@@ -51,7 +50,7 @@ Assess = Callable[[Sequence[Place]], list[Trial[Content]]]
 
 
 def exponent(factor: float) -> int:
-    """The largest exponent of STEP that does not exceed a factor."""
+    """Return the largest exponent of STEP that does not exceed a factor."""
     return math.floor(math.log(factor) / math.log(STEP))
 
 
@@ -62,11 +61,11 @@ def descend(
     lowest: IntArray,
     highest: IntArray,
 ) -> Trial[Content]:
-    """The trial that no move of one channel betters, from a start.
+    """Move from a start until no move of a single channel is better, and return the last trial.
 
-    `lowest` and `highest`, (k, m), are the bounds of the exponents. With a shortage the best move
-    of all channels counts, and the reach doubles where none helps. Without a shortage each channel
-    moves in turn, from the last reach on, and the reach is halved where none helps.
+    `lowest` and `highest`, (k, m), bound the exponents. As long as there is a shortage, the best
+    move of all channels is taken, and the reach doubles if none helps. Without a shortage each
+    channel moves in turn, beginning with the last reach, which is halved if no move helps.
     """
     best = start
     reach = moves.begin
@@ -106,7 +105,7 @@ def _neighbours(
     moves: Sequence[tuple[int, ...]],
     bounds: tuple[IntArray, IntArray],
 ) -> list[Place]:
-    """The places that moves of a channel, or of some, lead to, other than the place itself."""
+    """List the places to which moves of one or several channels lead, except the place itself."""
     places = np.repeat(np.reshape(place, (1, *bounds[0].shape)), len(moves), axis=0)
     for channel in np.atleast_1d(channels):
         places[:, :, channel] += reach * np.array(moves)

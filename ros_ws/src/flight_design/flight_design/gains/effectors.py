@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Design of an allocation for the effectors of an airframe.
 
-The results are T, and the loop as the law sees it through T.
+It yields T, and the loop as the law sees it through T.
 """
 
 from collections.abc import Sequence
@@ -18,11 +18,11 @@ from flight_core.parameters import require
 from flight_core.vectors import FloatArray
 from rise_di_controller.extensions.model_sections import AllocationConfig
 
-LAW_INPUT = "v_"  # begin of the name of an input of the law: v_q is that of the output q
+LAW_INPUT = "v_"  # beginning of the name of an input of the law: v_q belongs to the output q
 DIGITS = 10  # of T and effect in a file: their product is I to 1e-9
-# s, added to the lags in the weights: that of a fast servo, so that an ideal one is not alone
+# s, added to the lags in the weights: a fast servo's, so that an ideal one does not do all
 SERVO = 0.01
-# part of the largest: an effector that gives less of an input of the law does not limit it
+# fraction of the largest: an effector that gives less of an input of the law does not limit it
 SMALL = 1e-9
 
 
@@ -39,7 +39,7 @@ class LawInputs(NamedTuple):
     """The inputs v of the law through an allocation, one an output; shapes (m,), units of y / s."""
 
     names: tuple[str, ...]
-    lower: FloatArray  # an input alone takes the first effector to its stop
+    lower: FloatArray  # at this limit an input by itself takes the first effector to its stop
     upper: FloatArray
     slew: FloatArray
     lag: FloatArray  # s
@@ -48,7 +48,7 @@ class LawInputs(NamedTuple):
 def design_allocation(
     airframe: Airframe, effectors: Effectors, priority: Sequence[str] = ()
 ) -> tuple[AllocationConfig, LawInputs]:
-    """The allocation and the inputs of the law: C B T = I.
+    """Design the allocation and the inputs of the law, so that C B T = I.
 
     The allocation is the weighted pseudo-inverse of Omega = C B, (m, p).
 
@@ -98,7 +98,7 @@ def design_allocation(
 
 
 def _require_effectors(airframe: Airframe, effectors: Effectors) -> None:
-    """Raise ParameterError for fewer effectors than outputs, and for infinite stops."""
+    """Refuse fewer effectors than outputs, and infinite stops."""
     names = tuple(airframe.inputs)
     m = len(airframe.outputs)
     require(
@@ -120,9 +120,9 @@ def _require_effectors(airframe: Airframe, effectors: Effectors) -> None:
 
 
 def _pseudo_inverse(airframe: Airframe, Omega: FloatArray, effectors: Effectors) -> FloatArray:
-    """T, (p, m), by the weights of `design_allocation`.
+    """Compute T, (p, m), with the weights of `design_allocation`.
 
-    Raises ParameterError for dependent rows of Omega.
+    Raises ParameterError if rows of Omega depend on each other.
     """
     reach = (effectors.upper - effectors.lower) / 2.0 / (effectors.lag + SERVO)
     scaled_Omega = Omega * reach
@@ -138,9 +138,9 @@ def _pseudo_inverse(airframe: Airframe, Omega: FloatArray, effectors: Effectors)
 
 
 def _alone(T: FloatArray, sides: tuple[FloatArray, FloatArray]) -> FloatArray:
-    """The largest v_i >= 0 alone inside the ends.
+    """Return the largest v_i >= 0 that each input reaches by itself inside the stops.
 
-    `sides`: the ends in the direction -T_ji and +T_ji, of either sign.
+    `sides` are the stops in the directions -T_ji and +T_ji, of either sign.
     """
     against, along = (np.abs(side)[:, None] for side in sides)
     counts = np.abs(T) > SMALL * np.abs(T).max(axis=0)
@@ -157,7 +157,7 @@ def _rounded(matrix: FloatArray) -> list[float]:
 
 
 def lags_by_input(lag: ArrayLike, airframe: Airframe) -> dict[str, float]:
-    """Lags by input, s. Raises ParameterError."""
+    """Return the lags by input, s. Raises ParameterError."""
     names = list(airframe.inputs)
     values = as_numbers(lag, "lag", expected := "seconds, 0 or more")
     values = values * len(names) if len(values) == 1 else values

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Gains beside an extended state observer.
 
-The aircraft is an integrator for each output, known by sign and size alone.
+It takes the aircraft for an integrator in each output, of which only sign and size are known.
 """
 
 from collections.abc import Mapping
@@ -20,9 +20,9 @@ EXTENDED_STATE_PRODUCTS: Mapping[str, tuple[float, ...]] = {
     "r": (0.714, 0.0242, 0.098, 0.161),
     "V": (1.31, 0.0242, 0.184, 0.667),
 }
-"""effort / T, drift T, rate_drift T and decay T with the total lag T, by output. They are those of
-a search on the `osprey`, T = 0.035 s and 0.115 s in V, with the cost of gusts and turbulence
-together: no other aircraft was in it."""
+"""effort / T, drift T, rate_drift T and decay T with the total lag T, by output. A search on the
+`osprey` found them for T = 0.035 s, and 0.115 s in V, with the cost of gusts and turbulence
+together; no other aircraft took part."""
 
 
 # for an output that is not in EXTENDED_STATE_PRODUCTS
@@ -30,16 +30,16 @@ DEFAULT_PRODUCTS = EXTENDED_STATE_PRODUCTS["p"]
 
 
 def extended_state_weights(outputs: tuple[str, ...], T: FloatArray) -> ExtendedStateWeights:
-    """Weights of an extended-state observer by EXTENDED_STATE_PRODUCTS.
+    """Choose the weights of an extended-state observer by EXTENDED_STATE_PRODUCTS.
 
-    `T`: the total lags of the loop, (m,), s.
+    T holds the total lags of the loop, (m,), s.
     """
     products = np.array([EXTENDED_STATE_PRODUCTS.get(name, DEFAULT_PRODUCTS) for name in outputs]).T
     return ExtendedStateWeights(products[0] * T, *(products[1:] / T))
 
 
 def integrator_model(controller: ControllerConfig, Omega: FloatArray) -> FeedforwardConfig:
-    """The model y_dot = Omega u of a feedforward, Omega (m, m) in the law's order.
+    """Build the model y_dot = Omega u of a feedforward, Omega (m, m) in the law's order.
 
     lead = lag + delay + half a period.
     """

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A first scenario for an airframe.
 
-The scenario has the channels, assumed actuators, noise, and gusts in proportion to the aircraft.
+It has the channels, assumed actuators, noise, and gusts in proportion to the aircraft.
 """
 
 from collections.abc import Mapping, Sequence
@@ -38,10 +38,10 @@ ENGINE_LAG = 0.3
 # rad, rad/s: 20 deg, 57 deg/s, assumed
 STOP = 0.35
 SURFACE_RATE = 1.0
-# m/s^2, rad/s^2: what the end stop of another input gives, assumed
+# m/s^2, rad/s^2: what any other input gives at its end stop, assumed
 AUTHORITY = {SPEED: 0.3 * GRAVITY, ANGULAR_RATE: 2.0}
 NOISE = {"V": 0.05, "u": 0.05}  # m/s
-RATE_NOISE = 0.001  # rad/s, and of another output
+RATE_NOISE = 0.001  # rad/s, also for any other output
 RATE = 200.0  # Hz, of y and y_m
 CONTROL_RATE = 100.0  # Hz, of the law
 DELAY = 0.003  # s, beyond sampling
@@ -57,10 +57,10 @@ def first_flight(
     part: float = 1.0,
     shortfall: str = "",
 ) -> str:
-    """A scenario file for the airframe in `path`, with the text of the section controller.
+    """Write a scenario file for the airframe in `path`, with the text of the section controller.
 
-    `part` multiplies the commands, and `shortfall` is the first line. The commands are
-    `first_commands`; gusts have 3 % of the trim speed, across it.
+    `part` multiplies the commands, and `shortfall` becomes the first line. The commands are those
+    of `first_commands`; gusts have 3 % of the trim speed, across it.
     """
     V0 = airframe.speed
     stops = _stops(airframe)
@@ -109,7 +109,7 @@ def first_flight(
 
 
 def _channels(airframe: Airframe, lag: Sequence[float]) -> dict[str, Channel]:
-    """The channels by output."""
+    """Return the channels by output."""
     outputs = list(airframe.outputs)
     if len(airframe.inputs) > len(outputs):
         _, law = _distributed(airframe, lag)
@@ -141,9 +141,9 @@ def _surfaces(airframe: Airframe) -> list[bool]:
 
 
 def _stops(airframe: Airframe) -> list[float]:
-    """The end stop of every input.
+    """Choose the end stop of every input.
 
-    A surface has STOP, a further input what gives AUTHORITY on the driven output.
+    A surface has STOP; any other input has what gives AUTHORITY on the output that it drives.
     """
     Omega = np.abs(airframe.matrix_c() @ airframe.matrix_b())
     authorities = np.array(
@@ -170,7 +170,7 @@ def _rates(airframe: Airframe) -> list[float]:
 
 
 def _distributed(airframe: Airframe, lag: Sequence[float]) -> tuple[AllocationConfig, LawInputs]:
-    """The allocation of an airframe with more inputs than outputs."""
+    """Design the allocation of an airframe with more inputs than outputs."""
     stops = np.array(_stops(airframe))
     return design_allocation(
         airframe, Effectors(-stops, stops, np.array(_rates(airframe)), np.array(lag))
@@ -178,12 +178,12 @@ def _distributed(airframe: Airframe, lag: Sequence[float]) -> tuple[AllocationCo
 
 
 def default_lags(airframe: Airframe) -> tuple[float, ...]:
-    """Lags of the inputs, s: a servo for an angle, an engine for the rest."""
+    """Return the lags of the inputs, s: a servo's for an angle, an engine's for the rest."""
     return tuple(SURFACE_LAG if surface else ENGINE_LAG for surface in _surfaces(airframe))
 
 
 def placeholder(airframe: Airframe, lag: Sequence[float]) -> str:
-    """A section controller with gains of 1, for the selection of gains."""
+    """Write a section controller with gains of 1, from which gains can be selected."""
     allocation = None
     m = len(airframe.outputs)
     if len(airframe.inputs) > m:
@@ -216,9 +216,9 @@ def placeholder(airframe: Airframe, lag: Sequence[float]) -> str:
 
 
 def pairing(airframe: Airframe) -> tuple[int, ...]:
-    """The input of every output, as the smallest change to D = I within MAX_COUPLING.
+    """Return the input of every output by the smallest change to D = I within MAX_COUPLING.
 
-    Where there is none, the inputs are in their order.
+    If there is none, the inputs stay in their order.
     """
     best = search(airframe.matrix_c() @ airframe.matrix_b(), MAX_COUPLING)
     if best is None:

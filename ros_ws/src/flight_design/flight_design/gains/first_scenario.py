@@ -28,16 +28,17 @@ from rise_di_controller.params import ControllerConfig
 
 LICENCE = "# SPDX-FileCopyrightText: RISE-DI contributors\n# SPDX-License-Identifier: Apache-2.0\n"
 
-# rad/s, natural frequency of the reference model at most, as in osprey_gust
+# rad/s, largest natural frequency of the reference model, as in osprey_gust
 FASTEST = {"q": 4.0, "p": 5.0, "r": 4.0}
-FASTEST_SPEED = 1.2  # rad/s, of an airspeed, a climb, and any other output
-OF_BANDWIDTH = 0.5  # of the bandwidth of the loop: what the loop follows without a model
-OF_AUTHORITY = 1.0 / 3.0  # for the command; the rest is for climbs, turns and gusts
+FASTEST_SPEED = 1.2  # rad/s, the same for an airspeed, a climb, and any other output
+OF_BANDWIDTH = 0.5  # fraction of the bandwidth of the loop, which it follows without a model
+# fraction of the authority for the command; the rest is for climbs, turns and gusts
+OF_AUTHORITY = 1.0 / 3.0
 SIZE = {"q": 0.05, "p": 0.15, "r": 0.05, "climb": 1.0}  # rad/s, m/s
-HOVER = 0.15  # rad/s, of a rate without an airspeed
+HOVER = 0.15  # rad/s, of a rate if there is no airspeed
 OF_SPEED = 0.03  # of V0: dynamic pressure changes by 6 %, within what the gains allow
-LARGEST_SPEED = 2.0  # m/s, change of an airspeed at most
-SEEN = 5.0  # times the noise: a command that an error shows beside it
+LARGEST_SPEED = 2.0  # m/s, largest change of an airspeed
+SEEN = 5.0  # times the noise: size from which the error of a command shows
 SPEEDS = {"V", "u", "climb"}  # motions that thrust moves: slow, without overshoot
 
 RISE = 0.2  # s, edge of a pulse, which bounds u_m_dot: short beside the filters
@@ -47,16 +48,16 @@ TURNS = ((0.0, 1.0), (2.0, -1.0), (5.0, -1.0), (7.0, 1.0))
 PULSE = 1.0  # s, of a rate
 TURNS_TIME = 9.0  # s, of the four pulses
 SPEED_PULSE = 20.0  # s, of an airspeed or a climb
-LAST = 20.0  # s, after the last command: for a gust and the way back
+LAST = 20.0  # s, after the last command, for a gust and the way back
 COMMANDED = "osprey_servo"  # commands and gusts of gains without a scenario of their own
 GAINS = {"k_g", "k_d", "Lambda", "beta", "omega", "input_scale", "D"}  # that are selected
 
 
 class Channel(NamedTuple):
-    """What the commands of an output follow from, SI."""
+    """What the commands of an output follow from, in SI."""
 
-    motion: str  # q, p, r, V or climb; another output has no size of its own
-    authority: float  # y_dot by the input at its nearer end stop
+    motion: str  # q, p, r, V or climb; any other output has no size of its own
+    authority: float  # y_dot that the input gives at its nearer end stop
     bandwidth: float  # rad/s, of the loop, from lags, delay and rate
     noise: float = 0.0  # rms a sample
     damping: float = 0.0  # 1/s, with which y returns
@@ -72,20 +73,21 @@ class Channel(NamedTuple):
         return min(FASTEST.get(self.motion, FASTEST_SPEED), OF_BANDWIDTH * self.bandwidth)
 
     def size(self, speed: float | None) -> float:
-        """Height of a pulse, `speed` V0 in m/s, None in hover.
+        """Compute the height of a pulse; `speed` is V0 in m/s, None in hover.
 
             least(size of the motion, reach), at least SEEN noise
             reach (frequency / e + damping) = OF_AUTHORITY authority
 
-        A critically damped filter of second order answers a step A at A frequency / e at most, at
-        1 / frequency; A damping holds the end. The size of a pitch rate is 1 g / V0 at most.
+        A critically damped filter of second order answers a step A with a rate of at most A
+        frequency / e, at the time 1 / frequency; A damping holds it at the end. The size of a pitch
+        rate is at most 1 g / V0.
         """
         reach = OF_AUTHORITY * self.authority / (self.frequency / math.e + self.damping)
         return max(min(_largest(self.motion, speed), reach), SEEN * self.noise)
 
 
 def _largest(motion: str, speed: float | None) -> float:
-    """Size of a command by its motion alone."""
+    """Return the size of a command from its motion alone."""
     if motion in SIZE and (speed is None) and motion != "climb":
         return HOVER
     if motion == "q" and speed is not None:
@@ -116,11 +118,11 @@ def first_commands(
     wait: float = 0.0,
     part: float = 1.0,
 ) -> FirstCommands:
-    """The commands of a first flight by output: rates one after another, then the speeds.
+    """Choose the commands of a first flight by output: rates one after another, then the speeds.
 
-    Frequency and height of each are those of its `Channel`; `part` multiplies the heights. Where
-    the aircraft `banks` to turn, the yaw rate is that of a coordinated turn, g / V0 sin(bank).
-    `speed` is V0, m/s, None in hover; `rate` that of the reference model, Hz; `wait` the time
+    Frequency and height of each follow from its `Channel`; `part` multiplies the heights. If the
+    aircraft `banks` to turn, the yaw rate is that of a coordinated turn, g / V0 sin(bank). `speed`
+    is V0, m/s, or None in hover; `rate` is that of the reference model, Hz; `wait` is the time
     before all commands, s.
 
     A reference slower than the loop, within the authority of the input: K. J. Astrom, R. M.
@@ -159,9 +161,9 @@ def first_commands(
 
 
 def unit_gains(lag: Sequence[float], delay: float) -> dict[str, Any]:
-    """The keys of a controller of channels with lags and a delay, s.
+    """Return the keys of a controller for channels with lags and a delay, s.
 
-    The gains, 1 here, are to be selected.
+    The gains are 1 here; they still have to be selected.
     """
     ones = [1.0] * len(lag)
     return dict.fromkeys(("Lambda", "beta", "input_scale", "omega"), ones) | {
@@ -176,7 +178,7 @@ def unit_gains(lag: Sequence[float], delay: float) -> dict[str, Any]:
 
 
 def scenario_to_design(scenario: FilePath | Scenario) -> Scenario:
-    """A scenario whose section controller may lack the gains: they are 1 then, to be selected.
+    """Load a scenario whose section controller may lack the gains; they are then 1, to be selected.
 
     Rate, channels, lags, delay and failsafe are needed. Raises ParameterError.
     """
@@ -194,10 +196,10 @@ def scenario_to_design(scenario: FilePath | Scenario) -> Scenario:
 
 
 def scenario_to_check(scenario: FilePath | Scenario) -> Scenario:
-    """A scenario, or that of the commands of a file with the section controller alone.
+    """Load a scenario, or that of the commands if a file has only the section controller.
 
-    COMMANDED has the commands, gusts and rate limits then, and need not fly the controller. Raises
-    ParameterError.
+    COMMANDED then gives the commands, gusts and rate limits, and need not fly the controller.
+    Raises ParameterError.
     """
     controller = controller_alone(scenario)
     if controller is None:
@@ -225,9 +227,9 @@ def airframe_to_check(airframe: FilePath | Airframe, flight: Scenario) -> Airfra
 
 
 def controller_alone(scenario: FilePath | Scenario) -> ControllerConfig | None:
-    """The controller of a file with this section alone, as `gain_yaml.selection_yaml` writes it.
+    """Return the controller of a file with only this section, as `selection_yaml` writes it.
 
-    None for a scenario and for another file. Raises ParameterError.
+    Returns None for a scenario and for any other file. Raises ParameterError.
     """
     if isinstance(scenario, Scenario):
         return None
@@ -294,10 +296,10 @@ Sections = Mapping[str, Mapping[str, Any] | str]
 
 
 def scenario_text(heading: Iterable[str], sections: Sections) -> str:
-    """The text of a scenario file: a heading, a comment a line, then the sections.
+    """Write the text of a scenario file: a heading, each line as a comment, then the sections.
 
-    `gain_yaml.selection_yaml` writes a whole section. Empty lines of the heading, and keys without
-    a value, None or {}, are left out.
+    `gain_yaml.selection_yaml` writes a whole section. Empty lines of the heading are left out, and
+    so are keys without a value, None or {}.
     """
     rows = {name: _with_values(section) for name, section in sections.items()}
     lines = LICENCE + "#\n" + comment(filter(None, heading))
@@ -305,7 +307,7 @@ def scenario_text(heading: Iterable[str], sections: Sections) -> str:
 
 
 def _with_values(section: Mapping[str, Any] | str) -> Mapping[str, Any] | str:
-    """A section without the keys that have no value; a text as it is."""
+    """Drop the keys of a section that have no value; return a text as it is."""
     if isinstance(section, str):
         return section
     return {key: value for key, value in section.items() if value is not None and value != {}}

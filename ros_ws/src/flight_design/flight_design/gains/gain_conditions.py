@@ -3,21 +3,20 @@
 # ruff: noqa: N802 - K, U, Phi and N_d are the paper's names
 """Gains of the law: two procedures, and the conditions on the gains.
 
-The procedures are Theorem 1 and the engineering procedure.
+The two procedures are Theorem 1 and the engineering procedure.
 
 The theorem's conditions are sufficient, not necessary, and they contain no actuator.
-`theorem_gains` meets them all; behind servos its result is unstable. `engineering_gains` starts
+`theorem_gains` meets them all, but behind servos its result is unstable. `engineering_gains` starts
 from the lag of the loop. `check_theorem` evaluates the theorem's conditions on a gain set,
-`check_rules` the rules of the engineering procedure, `check_loop` what the linear margins of the
-loop leave out. `rise_di_controller.law.linear_loop` has the linear loop and its
-delay margin.
+`check_rules` the rules of the engineering procedure, and `check_loop` what the linear margins of
+the loop leave out. `rise_di_controller.law.linear_loop` has the linear loop and its delay margin.
 
 The crossover lag product of a channel is its bandwidth times the lag of its loop, in rad. It is the
 phase that the lag costs at the crossover: 57.3 degrees times the product. A loop that integrates
-then has a phase margin of 90 degrees minus that. With the lag taken as a pure delay its gain margin
-is (pi / 2) / product: 2.5 at 0.63, 2.0 at 0.8.
+then has a phase margin of 90 degrees minus that. If you take the lag as a pure delay, its gain
+margin is (pi / 2) / product: 2.5 at 0.63, 2.0 at 0.8.
 
-All quantities are in the law's channel order and its scaled inputs v (u = input_scale v), where
+All quantities are in the law's channel order and its scaled inputs v (u = input_scale v), in which
 abs(Omega_ii) is about 1.
 """
 
@@ -36,12 +35,12 @@ from rise_di_controller.law.linear_loop import LoopTiming
 
 MIN_K = 1.5
 """1/s, lower bound of K, since (22) requires K > 1. A slower channel gets this K and a smaller
-input scale: the same loop."""
+input scale, which is the same loop."""
 
-# factor of k_g above its bound rho^2 / (4 min(Lambda, 1)). Step 2 then leaves a third of the decay
+# factor of k_g above its bound rho^2 / (4 min(Lambda, 1)): step 2 then leaves a third of the decay
 # to step 3.
 K_G_MARGIN = 1.5
-MAX_STEP_3_FRACTION = 0.3  # fraction of the decay that all of step 3 uses, out of that third
+MAX_STEP_3_FRACTION = 0.3  # fraction of the decay that step 3 uses in total, out of that third
 
 MAX_CROSSOVER_LAG_PRODUCT = 0.8
 """rad, bandwidth times the lag of the loop: 46 degrees of phase at the crossover. On the `osprey`
@@ -74,14 +73,14 @@ class GainSet(NamedTuple):
 
 
 class Bounds(NamedTuple):
-    """Bounds of the aircraft that Theorem 1 requires."""
+    """Bounds on the aircraft that Theorem 1 requires."""
 
     # (m, m) bounds of abs(U_ij), j > i, zero elsewhere: zeta_U of (27), zeta_Psi of (30) with two
     # indices
     U: FloatArray
     N_d: FloatArray  # (m,) zeta_Nd,i of (19), units of y / s^2
     rho: float  # of (19), 1/s
-    gamma_2: FloatArray  # (m,) of Lemma 1, 1/s: an assumption, nothing bounds it
+    gamma_2: FloatArray  # (m,) of Lemma 1, 1/s: an assumption, which nothing bounds
 
 
 class GainCondition(NamedTuple):
@@ -91,23 +90,23 @@ class GainCondition(NamedTuple):
     """
 
     name: str
-    channel: int | None  # None: all of them together
+    channel: int | None  # None for all of them together
     value: float
     bound: float
     at_least: bool = True
-    estimate: bool = False  # depends on gamma_2, an assumption
-    strict: bool = False  # value = bound does not meet it
+    estimate: bool = False  # whether it depends on gamma_2, an assumption
+    strict: bool = False  # whether value = bound fails to meet it
 
     @property
     def side(self) -> str:
-        """The relation in words: the value is "at least", "at most" or "above" the bound."""
+        """Relation in words: the value is "at least", "at most" or "above" the bound."""
         if self.strict:
             return "above"
         return "at least" if self.at_least else "at most"
 
     @property
     def holds(self) -> bool:
-        """Whether the gain set meets it."""
+        """Whether the gain set meets the condition."""
         if self.strict:
             return self.value > self.bound
         slack = BOUND_TOLERANCE * abs(self.bound)
@@ -117,9 +116,9 @@ class GainCondition(NamedTuple):
 
     @property
     def margin(self) -> float:
-        """Factor by which it is met: below 1 if it fails, 0 if no gain can meet it.
+        """Factor by which the condition is met: below 1 if it fails, 0 if no gain can meet it.
 
-        NaN for a lower bound of 0.
+        It is NaN for a lower bound of 0.
         """
         if self.at_least:
             return self.value / self.bound if self.bound > 0.0 else math.nan
@@ -128,7 +127,7 @@ class GainCondition(NamedTuple):
         return self.bound / self.value if self.value > 0.0 else math.inf
 
     def sentence(self, channels: Sequence[str]) -> str:
-        """In the form of errors: "beta (30) of q: found 15, expected at least 29.1".
+        """Write the condition as errors do: "beta (30) of q: found 15, expected at least 29.1".
 
         `channels` are the names of y.
         """
@@ -137,7 +136,7 @@ class GainCondition(NamedTuple):
 
 
 def failing(conditions: Sequence[GainCondition]) -> tuple[GainCondition, ...]:
-    """The conditions that the gain set does not meet."""
+    """Return the conditions that the gain set does not meet."""
     return tuple(condition for condition in conditions if not condition.holds)
 
 
@@ -145,20 +144,20 @@ def failing(conditions: Sequence[GainCondition]) -> tuple[GainCondition, ...]:
 
 
 def bound_U(Omegas: FloatArray) -> FloatArray:
-    """Largest abs(U_ij), j > i, over samples of Omega, zero elsewhere.
+    """Find the largest abs(U_ij), j > i, over samples of Omega; all other entries are zero.
 
-    Omegas (N, m, m), result (m, m). U is that of Omega = S D U (11). The result bounds the
-    off-diagonal entries of D U D as well: their sizes are the same. Raises DecompositionError for a
-    sample without decomposition.
+    Omegas has shape (N, m, m), the result (m, m). U is that of Omega = S D U (11). The result
+    bounds the off-diagonal entries of D U D as well, because their sizes are the same. Raises
+    DecompositionError for a sample without decomposition.
     """
     return np.asarray(np.max([np.triu(np.abs(decompose(Omega).U), 1) for Omega in Omegas], axis=0))
 
 
 def rho(Omega: FloatArray, CAC: FloatArray, Lambda: FloatArray) -> float:
-    """Bound of norm(N~) / norm(z), (19), 1/s: the largest singular value of [I - G Lambda, G].
+    """Bound norm(N~) / norm(z), (19), 1/s, by the largest singular value of [I - G Lambda, G].
 
-    G = M (C A C^+ + Lambda) with M = S^-1; N~ = G (r - Lambda e) + e, the reference term of (18)
-    moved to N_d. Arguments: Omega and CAC = C A C^+, shape (m, m); Lambda (m,). Raises
+    G = M (C A C^+ + Lambda) with M = S^-1. N~ = G (r - Lambda e) + e, where the reference term of
+    (18) has moved to N_d. Omega and CAC = C A C^+ have shape (m, m), Lambda has (m,). Raises
     DecompositionError if Omega has no S D U. Source: (16)-(19) of Tanyer, Tatlicioglu, Zergeroglu,
     with the correction of docs/theory.md.
     """
@@ -167,7 +166,7 @@ def rho(Omega: FloatArray, CAC: FloatArray, Lambda: FloatArray) -> float:
 
 
 def least_beta(Lambda: FloatArray, bounds: Bounds) -> FloatArray:
-    """Step 1 of Theorem 1: the smallest beta, shape (m,), from the last channel up.
+    """Compute the smallest beta of step 1 of Theorem 1, shape (m,), from the last channel up.
 
     beta_i = (zeta_Nd,i + sum_(j>i) zeta_U,ij beta_j) (1 + gamma_2,i / Lambda_i), i = m .. 1
     Source: (29), (30), with the two-index bound that Lemma 2 requires (docs/theory.md).
@@ -179,17 +178,17 @@ def least_beta(Lambda: FloatArray, bounds: Bounds) -> FloatArray:
 
 
 def zeta_Phi(i: int, K: FloatArray, U: FloatArray) -> float:
-    """Bound of abs(Phi_i) / norm(z), (25)-(27), 1/s.
+    """Bound abs(Phi_i) / norm(z), (25)-(27), 1/s.
 
-    The bound is the norm over j > i of zeta_U,ij k_j. K (m,), U (m, m).
+    The bound is the norm over j > i of zeta_U,ij k_j. K has shape (m,), U (m, m).
     """
     return float(np.linalg.norm(U[i, i + 1 :] * K[i + 1 :]))
 
 
 def theorem_gains(bounds: Bounds, Lambda: FloatArray) -> GainSet:
-    """Gains to meet (22), (29), (30) and steps 2 and 3 of Theorem 1 for the bounds given.
+    """Compute gains that meet (22), (29), (30) and steps 2 and 3 of Theorem 1 for given bounds.
 
-    The shape is as in the fields.
+    Shapes are those of the fields.
 
         least = min(Lambda, 1), the decay of e and r before N~ and Phi
         k_g   = 1.5 rho^2 / (4 least)                                     step 2
@@ -197,7 +196,8 @@ def theorem_gains(bounds: Bounds, Lambda: FloatArray) -> GainSet:
         beta  = `least_beta`                                              step 1
 
     so that rho^2 / (4 k_g) + sum zeta_Phi,i^2 / (4 k_d,i) <= (2/3 + 0.3) least. The factors 1.5 and
-    0.3 are this project's: the paper only says "small". bounds.rho must be that of the same Lambda.
+    0.3 are this project's, because the paper only says "small". bounds.rho must belong to the same
+    Lambda.
     """
     m = len(Lambda)
     least = min(float(Lambda.min()), 1.0)
@@ -213,16 +213,17 @@ def theorem_gains(bounds: Bounds, Lambda: FloatArray) -> GainSet:
 
 
 def check_theorem(gains: GainSet, bounds: Bounds) -> tuple[GainCondition, ...]:
-    """Conditions of Theorem 1 on a gain set.
+    """Evaluate the conditions of Theorem 1 on a gain set.
 
-    They are (29), (30) from the last channel up, then steps 2 and 3.
+    They are (29), (30) from the last channel up, then steps 2 and 3:
 
-        beta_i >= (zeta_Nd,i + sum_(j>i) zeta_U,ij beta_j) (1 + gamma_2,i / Lambda_i), beta_j those
-        of the gain set k_g >= rho^2 / (4 min(Lambda, 1))
+        beta_i >= (zeta_Nd,i + sum_(j>i) zeta_U,ij beta_j) (1 + gamma_2,i / Lambda_i)
+        k_g >= rho^2 / (4 min(Lambda, 1))
         sum_i zeta_Phi,i^2 / (4 k_d,i) <= min(Lambda, 1) - rho^2 / (4 k_g)
 
-    The last names the channel with the largest term. (22) needs no condition, since the gain set
-    holds k_g and k_d. Raises ParameterError if a gain is not positive.
+    beta_j are those of the gain set. The last condition names the channel with the largest term.
+    (22) needs no condition, since the gain set holds k_g and k_d. Raises ParameterError if a gain
+    is not positive.
     """
     for key in GainSet._fields:
         require(
@@ -261,20 +262,20 @@ def check_theorem(gains: GainSet, bounds: Bounds) -> tuple[GainCondition, ...]:
 
 
 def bandwidths(loop: LoopTiming, crossover_lag_product: FloatArray) -> FloatArray:
-    """Bandwidths of the channels, shape (m,), rad/s.
+    """Compute the bandwidths of the channels, shape (m,), rad/s.
 
     Bandwidth i is crossover_lag_product_i / (lag_i + 1.5 period + delay). A product of 0.63 rad
-    costs 36 degrees of phase at the crossover: the phase margin is 90 - 36 = 54 degrees. Source:
-    this project.
+    costs 36 degrees of phase at the crossover, so that the phase margin is 90 - 36 = 54 degrees.
+    Source: this project.
     """
     return np.asarray(crossover_lag_product / loop.total)
 
 
 def split_gain(K: FloatArray) -> tuple[float, FloatArray]:
-    """k_g and k_d of (22) for K = 1 + k_g + (k_d, 0), shape (m,), 1/s.
+    """Split K = 1 + k_g + (k_d, 0), shape (m,), 1/s, into k_g and k_d of (22).
 
-    k_d is at least 0.01: (22) requires it to be positive. Raises ParameterError if the last K is
-    not the smallest or not above 1: (22) has no such K.
+    k_d is at least 0.01, because (22) requires it to be positive. Raises ParameterError if the last
+    K is not the smallest or not above 1: (22) has no such K.
     """
     require(
         float(K[-1]) <= float(K.min()),
@@ -293,10 +294,10 @@ def engineering_gains(
     rate_limit: FloatArray,
     slower: FloatArray | float = 1.0,
 ) -> tuple[GainSet, FloatArray]:
-    """Gains for a loop with lag, from bandwidths (rad/s); all arguments shape (m,).
+    """Compute gains for a loop with lag from bandwidths (rad/s); all arguments have shape (m,).
 
-    The second result is response_i, abs(Omega_ii) in scaled inputs: 1, or less in a channel too
-    slow for (22).
+    The second result is response_i, which is abs(Omega_ii) in scaled inputs: 1, or less in a
+    channel that is too slow for (22).
 
         K_m = max(bandwidth_m, 1.5),  K_i = max(bandwidth_i, K_m),  response_i = bandwidth_i / K_i
         Lambda_i = bandwidth_i / (4 slower_i)  K_i response_i is the bandwidth
@@ -317,11 +318,11 @@ def engineering_gains(
 
 
 def N_d(Omega: FloatArray, v_dot: FloatArray) -> FloatArray:
-    """N_d of (17) along the ideal control v*, at e = 0: -D U v*_dot.
+    """Compute N_d of (17) along the ideal control v*, at e = 0: -D U v*_dot.
 
-    N_d has the shape of v_dot, (..., m), and units of y / s^2. From Omega v*_dot = y_m_ddot - C (A
-    x_dot + f_dot) and N_d = M (C A x_dot + C f_dot - y_m_ddot), M Omega = D U. Omega (m, m) in the
-    inputs of v. Raises DecompositionError if it has no S D U.
+    It has the shape of v_dot, (..., m), and units of y / s^2. It follows from Omega v*_dot =
+    y_m_ddot - C (A x_dot + f_dot) and N_d = M (C A x_dot + C f_dot - y_m_ddot) with M Omega = D U.
+    Omega (m, m) is in the inputs of v. Raises DecompositionError if it has no S D U.
     """
     factors = decompose(Omega)
     return np.asarray(-v_dot @ (factors.D[:, None] * factors.U).T)
@@ -339,14 +340,14 @@ def check_rules(
         softening:        eps_i K_i / beta_i >= total_i      softened sign
 
     The search for gains begins at these rules. They estimate what the margins of the loop measure,
-    so a loop whose margins suffice may break them.
+    so a loop may break them if its margins suffice.
 
-    Arguments: response_i = abs(Omega_ii) in the inputs of the law, nominal; slew in those same
-    inputs, units of y / s^2; all of shape (m,).
+    response_i = abs(Omega_ii) is nominal, in the inputs of the law; slew is in those same inputs,
+    units of y / s^2. All have shape (m,).
     """
     bandwidth = params.K * response
     most = np.full(len(loop.total), MAX_CROSSOVER_LAG_PRODUCT)
-    # beta in the same inputs for every gain set
+    # show beta in the same inputs for every gain set
     rules = (
         *_by_channel("lag product", bandwidth * loop.total, most, at_least=False),
         *_by_channel(

@@ -64,21 +64,21 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 
 OBSERVER_LAWS = ("rise_observer", "pi_observer")
 OBJECTIVE = "gust_turbulence"
-"""Laws and cost of a search whose gains are taken: the least cost. PI is RISE-DI with an integral
-as the sign."""
+"""Objective whose tuned gains are taken, those with the least cost. Of the laws searched, PI is
+RISE-DI with an integral in place of the sign."""
 SLOWER = 1.8
-"""Gains of a search are taken below this factor on the total lag of a channel. On the `osprey`,
-searched with 38 ms in q, the gains have the margins with 55 ms and miss the margins with 65 and 75
-ms. The gains of the rule have the margins from 75 ms on."""
+"""Gains of a search are used only below this factor on the total lag of a channel. On the `osprey`,
+searched with 38 ms in q, the gains have the margins with 55 ms but not with 65 and 75 ms. From 75
+ms on, the gains of the rule have the margins."""
 BY_RULE = "gains by a rule from the lags, a start"
 STABLE = Requirement(phase=1e-3, gain=1.001, sensitivity=1e3, damping=1e-3, worst_phase=0.0)
-"""What gains from a file need: a stable loop."""
+"""What gains from a file need: only a stable loop."""
 DIAGONAL, FULL = MIXINGS = ("diagonal", "full")
-MESSAGES = 3.0  # of y: the age limit of the law, at least
+MESSAGES = 3.0  # periods of y: the least age limit of the law
 RATES = (1.0, 1000.0)  # Hz, the lowest and the highest
 MAX_SAMPLES = 10_000
-PERFECT_VANE = 1e-4  # rad, noise in place of none of a perfect vane
-LEAST_SPEED, MOST_SPEED = 0.6, 1.8  # parts of the trim speed, in the range of the schedule
+PERFECT_VANE = 1e-4  # rad, noise of a vane that is called perfect
+LEAST_SPEED, MOST_SPEED = 0.6, 1.8  # fractions of the trim speed, in the range of the schedule
 
 
 def select_gains(
@@ -105,51 +105,49 @@ def select_gains(
     mixing: str = DIAGONAL,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Selection:
-    """Gains for an airframe by Theorem 1 and by the engineering procedure.
+    """Select gains for an airframe by Theorem 1 and by the engineering procedure.
 
-    A gain set comes with every condition. The commands, the gusts and the loop are those of the
-    scenario. `scenario.vary(controller=selection.chosen)` flies the engineering gains; `gains_yaml`
-    writes them as a section of a scenario file.
+    Each gain set comes with every condition. Commands, gusts and loop are those of the scenario.
+    `scenario.vary(controller=selection.chosen)` flies the engineering gains; `gains_yaml` writes
+    them as a section of a scenario file.
 
     Args:
         airframe: Name in the library, path of an airframe file (.yaml), or an Airframe.
         scenario: Name, path of a file (.yaml) whose controller may lack the gains, or a Scenario.
         uncertainty: Largest relative deviation of each entry of A and B, 0 to 1.
-        rate: Rate of the law in Hz; None: that of the scenario.
-        y_rate: Rate of y in Hz: a period above that of the law counts as delay, and y is stale
-            after three.
-        lag: Lags of the actuators in s, one or one an input in the airframe's order; None: those of
-            the scenario.
-        delay: Pure delay in s; None: that of the scenario.
-        inputs: Input of each output, in the airframe's order: a list, or a text with commas. Empty:
-            those of the scenario, else the airframe's.
+        rate: Rate of the law in Hz; None for that of the scenario.
+        y_rate: Rate of y in Hz. If its period is longer than that of the law, the difference
+            counts as delay, and y is stale after three periods.
+        lag: Lags of the actuators in s, one for all or one per input in the airframe's order;
+            None for those of the scenario.
+        delay: Pure delay in s; None for that of the scenario.
+        inputs: Input of each output, in the airframe's order: a list, or a text with commas. If it
+            is empty, the pairing is that of the scenario or else of the airframe.
         gamma_2: gamma_2 of Lemma 1 in 1/s, an assumption.
         samples: Number of uncertain airframes for the bounds of the theorem, at most 10,000.
         seed: Seed of the uncertain airframes.
-        feedforward: Whether the engineering gains have the airframe as the model of a feedforward.
-        observer: Whether the gains have a feedforward and an observer beside.
-        model: Airframe that the observer takes as model; None: the airframe.
+        feedforward: Whether the engineering gains use the airframe as the model of a feedforward.
+        observer: Whether a feedforward and an observer are added to the gains.
+        model: Airframe that the observer takes as its model; None for `airframe`.
         margin: Least delay margin of the nominal loop with the observer, s.
-        speeds: Two parts of the trim speed, one below 1 and one above, with models of their own. A
-            schedule flies the observer from the one to the other. Empty: the observer holds at the
-            trim speed alone.
+        speeds: Two fractions of the trim speed, one below 1 and one above, with models of their
+            own. A schedule then flies the observer from one to the other. If it is empty, the
+            observer holds only at the trim speed.
         weights: File of gains and weights from which the search for the margins begins
-            (`observer_gains.read_gains`); with `accept` they are taken as they are. None: those of
-            a search for the scenario, or of a rule.
-        phase_margin: Least phase margin of the nominal loop behind servos, deg, beside 6 dB, a
-            sensitivity of at most 2 and a damping of 0.4; 35 deg with the observer.
+            (`observer_gains.read_gains`); with `accept` they are taken as they are. None for those
+            of a search for the scenario, or of a rule.
+        phase_margin: Least phase margin of the nominal loop behind servos, deg. The gain margin
+            must be 6 dB, the sensitivity at most 2 and the damping 0.4. 35 deg with the observer.
         accept: Whether less than 40 deg are accepted.
-        mixing: "diagonal": an input an output; "full": the law has inputs v of its own, an
-            allocation u = T v by the pseudo-inverse of the airframe's C B distributes them. More
-            inputs than outputs always have an allocation.
-        progress: Called with a sentence before a step of the search for the observer.
+        mixing: "diagonal", one input per output, or "full": an allocation u = T v distributes inputs
+            v of the law by the pseudo-inverse of C B, as always with more inputs than outputs.
+        progress: Called with a sentence before each step of the search for the observer.
 
     Returns:
         The gain set of Theorem 1 and the engineering gains, with the conditions on the gains.
 
     Raises:
-        ParameterError: An argument is invalid, or the inputs of the airframe cannot be paired with
-            the outputs.
+        ParameterError: An argument is invalid, or inputs cannot be paired with outputs.
 
     Examples:
         >>> selection = rise_di.select_gains("osprey", samples=1)
@@ -193,9 +191,9 @@ def select_gains(
 
 
 def _beside_observer(required: Requirement, *, as_read: bool) -> Requirement:
-    """A requirement for a loop with an observer.
+    """Adapt a requirement to a loop with an observer.
 
-    `as_read` from a file, the gains need no more than a stable loop.
+    If the gains are taken `as_read` from a file, they only need a stable loop.
     """
     if as_read:
         return STABLE
@@ -203,7 +201,7 @@ def _beside_observer(required: Requirement, *, as_read: bool) -> Requirement:
 
 
 def _two_speeds(speeds: ArrayLike, *, observer: bool) -> tuple[float, float] | None:
-    """The two parts of the trim speed; None for none. Raises ParameterError."""
+    """Return the two fractions of the trim speed; None if there are none. Raises ParameterError."""
     ratios = as_numbers(
         speeds,
         "speeds",
@@ -232,23 +230,25 @@ def check_gains(
     entries: Mapping[str, float] = UNIFORM.entries,
     as_told: bool = False,
 ) -> GainAssessment[ControllerConfig]:
-    """Every condition on the gains of a scenario under any law, and the margins of the loop.
+    """Evaluate all conditions on the gains of a scenario, and the margins of its loop.
 
-    Lags and delay are those of the aircraft in the scenario where the controller was told others.
+    Any law will do. Lags and delay are those of the aircraft in the scenario, even if the
+    controller was told others.
 
     Args:
-        airframe: Name in the library, path of an airframe file (.yaml), or an Airframe; or the
-            aircraft of JSBSim that the scenario flies, as jsbsim:c172p, for y_dot = Omega u.
-        scenario: Name, path of a scenario file (.yaml), or a Scenario; or path of a file with the
-            section controller alone: commands, gusts and rate limits are those of osprey_servo.
+        airframe: Name in the library, path of an airframe file (.yaml), or an Airframe. If the
+            scenario flies an aircraft of JSBSim, you can name it, as jsbsim:c172p; the model is
+            then y_dot = Omega u.
+        scenario: Name, path of a scenario file (.yaml), or a Scenario. If a file has only the
+            section controller, commands, gusts and rate limits are those of osprey_servo.
         uncertainty: Largest relative deviation of each entry of A and B, 0 to 1.
         gamma_2: gamma_2 of Lemma 1 in 1/s, an assumption.
         samples: Number of uncertain airframes for the bounds of the theorem, at most 10,000.
         seed: Seed of the uncertain airframes.
-        entries: Deviations by entry, {"A[q,alpha]": 0.6}; {"1/lag[elevator]": 0.3} is that of an
-            actuator, whose lag is exact otherwise.
-        as_told: Whether lags and delay are those of the controller: of an aircraft of your own, for
-            which the one in the scenario stands in.
+        entries: Deviations by entry, {"A[q,alpha]": 0.6}. {"1/lag[elevator]": 0.3} is that of an
+            actuator, whose lag is otherwise exact.
+        as_told: Whether lags and delay are those of the controller. Set it for an aircraft of your
+            own, for which the one in the scenario stands in.
 
     Returns:
         The controller, the conditions and the margins.
@@ -281,10 +281,10 @@ def study(
     spread: Spread = UNIFORM,
     flown: Flown | None = None,
 ) -> Study:
-    """The airframe as the law of a controller sees it, and uncertain airframes around.
+    """Study the airframe as the law of a controller sees it, and uncertain airframes around it.
 
-    They fly along the commands and gusts of a scenario. With `flown` lags and delay are those of an
-    aircraft, else as the controller was told. Raises ParameterError.
+    They fly along the commands and gusts of a scenario. With `flown`, lags and delay are those of
+    an aircraft, otherwise those that the controller was told. Raises ParameterError.
     """
     timing = loop_of(controller) if flown is None else flown.comparison.timing
     matrices, _ = of_matrices_and_lags(spread, timing, controller.inputs)
@@ -311,10 +311,10 @@ def _loop(
     lag: ArrayLike | None,
     delay: float | None,
 ) -> LoopSetting:
-    """The loop of a scenario with another rate of the law or of y, Hz, lag or delay, s.
+    """Return the loop of a scenario with another rate of the law or of y, Hz, lag or delay, s.
 
-    Raises ParameterError. The law steps with each y, so the lag of sampling is 1.5 periods of y.
-    Those of the law are counted from its own rate.
+    The law steps with each y, so the lag of sampling is 1.5 periods of y, while those of the law
+    are counted from its own rate. Raises ParameterError.
     """
     loop = gain_selection.loop_setting(scenario)
     if rate is not None:
@@ -334,9 +334,9 @@ def _loop(
 
 
 def _mixed(loop: LoopSetting, scenario: Scenario, airframe: Airframe, mixing: str) -> LoopSetting:
-    """The loop with an allocation where the airframe or the mixing asks for one.
+    """Add an allocation to the loop if the airframe or the mixing needs one.
 
-    Otherwise the loop has the limits of the actuators.
+    Otherwise the loop gets the limits of the actuators.
     """
     if mixing == FULL or len(airframe.inputs) > len(airframe.outputs):
         return _allocated(loop, scenario, airframe)
@@ -344,7 +344,7 @@ def _mixed(loop: LoopSetting, scenario: Scenario, airframe: Airframe, mixing: st
 
 
 def _with_limits(loop: LoopSetting, scenario: Scenario, airframe: Airframe) -> LoopSetting:
-    """The loop with limits of u within the end stops of the scenario's actuators.
+    """Limit u within the end stops of the scenario's actuators.
 
     The loop of a different aircraft has no limits.
     """
@@ -369,7 +369,10 @@ def _with_limits(loop: LoopSetting, scenario: Scenario, airframe: Airframe) -> L
 def _pairing(
     inputs: str | Sequence[str], controller: ControllerConfig, airframe: Airframe
 ) -> tuple[str, ...]:
-    """Inputs as asked for, else of each output by a controller of the same names, else ()."""
+    """Return the input of each output as asked for, or as the controller pairs them, or ().
+
+    The pairs of the controller count only if it has the same inputs as the airframe.
+    """
     names = as_names(inputs, "inputs", f"the inputs {', '.join(airframe.inputs)} in any order")
     if names:
         return names
@@ -380,9 +383,9 @@ def _pairing(
 
 
 def _without_allocation(loop: LoopSetting, scenario: Scenario) -> LoopSetting:
-    """The loop of a scenario with an allocation for the inputs of the aircraft.
+    """Return the loop of a scenario without its allocation, with the inputs of the aircraft.
 
-    The lags are of the actuators.
+    The lags are those of the actuators.
     """
     if loop.base.allocation is None:
         return loop
@@ -394,10 +397,10 @@ def _without_allocation(loop: LoopSetting, scenario: Scenario) -> LoopSetting:
 
 
 def _allocated(loop: LoopSetting, scenario: Scenario, airframe: Airframe) -> LoopSetting:
-    """The loop with an allocation by the airframe's own C B.
+    """Add an allocation by the airframe's own C B to the loop.
 
-    Lags are those of the loop, else of the actuators. Raises ParameterError without the end stops
-    of the airframe's actuators.
+    Lags are those of the loop, or else of the actuators. Raises ParameterError if the airframe's
+    actuators have no end stops.
     """
     actuators = scenario.aircraft.actuators
     names = list(airframe.inputs)
@@ -423,7 +426,7 @@ def _allocated(loop: LoopSetting, scenario: Scenario, airframe: Airframe) -> Loo
     allocation, law = design_allocation(airframe, effectors, priority)
     m = len(law.names)
     slew = dict(zip(law.names, law.slew.tolist(), strict=True))
-    # The law has inputs of its own now: models and gains are to be selected.
+    # The law has inputs of its own now, so models and gains still have to be selected.
     base = {
         "outputs": airframe.outputs,
         "inputs": law.names,
@@ -464,17 +467,18 @@ def selected_observer(
     activity: float = 1.0,
     progress: Callable[[str], None] = lambda _: None,
 ) -> SelectedObserver:
-    """A controller with feedforward and observer of a model, and what it comes from.
+    """Return a controller with feedforward and observer of a model, and where its gains come from.
 
-    The gains are those of the file `weights`. Without a file they are those that `rise-di compare
-    --tune` found in the scenario, or in one that ships with its airframe and lags, where the model
-    has the same states and no channel has SLOWER times the total lag; else they follow from the
-    lags by a rule. From there the search for the least error begins, of several gain sets with
-    each; gains of a file and those beside a sketch are only relaxed, where the margins need it.
-    `uncertain` counts the phase margin of uncertain aircraft too, `sketched` takes the gains for a
-    model from a sketch, and `speeds` are two ratios to the trim speed, with models there. `margin`,
-    `is_free`, `activity`, `progress` and `earlier_design` as for `with_aircraft_observer`; channels
-    that are not free keep the gains of the latter.
+    The gains are those of the file `weights` if there is one. Otherwise they are those that
+    `rise-di compare --tune` found in the scenario, or in a shipped one with the same airframe and
+    lags, provided that the model has the same states and no channel has SLOWER times the total lag.
+    If there are none, a rule derives them from the lags. From there the search for the least error
+    begins, once for each gain set; gains of a file and those beside a sketch are only relaxed, if
+    the margins need it. With `uncertain` the phase margin of uncertain aircraft counts too, with
+    `sketched` the gains are those for a model from a sketch, and `speeds` are two ratios to the
+    trim speed, with models there. `margin`, `is_free`, `activity`, `progress` and `earlier_design`
+    are as for `with_aircraft_observer`; channels that are not free keep the gains of the earlier
+    design.
     """
     seen = through_allocation(model, controller)
     noise, vanes = _noise(controller, scenario, seen)
@@ -519,9 +523,9 @@ def selected_observer(
 def _noise(
     controller: RiseDiConfig, scenario: Scenario, model: Airframe
 ) -> tuple[FloatArray, dict[str, float]]:
-    """Rms per sample of the outputs, (m,), and of the vanes in use, by channel.
+    """Return the rms per sample of the outputs, (m,), and of the vanes in use, by channel.
 
-    A perfect sensor has a small noise here.
+    A perfect sensor gets a small noise here.
     """
     channels = scenario.aircraft.channels().outputs
     measured = scenario.aircraft.sensors.noise or (0.0,) * len(channels)
@@ -542,7 +546,7 @@ def _gain_sets(
     *,
     sketched: bool,
 ) -> list[tuple[ObserverGains, str]]:
-    """The gain sets from which the margins choose, each with what it comes from."""
+    """Return the gain sets from which the margins choose, each with where it comes from."""
     axes = tuple(model.gusts)
     if sketched:
         gains = gains_beside_sketch(nominal, controller.outputs, axes, model.speed)
@@ -570,12 +574,12 @@ def _gain_sets(
 
 @lru_cache
 def _shipped(name: str) -> Scenario:
-    """A scenario of the library, read once: a learner designs every few seconds."""
+    """Read a scenario of the library, once, because a learner designs every few seconds."""
     return find_scenario(name)
 
 
 def _tuned_scenario(scenario: Scenario) -> Scenario:
-    """A scenario with tuned gains: itself, or a shipped scenario.
+    """Return a scenario with tuned gains: this one, or a shipped one.
 
     The shipped scenario has the same airframe and actuators.
     """

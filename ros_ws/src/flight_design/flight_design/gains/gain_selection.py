@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Gain selection for an airframe: two gain sets, and their assessment.
 
-The gain sets come from the ideal control of the airframe along a manoeuvre.
+The gain sets follow from the ideal control of the airframe along a manoeuvre.
 
 `study_airframe` finds the rates of the ideal control, on the airframe as published and on uncertain
-ones around it. `gain_sets` derives two gain sets, of Theorem 1 and of the engineering procedure.
-`assess_scenario` assesses the gain set of a scenario: conditions, stability and delay margin.
-`gain_yaml.selection_yaml` writes a gain set as the section of a scenario file.
+ones around it. `gain_sets` derives two gain sets, one by Theorem 1 and one by the engineering
+procedure. `assess_scenario` assesses the gain set of a scenario: conditions, stability and delay
+margin. `gain_yaml.selection_yaml` writes a gain set as the section of a scenario file.
 """
 
 import math
@@ -61,21 +61,21 @@ CROSSOVER_LAG_PRODUCTS: Mapping[str, float] = {
     "V": 0.46,
     "climb": 0.46,
 }
-"""Bandwidth of a channel times the lag of its loop, rad, by output, at the begin of the search:
-0.63 and 0.46 cost 36 and 26 degrees of phase at the crossover. Yaw has a margin for the dutch roll,
-speed for the engine. The integral, Lambda and the slope of the softened sign, costs more: the
-search makes the integral slower, and lowers the bandwidth where that is not enough, until the
+"""Bandwidth of a channel times the lag of its loop, rad, by output, where the search begins: 0.63
+and 0.46 cost 36 and 26 degrees of phase at the crossover. Yaw has a margin for the dutch roll,
+speed one for the engine. The integral (Lambda and the slope of the softened sign) costs more phase.
+The search makes the integral slower, and lowers the bandwidth if that is not enough, until the
 margins meet the requirement."""
 
 DEFAULT_CROSSOVER_LAG_PRODUCT = 0.23  # rad, for an output that is not in CROSSOVER_LAG_PRODUCTS
 
-SOFTENING = 2.75  # 1, width of the softened sign in total lags at the begin of the search
+SOFTENING = 2.75  # 1, width of the softened sign in total lags where the search begins
 
 BETA_TO_SLEW = 1.25
 """beta / largest slew of the ideal control. The law needs at least 1; more than 1.5 gained nothing
 on the `osprey`."""
 
-# limits of the controller, one an input. They are reordered with the inputs.
+# limits of the controller, one per input; they are reordered with the inputs
 INPUT_LIMITS = ("lower", "upper", "slew")
 
 
@@ -83,7 +83,8 @@ INPUT_LIMITS = ("lower", "upper", "slew")
 SPEED_STEP = 0.05
 MAX_SPEED_RATIO = 3.0
 
-STABILITY = "linear stability"  # the condition: the part of the aircraft whose loop is stable
+# name of the condition on the fraction of aircraft whose loop is stable
+STABILITY = "linear stability"
 
 Controller = TypeVar("Controller", bound=ControllerConfig)
 
@@ -99,9 +100,9 @@ class LoopSetting(NamedTuple):
     gamma_2: float = 0.0  # 1/s, an assumption: 0 gives the smallest bounds (29), (30)
     factor: float = BETA_TO_SLEW  # beta / slew of the ideal control
     crossover_lag_products: Mapping[str, float] = CROSSOVER_LAG_PRODUCTS
-    # input of each output, in the airframe's order; empty: the airframe's pairing
+    # input of each output, in the airframe's order; empty for the airframe's pairing
     inputs: tuple[str, ...] = ()
-    # whether the result has the published airframe as model of a feedforward
+    # whether the result uses the published airframe as model of a feedforward
     feedforward: bool = False
     requirement: Requirement = Requirement()
 
@@ -121,7 +122,7 @@ class GainAssessment(NamedTuple, Generic[Controller]):
     def delay_margin(self) -> float | None:
         """Delay margin of the nominal aircraft with the delay in every channel, s.
 
-        None for the literal sign.
+        It is None for the literal sign.
         """
         return None if self.margins is None else self.margins.delay
 
@@ -129,25 +130,25 @@ class GainAssessment(NamedTuple, Generic[Controller]):
     def channel_margins(self) -> tuple[float, ...]:
         """Delay margins of the nominal aircraft with the delay in a single channel, s.
 
-        Empty for the literal sign.
+        They are empty for the literal sign.
         """
         return () if self.margins is None else self.margins.channel_delay
 
     def loop_with_box(self) -> LinearLoop:
-        """The linear loop with the box of the study. Raises ParameterError for the literal sign."""
+        """Return the linear loop with the box of the study, or refuse the literal sign."""
         return loop_with_box(self.study, self.controller)
 
     @property
     def has_requirement(self) -> bool:
-        """Whether margins are asked of the loop.
+        """Whether the loop must have certain margins.
 
-        They are not of an ideal loop with the implicit or the literal sign.
+        An ideal loop with the implicit or the literal sign need not.
         """
         return any(condition.name in REQUIRED for condition in self.loop)
 
     @property
     def unmet(self) -> tuple[GainCondition, ...]:
-        """The margins of the requirement that the loop does not have."""
+        """Margins of the requirement that the loop does not have."""
         return tuple(
             condition
             for condition in gain_conditions.failing(self.loop)
@@ -162,7 +163,7 @@ class GainAssessment(NamedTuple, Generic[Controller]):
 
 
 def loop_with_box(study: Study, controller: ControllerConfig) -> LinearLoop:
-    """The linear loop of a controller around the aircraft of a study, with the box of these."""
+    """Return the linear loop of a controller around the aircraft of a study, with their box."""
     timing = study.timing_of(controller)
     loop = linear_loop(controller, study.airframe, study.A, study.B, timing)
     airframe = study.airframe if study.effected is None else study.effected.airframe
@@ -176,38 +177,38 @@ def loop_with_box(study: Study, controller: ControllerConfig) -> LinearLoop:
 class Selection:
     """The two gain sets for an airframe.
 
-    A set is assessed on first use, for the margins of all samples cost most.
+    A set is assessed when it is first used, because the margins of all samples cost most.
     """
 
     study: Study
     setting: LoopSetting
     literal: RiseDiConfig  # the gain set of Theorem 1
     chosen: RiseDiConfig  # the engineering gains
-    origin: str = ""  # of the gains beside an observer, a sentence
+    origin: str = ""  # where the gains beside an observer come from, a sentence
 
     @cached_property
     def theorem(self) -> GainAssessment[RiseDiConfig]:
-        """The gain set of Theorem 1, assessed."""
+        """Gain set of Theorem 1, assessed."""
         return assess_gains(self.study, self.literal, self.setting)
 
     @cached_property
     def engineering(self) -> GainAssessment[RiseDiConfig]:
-        """The engineering gains, assessed."""
+        """Engineering gains, assessed."""
         return assess_gains(self.study, self.chosen, self.setting)
 
 
 def gain_sets(study: Study, setting: LoopSetting) -> Selection:
-    """Two gain sets for an airframe: by Theorem 1 and by the engineering procedure.
+    """Derive two gain sets for an airframe: by Theorem 1 and by the engineering procedure.
 
-    The set by Theorem 1 is literal.
+    The set by Theorem 1 has the literal sign.
 
-    Both have the same channels (the fastest first, so that the last has the smallest K), inputs
-    scaled by 1 / abs(Omega_ii) and D from the minors. The theorem's set is `theorem_gains` with
-    Lambda = 1 1/s, which needs the smallest k_g. The other one is `engineering_gains` with the slew
-    of the nominal airframe; behind servos, `within_requirement` finds the integrals and bandwidths
-    of the least error whose margins meet the setting's requirement, on the samples too. `omega` is
-    the largest abs(Omega_ii) of the samples. Raises ParameterError as `signs_of_pairing` does, and
-    for parameters that the controller does not accept.
+    Both sets have the same channels (the fastest first, so that the last has the smallest K),
+    inputs scaled by 1 / abs(Omega_ii), and D from the minors. The theorem's set is `theorem_gains`
+    with Lambda = 1 1/s, which needs the smallest k_g. The other one is `engineering_gains` with the
+    slew of the nominal airframe; behind servos, `within_requirement` finds the integrals and
+    bandwidths with the least error whose margins meet the setting's requirement, for the samples
+    too. `omega` is the largest abs(Omega_ii) of the samples. Raises ParameterError as
+    `signs_of_pairing` does, and for parameters that the controller does not accept.
     """
     pairs = _paired(study, setting)
     engineering = gain_candidates(study, setting)
@@ -223,10 +224,10 @@ def gain_sets(study: Study, setting: LoopSetting) -> Selection:
 def gain_candidates(
     study: Study, setting: LoopSetting
 ) -> Callable[[FloatArray, FloatArray], Candidate[RiseDiConfig]]:
-    """A function of `slower` and `lower`, (m,), to the engineering gains and the loop.
+    """Return a function from `slower` and `lower`, (m,), to the engineering gains and the loop.
 
     The bandwidth is lower by `lower`, and the integral slower by `slower` and `lower`. Raises
-    ParameterError as `gain_sets`.
+    ParameterError as `gain_sets` does.
     """
     pairs = _paired(study, setting)
     limits = (
@@ -238,7 +239,7 @@ def gain_candidates(
 
     def engineering(slower: FloatArray, lower: FloatArray) -> Candidate[RiseDiConfig]:
         selected = gain_conditions.engineering_gains(pairs.bandwidth / lower, *limits, slower)
-        # both parts of the integral fall with the bandwidth
+        # both terms of the integral fall with the bandwidth
         config = controller(*selected, slower * lower)
         return Candidate(config, linear_loop(config, study.airframe, study.A, study.B))
 
@@ -246,19 +247,19 @@ def gain_candidates(
 
 
 class _Paired(NamedTuple):
-    """The channels of a selection, the fastest first: (22) gives the last one the smallest K."""
+    """The channels of a selection, the fastest first: (22) gives the last the smallest K."""
 
     channels: ChannelPairing
     rows: list[int]  # of the outputs, in the airframe's order
     columns: list[int]  # of the inputs
-    bandwidth: FloatArray  # (m,) rad/s, at the begin of the search
+    bandwidth: FloatArray  # (m,) rad/s, where the search begins
     D: FloatArray  # (m,)
     unit: FloatArray  # (m,) 1 / abs(Omega_ii)
     spread: FloatArray  # (m,) largest abs(Omega_ii) of the samples
 
 
 def _paired(study: Study, setting: LoopSetting) -> _Paired:
-    """The channels of a study. Raises ParameterError as `signs_of_pairing`."""
+    """Pair the channels of a study. Raises ParameterError as `signs_of_pairing` does."""
     inputs = list(study.airframe.inputs)
     pairing = ChannelPairing(study.airframe.outputs, setting.inputs or tuple(inputs))
     require(
@@ -294,13 +295,13 @@ def _paired(study: Study, setting: LoopSetting) -> _Paired:
 
 
 def _literal(study: Study, setting: LoopSetting, pairs: _Paired) -> RiseDiConfig:
-    """The gain set of Theorem 1."""
+    """Return the gain set of Theorem 1."""
     ones = np.ones(len(pairs.rows))
     bounds, *_ = _bounds(
         study, pairs.rows, pairs.columns, pairs.unit, pairs.D, ones, setting.gamma_2
     )
     sufficient = gain_conditions.theorem_gains(bounds, ones)
-    # The theorem may ask for gains beyond those that a controller takes, as k_d of 2e17 1/s for the
+    # The theorem may demand gains beyond those that a controller takes, as k_d of 2e17 1/s for the
     # f16 of JSBSim.
     rows = (sufficient.k_d, sufficient.Lambda, sufficient.beta)
     accepted = GainSet(
@@ -319,9 +320,9 @@ def _controller(
     response: FloatArray,
     slower: FloatArray,
 ) -> RiseDiConfig:
-    """The controller with gains.
+    """Build the controller with the gains.
 
-    The integral is `slower`, and abs(Omega_ii) is `response` in the scaled inputs.
+    The integral is slower by `slower`, and abs(Omega_ii) is `response` in the scaled inputs.
     """
     channels = pairs.channels
     scale = pairs.unit * response
@@ -358,11 +359,11 @@ def _controller(
 
 
 def with_feedforward(controller: Controller, airframe: Airframe) -> Controller:
-    """The same controller with the airframe as the nominal model of its feedforward.
+    """Return the same controller with the airframe as the nominal model of its feedforward.
 
-    A feedforward is an extension of the paper. lead = lag + delay + half a period, of the
-    controller. Raises ParameterError for an airframe that cannot be the model, such as one with a
-    zero in the right half plane.
+    lead = lag + delay + half a period of the
+    controller. Raises ParameterError if the airframe cannot be the model, for example because it
+    has a zero in the right half plane.
     """
     for name in controller.outputs:
         require(
@@ -388,16 +389,16 @@ def with_feedforward(controller: Controller, airframe: Airframe) -> Controller:
 def assess_scenario(
     scenario: Scenario, study: Study, gamma_2: float = 0.0
 ) -> GainAssessment[ControllerConfig]:
-    """Every condition on the gain set of a scenario's controller.
+    """Evaluate every condition on the gain set of a scenario's controller.
 
-    The airframe is studied along the scenario's manoeuvre, and has its outputs. Raises
-    ParameterError if D or the pairing contradict the airframe.
+    The airframe is studied along the scenario's manoeuvre and must have its outputs. Raises
+    ParameterError if D or the pairing contradicts the airframe.
     """
     return assess_gains(study, scenario.controller, loop_setting(scenario, gamma_2))
 
 
 def loop_setting(scenario: Scenario, gamma_2: float = 0.0) -> LoopSetting:
-    """The loop of a scenario: its controller, and the rate limits of controller and actuators."""
+    """Return the loop of a scenario: its controller, and rate limits of it and the actuators."""
     controller = scenario.controller
     rates = scenario.aircraft.actuators.rate
     slew = dict(zip(controller.inputs, controller.slew or (), strict=bool(controller.slew)))
@@ -418,18 +419,18 @@ def loop_setting(scenario: Scenario, gamma_2: float = 0.0) -> LoopSetting:
 def assess_gains(
     study: Study, controller: Controller, setting: LoopSetting
 ) -> GainAssessment[Controller]:
-    """Every condition on a gain set.
+    """Evaluate every condition on a gain set.
 
     Rate, lag and delay are the controller's; gamma_2 and rate limits are the setting's.
 
-    Theorem: see `_rise_di_conditions`. Rules: `check_rules` without an observer.
-    Loop: `check_loop` without an observer, the fraction of the samples for which the linear loop is
-    stable, and its delay margin on the nominal airframe, which should be at least one period, a
-    missed tick, or what an observer requires beyond the delay, and the
-    margins of the setting's requirement, 35 degrees of phase with an observer. With the implicit
-    sign the linear loop is the one inside the width of the sign, dt^2 omega beta. Its margin is
-    then the delay at which chatter begins, and at most half a period. A law other than RISE-DI has
-    the conditions of the linear loop alone.
+    The conditions of the theorem are those of `_rise_di_conditions`. The rules are those of
+    `check_rules`, if there is no observer. The conditions of the loop are `check_loop`, if there is
+    no observer, the fraction of the samples for which the linear loop is stable, its delay margin
+    on the nominal airframe, and the margins of the setting's requirement (35 degrees of phase with
+    an observer). The delay margin should be at least one period, a missed tick, or what an observer
+    requires beyond the delay. With the implicit sign the linear loop is the one inside the width of
+    the sign, dt^2 omega beta; its margin is then the delay at which chatter begins, at most half a
+    period. A law other than RISE-DI only has the conditions of the linear loop.
     """
     rows, columns = law_order(study.airframe, controller)
     channels = ChannelPairing(controller.outputs, controller.inputs)
@@ -479,7 +480,7 @@ def assess_gains(
 def _rise_di_conditions(
     study: Study, controller: RiseDiConfig, setting: LoopSetting, D: FloatArray
 ) -> tuple[tuple[GainCondition, ...], tuple[GainCondition, ...], tuple[GainCondition, ...], Bounds]:
-    """The conditions of Theorem 1, `check_rules`, `check_loop`, and the bounds of the theorem.
+    """Evaluate the conditions of Theorem 1, `check_rules`, `check_loop`, and the theorem's bounds.
 
     "D" and "zero dynamics" are the fractions of the samples for which they hold. The bounds of
     (29), (30), steps 2 and 3 are the largest over the samples for which both hold. "V2_dot" is the
@@ -507,7 +508,7 @@ def _rise_di_conditions(
         *gain_conditions.check_theorem(gains, bounds),
         GainCondition("V2_dot", None, decay_rate, 0.0, strict=True),
     )
-    # the engineering rules are those of a law that has no other feedback beside it
+    # the engineering rules hold for a law without any other feedback beside it
     if controller.observer is not None:
         return theorem, (), (), bounds
     responses = np.abs(np.einsum("Nii->Ni", C @ Bs))[counts] * params.input_scale
@@ -522,9 +523,9 @@ def _rise_di_conditions(
 
 
 def response(study: Study, controller: ControllerConfig) -> FloatArray:
-    """abs(Omega_ii) in the scaled inputs of a controller, law's order, (m,).
+    """Compute abs(Omega_ii) in the scaled inputs of a controller, law's order, (m,).
 
-    A channel too slow for (22) has less than 1, any further channel 1.
+    It is less than 1 in a channel that is too slow for (22), and 1 in all others.
     """
     rows, columns = law_order(study.airframe, controller)
     scale = getattr(controller, "input_scale", 1.0)
@@ -532,11 +533,12 @@ def response(study: Study, controller: ControllerConfig) -> FloatArray:
 
 
 def stable_speed_ratio(study: Study, controller: ControllerConfig) -> float:
-    """Airspeed over that of the trim up to which the delay margin lasts with fixed gains.
+    """Find the ratio to the trim speed up to which the delay margin lasts with fixed gains.
 
-    0 without a delay margin at trim. The response to every input but that of V grows with V^2, all
-    else is that of the trim. The answer is rounded down to SPEED_STEP, and infinite where the
-    linear loop is stable up to MAX_SPEED_RATIO. Raises ParameterError for the literal sign.
+    The response to every input but that of V grows with V^2, and everything else stays as in trim.
+    The result is rounded down to SPEED_STEP. It is 0 if there is no delay margin in trim, and
+    infinite if the linear loop is stable up to MAX_SPEED_RATIO. Raises ParameterError for the
+    literal sign.
     """
     timing = study.timing_of(controller)
     loop = linear_loop(controller, study.airframe, study.A[:1], study.B[:1], timing)
@@ -561,9 +563,9 @@ def _bounds(
     Lambda: FloatArray,
     gamma_2: float,
 ) -> tuple[Bounds, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Bounds of Theorem 1 in inputs scaled by `scale` (m,), with two masks of the samples.
+    """Compute the bounds of Theorem 1 in inputs over `scale` (m,), with two masks of samples.
 
-    The first mask has the samples with this D, the second only samples with stable zeros too.
+    The first mask has the samples with this D, the second those that have stable zeros as well.
     """
     C = study.C[rows]
     Omegas = C @ study.B[:, :, columns] * scale

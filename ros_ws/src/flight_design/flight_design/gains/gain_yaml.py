@@ -33,7 +33,7 @@ PLAIN = re.compile(r"[A-Za-z/][A-Za-z0-9_./:-]*")
 
 
 def yaml_flow(value: Any, precision: int = 6) -> str:
-    """A value in YAML's flow style.
+    """Write a value in YAML's flow style.
 
     Floats have six digits and always a point, which YAML 1.1 requires of a float.
     """
@@ -53,15 +53,15 @@ def yaml_flow(value: Any, precision: int = 6) -> str:
     if isinstance(value, str) and not (
         PLAIN.fullmatch(value) and parse_yaml(value, "", "") == value
     ):
-        return json.dumps(value, ensure_ascii=False)  # which is YAML too
+        return json.dumps(value, ensure_ascii=False)  # JSON is YAML too
     return str(value)
 
 
 def yaml_template(text: str) -> Template:
-    """A template of a YAML file.
+    """Make a template of a YAML file.
 
-    "{{ value | flow }}" is `yaml_flow`, "| digits(3)" a number with three digits, "| line" a text
-    without a line end.
+    "{{ value | flow }}" is `yaml_flow`, "| digits(3)" writes a number with three digits, and "|
+    line" a text without a line end.
     """
     environment = Environment(
         trim_blocks=True,
@@ -113,9 +113,9 @@ def _listed(values: FloatArray) -> str:
 
 
 def selection_yaml(selection: Selection, *, theorem: bool = False) -> str:
-    """The engineering gain set as the section `/**/controller` of a scenario file.
+    """Write the engineering gain set as the section `/**/controller` of a scenario file.
 
-    Comments have units and reasons.
+    Comments give units and reasons.
 
     Args:
         selection: The result of `select_gains`.
@@ -135,7 +135,7 @@ def selection_yaml(selection: Selection, *, theorem: bool = False) -> str:
     as_instance(selection, Selection, "selection", "a Selection, as select_gains returns one")
     assessed = selection.theorem if theorem else selection.engineering
     controller = assessed.controller
-    # else the observer of a learner, later
+    # a part of 0 is for an observer that a learner designs later
     has_observer = controller.observer is not None and controller.observer.part > 0.0
     engineering = "beside an observer" if has_observer else "by the engineering procedure"
     comments = _comments(selection, controller)
@@ -160,7 +160,7 @@ def selection_yaml(selection: Selection, *, theorem: bool = False) -> str:
 
 
 def _comments(selection: Selection, controller: RiseDiConfig) -> dict[str, str]:
-    """Unit and reason of each parameter of the engineering gains."""
+    """Write the unit and reason of each parameter of the engineering gains."""
     study = selection.study
     params = controller.law_params()
     _, columns = law_order(study.airframe, controller)
@@ -189,7 +189,7 @@ def _comments(selection: Selection, controller: RiseDiConfig) -> dict[str, str]:
 
 
 def _within(uncertainty: float) -> str:
-    """What the largest of uncertain aircraft is taken of; "" without any."""
+    """Say over which uncertain aircraft a value is the largest; "" if there are none."""
     return f", the largest within +-{100 * uncertainty:g} %" if uncertainty else ""
 
 
@@ -201,9 +201,9 @@ def section_yaml(
     comments: Mapping[str, str],
     unmet: Sequence[GainCondition] = (),
 ) -> str:
-    """A controller as the section `/**/controller` of a scenario file.
+    """Write a controller as the section `/**/controller` of a scenario file.
 
-    A parameter without a comment gets the description. `unmet` margins are named first.
+    A parameter without a comment gets its description. Margins that are `unmet` are named first.
     """
     parameters = [
         (key, value, comments.get(key, type(controller).model_fields[key].description))
@@ -224,15 +224,15 @@ def section_yaml(
 
 
 def below_requirement(unmet: Sequence[GainCondition], outputs: Sequence[str]) -> str:
-    """The first line of a file whose margins fall short; "" where none does."""
+    """Write the first line of a file whose margins fall short; "" if none does."""
     lacking = "; ".join(condition.sentence(outputs) for condition in unmet)
     return f"Margins below the requirement: {lacking}." if lacking else ""
 
 
 def margins_sentence(controller: ControllerConfig, margins: LoopMargins | None) -> str:
-    """The margins of a loop in a sentence: nominal and worst phase margins.
+    """Write the margins of a loop in a sentence: nominal and worst phase margins.
 
-    "" without a softened sign, or unstable.
+    Returns "" if the loop has no softened sign or is unstable.
     """
     implicit = (
         isinstance(controller, RiseDiConfig) and controller.sampled_sign()[0] is Sign.IMPLICIT
@@ -254,7 +254,7 @@ def margins_sentence(controller: ControllerConfig, margins: LoopMargins | None) 
 
 
 def _shown_response(responses: FloatArray) -> str:
-    """The factors of 1 / abs(Omega_ii).
+    """Write the factors of 1 / abs(Omega_ii).
 
     They are 1, or less in a channel that is too slow for a K of (22).
     """
@@ -265,9 +265,9 @@ def _shown_response(responses: FloatArray) -> str:
 def _sections(
     controller: ControllerConfig, airframe: Airframe
 ) -> dict[str, tuple[str, dict[str, Any]]]:
-    """The sections allocation, feedforward and observer, if any.
+    """Write the sections allocation, feedforward and observer, if there are any.
 
-    A section has a comment, and the parameters in flow style.
+    Each section has a comment, and its parameters in flow style.
     """
     along = f"the input of {airframe.name} along y_m is added; SI, a line a state, lead in s"
     corrects = (
@@ -312,7 +312,7 @@ def _sections(
 def _columns_of(
     section: AllocationConfig | FeedforwardConfig | ObserverConfig | VanesConfig, m: int
 ) -> dict[str, int]:
-    """The columns of each matrix of a section."""
+    """Return the number of columns of each matrix of a section."""
     if isinstance(section, VanesConfig):
         return {"H": len(section.H) // len(section.channels), "L": m + 1}
     if isinstance(section, AllocationConfig):
@@ -326,7 +326,7 @@ def _columns_of(
 def _matrix_rows(
     section: AllocationConfig | FeedforwardConfig | ObserverConfig | VanesConfig, m: int
 ) -> dict[str, Any]:
-    """Entries of each parameter in flow style, a matrix in rows.
+    """Write the entries of each parameter in flow style, matrices in rows.
 
     Numbers of an allocation and an observer have ten digits.
     """

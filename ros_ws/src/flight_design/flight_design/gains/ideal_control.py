@@ -33,7 +33,7 @@ from rise_di_controller.law.linear_loop import LoopTiming
 from rise_di_controller.params import ControllerConfig
 
 STEP = 0.01
-"""s, step of the ideal control. It resolves a gust of one second and hidden modes up to 10 1/s to
+"""s, step of the ideal control. It resolves a gust of one second, and hidden modes up to 10 1/s, to
 1e-6 of their size."""
 
 STABLE_STEP = -2.785
@@ -42,7 +42,7 @@ Source: E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, sectio
 
 
 class Manoeuvre(NamedTuple):
-    """The commands and gusts that the gains are selected for."""
+    """The commands and gusts for which the gains are selected."""
 
     reference: ReferenceModelConfig
     gusts: dict[str, Gust]
@@ -57,14 +57,14 @@ class ChannelPairing(NamedTuple):
 
 
 class Effected(NamedTuple):
-    """An airframe file whose effectors an allocation moves, u = T v: its entries are uncertain."""
+    """An airframe file with uncertain entries, whose effectors an allocation moves, u = T v."""
 
     airframe: Airframe
     T: FloatArray  # (p, m)
 
 
 class Flown(NamedTuple):
-    """The flight of a study: what its aircraft has, beside what the controller was told."""
+    """The flight of a study: its aircraft, compared with what the controller was told."""
 
     scenario: Scenario
     comparison: Comparison
@@ -93,12 +93,12 @@ class Study(NamedTuple):
     flown: Flown | None = None  # None: a loop that flies no aircraft yet
 
     def timing_of(self, controller: ControllerConfig) -> LoopTiming:
-        """Return lags, delay and period of the loop that flies, else as the controller was told."""
+        """Return lags, delay and period that fly, or else those that the controller was told."""
         return loop_of(controller) if self.flown is None else self.flown.comparison.timing
 
     @property
     def differences(self) -> list[str]:
-        """How the aircraft that flies differs from what the controller was told, sentences."""
+        """Sentences on how the aircraft that flies differs from what the controller was told."""
         flown = self.flown
         return [] if flown is None else [each.sentence for each in flown.comparison.differences]
 
@@ -109,10 +109,10 @@ class Study(NamedTuple):
 
 
 def manoeuvre(scenario: Scenario, airframe: Airframe) -> Manoeuvre:
-    """The commands and gusts of a scenario for the channels and gust axes that an airframe has.
+    """Extract the commands and gusts of a scenario that an airframe has channels and gust axes for.
 
     A coordinated turn stays if the airframe has both of its channels, at the airframe's own speed.
-    Raises ParameterError for an output without command in the scenario.
+    Raises ParameterError if the scenario has no command for an output.
     """
     commands = scenario.reference_model
     for name in airframe.outputs:
@@ -158,11 +158,12 @@ def study_airframe(
     effected: Effected | None = None,
     spread: Spread = UNIFORM,
 ) -> Study:
-    """Rates of the ideal control along a manoeuvre.
+    """Compute the rates of the ideal control along a manoeuvre.
 
-    The first rates are of the airframe as published, the rest of uncertain airframes.
+    The first rates belong to the airframe as published, the others to uncertain airframes.
 
-    The ideal control keeps y on y_m. With x = P y_m + N eta, eta the states beside the outputs
+    The ideal control keeps y on y_m. With x = P y_m + N eta, where eta are the states beside the
+    outputs
     (`output_coordinates`):
 
         eta_dot = H' (I - B Omega^-1 C) (A x + f(x, t)) + H' B Omega^-1 y_m_dot
@@ -170,12 +171,12 @@ def study_airframe(
         u* = Omega^-1 (y_m_dot - C (A x + f)),  x_dot = A x + f + B u*
         u*_dot = Omega^-1 (y_m_ddot - C (A x_dot + f_dot)),  f_dot along (1, x_dot)
 
-    Runge-Kutta in steps of 0.01 s; u*_dot is evaluated at the steps; only f_dot and u_m_dot are
-    differences, central and over 1e-5 s. f is that of the nominal airframe. The entries of
-    `effected` are drawn, if any. Raises ParameterError if Omega is singular or if the nominal
-    airframe has a zero in the right half plane: then Assumption 3 does not hold. Raises FlightEnded
-    if the ideal flight of the nominal airframe diverges; an uncertain one that does counts as
-    unstable.
+    It is integrated by Runge-Kutta in steps of 0.01 s, and u*_dot is evaluated at the steps. Only
+    f_dot and u_m_dot are differences, central and over 1e-5 s. f is that of the nominal airframe.
+    If there is an `effected` airframe, its entries are drawn. Raises ParameterError if Omega is
+    singular or if the nominal airframe has a zero in the right half plane, because Assumption 3
+    does not hold then, and FlightEnded if the ideal flight of the nominal airframe diverges. An
+    uncertain one that diverges counts as unstable.
     """
     drawn_airframe = airframe if effected is None else effected.airframe
     A, B = nominal_and_sampled(drawn_airframe, uncertainty, samples, seed, spread)
@@ -242,11 +243,11 @@ class _IdealPlant(NamedTuple):
     N: FloatArray  # (n, n - m)
 
     def state(self, y_m: FloatArray, eta: FloatArray) -> FloatArray:
-        """X = P y_m + N eta, (n, N)."""
+        """Compute x = P y_m + N eta, (n, N)."""
         return np.asarray((self.P @ y_m)[:, None] + self.N @ eta)
 
     def drift(self, t: Any, x: FloatArray) -> FloatArray:
-        """A x + f, (n, N)."""
+        """Compute A x + f, (n, N)."""
         return np.asarray(_times(self.A, x) + dynamics.f(t, x, self.aircraft))
 
 
@@ -257,7 +258,7 @@ def _times(matrices: FloatArray, columns: FloatArray) -> FloatArray:
 def _ideal_plant(
     airframe: Airframe, manoeuvre: Manoeuvre, A: FloatArray, B: FloatArray
 ) -> _IdealPlant:
-    """The plants of a study. Raises ParameterError for a singular Omega."""
+    """Build the plants of a study. Raises ParameterError for a singular Omega."""
     C = airframe.matrix_c()
     P, N, H = output_coordinates(C)
     Omega: FloatArray = np.einsum("ij,Njk->Nik", C, B)
@@ -279,7 +280,7 @@ def _ideal_plant(
 def _ideal_rates(
     plant: _IdealPlant, references: tuple[FloatArray, FloatArray, FloatArray]
 ) -> FloatArray:
-    """u*_dot at the steps, (T, N, m)."""
+    """Compute u*_dot at the steps, (T, N, m)."""
     y_m, y_m_dot, y_m_ddot = references
 
     def eta_dot(t: float, eta: Array, _: None, __: None) -> Array:
@@ -311,7 +312,7 @@ def _ideal_rates(
 def _references(
     manoeuvre: Manoeuvre, airframe: Airframe
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """y_m and its two derivatives every STEP / 2, for the stages of Runge-Kutta.
+    """Compute y_m and its two derivatives every STEP / 2, for the stages of Runge-Kutta.
 
     The order is the airframe's, the shape (2 T - 1, m).
     """
@@ -334,9 +335,9 @@ def _references(
 
 
 def _columns(airframe: Airframe, gusts: Mapping[str, Gust], columns: int) -> Aircraft:
-    """The aircraft with f for states in columns, shape (n, columns).
+    """Return the aircraft with f for states in columns, shape (n, columns).
 
-    The last column is without gusts.
+    The last column has no gusts.
     """
     gust_on = np.append(np.ones(columns - 1), 0.0)
     profiles = np.array([(gust.start, gust.speed, gust.length) for gust in gusts.values()]).reshape(

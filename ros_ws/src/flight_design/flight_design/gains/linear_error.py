@@ -20,9 +20,9 @@ from rise_di_controller.law.linear_loop import (
 )
 
 HORIZON = 20.0  # s, of turbulence and noise: longer than the slowest mode that counts
-GUST_HORIZON = 8.0  # s, of the response to a gust
-FLIGHT = 60.0  # s, over which the errors of the gusts are averaged: one of each axis
-TURBULENT = 0.5  # weight of turbulence, where errors are about twice those in the gusts
+GUST_HORIZON = 8.0  # s, over which the response to a gust counts
+FLIGHT = 60.0  # s, over which the errors of the gusts, one for each axis, are averaged
+TURBULENT = 0.5  # weight of turbulence, because its errors are about twice those in the gusts
 MEAN = math.sqrt(2.0 / math.pi)  # of the magnitude of a normal value, in standard deviations
 
 GUST_TIME = 0.6  # s, from the entry of a gust to its peak
@@ -31,14 +31,15 @@ GUST_SPEED = 17.07  # m/s, at 106.7 m and sea level, CS 25.341 (a)(5): 56 ft/s
 
 
 class Air(NamedTuple):
-    """The wind that a loop has to bear, and the noise that it measures.
+    """The wind that a loop must withstand, and the noise that it measures.
 
-    The turbulence of each of G axes is a first-order process with a time constant and a standard
-    deviation. A 1-cosine gust of each axis has a duration and a peak, 0 for none.
+    The turbulence on each of G axes is a first-order process with a time constant and a standard
+    deviation. On each axis there is also a 1-cosine gust with a duration and a peak, which is 0 for
+    no gust.
     """
 
     wind: FloatArray  # (n, G) effect of 1 m/s on x_dot
-    reading: FloatArray  # (m + k, G) effect of 1 m/s on a measurement: of a vane
+    reading: FloatArray  # (m + k, G) effect of 1 m/s on a measurement, namely on a vane
     time: FloatArray  # (G,) s
     sigma: FloatArray  # (G,) m/s
     noise: FloatArray  # (m + k,) rms per sample of the measurements, SI
@@ -47,12 +48,12 @@ class Air(NamedTuple):
 
 
 def discrete_gust(speed: float) -> tuple[float, float]:
-    """Peak, m/s, and duration, s, of a 1-cosine gust at a speed, m/s:
+    """Return the peak, m/s, and the duration, s, of a 1-cosine gust at a speed, m/s.
 
         U = GUST_SPEED (H / 106.7 m)^(1/6),  H = GUST_TIME speed within GUST_LENGTHS
 
     Source: CS 25.341 (a), without the alleviation factor.
-    """  # noqa: D415 - what follows is an equation
+    """
     length = min(max(GUST_TIME * speed, GUST_LENGTHS[0]), GUST_LENGTHS[1])
     peak = GUST_SPEED * (length / GUST_LENGTHS[1]) ** (1.0 / 6.0)
     return peak, 2.0 * length / speed
@@ -66,12 +67,12 @@ class AirResponse(NamedTuple):
 
 
 def air_response(plant: LinearPlant, law: LinearLaw, loop: LoopTiming, air: Air) -> AirResponse:
-    """What a stable loop does in the gusts, and in turbulence with noise for HORIZON from rest.
+    """Compute what a stable loop does in gusts, and in turbulence with noise for HORIZON from rest.
 
         z+ = A z + N n,  P+ = A P A' + N N',  n white with unit variance
 
-    The covariance P after 2^j periods comes from that after 2^(j-1). The noise counts in turbulence
-    alone.
+    The covariance P after 2^j periods follows from that after 2^(j-1). Noise only counts in
+    turbulence.
     """
     none = np.zeros(len(loop.lag))
     matrix = closed_loop(plant, law, loop, none)
@@ -100,7 +101,7 @@ def air_response(plant: LinearPlant, law: LinearLaw, loop: LoopTiming, air: Air)
 def _gust_energy(
     matrix: FloatArray, response: FloatArray, C: FloatArray, period: float, air: Air
 ) -> FloatArray:
-    """Integral of the squares of the outputs in a gust of each axis, (m,)."""
+    """Integrate the squares of the outputs in a gust on each axis, (m,)."""
     state = np.zeros(response.shape)
     energy = np.zeros(len(C))
     for k in range(round(GUST_HORIZON / period)):
@@ -115,9 +116,9 @@ def _gust_energy(
 def _turbulent(
     matrix: FloatArray, blown: FloatArray, noise: FloatArray, period: float, air: Air
 ) -> tuple[FloatArray, FloatArray]:
-    """The covariance of the state of a loop in turbulence and noise, and the transition.
+    """Return the covariance of the state of a loop in turbulence and noise, and the transition.
 
-    In the state the wind stands below the loop.
+    The state of the wind comes below that of the loop.
     """
     size, G = blown.shape
     decay = np.exp(-period / air.time)
@@ -137,11 +138,11 @@ def _turbulent(
 
 
 def linear_error(loop: LinearLoop, u_dot: FloatArray) -> FloatArray:
-    """Rms of e of the nominal linear loop under the ideal control u*, (..., m), SI.
+    """Compute the rms of e of the nominal linear loop under the ideal control u*, (..., m), SI.
 
-    The loop has to give u*. The leading axes are from the laws of the loop. u* keeps y on y_m, so e
-    is the response of the loop to the disturbance -u* at the input of the aircraft, from trim on.
-    `u_dot` (T, m) is the rate of u* every STEP, inputs in the law's order.
+    The loop must produce u* itself. u* keeps y on y_m, so e is the response of the loop to the
+    disturbance -u* at the input of the aircraft, starting from trim. Leading axes are those of the
+    laws of the loop. `u_dot` (T, m) is the rate of u* every STEP, inputs in the law's order.
     """
     period = loop.loop.period
     u = np.concatenate(

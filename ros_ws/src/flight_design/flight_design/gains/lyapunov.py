@@ -65,11 +65,11 @@ class Evidence(NamedTuple):
 
 
 def from_tape(scenario: Scenario, tape: Tape) -> tuple[KnownPlant, FlightSamples]:
-    """Plant and samples of a scenario's tape at the ticks of the law.
+    """Read plant and samples from a scenario's tape at the ticks of the law.
 
-    The channels are in the law's order, in scaled inputs. Raises ValueError if a tick has no sample
-    of `truth` or `y_m` with its stamp. The tape is that of a simulation in one process or of a bag
-    with an exact clock.
+    The channels are in the law's order, in scaled inputs. The tape must be that of a simulation in
+    one process, or of a bag with an exact clock. Raises ValueError if a tick has no sample of
+    `truth` or `y_m` with its stamp.
     """
     airframe, aircraft = scenario.aircraft.load()
     controller = scenario.controller
@@ -100,11 +100,11 @@ def from_tape(scenario: Scenario, tape: Tape) -> tuple[KnownPlant, FlightSamples
 def fly_known_plant(
     plant: KnownPlant, y_m: FloatArray, dt: float, params: LawParams, x_0: FloatArray
 ) -> FlightSamples:
-    """The plant under the law from x_0, engaged at t = 0.
+    """Fly the plant under the law from x_0, engaged at t = 0.
 
-    A dt has a tick and a Runge-Kutta step, v held between ticks. Arguments: `y_m` the reference at
-    the ticks, shape (N, m); `dt` in s; `params` with input_scale 1, since B acts on v; `x_0` shape
-    (n,).
+    Each dt has a tick and a Runge-Kutta step, with v held between ticks. `y_m` is the reference at
+    the ticks, shape (N, m); `dt` is in s; `params` must have input_scale 1, since B acts on v;
+    `x_0` has shape (n,).
     """
 
     def x_dot(t: float, x: FloatArray, v: FloatArray, _: None) -> FloatArray:
@@ -128,7 +128,7 @@ def fly_known_plant(
 def evidence(
     plant: KnownPlant, flight: FlightSamples, params: LawParams, zeta_b: float = 0.0
 ) -> Evidence:
-    """The signals of the proof along a flight, with Omega = C B = S D U (11) and M = S^-1.
+    """Compute the signals of the proof along a flight, with Omega = C B = S D U (11), M = S^-1.
 
         e = C x - y_m (3),  r = e_dot + Lambda e (4)
         N_d = M (C A (x_dot - C^+ e_dot) + C f_dot - y_m_ddot)
@@ -161,7 +161,7 @@ def evidence(
 
 
 def decay_matrix(plant: KnownPlant, params: LawParams) -> FloatArray:
-    """Q of V2_dot = -z' Q z along every flight of the continuous law, shape (2m, 2m).
+    """Compute Q of V2_dot = -z' Q z along every flight of the continuous law, shape (2m, 2m).
 
     z = [e; r], and Q is symmetric.
 
@@ -182,7 +182,7 @@ def decay_matrix(plant: KnownPlant, params: LawParams) -> FloatArray:
 
 
 def lemma_2(plant: KnownPlant, signals: Evidence, params: LawParams) -> float:
-    """The constant zeta_b of (47) that Lemma 2 gives for a flight.
+    """Compute the constant zeta_b of (47) that Lemma 2 gives for a flight.
 
     P >= 0 then follows from (29), (30).
 
@@ -208,9 +208,9 @@ def lemma_2(plant: KnownPlant, signals: Evidence, params: LawParams) -> float:
 
 
 def integral(signal: FloatArray, t: FloatArray) -> FloatArray:
-    """integral_0^t of a sampled signal by the trapezoid rule, 0 at the first sample.
+    """Integrate a sampled signal from 0 to t by the trapezoid rule; 0 at the first sample.
 
-    The shape is as of the signal: (N,) or (N, m).
+    The result has the shape of the signal: (N,) or (N, m).
     """
     return np.asarray(cumulative_trapezoid(signal, t, axis=0, initial=0))
 
@@ -225,11 +225,11 @@ class Example(NamedTuple):
 
 
 def example(dt: float, duration: float) -> Example:
-    """Four states and two inputs, Omega = S D U with D = diag(1, -1) and a full U.
+    """Build an example of four states and two inputs with D = diag(1, -1) and a full U.
 
     The disturbance and the reference are persistent. It is well conditioned (M between 0.8 and 1.3,
     zeros -1.48 and -1.02). Its gains meet the conditions of Theorem 1 on this flight:
-    `decay_matrix` is positive definite and `lemma_2` finds a constant. Times in s.
+    `decay_matrix` is positive definite and `lemma_2` finds a constant. Times are in s.
     """
     D = np.array([1.0, -1.0])
     U = np.array([[1.0, 0.4], [0.0, 1.0]])

@@ -14,20 +14,21 @@ from flight_core.units import ANGLE, DIMENSIONLESS, LENGTH, SPEED, quantity
 from flight_core.vectors import FloatArray
 from rise_di_controller.law.linear_loop import LoopTiming
 
-SIZES = {SPEED: 1.0, LENGTH: 1.0}  # m/s, m: the units of states in weights, "sizes"
-ANGLE_SIZE = 0.1  # rad (/s), and of states without a dimension
+SIZES = {SPEED: 1.0, LENGTH: 1.0}  # m/s, m: the "sizes" in which weights measure states
+ANGLE_SIZE = 0.1  # rad (/s), also for states without a dimension
 ERROR_SHARE = 0.1  # of a size: the unit of an error in a score, 0.1 m/s or 0.01 rad/s
 
-# Mean abs(u_dot) that costs as much as one unit of error
+# mean abs(u_dot) that costs as much as one unit of error
 SURFACE_ACTIVITY = np.deg2rad(60.0)  # rad/s
 THROTTLE_ACTIVITY = 6.0  # 1/s: 600 %/s
 THRUST_ACTIVITY = 12.0  # 1/s, of the thrust in trim: 600 %/s where trim needs half of the throttle
 
 
 def activity_units(airframe: Airframe) -> FloatArray:
-    """Mean abs(u_dot) of each input that costs as much as one unit of error, (p,), SI per s.
+    """Return the mean abs(u_dot) of each input that costs as much as a unit of error, (p,).
 
-    A thrust in newtons whose file has no `no_thrust` has no cost: infinity.
+    It is in SI per s. A thrust in newtons costs nothing, an infinite unit, if its file has no
+    `no_thrust`.
     """
     units = []
     channels = zip(airframe.inputs.values(), airframe.no_thrust(), strict=True)
@@ -43,7 +44,7 @@ def activity_units(airframe: Airframe) -> FloatArray:
 
 
 def unit_sizes(units: Iterable[str]) -> FloatArray:
-    """Sizes of values with these units."""
+    """Return the sizes of values with these units."""
     return np.array([SIZES.get(quantity(unit).dimension, ANGLE_SIZE) for unit in units])
 
 
@@ -54,10 +55,10 @@ def airframe_model(
     noise: FloatArray,
     loop: LoopTiming,
 ) -> NominalModel:
-    """The model of an airframe with channels in this order, without limits.
+    """Build the model of an airframe with channels in this order, without limits.
 
-    D = I until a caller sets D. Arguments: `noise` of the outputs, (m,), rms per sample, and
-    `loop`, in this order.
+    D = I until the caller sets D. `noise` is that of the outputs, (m,), rms per sample, and `loop`
+    is in this order too.
     """
     rows = [airframe.outputs.index(name) for name in outputs]
     columns = [list(airframe.inputs).index(name) for name in inputs]

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Gains of the law beside an observer, with the weights of the observer.
 
-They come by a rule, beside a sketch, and of a search.
+They follow from a rule, from a sketch, or from a search.
 """
 
 from collections.abc import Mapping
@@ -19,7 +19,8 @@ from flight_core.files import read_yaml
 from flight_core.parameters import require
 from flight_core.vectors import FloatArray
 
-SHARE = 0.9  # of the integral gain of PI that is Lambda; the rest is the slope of the softened sign
+# of the integral gain of PI, which becomes Lambda; the rest is the slope of the softened sign
+SHARE = 0.9
 
 
 class ObserverGains(NamedTuple):
@@ -36,15 +37,15 @@ class ObserverGains(NamedTuple):
 
 
 def gains_by_rule(model: NominalModel, axes: tuple[str, ...], speed: float) -> ObserverGains:
-    """Gains from the lags of the loop, as a start.
+    """Derive gains from the lags of the loop, as a start.
 
-    They were found on the `osprey` and scale with the total lag T.
+    They were found on the `osprey` and scale with the total lag T:
 
         effort = 0.38 T,  drift = 0.4 0.035 s / T,  loose = 0.0036,  K = 0.026 / T,  Lambda = K / 4
         wind: 0.12 of Dryden's noise sqrt(2 V0 / L) sigma, with 17 times its time L / V0
         beta = K / T, and a softened sign of 3 T: eps is 3 units of y / s times T
 
-    Arguments: `axes` of the wind in the order of the model's columns; `speed` V0, m/s.
+    `axes` are those of the wind in the order of the model's columns; `speed` is V0, m/s.
     """
     T = model.total_lag
     spectrum = dryden(**MODERATE, sigma=0.0)
@@ -68,14 +69,14 @@ def gains_by_rule(model: NominalModel, axes: tuple[str, ...], speed: float) -> O
 
 BESIDE_SKETCH = {"effort": (0.25, 4.0), "K": (16.0, 1.0)}
 """Factors on `gains_by_rule` beside a sketch, for a body rate and for V, found on the c172p and the
-737 of JSBSim: the law of the rates keeps two thirds of its bandwidth, because a sketch leaves out
+737 of JSBSim. The law of the rates keeps two thirds of its bandwidth, because a sketch leaves out
 more than a model does."""
 
 
 def gains_beside_sketch(
     model: NominalModel, outputs: tuple[str, ...], axes: tuple[str, ...], speed: float
 ) -> ObserverGains:
-    """Gains from the lags for a model from a sketch: `gains_by_rule` times BESIDE_SKETCH."""
+    """Derive gains for a model from a sketch: `gains_by_rule` times BESIDE_SKETCH."""
     by_rule = gains_by_rule(model, axes, speed)
     airspeed = [name == "V" for name in outputs]
     effort, K = (np.where(airspeed, *reversed(BESIDE_SKETCH[key])) for key in ("effort", "K"))
@@ -86,7 +87,7 @@ def gains_beside_sketch(
 
 
 def read_gains(path: Path, T: FloatArray, axes: int, states: int) -> ObserverGains:
-    """Gains of a file with the fields of ObserverGains and of Weights by name, a list each.
+    """Read gains from a file with the fields of ObserverGains and of Weights by name, each a list.
 
     T is the total lag, (m,), s; `axes` of the wind and `states` of the model are counts. Raises
     ParameterError.
@@ -109,10 +110,10 @@ def read_gains(path: Path, T: FloatArray, axes: int, states: int) -> ObserverGai
 
 
 def gains_of_search(gains: Mapping[str, list[float]], T: FloatArray) -> ObserverGains:
-    """Gains as `rise-di compare --tune` finds them for rise_observer or pi_observer, by name.
+    """Convert gains that `rise-di compare --tune` finds for rise_observer or pi_observer, by name.
 
-    T is the total lag, (m,), s. PI with K and Lambda is RISE-DI inside its softened sign with the
-    same K, SHARE Lambda, and 1 / (softening T) of the rest.
+    T is the total lag, (m,), s. PI with K and Lambda equals RISE-DI inside its softened sign with
+    the same K, SHARE Lambda, and 1 / (softening T) for the rest.
     """
     values = {name: np.array(row, dtype=np.float64) for name, row in gains.items()}
     weights = Weights(**{name: values[name] for name in Weights._fields})

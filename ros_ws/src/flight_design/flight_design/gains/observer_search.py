@@ -3,8 +3,8 @@
 """The search for the relaxation of an observer's gains with the least error within the margins.
 
 The relaxation of a channel divides K and the integral, and multiplies `effort`. Above 1 the loop is
-slower than the gains say, below 1 faster: the inputs of an aircraft may act less or more than those
-for which the gains were found.
+slower than the gains say, below 1 faster, because the inputs of an aircraft may act less or more
+than those for which the gains were found.
 """
 
 import math
@@ -62,32 +62,32 @@ MOVES = Moves(mending=((1,),), cheaper=((-1,), (1,)), begin=4, is_joint=True)
 SLOWER = Moves(mending=((1,),), cheaper=((-1,),), is_joint=True)
 """Moves of the relaxation of a channel: both ways, or only where the margins need it."""
 
-RESOLUTION = 3e-4  # s: of the delay margin, and of what its digits in a file change
+RESOLUTION = 3e-4  # s: of the delay margin, and of the effect of its digits in a file
 
-MAX_RELAXATION = 18.0  # of a channel
-MAX_QUICKENING = 4.0  # of a channel: inputs that act four times as much
+MAX_RELAXATION = 18.0  # most of a channel
+MAX_QUICKENING = 4.0  # most of a channel, for inputs that act four times as much
 MEND = (
     "give the loop less delay or lag, ask for a smaller delay margin, or fly the law without "
     "an observer"
 )
-WORST_OF = 50  # uncertain aircraft whose least phase margin counts
+WORST_OF = 50  # number of uncertain aircraft whose least phase margin counts
 
 
 class SelectedObserver(NamedTuple):
     """A controller with an observer, and what it tolerates."""
 
     controller: RiseDiConfig
-    delay_margin: float  # s, of the nominal linear loop, the declared delay included
+    delay_margin: float  # s, of the nominal linear loop, including the declared delay
     phase_margin: float  # rad, the least of the nominal linear loop
-    # (m,) factors on `effort`, and of which K and the integral are lower; 1: as the gains say
+    # (m,) factors that raise `effort`, and lower K and the integral; 1: as the gains say
     relaxation: FloatArray
-    cost: float  # a logarithm, in wind and noise
-    place: int = 0  # of its gain set
-    origin: str = ""  # of its gains, a sentence
-    left_out: int = 0  # uncertain aircraft that no gains hold
+    cost: float  # in wind and noise, a logarithm
+    place: int = 0  # number of its gain set
+    origin: str = ""  # where its gains come from, a sentence
+    left_out: int = 0  # number of uncertain aircraft that no gains can hold
 
     def not_counted(self) -> str:
-        """A sentence on the aircraft left out; "" where none is."""
+        """Write a sentence about the aircraft that are left out; "" if none is."""
         if not self.left_out:
             return ""
         return (
@@ -106,12 +106,12 @@ class AtSpeed(NamedTuple):
     design: Callable[[FloatArray], ObserverDesign]
 
     def model(self, slower: FloatArray) -> SpeedConfig:
-        """The models of feedforward and observer."""
+        """Return the models of feedforward and observer."""
         nominal = {key: getattr(self.feedforward, key) for key in ("A", "B", "gravity")}
         return SpeedConfig(ratio=self.ratio, **nominal, **_matrices(self.design(slower)))
 
     def flown(self, controller: RiseDiConfig, slower: FloatArray) -> RiseDiConfig:
-        """What flies at this speed; not checked."""
+        """Return what flies at this speed; it is not checked."""
         assert controller.observer is not None  # noqa: S101 - it was designed
         values = {
             "observer": controller.observer.model_copy(update=_matrices(self.design(slower))),
@@ -126,7 +126,8 @@ class _Loops(NamedTuple):
 
     controller: RiseDiConfig
     relaxation: FloatArray
-    around: list[tuple[LinearPlant, LinearLaw]]  # at the trim speed first, all vanes in use first
+    # first at the trim speed, and first with all vanes in use
+    around: list[tuple[LinearPlant, LinearLaw]]
 
 
 class ObserverSearch(NamedTuple):
@@ -141,28 +142,30 @@ class ObserverSearch(NamedTuple):
     needed: Requirement
     vanes: VanesConfig | None = None
     others: Sequence[AtSpeed] = ()  # speeds whose margins count too
-    # None: the gains stay, but where the margins need slower ones
+    # None: the gains stay, unless the margins need slower ones
     air: Air | None = None
     activity_unit: FloatArray | float = math.inf  # (m,) of mean abs(u_dot) in the cost, SI
-    # the design whose loop the search begins at; None: at a relaxation of 1
+    # the design at whose loop the search begins; None: it begins at a relaxation of 1
     earlier_design: SelectedObserver | None = None
-    is_free: Sequence[bool] | None = None  # (m,) whether it may change; None: in every channel
+    # (m,) whether the relaxation may change; None: in every channel
+    is_free: Sequence[bool] | None = None
 
     @property
     def nominal(self) -> LinearPlant:
-        """The nominal aircraft."""
+        """Nominal aircraft."""
         return LinearPlant(self.plant.A[0], self.plant.B[0], self.plant.C)
 
     @property
     def loop(self) -> LoopTiming:
-        """The loop without its delay: the delay margin counts the declared delay too."""
+        """Loop without its delay, because the delay margin counts the declared delay too."""
         return LoopTiming(self.model.lag, 0.0, self.model.period)
 
     def best(self, progress: Callable[[str], None] = lambda _: None) -> Trial[_Loops]:
-        """The trial with the least error that has the margins, or that lacks least of them.
+        """Find the trial with the least error that has the margins, or that lacks least of them.
 
-        The damping asked for is at most that of the zeros of the aircraft: no feedback moves a
-        zero. Without `air` the least relaxed trial counts. `progress` gets a sentence a loop.
+        The damping that is required is at most that of the zeros of the aircraft, because no
+        feedback moves a zero. Without `air`, the least relaxed trial is best. `progress` gets a
+        sentence for each loop.
         """
         m = len(self.model.lag)
         free = np.ones((1, m)) if self.is_free is None else np.array([self.is_free])
@@ -187,10 +190,10 @@ class ObserverSearch(NamedTuple):
         return descend(assess, start, moves, lowest_of, highest_of)
 
     def _trial(self, place: Place, requirement: Requirement, least: float) -> Trial[_Loops]:
-        """The trial at a place.
+        """Evaluate the trial at a place.
 
-        Beside one with the margins and the cost `least`, the margins of a trial that is late or
-        costs more are not computed.
+        If another trial has the margins at the cost `least`, the margins of this one are computed
+        only if it tolerates its delay and costs less.
         """
         loops = self._loops(place)
         if least < math.inf:
@@ -206,9 +209,9 @@ class ObserverSearch(NamedTuple):
         return Trial(place, shortage, cost, loops)
 
     def selected(self, best: Trial[_Loops]) -> SelectedObserver:
-        """The controller of a trial, with the delay margin that it states.
+        """Return the controller of a trial, with the delay margin that it states.
 
-        Raises ParameterError for a trial without the margins.
+        Raises ParameterError if the trial lacks the margins.
         """
         if best.shortage:
             raise self._refusal(best.content)
@@ -226,7 +229,7 @@ class ObserverSearch(NamedTuple):
         )
 
     def _loops(self, place: Place) -> _Loops:
-        """The loops of a place: at the begin that of the earlier design, with this feedforward."""
+        """Build the loops of a place; the start has those of the earlier design."""
         earlier = self.earlier_design
         begin = np.ones(len(place)) if earlier is None else earlier.relaxation
         relaxation = begin * STEP ** np.array(place, dtype=np.float64)
@@ -249,7 +252,7 @@ class ObserverSearch(NamedTuple):
         return all(is_stable(plant, law, self.loop, late) for plant, law in loops.around)
 
     def _delay_fraction(self, plant: LinearPlant, law: LinearLaw) -> float:
-        """The delay margin over what is needed with each input late by its share; 1 for enough."""
+        """Return the delay margin over what is needed, each input late by its share; at most 1."""
         longest = float(self.margin.max())
         if longest == 0.0 or is_stable(plant, law, self.loop, self.margin + RESOLUTION):
             return 1.0
@@ -257,7 +260,7 @@ class ObserverSearch(NamedTuple):
         return min(margin / (longest + RESOLUTION), 1.0)
 
     def _shortage(self, loops: _Loops, requirement: Requirement) -> float:
-        """The sum over the goals of 1 - found / needed, where this is above 0."""
+        """Sum 1 - found / needed over the goals, where it is above 0."""
         loop = loop_of(loops.controller)
         goals = [np.array([self._delay_fraction(plant, law) for plant, law in loops.around])]
         for plant, law in loops.around:
@@ -268,9 +271,9 @@ class ObserverSearch(NamedTuple):
         return float(np.maximum(1.0 - np.concatenate(goals), 0.0).sum())
 
     def _cost(self, loops: _Loops) -> float:
-        """The logarithms of error and activity in wind and noise, summed over the channels.
+        """Sum the logarithms of error and activity in wind and noise over the channels.
 
-        They are in units of a score. Without `air` the relaxation counts.
+        They are in units of a score. Without `air`, only the relaxation counts.
         """
         if self.air is None:
             return float(np.log(loops.relaxation).sum())
@@ -279,7 +282,7 @@ class ObserverSearch(NamedTuple):
         return float(np.log(response.error / unit + response.activity / self.activity_unit).sum())
 
     def _worst_phase(self, loops: _Loops) -> float:
-        """The least phase margin of uncertain aircraft, rad; infinite without any."""
+        """Return the least phase margin of uncertain aircraft, rad; infinite if there are none."""
         uncertain = self.plant._replace(A=self.plant.A[1:], B=self.plant.B[1:])
         if not len(uncertain.A):
             return math.inf
@@ -288,7 +291,7 @@ class ObserverSearch(NamedTuple):
         return min(float(phase_margins(uncertain, law, loop).min()) for law in laws)
 
     def _refusal(self, loops: _Loops) -> ParameterError:
-        """What is missing at the end of the search."""
+        """Say what is missing at the end of the search."""
         lacking = self._lacking(loops)
         if self.others and not lacking:
             return ParameterError(
@@ -302,7 +305,7 @@ class ObserverSearch(NamedTuple):
         return ParameterError(f"--margin: {lacking or uncertain}; {MEND}")
 
     def _lacking(self, loops: _Loops) -> str:
-        """The margins missing around the nominal aircraft, in sentences."""
+        """List the margins missing around the nominal aircraft, in sentences."""
         requirement = above_zeros(self.needed, self.nominal)
         longest = float(self.margin.max())
         lacking = []
@@ -319,9 +322,9 @@ class ObserverSearch(NamedTuple):
 def least_error(
     searches: Sequence[ObserverSearch], progress: Callable[[str], None] = lambda _: None
 ) -> SelectedObserver:
-    """The best of the searches of several gain sets.
+    """Return the best of the searches of several gain sets.
 
-    Raises ParameterError where none has the margins.
+    Raises ParameterError if none has the margins.
     """
     trials = [search.best(progress) for search in searches]
     place = 0
@@ -331,7 +334,7 @@ def least_error(
 
 
 def _laws(controller: RiseDiConfig) -> list[LinearLaw]:
-    """The linear laws of a controller, for every set of vanes in use."""
+    """Linearise the law of a controller for every set of vanes in use."""
     (law, params), period = controller.tuned_law(), 1.0 / controller.rate
     sets = product((False, True), repeat=len(controller.vanes))
     laws = (without_frozen(params, frozen) for frozen in sets)
@@ -342,7 +345,7 @@ def _laws(controller: RiseDiConfig) -> list[LinearLaw]:
 
 
 def _matrices(design: ObserverDesign) -> dict[str, Any]:
-    """The matrices of an observer, row by row."""
+    """Return the matrices of an observer, row by row."""
     names = ("Phi", "Gamma", "L", "F")
     return {name: tuple(getattr(design, name).ravel().tolist()) for name in names}
 
@@ -355,9 +358,9 @@ def _parameters(
     relaxation: FloatArray,
     vanes: VanesConfig | None,
 ) -> RiseDiConfig:
-    """The parameters with gains and matrices.
+    """Return the parameters with gains and matrices.
 
-    A K below MIN_K is MIN_K with a smaller input scale: the same loop.
+    A K below MIN_K becomes MIN_K with a smaller input scale, which is the same loop.
     """
     K = gains.K / relaxation
     permitted = np.maximum(K, MIN_K + MIN_GAIN)

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Observer selection: the sections feedforward and observer of a controller.
 
-The gains of the law are selected too.
+The gains of the law are selected together with them.
 
-`with_aircraft_observer` takes the model of an airframe, `with_extended_state_observer` Omega and
-the lags alone. Both give a controller whose nominal linear loop has a delay margin and meets a
+`with_aircraft_observer` takes the model of an airframe, `with_extended_state_observer` only Omega
+and the lags. Both give a controller whose nominal linear loop has a delay margin and meets a
 requirement on phase, gain, sensitivity and damping.
 """
 
@@ -59,22 +59,22 @@ from rise_di_controller.law.linear_loop import LinearPlant
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di_config import RiseDiConfig
 
-# deviation of the uncertain aircraft whose least phase margin counts
+# deviation of the uncertain aircraft, whose least phase margin counts
 WORST_UNCERTAINTY = 0.3
-# 1/s, of a zero on the right: the aircraft diverges so fast while its outputs are held
+# 1/s, of a zero on the right, at which an aircraft diverges while its outputs are held
 FASTEST = 1e-3
 WORST_SEED = 1
 
 # factor on the noise of the wind of a filter that has a vane: with 10 u moves three times as much
 GUST_WITH_VANE = 2.0
-SPAN_TIME = 0.12  # s, wing span over the trim speed of an airframe without a span: the osprey's
-STILL = 1.4  # of the noise of a vane: a motion of less counts as none
+SPAN_TIME = 0.12  # s, wing span over trim speed for an airframe without a span: the osprey's
+STILL = 1.4  # times the noise of a vane: less motion counts as none
 
 
 def model_for(airframe: Airframe, controller: ControllerConfig, noise: FloatArray) -> NominalModel:
-    """The model of an airframe for a controller, in the law's order.
+    """Build the model of an airframe for a controller, in the law's order.
 
-    `noise` of the measured outputs, (m,), rms per sample.
+    `noise` is that of the measured outputs, (m,), rms per sample.
     """
     model = airframe_model(
         airframe, controller.outputs, controller.inputs, noise, loop_of(controller)
@@ -83,7 +83,7 @@ def model_for(airframe: Airframe, controller: ControllerConfig, noise: FloatArra
 
 
 def _limited(model: NominalModel, controller: ControllerConfig) -> NominalModel:
-    """A model with the limits and D of a controller."""
+    """Give a model the limits and D of a controller."""
     limits = controller.guard().limits
     return model._replace(
         D=np.array(controller.D, dtype=np.float64), lower=limits.lower, upper=limits.upper
@@ -107,23 +107,24 @@ def with_aircraft_observer(
     activity: float = 1.0,
     progress: Callable[[str], None] = lambda _: None,
 ) -> SelectedObserver:
-    """The controller with the feedforward and the observer of an airframe.
+    """Give a controller the feedforward and the observer of an airframe.
 
     The gains of the law are selected beside the observer.
 
-    The gains are relaxed, or made faster, channel by channel: the error of the linear loop in
+    The gains are relaxed, or made faster, channel by channel, until the error of the linear loop in
     moderate turbulence with the noise of the sensors is the least with which the loop has its
-    margins. Of several gain sets the one with the least error is taken. `margin` is the least delay
-    margin, s, of all inputs or of each, (m,). `vanes` has the noise of each vane, rms per sample in
-    rad, by its channel, alpha or beta. The phase margin is also that of WORST_OF uncertain aircraft
-    where the airframe is `uncertain`; those with a zero on the right do not count: no gains hold
-    all outputs there. `speeds` are two ratios to the trim speed: the controller has a schedule
-    then, and the margins at these speeds too. With `keeps_gains` the gains are only relaxed, where
-    the margins need it. The search begins at the loop of the `earlier_design`, with the new
-    feedforward, and changes the relaxation of the channels that are free: this loop stays where no
-    change has less error. `activity` is the weight of the activity of u beside the error.
-    `progress` gets a sentence a loop. Raises ParameterError for an airframe with another D or
-    without a wind, one that a feedforward refuses, and for margins that no relaxation reaches.
+    margins. If there are several gain sets, the one with the least error is taken. `margin` is the
+    least delay margin, s, of all inputs or of each, (m,). `vanes` has the noise of each vane, rms
+    per sample in rad, by its channel, alpha or beta. If the airframe is `uncertain`, WORST_OF
+    uncertain aircraft must have the phase margin too; those with a zero on the right do not count,
+    because no gains can hold all of their outputs. `speeds` are two ratios to the trim speed: the
+    controller then has a schedule, and the margins at these speeds too. With `keeps_gains` the
+    gains are only relaxed, if the margins need it. The search begins at the loop of the
+    `earlier_design`, with the new feedforward, and changes the relaxation of the channels that are
+    free, so this loop stays if no change has less error. `activity` is the weight of the activity
+    of u against the error. `progress` gets a sentence for each loop. Raises ParameterError for an
+    airframe with another D or without wind, one that a feedforward refuses, and for margins that no
+    relaxation reaches.
     """
     activity_unit = law_activity_unit(airframe, controller) / activity
     airframe = through_allocation(airframe, controller)
@@ -132,7 +133,7 @@ def with_aircraft_observer(
         _require_no_vanes(vanes, controller.outputs)
     model = designs.model
     plant = designs.plant(WORST_OF * uncertain, vanes)
-    # A search for each gain set; the one with the least error is taken.
+    # Search with each gain set, and take the result with the least error.
     searches = []
     for gains in sets:
         section = None
@@ -162,7 +163,7 @@ def with_aircraft_observer(
 
 
 def law_activity_unit(airframe: Airframe, controller: ControllerConfig) -> FloatArray:
-    """Mean abs(v_dot) of each input of the law that costs as much as one unit of error, (m,).
+    """Return the mean abs(v_dot) of each input v that costs as much as a unit of error, (m,).
 
         unit_i = min_j unit_j / abs(T_ji),  u = T v
 
@@ -183,7 +184,7 @@ def _with_schedule(
     controller: RiseDiConfig,
     airframe: Airframe,
 ) -> SelectedObserver:
-    """The selected observer with the models of the search at two speeds as a schedule."""
+    """Add the models of the search at two speeds to the selected observer, as a schedule."""
     slow, fast = (speed.model(selected.relaxation).model_dump() for speed in search.others)
     schedule = {"speed": airframe.speed, "slow": slow, "fast": fast}
     if controller.schedule is not None:
@@ -195,9 +196,9 @@ def _with_schedule(
 
 
 def _air(airframe: Airframe, model: NominalModel, vanes: Mapping[str, float]) -> Air:
-    """Moderate turbulence, gusts from below and from the side, noise of outputs and vanes.
+    """Return moderate turbulence, gusts from below and the side, and noise of all sensors.
 
-    The air rolls, too: without that nothing but noise would move a symmetrical aircraft in roll.
+    The air rolls too; otherwise nothing but noise would move a symmetrical aircraft in roll.
     """
     speed = airframe.speed
     spectrum = dryden(**MODERATE, sigma=0.0)
@@ -245,7 +246,7 @@ class _AircraftDesigns(NamedTuple):
     def around(
         cls, controller: RiseDiConfig, airframe: Airframe, noise: FloatArray
     ) -> "_AircraftDesigns":
-        """Raises ParameterError for an airframe that no observer of the controller fits."""
+        """Prepare the designs, or refuse an airframe that no observer of the controller fits."""
         require(
             bool(airframe.gusts),
             f"airframe {airframe.name}",
@@ -262,9 +263,9 @@ class _AircraftDesigns(NamedTuple):
         return cls(with_feedforward(bare, airframe), airframe, noise, model, names)
 
     def plant(self, count: int, vanes: Iterable[str]) -> LinearPlant:
-        """The nominal aircraft, and the controllable part of `count` uncertain aircraft.
+        """Return the nominal aircraft, and the controllable ones of `count` uncertain aircraft.
 
-        The vanes stand below the outputs.
+        Vanes come below the outputs.
         """
         A, B = nominal_and_sampled(self.airframe, WORST_UNCERTAINTY, count, WORST_SEED)
         _, columns = law_order(self.airframe, self.base)
@@ -274,13 +275,13 @@ class _AircraftDesigns(NamedTuple):
         B = B[:, :, columns]
         zeros = [fastest_zero(*pair, self.model.C) for pair in zip(A, B, strict=True)]
         is_stable = np.array(zeros) < FASTEST
-        is_stable[0] = True  # the nominal aircraft: its margins say more
+        is_stable[0] = True  # keep the nominal aircraft, whose margins say more
         return LinearPlant(A[is_stable], B[is_stable], np.vstack([self.model.C, *vane_rows]))
 
     def observer(
         self, model: NominalModel, gains: ObserverGains
     ) -> Callable[[FloatArray], ObserverDesign]:
-        """The observer of a model by relaxation, (m,): u_o alone changes."""
+        """Return a function from relaxation, (m,), to the observer of a model; only u_o changes."""
         observer = aircraft_observer(model, self.names, gains.weights)
         model_by_tick = ObserverModel(observer.states, observer.Phi, observer.Gamma, observer.H)
         return lambda slower: observer._replace(
@@ -288,7 +289,7 @@ class _AircraftDesigns(NamedTuple):
         )
 
     def at_speed(self, ratio: float, gains: ObserverGains) -> AtSpeed:
-        """The design at a ratio to the trim speed."""
+        """Design the observer at a ratio to the trim speed."""
         outputs = self.base.outputs
         frame = at_speed(self.airframe, ratio, self.base.inputs[outputs.index("V")])
         model = model_for(frame, self.base, self.noise)
@@ -306,7 +307,7 @@ class _AircraftDesigns(NamedTuple):
 
 
 def _require_no_vanes(vanes: Mapping[str, float], outputs: Sequence[str]) -> None:
-    """Raise ParameterError for what a design at several speeds does not cover."""
+    """Refuse what a design at several speeds does not cover."""
     require(
         not vanes,
         "speeds",
@@ -323,7 +324,7 @@ def _vanes(
     weights: Weights,
     vanes: Mapping[str, float],
 ) -> VanesConfig:
-    """The section of the vanes: alpha and beta less the wind along their axes over V0."""
+    """Build the section of the vanes: alpha and beta less the wind along their axes over V0."""
     model_by_tick = aircraft_model(model, names, weights.wind_time)
     H = []
     L = []
@@ -348,14 +349,14 @@ def with_extended_state_observer(
     margin: float,
     requirement: Requirement = OBSERVER_REQUIREMENT,
 ) -> SelectedObserver:
-    """The controller with an observer from Omega and lags alone: no A, no f, no wind.
+    """Give a controller an observer that knows only Omega and lags: no A, no f, no wind.
 
-    Its gains stay, but for the margin.
+    Its gains stay, unless the margin needs slower ones.
 
     The model of its feedforward is y_dot = Omega u, that of its observer y_dot = diag(Omega) u:
-    with all of Omega the elevator would correct V, and turn the aircraft for it. Arguments: Omega
-    (m, m) in the law's order; `noise` of the outputs, (m,), rms per sample; `size` (m,), their
-    units, 1 m/s or 0.1 rad/s. Raises ParameterError as `with_aircraft_observer`.
+    with all of Omega the elevator would correct V, and turn the aircraft for it. Omega (m, m) is in
+    the law's order; `noise` is that of the outputs, (m,), rms per sample; `size` (m,) holds their
+    units, 1 m/s or 0.1 rad/s. Raises ParameterError as `with_aircraft_observer` does.
     """
     m = len(controller.outputs)
     require_same_signs(Omega, controller.D, "Omega")
@@ -368,7 +369,7 @@ def with_extended_state_observer(
     names = Names(controller.outputs, controller.inputs, controller.outputs, ())
     law = controller.law_params()
     weights = extended_state_weights(controller.outputs, model.total_lag)
-    # y_dot by a unit of scaled input: the gains are those for a unit response
+    # y_dot for a unit of scaled input, because the gains are for a unit response
     response = np.abs(np.diag(Omega)) * law.input_scale
     unused = Weights(
         effort=weights.effort,
@@ -410,7 +411,7 @@ def with_extended_state_observer(
 def _integrators(
     controller: RiseDiConfig, effects: FloatArray, noise: FloatArray, size: FloatArray
 ) -> NominalModel:
-    """The model y_dot = diag(effects) u with the loop of a controller."""
+    """Build the model y_dot = diag(effects) u with the loop of a controller."""
     m = len(effects)
     none = np.zeros((m, m))
     ones = np.ones(m)

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The required margins of a loop, and the search for gains with these margins.
 
-Every margin is a condition, and the search measures the margins.
+Every margin is a condition, and the search measures the margins themselves.
 
-The margins are those of the sampled loop with actuators, delay and hold
+They are those of the sampled loop with actuators, delay and hold
 (`flight_analysis.linear_loop.input_margins`). 45 degrees and 6 dB are those of MIL-F-9490D,
-3.1.3.6.1, for an aerodynamic surface, a sensitivity of at most 2 that of K. J. Astrom, R. M.
+3.1.3.6.1, for an aerodynamic surface; a sensitivity of at most 2 is that of K. J. Astrom, R. M.
 Murray, "Feedback Systems", 12.3.
 """
 
@@ -40,8 +40,8 @@ from rise_di_controller.params import ControllerConfig
 Controller = TypeVar("Controller", bound=ControllerConfig)
 
 PHASE_MARGIN = 45.0  # deg, the default
-ACCEPTED_PHASE_MARGIN = 40.0  # deg: a requirement below this has to be accepted by name
-# deg, the range of a requirement: a loop that integrates behind a lag has less than 90
+ACCEPTED_PHASE_MARGIN = 40.0  # deg: a requirement below this must be accepted explicitly
+# deg, range of a requirement: a loop that integrates behind a lag has less than 90
 PHASE_MARGINS = (5.0, 80.0)
 
 # largest factors of the search by which the integral and the bandwidth fall. A throttle that is
@@ -56,34 +56,35 @@ FURTHER_STARTS = (
 )
 CHEAPER = ((-1, 0), (0, -1), (1, -1), (2, -1), (-3, 1))
 MOVES = Moves(mending=(*CHEAPER, (-1, 1), (1, 0), (0, 1)), cheaper=CHEAPER)
-"""Of the two exponents of a channel, a of the integral and b of the bandwidth. The error after a
-slow disturbance grows with slower lower^2: only moves with a + 2 b <= 0 can lower the cost."""
+"""Moves of the two exponents of a channel, a of the integral and b of the bandwidth. The error
+after a slow disturbance grows with slower lower^2, so only moves with a + 2 b <= 0 can lower the
+cost."""
 
 NO_ERROR = 1e-12  # SI: an error below it costs nothing
-# step of the nominal phase margin while the worst aircraft has too little
+# step by which the nominal phase margin rises while the worst aircraft has too little
 WORST_STEP = math.radians(2.5)
 MAX_WORST_STEPS = 8
 
-OF_ZERO = 0.98  # of the damping of a zero that is asked for; 1/s
-NO_MOTION = 1e-3  # of a zero at the origin up to rounding
+OF_ZERO = 0.98  # fraction of the damping of a zero that is required; 1/s
+NO_MOTION = 1e-3  # motion of a zero that counts as at the origin
 
 
 class Requirement(NamedTuple):
-    """The least margins of a loop, with one input open and with the worst input counting."""
+    """The least margins of a loop, each with one input open, where the worst input counts."""
 
     phase: float = math.radians(PHASE_MARGIN)  # rad, nominal aircraft
     gain: float = 10.0 ** (6.0 / 20.0)  # factor, up or down: 6 dB
     sensitivity: float = 2.0  # the largest abs(S_ii)
     damping: float = 0.4  # of the slow modes
     worst_phase: float = math.radians(30.0)  # rad, of the uncertain aircraft, by samples
-    # by search over the corners: what 30 deg of uniform samples leave there in the shipped loops
+    # by a search over the corners: in the shipped loops, 30 deg of samples leave this much there
     searched_phase: float = math.radians(28.0)
 
     @property
     def uncertain_phase(self) -> float:
         """Phase margin of the worst uncertain aircraft, rad.
 
-        At most what the nominal aircraft has to have.
+        It is at most what the nominal aircraft must have.
         """
         return min(self.worst_phase, self.phase)
 
@@ -100,14 +101,14 @@ NAMES = (
 REQUIREMENT = Requirement()
 
 OBSERVER_REQUIREMENT = Requirement(phase=math.radians(35.0))
-"""Of a loop with an observer, beside the delay margin: the observer is a filter in the loop, and
-costs phase."""
+"""Requirement for a loop with an observer, beside the delay margin: the observer is a filter in the
+loop, and costs phase."""
 
 
 def requirement(phase_margin: float, *, accept: bool = False) -> Requirement:
-    """The requirement with a phase margin in deg.
+    """Return the requirement with a phase margin in deg.
 
-    Raises ParameterError for less than 40 deg without `accept`.
+    Raises ParameterError if it is below 40 deg, unless you `accept` it.
     """
     phase_margin = as_number(phase_margin, "phase_margin", *PHASE_MARGINS, "deg")
     expected = f"at least {ACCEPTED_PHASE_MARGIN:g} deg, or accept beside it"
@@ -116,9 +117,9 @@ def requirement(phase_margin: float, *, accept: bool = False) -> Requirement:
 
 
 def above_zeros(requirement: Requirement, plant: LinearPlant) -> Requirement:
-    """A requirement with a damping within reach of a loop around an aircraft.
+    """Lower the damping of a requirement to what a loop around an aircraft can reach.
 
-    The damping is at most about that of the zeros. No feedback moves a zero, and a loop with small
+    It becomes at most about that of the zeros. No feedback moves a zero, and a loop with small
     errors has modes near the zeros.
     """
     zeros = invariant_zeros(plant.A, plant.B, plant.C[: plant.B.shape[-1]])  # without vanes
@@ -130,9 +131,9 @@ def above_zeros(requirement: Requirement, plant: LinearPlant) -> Requirement:
 def fractions(
     margins: Margins, requirement: Requirement
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """What is found over what is needed, for m inputs, (..., m), (..., m), (...).
+    """Compute what is found over what is needed, for m inputs, (..., m), (..., m), (...).
 
-    A fraction is at least 1 where the requirement holds. The first is the lesser of phase and
+    A fraction is at least 1 if the requirement holds. The first is the lesser of phase and
     sensitivity, the second that of the gain, in dB, the third that of the damping.
     """
     with np.errstate(divide="ignore"):
@@ -147,9 +148,9 @@ def fractions(
 
 
 def least_fractions(margins: Margins, requirement: Requirement) -> FloatArray:
-    """The least of `fractions` of a loop, (...).
+    """Return the least of the `fractions` of a loop, (...).
 
-    A fraction is at least 1 where the requirement holds, 0 for an unstable loop.
+    It is at least 1 if the requirement holds, and 0 for an unstable loop.
     """
     phase, gain, damping = fractions(margins, requirement)
     least = np.minimum(np.minimum(phase.min(axis=-1), gain.min(axis=-1)), damping)
@@ -157,12 +158,12 @@ def least_fractions(margins: Margins, requirement: Requirement) -> FloatArray:
 
 
 def least_fraction(margins: Margins, requirement: Requirement) -> float:
-    """The `least_fractions` of one loop."""
+    """Return the `least_fractions` of a single loop."""
     return float(least_fractions(margins, requirement))
 
 
 def margin_conditions(margins: LoopMargins, requirement: Requirement) -> tuple[GainCondition, ...]:
-    """The requirement as conditions, input by input, the nominal aircraft first."""
+    """Write the requirement as conditions, input by input, with the nominal aircraft first."""
     nominal = nominal_conditions(margins.nominal, requirement)
     if margins.worst is None:
         return nominal
@@ -174,7 +175,7 @@ def margin_conditions(margins: LoopMargins, requirement: Requirement) -> tuple[G
 
 
 def nominal_conditions(nominal: Margins, requirement: Requirement) -> tuple[GainCondition, ...]:
-    """The requirement on the margins of the nominal aircraft as conditions, input by input."""
+    """Write the requirement on the nominal aircraft as conditions, input by input."""
     with np.errstate(divide="ignore"):
         decibels = 20.0 * np.log10(nominal.gain)
     rows: list[tuple[str, FloatArray, float, bool]] = [
@@ -192,7 +193,7 @@ def nominal_conditions(nominal: Margins, requirement: Requirement) -> tuple[Gain
 
 
 def unmet(margins: LoopMargins, requirement: Requirement, outputs: Sequence[str]) -> str:
-    """What a loop lacks, in sentences; "" for nothing. `outputs` of the law."""
+    """Say what a loop lacks, in sentences; "" if nothing. `outputs` are those of the law."""
     return "; ".join(
         condition.sentence(outputs)
         for condition in failing(margin_conditions(margins, requirement))
@@ -211,17 +212,17 @@ def within_requirement(
     requirement: Requirement,
     u_dot: FloatArray,
 ) -> Candidate[Controller]:
-    """The candidate of the least error whose measured margins meet a requirement.
+    """Search for the candidate with the least error whose measured margins meet a requirement.
 
-    Where the search finds none, the candidate with the least shortage is taken.
+    If there is none, the candidate with the least shortage is returned.
 
-    `build(slower, lower)` gives a controller with the integral slower by both factors, the
-    bandwidth lower by the second, a factor a channel, (m,), 1 by the rule at the least. The error
-    is the product over the outputs of `linear_error` along `u_dot` (T, m), inputs in the law's
-    order. The damping asked for is that of `above_zeros`. The search begins with the bandwidths of
-    the rule and the fastest integrals that have the margins of their own channel, and tries further
-    starts where its end lacks a margin. While the worst uncertain aircraft has less than
-    `worst_phase`, the nominal loop has to have 2.5 degrees more.
+    `build(slower, lower)` makes a controller whose integral is slower by both factors and whose
+    bandwidth is lower by the second, one factor per channel, (m,), at least 1, which is the rule.
+    The error is the product over the outputs of `linear_error` along `u_dot` (T, m), inputs in the
+    law's order. The damping that is required is that of `above_zeros`. The search begins with the
+    bandwidths of the rule and the fastest integrals that have the margins of their own channel, and
+    tries other starts if it ends with a margin missing. While the worst uncertain aircraft has less
+    than `worst_phase`, the nominal loop must have 2.5 degrees more.
     """
     loops = _Loops(build, u_dot)
     target = above_zeros(requirement, loops.start.loop.nominal)
@@ -242,11 +243,11 @@ def within_requirement(
 
 class _Measured(NamedTuple, Generic[Controller]):
     candidate: Candidate[Controller]
-    reached: FloatArray  # (m,) found over needed of each channel by itself
+    reached: FloatArray  # (m,) found over needed, for each channel by itself
 
 
 class _Loops(Generic[Controller]):
-    """The loops of a search, built and measured once.
+    """The loops of a search, each built and measured once.
 
     A place has the exponents of `slower`, then those of `lower`.
     """
@@ -263,7 +264,7 @@ class _Loops(Generic[Controller]):
         self.highest = np.repeat([[exponent(MAX_SLOWER)], [exponent(MAX_LOWER)]], self.m, axis=1)
 
     def search(self, requirement: Requirement) -> Trial[_Measured[Controller]]:
-        """The trial with the least cost that meets a requirement, or the least shortage."""
+        """Find the trial with the least cost that meets a requirement, or the least shortage."""
         assess = partial(self.assess, requirement)
         lowest = np.zeros_like(self.highest)
         best = descend(assess, self._fastest_integrals(assess), MOVES, lowest, self.highest)
@@ -279,14 +280,14 @@ class _Loops(Generic[Controller]):
     def assess(
         self, requirement: Requirement, places: Sequence[Place]
     ) -> list[Trial[_Measured[Controller]]]:
-        """The trials at some places."""
+        """Evaluate the trials at some places."""
         self._measure([place for place in dict.fromkeys(places) if place not in self._measured])
         candidates = []
         shortages = []
         for place in places:
             candidate, margins = self._measured[place]
             phase, gain, damping = fractions(margins, requirement)
-            # each channel integrates: a phase without a crossover lies below the frequencies seen
+            # each channel integrates: if it has no crossover, that lies below the frequencies seen
             is_certain = margins.stable & np.isfinite(margins.phase)
             fraction = np.where(is_certain, np.minimum(phase, gain), 0.0)
             goals = np.append(fraction, damping if margins.stable else 0.0)
@@ -321,18 +322,18 @@ class _Loops(Generic[Controller]):
     def _fastest_integrals(
         self, assess: Assess[_Measured[Controller]]
     ) -> Trial[_Measured[Controller]]:
-        """The trial with the bandwidths of the rule and the fastest integrals within the margins.
+        """Find the trial with the rule's bandwidths and the fastest integrals within the margins.
 
-        Every channel has margins by itself. A channel without such an integral gets the integral by
-        the rule.
+        Here every channel has its margins by itself. If a channel has no such integral, it gets the
+        integral of the rule.
 
-        All channels double and bisect their exponents at once, since channels couple little. Where
-        the result lacks a margin, its channel gets a slower integral, step by step.
+        All channels double and bisect their exponents at once, since channels couple little. If the
+        result then lacks a margin, its channel gets a slower integral, step by step.
         """
         highest = self.highest[0]
         rule = np.zeros(self.m, dtype=np.int64)
-        short = rule - 1  # the largest exponents that lack a margin
-        enough = highest + 1  # the least that have all
+        short = rule - 1  # the largest exponents at which a margin is missing
+        enough = highest + 1  # the least exponents at which none is
         tried = rule
         while True:
             (trial,) = assess([(*tried.tolist(), *rule.tolist())])
@@ -357,13 +358,13 @@ class _Loops(Generic[Controller]):
 
 
 def _stacked(candidates: Sequence[Candidate[Controller]]) -> LinearLoop:
-    """The loops of candidates around one aircraft as one, with a law each."""
+    """Stack the loops of candidates around one aircraft into one, with a law each."""
     laws = zip(*(candidate.loop.law for candidate in candidates), strict=True)
     return candidates[0].loop._replace(law=LinearLaw(*(np.stack(matrices) for matrices in laws)))
 
 
 def _worst_phase(loop: LinearLoop) -> float:
-    """Smallest phase margin of the uncertain aircraft, rad; infinite without any."""
+    """Return the smallest phase margin of the uncertain aircraft, rad, or infinity."""
     if len(loop.plant.A) == 1:
         return math.inf
     uncertain = loop.plant._replace(A=loop.plant.A[1:], B=loop.plant.B[1:])

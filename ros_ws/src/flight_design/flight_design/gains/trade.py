@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a phase margin costs: the error of the linear loop along a manoeuvre.
 
-The gains are selected by several requirements.
+Gains are selected for several requirements, and their errors compared.
 """
 
 import math
@@ -24,16 +24,16 @@ class TradeRow(NamedTuple):
     phase_margin: float  # deg, the requirement
     reached: float  # deg, the least of the loop
     delay_margin: float  # s
-    # (m,) of the error of the linear loop along the manoeuvre, SI, by output of the law
+    # (m,) rms error of the linear loop along the manoeuvre, SI, by output of the law
     rms: FloatArray
 
 
 def trade(
     selection: Selection, phase_margins: Sequence[float] = TRADED_PHASE_MARGINS
 ) -> tuple[TradeRow, ...]:
-    """The engineering gains of a selection for further phase margins, deg.
+    """Select the engineering gains for other phase margins, deg.
 
-    The errors are of the nominal aircraft.
+    The errors are those of the nominal aircraft.
     """
     nominal = _nominal(selection.study)
     rows = []
@@ -53,7 +53,7 @@ def trade(
 
 
 def _nominal(study: Study) -> Study:
-    """The study of the nominal airframe alone."""
+    """Reduce a study to the nominal airframe."""
     return study._replace(
         A=study.A[:1], B=study.B[:1], u_dot=study.u_dot[:, :1], stable=study.stable[:1]
     )

@@ -40,14 +40,14 @@ _Dumper.add_representer(
 
 
 def tuned_file(scenario: Scenario) -> Path:
-    """Path of the tuned gains of a scenario."""
+    """Return the path of the tuned gains of a scenario."""
     return TUNED / f"{scenario.name}.yaml"
 
 
 def load(path: Path) -> dict[str, dict[str, TuningResult]]:
-    """Tuned gains by law and objective; empty if there is no file.
+    """Load tuned gains by law and objective; empty if there is no file.
 
-    Raises ParameterError for an unreadable file.
+    Raises ParameterError if the file cannot be read.
     """
     if not path.exists():
         return {}
@@ -56,7 +56,7 @@ def load(path: Path) -> dict[str, dict[str, TuningResult]]:
 
 @lru_cache(maxsize=16)
 def _load(path: Path, _changed_ns: int) -> dict[str, dict[str, TuningResult]]:
-    """`load`, once for each state of a file: a learner designs every few seconds."""
+    """Do the work of `load` once per state of a file: a learner designs every few seconds."""
     content = read_yaml(path, path.name, "a file of tuned gains")
     try:
         laws = content["laws"].items()
@@ -71,9 +71,9 @@ def _load(path: Path, _changed_ns: int) -> dict[str, dict[str, TuningResult]]:
 
 
 def find(scenario: Scenario, law: str, objective: str) -> TuningResult | None:
-    """The tuned gains of a law in a scenario, None without any.
+    """Return the tuned gains of a law in a scenario, or None if there are none.
 
-    Raises ParameterError for an unreadable file.
+    Raises ParameterError if the file cannot be read.
     """
     return load(tuned_file(scenario)).get(law, {}).get(objective)
 
@@ -86,8 +86,8 @@ def save(
 ) -> None:
     """Write tuned gains, costs and the tuning command.
 
-    Laws are in the order of the catalogue first, objectives as given. Raises ParameterError where
-    the file cannot be written.
+    Laws come in the order of the catalogue, objectives as given. Raises ParameterError if the file
+    cannot be written.
     """
     known = set().union(*results.values())
     objectives = [name for name in order if name in known]
