@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""u that the aircraft applies.
+"""The u that the aircraft applies.
 
-The received u, the failsafe of a u that times out, and a bumpless return.
+It follows the received u, the failsafe if u times out, and a bumpless return.
 """
 
 import numpy as np
@@ -29,7 +29,7 @@ class AppliedInput:
         self._u_ns = self._transfer_ns = 0
 
     def take(self, u: FloatArray, now_ns: int, *, transfer: bool) -> None:
-        """Take a received u. `transfer`: the publisher is new."""
+        """Take a received u; `transfer` says that its publisher is new."""
         if transfer or self._scale(now_ns) < 1.0:
             self._offset = self.u_at(now_ns) - u
             self._transfer_ns = now_ns
@@ -37,7 +37,7 @@ class AppliedInput:
         self._u_ns = now_ns
 
     def u_at(self, now_ns: int) -> FloatArray:
-        """The applied u at an instant."""
+        """Return the applied u at an instant."""
         scale = self._scale(now_ns)
         fading = failsafe_scale(now_ns - self._transfer_ns, 0, self._ramp_ns)
         u = self._u if scale == 1.0 else scale * self._u

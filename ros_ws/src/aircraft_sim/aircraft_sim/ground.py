@@ -9,18 +9,19 @@ from flight_core.rates import seconds
 from flight_core.units import FOOT
 
 SOFT = 7.0 * FOOT
-"""Largest sink of a landing, m/s: the least descent velocity that a landing gear is built for, 14
-CFR 23.473(d), 7 ft/s."""
+"""Largest sink of a landing, m/s: the least descent velocity for which a landing gear must be
+built, 14 CFR 23.473(d), 7 ft/s."""
 
 LEVEL = math.radians(22.0)
-"""Largest bank of a landing, rad, without a model of the gear: a low wing of 2.5 m per metre of
-height touches at 22 deg."""
+"""Largest bank of a landing, rad, if there is no model of the gear: a low wing of 2.5 m per metre
+of height touches the ground at 22 deg."""
 
 
 def touch(title: str, t_ns: int, sink: float, *, is_on_wheels: bool) -> FlightEnded:
-    """The end of a flight that touches the ground with a sink, m/s.
+    """End a flight that touches the ground with a sink, m/s.
 
-    Landed on the wheels with a sink of at most SOFT, else the aircraft has hit the ground.
+    It has landed if it is on its wheels and the sink is at most SOFT; otherwise it has hit the
+    ground.
     """
     has_landed = is_on_wheels and sink <= SOFT
     verb = "landed" if has_landed else "hit the ground"

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A multicopter: the linear model of an airframe for rates and climb.
 
-The tilt of the thrust makes the flight over ground.
+The tilt of the thrust moves it over ground.
 """
 
 from collections.abc import Sequence
@@ -21,15 +21,15 @@ THETA = POSE_STATES.index("theta")
 
 
 class MulticopterModel(StateSpaceModel):
-    """Equation (1) for p, q, r and the climb rate c, with attitude and horizontal velocity v:
+    """Equation (1) for p, q, r and the climb rate c, with attitude and horizontal velocity v.
 
         c_dot = A[c, c] c + T_c + (n_up - 1) T,  T = g + T_c,  T_c = (B u)[c]
         v_dot = T [n_north, n_east] + A[c, c] v
 
     with n = `thrust_axis` of the attitude, which follows Euler's equations. The damping of the
-    climb counts in every direction. States phi and theta of the airframe, as A has them, act on
-    no pose. The middle of a step gives n and the rates.
-    """  # noqa: D415 - what follows is an equation
+    climb acts in every direction. States phi and theta of the airframe, as A has them, do not act
+    on the pose. n and the rates are taken in the middle of a step.
+    """
 
     def __init__(self, parameters: AircraftConfig) -> None:
         states = [*parameters.sampled_airframe().states]
@@ -43,7 +43,7 @@ class MulticopterModel(StateSpaceModel):
         super().__init__(parameters)
 
     def _thrust(self) -> float:
-        """T, m/s^2."""
+        """Return T, m/s^2."""
         row = self._plant.aircraft.B[self._climb]
         return GRAVITY + self._up * float(row @ self._state.position)
 

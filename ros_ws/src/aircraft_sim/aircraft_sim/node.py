@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node of the simulated aircraft, in real time or in lockstep.
 
-Subscribes u, and publishes y, pose and truth. A watchdog measures the age of u. A timeout of u
-starts the failsafe: hold the last value, then ramp to trim.
+It subscribes to u, and publishes y, pose and truth. A watchdog measures the age of u. If u times
+out, the failsafe holds the last value, then ramps to trim.
 """
 
 from collections.abc import Sequence
@@ -27,17 +27,17 @@ from flight_ros.ticker import Tick
 from flight_ros.topics import CLOCK, POSE, RECORDED, TRUTH, NodeState, U, Y
 
 WINDOW = 100
-"""Largest lead of a lockstep flight over its log, in samples: less than publishers keep for a
+"""Largest lead of a lockstep flight over its log, in samples. It is less than publishers keep for a
 recorder that overruns."""
 
 
 class AircraftNode(FlightNode[AircraftConfig]):
-    """At tick k the node integrates from t(k-1) to t(k) with the last u held.
+    """Integrates at tick k from t(k-1) to t(k), with the last u held.
 
-    Then the node publishes y and truth, and takes the newest u. In lockstep the node sets the time:
-    y, truth and pose come at their instants. At the controller's instants the node waits for u,
-    then publishes clock with the next instant. An instant has exactly one y, without channels where
-    no sample arrives.
+    Then it publishes y and truth, and takes the newest u. In lockstep this node sets the time: y,
+    truth and pose come at their instants. At each instant of the controller the node waits for u,
+    then publishes clock with the next instant. Each instant has exactly one y, which has no
+    channels if no sample arrives.
     """
 
     def __init__(self) -> None:
@@ -48,7 +48,8 @@ class AircraftNode(FlightNode[AircraftConfig]):
         self._applied = AppliedInput(len(self._u), held_ns, nanoseconds(self.parameters.ramp))
         self._publisher_lock = self.publisher_lock(self._timeouts_ns)
         self._timeout_logged = False
-        # ns, since the last diagnostics, by the own clock: a u has the stamp of its y.
+        # ns, since the last diagnostics, by the node's own clock, because a u has the stamp of its
+        # y.
         self._ages_of_u: list[int] = []
         decode = Decoder(self._simulator.inputs).decode
         self._u_receiver = self.receive(
@@ -59,7 +60,7 @@ class AircraftNode(FlightNode[AircraftConfig]):
         self._y_encoder = self.encoder(self._simulator.outputs)
         self._truth_encoder = self.encoder(self._simulator.truth_names)
         if self.parameters.lockstep:
-            self._number = 0  # of the next sample
+            self._number = 0  # number of the next sample
             self._u_received = True
             self._completed = False
             self._recorded_ns = 0
@@ -88,7 +89,7 @@ class AircraftNode(FlightNode[AircraftConfig]):
         self._take_u(now_ns)
 
     def _fly_to(self, number: int, start_ns: int, u: FloatArray) -> list[bytes]:
-        """Fly to a sample; the messages of y that arrive."""
+        """Fly to a sample, and return the messages of the y that arrive."""
         return [
             self._y_encoder.encode(start_ns + y.stamp_ns, y.value)
             for y in self._simulator.sample(number, u)
@@ -117,7 +118,8 @@ class AircraftNode(FlightNode[AircraftConfig]):
         # The next instant that needs a u.
         waits_ns = -(-self._number * self.period_ns() // self._control_ns) * self._control_ns
         until_ns = min(waits_ns, self._end_ns or waits_ns)
-        # The clock comes first: the reference model computes y_m while the aircraft integrates.
+        # The clock comes first, so that the reference model computes y_m while the aircraft
+        # integrates.
         self._publish_clock(instant(until_ns))
         messages: list[bytes] = []
         while (t_ns := self._number * self.period_ns()) <= until_ns:
@@ -126,14 +128,14 @@ class AircraftNode(FlightNode[AircraftConfig]):
             ]
             self._publish_motion(self._number, 0)
             self._number += 1
-        # The messages are sent together: each y by itself would wake up the controller.
+        # Send the messages together, because each y by itself would wake up the controller.
         for message in messages:
             self._publish_y(message)
         self._u_received = until_ns % self._control_ns != 0
         return True
 
     def _complete(self) -> None:
-        """Tell that the flight is complete: with the u of its last instant."""
+        """Report that the flight is complete, with the u of its last instant."""
         if not self._completed:
             self._completed = True
             self.publish_state(NodeState.COMPLETED)
@@ -156,14 +158,14 @@ class AircraftNode(FlightNode[AircraftConfig]):
         return self._u_receiver.name if not self._u_received else self._recorded_subscription.name
 
     def _take_u(self, now_ns: int) -> bool:
-        """Take the received u. Returns whether there was a valid message.
+        """Take the received u, and return whether there was a valid message.
 
-        A message without channels is valid: the controller has no output at this instant of a
+        A message without channels is valid: the controller then has no output at this instant of a
         lockstep flight.
         """
         publisher = self._publisher_lock.publisher
         u = self._u
-        # In lockstep there is one u for each y, and what is refused is none.
+        # In lockstep there is one u for each y, and a refused one does not count.
         most = 1 if self.parameters.lockstep else None
         valid = self._u_receiver.poll(now_ns, most)
         while most and valid == [False]:
@@ -188,7 +190,7 @@ class AircraftNode(FlightNode[AircraftConfig]):
             self._ages_of_u.append(now_ns - sample.stamp_ns)
 
     def _max_u_age_ns(self) -> int:
-        """Age limit of a u by the stamp, the instant of the y from which the controller computed u.
+        """Return the age limit of a u by its stamp, that of the y it was computed from.
 
         The middleware of a controller that was stopped sends the last u when the process continues.
         """
@@ -199,7 +201,10 @@ class AircraftNode(FlightNode[AircraftConfig]):
         return nanoseconds(self.parameters.max_age)
 
     def _timeouts_ns(self) -> tuple[int, int]:
-        """Timeouts of the publisher of u. Another node may take over once u has reached trim."""
+        """Return the timeouts of the publisher of u.
+
+        Another node may take over once u has reached trim.
+        """
         return self._max_age_ns, self._max_age_ns + nanoseconds(
             self.parameters.hold + self.parameters.ramp
         )

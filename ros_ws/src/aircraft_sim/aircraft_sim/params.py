@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameters of the simulated aircraft, validated once.
 
-They convert to the arrays of the equations.
+They convert themselves to the arrays of the equations.
 """
 
 from collections.abc import Sequence
@@ -70,7 +70,7 @@ from flight_core.parameters import (
 from flight_core.rates import divide, nanoseconds, period_ns, seconds
 from flight_core.vectors import FloatArray
 
-SHORTEST_STEP = 1e-5  # s: 100,000 integrations a second of flight, which take about as long as 5 s
+SHORTEST_STEP = 1e-5  # s: 100,000 integrations for a second of flight, which take about 5 s
 
 
 class AircraftChannels(NamedTuple):
@@ -85,27 +85,30 @@ class AircraftChannels(NamedTuple):
 class AircraftConfig(NodeConfig):
     """Parameters of the aircraft's node."""
 
-    airframe: str = Field(description="name, path of a file, jsbsim:NAME or jsbsim:PATH")
+    airframe: str = Field(
+        description="airframe: a name, the path of a file, jsbsim:NAME or jsbsim:PATH"
+    )
     speed: Positive | None = Field(
-        default=None, description="of JSBSim: true airspeed of the trim, m/s"
+        default=None, description="true airspeed of the trim, m/s; only for JSBSim"
     )
     altitude: NonNegative | None = Field(
-        default=None, description="of JSBSim: altitude of the trim above sea level, m"
+        default=None, description="altitude of the trim above sea level, m; only for JSBSim"
     )
     commands: dict[str, str] = Field(
         default={},
-        description="of JSBSim: by input, properties with their values at the command 1; "
-        "`rudder: none` of a model without rudder",
+        description="for JSBSim, by input: properties with their values at the command 1; "
+        "`rudder: none` for a model without rudder",
     )
-    rate: Annotated[float, Field(ge=1, le=1000)] = Field(description="the rate of y and u, Hz")
+    rate: Annotated[float, Field(ge=1, le=1000)] = Field(description="rate of y and u, Hz")
     step: Annotated[float, Field(gt=0, ge=SHORTEST_STEP, le=1)] = Field(
-        description="the integration step, s; a whole fraction of 1 / rate"
+        description="integration step, s; a whole fraction of 1 / rate"
     )
     start_time: float = Field(
         default=0.0,
         ge=-1,
         le=1e10,
-        description="system time of t = 0, s since the epoch; 0: at once; -1: by the topic `start`",
+        description="system time of t = 0, s since the epoch; 0: at once; -1: as the topic "
+        "`start` says",
     )
     start: StartConfig = Field(default=StartConfig(), description="where the aircraft is at t = 0")
     gusts: dict[str, Gust] = Field(
@@ -117,60 +120,71 @@ class AircraftConfig(NodeConfig):
     bias: dict[str, BiasConfig] = Field(default={}, description="biases on x_dot by state")
     sines: dict[str, SineConfig] = Field(default={}, description="sines on x_dot by state")
     inertial_coupling: float = Field(
-        default=0.0, ge=0, le=1, description="the factor on the airframe's inertial coupling"
+        default=0.0, ge=0, le=1, description="factor on the airframe's inertial coupling"
     )
     kinematics: Literal["linear", "euler", "thrust"] = Field(
         default="linear",
-        description="the attitude by A; by Euler's equations with the loss of lift in a bank; of a "
-        "multicopter",
+        description="attitude: linear by A; euler by Euler's equations with the loss of lift in a"
+        " bank; "
+        "thrust for a multicopter",
     )
     wind: Annotated[Numbers, Field(min_length=2, max_length=2)] = Field(
-        default=(0.0, 0.0), description="the steady wind, m/s, where the air moves to: north, east"
+        default=(0.0, 0.0), description="steady wind, m/s, towards which the air moves: north, east"
     )
-    shear: ShearConfig | None = Field(default=None, description="steady wind over the height")
-    microburst: MicroburstConfig | None = Field(default=None, description="a microburst; none")
+    shear: ShearConfig | None = Field(
+        default=None, description="steady wind as a function of height"
+    )
+    microburst: MicroburstConfig | None = Field(
+        default=None, description="microburst; none: no microburst"
+    )
     uncertainty: UncertaintyConfig = Field(
-        default=UncertaintyConfig(), description="deviation from the airframe"
+        default=UncertaintyConfig(), description="how the aircraft deviates from the airframe file"
     )
     drift: DriftConfig | None = Field(
-        default=None, description="how A and B change in flight, as by ice"
+        default=None, description="how A and B change in flight, for example by ice"
     )
     over_airspeed: str | None = Field(
         default=None,
-        description="the the thrust, if A, B and the trim follow the airspeed",
+        description="name of the thrust input; A, B and the trim then follow the airspeed",
     )
     actuators: ActuatorConfig = Field(
-        default=ActuatorConfig(), description="the actuators; ideal where left out"
+        default=ActuatorConfig(), description="actuators; ideal if left out"
     )
-    sensors: SensorConfig = Field(
-        default=SensorConfig(), description="the sensors, ideal where left out"
-    )
+    sensors: SensorConfig = Field(default=SensorConfig(), description="sensors; ideal if left out")
     vanes: VaneSensorsConfig = Field(
-        default=VaneSensorsConfig(), description="vanes beside the outputs, none where left out"
+        default=VaneSensorsConfig(), description="vanes beside the outputs; none if left out"
     )
     pose: PoseConfig = Field(
-        default=PoseConfig(), description="how pose is measured, ideal where left out"
+        default=PoseConfig(), description="how pose is measured; ideally if left out"
     )
 
     control_rate: float = Field(
-        default=0.0, ge=0, le=1000, description="in lockstep: the controller's rate, Hz"
+        default=0.0, ge=0, le=1000, description="the controller's rate in lockstep, Hz"
     )
     duration: float = Field(
-        default=0.0, ge=0, le=1e6, description="in lockstep: flight time to stop at, s; 0: never"
+        default=0.0,
+        ge=0,
+        le=1e6,
+        description="flight time at which a lockstep flight ends, s; 0: never",
     )
-    recorded: bool = Field(default=False, description="in lockstep: wait for the recorder")
+    recorded: bool = Field(
+        default=False, description="whether a lockstep flight waits for the recorder"
+    )
 
     max_age: float = Field(default=0.2, gt=0, le=1e6, description="age at which u times out, s")
-    hold: float = Field(default=0.5, ge=0, le=1e6, description="failsafe: how long u is held, s")
+    hold: float = Field(default=0.5, ge=0, le=1e6, description="how long the failsafe holds u, s")
     ramp: float = Field(
-        default=2.0, ge=0, le=1e6, description="failsafe: how long the ramp to trim takes, s"
+        default=2.0,
+        ge=0,
+        le=1e6,
+        description="how long the failsafe then takes to bring u to trim, s",
     )
 
     @classmethod
     def tunable(cls) -> frozenset[str]:
-        """Faults that begin and end in flight.
+        """Return the faults that may begin and end in flight.
 
-        Faults of effectors and sensors, gusts, and the start of a drift.
+        They are faults of effectors and sensors, gusts, and the start of a drift.
         """
         gusts = {f"gusts.{axis}.{key}" for axis, key in product(AXES, Gust.model_fields)}
         sensors = {f"sensors.{key}" for key in ("bias", "noise", "dropout")} | {
@@ -307,13 +321,13 @@ class AircraftConfig(NodeConfig):
         )
 
     def _stops(self) -> dict[str, Sequence[float]]:
-        """The end stops by their keys."""
+        """Return the end stops by their keys."""
         return {end: getattr(self.actuators, end) for end in effector_faults.ENDS}
 
     def _no_thrust(self) -> FloatArray:
-        """The inputs without thrust, deviations from trim, SI: nan where unknown.
+        """Return the inputs without thrust, deviations from trim, SI; nan if unknown.
 
-        Of JSBSim the throttle is -1 until the model has its trim.
+        For JSBSim the throttle is -1 until the model has its trim.
         """
         if self.is_jsbsim:
             inputs = self.flight_condition().inputs()
@@ -357,11 +371,11 @@ class AircraftConfig(NodeConfig):
 
     @property
     def step_ns(self) -> int:
-        """The integration step in ns."""
+        """Integration step in ns."""
         return nanoseconds(self.step)
 
     def channels(self) -> AircraftChannels:
-        """Outputs and inputs with their units, the effects of the inputs, and the trim speed."""
+        """Return outputs and inputs with units, the effects of the inputs, and the trim speed."""
         vanes: dict[str, Unit] = dict.fromkeys(self.vanes.channels, "rad")
         if self.is_jsbsim:
             condition = self.flight_condition()
@@ -382,14 +396,14 @@ class AircraftConfig(NodeConfig):
         return self.turbulence is not None and self.turbulence.rotary
 
     def nominal_airframe(self) -> Airframe:
-        """The named airframe, with the axes of the rotary gusts that act."""
+        """Return the named airframe, with the axes of the rotary gusts that act."""
         airframe = load_airframe(self.airframe)
         return airframe.with_rotary_gusts() if self.has_rotary_gusts else airframe
 
     def sampled_airframe(self) -> Airframe:
-        """The airframe in flight.
+        """Return the airframe in flight.
 
-        The named airframe, or a sample of `uncertainty` around the named airframe.
+        It is the named airframe, or a sample of `uncertainty` around it.
         """
         section = self.uncertainty
         return uncertainty.sample_airframe(
@@ -403,7 +417,7 @@ class AircraftConfig(NodeConfig):
         )
 
     def drifted_airframe(self) -> Airframe:
-        """The airframe in flight after its drift."""
+        """Return the airframe in flight after its drift."""
         airframe = self.sampled_airframe()
         section = self.drift
         if section is None:
@@ -413,7 +427,7 @@ class AircraftConfig(NodeConfig):
         )
 
     def drift_factors(self) -> Drift | None:
-        """The drift as factors of the matrices of equation (1)."""
+        """Return the drift as factors on the matrices of equation (1)."""
         if self.drift is None:
             return None
         matrices = (
@@ -427,9 +441,9 @@ class AircraftConfig(NodeConfig):
         return Drift(self.drift.start, self.drift.duration, *factors)
 
     def load(self) -> tuple[Airframe, Aircraft]:
-        """The airframe in flight and the arrays of equation (1) with the disturbances.
+        """Return the airframe in flight and the arrays of equation (1) with the disturbances.
 
-        The disturbances are for the axes of the airframe's gusts.
+        The disturbances act along the axes of the airframe's gusts.
         """
         airframe = self.sampled_airframe()
         gain, first, second = airframe.products()
@@ -452,7 +466,7 @@ class AircraftConfig(NodeConfig):
         )
 
     def plant(self) -> PlantParams:
-        """The plant as arrays: equation (1), the actuators, the turbulence and the drift."""
+        """Return the plant as arrays: equation (1), actuators, turbulence and drift."""
         airframe, aircraft = self.load()
         span = airframe.span if self.has_rotary_gusts else None
         turbulence = self._turbulence(airframe.speed, list(airframe.gusts), span)
@@ -467,7 +481,7 @@ class AircraftConfig(NodeConfig):
         )
 
     def actuator_model(self) -> Actuators:
-        """The actuators as arrays."""
+        """Return the actuators as arrays."""
         section = self.actuators
         columns: dict[str, Any] = {
             key: _array(values, key in {"lag", "dead_zone"})
@@ -480,7 +494,7 @@ class AircraftConfig(NodeConfig):
         return Actuators(**columns, no_thrust=self._no_thrust() if needs_no_thrust else None)
 
     def flight_condition(self) -> FlightCondition:
-        """The aircraft of JSBSim and the flight condition.
+        """Return the aircraft of JSBSim with its flight condition.
 
         Raises ParameterError for a linear aircraft.
         """
@@ -499,23 +513,23 @@ class AircraftConfig(NodeConfig):
         )
 
     def wind_model(self) -> WindModel:
-        """The wind of an aircraft of JSBSim, on every axis."""
+        """Return the wind of an aircraft of JSBSim, on every axis."""
         turbulence = self._turbulence(self.flight_condition().speed, AXES, None)
         return WindModel(self.gust_arrays(AXES), turbulence, self.relative_wind())
 
     def ground(self) -> float | None:
-        """Altitude of the ground, m, as `pose`; None where no section states one."""
+        """Return the altitude of the ground, m, as in `pose`; None if no section states one."""
         section = self.microburst if self.shear is None else self.shear
         return None if section is None else section.ground
 
     def relative_wind(self) -> RelativeWind | None:
-        """The wind that differs from place to place; None without any."""
+        """Return the wind that differs from place to place; None if there is none."""
         field = wind_field_of(self.wind, self.shear, self.microburst)
         start = Start(**self.start.model_dump())
         return None if field is None else RelativeWind(field, start, self.altitude or 0.0)
 
     def gust_arrays(self, axes: Sequence[str]) -> Gusts:
-        """The gusts as arrays, along these axes."""
+        """Return the gusts as arrays along these axes."""
         gusts = [self.gusts.get(axis, STILL_AIR) for axis in axes]
         start = np.array([gust.start for gust in gusts])
         speed = np.array([gust.speed for gust in gusts])
@@ -537,7 +551,7 @@ class AircraftConfig(NodeConfig):
         return filters(spectrum, speed, self.step, places, section.seed, span)
 
     def sensor_arrays(self) -> Sensors:
-        """The sensors as arrays."""
+        """Return the sensors as arrays."""
         sensors = self.sensors
         drift = _array(sensors.drift, zero_is_none=True)
         return Sensors(
@@ -553,16 +567,16 @@ class AircraftConfig(NodeConfig):
         )
 
     def pose_every(self) -> int:
-        """Number of the aircraft's instants from pose to pose."""
+        """Return the number of the aircraft's instants from pose to pose."""
         rate = self.pose.rate
         if rate is None:
             return every(self.rate)
         return divide(period_ns(rate, "pose.rate"), period_ns(self.rate, "rate"), "rate", "")
 
     def pose_sensors(self) -> Sensors | None:
-        """The errors of pose as arrays, in the order of `channels.POSE`; None of an ideal pose.
+        """Return the errors of pose as arrays, ordered as `channels.POSE`; None if ideal.
 
-        Independent of the errors of y.
+        They are independent of the errors of y.
         """
         pose = self.pose
         if not (
@@ -590,7 +604,7 @@ STILL_AIR = Gust(start=0.0, speed=0.0, length=1.0)
 
 
 def _array(values: Sequence[float], zero_is_none: bool) -> FloatArray | None:
-    """The values as an array; None for missing values and, with zero_is_none, for zeros alone."""
+    """Return the values as an array; None if missing or, with zero_is_none, if all are zero."""
     if not values or (zero_is_none and not any(values)):
         return None
     return np.array(values, dtype=np.float64)

@@ -3,9 +3,9 @@
 """Pose of the aircraft: attitude, position and velocity over ground as absolute values.
 
 Guidance and the log take it. Position is in a local tangent plane whose origin is below the
-aircraft at t = 0, unless it starts elsewhere. A steady wind moves the air mass as a whole: the
-flight relative to the air is as in still air, and the pose alone gets the wind (Galilean
-invariance).
+aircraft at t = 0, unless the aircraft starts elsewhere. A steady wind moves the air mass as a
+whole, so the flight relative to the air is as in still air, and only the pose includes the wind
+(Galilean invariance).
 """
 
 import math
@@ -18,26 +18,26 @@ from flight_core.channels import POSE
 from flight_core.vectors import FloatArray, Scalar, array_namespace
 
 RATE = 50.0
-"""Hz, the highest rate of pose without `pose.rate`: the aircraft publishes at every k-th instant,
+"""Hz, highest rate of pose without `pose.rate`. The aircraft publishes it at every k-th instant,
 with the least such k."""
 
 
 def every(rate: float) -> int:
-    """Number k of the aircraft's instants from pose to pose, by the aircraft's rate in Hz."""
+    """Return the number k of instants from pose to pose, given the aircraft's rate in Hz."""
     return max(1, math.ceil(rate / RATE))
 
 
 def wrapped(angle: float) -> float:
-    """An angle in (-pi, pi], rad."""
+    """Wrap an angle to (-pi, pi], rad."""
     return angle - 2.0 * math.pi * math.ceil(angle / (2.0 * math.pi) - 0.5)
 
 
 def velocity(
     speed: Scalar, alpha: Scalar, beta: Scalar, phi: Scalar, theta: Scalar, psi: Scalar
 ) -> tuple[Scalar, Scalar, Scalar]:
-    """Velocity to the north, to the east and up, m/s.
+    """Compute the velocity to the north, to the east and up, m/s.
 
-    The aircraft has this airspeed, m/s, and these angles, rad.
+    The aircraft has this airspeed, m/s, and these angles, rad:
 
         [v_north, v_east, -climb] = R_z(psi) R_y(theta) R_x(phi) V [cos(alpha) cos(beta), sin(beta),
         sin(alpha) cos(beta)]
@@ -69,10 +69,10 @@ class Start(NamedTuple):
 
 
 def over_ground(pose: FloatArray, t: float, wind: Sequence[float], start: Start) -> FloatArray:
-    """A pose relative to the air mass as a pose over ground after t s of a steady wind.
+    """Turn a pose relative to the air mass into one over ground after t s of a steady wind.
 
     The wind is in m/s to the north and to the east. The pose is that of a flight from the origin to
-    the north. The heading of the start turns the pose, and its place moves it.
+    the north; the heading of the start turns it, and the place of the start moves it.
     """
     pose_over_ground = pose.copy()
     if start.heading:

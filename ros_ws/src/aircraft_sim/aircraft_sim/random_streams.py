@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Counter-based random numbers (Philox).
 
-A draw depends on seed, stream and number alone, not on earlier draws. Two flights of a scenario
-therefore agree, even if samples are missing in the second flight. NumPy's generator stays outside
-the functions on further array types.
+A draw depends only on seed, stream and number, not on earlier draws. Two flights of a scenario
+therefore agree, even if samples are missing in the second one. NumPy's generator is not called in
+functions that also take other array types.
 """
 
 import numpy as np
@@ -16,9 +16,9 @@ ROTARY, ROTARY_START = range(8, 10)
 """Streams, one for each use. Under the same seed they are independent of each other."""
 
 
-# The type is a text: np.random loads when it is used.
+# The type is a string, so that np.random is loaded only when it is used.
 def generator(number: int, stream: int, seed: int) -> "np.random.Generator":
-    """Generator of draw `number` >= 0 of a stream, with seed >= 0.
+    """Make the generator of draw `number` >= 0 of a stream, with seed >= 0.
 
     Source: Salmon et al., Parallel random numbers: as easy as 1, 2, 3, SC11 (Philox).
     """
@@ -27,10 +27,10 @@ def generator(number: int, stream: int, seed: int) -> "np.random.Generator":
 
 
 def uniform(first: int, count: int, width: int, stream: int, seed: int) -> FloatArray:
-    """Draws first, first + 1, ... of `width` numbers, uniform in [0, 1), shape (count, width).
+    """Draw `width` numbers first, first + 1, ..., uniform in [0, 1), shape (count, width).
 
-    A draw takes a whole number of counter steps of four numbers, so a single generator gives every
-    draw.
+    Each draw takes a whole number of counter steps of four numbers, so that a single generator
+    gives every draw.
     """
     steps = -(-width // 4)
     generator = np.random.Generator(

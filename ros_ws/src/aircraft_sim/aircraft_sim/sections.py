@@ -28,34 +28,33 @@ from flight_core.vectors import FloatArray
 class Gust(Config):
     """A 1-cosine gust."""
 
-    start: NonNegative = Field(description="the instant of entry, s")
-    speed: Number = Field(description="the peak speed U_ds, m/s")
-    length: Positive = Field(description="the distance H from entry to peak, m")
+    start: NonNegative = Field(description="instant of entry, s")
+    speed: Number = Field(description="peak speed U_ds, m/s")
+    length: Positive = Field(description="distance H from entry to peak, m")
     every: Annotated[float, Field(gt=0, allow_inf_nan=True)] = Field(
-        default=math.inf, description="the period of further gusts, s"
+        default=math.inf, description="period after which the gust comes again, s"
     )
 
 
 class TurbulenceConfig(Config):
-    """Dryden turbulence by MIL-F-8785C.
+    """Dryden turbulence of MIL-F-8785C.
 
-    `wind` gives the intensity at low altitude, `sigma` at high altitude.
+    `wind` sets the intensity at low altitude, `sigma` at high altitude.
     """
 
-    altitude: Number = Field(ge=LOWEST, description="the altitude above the ground, m")
+    altitude: Number = Field(ge=LOWEST, description="altitude above the ground, m")
     wind: NonNegative | None = Field(
         default=None,
-        description="the wind at 20 ft above the ground, m/s: 7.7 light, 15.4 moderate, 23.1 "
-        "severe",
+        description="wind at 20 ft above the ground, m/s: 7.7 light, 15.4 moderate, 23.1 severe",
     )
     sigma: NonNegative | None = Field(
-        default=None, description="the standard deviation at high altitude, m/s"
+        default=None, description="standard deviation at high altitude, m/s"
     )
     rotary: bool = Field(
         default=False,
-        description="whether the air turns, too: p_g, q_g, r_g",
+        description="whether the air also turns with p_g, q_g, r_g",
     )
-    seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of the turbulence")
+    seed: int = Field(default=1, ge=0, lt=2**63, description="seed of the turbulence")
 
     def _check(self) -> None:
         for key, acts, where in (
@@ -81,23 +80,25 @@ NEEDS = {
 
 
 class ShearConfig(Config):
-    """The steady wind over the height above the ground.
+    """The steady wind as a function of the height above the ground.
 
-    `aircraft.wind` at `reference`, or a table.
+    Either `aircraft.wind` holds at `reference`, or a table gives the wind.
     """
 
-    law: Literal["log", "power", "table"] = Field(description="of the wind over the height")
-    ground: Number = Field(description="the altitude of the ground, m, as `pose`")
+    law: Literal["log", "power", "table"] = Field(description="law of the wind over the height")
+    ground: Number = Field(description="altitude of the ground, m, as in `pose`")
     reference: Positive | None = Field(
-        default=None, description="log, power: the height of `aircraft.wind`, m"
+        default=None, description="for log and power: height at which `aircraft.wind` holds, m"
     )
-    roughness: Positive | None = Field(default=None, description="log: roughness length, m")
-    exponent: Positive | None = Field(default=None, description="power: the exponent, 1")
-    height: tuple[Number, ...] = Field(default=(), description="table: rising heights, m")
+    roughness: Positive | None = Field(default=None, description="for log: roughness length, m")
+    exponent: Positive | None = Field(default=None, description="for power: exponent, 1")
+    height: tuple[Number, ...] = Field(default=(), description="for table: rising heights, m")
     north: tuple[Number, ...] = Field(
-        default=(), description="table: the wind at these, where the air moves to, m/s"
+        default=(), description="for table: wind to the north at each height, m/s"
     )
-    east: tuple[Number, ...] = Field(default=(), description="table: m/s")
+    east: tuple[Number, ...] = Field(
+        default=(), description="for table: wind to the east at each height, m/s"
+    )
 
     def _check(self) -> None:
         every = {key for keys in NEEDS.values() for key in keys}
@@ -117,7 +118,7 @@ class ShearConfig(Config):
             require(above, "reference", f"{self.reference:g} m", expected)
 
     def profile(self) -> wind_field.Log | wind_field.Power | wind_field.Table:
-        """The profile of the equations."""
+        """Return the profile that the equations use."""
         if self.law == "table":
             return wind_field.Table(self.height, self.north, self.east)
         reference = self.reference or math.inf
@@ -129,15 +130,15 @@ class ShearConfig(Config):
 class MicroburstConfig(Config):
     """A microburst: a downdraft that spreads over the ground."""
 
-    ground: Number = Field(description="the altitude of the ground, m, as `pose`")
-    north: Number = Field(description="of the centre, m")
-    east: Number = Field(description="of the centre, m")
-    radius: Positive = Field(description="the radius R of the downdraft, m")
-    speed: Positive = Field(description="the largest outflow, m/s")
-    height: Positive = Field(description="its height above the ground, m")
+    ground: Number = Field(description="altitude of the ground, m, as in `pose`")
+    north: Number = Field(description="north coordinate of the centre, m")
+    east: Number = Field(description="east coordinate of the centre, m")
+    radius: Positive = Field(description="radius R of the downdraft, m")
+    speed: Positive = Field(description="largest outflow, m/s")
+    height: Positive = Field(description="height of the largest outflow above the ground, m")
 
     def model(self) -> wind_field.Microburst:
-        """The microburst of the equations."""
+        """Return the microburst that the equations use."""
         values = self.model_dump(exclude={"ground"})
         return wind_field.Microburst(**values)
 
@@ -145,10 +146,7 @@ class MicroburstConfig(Config):
 def require_one_wind(
     wind: Sequence[float], shear: ShearConfig | None, burst: MicroburstConfig | None
 ) -> None:
-    """Raise ParameterError for a wind beside a table of the wind.
-
-    Two altitudes of the ground are refused, too.
-    """
+    """Refuse a wind beside a table of the wind, and two altitudes of the ground."""
     if shear is not None and shear.law == "table":
         expected = "0 beside shear.law table, which has the whole wind"
         require(not any(wind), "wind", list(wind), expected)
@@ -161,7 +159,7 @@ def require_one_wind(
 def wind_field_of(
     wind: Sequence[float], shear: ShearConfig | None, burst: MicroburstConfig | None
 ) -> wind_field.WindField | None:
-    """The wind over the place; None of a wind that is the same everywhere."""
+    """Return the wind as a function of place; None if it is the same everywhere."""
     section = burst if shear is None else shear
     if section is None:
         return None
@@ -176,50 +174,53 @@ def wind_field_of(
 class BiasConfig(Config):
     """A bias on x_dot of a state.
 
-    A rise from 0 to the value along half a cosine, or a step with rise 0.
+    It rises from 0 to the value along half a cosine, or in a step if rise is 0.
     """
 
-    start: NonNegative = Field(description="the instant at which it begins, s")
-    value: Number = Field(description="the final value, SI unit of the state per s")
-    rise: NonNegative = Field(description="the rise time, s; 0: a step, outside the theorem")
+    start: NonNegative = Field(description="instant at which it begins, s")
+    value: Number = Field(description="final value, SI unit of the state per s")
+    rise: NonNegative = Field(
+        description="rise time, s; 0 for a step, which is outside the theorem"
+    )
 
 
 class SineConfig(Config):
     """A sine on x_dot of a state: amplitude sin(frequency t + phase)."""
 
-    amplitude: Number = Field(description="the amplitude, SI unit of the state per s")
-    frequency: Positive = Field(description="the frequency, rad/s")
-    phase: Number = Field(default=0.0, description="the phase, rad")
+    amplitude: Number = Field(description="amplitude, SI unit of the state per s")
+    frequency: Positive = Field(description="frequency, rad/s")
+    phase: Number = Field(default=0.0, description="phase, rad")
 
 
 class DrawConfig(Config):
-    """Entries of A and B times 1 + d, drawn by a seed."""
+    """Entries of A and B are multiplied by 1 + d, with d drawn from a seed."""
 
-    A: float = Field(default=0.0, ge=0, lt=1, description="the largest d of an entry of A")
-    B: float = Field(default=0.0, ge=0, lt=1, description="the largest d of an entry of B")
-    seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of the draw")
-    number: int = Field(default=0, ge=0, lt=2**32, description="the number of the seed's draw")
+    A: float = Field(default=0.0, ge=0, lt=1, description="largest d of an entry of A")
+    B: float = Field(default=0.0, ge=0, lt=1, description="largest d of an entry of B")
+    seed: int = Field(default=1, ge=0, lt=2**63, description="seed of the draw")
+    number: int = Field(default=0, ge=0, lt=2**32, description="number of the draw with this seed")
 
 
 class UncertaintyConfig(DrawConfig):
-    """An aircraft sampled around the airframe: every entry times 1 + d, d independent.
+    """An aircraft sampled around the airframe: every entry is multiplied by 1 + d, d independent.
 
-    The rows of angles stay.
+    The rows of angles stay as they are.
     """
 
     entries: tuple[str, ...] = Field(
-        default=(), description="entries with their own largest d, as A[q,alpha]"
+        default=(), description="entries with a largest d of their own, such as A[q,alpha]"
     )
     parts: tuple[Annotated[float, Field(ge=0, lt=1)], ...] = Field(
-        default=(), description="the largest d of these entries"
+        default=(), description="largest d of each of these entries"
     )
     distribution: Distribution = Field(
         default="uniform",
-        description="of d: normal: limit at three standard deviations; corners: its limits",
+        description="distribution of d; normal: cut at three standard deviations; corners: one of"
+        " the limits",
     )
     wind: WindEffect = Field(
         default=AIR_RELATIVE,
-        description="effect of wind: by the aircraft's own A, or as published",
+        description="whether wind acts by the aircraft's own A, or as published",
     )
 
     def _check(self) -> None:
@@ -232,7 +233,7 @@ class UncertaintyConfig(DrawConfig):
         require_length("parts", self.parts, self.entries)
 
     def spread(self) -> Spread:
-        """How the entries are drawn."""
+        """Return how the entries are drawn."""
         return Spread(dict(zip(self.entries, self.parts, strict=True)), self.distribution)
 
 
@@ -243,18 +244,18 @@ class DriftConfig(DrawConfig):
     """
 
     start: Annotated[float, Field(ge=0, allow_inf_nan=True)] = Field(
-        description="when it begins, s"
+        description="instant at which it begins, s"
     )
     duration: NonNegative = Field(
-        default=60.0, description="how long the entries change, s; 0 is at once"
+        default=60.0, description="how long the entries change, s; 0 for at once"
     )
 
     def _check(self) -> None:
         require(self.A > 0.0 or self.B > 0.0, "A", "0, and B 0", "how far A or B change")
 
 
-# One value per channel; an empty list means ideal channels. A limit may be infinite (.inf in YAML):
-# no limit on that channel.
+# One value per channel; an empty list means ideal channels. A limit may be infinite (.inf in YAML),
+# which means no limit on that channel.
 NonNegativesOrNone = tuple[NonNegative, ...]
 
 
@@ -280,7 +281,7 @@ class ActuatorConfig(Config):
     """
 
     lag: NonNegativesOrNone = Field(
-        default=(), description="time constants of first order, s; 0: none"
+        default=(), description="time constants of first order, s; 0 for none"
     )
     lower: Lower = Field(default=(), description="lower end stops, deviations from trim, SI")
     upper: Upper = Field(default=(), description="upper end stops, deviations from trim, SI")
@@ -288,20 +289,20 @@ class ActuatorConfig(Config):
     dead_zone: NonNegativesOrNone = Field(default=(), description="half-widths of the dead zones")
     faults: tuple[str, ...] = Field(
         default=(),
-        description="INPUT KIND AT, s, perhaps how strong: aileron lost 60",
+        description="INPUT KIND AT, with AT in s, and how strong if need be: aileron lost 60",
     )
     delay: float = Field(
         default=0.0,
         ge=0,
         le=10,
-        description="delay of u, s; whole periods of the aircraft",
+        description="delay of u, s; a whole number of the aircraft's periods",
     )
 
     def _check(self) -> None:
         self.read_faults()
 
     def read_faults(self) -> tuple[effector_faults.Fault, ...]:
-        """The faults. Raises ParameterError."""
+        """Read the faults. Raises ParameterError."""
         return tuple(
             effector_faults.read_fault(sentence, f"faults[{number}]")
             for number, sentence in enumerate(self.faults)
@@ -313,22 +314,22 @@ class SensorConfig(Config):
 
     bias: NumbersOrNone = Field(default=(), description="constant errors")
     drift: NonNegativesOrNone = Field(
-        default=(), description="random walks: standard deviation, SI per sqrt(s)"
+        default=(), description="standard deviation of the random walks, SI per sqrt(s)"
     )
     noise: NonNegativesOrNone = Field(
-        default=(), description="noise: standard deviation per sample"
+        default=(), description="standard deviation of the noise per sample"
     )
-    quantisation: NonNegativesOrNone = Field(default=(), description="steps of the values; 0: none")
+    quantisation: NonNegativesOrNone = Field(
+        default=(), description="steps of the quantised values; 0 for none"
+    )
     delay: float = Field(
         default=0.0,
         ge=0,
         le=10,
-        description="delay, s; whole periods of `rate`",
+        description="delay, s; a whole number of periods of `rate`",
     )
-    dropout: float = Field(
-        default=0.0, ge=0, lt=1, description="the probability that a sample is lost"
-    )
-    seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of noise, drift and losses")
+    dropout: float = Field(default=0.0, ge=0, lt=1, description="probability that a sample is lost")
+    seed: int = Field(default=1, ge=0, lt=2**63, description="seed of noise, drift and losses")
 
 
 PerPose = dict[str, Number]
@@ -337,41 +338,40 @@ PerPose = dict[str, Number]
 class PoseConfig(Config):
     """How `pose` is measured.
 
-    The defaults are an ideal estimator: the true pose at once, at up to 50 Hz.
+    By default the estimator is ideal: it gives the true pose at once, at up to 50 Hz.
     """
 
     rate: Positive | None = Field(
-        default=None, description="the rate, Hz, a whole fraction of the aircraft's; none: 50 Hz"
+        default=None,
+        description="rate, Hz, a whole fraction of the aircraft's; none: at most 50 Hz",
     )
     delay: float = Field(
         default=0.0,
         ge=0,
         le=10,
-        description="delay, s; whole periods of the aircraft",
+        description="delay, s; a whole number of the aircraft's periods",
     )
     bias: PerPose = Field(default={}, description="constant errors")
     drift: dict[str, NonNegative] = Field(
-        default={}, description="random walks: standard deviation, SI per sqrt(s)"
+        default={}, description="standard deviation of the random walks, SI per sqrt(s)"
     )
     noise: dict[str, NonNegative] = Field(
-        default={}, description="noise: standard deviation per sample"
+        default={}, description="standard deviation of the noise per sample"
     )
-    seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of noise and drift")
+    seed: int = Field(default=1, ge=0, lt=2**63, description="seed of noise and drift")
 
 
 class StartConfig(Config):
     """Where the aircraft is at t = 0."""
 
-    north: Number = Field(default=0.0, description="to the north of the origin, m")
-    east: Number = Field(default=0.0, description="to the east of the origin, m")
-    heading: Number = Field(
-        default=0.0, description="the heading, rad, positive to the right of north"
-    )
+    north: Number = Field(default=0.0, description="distance to the north of the origin, m")
+    east: Number = Field(default=0.0, description="distance to the east of the origin, m")
+    heading: Number = Field(default=0.0, description="heading, rad, positive to the right of north")
 
 
 def by_state(
     configs: Mapping[str, Config], keys: Sequence[str], states: Iterable[str]
 ) -> list[FloatArray]:
-    """An array per key, over the states, with 0 for an unnamed state."""
+    """Return an array per key, over the states, with 0 for a state that is not named."""
     sections = [configs.get(state) for state in states]
     return [np.array([float(getattr(section, key, 0.0)) for section in sections]) for key in keys]

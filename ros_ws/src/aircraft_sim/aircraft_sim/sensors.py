@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sensors between the aircraft and y.
 
-They have bias, drift, noise and quantisation, then loss and delay of samples.
+They add bias, drift, noise and quantisation, then lose and delay samples.
 """
 
 from typing import NamedTuple
@@ -16,7 +16,7 @@ from flight_core.vectors import Array, FloatArray, StampedVector, array_namespac
 class Sensors(NamedTuple):
     """Parameters of the sensors of m outputs.
 
-    Ideal sensors have noise 0, delay 0 and dropout 0. None: the error is absent.
+    Ideal sensors have noise 0, delay 0 and dropout 0. An error that is None is absent.
     """
 
     noise: FloatArray  # (m,) standard deviation per sample, SI
@@ -32,7 +32,7 @@ class Sensors(NamedTuple):
 class RandomWalk(NamedTuple):
     """State of the sensors: the random walk at a sample."""
 
-    number: int  # of the sample
+    number: int  # number of the sample
     value: FloatArray  # (m,) SI
 
 
@@ -49,18 +49,18 @@ DelayLine = tuple[StampedVector, ...]
 
 
 def initial_drift(params: Sensors) -> RandomWalk:
-    """The random walk at sample 0, from zero."""
+    """Return the random walk at sample 0, which starts from zero."""
     return RandomWalk(0, np.zeros_like(params.noise))
 
 
 def measure(number: int, y: FloatArray, drift: RandomWalk, params: Sensors) -> Measured:
-    """Measurement of y = C x, shape (m,), at sample `number`, not before the sample of `drift`:
+    """Measure y = C x, shape (m,), at sample `number`, not before the sample of `drift`.
 
         measured = quantised(y + error(number))
 
-    The error of a quantised sample is the measured value less y. Ideal sensors give y to the last
+    The error of a quantised sample is the measured value less y. Ideal sensors return y to the last
     bit.
-    """  # noqa: D415 - what follows is an equation
+    """
     added, drift = error(number, drift, params)
     y_measured = y + added
     if params.quantum is not None:
@@ -70,9 +70,9 @@ def measure(number: int, y: FloatArray, drift: RandomWalk, params: Sensors) -> M
 
 
 def error(number: int, drift: RandomWalk, params: Sensors) -> tuple[FloatArray, RandomWalk]:
-    """Additive error at sample `number`, bias + walk(number) + noise(number), shape (m,).
+    """Compute the additive error at sample `number`: bias + walk(number) + noise(number), (m,).
 
-    Returns further the walk; y plays no part.
+    Also returns the random walk at this sample, for the next call. y plays no part.
     """
     drift = walk(number, drift, params)
     added = noise(number, params)
@@ -82,7 +82,7 @@ def error(number: int, drift: RandomWalk, params: Sensors) -> tuple[FloatArray, 
 
 
 def quantised(measured: Array, quantum: Array) -> Array:
-    """Quantum round(measured / quantum), half to even; as measured where the quantum is 0.
+    """Round to quantum round(measured / quantum), half to even; unchanged if the quantum is 0.
 
     Works on any array type.
     """
@@ -96,11 +96,11 @@ def quantised(measured: Array, quantum: Array) -> Array:
 
 
 def noise(number: int, params: Sensors) -> FloatArray:
-    """Error of sample `number` >= 0, shape (m,): noise_i n_i.
+    """Draw the noise of sample `number` >= 0, shape (m,): noise_i n_i.
 
     n_i is standard normal, white over channels and samples.
     """
-    # A seventh of the time of .any() for a few channels.
+    # For a few channels this takes a seventh of the time of .any().
     if not any(params.noise.tolist()):
         return params.noise
     return params.noise * random_streams.generator(
@@ -109,10 +109,10 @@ def noise(number: int, params: Sensors) -> FloatArray:
 
 
 def walk(number: int, drift: RandomWalk, params: Sensors) -> RandomWalk:
-    """The random walk at sample `number`: w(0) = 0, w(k) = w(k-1) + drift_i n_i(k).
+    """Advance the random walk to sample `number`: w(0) = 0, w(k) = w(k-1) + drift_i n_i(k).
 
-    n is standard normal and independent. Steps of skipped samples are added too, so the walk does
-    not depend on the measured samples.
+    n is standard normal and independent. The steps of skipped samples are added too, so that the
+    walk does not depend on which samples are measured.
     """
     if params.drift is None:
         return drift
@@ -138,10 +138,10 @@ def arrives(number: int, params: Sensors) -> bool:
 def transmit(
     delay_line: DelayLine, now_ns: int, y: FloatArray | None, params: Sensors
 ) -> tuple[DelayLine, DelayLine]:
-    """Transport delay at a sample instant: (delay line, now, y) -> (delay line, arrived samples).
+    """Delay samples at a sample instant: (delay line, now, y) -> (delay line, arrived samples).
 
-    y enters the delay line with the stamp now; None: the sample is dropped. Samples as old as the
-    delay arrive, the oldest first. A stamp stays the instant of measurement.
+    y enters the delay line with the stamp now; None means that the sample is dropped. Samples as
+    old as the delay arrive, the oldest first. A stamp remains the instant of measurement.
     """
     line = delay_line if y is None else (*delay_line, StampedVector(now_ns, y))
     arrived = sum(sample.stamp_ns + params.delay_ns <= now_ns for sample in line)

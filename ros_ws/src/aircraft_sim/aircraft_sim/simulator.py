@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The simulated aircraft at the sample instants: a flight dynamics model and sensors.
 
-The node and the loop in one process use this simulator, for every kind of aircraft.
+The node and the loop in one process use it, for every kind of aircraft.
 """
 
 import math
@@ -25,32 +25,32 @@ from flight_core.rates import nanoseconds, period_ns, seconds
 from flight_core.vectors import FloatArray, StampedVector
 
 WRAPPED = [POSE.index(name) for name in ("phi", "psi")]
-"""Channels of pose within half a turn."""
+"""Channels of pose that are kept within half a turn."""
 
 
 class FlightDynamicsModel(Protocol):
-    """The interface of an aircraft between command and sensors."""
+    """What an aircraft must offer between command and sensors."""
 
     @property
     def truth_names(self) -> tuple[str, ...]:
         """Channels of `truth`: "group.name"."""
 
     def advance(self, t_ns: int, u: FloatArray, duration_ns: int) -> None:
-        """From t to t + duration with the command u held, deviations from trim, SI."""
+        """Fly from t to t + duration with the command u held, deviations from trim, SI."""
 
     def y(self) -> FloatArray:
-        """The outputs before the sensors, deviations from trim, shape (m,), SI."""
+        """Return the outputs before the sensors, deviations from trim, shape (m,), SI."""
 
     def air_angles(self, t_ns: int) -> FloatArray:
-        """Alpha and beta relative to the air, deviations from trim, rad, shape (2,)."""
+        """Return alpha and beta relative to the air, deviations from trim, rad, shape (2,)."""
 
     def truth(self, t_ns: int) -> FloatArray:
-        """Values in the order of `truth_names`."""
+        """Return the values in the order of `truth_names`."""
 
     def pose(self) -> FloatArray:
-        """The pose relative to the air mass, absolute values, SI.
+        """Return the pose relative to the air mass, absolute values, SI.
 
-        In the order of `channels.POSE`.
+        It is in the order of `channels.POSE`.
         """
 
     def diverged(self) -> bool:
@@ -116,7 +116,7 @@ class Simulator:
     def retune(self, parameters: AircraftConfig) -> None:
         """Take faults and gusts of these parameters from now on.
 
-        Raises ParameterError where one would change the past.
+        Raises ParameterError if one of them would change the past.
         """
         now_ns = self._number * self.period_ns
         t = seconds(now_ns)
@@ -158,8 +158,8 @@ class Simulator:
     def sample(self, number: int, u: FloatArray) -> DelayLine:
         """Advance to sample `number` with u held since the last sample, and measure.
 
-        The sample is at `number` periods of flight time. Returns the arriving y, the oldest first;
-        their stamps are flight time. Raises FlightEnded on the ground, and where the aircraft has
+        The sample is at `number` periods of flight time. Returns the y that arrive, the oldest
+        first, with stamps in flight time. Raises FlightEnded on the ground, and if the aircraft has
         diverged: its state, or an output beyond `flight_core.plausible`.
         """
         t_ns = number * self.period_ns
@@ -187,7 +187,7 @@ class Simulator:
         return arrived
 
     def _advance(self, number: int, u: FloatArray) -> None:
-        """The model to a sample, period by period where u is late."""
+        """Advance the model to a sample, period by period if u is late."""
         step = 1 if self._commands else max(number - self._number, 1)
         for k in range(self._number, number, step):
             self._commands.append(u)
@@ -200,7 +200,7 @@ class Simulator:
         self._require_above_ground(number * self.period_ns)
 
     def _require_above_ground(self, t_ns: int) -> None:
-        """Raise FlightEnded where the aircraft comes down on the ground of the scenario."""
+        """Raise FlightEnded if the aircraft comes down on the ground of the scenario."""
         if self._ground is None:
             return
         at = dict(zip(POSE, self.pose().tolist(), strict=True))
@@ -212,7 +212,7 @@ class Simulator:
             raise self._with_place(end)
 
     def _with_place(self, end: FlightEnded) -> FlightEnded:
-        """The end with the speed across the heading and the place, where it is a landing."""
+        """Add the speed across the heading and the place to the end, if it is a landing."""
         if end.end is not End.LANDED:
             return end
         at = dict(zip(POSE, self.pose().tolist(), strict=True))
@@ -221,15 +221,15 @@ class Simulator:
         return FlightEnded(f"{end}, {abs(across):.1f} m/s sideways, at {place}", end.end)
 
     def pose(self) -> FloatArray:
-        """The true pose at the instant of the last sample, in the order of `channels.POSE`."""
+        """Return the true pose at the last sample, in the order of `channels.POSE`."""
         return pose.over_ground(
             self._model.pose(), seconds(self._number * self.period_ns), self._wind, self._start
         )
 
     def poses(self) -> DelayLine:
-        """The poses that arrive at the instant of the last sample, the oldest first.
+        """Return the measured poses that arrive at the last sample, the oldest first.
 
-        They are as measured; stamps are flight time.
+        Their stamps are in flight time.
         """
         due = self._number % self._pose_every == 0
         t_ns = self._number * self.period_ns
@@ -249,7 +249,7 @@ class Simulator:
         return arrived
 
     def truth(self) -> FloatArray:
-        """The true values at the instant of the last sample, in the order of `truth_names`."""
+        """Return the true values at the last sample, in the order of `truth_names`."""
         t_ns = self._number * self.period_ns
         pose_errors = () if self._pose_sensors is None else (self._pose_error,)
         return np.concatenate(

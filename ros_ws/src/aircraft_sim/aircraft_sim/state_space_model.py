@@ -25,8 +25,8 @@ class StateSpaceModel:
     """Equation (1) with the matrices of an airframe, behind actuators.
 
     The forcing is computed for BLOCK steps together, which takes a tenth of the time. Heading,
-    position and altitude, no states of an airframe, are integrated by the trapezoidal rule over
-    `advance`, from 0. States missing in the airframe are 0, as in trim.
+    position and altitude are no states of an airframe; they are integrated by the trapezoidal rule
+    over `advance`, from 0. States that the airframe lacks are 0, as in trim.
     """
 
     def __init__(self, parameters: AircraftConfig) -> None:
@@ -51,7 +51,8 @@ class StateSpaceModel:
         self._over_place = parameters.relative_wind()
         self._wind_here = self._wind_at(0)
         self._wind_dot = np.zeros(3)
-        self._into = np.zeros((len(states), 3))  # of a change of the wind forward, right, down
+        # effect of a change of the wind forward, right, down
+        self._into = np.zeros((len(states), 3))
         for k, name in enumerate(("V", "beta", "alpha")):
             if name in states:
                 self._into[states.index(name), k] = -1.0 if name == "V" else -1.0 / self._speed
@@ -96,23 +97,23 @@ class StateSpaceModel:
             self._wind_dot = (self._wind_here - before) / (2.0 * half)
 
     def _tilted(self, forced: Forcing) -> Forcing:
-        """The forcing of a step, with what a tilt takes from the lift: nothing of an airplane."""
+        """Add what a tilt takes from the lift to the forcing of a step; nothing for an airplane."""
         return forced
 
     def _fly_on(self, dt: float) -> None:
-        """Integrate over a step what no state of the airframe holds, beside heading and place."""
+        """Integrate what no state of the airframe holds, beside heading and place, over a step."""
 
     def _wind_at(self, t_ns: int) -> FloatArray:
-        """The wind against that of the start, to the north, to the east and down, m/s."""
+        """Return the wind relative to that of the start: north, east and down, m/s."""
         if self._over_place is None:
             return np.zeros(3)
         return self._over_place.at(seconds(t_ns), *self._position)
 
     def _rate_by_wind(self) -> FloatArray:
-        """x_dot by the change of the wind along the flight, shape (n,).
+        """Compute x_dot caused by the change of the wind along the flight, shape (n,).
 
         The states V, beta and alpha are relative to the air: V_dot -= W_dot forward, beta_dot -=
-        W_dot right / V0, alpha_dot -= W_dot down / V0. W_dot is that over the period before.
+        W_dot right / V0, alpha_dot -= W_dot down / V0. W_dot is taken over the period before.
         Source: B. Etkin, Dynamics of Atmospheric Flight (1972), 5.5.
         """
         _, _, _, phi, theta, *_ = self._states()
@@ -138,17 +139,17 @@ class StateSpaceModel:
         return np.array([*attitude, *self._position, *velocity, beta])
 
     def _states(self) -> list[float]:
-        """The POSE_STATES, deviations from trim."""
+        """Return the POSE_STATES, deviations from trim."""
         x = self._state.x.tolist()
         return [0.0 if place is None else x[place] for place in self._places]
 
     def _heading_rate(self, states: Sequence[float]) -> float:
-        """psi_dot in rad/s from the POSE_STATES; r with the linear kinematics."""
+        """Compute psi_dot in rad/s from the POSE_STATES; it is r with the linear kinematics."""
         *_, phi, theta, q, r = states
         return heading_rate(phi, theta, q, r) if self._euler else r
 
     def _air_velocity(self, states: Sequence[float]) -> tuple[float, float, float]:
-        """Velocity relative to the air mass: north, east, up, m/s."""
+        """Return the velocity relative to the air mass: north, east, up, m/s."""
         V, alpha, beta, phi, theta, *_ = states
         return pose.velocity(self._speed + V, alpha, beta, phi, theta, self._psi)
 
@@ -160,7 +161,7 @@ class StateSpaceModel:
     def air_angles(self, t_ns: int) -> FloatArray:
         """See FlightDynamicsModel.
 
-        x less the wind along the axis of the angle over V0, `disturbance.AIR_STATE`.
+        They are x less the wind along the axis of the angle over V0, `disturbance.AIR_STATE`.
         """
         x = self._states()
         wind = self._block.wind[2 * ((t_ns - self._block_ns) // self._plant.step_ns)]

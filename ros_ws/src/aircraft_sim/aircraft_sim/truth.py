@@ -15,11 +15,11 @@ from flight_core.vectors import FloatArray
 
 
 def names(airframe: Airframe) -> tuple[str, ...]:
-    """Channels of `truth`, group by group.
+    """Name the channels of `truth`, group by group.
 
-    "x.state", "f.state" (f of equation (1), with the disturbances), "gust.axis" (the wind along the
-    axes of the airframe's gusts, 1-cosine gust plus turbulence, m/s), "actuator.input" (the
-    position now).
+    They are "x.state", "f.state" (f of equation (1), with the disturbances), "gust.axis" (the wind
+    along the axes of the airframe's gusts, 1-cosine gust plus turbulence, m/s) and "actuator.input"
+    (the position now).
     """
     groups = (
         ("x", airframe.states),
@@ -36,7 +36,7 @@ def names(airframe: Airframe) -> tuple[str, ...]:
 def values(
     state: AircraftState, wind: FloatArray, rate: FloatArray, plant: PlantParams
 ) -> FloatArray:
-    """Values of `truth` in the order of `names`; f and the wind act from now on.
+    """Return the values of `truth` in the order of `names`; f and the wind act from now on.
 
     `wind` (G,) and `rate` (n,) are the `dynamics.Forcing` of this instant.
     """

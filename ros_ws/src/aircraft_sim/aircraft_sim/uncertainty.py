@@ -19,18 +19,18 @@ from flight_core.parameters import require
 from flight_core.vectors import FloatArray
 
 KINEMATIC = ("theta", "phi", "psi")
-"""States whose derivatives are known exactly: their rows stay as published in uncertain
+"""States whose derivatives are known exactly, so that their rows stay as published in uncertain
 airframes."""
 
 WindEffect = Literal["air_relative", "published"]
-"""Effect of wind on the x_dot of an uncertain aircraft: by its own A, or that of the published
-airframe. See `wind_factors`."""
+"""How wind acts on x_dot of an uncertain aircraft: by its own A, or as on the published airframe.
+See `wind_factors`."""
 
 AIR_RELATIVE: WindEffect = "air_relative"
 
 Distribution = Literal["uniform", "normal", "corners"]
-"""Of the relative deviations d within +-uncertainty: uniform; normal, cut at three standard
-deviations; or the two limits, with equal probability."""
+"""Distribution of the relative deviations d within +-uncertainty: uniform; normal, cut at three
+standard deviations; or the two limits, with equal probability."""
 
 
 class Spread(NamedTuple):
@@ -47,10 +47,10 @@ UNIFORM = Spread()
 def nominal_and_sampled(
     airframe: Airframe, uncertainty: float, samples: int, seed: int, spread: Spread = UNIFORM
 ) -> tuple[FloatArray, FloatArray]:
-    """A and B, shapes (1 + samples, n, n) and (1 + samples, n, m), SI.
+    """Return A and B, shapes (1 + samples, n, n) and (1 + samples, n, m), SI.
 
-    The first are as published, then come numbers 0, 1, ... of the seed. Raises as
-    `sampled_matrices`.
+    The first ones are as published, followed by numbers 0, 1, ... of the seed. Raises as
+    `sampled_matrices` does.
     """
     A, B = sampled_matrices(airframe, uncertainty, uncertainty, seed, 0, samples, spread)
     return np.concatenate([airframe.matrix_a()[None], A]), np.concatenate(
@@ -67,10 +67,10 @@ def sample_airframe(
     wind: WindEffect = AIR_RELATIVE,
     spread: Spread = UNIFORM,
 ) -> Airframe:
-    """Uncertain airframe `number` of a seed, with uncertainties of A and of B.
+    """Sample uncertain airframe `number` of a seed, with uncertainties of A and of B.
 
-    0, 0 and no entry give the published airframe. The effect of wind comes from `wind_factors`; the
-    rest of f stays as published. Raises as `sampled_matrices`.
+    If both are 0 and no entry is given, this is the published airframe. The effect of wind comes
+    from `wind_factors`; the rest of f stays as published. Raises as `sampled_matrices` does.
     """
     A, B = sampled_matrices(airframe, part_A, part_B, seed, number, 1, spread)
     if part_A == part_B == 0.0 and not spread.entries:
@@ -79,17 +79,17 @@ def sample_airframe(
 
 
 def wind_factors(airframe: Airframe, A: FloatArray, wind: WindEffect) -> FloatArray:
-    """Factors on the published effect of wind, shape (N, n, G), of N aircraft.
+    """Compute the factors on the published effect of wind, shape (N, n, G), of N aircraft.
 
-    A, shape (N, n, n), SI, are their matrices. Wind w along an axis changes the state j of
+    A holds their matrices, shape (N, n, n), SI. Wind w along an axis changes the state j of
     AIR_STATE relative to the air, so the wind acts as minus column j of A:
 
         air_relative    factor_i = A_ij / published A_ij
             1 where the published A_ij is 0 or the airframe has no state j
         published       factor_i = 1
 
-    A published effect equal to minus the published column, per w / V0 or w, then equals minus the
-    aircraft's own column.
+    If the published effect equals minus the published column, per w / V0 or w, it then equals minus
+    the aircraft's own column.
     """
     nominal = airframe.matrix_a()
     factors = np.ones((len(A), len(airframe.states), len(airframe.gusts)))
@@ -101,9 +101,9 @@ def wind_factors(airframe: Airframe, A: FloatArray, wind: WindEffect) -> FloatAr
 
 
 def gust_directions(airframe: Airframe, A: FloatArray, wind: WindEffect) -> FloatArray:
-    """Change of x_dot for 1 m/s of wind along the axes, shape (N, n, G), of N aircraft.
+    """Compute how x_dot changes for 1 m/s of wind along the axes, shape (N, n, G), of N aircraft.
 
-    A are their matrices; see `wind_factors`.
+    A holds their matrices; see `wind_factors`.
     """
     return wind_factors(airframe, A, wind) * airframe.matrix_gusts()
 
@@ -117,12 +117,12 @@ def sampled_matrices(
     count: int,
     spread: Spread = UNIFORM,
 ) -> tuple[FloatArray, FloatArray]:
-    """A and B of the aircraft first, first + 1, ... of a seed, SI.
+    """Draw A and B of the aircraft first, first + 1, ... of a seed, SI.
 
-    The shapes are (count, n, n) and (count, n, m). Every entry is multiplied by 1 + d, d
-    independent and within +-uncertainty, as `spread` says. The rows of angles stay. An aircraft
-    depends on seed and number alone, not on `count`. Raises ParameterError for an uncertainty
-    outside [0, 1), and for an unknown entry.
+    The shapes are (count, n, n) and (count, n, m). Every entry is multiplied by 1 + d, with d
+    independent and within +-uncertainty, distributed as `spread` says. The rows of angles stay. An
+    aircraft depends only on seed and number, not on `count`. Raises ParameterError for an
+    uncertainty outside [0, 1), and for an unknown entry.
     """
     parts = {
         "A": np.full(airframe.matrix_a().shape, part_A),
@@ -155,7 +155,7 @@ def sampled_matrices(
 
 
 def deviations(uniform: FloatArray, distribution: Distribution) -> FloatArray:
-    """Deviations in [-1, 1] from numbers in [0, 1)."""
+    """Turn numbers in [0, 1) into deviations in [-1, 1]."""
     if distribution == "uniform":
         return 2.0 * uniform - 1.0
     if distribution == "corners":
@@ -166,10 +166,10 @@ def deviations(uniform: FloatArray, distribution: Distribution) -> FloatArray:
 
 
 def drawn_entries(airframe: Airframe, A: FloatArray, B: FloatArray) -> dict[str, FloatArray]:
-    """The entries that `sampled_matrices` draws, by name as A[q,alpha] and B[V,thrust].
+    """Return the entries that `sampled_matrices` draws, by name as A[q,alpha] and B[V,thrust].
 
-    Shape (N,), SI. A, of shape (N, n, n), and B, of shape (N, n, m), are those of N aircraft.
-    Entries that are 0 as published, and the rows of angles, are not drawn.
+    They have shape (N,), SI. A, of shape (N, n, n), and B, of shape (N, n, m), are those of N
+    aircraft. Entries that are 0 as published, and the rows of angles, are not drawn.
     """
     matrices = {"A": A, "B": B}
     return {
@@ -178,7 +178,7 @@ def drawn_entries(airframe: Airframe, A: FloatArray, B: FloatArray) -> dict[str,
 
 
 def drawn_places(airframe: Airframe) -> dict[str, tuple[str, int, int]]:
-    """The entries that `sampled_matrices` draws: matrix, row and column by name."""
+    """Locate the entries that `sampled_matrices` draws: matrix, row and column by name."""
     matrices = {
         "A": (airframe.matrix_a(), [*airframe.states]),
         "B": (airframe.matrix_b(), [*airframe.inputs]),
@@ -195,9 +195,9 @@ def drawn_places(airframe: Airframe) -> dict[str, tuple[str, int, int]]:
 def with_entries(
     airframe: Airframe, deviations: Mapping[str, float], wind: WindEffect = AIR_RELATIVE
 ) -> Airframe:
-    """The airframe with entries multiplied by 1 + deviation, named as in `drawn_entries`.
+    """Multiply entries of an airframe by 1 + deviation, named as in `drawn_entries`.
 
-    Wind as in `wind_factors`.
+    The wind acts as `wind_factors` says.
     """
     matrices = {"A": airframe.matrix_a().copy(), "B": airframe.matrix_b().copy()}
     places = drawn_places(airframe)
@@ -210,8 +210,8 @@ def with_entries(
 
 
 def as_yaml(airframe: Airframe) -> str:
-    """An airframe as the text of an airframe file.
+    """Write an airframe as the text of an airframe file.
 
-    The numbers read back as they are to the last bit.
+    The numbers read back to the last bit.
     """
     return dump_yaml(airframe.model_dump(mode="json", exclude_defaults=True))

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Vanes: angle of attack and sideslip relative to the air.
 
-Icing is before the sensor, lost readings are behind it.
+Icing acts before the sensor, lost readings come after it.
 """
 
 from collections.abc import Sequence
@@ -25,23 +25,23 @@ class Vanes(NamedTuple):
     """Parameters of k vanes."""
 
     places: Sequence[int]  # (k,) in ANGLES
-    frozen_at: FloatArray  # (k,) s, from when on a vane keeps its angle, infinite for never
-    dropout: float  # probability that a reading of a vane is lost, each vane by itself
+    frozen_at: FloatArray  # (k,) s, from when a vane keeps its angle; infinite for never
+    dropout: float  # probability that a reading of a vane is lost, independently for each vane
     seed: int
 
 
 class VaneSensorsConfig(Config):
-    """Vanes: further channels of y, alpha and beta relative to the air.
+    """Vanes are more channels of y: alpha and beta relative to the air.
 
-    The errors of `sensors` apply, too.
+    The errors of `sensors` apply to them too.
     """
 
     channels: tuple[Literal["alpha", "beta"], ...] = Field(
-        default=(), description="the angles that have a vane; none if empty"
+        default=(), description="angles that have a vane; empty for none"
     )
-    frozen_at: Times = Field(default=(), description="from when on each keeps its angle, s")
+    frozen_at: Times = Field(default=(), description="instant from which each keeps its angle, s")
     dropout: float = Field(
-        default=0.0, ge=0, lt=1, description="the probability that a reading repeats the one before"
+        default=0.0, ge=0, lt=1, description="probability that a reading repeats the one before"
     )
 
     def _check(self) -> None:
@@ -55,7 +55,7 @@ class VaneSensorsConfig(Config):
             require_length("frozen_at", self.frozen_at, self.channels)
 
     def require_fit(self, airframe: Airframe) -> None:
-        """Raise ParameterError for a vane that an airframe cannot have."""
+        """Refuse a vane that an airframe cannot have."""
         key = "vanes.channels"
         has_none = f"none: the airframe {airframe.name} has no"
         for name in self.channels:
@@ -65,7 +65,7 @@ class VaneSensorsConfig(Config):
             require(airframe.speed > 0.0, key, name, f"{has_none} speed")
 
     def arrays(self, seed: int) -> Vanes | None:
-        """The vanes as arrays, with losses of this seed; None without any."""
+        """Return the vanes as arrays, with losses of this seed; None if there are none."""
         if not self.channels:
             return None
         frozen_at = np.array(self.frozen_at or (np.inf,) * len(self.channels))
@@ -77,26 +77,26 @@ class VaneState(NamedTuple):
     """State of the vanes between two samples."""
 
     angle: FloatArray  # (k,) of the vanes
-    reading: FloatArray  # (k,) the last received
+    reading: FloatArray  # (k,) last readings received
 
 
 def initial_state(params: Vanes) -> VaneState:
-    """The state before the first sample, in trim."""
+    """Return the state before the first sample, in trim."""
     zero = np.zeros(len(params.places))
     return VaneState(zero, zero)
 
 
 def turned(t: float, angles: FloatArray, state: VaneState, params: Vanes) -> VaneState:
-    """The angles of the vanes at t for (alpha, beta) of the air, (2,); a frozen vane stays."""
+    """Turn the vanes at t to (alpha, beta) of the air, (2,); a frozen vane stays as it is."""
     return state._replace(
         angle=np.where(t >= params.frozen_at, state.angle, angles[list(params.places)])
     )
 
 
 def read_vanes(number: int, measured: FloatArray, state: VaneState, params: Vanes) -> VaneState:
-    """The readings of sample `number`, (k,), from measured angles with errors.
+    """Read sample `number`, (k,), from measured angles with errors.
 
-    A lost reading repeats the last.
+    If a reading is lost, the last one is repeated.
     """
     if params.dropout == 0.0:
         return state._replace(reading=measured)

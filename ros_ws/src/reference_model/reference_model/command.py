@@ -14,7 +14,7 @@ from flight_core.vectors import Array, FloatArray
 
 
 class Line(NamedTuple):
-    """A piecewise linear signal through points, held before the first and after the last one."""
+    """A piecewise linear signal through points, held before the first and after the last."""
 
     time: FloatArray  # (N,) s, increasing
     value: FloatArray  # (N,) in the channel's unit
@@ -28,12 +28,12 @@ class Edge(NamedTuple):
     change: float  # in the channel's unit
 
     def line(self) -> Line:
-        """The edge as a signal: 0 before, `change` after."""
+        """Return the edge as a signal: 0 before, `change` after."""
         return Line(np.array([self.start, self.stop]), np.array([0.0, self.change]))
 
 
 class Polyline(NamedTuple):
-    """The sum of the piecewise linear signals of m channels, by K common knots."""
+    """The sum of the piecewise linear signals of m channels, with K common knots."""
 
     time: FloatArray  # (K,) s, increasing
     value: FloatArray  # (K, m) at the knots
@@ -42,7 +42,7 @@ class Polyline(NamedTuple):
 
     @classmethod
     def through(cls, lines: Sequence[Sequence[Line]]) -> "Polyline":
-        """The sums of the lines of each channel; the first knot is 0, or before it."""
+        """Sum the lines of each channel; the first knot is at 0, or before it."""
         every = [line for channel in lines for line in channel]
         time = np.unique(np.concatenate([[0.0], *(line.time for line in every)]))
         value = np.zeros((len(time), len(lines)))
@@ -68,7 +68,7 @@ class Chirps(NamedTuple):
 
 
 class Profile(NamedTuple):
-    """Commands on m channels, at most E edges a channel (unused edges have change 0).
+    """Commands on m channels with at most E edges a channel (unused edges have change 0).
 
     Times are in s, values in the channel's unit.
     """
@@ -90,22 +90,22 @@ class Profile(NamedTuple):
 
 
 def command(t: Array, profile: Profile) -> FloatArray:
-    """u_m(t), shape (m,), or (T, m) at T instants together.
+    """Compute u_m(t), shape (m,), or (T, m) at T instants together.
 
-    u_m = w(t) + turn_rate sin(phi(t)),  phi(t) = bank_rate . integral_0^t w
-    w_i = sum_k change_ik G(t - time_ik) + amplitude_i sin(frequency_i t + phase_i)
-          + lines_i(t) + chirps_i(t),  G(s) = clip(s / rise, 0, 1)
+        u_m = w(t) + turn_rate sin(phi(t)),  phi(t) = bank_rate . integral_0^t w
+        w_i = sum_k change_ik G(t - time_ik) + amplitude_i sin(frequency_i t + phase_i)
+              + lines_i(t) + chirps_i(t),  G(s) = clip(s / rise, 0, 1)
 
-    The integrals of the four have closed forms, so the function has no state: the integral of G is
-    r^2 / (2 rise) + max(s - rise, 0), with r = s clipped to [0, rise]. g/V0 sin(phi) is the turn
-    rate of a coordinated turn.
+    The integrals of all four terms have closed forms, so the function needs no state: the integral
+    of G is r^2 / (2 rise) + max(s - rise, 0), with r = s clipped to [0, rise]. g/V0 sin(phi) is the
+    turn rate of a coordinated turn.
     """
     t = np.asarray(t, dtype=np.float64)
     since = t[..., None, None] - profile.time
     elapsed = np.maximum(since, 0.0)
     rising = np.minimum(elapsed, profile.rise)
     angle = profile.frequency * t[..., None] + profile.phase
-    # a product with it sums over the edges several times faster than np.sum
+    # a product with ones sums over the edges several times faster than np.sum
     ones = np.ones_like(profile.change[0, :])
     w = (profile.change * rising) @ ones / profile.rise + profile.amplitude * np.sin(angle)
     w_integral = (
@@ -127,10 +127,10 @@ def command(t: Array, profile: Profile) -> FloatArray:
 
 
 def polyline(t: FloatArray, lines: Polyline) -> tuple[FloatArray, FloatArray]:
-    """Piecewise linear signals at t and their integrals, each of shape t.shape + (m,).
+    """Evaluate piecewise linear signals and their integrals at t, each of shape t.shape + (m,).
 
-    With s = t - time_k since the last knot: value_k + slope_k s, and area_k + value_k s + slope_k
-    s^2 / 2.
+    With s = t - time_k since the last knot they are value_k + slope_k s, and area_k + value_k s +
+    slope_k s^2 / 2.
     """
     k = np.maximum(np.searchsorted(lines.time, t, side="right") - 1, 0)
     since = np.maximum(t - lines.time[k], 0.0)[..., None]
@@ -140,12 +140,12 @@ def polyline(t: FloatArray, lines: Polyline) -> tuple[FloatArray, FloatArray]:
 
 
 def linear_chirp(t: FloatArray, chirps: Chirps) -> tuple[FloatArray, FloatArray]:
-    """Linear chirps at t and their integrals, each of shape t.shape + (m,).
+    """Evaluate linear chirps and their integrals at t, each of shape t.shape + (m,).
 
-    amplitude sin(theta), theta = frequency s + sweep s^2 / 2, s = t - start in [0, duration]. Then
-    the last frequency goes on to the next zero, so that no step ends the chirp. With c =
-    frequency^2 / (2 sweep) and x = (frequency + sweep s) / sqrt(pi abs(sweep)) the integral is that
-    of Fresnel's S and C,
+    amplitude sin(theta), theta = frequency s + sweep s^2 / 2, s = t - start in [0, duration].
+    Afterwards the last frequency continues until the next zero, so that no step ends the chirp.
+    With c = frequency^2 / (2 sweep) and x = (frequency + sweep s) / sqrt(pi abs(sweep)), the
+    integral is given by Fresnel's S and C:
 
         sqrt(pi / abs(sweep)) (cos c (S(x) - S(x_0)) - sign(sweep) sin c (C(x) - C(x_0)))
 

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Live commands u_m of a publisher, the age limit, and the ending after the loss of the publisher.
+"""Live commands u_m: their age limit, and how they end if their publisher is lost.
 
-Zero rates would keep the present bank. So the ending levels the wings first, from the attitude in
+Zero rates would keep the present bank, so the ending levels the wings first, from the attitude in
 u_m.
 """
 
@@ -24,7 +24,7 @@ class LiveParams(NamedTuple):
     bounds: FloatArray  # (m,) largest absolute values of u_m
     reach: FloatArray  # (m,) largest changes of u_m from step to step
     speed: float | None  # trim speed V0, m/s; None: the ending cannot turn the aircraft level
-    # places of q, V, p, r in u_m, of r None without rudder; None where another one is missing
+    # places of q, V, p, r in u_m; r is None without rudder, all is None if another one is missing
     channels: tuple[int, int, int, int | None] | None
     gain: tuple[float, float]  # of bank and of pitch, 1/s
     roll_rate: float  # largest roll rate of the ending, rad/s
@@ -35,13 +35,13 @@ class Live(NamedTuple):
 
     t_ns: int  # flight time of its stamp
     u_m: FloatArray  # (m,)
-    attitude: tuple[float, float] | None  # phi, theta, rad, at present; None where it is not known
+    attitude: tuple[float, float] | None  # phi, theta, rad, at present; None if not known
 
 
 def take(t_ns: int, u_m: FloatArray, attitude: FloatArray | None, params: LiveParams) -> Live:
-    """The state after a new u_m.
+    """Return the state after a new u_m.
 
-    Raises ChannelError, reason "bounds", for a command out of bounds.
+    Raises ChannelError, reason "bounds", if a command is out of bounds.
     """
     if (np.abs(u_m) > params.bounds).any():
         raise ChannelError(
@@ -51,16 +51,16 @@ def take(t_ns: int, u_m: FloatArray, attitude: FloatArray | None, params: LivePa
 
 
 def commands(t_ns: int, live: Live, y_m: FloatArray, params: LiveParams) -> FloatArray:
-    """u_m at t, shape (m,): the last u_m up to the age limit, then the ending.
+    """Compute u_m at t, shape (m,): the last u_m up to the age limit, then the ending.
 
-    For `levelling_ns`, where the attitude is known, with phi and theta by dead reckoning and V = V0
-    + V_m,
+    If the attitude is known, the ending takes phi and theta by dead reckoning and V = V0 + V_m for
+    `levelling_ns`, and commands
 
         phi_dot_c = -k_phi phi, at most `roll_rate`;  theta_dot_c = -k_theta theta
 
     p, q, r follow by the inverse of Euler's equations in a coordinated turn
-    (`flight_core.kinematics`); further commands ramp to zero. Afterwards, and without a known
-    attitude, every command is zero.
+    (`flight_core.kinematics`); all other commands ramp to zero. Afterwards, and if the attitude is
+    not known, every command is zero.
     """
     silent_ns = t_ns - live.t_ns - params.max_age_ns
     if silent_ns <= 0:
@@ -86,9 +86,9 @@ def commands(t_ns: int, live: Live, y_m: FloatArray, params: LiveParams) -> Floa
 
 
 def dead_reckon(live: Live, y_m: FloatArray, period_ns: int, params: LiveParams) -> Live:
-    """The state a period later: the attitude moves by Euler's equations.
+    """Return the state a period later: the attitude moves by Euler's equations.
 
-    The rates are the reference rates, which the law tracks.
+    The rates are those of the reference, which the law tracks.
     """
     if live.attitude is None or params.channels is None or params.speed is None:
         return live
@@ -103,7 +103,7 @@ def dead_reckon(live: Live, y_m: FloatArray, period_ns: int, params: LiveParams)
 
 
 def _turn(phi: float, theta: float, theta_dot: float, y_m: FloatArray, params: LiveParams) -> float:
-    """R of a coordinated turn at the airspeed V0 + V_m, rad/s."""
+    """Compute r of a coordinated turn at the airspeed V0 + V_m, rad/s."""
     if params.channels is None or params.speed is None:
         return 0.0
     speed = max(params.speed + float(y_m[params.channels[1]]), params.speed / 2.0)

@@ -20,12 +20,12 @@ class ReferenceMatrices(NamedTuple):
 
 
 def x_m_dot(t: Any, x_m: Array, u_m: Array, params: ReferenceMatrices) -> Array:
-    """Equation (2): A_m x_m + B_m u_m, shape (n,)."""
+    """Evaluate equation (2): A_m x_m + B_m u_m, shape (n,)."""
     return params.A_m @ x_m + params.B_m @ u_m
 
 
 def output(x_m: Array, params: ReferenceMatrices) -> Array:
-    """Reference output y_m = C x_m, shape (m,)."""
+    """Compute the reference output y_m = C x_m, shape (m,)."""
     return product(params.C, x_m)
 
 
@@ -37,9 +37,9 @@ class Stepper(NamedTuple):
 
 
 def stepper(dt: float, params: ReferenceMatrices) -> Stepper:
-    """Matrices of x_m(t + dt) = Phi x_m(t) + Gamma [u_m(t), u_m(t + dt/2), u_m(t + dt)].
+    """Build the matrices of x_m(t + dt) = Phi x_m(t) + Gamma [u_m(t), u_m(t + dt/2), u_m(t + dt)].
 
-    Their columns are Runge-Kutta steps of the unit vectors. The product is the same step to
+    Their columns are Runge-Kutta steps of the unit vectors. The product equals the same step up to
     rounding, in a quarter of the time.
     """
     n, m = params.B_m.shape
@@ -54,19 +54,21 @@ def stepper(dt: float, params: ReferenceMatrices) -> Stepper:
 
 
 def step(x_m: Array, u_m: Array, matrices: Stepper) -> Array:
-    """x_m(t + dt), shape (n,), from x_m(t) and u_m.
+    """Advance x_m by a step, shape (n,), from x_m(t) and u_m.
 
-    `u_m`, shape (3m,), is u_m at t, t + dt/2 and t + dt. The sums have the order of `product`, so
-    exported C code gives the same bits.
+    `u_m`, shape (3m,), holds u_m at t, t + dt/2 and t + dt. The sums have the order of `product`,
+    so that exported C code gives the same bits.
     """
     return product(matrices.Phi, x_m) + product(matrices.Gamma, u_m)
 
 
 def second_order(natural_frequency: FloatArray, damping: FloatArray) -> ReferenceMatrices:
-    """A filter of second order per channel, n = 2m.
+    """Build a filter of second order per channel, n = 2m.
 
-    y_m,i'' + 2 damping_i w_i y_m,i' + w_i^2 y_m,i = w_i^2 u_m,i. The states are [y_m,1, y_m,1',
-    y_m,2, ...]. C selects the outputs, as (2) requires. Arguments: shape (m,), rad/s and 1.
+        y_m,i'' + 2 damping_i w_i y_m,i' + w_i^2 y_m,i = w_i^2 u_m,i
+
+    The states are [y_m,1, y_m,1', y_m,2, ...]. C selects the outputs, as (2) requires. The
+    arguments have shape (m,), in rad/s and 1.
     """
     m = len(natural_frequency)
     model = ReferenceMatrices(np.zeros((2 * m, 2 * m)), np.zeros((2 * m, m)), np.zeros((m, 2 * m)))

@@ -24,24 +24,24 @@ class LiveCommand(NamedTuple):
 
     stamp_ns: int
     u_m: FloatArray
-    attitude: FloatArray | None  # phi and theta of the aircraft, where guidance sends them
+    attitude: FloatArray | None  # phi and theta of the aircraft, if guidance sends them
     sender: str
 
 
 class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
     """Computes x_m(k) from x_m(k-1) at tick k and publishes y_m(k).
 
-    Commands are the scenario's profile until u_m is received.
+    The commands are those of the scenario's profile until u_m is received.
 
     In lockstep the node publishes y_m up to the instant of clock and computes the next y_m ahead.
-    Where `u_m_rate` is set u_m comes first: every instant of u_m has exactly one y_m,
-    without channels where there is no command.
+    If `u_m_rate` is set, u_m comes first: every instant of u_m has exactly one y_m, which has no
+    channels if there is no command.
     """
 
     def __init__(self) -> None:
         super().__init__("reference_model", ReferenceModelConfig)
         self._reference = Reference(self.parameters)
-        self._start_ns = 0  # of the flight; in lockstep t = 0
+        self._start_ns = 0  # start of the flight; in lockstep t = 0
         self._publish_y_m = self.advertise(Y_M)
         self._encoder = self.encoder(self.parameters.outputs)
         self._decoder = Decoder(self.parameters.outputs)
@@ -82,7 +82,10 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
         return nanoseconds(self.parameters.live.max_age)
 
     def _timeouts_ns(self) -> tuple[int, int]:
-        """Timeouts of the publisher of u_m. Another node may take over once the wings are level."""
+        """Return the timeouts of the publisher of u_m.
+
+        Another node may take over once the wings are level.
+        """
         live = self.parameters.live
         return nanoseconds(live.max_age), nanoseconds(live.max_age + live.levelling)
 
@@ -93,7 +96,7 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
         return LiveCommand(sample.stamp_ns, sample.value, self._attitude(raw), sample.sender)
 
     def _attitude(self, raw: bytes) -> FloatArray | None:
-        """The attitude where the message has it."""
+        """Read the attitude if the message has it."""
         try:
             sample = self._attitude_decoder.decode(raw)
         except ChannelError as error:
@@ -132,9 +135,9 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
             advanced = True
 
     def _commands_known(self) -> bool:
-        """Lockstep: whether u_m of the instant before the next sample is here, if any.
+        """In lockstep, say whether u_m of the instant before the next sample is here, if due.
 
-        The u_m is taken.
+        That u_m is taken.
         """
         t_ns = (self._number - 1) * self.period_ns()
         if not self._u_m_ns or t_ns < 0 or t_ns % self._u_m_ns:

@@ -51,7 +51,7 @@ class Pulses(Config):
         _require_spans(self.start, self.stop, self.value, "pulse")
 
     def edges(self, rise: float) -> list[Edge]:
-        """Two edges a pulse."""
+        """Return two edges for each pulse."""
         return [
             Edge(t, t + rise, sign * value)
             for times, sign in ((self.start, 1.0), (self.stop, -1.0))
@@ -70,7 +70,7 @@ class Doublets(Config):
         _require_one_each(self.start, {"width": self.width, "value": self.value}, "doublet")
 
     def edges(self, rise: float) -> list[Edge]:
-        """Three edges a doublet; the middle one has twice the height."""
+        """Return three edges for each doublet; the middle one has twice the height."""
         return [
             Edge(start + k * width, start + k * width + rise, factor * value)
             for start, width, value in zip(self.start, self.width, self.value, strict=True)
@@ -89,29 +89,29 @@ class Ramps(Config):
         _require_spans(self.start, self.stop, self.value, "ramp")
 
     def edges(self, _rise: float) -> list[Edge]:
-        """One edge a ramp."""
+        """Return one edge for each ramp."""
         return list(map(Edge, self.start, self.stop, self.value))
 
 
 class Sine(Config):
     """A sine on a channel: amplitude sin(frequency t + phase)."""
 
-    amplitude: Number = Field(description="the amplitude, in the channel's unit")
-    frequency: Positive = Field(description="the frequency, rad/s")
-    phase: Number = Field(default=0.0, description="the phase, rad")
+    amplitude: Number = Field(description="amplitude, in the channel's unit")
+    frequency: Positive = Field(description="frequency, rad/s")
+    phase: Number = Field(default=0.0, description="phase, rad")
 
 
 class Chirp(Config):
     """A linear chirp on a channel: a sine whose frequency changes linearly.
 
-    After the sweep the last frequency goes on to the next zero.
+    After the sweep the last frequency continues until the next zero.
     """
 
-    amplitude: Number = Field(description="the amplitude, in the channel's unit")
-    start: Number = Field(description="the start of the sweep, s")
-    stop: Number = Field(description="the end of the sweep, s; the next zero ends the chirp")
-    first_frequency: Positive = Field(description="the frequency at `start`, rad/s")
-    last_frequency: Positive = Field(description="the frequency at `stop`, rad/s")
+    amplitude: Number = Field(description="amplitude, in the channel's unit")
+    start: Number = Field(description="start of the sweep, s")
+    stop: Number = Field(description="end of the sweep, s; the chirp ends at the next zero")
+    first_frequency: Positive = Field(description="frequency at `start`, rad/s")
+    last_frequency: Positive = Field(description="frequency at `stop`, rad/s")
 
     def _check(self) -> None:
         require(self.stop > self.start, "stop", self.stop, f"later than start = {self.start:g} s")
@@ -122,14 +122,14 @@ class Chirp(Config):
 class Recorded(Config):
     """A recorded command on a channel, interpolated linearly; the last value is held.
 
-    A `file` is read once: the set holds its values, and its path as `source`.
+    A `file` is read once: the set then holds its values, and its path as `source`.
     """
 
     file: str = Field(
         default="",
-        description="path of a CSV file `time,value`, from the folder of the scenario",
+        description="path of a CSV file `time,value`, relative to the folder of the scenario",
     )
-    source: str = Field(default="", description="the file that the values are from")
+    source: str = Field(default="", description="file from which the values come")
     time: Numbers = Field(default=(), max_length=MOST_RECORDED, description="times from 0 on, s")
     value: Numbers = Field(default=(), description="values at `time`, in the channel's unit")
 
@@ -137,7 +137,7 @@ class Recorded(Config):
     def read(
         cls, values: Mapping[Any, Any], key: str, problems: Problems, *, check: bool = True
     ) -> Self | None:
-        """Build the set, from the file where there is one."""
+        """Build the set, from the file if there is one."""
         if isinstance(file := values.get("file"), str) and file:
             try:
                 others = ", ".join(name for name in values if name != "file" and values[name])
@@ -157,7 +157,7 @@ class Recorded(Config):
             require(t > before, f"time[{k}]", t, f"later than time[{k - 1}] = {before:g} s")
 
     def line(self) -> Line:
-        """The command through its points."""
+        """Return the command through its points."""
         return Line(np.array(self.time), np.array(self.value))
 
 
@@ -167,7 +167,7 @@ def _require_one_each(start: Numbers, others: Mapping[str, Numbers], kind: str) 
 
 
 def _require_spans(start: Numbers, stop: Numbers, value: Numbers, kind: str) -> None:
-    """Raise ParameterError for values in different numbers, and a stop that is not later."""
+    """Refuse different numbers of values, and a stop that is not later than its start."""
     _require_one_each(start, {"stop": stop, "value": value}, kind)
     for k, (begin, end) in enumerate(zip(start, stop, strict=True)):
         require(end > begin, f"stop[{k}]", end, f"later than start[{k}] = {begin:g} s")
@@ -179,32 +179,33 @@ class CoordinatedTurn(Config):
     The rate is g/V0 sin(integral of the commanded bank rate).
     """
 
-    bank_rate: str = Field(description="the channel whose integral is the bank angle, e.g. p")
-    turn_rate: str = Field(description="the channel to which the turn rate is added, e.g. r")
-    speed: Positive = Field(description="the speed V0, m/s")
+    bank_rate: str = Field(description="channel whose integral is the bank angle, such as p")
+    turn_rate: str = Field(description="channel to which the turn rate is added, such as r")
+    speed: Positive = Field(description="trim speed V0, m/s")
 
 
 class LiveCommands(Config):
     """Live commands on the topic u_m in place of the profile.
 
-    They end when their publisher is lost.
+    They end if their publisher is lost.
     """
 
     max_age: Annotated[float, Field(gt=0, le=1e6)] = Field(
-        default=0.2, description="the age at which u_m times out, s"
+        default=0.2, description="age at which u_m times out, s"
     )
     speed: Positive | None = Field(
-        default=None, description="the trim speed V0, m/s, to level the wings; none: zero at once"
+        default=None,
+        description="trim speed V0, m/s, for levelling the wings; none: zero commands at once",
     )
     levelling: Annotated[float, Field(ge=0, le=1e6)] = Field(
         default=10.0, description="how long the wings are levelled after a timeout, s"
     )
     roll_rate: Positive = Field(
-        default=0.35, description="the largest roll rate to level the wings, rad/s"
+        default=0.35, description="largest roll rate for levelling the wings, rad/s"
     )
     bounds: dict[str, Positive] = Field(default={}, description="largest absolute commands")
     slew: dict[str, Positive] = Field(
-        default={}, description="largest rates of the commands, 1/s of their units"
+        default={}, description="largest rates of the commands, in their units per s"
     )
 
 
@@ -218,7 +219,7 @@ class SecondOrder(Config):
 class Linear(Config):
     """The model as the matrices of equation (2), row by row."""
 
-    states: Names = Field(description="the names of the states x_m, the outputs among them")
+    states: Names = Field(description="names of the states x_m, with the outputs among them")
     A_m: Numbers = Field(description="A_m row by row, 1/s")
     B_m: Numbers = Field(description="B_m row by row")
 
@@ -227,21 +228,22 @@ class ReferenceModelConfig(NodeConfig):
     """Parameters of the reference model node."""
 
     rate: Annotated[float, Field(ge=1, le=1000)] = Field(
-        description="the rate at which y_m is published, Hz"
+        description="rate at which y_m is published, Hz"
     )
     start_time: float = Field(
         default=0.0,
         ge=-1,
         le=1e10,
-        description="system time of t = 0, s since the epoch; 0: at once; -1: by the topic `start`",
+        description="system time of t = 0, s since the epoch; 0: at once; -1: as the topic "
+        "`start` says",
     )
-    outputs: Names = Field(description="the names of the outputs y_m")
+    outputs: Names = Field(description="names of the outputs y_m")
     second_order: SecondOrder | None = Field(
-        default=None, description="the model, one filter per channel"
+        default=None, description="model as one filter per channel"
     )
-    linear: Linear | None = Field(default=None, description="the model, as matrices")
+    linear: Linear | None = Field(default=None, description="model as matrices")
     rise: Positive = Field(
-        description="the duration of an edge of a pulse or doublet, s: bounds u_m_dot"
+        description="duration of an edge of a pulse or doublet, s; bounds u_m_dot"
     )
     pulses: dict[str, Pulses] = Field(default={}, description="pulses by channel")
     doublets: dict[str, Doublets] = Field(default={}, description="doublets by channel")
@@ -249,12 +251,12 @@ class ReferenceModelConfig(NodeConfig):
     sines: dict[str, Sine] = Field(default={}, description="sines by channel")
     chirps: dict[str, Chirp] = Field(default={}, description="linear chirps by channel")
     recorded: dict[str, Recorded] = Field(
-        default={}, description="recorded commands by channel, as of a stick"
+        default={}, description="recorded commands by channel, for example of a stick"
     )
     coordinated_turn: CoordinatedTurn | None = Field(default=None, description="turn coordination")
     live: LiveCommands = Field(default=LiveCommands(), description="live commands u_m")
     u_m_rate: float = Field(
-        default=0.0, ge=0, le=1000, description="in lockstep: rate of u_m, Hz; 0: none"
+        default=0.0, ge=0, le=1000, description="rate of u_m in lockstep, Hz; 0 for no u_m"
     )
 
     def _check(self) -> None:
@@ -351,7 +353,7 @@ class ReferenceModelConfig(NodeConfig):
         )
 
     def model(self) -> ReferenceMatrices:
-        """The matrices of equation (2)."""
+        """Return the matrices of equation (2)."""
         if self.second_order is not None:
             return second_order(
                 np.array(self.second_order.natural_frequency), np.array(self.second_order.damping)
@@ -366,10 +368,10 @@ class ReferenceModelConfig(NodeConfig):
         )
 
     def live_params(self) -> LiveParams:
-        """Limits of u_m and the gains of the ending.
+        """Return the limits of u_m and the gains of the ending.
 
         The gains are a quarter of the reference's bandwidths of p and q. With a second-order
-        reference of damping 0.9 this gain gives the loop of the angle a damping of about 0.74.
+        reference of damping 0.9, this gain gives the loop of the angle a damping of about 0.74.
         """
         section = self.live
         channels = None
@@ -396,7 +398,7 @@ class ReferenceModelConfig(NodeConfig):
         )
 
     def edges(self) -> dict[str, list[Edge]]:
-        """The edges of pulses, doublets and ramps by channel, in the order of the outputs."""
+        """Return the edges of pulses, doublets and ramps by channel, ordered as the outputs."""
         return self._edges(self.pulses, self.doublets, self.ramps)
 
     def _edges(self, *signals: Mapping[str, Pulses | Doublets | Ramps]) -> dict[str, list[Edge]]:
@@ -411,7 +413,7 @@ class ReferenceModelConfig(NodeConfig):
         }
 
     def profile(self) -> Profile:
-        """The commands u_m(t) as arrays over the outputs; the signals of a channel add up.
+        """Return the commands u_m(t) as arrays over the outputs; the signals of a channel add up.
 
         The edges of pulses and doublets are padded with edges of height 0.
         """
@@ -445,7 +447,7 @@ class ReferenceModelConfig(NodeConfig):
         )
 
     def _chirps(self) -> Chirps:
-        """The chirps; a channel without one has amplitude 0."""
+        """Return the chirps; a channel without one has amplitude 0."""
         columns = [
             (0.0, 0.0, 1.0, 1.0, 1.0)
             if chirp is None

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The reference model without ROS: y_m sample by sample.
 
-The node and the simulation in a single process use this class.
+The node and the simulation in a single process use it.
 """
 
 import numpy as np
@@ -23,7 +23,7 @@ BLOCK = 100  # steps for which the profile is evaluated at once
 class Reference:
     """Equation (2) with the state x_m at the instants k periods.
 
-    The commands are the profile's until the first live u_m.
+    The commands are those of the profile until the first live u_m.
     """
 
     def __init__(self, parameters: ReferenceModelConfig) -> None:
@@ -44,8 +44,8 @@ class Reference:
     def take(self, t_ns: int, u_m: FloatArray, attitude: FloatArray | None = None) -> None:
         """Take a live u_m, shape (m,), of flight time t, which acts from the next step on.
 
-        `attitude` has `channels.ATTITUDE`, None for an unknown attitude. Raises ChannelError for an
-        old u_m and for a u_m out of bounds.
+        `attitude` has `channels.ATTITUDE`, or is None if it is not known. Raises ChannelError if
+        u_m is old or out of bounds.
         """
         if self._live is not None:
             require_newer(t_ns, self._live.t_ns, "u_m")
@@ -57,9 +57,9 @@ class Reference:
         return self._x_m
 
     def source(self) -> str:
-        """Where the commands come from at the last sample.
+        """Say where the commands come from at the last sample.
 
-        The source is "profile", "live commands", or "ending" of a timed-out u_m.
+        The answer is "profile", "live commands", or "ending" if u_m has timed out.
         """
         if self._live is None:
             return "profile"
@@ -67,17 +67,17 @@ class Reference:
         return "ending" if aged else "live commands"
 
     def sample(self, number: int) -> FloatArray:
-        """y_m at sample `number`, shape (m,), computed in steps of a period.
+        """Compute y_m at sample `number`, shape (m,), in steps of a period.
 
-        The law tracks the last sample until this sample: over skipped samples the dead reckoning
-        takes the last rates. A step fails by an exception or a value that is not finite: the state
-        stays, and the last y_m goes on.
+        The law tracks the last sample until this one; over skipped samples the dead reckoning takes
+        the last rates. If a step raises an exception or gives a value that is not finite, the state
+        stays and the last y_m is repeated.
         """
         tracked: FloatArray = model.output(self._x_m, self._model)
         while self._number < number:
             try:
                 self._x_m, self._applied, self._live = self._stepped(tracked)
-            except Exception as error:  # whatever it is, the next step is tried
+            except Exception as error:  # whatever it is, try the next step
                 if self._failures.add(seconds(self._number * self.period_ns)):
                     self._failure = f"{LAST_GOES_ON}: {sentence(error)}"
             self._number += 1
@@ -90,13 +90,13 @@ class Reference:
         return self._failures.count
 
     def failure(self) -> str:
-        """Why steps have failed since the last call, as a sentence; empty without news."""
+        """Say why steps have failed since the last call, in a sentence; "" if there is no news."""
         failure = self._failure
         self._failure = ""
         return failure
 
     def _stepped(self, tracked: FloatArray) -> tuple[FloatArray, FloatArray, Live | None]:
-        """x_m, the applied u_m and the live u_m a period later."""
+        """Return x_m, the applied u_m and the live u_m a period later."""
         index = self._number % BLOCK
         if self._begin != self._number - index:
             self._u_m = self._block(self._number - index)
@@ -117,7 +117,7 @@ class Reference:
         return x_m, applied, after
 
     def rate(self) -> FloatArray:
-        """Derivative of y_m at the last sample, shape (m,): C x_m_dot, equation (2)."""
+        """Compute the derivative of y_m at the last sample, (m,): C x_m_dot, equation (2)."""
         index = self._number % BLOCK
         u_m = self._block(self._number)[0] if index == 0 else self._u_m[2 * index]
         u_m = u_m if self._live is None else self._live_u_m(self._live)
@@ -136,7 +136,7 @@ class Reference:
         return applied
 
     def _block(self, number: int) -> FloatArray:
-        """Commands of the profile at the starts, middles and ends of BLOCK steps.
+        """Compute the profile's commands at the starts, middles and ends of BLOCK steps.
 
         A block is ten times faster than BLOCK calls.
         """

@@ -54,38 +54,38 @@ AIRPLANE_STATES = {
     "r": "rad/s",
     "phi": "rad",
 }
-"""The states of an airplane with a sketch or a linearisation for a model, and their units."""
+"""States, with units, of an airplane whose model is a sketch or a linearisation."""
 
 
 class Input(Config):
-    """An input: the unit of the column of B, and the effect of a positive value.
+    """An input: the unit of its column of B, and the effect of a positive value.
 
-    Where an engine or a rotor stands still, too.
+    It may also say at which value an engine or a rotor stands still.
     """
 
-    unit: Unit = Field(description="the unit of this column of B")
-    positive: str = Field(description="what a positive value does")
+    unit: Unit = Field(description="unit of this column of B")
+    positive: str = Field(description="effect of a positive value")
     no_thrust: Number | None = Field(
         default=None,
-        description="the value without thrust, deviation from trim; absent: 0 of an angle, else "
-        "unknown",
+        description="value without thrust, deviation from trim; absent: 0 for an angle, "
+        "otherwise unknown",
     )
 
 
 class Gravity(Config):
     """A term f_into += gain sin(angle)."""
 
-    into: str = Field(description="the state whose derivative it adds to")
-    angle: str = Field(description="the angle, a state")
-    gain: Number = Field(description="the gain, SI")
+    into: str = Field(description="state to whose derivative it adds")
+    angle: str = Field(description="angle, a state")
+    gain: Number = Field(description="gain, SI")
 
 
 class Product(Config):
     """A term f_into += gain * product of two states."""
 
-    into: str = Field(description="the state whose derivative it adds to")
+    into: str = Field(description="state to whose derivative it adds")
     product: Names = Field(description="two states")
-    gain: Number = Field(description="the gain, SI")
+    gain: Number = Field(description="gain, SI")
 
 
 class Airframe(Config):
@@ -104,32 +104,32 @@ class Airframe(Config):
     """
 
     name: str
-    source: str = Field(description="where the figures come from")
+    source: str = Field(description="source of the figures")
     speed: NonNegative = Field(
-        default=0.0, description="the trim speed V0, m/s, or with a unit; 0 in hover"
+        default=0.0, description="trim speed V0, m/s, or with a unit; 0 in hover"
     )
     span: Positive | None = Field(
-        default=None, description="the wing span b, m, for rotary gusts; none: not known"
+        default=None, description="wing span b, m, for rotary gusts; none if unknown"
     )
     states: dict[Name, Unit] = Field(description="units by state")
     inputs: dict[Name, Input] = Field(description="unit and sign by input")
-    outputs: Names = Field(description="the outputs of y = C x: states, or the rows of C")
-    A: Matrix = Field(description="A, a row a state")
-    B: Matrix = Field(description="B, a row a state, a column an input")
+    outputs: Names = Field(description="outputs of y = C x: states, or the rows of C")
+    A: Matrix = Field(description="A, one row per state")
+    B: Matrix = Field(description="B, one row per state, one column per input")
     C: tuple[Numbers, ...] = Field(
         default=(),
-        description="C, a row an output, a column a state; absent: the outputs are states",
+        description="C, one row per output, one column per state; absent if the outputs are states",
     )
     D: tuple[Numbers, ...] = Field(
-        default=(), description="the feedthrough of other tools' models; 0 or absent"
+        default=(), description="feedthrough of other tools' models; 0 or absent"
     )
     output_units: dict[Name, Unit] = Field(
         default={}, description="units of the outputs of C that are not states"
     )
     identities: bool = Field(
         default=True,
-        description="check what physics fixes, as theta_dot = q; false for a model that differs "
-        "on purpose",
+        description="whether to check what physics fixes, such as theta_dot = q; false for a model "
+        "that differs on purpose",
     )
     gravity: tuple[Gravity, ...] = Field(default=(), description="sine terms of f")
     inertial_coupling: tuple[Product, ...] = Field(
@@ -138,7 +138,8 @@ class Airframe(Config):
     gusts: dict[str, dict[str, Number]] = Field(
         default={},
         description="what wind w along each axis adds to each x_dot, per w / V0; axes: "
-        "longitudinal, lateral, vertical; roll, pitch, yaw of air that turns",
+        "longitudinal, "
+        "lateral, vertical, and roll, pitch, yaw for air that turns",
     )
 
     def _check(self) -> None:
@@ -158,7 +159,7 @@ class Airframe(Config):
         ):
             quantity(unit, key)
         self._check_outputs(n, len(self.outputs))
-        # Every name of a state in the file, by key, is that of a state.
+        # Every name of a state in the file must be that of a state.
         states_by_key = (
             {} if self.C else {f"outputs[{i}]": name for i, name in enumerate(self.outputs)}
         )
@@ -198,7 +199,7 @@ class Airframe(Config):
             require(name in self.states, key, f"{name!r}", f"a state: {', '.join(self.states)}")
 
     def _units(self) -> list[tuple[str, Unit]]:
-        """Units of states and inputs with their keys."""
+        """Return the units of states and inputs with their keys."""
         states = [(f"states.{name}", unit) for name, unit in self.states.items()]
         return states + [
             (f"inputs.{name}.unit", channel.unit) for name, channel in self.inputs.items()
@@ -230,7 +231,7 @@ class Airframe(Config):
                 f"{name!r}",
                 expected,
             )
-        # A row of C is a state alone, or has a name and a unit of its own.
+        # A row of C is either a state, or has a name and a unit of its own.
         for name, row in zip(self.outputs, self.C, strict=bool(self.C)):
             require(
                 name in self.states or name in self.output_units,
@@ -251,37 +252,37 @@ class Airframe(Config):
             )
 
     def units_of_outputs(self) -> dict[str, Unit]:
-        """Units of the outputs, in their order."""
+        """Return the units of the outputs, in their order."""
         return {name: self.states.get(name) or self.output_units[name] for name in self.outputs}
 
     def index(self, state: str) -> int:
-        """Index of a state in x.
+        """Return the index of a state in x.
 
         Args:
             state: Name of the state.
 
         Returns:
-            The place, 0 to n - 1.
+            The index, 0 to n - 1.
         """
         return list(self.states).index(state)
 
     def matrix_a(self) -> FloatArray:
-        """A, shape (n, n), SI: A_ij unit_i / unit_j."""
+        """Return A, shape (n, n), SI: A_ij unit_i / unit_j."""
         unit = _si(self.states.values())
         matrix: FloatArray = np.array(self.A)
         return matrix * unit[:, None] / unit[None, :]
 
     def matrix_b(self) -> FloatArray:
-        """B, shape (n, p), SI: B_ij unit_i / unit_j."""
+        """Return B, shape (n, p), SI: B_ij unit_i / unit_j."""
         row = _si(self.states.values())
         column = _si(i.unit for i in self.inputs.values())
         matrix: FloatArray = np.array(self.B)
         return matrix * row[:, None] / column[None, :]
 
     def no_thrust(self) -> FloatArray:
-        """The inputs without thrust, deviations from trim, shape (p,), SI.
+        """Return the inputs without thrust, deviations from trim, shape (p,), SI.
 
-        0 of a surface, nan where the file has none.
+        They are 0 for a surface, and nan if the file does not say.
         """
         units = [quantity(channel.unit) for channel in self.inputs.values()]
         unsaid = [0.0 if unit.dimension == ANGLE else math.nan for unit in units]
@@ -292,7 +293,7 @@ class Airframe(Config):
         )
 
     def matrix_c(self) -> FloatArray:
-        """C, shape (m, n), SI: C_ij unit_i / unit_j; without `C` it selects the outputs."""
+        """Return C, shape (m, n), SI: C_ij unit_i / unit_j; without `C` it selects the outputs."""
         if self.C:
             return (
                 np.array(self.C)
@@ -302,14 +303,14 @@ class Airframe(Config):
         return selection_matrix(self.outputs, [*self.states])
 
     def matrix_gravity(self) -> FloatArray:
-        """Matrix of the sine terms, shape (n, n): f = matrix_gravity @ sin(x)."""
+        """Return the matrix of the sine terms, shape (n, n): f = matrix_gravity @ sin(x)."""
         matrix = np.zeros((len(self.states), len(self.states)))
         for term in self.gravity:
             matrix[self.index(term.into), self.index(term.angle)] += term.gain
         return matrix
 
     def products(self) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.int64]]:
-        """Inertial coupling, P terms: f = gain @ (x[first] * x[second]).
+        """Return the inertial coupling, P terms: f = gain @ (x[first] * x[second]).
 
         The shapes of gain, first and second are (n, P), (P,) and (P,).
         """
@@ -322,11 +323,11 @@ class Airframe(Config):
         return gain, first, second
 
     def with_matrices(self, A: FloatArray, B: FloatArray, wind_factor: FloatArray) -> Self:
-        """A copy with new A, shape (n, n), and B, shape (n, m).
+        """Copy the airframe with new A, shape (n, n), and B, shape (n, m).
 
         They are given in SI and stored in the units of the file. `wind_factor`, shape (n, G),
         multiplies the effect of wind along the axes of `gusts`. Sampled and identified entries need
-        not meet the identities of physics, so the copy is not checked for these.
+        not meet the identities of physics, so the copy is not checked for them.
 
         Args:
             A: Shape (n, n), SI.
@@ -334,7 +335,7 @@ class Airframe(Config):
             wind_factor: Factors of the effect of wind, shape (n, G).
 
         Returns:
-            The copy, unchecked for physics.
+            The copy, not checked against physics.
         """
         state = _si(self.states.values())
         inputs = _si(i.unit for i in self.inputs.values())
@@ -353,9 +354,9 @@ class Airframe(Config):
         )
 
     def through(self, T: FloatArray, inputs: Sequence[str]) -> Self:
-        """A copy with the m inputs v of u = T v, SI, for its p inputs u, in their order.
+        """Copy the airframe with the m inputs v of u = T v, SI, in place of its p inputs u.
 
-        Physics unchecked.
+        u is in the order of the airframe, and the copy is not checked against physics.
 
         Args:
             T: Matrix of u = T v, shape (p, m).
@@ -370,18 +371,18 @@ class Airframe(Config):
         return self.validate_mapping(self.model_dump() | values, f"airframe {self.name}")
 
     def with_rotary_gusts(self, axes: Sequence[str] = ROTARY) -> Self:
-        """A copy in which air that turns with p_g, q_g, r_g, rad/s, moves the aircraft.
+        """Copy the airframe so that air that turns with p_g, q_g, r_g, rad/s, moves it.
 
             x_dot_i -= A_ij w_j,  i and j in p, q, r
 
-        Forces by these rates are left out: A[alpha, q] and A[beta, r] hold kinematics, too. Effects
-        of the file stay.
+        Forces caused by these rates are left out, because A[alpha, q] and A[beta, r] also hold
+        kinematics. Effects that the file states stay.
 
         Args:
             axes: Axes of ROTARY; those of states that the airframe lacks are left out.
 
         Returns:
-            The copy with further axes of `gusts`.
+            The copy with more axes in `gusts`.
         """
         A = self.matrix_a()
         rates = [AIR_STATE[axis] for axis in ROTARY if AIR_STATE[axis] in self.states]
@@ -393,7 +394,7 @@ class Airframe(Config):
         return self.model_copy(update={"gusts": self.gusts | gusts})
 
     def matrix_gusts(self) -> FloatArray:
-        """Change of x_dot for 1 m/s of wind along the axes of `gusts`, shape (n, G)."""
+        """Compute how x_dot changes for 1 m/s of wind along the axes of `gusts`, shape (n, G)."""
         return (
             np.array([self.gust_direction(axis) for axis in self.gusts])
             .reshape(-1, len(self.states))
@@ -401,7 +402,7 @@ class Airframe(Config):
         )
 
     def gust_direction(self, gust: str) -> FloatArray:
-        """Change of x_dot for 1 m/s of wind along an axis, shape (n,).
+        """Compute how x_dot changes for 1 m/s of wind along an axis, shape (n,).
 
         Args:
             gust: Name of the axis.
@@ -422,14 +423,14 @@ class Airframe(Config):
 
 
 def _si(units: Iterable[Unit]) -> FloatArray:
-    """SI values of 1 of each unit."""
+    """Return the SI values of 1 of each unit."""
     return np.array([si_per_unit(unit) for unit in units])
 
 
 def check_identities(airframe: Airframe) -> None:
-    """Raise ParameterError for an airframe that contradicts what physics fixes.
+    """Refuse an airframe that contradicts what physics fixes.
 
-    Unless the file says `identities: false`.
+    It passes unchecked if the file says `identities: false`.
     """
     if airframe.identities:
         effects = {name: channel.positive for name, channel in airframe.inputs.items()}
@@ -452,7 +453,7 @@ def check_identities(airframe: Airframe) -> None:
 
 
 def airframes() -> list[str]:
-    """Names of the airframes in the library.
+    """Name the airframes in the library.
 
     Returns:
         The names, sorted.
@@ -465,7 +466,7 @@ def airframes() -> list[str]:
 
 
 def load_airframe(name: FilePath | Airframe) -> Airframe:
-    """An airframe by name in the library, or by the path of a file; an Airframe as it is.
+    """Load an airframe by name in the library or by path of a file; return an Airframe as it is.
 
     Args:
         name: Name in the library, path of an airframe file (.yaml), or an Airframe.
@@ -488,9 +489,9 @@ def load_airframe(name: FilePath | Airframe) -> Airframe:
 
 @lru_cache(maxsize=8)
 def _parsed(name: str, path: Path, content: bytes) -> Airframe:
-    """An airframe from the content of a file, cached.
+    """Read an airframe from the content of a file; cached.
 
-    A node that checks a change in flight saves 15 ms.
+    The cache saves 15 ms for a node that checks a change in flight.
     """
     parsed = parse_yaml(content, f"airframe {path}", EXPECTED)
     require(isinstance(parsed, dict), f"airframe {path}", type(parsed).__name__, "a mapping")
@@ -506,7 +507,7 @@ EULER_STATES = ("phi", "theta", "p", "q", "r")
 
 
 def euler_kinematics(airframe: Airframe) -> EulerKinematics:
-    """The arrays of Euler's equations. Raises ParameterError without a trim speed."""
+    """Return the arrays of Euler's equations. Raises ParameterError without a trim speed."""
     require(
         airframe.speed > 0.0,
         "kinematics",

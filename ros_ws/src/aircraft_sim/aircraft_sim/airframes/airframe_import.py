@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Airframes from the models of other tools.
 
-The tools are python-control, SciPy, MATLAB, AVL, XFLR5, and matrices with named states.
+The tools are python-control, SciPy, MATLAB, AVL, XFLR5, and anything with named matrices.
 """
 
 import re
@@ -23,7 +23,7 @@ Named = str | Mapping[str, Any] | Sequence[str]
 """Names with units: "u: ft/s, w: ft/s", a dictionary, or a list of names of states in SI."""
 
 AIR = {"longitudinal": ("V", "u"), "lateral": ("beta", "v"), "vertical": ("alpha", "w")}
-"""By axis of the wind the states that measure motion relative to the air."""
+"""For each axis of the wind, the states that measure motion relative to the air."""
 
 
 def import_airframe(
@@ -38,7 +38,7 @@ def import_airframe(
     text: str = "",
     **body: str | float,
 ) -> tuple[Airframe, str]:
-    """An airframe from the model of another tool, and a sentence on what it was made of.
+    """Make an airframe from the model of another tool, with a sentence about what it is made of.
 
     The airframe is checked against physics.
 
@@ -53,8 +53,8 @@ def import_airframe(
         inputs: Names of the inputs in the order of B, with units and effects: "elevator: rad nose
             down, thrust: 1 more thrust".
         outputs: As many as inputs, or fewer: names of states or of rows of C with units ("V:
-            ft/s"), or sums: "q, V = 0.987 u + 0.163 w".
-            Empty: q, V, p, r by elevator, thrust, aileron, rudder.
+            ft/s"), or sums: "q, V = 0.987 u + 0.163 w". If empty: q, V, p, r by elevator, thrust,
+            aileron, rudder.
         thrust: Whether to add an input thrust in units of the weight along the flight path, for a
             model without a thrust.
         text: Where the figures come from.
@@ -86,9 +86,9 @@ def import_airframe(
 
 
 def _of_file(source: str | Path, name: str, options: Mapping[str, Any]) -> Airframe:
-    """The airframe of an airframe file, with another name unless empty.
+    """Load an airframe file, under another name unless it is empty.
 
-    No option fits beside the file.
+    No other option may stand beside the file.
     """
     for key, value in options.items():
         require(not value, key, f"{value!r} beside an airframe file", "none: the file has it")
@@ -97,7 +97,7 @@ def _of_file(source: str | Path, name: str, options: Mapping[str, Any]) -> Airfr
 
 
 def _named(names: Named, key: str) -> dict[str, Any]:
-    """Names and what is said of each; {} for none."""
+    """Split names from what is said about each; {} if there are none."""
     if isinstance(names, str):
         parts = [part.strip() for part in names.split(",")] if names.strip() else []
         split = [(part.partition(":")[0].strip(), part.partition(":")[2].strip()) for part in parts]
@@ -109,7 +109,7 @@ def _named(names: Named, key: str) -> dict[str, Any]:
 
 
 def _check_identities(model: ToolModel, name: str, speed: float) -> None:
-    """Raise ParameterError for a model that breaks an identity of physics; trim speed in m/s."""
+    """Refuse a model that breaks an identity of physics; the trim speed is in m/s."""
     effects = {key: channel.get("positive", "") for key, channel in model.inputs.items()}
     units = tuple(channel["unit"] for channel in model.inputs.values())
     none = np.zeros_like(model.A)
@@ -128,9 +128,9 @@ def _check_identities(model: ToolModel, name: str, speed: float) -> None:
 
 
 def _with_thrust(model: ToolModel) -> ToolModel:
-    """The model with an input thrust in units of the weight along the flight path.
+    """Add an input thrust in units of the weight along the flight path.
 
-    V_dot, or u_dot, = g.
+    V_dot, or u_dot, is g times this input.
     """
     require(
         "thrust" not in model.inputs, "thrust", "an input thrust in the model", "none to add one"
@@ -170,7 +170,7 @@ def _airframe(
         output in names and np.array_equal(row, np.eye(len(names))[names.index(output)])
         for output, row in rows.items()
     )
-    # The content of an airframe file, with C and D only where needed.
+    # Write the content of an airframe file, with C and D only if needed.
     values: dict[str, Any] = {
         "name": name,
         "source": source,
@@ -200,7 +200,7 @@ def _airframe(
 def _rows_of_outputs(
     model: ToolModel, outputs: Sequence[str], labels: Sequence[str]
 ) -> tuple[dict[str, FloatArray], dict[str, str]]:
-    """Rows of C by output, and units of the outputs that are no states.
+    """Return rows of C by output, and units of the outputs that are not states.
 
     `labels` name the rows of the model's own C.
     """
@@ -233,7 +233,7 @@ def _rows_of_outputs(
 
 
 def _output(text: str, names: Sequence[str]) -> tuple[str, str, FloatArray | None]:
-    """Name, unit and row of C of an output: "q", "V: ft/s", "V = 0.987 u + 0.163 w"."""
+    """Read name, unit and row of C of an output: "q", "V: ft/s", "V = 0.987 u + 0.163 w"."""
     name, equals, terms = (part.strip() for part in text.partition("="))
     if not equals:
         name, _, unit = (part.strip() for part in text.partition(":"))
@@ -254,9 +254,9 @@ def _output(text: str, names: Sequence[str]) -> tuple[str, str, FloatArray | Non
 
 
 def _default_outputs(model: ToolModel) -> list[str]:
-    """q, V, p, r by elevator, thrust, aileron, rudder.
+    """Choose q, V, p, r by elevator, thrust, aileron, rudder.
 
-    V = u cos(alpha_0) + w sin(alpha_0) of body axes, by u_dot = -W0 q.
+    In body axes V = u cos(alpha_0) + w sin(alpha_0), where u_dot = -W0 q gives alpha_0.
     """
     outputs = []
     for name in model.inputs:
@@ -279,7 +279,7 @@ def _default_outputs(model: ToolModel) -> list[str]:
 
 
 def _effect(model: ToolModel, name: str) -> str:
-    """What a positive value of an input does, from the sign of B."""
+    """Say what a positive value of an input does, from the sign of B."""
     state, up, down = MOVES.get(name, ("", "", ""))
     state = "u" if state == "V" and "V" not in model.states else state
     if state not in model.states:
@@ -291,9 +291,10 @@ def _effect(model: ToolModel, name: str) -> str:
 
 
 def _gusts(frame: Airframe) -> dict[str, dict[str, float]]:
-    """What wind adds to x_dot, per w / V0.
+    """Return what wind adds to x_dot, per w / V0.
 
-    Minus the column of the state that moves relative to the air; not to angles, h.
+    This is minus the column of the state that moves relative to the air. Wind adds nothing to
+    angles and h.
     """
     A = frame.matrix_a()
     names = list(frame.states)

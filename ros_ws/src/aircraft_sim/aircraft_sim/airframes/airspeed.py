@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """An airframe away from the trim speed.
 
-A, B and trim are those in level flight at the same altitude, by powers of the airspeed.
+A, B and trim are those of level flight at the same altitude; they follow powers of the airspeed.
 """
 
 from collections.abc import Mapping
@@ -37,13 +37,12 @@ EXPONENTS: Mapping[str, Mapping[str, float]] = {
 }
 """Exponents of the ratio of airspeeds in the entries of A, by the kinds of row and column.
 
-In level flight lift is weight at any speed: alpha_dot = q - L / (m V) + g / V with L of V^2 about
-the trim, so A[alpha,V] is -2 g / V^2.
-"""
+In level flight lift equals weight at any speed: alpha_dot = q - L / (m V) + g / V, where L grows
+with V^2 about the trim. A[alpha,V] is therefore -2 g / V^2. """
 
 OF_SURFACE = {SPEED: 2.0, INCIDENCE: 1.0, RATE: 2.0, ANGLE: 0.0}
 OF_THRUST = {SPEED: 0.0, INCIDENCE: -1.0, RATE: 0.0, ANGLE: 0.0}
-"""The same of B, by the kind of the row."""
+"""The same for B, by the kind of the row."""
 
 WIND_STATE = {
     "longitudinal": SPEED,
@@ -51,10 +50,10 @@ WIND_STATE = {
     "vertical": INCIDENCE,
     **dict.fromkeys(ROTARY, RATE),
 }
-"""Kind of the state in which wind along an axis acts, relative to the air."""
+"""Kind of the state in which wind along an axis acts relative to the air."""
 
-TRIM_STEPS = 20  # of the airspeed: the trim from 1 to 1.4 V0 is exact to 1e-4 of it
-# V / V0 of the trims of a simulated aircraft, linear in between
+TRIM_STEPS = 20  # steps of the airspeed: the trim from 1 to 1.4 V0 is exact to 1e-4 of it
+# V / V0 of the trims of a simulated aircraft, which are linear in between
 SLOWEST = 0.5
 FASTEST = 2.0
 SPACING = 0.05
@@ -70,7 +69,7 @@ class Exponents(NamedTuple):
 
 
 def exponents(airframe: Airframe, thrust: str) -> Exponents:
-    """The exponents for the input `thrust`.
+    """Return the exponents for the input `thrust`.
 
     Raises ParameterError for a state whose exponents are not known.
     """
@@ -98,17 +97,18 @@ def exponents(airframe: Airframe, thrust: str) -> Exponents:
 
 
 def at_speed(airframe: Airframe, ratio: float, thrust: str) -> Airframe:
-    """The airframe trimmed at `ratio` times its speed V0, shape and units as before.
+    """Trim an airframe at `ratio` times its speed V0, with shape and units as before.
 
-    Moments by an angle of incidence or by a surface grow with V^2, dampings with V, what a force
-    does to an angle of incidence with the force over V; thrust, gravity and kinematics stay, and so
-    does lift, the weight. Every entry is scaled by a power of the ratio: EXPONENTS, OF_SURFACE and
-    OF_THRUST for the input `thrust`. Wind acts by the new A. Derivatives are those of the trim: no
-    Mach number, none changes with C_L. Source: B. L. Stevens, F. L. Lewis, "Aircraft Control and
-    Simulation", 2.6, dimensional derivatives. Raises as `exponents`.
+    Moments caused by an angle of incidence or by a surface grow with V^2, dampings with V, and what
+    a force does to an angle of incidence grows with the force over V. Thrust, gravity and
+    kinematics stay the same, and so does lift, which is the weight. Every entry is scaled by a
+    power of the ratio: EXPONENTS, OF_SURFACE, and OF_THRUST for the input `thrust`. Wind acts by
+    the new A. Derivatives are those of the trim: they depend neither on Mach number nor on C_L.
+    Source: B. L. Stevens, F. L. Lewis, "Aircraft Control and Simulation", 2.6, dimensional
+    derivatives. Raises as `exponents` does.
     """
     powers = exponents(airframe, thrust)
-    wind = ratio ** (powers.wind + 1.0)  # the file has the effect per w / V0
+    wind = ratio ** (powers.wind + 1.0)  # the file gives the effect per w / V0
     airframe_at_speed = airframe.with_matrices(
         airframe.matrix_a() * ratio**powers.A, airframe.matrix_b() * ratio**powers.B, wind
     )
@@ -123,13 +123,13 @@ def at_speed(airframe: Airframe, ratio: float, thrust: str) -> Airframe:
 
 
 def level_flight(airframe: Airframe, ratio: float, thrust: str) -> tuple[FloatArray, FloatArray]:
-    """Trim at `ratio` times V0 as deviations x, (n,), and u, (p,), from the trim at V0, SI.
+    """Trim at `ratio` times V0: deviations x, (n,), and u, (p,), from the trim at V0, SI.
 
         (A + gravity) dx + B du = 0,
             dx = dV, dalpha = dtheta in level flight, along the ratio from 1 on
 
-    with A, B of the airspeed and the least du where several inputs serve, in TRIM_STEPS steps.
-    Raises as `exponents`.
+    A and B are those of the airspeed, and du is the least one if several inputs can serve, in
+    TRIM_STEPS steps. Raises as `exponents` does.
     """
     names = list(airframe.states)
     powers = exponents(airframe, thrust)
@@ -154,9 +154,9 @@ def level_flight(airframe: Airframe, ratio: float, thrust: str) -> tuple[FloatAr
 
 
 def over_airspeed(airframe: Airframe, thrust: str) -> OverAirspeed:
-    """How matrices and trim of an airframe follow the airspeed.
+    """Return how matrices and trim of an airframe follow the airspeed.
 
-    Raises as `exponents`, and without V or a speed.
+    Raises as `exponents` does, and if there is no V or no speed.
     """
     require(
         "V" in airframe.states and airframe.speed > 0.0,

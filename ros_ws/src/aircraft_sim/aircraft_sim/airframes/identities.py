@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """What physics fixes in the matrices of an aircraft.
 
-Kinematics, gravity, trim speed, the sign and the size of a control. The names of the states say
-what they are: V, u, v, w speeds, alpha, beta, theta, phi, psi angles, p, q, r angular rates, h a
-height; FRD axes. A state of a different name is not checked, but VT and further names of these are
-refused. Source of the identities: the linear equations of motion about straight flight, B. L.
-Stevens, F. L. Lewis, Aircraft Control and Simulation, 2nd ed. (2003), sec. 3.7; B. Etkin, L. D.
-Reid, Dynamics of Flight, 3rd ed. (1996), eq. (4.9,18).
+That is kinematics, gravity, trim speed, and the sign and the size of a control. The names of the
+states say what they are: V, u, v, w speeds, alpha, beta, theta, phi, psi angles, p, q, r angular
+rates, h a height; FRD axes. A state of any other name is not checked, but VT and other names for
+these quantities are refused. Source of the identities: the linear equations of motion about
+straight flight, B. L. Stevens, F. L. Lewis, Aircraft Control and Simulation, 2nd ed. (2003), sec.
+3.7; B. Etkin, L. D. Reid, Dynamics of Flight, 3rd ed. (1996), eq. (4.9,18).
 """
 
 from collections.abc import Iterator, Mapping
@@ -33,15 +33,15 @@ OF_RATES = {
     "h": None,
     "altitude": None,
 }
-"""States whose derivative no force changes, and the named states that enter it; None: any."""
+"""States whose derivative no force changes, and the named states that enter it; None if any may."""
 
 TURNED = (0.7, 1.02)
 COUPLED = (0.6, 1.35)
 LIFT = (0.3, 2.8)
-"""Accepted parts of an expected value: cos of a trim angle up to 45 deg; of V0 with the force of a
-rate, Z_q or Y_r; of the change of lift = weight with speed, which compressibility and thrust
-change: published aircraft have 0.78 to 1.02."""
-FOREIGN = 0.02  # 1, the largest entry of an unrelated state in the row of an angle, SI
+"""Accepted fractions of an expected value: cos of a trim angle up to 45 deg; V0 with the force of a
+rate, Z_q or Y_r; the change of lift = weight with speed, which compressibility and thrust alter
+(published aircraft have 0.78 to 1.02)."""
+FOREIGN = 0.02  # SI, largest entry of an unrelated state that is accepted in the row of an angle
 EXPECTED: Mapping[tuple[str, str], tuple[float, str, tuple[float, float]]] = {
     ("theta", "q"): (1.0, "", TURNED),
     ("phi", "p"): (1.0, "", TURNED),
@@ -60,7 +60,7 @@ EXPECTED: Mapping[tuple[str, str], tuple[float, str, tuple[float, float]]] = {
     ("h", "alpha"): (-1.0, "V0", COUPLED),
     ("h", "w"): (-1.0, "", TURNED),
 }
-"""Entries of A by row and column: sign, value in SI, and accepted parts; about straight flight
+"""Entries of A by row and column: sign, value in SI, and accepted fractions, about straight flight
 without bank."""
 
 EFFECTS = {
@@ -72,18 +72,18 @@ EFFECTS = {
     "yaw left": ("r", -1.0),
     "more thrust": ("V u", 1.0), "more power": ("V u", 1.0),
 }  # fmt: skip
-"""What `positive` may say of an input: the states that it moves, and the sign."""
+"""What `positive` may say of an input: the state that it moves, and the sign."""
 
 CONTROLS = {
     "elevator": ("q", "alpha w", 0.06, 12.0),
     "aileron": ("p", "beta v", 0.015, 8.0),
     "rudder": ("r", "beta v", 0.015, 8.0),
 }
-"""By input the rate that it moves, the angle of the flow, and the range of effect / (stiffness +
-damping): `_strengths`.
+"""For each input: the rate that it moves, the angle of the flow, and the accepted range of effect /
+(stiffness + damping), see `_strengths`.
 
-Published aircraft have 0.27 to 3.3, 0.04 to 0.93 and 0.04 to 1.1. A column per deg taken per rad is
-57 times off.
+Published aircraft have 0.27 to 3.3, 0.04 to 0.93 and 0.04 to 1.1. If you take a column per deg for
+one per rad, it is 57 times off.
 """
 
 
@@ -100,25 +100,25 @@ class LinearModel(NamedTuple):
     gravity: FloatArray  # (n, n), SI, sine terms for small angles
 
     def matrix_a(self) -> FloatArray:
-        """A with gravity, SI."""
+        """Return A with gravity, SI."""
         unit = np.array([quantity(unit).si for unit in self.states.values()])
         return np.asarray(self.file_A * unit[:, None] / unit + self.gravity)
 
     def matrix_b(self) -> FloatArray:
-        """B, SI."""
+        """Return B, SI."""
         row = np.array([quantity(unit).si for unit in self.states.values()])
         column = np.array([quantity(unit).si for unit in self.inputs])
         return np.asarray(self.file_B * row[:, None] / column)
 
     @property
     def angular(self) -> frozenset[str]:
-        """The inputs that are angles: control surfaces."""
+        """Inputs that are angles: control surfaces."""
         units = zip(self.effects, self.inputs, strict=True)
         return frozenset(name for name, unit in units if quantity(unit).dimension == ANGLE)
 
 
 class Finding(NamedTuple):
-    """A contradiction: what the file has, and what is expected."""
+    """A contradiction: what the file has, and what physics expects."""
 
     key: str
     actual: str
@@ -138,7 +138,7 @@ def check(model: LinearModel) -> None:
 
 
 def contradictions(model: LinearModel) -> Iterator[Finding]:
-    """What contradicts physics, units first, then A, then B."""
+    """Yield what contradicts physics: units first, then A, then B."""
     yield from _dimensions(model)
     yield from _entries(model)
     yield from _kinematic_rows(model)
@@ -149,7 +149,7 @@ def contradictions(model: LinearModel) -> Iterator[Finding]:
 
 def _dimensions(model: LinearModel) -> Iterator[Finding]:
     for name, unit in model.states.items():
-        book_name = "V" if name.lower() == "vt" else name.lower()  # as books have it
+        book_name = "V" if name.lower() == "vt" else name.lower()  # as textbooks write it
         if name not in KINDS and book_name in KINDS:
             yield Finding(
                 f"states.{name}", name, f"{book_name}: the name by which a state is checked"
@@ -179,7 +179,7 @@ def _entries(model: LinearModel) -> Iterator[Finding]:
             continue
         entry = float(model.matrix_a()[names.index(row), names.index(column)])
         expected = sign * values[symbol]
-        # A multirotor hovers: its entry of V0 is 0.
+        # A multirotor hovers, so its entry of V0 is 0.
         left_out = entry == 0.0 and (
             symbol.startswith("2 g") or (symbol == "V0" and not model.angular)
         )
@@ -241,7 +241,7 @@ def _effects(model: LinearModel) -> Iterator[Finding]:
 
 
 def _strengths(model: LinearModel) -> Iterator[Finding]:
-    """Size of a control: angular acceleration per rad over stiffness + damping.
+    """Judge the size of a control: angular acceleration per rad over stiffness + damping.
 
     The latter is |M_alpha| + |M_q| (|M_q| + |Z_alpha|).
     """

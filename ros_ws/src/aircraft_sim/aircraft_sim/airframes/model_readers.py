@@ -42,7 +42,7 @@ MOVES = {
     "thrust": ("V", "more thrust", "less thrust"),
     "throttle": ("V", "more thrust", "less thrust"),
 }
-"""Output that an input drives, and what it does if positive, by the sign of B."""
+"""Output that an input drives, and what the input does if it is positive, by the sign of B."""
 
 
 class ToolModel(NamedTuple):
@@ -56,11 +56,11 @@ class ToolModel(NamedTuple):
     D: FloatArray | None = None
     outputs: tuple[str, ...] = ()  # names of the rows of C
     speed: float | None = None  # m/s
-    note: str = ""  # of what the file was read as
+    note: str = ""  # what the file was read as
 
 
 def _states(units_by_name: Mapping[str, Any], labels: Sequence[str], n: int) -> dict[str, str]:
-    """Units of the n states: as given, else by the names that the model carries."""
+    """Return the units of the n states: as given, or else by the names that the model carries."""
     names = units_by_name or dict.fromkeys(labels, "")
     names_text = ", ".join(names) or "no names"
     require(
@@ -85,7 +85,10 @@ def _states(units_by_name: Mapping[str, Any], labels: Sequence[str], n: int) -> 
 def _inputs(
     units_by_name: Mapping[str, Any], labels: Sequence[str], m: int
 ) -> dict[str, dict[str, str]]:
-    """Units and effects of the m inputs: as given ("rad nose down"), else rad, and 1 for thrust."""
+    """Return units and effects of the m inputs.
+
+    They are as given ("rad nose down"), or else rad, and 1 for thrust.
+    """
     names = units_by_name or dict.fromkeys(labels, "")
     names_text = ", ".join(names) or "no names"
     require(
@@ -113,7 +116,7 @@ def read_model(
     speed: float | None,
     body: Mapping[str, str | float],
 ) -> ToolModel:
-    """The model of a source of `import_airframe`. Raises ParameterError."""
+    """Read the model of a source of `import_airframe`. Raises ParameterError."""
     no_body = "none: it belongs to AVL's stability derivatives"
     if not isinstance(source, str | Path):
         require(not body, next(iter(body), ""), "it beside a state space", no_body)
@@ -168,7 +171,7 @@ def _square(A: FloatArray, B: FloatArray) -> None:
 
 
 def _state_space(system: Any, states: Mapping[str, Any], inputs: Mapping[str, Any]) -> ToolModel:
-    """python-control's and SciPy's StateSpace, by their attributes."""
+    """Read a StateSpace of python-control or SciPy, by its attributes."""
     if not all(hasattr(system, key) for key in "ABCD"):
         raise ParameterError(
             f"source: found {type(system).__name__}, expected a state space: control.ss or "
@@ -203,7 +206,7 @@ def _state_space(system: Any, states: Mapping[str, Any], inputs: Mapping[str, An
 
 
 def _matlab(path: Path, states: Mapping[str, Any], inputs: Mapping[str, Any]) -> ToolModel:
-    """A, B, C, D of a .mat file, or of a structure in the file.
+    """Read A, B, C, D of a .mat file, or of a structure in the file.
 
     The names are in StateName, InputName, OutputName.
     """
@@ -268,9 +271,9 @@ def _rows(lines: Sequence[str], count: int, columns: int, key: str) -> FloatArra
 
 
 def _xflr5(text: str, states: Mapping[str, Any], inputs: Mapping[str, Any]) -> ToolModel:
-    """Both 4 x 4 matrices of XFLR5's log, SI.
+    """Read both 4 x 4 matrices of XFLR5's log, SI.
 
-    The control matrices are per rad, a set of both a control.
+    The control matrices are per rad, one set of both for each control.
     """
     lines = text.splitlines()
 
@@ -310,7 +313,7 @@ def _xflr5(text: str, states: Mapping[str, Any], inputs: Mapping[str, Any]) -> T
 
 
 def _control(name: str) -> str:
-    """elevator, aileron or rudder for a name that begins like these, else the name."""
+    """Return elevator, aileron or rudder for a name that begins like them, or else the name."""
     return next(
         (full for full in ("elevator", "aileron", "rudder") if name.lower().startswith(full[:3])),
         name,
@@ -318,7 +321,7 @@ def _control(name: str) -> str:
 
 
 def _avl_header(text: str) -> tuple[int, list[str], list[str]] | None:
-    """Line, states and controls of the header of AVL's system matrix."""
+    """Find line, states and controls of the header of AVL's system matrix."""
     for i, line in enumerate(text.splitlines()):
         words = line.replace("|", " | ").split()
         if words[:4] == ["u", "w", "q", "the"]:
@@ -334,9 +337,9 @@ def _avl_matrix(
     inputs: Mapping[str, Any],
     speed: float | None,
 ) -> ToolModel:
-    """AVL's system matrix, SI.
+    """Read AVL's system matrix, SI.
 
-    The axes are those that physics confirms, x forward and z down, or x aft and z up.
+    The axes are those that physics confirms: x forward and z down, or x aft and z up.
     """
     line, names, controls = header
     require(
@@ -378,14 +381,14 @@ BODY = {
     "Ixz": "kg*m^2",
     "density": "kg/m^3",
 }
-"""What AVL's derivatives need of the aircraft, with units; Ixz is 0 by default."""
+"""What AVL's derivatives need to know of the aircraft, with units; Ixz is 0 by default."""
 DERIVATIVES = "Sref Cref Bref Alpha CLtot CDtot CLa CYb Clb Cma Cnb CYp Clp Cnp CLq Cmq CYr Clr Cnr"
 
 
 def _avl_derivatives(
     text: str, inputs: Mapping[str, Any], speed: float | None, body: Mapping[str, str | float]
 ) -> ToolModel:
-    """Linear equations about level flight in stability axes from AVL's stability derivatives.
+    """Derive linear equations about level flight in stability axes from AVL's derivatives.
 
     Derivatives by alpha_dot are left out. Source: R. C. Nelson, Flight Stability and Automatic
     Control, 2nd ed. (1998), tables 3.5, 3.6, eqs. (4.51), (5.33).
@@ -438,7 +441,7 @@ def _avl_derivatives(
 
 
 def _avl_body(body: Mapping[str, str | float]) -> list[float]:
-    """The values of BODY in SI, and the unit of length of AVL's file in m."""
+    """Return the values of BODY in SI, and the unit of length of AVL's file in m."""
     if unknown := [key for key in body if key not in {*BODY, "length"}]:
         raise ParameterError(
             f"{unknown[0]}: unknown, expected {one_of([*BODY, 'length'], unknown[0])}"
@@ -457,7 +460,7 @@ def _avl_body(body: Mapping[str, str | float]) -> list[float]:
 
 
 def _avl_values(text: str) -> dict[str, float]:
-    """The numbers of the file of AVL's command ST by name."""
+    """Read the numbers in the file of AVL's command ST by name."""
     require(
         "X aft" not in text,
         "axes",
@@ -472,7 +475,7 @@ def _avl_values(text: str) -> dict[str, float]:
 
 
 def _avl_controls(text: str, inputs: Mapping[str, Any]) -> dict[str, int]:
-    """The controls of AVL by number, of those that are named or have a name of the field."""
+    """Return the controls of AVL by number, those that are named or have a usual name."""
     numbers = {
         _control(name): int(number) for name, number in re.findall(r"(\S+)\s+d0?(\d+)\b", text)
     }

@@ -3,7 +3,7 @@
 """Disturbances as functions of time: 1-cosine gusts, biases and sines on x_dot.
 
 Assumption 2 requires f in C1 with f and f_dot bounded. Gusts, sines and biases with a rise meet it.
-A bias with rise 0 is a step, does not meet Assumption 2 and lies outside the theorem.
+A bias with rise 0 is a step: it does not meet Assumption 2 and lies outside the theorem.
 """
 
 from typing import NamedTuple
@@ -24,8 +24,8 @@ AIR_STATE = {
     "pitch": "q",
     "yaw": "r",
 }
-"""State that wind w along an axis changes relative to the air: V - w, beta - w / V0, alpha - w /
-V0, small angles; p - p_g, q - q_g, r - r_g."""
+"""State that wind w along an axis changes relative to the air: V - w, beta - w / V0, alpha - w / V0
+for small angles; p - p_g, q - q_g, r - r_g."""
 
 # s, used for rise 0, a step: t / 1e-30 saturates for every t > 0, in float32 too, without division
 # by 0.
@@ -59,11 +59,11 @@ class Sines(NamedTuple):
 
 
 def one_minus_cosine(t: Array, gusts: Gusts, airspeed: Array) -> Array:
-    """Speeds of the gusts in m/s, shape (G,): w = U_ds/2 (1 - cos(pi s/H)) up to s = 2H.
+    """Compute the speeds of the gusts, m/s, (G,): w = U_ds/2 (1 - cos(pi s/H)) up to s = 2H.
 
-    s = V0 ((t - start) mod every). Zero before entry, and after 2H/V0 seconds until it comes again.
-    The derivative is continuous and at most U_ds/2 pi V0/H, which meets Assumption 2. Source of the
-    form: FAR/CS 25.341(a).
+    s = V0 ((t - start) mod every). The speed is zero before entry, and after 2H/V0 seconds until
+    the gust comes again. The derivative is continuous and at most U_ds/2 pi V0/H, which meets
+    Assumption 2. Source of the form: FAR/CS 25.341(a).
     """
     xp = array_namespace(gusts.speed)
     since = t - gusts.start
@@ -76,10 +76,10 @@ def one_minus_cosine(t: Array, gusts: Gusts, airspeed: Array) -> Array:
 
 
 def bias(t: Array, params: Bias) -> Array:
-    """Biases at t, shape (n,), [x]/s: value/2 (1 - cos(pi s)).
+    """Compute the biases at t, shape (n,), [x]/s: value/2 (1 - cos(pi s)).
 
-    s = (t - start)/rise clipped to [0, 1]. With rise > 0 the derivative is continuous and at most
-    value/2 pi/rise. With rise = 0 the bias is a step: zero up to start, `value` afterwards.
+    s = (t - start)/rise clipped to [0, 1]. If rise > 0, the derivative is continuous and at most
+    value/2 pi/rise. If rise = 0, the bias is a step: zero up to start, `value` afterwards.
     Assumption 2 does not hold at the instant of the step.
     """
     xp = array_namespace(params.value)
@@ -88,7 +88,7 @@ def bias(t: Array, params: Bias) -> Array:
 
 
 def sines(t: Array, params: Sines) -> Array:
-    """Sines at t, shape (n,), [x]/s: amplitude sin(frequency t + phase).
+    """Compute the sines at t, shape (n,), [x]/s: amplitude sin(frequency t + phase).
 
     The derivative is at most amplitude frequency.
     """

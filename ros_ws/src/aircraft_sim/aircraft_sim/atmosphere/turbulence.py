@@ -2,15 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Dryden turbulence of MIL-F-8785C, MIL-HDBK-1797.
 
-Intensities, lengths, and shaping filters driven by white noise. Turbulence lies outside the
-theorem. Assumption 2 requires a bounded f with a bounded derivative. A Gaussian process has no
-bound, and none of the three winds has a derivative: the filters have a pole more than zeros.
+It gives intensities, lengths, and shaping filters driven by white noise. Turbulence lies outside
+the theorem: Assumption 2 requires a bounded f with a bounded derivative, but a Gaussian process has
+no bound, and none of the three winds has a derivative, because the filters have one pole more than
+zeros.
 
-The rotary gusts p_g, q_g, r_g act where a scenario has `turbulence.rotary`: they depend on the
-span, which not all airframe files state. Their effect is not small: at 100 m, for a span of 3 m,
-p_g gives the `osprey` seven times the roll acceleration (rms) of v_g; q_g adds two fifths to the
-pitch acceleration of w_g, r_g a sixteenth in yaw. Turbulent flights without these roll less than
-real ones.
+The rotary gusts p_g, q_g, r_g act only if a scenario has `turbulence.rotary`, because they depend
+on the span, which not all airframe files state. Their effect is not small: at 100 m, for a span of
+3 m, p_g gives the `osprey` seven times the roll acceleration (rms) of v_g; q_g adds two fifths to
+the pitch acceleration of w_g, and r_g a sixteenth in yaw. Turbulent flights without them roll less
+than real ones.
 """
 
 from collections.abc import Sequence
@@ -51,9 +52,10 @@ class Dryden(NamedTuple):
 
 
 class Turbulence(NamedTuple):
-    """Discretised turbulence filters of a step, for the winds of G axes.
+    """Turbulence filters discretised for a step, for the winds of G axes.
 
-    The state z is (s,), s = 5, or 8 with rotary gusts; the first five are of unit variance or less.
+    The state z is (s,), with s = 5, or 8 with rotary gusts. The first five have unit variance or
+    less.
     """
 
     transition: Array  # (s, s)
@@ -64,10 +66,10 @@ class Turbulence(NamedTuple):
 
 
 def dryden(altitude: float, wind: float, sigma: float) -> Dryden:
-    """Lengths and intensities at an altitude h above the ground, m.
+    """Return lengths and intensities at an altitude h above the ground, m.
 
-    Arguments: `wind` W_20 at 20 ft (6.1 m) above the ground, m/s: 7.7 light, 15.4 moderate, 23.1
-    severe turbulence (15, 30, 45 kt); `sigma` the intensity at high altitude, m/s, from the
+    `wind` is W_20 at 20 ft (6.1 m) above the ground, m/s: 7.7 light, 15.4 moderate, 23.1 severe
+    turbulence (15, 30, 45 kt). `sigma` is the intensity at high altitude, m/s, from the
     specification's chart by altitude and exceedance.
 
         h <= 1000 ft    L_w = h,  L_u = L_v = h / c^1.2,  sigma_w = 0.1 W_20,
@@ -89,7 +91,7 @@ def dryden(altitude: float, wind: float, sigma: float) -> Dryden:
 
 
 def roll_gust(spectrum: Dryden, airspeed: float, span: float) -> tuple[float, float]:
-    """Intensity, rad/s, and time constant, s, of p_g for a span b, m: of first order.
+    """Return intensity, rad/s, and time constant, s, of p_g for a span b, m; it is of first order.
 
         Phi_p = sigma_w^2 / (L_w V0) 0.8 (pi L_w / 4b)^(1/3) / (1 + (T omega)^2),  T = 4b / (pi V0)
 
@@ -109,10 +111,10 @@ def filters(
     seed: int,
     span: float | None = None,
 ) -> Turbulence:
-    """The shaping filters, discretised exactly.
+    """Build the shaping filters, discretised exactly.
 
-    At multiples of dt the winds are distributed as in continuous time. With a = V0/L by axis and
-    white noise n of unit intensity,
+    At multiples of dt the winds are distributed as in continuous time. With a = V0/L for each axis
+    and white noise n of unit intensity,
 
         u       z_dot = -a z + sqrt(2a) n,  u = sigma z
         v, w    z1_dot = -a z1 + sqrt(2a) n,  z2_dot = a (z1 - z2),
@@ -130,8 +132,8 @@ def filters(
     with g_k = gammainc(k, 2h), of the integrals of 2 s^(k-1) exp(-2s) from 0 to h; stationary
     stationary' belongs to h = inf.
 
-    Arguments: `airspeed` V0, m/s; `dt` in s; `axes` the required ones, as indices in AXES, then
-    ROTARY; `span` b, m, of rotary gusts, which `_with_rotary` adds. Source: MIL-F-8785C, 3.7.1.2.
+    `airspeed` is V0, m/s; `dt` is in s; `axes` are those required, as indices in AXES, then ROTARY;
+    `span` is b, m, for rotary gusts, which `_with_rotary` adds. Source: MIL-F-8785C, 3.7.1.2.
     """
     steps = airspeed / spectrum.length * dt
     p = np.sqrt(1.5)
@@ -154,14 +156,14 @@ def filters(
 def _with_rotary(
     winds: Turbulence, spectrum: Dryden, airspeed: float, dt: float, span: float
 ) -> Turbulence:
-    """The filters of all axes with rotary gusts of a span b, m.
+    """Add the rotary gusts for a span b, m, to the filters of all axes.
 
         p_g of first order, `roll_gust`
         q_g = -s / V0 / (1 + T_q s) w_g,  T_q = 4b / (pi V0)
         r_g =  s / V0 / (1 + T_r s) v_g,  T_r = 3b / (pi V0)
 
-    The air turns nose up where w_g falls along the flight, and nose right where v_g rises. The lags
-    of q_g and r_g have the wind of a step held. Source: MIL-F-8785C, 3.7.1.2, for FRD axes.
+    The air turns nose up if w_g falls along the flight, and nose right if v_g rises. For the lags
+    of q_g and r_g, the wind of a step is held. Source: MIL-F-8785C, 3.7.1.2, for FRD axes.
     """
     from scipy.linalg import solve_discrete_lyapunov  # noqa: PLC0415 - slow to load, only for this
 
@@ -196,7 +198,7 @@ def _with_rotary(
 
 
 def initial_state(params: Turbulence) -> FloatArray:
-    """State at t = 0, a sample of the stationary distribution, shape (s,)."""
+    """Draw the state at t = 0 from the stationary distribution, shape (s,)."""
     streams = [(random_streams.TURBULENCE_START, STATES)]
     if (more := len(params.stationary) - STATES) > 0:
         streams.append((random_streams.ROTARY_START, more))
@@ -208,10 +210,10 @@ def initial_state(params: Turbulence) -> FloatArray:
 
 
 def normals(first: int, count: int, params: Turbulence) -> FloatArray:
-    """Standard normal numbers of the steps first, first + 1, ... of `count`, shape (count, k).
+    """Draw the standard normal numbers of `count` steps from `first` on, shape (count, k).
 
-    Step k depends on seed and k. The numbers of the winds are the same with and without rotary
-    gusts.
+    Those of step k depend only on seed and k. The numbers of the winds are the same with and
+    without rotary gusts.
     """
     offset = first % BLOCK
     streams = [(random_streams.TURBULENCE, STATES)]
@@ -228,7 +230,7 @@ def normals(first: int, count: int, params: Turbulence) -> FloatArray:
 
 
 def step(z: Array, normal: Array, params: Turbulence) -> Array:
-    """State a step later, shape (s,): transition z + spread n.
+    """Advance the state by a step, shape (s,): transition z + spread n.
 
     n is standard normal, shape (k,).
     """
@@ -236,14 +238,14 @@ def step(z: Array, normal: Array, params: Turbulence) -> Array:
 
 
 def wind(z: Array, params: Turbulence) -> Array:
-    """The winds of the G axes in m/s, rotary gusts in rad/s, shape (G,): output z."""
+    """Return the winds along the G axes in m/s, rotary gusts in rad/s, shape (G,): output z."""
     return params.output @ z
 
 
 @lru_cache(maxsize=64)
 def _block(block: int, seed: int, stream: int, width: int) -> FloatArray:
     numbers = random_streams.generator(block, stream, seed).standard_normal((BLOCK, width))
-    numbers.flags.writeable = False  # the cache returns it again
+    numbers.flags.writeable = False  # because the cache returns it again
     return numbers
 
 
@@ -255,9 +257,9 @@ def _spread(h: float) -> FloatArray:
 
 
 def _axes(matrices: Sequence[FloatArray]) -> FloatArray:
-    """Block diagonal of the 2 x 2 matrices of the three axes, (5, 5).
+    """Build the block diagonal of the 2 x 2 matrices of the three axes, (5, 5).
 
-    Of the first matrix the first entry counts alone.
+    Only the first entry of the first matrix is used.
     """
     block = np.zeros((STATES, STATES))
     block[0, 0] = matrices[0][0, 0]

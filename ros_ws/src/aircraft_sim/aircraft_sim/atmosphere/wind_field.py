@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Wind that depends on the place: a profile over the height (wind shear), and a microburst.
 
-An aircraft flies in an air mass that moves with the wind at its start; what differs from this wind
-elsewhere acts on the aircraft.
+An aircraft flies in an air mass that moves with the wind at its start. Where the wind differs from
+this, the difference acts on the aircraft.
 """
 
 import math
@@ -19,8 +19,8 @@ PEAK_HEIGHT = math.log(LAYER) / (LAYER - 1.0)
 """z* over the height e of the boundary layer, and the height of the largest outflow over z*."""
 
 PEAK = 0.319086343 * (math.exp(-PEAK_HEIGHT) - math.exp(-LAYER * PEAK_HEIGHT))
-"""Largest outflow of a microburst over scale and radius: (1 - exp(-r^2)) / 2 r at 1.1209, times
-the spread at the height of the largest outflow."""
+"""Largest outflow of a microburst over scale and radius: (1 - exp(-r^2)) / 2 r at 1.1209, times the
+spread at the height of the largest outflow."""
 
 
 class Log(NamedTuple):
@@ -33,7 +33,7 @@ class Log(NamedTuple):
     roughness: float  # z0, m
 
     def factor(self, height: float) -> float:
-        """The factor at a height above the ground, m."""
+        """Return the factor at a height above the ground, m."""
         above = max(height / self.roughness, 1.0)
         return math.log(above) / math.log(self.reference / self.roughness)
 
@@ -45,12 +45,12 @@ class Power(NamedTuple):
     exponent: float  # a
 
     def factor(self, height: float) -> float:
-        """The factor at a height above the ground, m."""
+        """Return the factor at a height above the ground, m."""
         return float((max(height, 0.0) / self.reference) ** self.exponent)
 
 
 class Table(NamedTuple):
-    """Wind over the height: linear between the heights, constant beyond."""
+    """Wind over the height: linear between the heights, constant beyond them."""
 
     height: tuple[float, ...]  # m, rising
     north: tuple[float, ...]  # m/s, where the air moves to
@@ -75,7 +75,7 @@ class Microburst(NamedTuple):
     height: float  # of the largest outflow above the ground, m
 
     def wind(self, north: float, east: float, height: float) -> tuple[float, float, float]:
-        """Wind at a place, to the north, to the east and down, m/s."""
+        """Return the wind at a place, to the north, to the east and down, m/s."""
         x = north - self.north
         y = east - self.east
         r = max(math.hypot(x, y), 1e-6 * self.radius)
@@ -91,9 +91,9 @@ class Microburst(NamedTuple):
 
 
 class WindField(NamedTuple):
-    """Wind over the place.
+    """Wind as a function of place.
 
-    `wind` is the steady wind, of `Log` and `Power` that at their reference height.
+    `wind` is the steady wind; for `Log` and `Power` it is the one at their reference height.
     """
 
     wind: tuple[float, float]  # m/s to the north, to the east
@@ -102,7 +102,7 @@ class WindField(NamedTuple):
     microburst: Microburst | None = None
 
     def at(self, north: float, east: float, altitude: float) -> tuple[float, float, float]:
-        """Wind at a place over ground, to the north, to the east and down, m/s."""
+        """Return the wind at a place over ground, to the north, to the east and down, m/s."""
         height = altitude - self.ground
         shear = self.shear
         to_north, to_east = self.wind
@@ -120,10 +120,10 @@ class WindField(NamedTuple):
 
 
 class RelativeWind:
-    """Wind against that of the start, in the axes of a flight.
+    """Wind relative to that of the start, in the axes of a flight.
 
-    The flight begins at the origin, to the north. `carried`: the wind at the start to the north and
-    to the east, m/s, which moves the air mass.
+    The flight begins at the origin, to the north. `carried` is the wind at the start to the north
+    and to the east, m/s, which moves the air mass.
     """
 
     def __init__(self, field: WindField, start: Start, altitude: float) -> None:
@@ -134,9 +134,9 @@ class RelativeWind:
         self._sin = math.sin(start.heading)
 
     def at(self, t: float, north: float, east: float, altitude: float) -> FloatArray:
-        """Wind at t and at a place of the flight, m/s, shape (3,).
+        """Return the wind at t and at a place of the flight, m/s, shape (3,).
 
-        To the north, to the east and down.
+        Its components are north, east and down.
         """
         cos = self._cos
         sin = self._sin
@@ -149,7 +149,7 @@ class RelativeWind:
 
 
 def body_axes(phi: float, theta: float, psi: float) -> FloatArray:
-    """Matrix from north, east, down to forward, right, down of the body, shape (3, 3).
+    """Return the matrix from north, east, down to forward, right, down of the body, (3, 3).
 
     Source: Stevens, Lewis, Aircraft Control and Simulation, 2nd ed. (2003), eq. (1.3-20).
     """

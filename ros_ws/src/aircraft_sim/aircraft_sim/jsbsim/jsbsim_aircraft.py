@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Aircraft of JSBSim: names, channel tables, flight condition, wind.
 
-The import of JSBSim waits for the first use. JSBSim uses feet and normalised commands from stop to
-stop. u, y and truth are deviations from trim in SI. The tables INPUTS and STATES alone map between
+JSBSim is imported when it is first used. It has feet, and commands that are normalised from stop to
+stop. u, y and truth are deviations from trim in SI. Only the tables INPUTS and STATES map between
 the two, with units and signs.
 """
 
@@ -47,7 +47,7 @@ class Command(NamedTuple):
 
 
 NamedProperties = tuple[tuple[str, float], ...]
-"""Properties of a model, and the value of each at the command 1; empty without rudder."""
+"""Properties of a model, and the value of each at the command 1; empty if there is no rudder."""
 
 NONE = "none"
 
@@ -59,12 +59,12 @@ PROPERTY = re.compile(r"(?!simulation/)[A-Za-z][\w-]*(\[\d+\])?(/[A-Za-z][\w-]*(
 def named_properties(
     commands: Mapping[str, str], key: str
 ) -> tuple[tuple[str, NamedProperties], ...]:
-    """The user's own properties by input.
+    """Read the user's own properties by input.
 
     They come from texts such as "fcs/cmdAilR_rad=0.5 fcs/cmdAilL_rad=-0.5". The number is the
-    property's value at the command 1, which is the default; "none" of a rudder is a model without
-    rudder. Raises ParameterError for an unknown input, for what is no property of an aircraft, and
-    for the value 0.
+    property's value at the command 1, which is the default; "none" for the rudder means a model
+    without one. Raises ParameterError for an unknown input, for anything that is no property of an
+    aircraft, and for the value 0.
     """
     properties = list[tuple[str, NamedProperties]]()
     for name, text in commands.items():
@@ -97,7 +97,7 @@ def _number(text: str) -> float:
 
 
 class JsbsimQuantity(NamedTuple):
-    """A state: a property of JSBSim and the SI value of the unit."""
+    """A state: a property of JSBSim and the SI value of its unit."""
 
     property: str
     si: float
@@ -150,7 +150,8 @@ STATES: Mapping[str, JsbsimQuantity] = {
     "phi": JsbsimQuantity("attitude/phi-rad", 1.0, None),
     "altitude": JsbsimQuantity("position/h-sl-ft", FOOT, None),
 }
-"""States x.* of `truth`, deviations from trim: the outputs in the order of y, then the rest."""
+"""States x.* of `truth`, deviations from trim: first the outputs in the order of y, then the
+rest."""
 
 OUTPUTS: Mapping[str, Unit] = {
     name: quantity.unit for name, quantity in STATES.items() if quantity.unit is not None
@@ -181,11 +182,11 @@ class FlightCondition(NamedTuple):
 
     @property
     def title(self) -> str:
-        """The aircraft's name in messages, with PREFIX."""
+        """Name of the aircraft in messages, with PREFIX."""
         return f"{PREFIX}{self.name}"
 
     def commands(self) -> dict[str, Command]:
-        """INPUTS, with the user's own properties."""
+        """Return INPUTS, with the user's own properties."""
         properties = dict(self.named)
         return {
             name: command._replace(trim_property=None, named=properties[name])
@@ -195,11 +196,11 @@ class FlightCondition(NamedTuple):
         }
 
     def inputs(self) -> tuple[str, ...]:
-        """Names of the inputs in the order of INPUTS, without a missing rudder."""
+        """Name the inputs in the order of INPUTS, without a missing rudder."""
         return tuple(INPUTS)[:-1] if ("rudder", ()) in self.named else tuple(INPUTS)
 
     def paired_outputs(self) -> tuple[str, ...]:
-        """The outputs paired with `inputs`, in the order of OUTPUTS."""
+        """Name the outputs paired with `inputs`, in the order of OUTPUTS."""
         return tuple(OUTPUTS)[: len(self.inputs())]
 
 
@@ -223,7 +224,7 @@ class WindModel(NamedTuple):
 
 @cache
 def aircraft_names() -> tuple[str, ...]:
-    """Names of the aircraft of JSBSim. Raises ParameterError where JSBSim is not installed."""
+    """Name the aircraft of JSBSim. Raises ParameterError if JSBSim is not installed."""
     return tuple(
         sorted(
             path.parent.name
@@ -234,10 +235,10 @@ def aircraft_names() -> tuple[str, ...]:
 
 
 def root() -> Path:
-    """The folder with JSBSim's folders aircraft, engine and systems.
+    """Return the folder with JSBSim's folders aircraft, engine and systems.
 
-    $JSBSIM_ROOT, or in the package jsbsim. Raises ParameterError where JSBSim is not installed, and
-    for a $JSBSIM_ROOT that is no such folder.
+    It is $JSBSIM_ROOT, or in the package jsbsim. Raises ParameterError if JSBSim is not installed,
+    or if $JSBSIM_ROOT is no such folder.
     """
     try:
         import jsbsim  # noqa: PLC0415 - other aircraft fly without it
@@ -260,10 +261,10 @@ def root() -> Path:
 
 
 def require_aircraft(airframe: str) -> str:
-    """Name of the aircraft in "jsbsim:NAME", or the absolute path of the model in "jsbsim:PATH".
+    """Return the name in "jsbsim:NAME", or the absolute path of the model in "jsbsim:PATH".
 
-    PATH is the XML file of a model, or its folder; its text has a "/" or ends with ".xml". Raises
-    ParameterError, for a name with the closest known name, for a path with what is there.
+    PATH is the XML file of a model, or its folder; it has a "/" or ends with ".xml". Raises
+    ParameterError: for a name with the closest known name, for a path with what is there.
     """
     name = airframe.removeprefix(PREFIX)
     if "/" in name or name.endswith(SUFFIX):
@@ -277,9 +278,9 @@ def require_aircraft(airframe: str) -> str:
 
 
 def foreign_model(name: str) -> Path | None:
-    """The file of an aircraft's model that is not one of the package jsbsim.
+    """Return the file of an aircraft's model if it is not one of the package jsbsim.
 
-    The user's own, or of $JSBSIM_ROOT; else None.
+    It is the user's own, or comes from $JSBSIM_ROOT. Otherwise the result is None.
     """
     if Path(name).is_absolute():
         return Path(name)
@@ -287,10 +288,10 @@ def foreign_model(name: str) -> Path | None:
 
 
 def root_of(model: Path) -> Path:
-    """The folder of the engines and systems of a model.
+    """Return the folder of the engines and systems of a model.
 
-    $JSBSIM_ROOT, the ROOT of ROOT/aircraft/NAME/NAME.xml, or the package. JSBSim looks for the
-    files of a model beside the model first.
+    It is $JSBSIM_ROOT, the ROOT of ROOT/aircraft/NAME/NAME.xml, or the package. JSBSim first looks
+    for the files of a model beside the model.
     """
     folder = model.parents[min(2, len(model.parents) - 1)]
     is_tree = (
@@ -302,7 +303,7 @@ def root_of(model: Path) -> Path:
 
 
 def _model_file(path: Path, airframe: str) -> Path:
-    """The XML file of a model, from the path of the file or the folder. Raises ParameterError."""
+    """Find the XML file of a model from its path or its folder. Raises ParameterError."""
     expected = "the XML file of an aircraft of JSBSim (fdm_config), or its folder"
     if not path.is_dir():
         require(path.is_file(), "airframe", f"{airframe!r}, where no file is", expected)
@@ -331,7 +332,7 @@ def _model_file(path: Path, airframe: str) -> Path:
 
 
 def _first_element(path: Path) -> str:
-    """Name of the first element of an XML file; "" for a file that is not XML."""
+    """Read the name of the first element of an XML file; "" for a file that is not XML."""
     try:
         _, element = next(ElementTree.iterparse(path, events=("start",)))  # noqa: S314 - no entity is in a first element
         return str(element.tag)

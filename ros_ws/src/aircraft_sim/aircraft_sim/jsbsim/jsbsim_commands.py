@@ -22,14 +22,14 @@ FROZEN: Mapping[str, float] = {
     "simulation/integrator/position/translational": 0.0,
     "propulsion/fuel_freeze": 1.0,
 }
-"""Properties that freeze position, velocity, attitude and fuel. Engines and flight control systems
-still run."""
+"""Properties that freeze position, velocity, attitude and fuel, while engines and flight control
+systems run on."""
 
-PART = 0.2  # of a command, moved to see the effect
-MOVED = 0.5  # s of frozen flight after it: an engine begins to respond
-AFTERWARDS = 10.0  # s: an engine returns
-# Multiple of the difference between two equal runs, as of an engine that settles: a change beyond
-# is an effect.
+PART = 0.2  # of a command, by which it is moved to see its effect
+MOVED = 0.5  # s of frozen flight after that, in which an engine begins to respond
+AFTERWARDS = 10.0  # s, in which an engine returns
+# Multiple of the difference between two equal runs (an engine may still settle) beyond which a
+# change counts as an effect.
 NOISE = 2.0
 SYSTEMS = ("flight_control", "autopilot", "system")
 CONVENTION = "-cmd-norm"  # at the end of JSBSim's own commands
@@ -57,14 +57,14 @@ def settle(fdm: jsbsim.FGFDMExec, duration: float) -> None:
 
 
 def engine_count(fdm: jsbsim.FGFDMExec) -> int:
-    """Number of engines."""
+    """Return the number of engines."""
     return int(fdm.get_propulsion().get_num_engines())
 
 
 def command_paths(command: Command, engines: int) -> list[tuple[str, float]]:
-    """The properties of a command with the value of each at the command 1.
+    """List the properties of a command with the value of each at the command 1.
 
-    For one of the engines it is a property per engine.
+    A command for each engine has a property per engine.
     """
     if command.named:
         return list(command.named)
@@ -80,14 +80,14 @@ def set_command(fdm: jsbsim.FGFDMExec, command: Command, value: float) -> None:
 
 
 def residuals(fdm: jsbsim.FGFDMExec) -> FloatArray:
-    """The accelerations in the order of RESIDUALS, SI."""
+    """Return the accelerations in the order of RESIDUALS, SI."""
     return np.array([fdm[f"accelerations/{name}"] * si for name, si in RESIDUALS.items()])
 
 
 def commands_and_limits(
     fdm: jsbsim.FGFDMExec, inputs: Iterable[Command]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Whole commands, the trim's part included, and the distances to their stops, shapes (4,).
+    """Return whole commands, including the trim's part, and the distances to their stops, (4,).
 
     The stops are the lower and the upper ones.
     """
@@ -107,7 +107,7 @@ def commands_and_limits(
 
 
 def without_effect(fdm: jsbsim.FGFDMExec, commands: Mapping[str, Command]) -> list[str]:
-    """The inputs that move no acceleration of the frozen aircraft, whose engines run."""
+    """Name the inputs that move no acceleration of the frozen aircraft while its engines run."""
     return [
         name
         for name, command in commands.items()
@@ -142,9 +142,9 @@ def _moves(fdm: jsbsim.FGFDMExec, paths: Iterable[tuple[str, float]], part: floa
 def sentence_without_effect(
     fdm: jsbsim.FGFDMExec, commands: Mapping[str, Command], names: Iterable[str], model: Path | None
 ) -> str:
-    """A sentence on inputs without effect.
+    """Write a sentence about inputs without effect.
 
-    Properties that move nothing, and properties that the model reads.
+    It names the properties that move nothing, and those that the model reads.
     """
     parts = [
         f"{name}: {' and '.join(path for path, _ in command_paths(commands[name], 1))}"
@@ -163,9 +163,9 @@ def sentence_without_effect(
 
 
 def hysteresis_of(model: Path | None) -> str:
-    """The end of a sentence on a trim that fails, where servos of a model have hysteresis.
+    """End the sentence about a trim that fails, if servos of the model have hysteresis.
 
-    They hold their output while a command moves little; empty without such.
+    They hold their output while a command moves little. Returns "" if there are none.
     """
     members = {} if model is None else model_files(model).members
     if not any(b"<hysteresis_width>" in content for content in members.values()):
@@ -174,9 +174,9 @@ def hysteresis_of(model: Path | None) -> str:
 
 
 def _read_by_model(model: Path) -> list[str]:
-    """The properties that the control systems of a model read or declare.
+    """List the properties that the control systems of a model read or declare.
 
-    No component writes them.
+    They are those that no component writes.
     """
     inputs_of_components: set[str] = set()
     written: set[str] = set()

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The files of a foreign model of JSBSim, and what the model may not do.
 
-They are found as JSBSim finds files. JSBSim loads a copy of these files alone. Sources: JSBSim 1.3,
-FGModelLoader.cpp (a name without ".xml" gets it), FindFullPathName of FGModel, FGFCS and
+They are found as JSBSim finds files, and JSBSim loads a copy of these files only. Sources: JSBSim
+1.3, FGModelLoader.cpp (a name without ".xml" gets it), FindFullPathName of FGModel, FGFCS and
 FGPropulsion (the folders), FGFDMExec::LoadModel (input and output), FGPropagate.cpp and
 FGLinearization.cpp (properties that write a file), sg_path.cxx (a backslash is a slash).
 """
@@ -25,8 +25,8 @@ from flight_core.parameters import ParameterError, require
 
 # Sections of a model that open a socket or write a file; within a section they name properties.
 LEFT_OUT = ("input", "output")
-CHILD = "child"  # a section with the name of a further model, which JSBSim does not support yet
-# Properties of simulation/: JSBSim writes a file where one is set.
+CHILD = "child"  # a section that names another model, which JSBSim does not support yet
+# Properties of simulation/: JSBSim writes a file if one of them is set.
 WRITERS = ("do_linearization", "write-state-file")
 
 ENGINE_FOLDERS = ("Engines", "engines", "Engine", "engine")
@@ -51,23 +51,23 @@ SECTIONS = frozenset(
     }
     | {"flight_control", "aerodynamics", "planet"}
 )
-"""Further elements whose file JSBSim reads. An element with an attribute `file` beyond these needs
-no file."""
+"""Other elements whose file JSBSim reads. Any element with an attribute `file` that is not among
+these needs no file."""
 
 
 MOST_BYTES = 16 << 20  # of a file: the largest of JSBSim's own has a third of a megabyte
 
 
 class ModelFiles(NamedTuple):
-    """A model and the named files, as a root of JSBSim."""
+    """A model and the files that it names, as a root of JSBSim."""
 
     model: str  # its path in the root
-    # Content by path: aircraft/NAME/ has what is beside the model, engine/ and systems/ the rest.
+    # Content by path: aircraft/NAME/ holds what is beside the model, engine/ and systems/ the rest.
     members: Mapping[str, bytes]
     left_out: tuple[str, ...]  # the sections that are not loaded, as <output name="x.csv">
 
     def write(self, root: Path) -> Path:
-        """Write the files below a folder, the new root; the path of the model there."""
+        """Write the files below a folder, the new root, and return the path of the model there."""
         for name, content in self.members.items():
             path = root / name
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -75,7 +75,7 @@ class ModelFiles(NamedTuple):
         return root / self.model
 
     def archive(self) -> bytes:
-        """A zip file of the root, the same bytes for the same files.
+        """Pack a zip file of the root; the same files always give the same bytes.
 
         Unpacked, jsbsim:FOLDER/aircraft/NAME flies the same.
         """
@@ -87,18 +87,17 @@ class ModelFiles(NamedTuple):
 
 
 class _Place(NamedTuple):
-    """A file for JSBSim: the path in the new root, and the place of the source."""
+    """A file for JSBSim: its path in the new root, and where it comes from."""
 
     member: str
     path: Path
 
 
 def model_files(model: Path) -> ModelFiles:
-    """The files of a model that is not the package's.
+    """Collect the files of a model that is not the package's.
 
-    Raises ParameterError for a file that is missing, cut short, or outside of the folders of the
-    model and its root, also through a link, for a child model, and for a property that writes a
-    file.
+    Raises ParameterError if a file is missing, cut short, or outside of the folders of the model
+    and its root, also through a link, and for a child model or a property that writes a file.
     """
     first = _Place(f"aircraft/{model.stem}/{model.name}", model)
     members: dict[str, bytes] = {}
@@ -130,7 +129,7 @@ def model_files(model: Path) -> ModelFiles:
 
 
 def _places(model: Path, element: str, name: str) -> Iterator[_Place]:
-    """The files of a name in the folders of an element, in JSBSim's order.
+    """Yield the files of a name in the folders of an element, in JSBSim's order.
 
     Raises ParameterError for a link to elsewhere.
     """
@@ -155,9 +154,9 @@ def _places(model: Path, element: str, name: str) -> Iterator[_Place]:
 
 
 def _relative(name: str, path: Path) -> str:
-    """The path of a named file with the suffix.
+    """Return the path of a named file with its suffix.
 
-    Raises ParameterError where the path leaves the folder.
+    Raises ParameterError if the path leaves the folder.
     """
     plain = PurePosixPath(name.replace("\\", "/"))
     inside = not plain.is_absolute() and ".." not in plain.parts
@@ -168,9 +167,9 @@ def _relative(name: str, path: Path) -> str:
 
 
 def _sentence(model: Path, missing: Mapping[str, str]) -> str:
-    """A sentence on missing files, by name with the element.
+    """Write a sentence about missing files, by name with the element.
 
-    The files are those of elements like the first.
+    It is about the files of elements like the first.
     """
     element = next(iter(missing.values()))
     names = sorted(
@@ -201,7 +200,7 @@ def _content(path: Path) -> bytes:
 
 
 def _parsed(content: bytes, path: Path) -> ElementTree.Element:
-    """The elements as JSBSim reads them: names as they stand, without namespaces.
+    """Parse the elements as JSBSim reads them: names as they stand, without namespaces.
 
     Raises ParameterError.
     """
@@ -219,7 +218,7 @@ def _parsed(content: bytes, path: Path) -> ElementTree.Element:
 
 
 def _leave_out(tree: ElementTree.Element, model: Path) -> tuple[str, ...]:
-    """Remove the sections LEFT_OUT of a model; returns their texts.
+    """Remove the sections LEFT_OUT of a model, and return their texts.
 
     Raises ParameterError for a child model.
     """
@@ -241,7 +240,7 @@ def _start_tag(element: ElementTree.Element) -> str:
 
 
 def _require_no_writer(tree: ElementTree.Element, path: Path) -> None:
-    """Raise ParameterError for a property whose value JSBSim answers with a file."""
+    """Refuse a property to whose value JSBSim responds with a file."""
     attributes = chain.from_iterable(element.attrib.values() for element in tree.iter())
     text = "".join([*tree.itertext(), *attributes])
     for name in WRITERS:

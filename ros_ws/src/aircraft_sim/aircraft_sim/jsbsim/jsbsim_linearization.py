@@ -33,24 +33,24 @@ from flight_core.vectors import FloatArray
 RATES = ("p", "q", "r")
 MOTION = 0.01  # rad/s of a rate, and wind over V0: small beside the tables of a model
 SIZES = (0.05, 0.1, 0.2)
-"""Steps of a command: the small ones stay linear, the large ones exceed a hysteresis and reach a
+"""Steps of a command: the small ones stay linear, the large ones exceed a hysteresis or reach a
 rate limit."""
 MAX_STEP_FRACTION = 0.9  # upper bound of a step, as a fraction of the distance to the end stop
 SURFACE_TIME = 0.5  # s of frozen flight: long enough for flight control systems
 ENGINE_TIME = 20.0  # s: a turbine at altitude spools up in less
-STILL = 1e-6  # m/s^2, rad/s^2: an acceleration that a step does not move
-LEAST = 1e-6  # SI: an entry below it is rounding
+STILL = 1e-6  # m/s^2, rad/s^2: less than this, and a step moves nothing
+LEAST = 1e-6  # SI: an entry below this is rounding
 
 
 class Linearization(NamedTuple):
-    """An aircraft of JSBSim about its trim: an airframe, and what the steps of its inputs show."""
+    """An aircraft of JSBSim about its trim: an airframe, and what steps of its inputs show."""
 
-    condition: FlightCondition  # without a rudder that moves nothing
+    condition: FlightCondition  # a rudder that moves nothing is left out
     trim: Trim
     airframe: Airframe
     lag: FloatArray  # (m,) s, of each input's own output, the longest of all sizes
     size: FloatArray  # (m,) of the step with the largest effect, which counts
-    spread: FloatArray  # (m,) smallest effect of all sizes over the largest: 1 is linear
+    spread: FloatArray  # (m,) smallest effect of all sizes over the largest; 1 if it is linear
     still: tuple[str, ...]  # steps without an effect, in sentences
 
     @property
@@ -59,16 +59,16 @@ class Linearization(NamedTuple):
         return np.asarray(self.airframe.matrix_c() @ self.airframe.matrix_b())
 
     def travel(self) -> FloatArray:
-        """The distance of each input to its nearer end stop, (m,)."""
+        """Return the distance of each input to its nearer end stop, (m,)."""
         return np.minimum(-self.trim.lower, self.trim.upper)[: len(self.lag)]
 
     def authority(self) -> FloatArray:
-        """y_dot of each output by its own input at the nearer end stop, (m,), SI."""
+        """Compute the y_dot that each input gives its output at the nearer end stop, (m,), SI."""
         return np.abs(np.diag(self.Omega)) * self.travel()
 
 
 def linearize(condition: FlightCondition) -> Linearization:
-    """The linear aircraft about the trim of a flight condition.
+    """Linearise an aircraft about the trim of a flight condition.
 
         x = (V, alpha, q, theta, beta, p, r, phi),  x_dot = A x + gravity sin(x) + B u + wind w
         x_dot of V, alpha, beta: the accelerations in the axes of the flight path,
@@ -78,10 +78,10 @@ def linearize(condition: FlightCondition) -> Linearization:
             beta_dot += g cos(theta) / V sin(phi),  for the small bank of a trim
         B_j = x_dot(t_end) / size,  lag_j = step + integral of 1 - x_dot(t) / x_dot(t_end)
 
-    u in normalised commands from trim, w along AXES in m/s, lags of the output that an input
-    drives. The step is JSBSim's: a command acts a step later. Attitude acts by gravity alone, and
-    altitude not at all. Raises FlightEnded without a trim, and for an output that its input does
-    not move.
+    u is in normalised commands from trim, w along AXES in m/s, and each lag is that of the output
+    that the input drives. The step is JSBSim's: a command acts a step later. Attitude acts only by
+    gravity, and altitude not at all. Raises FlightEnded if there is no trim, or if an input does
+    not move its output.
     """
     solution = trim_solution(condition)
     _, trim = trimmed_fdm(condition, solution)
@@ -109,7 +109,7 @@ def linearize(condition: FlightCondition) -> Linearization:
 
 
 def driven(name: str) -> str:
-    """The output that an input drives."""
+    """Name the output that an input drives."""
     return list(OUTPUTS)[list(INPUTS).index(name)]
 
 
@@ -128,7 +128,7 @@ class _InputSteps(NamedTuple):
 
 
 def _steps(condition: FlightCondition, trim: Trim, name: str) -> _InputSteps | None:
-    """The response to steps of an input both ways; None where its output does not move."""
+    """Record the response to steps of an input both ways; None if its output does not move."""
     output = driven(name)
     place = list(INPUTS).index(name)
     travel = MAX_STEP_FRACTION * float(min(-trim.lower[place], trim.upper[place]))
@@ -161,7 +161,7 @@ def _steps(condition: FlightCondition, trim: Trim, name: str) -> _InputSteps | N
 
 
 def _response(condition: FlightCondition, trim: Trim, name: str, size: float) -> FloatArray:
-    """x_dot at each step of frozen flight after a step of an input, (N, n)."""
+    """Record x_dot at each step of frozen flight after a step of an input, (N, n)."""
     fdm, _ = trimmed_fdm(condition, trim_solution(condition))
     for path, at_one in command_paths(condition.commands()[name], engine_count(fdm)):
         fdm[path] += at_one * size
@@ -175,7 +175,7 @@ def _response(condition: FlightCondition, trim: Trim, name: str, size: float) ->
 
 
 def _x_dot(fdm: jsbsim.FGFDMExec, condition: FlightCondition, trim: Trim) -> FloatArray:
-    """The derivatives from the accelerations, (n,); 0 of the attitude."""
+    """Compute the derivatives from the accelerations, (n,); those of the attitude are 0."""
     u_dot, v_dot, w_dot, p_dot, q_dot, r_dot = residuals(fdm)
     alpha = _trim_state(trim, "alpha")
     along = math.cos(alpha) * u_dot + math.sin(alpha) * w_dot
@@ -189,7 +189,7 @@ def _trim_state(trim: Trim, name: str) -> float:
 
 
 def _derivative(condition: FlightCondition, trim: Trim, name: str) -> FloatArray:
-    """Change of x_dot by a unit of a rate, rad/s, or of the wind along an axis, m/s, (n,)."""
+    """Compute how x_dot changes by 1 rad/s of a rate, or 1 m/s of wind along an axis, (n,)."""
     ends = []
     for sign in (1.0, -1.0):
         fdm, _ = trimmed_fdm(condition, trim_solution(condition))
@@ -216,7 +216,7 @@ def _set_rate(fdm: jsbsim.FGFDMExec, trim: Trim, name: str, value: float) -> Non
 
 
 def _airframe(condition: FlightCondition, trim: Trim, B: FloatArray) -> Airframe:
-    """The airframe of a trim with the columns of its inputs."""
+    """Build the airframe of a trim with the columns of its inputs."""
     places = {name: i for i, name in enumerate(AIRPLANE_STATES)}
     V = condition.speed
     wind = np.column_stack([_derivative(condition, trim, axis) for axis in AXES])

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Flight dynamics model of JSBSim: a six-degree-of-freedom aircraft.
 
-Flown around a trim point like the linear aircraft.
+It flies around a trim point like the linear aircraft.
 """
 
 import math
@@ -44,7 +44,7 @@ POSE = (
 THROTTLE = list(INPUTS).index("throttle")
 
 LEAST_FUEL = 1.0
-"""lb, of all tanks: an engine that stops with less is out of fuel."""
+"""lb, in all tanks: an engine that stops with less than this is out of fuel."""
 
 
 class JsbsimModel:
@@ -56,14 +56,14 @@ class JsbsimModel:
         wind+     = gusts(t_k + dt) + turbulence.wind(z+), along the heading, to the right and down
         commands  = trim + actuators.effect(t_k, position+), then JSBSim runs
 
-    Engines whose throttle is lost have the throttle at 0 and no fuel or ignition.
+    Engines whose throttle is lost have it at 0, and no fuel or ignition.
 
     JSBSim integrates the forces of the step before, then computes the forces of the new commands
-    and the new wind: commands and wind act a step later. JSBSim computes forces at an instant, t_k
-    + dt, so the position at this instant is right: the mean over the past step would be half a step
-    older.
+    and the new wind, so commands and wind act a step later. Since it computes forces at an instant,
+    t_k + dt, the position at this instant is the right one: the mean over the past step would be
+    half a step older.
 
-    Raises FlightEnded where the aircraft does not trim, crashes or hangs. An isolated process tries
+    Raises FlightEnded if the aircraft does not trim, crashes or hangs. An isolated process tries
     the aircraft first.
     """
 
@@ -75,7 +75,7 @@ class JsbsimModel:
             condition, jsbsim_trim.trim_solution(condition)
         )
         engines = engine_count(self._fdm)
-        # For each input the nodes, their values in trim and at the command 1.
+        # For each input: the nodes, and their values in trim and at the command 1.
         self._commands = [
             [
                 (node := self._node(path), node.get_double_value(), at_one)
@@ -91,7 +91,7 @@ class JsbsimModel:
             self._node(path)
             for path in (jsbsim_trim.HEADING, jsbsim_trim.HEIGHT, jsbsim_trim.CONTACT)
         )
-        # The number and the flag of the engines that can stop: an electric engine has no flag.
+        # The number and the flag of each engine that can stop; an electric engine has no flag.
         running = {i + 1: self._node(jsbsim_trim.running_property(i)) for i in range(engines)}
         self._engines = {
             number: node for number, node in running.items() if node.get_double_value()
@@ -113,7 +113,7 @@ class JsbsimModel:
         self._altitude = self._node("position/h-sl-ft")
         self._position_ground = np.zeros(2)  # to the north and the east of the start
         self._apply_wind(self._wind(0))
-        # A step is made here: the wind of t = 0 acts from t = 0 on.
+        # Make a step here, so that the wind of t = 0 acts from t = 0 on.
         settle(self._fdm, seconds(condition.step_ns))
         self._x = self._deviations()
         self._pose_nodes = [(self._node(path), si) for path, si in POSE]
@@ -125,9 +125,9 @@ class JsbsimModel:
         )
 
     def advance(self, t_ns: int, u: FloatArray, duration_ns: int) -> None:
-        """From t to t + duration with the command u held, shape (m,), deviations from trim.
+        """Fly from t to t + duration with the command u held, shape (m,), deviations from trim.
 
-        Raises FlightEnded where JSBSim fails, an engine stops or the aircraft touches the ground.
+        Raises FlightEnded if JSBSim fails, an engine stops or the aircraft touches the ground.
         """
         step_ns = self.condition.step_ns
         model = self._actuator_model
@@ -171,7 +171,7 @@ class JsbsimModel:
         self._require_flight(t_ns + duration_ns, sink)
 
     def _require_flight(self, t_ns: int, sink: float) -> None:
-        """Raise FlightEnded on the ground, after a sink in m/s, and where an engine stopped."""
+        """Raise FlightEnded on the ground, given the sink in m/s, and if an engine has stopped."""
         if self._height.get_double_value() < 0.0 or abs(self._contact.get_double_value()) > 0.0:
             is_on_wheels = not any(node.get_double_value() for node in self._structure)
             raise touch(self.condition.title, t_ns, sink, is_on_wheels=is_on_wheels)
@@ -185,18 +185,18 @@ class JsbsimModel:
             )
 
     def y(self) -> FloatArray:
-        """[q, V, p, r], deviations from trim, shape (4,)."""
+        """Return [q, V, p, r], deviations from trim, shape (4,)."""
         return self._x[: len(OUTPUTS)]
 
     def air_angles(self, t_ns: int) -> FloatArray:
         """See `simulator.FlightDynamicsModel`.
 
-        alpha and beta of JSBSim are those relative to the air.
+        alpha and beta of JSBSim are relative to the air.
         """
         return self._x[[list(STATES).index(name) for name in ANGLES]]
 
     def truth(self, t_ns: int) -> FloatArray:
-        """Values in the order of `truth_names`."""
+        """Return the values in the order of `truth_names`."""
         return np.concatenate([self._x, self._wind(t_ns), self._position])
 
     def pose(self) -> FloatArray:
@@ -224,15 +224,15 @@ class JsbsimModel:
         self._wind_model = self._wind_model._replace(gusts=parameters.gust_arrays(AXES))
 
     def _cut_engines(self, cut: bool) -> None:
-        """Stop the engines with the begin of their loss, and start them with its end.
+        """Stop the engines when they are lost, and start them when that ends.
 
-        Whether they run is then no outcome.
+        Whether they run is not an outcome of the flight then.
         """
         if cut == self._are_engines_cut:
             return
         jsbsim_trim.cut_engines(self._fdm, cut)
         self._are_engines_cut = cut
-        self._engines = {}  # one that was cut off may need longer than a step to run again
+        self._engines = {}  # an engine that was cut off may need longer than a step to run again
 
     def _deviations(self) -> FloatArray:
         return (
@@ -248,7 +248,7 @@ class JsbsimModel:
         return node
 
     def _wind(self, t_ns: int) -> FloatArray:
-        """Wind along AXES in m/s, shape (3,), at the instant of the turbulence's state."""
+        """Return the wind along AXES, (3,), m/s, at the instant of the turbulence's state."""
         gusts = one_minus_cosine(
             np.array(seconds(t_ns)), self._wind_model.gusts, np.array(self.condition.speed)
         )

@@ -52,8 +52,8 @@ WIND = ("atmosphere/wind-north-fps", "atmosphere/wind-east-fps", "atmosphere/win
 
 MIXTURE = 0.9  # of piston engines: rich
 BOTH_MAGNETOS = 3.0  # ignition of piston engines: 0 off, 1 left, 2 right
-SETTLE = 10.0  # s of frozen flight: for running engines
-SPIN_UP = 30.0  # and for engines that have just been started
+SETTLE = 10.0  # s of frozen flight in which running engines settle
+SPIN_UP = 30.0  # the same for engines that have just been started
 SLOW_SETTLE = 80.0
 SLOW_SPIN_UP = 300.0
 """The same for a propeller that is slow to reach its speed, such as one of an electric engine with
@@ -65,13 +65,13 @@ ATTEMPTS = (
     (SETTLE, SPIN_UP, 1.0),
     (SLOW_SETTLE, SLOW_SPIN_UP, 1.0),
 )
-"""Settling times, s, and the part of the pitch trim given by the elevator: all, for a model without
-a trim of its own."""
+"""Settling times, s, and the fraction of the pitch trim that the elevator gives: all of it for a
+model without a trim of its own."""
 
-# Multiple of TOLERANCE that an engine leaves which has not settled; with more it is not the engine.
+# Multiple of TOLERANCE that an engine leaves until it has settled; more has another cause.
 NEAR = 100.0
-FAR = 1e6  # of TOLERANCE: of a motion whose accelerations are not finite
-IDLE = 0.01  # throttle below which an engine without thrust is no failure
+FAR = 1e6  # of TOLERANCE, in place of accelerations that are not finite
+IDLE = 0.01  # throttle below which an engine may give no thrust
 
 # alpha (rad), throttle, pitch trim, aileron, rudder (1), bank (rad).
 START = np.array([0.05, 0.7, 0.0, 0.0, 0.0, 0.0])
@@ -85,7 +85,7 @@ TOLERANCE = np.array([0.02, 0.02, 0.02, 0.002, 0.002, 0.002])
 NOT_BALANCED = "are left at best"  # words of a trim that the solver does not reach
 AXES_OF_RESIDUALS = ("forward", "sideways", "up or down", "in roll", "in pitch", "in yaw")
 NEIGHBOURS = ((0.9, 1.0), (1.1, 1.0), (0.75, 1.0), (1.35, 1.0), (1.0, 0.5), (0.75, 0.5))
-"""Factors on speed and altitude of the conditions tried beside one without a trim, by distance."""
+"""Factors on speed and altitude to try if a condition has no trim, by distance."""
 
 PROBE_TIME = 2.0  # s of the test flight in the isolated process
 PROBE_SIZE = 0.02  # how far the test flight moves each command
@@ -175,7 +175,7 @@ def solve_and_probe(
 def trimmed_fdm(
     condition: FlightCondition, solution: TrimSolution
 ) -> tuple[jsbsim.FGFDMExec, Trim]:
-    """The aircraft in the trim of a solution.
+    """Load the aircraft in the trim of a solution.
 
     Raises FlightEnded where the aircraft cannot be loaded.
     """
@@ -194,14 +194,14 @@ def trimmed_fdm(
 
 
 def structure_contacts(fdm: jsbsim.FGFDMExec) -> list[str]:
-    """The properties that are 1 while a part of the structure, not a wheel, touches the ground."""
+    """List the properties that are 1 while the structure, not a wheel, touches the ground."""
     catalog = fdm.query_property_catalog("contact/unit")
     lines = catalog.splitlines() if isinstance(catalog, str) else catalog
     return [line.split()[0] for line in lines if "/WOW" in line]
 
 
 def running_property(engine: int) -> str:
-    """The property with the value 1 while an engine runs.
+    """Name the property with the value 1 while an engine runs.
 
     An electric engine of JSBSim never has this value.
     """
@@ -209,24 +209,24 @@ def running_property(engine: int) -> str:
 
 
 def thrust_property(engine: int) -> str:
-    """The property of the thrust of an engine, lbf."""
+    """Name the property of the thrust of an engine, lbf."""
     return f"propulsion/engine[{engine}]/thrust-lbs"
 
 
 def cut_engines(fdm: jsbsim.FGFDMExec, cut: bool) -> None:
     """Cut off the fuel of all turbines and turboprops and the ignition of all pistons.
 
-    With `cut` false switch both on again. An electric engine and a rocket have no such switch: they
-    stop at throttle 0, where a turbine idles and gives thrust.
+    If `cut` is false, switch both on again. An electric engine and a rocket have no such switch:
+    they stop at throttle 0, where a turbine idles and gives thrust.
     """
     fdm["propulsion/cutoff_cmd"] = float(cut)
     fdm["propulsion/magneto_cmd"] = 0.0 if cut else BOTH_MAGNETOS
 
 
 def error_text(error: jsbsim.BaseError) -> str:
-    """JSBSim's message on a line.
+    """Write JSBSim's message on a single line.
 
-    Most often a property of a flight simulator around JSBSim is missing.
+    Most often it says that a property of a flight simulator around JSBSim is missing.
     """
     text = " ".join(str(error).split())
     missing = re.search(r"The property (\S+) does not exist", text)
@@ -236,13 +236,13 @@ def error_text(error: jsbsim.BaseError) -> str:
 
 
 def _solve_trim(condition: FlightCondition) -> TrimSolution:
-    """The trim: level, straight, sideslip 0, with the necessary bank angle.
+    """Find the trim: level, straight, sideslip 0, with the bank angle that this needs.
 
-    JSBSim's own trim comes first and assumes settled engines and flight control systems, so these
-    get time in frozen flight: everything runs but position, velocity and attitude. Where JSBSim's
-    trim fails, or does not last, a solver finds the six unknowns (alpha, throttle, pitch trim,
-    aileron, rudder, bank) in frozen flight, where everything has settled. Raises FlightEnded with
-    one sentence where there is no trim.
+    JSBSim's own trim comes first. It assumes settled engines and flight control systems, so these
+    get time in frozen flight, where everything runs except position, velocity and attitude. If
+    JSBSim's trim fails, or does not last, a solver finds the six unknowns (alpha, throttle, pitch
+    trim, aileron, rudder, bank) in frozen flight, where everything has settled. Raises FlightEnded
+    with one sentence if there is no trim.
     """
     fdm = _load(condition)
     try:
@@ -267,7 +267,7 @@ def _solve_trim(condition: FlightCondition) -> TrimSolution:
             if residual < nearest or not problem:
                 nearest = residual
                 problem = _trim_failure(attempt, condition)
-            # A solver far from a trim may have left it with numbers that are not finite.
+            # A solver that ends far from a trim may have left numbers that are not finite.
             fdm = _load(condition)
     except jsbsim.BaseError as error:
         problem = error_text(error)
@@ -278,7 +278,7 @@ def _solve_trim(condition: FlightCondition) -> TrimSolution:
 
 
 def _require_effect(condition: FlightCondition) -> None:
-    """Raise FlightEnded for an elevator or a throttle that moves nothing: no trim can be found."""
+    """Refuse an elevator or a throttle that moves nothing, because no trim can be found then."""
     fdm = _load(condition)
     commands = condition.commands()
     _start_engines(fdm, condition)
@@ -320,7 +320,7 @@ def _load(condition: FlightCondition) -> jsbsim.FGFDMExec:
 
 
 def _loaded(foreign: Path | None, name: str, folder: Path) -> jsbsim.FGFDMExec:
-    """A model of the package by its name, or a foreign one as a copy in a folder.
+    """Load a model of the package by its name, or a foreign one as a copy in a folder.
 
     Raises ParameterError, OSError and BaseError.
     """
@@ -345,7 +345,7 @@ def _loaded(foreign: Path | None, name: str, folder: Path) -> jsbsim.FGFDMExec:
 
 
 def _properties(condition: FlightCondition, engines: int) -> list[str]:
-    """Every property for reading or writing in flight."""
+    """List every property that is read or written in flight."""
     inputs = condition.commands().values()
     commands = [
         path
@@ -372,7 +372,7 @@ def _properties(condition: FlightCondition, engines: int) -> list[str]:
 
 
 def _jsbsim_trim(fdm: jsbsim.FGFDMExec, condition: FlightCondition) -> bool:
-    """Apply JSBSim's own trim; whether the trim succeeds and lasts."""
+    """Apply JSBSim's own trim, and return whether it succeeds and lasts."""
     fdm.run_ic()
     fdm["propulsion/set-running"] = -1  # all engines
     try:
@@ -386,7 +386,7 @@ def _jsbsim_trim(fdm: jsbsim.FGFDMExec, condition: FlightCondition) -> bool:
 def _solve_accelerations(
     fdm: jsbsim.FGFDMExec, condition: FlightCondition, settling: float, by_elevator: float
 ) -> tuple[float, ...]:
-    """The solver's root of the accelerations after `settling` s of frozen flight.
+    """Solve for zero accelerations after `settling` s of frozen flight.
 
     The unknowns are x = START + (scaled - 1) SCALE.
     """
@@ -398,7 +398,7 @@ def _solve_accelerations(
         return residuals(fdm)
 
     _start_engines(fdm, condition)
-    # The unknowns stay inside the stops, also where an input has no effect: a flying wing has no
+    # The unknowns stay inside the stops, even if an input has no effect: a flying wing has no
     # rudder.
     if by_elevator:
 
@@ -454,7 +454,7 @@ def _is_trimmed(fdm: jsbsim.FGFDMExec, condition: FlightCondition) -> bool:
 
 
 def _trim_failure(fdm: jsbsim.FGFDMExec, condition: FlightCondition) -> str:
-    """Why the solver's result is no trim, as a sentence."""
+    """Say why the solver's result is no trim, in a sentence."""
     engines = range(engine_count(fdm))
     paths = command_paths(condition.commands()["throttle"], len(engines))
     idle = [fdm[path] < IDLE * at_one for path, at_one in paths]
@@ -491,9 +491,9 @@ def _engines_start(condition: FlightCondition) -> bool:
 
 
 def nearest_trim(condition: FlightCondition) -> str:
-    """The nearest speed and altitude of NEIGHBOURS at which an aircraft trims, in words.
+    """Name the nearest speed and altitude of NEIGHBOURS at which an aircraft trims, in words.
 
-    "" for none.
+    Returns "" if there is none.
     """
     for speed, altitude in NEIGHBOURS:
         near = condition._replace(

@@ -16,7 +16,7 @@ MIN_LAG = 1e-30
 class Actuators(NamedTuple):
     """Parameters of m actuators, SI.
 
-    An ideal actuator has lag 0 and infinite limits. None: no actuator has this property.
+    An ideal actuator has lag 0 and infinite limits. If a property is None, no actuator has it.
     """
 
     lag: Array | None = None  # (m,) time constant of the first-order response, s, 0 = none
@@ -46,7 +46,7 @@ class Actuators(NamedTuple):
 
 
 def step(position: Array, command: Array, dt: Any, params: Actuators) -> Array:
-    """Actuator positions one step later, shape (m,), with the command held over the step.
+    """Advance the actuator positions by a step, shape (m,), with the command held over it.
 
         target  = command - clip(command, -dead_zone, dead_zone)
             dead zone: zero inside, no jump at the edge
@@ -56,9 +56,9 @@ def step(position: Array, command: Array, dt: Any, params: Actuators) -> Array:
         limited = position + clip(lagged - position, -rate dt, rate dt)        rate limit
         p+      = clip(limited, lower, upper)                                  end stops
 
-    A line is a property of the actuator and takes the result of the line before. An ideal actuator
-    passes the command on to the last bit: the difference is zero, and the limits only choose
-    between values.
+    Each line is a property of the actuator and takes the result of the line before. An ideal
+    actuator passes the command on to the last bit, because the difference is zero and the limits
+    only choose between values.
 
     Shapes: position, command (m,), dt (). Units: SI, deviations from trim; dt > 0 in s.
     Source: the lag is the zero-order-hold equivalent of 1 / (lag s + 1); Franklin, Powell, Workman,
@@ -77,9 +77,9 @@ def step(position: Array, command: Array, dt: Any, params: Actuators) -> Array:
 
 
 def mean_position(position: Array, command: Array, new: Array, dt: Any, params: Actuators) -> Array:
-    """Mean of the actuator positions over a step from `position` to `new`, shape (m,).
+    """Compute the mean actuator positions over a step from `position` to `new`, shape (m,).
 
-    The input of the aircraft in this step:
+    This is the input of the aircraft in this step:
 
         input                                                                     as in `step`
         lagged  = input - (input - position) lag / dt (1 - exp(-dt / lag))
@@ -89,8 +89,8 @@ def mean_position(position: Array, command: Array, new: Array, dt: Any, params: 
         mean    = clip(limited, min(position, new), max(position, new))
             the motion is monotonic and has end stops
 
-    The step in which a limit begins or ceases to act has an approximate mean, between the two ends.
-    An ideal actuator has mean = new, to the last bit.
+    In a step in which a limit begins or ceases to act, the mean is approximate and lies between the
+    two ends. An ideal actuator has mean = new, to the last bit.
 
     Shapes and units as in `step`; `new` is the result of `step`.
     """
@@ -111,9 +111,9 @@ def mean_position(position: Array, command: Array, new: Array, dt: Any, params: 
 def move(
     t: Any, position: Array, command: Array, dt: Any, params: Actuators
 ) -> tuple[Array, Array]:
-    """Positions at the end of a step from t on, and the mean input over the step.
+    """Return the positions at the end of a step from t, and the mean input over the step.
 
-    The input is that of the aircraft; both are with faults, shapes (m,).
+    The input is that of the aircraft. Both include faults and have shape (m,).
     """
     now = in_force(t, position, params)
     end = step(position, command, dt, now)
@@ -124,10 +124,10 @@ def move(
 
 
 def in_force(t: Any, position: Array, params: Actuators) -> Actuators:
-    """Parameters of a step from t on.
+    """Return the parameters of a step from t on.
 
-    A slow actuator has at least `slow_lag`, a loose one the backlash `loose_play`, and a runaway
-    goes to `hard_over_to` at the rate limit, without a lag.
+    A slow actuator has at least the lag `slow_lag`, a loose one has the backlash `loose_play`, and
+    a runaway goes to `hard_over_to` at the rate limit, without a lag.
     """
     xp = array_namespace(position)
     if params.slow_at is not None:
@@ -150,13 +150,13 @@ def in_force(t: Any, position: Array, params: Actuators) -> Actuators:
 
 
 def effect(t: Any, position: Array, params: Actuators) -> Array:
-    """The input of the aircraft at these positions, shape (m,).
+    """Compute the input of the aircraft at these positions, shape (m,).
 
         t >= weak_at    no_thrust + weak_effect (position - no_thrust)
             a part of the thrust, also of that in trim
         else            position
 
-    Arguments: `position` at t, after `apply_faults`.
+    `position` is the one at t, after `apply_faults`.
     """
     if params.weak_at is None:
         return position
@@ -178,17 +178,17 @@ def _input(position: Array, command: Array, params: Actuators) -> Array:
 
 
 def apply_faults(t: Any, position: Array, new: Array, params: Actuators) -> Array:
-    """Actuator positions at the end of a step from t on, with faults applied, shape (m,).
+    """Apply faults to the actuator positions at the end of a step from t on, shape (m,).
 
-    They may be means over the step.
+    The positions may also be means over the step.
 
         t >= stuck_at    position    the actuator keeps the position
         t >= lost_at     no_thrust
             an engine or a rotor stops at once, a surface floats at trim; also if stuck before
         else             new
 
-    Arguments: `position` at t, `new` without faults. A fault within a step acts from the next step
-    on.
+    `position` is the one at t, `new` the one without faults. A fault within a step acts from the
+    next step on.
     """
     xp = array_namespace(position)
     if params.stuck_at is not None:

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Equation (1), the aircraft: x_dot = A x + f(x, t) + B u, y = C x, in deviations from trim.
 
-f(x, t) = f_state(x) + f_time(t). `x_dot` computes the sum at an instant. `plant.advance` computes
-f_time once for the instants of the steps.
+f(x, t) = f_state(x) + f_time(t). `x_dot` computes the sum at one instant, while `plant.advance`
+computes f_time once for all instants of the steps.
 """
 
 from typing import Any, NamedTuple
@@ -23,7 +23,7 @@ class Coupling(NamedTuple):
 class EulerKinematics(NamedTuple):
     """Nonlinear kinematics in place of the linear kinematics of A.
 
-    Angles belong to the stability axes: 0 in trim.
+    Angles belong to the stability axes, so they are 0 in trim.
     """
 
     select: Array  # (5, n), picks phi, theta, p, q, r
@@ -37,7 +37,7 @@ class EulerKinematics(NamedTuple):
 class Aircraft(NamedTuple):
     """Matrices of equation (1) and the terms of f as arrays, SI and radians.
 
-    None: the term is absent.
+    A term that is None is absent.
     """
 
     A: Array  # (n, n)
@@ -51,36 +51,35 @@ class Aircraft(NamedTuple):
     bias: Bias | None = None
     sines: Sines | None = None
     kinematics: EulerKinematics | None = None
-    # (n,) of x_dot, where the matrices are those of another airspeed than the trim's
+    # (n,) term of x_dot if the matrices belong to another airspeed than the trim's
     trim: Array | None = None
 
 
 def f(t: Any, x: Array, params: Aircraft, turbulence: Array | None = None) -> Array:
-    """Uncertain part of equation (1), shape (n,):
+    """Compute the uncertain part of equation (1), shape (n,).
 
-        f = gravity @ sin(x) + gain @ (x[first] x[second]) + gust_direction @ (w(t) + turbulence) +
-        bias(t) + sines(t)
-            + kinematics(x)
+        f = gravity @ sin(x) + gain @ (x[first] x[second]) + gust_direction @ (w(t) + turbulence)
+            + bias(t) + sines(t) + kinematics(x)
 
-    `turbulence` is the wind along the G axes, shape (G,), m/s; None: no turbulence. x may hold N
-    states in columns, (n, N).
-    """  # noqa: D415 - what follows is an equation
+    `turbulence` is the wind along the G axes, shape (G,), m/s, or None for no turbulence. x may
+    hold N states in columns, (n, N).
+    """
     return f_state(x, params) + f_time(t, wind(t, params, turbulence), params)
 
 
 def x_dot(t: Any, x: Array, u: Array, params: Aircraft, turbulence: Array | None = None) -> Array:
-    """Equation (1): A x + f(x, t) + B u, shape (n,)."""
+    """Evaluate equation (1): A x + f(x, t) + B u, shape (n,)."""
     return x_dot_forced(x, f_time(t, wind(t, params, turbulence), params) + params.B @ u, params)
 
 
 def x_dot_forced(x: Array, forced: Array, params: Aircraft) -> Array:
-    """A x + f_state(x) + forced, shape (n,): equation (1) with forced = f_time + B u."""
-    # `dot` takes a third of the time of @ for a few states, with the same bits.
+    """Compute A x + f_state(x) + forced, shape (n,): equation (1) with forced = f_time + B u."""
+    # For a few states `dot` takes a third of the time of @, and gives the same bits.
     return params.A.dot(x) + f_state(x, params) + forced
 
 
 def f_state(x: Array, params: Aircraft) -> Array:
-    """The state-dependent part of f, shape (n,).
+    """Compute the state-dependent part of f, shape (n,).
 
     gravity @ sin(x) + gain @ (x[first] x[second]) + kinematics(x).
     """
@@ -92,7 +91,7 @@ def f_state(x: Array, params: Aircraft) -> Array:
 
 
 def kinematics(x: Array, params: EulerKinematics) -> Array:
-    """Difference of the nonlinear and the linear kinematics, shape (n,):
+    """Compute the difference between the nonlinear and the linear kinematics, shape (n,).
 
         alpha_dot += g/V0 (cos phi cos theta - 1)
         phi_dot    = p + tan theta (q sin phi + r cos phi)
@@ -100,7 +99,7 @@ def kinematics(x: Array, params: EulerKinematics) -> Array:
 
     The first term is the loss of lift along the vertical in a bank. Source: B. L. Stevens, F. L.
     Lewis, Aircraft Control and Simulation, 2nd ed. (2003), eqs. (1.3-22), (2.4-5).
-    """  # noqa: D415 - what follows is an equation
+    """
     xp = array_namespace(x)
     phi, theta, p, q, r = params.select @ x
     sine = xp.sin(phi)
@@ -114,9 +113,9 @@ def kinematics(x: Array, params: EulerKinematics) -> Array:
 
 
 def f_time(t: Any, wind: Array, params: Aircraft) -> Array:
-    """The time-dependent part of f, shape (n,).
+    """Compute the time-dependent part of f, shape (n,).
 
-    gust_direction @ wind + bias(t) + sines(t); wind of shape (G,), m/s.
+    gust_direction @ wind + bias(t) + sines(t),  wind of shape (G,), m/s
     """
     total = params.gust_direction @ wind
     if params.bias is not None:
@@ -127,7 +126,7 @@ def f_time(t: Any, wind: Array, params: Aircraft) -> Array:
 
 
 def wind(t: Any, params: Aircraft, turbulence: Array | None = None) -> Array:
-    """The wind along the G axes, shape (G,), m/s: gusts + turbulence."""
+    """Compute the wind along the G axes, shape (G,), m/s: gusts + turbulence."""
     gusts = one_minus_cosine(t, params.gusts, params.speed)
     return gusts if turbulence is None else gusts + turbulence
 
@@ -140,7 +139,7 @@ class Forcing(NamedTuple):
 
 
 def at_times(t: Array, params: Aircraft) -> Forcing:
-    """Forcing by the gusts, biases and sines at T instants, t of shape (T,)."""
+    """Compute the forcing by gusts, biases and sines at T instants, t of shape (T,)."""
 
     def column(term: Any) -> Any:
         if term is None:
@@ -155,5 +154,5 @@ def at_times(t: Array, params: Aircraft) -> Forcing:
 
 
 def y(x: Array, params: Aircraft) -> Array:
-    """Measured output y = C x, shape (m,)."""
+    """Compute the measured output y = C x, shape (m,)."""
     return params.C.dot(x)

@@ -4,7 +4,7 @@
 
     faults: [aileron lost 60, elevator weak 60 0.3, rudder hard_over 20 upper]
 
-A fault is INPUT KIND AT, AT in s of flight time, and for some kinds how strong the fault is.
+A fault is INPUT KIND AT, with AT in s of flight time, and for some kinds how strong the fault is.
 """
 
 import math
@@ -29,7 +29,7 @@ class FaultKind(NamedTuple):
 
 HARD_OVER = "hard_over"
 ENDS = ("lower", "upper")
-"""Ends of a runaway, as the keys of the stops."""
+"""Ends to which an effector can run away, as the keys of the stops."""
 
 KINDS = {
     "stuck": FaultKind("stuck_at"),
@@ -40,8 +40,8 @@ KINDS = {
     "slow": FaultKind("slow_at", "slow_lag", 0.2),
     "loose": FaultKind("loose_at", "loose_play", 0.01),
 }
-"""The kinds. Without a strength: half of the effect, ten times the lag of a servo of the osprey in
-s, and a half-width of 0.57 deg, or 1 % of thrust."""
+"""The kinds of faults. If no strength is given, it is half of the effect, ten times the lag of a
+servo of the osprey in s, or a half-width of 0.57 deg or 1 % of thrust."""
 
 STOPPED = frozenset({"stuck", "lost", "failed", HARD_OVER})
 """The kinds after which an input no longer follows u."""
@@ -60,7 +60,7 @@ class Fault(NamedTuple):
 
     @property
     def subject(self) -> str:
-        """As in "aileron lost"."""
+        """Subject of a sentence, such as "aileron lost"."""
         return f"{self.input} {self.kind}"
 
     @property
@@ -70,7 +70,7 @@ class Fault(NamedTuple):
 
 
 def read_fault(sentence: str, key: str) -> Fault:
-    """The fault of a sentence. Raises ParameterError."""
+    """Read the fault in a sentence. Raises ParameterError."""
     words = sentence.split()
     require(len(words) in {3, 4}, key, repr(sentence), FORM)
     name, kind_name, at, *how = words
@@ -107,10 +107,10 @@ def require_possible(
     no_thrust: FloatArray,
     owner: str,
 ) -> None:
-    """Raise ParameterError for a fault that these inputs of `owner` cannot have.
+    """Refuse a fault that these inputs of `owner` cannot have.
 
-    `stops`: the end stops by ENDS; `no_thrust`: the positions without thrust, nan where unknown, 0
-    of a surface.
+    `stops` are the end stops by ENDS. `no_thrust` has the positions without thrust, nan if unknown,
+    0 for a surface.
     """
     effects = [(fault.input, KINDS[fault.kind].begin) for fault in faults]
     for number, fault in enumerate(faults):
@@ -138,7 +138,7 @@ def require_possible(
 def arrays(
     faults: Sequence[Fault], stops: dict[str, Sequence[float]], inputs: Sequence[str]
 ) -> dict[str, Any]:
-    """The faults as fields of `actuators.Actuators`, shapes (m,): infinite for never."""
+    """Return the faults as fields of `actuators.Actuators`, shapes (m,), infinite for never."""
     columns: dict[str, Any] = {}
     for fault in faults:
         kind = KINDS[fault.kind]

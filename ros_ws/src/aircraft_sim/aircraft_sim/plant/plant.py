@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The simulated plant: equation (1) behind actuators, with zero-order hold of u.
 
-Integrated in fixed steps.
+It is integrated in fixed steps.
 """
 
 from typing import Any, NamedTuple
@@ -21,13 +21,13 @@ from flight_core.vectors import Array, array_namespace
 # SI. A state above this limit counts as diverged; no state of an aircraft in flight comes near it.
 DIVERGENCE_LIMIT = 1e6
 
-SHORTEST_DRIFT = 1e-9  # s, for duration 0, which has no division by 0 then
+SHORTEST_DRIFT = 1e-9  # s, replaces a duration of 0, so that nothing is divided by 0
 
 
 class Drift(NamedTuple):
     """A change of A, B and the effect of wind in flight.
 
-    The factors of their entries are those after `duration`, linear in time before.
+    The factors on their entries are those after `duration`; before that they change linearly.
     """
 
     start: float  # s of flight time
@@ -38,7 +38,7 @@ class Drift(NamedTuple):
 
 
 def share(t: Array, start: Any, duration: Any) -> Array:
-    """How far a drift acts at t: 0 before the start, 1 after the duration."""
+    """Compute how far a drift acts at t: 0 before the start, 1 after the duration."""
     xp = array_namespace(t)
     part = xp.minimum((t - start) / xp.maximum(duration, SHORTEST_DRIFT), 1.0)
     return xp.where(t >= start, xp.where(duration > 0.0, part, 1.0), 0.0)
@@ -47,7 +47,7 @@ def share(t: Array, start: Any, duration: Any) -> Array:
 class OverAirspeed(NamedTuple):
     """How A, B and the trim follow the airspeed V0 + V.
 
-    Exponents of the ratio to V0, and trims at K ratios.
+    It has exponents of the ratio to V0, and trims at K ratios.
     """
 
     speed: float  # V0, m/s
@@ -64,7 +64,8 @@ class OverAirspeed(NamedTuple):
 class PlantParams(NamedTuple):
     """Parameters of the plant.
 
-    Aircraft, actuators, integration step, turbulence, drift, and what follows the airspeed.
+    They are aircraft, actuators, integration step, turbulence, drift, and what follows the
+    airspeed.
     """
 
     aircraft: Aircraft
@@ -76,10 +77,11 @@ class PlantParams(NamedTuple):
 
 
 def aircraft_at(t_ns: int, plant: PlantParams, x: Array | None = None) -> Aircraft:
-    """The aircraft at t in the state x, (n,), at the trim without x.
+    """Return the aircraft at t in the state x, (n,), or in trim without x.
 
-    A, B and effect of wind are multiplied by 1 + share (factor - 1). Over the airspeed the entries
-    are times powers of r = 1 + V / V0, and about the trim of r, (x_r, u_r):
+    A, B and the effect of wind are multiplied by 1 + share (factor - 1). Over the airspeed, entries
+    are multiplied by powers of r = 1 + V / V0, and deviations are taken about the trim of r, (x_r,
+    u_r):
 
         x_dot = A x + gravity sin(x) + B u + trim,  trim = -(A x_r + gravity sin(x_r) + B u_r)
     """
@@ -97,7 +99,7 @@ def aircraft_at(t_ns: int, plant: PlantParams, x: Array | None = None) -> Aircra
 
 
 def _at_airspeed(x: Array, aircraft: Aircraft, over: OverAirspeed) -> Aircraft:
-    """The aircraft at the airspeed of a state, within the ratios of the trims."""
+    """Return the aircraft at the airspeed of a state, within the ratios of the trims."""
     least, most = over.ratio[[0, -1]].tolist()
     r = min(max(1.0 + x[over.place].item() / over.speed, least), most)
     A, B, gravity = (
@@ -124,9 +126,9 @@ class AircraftState(NamedTuple):
 
 
 def initial_state(plant: PlantParams) -> AircraftState:
-    """The state in trim: x = 0, actuators at 0.
+    """Return the state in trim: x = 0, actuators at 0.
 
-    The turbulence filters are in a sample of their stationary distribution.
+    The turbulence filters start from a sample of their stationary distribution.
     """
     xp = array_namespace(plant.aircraft.A)
     z = None if plant.turbulence is None else turbulence.initial_state(plant.turbulence)
@@ -136,9 +138,9 @@ def initial_state(plant: PlantParams) -> AircraftState:
 
 
 def forcing(t_ns: int, steps: int, plant: PlantParams, x: Array | None = None) -> Forcing:
-    """Forcing at the beginnings, middles and ends of some steps from t and x on.
+    """Compute the forcing at the beginnings, middles and ends of steps from t and x on.
 
-    These are 2 steps + 1 instants; the aircraft is that of then.
+    These are 2 steps + 1 instants; the aircraft is the one at t.
     """
     halves = array_namespace(plant.aircraft.A).arange(2 * steps + 1, dtype=plant.aircraft.A.dtype)
     return dynamics.at_times(
@@ -154,21 +156,22 @@ def advance(
     plant: PlantParams,
     forced: Forcing | None = None,
 ) -> AircraftState:
-    """State at t + duration from the state at t, with the command u held (zero-order hold).
+    """Integrate from the state at t to t + duration, with the command u held (zero-order hold).
 
-    A step dt, from t_k on, is
+    A step dt from t_k is
 
         position+, mean = actuators.move(t_k, position, u, dt)
         x+  = Runge-Kutta step of equation (1) with the input `mean` and the turbulence at t_k
         z+              = turbulence.step(z, n_k)
 
-    The mean position over the step acts during the whole step: the error against the continuous
-    actuator is of second order in dt, and an ideal actuator passes u on without delay, to the last
-    bit. The turbulence at the beginning of the step acts during the whole step: the spectrum is
-    exact at the steps, with a hold in between. Time is counted in ns, so steps add up exactly.
+    The mean position over the step acts during the whole step. The error against the continuous
+    actuator is then of second order in dt, and an ideal actuator passes u on without delay, to the
+    last bit. The turbulence at the beginning of the step acts during the whole step, so the
+    spectrum is exact at the steps, with a hold in between. Time is counted in ns, so that steps add
+    up exactly.
 
-    The aircraft of t acts during the whole duration. n_k follow from the seed. `forced` is the
-    `forcing` of these steps, from a caller that has computed it. Raises ParameterError where the
+    The aircraft at t acts during the whole duration. n_k follow from the seed. `forced` is the
+    `forcing` of these steps, if the caller has already computed it. Raises ParameterError if the
     step does not divide the duration.
     """
     x, position, z = state
@@ -203,5 +206,5 @@ def diverged(state: AircraftState) -> bool:
 
 
 def output(state: AircraftState, plant: PlantParams) -> Array:
-    """The outputs y = C x, before any sensor, shape (m,)."""
+    """Compute the outputs y = C x, before any sensor, shape (m,)."""
     return dynamics.y(state.x, plant.aircraft)

@@ -139,8 +139,8 @@ def select_gains(
         phase_margin: Least phase margin of the nominal loop behind servos, deg. The gain margin
             must be 6 dB, the sensitivity at most 2 and the damping 0.4. 35 deg with the observer.
         accept: Whether less than 40 deg are accepted.
-        mixing: "diagonal", one input per output, or "full": an allocation u = T v distributes inputs
-            v of the law by the pseudo-inverse of C B, as always with more inputs than outputs.
+        mixing: "diagonal", one input per output, or "full": an allocation u = T v distributes the
+            inputs v by the pseudo-inverse of C B, as always with more inputs than outputs.
         progress: Called with a sentence before each step of the search for the observer.
 
     Returns:
