@@ -85,9 +85,7 @@ class AircraftChannels(NamedTuple):
 class AircraftConfig(NodeConfig):
     """Parameters of the aircraft's node."""
 
-    airframe: str = Field(
-        description="airframe: a name, the path of a file, jsbsim:NAME or jsbsim:PATH"
-    )
+    airframe: str = Field(description="name, path of a file, jsbsim:NAME or jsbsim:PATH")
     speed: Positive | None = Field(
         default=None, description="true airspeed of the trim, m/s; only for JSBSim"
     )
@@ -107,8 +105,7 @@ class AircraftConfig(NodeConfig):
         default=0.0,
         ge=-1,
         le=1e10,
-        description="system time of t = 0, s since the epoch; 0: at once; -1: as the topic "
-        "`start` says",
+        description="system time of t = 0, s since the epoch; 0: at once; -1: by topic `start`",
     )
     start: StartConfig = Field(default=StartConfig(), description="where the aircraft is at t = 0")
     gusts: dict[str, Gust] = Field(
@@ -124,19 +121,14 @@ class AircraftConfig(NodeConfig):
     )
     kinematics: Literal["linear", "euler", "thrust"] = Field(
         default="linear",
-        description="attitude: linear by A; euler by Euler's equations with the loss of lift in a"
-        " bank; "
-        "thrust for a multicopter",
+        description="attitude by A; by Euler's equations, with the loss of lift in a bank; or of a "
+        "multicopter",
     )
     wind: Annotated[Numbers, Field(min_length=2, max_length=2)] = Field(
         default=(0.0, 0.0), description="steady wind, m/s, towards which the air moves: north, east"
     )
-    shear: ShearConfig | None = Field(
-        default=None, description="steady wind as a function of height"
-    )
-    microburst: MicroburstConfig | None = Field(
-        default=None, description="microburst; none: no microburst"
-    )
+    shear: ShearConfig | None = Field(default=None, description="steady wind over the height")
+    microburst: MicroburstConfig | None = Field(default=None, description="a microburst, if any")
     uncertainty: UncertaintyConfig = Field(
         default=UncertaintyConfig(), description="how the aircraft deviates from the airframe file"
     )
@@ -165,11 +157,9 @@ class AircraftConfig(NodeConfig):
         default=0.0,
         ge=0,
         le=1e6,
-        description="flight time at which a lockstep flight ends, s; 0: never",
+        description="end of a lockstep flight, s of flight time; 0: never",
     )
-    recorded: bool = Field(
-        default=False, description="whether a lockstep flight waits for the recorder"
-    )
+    recorded: bool = Field(default=False, description="in lockstep, wait for the recorder")
 
     max_age: float = Field(default=0.2, gt=0, le=1e6, description="age at which u times out, s")
     hold: float = Field(default=0.5, ge=0, le=1e6, description="how long the failsafe holds u, s")
@@ -177,7 +167,7 @@ class AircraftConfig(NodeConfig):
         default=2.0,
         ge=0,
         le=1e6,
-        description="how long the failsafe then takes to bring u to trim, s",
+        description="how long the failsafe then ramps u to trim, s",
     )
 
     @classmethod

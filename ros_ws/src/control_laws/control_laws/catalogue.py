@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Catalogue of the compared laws.
 
-A row has the measurements, the model data, the tuned gains, and the initial gains of a search.
+Each row has the measurements, the model data, the tuned gains, and the initial gains of a search.
 """
 
 from collections.abc import Callable
@@ -35,7 +35,7 @@ INITIAL_CHANNEL_GAINS = {
     "rate_drift": 0.5,
     "decay": 5.0,
 }
-"""Initial gains of a search in every channel, in scaled inputs and SI; K and Lambda start from the
+"""Initial gains of a search in every channel, in scaled inputs and SI. K and Lambda start from the
 lag of the loop."""
 
 INITIAL_COMMON_GAINS = {
@@ -48,7 +48,7 @@ INITIAL_COMMON_GAINS = {
 """Initial gains common to all channels."""
 
 INITIAL_WIND_GAINS = {"gust": 0.5, "wind_time": 2.0}
-"""Noise of the wind, m/s per root s, and the time constant, s, the same for every axis. Dryden's L
+"""Noise of the wind, m/s per root s, and its time constant, s, the same for every axis. Dryden's L
 / V0 at 100 m and 25 m/s is 4 s vertically and 10 s along the flight; a design gust of 15 m peaks
 after 0.6 s."""
 
@@ -56,14 +56,14 @@ after 0.6 s."""
 NONE = "none"
 AIRCRAFT = "aircraft"
 INTEGRATORS = "integrators"
-"""Models of a feedforward: none, A, B and f of the nominal aircraft, y_dot = Omega u."""
+"""Models of a feedforward: none; A, B and f of the nominal aircraft; y_dot = Omega u."""
 
 
 class Law(NamedTuple):
     """A law."""
 
     title: str
-    law: str  # that a scenario names as controller.law
+    law: str  # as a scenario names it in controller.law
     measurements: str  # of the aircraft, besides y_m
     model_data: str  # of the nominal aircraft, besides D
     control_law: Callable[[NominalModel], ControlLaw]
@@ -72,19 +72,19 @@ class Law(NamedTuple):
     feedforward: str = NONE  # model of the feedforward
     # gains at which a search begins; None: by the lag of the loop and the constants above
     initial: Gains | None = None
-    linear: bool = True  # near e = 0
+    linear: bool = True  # whether it is linear near e = 0
 
     @property
     def has_margins(self) -> bool:
         """Whether the law has a linear loop from y to u.
 
-        A law with further measurements or the implicit sign has none.
+        A law with more measurements or with the implicit sign has none.
         """
         return self.linear and self.measurements == "y"
 
 
 def initial_gains(law: Law, model: NominalModel) -> Gains:
-    """Initial gains of the search, shapes (m, 1) and (1, 1)."""
+    """Return the initial gains of the search, shapes (m, 1) and (1, 1)."""
     if law.initial is not None:
         return law.initial
     K = INITIAL_CROSSOVER_LAG_PRODUCT / model.total_lag[:, None]
@@ -100,7 +100,7 @@ def initial_gains(law: Law, model: NominalModel) -> Gains:
 def _over(
     law_params: Callable[[Gains, NominalModel], Any], part: float = observed.PART
 ) -> Callable[[Gains, NominalModel], ObserverParams]:
-    """Parameters of an observer with the aircraft's model over a law.
+    """Return parameters of an observer with the aircraft's model over a law.
 
     `law_params` is the function for the law's own parameters.
     """
@@ -116,7 +116,7 @@ def _extended_state(gains: Gains, model: NominalModel) -> ObserverParams:
 
 
 def _fixed(law: ControlLaw) -> Callable[[NominalModel], ControlLaw]:
-    """A law independent of the model."""
+    """Return a function that gives a law for any model."""
     return lambda _: law
 
 

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Excitation of the inputs in turn, open loop and without control.
 
-Doublets and a multisine excite the inputs for an identification.
+Doublets and a multisine excite each input for an identification.
 """
 
 from functools import cached_property
@@ -25,7 +25,7 @@ class ExcitationParams(NamedTuple):
 
     amplitude: Array  # units of u
     width: Array  # s
-    begin: Array  # s after engagement: of the doublets of an input
+    begin: Array  # s after engagement, when the doublets of an input begin
     period: Array  # s, of the multisine, also the duration
     harmonic: Array  # multiples of 1 / period
     phase: Array  # rad
@@ -40,7 +40,7 @@ class ExcitationState(NamedTuple):
 
 
 def signal(elapsed: Array, params: ExcitationParams) -> Array:
-    """Excitation of every input in units of the amplitude, shape (m,), in [-1, 1].
+    """Compute the excitation of every input over its amplitude, shape (m,), in [-1, 1].
 
     With tau = elapsed - begin in widths w of an input:
 
@@ -48,8 +48,8 @@ def signal(elapsed: Array, params: ExcitationParams) -> Array:
         sum_k part_k sin(2 pi harmonic_k (tau - 8) w / period + phase_k) in [8, 8 + period / w)
             a multisine
 
-    A doublet and the multisine have the mean 0: a rate in proportion to u leaves no attitude
-    behind.
+    A doublet and the multisine have the mean 0, so that a rate in proportion to u leaves no
+    attitude behind.
     """
     xp = array_namespace(params.amplitude)
     since = elapsed - params.begin
@@ -66,10 +66,10 @@ def signal(elapsed: Array, params: ExcitationParams) -> Array:
 def multisine(
     period: float, lowest: float, highest: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Harmonics of 1 / period from `lowest` to `highest`, Hz, phases, and parts of a peak of 1.
+    """Return harmonics of 1 / period from `lowest` to `highest`, Hz, their phases and parts.
 
-    Shapes (h,). phase_k = -pi k (k - 1) / h keeps the peak low. Source: M. R. Schroeder, IEEE
-    Trans. Information Theory 16(1), 1970.
+    Their shapes are (h,), and the parts add up to a peak of 1. phase_k = -pi k (k - 1) / h keeps
+    the peak low. Source: M. R. Schroeder, IEEE Trans. Information Theory 16(1), 1970.
     """
     harmonic = np.arange(
         max(round(lowest * period), 1), max(int(highest * period), 1) + 1, dtype=np.float64
@@ -115,7 +115,7 @@ EXCITATION = ControlLaw(
 
 
 class ExcitationConfig(ControllerConfig):
-    """A controller to excite the inputs in turn, in the order of `inputs`, without control."""
+    """A controller that excites the inputs in turn, in the order of `inputs`, without control."""
 
     amplitude: NonNegatives = Field(description="largest deviation of each input from trim")
     width: Positives = Field(description="half the first doublet of each input, s")
@@ -128,11 +128,11 @@ class ExcitationConfig(ControllerConfig):
 
     @classmethod
     def tunable(cls) -> frozenset[str]:
-        """No parameter: the timetable holds for a whole flight."""
+        """Return no parameter, because the timetable holds for a whole flight."""
         return frozenset()
 
     def check_law(self) -> None:
-        """A value per input, inside the limits of u."""
+        """Check that there is a value per input, inside the limits of u."""
         for key in ("amplitude", "width", "period", "lowest", "highest"):
             require_length(key, getattr(self, key), self.inputs)
         nyquist = self.rate / 2.0
@@ -164,7 +164,7 @@ class ExcitationConfig(ControllerConfig):
 
     @property
     def duration(self) -> float:
-        """Time from engagement to the end of the excitation, s."""
+        """Return the time from engagement to the end of the excitation, s."""
         return float(self.pause + sum(self._each))
 
     @cached_property
@@ -176,11 +176,11 @@ class ExcitationConfig(ControllerConfig):
         ]
 
     def control_law(self) -> ControlLaw:
-        """The excitation."""
+        """Return the excitation."""
         return EXCITATION
 
     def law_params(self) -> Any:
-        """The arrays of the excitation."""
+        """Return the arrays of the excitation."""
         waves = [
             multisine(*band) for band in zip(self.period, self.lowest, self.highest, strict=True)
         ]

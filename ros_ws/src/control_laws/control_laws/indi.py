@@ -36,7 +36,7 @@ class IndiState(NamedTuple):
 
 
 def control_law(model: NominalModel) -> ControlLaw:
-    """A tick inverts the increment of y_dot only; the measured y_dot contains the model error.
+    """Invert only the increment of y_dot at a tick; the measured y_dot contains the model error.
 
         y_dot_f    += a ((y - y_p) / dt - y_dot_f),  position_f += a (position - position_f),
             a = 1 - exp(-bandwidth dt)
@@ -70,7 +70,7 @@ def control_law(model: NominalModel) -> ControlLaw:
 
 
 def indi_params(gains: dict[str, FloatArray], _: NominalModel) -> IndiParams:
-    """Parameters from the gains, shapes (m, N)."""
+    """Compute parameters from the gains, shapes (m, N)."""
     return IndiParams(**gains)
 
 

@@ -16,7 +16,7 @@ from rise_di_controller.law.saturation import Limits
 from rise_di_controller.params import ControllerConfig
 
 ADAPTATION_POLE = 1.0
-"""1/s, of the predictor. It scales the estimate by a dt / (exp(a dt) - 1), 0.995 at 100 Hz; K
+"""1/s, pole of the predictor. It scales the estimate by a dt / (exp(a dt) - 1), 0.995 at 100 Hz; K
 corrects the rest."""
 
 
@@ -40,7 +40,7 @@ class L1State(NamedTuple):
 
 
 def _control_law(*, feedforward: bool) -> ControlLaw:
-    """L1 with piecewise-constant adaptation.
+    """Make L1 with piecewise-constant adaptation.
 
         y_hat     = y_p + dt Omega u_p  u_p, y_p of the previous tick
         sigma_hat = -Phi^-1 exp(-a dt) (y_hat - y),  Phi = (1 - exp(-a dt)) / a  a = ADAPTATION_POLE
@@ -111,7 +111,7 @@ CONTROL_LAWS = {feedforward: _control_law(feedforward=feedforward) for feedforwa
 
 
 def params_of(gains: dict[str, FloatArray], model: NominalModel) -> L1Params:
-    """Parameters from gains K and bandwidth, shapes (m, N)."""
+    """Return parameters from gains K and bandwidth, shapes (m, N)."""
     return L1Params(gains["K"], gains["bandwidth"], model.Omega, model.inverse)
 
 
@@ -122,10 +122,10 @@ class L1Config(ControllerConfig):
     bandwidth: Positives = Field(
         description="bandwidths of the low-pass filter of the estimate, rad/s"
     )
-    Omega: Numbers = Field(description="nominal Omega = C B, a row an output")
+    Omega: Numbers = Field(description="nominal Omega = C B, one row per output")
 
     def check_law(self) -> None:
-        """A value per channel, and an Omega with the controller's D."""
+        """Check that there is a value per channel, and an Omega with the controller's D."""
         for key in ("K", "bandwidth"):
             require_length(key, getattr(self, key), self.outputs)
         m = len(self.outputs)
@@ -149,11 +149,11 @@ class L1Config(ControllerConfig):
         )
 
     def control_law(self) -> ControlLaw:
-        """L1, with the feedforward if any."""
+        """Return L1, with the feedforward if there is one."""
         return CONTROL_LAWS[self.feedforward is not None]
 
     def law_params(self) -> Any:
-        """The arrays of the law."""
+        """Return the arrays of the law."""
         m = len(self.outputs)
         Omega = np.reshape(self.Omega, (m, m))
         return L1Params(np.array(self.K), np.array(self.bandwidth), Omega, np.linalg.inv(Omega))

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Linear-quadratic Gaussian control (LQG).
 
-The observer corrects the trim, and there is no further feedback.
+The observer corrects the trim, and there is no other feedback.
 """
 
 from typing import NamedTuple
@@ -16,17 +16,17 @@ from rise_di_controller.params import ControllerConfig
 
 
 class LqgParams(NamedTuple):
-    """The law has no parameters beside the observer's."""
+    """Empty, because the law has no parameters beside the observer's."""
 
 
 class LqgState(NamedTuple):
-    """The law has no state beside the observer's."""
+    """Empty, because the law has no state beside the observer's."""
 
 
 def _limited(
     state: LqgState, measurements: Measurements, dt: Array, params: LqgParams, limits: Limits
 ) -> tuple[LqgState, Array, Array]:
-    """U = u_trim, shape (m,), saturated. u_trim contains u_o of the observer."""
+    """Saturate u = u_trim, shape (m,); u_trim contains u_o of the observer."""
     u, _ = saturate_with_excess(measurements.u_trim, measurements, dt, limits)
     return state, measurements.u_trim, u
 
@@ -41,7 +41,7 @@ CONTROL_LAW = ControlLaw(
 
 
 def params_of(gains: dict[str, FloatArray], model: NominalModel) -> LqgParams:
-    """The law has no gains beside the observer's."""
+    """Return no parameters, because the law has no gains beside the observer's."""
     return LqgParams()
 
 
@@ -49,7 +49,7 @@ class LqgConfig(ControllerConfig):
     """The controller under LQG."""
 
     def check_law(self) -> None:
-        """The observer is the law."""
+        """Require an observer, which is the law."""
         require(
             self.observer is not None,
             "observer",
@@ -58,9 +58,9 @@ class LqgConfig(ControllerConfig):
         )
 
     def control_law(self) -> ControlLaw:
-        """The law extended by the observer."""
+        """Return the law, which the observer extends."""
         return CONTROL_LAW
 
     def law_params(self) -> LqgParams:
-        """The empty parameters of the law."""
+        """Return the empty parameters of the law."""
         return LqgParams()

@@ -26,8 +26,8 @@ from rise_di_controller.law.saturation import Limits
 from rise_di_controller.params import ControllerConfig
 
 LEAK = 0.01
-"""1/s, decay of the angles and of y_m in the design model: modes out of reach of inputs and cost
-have to be stable."""
+"""1/s, decay of the angles and of y_m in the design model, because modes that neither inputs nor
+cost reach must be stable."""
 
 
 class LqiParams(NamedTuple):
@@ -37,10 +37,10 @@ class LqiParams(NamedTuple):
 
 
 def control_law(_: NominalModel, *, vanes: bool) -> ControlLaw:
-    """State feedback and integral: u = -gain [x, y_m, y_m_dot, integral of e].
+    """Feed back state and integral: u = -gain [x, y_m, y_m_dot, integral of e].
 
-    With `vanes` x is relative to the air. The integral is a trapezoid with conditional integration
-    (anti-windup): integration of channel i stops while u_i is saturated and the increment has the
+    With `vanes`, x is relative to the air. The integral is a trapezoid with conditional integration
+    (anti-windup): channel i does not integrate while u_i is saturated and the increment has the
     sign of the excess.
     """
 
@@ -55,7 +55,7 @@ def control_law(_: NominalModel, *, vanes: bool) -> ControlLaw:
         e = measurements.y - measurements.y_m
         increment = dt * (e + state.e) / 2.0
         integral_e = state.integral_e + increment
-        # An addend that gives y_m and y_m_dot a column for each aircraft.
+        # This addend gives y_m and y_m_dot a column for each aircraft.
         zeros = xp.zeros_like(e)
         z = xp.concat(
             [
@@ -88,11 +88,12 @@ class LqiConfig(ControllerConfig):
 
 
 def design(model: NominalModel, fade: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The nominal aircraft with the reference and the integral of e: F, G and E.
+    """Build the nominal aircraft with the reference and the integral of e: F, G and E.
 
     The model is sampled with u held over a period.
 
-    z+ = F z + G u; the cost is on E z, e and the integral of e. Shapes (n + 3 m, n + 3 m), (n + 3
+    z+ = F z + G u; the cost is on E z, e and the integral of e. Shapes are (n + 3 m, n + 3 m), (n +
+    3
     m, m) and (2 m, n + 3 m).
 
         x_dot   = (A + gravity) x + B u      rows of angles: -LEAK angle, a measured disturbance
@@ -121,16 +122,16 @@ def design(model: NominalModel, fade: float) -> tuple[FloatArray, FloatArray, Fl
 
 
 def lqi_params(gains: dict[str, FloatArray], model: NominalModel) -> LqiParams:
-    """The gain of the least cost over z+ = F z + G u, for N sets of weights: (m, n + 3 m, N).
+    """Compute the gain of least cost over z+ = F z + G u, for N weights: (m, n + 3 m, N).
 
-    The cost is the sum of e'Q e + q'Q_i q + u'R u.
+    The cost is the sum of e'Q e + q'Q_i q + u'R u:
 
         Q = 1 / size^2,  Q_i = integral^2 / size^2,  R = (effort / input_scale)^2 / size^2,
             q the integral of e
 
-    Arguments: `integral` (m, N), 1/s, `effort` (m, N), s: abs(e) at the cost of an input of unit
-    response, `fade` (1, N), 1/s. Source: E. Kreindler, D. Rothschild, AIAA J. 14(7), 1976, for
-    model following; B. D. O. Anderson, J. B. Moore, "Optimal Control", ch. 9.
+    `integral` (m, N) is in 1/s; `effort` (m, N), s, is the abs(e) that costs as much as an input of
+    unit response; `fade` (1, N) is in 1/s. Source: E. Kreindler, D. Rothschild, AIAA J. 14(7),
+    1976, for model following; B. D. O. Anderson, J. B. Moore, "Optimal Control", ch. 9.
     """
     size = (model.C @ model.size)[:, None]
     gains_by_set = []

@@ -41,7 +41,7 @@ class MacKunisState(NamedTuple):
 
 
 def control_law(model: NominalModel, *, ideal: bool) -> ControlLaw:
-    """The law with e_dot in the sign term.
+    """Make the law with e_dot in the sign term.
 
         r          = e_dot + Lambda e
         Pi        += dt beta clip(r / eps, -1, 1)  the sign, softened: measured r is noisy
@@ -99,9 +99,9 @@ class MacKunisConfig(ControllerConfig):
 
 
 def mackunis_params(gains: dict[str, FloatArray], model: NominalModel) -> MacKunisParams:
-    """Parameters from the gains of a search.
+    """Return parameters from the gains of a search.
 
-    They are K, Lambda, beta (m, N), softening (1, N) and, without ideal y_dot, filter (1, N),
+    The gains are K, Lambda, beta (m, N), softening (1, N) and, without ideal y_dot, filter (1, N),
     rad/s. eps = beta / K softening: inside eps the sign adds K / softening to K.
     """
     K = gains["K"]

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The nominal model of a model-based law, and the common parts of laws.
+"""The nominal model of a model-based law, and what several laws share.
 
-The parts are saturation of u, and anti-windup of integrals. Channels are in the law's order, states
-in the airframe's.
+They share the saturation of u and the anti-windup of integrals. Channels are in the law's order,
+states in the airframe's.
 """
 
 from collections.abc import Callable
@@ -18,9 +18,9 @@ from rise_di_controller.law.saturation import Limits
 
 
 class NominalModel(NamedTuple):
-    """The nominal aircraft, SI, and the loop around the aircraft.
+    """The nominal aircraft, SI, and the loop around it.
 
-    The docstring of a law names the fields in use.
+    The docstring of each law names the fields that it uses.
     """
 
     A: FloatArray  # (n, n)
@@ -53,7 +53,7 @@ class NominalModel(NamedTuple):
 
     @property
     def limits(self) -> Limits:
-        """The limits as arguments of a law, shape (m, 1); the rate of u has none."""
+        """Limits as arguments of a law, shape (m, 1); the rate of u has none."""
         return Limits(
             self.lower[:, None], self.upper[:, None], np.full((len(self.lower), 1), np.inf)
         )
@@ -64,9 +64,9 @@ def campaign_law(
     engage: Callable[[Measurements, Any], Any],
     limited: Callable[[Any, Measurements, Array, Any, Limits], tuple[Any, Array, Array]],
 ) -> ControlLaw:
-    """A control law flown by campaigns only, for lack of topics with the measurements.
+    """Make a control law that only campaigns fly, because no topic has its measurements.
 
-    No retuning in flight.
+    It cannot be retuned in flight.
     """
 
     def retune(state: Any, old: Any, new: Any) -> Any:
@@ -85,15 +85,15 @@ class ErrorIntegral(NamedTuple):
 
 
 def start_integral(measurements: Measurements, _: Any) -> ErrorIntegral:
-    """The state at engagement."""
+    """Return the state at engagement."""
     e = measurements.y - measurements.y_m
     return ErrorIntegral(e, array_namespace(e).zeros_like(e))
 
 
 def state_of(measurements: Measurements, *, vanes: bool = False) -> Array:
-    """The full state, shape (n, N), with `vanes` relative to the air.
+    """Return the full state, shape (n, N), with `vanes` relative to the air.
 
-    Raises ValueError where x is not measured.
+    Raises ValueError if x is not measured.
     """
     x = measurements.x_air if vanes else measurements.x
     if x is None:
@@ -104,18 +104,18 @@ def state_of(measurements: Measurements, *, vanes: bool = False) -> Array:
 def saturate_with_excess(
     u: Array, measurements: Measurements, dt: Array, limits: Limits
 ) -> tuple[Array, Array]:
-    """Saturation of u, shape (m,).
+    """Saturate u, shape (m,).
 
-    The results are the commanded u inside the limits, and the excess of the requested u.
+    Returns the commanded u inside the limits, and the excess of the requested u.
     """
     commanded = saturation.saturate(u, measurements.u_before, dt, limits)
     return commanded, u - commanded
 
 
 def conditional_integration(before: Array, after: Array, effect: Array, excess: Array) -> Array:
-    """Anti-windup by conditional integration: `before` where effect * excess > 0, else `after`.
+    """Choose `before` if effect * excess > 0, else `after`: anti-windup by conditional integration.
 
-    Arguments: `effect`, change of u (or of the scaled input) by the increment; `excess`, u over the
+    `effect` is the change of u (or of the scaled input) by the increment; `excess` is u over the
     limit, in the same units and channels. Source: K. J. Astrom, T. Hagglund, "Advanced PID
     Control", 3.5.
     """
@@ -123,8 +123,8 @@ def conditional_integration(before: Array, after: Array, effect: Array, excess: 
 
 
 def filter_gain(rate: Array, dt: Array) -> Array:
-    """1 - exp(-rate dt): gain of a first-order low-pass filter on the input in a tick.
+    """Compute 1 - exp(-rate dt), the gain of a first-order low-pass filter in a tick.
 
-    The gain is exact for a held input.
+    It is exact for a held input.
     """
     return -array_namespace(rate).expm1(-rate * dt)

@@ -25,14 +25,14 @@ from rise_di_controller.law.saturation import Limits
 PART = 0.6
 WITHIN = 0.1
 FADE = 1.0
-"""Bound of u_o as a part of the limits of u, the time from 0 to it, s, and the time of the fade-in,
-s: the defaults of `ObserverConfig`."""
+"""Bound of u_o as a fraction of the limits of u, time from 0 to it, s, and time of the fade-in, s:
+the defaults of `ObserverConfig`."""
 
 
 def observer_params(
     design: ObserverDesign, law_params: Any, model: NominalModel, part: float = PART
 ) -> ObserverParams:
-    """Parameters of an observer over the law of `law_params`, from N designs.
+    """Make the parameters of an observer over the law of `law_params`, from N designs.
 
     u_o is within `part` of the limits.
     """
@@ -61,9 +61,9 @@ def observer_params(
 def aircraft_design(
     gains: dict[str, FloatArray], model: NominalModel, names: Names | None = None
 ) -> ObserverDesign:
-    """Designs with the aircraft's model from the gains of a search.
+    """Design observers with the aircraft's model from the gains of a search.
 
-    They are effort, drift (m, N), gust, wind_time (G, N) and loose (1, N) or (n, N).
+    The gains are effort, drift (m, N), gust, wind_time (G, N) and loose (1, N) or (n, N).
     """
     weights = Weights(*(gains[name].T for name in Weights._fields))
     return aircraft_observer(model, names or unnamed(model), weights)
@@ -72,13 +72,13 @@ def aircraft_design(
 def extended_state_design(
     gains: dict[str, FloatArray], model: NominalModel, names: Names | None = None
 ) -> ObserverDesign:
-    """Designs from Omega and lags alone: effort, drift, rate_drift and decay, shapes (m, N)."""
+    """Design observers from Omega and lags alone: effort, drift, rate_drift, decay, (m, N)."""
     weights = ExtendedStateWeights(*(gains[name].T for name in ExtendedStateWeights._fields))
     return extended_state_observer(model, names or unnamed(model), weights)
 
 
 def unnamed(model: NominalModel) -> Names:
-    """Numbers as names, for designs not written to a file."""
+    """Return numbers as names, for designs that are not written to a file."""
     (n, m), G = model.B.shape[-2:], model.wind.shape[-1]
     numbers = [tuple(map(str, range(count))) for count in (n, m, m, G)]
     return Names(*numbers)

@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Design of the observer, for many models and weights at once.
 
-The design is a model in discrete time and two linear-quadratic gains.
+A design is a model in discrete time with two linear-quadratic gains.
 
-Two models: `aircraft_observer` knows A, B, f, wind and lags of an airframe,
-`extended_state_observer` Omega and lags alone. A, B, wind and the weights may have leading axes,
-broadcast together: N aircraft, or N sets of weights, are N designs. Phi, Gamma, H, L, F are the
-matrices of the observer of `rise_di_controller.extensions.observer`.
+There are two models: `aircraft_observer` knows A, B, f, wind and lags of an airframe,
+`extended_state_observer` only Omega and lags. A, B, wind and the weights may have leading axes,
+which are broadcast together: N aircraft, or N sets of weights, are N designs. Phi, Gamma, H, L, F
+are the matrices of the observer of `rise_di_controller.extensions.observer`.
 """
 
 from collections.abc import Callable
@@ -24,7 +24,7 @@ from rise_di_controller.law.linear_loop import zero_order_hold
 Correction = Callable[[FloatArray, FloatArray, FloatArray, FloatArray], FloatArray]
 """`riccati.correction_of`, or another function for the same gain."""
 
-# 1/s, decay of angles and disturbances in the model: every mode is then observable or stable
+# 1/s, decay of angles and disturbances in the model, so that every mode is observable or stable
 LEAK = 0.01
 MIN_LAG = 1e-4  # s, lag of an ideal actuator in the model
 ACTUATOR_NOISE = 1e-6  # rad or 1 per root s, noise of the actuators' positions: negligible
@@ -91,14 +91,13 @@ class ObserverDesign(NamedTuple):
 
 
 def aircraft_model(model: NominalModel, names: Names, wind_time: FloatArray) -> ObserverModel:
-    """The aircraft around the reference, with actuators, wind and a disturbance per output.
+    """Model the aircraft around the reference, with actuators, wind and a disturbance per output.
 
-    z = [x, position, w, d].
-
+        z = [x, position, w, d]
         x_dot        = (A + gravity) x + B position + wind w + C' d
         position_dot = (u - u_ff - position) / lag,  w_dot = -w / wind_time,  d_dot = -LEAK d
 
-    Angles decay with LEAK too. u_ff produces the motion along the reference: the model holds for
+    Angles decay with LEAK too. u_ff produces the motion along the reference, so the model holds for
     small deviations from this motion. s = n + m + G + m. A, B and wind of the model and
     `wind_time`, (.., G), may have leading axes.
     """
@@ -128,16 +127,15 @@ def aircraft_model(model: NominalModel, names: Names, wind_time: FloatArray) -> 
 
 
 def extended_state_model(model: NominalModel, names: Names, decay: FloatArray) -> ObserverModel:
-    """Outputs as integrals of Omega times the actuators and a disturbance of second order.
+    """Model outputs as integrals of Omega times the actuators and a second-order disturbance.
 
-    z = [x, position, d, d_dot].
-
+        z = [x, position, d, d_dot]
         x_dot        = Omega position + d,  position_dot = (u - u_ff - position) / lag
         d_dot        = disturbance_rate - LEAK d,  disturbance_rate_dot = -decay disturbance_rate
 
-    x are the outputs. s = 4 m. Of the model the function uses Omega, the lags and the period.
-    `decay` (.., m), 1/s. Source: J. Han, "From PID to Active Disturbance Rejection Control", IEEE
-    Trans. Industrial Electronics 56(3), 2009.
+    x are the outputs, and s = 4 m. Of the model only Omega, the lags and the period are used.
+    `decay` (.., m) is in 1/s. Source: J. Han, "From PID to Active Disturbance Rejection Control",
+    IEEE Trans. Industrial Electronics 56(3), 2009.
     """
     m = len(model.C)
     x, p, d, rate = np.split(np.arange(4 * m), 4)
@@ -165,9 +163,9 @@ def _sampled(
     C: FloatArray,
     model: NominalModel,
 ) -> ObserverModel:
-    """A model in discrete time.
+    """Sample a model.
 
-    The actuators' positions are the states p, the first states have the outputs C.
+    The actuators' positions are the states p, and the first states have the outputs C.
     """
     lag, (m, n) = np.maximum(model.lag, MIN_LAG), C.shape
     drive = np.zeros((motion.shape[-1], m))
@@ -182,10 +180,10 @@ def _sampled(
 
 
 def aircraft_observer(model: NominalModel, names: Names, weights: Weights) -> ObserverDesign:
-    """The observer over `aircraft_model`, with the gains of two Riccati equations.
+    """Design the observer over `aircraft_model`, with the gains of two Riccati equations.
 
     F minimises the sum of (e / size)^2 + (effort (u - u_ff) / (input_scale size))^2, and L the
-    variance of the estimate: white noise of `gust` drives the wind, of `drift` the disturbances, of
+    variance of the estimate: white noise of `gust` drives the wind, `drift` the disturbances,
     `loose` the states, and e has the noise of the model. Source: H. Kwakernaak, R. Sivan, "Linear
     Optimal Control Systems", ch. 5 and 6.
     """
@@ -203,7 +201,7 @@ def aircraft_correction(
     weights: Weights,
     correction: Correction = correction_of,
 ) -> FloatArray:
-    """L of `aircraft_observer`, shape (.., s, m)."""
+    """Compute L of `aircraft_observer`, shape (.., s, m)."""
     positions = np.full(len(model.lag), ACTUATOR_NOISE)
     intensities = [
         weights.loose * model.size,
@@ -221,11 +219,11 @@ def vane_correction(
     row: FloatArray,
     noise: float,
 ) -> FloatArray:
-    """Gains of a vane beside L of `aircraft_correction`, (s, m + 1).
+    """Compute the gains of a vane that are added to L of `aircraft_correction`, (s, m + 1).
 
-    They are the filter of y and the vane less the filter of y. The last column acts on the vane: a
-    reading beyond the reference motion is `row` z, (s,), with white `noise`, rms. `weights` without
-    and with the vane.
+    They are the filter of y and the vane less the filter of y alone. The last column acts on the
+    vane: a reading beyond the reference motion is `row` z, (s,), with white `noise`, rms. `weights`
+    come without and with the vane.
     """
     without_vane = aircraft_correction(model_by_tick, model, weights[0])
     with_vane = model_by_tick._replace(H=np.vstack([model_by_tick.H, row]))
@@ -238,7 +236,7 @@ def vane_correction(
 def extended_state_observer(
     model: NominalModel, names: Names, weights: ExtendedStateWeights
 ) -> ObserverDesign:
-    """The observer over `extended_state_model`, with gains as in `aircraft_observer`."""
+    """Design the observer over `extended_state_model`, with gains as in `aircraft_observer`."""
     model_by_tick = extended_state_model(model, names, weights.decay)
     size = model.C @ model.size
     intensities = [
@@ -254,7 +252,7 @@ def extended_state_observer(
 def feedback_gain(
     model_by_tick: ObserverModel, model: NominalModel, effort: FloatArray
 ) -> FloatArray:
-    """F of `aircraft_observer`, shape (.., m, s), for `effort` (.., m), s."""
+    """Compute F of `aircraft_observer`, shape (.., m, s), for `effort` (.., m), s."""
     size = model.C @ model.size
     Q = transpose(model_by_tick.H) @ np.diag(1.0 / size**2) @ model_by_tick.H
     return gain_of(
@@ -271,9 +269,9 @@ def _correction(
     intensities: list[FloatArray],
     correction: Correction = correction_of,
 ) -> FloatArray:
-    """L for white noise of these intensities, shapes (.., k).
+    """Compute L for white noise of these intensities, shapes (.., k).
 
-    The noise is on the states in order, SI per root s.
+    The noise acts on the states in their order, SI per root s.
     """
     batch = np.broadcast_shapes(*(intensity.shape[:-1] for intensity in intensities))
     process = np.concatenate(

@@ -33,7 +33,7 @@ class PiState(NamedTuple):
 
 
 def _u(state: PiState, params: PiParams) -> Array:
-    """U from trim, shape (m,): -input_scale D K (e - e_0 + Lambda integral of e)."""
+    """Compute u from trim, shape (m,): -input_scale D K (e - e_0 + Lambda integral of e)."""
     return (
         -params.input_scale
         * params.D
@@ -50,7 +50,7 @@ def _engage(measurements: Measurements, params: PiParams) -> PiState:
 def _limited(
     state: PiState, measurements: Measurements, dt: Array, params: PiParams, limits: Limits
 ) -> tuple[PiState, Array, Array]:
-    """PI: u = u_trim - input_scale D K (e - e_0 + Lambda integral of e).
+    """Compute PI: u = u_trim - input_scale D K (e - e_0 + Lambda integral of e).
 
     The integral is a trapezoid with anti-windup (`limited_integral`).
     """
@@ -75,9 +75,9 @@ def _limited(
 
 
 def _retune(state: PiState, old: PiParams, new: PiParams) -> PiState:
-    """The same u with new parameters (bumpless transfer).
+    """Keep u with new parameters (bumpless transfer).
 
-    e_0 takes the difference, so Lambda may be 0.
+    e_0 takes the difference, so that Lambda may be 0.
     """
     start_error = -new.D * _u(state, old) / (new.input_scale * new.K)
     return state._replace(e_0=state.e + new.Lambda * state.integral_e - start_error)
@@ -89,7 +89,7 @@ CONTROL_LAW = ControlLaw(
 
 
 def params_of(gains: dict[str, FloatArray], model: NominalModel) -> PiParams:
-    """Parameters from gains K and Lambda, shapes (m, N)."""
+    """Return parameters from gains K and Lambda, shapes (m, N)."""
     return PiParams(gains["K"], gains["Lambda"], model.D[:, None], model.input_scale[:, None])
 
 
@@ -100,16 +100,16 @@ class PiConfig(ControllerConfig):
     Lambda: NonNegatives = Field(description="integral gains over proportional ones, 1/s")
 
     def check_law(self) -> None:
-        """A value per channel."""
+        """Check that there is a value per channel."""
         for key in ("K", "Lambda"):
             require_length(key, getattr(self, key), self.outputs)
 
     def control_law(self) -> ControlLaw:
-        """PI control."""
+        """Return PI control."""
         return CONTROL_LAW
 
     def law_params(self) -> PiParams:
-        """The arrays of the law."""
+        """Return the arrays of the law."""
         return PiParams(
             np.array(self.K),
             np.array(self.Lambda),

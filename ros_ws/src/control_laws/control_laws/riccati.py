@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Linear-quadratic design for many models and sets of weights at once.
 
-The discrete Riccati equation is solved.
+It solves the discrete Riccati equation.
 
 Leading axes of the arguments of a function are broadcast together.
 """
@@ -15,7 +15,7 @@ MAX_DOUBLINGS = 40  # 2^40 steps of a finite horizon: enough for a mode that dec
 
 
 def riccati(F: FloatArray, G: FloatArray, Q: FloatArray, R: FloatArray) -> FloatArray:
-    """The stabilising P = F'P F - F'P G (R + G'P G)^-1 G'P F + Q by doubling, shape (.., s, s).
+    """Solve for the stabilising P = F'P F - F'P G (R + G'P G)^-1 G'P F + Q, shape (.., s, s).
 
     A doubling squares the horizon's transition: with W = I + G_k P_k,
 
@@ -45,19 +45,19 @@ def riccati(F: FloatArray, G: FloatArray, Q: FloatArray, R: FloatArray) -> Float
 
 
 def transpose(matrix: FloatArray) -> FloatArray:
-    """The transpose of matrices (.., n, m), shape (.., m, n)."""
+    """Transpose matrices (.., n, m), shape (.., m, n)."""
     return np.swapaxes(matrix, -1, -2)
 
 
 def diagonal(values: FloatArray) -> FloatArray:
-    """Diagonal matrices, (.., s, s), of diagonals (.., s)."""
+    """Make diagonal matrices, (.., s, s), of diagonals (.., s)."""
     return np.asarray(values[..., :, None] * np.eye(values.shape[-1]))
 
 
 def gain_of(F: FloatArray, G: FloatArray, Q: FloatArray, R: FloatArray) -> FloatArray:
-    """The gain (R + G'P G)^-1 G'P F of u = -gain z, shape (.., m, s).
+    """Compute the gain (R + G'P G)^-1 G'P F of u = -gain z, shape (.., m, s).
 
-    The sum is the least of z'Q z + u'R u.
+    It minimises the sum of z'Q z + u'R u.
     """
     P = riccati(F, G, Q, R)
     return np.asarray(np.linalg.solve(R + transpose(G) @ P @ G, transpose(G) @ P @ F))
@@ -66,11 +66,11 @@ def gain_of(F: FloatArray, G: FloatArray, Q: FloatArray, R: FloatArray) -> Float
 def correction_of(
     F: FloatArray, H: FloatArray, process: FloatArray, noise: FloatArray
 ) -> FloatArray:
-    """The gain S H'(H S H' + noise)^-1 of the stationary Kalman filter, shape (.., s, m).
+    """Compute the gain S H'(H S H' + noise)^-1 of the stationary Kalman filter, (.., s, m).
 
-    The filter is z + gain (y - H z). S is the covariance of the predicted state. Arguments:
-    covariances `process` of the state in a step, (.., s, s), and `noise` of y, (.., m, m); H (..,
-    m, s). Source: B. D. O. Anderson, J. B. Moore, "Optimal Filtering", 4.4.
+    The filter is z + gain (y - H z), and S is the covariance of the predicted state. `process` is
+    the covariance of the state in a step, (.., s, s), `noise` that of y, (.., m, m), and H has
+    shape (.., m, s). Source: B. D. O. Anderson, J. B. Moore, "Optimal Filtering", 4.4.
     """
     S = riccati(transpose(F), transpose(H), process, noise)
     return transpose(np.asarray(np.linalg.solve(H @ S @ transpose(H) + noise, H @ S)))
@@ -79,7 +79,7 @@ def correction_of(
 def corrections_near(
     F: FloatArray, H: FloatArray, process: FloatArray, noise: FloatArray
 ) -> FloatArray:
-    """Gains of `correction_of` for models close to the first model.
+    """Compute the gains of `correction_of` for models close to the first model.
 
     The gains are exact to first order in the difference.
 

@@ -10,10 +10,10 @@ from rise_di_controller.law.law import LawParams
 
 
 def params_of(gains: dict[str, FloatArray], model: NominalModel) -> LawParams:
-    """Parameters from the gains of a search, in scaled inputs.
+    """Compute parameters from the gains of a search, in scaled inputs.
 
-    They are K, Lambda, beta (m, N) and softening, (m, N) or (1, N), or omega (1, N). eps = beta / K
-    softening total_lag.
+    The gains are K, Lambda, beta (m, N) and softening, (m, N) or (1, N), or omega (1, N). eps =
+    beta / K softening total_lag.
     """
     K = gains["K"]
     beta = gains["beta"]
