@@ -30,11 +30,11 @@ from flight_ros.topics import (
     Topic,
 )
 
-TARGET_TIMEOUT = 3.0  # s, in which guidance takes a target at its ticks
+TARGET_TIMEOUT = 3.0  # s, within which guidance takes a target at its ticks
 TARGET_PERIOD = 0.2  # s, between two equal targets
-LINK_PERIOD = 1.0  # s, between two targets without channels
-REFUSED = "sample refused: "  # before the reason in the log of a node
-ROUTE_TIMEOUT = 3.0  # s, in which the middleware of guidance confirms a route
+LINK_PERIOD = 1.0  # s, between two targets without channels, which keep the link
+REFUSED = "sample refused: "  # stands before the reason in the log of a node
+ROUTE_TIMEOUT = 3.0  # s, within which the middleware of guidance confirms a route
 ROUTE_POLL_PERIOD = Duration(seconds=0.05)
 NAME = "guidance"
 
@@ -81,13 +81,13 @@ class GuidanceClient(Client):
             )
             return self._reason(ROUTE, lambda: self._has_taken({"leg": 0.0}), "")
         finally:
-            # Guidance that starts later must not receive the route, and fly it.
+            # Guidance that starts later must not receive the route and fly it.
             self._node.destroy_publisher(publisher)
 
     def _reaches_guidance(self, publisher: Publisher) -> bool:
         """Whether guidance is among the subscribers in the graph.
 
-        Every subscriber has to be matched, too.
+        Every subscriber must be matched, too.
         """
         names = [
             endpoint.node_name
@@ -96,9 +96,9 @@ class GuidanceClient(Client):
         return NAME in names and len(names) <= publisher.get_subscription_count()
 
     def _reason(self, topic: Topic, is_taken: Callable[[], bool], unknown: str) -> str:
-        """Wait until guidance has taken a message, or has refused it.
+        """Wait until guidance has taken a message or refused it, and return the reason.
 
-        Returns the reason, `unknown` after TARGET_TIMEOUT.
+        The reason is `unknown` after TARGET_TIMEOUT.
         """
         reasons: list[str] = []
 
@@ -118,7 +118,7 @@ class GuidanceClient(Client):
         return reasons[-1] if reasons else ""
 
     def _refusals(self, topic: Topic) -> list[str]:
-        """Why guidance has refused messages of a topic since the last call.
+        """Return why guidance has refused messages of a topic since the last call.
 
         The reasons come from the log of the nodes.
         """
@@ -148,7 +148,7 @@ class GuidanceClient(Client):
         return any(map(has_taken, self._received()))
 
     def _received(self) -> list[dict[str, float]]:
-        """The channels of the samples of `guidance` since the last call."""
+        """Return the channels of the samples of `guidance` since the last call."""
         return [sample.channels for sample in self._decoded(self._guidance, self._decoder.decode)]
 
 
@@ -178,9 +178,9 @@ class TargetClient(GuidanceClient):
         self._publish({})
 
     def hold_link(self) -> NoReturn:
-        """Keep the link, a message each LINK_PERIOD.
+        """Keep the link by a message each LINK_PERIOD.
 
-        Raises ParameterError where no guidance flies in the domain.
+        Raises ParameterError if no guidance flies in the domain.
         """
         while True:
             self._spin_until(lambda: bool(self._received()), self._silent)

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Feasibility: refusal of a route beyond the aircraft's performance before the flight.
+"""Feasibility: a route beyond the aircraft's performance is refused before the flight.
 
-The refusal has the nearest feasible value.
+The refusal names the nearest feasible value.
 """
 
 import math
@@ -21,14 +21,14 @@ from flight_guidance.steering.lateral import least_period, least_radius
 from flight_guidance.steering.path import Leg, Line, Loiter, Point, Route
 
 HEADWIND = 1.2
-"""Least ratio of the airspeed to the wind: against the wind the aircraft still goes ahead by a
+"""Least ratio of the airspeed to the wind: against the wind the aircraft still moves ahead by a
 sixth of the airspeed."""
 
 
 class Performance(NamedTuple):
     """Performance of the aircraft, and the largest wind."""
 
-    speed: float  # airspeed where the route names none, m/s
+    speed: float  # airspeed if the route names none, m/s
     stall_speed: float  # m/s
     bank: float  # largest bank, rad
     roll_rate: float  # largest phi_dot, rad/s
@@ -41,9 +41,9 @@ class Performance(NamedTuple):
 
 
 def speeds(waypoints: Sequence[Waypoint], first: float) -> tuple[float, ...]:
-    """Airspeeds on the legs to the waypoints, m/s.
+    """Return the airspeeds on the legs to the waypoints, m/s.
 
-    The airspeed is that of the waypoint, or of the leg before; `first` where none is named yet.
+    Each is that of the waypoint, or of the leg before, or `first` if none is named yet.
     """
     leg_speeds = []
     for waypoint in waypoints:
@@ -53,7 +53,7 @@ def speeds(waypoints: Sequence[Waypoint], first: float) -> tuple[float, ...]:
 
 
 class FlyableRoute(NamedTuple):
-    """The legs of a route, and the waypoints that the legs fly.
+    """The legs of a route, and the waypoints that they fly.
 
     Waypoints that are cut are missing, and steep legs have loiters.
     """
@@ -67,15 +67,16 @@ class FlyableRoute(NamedTuple):
 def flyable(
     waypoints: tuple[Waypoint, ...], radius: float, period: float, can: Performance
 ) -> FlyableRoute:
-    """The legs of a route with fillets of `radius`, m, and path following with `period`, s.
+    """Plan the legs of a route with fillets of `radius`, m, and path following with `period`, s.
 
-    Of a leg too short for the fillets one waypoint is left out, where the route still passes within
-    `radius`, or 1 s of flight, of the waypoint. A change of altitude beyond the climb or sink along
-    the straight part of the leg, the wind from behind, is flown on a circle: a climb round the
-    waypoint before, a descent round the waypoint after. Raises ParameterError for a waypoint not
-    finite or beyond LARGEST, an altitude or a speed beyond the bounds, a speed of at most HEADWIND
-    times the wind, a period below the rule, a radius below (V + W)^2 / (g tan(0.8 phi_max)), and a
-    leg too short for the fillets. phi_max is the largest bank at V for the stall speed.
+    If a leg is too short for the fillets, one waypoint is left out, provided that the route still
+    passes within `radius`, or 1 s of flight, of it. If a change of altitude exceeds the climb or
+    sink along the straight part of the leg with the wind from behind, it is flown on a circle: a
+    climb round the waypoint before, a descent round the waypoint after. Raises ParameterError for a
+    waypoint that is not finite or beyond LARGEST, an altitude or a speed beyond the bounds, a speed
+    of at most HEADWIND times the wind, a period below the rule, a radius below (V + W)^2 / (g
+    tan(0.8 phi_max)), and a leg too short for the fillets. phi_max is the largest bank at V for the
+    stall speed.
     """
     require_bounds(waypoints, can)
     leg_speeds = speeds(waypoints, can.speed)
@@ -103,7 +104,7 @@ def as_route(
     slopes: bool,
     notes: tuple[str, ...] = (),
 ) -> Route:
-    """The route of legs through waypoints. `speed`: m/s where no waypoint names one.
+    """Make the route of legs through waypoints; `speed`, m/s, holds if no waypoint names one.
 
     A fillet leads to the next waypoint; a leg leaves the waypoint before. An orbit changes the
     altitude at its waypoint.
@@ -143,9 +144,9 @@ def _legs(waypoints: Sequence[Waypoint], radius: float, least: float) -> tuple[L
 def _without_short_legs(
     waypoints: Sequence[Waypoint], radius: float, least: float
 ) -> tuple[list[tuple[int, Waypoint]], tuple[str, ...]]:
-    """The waypoints with their numbers, without those left out for short legs.
+    """Return the waypoints with their numbers, without those left out for short legs.
 
-    A note tells each of the latter. Raises ShortLegError where none can go.
+    A note names each one that is left out. Raises ShortLegError if none can be left out.
     """
     remaining = list(enumerate(waypoints))
     refusal = None
@@ -171,7 +172,7 @@ def _without_short_legs(
                 )
             ]
         except ParameterError as error:
-            # The rest has corners of its own, which may be too short.
+            # The rest has corners of its own, whose legs may be too short.
             raise refusal or error from None
     numbers = {number for number, _ in remaining}
     notes = []
@@ -189,7 +190,7 @@ def _without_short_legs(
 
 
 def _offset(before: Point, point: Point, after: Point) -> float:
-    """Distance of a point from the line between two others, m."""
+    """Return the distance of a point from the line between two others, m."""
     line = Line(before, after)
     share = path.nearest(line, point) / max(path.length(line), 1e-9)
     return math.dist(point, path.along(before, after, share))
@@ -202,9 +203,9 @@ def _with_circles(
     least: float,
     can: Performance,
 ) -> FlyableRoute:
-    """The route with a circle for each change of altitude that the leg does not allow.
+    """Add a circle to the route for each change of altitude that the leg does not allow.
 
-    The change is beyond the climb or sink along the leg. Waypoints are by number.
+    Such a change is beyond the climb or sink along the leg. Waypoints are by number.
     """
     numbers = list(by_number)
     waypoints = list(by_number.values())
@@ -247,7 +248,7 @@ def _with_circles(
 
 
 def require_bounds(waypoints: Sequence[Waypoint], can: Performance) -> None:
-    """Raise ParameterError for a waypoint, an altitude or an airspeed out of bounds."""
+    """Refuse a waypoint, an altitude or an airspeed out of bounds."""
     for k, waypoint in enumerate(waypoints):
         north, east, altitude = waypoint[:3]
         is_plausible = all(
@@ -291,9 +292,9 @@ def require_bounds(waypoints: Sequence[Waypoint], can: Performance) -> None:
 
 
 def require_inside(route: Route, fence: Fence, margin: float) -> None:
-    """Raise ParameterError for a leg nearer to the fence than `margin`, m.
+    """Refuse a leg nearer to the fence than `margin`, m.
 
-    The sentence has the place that is the farthest outside.
+    The sentence names the place that is farthest outside.
     """
     start: Point = (0.0, 0.0)
     for number, leg in enumerate(route.legs):
@@ -325,5 +326,5 @@ POINT_DISTANCE = 0.05
 
 
 def _up(value: float, step: float) -> float:
-    """A value rounded up to a multiple of a step: still feasible."""
+    """Round a value up to a multiple of a step, which is still feasible."""
     return math.ceil(value / step) * step

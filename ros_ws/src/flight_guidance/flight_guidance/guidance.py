@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Guidance without ROS: the step of `modes` with state, the last samples and the program.
+"""Guidance without ROS: the step of `modes`, with state, the last samples and the program.
 
 The node and the simulation in one process use the same class `Guidance`.
 """
@@ -53,9 +53,9 @@ class GuidanceOutput(NamedTuple):
 
 
 def u_m(state: GuidanceState) -> FloatArray:
-    """What is published as u_m.
+    """Return what is published as u_m.
 
-    The commands in the order of the parameters' outputs, then ATTITUDE.
+    These are the commands in the order of the parameters' outputs, then ATTITUDE.
     """
     return np.array([*state.u_m, state.phi, state.theta - state.alpha])
 
@@ -63,13 +63,13 @@ def u_m(state: GuidanceState) -> FloatArray:
 def step(
     state: GuidanceState | None, inputs: Inputs, route: Route | None, params: GuidanceParams
 ) -> tuple[GuidanceState, StepCommands]:
-    """The step of the kind of aircraft: `modes.step`, or `multicopter.step`."""
+    """Step the kind of aircraft that flies, by `modes.step` or `multicopter.step`."""
     step_of_kind = modes.step if params.multicopter is None else multicopter.step
     return step_of_kind(state, inputs, route, params)
 
 
 def digest(route: Route | None) -> int:
-    """A number to distinguish routes; 0 for none."""
+    """Return a number that distinguishes routes; 0 for none."""
     return 0 if route is None else zlib.crc32(repr(route).encode())
 
 
@@ -90,16 +90,17 @@ class Guidance:
         self._pose: StampedVector | None = None
         self._y: StampedVector | None = None
         self._commands: dict[str, float] = {} if self.route is None else {"leg": 0.0}
-        self._route_waits = self.route is not None  # no step has flown it yet
+        self._route_waits = self.route is not None  # whether no step has flown it yet
         self._state: GuidanceState | None = None
         self._is_engaged = True
         self._paused = False
         self._begin = Begin.HOLD
         self._notices = parameters.notices()
-        # Since when guidance waits for a pose that is young enough, or a step that does not fail.
+        # Since when guidance has waited for a pose that is young enough, or for a step that does
+        # not fail.
         self._waits_from_ns: int | None = None
         self._failures = Failures()
-        self._failure = ""  # why there is no u_m, as a sentence; empty where it waits for a pose
+        self._failure = ""  # why there is no u_m, as a sentence; empty if it waits for a pose
         # The instant of the operator's last message, or of the first step.
         self._operated_ns: int | None = None
         self._link_lost = False
@@ -120,14 +121,14 @@ class Guidance:
 
     @property
     def state(self) -> GuidanceState | None:
-        """The state after the last step, None before the first."""
+        """State after the last step, None before the first."""
         return self._state
 
     def take_pose(self, sample: StampedVector, now_ns: int) -> None:
         """Take a pose in the order of `channels.POSE`.
 
-        Raises ChannelError for a stamp not newer than the last or in the future, for a value beyond
-        LARGEST, and for a pose equal to the last in every value.
+        Raises ChannelError if the stamp is not newer than the last or is in the future, if a value
+        is beyond LARGEST, and if the pose equals the last in every value.
         """
         last = self._pose
         newest = self._newest(self._pose, sample, now_ns)
@@ -140,7 +141,7 @@ class Guidance:
     def take_y(self, sample: StampedVector, now_ns: int) -> None:
         """Take a y in the order of the parameters' outputs.
 
-        Raises ChannelError as `take_pose` does, but for equal values.
+        Raises ChannelError as `take_pose` does, except for equal values.
         """
         self._y = self._newest(self._y, sample, now_ns)
 
@@ -182,11 +183,11 @@ class Guidance:
     def take_route(self, route: Route) -> None:
         """Fly a route from its first leg on.
 
-        While guidance is off, the route waits for the engagement. Commands before the route and not
-        taken by a step yet are void, and so are the legs of the program.
+        While guidance is off, the route waits for the engagement. Commands from before the route
+        that no step has taken yet are void, and so are the legs of the program.
         """
         self.route = route
-        self._lander = None  # that of the parameters lands on their route
+        self._lander = None  # the lander of the parameters is for their route
         self._digest = digest(route)
         self._commands = {}
         self._route_waits = True
@@ -199,14 +200,14 @@ class Guidance:
         self.take_target({"leg": 0.0})
 
     def keep_link(self) -> None:
-        """Know that an operator is there: the age of the link counts from the next step on."""
+        """Note that an operator is there: the age of the link counts from the next step on."""
         self._operated_ns = None
         self._link_lost = False
 
     def hold(self) -> bool:
-        """Hold the heading, the altitude and the airspeed of now, or of a multicopter the place.
+        """Hold the present heading, altitude and airspeed, or for a multicopter the place.
 
-        False while guidance does not fly.
+        Returns False if guidance does not fly.
         """
         if self.mode is not GuidanceMode.ENGAGED or self._pose is None or self._y is None:
             return False
@@ -216,7 +217,7 @@ class Guidance:
         return True
 
     def home(self) -> bool:
-        """Fly home and orbit there; False while guidance does not fly."""
+        """Fly home and orbit there. Returns False if guidance does not fly."""
         if self.mode is not GuidanceMode.ENGAGED or self._pose is None:
             return False
         params = targets.within_reach(self._params, self._authority)
@@ -224,9 +225,9 @@ class Guidance:
         return True
 
     def skip(self) -> bool:
-        """Leave the waypoint ahead out and fly to the next waypoint.
+        """Leave out the waypoint ahead and fly to the next one.
 
-        False while no route is flown, and on the last leg.
+        Returns False if no route is flown, and on the last leg.
         """
         state = self._state
         route = self.route
@@ -249,7 +250,7 @@ class Guidance:
     def resume(self) -> bool:
         """Fly the last leg again from the nearest point.
 
-        False while the route is flown, and without a route.
+        Returns False if the route is flown already, and if there is none.
         """
         state = self._state
         route = self.route
@@ -266,7 +267,7 @@ class Guidance:
         return True
 
     def engage(self, *, engaged: bool) -> None:
-        """Engage, with the heading, the altitude and the airspeed of then; or command nothing."""
+        """Engage with the heading, altitude and airspeed at that moment, or command nothing."""
         if engaged and not self._is_engaged:
             self._begin = Begin.HOLD
             self._forget_commands()
@@ -275,7 +276,7 @@ class Guidance:
     def pause(self, *, paused: bool, forget: bool) -> None:
         """Command nothing while the controller does not fly.
 
-        `forget`: then hold what is measured, else go on as before.
+        With `forget`, hold what is measured afterwards; otherwise go on as before.
         """
         if forget:
             self._begin = Begin.HOLD
@@ -284,9 +285,9 @@ class Guidance:
         self._paused = paused
 
     def _forget_commands(self) -> None:
-        """Forget commands given while guidance did not fly, but a route.
+        """Forget commands given while guidance did not fly, except a route.
 
-        Before the first step commands wait.
+        Before the first step, commands wait.
         """
         if self._state is not None:
             self._commands = {
@@ -296,17 +297,17 @@ class Guidance:
             }
 
     def pose(self) -> dict[str, float]:
-        """The last pose by channel; empty before the first pose."""
+        """Return the last pose by channel; empty before the first pose."""
         return {} if self._pose is None else dict(zip(POSE, self._pose.value.tolist(), strict=True))
 
     def y(self) -> dict[str, float]:
-        """The last y by channel; empty before the first y."""
+        """Return the last y by channel; empty before the first y."""
         if self._y is None:
             return {}
         return dict(zip(self._params.outputs, self._y.value.tolist(), strict=True))
 
     def ages(self, now_ns: int) -> dict[str, float]:
-        """Ages of the last received y and pose, s; a channel never received is absent."""
+        """Return the ages of the last y and pose, s; a channel that never came is absent."""
         samples = {"y": self._y, "pose": self._pose}
         return {
             name: seconds(now_ns - sample.stamp_ns)
@@ -315,9 +316,10 @@ class Guidance:
         }
 
     def waits(self, now_ns: int) -> str:
-        """Why there is no u_m; "" where there is one.
+        """Say why there is no u_m; "" if there is one.
 
-        Guidance then has waited for STALE_TIME for a young pose or a step without a failure.
+        There is a reason once guidance has waited STALE_TIME for a young pose, or for a step that
+        does not fail.
         """
         since = self._waits_from_ns
         pose = self._pose
@@ -330,21 +332,21 @@ class Guidance:
         return f"no u_m: pose is {age:.2f} s old, guidance.max_age {limit:g} s"
 
     def _watch_link(self, now_ns: int) -> None:
-        """Fly home, once, where the age of the operator's link exceeds the limit."""
+        """Fly home, once, if the age of the operator's link exceeds the limit."""
         if not self._params.link_timeout_ns:
             return
         if self._operated_ns is None:
             self._operated_ns = now_ns
         if now_ns - self._operated_ns > self._params.link_timeout_ns and not self._link_lost:
-            # While guidance does not fly, `home` is tried again at the next step.
+            # If guidance does not fly, try `home` again at the next step.
             self._link_lost = self.home()
 
     def _link_age(self, now_ns: int) -> float:
-        """Age of the operator's link, s, 0 without a limit."""
+        """Return the age of the operator's link, s, 0 without a limit."""
         return 0.0 if self._operated_ns is None else seconds(now_ns - self._operated_ns)
 
     def _test_roll(self, y: Sequence[float]) -> None:
-        """Add to the authority whether p follows the command of the last step."""
+        """Test whether p follows the command of the last step, and add this to the authority."""
         state = self._state
         params = self._params
         if state is None or params.multicopter is not None:
@@ -368,22 +370,22 @@ class Guidance:
             self._commands |= self._lander.commands(state, self.pose(), self.route)
 
     def step(self, now_ns: int, t_ns: int) -> GuidanceOutput | None:
-        """A step at an instant and flight time t.
+        """Take a step at an instant and flight time t.
 
-        None without fresh y, before the first pose, and while disengaged. After steps of None the
-        filters start again at the measured values. A step fails by an exception or a value that is
-        not finite: the state stays, commands wait for the next step, and the last u_m goes on up to
-        the age limit.
+        Returns None without a fresh y, before the first pose, and while disengaged. After such
+        steps the filters start again at the measured values. If a step raises an exception or gives
+        a value that is not finite, the state stays, commands wait for the next step, and the last
+        u_m goes on until the age limit.
         """
         try:
             return self._step(now_ns, t_ns)
         except Exception as error:
-            # Whatever it is, the next step is tried.
+            # Whatever it is, try the next step.
             is_said = self._failures.add(seconds(t_ns))
             return self._last_goes_on(now_ns, sentence(error), is_said=is_said)
 
     def _last_goes_on(self, now_ns: int, cause: str, *, is_said: bool) -> GuidanceOutput | None:
-        """The output of a failed step: the last u_m; None beyond the age limit."""
+        """Return the output of a failed step: the last u_m, or None beyond the age limit."""
         state = self._state
         pose = self._pose
         y = self._y
@@ -401,7 +403,7 @@ class Guidance:
     def _row(
         self, inputs: Inputs, state: GuidanceState, commands: StepCommands, now_ns: int
     ) -> FloatArray:
-        """The sample of the log of a step at an instant."""
+        """Return the sample of the log for a step at an instant."""
         sample = guidance_log.GuidanceSample(
             inputs=inputs,
             state=state,
@@ -413,7 +415,7 @@ class Guidance:
         return guidance_log.row(sample, self._params.outputs)
 
     def _inputs(self, now_ns: int, pose: StampedVector, y: StampedVector) -> Inputs:
-        """What a step takes at an instant."""
+        """Collect what a step takes at an instant."""
         return Inputs(
             t_ns=now_ns,
             begin=self._begin,

@@ -50,7 +50,7 @@ class GuidanceSample(NamedTuple):
 
     @property
     def given(self) -> int:
-        """The new commands, as `bits`."""
+        """New commands, as `bits`."""
         return guidance_state.bits(self.inputs.commands)
 
 
@@ -66,17 +66,17 @@ class LogChannels(NamedTuple):
     kind: Callable[..., Any] = float  # makes the attribute of the logged numbers
 
     def logged(self, sample: GuidanceSample) -> Sequence[float]:
-        """The numbers of the channels."""
+        """Return the numbers of the channels."""
         value = attrgetter(self.attribute)(sample)
         return value if isinstance(value, tuple) else (value,)
 
     def restored(self, numbers: Mapping[str, float]) -> Any:
-        """The attribute."""
+        """Rebuild the attribute."""
         return self.kind(*(numbers[name] for name in self.names))
 
 
 def channels(outputs: Sequence[str]) -> tuple[LogChannels, ...]:
-    """The channels of the log, in its order."""
+    """Return the channels of the log, in its order."""
     return (
         LogChannels(["mode"], "state.mode", GuidanceMode),
         LogChannels(["mode.lateral"], "state.lateral", Lateral),
@@ -113,18 +113,18 @@ def channels(outputs: Sequence[str]) -> tuple[LogChannels, ...]:
 
 
 def names(outputs: Sequence[str]) -> tuple[str, ...]:
-    """Names of the channels of the log."""
+    """Return the names of the channels of the log."""
     return tuple(chain.from_iterable(each.names for each in channels(outputs)))
 
 
 def require_channels(logged: Collection[str]) -> None:
-    """Raise ParameterError for a log of guidance without one of the channels of `names`."""
+    """Refuse a log of guidance that lacks one of the channels of `names`."""
     missing = [name for name in names(()) if name not in logged]
     require(not missing, "guidance", f"a log without {', '.join(missing)}", "all of its channels")
 
 
 def row(sample: GuidanceSample, outputs: Sequence[str]) -> FloatArray:
-    """A sample of the log, in the order of `names`."""
+    """Write a sample of the log, in the order of `names`."""
     values = chain.from_iterable(each.logged(sample) for each in channels(outputs))
     return np.array([*values], dtype=np.float64)
 
@@ -132,7 +132,7 @@ def row(sample: GuidanceSample, outputs: Sequence[str]) -> FloatArray:
 def restored(
     t_ns: int, logged: Mapping[str, float], outputs: Sequence[str]
 ) -> tuple[Inputs, GuidanceState]:
-    """The inputs of a step and the state after the step, from a sample of the log."""
+    """Rebuild the inputs of a step and the state after it from a sample of the log."""
     attributes = {each.attribute: each.restored(logged) for each in channels(outputs)}
 
     def group(prefix: str) -> dict[str, Any]:

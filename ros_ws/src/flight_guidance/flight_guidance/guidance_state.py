@@ -246,7 +246,7 @@ class StepCommands(NamedTuple):
 
 
 def bits(names: Collection[str]) -> int:
-    """The names of targets as the channel `given` of the log: bit k for TARGETS[k]."""
+    """Encode the names of targets as the channel `given` of the log: bit k for TARGETS[k]."""
     return sum(1 << k for k, name in enumerate(TARGETS) if name in names)
 
 
@@ -261,9 +261,9 @@ def begun_again(
     params: GuidanceParams,
     *further: str,
 ) -> GuidanceState:
-    """The state `holding` with what a state before leaves, and further values by name.
+    """Return the state `holding` with what an earlier state leaves, and more values by name.
 
-    Up to the age limit of u_m the reference model still flies the last u_m.
+    Up to the age limit of u_m, the reference model still flies the last u_m.
     """
     if state is None or inputs.begin is Begin.HOLD:
         return holding

@@ -66,10 +66,10 @@ from flight_ros.topics import (
 TFMessage: Any = resolve_name("tf2_msgs.msg:TFMessage") if find_spec("tf2_msgs") else None
 
 TRANSFORMS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)  # as tf2_ros has it
-MAX_TARGETS = 16  # messages of target a tick; later messages wait, so that a storm delays no u_m
+MAX_TARGETS = 16  # messages of target per tick; later ones wait, so that a storm delays no u_m
 MAX_ROUTE_SIZE = 65_536  # bytes, 900 waypoints: decoding takes 0.14 ms a waypoint
 CONTROLLER = "controller"  # the node of `internals` and `authority`
-FEWEST_AUTHORITIES = 3  # periods: one sample may be late, and one lost
+FEWEST_AUTHORITIES = 3  # periods, in which one sample may be late and one lost
 ODOMETRY_PERIOD_NS = NANOSECONDS // 10
 PATH_PERIOD_NS = NANOSECONDS
 PATH_LENGTH = 120  # poses of the flown path, one a second
@@ -88,12 +88,12 @@ LEVELS = {
 
 
 class GuidanceNode(FlightNode[GuidanceConfig]):
-    """A tick takes the inputs, steps `guidance.Guidance` and publishes u_m and guidance.
+    """Takes the inputs at every tick, steps `guidance.Guidance` and publishes u_m and guidance.
 
     The inputs are the received y, pose, target and route. In real time guidance flies while the
     controller is ENGAGED. In lockstep the number of samples of y gives the time. A step waits for
-    the y and the pose of the instant and publishes exactly one u_m, without channels where guidance
-    has no command.
+    the y and the pose of its instant and publishes exactly one u_m, which has no channels if
+    guidance has no command.
     """
 
     def __init__(self) -> None:
@@ -104,7 +104,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         self._named = NamedDecoder()
         self._pose = self._receive(POSE, self._decode_pose, self._guidance.take_pose)
         # An operator has the system clock, not simulated time. A target from before a stop of
-        # guidance is void: the operator knows that the target failed.
+        # guidance is void, because the operator knows that it failed.
         max_age_ns = None if self.parameters.lockstep or self.simulated else self._max_age_ns
         self._target = self.receive(
             TARGET, self._named.decode, self._take_target, max_age_ns=max_age_ns, qos=NEWEST_SAMPLES
@@ -118,7 +118,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         self._waits = ""
         self._authority = self._receive_authority()
         self._authorities = deque[StampedVector]()
-        self._authority_ns = -1  # stamp of the last one; -1: none, or void
+        self._authority_ns = -1  # stamp of the last one; -1 if there is none, or it is void
         self._has_authority = True
         if self.parameters.lockstep:
             y_period_ns = period_ns(self.parameters.y_rate, "y_rate")
@@ -133,7 +133,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         self._advertise_services()
 
     def _advertise_views(self) -> None:
-        """The topics of maps and 3-D views."""
+        """Advertise the topics of maps and 3-D views."""
         self._odometry, self._imu, self._fix, self._wind = map(
             self._view, (ODOMETRY, IMU, FIX, WIND)
         )
@@ -187,7 +187,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
             if y is not None:
                 self._y.accept(y, now_ns)
             for pose in poses:
-                # One without channels says that no pose of the instant comes.
+                # A pose without channels says that no pose of the instant will come.
                 if pose.value.size:
                     self._pose.accept(pose, now_ns)
             if due and (output := self._step(now_ns, now_ns)) is not None:
@@ -203,7 +203,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         return (self._pose if self._inputs.has_y else self._y).name
 
     def _receives_authority(self, now_ns: int) -> bool:
-        """Lockstep: whether the last `authority` from before a step has arrived.
+        """In lockstep, say whether the last `authority` from before a step has arrived.
 
         A controller that learns sends `authority`.
         """
@@ -216,8 +216,8 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         return self._has_authority
 
     def _step(self, now_ns: int, t_ns: int) -> GuidanceOutput | None:
-        # One of the instant of the step itself comes before or after it: in lockstep it acts from
-        # the next step on.
+        # One of the instant of the step itself may come before or after it, so in lockstep it acts
+        # from the next step on.
         while self._authorities and (
             self._authorities[0].stamp_ns < now_ns or not self.parameters.lockstep
         ):
@@ -266,7 +266,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         return self.receive(topic, decode, take, max_age_ns=self._max_age_ns, lock=lock)
 
     def _decode_pose(self, raw: bytes) -> StampedVector:
-        """A pose in the order of `channels.POSE`, without sideslip where there is none."""
+        """Decode a pose in the order of `channels.POSE`, without sideslip if there is none."""
         sample = self._named.decode(raw)
         if self.parameters.lockstep and not sample.channels:
             return StampedVector(sample.stamp_ns, np.array(()), sample.sender)
@@ -279,11 +279,11 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         return nanoseconds(self.parameters.max_age)
 
     def _timeouts_ns(self) -> tuple[int, int]:
-        """Timeouts of the publishers of y, pose and internals."""
+        """Return the timeouts of the publishers of y, pose and internals."""
         return self._max_age_ns(), self._max_age_ns() + nanoseconds(self.parameters.hold)
 
     def _take_target(self, sample: NamedSample, now_ns: int) -> None:
-        # A target without channels keeps the operator's link alone.
+        # A target without channels only keeps the operator's link.
         if sample.channels:
             self._guidance.take_target(sample.channels)
         self._guidance.keep_link()
@@ -314,9 +314,9 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
                 self._guidance.keep_link()
 
     def _receive_authority(self) -> Receiver[StampedVector] | None:
-        """The receiver of `authority`; None in a flight without a learner.
+        """Make the receiver of `authority`; None in a flight without a learner.
 
-        There an unexpected publisher alone would send.
+        In such a flight only an unexpected publisher would send it.
         """
         rate = self.parameters.authority_rate
         self._authority_period_ns = period_ns(rate, "authority_rate") if rate else 0
@@ -327,20 +327,20 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
             Decoder(AUTHORITY_CHANNELS).decode,
             self._take_authority,
             max_age_ns=None if self.parameters.lockstep else self._max_age_ns,
-            # In real time that of `internals`: of the controller that flies.
+            # In real time it is that of `internals`, the controller that flies.
             lock=LockstepLock() if self.parameters.lockstep else None,
             qos=LOCKSTEP if self.parameters.lockstep else NEWEST_SAMPLES,
         )
 
     def _controller(self) -> str | None:
-        """The controller that flies; None before its first sample."""
+        """Name the controller that flies; None before its first sample."""
         # In lockstep the sender has no process in its name.
         if self.parameters.lockstep:
             return f"{self.get_namespace().rstrip('/')}/{CONTROLLER}"
         return None if self._internals.lock is None else self._internals.lock.publisher
 
     def _poll_authority(self, now_ns: int) -> None:
-        """Real time: take `authority`.
+        """In real time, take `authority`.
 
         The last sample is void after FEWEST_AUTHORITIES periods and the age limit.
         """
@@ -359,7 +359,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
     def _take_authority(self, sample: StampedVector, now_ns: int) -> None:
         controller = self._controller()
         if controller is None:
-            # Nothing flies yet, and the next sample says the same.
+            # Nothing flies yet, and the next sample will say the same.
             return
         require_sender(sample.sender, controller)
         if np.any(sample.value < 0.0):
@@ -373,7 +373,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
     def _take_mode(self, sample: StampedVector, now_ns: int) -> None:
         """Fly while the controller is ENGAGED.
 
-        After INACTIVE, hold what is measured; after a failsafe, go on.
+        After INACTIVE, hold what is measured; after a failsafe, continue.
         """
         try:
             mode = Mode(int(sample.value[0]))
@@ -410,20 +410,20 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
             setattr(pose_of_message.orientation, key, value)
         for key, value in zip("xyz", body_velocity(pose), strict=True):
             setattr(message.twist.twist.linear, key, value)
-        speed = self.parameters.speed + y.get("V", 0.0)  # a multicopter has no V, and measures r
+        speed = self.parameters.speed + y.get("V", 0.0)  # a multicopter has no V but measures r
         r = yaw_rate(y, pose["phi"], pose["theta"], speed)
         for key, value in zip("xyz", (y["p"], -y["q"], -r), strict=True):
             setattr(message.twist.twist.angular, key, value)
         return message
 
     def _view(self, topic: Topic, period_ns: int = ODOMETRY_PERIOD_NS) -> Any:
-        """The publisher of a topic for tools."""
+        """Make the publisher of a topic for tools."""
         return self.create_publisher(topic.type, topic.name, publisher_qos(period_ns))
 
     def _publish_sensors(self, odometry: Odometry) -> None:
         """Publish attitude and rates, the place on the Earth, and the estimated wind.
 
-        The place is published where an origin is given. The wind is by where the air moves to.
+        The place is published only if an origin is given. The wind says where the air moves to.
         """
         place = odometry.pose.pose
         twist = odometry.twist.twist
@@ -491,9 +491,9 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
 def _service(
     answer: Callable[[Any], bool | str], called: Callable[[], None]
 ) -> Callable[[Any, Any], Any]:
-    """A service callback: True, or a sentence of refusal, as the response.
+    """Make a service callback whose response is True, or a sentence of refusal.
 
-    `called` knows of each call.
+    `called` is told of each call.
     """
 
     def callback(request: Any, response: Any) -> Any:
@@ -507,7 +507,7 @@ def _service(
 
 
 def _transform(odometry: Odometry) -> TransformStamped:
-    """The transform from the map to the body frame."""
+    """Return the transform from the map to the body frame."""
     transform = TransformStamped(header=odometry.header, child_frame_id=odometry.child_frame_id)
     place = odometry.pose.pose
     translation = transform.transform

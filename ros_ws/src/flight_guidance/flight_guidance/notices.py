@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Notices of guidance.
 
-They tell of a missed leg, a go-around, the fence, a flight carried back, a strong wind, a lost
-link, new limits. The node logs the sentences as warnings; the summary of a flight takes the same
+They report a missed leg, a go-around, the fence, a flight carried back, a strong wind, a lost link,
+and new limits. The node logs the sentences as warnings, and the summary of a flight takes the same
 sentences from the log.
 """
 
@@ -21,7 +21,7 @@ from flight_guidance.modes.landing import Landing
 from flight_guidance.reach import Authority
 
 DWELL = 10.0
-"""Time for which a condition lasts before the notice, and ends before a second notice, s."""
+"""Time for which a condition must last before a notice, and be over before another one, s."""
 
 LEARNED = tuple(f"authority.{name}" for name in Authority._fields)
 """Channels of `guidance`: what the inputs can do, as learned in flight."""
@@ -35,15 +35,15 @@ LINK_AGE = "age.link"
 """Channel of `guidance`: time since the last message of an operator, s, 0 without a limit."""
 
 TILTED = math.radians(8.0)
-"""A multicopter beyond its largest tilt by as much does not follow: a step of the command to the
-largest tilt, 30 deg, overshoots by 1 deg."""
+"""A multicopter that exceeds its largest tilt by this much does not follow: a step of the command
+to the largest tilt, 30 deg, overshoots by 1 deg."""
 
 STALE_TIME = 2.0
 """The same for a pose older than its limit, s."""
 
 
 class Notice(NamedTuple):
-    """A sentence and the flight time."""
+    """A sentence and its flight time."""
 
     t: float  # s
     text: str
@@ -52,7 +52,7 @@ class Notice(NamedTuple):
 def is_blown_back(log: Mapping[str, Scalar]) -> Scalar:
     """Whether an aircraft that flies ahead along a path goes back along it over ground.
 
-    The aircraft flies ahead through the air. `log`: channels of `guidance`, values or arrays.
+    It flies ahead through the air. `log` has the channels of `guidance`, as values or arrays.
     """
     track = log["track"]
     lateral = log["mode.lateral"]
@@ -66,9 +66,9 @@ def is_blown_back(log: Mapping[str, Scalar]) -> Scalar:
 
 
 class _Lasting:
-    """Whether a condition has lasted for `dwell`.
+    """Tells whether a condition has lasted for `dwell`.
 
-    Due once, and again after the condition has been away for `dwell`.
+    It is due once, and again after the condition has been away for `dwell`.
     """
 
     def __init__(self, dwell: float = DWELL) -> None:
@@ -92,10 +92,10 @@ class _Lasting:
 class Notices:
     """The notices of a flight, sample by sample of the log of guidance.
 
-    `wind`: guidance.wind, m/s; `max_age`: guidance.max_age, s; `largest_wind`: of the airspeed
-    command, m/s, the wind up to which circles fit into the bank; `link_timeout`:
-    guidance.home.link_timeout, s; `reach`: `targets.reach_sentence`; `largest_tilt`: that of a
-    multicopter, rad; `landing`: that of the route.
+    `wind` is guidance.wind, m/s; `max_age` is guidance.max_age, s; `largest_wind` gives, for an
+    airspeed command in m/s, the wind up to which circles fit into the bank; `link_timeout` is
+    guidance.home.link_timeout, s; `reach` is `targets.reach_sentence`; `largest_tilt` is that of a
+    multicopter, rad; `landing` is that of the route.
     """
 
     CHANNELS = (
@@ -143,16 +143,16 @@ class Notices:
         self._strong = _Lasting()
         self._leg = 0
         self._action = 0.0
-        # NaN: inside
+        # NaN while inside
         self._outside_from = math.nan
         self._farthest = 0.0
 
     def take(self, t: float, log: Mapping[str, float]) -> list[Notice]:
-        """The notices of a sample at the flight time t, s, from the CHANNELS of the log."""
+        """Return the notices of a sample at the flight time t, s, from the CHANNELS of the log."""
         before = self._leg
         self._leg = int(log["leg"])
         texts = []
-        # Events of this step: a leg, the landing, the fence, new limits.
+        # The events of this step: a leg, the landing, the fence, new limits.
         if log["missed"] > 0.0:
             texts.append(f"leg {before} missed by {log['missed']:.0f} m")
         if self._landing is not None and before == self._landing.leg < self._leg:
@@ -175,7 +175,7 @@ class Notices:
             self._reach_text = self._reach(authority)
             if self._reach_text != earlier:
                 texts.append(f"from now on {self._reach_text or 'own limits again'}")
-        # Conditions that have lasted: the link, the pose, the tilt, the wind.
+        # The conditions that have lasted: the link, the pose, the tilt, the wind.
         if self._link.due(t, holds=log[LINK_AGE] > self._link_timeout):
             texts.append(f"no message of an operator for {self._link_timeout:g} s: home")
         if self._stale.due(t, holds=log["age.pose"] > self._max_age):
@@ -202,7 +202,7 @@ class Notices:
         return [Notice(t, text) for text in texts]
 
     def _outside(self, t: float, clearance: float) -> list[str]:
-        """The sentence where the aircraft leaves the fence, or is back inside.
+        """Return the sentence if the aircraft leaves the fence, or is back inside.
 
         While pose is lost, neither is known.
         """
@@ -224,7 +224,7 @@ class Notices:
         return []
 
     def read_log(self, t: Array, log: Mapping[str, Array]) -> list[Notice]:
-        """The notices of a whole log, with arrays as channels."""
+        """Return the notices of a whole log, with arrays as channels."""
         columns = [log[name].tolist() for name in self.CHANNELS]
         notices: list[Notice] = []
         for instant, *row in zip(t.tolist(), *columns, strict=True):

@@ -11,13 +11,13 @@ from collections.abc import Mapping
 # Frames of REP 105: east, north, up; forward, left, up.
 MAP = "map"
 BODY = "base_link"
-ROUTE_FRAMES = (MAP, "")  # of a route that guidance takes
+ROUTE_FRAMES = (MAP, "")  # frames of a route that guidance takes
 
 
 def quaternion(phi: float, theta: float, psi: float) -> tuple[float, float, float, float]:
-    """Orientation x, y, z, w of forward-left-up in east-north-up.
+    """Compute the orientation x, y, z, w of forward-left-up in east-north-up.
 
-    R_z(pi/2 - psi) R_y(-theta) R_x(phi); angles in rad.
+    It is R_z(pi/2 - psi) R_y(-theta) R_x(phi), with angles in rad.
     """
     (cr, sr), (cp, sp), (cy, sy) = (
         (math.cos(angle / 2.0), math.sin(angle / 2.0))
@@ -32,7 +32,7 @@ def quaternion(phi: float, theta: float, psi: float) -> tuple[float, float, floa
 
 
 def body_velocity(pose: Mapping[str, float]) -> tuple[float, float, float]:
-    """Velocity over ground forward, left and up in the body frame, m/s, from a pose."""
+    """Return the velocity over ground forward, left and up in the body frame, m/s, from a pose."""
     phi = pose["phi"]
     theta = pose["theta"]
     psi = pose["psi"]

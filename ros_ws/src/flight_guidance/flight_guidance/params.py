@@ -40,14 +40,10 @@ class GuidanceConfig(SteeringConfig):
     """Parameters of the guidance node."""
 
     program: dict[str, Steps] = Field(default={}, description="targets over flight time by channel")
-    route: RouteConfig | None = Field(
-        default=None, description="the route, flown from the start on"
-    )
-    fence: dict[str, ZoneConfig] = Field(
-        default={}, description="zones to stay in or to keep out of"
-    )
+    route: RouteConfig | None = Field(default=None, description="route, flown from the start")
+    fence: dict[str, ZoneConfig] = Field(default={}, description="zones to stay in or keep out of")
     touchdown: ZoneConfig | None = Field(
-        default=None, description="where a landing is to touch down; none: anywhere"
+        default=None, description="where a landing must touch down; none: anywhere"
     )
     landing: LandingConfig | None = Field(
         default=None, description="a landing at a waypoint of the route"
@@ -90,7 +86,7 @@ class GuidanceConfig(SteeringConfig):
                 f"{self.rate:g} Hz",
                 f"a whole fraction of y_rate ({self.y_rate:g} Hz)",
             )
-        # The altitudes, and home between them.
+        # Check the altitudes, and that home is between them.
         lowest, highest = self.altitudes()
         require(
             lowest < highest, "ceiling", f"{highest:g} m", f"more than altitude_floor, {lowest:g} m"
@@ -103,7 +99,7 @@ class GuidanceConfig(SteeringConfig):
             self._check_multicopter()
         else:
             self._check_airplane()
-        # Route, landing and program need the numbers of the equations.
+        # Check route, landing and program, which need the numbers of the equations.
         params = self.params()
         route = None if self.route is None else self.plan(self.waypoints())
         if self.landing is not None:
@@ -114,7 +110,7 @@ class GuidanceConfig(SteeringConfig):
             read_target(target, params, route, f"program at {start:g} s")
 
     def _check_multicopter(self) -> None:
-        """What an airplane alone has, and home inside of the fence."""
+        """Refuse what only an airplane has, and a home outside the fence."""
         for key in ("stall_speed", "landing", "touchdown", "throttle_authority"):
             require(not getattr(self, key), key, getattr(self, key), "none of a multicopter")
         inside = self.fence_clearance(self.home.north, self.home.east)
@@ -162,7 +158,7 @@ class GuidanceConfig(SteeringConfig):
             require(False, "home", turn, f"at least {margin:.0f} m inside; {size}")
 
     def _at_home(self) -> Motion:
-        """The level aircraft over home, with the turns of the fence."""
+        """Return the level aircraft over home, with the turns of the fence."""
         params = self.params()
         limits = params.limits
         bank = protection.bank_limit(limits.bank, limits.stall_speed, self.speed)
@@ -180,7 +176,7 @@ class GuidanceConfig(SteeringConfig):
         )
 
     def fence_zones(self) -> Fence | None:
-        """The fence of the equations; None without zones."""
+        """Return the fence as the equations use it; None if there are no zones."""
         zones = tuple(zone.zone() for zone in self.fence.values())
         if not zones:
             return None
@@ -188,21 +184,21 @@ class GuidanceConfig(SteeringConfig):
         return Fence(zones, (self.home.north, self.home.east), radius)
 
     def fence_clearance(self, north: float, east: float) -> float:
-        """Distance of a place from the fence, m, negative outside; infinite without a fence."""
+        """Return the distance of a place from the fence, m, negative outside; infinite if none."""
         fence = self.fence_zones()
         if fence is None:
             return math.inf
         return float(clearance(fence.zones, np.array(north), np.array(east)))
 
     def fence_margin(self, speed: float) -> float:
-        """Least distance of a route from the fence at an airspeed, m.
+        """Return the least distance that a route must keep from the fence at an airspeed, m.
 
-        MARGIN of flight with the wind from behind.
+        It is MARGIN of flight with the wind from behind.
         """
         return MARGIN * (speed + self.wind)
 
     def params(self) -> GuidanceParams:
-        """The numbers of the equations."""
+        """Return the numbers that the equations use."""
         return GuidanceParams(
             outputs=self.outputs,
             period_ns=period_ns(self.rate, "rate"),
@@ -216,7 +212,7 @@ class GuidanceConfig(SteeringConfig):
         )
 
     def notices(self) -> Notices:
-        """What the notices of a flight depend on."""
+        """Return what the notices of a flight depend on."""
         link_timeout = self.home.link_timeout or math.inf
         if self.drag is not None:
             strongest = GRAVITY * math.tan(self.bank) / self.drag
@@ -242,11 +238,11 @@ class GuidanceConfig(SteeringConfig):
         )
 
     def waypoints(self) -> tuple[Waypoint, ...]:
-        """The waypoints of the section's route; none without a route."""
+        """Return the waypoints of the section's route; none without a route."""
         return () if self.route is None else self.route.waypoints()
 
     def plan(self, waypoints: Sequence[Waypoint]) -> Route:
-        """Legs through waypoints. Raises ParameterError for a route that is not feasible."""
+        """Plan legs through waypoints. Raises ParameterError if the route is not feasible."""
         if self.drag is None:
             route = self._airplane_route(waypoints)
         else:
@@ -303,10 +299,10 @@ class GuidanceConfig(SteeringConfig):
         return as_route(legs, waypoints, self.speed, slopes=self.profile == "slope", notes=notes)
 
     def landing_on(self, route: Route) -> Landing | None:
-        """The landing at the end of a line of a route; None without one.
+        """Find the landing at the end of a line of a route; None if there is none.
 
-        Raises ParameterError for a waypoint that no line leads to and none goes straight on from, a
-        line that does not descend, and an airspeed out of bounds.
+        Raises ParameterError for a waypoint that no line leads to or from which none goes straight
+        on, a line that does not descend, and an airspeed out of bounds.
         """
         if (section := self.landing) is None:
             return None
@@ -326,12 +322,12 @@ class GuidanceConfig(SteeringConfig):
         return landing_at(waypoints[number].point, route, section, box, self.params())
 
     def lander(self, route: Route | None) -> Lander | None:
-        """What lands on the route of the parameters; None without a landing."""
+        """Make what lands on the route of the parameters; None if there is no landing."""
         landing = None if route is None else self.landing_on(route)
         return None if landing is None else Lander(landing, self.params())
 
     def program_steps(self) -> list[tuple[float, dict[str, float]]]:
-        """The targets of the program by instant, in order: (s, {channel: value})."""
+        """Return the targets of the program by instant, in order: (s, {channel: value})."""
         for name in self.program:
             require(name in TARGETS, f"program.{name}", "a channel", f"one of {', '.join(TARGETS)}")
         steps: dict[float, dict[str, float]] = {}

@@ -35,19 +35,21 @@ class Steps(Config):
 class RouteConfig(Config):
     """Waypoints in the local tangent plane of `pose`."""
 
-    north: Numbers = Field(description="m")
-    east: Numbers = Field(description="m")
-    altitude: Numbers = Field(description="m, as `pose`")
+    north: Numbers = Field(description="distance to the north of the origin, m")
+    east: Numbers = Field(description="distance to the east of the origin, m")
+    altitude: Numbers = Field(description="altitude, m, as in `pose`")
     V: tuple[Positive, ...] = Field(
         default=(), description="airspeed to each waypoint, m/s; none: trim speed"
     )
-    turns: tuple[NonNegative, ...] = Field(default=(), description="turns round each waypoint")
+    turns: tuple[NonNegative, ...] = Field(
+        default=(), description="number of turns round each waypoint"
+    )
     wait: tuple[NonNegative, ...] = Field(
         default=(), description="time on a circle round each waypoint, s"
     )
     leave: tuple[Number, ...] = Field(
         default=(),
-        description="altitude at which a circle is left, m; none: `altitude`",
+        description="altitude at which the aircraft leaves the circle, m; none: `altitude`",
     )
     left: tuple[bool, ...] = Field(
         default=(), description="whether the circles are counter-clockwise; none: clockwise"
@@ -74,7 +76,7 @@ class RouteConfig(Config):
         )
 
     def waypoints(self) -> tuple[Waypoint, ...]:
-        """The waypoints of the equations."""
+        """Return the waypoints that the equations use."""
         count = len(self.north)
         columns = (
             self.V or (None,) * count,
@@ -90,13 +92,18 @@ class RouteConfig(Config):
 class ZoneConfig(Config):
     """A zone of the fence: a polygon of three or more corners, or a circle round a single point."""
 
-    north: Numbers = Field(description="of the corners, or of the centre, m")
-    east: Numbers = Field(description="m")
-    radius: Positive | None = Field(default=None, description="of a circle, m; none: a polygon")
-    exclude: bool = Field(default=False, description="keep out of the zone, not in")
+    north: Numbers = Field(description="north coordinates of the corners, or of the centre, m")
+    east: Numbers = Field(description="their east coordinates, m")
+    radius: Positive | None = Field(
+        default=None, description="radius of a circle, m; none for a polygon"
+    )
+    exclude: bool = Field(
+        default=False, description="whether the aircraft must keep out of the zone instead of in it"
+    )
     group: Annotated[int, Field(ge=0, le=255)] | None = Field(
         default=None,
-        description="the aircraft stays in all zones of a group; none: its own",
+        description="group of the zone: the aircraft stays in all zones of one group; none: a "
+        "group of its own",
     )
 
     def _check(self) -> None:
@@ -122,7 +129,7 @@ class ZoneConfig(Config):
         )
 
     def zone(self) -> Zone:
-        """The zone of the equations."""
+        """Return the zone that the equations use."""
         return Zone(
             north=self.north,
             east=self.east,
@@ -135,17 +142,20 @@ class ZoneConfig(Config):
 class HomeConfig(Config):
     """Where the aircraft goes at a fence and by `guidance/home`.
 
-    By choice it also goes there after a loss of pose or of the operator's link.
+    If you choose so, it also goes there after a loss of pose or of the operator's link.
     """
 
-    north: Number = Field(default=0.0, description="m")
-    east: Number = Field(default=0.0, description="m")
-    altitude: Number | None = Field(default=None, description="m; none: the altitude of then")
+    north: Number = Field(default=0.0, description="distance to the north of the origin, m")
+    east: Number = Field(default=0.0, description="distance to the east of the origin, m")
+    altitude: Number | None = Field(
+        default=None, description="altitude, m; none: the altitude when the aircraft turns home"
+    )
     after_loss: bool = Field(
-        default=False, description="fly home when pose returns; else level the wings"
+        default=False,
+        description="whether to fly home when pose returns, instead of levelling the wings",
     )
     link_timeout: Positive | None = Field(
-        default=None, description="time without an operator before the way home, s"
+        default=None, description="time without an operator after which the aircraft flies home, s"
     )
 
 
@@ -159,7 +169,7 @@ class LandingConfig(Config):
         description="number of the waypoint on the ground, from 0 on"
     )
     flare: Positive | None = Field(
-        default=None, description="height of the flare, m; none: 5 s of sink"
+        default=None, description="height at which the flare begins, m; none: 5 s of sink"
     )
     sink: Positive = Field(default=0.5, description="sink at the touch, m/s")
     decrab: NonNegative = Field(

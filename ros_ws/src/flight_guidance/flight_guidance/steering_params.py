@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameters of steering: limits and gains of an aircraft.
 
-What is left out follows by rule from the reference model, the throttle and the speeds.
+What you leave out follows by rule from the reference model, the throttle and the speeds.
 """
 
 import math
@@ -30,7 +30,7 @@ from flight_guidance.steering.vertical import VerticalParams, path_lag
 
 BY_RULE = ("outputs", "natural_frequency", "speed", "throttle_authority", "roll_authority")
 FLOOR_FRACTION = 0.8
-"""Speed floor over the trim speed where no stall speed is known."""
+"""Speed floor over the trim speed if no stall speed is known."""
 
 FASTEST_ROLL = 0.35
 """rad/s, 20 deg/s."""
@@ -41,11 +41,11 @@ ALPHA_TIME = 2.0
 
 TURN_LEAD = 2.4
 """r leads the bank by this over the frequency of the reference model of r: 1.8 is the lag of the
-model with a damping of 0.9, the rest that of the sideslip in a roll of the osprey."""
+model with a damping of 0.9, the rest is that of the sideslip in a roll of the osprey."""
 
 RUDDERLESS = 1.5
-"""Factor on the period without rudder: no lead makes up for the lag of the turn. The X8 cycled with
-the period of an aircraft with rudder, and not with 1.4 times that."""
+"""Factor on the period without rudder, because no lead makes up for the lag of the turn. The X8
+cycled with the period of an aircraft with rudder, but not with 1.4 times that."""
 
 STEEPEST = 0.1
 """Largest climb and sink rate over the trim speed."""
@@ -55,23 +55,24 @@ class SteeringConfig(NodeConfig):
     """Parameters of steering, and the numbers of its equations."""
 
     rate: Annotated[float, Field(ge=1, le=1000)] = Field(
-        default=50.0, description="the rate at which u_m is published, Hz"
+        default=50.0, description="rate at which u_m is published, Hz"
     )
     start_time: float = Field(
         default=0.0,
         ge=-1,
         le=1e10,
-        description="system time of t = 0, s since the epoch; 0: at once; -1: by the topic `start`",
+        description="system time of t = 0, s since the epoch; 0: at once; -1: by topic `start`",
     )
-    y_rate: float = Field(default=0.0, ge=0, le=1000, description="in lockstep: the rate of y, Hz")
+    y_rate: float = Field(default=0.0, ge=0, le=1000, description="rate of y in lockstep, Hz")
     authority_rate: float = Field(
-        default=0.0, ge=0, le=1000, description="rate of `authority`, Hz; 0: of no learner"
+        default=0.0, ge=0, le=1000, description="rate of `authority`, Hz; 0 without a learner"
     )
-    outputs: Names = Field(default=RATES_AND_SPEED, description="the commands u_m in any order")
+    outputs: Names = Field(default=RATES_AND_SPEED, description="commands u_m, in any order")
     natural_frequency: Positives = Field(
-        description="those of the reference model, rad/s; `parameters.yaml` of a run has them"
+        description="natural frequencies of the reference model, rad/s; in `parameters.yaml` of a"
+        " run"
     )
-    speed: Positive = Field(description="the trim speed V0, m/s: airspeed is speed + V")
+    speed: Positive = Field(description="trim speed V0, m/s; airspeed is speed + V")
     throttle_authority: tuple[Positive, ...] = Field(
         default=(), description="deceleration and acceleration by throttle from trim, m/s^2"
     )
@@ -80,12 +81,14 @@ class SteeringConfig(NodeConfig):
     )
     stall_speed: Positive | None = Field(default=None, description="V_s, true airspeed, m/s")
     speed_limit: Positive | None = Field(default=None, description="largest true airspeed, m/s")
-    ceiling: Number | None = Field(default=None, description="largest altitude, m, as `pose`")
-    altitude_floor: Number | None = Field(default=None, description="least altitude, m, as `pose`")
-    wind: NonNegative = Field(default=0.0, description="the largest wind, m/s")
+    ceiling: Number | None = Field(default=None, description="largest altitude, m, as in `pose`")
+    altitude_floor: Number | None = Field(
+        default=None, description="least altitude, m, as in `pose`"
+    )
+    wind: NonNegative = Field(default=0.0, description="largest wind, m/s")
     drag: Positive | None = Field(
         default=None,
-        description="of a multicopter: g tan(tilt) / V in steady flight, 1/s; none: an airplane",
+        description="for a multicopter: g tan(tilt) / V in steady flight, 1/s; none: an airplane",
     )
 
     bank: Annotated[float, Field(gt=0, le=math.radians(60.0))] = Field(
@@ -128,7 +131,7 @@ class SteeringConfig(NodeConfig):
         default="slope", description="altitude changes along a leg, or at its begin"
     )
     max_age: Annotated[float, Field(gt=0, le=1e6)] = Field(
-        default=0.2, description="the age at which y and pose are stale, s"
+        default=0.2, description="age at which y and pose are stale, s"
     )
     hold: Annotated[float, Field(ge=0, le=1e6)] = Field(
         default=10.0, description="how long dead reckoning replaces a stale pose, s"
@@ -139,7 +142,7 @@ class SteeringConfig(NodeConfig):
     )
 
     def by_rule(self) -> list[tuple[str, Any]]:
-        """Parameters by rule from the remaining sections of a scenario, for parameters left out."""
+        """Return the parameters that follow by rule from other sections of a scenario."""
         return [(name, getattr(self, name)) for name in BY_RULE if getattr(self, name)]
 
     def _floor(self) -> float:
@@ -151,26 +154,26 @@ class SteeringConfig(NodeConfig):
         return self.speed_limit or protection.FASTEST * self.speed
 
     def altitudes(self) -> tuple[float, float]:
-        """Least and largest altitude, m."""
+        """Return least and largest altitude, m."""
         return (
             -math.inf if self.altitude_floor is None else self.altitude_floor,
             math.inf if self.ceiling is None else self.ceiling,
         )
 
     def largest_roll_rate(self) -> float:
-        """Largest roll rate p_max, rad/s.
+        """Return the largest roll rate p_max, rad/s.
 
-        0.35, or less where 0.4 w p_max, the largest p_m_dot after a step, is a third of the
-        authority.
+        It is 0.35, or less if 0.4 w p_max, the largest p_m_dot after a step, would exceed a third
+        of the authority.
         """
         frequency = self._frequency()["p"]
         authority = math.inf if self.roll_authority is None else self.roll_authority
         return self.roll_rate or min(FASTEST_ROLL, reach.roll_rate(authority, frequency))
 
     def k_beta(self) -> float:
-        """k_beta = min(0.5, k_chi V0 d / s), 1/s.
+        """Compute k_beta = min(0.5, k_chi V0 d / s), 1/s.
 
-        A lateral gust of s = 1.5 m/s turns a held heading by d = 1 deg.
+        A lateral gust of s = 1.5 m/s then turns a held heading by d = 1 deg.
         """
         if self.sideslip_gain is not None:
             return self.sideslip_gain
@@ -178,20 +181,20 @@ class SteeringConfig(NodeConfig):
         return min(0.5, k_chi * self.speed * math.radians(1.0) / 1.5)
 
     def least_period(self) -> float:
-        """Least period of path following, s."""
+        """Return the least period of path following, s."""
         lag = 1.0 if "r" in self.outputs else RUDDERLESS
         return lag * least_period(self.speed, self.bank, self.largest_roll_rate())
 
     def least_radius(self) -> float:
-        """Least radius of fillets and orbits, m."""
+        """Return the least radius of fillets and orbits, m."""
         return least_radius(self.speed, self.wind, self.bank)
 
     def climb_limits(self) -> tuple[float, float]:
-        """Largest climb and sink rate, m/s.
+        """Return the largest climb and sink rate, m/s.
 
         They are 0.7 and 0.5 of what full throttle gives, a V0 / g, and at most a tenth of V0. The
-        rest of the throttle holds the airspeed. `protection.climb_range` takes the climb back where
-        the rest is too little.
+        rest of the throttle holds the airspeed. If that is too little, `protection.climb_range`
+        reduces the climb.
         """
         steepest = STEEPEST * self.speed
         down, up = self.throttle_authority or (math.inf, math.inf)
@@ -199,7 +202,7 @@ class SteeringConfig(NodeConfig):
         return self.climb or min(climb, steepest), self.sink or min(sink, steepest)
 
     def equation_numbers(self) -> dict[str, Any]:
-        """The numbers of the equations that follow by rule, by field of `GuidanceParams`."""
+        """Return the numbers of the equations that follow by rule, by field of `GuidanceParams`."""
         if self.drag is not None:
             return self._multicopter_numbers(self.drag)
         frequency = self._frequency()
@@ -248,7 +251,7 @@ class SteeringConfig(NodeConfig):
         }
 
     def _frequency(self) -> dict[str, float]:
-        """The natural frequency of the reference model by output, rad/s."""
+        """Return the natural frequency of the reference model by output, rad/s."""
         return dict(zip(self.outputs, self.natural_frequency, strict=True))
 
     def _gains(self, drag: float) -> MulticopterParams:
@@ -257,7 +260,7 @@ class SteeringConfig(NodeConfig):
         )
 
     def _multicopter_numbers(self, drag: float) -> dict[str, Any]:
-        """The numbers of the equations of a multicopter that follow by rule."""
+        """Return the numbers of a multicopter's equations that follow by rule."""
         gains = self._gains(drag)
         frequency = self._frequency()
         lowest, highest = self.altitudes()
@@ -298,10 +301,10 @@ class SteeringConfig(NodeConfig):
         }
 
     def _vertical(self, climb: float, sink: float) -> VerticalParams:
-        """The altitude loop.
+        """Return the altitude loop.
 
-        Where the lag T_L of the flight path is known, T >= T_L and k_h <= 0.4 / T_L. The flight
-        path then has a damping of 0.5 or more, and the altitude a gain margin of 2.5 by Routh's
+        If the lag T_L of the flight path is known, T >= T_L and k_h <= 0.4 / T_L. The flight path
+        then has a damping of at least 0.5, and the altitude a gain margin of 2.5 by Routh's
         criterion.
         """
         lag = path_lag(self.stall_speed, self.speed) if self.stall_speed else 0.0

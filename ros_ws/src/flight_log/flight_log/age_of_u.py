@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The age of u at the aircraft, from the diagnostics.
 
-The age is the delay of the whole loop, from the instant of y to the action of u.
+It is the delay of the whole loop, from the instant of y to the action of u.
 """
 
 from collections.abc import Iterable
@@ -19,12 +19,12 @@ from flight_log.named_vectors import typestore
 DIAGNOSTICS = "/diagnostics"
 MEAN = "age of u mean (s)"
 MAX = "age of u max (s)"
-IN_MESSAGE = MEAN.encode()  # of a message with an age of u
+IN_MESSAGE = MEAN.encode()  # occurs in a message with an age of u
 CHANNELS = ("mean", "max")
 
 
 def age_of_u(messages: Iterable[bytes], namespace: str) -> Signal | None:
-    """Mean and largest age of u between two reports of an aircraft, s; None without any.
+    """Return mean and largest age of u between two reports of an aircraft, s; None if none.
 
     `namespace` is that of the aircraft.
     """

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Writes a bag in the layout of rosbag2: an MCAP file of CDR messages, and metadata.yaml.
 
-Needs no ROS.
+It needs no ROS.
 """
 
 import struct
@@ -25,15 +25,15 @@ from flight_log.message_definitions import MessageDefinition, definition
 from flight_log.rosbag2_metadata import METADATA, FileContents, TopicCount, bag_metadata_yaml
 from flight_log.scan import RECORD
 
-SCENARIO_MEDIA_TYPE = "application/yaml"  # of attachments: the scenario
-FILE_MEDIA_TYPE = "text/yaml"  # and other files
+SCENARIO_MEDIA_TYPE = "application/yaml"  # media type of the attached scenario
+FILE_MEDIA_TYPE = "text/yaml"  # and of other attached files
 BEFORE_REMAP = "rise_di_topic"  # of a channel: the full name of its topic before a remap of ROS 2
 OUTCOME = "rise_di_outcome"  # name of the metadata record with the outcome of the flight
 SILENCES = "rise_di_silent"  # name of the metadata record with the silences of topics, s
 OUTCOME_FILE = "outcome"  # in the folder of a run, from the flight to the recorder
 # Name of the metadata record of a log that the stack did not fly: "log", "kind", "map", COMPARED.
 IMPORTED = "rise_di_imported"
-# What the parameters of the vehicle do not tell, a sentence; empty where all agree with the map.
+# What the vehicle's parameters do not tell, as a sentence; empty if all agree with the map.
 COMPARED = "parameters"
 # Name of the metadata record with the SI units of channels, for a log without a scenario.
 CHANNEL_UNITS = "rise_di_units"
@@ -43,9 +43,9 @@ SIMULATED_TIME = "rise_di_simulated_time"
 LOST_MESSAGES = "rise_di_lost"
 CHUNK_BYTES = 256 * 1024
 
-# Bytes reserved for the end of a file: the chunk in progress and its index, and the summary without
-# the chunk indexes. The chunk indexes grow with the file: 77 bytes for each chunk and 10 for each
-# topic in it (MCAP specification, Chunk Index).
+# Bytes reserved for the end of a file: the chunk in progress with its index, and the summary
+# without the chunk indexes. The chunk indexes grow with the file: 77 bytes for each chunk, and 10
+# for each topic in it (MCAP specification, Chunk Index).
 END_BYTES = 2 * CHUNK_BYTES
 INDEX_BYTES = 77
 INDEX_BYTES_BY_TOPIC = 10
@@ -93,7 +93,7 @@ class _MessageIndex(MessageIndex):
 class _ChunkBuilder(ChunkBuilder):
     """Writes the bytes of mcap's builder in half the time.
 
-    The builder of mcap writes a message field by field, and the length afterwards.
+    mcap's own builder writes a message field by field, and its length afterwards.
     """
 
     def add_message(self, message: Message) -> None:
@@ -117,10 +117,10 @@ class _ChunkBuilder(ChunkBuilder):
 
 
 class _ChunkIndexes:
-    """Chunk indexes as records on disk, in place of mcap's list in memory.
+    """Chunk indexes as records on disk, instead of mcap's list in memory.
 
-    The list of mcap grows by 1 kB a chunk, 36 MB an hour. The reserve for the end of the file grows
-    with the number of chunks.
+    mcap's list grows by 1 kB a chunk, 36 MB an hour. The reserve for the end of the file grows with
+    the number of chunks.
     """
 
     def __init__(self, file: ReservedFile, channels: Sequence[BagChannel]) -> None:
@@ -145,14 +145,14 @@ class _ChunkIndexes:
 
 
 def full_names(remaps: Mapping[str, str]) -> dict[str, str]:
-    """Full names in the stack by topics of a log; `remaps` are topics of the log by names."""
+    """Map topics of a log to full names in the stack; `remaps` gives topics of the log by name."""
     return {topic: f"/{name.lstrip('/')}" for name, topic in remaps.items()}
 
 
 def stack_topic(channel: Channel, remaps: Mapping[str, str] = {}) -> str:
-    """The full name in the stack of a topic of a log.
+    """Return the full name in the stack of a topic of a log.
 
-    The names in `remaps`, by topics of the log, come before those that the log itself has.
+    The names in `remaps`, by topics of the log, take precedence over those in the log itself.
     """
     return remaps.get(channel.topic) or channel.metadata.get(BEFORE_REMAP) or channel.topic
 
@@ -160,10 +160,10 @@ def stack_topic(channel: Channel, remaps: Mapping[str, str] = {}) -> str:
 class BagWriter:
     """Writes a bag into a folder.
 
-    `flush` closes the chunk in progress: closed chunks stay readable after a kill of the process.
-    Disk space for the end of the file is reserved. Once a write has used the reserve, `full` is
-    true and the bag has to be closed. Raises OSError when a write fails for any further reason, or
-    when the reserve does not suffice.
+    `flush` closes the chunk in progress; closed chunks stay readable if the process is killed. Disk
+    space for the end of the file is reserved. Once a write has used the reserve, `full` is true and
+    the bag must be closed. Raises OSError if a write fails for any other reason, or if the reserve
+    is not enough.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -213,10 +213,10 @@ class BagWriter:
         self._writer.add_metadata(name, dict(values))
 
     def add_topic(self, topic: str, type_name: str, qos: str, before_remap: str = "") -> BagChannel:
-        """Add a topic by the full name.
+        """Add a topic by its full name.
 
-        `qos` is rosbag2's YAML list of offered profiles, `before_remap` the name in the stack.
-        Raises ParameterError when the definition of the type is unknown.
+        `qos` is rosbag2's YAML list of offered profiles, and `before_remap` the name in the stack.
+        Raises ParameterError if the definition of the type is not known.
         """
         type_definition = definition(type_name)
         schema = self._writer.register_schema(
@@ -249,7 +249,7 @@ class BagWriter:
         self._writer.flush()
 
     def contents(self) -> FileContents:
-        """What the file holds so far."""
+        """Return what the file holds so far."""
         counts = (
             TopicCount(
                 topic=channel.topic,
@@ -281,7 +281,7 @@ def _is_mapping_of_strings(content: object) -> bool:
 
 
 def read_metadata_records(path: Path) -> dict[str, dict[str, str]]:
-    """Named sets of strings from a YAML file. Raises ParameterError for any further content."""
+    """Read named sets of strings from a YAML file; raise ParameterError for anything else."""
     expected = "a mapping of mappings of strings"
     content = read_yaml(path, str(path), expected)
     valid = isinstance(content, dict) and all(map(_is_mapping_of_strings, content.values()))

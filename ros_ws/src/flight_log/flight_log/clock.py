@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The clock of the stamps of a topic, followed in the order of the recording.
 
-Steps of the clock, damaged stamps and equal stamps are found.
+It finds steps of the clock, damaged stamps and equal stamps.
 """
 
 from collections.abc import Iterator, Mapping
@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from flight_core.rates import NANOSECONDS, seconds
 from flight_core.tape import Recording, Signal
 
-STEP_NS = NANOSECONDS // 10  # back: late samples are less late
-LEAP_NS = NANOSECONDS // 4  # forth, beside the time of the recording
+STEP_NS = NANOSECONDS // 10  # ns, step back of a clock; late samples are less late than this
+LEAP_NS = NANOSECONDS // 4  # ns, step forth of a clock, compared with the time of the recording
 # ns, back. Fewer messages than CONFIRMED that are so much older have a damaged stamp.
 STRAY_NS = NANOSECONDS
 LATE_NS = 4 * NANOSECONDS  # a recorder that starts on a busy host stores its first sample so late
-# Successive messages after a step. Fewer come from a further publisher, or have a damaged stamp.
+# Successive messages after a step. Fewer come from another publisher, or have a damaged stamp.
 CONFIRMED = 10
 CONFIRMED_AT_END = 3
 SINCE_EPOCH_NS = 10**15  # larger stamps count from 1970, not from the start of the flight
@@ -30,8 +30,8 @@ class StampClock:
     """Follows the stamps of a topic, up to a step of their clock.
 
     A step of the clock ends the usable part of the topic. A sample with a damaged stamp is left
-    out. The samples after a step forth stay: `without_leaps` knows all topics and decides on these
-    samples.
+    out. The samples after a step forth stay, because `without_leaps`, which knows all topics,
+    decides on them.
     """
 
     def __init__(self) -> None:
@@ -52,12 +52,13 @@ class StampClock:
         more: bool,
         end: bool = False,
     ) -> tuple[NDArray[np.bool_], int]:
-        """Mask of the usable messages of the next K messages, shape (K,), and K.
+        """Return the mask of the usable messages among the next K messages, shape (K,), and K.
 
-        With `more` messages to come at once, K is less than the number of messages where the last
-        messages confirm no step. `end`: the messages are the last messages of the topic. `steps`:
-        of the publisher's number before each message, (K,). A number falls together with both times
-        in a part of the log out of order. A jump forth beside lost messages is a gap.
+        If `more` messages come at once, K is less than the number of messages unless the last ones
+        confirm or exclude a step. `end` says that these are the last messages of the topic. `steps`
+        are those of the publisher's number before each message, (K,). If a number falls together
+        with both times, this part of the log is out of order. A jump forth beside lost messages is
+        a gap.
         """
         latest = np.maximum.accumulate(np.append(self._last_ns or 0, stamp_ns))[:-1]
         unset = (stamp_ns == 0) & (latest > STEP_NS)
@@ -74,7 +75,7 @@ class StampClock:
         numbers = np.ones(len(stamps), dtype=np.int64) if steps is None else steps[places]
         back = (jumps < -STEP_NS) & ((numbers >= 0) | (np.abs(leads) > STEP_NS))
         forth = (jumps > STEP_NS) & ((leads > STEP_NS) | ~has_time) & (numbers <= 1)
-        # What pauses with the reception is the publisher or the host, not the clock.
+        # If the reception pauses too, the publisher or the host has paused, not the clock.
         with_reception = (jumps > LEAP_NS) & (leads <= LEAP_NS) & has_time
         self._pauses_ns.update((stamps - jumps)[with_reception].tolist())
         # Places where the messages of a clock begin.
@@ -104,7 +105,7 @@ class StampClock:
                 after_step = int(places[first])
                 keep[after_step:] = self._after_step(stamp_ns[after_step:])
                 return self._taken(stamp_ns, keep, len(stamp_ns), after_step)
-            # The messages before are too few to be the begin of the clock.
+            # The messages before are too few to be the beginning of the clock.
             if self._last_ns is None:
                 keep[places[:first]] &= _begins(stamps[: first + 1], offsets[: first + 1])
             self._follow(stamps[first:after], offsets[first:after])
@@ -119,10 +120,11 @@ class StampClock:
             self._is_history = _in_burst(stamp_ns, offset_ns)
 
     def _catches_up(self, stamp_ns: NDArray[np.int64], offset_ns: NDArray[np.int64]) -> bool | None:
-        """Whether samples behind a step back are late ones: a clock that was set stays behind.
+        """Tell whether samples behind a step back are only late; a clock that was set stays behind.
 
         A late sample is at most STRAY_NS older than the one before, and within STRAY_NS of the
-        reception the samples are as late as before. None: too few messages to tell.
+        reception the samples are as late as before. Returns None if there are too few messages to
+        tell.
         """
         if self._last_ns is None or stamp_ns[0] < self._last_ns - STRAY_NS:
             return False
@@ -133,9 +135,9 @@ class StampClock:
         return None if within.all() else False
 
     def _jump_to(self, stamp_ns: int, offset_ns: int, *, has_time: bool) -> tuple[int, bool]:
-        """The time from the usable part to a stamp, ns; and whether the stamp leads its clock.
+        """Return the time from the usable part to a stamp, ns, and whether it leads its clock.
 
-        The time is 0 without a usable part.
+        The time is 0 if there is no usable part.
         """
         # There is no usable stamp, or a stamp that was not set.
         if not self._last_ns:
@@ -145,7 +147,7 @@ class StampClock:
         return jump_ns, is_ahead and has_time and not self._is_history
 
     def _after_step(self, stamp_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Mask of the samples that stay after the step.
+        """Mask the samples that stay after the step.
 
         Behind a step forth they are those later than the step; behind a step back there are none.
         """
@@ -166,7 +168,7 @@ class StampClock:
         return keep, count
 
     def recording(self, unset: int = 0) -> Recording:
-        """The result; `unset`: further messages without a usable stamp."""
+        """Return the result; `unset` counts more messages without a usable stamp."""
         return Recording(
             found=self._count,
             unset=self._unset + unset,
@@ -179,7 +181,7 @@ class StampClock:
 
 
 def _begins(stamp_ns: NDArray[np.int64], offset_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Mask of the samples that may come before the last one, (N - 1,) of N, by the same clock."""
+    """Mask the samples that may come before the last one by the same clock, (N - 1,) of N."""
     away_ns = stamp_ns[-1] - stamp_ns[:-1]
     lead_ns = offset_ns[-1] - offset_ns[:-1]
     is_near = (away_ns <= STRAY_NS) | (lead_ns <= LATE_NS)
@@ -187,11 +189,11 @@ def _begins(stamp_ns: NDArray[np.int64], offset_ns: NDArray[np.int64]) -> NDArra
 
 
 def _in_burst(stamp_ns: NDArray[np.int64], offset_ns: NDArray[np.int64]) -> bool:
-    """Whether the last samples were recorded in a burst, as a publisher's history is.
+    """Whether the last samples were recorded in a burst, like the history of a publisher.
 
     The last samples span LEAP_NS of stamps. In a burst they were recorded in less than half of that
-    time: a recorder that starts late receives the history of the publisher at once. A pause in such
-    a history is no step of the clock.
+    time, because a recorder that starts late receives the history of the publisher at once. A pause
+    in such a history is no step of the clock.
     """
     recent = stamp_ns >= stamp_ns[-1] - LEAP_NS
     span_ns = stamp_ns[-1] - stamp_ns[recent][0]
@@ -200,7 +202,7 @@ def _in_burst(stamp_ns: NDArray[np.int64], offset_ns: NDArray[np.int64]) -> bool
 
 
 def recording_note(name: str, recording: Recording, start_ns: int) -> str:
-    """The sentence on the stamps of a topic; empty for a clock without steps and damaged stamps."""
+    """Write the sentence about the stamps of a topic; "" if they have neither steps nor damage."""
     parts = []
     if recording.unset:
         parts.append(
@@ -224,7 +226,7 @@ class Leap(NamedTuple):
     by_ns: int
 
     def undone(self, stamp_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-        """The stamps by the clock before the leap."""
+        """Convert stamps to the clock before the leap."""
         return stamp_ns - np.where(stamp_ns > self.at_ns + STEP_NS, self.by_ns, 0)
 
 
@@ -235,9 +237,9 @@ LEAPS = "the clock of all stamps leaps forth by "  # in a note
 def without_leaps(
     signals: Mapping[str, Signal], recording: Mapping[str, Recording]
 ) -> tuple[dict[str, Signal], dict[str, Recording], list[Leap]]:
-    """The signals by the clock before each leap, with the leaps.
+    """Convert the signals to the clock before each leap, and return the leaps too.
 
-    A step forth of a single topic is no leap: the samples after such a step are left out.
+    A step forth of a single topic is no leap: the samples after it are left out.
     """
     mended = dict(signals)
     clocks = dict(recording)
@@ -270,11 +272,11 @@ def without_leaps(
 def _candidates(
     signals: Mapping[str, Signal], recording: Mapping[str, Recording]
 ) -> Iterator[Leap]:
-    """Leaps of the stamps against a second measure of time.
+    """Yield leaps of the stamps against a second measure of time.
 
-    The measure is the flight time in `truth`. Without one it is a constant period, where the
-    numbers of the messages have no gap and the reception did not pause as long: a host that was
-    busy or suspended leaves out time, and its clock goes on.
+    The measure is the flight time in `truth`. If there is none, it is a constant period, wherever
+    the numbers of the messages have no gap and the reception did not pause as long: a host that was
+    busy or suspended leaves out time, but its clock goes on.
     """
     name = next((name for name in ("truth", "y_m", "y") if name in signals), "")
     if not name:
@@ -307,6 +309,6 @@ def _has_gap(signal: Signal, leap: Leap) -> bool:
 
 
 def leap_note(leap: Leap, start_ns: int) -> str:
-    """The sentence on a leap of the clock."""
+    """Write the sentence about a leap of the clock."""
     times = f"{seconds(leap.by_ns):.3f} s at t = {seconds(leap.at_ns - start_ns):.3f} s"
     return f"{LEAPS}{times}: later times are by the clock before the leap"

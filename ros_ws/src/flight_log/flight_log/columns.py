@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Samples of a topic as columns: a short topic in memory, a long one in a temporary file.
 
-Metrics and figures use whole channels, one after another. An hour of `truth` has 400 MB, and one of
-its channels 14 MB.
+Metrics and figures use whole channels, one after another. An hour of `truth` takes 400 MB, each of
+its channels only 14 MB.
 """
 
 from collections.abc import Iterator
@@ -19,14 +19,14 @@ from flight_core.tape import Signal
 from flight_core.vectors import FloatArray
 
 IN_MEMORY = 32_000_000
-"""Bytes of a topic in memory. 28 channels of `truth` at 500 Hz need more after 5 min."""
+"""Bytes of a topic that stay in memory; 28 channels of `truth` at 500 Hz need more after 5 min."""
 
 
 class Columns:
     """Samples in order of arrival: stamps, and rows of equal length.
 
-    The rows are read as columns, contiguous in memory. `expected` samples are expected, more are
-    taken. Raises ParameterError where no temporary file can hold a long topic.
+    The rows are read as columns, contiguous in memory. `expected` samples are expected, but more
+    are taken. Raises ParameterError if no temporary file can hold a long topic.
     """
 
     def __init__(self, width: int, expected: int) -> None:
@@ -38,7 +38,7 @@ class Columns:
 
     @property
     def senders(self) -> list[str]:
-        """The publishers by their numbers."""
+        """Publishers by their numbers."""
         return [*self._senders]
 
     def _new(self, capacity: int) -> tuple[NDArray[np.int64], "_MemoryColumns | _FileColumns"]:
@@ -63,7 +63,7 @@ class Columns:
         self.count = end
 
     def signal(self, names: tuple[str, ...]) -> Signal:
-        """The samples as a signal, in the order of arrival."""
+        """Return the samples as a signal, in the order of arrival."""
         stamp_ns = self._stamp_ns[: self.count]
         sender = np.concatenate(self._sender) if len(self._senders) > 1 else None
         if isinstance(self._store, _FileColumns):
@@ -87,7 +87,7 @@ class _MemoryColumns:
 class _FileColumns:
     """Columns in a temporary file without a name.
 
-    They are written past memory, and mapped as long as an array of them is used.
+    They are written past memory, and mapped only while an array of them is used.
     """
 
     def __init__(self, width: int, capacity: int) -> None:
@@ -104,7 +104,7 @@ class _FileColumns:
             self._file.write(np.ascontiguousarray(values).data)
 
     def read(self, first: int, end: int, count: int) -> FloatArray:
-        """Columns, (count, end - first)."""
+        """Read columns, (count, end - first)."""
         with _on_disk():
             self._file.flush()
         if not self._capacity or first == end:
@@ -128,8 +128,8 @@ def _on_disk() -> Iterator[None]:
 class _StoredSignal(Signal):
     """A signal with values in a file, whose neighbouring columns from `first` on are its channels.
 
-    `values` maps the file each time: the memory is free once the caller drops the array. A caller
-    in a loop keeps the array.
+    `values` maps the file each time, so the memory is free once you drop the array. In a loop, keep
+    the array.
     """
 
     def __init__(

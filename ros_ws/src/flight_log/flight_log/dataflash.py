@@ -20,9 +20,9 @@ TAIL = 528  # bytes: with fewer at its end a log is whole (pymavlink, DFReader.p
 
 
 class Packets(DFReader.DFReader_binary):
-    """The packets of a log that another packet or the end follows.
+    """The packets of a log that are followed by another packet or by the end.
 
-    The index of pymavlink ends at the first unknown packet, as lost bytes leave one.
+    pymavlink's own index ends at the first unknown packet, such as lost bytes leave.
     """
 
     def init_arrays(self, progress_callback: Callable[[int], None] | None = None) -> None:
@@ -51,7 +51,7 @@ class Packets(DFReader.DFReader_binary):
     init_arrays_fast = init_arrays
 
     def _length(self, here: int) -> int:
-        """The length of the packet at a place in bytes; 0 without a whole packet there."""
+        """Return the length of the packet at a place in bytes; 0 if there is no whole packet."""
         form = self.formats.get(int.from_bytes(self.data_map[here + 2 : here + 3], "little"))
         if self.data_map[here : here + 2] != HEAD or form is None:
             return 0
@@ -63,7 +63,7 @@ class Packets(DFReader.DFReader_binary):
         return int(form.len)
 
     def _declare(self, content: bytes) -> bool:
-        """Take the format that a packet declares; False for a damaged one."""
+        """Take the format that a packet declares, and return False if it is damaged."""
         identity, length, *texts = struct.unpack(self.formats[FORMAT].msg_struct, content)
         name, types, columns = map(DFReader.null_term, texts)
         try:
@@ -82,12 +82,12 @@ class Packets(DFReader.DFReader_binary):
         return True
 
     def _stamp_ns(self, place: int) -> int:
-        """The stamp of the packet at a place; 0 of one without."""
+        """Return the stamp of the packet at a place; 0 if it has none."""
         self.offset = place
         return round(1e3 * stamp_us(self._parse_next(), 0.0))
 
     def loss(self) -> Loss | None:
-        """The bytes without a packet; None for a whole log."""
+        """Return the bytes without a packet; None for a whole log."""
         lost = self.lost
         if lost and lost[-1][1] == self.data_len and lost[-1][1] - lost[-1][0] < TAIL:
             lost = lost[:-1]
@@ -131,7 +131,7 @@ class Lines(DFReader.DFReader_text):
         self.offset = 0
 
     def _parse_next(self) -> Any:
-        """The message of the next line that has one."""
+        """Return the message of the next line that has one."""
         place = bisect_left(self._places, self.offset)
         if place == len(self._places):
             self.offset = self.data_len
@@ -140,7 +140,7 @@ class Lines(DFReader.DFReader_text):
         return super()._parse_next()
 
     def _message(self, here: int, line: bytes) -> Any:
-        """The message of a line; None of a damaged one."""
+        """Return the message of a line; None if it is damaged."""
         try:
             name, *values = line.decode().split(self.delimiter)
             form = self.formats.get(name)
@@ -158,7 +158,7 @@ class Lines(DFReader.DFReader_text):
         return message
 
     def loss(self) -> Loss | None:
-        """The lines without a message; None for a whole log."""
+        """Return the lines without a message; None for a whole log."""
         if not self.lost_us:
             return None
         what = f"{len(self.lost_us)} of {self._count} lines hold no message"
@@ -166,8 +166,8 @@ class Lines(DFReader.DFReader_text):
 
 
 def stamp_us(message: Any, before_us: float) -> float:
-    """The stamp of a message, us; `before_us` of one without, as MODE of 2014 and before.
+    """Return the stamp of a message, us, or `before_us` if it has none, as MODE of 2014 and before.
 
-    Such logs have ms.
+    Logs of that time have ms.
     """
     return float(getattr(message, "TimeUS", 1e3 * getattr(message, "TimeMS", 1e-3 * before_us)))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Files on a full disk: free space, a file with reserved space."""
+"""Files on a full disk: free space, and a file with reserved space."""
 
 import errno
 import fcntl
@@ -14,7 +14,7 @@ RESERVE_STEP = 64 * 1024  # bytes; the reserve grows by at least this
 
 
 def free_bytes(folder: Path) -> int:
-    """Bytes that an unprivileged user may still write to the disk of a folder."""
+    """Return how many bytes an unprivileged user may still write to the disk of a folder."""
     disk = os.statvfs(folder)
     return disk.f_bavail * disk.f_frsize
 
@@ -22,8 +22,8 @@ def free_bytes(folder: Path) -> int:
 def try_lock(stream: IO[bytes] | int, kind: int = fcntl.LOCK_EX) -> bool:
     """Lock a file until the stream is closed.
 
-    False when a second process, such as a recorder, holds the lock. A file system without locks
-    always grants the lock.
+    Returns False if a second process, such as a recorder, holds the lock. A file system without
+    locks always grants it.
     """
     try:
         fcntl.flock(stream, kind | fcntl.LOCK_NB)
@@ -37,18 +37,18 @@ def try_lock(stream: IO[bytes] | int, kind: int = fcntl.LOCK_EX) -> bool:
 def is_locked(path: Path) -> bool:
     """Whether a second process, such as a recorder, holds the lock of a file.
 
-    Raises OSError when the file cannot be opened.
+    Raises OSError if the file cannot be opened.
     """
     with path.open("rb") as stream:
         return not try_lock(stream, fcntl.LOCK_SH)
 
 
 class ReservedFile:
-    """A new unbuffered file with a reserve of disk space for the end of the file on a full disk.
+    """A new unbuffered file that reserves disk space, so that it can be finished on a full disk.
 
-    A second, unnamed file takes up the reserve. The first write without space closes the unnamed
-    file and then succeeds. The reserve also ends with the process. Until then the reserve holds the
-    data of `keep`, for the end of the file.
+    A second, unnamed file takes up the reserve. The first write without space closes that file and
+    then succeeds. The reserve also ends with the process. Until then it holds the data of `keep`,
+    which belong to the end of the file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -67,13 +67,13 @@ class ReservedFile:
         self._end_data = bytearray()
         self._position = 0
         self._closed = False
-        self.full = False  # the reserve was needed
+        self.full = False  # whether the reserve was needed
 
     def reserve(self, size: int) -> None:
         """Reserve this many bytes in total.
 
-        Without enough space `full` is set and the earlier reserve stays. A call after `release` has
-        no effect: the last chunk is written then.
+        If there is not enough space, `full` is set and the earlier reserve stays. A call after
+        `release` has no effect, because the last chunk is being written then.
         """
         if self.full or self._reserve.closed or size <= self._reserved_bytes:
             return
@@ -100,7 +100,7 @@ class ReservedFile:
         self._end_data += data
 
     def kept_data(self) -> bytes:
-        """The kept data, once the reserve is free."""
+        """Return the kept data, once the reserve is free."""
         return bytes(self._end_data)
 
     def release(self) -> None:
@@ -112,7 +112,7 @@ class ReservedFile:
     def write(self, data: bytes | memoryview) -> int:
         """Write the data.
 
-        Raises OSError when the reserve does not suffice, or for any further reason.
+        Raises OSError if the reserve is not enough, or for any other reason.
         """
         unwritten = memoryview(data)
         size = unwritten.nbytes
@@ -130,7 +130,7 @@ class ReservedFile:
         return size
 
     def tell(self) -> int:
-        """Bytes written."""
+        """Return the number of bytes written."""
         return self._position
 
     def flush(self) -> None:

@@ -15,15 +15,15 @@ ENGAGED = "ENGAGED"  # the key of a report
 
 
 class Engagement(NamedTuple):
-    """A time of engagement of an autopilot. Times in ns, by the clock of the stamps."""
+    """A span in which an autopilot was engaged. Times in ns, by the clock of the stamps."""
 
     start_ns: int
-    stop_ns: int | None  # None where the log ends before
-    reason: str  # of its end
+    stop_ns: int | None  # None if the log ends before
+    reason: str  # why it ended
 
 
 def engagements_of(reports: Iterable[tuple[int, bytes]]) -> list[Engagement] | None:
-    """The engagements, in order, from the reports of a bridge; None without a report.
+    """Return the engagements, in order, from the reports of a bridge; None if there is none.
 
     A report is the time of sending and the message.
     """

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Names the kind of a file by the first bytes.
+"""Names the kind of a file by its first bytes.
 
 A file is a log, a packed log, or a file of another program.
 """
@@ -26,7 +26,7 @@ ULOG = "a ULog of PX4"
 DATAFLASH = "a DataFlash log of ArduPilot"
 TLOG = "a tlog of MAVLink"
 IMPORTABLE = frozenset({ULOG, DATAFLASH, TLOG})
-"""Kinds of logs of autopilots, of which `rise-di import` makes a bag."""
+"""Kinds of logs of autopilots from which `rise-di import` makes a bag."""
 
 PACKED = (ZSTD, LZ4)
 """Kinds that may hold a log."""
@@ -78,7 +78,7 @@ HEAD_BYTES = 4096
 
 
 def file_kind(path: Path) -> str:
-    """The kind of a file with an article, as in "a ULog of PX4". Never raises."""
+    """Name the kind of a file with an article, as in "a ULog of PX4". Never raises."""
     try:
         with open_nonblocking(path) as stream:
             head = stream.read(HEAD_BYTES)
@@ -88,11 +88,11 @@ def file_kind(path: Path) -> str:
 
 
 def kind_of_head(head: bytes) -> str:
-    """The kind of a file by the first HEAD_BYTES bytes.
+    """Name the kind of a file by its first HEAD_BYTES bytes.
 
     Bytes of no kind in the table are a text or unknown bytes.
     """
-    # Also of a recorder that was killed at its start.
+    # A recorder that is killed at its start also leaves such a file.
     if MCAP0_MAGIC.startswith(head):
         return BEGUN if head else EMPTY
     text = head.removeprefix(b"\xef\xbb\xbf").lstrip(b" \t\r\n")
@@ -116,9 +116,9 @@ def kind_of_head(head: bytes) -> str:
 
 
 def tlog_start(head: bytes) -> int | None:
-    """The place of the first packet with its time before it; None without one.
+    """Find the first packet with its time before it; None if there is none.
 
-    The text that a radio sends at its start may come before: then a second packet has to follow.
+    The text that a radio sends at its start may come before it; a second packet must then follow.
     """
     for start in range(len(head) - TLOG_TIME.size):
         end = _packet_end(head, start)
@@ -128,7 +128,7 @@ def tlog_start(head: bytes) -> int | None:
 
 
 def _packet_end(head: bytes, start: int) -> int:
-    """The end of a packet of MAVLink behind its time; 0 without one."""
+    """Return the end of a packet of MAVLink behind its time; 0 if there is none."""
     place = start + TLOG_TIME.size
     magic = head[place : place + 1]
     if magic not in MAVLINK or not _is_time(*TLOG_TIME.unpack_from(head, start)):
@@ -145,7 +145,7 @@ def _is_time(microseconds: int) -> bool:
 
 
 def _text_kind(head: bytes) -> str:
-    """The kind of a text; unknown bytes are no text."""
+    """Name the kind of a text; unknown bytes are no text."""
     try:
         text = head.decode("utf-8-sig")
     except UnicodeDecodeError as error:

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The processes of a flight in a log.
 
-When a process is ready is read from its line on /rosout, how long it lives from its samples.
+When a process was ready follows from its line on /rosout, how long it lived from its samples.
 """
 
 import re
@@ -33,7 +33,7 @@ class SampleSpan(NamedTuple):
     samples: int
 
     def joined(self, later: "SampleSpan") -> "SampleSpan":
-        """The joint span."""
+        """Join two spans."""
         return SampleSpan(
             min(self.first_ns, later.first_ns),
             max(self.last_ns, later.last_ns),
@@ -42,7 +42,7 @@ class SampleSpan(NamedTuple):
 
 
 def ready_times(lines: Iterable[bytes]) -> list[tuple[str, int]]:
-    """Node and system time in ns of each line "ready" of a node of a flight, in order."""
+    """Return node and system time, ns, of each line "ready" of a flight's nodes, in order."""
     times = []
     for data in lines:
         try:
@@ -62,12 +62,12 @@ def ready_times(lines: Iterable[bytes]) -> list[tuple[str, int]]:
 def flight_processes(
     spans: Mapping[str, SampleSpan], ready: Iterable[tuple[str, int]], namespace: str
 ) -> dict[str, Process]:
-    """The processes by name, "/controller#4711", by the `spans` of the publishers.
+    """Return the processes by name, "/controller#4711", from the `spans` of the publishers.
 
     A node that was restarted is several processes. A process was ready at the last such time of its
-    node before its first sample. A node without samples, as the recorder, has no process id. In
-    lockstep no node has one. Beside nodes of the stack every publisher counts, as `ros2 topic pub`,
-    which gives no name.
+    node before its first sample. A node without samples, such as the recorder, has no process id,
+    and in lockstep no node has one. Beside nodes of the stack every publisher counts, even `ros2
+    topic pub`, which gives no name.
     """
     waiting: dict[str, list[int]] = {}
     for node, time_ns in ready:
@@ -94,12 +94,12 @@ def flight_processes(
     }
 
 
-SILENT_NS = NANOSECONDS // 5  # `aircraft.max_age`: a further publisher is then admitted
-SILENT_PERIODS = 3  # of a slow publisher
+SILENT_NS = NANOSECONDS // 5  # `aircraft.max_age`, after which another publisher is admitted
+SILENT_PERIODS = 3  # the same for a slow publisher
 
 
 def admitted(signal: Signal) -> Signal:
-    """The samples that the nodes admit: of the first publisher, and after a silence of the next."""
+    """Keep what the nodes admit: the first publisher, and after a silence the next."""
     if signal.sender is None:
         return signal
     keep = np.zeros(len(signal.stamp_ns), dtype=np.bool_)
@@ -116,14 +116,14 @@ def admitted(signal: Signal) -> Signal:
     return signal if keep.all() else signal.where(keep)
 
 
-RESTART = 10  # a number of a tick that is less by more is of another controller
+RESTART = 10  # a tick number that falls by more than this belongs to another controller
 
 
 def controller_starts(number: FloatArray) -> list[int]:
-    """The places where a new controller begins in the numbers of ticks (N,), in order of time.
+    """Find where a new controller begins in the numbers of ticks (N,), in order of time.
 
-    Two ticks of one instant may be stored in either order: a number a little less, new to the
-    controller, begins no controller.
+    Two ticks of one instant may be stored in either order, so a number that is a little less, and
+    new to the controller, does not begin a new one.
     """
     starts = []
     first = 0

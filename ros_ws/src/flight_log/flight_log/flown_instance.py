@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The sensor or instance of an autopilot's log with the flight.
+"""Finds the sensor or instance in an autopilot's log with which it flew.
 
 Sources: ArduPilot, AP_Logger/LogStructure.h (ARSP: H healthy, U used, Pri primary; IMU: GH),
 AP_InertialSensor.cpp (INS_USE), AP_Airspeed.cpp (ARSPD_USE); ArduPlane/Log.cpp (CTUN.As: the
-airspeed sensor where used and healthy, else the estimate by wind and ground speed); PX4,
+airspeed sensor if used and healthy, else the estimate by wind and ground speed); PX4,
 vtol_att_control (instance 0 of the setpoints of torque is of the rotors, 1 of the surfaces).
 """
 
@@ -16,9 +16,9 @@ from flight_core.parameters import ParameterError, require
 from flight_log.log_samples import Instances
 from flight_log.vehicle_tables import PLANE, Choice, MessageTable, Parameters
 
-STILL = 0.1  # of the largest motion: an instance with less does not fly
-UNLIKE = 0.4  # of the deviation of a quantity: two sensors of one quantity differ by less
-MOST = 0.5  # of the samples, and of the airspeed of a flight
+STILL = 0.1  # fraction of the largest motion: an instance with less does not fly
+UNLIKE = 0.4  # fraction of a quantity's deviation by which two sensors of it differ at most
+MOST = 0.5  # fraction of the samples, and of the airspeed of a flight
 AIRSPEEDS = frozenset({"Airspeed", "true_airspeed_m_s"})
 TYPICAL = 90.0  # percentile of an airspeed
 SURFACES = ("vehicle_torque_setpoint", "actuator_controls_0")  # of a VTOL of PX4, by the instance 1
@@ -28,10 +28,10 @@ CORES = ("XKF1", "NKF1", "EKF1")
 def instances_of_flight(
     instances: Instances, fields: Mapping[str, Set[str]], parameters: Parameters, choice: Choice
 ) -> tuple[dict[str, MessageTable], list[tuple[str, str]]]:
-    """A table by message, and the choice among several instances with the reason.
+    """Return a table per message, and the choice among several instances with its reason.
 
-    `fields`: the fields that are read, by message; further messages give their first instance.
-    Raises ParameterError where two unlike instances remain.
+    `fields` are the fields that are read, by message; other messages give their first instance.
+    Raises ParameterError if two unlike instances remain.
     """
     for name in choice.instances:
         require(
@@ -77,7 +77,7 @@ def instances_of_flight(
 
 
 def _of_motion(name: str, tables: Mapping[int, MessageTable], fields: Set[str]) -> tuple[int, str]:
-    """The moving instance; the first of several equal ones."""
+    """Return the moving instance, or the first of several equal ones."""
     motions = {number: _motion(table, fields) for number, table in tables.items()}
     moving = {
         number: tables[number]
@@ -93,12 +93,12 @@ def _of_motion(name: str, tables: Mapping[int, MessageTable], fields: Set[str]) 
 
 
 def moving_numbers(motions: Mapping[int, float], least: float = STILL) -> list[int]:
-    """The numbers of all motions above a part of the largest motion."""
+    """Return the numbers of all motions above a fraction of the largest motion."""
     return [number for number, motion in motions.items() if motion >= least * max(motions.values())]
 
 
 def _motion(table: MessageTable, fields: Set[str]) -> float:
-    """The sum of the deviations of the fields, or the typical value of an airspeed.
+    """Sum the deviations of the fields, or return the typical value of an airspeed.
 
     A dead sensor has no airspeed.
     """
@@ -127,7 +127,7 @@ def _agree(first: MessageTable, second: MessageTable, fields: Set[str]) -> bool:
 
 
 def _usable_sensors(tables: Mapping[int, MessageTable], parameters: Parameters) -> set[int]:
-    """The healthy gyroscopes in use, by INS_USE, INS_USE2 and INS_USE3."""
+    """Return the healthy gyroscopes in use, by INS_USE, INS_USE2 and INS_USE3."""
     names = {number: f"INS_USE{number + 1 if number else ''}" for number in tables}
     numbers = {
         number
@@ -148,12 +148,12 @@ def _usable_sensors(tables: Mapping[int, MessageTable], parameters: Parameters) 
 
 
 def _share(table: MessageTable, field: str) -> float:
-    """The part of the samples in which a flag is set; 1 without the flag."""
+    """Return the fraction of the samples in which a flag is set; 1 if there is no such flag."""
     return float(np.mean(table.fields[field] != 0.0)) if field in table.fields else 1.0
 
 
 def _airspeed(sensors: Mapping[int, MessageTable]) -> tuple[MessageTable, str]:
-    """The primary airspeed sensor at every instant where healthy, else a healthy sensor in use.
+    """Take the primary airspeed sensor at every instant at which it is healthy, else one in use.
 
     NaN stands for a sensor that is not healthy.
     """
@@ -182,9 +182,9 @@ def _airspeed(sensors: Mapping[int, MessageTable]) -> tuple[MessageTable, str]:
 
 
 def _unused(sensors: Mapping[int, MessageTable], parameters: Parameters) -> str:
-    """Why the autopilot flew by none of its airspeed sensors, by U and H, else by ARSPD_USE.
+    """Say why the autopilot flew by none of its airspeed sensors, by U and H, else ARSPD_USE.
 
-    "" where it flew by one, or where the log does not say.
+    Returns "" if it flew by one, or if the log does not say.
     """
     reasons = []
     for number, table in sorted(sensors.items()):
@@ -214,9 +214,9 @@ def _healthy(table: MessageTable) -> MessageTable:
 
 
 def _primary(tables: Mapping[int, MessageTable]) -> tuple[list[int], MessageTable] | None:
-    """The samples of the primary sensor at every instant, and the numbers of the sensors.
+    """Return the samples of the primary sensor at every instant, and the numbers of the sensors.
 
-    None for a log without `Pri`.
+    Returns None for a log without `Pri`.
     """
     if not all("Pri" in table.fields for table in tables.values()):
         return None

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reads a growing log by `Scan`: a call continues at the end of the last call.
 
-A finished log is read in the same way. A packed log is finished: `open_log` reads it. A record is
-read once the record is whole: a chunk in progress is never read.
+A finished log is read in the same way. A packed log is finished, so `open_log` reads it. A record
+is read once it is whole; a chunk in progress is never read.
 """
 
 import math
@@ -39,10 +39,10 @@ class _Channel:
     type_name: str
     rate: float  # highest rate that is wanted, Hz; 0 for none, infinite for all messages
     step: int = 0  # every step-th message is read; 0 until two messages gave their distance
-    skip: int = 0  # messages before the next one that is read
+    skip: int = 0  # number of messages before the next one that is read
 
     def chosen(self, batch: MessageBatch) -> slice:
-        """Which messages of a batch are read."""
+        """Choose which messages of a batch are read."""
         if self.rate == math.inf:
             return slice(None)
         if self.step == 0 and len(batch.data) > 1 and batch.data.shape[1] >= STAMP.stop:
@@ -60,7 +60,7 @@ class Follower:
     """Follows the log of a run: the folder of a bag, with or without a file yet, or an MCAP file.
 
     `rate_of(topic, type_name)` is the highest wanted rate of the messages of a topic, Hz: infinite
-    without a limit, 0 for none. `remaps` are names of the stack by topics of the log.
+    for no limit, 0 for no messages. `remaps` are names of the stack by topics of the log.
     """
 
     def __init__(
@@ -70,8 +70,8 @@ class Follower:
         remaps: Mapping[str, str] = {},
     ) -> None:
         self.run = run
-        self.complete = False  # the end of the data has been read
-        self.fault = ""  # why nothing more of the log can be read
+        self.complete = False  # whether the end of the data has been read
+        self.fault = ""  # why no more of the log can be read
         # Definitions of the message types that have occurred, ros2msg, by name.
         self.definitions: dict[str, str] = {}
         self._rate_of = rate_of
@@ -93,7 +93,7 @@ class Follower:
 
     @property
     def path(self) -> Path | None:
-        """The present file; None before the first file.
+        """Present file; None before the first file.
 
         Raises ParameterError for a folder with several bags.
         """
@@ -106,26 +106,26 @@ class Follower:
 
     @property
     def damaged(self) -> int:
-        """Records that could not be read."""
+        """Number of records that could not be read."""
         return self._damaged + (0 if self._scan is None else self._scan.damaged)
 
     @property
     def backlog(self) -> int:
-        """Unread bytes of the file. Raises as `path` and OSError."""
+        """Number of unread bytes of the file. Raises as `path` does, and OSError."""
         position = self._scan.position if isinstance(self._scan, Scan) else 0
         return 0 if self.path is None else self.path.stat().st_size - position
 
     def skip(self, topics: Container[str]) -> None:
-        """Read no more messages of these topics, by their full names, in this file."""
+        """Stop reading messages of these topics, by their full names, in this file."""
         for channel in self._channels.values():
             if channel.topic in topics:
                 channel.rate = 0.0
 
     def read(self) -> Iterator[Messages | Attachment | Metadata]:
-        """The records since the last call.
+        """Yield the records since the last call.
 
-        A caller may stop the iteration: the next call continues. Raises OSError when the file
-        cannot be read, ParameterError for a folder with several bags.
+        You may stop the iteration; the next call continues. Raises OSError if the file cannot be
+        read, and ParameterError for a folder with several bags.
         """
         yield from self._pending_records()
         while not self.fault and (path := self.path) is not None:
@@ -163,7 +163,7 @@ class Follower:
         self._begin_file()
 
     def _read_finished(self, path: Path) -> Iterator[Messages | Attachment | Metadata]:
-        """The records of a packed file."""
+        """Yield the records of a packed file."""
         if self._finished is None:
             self._finished = self._records_of(path)
         for record in self._finished:
@@ -177,7 +177,7 @@ class Follower:
         self._damaged += not self._scan.complete
 
     def _pending_records(self) -> Iterator[Messages | Attachment | Metadata]:
-        """The decoded records; a caller that stops gets the rest with the next call."""
+        """Yield the decoded records; if the caller stops, the next call yields the rest."""
         while self._pending:
             yield self._pending.popleft()
 

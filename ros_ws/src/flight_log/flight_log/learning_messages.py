@@ -19,7 +19,7 @@ WARN = 1
 
 
 def learning_message(stamp_ns: int, kind: str, sentence: str, *, warns: bool) -> bytes:
-    """A message of LEARNING, as the controller itself publishes it; `kind` is that of the event."""
+    """Make a message of LEARNING as the controller publishes it; `kind` is that of the event."""
     store = typestore()
     types = {
         name: store.types[f"diagnostic_msgs/msg/{name}"]
@@ -33,7 +33,7 @@ def learning_message(stamp_ns: int, kind: str, sentence: str, *, warns: bool) ->
 
 
 def stamped_sentence(message: Any) -> tuple[int, str]:
-    """Stamp, ns, and sentence of a message of LEARNING; "" for one without."""
+    """Return stamp, ns, and sentence of a message of LEARNING; "" if it has none."""
     stamp = message.header.stamp
     return stamp.sec * NANOSECONDS + stamp.nanosec, " ".join(
         status.message for status in message.status

@@ -63,21 +63,21 @@ ROUTE = "route"
 BATCH = 512
 
 
-LEAST_CLOCK_STEP_NS = NANOSECONDS  # a stamp is the less before the sending by the age of its sample
+LEAST_CLOCK_STEP_NS = NANOSECONDS  # a stamp precedes its sending only by the age of the sample
 
 
-RESTING = ("u", "internals")  # topics whose stamps rest during a failsafe
+RESTING = ("u", "internals")  # topics whose stamps may repeat during a failsafe
 
 
 UNSTAMPED = ("route",)  # plans, which are often published without a stamp
 
 
 SCENARIO_NAME = re.compile(r"(?!metadata\.yaml)[\w-][\w .()-]{0,99}\.yaml")
-"""Names under which the scenario of a log may be written beside it: not metadata.yaml, and no path
-to another folder."""
+"""Names under which the scenario of a log may be written beside it: neither metadata.yaml nor a
+path to another folder."""
 
 
-MOST_PUBLISHERS = 64  # of a topic, that are counted each for itself
+MOST_PUBLISHERS = 64  # most publishers of a topic that are counted separately
 
 
 class StoredFile(NamedTuple):
@@ -133,16 +133,16 @@ class _Publisher:
         return least_of_other - LATE_NS <= least and largest <= largest_of_other + LATE_NS
 
     def recording(self) -> Recording:
-        """The stamps in the order of the recording."""
+        """Return the stamps in the order of the recording."""
         is_counted = self._numbered and not self._restarted
         return self.clock.recording(self.zeros)._replace(lost=self._lost if is_counted else None)
 
 
 class TopicSamples:
-    """Samples of a topic, decoded in batches. The samples with equal names are the signal.
+    """Samples of a topic, decoded in batches; those with equal names are the signal.
 
-    Clock, numbers and damages are counted for each sender, so that those of a foreign
-    publisher count for no other one.
+    Clock, numbers and damage are counted for each sender, so that those of a foreign publisher are
+    not blamed on another one.
     """
 
     def __init__(self, decode: Decoder, expected: int) -> None:
@@ -155,7 +155,7 @@ class TopicSamples:
     def add(self, table: Table, log_ns: NDArray[np.int64], sequence: NDArray[np.int64]) -> None:
         """Add messages of one length, a row each, with log times and the publisher's numbers."""
         for sender, rows in rows_by_sender(table):
-            # Many names are of a hostile log.
+            # A log with many names is hostile.
             known = sender in self._publishers or len(self._publishers) < MOST_PUBLISHERS
             publisher = self._publishers.setdefault(sender if known else b"", _Publisher())
             part = table if rows is None else table[rows]
@@ -207,7 +207,7 @@ class TopicSamples:
                 publisher.name = sender
                 publisher.kept[names] += len(stamp_ns)
                 if names not in self._samples:
-                    # Samples with other names are few, or those of a hostile log.
+                    # Samples with other names are few, unless the log is hostile.
                     expected = 0 if self._samples else self._expected
                     self._samples[names] = Columns(len(names), max(expected, len(values)))
                 self._samples[names].append(stamp_ns, values, sender)
@@ -217,7 +217,7 @@ class TopicSamples:
     def _ordered(
         self, names: tuple[str, ...], values: NDArray[np.float64]
     ) -> tuple[tuple[str, ...], NDArray[np.float64]]:
-        """Names and values in the order of the first sample with these names.
+        """Bring names and values into the order of the first sample with these names.
 
         Values are matched by name.
         """
@@ -227,9 +227,9 @@ class TopicSamples:
         return names, values
 
     def signal(self, name: str) -> Signal | None:
-        """The samples of a topic in the order of the stamps; None without a stamped sample.
+        """Return the samples of a topic in the order of the stamps; None without a stamped sample.
 
-        Equal stamps may follow one another in RESTING topics, so that a stamp of 0 may be flight
+        In RESTING topics, equal stamps may follow one another, so that a stamp of 0 may be flight
         time. A plan needs no stamp.
         """
         for publisher in self._publishers.values():
@@ -262,7 +262,7 @@ class TopicSamples:
         return signal
 
     def _unset_zeros(self, name: str, signal: Signal, columns: Columns) -> NDArray[np.bool_]:
-        """Mask of the samples whose zero stamp was not set, shape (N,), noted for each sender."""
+        """Mask the samples whose zero stamp was not set, shape (N,), noted for each sender."""
         unset = np.zeros(len(signal.stamp_ns), dtype=np.bool_)
         if name in UNSTAMPED or not np.any(signal.stamp_ns == 0):
             return unset
@@ -283,13 +283,13 @@ class TopicSamples:
         return unset
 
     def _most(self) -> _Publisher:
-        """The publisher with the most samples."""
+        """Return the publisher with the most samples."""
         return max(self._publishers.values(), key=lambda publisher: publisher.kept.total())
 
     def _names(self) -> tuple[str, ...]:
-        """The names of the samples of the publisher with the most of them.
+        """Return the names of the samples of the publisher with the most of them.
 
-        They are the first ones, or those of the majority where samples have further names.
+        They are the first ones, or those of the majority if samples have other names too.
         """
         most = self._most()
         first = next(iter(most.kept))
@@ -298,7 +298,7 @@ class TopicSamples:
         )
 
     def of_flight(self, signal: Signal | None) -> list[_Publisher]:
-        """The publishers of the samples of a signal that the nodes admit; without one all."""
+        """Return the publishers of the samples that the nodes admit; all if there is no signal."""
         publishers = [*self._publishers.values()]
         if signal is None or not self._samples:
             return publishers
@@ -308,7 +308,7 @@ class TopicSamples:
         return [publisher for publisher in publishers if publisher.name in names]
 
     def further_publishers(self, signal: Signal | None) -> list[str]:
-        """The names of further publishers, "" for one without a name."""
+        """Name the other publishers, "" for one without a name."""
         of_flight = self.of_flight(signal)
         return [
             sender[:-1].decode(errors="replace") if publisher.name is None else publisher.name
@@ -322,7 +322,7 @@ class TopicSamples:
         return any(before[1] >= after[0] for before, after in pairwise(spans))
 
     def recording(self, signal: Signal | None = None) -> Recording:
-        """The stamps of the flight's publishers in the order of the recording; after `signal`."""
+        """Return the stamps of the flight's publishers as recorded; call `signal` first."""
         recordings = [publisher.recording() for publisher in self.of_flight(signal)]
         if len(recordings) == 1:
             return recordings[0]
@@ -339,7 +339,7 @@ class TopicSamples:
         )
 
     def refused(self, signal: Signal | None = None) -> int:
-        """How many samples of the flight are damaged, not finite, or of other channels."""
+        """Count the samples of the flight that are damaged, not finite, or of other channels."""
         names = self._names() if self._samples else ()
         return sum(
             publisher.refused + publisher.kept.total() - publisher.kept[names]
@@ -369,7 +369,7 @@ class LogContent:
     def reader_of(
         self, topic: str, type_name: str, expected: int
     ) -> Callable[[MessageBatch], None] | None:
-        """Receiver of the messages of a topic, `expected` in the file; None for an unused topic."""
+        """Make a receiver of a topic's `expected` messages; None if the topic is unused."""
         samples = self.samples_of(topic, type_name, expected)
         is_timed = topic.rpartition("/")[2] in TIMED_TOPICS
         if samples is not None:
@@ -394,9 +394,9 @@ class LogContent:
         return None
 
     def _time_of_stamps(self, sent_ns: np.int64) -> int:
-        """A time of sending by the clock of the stamps.
+        """Convert a time of sending to the clock of the stamps.
 
-        The nodes keep their time when the system clock is set.
+        The nodes keep their time if the system clock is set.
         """
         if self.times is not None:
             nearest = np.argmin(np.abs(self.times.sent_ns - sent_ns))
@@ -406,7 +406,7 @@ class LogContent:
         return int(sent_ns)
 
     def samples_of(self, topic: str, type_name: str, expected: int = 0) -> TopicSamples | None:
-        """The samples of a topic; None for a type without named vectors or waypoints."""
+        """Return the samples of a topic; None for a type without named vectors or waypoints."""
         is_route = topic.rpartition("/")[2] == ROUTE and type_name == PATH
         if (
             topic not in self.topics
@@ -429,7 +429,7 @@ class LogContent:
                 self.attachments.append(StoredFile(name, record.data))
 
     def notes_at(self, end: float | None) -> list[str]:
-        """The notes. `end` is the flight time of the last sample in s, None without samples."""
+        """Return the notes; `end` is the flight time of the last sample, s, or None."""
         where = "" if end is None else f", t = {end:.3f} s"
         missing = seconds(self.known_end_ns - self.last_ns)
         more = f"; {missing:.3f} s are missing after it" if missing > 0 and self.last_ns else ""
@@ -465,9 +465,9 @@ def read_content(run: Path, remaps: Mapping[str, str]) -> LogContent:
 
 
 def _add_metadata(folder: Path, log: LogContent) -> None:
-    """Add what metadata.yaml tells of a bag.
+    """Add what metadata.yaml says of a bag.
 
-    For an unreadable file a note names the repair command.
+    If the file cannot be read, a note names the repair command.
     """
     information: Mapping[str, Any] = {}
     try:
@@ -521,7 +521,7 @@ def _read_file(file: Path, log: LogContent) -> None:
         raise ParameterError(
             f"{file}: cannot be read ({error.strerror}), expected {A_RUN}"
         ) from None
-    # What the file says of the whole log goes to its notes.
+    # Put what the file says of the whole log into its notes.
     if first_ns < before_ns - NANOSECONDS and file.parent.name != ROSBAG2:
         log.notes.append(
             f"{file.name} begins before the end of the part before: the parts are out of order, "

@@ -18,15 +18,15 @@ WARN = 30  # level of rcl_interfaces/msg/Log
 CONTROL = "control"  # name of the node that carries out the requests of a page
 PARAMETER = "parameter"
 MAX_TEXT = 400  # characters of a text from the log
-CUT = " ..."  # the end of a longer text
-MAX_VALUES = 16  # of a parameter: one a channel, not a matrix
+CUT = " ..."  # end of a longer text
+MAX_VALUES = 16  # most values of a parameter that are shown: one per channel, but not a matrix
 
 
 class LogMessage(NamedTuple):
-    """A message of a flight. `stamp_ns` as in the samples, or by the clock of the host.
+    """A message of a flight. `stamp_ns` is as in the samples, or by the clock of the host.
 
-    `kind` is "warning", "error", "control", "parameter", "learning" or "bridge"; of the live page
-    also "mode" or "route". `namespace` of a parameter is that of its node.
+    `kind` is "warning", "error", "control", "parameter", "learning" or "bridge"; on the live page
+    also "mode" or "route". For a parameter, `namespace` is that of its node.
     """
 
     stamp_ns: int
@@ -56,9 +56,9 @@ def holds_texts(topic: str, type_name: str) -> bool:
 def log_message(
     message: Any, type_name: str, sent_ns: int, *, has_begun: bool = True
 ) -> LogMessage | None:
-    """A decoded message as a LogMessage; None for information and empty messages.
+    """Turn a decoded message into a LogMessage; None for information and empty messages.
 
-    Before the first sample, with `has_begun` False, starting nodes declare parameters.
+    Before the first sample, with `has_begun` False, starting nodes still declare parameters.
     """
     if type_name == LOG:
         if message.level >= WARN:
@@ -80,7 +80,7 @@ def log_message(
 
 
 def log_messages(texts: Iterable[StoredText], namespace: str, first_ns: int) -> list[LogMessage]:
-    """The messages of an aircraft in a log by stamp; `first_ns`: stamp of its first sample."""
+    """Return the messages of an aircraft in a log by stamp; `first_ns` is its first sample's."""
     messages = []
     for topic, type_name, sent_ns, data in texts:
         is_shared = topic in {ROSOUT, PARAMETER_EVENTS}
@@ -97,7 +97,7 @@ def log_messages(texts: Iterable[StoredText], namespace: str, first_ns: int) -> 
 
 
 def shown(value: Any) -> str:
-    """The value of a parameter with four digits; of a matrix its size."""
+    """Show the value of a parameter with four digits, or the size of a matrix."""
     if isinstance(value, list) and len(value) > MAX_VALUES:
         return f"{len(value)} values"
     if isinstance(value, list):
@@ -106,6 +106,6 @@ def shown(value: Any) -> str:
 
 
 def bounded(text: str) -> str:
-    """A text from the log: printable and of bounded length, with a mark where it is cut."""
+    """Make a text from the log printable and of bounded length, with a mark where it is cut."""
     whole = printable(text)
     return whole if len(whole) <= MAX_TEXT else f"{whole[: MAX_TEXT - len(CUT)]}{CUT}"

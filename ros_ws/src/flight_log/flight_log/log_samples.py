@@ -12,11 +12,11 @@ from flight_core.rates import NANOSECONDS
 from flight_core.vectors import FloatArray
 from flight_log.vehicle_tables import PARAMETER, MessageTable, ParameterRecord, Parameters
 
-LARGEST = 2**62  # ns, of a damaged stamp
-# An autopilot that goes back by a step has started again; a link may be lost.
+LARGEST = 2**62  # ns; a larger stamp is damaged
+# ns. An autopilot whose clock goes back by more has started again; a link may be lost.
 STEP_NS = NANOSECONDS
 LOST_NS = 60 * NANOSECONDS
-AGREEING = 5  # samples, after which another time is that of the clock
+AGREEING = 5  # samples that must agree on another time before it counts as that of the clock
 
 Sample = tuple[tuple[str, int], int, Any]
 """Name and instance, stamp in ns and content of a message; the content of a PARAMETER is a name and
@@ -31,12 +31,14 @@ SETTING = (PARAMETER, 0)
 def tables_of(
     samples: Iterable[Sample], fields: Mapping[str, set[str]]
 ) -> tuple[Instances, Parameters, str]:
-    """Tables of messages, parameters, and a note. A field that its first message lacks is absent.
+    """Make tables of messages, parameters, and a note.
 
-    Where the clock goes back by more than STEP_NS, as of an autopilot that started again, the
-    longest part counts alone. A stamp is damaged, and its sample is left out, where fewer than
-    AGREEING samples in a row agree with it. A parameter belongs to the part of the next sample: an
-    autopilot that starts writes its parameters first.
+    A field that the first message lacks is absent.
+
+    If the clock goes back by more than STEP_NS, as when an autopilot starts again, only the longest
+    part counts. A stamp is damaged, and its sample is left out, if fewer than AGREEING samples in a
+    row agree with it. A parameter belongs to the part of the next sample, because an autopilot that
+    starts writes its parameters first.
     """
     parts = [list[Sample]()]
     newest_ns = 0
@@ -73,7 +75,7 @@ def tables_of(
 
 
 def parameters_of(records: Iterable[Sample]) -> Parameters:
-    """The records of each parameter, in their order."""
+    """Collect the records of each parameter, in their order."""
     parameters: dict[str, list[ParameterRecord]] = {}
     for _, stamp_ns, (name, value) in records:
         parameters.setdefault(name, []).append(ParameterRecord(stamp_ns, value))
@@ -98,7 +100,7 @@ def _columns(samples: Iterable[Sample], fields_of: Mapping[str, set[str]]) -> In
     for (name, _), values_ns in stamps.items():
         most[name] = max(most.get(name, 0), len(values_ns))
     for (name, number), lists in columns.items():
-        # A damaged number is that of no sensor.
+        # A damaged number belongs to no sensor.
         if len(stamps[name, number]) < min(AGREEING, most[name]):
             continue
         fields = {field: np.array(values) for field, values in lists.items()}
@@ -114,7 +116,7 @@ def is_number(value: object) -> bool:
 
 
 def near(stamp_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Which stamps are near the median of the five around them: a damaged stamp is not."""
+    """Mask the stamps near the median of the five around them; a damaged stamp is not near."""
     if len(stamp_ns) <= 2:
         return np.ones(len(stamp_ns), dtype=bool)
     fives = np.lib.stride_tricks.sliding_window_view(np.pad(stamp_ns, 2, mode="reflect"), 5)
@@ -123,6 +125,6 @@ def near(stamp_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
 
 
 def table_of(stamp_ns: NDArray[np.int64], fields: Mapping[str, FloatArray]) -> MessageTable:
-    """A table in the order of its stamps, without samples of a repeated stamp."""
+    """Make a table in the order of its stamps, without samples of a repeated stamp."""
     stamps, places = np.unique(stamp_ns, return_index=True)
     return MessageTable(stamps, {name: values[places] for name, values in fields.items()})

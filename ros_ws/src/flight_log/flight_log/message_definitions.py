@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Message definitions for MCAP and rosbag2: of the installed packages, else of rosbags.
+"""Message definitions for MCAP and rosbag2: of the installed packages, or else of rosbags.
 
-Needs no ROS at run time.
+No ROS is needed at run time.
 """
 
 import json
@@ -25,13 +25,13 @@ class MessageDefinition(NamedTuple):
 
 @cache
 def definition(name: str) -> MessageDefinition:
-    """Definition of "pkg/msg/Type".
+    """Return the definition of "pkg/msg/Type".
 
     The text is the main definition, then for each referenced type a line of 80 "=", "MSG: pkg/Type"
     and its definition (MCAP registry, schema encoding ros2msg). The hash is that of REP 2016, read
-    from the JSON of the package. rosbags knows the common types of ROS 2 Jazzy: the same fields and
-    the same hash, without comments. Raises ParameterError when neither an installed package nor
-    rosbags has the type.
+    from the JSON of the package. rosbags knows the common types of ROS 2 Jazzy, with the same
+    fields and the same hash, but without comments. Raises ParameterError if neither an installed
+    package nor rosbags has the type.
     """
     try:
         description = json.loads(read_definition(name, "json"))
@@ -55,9 +55,9 @@ def definition(name: str) -> MessageDefinition:
 
 
 def read_definition(name: str, suffix: str) -> str:
-    """The file of "pkg/msg/Type" or "pkg/srv/Type" with a suffix.
+    """Read the file of "pkg/msg/Type" or "pkg/srv/Type" with a suffix.
 
-    Raises ParameterError where no installed package has it.
+    Raises ParameterError if no installed package has it.
     """
     package, section, kind = name.split("/")
     # The wheels install into the prefix of the interpreter and do not set AMENT_PREFIX_PATH.

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Decodes the messages of a topic as named vectors. Needs no ROS.
+"""Decodes the messages of a topic as named vectors, without ROS.
 
-The messages of a topic usually have the same sender and channels, and differ in stamp and values
-only. The decoder learns the byte layout from a message and decodes the messages of equal layout
-together.
+The messages of a topic usually have the same sender and channels, and differ only in stamp and
+values. The decoder learns the byte layout from one message and decodes all messages of the same
+layout together.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -40,7 +40,7 @@ SENDER_PLACE = STAMP.stop + 4  # of header.frame_id, behind its length
 BYTE_ORDERS: Mapping[bytes, Literal["big", "little"]] = MappingProxyType(
     {b"\x00\x00": "big", b"\x00\x01": "little"}
 )
-MAX_FLIGHT_TIME = 1e9  # s. A larger value is not a flight time.
+MAX_FLIGHT_TIME = 1e9  # s; a larger value is not a flight time
 
 
 class Samples(NamedTuple):
@@ -70,13 +70,13 @@ Decoder = Callable[[Table], Decoded]
 
 @cache
 def typestore() -> Typestore:
-    """The message types of ROS 2 Jazzy, made once: loading takes 70 ms."""
+    """Return the message types of ROS 2 Jazzy, made once, because loading takes 70 ms."""
     return get_typestore(Stores.ROS2_JAZZY)
 
 
 @cache
 def joint_state_types() -> Typestore:
-    """JOINT_STATE_TYPES, enough for most logs."""
+    """Return JOINT_STATE_TYPES, which are enough for most logs."""
     # The empty store has Time.
     store = get_typestore(Stores.EMPTY)
     for name, definition in JOINT_STATE_TYPES.items():
@@ -85,20 +85,20 @@ def joint_state_types() -> Typestore:
 
 
 def full_name(type_name: str) -> str:
-    """The name of a message type, "pkg/msg/Type", also of the short "pkg/Type"."""
+    """Return the full name of a message type, "pkg/msg/Type", also for the short "pkg/Type"."""
     return type_name.replace("/", "/msg/") if type_name.count("/") == 1 else type_name
 
 
 def decoder(type_name: str) -> Decoder | None:
-    """Decoder from messages of a type to named vectors; None for a type without named vectors.
+    """Return a decoder from messages of a type to named vectors; None if the type has none.
 
-    A decoder serves a topic. A call takes several messages in their order.
+    A decoder serves one topic. A call takes several messages in their order.
     """
     return _JointStateDecoder() if type_name == JOINT_STATE else None
 
 
 def tables(messages: Iterable[bytes]) -> Iterator[Table]:
-    """Messages in their order, successive messages of equal length in a table."""
+    """Group messages in their order into tables of successive messages of equal length."""
     for size, group in groupby(messages, len):
         messages_of_size = list(group)
         yield np.frombuffer(b"".join(messages_of_size), dtype=np.uint8).reshape(
@@ -107,20 +107,20 @@ def tables(messages: Iterable[bytes]) -> Iterator[Table]:
 
 
 def stamp_in(data: bytes) -> int:
-    """The stamp at the begin of a message, ns."""
+    """Read the stamp at the beginning of a message, ns."""
     return int.from_bytes(data[STAMP][:4], "little", signed=True) * NANOSECONDS + int.from_bytes(
         data[STAMP][4:], "little"
     )
 
 
 def stamps_of(table: Table) -> NDArray[np.int64]:
-    """The stamps at the begin of messages, ns, shape (N,)."""
+    """Read the stamps at the beginning of messages, ns, shape (N,)."""
     stamps = np.ascontiguousarray(table[:, STAMP])
     return stamps.view("<i4")[:, 0].astype(np.int64) * NANOSECONDS + stamps.view("<u4")[:, 1]
 
 
 def rows_by_sender(table: Table) -> list[tuple[bytes, NDArray[np.int64] | None]]:
-    """The senders in the headers of messages, as bytes, with their rows; None for all rows.
+    """List the senders in the headers of messages, as bytes, with their rows; None for all rows.
 
     A message without a header in plain CDR has the sender b"".
     """
@@ -139,7 +139,7 @@ def rows_by_sender(table: Table) -> list[tuple[bytes, NDArray[np.int64] | None]]
 
 
 def _sender(row: NDArray[np.uint8]) -> bytes:
-    """The bytes of header.frame_id, with the final zero."""
+    """Return the bytes of header.frame_id, with the final zero."""
     header = bytes(row[:SENDER_PLACE])
     order = BYTE_ORDERS.get(header[:2])
     if len(header) < SENDER_PLACE or order is None:
@@ -150,18 +150,18 @@ def _sender(row: NDArray[np.uint8]) -> bytes:
 
 
 def flight_start_ns(stamp_ns: int, t: float) -> int | None:
-    """Stamp of flight time 0, from a sample of `truth` with t in s: stamp - t.
+    """Return the stamp of flight time 0, from a sample of `truth` with t in s: stamp - t.
 
-    None when t is not a flight time.
+    Returns None if t is not a flight time.
     """
     return stamp_ns - nanoseconds(t) if abs(t) <= MAX_FLIGHT_TIME else None
 
 
 def encoded(samples: Samples) -> NDArray[np.uint8]:
-    """The samples as serialised sensor_msgs/JointState, a row a message.
+    """Serialise samples as sensor_msgs/JointState, one message in each row.
 
-    Velocity and effort are empty. The first message is serialised by its definition. The further
-    messages differ in stamp and values only.
+    Velocity and effort are empty. The first message is serialised by its definition; the others
+    differ only in stamp and values.
     """
     store = joint_state_types()
     types: dict[str, Any] = store.types
@@ -183,18 +183,18 @@ def encoded(samples: Samples) -> NDArray[np.uint8]:
 
 
 def _marks(k: int) -> FloatArray:
-    """Values that occur in no string."""
+    """Return values that occur in no string."""
     return np.asarray(-np.arange(1.0, k + 1.0) * np.pi)
 
 
 def _position(message: bytes, marks: FloatArray) -> slice:
-    """The place of the values in a message with marks."""
+    """Return the place of the values in a message with marks."""
     start = message.index(marks.tobytes())
     return slice(start, start + marks.nbytes)
 
 
 def decode_routes(table: Table) -> Decoded:
-    """Routes of nav_msgs/Path in the frame map (east, north, up).
+    """Decode routes of nav_msgs/Path in the frame map (east, north, up).
 
     A waypoint becomes a sample with the channels WAYPOINT.
     """
@@ -220,7 +220,7 @@ class _JointStateDecoder:
         self._store = joint_state_types()
         self._names: tuple[str, ...] = ()
         self._sender = ""
-        self._template = np.zeros(0, dtype="<u4")  # the message that the layout was learnt from
+        self._template = np.zeros(0, dtype="<u4")  # the message from which the layout was learnt
         # 255 for the bytes that are equal in all messages of the layout, else 0
         self._constant = np.zeros(0, dtype="<u4")
         self._values = slice(0, 0)
@@ -254,7 +254,7 @@ class _JointStateDecoder:
         return Decoded(samples, unreadable)
 
     def _same_layout(self, table: Table) -> NDArray[np.bool_]:
-        """Mask of the messages with the learnt layout."""
+        """Mask the messages with the learnt layout."""
         if not self._names or table.shape[1] != self._template.nbytes:
             return np.zeros(len(table), dtype=np.bool_)
         different = table.view("<u4") ^ self._template
@@ -264,8 +264,7 @@ class _JointStateDecoder:
     def _learn(self, message: bytes) -> None:
         """Learn the byte layout of a message.
 
-        Marked values are serialised with the same strings. The place of the marks is that of the
-        values.
+        Marked values are serialised with the same strings. The marks are then where the values are.
         """
         try:
             vector: Any = self._store.deserialize_cdr(message, JOINT_STATE)

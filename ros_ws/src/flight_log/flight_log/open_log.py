@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Opens the files of a log for every reader.
 
-Packed files and compressed messages are unpacked, and the files of a bag ordered. A path that is no
-log is refused in one sentence with what is there.
+It unpacks packed files and compressed messages, and orders the files of a bag. A path that is no
+log is refused in one sentence that says what is there.
 """
 
 import re
@@ -44,18 +44,18 @@ from flight_log.scan import MAX_CHUNK_BYTES, MessageBatch, Scan
 
 A_RUN = "the folder of a run or an MCAP file"
 ROSBAG2 = "rosbag2"
-"""In the folder of a run: the bag of `ros2 bag record` where that recorded the flight. A log beside
-it has the attachments."""
+"""Folder inside the folder of a run with the bag of `ros2 bag record`, if that recorded the flight.
+A log beside it has the attachments."""
 
-NAMED = 5  # files, folders or topics that a sentence names
+NAMED = 5  # most files, folders or topics that a sentence names
 COPY_BYTES = 1 << 20
 UNPACK = {".zst": "zstd -d", ".zstd": "zstd -d", ".lz4": "lz4 -d"}
 
 
 def log_files(run: Path) -> list[Path]:
-    """The files of a log in the order of recording; those of the folder ROSBAG2 come last.
+    """List the files of a log in the order of recording; those of the folder ROSBAG2 come last.
 
-    Raises ParameterError for a path without a log: the sentence names what is there.
+    Raises ParameterError for a path without a log, in a sentence that names what is there.
     """
     files = [*bag_files(run), *(bag_files(run / ROSBAG2) if is_folder(run / ROSBAG2) else ())]
     kinds = [file_kind(file) for file in files]
@@ -70,7 +70,7 @@ def log_files(run: Path) -> list[Path]:
 
 
 def _what_is_there(run: Path, files: Sequence[Path], kinds: Sequence[str]) -> str:
-    """What a path without a log holds, for a sentence."""
+    """Say what a path without a log holds, for a sentence."""
     if files:
         if is_file(run):
             return kinds[0]
@@ -103,16 +103,16 @@ def _is_bag(folder: Path) -> bool:
 
 
 def _some(names: Sequence[str]) -> str:
-    """The first names, and the number of the rest."""
+    """List the first names, and count the rest."""
     surplus = len(names) - NAMED
     return "; ".join(names[:NAMED]) + (f"; and {surplus} more" if surplus > 0 else "")
 
 
 def missing_parts(files: Sequence[Path], information: Mapping[str, Any]) -> list[str]:
-    """Names of the files of a bag that metadata.yaml names and the folder lacks.
+    """Name the files of a bag that metadata.yaml lists but the folder lacks.
 
-    Without metadata.yaml: those of the numbers from 0, where rosbag2 begins, to the last. Renamed
-    files are compared by number.
+    Without metadata.yaml they are those of the numbers from 0, where rosbag2 begins, to the last.
+    Renamed files are compared by number.
     """
     paths = information.get("relative_file_paths")
     file_names = [Path(str(path)).name for path in paths] if isinstance(paths, list) else []
@@ -131,10 +131,10 @@ def missing_parts(files: Sequence[Path], information: Mapping[str, Any]) -> list
 
 @contextmanager
 def open_scan(file: Path) -> Iterator[Scan]:
-    """The reader of a file of a log, by the first bytes.
+    """Open the reader of a file of a log, by its first bytes.
 
-    A packed file is unpacked into a temporary folder. Raises ParameterError for a file that cannot
-    be read.
+    A packed file is unpacked into a temporary folder. Raises ParameterError if the file cannot be
+    read.
     """
     kind = file_kind(file)
     if kind not in PACKED:
@@ -148,7 +148,7 @@ def open_scan(file: Path) -> Iterator[Scan]:
 
 
 def _unpack(file: Path, plain: Path, kind: str) -> None:
-    """Write the content of a packed file; of a truncated file the beginning.
+    """Write the content of a packed file; for a truncated file, its beginning.
 
     Raises ParameterError.
     """
@@ -177,10 +177,10 @@ def _unpack(file: Path, plain: Path, kind: str) -> None:
 
 
 def log_topics(run: Path, remaps: Mapping[str, str] = {}) -> dict[str, str]:
-    """The types of the topics of a log by full name.
+    """Return the types of the topics of a log by full name.
 
-    A type of messages that are no CDR ends with "in ENCODING". Where the file has an index, the
-    index alone is read. Raises ParameterError for a path without a log.
+    The type of messages that are not CDR ends with "in ENCODING". If the file has an index, only
+    the index is read. Raises ParameterError for a path without a log.
     """
     topics: dict[str, str] = {}
     for file in log_files(run):
@@ -203,10 +203,10 @@ def log_topics(run: Path, remaps: Mapping[str, str] = {}) -> dict[str, str]:
 
 
 def plain_message(data: bytes) -> bytes:
-    """A message that `ros2 bag record` may have compressed, without the compression.
+    """Return a message that `ros2 bag record` may have compressed, without the compression.
 
-    A compressed message begins as no CDR does. A damaged message stays as it is: no decoder takes
-    it.
+    A compressed message begins as no CDR does. A damaged message stays as it is, since no decoder
+    takes it.
     """
     if data[:4] != ZSTD_MAGIC:
         return data
@@ -219,7 +219,7 @@ def plain_message(data: bytes) -> bytes:
 
 
 def plain_batches(batch: MessageBatch) -> Iterator[MessageBatch]:
-    """As `plain_message`, of the messages of a batch; the lengths may then differ."""
+    """Decompress the messages of a batch as `plain_message` does; their lengths may then differ."""
     if not len(batch.data) or batch.data[0, :4].tobytes() != ZSTD_MAGIC:
         yield batch
         return
@@ -232,7 +232,7 @@ def plain_batches(batch: MessageBatch) -> Iterator[MessageBatch]:
 
 
 def require_mcap(file: Path) -> None:
-    """Raise ParameterError with the kind of a file that is no MCAP file; an empty file passes."""
+    """Refuse a file that is no MCAP file, by its kind; an empty file passes."""
     kind = file_kind(file)
     if kind in PACKED and file.name.endswith(PACKED_SUFFIXES):
         kind += f", which {UNPACK[file.suffix]} unpacks"

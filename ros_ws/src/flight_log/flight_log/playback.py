@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Playback schedule of a log: the messages and the times to send them.
 
-Needs no ROS; `flight_bringup.player` sends.
+It needs no ROS; `flight_bringup.player` sends.
 """
 
 import re
@@ -26,7 +26,8 @@ CLOCK = "/clock"  # never played: the player publishes its own clock
 SHARED = ("/diagnostics", "/parameter_events", "/rosout")
 """Topics on which every node of a domain may publish. They are played only by name."""
 
-MAX_LATCHED = 100  # messages of a topic; a lockstep flight keeps 20,000, which is no latch
+# most messages of a latched topic; a lockstep flight keeps 20,000, which is no latch
+MAX_LATCHED = 100
 # A stamp further than a day from the host's clock is flight time, as in lockstep.
 MAX_CLOCK_OFFSET_NS = 86_400 * NANOSECONDS
 NO_FIELD = re.compile(r"\s*(#|$|\S+\s+\w+\s*=)")  # a comment, an empty line, a constant
@@ -40,7 +41,7 @@ class ScheduledMessage(NamedTuple):
     due_ns: int  # on the time scale of the log's stamps
     topic: str
     data: bytes  # CDR, as recorded
-    stamped: bool  # whether it begins with a stamp on that time scale
+    stamped: bool  # whether the data begin with a stamp on that time scale
 
 
 class Playback(NamedTuple):
@@ -49,24 +50,25 @@ class Playback(NamedTuple):
     types: Mapping[str, str]  # type names by full topic name
     messages: Sequence[ScheduledMessage]
     start_ns: int  # the instant of flight time 0
-    skipped: Mapping[str, str]  # by full topic name: the encoding, which no ROS topic has
+    skipped: Mapping[str, str]  # by full topic name the encoding, which no ROS topic has
 
     def t(self, due_ns: int) -> float:
-        """Flight time of an instant, s."""
+        """Return the flight time of an instant, s."""
         return seconds(due_ns - self.start_ns)
 
 
 def read_playback(
     run: Path, topics: Sequence[str] = (), start: float = 0.0, namespace: str | None = None
 ) -> Playback:
-    """The messages of a log from flight time `start` in s.
+    """Read the messages of a log from flight time `start` in s.
 
-    `topics` are full or last names; empty for every topic except SHARED. `namespace` selects an
-    aircraft; None plays every aircraft. Topics without CDR, e.g. with JSON, are skipped.
+    `topics` are full or last names; if they are empty, every topic except SHARED is played.
+    `namespace` selects an aircraft; None plays every aircraft. Topics without CDR, such as with
+    JSON, are skipped.
 
-    A message is due at the time of sending. In a log of a lockstep flight the host's clock has no
-    meaning: there a message is due at the stamp, but not before the messages sent earlier. Raises
-    ParameterError when the log cannot be read, lacks a topic or the namespace, or ends before the
+    A message is due at its time of sending. In the log of a lockstep flight the host's clock has no
+    meaning, so a message is due at its stamp, but not before the messages sent earlier. Raises
+    ParameterError if the log cannot be read, lacks a topic or the namespace, or ends before the
     start.
     """
     stored = sorted(
@@ -102,7 +104,7 @@ def read_playback(
 
 
 def _within(messages: Sequence[StoredMessage], namespace: str, where: str) -> list[StoredMessage]:
-    """The messages of an aircraft, and of SHARED topics. Raises ParameterError."""
+    """Return the messages of an aircraft, and of SHARED topics. Raises ParameterError."""
     topics = {message.topic for message in messages}
     names = names_within(chosen_namespace(topics, namespace, where), topics)
     inside = {*names, *SHARED}
@@ -126,7 +128,7 @@ def _scheduled(
     *,
     lockstep: bool,
 ) -> Iterator[ScheduledMessage]:
-    """The messages of the selected topics with their due times."""
+    """Yield the messages of the selected topics with their due times."""
     stamped_topics = {
         topic for topic, message in last_messages.items() if begins_with_stamp(_definition(message))
     }
@@ -146,7 +148,7 @@ def _scheduled(
 def _latched(
     messages: Sequence[ScheduledMessage], last_messages: Mapping[str, StoredMessage], begin_ns: int
 ) -> Iterator[ScheduledMessage]:
-    """The last messages of latched topics before the begin, for late subscribers.
+    """Yield the last messages of latched topics before the beginning, for late subscribers.
 
     /robot_description is such a topic.
     """
@@ -161,7 +163,7 @@ def _latched(
 
 
 def latched_depth(qos: str) -> int:
-    """The number of messages for a late subscriber; 0 of a volatile topic.
+    """Return the number of messages for a late subscriber; 0 for a volatile topic.
 
     `qos` is the YAML list of the offered profiles of rosbag2.
     """
@@ -179,14 +181,14 @@ def latched_depth(qos: str) -> int:
 
 
 def _unsendable(message: StoredMessage) -> str:
-    """The reason why no ROS topic can have a message; empty for a message of a ROS topic."""
+    """Say why no ROS topic can have a message; "" for a message of a ROS topic."""
     if message.encoding != "cdr":
         return f"{message.type_name} in {message.encoding}".strip()
     return "" if message.type_name else "no type"
 
 
 def _definition(message: StoredMessage) -> str:
-    """The definition of a type as text: of the installed package, else of the log."""
+    """Return the definition of a type as text: of the installed package, or else of the log."""
     try:
         return definition(message.type_name).text
     except ParameterError:
@@ -221,9 +223,9 @@ def _is_flight_time(message: StoredMessage) -> bool:
 
 
 def _start_ns(messages: Iterable[StoredMessage], otherwise: int) -> int:
-    """Stamp of flight time 0, by the first `truth` or else the first `y_m`.
+    """Return the stamp of flight time 0, by the first `truth` or else the first `y_m`.
 
-    `otherwise` without both.
+    Returns `otherwise` if there is neither.
     """
     first: dict[str, StoredMessage] = {}
     for message in messages:

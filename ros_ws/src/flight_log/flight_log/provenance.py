@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Provenance of a flight for the metadata of a log, as named sets of strings.
 
-Versions, revision, host and command are collected.
+It consists of versions, revision, host and command.
 """
 
 import os
@@ -41,8 +41,8 @@ STACK = (
     "rise_di",
     "rise_di_controller",
 )
-# The dependencies that the numbers and the bytes of a flight depend on; the middleware by the names
-# of its wheels.
+# The dependencies that affect the numbers and the bytes of a flight; the middleware by the names of
+# its wheels.
 DEPENDENCIES = (
     "jsbsim",
     "mcap",
@@ -61,7 +61,7 @@ GIT_TIMEOUT = 5.0  # s
 
 
 def provenance() -> dict[str, dict[str, str]]:
-    """The provenance of this process now. What cannot be determined is left out."""
+    """Return the provenance of this process now; what cannot be determined is left out."""
     return {
         FLIGHT: {
             "start": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -74,14 +74,14 @@ def provenance() -> dict[str, dict[str, str]]:
 
 
 def recorded_arithmetic(metadata: Mapping[str, Mapping[str, str]]) -> str:
-    """Number of the arithmetic of u in a log; that of this version where the log has none."""
+    """Return the arithmetic of u in a log, or that of this version if the log has none."""
     return metadata.get(VERSIONS, {}).get("arithmetic", ARITHMETIC)
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python, the arithmetic of u, the stack and its main dependencies.
+    """Return the versions of Python, the arithmetic of u, the stack and its main dependencies.
 
-    The packages are those that are installed.
+    Only packages that are installed are listed.
     """
     installed = {"python": platform.python_version(), "arithmetic": ARITHMETIC}
     for name in (*STACK, *DEPENDENCIES):
@@ -95,9 +95,9 @@ def versions() -> dict[str, str]:
 
 
 def revision(source: Path) -> dict[str, str]:
-    """The git commit of a source file, and `dirty`, "true" when a tracked file was changed.
+    """Return the git commit of a source file, and `dirty`, "true" if a tracked file was changed.
 
-    Empty without a commit.
+    The result is empty without a commit.
     """
     git = shutil.which("git")
     if git is None:
@@ -120,7 +120,7 @@ def revision(source: Path) -> dict[str, str]:
 
 
 def host() -> dict[str, str]:
-    """The host without the name: system and kernel, processor, cores, memory."""
+    """Describe the host without its name: system and kernel, processor, cores, memory."""
     return {
         "system": platform.system(),
         "kernel": platform.release(),

@@ -30,8 +30,8 @@ DEFAULTS: Mapping[str, float] = MappingProxyType(
 """Values of PX4 1.16 for parameters that a file leaves out."""
 
 EXPECTED = "a parameter file of QGroundControl, or a ULog"
-COLUMNS = 5  # of a row of a parameter file
-LIKE_PART = 1.05  # of the rate of the law: a faster gyro is interpolated (rise_di_rates.c)
+COLUMNS = 5  # columns of a row of a parameter file
+LIKE_PART = 1.05  # of the rate of the law; a faster gyro is interpolated (rise_di_rates.c)
 
 
 class RateLoop(NamedTuple):
@@ -39,17 +39,17 @@ class RateLoop(NamedTuple):
 
     rate: float  # of the law, Hz
     delay: float  # from the rates to the torque, s
-    filters: float  # s, the part of the gyro's filters
+    filters: float  # s, part that the gyro's filters cause
     origin: str  # what they come from
 
 
 def rate_loop(path: Path, rate: float | None = None) -> RateLoop:
-    """The loop for a law at a rate, by default at that of the gyro.
+    """Return the loop for a law at a rate, by default at that of the gyro.
 
         delay = 1 / (sqrt(2) pi f) + sum_k b_k / (2 pi f_k^2) + 1 / rate + wait
 
     with the cut-off f of a second-order Butterworth filter, the notches of frequency f_k and width
-    b_k, and a period of the law. Beside a faster gyro a tick waits for the next sample, at most a
+    b_k, and a period of the law. If the gyro is faster, a tick waits for the next sample, at most a
     period of the gyro. Raises ParameterError.
     """
     values = {**DEFAULTS, **_read(path)}
@@ -79,12 +79,15 @@ def rate_loop(path: Path, rate: float | None = None) -> RateLoop:
 
 
 def low_pass_delay(cutoff: float) -> float:
-    """The delay of a Butterworth low-pass of second order, 1 / (sqrt(2) pi f), s; 0 Hz: none."""
+    """Compute the delay of a second-order Butterworth low-pass, 1 / (sqrt(2) pi f), s.
+
+    It is 0 for 0 Hz, which means no filter.
+    """
     return 1.0 / (math.sqrt(2.0) * math.pi * cutoff) if cutoff > 0.0 else 0.0
 
 
 def _read(path: Path) -> dict[str, float]:
-    """The parameters that a file has, of DEFAULTS. Raises ParameterError."""
+    """Read those parameters of DEFAULTS that a file has. Raises ParameterError."""
     require(path.is_file(), "px4", f"no file {path}", EXPECTED)
     if "ULog" in file_kind(path):
         parameters = read_foreign_log(path).parameters

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Repairs a truncated or damaged bag, as a killed recorder leaves behind.
+"""Repairs a truncated or damaged bag, such as a killed recorder leaves behind.
 
-Every rosbag2 reader accepts the result. Needs no ROS.
+Every rosbag2 reader accepts the result. It needs no ROS.
 """
 
 import os
@@ -36,7 +36,7 @@ class FileRepair(NamedTuple):
     """The result for a file."""
 
     path: Path
-    messages: int  # messages in it now
+    messages: int  # messages in the file now
     last_ns: int  # log time of the last message
     known_end_ns: int  # the latest log time in any index or metadata, else 0
     faults: str  # empty for an intact file
@@ -48,7 +48,7 @@ class Repair(NamedTuple):
 
     files: tuple[FileRepair, ...]
     wrote_metadata: bool
-    # Names of the files that metadata.yaml names and the folder lacks.
+    # Names of the files that metadata.yaml lists but the folder lacks.
     missing: tuple[str, ...] = ()
 
 
@@ -56,11 +56,11 @@ def repair(run: Path) -> Repair:
     """Rebuild the damaged files in the folder of a bag, and metadata.yaml.
 
     A damaged file is truncated or has damaged parts. A rebuilt file holds every readable record and
-    has an index. The rebuilt file replaces the damaged file atomically; the damaged file stays as
-    *.damaged. An intact bag does not change. metadata.yaml keeps the names of missing files. The
-    file of a bag is repaired alone, without metadata.yaml. Raises ParameterError without a bag,
-    while a recorder writes the bag, for a bag without a readable message, for a metadata.yaml of
-    another program, and for a folder that cannot be written.
+    has an index. It replaces the damaged file atomically, which stays as *.damaged. An intact bag
+    does not change. metadata.yaml keeps the names of missing files. If you name a single file of a
+    bag, only that file is repaired, not metadata.yaml. Raises ParameterError without a bag, while a
+    recorder writes the bag, for a bag without a readable message, for a metadata.yaml of another
+    program, and for a folder that cannot be written.
     """
     # `log_files` says what is there.
     files = bag_files(run) or log_files(run)
@@ -98,10 +98,10 @@ def repair(run: Path) -> Repair:
 
 
 def _previous_metadata(path: Path) -> tuple[Mapping[str, Any], int]:
-    """The content of metadata.yaml and the log time of the last message.
+    """Return the content of metadata.yaml and the log time of the last message.
 
-    Empty and 0 for a missing or damaged file. Raises ParameterError for a file of another program,
-    which must not be replaced.
+    They are empty and 0 for a missing or damaged file. Raises ParameterError for a file of another
+    program, which must not be replaced.
     """
     try:
         return read_bag_metadata(path.parent)
@@ -190,7 +190,7 @@ class _FileScan:
         with replacing(self.path) as stream:
             self._copy(Writer(stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD))
             stream.flush()
-            # A full disk shows here at the latest: the damaged file gets no second name then.
+            # A full disk shows here at the latest, before the damaged file gets a second name.
             os.fsync(stream.fileno())
             damaged = _keep_damaged(self.path)
         return FileRepair(
@@ -205,7 +205,7 @@ class _FileScan:
     def _copy(self, writer: Writer) -> None:
         """Copy the records, schemas and channels first.
 
-        The index also holds the channels of a damaged chunk.
+        The index also knows the channels of a damaged chunk.
         """
         writer.start(profile="ros2", library="rise-di repair")
         schemas = {
@@ -241,7 +241,7 @@ class _FileScan:
 
 
 def _keep_damaged(path: Path) -> Path:
-    """Give the damaged file a second name for the time after the replacement.
+    """Give the damaged file a second name, which stays after the replacement.
 
     On a file system without hard links it is a copy.
     """

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """metadata.yaml of a bag, version 9 of rosbag2, and the files of a bag.
 
-Reads the file, makes its text, and finds the MCAP files of a bag. Needs no ROS.
+This module reads the file, makes its text, and finds the MCAP files of a bag. It needs no ROS.
 """
 
 import re
@@ -16,7 +16,7 @@ from flight_core.parameters import ParameterError, require
 
 ROSBAG2_VERSION = 9
 METADATA = "metadata.yaml"
-INFORMATION = "rosbag2_bagfile_information"  # the one key in it
+INFORMATION = "rosbag2_bagfile_information"  # the only key in it
 
 
 class TopicCount(NamedTuple):
@@ -39,33 +39,32 @@ class FileContents(NamedTuple):
 
     @property
     def messages(self) -> int:
-        """Number of messages on every topic."""
+        """Number of messages on all topics."""
         return sum(count.messages for count in self.counts)
 
 
 SUFFIXES = (".mcap", ".db3")
 PACKED_SUFFIXES = (".zstd", ".zst", ".lz4")
-"""Suffixes of the files of a bag, and the suffixes behind of packed files."""
+"""Suffixes of the files of a bag, and the suffixes that packed files add."""
 
 
 def plain_name(name: str) -> str:
-    """The name of a file of a bag without the suffix of a packed file."""
+    """Return the name of a file of a bag without the suffix of a packed file."""
     suffix = next((suffix for suffix in PACKED_SUFFIXES if name.endswith(suffix)), "")
     return name.removesuffix(suffix)
 
 
 def part_number(name: str) -> int | None:
-    """The number of a file in a bag; None without a number."""
+    """Return the number of a file in a bag; None if it has none."""
     number = re.search(r"_(\d{1,9})$", Path(plain_name(name)).stem)
     return None if number is None else int(number[1])
 
 
 def bag_files(run: Path) -> list[Path]:
-    """The files of a bag in the order of their numbers; empty without a file.
+    """List the files of a bag in the order of their numbers; empty if there are none.
 
-    The path of a file is the file itself. A file that is unpacked beside the packed file comes in
-    place of the latter. Raises ParameterError when the files in the folder are not parts of a
-    single bag.
+    If the path is a file, it is that file itself. A file that is unpacked beside its packed file
+    replaces it. Raises ParameterError if the files in the folder are not parts of a single bag.
     """
     if is_file(run):
         return [run]
@@ -88,16 +87,16 @@ def bag_files(run: Path) -> list[Path]:
 
 
 def _several(files: Sequence[Path]) -> str:
-    """Files of several bags, for a sentence."""
+    """Describe files of several bags, for a sentence."""
     present = {*chain.from_iterable(file.suffixes for file in files)}
     suffixes = " and ".join(suffix for suffix in SUFFIXES if suffix in present)
     return f"{len(files)} {suffixes} files that are not parts of one bag"
 
 
 def read_bag_metadata(run: Path) -> tuple[dict[str, Any], int]:
-    """The content of metadata.yaml, and the log time of the last message in ns.
+    """Read metadata.yaml, and the log time of the last message in ns.
 
-    Raises ParameterError when the file is missing or is not rosbag2's.
+    Raises ParameterError if the file is missing or is not rosbag2's.
     """
     tree = read_yaml(run / METADATA, METADATA, "that of rosbag2")
     try:
@@ -118,10 +117,10 @@ def bag_metadata_yaml(
     previous: Mapping[str, Any] | None = None,
     missing: Sequence[str] = (),
 ) -> str:
-    """The text of metadata.yaml.
+    """Write the text of metadata.yaml.
 
-    Compression, custom data and distribution come from the `previous` content. `missing` files of
-    the previous content stay in the lists of files.
+    Compression, custom data and distribution come from the `previous` content. Files of the
+    previous content that are `missing` stay in the lists of files.
     """
     counts: dict[str, TopicCount] = {}
     for count in chain.from_iterable(file.counts for file in files):
@@ -161,12 +160,12 @@ def bag_metadata_yaml(
 
 
 def _order(name: str) -> tuple[int, str]:
-    """The key that sorts the files of a bag by number: _2 before _10."""
+    """Return the key that sorts the files of a bag by number: _2 before _10."""
     return len(plain_name(name)), name
 
 
 def _entries(information: Mapping[str, Any], names: Sequence[str]) -> list[dict[str, Any]]:
-    """The entries of files in the content of metadata.yaml."""
+    """Return the entries of files in the content of metadata.yaml."""
     entries = information.get("files")
     entries_of_files = entries if isinstance(entries, list) else []
     return [
@@ -177,7 +176,7 @@ def _entries(information: Mapping[str, Any], names: Sequence[str]) -> list[dict[
 
 
 def _profiles(qos: str) -> list[Any]:
-    """The offered profiles in the metadata of a channel; empty when they are not a YAML list."""
+    """Return the offered profiles in a channel's metadata; empty if they are no YAML list."""
     try:
         profiles = parse_yaml(qos, "qos", "a list")
     except ParameterError:

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reads the records of an MCAP file that may be truncated, damaged or growing.
 
-Reading goes to the end of the file, without the damaged parts.
+It reads to the end of the file and leaves out the damaged parts.
 """
 
 import os
@@ -40,8 +40,8 @@ from mcap.records import (
 from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
-# What reading raises when bytes were changed: between records, inside a record, inside a compressed
-# chunk.
+# What reading raises if bytes were changed: between records, inside a record, or inside a
+# compressed chunk.
 DECODE_ERRORS = (
     McapError,
     MemoryError,
@@ -78,15 +78,15 @@ FOOTER = struct.Struct("<BQQQI")
 CRC = struct.Struct("<I")
 
 ENDS = (int(Opcode.DATA_END), int(Opcode.FOOTER))
-DAMAGED = 0  # in place of the opcode, which is larger
+DAMAGED = 0  # stands for an opcode, all of which are larger
 
 JOINED_BYTES = 1 << 20
 """Bytes of the records in chunks that are decoded together: about a second of a flight."""
 
-AHEAD = 2  # groups of chunks that are decoded before they are asked for
+AHEAD = 2  # number of groups of chunks that are decoded ahead
 
 MAX_CHUNK_BYTES = 64 << 20
-"""Limit for a chunk that is larger than its compressed bytes. A damaged chunk of 1 kB may give any
+"""Limit for a chunk that is larger than its compressed bytes. A damaged chunk of 1 kB may claim any
 size, and hold 20 MB.
 
 Recorders close a chunk at about 1 MB, or after the message that exceeds it.
@@ -105,7 +105,7 @@ RECORD_READERS: dict[int, Callable[[ReadDataStream], McapRecord]] = {
 
 
 class _Decompressor(threading.local):
-    """A decompressor a thread. A new decompressor a chunk would take as long as the chunk."""
+    """A decompressor per thread; a new one per chunk would take as long as the chunk itself."""
 
     def __init__(self) -> None:
         self.zstd = zstandard.ZstdDecompressor()
@@ -129,13 +129,13 @@ class MessageBatch(NamedTuple):
     channel_id: int
     data: NDArray[np.uint8]  # (N, length)
     log_ns: NDArray[np.int64]  # (N,)
-    publish_ns: NDArray[np.int64]  # (N,), 0 where the log has no time of sending
-    # (N,), number of the message by the publisher, 0 where the log has none
+    publish_ns: NDArray[np.int64]  # (N,), 0 if the log has no time of sending
+    # (N,), number of the message by the publisher, 0 if the log has none
     sequence: NDArray[np.int64]
 
     @property
     def sent_ns(self) -> NDArray[np.int64]:
-        """Times of sending, (N,); of receipt where the log has none."""
+        """Times of sending, (N,), or of receipt if the log has none."""
         return np.where(self.publish_ns == 0, self.log_ns, self.publish_ns)
 
 
@@ -144,18 +144,18 @@ T = TypeVar("T")
 
 
 class Scan:
-    """A file, read from where the last reading ended, as a growing file needs.
+    """A file that is read from where the last reading ended, as a growing file needs.
 
-    `records`, `batches` and `groups` read. The attributes are valid afterwards.
+    `records`, `batches` and `groups` read it. The attributes are valid afterwards.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.position = 0  # bytes that have been read
-        self.ended = False  # the end of the data has been read
-        self.complete = False  # the file has its footer
-        self.damaged = 0  # chunks and other parts that could not be read
-        self.endless = 0  # bytes of a record that no file holds, at `position`
+        self.position = 0  # number of bytes that have been read
+        self.ended = False  # whether the end of the data has been read
+        self.complete = False  # whether the file has its footer
+        self.damaged = 0  # number of chunks and other parts that could not be read
+        self.endless = 0  # claimed size of a record at `position` that no file can hold, bytes
         # The latest log time in the index and the chunk headers, including lost messages.
         self.known_end_ns = 0
         # Counts by channel, as the index has them; known from the first record on.
@@ -164,25 +164,25 @@ class Scan:
 
     @property
     def faults(self) -> str:
-        """The faults of the file; empty for an intact file."""
+        """Faults of the file; "" for an intact file."""
         faults = [] if self.complete else ["a truncated end"]
         faults += [f"{self.damaged} damaged parts"] if self.damaged else []
         return " and ".join(faults)
 
     def records(self) -> Iterator[McapRecord]:
-        """The schemas, channels, messages, attachments and metadata.
+        """Yield the schemas, channels, messages, attachments and metadata.
 
-        Schemas and channels of the index come first, so a damaged chunk loses none. Raises OSError
-        for a file that cannot be read, and nothing for damaged content.
+        Schemas and channels of the index come first, so that a damaged chunk loses none of them.
+        Raises OSError if the file cannot be read, and nothing for damaged content.
         """
         return chain.from_iterable(self._read(decode_parts, 0, map))
 
     def batches(self) -> Iterator[McapRecord | MessageBatch]:
-        """As `records`, many times faster: the messages of a channel in some chunks together."""
+        """Yield as `records` does, many times faster: messages of a channel come together."""
         return chain.from_iterable(self._read(decode_batches, JOINED_BYTES, map_ahead))
 
     def groups(self) -> Iterator[Sequence[McapRecord | MessageBatch]]:
-        """As `batches`, a chunk at a time: a caller may end between two."""
+        """Yield as `batches` does, a chunk at a time, so that a caller may stop in between."""
         return self._read(decode_batches, 0, map)
 
     def _read(
@@ -207,9 +207,9 @@ class Scan:
                 self.damaged += 1  # a changed opcode makes a record unrecognisable
 
     def _index(self, stream: IO[bytes], size: int) -> list[McapRecord]:
-        """The records of the index, the MCAP summary.
+        """Read the records of the index, the MCAP summary.
 
-        Empty when the file is truncated or the index damaged.
+        They are empty if the file is truncated or the index damaged.
         """
         position = size - FOOTER.size - len(MCAP0_MAGIC)
         if position < len(MCAP0_MAGIC):
@@ -236,7 +236,7 @@ class Scan:
             if isinstance(record, Statistics | ChunkIndex)
         ]
         self.known_end_ns = max(ends, default=0)
-        most = size // INDEX_ENTRY.itemsize  # the message indexes alone take that much
+        most = size // INDEX_ENTRY.itemsize  # the message indexes alone take that many bytes
         self.message_counts = {
             channel: min(count, most)
             for record in index
@@ -248,7 +248,7 @@ class Scan:
     def _parts(
         self, stream: IO[bytes], size: int, index: Sequence[McapRecord]
     ) -> Iterator[FilePart]:
-        """The parts from the position to the end of the data, or of the file so far."""
+        """Yield the parts from the position to the end of the data, or of the file so far."""
         stream.seek(0)
         if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
             self.complete = False
@@ -271,7 +271,7 @@ class Scan:
 
 
 def _known_places(index: Sequence[McapRecord], size: int) -> list[int]:
-    """The places of the records in the index, in order, and the size of the file."""
+    """List the places of the records in the index, in order, and the size of the file."""
     starts = (
         record.chunk_start_offset if isinstance(record, ChunkIndex) else record.offset
         for record in index
@@ -281,10 +281,10 @@ def _known_places(index: Sequence[McapRecord], size: int) -> list[int]:
 
 
 def whole_parts(stream: IO[bytes], position: int, places: Sequence[int]) -> Iterator[FilePart]:
-    """Every whole record from a place up to the end of the data, with the message indexes behind.
+    """Yield every whole record from a place to the end of the data, with its message indexes.
 
-    After a damaged record, with the opcode DAMAGED, the next record of the index follows. The last
-    record is in ENDS, or the file is truncated, or grows.
+    After a damaged record, which gets the opcode DAMAGED, the next record of the index follows.
+    Either the last record is in ENDS, or the file is truncated or still growing.
     """
     stream.seek(position)
     size = places[-1]
@@ -315,9 +315,9 @@ def whole_parts(stream: IO[bytes], position: int, places: Sequence[int]) -> Iter
 
 
 def _joined(parts: Iterator[FilePart], most: int) -> Iterator[Sequence[FilePart]]:
-    """Successive chunks with up to `most` bytes of records together; every further record alone.
+    """Join successive chunks with up to `most` bytes of records; any other record stays alone.
 
-    A chunk of more bytes is alone too.
+    A chunk of more bytes stays alone too.
     """
     chunks: list[FilePart] = []
     size = 0
@@ -341,7 +341,7 @@ def _joined(parts: Iterator[FilePart], most: int) -> Iterator[Sequence[FilePart]
 def _decoded(
     decode_record: Callable[[Sequence[FilePart]], Iterator[R]], parts: Sequence[FilePart]
 ) -> tuple[FilePart, list[R], int]:
-    """The last of parts, their records without those of damaged parts, and how many these are."""
+    """Decode parts: the last of them, their records, and how many damaged parts were left out."""
     try:
         return parts[-1], list(decode_record(parts)), 0
     except DECODE_ERRORS:
@@ -357,7 +357,7 @@ def _decoded(
 
 
 def map_ahead(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
-    """As `map`, with the next results from a thread.
+    """Map as `map` does, with the next results from a thread.
 
     Decompression and NumPy leave the interpreter to the caller meanwhile.
     """
@@ -371,7 +371,7 @@ def map_ahead(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
 
 
 def split(data: bytes) -> Iterator[McapRecord]:
-    """The records in a sequence of bytes. Raises DECODE_ERRORS."""
+    """Yield the records in a sequence of bytes. Raises DECODE_ERRORS."""
     position = 0
     while position < len(data):
         opcode, length = RECORD.unpack_from(data, position)
@@ -395,23 +395,23 @@ def _messages_in(record: object) -> int:
 
 
 def decode_batches(parts: Sequence[FilePart]) -> Iterator[McapRecord | MessageBatch]:
-    """As `decode_record` of chunks or of a single record, with the messages of a channel together.
+    """Decode as `decode_record` does, with the messages of a channel together.
 
-    The message indexes of a chunk save most of the time. A wrong index changes nothing. Raises
-    DECODE_ERRORS.
+    The parts are chunks or a single record. The message indexes of a chunk save most of the time; a
+    wrong index changes nothing. Raises DECODE_ERRORS.
     """
     yield from _split_batches([(_plain(part), _places(part.message_indexes)) for part in parts])
 
 
 def _plain(part: FilePart) -> bytes:
-    """The records of a part, those of a chunk decompressed. Raises DECODE_ERRORS."""
+    """Return the records of a part, those of a chunk decompressed. Raises DECODE_ERRORS."""
     if part.opcode == Opcode.CHUNK:
         return decompress(part.content)
     return RECORD.pack(part.opcode, len(part.content)) + part.content
 
 
 def _places(message_indexes: Sequence[bytes]) -> NDArray[np.int64]:
-    """The places of messages in a chunk in their order, by the message indexes, damaged or not."""
+    """Read the places of messages in a chunk in their order from its indexes, damaged or not."""
     ends = (
         len(content) - (len(content) - MESSAGE_INDEX.size) % INDEX_ENTRY.itemsize
         for content in message_indexes
@@ -426,9 +426,9 @@ def _places(message_indexes: Sequence[bytes]) -> NDArray[np.int64]:
 def _split_batches(
     chunks: Sequence[tuple[bytes, NDArray[np.int64]]],
 ) -> Iterator[McapRecord | MessageBatch]:
-    """The records in chunks, and then the messages by channel. Raises DECODE_ERRORS.
+    """Yield the records in chunks, and then the messages by channel. Raises DECODE_ERRORS.
 
-    A chunk has the places of the messages in their order, by the message indexes.
+    Each chunk comes with the places of its messages in their order, by the message indexes.
     """
     joined_places: list[NDArray[np.int64]] = []
     size = 0
@@ -436,7 +436,7 @@ def _split_batches(
         try:
             others, places = _walk(data, indexed)
         except DECODE_ERRORS:
-            # An index may be wrong, or of another chunk.
+            # An index may be wrong, or belong to another chunk.
             others, places = _walk(data, NO_PLACES)
         yield from others
         joined_places.append(places + size)
@@ -461,12 +461,12 @@ def _split_batches(
 
 
 def _heads(data: bytes) -> NDArray[np.void]:
-    """The head of a message at every place of a chunk."""
+    """Return the head of a message at every place of a chunk."""
     return np.ndarray((max(len(data) - HEAD.itemsize + 1, 0),), HEAD, data, strides=(1,))
 
 
 def _walk(data: bytes, places: NDArray[np.int64]) -> tuple[list[McapRecord], NDArray[np.int64]]:
-    """The records of a chunk except messages, and the places of the messages, sorted.
+    """Find the records of a chunk except messages, and the places of the messages, sorted.
 
     The search steps over the messages at `places`, and from record to record in between. Raises
     DECODE_ERRORS.
@@ -500,14 +500,14 @@ def _walk(data: bytes, places: NDArray[np.int64]) -> tuple[list[McapRecord], NDA
 
 
 def decode_parts(parts: Iterable[FilePart]) -> Iterator[McapRecord]:
-    """The records of parts of a file, in order. Raises DECODE_ERRORS."""
+    """Yield the records of parts of a file, in order. Raises DECODE_ERRORS."""
     for part in parts:
         yield from split(_plain(part))
 
 
 def decode_record(opcode: int, content: bytes) -> Iterator[McapRecord]:
-    """A record that is no message. Raises DECODE_ERRORS."""
-    # No chunk holds another one.
+    """Decode a record that is no message. Raises DECODE_ERRORS."""
+    # A chunk does not contain another one.
     if opcode in {DAMAGED, Opcode.CHUNK, Opcode.MESSAGE}:
         raise McapError("a record that is damaged")
     if opcode in RECORD_READERS:
@@ -519,7 +519,7 @@ def decode_record(opcode: int, content: bytes) -> Iterator[McapRecord]:
 
 
 def decompress(chunk: bytes) -> bytes:
-    """The bytes of the records in the content of a chunk, limited to the stated size.
+    """Decompress the records in a chunk, limited to the stated size.
 
     Raises DECODE_ERRORS.
     """

@@ -38,10 +38,10 @@ NO_SCHEMA = Schema(id=0, data=b"", encoding="", name="")
 
 
 def stored_messages(run: Path) -> Iterator[StoredMessage]:
-    """The messages of a log in the order of writing.
+    """Yield the messages of a log in the order of writing.
 
-    Of a truncated or damaged file they are the readable messages. Raises ParameterError for a
-    missing or unreadable log.
+    In a truncated or damaged file they are the readable ones. Raises ParameterError for a missing
+    or unreadable log.
     """
     for file in log_files(run):
         schemas: dict[int, Schema] = {}
@@ -75,11 +75,10 @@ def stored_messages(run: Path) -> Iterator[StoredMessage]:
 def parameter_changes(
     run: Path, node: str, parameters: Mapping[str, object]
 ) -> list[dict[str, Any]]:
-    """The changes of a node's parameters on `/parameter_events`, in the order of the stamps.
+    """Return the changes of a node's parameters on `/parameter_events`, in order of the stamps.
 
-    `node` is the full name of a node, as in "/one/controller". A change maps dotted names to
-    values, for `parameters` or groups of parameters. None stands for a deleted parameter. SI
-    units.
+    `node` is the full name of a node, as in "/one/controller". A change maps dotted names to values
+    in SI units, for `parameters` or groups of parameters. None stands for a deleted parameter.
     """
     store = typestore()
     events: list[tuple[int, dict[str, Any]]] = []
@@ -106,9 +105,9 @@ def parameter_changes(
 
 
 def parameter_event(stamp_ns: int, node: str, changes: Mapping[str, Any]) -> bytes:
-    """A message of PARAMETER_EVENTS with changes by dotted name; None deletes a parameter.
+    """Make a message of PARAMETER_EVENTS with changes by dotted name; None deletes a parameter.
 
-    The inverse of `parameter_changes`.
+    This is the inverse of `parameter_changes`.
     """
     store = typestore()
     types = {
@@ -138,7 +137,7 @@ def parameter_event(stamp_ns: int, node: str, changes: Mapping[str, Any]) -> byt
 
 
 def parameter_value(message: Any) -> Any:
-    """The value in a rcl_interfaces/msg/ParameterValue; None for an unset value."""
+    """Return the value in a rcl_interfaces/msg/ParameterValue; None for an unset value."""
     # After the field "type" of rcl_interfaces/msg/ParameterValue there is one field for each type,
     # in their order from 1 on.
     kind = message.type

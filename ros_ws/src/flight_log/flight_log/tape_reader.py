@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reads a bag as a Tape, without ROS.
 
-Bags of this stack and of `ros2 bag record` are read, also truncated.
+It reads bags of this stack and of `ros2 bag record`, even if they are truncated.
 """
 
 from collections import defaultdict
@@ -59,14 +59,14 @@ AIRCRAFT_TOPICS = ("y", "y_m", "u", "u_m", "internals", "truth")
 
 
 class RecordedRun(NamedTuple):
-    """The content of a log, of the aircraft in `namespace`, "" for the root.
+    """The content of a log for the aircraft in `namespace`, "" for the root.
 
-    `metadata` holds the named sets of strings, `attachments` the files except the scenario.
-    `latency` is that of the loop from y to u, `age_of_u` the age of u at the aircraft,
-    `engagements` are the engagements of a bridge; None for a log without samples of the kind, or
-    without times of sending. `messages` are its warnings, errors, parameter changes, and those of
-    learning and of a bridge. `path` is where the log was read, `topics` are the types of all topics
-    of the log by full name.
+    `metadata` holds the named sets of strings, and `attachments` the files except the scenario.
+    `latency` is that of the loop from y to u, `age_of_u` is the age of u at the aircraft, and
+    `engagements` are those of a bridge; each is None for a log without such samples, or without
+    times of sending. `messages` are its warnings, errors, parameter changes, and those about
+    learning and a bridge. `path` is where the log was read, and `topics` has the types of all
+    topics of the log by full name.
     """
 
     tape: Tape
@@ -83,17 +83,17 @@ class RecordedRun(NamedTuple):
 
     @property
     def account(self) -> Any:
-        """The share of each topic, and what the log lacks.
+        """Share of each topic, and what the log lacks.
 
-        `rise_di.read_run` finds them; None without it.
+        `rise_di.read_run` finds them; without it they are None.
         """
         return self.tape.account
 
     def require(self, *names: str) -> None:
-        """Raise ParameterError where the log has no sample of a topic, with the topics that it has.
+        """Raise ParameterError if the log has no sample of a topic, with the topics that it has.
 
         Args:
-            names: Topics that need a sample; none: at least a topic of a flight.
+            names: Topics that need a sample; none means at least one topic of a flight.
 
         Raises:
             ParameterError: A topic has no sample.
@@ -108,7 +108,7 @@ class RecordedRun(NamedTuple):
             raise ParameterError(f"{where}: found {lack}, expected {A_FLIGHT}")
 
     def scenario_file(self) -> StoredFile:
-        """The scenario in the log. Raises ParameterError for a log without one."""
+        """Return the scenario in the log. Raises ParameterError for a log without one."""
         if self.scenario is None:
             where = "the log" if self.path is None else str(self.path)
             if IMPORTED in self.metadata:
@@ -122,7 +122,7 @@ class RecordedRun(NamedTuple):
 
 
 def topics_text(topics: Mapping[str, str]) -> str:
-    """Topics with the types, for a sentence; empty without topics."""
+    """List topics with their types, for a sentence; "" if there are none."""
     names = [f"{topic} ({type_name or 'no type'})" for topic, type_name in sorted(topics.items())]
     surplus = len(names) - NAMED
     return ", ".join(names[:NAMED]) + (f" and {surplus} more topics" if surplus > 0 else "")
@@ -182,7 +182,7 @@ def read_run(
 
 
 def _require_samples(log: LogContent, signals: Mapping[str, Signal], run: Path) -> None:
-    """Raise ParameterError for a log without a sample of a flight, with the reasons."""
+    """Refuse a log without a sample of a flight, and give the reasons."""
     has = topics_text(log.kinds)
     lacks = [f"no sample of a flight among {has}" if has else "no sample on any topic"]
     for topic, samples in log.topics.items():
@@ -196,7 +196,7 @@ def _require_samples(log: LogContent, signals: Mapping[str, Signal], run: Path) 
 def _tape(
     log: LogContent, aircraft: str, names: Mapping[str, str], filled: Mapping[str, Signal]
 ) -> Tape:
-    """The tape of an aircraft, without the duration.
+    """Make the tape of an aircraft, without the duration.
 
     `names` are the names within the namespace by topic, `filled` the signals by name.
     """
@@ -212,7 +212,7 @@ def _tape(
     }
     recording = {name: clock for name, clock in recordings.items() if clock.found}
     leaps: list[Leap] = []
-    # The import numbers the samples that it found: a gap is one of the log, not of its clock.
+    # The import numbers the samples that it found, so a gap is one of the log, not of its clock.
     if IMPORTED not in log.metadata:
         signals, recording, leaps = without_leaps(signals, recording)
     start_ns = _start_ns(signals)
@@ -248,9 +248,9 @@ def _tape(
 def _publisher_notes(
     topics: Mapping[str, TopicSamples], of_flight: Mapping[str, Signal | None]
 ) -> list[str]:
-    """The notes on further publishers of topics: of samples at one time, and of other messages.
+    """Write the notes on other publishers of topics: samples at the same time, other messages.
 
-    A note is of all topics with the same publishers.
+    A note covers all topics with the same publishers.
     """
     conflicts = defaultdict[tuple[str, ...], list[str]](list)
     foreign = defaultdict[tuple[str, ...], list[str]](list)
@@ -275,7 +275,7 @@ def _publisher_notes(
 
 
 def _publishers(senders: Sequence[str]) -> str:
-    """The names of publishers for a sentence."""
+    """Name publishers for a sentence."""
     surplus = len(senders) - NAMED
     more = f" and {surplus} more publishers" if surplus > 0 else ""
     return ", ".join(bounded(sender) or UNNAMED for sender in senders[:NAMED]) + more
@@ -290,9 +290,9 @@ def _is_before_epoch(start_ns: int, spans: Mapping[str, SampleSpan]) -> bool:
 
 
 def _spans(topics: Iterable[tuple[str, Mapping[str, SampleSpan]]]) -> dict[str, SampleSpan]:
-    """The span of each publisher over its topics, which are names with spans.
+    """Return the span of each publisher over its topics, which are names with spans.
 
-    Of other programs only the topics of aircraft count.
+    For other programs only the topics of aircraft count.
     """
     spans: dict[str, SampleSpan] = {}
     for name, senders in topics:
@@ -303,17 +303,17 @@ def _spans(topics: Iterable[tuple[str, Mapping[str, SampleSpan]]]) -> dict[str, 
 
 
 def stored_scenario(path: Path) -> StoredFile:
-    """A scenario file as a file inside a log.
+    """Read a scenario file as a file inside a log.
 
-    Raises ParameterError for a file that cannot be read.
+    Raises ParameterError if it cannot be read.
     """
     return StoredFile(path.name, read_file(path, str(path), A_SCENARIO))
 
 
 def files_beside(run: Path) -> list[StoredFile]:
-    """The scenario and the parameters beside a log without attachments.
+    """Find the scenario and the parameters beside a log without attachments.
 
-    The content tells a scenario. Several scenarios are as none.
+    A scenario is recognised by its content. Several scenarios count as none.
     """
     folder = run if is_folder(run) else run.parent
     files = []
@@ -329,7 +329,7 @@ def files_beside(run: Path) -> list[StoredFile]:
 
 
 def aircraft_namespaces(topics: Collection[str]) -> list[str]:
-    """The namespaces of aircraft."""
+    """List the namespaces of aircraft."""
     return sorted(
         {
             topic.rpartition("/")[0]
@@ -340,7 +340,7 @@ def aircraft_namespaces(topics: Collection[str]) -> list[str]:
 
 
 def chosen_namespace(topics: Collection[str], namespace: str | None, where: str) -> str:
-    """The namespace of an aircraft, "" for the root and without an aircraft.
+    """Choose the namespace of an aircraft; "" for the root and if there is no aircraft.
 
     `namespace` is the choice of the caller.
     """
@@ -365,7 +365,7 @@ def chosen_namespace(topics: Collection[str], namespace: str | None, where: str)
 
 
 def names_within(namespace: str, topics: Collection[str]) -> dict[str, str]:
-    """Names within the namespace of an aircraft, by full topic name, without nested aircraft."""
+    """Map full topic names to names within an aircraft's namespace, without nested aircraft."""
     inner_aircraft = [
         f"{name}/" for name in aircraft_namespaces(topics) if name.startswith(f"{namespace}/")
     ]
@@ -377,7 +377,7 @@ def names_within(namespace: str, topics: Collection[str]) -> dict[str, str]:
 
 
 def _duration(attachments: Sequence[StoredFile]) -> float | None:
-    """The duration of the whole flight by the attached parameters, s; None without them."""
+    """Return the duration of the whole flight by the attached parameters, s; None without them."""
     for file in attachments:
         if file.name == PARAMETERS:
             with suppress(ParameterError, LookupError, OverflowError, TypeError, ValueError):
@@ -387,9 +387,10 @@ def _duration(attachments: Sequence[StoredFile]) -> float | None:
 
 
 def _start_ns(signals: Mapping[str, Signal]) -> int:
-    """Stamp of flight time 0.
+    """Return the stamp of flight time 0.
 
-    `truth` tells the stamp, else the first y_m, where commands begin, else the earliest stamp.
+    `truth` tells it; without `truth` it is the first y_m, where commands begin, or else the
+    earliest stamp.
     """
     truth = signals.get("truth")
     if truth is not None and "t" in truth.names:

@@ -23,14 +23,14 @@ from flight_log.stored_messages import PARAMETER_EVENT, PARAMETER_EVENTS, parame
 EXPECTED = "a folder and a disk that can"
 
 DELAY_NS = NANOSECONDS
-"""The longest delay of a sample for which messages of successive parts of a flight are in the order
+"""Longest delay of a sample with which messages of successive parts of a flight stay in the order
 of their stamps."""
 
 
 def write_run(tape: Tape, directory: Path, attachments: LogAttachments) -> Path:
     """Write the tape and the attachments as a bag into a folder; return the path of the MCAP file.
 
-    Raises ParameterError where the bag cannot be written.
+    Raises ParameterError if the bag cannot be written.
     """
     with (
         writing("", directory, EXPECTED),
@@ -41,10 +41,10 @@ def write_run(tape: Tape, directory: Path, attachments: LogAttachments) -> Path:
 
 
 class TapeWriter:
-    """Writes a flight part by part as a bag. A sample becomes a message with the stamp as log time.
+    """Writes a flight part by part as a bag; each sample is a message with its stamp as log time.
 
     Messages are in the order of time: the samples of the last DELAY_NS wait for the next part.
-    Raises OSError where the bag cannot be written.
+    Raises OSError if the bag cannot be written.
     """
 
     def __init__(self, directory: Path, attachments: LogAttachments, start_ns: int = 0) -> None:

@@ -19,11 +19,11 @@ LEAST = MappingProxyType(
     | {ord("S"): 8, ord("O"): 2, ord("L"): 9, ord("C"): 11, ord("R"): 2}
     | dict.fromkeys(b"FIMPQ", 3)
 )
-"""The least bytes of a message, by its type."""
+"""Least number of bytes of a message, by its type."""
 
 LARGEST = 10_000  # bytes, of a message (pyulog, core.py)
 APPENDED = slice(HEAD + MESSAGE.size + 16, HEAD + MESSAGE.size + 40)  # offsets, of FLAGS
-TAIL = 528  # bytes: with fewer at its end a log is whole, cut inside a message
+TAIL = 528  # bytes: with fewer at its end a log counts as whole, cut inside a message
 
 
 class Messages(NamedTuple):
@@ -34,9 +34,10 @@ class Messages(NamedTuple):
 
 
 def whole_messages(content: bytes) -> Messages:
-    """The messages that another message or the end follows.
+    """Keep the messages that are followed by another message or by the end.
 
-    The content is unchanged without lost bytes, and with appended parts, which offsets name.
+    The content is unchanged if no bytes are lost, or if there are appended parts, which offsets
+    name.
     """
     if any(content[APPENDED]) and content[HEAD + 2 : HEAD + 3] == b"B":
         return Messages(content, None)
@@ -65,7 +66,7 @@ def whole_messages(content: bytes) -> Messages:
 
 
 class _Log:
-    """What the messages so far tell of the next ones."""
+    """What the messages so far tell about the next ones."""
 
     def __init__(self, content: bytes) -> None:
         self._content = content
@@ -73,7 +74,7 @@ class _Log:
         self.stamp_us = 0  # of the newest data
 
     def end_of(self, here: int) -> int:
-        """The end of the whole message at a place; 0 without one."""
+        """Return the end of the whole message at a place; 0 if there is none."""
         size = self._size(here)
         end = here + MESSAGE.size + size
         if not size or end > len(self._content):
@@ -84,9 +85,9 @@ class _Log:
         return end if is_last or self._size(end, number) else 0
 
     def _size(self, here: int, subscribed: int | None = None) -> int:
-        """The size by the head of a message, bytes; 0 of a head that no message has.
+        """Return the size that the head of a message gives, bytes; 0 if no message has such a head.
 
-        `subscribed`: the number of data that the message before subscribes.
+        `subscribed` is the number of data to which the message before subscribes.
         """
         if here + MESSAGE.size + 2 > len(self._content):
             return 0

@@ -25,8 +25,8 @@ EXPECTED = "a DataFlash log (.bin, .log), a tlog or a ULog"
 def read_vehicle_log(path: Path, choice: Choice = ANY) -> VehicleLog:
     """Read the log of an autopilot.
 
-    Raises ParameterError for another file, where no message can be decoded, and where two systems
-    or sensors may have flown.
+    Raises ParameterError for any other file, if no message can be decoded, and if two systems or
+    sensors may have flown.
     """
     require(path.is_file(), str(path), "no such file", EXPECTED)
     kind = file_kind(path)
@@ -56,7 +56,7 @@ def read_vehicle_log(path: Path, choice: Choice = ANY) -> VehicleLog:
 
 @contextmanager
 def _silent() -> Iterator[None]:
-    """Discard what pymavlink and pyulog print of a damaged file, from C too.
+    """Discard what pymavlink and pyulog print about a damaged file, even from C.
 
     They print a line for each byte without a message.
     """
@@ -80,15 +80,15 @@ def _silent() -> Iterator[None]:
 
 
 LIMITS = (5.0, 6.0)
-"""Processor time of the decoding, s, and s a megabyte of the log: pymavlink takes 1.2 s a megabyte
-of DataFlash here."""
+"""Processor time of the decoding, s, and s per megabyte of the log: pymavlink takes 1.2 s for a
+megabyte of DataFlash here."""
 
 MEMORY = (1 << 30, 100)
-"""Data of the decoding, bytes, and bytes a byte of the log: pymavlink takes some 35."""
+"""Data of the decoding, bytes, and bytes per byte of the log: pymavlink takes some 35."""
 
 
 def read_foreign_log(path: Path, choice: Choice = ANY) -> VehicleLog:
-    """`read_vehicle_log` in an isolated process, which a hostile log cannot harm.
+    """Read a log by `read_vehicle_log` in an isolated process, which a hostile log cannot harm.
 
     A log of a few bytes may claim billions of values. Raises ParameterError.
     """

@@ -80,7 +80,7 @@ OLD_NAMES = MappingProxyType({"IMU2": ("IMU", 1), "IMU3": ("IMU", 2), "ASP2": ("
 FLAGS: Mapping[str, set[str]] = MappingProxyType(
     {"ARSP": {"H", "U", "Pri"}, "IMU": {"GH"}, "CTUN": {"E2T"}}
 )
-"""Further fields of DataFlash: flags of the sensors, and the ratio of true to equivalent
+"""More fields of DataFlash that are read: flags of the sensors, and the ratio of true to equivalent
 airspeed."""
 
 
@@ -206,9 +206,9 @@ def _read_tlog(path: Path, kind: str, choice: Choice) -> VehicleLog:
 def _flown_system(
     messages_of: Mapping[int, list[Received]], choice: int | None
 ) -> tuple[int, tuple[tuple[str, str], ...]]:
-    """The flying system of a tlog, and a row on the choice.
+    """Choose the flying system of a tlog, and return a row about the choice.
 
-    Raises ParameterError where two systems moved.
+    Raises ParameterError if two systems moved.
     """
     numbers = " and ".join(map(str, messages_of)) or "none with a heartbeat"
     if choice is not None:
@@ -236,17 +236,17 @@ def _flown_system(
 
 # Share of different times among the messages with a time: with fewer the clock stands still.
 LEAST_TIMES = 0.1
-RECENT = 16  # messages with a time, of which one tells the time of a message without
+RECENT = 16  # messages with a time among which one tells the time of a message without
 AGAIN_NS = 30 * NANOSECONDS
 
 
 def _dated(messages: list[Received]) -> Iterator[Sample]:
-    """The samples by the clock of the autopilot.
+    """Yield the samples by the clock of the autopilot.
 
-    The times of arrival do not serve: a radio may bunch messages, and a second link repeats
-    messages later. A message without a time gets the time of the message before on the same link,
-    the nearest by the sequence. Stamps count from the first arrival. Without a clock in the
-    messages the arrival is the time.
+    The times of arrival cannot serve: a radio may bunch messages, and a second link repeats
+    messages later. A message without a time gets the time of the message before it on the same
+    link, the nearest by the sequence. Stamps count from the first arrival. If the messages have no
+    clock, the arrival is the time.
     """
     with_time = [message for message in messages if hasattr(message.content, "time_boot_ms")]
     times = {message.content.time_boot_ms for message in with_time}
@@ -319,7 +319,7 @@ def _read_ulog(path: Path, kind: str, choice: Choice) -> VehicleLog:
     records = [
         (SETTING, 1000 * stamp_us, (name, float(value)))
         for stamp_us, name, value in (*initial, *log.changed_parameters)
-        # A value that is no number is damaged.
+        # A value that is not a number is damaged.
         if is_number(value)
     ]
     parameters = parameters_of(records)
@@ -343,7 +343,7 @@ def _read_ulog(path: Path, kind: str, choice: Choice) -> VehicleLog:
 
 
 class UlogContent(BytesIO):
-    """The content of a ULog: pyulog may go back from a cut message to the same one for ever."""
+    """The content of a ULog; pyulog may go back from a cut message to the same one for ever."""
 
     def __init__(self, content: bytes) -> None:
         """Permit more reads than messages and single steps over damaged bytes need."""
@@ -359,7 +359,7 @@ class UlogContent(BytesIO):
 
 
 def _with_dropouts(loss: Loss | None, dropouts: Sequence[Any]) -> Loss:
-    """The loss of bytes, and what the logger says that it did not write: message O of a ULog."""
+    """Combine the loss of bytes with what the logger says it did not write: message O of a ULog."""
     seconds = 1e-3 * sum(dropout.duration for dropout in dropouts)
     count = "a dropout" if len(dropouts) == 1 else f"{len(dropouts)} dropouts"
     what = f"{count} of the logger, {seconds:.2g} s in all"
@@ -374,7 +374,7 @@ def _with_dropouts(loss: Loss | None, dropouts: Sequence[Any]) -> Loss:
 
 
 def _angles(attitude: MessageTable) -> dict[str, FloatArray]:
-    """Euler angles z, y, x, as of autopilot_bridge.channel_map."""
+    """Compute Euler angles z, y, x, as autopilot_bridge.channel_map does."""
     w, x, y, z = (attitude.fields[f"q[{k}]"] for k in range(4))
     return {
         "phi": np.arctan2(2 * (w * x + y * z), w * w - x * x - y * y + z * z),
@@ -384,7 +384,7 @@ def _angles(attitude: MessageTable) -> dict[str, FloatArray]:
 
 
 def _vehicle(instances: Instances) -> tuple[str, bool]:
-    """The kind of vehicle by `vehicle_status`, "" where unknown, and whether it is a VTOL."""
+    """Return the kind of vehicle by `vehicle_status`, "" if unknown, and whether it is a VTOL."""
     table = instances.get("vehicle_status", {}).get(0)
     if table is None:
         return "", False
@@ -402,7 +402,7 @@ def _vehicle(instances: Instances) -> tuple[str, bool]:
 
 
 def _by_message(places: Iterable[tuple[str, str]]) -> dict[str, set[str]]:
-    """The fields of places by message."""
+    """Collect the fields of places by message."""
     fields: dict[str, set[str]] = {}
     for message, field in places:
         fields.setdefault(message, set()).add(field)
@@ -410,7 +410,7 @@ def _by_message(places: Iterable[tuple[str, str]]) -> dict[str, set[str]]:
 
 
 def _wanted(log_format: Format) -> dict[str, set[str]]:
-    """The fields that are read, by message."""
+    """Collect the fields that are read, by message."""
     sources = (*log_format.sources.values(), *log_format.torques.values(), log_format.mode)
     places = [(source.message, source.field) for source in chain(*sources)]
     for source, count in ((log_format.sticks, STICKS), (log_format.servos, SERVOS)):
@@ -419,11 +419,11 @@ def _wanted(log_format: Format) -> dict[str, set[str]]:
 
 
 ULOG_VALUES = 65535
-"""Values of a message of a ULog at most: its length in bytes is a number of 16 bits."""
+"""Most values in a message of a ULog, because its length in bytes is a number of 16 bits."""
 
 
 def _require_short(formats: Mapping[str, Any]) -> None:
-    """Raise ValueError for a format with more values than a message holds.
+    """Refuse a format with more values than a message can hold, by ValueError.
 
     pyulog would make a field of each value.
     """
@@ -442,4 +442,4 @@ def _require_short(formats: Mapping[str, Any]) -> None:
 READERS: Mapping[str, Callable[[Path, str, Choice], VehicleLog]] = MappingProxyType(
     {"ULog": _read_ulog, "DataFlash": _read_dataflash, "tlog": _read_tlog}
 )
-"""By the word in the kind of a file."""
+"""Readers by the word in the kind of a file."""

@@ -28,14 +28,14 @@ SERVOS = 16
 class MessageTable(NamedTuple):
     """The samples of a message.
 
-    The stamps, ns, have the shape (N,) and ascend. The fields, by name, have the shape (N,) each.
+    The stamps, ns, have the shape (N,) and ascend. Each field, by name, has the shape (N,).
     """
 
     stamp_ns: NDArray[np.int64]
     fields: Mapping[str, FloatArray]
 
     def at(self, field: str, stamp_ns: NDArray[np.int64]) -> FloatArray:
-        """The newest value of a field at each of some instants, (n,); NaN before the first."""
+        """Return the newest value of a field at some instants, (n,); NaN before the first."""
         places = np.searchsorted(self.stamp_ns, stamp_ns, side="right") - 1
         return np.where(places < 0, np.nan, self.fields[field][places])
 
@@ -63,18 +63,18 @@ class LogField(NamedTuple):
 
 
 Sources = Mapping[str, tuple[LogField, ...]]
-"""By quantity the places that may have it, the first one first."""
+"""For each quantity the places that may have it, the first one first."""
 
 
 class Format(NamedTuple):
     """A format of logs: where it has each quantity.
 
     The quantities are y and pose in SI (body FRD; north, east, up), the channels of the
-    transmitter, the servos.
+    transmitter, and the servos.
     """
 
     sources: Sources
-    sticks: LogField  # its field has the number of the channel in place of {}
+    sticks: LogField  # its field has {} in place of the number of the channel
     servos: LogField
     mode: tuple[LogField, ...]
     # Outputs of a multicopter's rate controllers, normalised, by what responds to them.
@@ -123,10 +123,10 @@ COPTER = "multicopter"
 
 
 class Choice(NamedTuple):
-    """What a user takes of a log, and the kind of vehicle of the map."""
+    """What a user takes from a log, and the kind of vehicle of the map."""
 
-    system: int | None = None  # of a tlog; None: the system that flew
-    # The number of the sensor by message; else the sensor or the part that flew.
+    system: int | None = None  # number in a tlog; None for the system that flew
+    # Number of the sensor by message; without it, the sensor or the part that flew.
     instances: Mapping[str, int] = MappingProxyType({})
     vehicle: str = PLANE
 
@@ -142,7 +142,7 @@ class Loss(NamedTuple):
     last_ns: int
 
     def sentence(self, start_ns: int) -> str:
-        """The loss with its times since the begin of the log."""
+        """Write the loss with its times since the beginning of the log."""
         first, last = (
             max(seconds(stamp_ns - start_ns), 0.0) for stamp_ns in (self.first_ns, self.last_ns)
         )
@@ -160,7 +160,7 @@ class VehicleLog(NamedTuple):
     tables: Mapping[str, MessageTable]
     parameters: Parameters
     format: Format | None
-    vehicle: str = PLANE  # "": the log does not say
+    vehicle: str = PLANE  # "" if the log does not say
     # The number of the mode in which the sticks of a plane are the commands: 0 of ArduPlane
     # (mode.h).
     manual: int = 0
@@ -169,17 +169,17 @@ class VehicleLog(NamedTuple):
     loss: Loss | None = None
 
     def source(self, quantity: str) -> LogField | None:
-        """The place in this log that has a quantity of y or of the pose; None where it has none."""
+        """Return where this log has a quantity of y or of the pose; None if it has none."""
         sources = ULOG_SOURCES if self.format is None else self.format.sources
         return next((source for source in sources.get(quantity, ()) if self.has(source)), None)
 
     def start_ns(self, quantity: str) -> int:
-        """The first stamp of a quantity that the log has."""
+        """Return the first stamp of a quantity that the log has."""
         source = self.source(quantity)
         return 0 if source is None else int(self.tables[source.message].stamp_ns[0])
 
     def parameters_at(self, stamp_ns: int) -> dict[str, float]:
-        """The values of the parameters at an instant.
+        """Return the values of the parameters at an instant.
 
         A parameter whose first record comes later is missing.
         """
@@ -195,5 +195,5 @@ class VehicleLog(NamedTuple):
         return source.message in self.tables and source.field in self.tables[source.message].fields
 
     def at(self, source: LogField, stamp_ns: NDArray[np.int64]) -> FloatArray:
-        """The newest value of a place at each of some instants, (n,); NaN before the first."""
+        """Return the newest value of a place at some instants, (n,); NaN before the first."""
         return source.scale * self.tables[source.message].at(source.field, stamp_ns)

@@ -9,7 +9,7 @@ PARAMETERS = ("recorder", "flight_recorder.params:RecorderConfig")
 
 def main() -> None:
     """Run the recorder."""
-    # Not early: a matched recorder receives the history of every publisher. The history delays a
+    # Do not start early: a matched recorder receives the history of every publisher, which delays a
     # flight by 10 to 35 ms, and by 20 to 70 ms while the recorder also loads its modules.
     start_nodes("flight_recorder.node:RecorderNode", early=False, lower_by=3, parameters=PARAMETERS)
 

@@ -145,7 +145,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
             ) from None
 
     def _open_bag(self) -> BagWriter:
-        """The bag with its attachments. Raises ParameterError when the bag cannot be written."""
+        """Open the bag with its attachments. Raises ParameterError if it cannot be written."""
         parameters = self.parameters
         attachments = LogAttachments(
             _file(parameters.scenario_file, "scenario_file"),
@@ -168,16 +168,16 @@ class RecorderNode(FlightNode[RecorderConfig]):
         return bag
 
     def _free_folder(self, directory: Path) -> Path:
-        """The folder, or another one beside it.
+        """Return the folder, or another one beside it.
 
-        A new folder where this folder holds the log of a simulation that ended before.
+        It is a new folder if this one already holds the log of a simulation that has ended.
         """
         folders = (directory.with_name(f"{directory.name}-{number}") for number in count(2))
         has_log = self.simulated is not None and any(directory.glob("*.mcap"))
         return next(folder for folder in folders if not folder.exists()) if has_log else directory
 
     def _space_shortage(self, directory: Path) -> str:
-        """The sentence about too little free space; empty with enough."""
+        """Write the sentence about too little free space; "" if there is enough."""
         free = free_bytes(directory) / MEGABYTE
         least = self.parameters.min_free
         if free >= least:
@@ -185,7 +185,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
         return f"found {free:.1f} MB free in {directory}, expected at least {least:g} MB"
 
     def _among(self, topics: Sequence[Topic], *, heard: bool = False) -> list[_RecordedTopic]:
-        """The recorded topics among `topics`; `heard`: with messages."""
+        """Return the recorded topics among `topics`; with `heard`, only those with messages."""
         selection = (topic for topic in self._topics if topic.subscription.topic in topics)
         return [topic for topic in selection if topic.channel.messages or not heard]
 
@@ -214,9 +214,9 @@ class RecorderNode(FlightNode[RecorderConfig]):
         return False
 
     def advance(self) -> bool:
-        """In a process with further nodes: write at ticks between the steps of the nodes.
+        """Write at ticks between the steps of the other nodes, if they share this process.
 
-        No node is delayed.
+        No node is delayed by this.
         """
         if time.monotonic_ns() - self._drained_ns > self.period_ns():
             self._write()
@@ -292,9 +292,9 @@ class RecorderNode(FlightNode[RecorderConfig]):
             )
 
     def _publish_span(self) -> None:
-        """In real time: publish the stamp up to which y, y_m and u are in the log.
+        """In real time, publish the stamp up to which y, y_m and u are in the log.
 
-        A flight ends once these span it.
+        A flight ends once these cover it.
         """
         stamps = [topic.stamp_ns for topic in self._among(LOOP)]
         if not self.parameters.lockstep and min(stamps) >= 0:
@@ -361,7 +361,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
         return ""
 
     def _add_silences(self) -> None:
-        """Store the silences of topics, also those that last."""
+        """Store the silences of topics, including those that still last."""
         now_ns = self._flight_time.monotonic_ns()
         lasting = {
             topic.name: now_ns - topic.silent_ns for topic in self._topics if topic.silent_ns
@@ -377,7 +377,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
             self._bag.add_metadata(SILENCES, texts)
 
     def _told_outcome(self) -> Outcome:
-        """The outcome that the flight left for the log; UNKNOWN without one."""
+        """Return the outcome that the flight left for the log; UNKNOWN if there is none."""
         file = self._bag.directory / OUTCOME_FILE
         if not is_file(file):
             return UNKNOWN
@@ -409,9 +409,9 @@ class RecorderNode(FlightNode[RecorderConfig]):
             )
 
     def _warn_of_a_part(self) -> None:
-        """Warn of a log with some of y, y_m and u.
+        """Warn if a log has only some of y, y_m and u.
 
-        A flight has y, y_m and u, but discovery may fail on a busy domain.
+        A flight has all three, but discovery may fail on a busy domain.
         """
         silent = [topic for topic in self._among(LOOP) if not topic.channel.messages]
         for topic in silent if len(silent) < len(LOOP) else ():
@@ -436,10 +436,10 @@ class RecorderNode(FlightNode[RecorderConfig]):
             )
 
     def _warn_of_topic_silence(self, now_ns: int) -> None:
-        """Warn of a steady topic without messages, while its publisher is there.
+        """Warn of a steady topic that is silent although its publisher is there.
 
-        Further topics go on. A reader may miss all of a topic: a full queue, or a message of the
-        middleware that was forged.
+        The other topics go on. A reader may miss all of a topic because of a full queue, or of a
+        forged message of the middleware.
         """
         steady = self._among(STEADY, heard=True)
         newest_ns = max((topic.heard_ns for topic in steady), default=0)
@@ -488,9 +488,9 @@ class RecorderNode(FlightNode[RecorderConfig]):
         ]
 
     def _weaken_qos(self, topic: _RecordedTopic) -> None:
-        """Subscribe again with a weaker QoS where publishers offer less than is requested.
+        """Subscribe again with a weaker QoS if publishers offer less than is requested.
 
-        A weaker publisher beside one of the stack does not lower the QoS: EndpointMonitor logs the
+        A weaker publisher beside one of the stack does not lower the QoS; EndpointMonitor logs the
         mismatch.
         """
         subscription = topic.subscription
@@ -543,7 +543,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
             if all(topic.sent_ns >= sent_ns for topic in self._among(STEADY, heard=True)):
                 return
             time.sleep(QUIET_NS / 20 / NANOSECONDS)
-            # a publisher that goes on, as an aircraft of one's own, delays no end
+            # a publisher that goes on, such as an aircraft of your own, does not delay the end
             behind = [topic for topic in self._topics if topic.sent_ns < sent_ns]
             before = [topic.sent_ns for topic in behind]
             self._drain_subscriptions()

@@ -13,18 +13,18 @@ OptionalNames = tuple[str, ...]
 class RecorderConfig(NodeConfig):
     """Parameters of the recorder's node."""
 
-    # that of the laws: what one tick sends is written in one go
+    # the rate of the laws, so that what one tick sends is written in one go
     rate: Annotated[float, Field(ge=5, le=1000)] = Field(
         default=100.0, description="rate of writing, Hz"
     )
     directory: str = Field(
         default="", description="folder of the bag; empty: runs/<UTC stamp>-recording"
     )
-    topics: OptionalNames = Field(default=(), description="further topics to record, of any type")
+    topics: OptionalNames = Field(default=(), description="more topics to record, of any type")
     min_free: NonNegative = Field(
-        default=100.0, description="free disk space below which recording ends, MB; 0: no check"
+        default=100.0, description="free disk space below which recording ends, MB; 0 for no check"
     )
-    attach: OptionalNames = Field(default=(), description="further files to attach to the log")
+    attach: OptionalNames = Field(default=(), description="more files to attach to the log")
     metadata_file: str = Field(
         default="", description="YAML file of named sets of strings, the records of the log"
     )

@@ -4,8 +4,8 @@
 
 Each step predicts the turn at the largest bank to either side, until the course points along the
 way home. Once the better of the two turns comes nearer to the fence than MARGIN of flight, the
-aircraft flies the better turn, then home. From outside the aircraft flies back inside the shortest
-way, then home. Functions take Python floats, or arrays with an element per aircraft of a fleet.
+aircraft flies that turn, then home. If it is outside, it flies back inside the shortest way, then
+home. Functions take Python floats, or arrays with an element per aircraft of a fleet.
 """
 
 import math
@@ -28,37 +28,37 @@ MARGIN = 0.5
 turbulence."""
 
 HOMEWARD = math.radians(20.0)
-"""Angle before the bearing of the way home at which the turn ends."""
+"""Angle before the bearing of the way home at which a turn ends."""
 
 AHEAD = math.radians(60.0)
-"""Angle between the course and the bearing of the way home up to which an aircraft flies along the
-way."""
+"""Largest angle between the course and the bearing of the way home at which an aircraft flies along
+the way."""
 
 LEAST_TURN = math.radians(5.0)
-"""Bank of the longest predicted turn: 2 min at 20 m/s.
+"""Bank of the longest turn that is predicted: 2 min at 20 m/s.
 
-A turn at a smaller bank is predicted for as long. At a bank of 0, at 1.1 V_s and below, the
-prediction is the straight way.
+A turn at a smaller bank is predicted for as long. At a bank of 0, which is the limit at 1.1 V_s and
+below, the prediction is the straight way.
 """
 
 SHARES = (1.0, 1.0 - LARGEST_SLIP)
-"""Shares of the coordinated turn that the predicted turns have; the nearer turn counts.
+"""Fractions of the coordinated turn for which turns are predicted; the nearer one counts.
 
 r follows psi' = g tan(phi) / V, but the aircraft flies along chi = psi + beta: a growing sideslip,
-and k_beta beta in r_m, take from the turn. Of the osprey with every entry of A and B off by up to
-30 % the sideslip takes 0.19, of JSBSim's f16 0.09.
+and k_beta beta in r_m, reduce the turn. On the osprey with every entry of A and B off by up to 30 %
+the sideslip takes 0.19, on JSBSim's f16 0.09.
 """
 
 
 class Motion(NamedTuple):
-    """What the prediction takes of an aircraft, and the limits of the turn."""
+    """What the prediction needs to know of an aircraft, and the limits of the turn."""
 
     north: Scalar  # m
     east: Scalar  # m
-    phi: Scalar  # rad, once a roll that has begun ends
+    phi: Scalar  # rad, once a roll that is under way has ended
     heading: Scalar  # rad, psi + beta
     speed: Scalar  # airspeed, m/s
-    wind: tuple[Scalar, Scalar]  # where the air moves to: north, east, m/s
+    wind: tuple[Scalar, Scalar]  # towards which the air moves: north, east, m/s
     bank: Scalar  # largest bank, rad
     roll_rate: float  # rad/s
     # s, of the turn behind the commanded bank: half of 1 / k_phi, and `turn_lag`.
@@ -66,24 +66,24 @@ class Motion(NamedTuple):
 
 
 def _remaining(side: Array, bearing: Array, course: Array) -> Array:
-    """Angle of a turn to a side from the course to a bearing, rad, 0 to 2 pi."""
+    """Return the angle of a turn to a side from the course to a bearing, rad, 0 to 2 pi."""
     return side * (bearing - course) % (2.0 * math.pi)
 
 
 def _bearing(chart: Ways, fence: Fence, north: Array, east: Array) -> Array:
-    """Bearing of the way home, rad."""
+    """Return the bearing of the way home, rad."""
     aim_north, aim_east, _ = chart.aim(fence, north, east)
     return array_namespace(north).atan2(aim_east - east, aim_north - north)
 
 
 def turn_clearance(fence: Fence, motion: Motion) -> tuple[Array, Array]:
-    """Least clearance of the turn to the right and to the left, m.
+    """Compute the least clearance of the turn to the right and to the left, m.
 
         phi' = p_max after the lag, to the largest bank;  chi' = share g tan(phi) / V;
             [n, e]' = V [cos, sin](chi) + W
 
-    until the course is HOMEWARD before the way home, at the latest after nearly a full turn, at
-    LEAST_TURN or more. Trapezoidal rule over POINTS.
+    until the course is HOMEWARD before the way home, at the latest after nearly a full turn at
+    LEAST_TURN or more. It is integrated by the trapezoidal rule over POINTS.
     """
     xp = array_namespace(motion.phi)
     axes = (1,) * np.ndim(motion.phi)
@@ -116,15 +116,15 @@ def turn_clearance(fence: Fence, motion: Motion) -> tuple[Array, Array]:
 
 
 COURSES = 24
-"""Courses and directions of the wind of `room_at_home`."""
+"""Number of courses, and of directions of the wind, for `room_at_home`."""
 
 
 def room_at_home(fence: Fence, motion: Motion, wind: float) -> float:
-    """Least clearance of the better turn from home onto the orbit, m.
+    """Compute the least clearance of the better turn from home onto the orbit, m.
 
-    The least of COURSES courses in a wind, m/s, from COURSES sides. `motion`: the aircraft at home.
-    An aircraft comes over home on any course, and its turn onto the orbit leaves the orbit by up to
-    twice the radius of the turn.
+    It is the least over COURSES courses in a wind, m/s, from COURSES sides. `motion` is that of the
+    aircraft at home. An aircraft may come over home on any course, and its turn onto the orbit
+    leaves the orbit by up to twice the radius of the turn.
     """
     angles = np.linspace(0.0, 2.0 * math.pi, COURSES, endpoint=False)
     from_sides = angles if wind else angles[:1]
@@ -140,9 +140,9 @@ def room_at_home(fence: Fence, motion: Motion, wind: float) -> float:
 
 
 def _integral(rate: Array, longest: Array) -> Array:
-    """Integral from 0 over the axis 1 of a rate at POINTS equal times up to `longest`.
+    """Integrate a rate from 0 over axis 1, given at POINTS equal times up to `longest`.
 
-    The trapezoidal rule gives it.
+    The trapezoidal rule is used.
     """
     xp = array_namespace(rate)
     steps = 0.5 * (rate[:, 1:] + rate[:, :-1]) * (longest / (POINTS - 1))
@@ -154,8 +154,8 @@ class Escape(NamedTuple):
 
     action: Any  # RIGHT, LEFT, HOME, BACK, AROUND or 0
     begins: Any  # whether the fence begins to act
-    clearance: Any  # m, now
-    predicted: Any  # m, least clearance of the best way
+    clearance: Any  # m, at present
+    predicted: Any  # m, least clearance along the best way
     course: Any  # rad, over ground: of the way home
 
 
@@ -164,20 +164,20 @@ LEFT = -1.0
 HOME = 2.0
 BACK = 3.0
 AROUND = 4.0
-"""Actions of the fence; 0 is none.
+"""Actions of the fence; 0 means none.
 
-A turn to the right, to the left; the way home in a straight line; the way back from outside, the
-shortest way; the way home around a zone or a corner.
+They are a turn to the right or to the left, the way home in a straight line, the shortest way back
+from outside, and the way home around a zone or a corner.
 """
 
 
 def last_safe_turn(fence: Fence, action: Scalar, motion: Motion) -> Escape:
-    """The action of the fence after a step, from the action before.
+    """Choose the action of the fence after a step, given the action before.
 
-    A turn begins where the better turn comes nearer to the fence than MARGIN of flight. It ends
-    HOMEWARD before the way home, and beyond where the way is free. On the way home a turn begins
-    only where it keeps farther from the fence than the way that is flown, and the clearance of now
-    is enough. Outside no turn begins: the aircraft flies back until it is MARGIN inside.
+    A turn begins when the better turn comes nearer to the fence than MARGIN of flight. It ends
+    HOMEWARD before the way home, or later if the way is not free yet. On the way home a turn begins
+    only if it keeps farther from the fence than the way that is flown, provided that the present
+    clearance is enough. Outside no turn begins: the aircraft flies back until it is MARGIN inside.
     """
     if isinstance(motion.phi, float):
         north, east, phi = map(np.float64, (motion.north, motion.east, motion.phi))

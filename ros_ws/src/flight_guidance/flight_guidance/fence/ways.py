@@ -1,10 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Ways home inside of a fence, and back inside from outside.
+"""Ways home inside a fence, and back inside from outside.
 
-They are a map of square cells, made once for a fence. Dijkstra's shortest ways over cells that stay
-inside, with room for a turn where there is room. Each cell has an aim: a place on the way, about a
-radius ahead. An aircraft that flies the course to the aim of the cell it is in comes home.
+They are a map of square cells, made once for a fence. It has Dijkstra's shortest ways over cells
+that stay inside, with room for a turn if there is any. Each cell has an aim: a place on the way,
+about a radius ahead. An aircraft comes home if it always flies the course to the aim of the cell
+that it is in.
 """
 
 import math
@@ -18,22 +19,23 @@ from flight_core.vectors import Array, FloatArray, array_namespace
 from flight_guidance.fence.zones import Fence, clearance
 
 CELLS_PER_RADIUS = 4
-"""A circle round home has 25 cells around, and a turn of 180 deg crosses 8."""
+"""Cells per radius: a circle round home has 25 cells around it, and a turn of 180 deg crosses 8."""
 
 MOST_CELLS = 100
-"""Cells along the longer side of the map, so that a large fence takes a second."""
+"""Largest number of cells along the longer side of the map, so that a large fence takes a
+second."""
 
 STEPS = ((1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1))
 """Neighbours of a cell."""
 
 POINTS = 64
-"""Points of a line at which the clearance is taken."""
+"""Number of points of a line at which the clearance is taken."""
 
 
 class Ways(NamedTuple):
-    """The map: the aim of a cell, and whether the straight way home is free.
+    """The map: the aim of each cell, and whether the straight way home from it is free.
 
-    The straight way leads onto the orbit round home. Shapes (rows, columns).
+    The straight way leads onto the orbit round home. Shapes are (rows, columns).
     """
 
     corner: tuple[float, float]  # north, east of the first cell, m
@@ -43,7 +45,7 @@ class Ways(NamedTuple):
     straight: NDArray[np.bool_]
 
     def aim(self, fence: Fence, north: Array, east: Array) -> tuple[Array, Array, Array]:
-        """The aim of places, north and east, m, and whether the straight way home is free.
+        """Return the aim of places, north and east, m, and whether the straight way home is free.
 
         Beside the map the nearest cell counts.
         """
@@ -68,9 +70,9 @@ class Ways(NamedTuple):
 
 
 def onto_orbit(fence: Fence, north: Array, east: Array) -> tuple[Array, Array]:
-    """Where the tangent from a place touches the clockwise orbit round home.
+    """Return where the tangent from a place touches the clockwise orbit round home.
 
-    Within the orbit it is a place 1 m on along it.
+    Within the orbit this is a place 1 m further along it.
     """
     xp = array_namespace(north)
     x = fence.home[0] - north
@@ -88,7 +90,7 @@ def onto_orbit(fence: Fence, north: Array, east: Array) -> tuple[Array, Array]:
 def line_clearance(
     fence: Fence, north: Array, east: Array, to_north: Array, to_east: Array
 ) -> Array:
-    """Least clearance of straight lines, m."""
+    """Return the least clearance of straight lines, m."""
     share = np.linspace(0.0, 1.0, POINTS).reshape(-1, *(1,) * np.ndim(north))
     on_north = north + share * (to_north - north)
     on_east = east + share * (to_east - east)
@@ -97,15 +99,15 @@ def line_clearance(
 
 @lru_cache(maxsize=64)
 def ways(fence: Fence) -> Ways:
-    """The map of a fence.
+    """Make the map of a fence.
 
-    A cell is open where a circle of half a cell fits inside. Ways lead from open cell to open cell
-    where the fitting circles overlap: the line between the cells stays inside. A metre counts
-    `radius / clearance`, at least 1.
+    A cell is open if a circle of half a cell fits inside the fence there. Ways lead from open cell
+    to open cell if the fitting circles overlap, so that the line between the cells stays inside. A
+    metre of the way costs `radius / clearance`, at least 1.
 
-    The aim of an open cell is on the way home, about a radius ahead; without a way home, the
-    roomiest cell around, for a hold. From a closed cell inside the way leads away from the border.
-    The aim of a cell outside is the nearest cell with a way home.
+    The aim of an open cell is on the way home, about a radius ahead. If there is no way home, it is
+    the roomiest cell around, for a hold. From a closed cell inside, the way leads away from the
+    border. The aim of a cell outside is the nearest cell with a way home.
     """
     north, east, cell = _cells(fence)
     room = clearance(fence.zones, north, east)
@@ -145,9 +147,9 @@ def ways(fence: Fence) -> Ways:
 
 
 def _cells(fence: Fence) -> tuple[FloatArray, FloatArray, float]:
-    """Centres of the cells, north and east, m, and the size of a cell, m.
+    """Return the centres of the cells, north and east, m, and the size of a cell, m.
 
-    The cells lie over all zones, home and the surroundings.
+    The cells cover all zones, home and the surroundings.
     """
     sides = list[tuple[float, float]]()
     for axis in ("north", "east"):
@@ -173,7 +175,7 @@ def _cells(fence: Fence) -> tuple[FloatArray, FloatArray, float]:
 
 
 def _neighbours(values: FloatArray, fill: float) -> list[FloatArray]:
-    """The values of the neighbours at STEPS; `fill` beside the map."""
+    """Return the values of the neighbours at STEPS, and `fill` beside the map."""
     padded = np.pad(values, 1, constant_values=fill)
     rows, columns = values.shape
     return [
@@ -182,7 +184,7 @@ def _neighbours(values: FloatArray, fill: float) -> list[FloatArray]:
 
 
 def _uphill(values: FloatArray) -> NDArray[np.intp]:
-    """The neighbour of a cell in the direction of rising values; the cell itself at a peak."""
+    """Return the neighbour of each cell towards rising values; at a peak the cell itself."""
     slopes = np.gradient(values)
     steepness = np.maximum(np.hypot(*slopes), 1e-6)
     last = np.array(values.shape).reshape(2, 1, 1) - 1
@@ -195,10 +197,10 @@ def _uphill(values: FloatArray) -> NDArray[np.intp]:
 def _shortest(
     seeds: NDArray[np.bool_], room: FloatArray, cost: FloatArray, cell: float
 ) -> tuple[FloatArray, NDArray[np.intp]]:
-    """Weighted length of the shortest way to a seed, and the following cell on the way.
+    """Find the weighted length of the shortest way to a seed, and the next cell on the way.
 
-    The following cell of a seed, or without a way, is the cell itself. Bellman and Ford: the
-    lengths of all cells at once, until none becomes shorter.
+    For a seed, or if there is no way, the next cell is the cell itself. The method is that of
+    Bellman and Ford: the lengths of all cells at once, until none becomes shorter.
     """
     lengths = [cell * math.hypot(*step) for step in STEPS]
     costs = _neighbours(cost, math.inf)
@@ -225,7 +227,7 @@ def _shortest(
 def _nearest(
     north: FloatArray, east: FloatArray, to_north: FloatArray, to_east: FloatArray
 ) -> NDArray[np.intp]:
-    """Number of the nearest of places for a place."""
+    """Return the number of the nearest of some places for each place."""
     rows = [
         np.argmin((to_north - n) ** 2 + (to_east - e) ** 2)
         for n, e in zip(north, east, strict=True)
@@ -238,7 +240,7 @@ def _is_straight(
 ) -> NDArray[np.bool_]:
     """Whether the line onto the orbit round home has a cell of clearance.
 
-    Where the ends have less, it has the clearance of the ends.
+    If the ends have less, it must have the clearance of the ends.
     """
     to_north, to_east = onto_orbit(fence, north, east)
     at_end = clearance(fence.zones, to_north, to_east)

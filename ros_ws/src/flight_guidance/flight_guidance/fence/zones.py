@@ -15,12 +15,12 @@ import numpy as np
 from flight_core.vectors import Array, FloatArray, array_namespace
 
 CHORDS = 180
-"""Chords of a circle among several groups: they depart from the circle by 0.15 thousandths of the
+"""Chords that replace a circle among several groups. They depart from it by 0.15 thousandths of the
 radius."""
 
 SEAM = 1e-3
-"""m. Two groups that share a border are one region: a gap is wider. A position in m has more
-digits."""
+"""m. Two groups that share a border are one region; a gap between them is wider than this. A
+position in m has more digits."""
 
 
 class Zone(NamedTuple):
@@ -29,8 +29,8 @@ class Zone(NamedTuple):
     north: tuple[float, ...]  # m
     east: tuple[float, ...]  # m
     radius: float = 0.0  # m, 0 of a polygon
-    exclude: bool = False  # whether the aircraft keeps out
-    group: int | None = None  # of a zone to stay in; None: a group of its own
+    exclude: bool = False  # whether the aircraft must keep out
+    group: int | None = None  # of a zone to stay in; None for a group of its own
 
 
 class Fence(NamedTuple):
@@ -45,7 +45,7 @@ class Fence(NamedTuple):
 
 
 def inside(zone: Zone, north: Array, east: Array) -> Array:
-    """Distance from the border of a zone, m, positive inside of the polygon or circle."""
+    """Return the distance from the border of a zone, m, positive inside the polygon or circle."""
     xp = array_namespace(north)
     if zone.radius:
         return zone.radius - xp.hypot(north - zone.north[0], east - zone.east[0])
@@ -56,9 +56,9 @@ def inside(zone: Zone, north: Array, east: Array) -> Array:
     distance = _distance(start_north, start_east, edge_north, edge_east, north, east)
     x = north[..., None] - start_north
     y = east[..., None] - start_east
-    # An edge to the east crosses no line to the east.
+    # An edge that runs east crosses no line to the east.
     level = np.where(edge_north == 0.0, 1.0, edge_north)
-    # A ray to the east counts the edges: even-odd rule.
+    # Count the edges that a ray to the east crosses: even-odd rule.
     crossed = ((x < 0.0) != (x < edge_north)) & (y < x * edge_east / level)
     return xp.where(xp.sum(crossed, axis=-1) % 2 == 1, distance, -distance)
 
@@ -71,7 +71,7 @@ def _distance(
     north: Array,
     east: Array,
 ) -> Array:
-    """Distance of places from the nearest of edges, m."""
+    """Return the distance of places from the nearest edge, m."""
     xp = array_namespace(north)
     x = north[..., None] - start_north
     y = east[..., None] - start_east
@@ -80,14 +80,14 @@ def _distance(
 
 
 def clearance(zones: tuple[Zone, ...], north: Array, east: Array) -> Array:
-    """Distance from the fence, m, negative outside of the fence."""
+    """Return the distance from the fence, m, negative outside of it."""
     xp = array_namespace(north)
     groups = _groups(zones)
     out = [-inside(zone, north, east) for zone in zones if zone.exclude]
     if not groups:
         return reduce(xp.minimum, out)
     stay = _deepest(groups, north, east)
-    # A border inside of another group is no border.
+    # A border inside another group is no border.
     if len(groups) > 1:
         stay = xp.where(
             stay >= 0.0, xp.maximum(stay, _distance(*_border(groups), north, east)), stay
@@ -96,7 +96,7 @@ def clearance(zones: tuple[Zone, ...], north: Array, east: Array) -> Array:
 
 
 def _groups(zones: tuple[Zone, ...]) -> tuple[tuple[Zone, ...], ...]:
-    """The zones to stay in, by group."""
+    """Collect the zones to stay in, by group."""
     groups: dict[tuple[int | None, int], tuple[Zone, ...]] = {}
     for k, zone in enumerate(zones):
         if not zone.exclude:
@@ -106,9 +106,9 @@ def _groups(zones: tuple[Zone, ...]) -> tuple[tuple[Zone, ...], ...]:
 
 
 def _deepest(groups: tuple[tuple[Zone, ...], ...], north: Array, east: Array) -> Array:
-    """Distance from the border of the deepest group of a place, m.
+    """Return the distance from the border of the group in which a place lies deepest, m.
 
-    Negative outside of the groups.
+    It is negative outside of all groups.
     """
     xp = array_namespace(north)
     depths = []
@@ -122,10 +122,10 @@ def _deepest(groups: tuple[tuple[Zone, ...], ...], north: Array, east: Array) ->
 def _border(
     groups: tuple[tuple[Zone, ...], ...],
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """The border of all groups together: starts and lengths of edges, m, shapes (M,).
+    """Compute the border of all groups together: starts and lengths of edges, m, shapes (M,).
 
     They are to the north and to the east. Each edge of a zone is cut where other edges cross or
-    touch it. A piece belongs to the border where one side is inside.
+    touch it. A piece belongs to the border if only one side of it is inside.
     """
     groups = tuple(tuple(map(_polygon, group)) for group in groups)
     corners = [np.column_stack([zone.north, zone.east]) for zone in chain.from_iterable(groups)]
@@ -146,7 +146,7 @@ def _border(
 
 
 def _polygon(zone: Zone) -> Zone:
-    """The zone, a circle as a polygon of CHORDS."""
+    """Return the zone, with a circle as a polygon of CHORDS."""
     if not zone.radius:
         return zone
     angles = [2.0 * math.pi * k / CHORDS for k in range(CHORDS)]
@@ -158,9 +158,9 @@ def _polygon(zone: Zone) -> Zone:
 def _cut(
     start: FloatArray, end: FloatArray, starts: FloatArray, ends: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Starts and ends of the pieces of an edge, shapes (P, 2).
+    """Cut an edge into pieces, and return their starts and ends, shapes (P, 2).
 
-    Further edges cross or begin at a cut.
+    The cuts are where other edges cross it or begin on it.
     """
     edge = end - start
     edges = ends - starts
@@ -181,5 +181,5 @@ def _cut(
 
 
 def clearance_text(distance: float) -> str:
-    """A distance of `clearance` in words: "9 m inside of the fence"."""
+    """Write a distance of `clearance` in words: "9 m inside of the fence"."""
     return f"{abs(distance):.0f} m {'inside' if distance >= 0.0 else 'outside'} of the fence"

@@ -3,8 +3,8 @@
 """A landing on a line of a route: the flare by height, the nose along the line, the go-around.
 
 The line to a waypoint on the ground is the glide path, which the modes of a route hold. From the
-height of the flare on each step has commands of its own. The log has these commands, so the
-landing is computed again from the log like any flight.
+height of the flare on, each step has commands of its own. They are in the log, so a landing can be
+computed again from the log like any flight.
 """
 
 import math
@@ -25,11 +25,11 @@ from flight_guidance.steering import path
 from flight_guidance.steering.path import Line, Point, Route
 
 FLARE = 5.0
-"""s of the sink on the glide path. The flight path lags behind the pitch by 2 s."""
+"""s of sink on the glide path, as height of the flare. The flight path lags the pitch by 2 s."""
 
 STRAIGHT_DEG = 1.0
 STRAIGHT = math.radians(STRAIGHT_DEG)
-"""Largest corner at the waypoint on the ground: the wings stay level there."""
+"""Largest corner at the waypoint on the ground, because the wings must stay level there."""
 
 WING_LOW = math.radians(5.0)
 """Largest bank near the ground, rad: a low wing of 2.5 m per metre of height touches at 22 deg."""
@@ -60,9 +60,9 @@ class Landing(NamedTuple):
 def landing_at(
     place: Point, route: Route, section: LandingConfig, box: Zone | None, params: GuidanceParams
 ) -> Landing:
-    """The landing at a place.
+    """Find the landing at a place.
 
-    Raises ParameterError where no line of the route descends to the place and goes straight on.
+    Raises ParameterError if no line of the route descends to the place and goes straight on.
     """
     key = f"landing.waypoint {section.waypoint}"
     lines = [k for k, leg in enumerate(route.legs) if isinstance(leg, Line)]
@@ -96,16 +96,16 @@ def landing_at(
 
 
 def flare_climb(height: float, path_sink: float, landing: Landing) -> float:
-    """Commanded climb rate in the flare, m/s.
+    """Compute the climb rate commanded in the flare, m/s.
 
-    From the rate of the glide path to -sink in proportion to the height, m.
+    It goes from the rate of the glide path to -sink in proportion to the height, m.
     """
     share = min(max(height / landing.flare, 0.0), 1.0)
     return -(landing.sink + max(path_sink - landing.sink, 0.0) * share)
 
 
 def time_to_touch(height: float, path_sink: float, landing: Landing) -> float:
-    """Time of `flare_climb` from a height to the ground, s: the integral of dh / sink(h)."""
+    """Compute the time of `flare_climb` to the ground, s: the integral of dh / sink(h)."""
     rate = max(path_sink - landing.sink, 1e-3) / landing.flare
     return math.log1p(rate * max(height, 0.0) / landing.sink) / rate
 
@@ -125,7 +125,7 @@ class Lander:
     def commands(
         self, state: GuidanceState, pose: Mapping[str, float], route: Route
     ) -> dict[str, float]:
-        """Commands of the step after a state; none above the flare."""
+        """Return the commands of the step after a state; none above the flare."""
         landing = self._landing
         height = pose["altitude"] - landing.ground
         if state.mode is not GuidanceMode.ENGAGED:
@@ -156,13 +156,13 @@ class Lander:
         return float(clearance((self._landing.box,), north, east)[0]) < 0.0
 
     def _go_around(self, pose: Mapping[str, float], route: Route) -> dict[str, float]:
-        """The line of a go-around, from the nearest point on."""
+        """Fly the line of a go-around, from its nearest point on."""
         leg = self._landing.around
         along = path.nearest(route.legs[leg], (pose["north"], pose["east"]))
         return {"leg": float(leg), "along": along}
 
     def _along_line(self, pose: Mapping[str, float], drift: float) -> dict[str, float]:
-        """The nose along the line, and the upwind wing low against the drift, m/s.
+        """Point the nose along the line, and lower the upwind wing against the drift, m/s.
 
         r = k (course - psi),  g tan(phi) = -w^2 e - 2 zeta w drift,  w = 2 pi / P
         """

@@ -27,7 +27,7 @@ from flight_guidance.steering.path import Arc, Point, Route
 from flight_guidance.steering.vertical import path_angle
 
 STEEPEST = math.radians(89.0)
-"""Largest bank that a mode asks for, before protection."""
+"""Largest bank that a mode may ask for, before protection."""
 
 NOWHERE = PathError(0.0, 0.0, 0.0)
 """The error of a mode without a path."""
@@ -40,9 +40,9 @@ def lateral_bank(
     route: Route | None,
     params: GuidanceParams,
 ) -> tuple[float, PathError, float]:
-    """Bank of the lateral mode, rad, with the error beside the path.
+    """Compute the bank of the lateral mode, rad, with the error beside the path.
 
-    Returns further the distance to the end of the leg, m.
+    Also returns the distance to the end of the leg, m.
     """
     if state.mode is not GuidanceMode.ENGAGED:
         return 0.0, NOWHERE, 0.0
@@ -68,7 +68,7 @@ def lateral_bank(
 
 
 def _wide_enough(orbit: Arc, params: GuidanceParams) -> Arc:
-    """An orbit of at least the least radius, which grows as the largest bank falls in flight."""
+    """Widen an orbit to the least radius, which grows as the largest bank falls in flight."""
     return orbit._replace(
         radius=math.copysign(max(abs(orbit.radius), params.limits.radius), orbit.radius)
     )
@@ -81,7 +81,7 @@ def _onto_leg(
     route: Route,
     params: GuidanceParams,
 ) -> tuple[float, PathError, float]:
-    """`lateral_bank` on the circle onto a leg."""
+    """Compute the `lateral_bank` on the circle onto a leg."""
     position = (pose["north"], pose["east"])
     course_over_ground, _ = course_and_speed(pose)
     start, course = route.start(state.leg, state.target.along)
@@ -103,7 +103,7 @@ def _along_leg(
     route: Route,
     params: GuidanceParams,
 ) -> tuple[float, PathError, float]:
-    """`lateral_bank` on a leg of the route."""
+    """Compute the `lateral_bank` on a leg of the route."""
     position = (pose["north"], pose["east"])
     leg = route.legs[state.leg]
     if isinstance(leg, Arc) and leg.end is None:
@@ -134,12 +134,12 @@ def follow(
     speed: Scalar,
     params: GuidanceParams,
 ) -> Scalar:
-    """Bank to follow a path, rad, before protection.
+    """Compute the bank that follows a path, rad, before protection.
 
-    `entry` is the curvature of the following leg at the start, 1/m. `entry` replaces the curvature
-    of the leg early, by the lag of the bank: as soon as `is_entered` holds for the position a mean
-    lag ahead. The mean lag of a change of the bank d is abs(d) / (2 p_max) + 1 / (2 k_phi), a ramp,
-    then the loop of the bank; without rudder and the lag of the turn behind the bank.
+    `entry` is the curvature of the following leg at its start, 1/m. It replaces the curvature of
+    the leg early, by the lag of the bank: as soon as `is_entered` holds for the position a mean lag
+    ahead. The mean lag of a change of the bank d is abs(d) / (2 p_max) + 1 / (2 k_phi): a ramp,
+    then the loop of the bank. Without rudder, the lag of the turn behind the bank is added.
     """
     course, ground_speed = course_and_speed(pose)
     xp = array_namespace(ground_speed)
@@ -161,9 +161,9 @@ def escaping_bank(
     speed: Scalar,
     params: GuidanceParams,
 ) -> Scalar:
-    """Bank by the action of the fence, rad, in place of `bank` by the lateral mode.
+    """Compute the bank for the action of the fence, rad, in place of `bank` of the lateral mode.
 
-    The bank of a turn, or of a course.
+    It is the bank of a turn, or of a course.
     """
     course, ground_speed = course_and_speed(pose)
     xp = array_namespace(ground_speed)

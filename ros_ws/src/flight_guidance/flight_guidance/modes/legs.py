@@ -18,18 +18,18 @@ from flight_guidance.steering import path
 from flight_guidance.steering.path import Arc, Leg, Loiter, Point, Route
 
 EXIT = 0.5
-"""s of flight beyond the end of a circle within which an aircraft leaves; later it flies another
+"""s of flight beyond the end of a circle within which an aircraft leaves it; later it flies another
 turn."""
 
 
 LEVEL = 5.0
-"""m. Largest distance from the altitude at which an aircraft leaves a loiter."""
+"""m, largest distance from the altitude at which an aircraft may leave a loiter."""
 
 
 def along_route(
     state: GuidanceState, pose: Mapping[str, float], dt: float, route: Route
 ) -> tuple[GuidanceState, float]:
-    """The state on the leg once the leg is joined, and the distance missed by, m.
+    """Put the state on the leg once it is joined, and return the distance missed by, m.
 
     The next leg begins once the leg is passed.
     """
@@ -49,7 +49,7 @@ def along_route(
         return on_leg(state, state.leg + 1, route) if ends else state, 0.0
     if leg.end is None or not path.is_passed(leg, position):
         return state, 0.0
-    # After a sharp corner, too, the next leg is joined.
+    # After a sharp corner, the next leg is joined too.
     distance = math.dist(leg.end, position)
     return joining_state(
         state, state.leg + 1, 0.0, pose, route
@@ -59,9 +59,9 @@ def along_route(
 def _loitering(
     state: GuidanceState, leg: Arc, loiter: Loiter, pose: Mapping[str, float], dt: float
 ) -> GuidanceState:
-    """The state with the share of a loiter that is flown.
+    """Update the fraction of a loiter that is flown.
 
-    The share counts from within 1 s of flight of the circle on.
+    It counts once the aircraft is within 1 s of flight of the circle.
     """
     error, (course, ground_speed) = (
         path.error(leg, (pose["north"], pose["east"])),
@@ -84,7 +84,7 @@ def has_loitered(state: GuidanceState, pose: Mapping[str, float], route: Route) 
 def leaves(leg: Leg, reach: float, pose: Mapping[str, float], position: Point) -> bool:
     """Whether a position is beyond the end of a circle, and the aircraft flies the course there.
 
-    `reach`: largest distance from the end, m.
+    `reach` is the largest distance from the end, m.
     """
     return leg.end is not None and bool(
         path.is_joined(leg.end, path.end_course(leg), reach, position, course_and_speed(pose)[0])
@@ -100,12 +100,12 @@ def with_commands(
     follow: Callable[[GuidanceState, Route], tuple[GuidanceState, float]],
     join: Callable[[GuidanceState, int, float, Route], GuidanceState],
 ) -> tuple[GuidanceState, float]:
-    """The modes and commands in force.
+    """Put the modes and commands in force.
 
-    They are of the next leg by `follow` once a leg is passed, then the commands given. `join`: the
-    state on the way to a leg, from a distance along the leg on. A lateral command ends the leg: the
-    command may come with a new route, and so with new legs. Returns further the distance from the
-    end of a leg that ends here and is missed, m.
+    If a leg is passed, those of the next leg by `follow` come first; then the commands given
+    follow. `join` makes the state on the way to a leg, from a distance along it. A lateral command
+    ends the leg, because it may come with a new route, and so with new legs. Also returns the
+    distance from the end of a leg that ends here and is missed, m.
     """
     lateral_names = channels.lateral.keys() & commands.keys()
     miss = 0.0
@@ -131,12 +131,12 @@ def with_commands(
         if channels.vertical.keys() & commands.keys():
             state = state._replace(vertical=vertical)
     if state.vertical is Vertical.PROFILE and state.lateral is not Lateral.ROUTE:
-        state = state._replace(vertical=Vertical.ALTITUDE)  # that of now
+        state = state._replace(vertical=Vertical.ALTITUDE)  # at the present altitude
     return on_profile(state, pose, route), miss
 
 
 def on_leg(state: GuidanceState, leg: int, route: Route) -> GuidanceState:
-    """The state on a leg of the route, with the leg's altitude and airspeed."""
+    """Put the state on a leg of the route, with the leg's altitude and airspeed."""
     target = state.target._replace(V=route.V[leg], along=0.0)
     return state._replace(
         leg=leg, target=target, vertical=Vertical.PROFILE, joining=0.0, loitered=0.0
@@ -146,9 +146,9 @@ def on_leg(state: GuidanceState, leg: int, route: Route) -> GuidanceState:
 def on_profile(
     state: GuidanceState, pose: Mapping[str, float], route: Route | None
 ) -> GuidanceState:
-    """The state with the altitude and the climb rate of the leg.
+    """Set the altitude and the climb rate of the leg.
 
-    Of the nearest point, or where the aircraft joins the leg.
+    They are those at the nearest point, or where the aircraft joins the leg.
     """
     flies = (
         state.mode is GuidanceMode.ENGAGED
@@ -172,13 +172,13 @@ def on_profile(
 def joining_state(
     state: GuidanceState, leg: int, along: float, pose: Mapping[str, float], route: Route
 ) -> GuidanceState:
-    """The state on the way to a point of a leg, at the altitude and the airspeed there.
+    """Return the state on the way to a point of a leg, at the altitude and the airspeed there.
 
-    Where the point is near, the state is on the leg.
+    If the point is near, the state is already on the leg.
     """
     state = on_leg(state, leg, route)
     leg_path = route.legs[leg]
-    # The law of circles leads to an orbit from afar.
+    # The law for circles leads to an orbit from afar.
     if path.is_orbit(leg_path):
         return state
     start, course = route.start(leg, along)
@@ -195,7 +195,7 @@ def joining_state(
 
 
 def course_and_speed(pose: Mapping[str, Scalar]) -> tuple[Scalar, Scalar]:
-    """Course, rad, and speed over ground, m/s, at least 1."""
+    """Return the course, rad, and the speed over ground, m/s, at least 1."""
     v_north = pose["v_north"]
     v_east = pose["v_east"]
     xp = array_namespace(v_north)

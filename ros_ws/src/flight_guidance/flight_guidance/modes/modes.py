@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Modes of guidance: a step from pose, y and target to u_m.
 
-Lateral: hold a bank, a heading or a course, or follow an orbit or a route. Vertical: hold a pitch,
-a climb rate or an altitude. The law holds the airspeed; guidance limits the command. The step has
-no clock and no hidden state: the state is in the log, so a sample of the log can be computed again
-from the sample before.
+Laterally they hold a bank, a heading or a course, or follow an orbit or a route. Vertically they
+hold a pitch, a climb rate or an altitude. The law holds the airspeed; guidance limits its command.
+The step has no clock and no hidden state: the state is in the log, so that you can compute a sample
+of the log again from the sample before.
 """
 
 import math
@@ -51,16 +51,16 @@ from flight_guidance.steering.vertical import (
 from flight_guidance.steering.wind import Wind, wind_estimate, wind_of
 
 LONGEST_LEAD = 0.5
-"""s. Largest age of a pose over which its attitude is brought to now: the rates change within a
-second."""
+"""s. Largest age of a pose whose attitude is still brought forward to the present: the rates change
+within a second."""
 
 
 def holding(
     t_ns: int, pose: Mapping[str, Scalar], speed: Scalar, params: GuidanceParams
 ) -> GuidanceState:
-    """The state before the first step, at t.
+    """Return the state before the first step, at t.
 
-    Heading, altitude and airspeed of now are held.
+    The present heading, altitude and airspeed are held.
     """
     alpha = pose["theta"] - path_angle(pose["climb"], speed)
     return GuidanceState(
@@ -84,7 +84,7 @@ def holding(
 
 
 def begin(state: GuidanceState | None, inputs: Inputs, params: GuidanceParams) -> GuidanceState:
-    """The state before a step, with filters at the measured values where the filters begin."""
+    """Return the state before a step; if the filters begin, they have the measured values."""
     if state is not None and inputs.begin is Begin.NO:
         return state
     holding_state = holding(
@@ -96,41 +96,40 @@ def begin(state: GuidanceState | None, inputs: Inputs, params: GuidanceParams) -
 def hold_now(
     pose: Mapping[str, float], y: tuple[float, ...], params: GuidanceParams
 ) -> dict[str, float]:
-    """Commands to hold the heading, the altitude and the airspeed of a pose and a y."""
+    """Return commands to hold the heading, the altitude and the airspeed of a pose and a y."""
     return hold(pose, airspeed(y, params), params)
 
 
 def airspeed(y: tuple[float, ...], params: GuidanceParams) -> float:
-    """True airspeed V0 + V, m/s, at least half of V0."""
+    """Return the true airspeed V0 + V, m/s, at least half of V0."""
     return float(true_airspeed(y[params.outputs.index("V")], params))
 
 
 def true_airspeed(V: Scalar, params: GuidanceParams) -> Scalar:
-    """`airspeed` from the channel V of y, m/s."""
+    """Compute the `airspeed` from the channel V of y, m/s."""
     return array_namespace(V).maximum(params.speed + V, params.speed / 2.0)
 
 
 def yaw_rate(y: Mapping[str, Scalar], phi: Scalar, theta: Scalar, speed: Scalar) -> Scalar:
-    """The measured r, or that of a coordinated turn for an aircraft without rudder, rad/s."""
+    """Return the measured r, or that of a coordinated turn without a rudder, rad/s."""
     return y["r"] if "r" in y else turn_rate(phi, theta, 0.0, speed)
 
 
 def step(
     state: GuidanceState | None, inputs: Inputs, route: Route | None, params: GuidanceParams
 ) -> tuple[GuidanceState, StepCommands]:
-    """A step: attitude, commands, u_m.
+    """Take a step: attitude, commands, u_m.
 
-    1. Attitude: phi and theta of pose, brought to now over the age of pose by Euler's kinematics
-       with p, q, r of y, and psi by `heading_estimate`. While pose is stale: Euler's kinematics
-       alone (`Mode.DEAD_RECKONING`). After `hold` the attitude is unknown (`Mode.POSE_LOST`) until
-       pose returns; then wings level and the altitude of then.
-    2. Commands: the next leg at the end of a leg, then the commands given. A leg is joined by a
-       circle that touches the leg at the start, unless the aircraft is near; a leg whose end the
-       aircraft passes far away is missed.
-    3. The fence: the last safe turn, then home, in place of the lateral mode.
-    4. Protection in this order: bank, airspeed, climb, pitch; roll rate and load in
-       `attitude.body_rates`; slew of u_m.
-    5. u_m: p, q, r by `attitude.body_rates`, V_m = V_c - V0. In POSE_LOST p, q, r are 0.
+    1. The attitude is phi and theta of pose, brought forward over the age of pose by Euler's
+    kinematics with p, q, r of y, and psi by `heading_estimate`. While pose is stale, only Euler's
+    kinematics act (`Mode.DEAD_RECKONING`). After `hold` the attitude is unknown (`Mode.POSE_LOST`)
+    until pose returns; then the wings are levelled at the altitude of that moment. 2. The commands
+    are those of the next leg once a leg ends, then those given. A leg is joined by a circle that
+    touches it at its start, unless the aircraft is near. If the aircraft passes the end of a leg
+    far away, the leg counts as missed. 3. The fence replaces the lateral mode by the last safe
+    turn, then home. 4. Protection follows in this order: bank, airspeed, climb, pitch; roll rate
+    and load in `attitude.body_rates`; slew of u_m. 5. u_m is p, q, r by `attitude.body_rates`, and
+    V_m = V_c - V0. In POSE_LOST p, q, r are 0.
     """
     params = within_reach(params, inputs.authority)
     state = begin(state, inputs, params)
@@ -170,9 +169,9 @@ def _wanted_rates(
     speed: Scalar,
     params: GuidanceParams,
 ) -> BodyRates:
-    """Body rates to the commanded attitude, rad/s.
+    """Compute the body rates that lead to the commanded attitude, rad/s.
 
-    There are none after the loss of the pose, and none of a dead output.
+    They are 0 after the loss of the pose, and for a dead output.
     """
     flies = state.mode is GuidanceMode.ENGAGED
     attitude = params.attitude._replace(n_alpha=1.0 / (state.alpha_trim + 0.05))
@@ -181,7 +180,7 @@ def _wanted_rates(
     rates = body_rates(
         phi_c, theta_c, state.phi, state.theta, r, 0.0 if flat else beta, speed, attitude
     )
-    # The sideslip is wanted.
+    # Here the sideslip is wanted.
     if flat:
         rates = rates._replace(r=rates.r + state.target.r)
     if state.mode is GuidanceMode.POSE_LOST:
@@ -200,7 +199,7 @@ def command(
     dt: float,
     params: GuidanceParams,
 ) -> tuple[GuidanceState, StepCommands]:
-    """Protection and u_m of `step`, from the bank of the lateral mode, rad.
+    """Apply protection and compute u_m of `step`, from the bank of the lateral mode, rad.
 
     `t_ns` of the state stays. The values may be arrays with an element per aircraft of a fleet; the
     modes hold for the whole fleet.
@@ -256,7 +255,7 @@ def _with_estimates(
     dt: float,
     params: GuidanceParams,
 ) -> GuidanceState:
-    """The state with new estimates of the angle of attack, the slip and the wind."""
+    """Update the estimates of the angle of attack, the slip and the wind."""
     alpha = alpha_estimate(state.alpha, state.theta, pose["climb"], speed, dt, params.vertical)
     turn = GRAVITY * array_namespace(speed).tan(tilt(state.phi))
     r = yaw_rate(y, state.phi, state.theta, speed)
@@ -273,7 +272,7 @@ def _with_estimates(
 def _with_attitude(
     state: GuidanceState, inputs: Inputs, dt: float, params: GuidanceParams
 ) -> GuidanceState:
-    """Mode, and attitude from pose or by dead reckoning."""
+    """Update mode and attitude, from pose or by dead reckoning."""
     pose = dict(zip(POSE, inputs.pose, strict=True))
     if inputs.pose_age_ns <= params.max_age_ns:
         # The aircraft may be anywhere by now.
@@ -316,9 +315,9 @@ def motion_of(
     speed: Scalar,
     params: GuidanceParams,
 ) -> Motion:
-    """What the fence predicts a turn from.
+    """Return what the fence predicts a turn from.
 
-    A roll that has begun goes on for the lag of the bank, 1 / (2 k_phi).
+    A roll that is under way continues for the lag of the bank, 1 / (2 k_phi).
     """
     bank = protection.bank_limit(params.limits.bank, params.limits.stall_speed, speed)
     lag = 0.5 / params.attitude.k_phi
@@ -344,7 +343,7 @@ def _within_fence(
     speed: float,
     params: GuidanceParams,
 ) -> tuple[GuidanceState, Escape]:
-    """The state with the action of the fence; home is the target from the begin of the action on.
+    """Apply the action of the fence to the state; home becomes the target once the action begins.
 
     A lateral command during a turn is flown after the turn, unless the aircraft is outside.
     """
@@ -385,9 +384,9 @@ def _climb(
     dt: float,
     params: GuidanceParams,
 ) -> tuple[Scalar, Any]:
-    """Commanded climb rate, m/s, and whether protection limits the rate."""
+    """Return the commanded climb rate, m/s, and whether protection limits it."""
     if state.vertical is Vertical.THETA:
-        # The start value for the modes CLIMB and ALTITUDE.
+        # This is the start value for the modes CLIMB and ALTITUDE.
         return pose["climb"], False
     vertical = params.vertical
     target = state.target
@@ -416,7 +415,7 @@ def _climb(
 def _pitch_within(
     state: GuidanceState, altitude: Scalar, speed: Scalar, params: GuidanceParams
 ) -> Scalar:
-    """The commanded pitch, rad, within the range that the altitudes allow.
+    """Return the commanded pitch, rad, within the range that the altitudes allow.
 
     The range is that of the climb rates to the least and the largest altitude.
     """
@@ -430,9 +429,9 @@ def _pitch_within(
 
 
 def _climb_within(altitude: Scalar, params: GuidanceParams) -> tuple[Scalar, Scalar]:
-    """Least and largest climb rate by the least and the largest altitude, m/s.
+    """Return least and largest climb rate for the least and the largest altitude, m/s.
 
-    The rates of `climb_for` to the bounds.
+    They are the rates of `climb_for` to these bounds.
     """
     vertical = params.vertical
     limits = params.limits

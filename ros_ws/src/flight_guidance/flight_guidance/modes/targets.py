@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The targets that an operator may command, to hold and to fly home.
 
-The limits are those of the parameters and of a learned model.
+Their limits are those of the parameters and of a learned model.
 """
 
 import math
@@ -21,12 +21,12 @@ from flight_guidance.steering.path import Route
 
 
 def within_reach(params: GuidanceParams, authority: Authority) -> GuidanceParams:
-    """The parameters with limits by a model learned in flight, where less than their own.
+    """Lower the limits of the parameters to those of a model learned in flight.
 
-    The rules are those of an airplane: the limits of a multicopter are its own.
-    Climb and sink by the throttle, the roll rate by the aileron, by the rules of the parameters.
+    The rules are those of an airplane; the limits of a multicopter are its own. Climb and sink
+    follow from the throttle, and the roll rate from the aileron, by the rules of the parameters.
     Reversals of the bank fit into the period of path following, and orbits have the radius for the
-    bank. Where p has no aileron, or ignores its command, the largest bank is YAWED_BANK. Without a
+    bank. If p has no aileron, or ignores its command, the largest bank is YAWED_BANK. Without a
     throttle there is no climb, and the sink stays: pitch then flies the airspeed at the floor.
     """
     if authority == Authority() or params.multicopter is not None:
@@ -45,7 +45,7 @@ def within_reach(params: GuidanceParams, authority: Authority) -> GuidanceParams
     if rolls:
         rate = min(rate, reach.roll_rate(authority.p, 4.0 * attitude.k_phi))
         bank = limits.bank * min(1.0, params.path.period / reach.least_period(limits.bank, rate))
-    # The airspeed flies the climb: its command moves by the bandwidth of V, 1 m/s each.
+    # The airspeed flies the climb, so its command moves by the bandwidth of V for each m/s.
     if "q" in dead:
         faster = tuple(
             4.0 * rate if name == "V" else rate
@@ -63,9 +63,9 @@ def within_reach(params: GuidanceParams, authority: Authority) -> GuidanceParams
 
 
 def reach_sentence(params: GuidanceParams, authority: Authority) -> str:
-    """The limits by what is learned in flight, as a sentence.
+    """Write the limits that follow from what is learned in flight, in a sentence.
 
-    Empty where the own limits are less.
+    It is empty if the aircraft's own limits are lower.
     """
     now = within_reach(params, authority)
     parts = [
@@ -111,10 +111,11 @@ def read_target(
     *,
     degrees: bool = False,
 ) -> None:
-    """Raise ChannelError for commands that guidance cannot fly.
+    """Refuse commands that guidance cannot fly, by ChannelError.
 
-    Commands of no mode or two modes, of no leg of the route, or beyond the limits. `degrees`: the
-    sentence has angles in degrees, as an operator types angles; else in rad.
+    These are commands of no mode or of two modes, of no leg of the route, or beyond the limits.
+    With `degrees`, the sentence gives angles in degrees, as an operator types them; otherwise in
+    rad.
     """
     channels = params.channels
     lateral_modes = {mode for name, mode in channels.lateral.items() if name in values}
@@ -161,7 +162,7 @@ def read_target(
 def _require_limits(
     values: Mapping[str, float], params: GuidanceParams, what: str, *, degrees: bool
 ) -> None:
-    """Raise ChannelError for an angle, a climb, an altitude or an airspeed beyond the limits."""
+    """Refuse an angle, a climb, an altitude or an airspeed beyond the limits, by ChannelError."""
     limits = params.limits
     vertical = params.vertical
     for name, least, largest in (
@@ -181,7 +182,7 @@ def _require_limits(
 
 
 def _read_leg(values: Mapping[str, float], route: Route | None, what: str) -> None:
-    """Raise ChannelError for a leg that the route does not have."""
+    """Refuse a leg that the route does not have, by ChannelError."""
     if "leg" in values and route is None:
         raise ChannelError("bounds", f"{what}.leg: found no route, expected one")
     if "leg" in values and route is not None and values["leg"] not in range(len(route.legs)):
@@ -199,9 +200,9 @@ def _read_leg(values: Mapping[str, float], route: Route | None, what: str) -> No
 
 
 def hold(pose: Mapping[str, Scalar], speed: Scalar, params: GuidanceParams) -> dict[str, Scalar]:
-    """Commands to hold the heading, the altitude and the airspeed of now.
+    """Return commands to hold the present heading, altitude and airspeed.
 
-    The airspeed is within its limits.
+    The airspeed is kept within its limits.
     """
     return {
         "heading": pose["psi"],
@@ -211,15 +212,16 @@ def hold(pose: Mapping[str, Scalar], speed: Scalar, params: GuidanceParams) -> d
 
 
 def permitted_speed(speed: Scalar, params: GuidanceParams) -> Scalar:
-    """An airspeed within the limits, m/s."""
+    """Limit an airspeed, m/s."""
     xp = array_namespace(speed)
     return xp.minimum(xp.maximum(speed, params.limits.floor), params.limits.largest_speed)
 
 
 def permitted(commands: Mapping[str, float], params: GuidanceParams) -> dict[str, float]:
-    """Return commands of a pose, each inside of what `read_target` takes.
+    """Return commands of a pose, each limited to what `read_target` takes.
 
-    An aircraft may be above its highest altitude when it holds or flies home: it goes there.
+    An aircraft that holds or flies home may be above its highest altitude; it then descends to
+    that.
     """
     limits = params.limits
     inside = {name: min(max(value, -LARGEST), LARGEST) for name, value in commands.items()}
@@ -229,9 +231,9 @@ def permitted(commands: Mapping[str, float], params: GuidanceParams) -> dict[str
 
 
 def home(pose: Mapping[str, float], params: GuidanceParams) -> dict[str, float]:
-    """Commands to orbit home clockwise on the least radius, or of a multicopter to hover there.
+    """Return commands to orbit home clockwise on the least radius, or to hover there.
 
-    The altitude is that of home or of now.
+    A multicopter hovers. The altitude is that of home, or the present one.
     """
     place = params.home
     altitude = pose["altitude"] if place.altitude is None else place.altitude

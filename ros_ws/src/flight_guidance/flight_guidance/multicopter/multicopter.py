@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Guidance of a multicopter: place, velocity, acceleration, direction of the thrust, body rates.
 
-The heading is apart: no lateral mode needs a nose. As `modes.step`, the step has no clock and no
-hidden state.
+The heading is separate, because no lateral mode needs the nose to point anywhere. Like
+`modes.step`, the step has no clock and no hidden state.
 """
 
 import cmath
@@ -49,16 +49,16 @@ from flight_guidance.steering.path import Arc, Point, Route
 from flight_guidance.steering.vertical import VerticalParams, climb_for, slewed
 
 NEAR = 0.5
-"""s of flight from a place within which the place counts as reached, at least 0.5 m."""
+"""s of flight from a place within which the place counts as reached; at least 0.5 m."""
 
 ACROSS = math.sin(math.radians(60.0))
-"""Largest share of the speed towards a path, as guidance of airplanes has it."""
+"""Largest fraction of the speed towards a path, as in the guidance of airplanes."""
 
 WIND_TIME = 3.0
 """T, s: long against a leg's end, short against a leg."""
 
 LONGEST_LEAD = 0.5
-"""s. Largest age of a pose over which the attitude is brought to now."""
+"""s, largest age of a pose whose attitude is still brought forward to the present."""
 
 
 class MotionCommand(NamedTuple):
@@ -79,9 +79,9 @@ def _gains(params: GuidanceParams) -> MulticopterParams:
 def hold(
     pose: Mapping[str, float], _y: tuple[float, ...], params: GuidanceParams
 ) -> dict[str, float]:
-    """Commands to hover where the aircraft stops, v abs(v) / (2 a) ahead.
+    """Return commands to hover where the aircraft stops, v abs(v) / (2 a) ahead.
 
-    The heading and the altitude are those of now.
+    Heading and altitude are the present ones.
     """
     stop = _stop(pose, _gains(params))
     place = {"north": stop.real, "east": stop.imag}
@@ -101,7 +101,7 @@ def _parts(vector: complex) -> tuple[float, float]:
 
 
 def _stop(pose: Mapping[str, float], gains: MulticopterParams) -> complex:
-    """Where the aircraft stops, m."""
+    """Return where the aircraft stops, m."""
     v = _velocity(pose)
     return _place(pose) + (gains.lead + abs(v) / (2.0 * gains.braking)) * v
 
@@ -109,20 +109,20 @@ def _stop(pose: Mapping[str, float], gains: MulticopterParams) -> complex:
 def step(
     state: GuidanceState | None, inputs: Inputs, route: Route | None, params: GuidanceParams
 ) -> tuple[GuidanceState, StepCommands]:
-    """A step: attitude, commands, u_m.
+    """Take a step: attitude, commands, u_m.
 
         v_c = towards the place or the path, within V
         a_c = a_ff + k_v (v_c - v) + d (v_ff - W),  within g tan(bank)
         [p, q] = k_tilt (angle from the thrust to [a_c, g]),  r = k_psi (heading - psi)
 
-    1. Attitude: of pose, brought to now by p, q, r of y. While pose is stale the thrust is
-       vertical; after `hold` the rates are 0 until pose returns.
-    2. Commands: the next leg at the end of a leg, then the commands given.
-    3. The fence: the place where the aircraft stops stays inside, else the way home.
-    4. W, the wind, by `_with_wind`: what holds the aircraft back is drag in a wind.
-    5. The climb rate by the altitude, as of an airplane.
+    1. The attitude is that of pose, brought forward to the present by p, q, r of y. While pose is
+    stale, the thrust is vertical; after `hold` the rates are 0 until pose returns. 2. The commands
+    are those of the next leg once a leg ends, then those given. 3. The fence acts on the place
+    where the aircraft stops: if it is not inside, the aircraft flies the way home. 4. W, the wind,
+    follows by `_with_wind`: what holds the aircraft back is drag in a wind. 5. The climb rate
+    follows from the altitude, as for an airplane.
 
-    a_ff and v_ff are those of the path `lead` ahead, for the tilt comes later by as much.
+    a_ff and v_ff are those of the path `lead` ahead, because the tilt comes later by that much.
     """
     gains = _gains(params)
     pose = dict(zip(POSE, inputs.pose, strict=True))
@@ -183,9 +183,9 @@ def _begin(
     pose: Mapping[str, float],
     params: GuidanceParams,
 ) -> GuidanceState:
-    """The state before a step.
+    """Return the state before a step.
 
-    Where the filters begin, it is that of a hover where the aircraft stops.
+    If the filters begin, it is that of a hover where the aircraft stops.
     """
     if state is not None and inputs.begin is Begin.NO:
         return state
@@ -219,7 +219,7 @@ def _with_attitude(
     dt: float,
     params: GuidanceParams,
 ) -> GuidanceState:
-    """Mode, and attitude from pose or by dead reckoning.
+    """Update mode and attitude, from pose or by dead reckoning.
 
     A pose that returns after a loss begins a hover, or the way home.
     """
@@ -256,7 +256,7 @@ def _is_near(state: GuidanceState, pose: Mapping[str, float], place: Point) -> b
 def _stops(route: Route, number: int) -> bool:
     """Whether an aircraft stops at the end of a leg.
 
-    A stop comes before a hover, and where a corner has no fillet.
+    It stops before a hover, and if a corner has no fillet.
     """
     following = next(iter(route.legs[number + 1 :]), None)
     hovers = following is not None and path.is_orbit(following)
@@ -266,7 +266,7 @@ def _stops(route: Route, number: int) -> bool:
 def _along_route(
     state: GuidanceState, pose: Mapping[str, float], dt: float, route: Route
 ) -> tuple[GuidanceState, float]:
-    """The state on the leg once its start is reached, and the distance missed by, m.
+    """Put the state on the leg once its start is reached, and return the distance missed by, m.
 
     The next leg begins once the leg is passed or the wait there is over.
     """
@@ -295,9 +295,9 @@ def _along_route(
 def _within_fence(
     state: GuidanceState, pose: Mapping[str, float], params: GuidanceParams
 ) -> tuple[GuidanceState, Escape]:
-    """The state with the action of the fence; home is the target from the begin of the action on.
+    """Apply the action of the fence to the state; home becomes the target once the action begins.
 
-    The action begins where the way to a stop comes nearer to the fence than MARGIN of flight.
+    It begins when the way to a stop comes nearer to the fence than MARGIN of flight.
     """
     fence = params.fence
     if fence is None or state.mode is not GuidanceMode.ENGAGED:
@@ -322,7 +322,7 @@ def _within_fence(
 
 
 def _action(fence: Fence, position: tuple[Any, Any], now: float) -> float:
-    """The action of a fence that acts: home in a straight line or around, or back inside."""
+    """Choose the action of a fence that acts: home in a straight line or around, or back inside."""
     if now < 0.0:
         return BACK
     return HOME if bool(ways(fence).aim(fence, *position)[2]) else AROUND
@@ -335,7 +335,7 @@ def _wanted(
     escape: Escape,
     params: GuidanceParams,
 ) -> MotionCommand:
-    """What the lateral mode asks for; the way around a fence in its place."""
+    """Return what the lateral mode asks for, or instead the way around a fence."""
     gains = _gains(params)
     target = state.target
     place = (target.north, target.east)
@@ -357,9 +357,9 @@ def _wanted(
 
 
 def _approach(distance: float, speed: float, gains: MulticopterParams) -> tuple[float, float]:
-    """Speed towards a place at a distance, m/s, and its slope over the distance, 1/s.
+    """Return the speed towards a place at a distance, m/s, and its slope over distance, 1/s.
 
-    `climb_for` with `k_p`, falling by `braking`.
+    It is `climb_for` with `k_p`, falling by `braking`.
     """
     params = VerticalParams(
         k_h=gains.k_p, acceleration=2.0 * gains.braking, climb=speed, sink=speed, alpha_time=0.0
@@ -372,7 +372,7 @@ def _approach(distance: float, speed: float, gains: MulticopterParams) -> tuple[
 def _to_place(
     place: complex, state: GuidanceState, pose: Mapping[str, float], gains: MulticopterParams
 ) -> MotionCommand:
-    """Towards a place, with the deceleration of the way."""
+    """Fly towards a place, with the deceleration of the way."""
     distance, course = cmath.polar(place - _place(pose))
     speed, slope = _approach(distance, state.V_c, gains)
     velocity = cmath.rect(speed, course)
@@ -390,7 +390,7 @@ def _to_place(
 def _on_path(
     state: GuidanceState, pose: Mapping[str, float], route: Route, gains: MulticopterParams
 ) -> MotionCommand:
-    """Along a line or a fillet of the route."""
+    """Fly along a line or a fillet of the route."""
     leg = route.legs[state.leg]
     position = (pose["north"], pose["east"])
     error = path.error(leg, position)
@@ -417,7 +417,7 @@ def _on_path(
 def _by_tilt(
     attitude: Mapping[str, float], pose: Mapping[str, float], gains: MulticopterParams
 ) -> complex:
-    """Acceleration by an attitude, (g + d climb) tan(tilt), m/s^2."""
+    """Compute the acceleration at an attitude, (g + d climb) tan(tilt), m/s^2."""
     angles = (tilt(attitude["phi"]), tilt(attitude["theta"]), attitude["psi"])
     north, east, up = thrust_axis(*angles)
     return _lift(pose, gains) / up * complex(north, east)
@@ -426,12 +426,13 @@ def _by_tilt(
 def _with_wind(
     state: GuidanceState, pose: Mapping[str, float], dt: float, params: GuidanceParams
 ) -> GuidanceState:
-    """The state with the wind of a step later, m/s.
+    """Advance the estimated wind by a step, m/s.
 
         W' = (v' - (g + d climb) tan(tilt) + d (v - W)) / (d T)
 
-    A low-pass of the wind that explains the acceleration of the pose. The tilt is that of the
-    pose, so commands that are not flown move no wind. W is within what the largest tilt holds.
+    This is a low-pass of the wind that explains the acceleration of the pose. The tilt is that of
+    the pose, so commands that are not flown do not move the wind. W stays within what the largest
+    tilt can hold.
     """
     gains = _gains(params)
     v = _velocity(pose)
@@ -450,14 +451,14 @@ def _within(vector: complex, largest: float) -> complex:
 
 
 def _lift(pose: Mapping[str, float], gains: MulticopterParams) -> float:
-    """Vertical part of the thrust in steady flight, g + d climb, m/s^2, at least half of g."""
+    """Return the vertical thrust in steady flight, g + d climb, m/s^2, at least half of g."""
     return max(GRAVITY + gains.drag * pose["climb"], GRAVITY / 2.0)
 
 
 def _attitude_for(
     state: GuidanceState, pose: Mapping[str, float], motion: MotionCommand, params: GuidanceParams
 ) -> tuple[float, float, bool]:
-    """Bank and pitch for the wanted acceleration, rad, and whether the tilt is limited."""
+    """Return bank and pitch for the wanted acceleration, rad, and whether the tilt is limited."""
     gains = _gains(params)
     largest = params.limits.bank
     if state.mode is not GuidanceMode.ENGAGED:
@@ -484,7 +485,7 @@ def _attitude_for(
 def _with_climb(
     state: GuidanceState, pose: Mapping[str, float], dt: float, params: GuidanceParams
 ) -> tuple[GuidanceState, bool]:
-    """The state with the commanded climb rate, and whether the altitudes limit the rate."""
+    """Command a climb rate, and return whether the altitudes limit it."""
     vertical_params = params.vertical
     climb = 0.0
     bounded_climb = 0.0
@@ -503,15 +504,16 @@ def _with_climb(
 def _rates(
     state: GuidanceState, phi_c: float, theta_c: float, gains: MulticopterParams
 ) -> dict[str, float]:
-    """Body rates that turn the thrust into its direction by the shortest way, rad/s.
+    """Compute the body rates that turn the thrust to its direction by the shortest way, rad/s.
 
-    They turn the heading at its rate, the inverse of `kinematics.heading_rate`:
+    They turn the heading at its own rate, by the inverse of `kinematics.heading_rate`:
 
         [p, q] = k_tilt angle [d_y, -d_x] / sqrt(d_x^2 + d_y^2),  angle = atan2(sqrt(..), -d_z)
 
-    with d, the direction [phi_c, theta_c] in body axes: the reduced quaternion error, without a
-    singularity short of a thrust downwards. Source: D. Brescianini, R. D'Andrea, Tilt-prioritized
-    quadrocopter attitude control, IEEE Trans. Control Systems Technology 28 (2020).
+    with d, the direction [phi_c, theta_c] in body axes. This is the reduced quaternion error, which
+    has no singularity short of a thrust downwards. Source: D. Brescianini, R. D'Andrea,
+    Tilt-prioritized quadrocopter attitude control, IEEE Trans. Control Systems Technology 28
+    (2020).
     """
     if state.mode is GuidanceMode.POSE_LOST:
         return dict.fromkeys("pqr", 0.0)

@@ -15,24 +15,24 @@ from flight_guidance.steering import path
 from flight_guidance.steering.path import Arc, Leg, Loiter, Route
 
 BRAKING = 0.3
-"""Part of the acceleration of the largest tilt for a fillet and for a stop: the drag and the errors
-take the rest."""
+"""Fraction of the acceleration at the largest tilt that is used in a fillet and for a stop: the
+drag and the errors take the rest."""
 
 CLIMB = 0.5
 SINK = 0.3
-"""Largest climb and sink rate over the speed where the parameters have none."""
+"""Largest climb and sink rate over the speed if the parameters have none."""
 
 
 def gains(
     frequency: Mapping[str, float], bank: float, drag: float, roll_authority: float
 ) -> MulticopterParams:
-    """Gains by the reference model's natural frequencies w, rad/s, and the largest tilt, rad.
+    """Choose gains from the reference model's frequencies w, rad/s, and the largest tilt, rad.
 
         k_tilt = w / 4,  k_v = k_tilt / 3,  k_p = k_v / 2,  lead = 1 / k_tilt,  k_psi = w_r / 4,
             braking = BRAKING g tan(bank)
 
     with the lesser w of p and q. With a reference of damping 0.9 the tilt has a phase margin of 65
-    deg, velocity and place together have 44 deg and a largest sensitivity of 1.5; the lead is the
+    deg; velocity and place together have 44 deg and a largest sensitivity of 1.5. The lead is the
     delay of the tilt behind a ramp.
     """
     w = min(frequency["p"], frequency["q"])
@@ -55,9 +55,9 @@ def gains(
 def route_through(
     waypoints: Sequence[Waypoint], radius: float | None, braking: float, can: Performance
 ) -> Route:
-    """Lines with fillets through waypoints, and a hover at the last one and at each `wait`.
+    """Plan lines with fillets through waypoints, with a hover at the last one and at each `wait`.
 
-    The aircraft reaches a hover by a line without a fillet: its leg is a circle of the radius of
+    The aircraft reaches a hover by a line without a fillet; its leg is a circle with the radius of
     the fillets within which the place counts as reached. Altitudes change along the lines.
     `braking`, m/s^2, bounds the curvature. Raises ParameterError for a waypoint beyond the bounds,
     and for circles, which a multicopter does not fly.
@@ -77,7 +77,7 @@ def route_through(
 
 
 def _legs(waypoints: Sequence[Waypoint], radius: float) -> list[Leg]:
-    """Lines with fillets between the hovers; the last hover has no end."""
+    """Plan lines with fillets between the hovers; the last hover has no end."""
     points = [waypoint.point for waypoint in waypoints]
     legs: list[Leg] = []
     first = 0

@@ -58,7 +58,7 @@ MEANINGS = {
 }
 # Commands after which an autopilot flies no item: a loiter without end, the return, the landings.
 LAST = (UNLIMITED, 20, LAND, 85)
-OTHER_WAYS = (34, 35, 36, 94)  # to a place, no line and no loiter
+OTHER_WAYS = (34, 35, 36, 94)  # other ways to a place, neither a line nor a loiter
 
 
 class Item(NamedTuple):
@@ -68,14 +68,14 @@ class Item(NamedTuple):
     frame: int
     command: int
     params: Sequence[Any]  # seven
-    number: Any  # by which a DO_JUMP names the item
+    number: Any  # number by which a DO_JUMP names the item
     goes_on: bool = True  # autocontinue: without it an autopilot waits for the pilot after the item
 
 
 def named(command: int, number: int) -> str:
-    """The name of a command and the number of the item.
+    """Name a command with the number of its item.
 
-    pymavlink has the name where COMMANDS lacks the command.
+    pymavlink has the name if COMMANDS lacks the command.
     """
     name = COMMANDS.get(command, f"MAV_CMD {command}")
     if command not in COMMANDS:
@@ -92,15 +92,14 @@ MOST_ITEMS = 20_000
 
 
 def _in_order(key: str, items: Sequence[Item]) -> list[int]:
-    """The positions of the items in the order of flight, up to an item of LAST.
+    """Return the positions of the items in the order of flight, up to an item of LAST.
 
-    The jumps are followed. A DO_JUMP leads to an item as often as it says, with a negative number
-    for good; a jump back for good ends the order. Raises ParameterError for a jump to no item, for
-    a loop inside of a loop, which PX4 begins again and ArduPilot does not, and for more than
-    MOST_ITEMS.
+    Jumps are followed. A DO_JUMP leads to an item as often as it says, with a negative number for
+    ever; a jump back for ever ends the order. Raises ParameterError for a jump to no item, for a
+    loop inside a loop, which PX4 begins again but ArduPilot does not, and for more than MOST_ITEMS.
     """
     places = {items[k].number: k for k in reversed(range(len(items)))}
-    repetitions: dict[int, float] = {}  # repetitions of a jump
+    repetitions: dict[int, float] = {}  # how often each jump has been repeated
     order: list[int] = []
     k = steps = 0
     while k < len(items) and not (order and items[order[-1]].command in LAST):
@@ -145,9 +144,9 @@ def _in_order(key: str, items: Sequence[Item]) -> list[int]:
 def mission_route(
     key: str, items: Sequence[Item], home: HomePlace | None, notes: Sequence[str] = ()
 ) -> Places:
-    """The waypoints and loiters of a mission in the order of flight.
+    """Return the waypoints and loiters of a mission in the order of flight.
 
-    The notes tell the items that are not flown.
+    The notes name the items that are not flown.
     """
     places: list[Place] = []
     route_items: set[int] = set()
@@ -197,14 +196,14 @@ def mission_route(
 
 
 def _skipped_name(item: Item) -> str:
-    """The name of an item that is not flown; of one at 0, 0 with the reason."""
+    """Name an item that is not flown; if it is at 0, 0, also say so."""
     is_place = item.command in (WAYPOINT, SPLINE, *LOITERS)
     nowhere = is_place and not any(item.params[4:6])
     return f"{item.name}, at latitude and longitude 0" if nowhere else item.name
 
 
 def _mission_place(key: str, item: Item, speed: Any, before: Place | None) -> Place:
-    """The place of an item; of a loiter without a latitude and a longitude the place before."""
+    """Return the place of an item; a loiter without latitude and longitude takes the one before."""
     latitude, longitude, altitude = item.params[4:7]
     if not (latitude or longitude) and before is not None:
         latitude = before.latitude

@@ -37,12 +37,12 @@ FENCE_NOTE = "the fence and the rally points of the plan are no part of the rout
 
 
 def read_plan(content: bytes, key: str, line: str | None = None) -> Places:
-    """The mission of a plan of QGroundControl."""
+    """Read the mission of a plan of QGroundControl."""
     return read_plan_tree(parsed_json(content, key), key, line)
 
 
 def read_plan_tree(tree: Any, key: str, line: str | None) -> Places:
-    """The mission of a plan that is parsed."""
+    """Read the mission of a plan that is already parsed."""
     require(line is None, "line", f"a mission, {key}", "a file with several lines")
     mission = member(tree, "mission")
     rows = member(mission, "items")
@@ -147,9 +147,9 @@ LANDINGS = ("fwLandingPattern", "vtolLandingPattern")  # as NAV_LAND, not flown
 
 
 def _plan_items(as_list: Sequence[Any], key: str) -> Iterator[tuple[int, Any]]:
-    """The items of a plan with their numbers from 1 on.
+    """Yield the items of a plan with their numbers from 1 on.
 
-    Items inside of a survey have the number of the survey.
+    Items inside a survey have the number of the survey.
     """
     for number, entry in enumerate(as_list, start=1):
         if member(entry, "complexItemType") in TRANSECTS:
@@ -167,11 +167,11 @@ def _plan_items(as_list: Sequence[Any], key: str) -> Iterator[tuple[int, Any]]:
 
 WPL = "QGC WPL"
 WPL_COLUMNS = 12
-COMMA = re.compile(r"-?\d+,\d+")  # of a program in a language with decimal commas
+COMMA = re.compile(r"-?\d+,\d+")  # written by a program in a language with decimal commas
 
 
 def read_wpl(content: bytes, key: str, line: str | None = None) -> Places:
-    """The mission of a QGC WPL 110."""
+    """Read the mission of a QGC WPL 110."""
     require(line is None, "line", f"a mission, {key}", "a file with several lines")
     items, home = wpl_items(content, key)
     if home is None:
@@ -182,7 +182,7 @@ def read_wpl(content: bytes, key: str, line: str | None = None) -> Places:
 
 
 def wpl_items(content: bytes, key: str) -> tuple[list[Item], HomePlace | None]:
-    """The items of a QGC WPL 110, and the home of its item 0."""
+    """Read the items of a QGC WPL 110, and the home in its item 0."""
     encoding = (
         "utf-16" if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else "utf-8-sig"
     )
@@ -244,7 +244,7 @@ class FencePlaces(NamedTuple):
 
 
 def plan_fence(tree: Any, key: str) -> FencePlaces:
-    """The fence of a plan of QGroundControl, of version 2."""
+    """Read the fence of a plan of QGroundControl, version 2."""
     fence = member(tree, "geoFence")
     zones = []
     for zone in entries(fence, "polygons", key):
@@ -267,9 +267,9 @@ def plan_fence(tree: Any, key: str) -> FencePlaces:
 
 
 def _grouped(area: Area, group: Any = 0) -> Area:
-    """A zone of an autopilot, in its group where the aircraft stays in.
+    """Put a zone of an autopilot into its group, if the aircraft must stay in it.
 
-    A plan has the group 0 alone. MAVLink, MAV_CMD_NAV_FENCE_POLYGON_VERTEX_INCLUSION and
+    A plan only has the group 0. MAVLink, MAV_CMD_NAV_FENCE_POLYGON_VERTEX_INCLUSION and
     MAV_CMD_NAV_FENCE_CIRCLE_INCLUSION, parameter 2, Inclusion Group: "Vehicle must be inside ALL
     inclusion zones in a single group, vehicle must be inside at least one group".
     """
@@ -277,10 +277,10 @@ def _grouped(area: Area, group: Any = 0) -> Area:
 
 
 def json_fence(tree: Any, key: str) -> FencePlaces:
-    """Polygons, whose holes are excluded, and Points with the property `radius`.
+    """Read polygons, whose holes are excluded, and Points with the property `radius`.
 
-    The property `exclude` excludes a zone. Zones with the same property `group` are a group; else
-    each zone is one alone.
+    The property `exclude` excludes a zone. Zones with the same property `group` form a group;
+    otherwise each zone is one by itself.
     """
     require_wgs84(tree, key)
     zones: list[Area] = []
@@ -317,7 +317,7 @@ def json_fence(tree: Any, key: str) -> FencePlaces:
 
 
 def wpl_fence(content: bytes, key: str) -> FencePlaces:
-    """The polygons, circles, return point and rally points of MAVLink.
+    """Read the polygons, circles, return point and rally points of MAVLink.
 
     The commands are MAV_CMD_NAV_FENCE_... and MAV_CMD_NAV_RALLY_POINT.
     """
@@ -363,7 +363,7 @@ def wpl_fence(content: bytes, key: str) -> FencePlaces:
 
 
 def _group(item: Item, key: str) -> int:
-    """The inclusion group of an item; 0 of a zone to keep out of, which has none."""
+    """Return the inclusion group of an item; 0 for a zone to keep out of, which has none."""
     if item.command in {FENCE_OUT, CIRCLE_OUT}:
         return 0
     group = float(item.params[1])
@@ -378,14 +378,14 @@ def _group(item: Item, key: str) -> int:
 
 
 def lat_lon(position: Any, above: Above = Above.AS_POSE) -> Place:
-    """A position of a plan: latitude, longitude and perhaps altitude."""
+    """Read a position of a plan: latitude, longitude and perhaps altitude."""
     require(is_position(position), "fence", short_repr(position), "latitude and longitude")
     latitude, longitude, *altitude = position
     return Place("fence", latitude, longitude, altitude[0] if altitude else None, above=above)
 
 
 def home_of(position: Any) -> HomePlace | None:
-    """The home in latitude, longitude and perhaps altitude; None for anything else."""
+    """Read the home from latitude, longitude and perhaps altitude; None for anything else."""
     if not is_position(position) or not all(isinstance(value, int | float) for value in position):
         return None
     return HomePlace(position[0], position[1], position[2] if len(position) == 3 else None)

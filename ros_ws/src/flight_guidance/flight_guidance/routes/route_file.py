@@ -3,8 +3,8 @@
 """Route files as waypoints in the local tangent plane.
 
 `route_formats` reads the formats with latitudes and longitudes. A YAML file holds the list `route`
-of [north, east, altitude], [north, east, altitude, V] or a mapping: north and east, or latitude and
-longitude, altitude, and perhaps V, turns, wait, leave and left of `Waypoint`.
+of [north, east, altitude], [north, east, altitude, V] or a mapping with north and east, or latitude
+and longitude, altitude, and perhaps V, turns, wait, leave and left of `Waypoint`.
 """
 
 import math
@@ -30,7 +30,7 @@ FLATTENING = 1.0 / 298.257223563
 """a in m and f of the ellipsoid WGS84. Source: NGA.STND.0036 (2014)."""
 
 MAX_DISTANCE = 100e3
-"""m from the origin. The plane's north and east are 4 m short of the distance on the ground there
+"""m from the origin. There the plane's north and east are 4 m short of the distance on the ground
 (d^3 / 6 R^2)."""
 
 
@@ -39,7 +39,7 @@ class Waypoint(NamedTuple):
 
     north: float  # m from the origin
     east: float  # m from the origin
-    altitude: float  # m, as `pose` counts it
+    altitude: float  # m, counted as in `pose`
     # Airspeed on the leg to the waypoint, m/s; None: as on the leg before.
     speed: float | None = None
     turns: float = 0.0  # turns round the waypoint before the aircraft flies on, 1
@@ -51,7 +51,7 @@ class Waypoint(NamedTuple):
 
     @property
     def point(self) -> Point:
-        """The waypoint in the local tangent plane."""
+        """Position of the waypoint in the local tangent plane."""
         return self.north, self.east
 
     @property
@@ -61,7 +61,7 @@ class Waypoint(NamedTuple):
 
     @property
     def departure(self) -> float:
-        """The altitude at which the aircraft flies on, m."""
+        """Altitude at which the aircraft flies on, m."""
         return self.altitude if self.leave is None else self.leave
 
 
@@ -69,7 +69,7 @@ class RouteFile(NamedTuple):
     """The content of a route file."""
 
     waypoints: tuple[Waypoint, ...]
-    notes: tuple[str, ...]  # sentences on what of the file is not flown
+    notes: tuple[str, ...]  # sentences on what in the file is not flown
 
 
 class Origin(NamedTuple):
@@ -84,16 +84,16 @@ FURTHER = ("V", "turns", "wait", "leave", "left")
 
 
 def local(latitude: float, longitude: float, origin: Origin) -> Point:
-    """North and east of a position on the ellipsoid WGS84 in the tangent plane, m.
+    """Project a position on the ellipsoid WGS84 to north and east in the tangent plane, m.
 
-    The plane touches the ellipsoid at the origin; angles in deg.
+    The plane touches the ellipsoid at the origin; angles are in deg.
 
         [x, y, z] = N(lat) [cos(lat) cos(lon), cos(lat) sin(lon), (1 - e^2) sin(lat)],
             N = a / sqrt(1 - e^2 sin(lat)^2)
 
-    and the difference of two vectors [x, y, z] turned to north and east at the origin. Altitude
-    takes no part: the altitude of an aircraft follows the curved Earth. Source: IOGP publication
-    373-7-2, methods EPSG:9602 and 9836.
+    The difference of two vectors [x, y, z] is turned to north and east at the origin. Altitude
+    takes no part, because the altitude of an aircraft follows the curved Earth. Source: IOGP
+    publication 373-7-2, methods EPSG:9602 and 9836.
     """
     lat = math.radians(origin.latitude)
     turn = math.radians(longitude - origin.longitude)
@@ -103,10 +103,10 @@ def local(latitude: float, longitude: float, origin: Origin) -> Point:
 
 
 def geographic(north: float, east: float, origin: Origin) -> Origin:
-    """Latitude and longitude, deg, of a position north and east of the origin, m.
+    """Compute latitude and longitude, deg, of a position north and east of the origin, m.
 
-    The position is on the ellipsoid: the inverse of `local`. Each step of the iteration leaves a
-    hundredth of the error within 50 km of an origin below 80 deg of latitude.
+    This is the inverse of `local`, for a position on the ellipsoid. Each step of the iteration
+    leaves a hundredth of the error within 50 km of an origin below 80 deg of latitude.
     """
     latitude, longitude = origin
     for _ in range(8):
@@ -129,7 +129,7 @@ def _is_above(latitude: float, longitude: float, origin: Origin) -> bool:
 
 
 def _meridian(latitude: float) -> tuple[float, float]:
-    """Distance of a position on the ellipsoid from the Earth's axis and the equator's plane, m."""
+    """Return the distance of a position on the ellipsoid from the Earth's axis and equator, m."""
     e_squared = FLATTENING * (2.0 - FLATTENING)
     normal = SEMI_MAJOR / math.sqrt(1.0 - e_squared * math.sin(latitude) ** 2)
     return normal * math.cos(latitude), normal * (1.0 - e_squared) * math.sin(latitude)
@@ -140,7 +140,7 @@ ENDINGS = (*FORMATS, *YAML)
 
 
 def read_route(path: Path, origin: Origin | None = None) -> tuple[Waypoint, ...]:
-    """The waypoints of a route file. Raises as `read_route_file`."""
+    """Read the waypoints of a route file. Raises as `read_route_file` does."""
     return read_route_file(path, origin).waypoints
 
 
@@ -153,16 +153,16 @@ def read_route_file(
     above_sea: bool | None = False,
     line: str | None = None,
 ) -> RouteFile:
-    """The waypoints of a route file, by the ending: one of ENDINGS.
+    """Read the waypoints of a route file, whose ending is one of ENDINGS.
 
     Latitudes and longitudes are turned to north and east of the origin, by default the home in the
-    file. `altitude` is the height in m to fly at where the file has none, and the height of the
-    ground or of the home where the file counts from there. `above_sea`: the altitudes of `pose`
-    count from the sea, else from the start, which is the home in the file; None where that is not
-    known, nor the start. Equal successive positions are one waypoint. Waypoints within `simplify`
-    in m of the line without them are left out. `line`: number from 1 on, or name, of the line to
-    fly of a file with several. Raises ParameterError for an unreadable file, a geometry that is no
-    route, a value missing or out of range, and latitudes without an origin.
+    file. `altitude` is the height in m to fly at if the file has none, and the height of the ground
+    or of the home if the file counts from there. `above_sea` says whether the altitudes of `pose`
+    count from the sea, or else from the start, which is the home in the file; it is None if that is
+    not known, nor the start. Equal successive positions are one waypoint. Waypoints within
+    `simplify` in m of the line without them are left out. `line` is the number from 1 on, or the
+    name, of the line to fly in a file with several. Raises ParameterError for an unreadable file, a
+    geometry that is no route, a value missing or out of range, and latitudes without an origin.
     """
     suffix = path.suffix.lower()
     require(
@@ -201,9 +201,9 @@ def read_route_file(
 
 
 def _merged(waypoints: Sequence[Waypoint]) -> list[Waypoint]:
-    """The waypoints, successive ones at a place as a single waypoint with all circles.
+    """Merge successive waypoints at one place into a single waypoint with all circles.
 
-    The aircraft leaves at the last altitude. The airspeed of the last waypoint is for the next leg.
+    The aircraft leaves at the last altitude. The airspeed of the last one is for the next leg.
     Raises ParameterError for circles in both directions at a place.
     """
     places: list[Waypoint] = []
@@ -232,12 +232,12 @@ def read_fence_file(
     *,
     above_sea: bool = False,
 ) -> dict[str, Any]:
-    """The sections `fence` and `home` of guidance from a file.
+    """Read the sections `fence` and `home` of guidance from a file.
 
-    The arguments are as of `read_route_file`. Home is the rally point nearest to the origin,
-    without rally points the return point of the fence, without both the home in the file, else not
-    in the result. Raises ParameterError for an unreadable file, a file without a zone, and a number
-    missing or out of range.
+    The arguments are as for `read_route_file`. Home is the rally point nearest to the origin;
+    without rally points it is the return point of the fence, without both the home in the file;
+    otherwise it is missing in the result. Raises ParameterError for an unreadable file, a file
+    without a zone, and a number missing or out of range.
     """
     suffix = path.suffix.lower()
     require(
@@ -263,7 +263,7 @@ def read_fence_file(
         corners = _merged([_placed(place, origin, _Heights()) for place in flat])
         points = [waypoint.point for waypoint in corners]
         if len(points) > 1 and points[0] == points[-1]:
-            del points[-1]  # of a ring
+            del points[-1]  # a ring ends with its first point
         zones[key] = {
             "north": [point[0] for point in points],
             "east": [point[1] for point in points],
@@ -279,7 +279,7 @@ def read_fence_file(
 
 
 def placed_lines(content: bytes, key: str, origin: Origin) -> list[list[Point]]:
-    """The lines, rings and points of a GeoJSON in the plane at the origin, north and east, m.
+    """Read the lines, rings and points of a GeoJSON as north and east of the origin, m.
 
     Raises ParameterError for unreadable content, no position, a coordinate system other than WGS84
     and a position out of range.
@@ -295,7 +295,7 @@ def placed_lines(content: bytes, key: str, origin: Origin) -> list[list[Point]]:
 
 
 def thinned(waypoints: Sequence[Waypoint], tolerance: float) -> list[Waypoint]:
-    """The waypoints without those within a distance in m of the line between the rest.
+    """Drop the waypoints within a distance in m of the line between the others.
 
     Waypoints with circles stay, and those where the airspeed changes; each has the airspeed of its
     leg. Source: Douglas and Peucker (1973), Algorithms for the reduction of the number of points
@@ -341,15 +341,15 @@ class _Heights:
     ) -> None:
         self._fixed = fixed
         self._sea = None if home is None else home.altitude
-        self._zero = fixed  # altitude of the home, as `pose` counts
+        self._zero = fixed  # altitude of the home, counted as in `pose`
         if fixed is None and above_sea is not None:
             self._zero = self._sea if above_sea else 0.0
         self._above_sea = above_sea
 
     def altitude(self, place: Place) -> Any:
-        """The altitude in m, not validated yet.
+        """Return the altitude in m, not validated yet.
 
-        Raises ParameterError where the file does not tell.
+        Raises ParameterError if the file does not tell it.
         """
         altitude = place.altitude
         above = place.above
@@ -381,7 +381,7 @@ class _Heights:
 def _home_of_fence(
     places: FencePlaces, origin: Origin | None, heights: _Heights
 ) -> dict[str, Any] | None:
-    """The section `home` by the rule of `read_fence_file`; None without one."""
+    """Return the section `home` by the rule of `read_fence_file`; None if there is none."""
     rally = [_placed(place._replace(key="rally point"), origin, heights) for place in places.rally]
     if rally:
         nearest = min(rally, key=lambda point: math.hypot(*point.point))
@@ -401,9 +401,9 @@ def _home_of_fence(
 
 
 def _require_order(places: Sequence[Place], origin: Origin | None) -> None:
-    """Raise ParameterError where latitude and longitude are exchanged.
+    """Refuse latitudes and longitudes that are exchanged.
 
-    The places are near the origin with latitude and longitude exchanged alone.
+    They are exchanged if the places are near the origin only after exchanging them back.
     """
     if origin is None:
         return
@@ -540,7 +540,7 @@ def _waypoint(key: str, north: float, east: float, altitude: Any, speed: Any = N
 
 
 def _number(key: str, value: Any, name: str, largest: float = 1e9) -> float:
-    """A value as a finite number within +-largest. Raises ParameterError."""
+    """Return a value as a finite number within +-largest. Raises ParameterError."""
     fits = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= largest
     expected = "a finite number" + (f" from {-largest:g} to {largest:g}" if largest < 1e9 else "")
     require(fits, f"{key}.{name}", "nothing" if value is None else short_repr(value), expected)

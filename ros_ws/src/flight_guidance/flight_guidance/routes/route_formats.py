@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Formats of routes with latitudes and longitudes of WGS84.
 
-They are GeoJSON, KML, KMZ, GPX, plans of QGroundControl, QGC WPL 110. A file holds one route: a
-line, or points in the order of the file. What else a file holds is refused, or named in a note.
+They are GeoJSON, KML, KMZ, GPX, plans of QGroundControl, and QGC WPL 110. A file holds one route: a
+line, or points in the order of the file. Anything else in a file is refused, or named in a note.
 Sources: RFC 7946 (GeoJSON); OGC 12-007r2 (KML); GPX 1.1 schema; QGroundControl guide, Plan File
 Format; MAVLink guide, File Formats and MAV_FRAME.
 """
@@ -29,9 +29,10 @@ from flight_guidance.routes.route_xml import read_gpx, read_kml, read_kmz
 
 
 def read_places(content: bytes, key: str, suffix: str, line: str | None = None) -> Places:
-    """The route in the content of a file; `key` names the file in errors. Raises ParameterError.
+    """Read the route in the content of a file; `key` names the file in errors.
 
-    `line`: the number from 1 on, or the name, of the line that is flown of a file with several.
+    `line` is the number from 1 on, or the name, of the line to fly in a file with several. Raises
+    ParameterError.
     """
     route = FORMATS[suffix](content, key, line)
     require(bool(route.places), key, "; ".join(["no position", *route.notes]), "a route")
@@ -40,7 +41,7 @@ def read_places(content: bytes, key: str, suffix: str, line: str | None = None) 
 
 
 def read_fence(content: bytes, key: str, suffix: str) -> FencePlaces:
-    """The zones and the rally points of a plan of QGroundControl, a QGC WPL 110 or a GeoJSON.
+    """Read the zones and rally points of a plan of QGroundControl, a QGC WPL 110 or a GeoJSON.
 
     Raises ParameterError.
     """
@@ -63,7 +64,7 @@ def read_fence(content: bytes, key: str, suffix: str) -> FencePlaces:
 
 WPL_ENDINGS = (".waypoints", ".mission", ".txt")
 FENCES = (".plan", ".geojson", ".json", *WPL_ENDINGS)
-"""Endings of files with a fence."""
+"""Endings of files that may have a fence."""
 
 
 def _read_json(content: bytes, key: str, line: str | None = None) -> Places:

@@ -16,7 +16,7 @@ from flight_guidance.routes.route_places import A_ROUTE, Geometry, Place, Places
 
 
 def parsed_json(content: bytes, key: str) -> Any:
-    """The content of a JSON file. Raises ParameterError."""
+    """Parse the content of a JSON file. Raises ParameterError."""
     try:
         return json.loads(
             content.removeprefix(b"\xef\xbb\xbf"), object_pairs_hook=_members, parse_int=_whole
@@ -26,9 +26,9 @@ def parsed_json(content: bytes, key: str) -> Any:
 
 
 def _whole(digits: str) -> int | float:
-    """A whole number; one of more digits than a float holds is a float.
+    """Read a whole number; with more digits than a float holds it becomes a float.
 
-    Infinite beyond the range of a float.
+    Beyond the range of a float it is infinite.
     """
     return int(digits) if len(digits) < 16 else float(digits)
 
@@ -43,7 +43,7 @@ def _members(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def json_route(tree: Any, key: str, line: str | None) -> Places:
-    """The route of a GeoJSON."""
+    """Read the route of a GeoJSON."""
     require_wgs84(tree, key)
     geometries: list[Geometry] = []
     others: list[str] = []
@@ -65,9 +65,9 @@ def json_route(tree: Any, key: str, line: str | None) -> Places:
 
 
 def read_lines(content: bytes, key: str) -> list[list[Place]]:
-    """The lines, rings and points of a GeoJSON, in the order of the file.
+    """Read the lines, rings and points of a GeoJSON, in the order of the file.
 
-    Raises ParameterError as `read`.
+    Raises ParameterError as `read` does.
     """
     tree = parsed_json(content, key)
     require_wgs84(tree, key)
@@ -92,9 +92,9 @@ def read_lines(content: bytes, key: str) -> list[list[Place]]:
 
 
 def _ring(rings: list[Any]) -> list[list[Any]]:
-    """The outer ring of a Polygon, whose only line is a route.
+    """Return the outer ring of a Polygon, which is a route if it is the only line.
 
-    Of a Polygon with holes, every ring.
+    For a Polygon with holes, return every ring.
     """
     return [ring for ring in rings if isinstance(ring, list)]
 
@@ -109,20 +109,20 @@ GEOJSON: Mapping[str, Callable[[list[Any]], list[list[Any]]]] = MappingProxyType
         "MultiPolygon": lambda polygons: [*chain.from_iterable(map(_ring, _ring(polygons)))],
     }
 )
-"""By the type of a geometry: its lines, or its points."""
+"""Lines or points of a geometry, by its type."""
 
 PARTS = {
     "MultiLineString": "line of a MultiLineString",
     "Polygon": "ring of a Polygon",
     "MultiPolygon": "ring of a MultiPolygon",
 }
-"""What one of several parts is called."""
+"""Names for one of several parts."""
 
 
 def nodes(tree: Any) -> Iterator[tuple[Any, Any]]:
-    """The geometries with the properties of their Feature, in the order of the file.
+    """Yield the geometries with the properties of their Feature, in the order of the file.
 
-    None for a Feature without geometry.
+    A Feature without a geometry yields None.
     """
     pending: list[tuple[Any, Any]] = [(tree, None)]
     while pending:
@@ -140,7 +140,7 @@ def nodes(tree: Any) -> Iterator[tuple[Any, Any]]:
 def require_wgs84(tree: Any, key: str) -> None:
     """Refuse a member `crs` of another system.
 
-    RFC 7946 has WGS84 alone, and GDAL wrote others before.
+    RFC 7946 only has WGS84, but GDAL used to write others.
     """
     crs = member(tree, "crs")
     name = str(member(member(crs, "properties"), "name") or "")
@@ -156,21 +156,21 @@ def require_wgs84(tree: Any, key: str) -> None:
 
 
 def member(tree: Any, name: str) -> Any:
-    """A member of a JSON object; None of anything else."""
+    """Return a member of a JSON object; None for anything else."""
     return tree.get(name) if isinstance(tree, Mapping) else None
 
 
 def entries(tree: Any, name: str, key: str) -> list[Any]:
-    """A member of a JSON object that is a list; empty where absent."""
+    """Return a member of a JSON object that is a list; empty if it is absent."""
     value = member(tree, name)
     require(value is None or isinstance(value, list), key, f"{name}: {short_repr(value)}", "a list")
     return list(value or ())
 
 
 def flag(tree: Any, name: str, absent: bool | None, key: str) -> bool:
-    """A member of a JSON object that is true or false, also as 1 or 0.
+    """Return a member of a JSON object that is true or false, also as 1 or 0.
 
-    `absent`: its value where the object lacks it.
+    `absent` is its value if the object lacks it.
     """
     value = absent if member(tree, name) is None else tree[name]
     require(value in (True, False), key, f"{name}: {short_repr(value)}", "true or false")
@@ -178,6 +178,6 @@ def flag(tree: Any, name: str, absent: bool | None, key: str) -> bool:
 
 
 def as_list(value: Any, key: str) -> list[Any]:
-    """A list that is not empty. Raises ParameterError."""
+    """Return a list that is not empty. Raises ParameterError."""
     require(isinstance(value, list) and bool(value), key, short_repr(value), "a list of positions")
     return list(value)

@@ -17,7 +17,7 @@ A_ROUTE = "a route file"
 class Above(Enum):
     """The zero of an altitude."""
 
-    AS_POSE = 0  # as `pose` counts: the number stands
+    AS_POSE = 0  # counted as in `pose`, so the number stands
     SEA = 1
     HOME = 2
     GROUND = 3
@@ -33,8 +33,8 @@ class Place(NamedTuple):
     speed: Any = None  # m/s
     above: Above = Above.AS_POSE
     altitude_text: str = ""  # what the file has in place of an altitude, for a sentence
-    turns: Any = 0.0  # round the place, 1
-    wait: Any = 0.0  # round the place, s
+    turns: Any = 0.0  # number of turns round the place, 1
+    wait: Any = 0.0  # time on a circle round the place, s
     # Whether the altitude is reached round the place, and not on the way to the place.
     climbs: bool = False
     left: bool | None = None  # whether circles are counter-clockwise; None: not said
@@ -59,15 +59,15 @@ class Places(NamedTuple):
 class Geometry(NamedTuple):
     """A line or points of a file."""
 
-    kind: str  # by the name in the format
+    kind: str  # name of its kind in the format
     places: list[Place]
-    name: str = ""  # by the user
+    name: str = ""  # name that the user gave it
 
 
 def one_route(
     key: str, geometries: Sequence[Geometry], others: Sequence[str] = (), line: str | None = None
 ) -> Places:
-    """The only line, or that of `line`; the points where there is no line.
+    """Return the only line, or the one of `line`; if there is no line, the points.
 
     Raises ParameterError that names what is there.
     """
@@ -110,7 +110,7 @@ def one_route(
 
 
 def _choice(lines: Sequence[Geometry]) -> str:
-    """What `--line` may name: "--line 1 (north), 2 or 3 (south)"."""
+    """Say what `--line` may name: "--line 1 (north), 2 or 3 (south)"."""
     names = [
         f"{k} ({geometry.name})" if geometry.name else f"{k}"
         for k, geometry in enumerate(lines[:SHOWN], start=1)
@@ -119,14 +119,14 @@ def _choice(lines: Sequence[Geometry]) -> str:
 
 
 SHOWN = 5
-"""Lines of a file that a refusal names."""
+"""Number of lines of a file that a refusal names."""
 
 POINTS = ("Point", "MultiPoint", "wpt")
 GPX = ("rte", "trk", "wpt")  # names of elements, without a plural
 
 
 def _counted(kinds: Sequence[str]) -> str:
-    """Kinds with their numbers: "2 LineStrings and 1 Polygon"."""
+    """Count kinds in words: "2 LineStrings and 1 Polygon"."""
     counts = []
     for kind, count in Counter(kinds).items():
         noun, *suffix = kind.split(" ", 1)
@@ -135,7 +135,7 @@ def _counted(kinds: Sequence[str]) -> str:
 
 
 def _joined(lines: Sequence[Geometry]) -> list[Geometry]:
-    """The lines, with parts that were cut at the antimeridian as one line.
+    """Join parts of lines that were cut at the antimeridian.
 
     Source: RFC 7946, section 3.1.9.
     """
@@ -164,7 +164,7 @@ def _meets(end: Place, begin: Place) -> bool:
 
 
 def number_of(text: str | None) -> float | str | None:
-    """The number of a text; any other text as is."""
+    """Return the number in a text; any other text as it is."""
     try:
         return None if text is None else float(text)
     except ValueError:
@@ -179,7 +179,7 @@ def is_position(value: Any) -> bool:
 def lon_lat(
     position: Any, speed: Any = None, above: Above = Above.AS_POSE, altitude_text: str = ""
 ) -> Place:
-    """A position of GeoJSON or KML: longitude, latitude and perhaps altitude."""
+    """Read a position of GeoJSON or KML: longitude, latitude and perhaps altitude."""
     require(is_position(position), "route", short_repr(position), "longitude, latitude, altitude")
     longitude, latitude, *altitude = position
     return Place(

@@ -27,7 +27,7 @@ from flight_guidance.routes.route_places import (
 
 
 class _NoDoctype(TreeBuilder):
-    """Refuses a document type, the only place of entity declarations.
+    """Refuses a document type, the only place in which entities can be declared.
 
     No entity is ever expanded or fetched.
     """
@@ -42,20 +42,21 @@ def _parsed_xml(content: bytes, key: str, kind: str) -> Element:
         parser.feed(content)
         root: Element = parser.close()
     except (ParseError, ValueError, LookupError) as error:
-        # ValueError and LookupError come of an encoding.
+        # ValueError and LookupError come from an encoding.
         raise ParameterError(f"{key}: found {error}, expected the XML of {kind}") from None
     return root
 
 
 def _kind(element: Element) -> str:
-    """The name of an element without the namespace."""
+    """Return the name of an element without its namespace."""
     return str(element.tag).rpartition("}")[2]
 
 
 KML_LINES = ("LineString", "LinearRing", "Track")
-KML_OTHERS = ("Model", "NetworkLink")  # geometry elsewhere
+KML_OTHERS = ("Model", "NetworkLink")  # their geometry is elsewhere
 KML_VIEWS = ("Tour", "GroundOverlay", "PhotoOverlay", "ScreenOverlay")  # no geometry
-DJI = "dji.com/wpmz"  # in the namespace of its missions, with heights and speeds beside KML's own
+# in the namespace of DJI's missions, which have heights and speeds of their own
+DJI = "dji.com/wpmz"
 KML_MODES = {
     "absolute": Above.AS_POSE,
     "relativeToGround": Above.GROUND,
@@ -64,7 +65,7 @@ KML_MODES = {
 
 
 def read_kml(content: bytes, key: str, line: str | None = None) -> Places:
-    """The route of a KML file."""
+    """Read the route of a KML file."""
     root = _parsed_xml(content, key, "a KML file")
     elements = [*root.iter()]
     way_out = (
@@ -82,14 +83,14 @@ def read_kml(content: bytes, key: str, line: str | None = None) -> Places:
     polygons = _outer_elements(kinds, "Polygon")
     tracks = _outer_elements(kinds, "Track")
     marks = _outer_elements(kinds, "Placemark")
-    # A Model beside a route is a sign.
+    # A Model beside a route is only a sign.
     others = [kind for kind, element in kinds if kind in KML_OTHERS and element not in tracks]
     geometries: list[Geometry] = []
     for kind, element in kinds:
         if kind == "Point" and has_line:
             geometries.append(Geometry(kind, []))  # a mark, at any altitude
         elif kind in (*KML_LINES, "Point"):
-            # The altitudeMode of a Polygon is that of its rings.
+            # The altitudeMode of a Polygon holds for its rings.
             name = _text(marks.get(element), "name") or ""
             geometries.append(
                 Geometry(kind, _kml_places(key, kind, element, polygons.get(element)), name.strip())
@@ -100,7 +101,7 @@ def read_kml(content: bytes, key: str, line: str | None = None) -> Places:
 
 
 def _outer_elements(kinds: Sequence[tuple[str, Element]], outer: str) -> dict[Element, Element]:
-    """The element of a kind round each element in it."""
+    """Find the element of a kind that encloses each element in it."""
     outers: dict[Element, Element] = {}
     for kind, element in kinds:
         if kind == outer:
@@ -109,7 +110,7 @@ def _outer_elements(kinds: Sequence[tuple[str, Element]], outer: str) -> dict[El
 
 
 def _text(parent: Element | None, kind: str) -> str | None:
-    """The text of the first child of a kind; None without it."""
+    """Return the text of the first child of a kind; None if there is none."""
     return next(
         (child.text for child in (() if parent is None else parent) if _kind(child) == kind), None
     )
@@ -143,9 +144,9 @@ def _kml_places(key: str, kind: str, element: Element, polygon: Element | None) 
 
 
 def read_kmz(content: bytes, key: str, line: str | None = None) -> Places:
-    """The KML file of a KMZ archive: doc.kml, or the only one.
+    """Return the KML file of a KMZ archive: doc.kml, or the only one.
 
-    Where the root has one, it is that (OGC 12-007r2, Annex C).
+    If the root has one, it is that (OGC 12-007r2, Annex C).
     """
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
@@ -184,12 +185,12 @@ EARTH_RADIUS = 6371e3
 """m, mean radius R_1 of GRS80."""
 
 LARGEST_GAP = 1000.0
-"""m. Segments of a track that are nearer are one track: GPX begins a segment where the receiver
-lost its satellites."""
+"""m. Segments of a track that are nearer than this are one track: GPX begins a new segment when the
+receiver has lost its satellites."""
 
 
 def read_gpx(content: bytes, key: str, line: str | None = None) -> Places:
-    """A route (rte), without one a track (trk), without both the waypoints (wpt).
+    """Read a route (rte); without one a track (trk); without both the waypoints (wpt).
 
     With `line` it is one of all routes and tracks.
     """
@@ -209,7 +210,7 @@ def read_gpx(content: bytes, key: str, line: str | None = None) -> Places:
         geometries = routes + tracks
     else:
         geometries = routes
-    # Lines and marks are the geometries; the rest goes to the notes.
+    # Lines and marks are geometries; the rest goes to the notes.
     lines = [
         Geometry(_kind(element), [*chain(*segments)], (_text(element, "name") or "").strip())
         for element, segments in geometries
@@ -223,7 +224,7 @@ def read_gpx(content: bytes, key: str, line: str | None = None) -> Places:
         notes.append(f"{len(tracks)} trk beside the rte: no part of the route")
     if shapes := sum(_kind(element) == "rpt" for element in root.iter()):
         notes.append(f"{shapes} rpt of extensions: no part of the route")
-    # The segments of the track that is flown join, unless a gap is too wide.
+    # Join the segments of the track that is flown, unless a gap is too wide.
     segments = next(
         (segments for _, segments in geometries if [*chain(*segments)] == route.places), []
     )
@@ -245,15 +246,15 @@ def read_gpx(content: bytes, key: str, line: str | None = None) -> Places:
 
 
 def _gpx_segments(line: Element, kind: str) -> list[list[Place]]:
-    """The segments of a track, or the only one of a route, that have a position."""
+    """Return the segments of a track, or the only one of a route, that have a position."""
     parts = [line] if kind == "rte" else [element for element in line if _kind(element) == "trkseg"]
     return [places for element in parts if (places := _gpx_places(element, f"{kind}pt"))]
 
 
 def _gap(end: Place, begin: Place) -> float:
-    """Distance of two near positions on a sphere, m.
+    """Return the distance of two near positions on a sphere, m.
 
-    0 where one of them is no position, which is refused later.
+    It is 0 if one of them is no position, which is refused later.
     """
     values = (end.latitude, end.longitude, begin.latitude, begin.longitude)
     if not all(isinstance(value, float) and math.isfinite(value) for value in values):

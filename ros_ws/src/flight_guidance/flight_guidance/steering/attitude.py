@@ -12,15 +12,15 @@ from flight_core.vectors import Scalar, array_namespace
 from flight_guidance.steering.protection import forward
 
 YAW_TO_BANK = 1.5
-"""1/s. A yaw rate of 0.1 rad/s rolls the osprey by 0.02 rad/s, and 0.004 where A and B are 30 % off
+"""1/s. A yaw rate of 0.1 rad/s rolls the osprey by 0.02 rad/s, and by 0.004 if A and B are 30 % off
 for the worse."""
 
 SKIDDING = 1.6
-"""Bank of the osprey in a turn by the rudder over that of a coordinated turn at the same rate: the
-sideslip rolls until then. 1.3 to 1.7 where A and B are 30 % off."""
+"""Bank of the osprey in a turn by the rudder over that of a coordinated turn at the same rate,
+because the sideslip rolls it until then. It is 1.3 to 1.7 if A and B are 30 % off."""
 
 LARGEST_YAW = math.radians(20.0)
-"""Bank whose turn rate the yaw rate has at most: the rudder of the osprey is at half of its
+"""Bank whose turn rate limits the yaw rate: the rudder of the osprey is then at half of its
 stop."""
 
 
@@ -32,7 +32,7 @@ class AttitudeParams(NamedTuple):
     roll_rate: float  # largest phi_dot, rad/s
     load: float  # largest change of the load factor, 1
     n_alpha: Scalar  # slope of the load factor over the angle of attack, 1/rad
-    k_beta: float  # 1/s, 0 where beta is not measured
+    k_beta: float  # 1/s, 0 if beta is not measured
     turn_lead: float = 0.0  # s, by which r leads the bank
 
 
@@ -54,9 +54,9 @@ def body_rates(
     speed: Scalar,
     params: AttitudeParams,
 ) -> BodyRates:
-    """Rates to bring phi and theta to their commands.
+    """Compute the rates that bring phi and theta to their commands.
 
-    The inverse of Euler's equations in a coordinated turn gives them:
+    They follow by the inverse of Euler's equations in a coordinated turn:
 
         phi_dot_c   = clip(k_phi (phi_c - phi), +-roll_rate),
             theta_dot_c = clip(k_theta (theta_c - theta), +-load g/V)
@@ -65,10 +65,10 @@ def body_rates(
         q_m = (theta_dot_c + r sin(phi)) / cos(phi) + phi_dot_c tan(phi) / (cos(phi) n_alpha)
         p_m = phi_dot_c - tan(theta) (q_m sin(phi) + r cos(phi))
 
-    with the measured r where r is not tracked exactly. `turn_lead` makes up for the lag of the turn
-    behind the bank, by the reference model of r and by the sideslip of a roll. The last term of q_m
-    leads the angle of attack of the turn. Arguments: angles in rad, `speed` V in m/s. Source: R. W.
-    Beard, T. W. McLain, Small Unmanned Aircraft (2012), chapters 2 and 9.
+    with the measured r, in case r is not tracked exactly. `turn_lead` makes up for the lag of the
+    turn behind the bank, caused by the reference model of r and by the sideslip in a roll. The last
+    term of q_m leads the angle of attack of the turn. Angles are in rad, `speed` V in m/s. Source:
+    R. W. Beard, T. W. McLain, Small Unmanned Aircraft (2012), chapters 2 and 9.
     """
     speed = forward(speed)
     phi_dot = clip(params.k_phi * (phi_c - phi), params.roll_rate)
@@ -80,9 +80,9 @@ def body_rates(
 
 
 def yaw_for_bank(phi_c: Scalar, phi: Scalar, speed: Scalar) -> Scalar:
-    """Yaw rate for a bank without an aileron, rad/s, within +-g tan(LARGEST_YAW) / V.
+    """Compute the yaw rate for a bank without an aileron, rad/s, within +-g tan(LARGEST_YAW) / V.
 
-    The rate of the turn, and more to roll there:
+    It is the rate of the turn, plus more to roll there:
 
         r_m = g tan(phi_c) / V + k (SKIDDING phi_c - phi),  k = YAW_TO_BANK
 

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Lateral: the acceleration to the right, and the bank for it.
+"""Lateral guidance: the acceleration to the right, and the bank that gives it.
 
-A heading or course is held, or a path followed.
+It holds a heading or course, or follows a path.
 """
 
 import math
@@ -19,8 +19,8 @@ from flight_guidance.steering.protection import forward
 LARGEST_SLIP = 0.2
 
 HEADING_TIME = 2.0
-"""s. Ten poses of a receiver of 5 Hz; a bias of the gyro of 1 mrad/s then turns the heading by 0.1
-deg."""
+"""s. This covers ten poses of a receiver of 5 Hz; a bias of the gyro of 1 mrad/s then turns the
+heading by 0.1 deg."""
 
 
 class PathError(NamedTuple):
@@ -40,9 +40,9 @@ class PathParams(NamedTuple):
 
 
 def turn_towards(difference: Scalar) -> Scalar:
-    """Normalised turn for a difference of courses, within +-1: the sine up to 90 deg, +-1 beyond.
+    """Normalise the turn for a difference of courses to +-1: the sine up to 90 deg, +-1 beyond.
 
-    A sine alone would leave an aircraft on the opposite course there.
+    The sine alone would leave an aircraft on the opposite course.
     """
     xp = array_namespace(difference)
     sine = xp.sin(difference)
@@ -50,14 +50,14 @@ def turn_towards(difference: Scalar) -> Scalar:
 
 
 def heading_estimate(psi: float, measured: float | None, psi_dot: float, dt: float) -> float:
-    """Heading a step later, rad, from the heading rate of y, rad/s, and the heading of pose.
+    """Advance the heading by a step, rad, from the heading rate of y, rad/s, and that of pose.
 
-    The latter is None where pose is stale.
+    The heading of pose is None if pose is stale.
 
         psi+ = psi + dt psi_dot + (1 - exp(-dt/T)) (measured - psi - dt psi_dot),  T = HEADING_TIME
 
-    A complementary filter: noise of pose is smoothed, the gyro has no lag. A bias of the gyro turns
-    the heading by T times it.
+    This is a complementary filter: it smooths the noise of pose, and the gyro has no lag. A bias of
+    the gyro turns the heading by T times the bias.
     """
     heading = psi + dt * psi_dot
     innovation = 0.0 if measured is None else math.remainder(measured - heading, 2.0 * math.pi)
@@ -67,27 +67,27 @@ def heading_estimate(psi: float, measured: float | None, psi_dot: float, dt: flo
 
 
 def course_acceleration(course_c: float, course: float, speed: float, k: float) -> float:
-    """A = k V turn_towards(course_c - course), m/s^2. Also for a heading."""
+    """Compute a = k V turn_towards(course_c - course), m/s^2; also for a heading."""
     return float(k * speed * turn_towards(math.remainder(course_c - course, 2.0 * math.pi)))
 
 
 def path_acceleration(
     error: PathError, course: Scalar, ground_speed: Scalar, params: PathParams
 ) -> Scalar:
-    """Acceleration to the right to follow a path, m/s^2:
+    """Compute the acceleration to the right that follows a path, m/s^2.
 
         x       = min(abs(e) / (v_g P zeta), 1),  look-ahead angle l = pi/2 (1 - x)^2
         bearing = track - sign(e) min(pi/2 - l, max(capture, acos(1 / max(1 - kappa e, 1))))
         a = (4 pi zeta / P) v_g turn_towards(bearing - course) + sin(l)^2 kappa / (1 - kappa e)
         v_g^2 cos(course - track)
 
-    Outside a circle of radius R, at the distance d from the centre, 1 - kappa e = d / R: acos(R /
+    Outside a circle of radius R, at the distance d from the centre, 1 - kappa e = d / R. acos(R /
     d) is the angle between the tangent to the circle and the track, so an aircraft from afar flies
     along the tangent. Near a line e'' + 2 zeta w e' + w^2 e = 0 with w = 2 pi / P. The velocity is
-    over ground, so a wind changes nothing. On the inner side of an arc, e is limited to half of the
-    radius. Source: PX4-Autopilot, src/lib/npfg/DirectionalGuidance.cpp, without the adaptation to
-    wind.
-    """  # noqa: D415 - what follows is an equation
+    that over ground, so a wind changes nothing. On the inner side of an arc, e is limited to half
+    of the radius. Source: PX4-Autopilot, src/lib/npfg/DirectionalGuidance.cpp, without the
+    adaptation to wind.
+    """
     e, track, kappa = error
     xp = array_namespace(e)
     x = xp.minimum(abs(e) / (forward(ground_speed) * params.period * params.damping), 1.0)
@@ -111,17 +111,17 @@ def path_acceleration(
 def slip_estimate(
     slip: Scalar, turn: Scalar, acceleration: Scalar, rolling: Scalar, dt: float, time: float
 ) -> Scalar:
-    """Loss of turn by a sideslip at a bank, a step later, m/s^2.
+    """Advance the estimate of the turn that a sideslip takes away at a bank, m/s^2.
 
     `turn` = g tan(phi), `acceleration` = V psi_dot:
 
         slip+ = slip + (1 - exp(-dt/T)) max(1 - rolling / 0.2, 0) (turn - acceleration - slip),
         within +-LARGEST_SLIP abs(turn)
 
-    `rolling` is abs(p) / p_max: the turn lags the bank by the reference model of r, so a roll looks
-    like a sideslip. A bias of the gyro of r looks like a sideslip too; the bound is 0 in straight
-    flight and keeps the bias out there. Added to the acceleration of a path, the estimate keeps an
-    aircraft on an arc in a turn that is not coordinated.
+    `rolling` is abs(p) / p_max. Since the turn lags the bank by the reference model of r, a roll
+    looks like a sideslip. A bias of the gyro of r looks like a sideslip too; the bound is 0 in
+    straight flight and keeps the bias out there. Added to the acceleration of a path, the estimate
+    keeps an aircraft on an arc in a turn that is not coordinated.
     """
     steady = array_namespace(slip).maximum(1.0 - rolling / 0.2, 0.0)
     return clip(
@@ -131,13 +131,15 @@ def slip_estimate(
 
 
 def bank_for(acceleration: Scalar, path_angle: Scalar, limit: float) -> Scalar:
-    """Bank of a coordinated turn, rad: atan(a / (g cos(gamma))) within +-limit."""
+    """Compute the bank of a coordinated turn, rad: atan(a / (g cos(gamma))) within +-limit."""
     xp = array_namespace(acceleration)
     return clip(xp.atan(acceleration / (GRAVITY * xp.cos(path_angle))), limit)
 
 
 def least_period(speed: float, bank: float, roll_rate: float) -> float:
-    """Least period of path following, s: max(14, 1.5 V / (g tan(phi_max)), 9.3 phi_max / p_max).
+    """Compute the least period of path following, s.
+
+        max(14, 1.5 V / (g tan(phi_max)), 9.3 phi_max / p_max)
 
     The last term is `reach.least_period`.
     """
@@ -145,7 +147,7 @@ def least_period(speed: float, bank: float, roll_rate: float) -> float:
 
 
 def largest_wind(speed: float, wind: float, bank: float) -> float:
-    """Wind in which a circle of `least_radius` for `wind` takes the whole bank, m/s.
+    """Compute the wind in which a circle of `least_radius` for `wind` takes the whole bank, m/s.
 
     (V + W) sqrt(tan(b) / tan(0.8 b)) - V.
     """
@@ -153,5 +155,5 @@ def largest_wind(speed: float, wind: float, bank: float) -> float:
 
 
 def least_radius(speed: float, wind: float, bank: float) -> float:
-    """Least radius of a circle flown in a wind, m: (V + W)^2 / (g tan(0.8 phi_max))."""
+    """Compute the least radius of a circle in a wind, m: (V + W)^2 / (g tan(0.8 phi_max))."""
     return (speed + wind) ** 2 / (GRAVITY * math.tan(0.8 * bank))

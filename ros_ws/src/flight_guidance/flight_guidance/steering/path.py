@@ -31,12 +31,12 @@ OPPOSITE = math.radians(120.0)
 joining circle too."""
 
 SLACK = 0.1
-"""rad. A tangent that touches the joining circle by less beyond the point of the leg needs no
-further turn of 360 deg."""
+"""rad. If a tangent touches the joining circle by less than this beyond the point of the leg, no
+further turn of 360 deg is needed."""
 
 SHORTEST = 1e-3
-"""m. A fillet with ends nearer to the waypoint is left out: waypoints on a straight line have a
-fillet by rounding alone."""
+"""m. A fillet whose ends are nearer to the waypoint is left out: waypoints on a straight line have
+a fillet only by rounding."""
 
 
 class Line(NamedTuple):
@@ -59,7 +59,7 @@ class Loiter(NamedTuple):
 class Arc(NamedTuple):
     """A leg on a circle, less than a full turn.
 
-    Without an end it is an orbit, with a loiter an orbit until the loiter is flown.
+    Without an end it is an orbit; with a loiter it is an orbit until the loiter is flown.
     """
 
     centre: Point
@@ -78,9 +78,9 @@ class Route(NamedTuple):
     altitude: tuple[float, ...]  # m
     V: tuple[float, ...]  # m/s
     from_altitude: tuple[float, ...] = ()  # m, of the waypoint that the leg leaves
-    from_V: tuple[float, ...] = ()  # m/s, likewise
-    slopes: bool = False  # whether the altitude changes along a line; else at the begin of a leg
-    notes: tuple[str, ...] = ()  # sentences on what is flown otherwise than the waypoints say
+    from_V: tuple[float, ...] = ()  # m/s, the same
+    slopes: bool = False  # whether the altitude changes along a line, or else where a leg begins
+    notes: tuple[str, ...] = ()  # sentences on what is flown differently than the waypoints say
 
     @property
     def radius(self) -> float:
@@ -88,16 +88,16 @@ class Route(NamedTuple):
         return abs(self.legs[-1].radius) if isinstance(self.legs[-1], Arc) else 0.0
 
     def near(self, leg: int) -> float:
-        """Distance from the end of a leg within which the leg counts as flown, m.
+        """Return the distance from the end of a leg within which the leg counts as flown, m.
 
-        The radius, at least 1 s of flight.
+        It is the radius, at least 1 s of flight.
         """
         return max(self.radius, self.V[leg])
 
     def start(self, leg: int, along: float = 0.0) -> tuple[Point, float]:
-        """The start of a leg and the course there, rad; the centre of an orbit.
+        """Return the start of a leg and the course there, rad; for an orbit its centre.
 
-        Of a line it is the point at a distance along, m.
+        For a line the start is the point at the distance `along`, m.
         """
         path = self.legs[leg]
         if isinstance(path, Line):
@@ -109,7 +109,7 @@ class Route(NamedTuple):
         return before.end or path.centre, end_course(before)
 
     def profile(self, leg: int, along: float) -> tuple[float, float]:
-        """The altitude at a distance along a leg, m, and its slope, 1.
+        """Return the altitude at a distance along a leg, m, and its slope, 1.
 
         The altitude is a straight line from waypoint to waypoint, or a step.
         """
@@ -121,7 +121,7 @@ class Route(NamedTuple):
         return altitude - slope * (distance - along), slope
 
     def joining_altitude(self, leg: int, along: float) -> float:
-        """The altitude at which the aircraft joins a leg at a distance along the leg, m."""
+        """Return the altitude at which the aircraft joins a leg at a distance along it, m."""
         if along or not self.from_altitude:
             return self.profile(leg, along)[0]
         return self.from_altitude[leg]
@@ -133,19 +133,19 @@ def is_orbit(leg: Leg) -> bool:
 
 
 def length(leg: Leg) -> float:
-    """Length of a line, m; 0 for an arc."""
+    """Return the length of a line, m; 0 for an arc."""
     return math.dist(leg.start, leg.end) if isinstance(leg, Line) else 0.0
 
 
 def along(start: Point, end: Point, share: float) -> Point:
-    """The point at a share of the way from a start to an end."""
+    """Return the point at a fraction of the way from a start to an end."""
     return start[0] + share * (end[0] - start[0]), start[1] + share * (end[1] - start[1])
 
 
 def nearest(leg: Leg, position: Point) -> float:
-    """Distance along a line from the start to the point nearest to a position, m.
+    """Return the distance along a line from its start to the point nearest to a position, m.
 
-    From 0 to the length; 0 for an arc.
+    It lies between 0 and the length, and is 0 for an arc.
     """
     if isinstance(leg, Line):
         return min(max(length(leg) - to_go(leg, position), 0.0), length(leg))
@@ -153,12 +153,12 @@ def nearest(leg: Leg, position: Point) -> float:
 
 
 def course_of(start: Point, end: Point) -> float:
-    """Course from a start to an end, rad from north."""
+    """Return the course from a start to an end, rad from north."""
     return math.atan2(end[1] - start[1], end[0] - start[0])
 
 
 def error(leg: Leg, position: Point) -> PathError:
-    """The cross-track error of a position.
+    """Compute the cross-track error of a position.
 
     Course and curvature are those of the leg at the nearest point.
     """
@@ -168,7 +168,7 @@ def error(leg: Leg, position: Point) -> PathError:
 
 
 def line_error(start: Point, track: Scalar, position: Point) -> PathError:
-    """`error` beside a line from a point on a course, rad."""
+    """Compute the `error` beside a line from a point on a course, rad."""
     xp = array_namespace(track)
     north = position[0] - start[0]
     east = position[1] - start[1]
@@ -176,12 +176,12 @@ def line_error(start: Point, track: Scalar, position: Point) -> PathError:
 
 
 def circle_error(centre: Point, radius: Scalar, position: Point) -> PathError:
-    """`error` beside a circle, radius in m, positive to the right."""
+    """Compute the `error` beside a circle, radius in m, positive to the right."""
     xp = array_namespace(radius)
     north = position[0] - centre[0]
     east = position[1] - centre[1]
     side = xp.copysign(1.0, radius)
-    # The bearing is that from the centre.
+    # This is the bearing from the centre.
     bearing = xp.atan2(east, north)
     return PathError(
         side * (abs(radius) - xp.hypot(north, east)), bearing + side * math.pi / 2.0, 1.0 / radius
@@ -189,7 +189,7 @@ def circle_error(centre: Point, radius: Scalar, position: Point) -> PathError:
 
 
 def end_course(leg: Leg) -> float:
-    """Course at the end of a leg, rad. An orbit has none: raises ValueError."""
+    """Return the course at the end of a leg, rad, or raise ValueError for an orbit."""
     if isinstance(leg, Line):
         return course_of(leg.start, leg.end)
     if leg.end is None:
@@ -200,7 +200,7 @@ def end_course(leg: Leg) -> float:
 def is_passed(leg: Leg, position: Point) -> bool:
     """Whether a position lies beyond the half plane at the end of a leg, across the course there.
 
-    Never for an orbit.
+    It never does for an orbit.
     """
     return (
         leg.end is not None
@@ -225,7 +225,7 @@ def is_entered(leg: Leg, following: Leg | None, position: Point) -> bool:
 
 
 def to_go(leg: Leg, position: Point) -> float:
-    """Distance along a leg from the point nearest to a position to the end, m; 0 for an orbit."""
+    """Return the distance along a leg from the point nearest to a position to the end, m."""
     if leg.end is None or is_orbit(leg):
         return 0.0
     if isinstance(leg, Line):
@@ -243,7 +243,7 @@ def to_go(leg: Leg, position: Point) -> float:
 
 
 def joining_centre(point: Point, course: Scalar, radius: Scalar) -> Point:
-    """Centre of the circle that touches a course, rad, at a point.
+    """Return the centre of the circle that touches a course, rad, at a point.
 
     The radius is positive to the right, m.
     """
@@ -254,11 +254,11 @@ def joining_centre(point: Point, course: Scalar, radius: Scalar) -> Point:
 def joining_length(
     point: Point, course: Scalar, radius: Scalar, position: Point, course_flown: Scalar
 ) -> Scalar:
-    """Length of the way onto a course at a point, m: R abs(turn) + sqrt(d^2 - R^2) + R sweep.
+    """Compute the length of the way onto a course, m: R abs(turn) + sqrt(d^2 - R^2) + R sweep.
 
-    turn: from the course flown to the tangent; d: distance from the centre of the joining circle;
-    sweep: from the point where the tangent touches the circle to the point of the leg.
-    `course_flown` and `course` in rad.
+    turn leads from the course flown to the tangent; d is the distance from the centre of the
+    joining circle; sweep leads from the point where the tangent touches the circle to the point of
+    the leg. `course_flown` and `course` are in rad.
     """
     xp = array_namespace(radius)
     centre = joining_centre(point, course, radius)
@@ -282,10 +282,10 @@ def joining(
     position: Point,
     course_flown: Scalar,
 ) -> Scalar:
-    """Side of the shorter joining circle onto a course at a point.
+    """Choose the side of the shorter joining circle onto a course at a point.
 
-    1 turns to the right, -1 to the left, 0 needs none. None is needed within `near`, m, and within
-    OPPOSITE of the course.
+    1 turns to the right, -1 to the left, and 0 means that none is needed. None is needed within
+    `near`, m, and within OPPOSITE of the course.
     """
     right_way, left_way = (
         joining_length(point, course, side * radius, position, course_flown) for side in (1.0, -1.0)
@@ -314,7 +314,7 @@ def is_joined(
 
 
 def outline(leg: Leg, start: Point) -> list[Point]:
-    """Points along a leg from the start, for drawing.
+    """Draw points along a leg from its start.
 
     They are at most 10 deg apart on an arc; an orbit is at least a full turn.
     """
@@ -333,7 +333,7 @@ def outline(leg: Leg, start: Point) -> list[Point]:
 
 
 def route_outline(route: Route) -> list[tuple[float, float, float]]:
-    """Points along a route, for drawing: north, east and altitude, m."""
+    """Draw points along a route: north, east and altitude, m."""
     points: list[tuple[float, float, float]] = []
     for number, leg in enumerate(route.legs):
         if isinstance(leg, Line):
@@ -349,7 +349,7 @@ def route_outline(route: Route) -> list[tuple[float, float, float]]:
 
 
 def lengths_after(route: Route) -> list[float]:
-    """Length of the legs after each leg, m, without the last orbit, which has no end."""
+    """Return the length of the legs after each leg, m, without the last orbit, which has no end."""
     lengths = []
     point = route.start(0)[0]
     for leg in route.legs[:-1]:
@@ -360,7 +360,7 @@ def lengths_after(route: Route) -> list[float]:
 
 
 def leg_places(route: Route) -> list[Point]:
-    """Where the number of each leg is drawn: the middle of a line or of an arc."""
+    """Return where the number of each leg is drawn: the middle of a line or of an arc."""
     places = []
     point = route.start(0)[0]
     for leg in route.legs:
@@ -375,7 +375,7 @@ def leg_places(route: Route) -> list[Point]:
 
 
 def distance_from(legs: Sequence[Leg], point: Point) -> float:
-    """Distance of a point from the lines, the fillets and the endless orbit of a route, m."""
+    """Return the distance of a point from lines, fillets and the endless orbit of a route, m."""
     distances = []
     for leg in legs:
         if isinstance(leg, Line):
@@ -397,7 +397,7 @@ def turns_back(leg: Leg, following: Leg | None) -> bool:
 
 
 def leads(legs: Sequence[Leg]) -> list[int]:
-    """Numbers of the waypoints at the ends of the legs of a route.
+    """Return the numbers of the waypoints at the ends of the legs of a route.
 
     A fillet at a waypoint leads to the next waypoint.
     """
@@ -410,7 +410,7 @@ def leads(legs: Sequence[Leg]) -> list[int]:
 
 
 class ShortLegError(ParameterError):
-    """A leg is too short for its fillets."""
+    """Raised if a leg is too short for its fillets."""
 
     def __init__(self, sentence: str, number: int) -> None:
         super().__init__(sentence)
@@ -424,11 +424,11 @@ def route(
     loiters: Mapping[int, Loiter] = MappingProxyType({}),
     left: Collection[int] = frozenset(),
 ) -> tuple[Leg, ...]:
-    """Legs through waypoints, then an orbit round the last waypoint.
+    """Plan legs through waypoints, then an orbit round the last waypoint.
 
-    The corners have fillets of a radius, m. A corner of the turn tau begins and ends radius tan(tau
-    / 2) from the waypoint; one beyond SHARPEST has no fillet. At a waypoint of `loiters`, by the
-    number, a circle round the waypoint takes the place of the fillet. Circles and the orbit are
+    The corners have fillets of a radius, m. A corner with the turn tau begins and ends radius
+    tan(tau / 2) from the waypoint; one beyond SHARPEST has no fillet. At a waypoint of `loiters`,
+    by number, a circle round the waypoint takes the place of the fillet. Circles and the orbit are
     clockwise, at the waypoints of `left` counter-clockwise. Lines touch them; a line too short for
     a tangent leads to the waypoint. Raises ParameterError for fewer than two waypoints, a radius
     below `least` (`lateral.least_radius`), a waypoint within the circle of a loiter, and circles of
@@ -445,7 +445,7 @@ def route(
     legs: list[Leg] = []
     first = 0
     last = len(waypoints) - 1
-    before = 0  # side of the circle before: 1 right, -1 left, 0 without a circle
+    before = 0  # side of the circle before: 1 right, -1 left, 0 if there is none
     for k in [*sorted(number for number in loiters if number < last), last]:
         side = -1 if k in left else 1
         if k > 0:
@@ -462,7 +462,7 @@ def route(
 
 
 def tangent(centres: tuple[Point, Point], radius: float, sides: tuple[int, int]) -> Line:
-    """The line from one circle to the next, each of a radius in m.
+    """Compute the line from one circle to the next, each of a radius in m.
 
     Sides are 1 for a clockwise circle, -1 for a counter-clockwise one, 0 for a point. With the
     bearing and the distance of the second centre from the first,
@@ -482,9 +482,10 @@ def tangent(centres: tuple[Point, Point], radius: float, sides: tuple[int, int])
 def _between_circles(
     waypoints: Sequence[Point], radius: float, first: int, sides: tuple[int, int]
 ) -> list[Leg]:
-    """Lines and fillets from a circle round the first waypoint onto one round the last.
+    """Plan lines and fillets from a circle round the first waypoint onto one round the last.
 
-    `sides` as of `tangent`; without a circle the first is 0. `first`: number of the first waypoint.
+    `sides` are as for `tangent`; the first is 0 if there is no circle. `first` is the number of the
+    first waypoint.
     """
     points = list(waypoints)
     if sides[0]:
@@ -510,9 +511,9 @@ def _between_circles(
 
 
 def filleted(waypoints: Sequence[Point], radius: float, first: int = 0) -> list[Leg]:
-    """Lines through waypoints, and the fillets in the corners.
+    """Plan lines through waypoints, with fillets in the corners.
 
-    `first`: number of the first waypoint. Raises as `route`.
+    `first` is the number of the first waypoint. Raises as `route` does.
     """
     turns = [0.0]
     for before, corner, after in zip(waypoints, waypoints[1:], waypoints[2:], strict=False):

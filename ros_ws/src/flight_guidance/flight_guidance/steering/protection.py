@@ -15,26 +15,26 @@ FLOOR = 1.15
 """Speed floor over the stall speed."""
 
 FASTEST = 1.4
-"""Largest airspeed over the trim speed where no limit of the aircraft is given."""
+"""Largest airspeed over the trim speed if no limit of the aircraft is given."""
 
 SHORTFALL = 0.05
-"""Largest error of V over the trim speed before the climb or sink is limited; at twice the value
+"""Largest error of V over the trim speed before the climb or sink is limited; at twice this value
 the limit is zero."""
 
 
 LEAST_SPEED = 0.1
-"""m/s, of a divisor: no aircraft flies there, and a flow from behind counts as none."""
+"""m/s, for a divisor: no aircraft flies there, and a flow from behind counts as none."""
 
 
 def forward(speed: Scalar) -> Scalar:
-    """A speed as a divisor, m/s: max(V, LEAST_SPEED)."""
+    """Make a speed usable as a divisor, m/s: max(V, LEAST_SPEED)."""
     return array_namespace(speed).maximum(speed, LEAST_SPEED)
 
 
 def bank_limit(limit: float, stall_speed: float, speed: Scalar) -> Scalar:
-    """Largest bank, rad: min(phi_max, acos((1.1 V_s / V)^2)).
+    """Compute the largest bank, rad: min(phi_max, acos((1.1 V_s / V)^2)).
 
-    The load factor of a level turn is 1 / cos(phi). The bank is 0 at a V of 1.1 V_s and below: the
+    The load factor of a level turn is 1 / cos(phi). At a V of 1.1 V_s and below the bank is 0: the
     wings are level.
     """
     xp = array_namespace(speed)
@@ -43,7 +43,7 @@ def bank_limit(limit: float, stall_speed: float, speed: Scalar) -> Scalar:
 
 
 def speed_floor(stall_speed: float) -> float:
-    """Least commanded speed, m/s: 1.15 V_s."""
+    """Compute the least speed that may be commanded, m/s: 1.15 V_s."""
     return FLOOR * stall_speed
 
 
@@ -53,20 +53,20 @@ def _share(value: Scalar) -> Scalar:
 
 
 def climb_limit(climb: float, sink: float, speed: Scalar, floor: float) -> Scalar:
-    """Largest climb rate, m/s: ratio climb - (1 - ratio) sink.
+    """Compute the largest climb rate, m/s: ratio climb - (1 - ratio) sink.
 
-    ratio = clip((V - 0.9 V_floor) / (0.1 V_floor), 0, 1). Below the floor pitch flies the speed: at
-    nine tenths of the floor the aircraft sinks at the largest rate.
+    ratio = clip((V - 0.9 V_floor) / (0.1 V_floor), 0, 1). Below the floor, pitch flies the speed:
+    at nine tenths of the floor the aircraft sinks at the largest rate.
     """
     ratio = _share((speed - 0.9 * floor) / (0.1 * floor))
     return ratio * climb - (1.0 - ratio) * sink
 
 
 def sink_limit(climb: float, sink: float, speed: Scalar, largest: float) -> Scalar:
-    """Least climb rate, m/s: (1 - ratio) climb - ratio sink.
+    """Compute the least climb rate, m/s: (1 - ratio) climb - ratio sink.
 
-    ratio = clip((1.1 V_max - V) / (0.1 V_max), 0, 1). The mirror of `climb_limit`: beyond the
-    largest airspeed pitch flies the speed.
+    ratio = clip((1.1 V_max - V) / (0.1 V_max), 0, 1). This mirrors `climb_limit`: beyond the
+    largest airspeed, pitch flies the speed.
     """
     ratio = _share((1.1 * largest - speed) / (0.1 * largest))
     return (1.0 - ratio) * climb - ratio * sink
@@ -75,14 +75,14 @@ def sink_limit(climb: float, sink: float, speed: Scalar, largest: float) -> Scal
 def climb_range(
     climb: float, sink: float, shortfall: Scalar, speed: float
 ) -> tuple[Scalar, Scalar]:
-    """Least and largest climb rate, m/s, by the shortfall V_c - V of the airspeed, m/s.
+    """Compute least and largest climb rate, m/s, from the shortfall V_c - V of the airspeed, m/s.
 
-    There is a shortfall since a throttle at the stop leaves V:
+    A shortfall arises when a throttle at its stop cannot hold V:
 
         -sink clip(2 + shortfall / d, 0, 1),  climb clip(2 - shortfall / d, 0, 1),
             d = max(0.05 V0, g climb / (0.4 V0))
 
-    `speed`: V0, m/s. With V_dot = -g climb / V the second term of d bounds the bandwidth of V by
+    `speed` is V0, m/s. With V_dot = -g climb / V, the second term of d bounds the bandwidth of V by
     climb to 0.4 rad/s.
     """
     margins = (max(SHORTFALL * speed, GRAVITY * rate / (0.4 * speed)) for rate in (sink, climb))

@@ -31,14 +31,14 @@ class VerticalParams(NamedTuple):
 
 
 def climb_for(error: Scalar, params: VerticalParams) -> Scalar:
-    """Climb rate for an error of altitude (command less altitude, m), in m/s.
+    """Compute the climb rate for an error of altitude (command less altitude, m), in m/s.
 
-    Within -sink and climb:
+    It stays within -sink and climb:
 
         k_h e  near,  sign(e) sqrt(a (abs(e) - e_l / 2))  from e_l = a / (2 k_h^2) on
 
-    The two branches and the slopes agree at e_l. Far away the climb rate falls by a/2 a second:
-    slow enough for the aircraft.
+    The two branches and their slopes agree at e_l. Far away the climb rate falls by a/2 a second,
+    slowly enough for the aircraft.
     """
     k_h = params.k_h
     a = params.acceleration
@@ -51,18 +51,19 @@ def climb_for(error: Scalar, params: VerticalParams) -> Scalar:
 
 
 def slewed(value: Scalar, target: Scalar, rate: float, dt: float) -> Scalar:
-    """A value moved towards a target by at most rate dt."""
+    """Move a value towards a target by at most rate dt."""
     return value + clip(target - value, rate * dt)
 
 
 def alpha_estimate(
     alpha: Scalar, theta: Scalar, climb: Scalar, speed: Scalar, dt: float, params: VerticalParams
 ) -> Scalar:
-    """Low-pass of theta - gamma a step later, gamma = asin(climb / V).
+    """Advance the low-pass of theta - gamma by a step, gamma = asin(climb / V).
 
         alpha+ = alpha + (1 - exp(-dt/T)) (theta - gamma - alpha)
 
-    The filter replaces an integrator: bumpless, without windup, right in any bank, speed or trim.
+    The filter replaces an integrator: it is bumpless, has no windup, and is right at any bank,
+    speed or trim.
     """
     return alpha + (1.0 - math.exp(-dt / params.alpha_time)) * (
         theta - path_angle(climb, speed) - alpha
@@ -70,21 +71,21 @@ def alpha_estimate(
 
 
 def pitch_for(climb: Scalar, speed: Scalar, alpha: Scalar) -> Scalar:
-    """Pitch for a climb rate, rad: theta_c = asin(climb / V) + alpha."""
+    """Compute the pitch for a climb rate, rad: theta_c = asin(climb / V) + alpha."""
     return path_angle(climb, speed) + alpha
 
 
 def climb_speed(error: Scalar, speed: Scalar) -> Scalar:
-    """Command of the airspeed over the target, m/s, for an error of the climb rate.
+    """Compute how much to raise the airspeed, m/s, for an error of the climb rate.
 
-    K V / (2 g) error, of an aircraft without an elevator. At a constant angle of attack the lift
-    goes with V^2, so h_ddot = 2 g dV / V, and the error decays at K = CLIMB_BANDWIDTH.
+    It is K V / (2 g) error, for an aircraft without an elevator. At a constant angle of attack the
+    lift grows with V^2, so h_ddot = 2 g dV / V, and the error decays at K = CLIMB_BANDWIDTH.
     """
     return CLIMB_BANDWIDTH * speed / (2.0 * GRAVITY) * error
 
 
 def path_lag(stall_speed: float, speed: float) -> float:
-    """Time constant of the flight path behind the pitch, s.
+    """Compute the time constant of the flight path behind the pitch, s.
 
         T_L = V alpha_1 / g,  alpha_1 = 0.3 rad (V_s / V)^2
 
@@ -95,5 +96,5 @@ def path_lag(stall_speed: float, speed: float) -> float:
 
 
 def path_angle(climb: Scalar, speed: Scalar) -> Scalar:
-    """Flight path angle in the air mass, rad: asin(climb / V)."""
+    """Compute the flight path angle in the air mass, rad: asin(climb / V)."""
     return array_namespace(climb).asin(clip(climb / forward(speed), 1.0))

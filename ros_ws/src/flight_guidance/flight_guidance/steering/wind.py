@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Wind: the velocity over ground less the velocity through the air.
 
-To the north and to the east.
+It is given to the north and to the east.
 """
 
 import math
@@ -10,17 +10,17 @@ import math
 from flight_core.vectors import Scalar, array_namespace
 
 WIND_TIME = 5.0
-"""Time constant of the estimated wind, s: long against a gust that the aircraft flies through,
-short against a leg."""
+"""Time constant of the estimated wind, s. It is long against a gust that the aircraft flies
+through, and short against a leg."""
 
 Wind = tuple[Scalar, Scalar]  # where the air moves to: north, east, m/s
 
 
 def wind_of(v_north: Scalar, v_east: Scalar, climb: Scalar, heading: Scalar, speed: Scalar) -> Wind:
-    """Wind from the velocity over ground and the airspeed, m/s.
+    """Compute the wind from the velocity over ground and the airspeed, m/s.
 
-    v_g - sqrt(V^2 - climb^2) [cos, sin](heading), with `heading` psi + beta, rad, the direction of
-    the flight through the air.
+    It is v_g - sqrt(V^2 - climb^2) [cos, sin](heading), where `heading` is psi + beta, rad, the
+    direction of the flight through the air.
     """
     xp = array_namespace(speed)
     level = xp.sqrt(xp.maximum(speed**2 - climb**2, 0.0))
@@ -28,9 +28,9 @@ def wind_of(v_north: Scalar, v_east: Scalar, climb: Scalar, heading: Scalar, spe
 
 
 def wind_estimate(wind: Wind, measured: Wind, dt: float) -> Wind:
-    """Low-pass of the wind a step later.
+    """Advance the low-pass of the wind by a step.
 
-    wind+ = wind + (1 - exp(-dt/T)) (measured - wind), T = WIND_TIME.
+    wind+ = wind + (1 - exp(-dt/T)) (measured - wind), T = WIND_TIME
     """
     share = 1.0 - math.exp(-dt / WIND_TIME)
     north, east = (
