@@ -27,7 +27,7 @@ NODES = ("controller", "guidance", "bridge", "aircraft")  # of an aircraft
 def start_middleware() -> None:
     """Start rclpy in the default context.
 
-    Raises ParameterError with the reason where the middleware does not start.
+    Raises ParameterError with the reason if the middleware does not start.
     """
     transport.prepare()
     try:
@@ -43,7 +43,7 @@ class Client:
     """A node in the default context.
 
     With a `parent` it is a node in the parent's context, whose cancellation ends the waits of both.
-    A context manager: the middleware always shuts down.
+    Use it as a context manager, so that the middleware always shuts down.
     """
 
     def __init__(
@@ -84,7 +84,7 @@ class Client:
     def _decoded(
         self, subscription: PolledSubscription | None, decode: Callable[[bytes], T]
     ) -> list[T]:
-        """The messages since the last call; none without a subscription."""
+        """Return the messages since the last call; none without a subscription."""
         if subscription is None:
             return []
         pairs = self._refused.decoded(subscription, subscription.take(), decode)
@@ -108,7 +108,7 @@ class Client:
             rclpy.spin_once(self._node, timeout_sec=0.02)
 
     def _elsewhere(self) -> list[str]:
-        """The namespaces of the aircraft in the graph where none is in this namespace.
+        """Name the namespaces of the aircraft in the graph if none is in this namespace.
 
         "/" is the root.
         """

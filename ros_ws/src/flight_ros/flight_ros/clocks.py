@@ -48,7 +48,7 @@ RESTART = "the system clock of this host was set between the starts of the two: 
 
 
 def number_of_host() -> float:
-    """A number of the boot of this host, which float64 holds; 0 where the system has none."""
+    """Return a number of this host's boot that float64 can hold; 0 if the system has none."""
     return float(int(BOOT_ID.read_text(encoding="ascii")[:8], 16)) if BOOT_ID.exists() else 0.0
 
 
@@ -102,16 +102,16 @@ class Peers:
             table.pop(name, None)
 
     def differences(self) -> dict[str, float]:
-        """The report of a node: the least difference of every peer.
+        """Return the report of a node: the least difference for every peer.
 
-        It has the figures for nodes of this host too.
+        It also has the figures for nodes of this host.
         """
         return {HOST: self._host, AHEAD: self.ahead} | {
             name: min(seen) for name, seen in self._seen.items()
         }
 
     def clocks(self) -> dict[str, ClockOfPeer]:
-        """The clocks of the nodes that have reported."""
+        """Return the clocks of the nodes that have reported."""
         seen = self.differences()
         clocks = {
             name: ClockOfPeer((reported - seen[name]) / 2.0, (reported + seen[name]) / 2.0)
@@ -136,9 +136,9 @@ class PeerClocks:
         self._decoder = NamedDecoder()
 
     def exchange(self, ahead_ns: int) -> None:
-        """Once a second: take the reports, send a report.
+        """Take the reports and send one, once a second.
 
-        `ahead_ns`: the system clock less the time of the node.
+        `ahead_ns` is the system clock less the time of the node.
         """
         self._peers.ahead = (time.time_ns() - ahead_ns - time.monotonic_ns()) / NANOSECONDS
         for sample, received in self._refusals.decoded(
@@ -152,17 +152,17 @@ class PeerClocks:
         self._publish(encoder.encode(time.time_ns() - ahead_ns, np.array([*differences.values()])))
 
     def received(self) -> list[str]:
-        """The received peers."""
+        """Name the peers that were received."""
         return [name for name in self._peers.differences() if name.startswith("/")]
 
     def clocks(self) -> dict[str, ClockOfPeer]:
-        """The clocks of the peers."""
+        """Return the clocks of the peers."""
         return self._peers.clocks()
 
     def sentence_on(self, sender: str) -> str:
-        """The end of a sentence on a stamp of a node whose clock differs.
+        """End a sentence on the stamp of a node whose clock differs.
 
-        Empty without a known difference.
+        Returns "" if no difference is known.
         """
         clock = self.clocks().get(sender)
         return (
@@ -172,7 +172,7 @@ class PeerClocks:
         )
 
     def report(self) -> dict[str, object]:
-        """For the diagnostics."""
+        """Return the clocks for the diagnostics."""
         report: dict[str, object] = {}
         for name, clock in sorted(self.clocks().items()):
             report |= {
@@ -182,7 +182,7 @@ class PeerClocks:
         return report
 
     def news(self) -> list[str]:
-        """A sentence for every clock with a new difference, or without a difference again."""
+        """Write a sentence for every clock that begins to differ, or that agrees again."""
         sentences = []
         for name, clock in self.clocks().items():
             offset = clock.offset if abs(clock.offset) > DIFFERS else 0.0

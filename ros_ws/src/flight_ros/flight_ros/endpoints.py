@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compatibility of the publishers and subscribers of a topic.
 
-Message type and quality of service (QoS) have to match.
+Message type and quality of service (QoS) must match.
 """
 
 import os
@@ -28,16 +28,16 @@ LOG_PERIOD_NS = 5 * NANOSECONDS  # between two lines on one mismatch
 
 
 def type_name(message: type) -> str:
-    """Name of a message class in the ROS graph, e.g. sensor_msgs/msg/JointState."""
+    """Return the name of a message class in the ROS graph, such as sensor_msgs/msg/JointState."""
     return f"{message.__module__.split('.')[0]}/msg/{message.__name__}"
 
 
 def require_no_publishers(
     node: Node, topics: Iterable[str], expected: str, duration: float = 0.0
 ) -> None:
-    """Raise ParameterError where a topic has a publisher already.
+    """Raise ParameterError if a topic already has a publisher.
 
-    `duration`, s: to discover the publishers.
+    `duration`, s, is the time to discover publishers.
     """
     end = time.monotonic() + duration
     names = [node.resolve_topic_name(topic) for topic in topics]
@@ -52,9 +52,9 @@ def require_no_publishers(
 
 
 def mismatch(peer: TopicEndpointInfo, message_type: str, qos: QoSProfile) -> str:
-    """Why a peer exchanges no messages with a local endpoint of this message type and QoS.
+    """Say why a peer exchanges no messages with a local endpoint of this message type and QoS.
 
-    Empty if both match.
+    Returns "" if both match.
     """
     node = f"{peer.node_namespace.rstrip('/')}/{peer.node_name}"
     publishes = peer.endpoint_type == TopicEndpointTypeEnum.PUBLISHER
@@ -70,20 +70,20 @@ def mismatch(peer: TopicEndpointInfo, message_type: str, qos: QoSProfile) -> str
 
 
 class EndpointMonitor:
-    """Logs an error for each peer of a node that does not match: the topic would stay silent."""
+    """Logs an error for each peer of a node that does not match: its topic would stay silent."""
 
     def __init__(self, node: Node) -> None:
         self._node = node
         self._throttle = Throttle(LOG_PERIOD_NS)
 
     def mismatches(self, subscription: PolledSubscription) -> list[str]:
-        """A sentence for every publisher with a type or QoS unfit for a subscription."""
+        """Write a sentence for every publisher whose type or QoS does not fit a subscription."""
         kind = type_name(subscription.topic.type)
         peers = self._node.get_publishers_info_by_topic(subscription.name)
         return [sentence for peer in peers if (sentence := mismatch(peer, kind, subscription.qos))]
 
     def unexpected(self, subscription: PolledSubscription) -> str:
-        """A sentence where nodes of several names publish a topic of a single node; else empty.
+        """Write a sentence if nodes of several names publish a topic of a single node; else "".
 
         A restarted node keeps the name.
         """

@@ -123,9 +123,9 @@ def _make_nodes(
 
 
 def _run_to_end(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> int | None:
-    """Run nodes. Returns the exit status.
+    """Run nodes, and return the exit status.
 
-    None: nodes with the same parameters are to begin again.
+    None means that nodes with the same parameters must begin again.
     """
     node = nodes[0]
     status: int | None = 0
@@ -168,7 +168,7 @@ def _run_to_end(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> int | None:
 
 
 def _serve(executor: SingleThreadedExecutor, node: FlightNode[Any], until_ns: int = 0) -> None:
-    """Serve a pending request, and further requests until an instant of the monotonic clock."""
+    """Serve a pending request, and more requests until an instant of the monotonic clock."""
     while True:
         if (execute := ready_callback(executor)) is None:
             return
@@ -251,10 +251,11 @@ def _run_lockstep(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> None:
 
 
 def require_input(nodes: Sequence[FlightNode[Any]], advance_ns: int, has_begun: bool) -> None:
-    """Raise FlightEnded where a lockstep flight waits for ever.
+    """Raise FlightEnded if a lockstep flight would wait for ever.
 
-    It waits for a sample that was refused, or for its first one. `advance_ns`: when it last
-    advanced. A flight that began waits for a peer that is stopped, for instance in a debugger.
+    It may wait for a sample that was refused, or for its first one. `advance_ns` is when it last
+    advanced. A flight that has begun may wait for a peer that is stopped, for example in a
+    debugger.
     """
     for node in nodes:
         topic = node.awaited_topic()
@@ -290,16 +291,16 @@ class RealTime:
         self._after_each = 1  # reports after each tick
 
     def run_due_tick(self) -> bool:
-        """Run the newest due tick. Returns whether there was a tick."""
+        """Run the newest due tick, and return whether there was one."""
         if (tick := self.ticker.due()) is None:
             return False
         self.node.run_tick(tick, self._start_ns + tick.number * self.ticker.period_ns)
         return True
 
     def report(self) -> None:
-        """Do the next reports, some after a tick.
+        """Do the next reports, some after each tick.
 
-        The reports together may exceed a period of 2 ms.
+        Together they may exceed a period of 2 ms.
         """
         now_ns = time.monotonic_ns()
         if now_ns >= self._report_ns:
@@ -318,7 +319,7 @@ class RealTime:
 def _start_instants(
     nodes: Sequence[FlightNode[Any]], executor: SingleThreadedExecutor, stop: _Stop
 ) -> list[int]:
-    """The starts of the nodes, ns of the system clock, once known; none after a signal."""
+    """Return the starts of the nodes, ns of the system clock, once known; none after a signal."""
     starts: dict[FlightNode[Any], int] = {}
     waiting = [node for node in nodes if node.waits_for_start()]
     while not stop.is_requested:
@@ -338,9 +339,9 @@ def _start_instants(
 
 
 def _run_real_time(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> None:
-    """Run nodes in a thread, a tick at a time.
+    """Run nodes in one thread, a tick at a time.
 
-    Of several due nodes the first node's, by the order of the nodes.
+    If several nodes are due, the first one in their order goes first.
     """
     executor = _start(nodes)
     starts = _start_instants(nodes, executor, stop)

@@ -115,11 +115,11 @@ class FlightNode(Node, Generic[P]):
     # Defined by a subclass
 
     def period_ns(self) -> int:
-        """The period of the ticks."""
+        """Return the period of the ticks."""
         raise NotImplementedError
 
     def inputs(self) -> Sequence[PolledSubscription]:
-        """Real time: the subscriptions without whose publishers a flight does not begin."""
+        """Return the subscriptions that need a publisher before a flight begins in real time."""
         return ()
 
     def waits_for_start(self) -> bool:
@@ -131,10 +131,10 @@ class FlightNode(Node, Generic[P]):
         return self.host is not self.simulated or self.simulated.known()
 
     def start_ns(self) -> int | None:
-        """System time of tick 0, ns: the parameter `start_time`.
+        """Return the system time of tick 0, ns, by the parameter `start_time`.
 
-        Where it is -1 the topic `start`, None before its message. Where it is 0 the next whole
-        period of the system clock, so that nodes of equal rates tick together.
+        If it is -1, the topic `start` gives it, or None before its message. If it is 0, it is the
+        next whole period of the system clock, so that nodes of equal rates tick together.
         """
         start_time = getattr(self.parameters, "start_time", 0.0)
         if start_time < 0.0:
@@ -142,28 +142,28 @@ class FlightNode(Node, Generic[P]):
         return nanoseconds(start_time) or self.next_period_ns()
 
     def tick(self, tick: Tick, now_ns: int) -> None:
-        """One tick; `now_ns` is the nominal instant of tick.number on the system clock's scale."""
+        """Do a tick; `now_ns` is the nominal instant of tick.number on the system clock's scale."""
         raise NotImplementedError
 
     def advance(self) -> bool:
-        """Lockstep: take every step with its messages. Returns whether there was a step."""
+        """Take every lockstep step whose messages have come, and return whether there was one."""
         raise NotImplementedError
 
     def awaited_topic(self) -> str:
-        """Lockstep: the topic whose next message this node waits for; empty for none."""
+        """Name the topic for whose next message this node waits in lockstep; "" for none."""
         return ""
 
     def status(self) -> tuple[bytes, str, dict[str, object]]:
-        """Level, sentence and further values of the 1 Hz diagnostics."""
+        """Return level, sentence and more values for the 1 Hz diagnostics."""
         return DiagnosticStatus.OK, "running", {}
 
     def close(self) -> None:
-        """Called once when the node ends, also after an error."""
+        """Clean up, once, when the node ends, also after an error."""
 
     def on_parameters(self, parameters: P) -> None:
-        """Called with a valid new set in flight, before it becomes `self.parameters`.
+        """Take a valid new set in flight, before it becomes `self.parameters`.
 
-        A ParameterError refuses it.
+        Raise ParameterError to refuse it.
         """
 
     # Used by a subclass
@@ -178,7 +178,7 @@ class FlightNode(Node, Generic[P]):
         return super().create_publisher(*args, event_callbacks=quiet, **kwargs)
 
     def next_period_ns(self) -> int:
-        """The next whole period of the system clock, ns."""
+        """Return the next whole period of the system clock, ns."""
         now_ns = self.host.time_ns()
         period_ns = self.period_ns()
         return now_ns - now_ns % period_ns + period_ns
@@ -216,7 +216,7 @@ class FlightNode(Node, Generic[P]):
     ) -> Receiver[S]:
         """Create a subscription with its `Receiver`.
 
-        Overruns of this node are no silence of the publisher.
+        If this node overruns, the publisher is not blamed for the silence.
         """
         subscription = self.subscribe(topic, qos)
         receiver = Receiver(
@@ -232,32 +232,32 @@ class FlightNode(Node, Generic[P]):
         return receiver
 
     def publisher_lock(self, timeouts_ns: Callable[[], tuple[int, int]]) -> PublisherLock:
-        """Create the lock of a topic. In lockstep it holds for good, without the timeouts."""
+        """Create the lock of a topic; in lockstep it holds for good, without the timeouts."""
         return LockstepLock() if self.parameters.lockstep else PublisherLock(timeouts_ns)
 
     def encoder(self, names: Sequence[str]) -> Encoder:
-        """Encoder of the samples of the node."""
+        """Create an encoder for the samples of the node."""
         return Encoder(names, self.instance)
 
     def now_ns(self) -> int:
-        """The time of the ticks, ns.
+        """Return the time of the ticks, ns.
 
         It is the system clock at the start plus the monotonic time since then.
         """
         return self.host.monotonic_ns() + self.time_offset_ns
 
     def clock_step_ns(self) -> int:
-        """How far the system clock is ahead of the time of the ticks, ns.
+        """Return how far the system clock is ahead of the time of the ticks, ns.
 
-        0 for less than CLOCK_STEP_NS, which is no step.
+        It is 0 for less than CLOCK_STEP_NS, which is no step.
         """
         step_ns = self.host.time_ns() - self.now_ns()
         return step_ns if abs(step_ns) > CLOCK_STEP_NS else 0
 
     def adopt(self, parameters: P) -> None:
-        """Replace the parameters by a valid set of the node's own choice.
+        """Replace the parameters by a valid set that the node itself has chosen.
 
-        A parameter event tells of it; there is no check.
+        A parameter event reports it; there is no check.
         """
         before, after = (
             dict(flatten(values.model_dump())) for values in (self.parameters, parameters)
@@ -277,7 +277,7 @@ class FlightNode(Node, Generic[P]):
         self.set_parameters_atomically(changes)
 
     def clock_of(self, sender: str) -> str:
-        """The end of a sentence on the stamp of a node whose clock differs; else empty."""
+        """End a sentence on the stamp of a node whose clock differs; "" if it does not."""
         return "" if self.clocks is None else self.clocks.sentence_on(sender)
 
     def warn_no_publisher(
@@ -335,7 +335,7 @@ class FlightNode(Node, Generic[P]):
     # Called by the event loop
 
     def _received_start_ns(self) -> int | None:
-        """The instant on the topic `start`, ns. An old instant is of an earlier flight."""
+        """Return the instant on the topic `start`, ns; an old one is of an earlier flight."""
         if self._start_subscription is None:
             return None
         if messages := self._start_subscription.take():
@@ -345,7 +345,7 @@ class FlightNode(Node, Generic[P]):
         return next((stamp_ns for stamp_ns in instants if stamp_ns > oldest_ns), None)
 
     def match(self) -> None:
-        """Real time: publish once when every input has a publisher."""
+        """Publish, once and in real time, that every input has a publisher."""
         awaited = [
             *self.inputs(),
             *([self._start_subscription] if self._start_subscription is not None else []),
@@ -357,7 +357,7 @@ class FlightNode(Node, Generic[P]):
             self.publish_state(NodeState.MATCHED)
 
     def run_tick(self, tick: Tick, now_ns: int) -> None:
-        """Run a tick; measure the period, the compute time and the overruns."""
+        """Run a tick, and measure the period, the compute time and the overruns."""
         self._tick_times.begin(tick)
         for receiver in self.receivers:
             if receiver.lock is not None:
@@ -387,7 +387,8 @@ class FlightNode(Node, Generic[P]):
     def compare_clocks(self) -> None:
         """Exchange the clocks of the nodes.
 
-        Log a warning where a clock begins to differ from the node's own, and once it agrees.
+        A warning is logged when a clock begins to differ from the node's own, and when it agrees
+        again.
         """
         if self.clocks is not None:
             self.clocks.exchange(time.time_ns() - self.now_ns())
@@ -395,15 +396,16 @@ class FlightNode(Node, Generic[P]):
                 self.get_logger().warning(sentence)
 
     def warn_without_time(self) -> None:
-        """In simulated time: log a warning while no /clock comes."""
+        """Log a warning while no /clock comes in simulated time."""
         if self.simulated is not None and self.simulated.silent():
             self.warn_no_publisher(self.simulated.subscription)
 
     def graph_checks(self) -> list[Callable[[], None]]:
-        """Checks of the graph, a topic each.
+        """Return the checks of the graph, one per topic.
 
-        To ask the middleware for all topics takes about a period of 2 ms. The checks log an error
-        for a peer with a wrong message type or incompatible QoS: its topic would stay silent.
+        Asking the middleware about all topics at once takes about a period of 2 ms. The checks log
+        an error for a peer with a wrong message type or an incompatible QoS, whose topic would stay
+        silent.
         """
         return [
             *(
@@ -423,7 +425,7 @@ class FlightNode(Node, Generic[P]):
     def require_flight(self) -> None:
         """Raise FlightEnded after the loss of a peer of a lockstep flight.
 
-        The other peers get a report of the loss. In simulated time raise ClockRestarted after a
+        The other peers get a report of the loss. In simulated time, raise ClockRestarted after a
         jump of /clock.
         """
         if self.simulated is not None:

@@ -18,8 +18,8 @@ from flight_ros.rclpy_private import take_messages
 from flight_ros.topics import LIVELINESS, NODES
 
 SHUTDOWN_GRACE_NS = 600_000_000
-"""Time for the report of a peer to arrive that shuts down because it lost a role. A peer of another
-cause sends no report."""
+"""Time for the report of a peer to arrive that shuts down because it lost a role. A peer that ends
+for another reason sends no report."""
 
 REPORT_TIMEOUT = Duration(seconds=0.2)
 """Longest wait until all peers have a report, after which the node ends. The lost peer never
@@ -29,12 +29,12 @@ ROLES = NODES[:-1]  # a bridge flies in real time alone
 
 
 class LivelinessMonitor:
-    """Asserts the liveliness of a node on `alive/<role>` and monitors the further roles.
+    """Asserts the liveliness of a node on `alive/<role>` and monitors the other roles.
 
     The middleware sends the heartbeats. It reports the end of a process within the lease duration
     of `LIVELINESS`, or within that of the participant, two seconds, if the process ended before its
-    first heartbeat. A role is lost after an appearance alone: a flight can run without a recorder.
-    The only message of a role is a report: the name of the lost role.
+    first heartbeat. A role can be lost only after it has appeared, because a flight can run without
+    a recorder. The only message of a role is a report: the name of the lost role.
     """
 
     def __init__(self, node: Node, role: str) -> None:
@@ -60,10 +60,10 @@ class LivelinessMonitor:
         ]
 
     def lost(self) -> str:
-        """The lost role; empty without one.
+        """Name the lost role; "" if there is none.
 
-        After a clean shutdown a role is lost after SHUTDOWN_GRACE_NS, unless a report names the
-        role with the first end.
+        After a clean shutdown a role counts as lost after SHUTDOWN_GRACE_NS, unless a report names
+        the role that ended first.
         """
         # the executor may serve a report later than the end of its publisher
         for subscription in self._subscriptions:
@@ -74,7 +74,7 @@ class LivelinessMonitor:
         return self._left
 
     def report(self, role: str) -> None:
-        """Publish the lost role, so that the peers name the role with the first end."""
+        """Publish the lost role, so that the peers name the role that ended first."""
         self._publisher.publish(String(data=role))
         self._publisher.wait_for_all_acked(REPORT_TIMEOUT)
 

@@ -32,7 +32,7 @@ class LockstepInputs:
         receive_other: Callable[[], Iterable[StampedVector | None]],
         is_ready: Callable[[int], bool] = lambda now_ns: True,
     ) -> None:
-        """`is_ready` tells of an instant of a step whether what else the step needs has arrived."""
+        """Take the inputs; `is_ready` tells whether what else a step needs has come."""
         self._is_ready = is_ready
         self._y_period_ns = y_period_ns
         self._period_ns = period_ns
@@ -43,7 +43,7 @@ class LockstepInputs:
         self._others_due: deque[StampedVector] = deque()
 
     def complete(self) -> Iterator[Instant]:
-        """The instants whose inputs have arrived, in their order, each once."""
+        """Yield the instants whose inputs have arrived, in their order, each once."""
         if not self._y_due:
             self._y_due.extend(self._receive_y())
         self._others_due.extend(sample for sample in self._receive_other() if sample is not None)

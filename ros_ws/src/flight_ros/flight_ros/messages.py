@@ -43,7 +43,7 @@ NO_CHANNELS: FloatArray = np.zeros(0)
 def to_message(
     stamp_ns: int, names: Sequence[str], values: FloatArray, frame_id: str
 ) -> JointState:
-    """A named vector as a message. `frame_id` carries the publisher's instance."""
+    """Write a named vector as a message; `frame_id` carries the publisher's instance."""
     message = JointState()
     message.header.stamp = Time(sec=stamp_ns // NANOSECONDS, nanosec=stamp_ns % NANOSECONDS)
     message.header.frame_id = frame_id
@@ -53,7 +53,7 @@ def to_message(
 
 
 def from_message(message: JointState, channels: Sequence[str]) -> StampedVector:
-    """Some channels of a message, in the order of `channels`.
+    """Read some channels of a message, in the order of `channels`.
 
     Raises ChannelError for invalid names, lengths or values.
     """
@@ -97,7 +97,7 @@ class Encoder:
         self._bytes += encoded
 
     def encode(self, stamp_ns: int, values: FloatArray) -> bytes:
-        """The message of a sample; values in the order of the names."""
+        """Write the message of a sample; values are in the order of the names."""
         STAMP.pack_into(self._bytes, STAMP_PLACE, *divmod(stamp_ns, NANOSECONDS))
         self._bytes[self._values] = values.tobytes()
         return bytes(self._bytes)
@@ -115,7 +115,7 @@ class Decoder:
         self._sender = ""
 
     def decode(self, raw: bytes) -> StampedVector | None:
-        """The sample; None for a vector without channels.
+        """Read the sample; None for a vector without channels.
 
         Raises ChannelError for an invalid message.
         """
@@ -169,7 +169,7 @@ class NamedDecoder:
     """
 
     def decode(self, raw: bytes) -> NamedSample:
-        """The sample. Raises ChannelError for an invalid message."""
+        """Read the sample. Raises ChannelError for an invalid message."""
         message = _message(raw)
         sample = from_message(message, message.name)
         names = list(message.name)
@@ -181,9 +181,9 @@ class NamedDecoder:
 
 
 def sender_of(raw: bytes) -> str | None:
-    """The publisher of a message that begins with a header, read without decoding names and values.
+    """Read the publisher of a message that begins with a header, without the names and values.
 
-    None for bytes that are too short, or not plain CDR.
+    Returns None if the bytes are too short, or not plain CDR.
     """
     if len(raw) < FRAME_ID_PLACE or (order := BYTE_ORDERS.get(raw[:2])) is None:
         return None
@@ -192,7 +192,7 @@ def sender_of(raw: bytes) -> str | None:
 
 
 def stamp_of(raw: bytes) -> int:
-    """The stamp at the begin of a message, ns. Raises ChannelError, reason "malformed"."""
+    """Read the stamp at the beginning of a message, ns, or raise ChannelError, "malformed"."""
     order = BYTE_ORDERS.get(raw[:2])
     if order is None or len(raw) < LENGTH_PLACE:
         raise ChannelError(
@@ -204,7 +204,7 @@ def stamp_of(raw: bytes) -> int:
 
 
 def instant(stamp_ns: int) -> bytes:
-    """A message that contains an instant alone: rosgraph_msgs/Clock, builtin_interfaces/Time."""
+    """Write a message with only an instant: rosgraph_msgs/Clock, builtin_interfaces/Time."""
     return ENCAPSULATION + STAMP.pack(*divmod(stamp_ns, NANOSECONDS))
 
 

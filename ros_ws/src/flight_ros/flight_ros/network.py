@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Profile of the middleware for nodes on several hosts.
 
-It is unicast over UDP between the addresses of the hosts alone.
+It is unicast over UDP, only between the addresses of the hosts.
 """
 
 import ipaddress
@@ -21,7 +21,7 @@ PORTS_A_DOMAIN = 250  # section 9.6.1.1
 
 
 def addresses(text: str) -> tuple[str, ...]:
-    """The addresses of the hosts, from "10.0.0.1,10.0.0.2". Raises ParameterError."""
+    """Read the addresses of the hosts from "10.0.0.1,10.0.0.2". Raises ParameterError."""
     hosts = tuple(part.strip() for part in text.split(","))
     for address in hosts:
         try:
@@ -42,7 +42,7 @@ def addresses(text: str) -> tuple[str, ...]:
 
 
 def own_address(peers: Sequence[str], local: Collection[str]) -> str:
-    """The address of this host among the peers, by the addresses of its interfaces.
+    """Find the address of this host among the peers, by the addresses of its interfaces.
 
     Raises ParameterError.
     """
@@ -58,7 +58,7 @@ def own_address(peers: Sequence[str], local: Collection[str]) -> str:
 
 
 def network_profile(own_host: str, peers: Sequence[str]) -> str:
-    """The loopback profile with the address of this host in place of 127.0.0.1.
+    """Write the loopback profile with the address of this host in place of 127.0.0.1.
 
     The hosts are its initial peers.
     """
@@ -92,6 +92,6 @@ def network_profile(own_host: str, peers: Sequence[str]) -> str:
 
 
 def ports(domain: int) -> tuple[int, int]:
-    """The first and the last UDP port of a domain."""
+    """Return the first and the last UDP port of a domain."""
     first = FIRST_PORT + PORTS_A_DOMAIN * domain
     return first, first + PORTS_A_DOMAIN - 1

@@ -23,7 +23,7 @@ from flight_core.text import bounded
 
 P = TypeVar("P", bound=NodeConfig)
 AT_RESTART = "a change at a restart only"
-"""What is expected of the parameters `learned`, from all but the node itself."""
+"""What is expected of the parameters `learned` from everybody but the node itself."""
 
 
 def read_parameters(node: Node, schema: type[P]) -> P:
@@ -77,10 +77,10 @@ def read_parameters(node: Node, schema: type[P]) -> P:
 def _without_global(
     node: Node, overrides: dict[str, Any], schema: type[NodeConfig]
 ) -> dict[str, Any]:
-    """The overrides without the parameters for all nodes that this node does not know.
+    """Drop the parameters given to all nodes that this node does not know.
 
-    The node undeclares these, as a node of ROS declares none of them. A parameter from a section
-    for this node stays, and is refused if it is unknown.
+    The node undeclares them, as a node of ROS declares none of them. A parameter from a section for
+    this node stays, and is refused if it is unknown.
     """
     known = schema.keys_beside(overrides)
     foreign = [key for key in overrides if key not in known and _is_global(node, key, sys.argv)]
@@ -126,7 +126,7 @@ def _require_no_octal(arguments: Sequence[str]) -> None:
 
 
 def changed(node: Node, parameters: P, changes: list[Parameter]) -> P:
-    """The set with some parameters changed, validated as a whole.
+    """Change some parameters of a set, and validate it as a whole.
 
     Raises ParameterError, also for a parameter of `learned`.
     """
@@ -151,7 +151,7 @@ def _overrides(node: Node) -> dict[str, Any]:
 
 
 def _as_list(value: Any) -> Any:
-    """A sequence as a list; any other value unchanged."""
+    """Return a sequence as a list; any other value unchanged."""
     return (
         value
         if isinstance(value, str | bytes | Mapping) or not hasattr(value, "__iter__")

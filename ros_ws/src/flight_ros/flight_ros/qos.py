@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Quality of service (QoS) of recorded topics.
 
-The strongest compatible profile, and rosbag2's form of offered profiles.
+It has the strongest compatible profile, and rosbag2's form of offered profiles.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ INFINITE_NS = 2**63 - 1  # rmw: RMW_DURATION_INFINITE
 
 
 def strongest_compatible(offered: Sequence[QoSProfile]) -> QoSProfile:
-    """The strongest profile that is compatible with all offered ones."""
+    """Return the strongest profile that is compatible with all offered ones."""
     reliable = all(profile.reliability == ReliabilityPolicy.RELIABLE for profile in offered)
     durable = reliable and all(
         profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for profile in offered
@@ -30,7 +30,7 @@ def strongest_compatible(offered: Sequence[QoSProfile]) -> QoSProfile:
 
 
 def rosbag2_profiles(offered: Sequence[QoSProfile]) -> list[dict[str, object]]:
-    """Profiles as rosbag2 stores them."""
+    """Write profiles as rosbag2 stores them."""
     return [
         {
             "history": qos.history.short_key,

@@ -35,19 +35,19 @@ ARGUMENT_ERRORS = (
 def create_participant(name: str, context: Context) -> Participant:
     """Create a node without topics, parameters or services.
 
-    Its process has a DDS participant then.
+    Its process then has a DDS participant.
     """
     with context.handle:
         return _rclpy.Node(name, "", context.handle, None, False, False)
 
 
 def destroy_participant(participant: Participant) -> None:
-    """Destroy it."""
+    """Destroy a participant."""
     participant.destroy_when_not_in_use()
 
 
 def take_messages(subscription: Subscription, limit: int) -> list[tuple[Any, Any]]:
-    """At most `limit` messages (or their bytes) with their metadata, oldest first.
+    """Take at most `limit` messages (or their bytes) with their metadata, oldest first.
 
     No executor takes part.
     """
@@ -105,8 +105,8 @@ def answer_invalid_transitions(node: Node) -> None:
 def refuse_foreign_parameters(node: Node) -> None:
     """Let a node refuse a request with an unknown parameter as a whole.
 
-    `ros2 param load` joins the sections of all nodes of a file. Without the refusal a node takes
-    the values of shared names, for example an age limit, from the section of a further node.
+    `ros2 param load` joins the sections of all nodes of a file. Without the refusal, a node would
+    take the values of names it shares, such as an age limit, from the section of another node.
     """
     (service,) = (
         service for service in node.services if service.srv_name.endswith("/set_parameters")
@@ -134,9 +134,9 @@ def refuse_foreign_parameters(node: Node) -> None:
 
 
 def ready_callback(executor: SingleThreadedExecutor) -> Callable[[], None] | None:
-    """A callback that is ready, None if there is none, without blocking.
+    """Return a callback that is ready, or None, without blocking.
 
-    Its call raises what the callback raises.
+    Calling it raises what the callback raises.
     """
     try:
         handler, _, _ = executor.wait_for_ready_callbacks(0, None, lambda: False)

@@ -31,15 +31,15 @@ FEWEST = 3  # samples within an age limit: one of them may be late, and one lost
 
 
 class Sample(Protocol):
-    """What a receiver needs of a decoded message."""
+    """What a receiver needs to know of a decoded message."""
 
     @property
     def stamp_ns(self) -> int:
-        """The instant to which the sample belongs."""
+        """Instant to which the sample belongs."""
 
     @property
     def sender(self) -> str:
-        """The publisher."""
+        """Publisher."""
 
 
 S = TypeVar("S", bound=Sample)
@@ -89,9 +89,9 @@ class Refusals:
         messages: Iterable[ReceivedMessage],
         decode: Callable[[bytes], T],
     ) -> list[tuple[T, ReceivedMessage]]:
-        """Decoded messages with their metadata.
+        """Decode messages, and return them with their metadata.
 
-        A message is refused where `decode` raises ChannelError.
+        A message is refused if `decode` raises ChannelError.
         """
         pairs = []
         for received in messages:
@@ -124,9 +124,9 @@ class Refusals:
         return stamps
 
     def since(self, subscription: PolledSubscription, begin_ns: int) -> str:
-        """The last refusal of a topic since an instant of the monotonic clock.
+        """Return the last refusal of a topic since an instant of the monotonic clock.
 
-        It has age and count; empty without one.
+        It has age and count, and is "" if there was none.
         """
         refused_ns, sentence = self.last.get(subscription.name, (0, ""))
         if not sentence or refused_ns < begin_ns:
@@ -138,9 +138,9 @@ class Refusals:
         return f"{count} samples refused, the last {age:.1f} s ago: {sentence}"
 
     def conflict(self) -> str:
-        """The last sample of a conflicting publisher since the last call, as a sentence.
+        """Return the last sample of a conflicting publisher since the last call, as a sentence.
 
-        Empty without a conflict.
+        Returns "" if there was no conflict.
         """
         sentence = self._conflict
         self._conflict = ""
@@ -150,14 +150,14 @@ class Refusals:
 class Receiver(Generic[S]):
     """The samples of a topic. Checks go from cheap to costly: size, publisher, content, stamp.
 
-    A message too long, or of a conflicting publisher, is refused without decoding names and
-    values: a flood of these messages costs no more than valid messages. Under the name of the
-    locked publisher, too long is GROWTH times the longest valid message, until the publisher times
-    out. `decode` returns None for a vector without channels. `take` gets a sample and the present
-    instant. `lock` admits one publisher at a time; None admits each. `max_age_ns` limits the age of
-    a stamp and the lead over the clock; None is for a sender without the clock of the flight.
-    `max_size` in bytes is for a topic of reports, whose lengths differ by more than GROWTH; None is
-    for one of samples. Refusals are raised as ChannelError.
+    A message that is too long, or from a conflicting publisher, is refused without decoding names
+    and values, so that a flood of such messages costs no more than valid ones. Under the name of
+    the locked publisher, too long means GROWTH times the longest valid message, until the publisher
+    times out. `decode` returns None for a vector without channels. `take` gets a sample and the
+    present instant. `lock` admits one publisher at a time; None admits every one. `max_age_ns`
+    limits the age of a stamp and its lead over the clock; None is for a sender without the clock of
+    the flight. `max_size` in bytes is for a topic of reports, whose lengths differ by more than
+    GROWTH; None is for one of samples. Refusals are raised as ChannelError.
     """
 
     def __init__(
@@ -184,7 +184,7 @@ class Receiver(Generic[S]):
 
     @property
     def name(self) -> str:
-        """The full name of the topic."""
+        """Full name of the topic."""
         return self.subscription.name
 
     def poll(self, now_ns: int, limit: int | None = None) -> list[bool]:
@@ -237,9 +237,9 @@ class Receiver(Generic[S]):
         return sender
 
     def slowness(self, max_age_ns: int) -> str:
-        """Why samples at their rate exceed an age limit at times, as a sentence.
+        """Say why samples at their rate exceed an age limit at times, in a sentence.
 
-        Empty where FEWEST of them fit.
+        Returns "" if FEWEST of them fit.
         """
         if (
             len(self._stamps_ns) < RECENT
@@ -259,7 +259,7 @@ class Receiver(Generic[S]):
         return f"{slow}: {mend}" if fit < FEWEST else ""
 
     def receive(self) -> list[S | None]:
-        """Lockstep: decode the messages of the flight's publisher, for `accept`.
+        """Decode the messages of the flight's publisher in lockstep, for `accept`.
 
         None is an instant without a sample: the publisher sent no channels, or content that is
         refused. A message of anybody else has no effect, because each message is an instant.
@@ -286,9 +286,9 @@ class Receiver(Generic[S]):
         return samples
 
     def _require_next(self, raw: bytes, now_ns: int, sender: str, sequence: int) -> None:
-        """Lockstep: refuse a message that is not the next one of the flight's publisher.
+        """Refuse a lockstep message that is not the next one of the flight's publisher.
 
-        The first message has a stamp of the flight.
+        The first message must have a stamp of the flight.
         """
         if self.lock is None:
             return
@@ -315,7 +315,7 @@ class Receiver(Generic[S]):
             self.lock.refresh(sample.sender, now_ns)
 
     def _require_stamp(self, stamp_ns: int, now_ns: int, sender: str) -> None:
-        """Raise ChannelError for a stamp further from the present than the age limit, if any."""
+        """Refuse a stamp further from the present than the age limit, if there is one."""
         if self._max_age_ns is None:
             return
         max_age_ns = self._max_age_ns()

@@ -32,7 +32,7 @@ class Report(NamedTuple):
 
 
 def encode(report: Report, name: str) -> bytes:
-    """The message of a report; `name` is that of its status."""
+    """Write the message of a report; `name` is that of its status."""
     message = DiagnosticArray()
     message.header.stamp = Time(
         sec=report.stamp_ns // NANOSECONDS, nanosec=report.stamp_ns % NANOSECONDS
@@ -47,7 +47,7 @@ def encode(report: Report, name: str) -> bytes:
 
 
 def decode(raw: bytes) -> Report:
-    """The report of a message. Raises ChannelError, reason "size" or "malformed"."""
+    """Read the report in a message, or raise ChannelError, reason "size" or "malformed"."""
     require_size(raw, MAX_REPORT_SIZE)
     try:
         message = deserialize_message(raw, DiagnosticArray)

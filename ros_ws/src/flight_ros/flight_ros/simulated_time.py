@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Simulated time: the time of the topic /clock, in place of the clocks of the host.
 
-Ticks, stamps and ages are in this time. So a flight takes the same ticks at any speed of the
+Ticks, stamps and ages are in this time, so a flight takes the same ticks at any speed of the
 simulator, and a pause of /clock is a pause of the flight. What concerns the process stays in the
 time of the host: diagnostics, services and log lines.
 """
@@ -27,7 +27,7 @@ HISTORY = 4096  # messages of /clock, by which the instants of other messages ar
 
 
 class ClockRestarted(Exception):  # noqa: N818 - an event of the simulator
-    """/clock went back or far ahead: another simulation begins."""
+    """Raised if /clock went back or far ahead, because another simulation begins."""
 
 
 class SimulatedTime:
@@ -53,7 +53,7 @@ class SimulatedTime:
         return not self.known() or time.time_ns() - self._received_ns[-1] > SILENT_NS
 
     def time_ns(self) -> int:
-        """The newest instant; 0 before the first."""
+        """Return the newest instant; 0 before the first."""
         return self._instants_ns[-1] if self.known() else 0
 
     monotonic_ns = time_ns
@@ -67,9 +67,9 @@ class SimulatedTime:
         self._wait_set.wait(LONGEST_WAIT_NS)
 
     def at(self, system_ns: int) -> int:
-        """The simulated time at an instant of the system clock.
+        """Return the simulated time at an instant of the system clock.
 
-        Between two messages it is in proportion.
+        Between two messages it is interpolated.
         """
         received_ns = self._received_ns
         instants_ns = self._instants_ns
@@ -83,7 +83,7 @@ class SimulatedTime:
         return instants_ns[place - 1] + round(share * step_ns)
 
     def speed(self) -> float:
-        """Simulated time over that of the host, since the first message."""
+        """Return simulated time over that of the host, since the first message."""
         instant_ns, received_ns = self._first
         return (
             (self.time_ns() - instant_ns) / max(self._received_ns[-1] - received_ns, 1)

@@ -71,9 +71,9 @@ def start_nodes(
 
 
 def _create_early_participant() -> "Participant | None":
-    """A node without topics.
+    """Create a node without topics.
 
-    It is hidden, as its name begins with _ (ROS 2 design, topic and service names).
+    It is hidden, because its name begins with _ (ROS 2 design, topic and service names).
     """
     import rclpy  # noqa: PLC0415 - on a full /dev/shm the import itself is a bus error
     from rclpy.signals import SignalHandlerOptions  # noqa: PLC0415

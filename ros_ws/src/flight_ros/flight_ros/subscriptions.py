@@ -61,9 +61,9 @@ class PolledSubscription:
         self.name = str(self.entity.topic_name)  # the full name
 
     def take(self, most: int | None = None) -> list[ReceivedMessage]:
-        """The messages since the last call, oldest first.
+        """Return the messages since the last call, oldest first.
 
-        At most `most`, by default the depth of the queue.
+        There are at most `most`, by default the depth of the queue.
         """
         return [
             ReceivedMessage(

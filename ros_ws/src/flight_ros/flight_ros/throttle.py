@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Throttle of repeated log lines.
 
-That of rclpy counts by the line of code, not by topic and reason.
+rclpy's own counts by the line of code, not by topic and reason.
 """
 
 import time
@@ -16,7 +16,7 @@ class Throttle:
         self._passed_ns: dict[str, int] = {}  # by line
 
     def due(self, line: str) -> bool:
-        """Whether the line has not passed for a period; then the line passes now."""
+        """Whether the line has not passed for a period; if so, it passes now."""
         now_ns = time.monotonic_ns()
         due = now_ns - self._passed_ns.get(line, -self._period_ns) >= self._period_ns
         if due:

@@ -13,13 +13,13 @@ import numpy as np
 
 
 class HostTime(Protocol):
-    """What the ticks of a node need of the module `time`."""
+    """What the ticks of a node need from the module `time`."""
 
     def monotonic_ns(self) -> int:
-        """The time of the ticks."""
+        """Return the time of the ticks."""
 
     def time_ns(self) -> int:
-        """The time of the stamps."""
+        """Return the time of the stamps."""
 
     def sleep(self, duration: float, /) -> None:
         """Wait, at most `duration` s."""
@@ -34,7 +34,7 @@ class Tick(NamedTuple):
 
     @property
     def missed(self) -> int:
-        """Periods missed since the previous tick by an overrun."""
+        """Number of periods missed since the previous tick by an overrun."""
         return max(self.number - self.previous - 1, 0)
 
 
@@ -51,7 +51,7 @@ class Ticker:
         self._last = -1
 
     def remaining(self) -> float:
-        """Time to the next deadline in s, negative when it has passed."""
+        """Return the time to the next deadline in s, negative if it has passed."""
         return (
             self._start_ns + (self._last + 1) * self.period_ns - self._host.monotonic_ns()
         ) / 1e9
@@ -66,7 +66,7 @@ class Ticker:
             self._host.sleep(min(pause, most))
 
     def due(self) -> Tick | None:
-        """The newest deadline that has passed and was not returned yet, else None."""
+        """Return the newest deadline that has passed and was not returned yet, else None."""
         number, late_ns = divmod(self._host.monotonic_ns() - self._start_ns, self.period_ns)
         if number <= self._last:
             return None
@@ -78,7 +78,7 @@ class Ticker:
 class TickTimes:
     """Periods and compute times of the ticks since the last report.
 
-    The number of missed ticks is beside them.
+    It also counts the missed ticks.
     """
 
     def __init__(self) -> None:
@@ -88,7 +88,7 @@ class TickTimes:
         self._begin_ns: int | None = None
 
     def begin(self, tick: Tick) -> None:
-        """A tick begins."""
+        """Note that a tick begins."""
         now_ns = time.monotonic_ns()
         if self._begin_ns is not None:
             self._periods.append(now_ns - self._begin_ns)
@@ -96,11 +96,11 @@ class TickTimes:
         self._missed += tick.missed
 
     def end(self) -> None:
-        """The tick that began ends."""
+        """Note that the tick that began has ended."""
         self._compute.append(time.monotonic_ns() - (self._begin_ns or 0))
 
     def report(self) -> dict[str, object]:
-        """Mean, 99th percentile and maximum in s of the times since the last report."""
+        """Return mean, 99th percentile and maximum in s of the times since the last report."""
         report: dict[str, object] = {"missed ticks": self._missed}
         for key, times in (("period", self._periods), ("compute time", self._compute)):
             if times:

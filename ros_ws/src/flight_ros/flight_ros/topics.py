@@ -13,7 +13,7 @@ from flight_core.topics import *  # noqa: F403 - a node imports both from here
 
 
 def kept(depth: int) -> QoSProfile:
-    """A reliable profile with the last `depth` messages for a late subscriber."""
+    """Make a reliable profile with the last `depth` messages for a late subscriber."""
     return QoSProfile(
         depth=depth,
         reliability=ReliabilityPolicy.RELIABLE,
@@ -62,15 +62,15 @@ PROFILES = {table.HISTORY: PUBLISH, table.LAST: STATE, table.NOTHING: NEWEST_SAM
 
 
 def offered(topic: table.Topic) -> QoSProfile:
-    """The quality of service of the publishers of a topic at the highest rate."""
+    """Return the quality of service of a topic's publishers at the highest rate."""
     return PROFILES[topic.keeps]
 
 
 def publisher_qos(period_ns: int) -> QoSProfile:
-    """PUBLISH at a rate, with a history of two seconds.
+    """Return PUBLISH at a rate, with a history of two seconds.
 
-    A longer history would delay the flight when a recorder joins: the threads that send new samples
-    send the history at once.
+    A longer history would delay the flight when a recorder joins, because the threads that send new
+    samples also send the history, all at once.
     """
     return kept(min(max(HISTORY_NS // period_ns, 1), PUBLISH.depth))
 

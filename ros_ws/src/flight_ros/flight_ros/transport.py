@@ -18,9 +18,9 @@ LOOPBACK_PROFILE = Path(str(files("flight_ros"))) / "loopback.xml"
 
 
 def environment() -> dict[str, str]:
-    """Environment variables that select the loopback transport.
+    """Return the environment variables that select the loopback transport.
 
-    Empty if the user has configured a profile.
+    They are empty if the user has configured a profile.
     """
     if PROFILE_VARIABLE in os.environ:
         return {}
@@ -48,7 +48,7 @@ def prepare() -> None:
 
 
 def open_to_network() -> list[str]:
-    """UDP sockets of this process on all interfaces in spite of the loopback profile.
+    """Find UDP sockets of this process on all interfaces in spite of the loopback profile.
 
     There should be none.
     """
