@@ -147,7 +147,7 @@ def _show(console: Console, facts: Sequence[AirframeFacts]) -> None:
 
 
 def _show_draft(draft: NewAirframe) -> None:
-    """What was read, and the files that were written."""
+    """Show what was read, and the files that were written."""
     frame = draft.airframe
     print(f"read:     {draft.note}")
     effects = (
@@ -181,7 +181,7 @@ def _roots(facts: AirframeFacts) -> tuple[str, str, str]:
 
 
 def _format_roots(roots: ComplexArray) -> str:
-    """Roots as text: a conjugate pair once, a root that is zero to rounding as 0."""
+    """Write roots: a conjugate pair once, a root that is zero to rounding as 0."""
     texts = []
     for root in roots:
         real, imaginary = (

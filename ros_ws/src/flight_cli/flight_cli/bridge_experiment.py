@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The part of `rise-di identify` that excites the aircraft behind a channel map.
 
-A scenario that flies the aircraft is written.
+It writes a scenario that flies the aircraft.
 """
 
 import shlex
@@ -128,7 +128,7 @@ class BridgeExperiment:
             require_envelope(channel_map)
 
     def _excite(self, console: Console, channel_map: ChannelMap) -> Path:
-        """Fly the experiment; the folder of its run."""
+        """Fly the experiment, and return the folder of its run."""
         airframe = self.folder / "experiment_airframe.yaml"
         scenario = self.folder / "experiment.yaml"
         plan = experiment(channel_map, self.speed, self.amplitude, str(airframe.resolve()))
@@ -160,7 +160,7 @@ class BridgeExperiment:
         *,
         imported: bool,
     ) -> IdentifiedChannels:
-        """The channels of an imported log with the delay of the link."""
+        """Add the delay of the link to the channels of an imported log."""
         expected = "a log of rise-di import: an experiment over the link contains its delay"
         require(imported or self.link_delay is None, "link_delay", self.link_delay, expected)
         if not imported:
@@ -170,7 +170,7 @@ class BridgeExperiment:
         return over_link(channels, later or 0.0)
 
     def _flyable(self, channel_map: ChannelMap, channels: IdentifiedChannels) -> Flyable:
-        """Airframe and scenario with gains. Raises ParameterError for short margins."""
+        """Make airframe and scenario with gains. Raises ParameterError for short margins."""
         airframe = str((self.folder / "airframe.yaml").resolve())
         flyable = flying_scenario(channel_map, channels, self.speed, airframe, self.needed)
         expected = "the margins, or --accept beside --bridge"
@@ -179,9 +179,9 @@ class BridgeExperiment:
 
 
 def guided_scenario(scenario: str, channel_map: ChannelMap, speed: float | None) -> str:
-    """The text of a scenario under guidance in place of its commands.
+    """Write a scenario under guidance in place of its commands.
 
-    Empty where guidance cannot fly: a map without pose, or without the rates and the airspeed.
+    Returns "" if guidance cannot fly: a map without pose, or without the rates and the airspeed.
     """
     if speed is None or not channel_map.pose or not {*RATES_AND_SPEED} <= {*channel_map.outputs}:
         return ""
@@ -204,7 +204,7 @@ def _identified(
     spans: list[tuple[int, int]],
     speed: float | None,
 ) -> tuple[dict[str, float], Response, IdentifiedChannels]:
-    """Trims, step responses and channels of an experiment, shown.
+    """Show trims, step responses and channels of an experiment, and return them.
 
     Raises ParameterError for a channel that is not certain.
     """
@@ -224,7 +224,7 @@ def _identified(
 
 
 def _write(folder: Path, files: Mapping[str, str]) -> None:
-    """Write YAML files by their names into a folder, which is created where it does not exist."""
+    """Write YAML files by name into a folder, which is created if it does not exist."""
     with writing("--write", folder, "a folder that can"):
         folder.mkdir(parents=True, exist_ok=True)
         for name, content in files.items():
@@ -232,7 +232,7 @@ def _write(folder: Path, files: Mapping[str, str]) -> None:
 
 
 def _announce(console: Console, plan: Experiment, duration: float, *, hovers: bool) -> None:
-    """The whole experiment, before it begins."""
+    """Show the whole experiment, before it begins."""
     controller = plan.controller
     table = new_table(
         f"Excitation, {controller.duration:.0f} s open loop after engagement, one input after "
@@ -260,11 +260,11 @@ def _announce(console: Console, plan: Experiment, duration: float, *, hovers: bo
 
 
 def _engaged(run: Path, channel_map: ChannelMap) -> tuple[Tape, list[tuple[int, int]], str]:
-    """The tape of an experiment, the engaged spans, ns, and a sentence on its end.
+    """Return the tape of an experiment, the engaged spans, ns, and a sentence on its end.
 
-    The sentence is on an early end by the bridge, else empty. A flight of `rise-di import` is a
-    single span. Raises ParameterError for a log without an engagement, and for a flight under
-    feedback: u follows y.
+    The sentence is about an early end by the bridge, and is otherwise "". A flight of `rise-di
+    import` is a single span. Raises ParameterError for a log without an engagement, and for a
+    flight under feedback, where u follows y.
     """
     recorded_run = read_run(run)
     warn_of_lacks(recorded_run)
@@ -304,7 +304,7 @@ def _engaged(run: Path, channel_map: ChannelMap) -> tuple[Tape, list[tuple[int, 
 
 
 def _digits(value: float, digits: int) -> str:
-    """A value by its leading digits, without an exponent up to 1e6.
+    """Write a value with its leading digits, without an exponent up to 1e6.
 
     A narrow column would cut an exponent off.
     """

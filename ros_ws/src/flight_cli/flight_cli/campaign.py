@@ -174,7 +174,7 @@ class Campaign:
         )
 
     def _continued(self) -> MonteCarlo:
-        """The campaign of a folder. Raises ParameterError beside an option of a new campaign."""
+        """Load the campaign of a folder, and refuse options of a new campaign beside it."""
         for name in OF_DEFINITION:
             source = self.context.get_parameter_source(name)
             is_default = source is None or source.name != "COMMANDLINE"
@@ -183,7 +183,7 @@ class Campaign:
         return MonteCarlo.resume(Path(self.scenario))
 
     def _begun(self) -> MonteCarlo:
-        """A new campaign of the scenario."""
+        """Define a new campaign of the scenario."""
         scenario = find_scenario(self.scenario, self.duration)
         quick_learner(scenario)  # refuses what the aircraft could not learn with
         spread = scenario.aircraft.uncertainty.spread()
@@ -206,7 +206,7 @@ class Campaign:
         return MonteCarlo.begin(new_run(scenario, self.runs, "campaign-"), definition)
 
     def _engine(self, *, is_single: bool) -> engines.Engine:
-        """The named engine, else dask for aircraft that fly one by one."""
+        """Return the named engine, or dask for aircraft that fly one by one."""
         engine_name = self.engine or (EngineName.DASK if is_single else EngineName.THREADS)
         if engine_name is EngineName.THREADS:
             return engines.threads(self.workers)
@@ -243,9 +243,9 @@ def _parse_sweep(text: str) -> Sweep:
 def _fly_missing(
     monte_carlo: MonteCarlo, engine: engines.Engine, place: str, *, quiet: bool
 ) -> float | None:
-    """Fly the chunks that are missing; aircraft-seconds per second, None if none is.
+    """Fly the chunks that are missing; return aircraft-seconds per second, None if none is.
 
-    `place` says where, as " on NVIDIA H200".
+    `place` says where, such as " on NVIDIA H200".
     """
     definition = monte_carlo.definition
     total = definition.aircraft * definition.cases

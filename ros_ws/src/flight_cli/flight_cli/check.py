@@ -165,14 +165,14 @@ def _show(console: Console, channel_map: ChannelMap, sign_check: SignCheck, airf
 
 
 def _format_field(row: OutputRow | InputRow) -> str:
-    """The field with the sign of the channel in front."""
+    """Write the field with the sign of the channel in front."""
     return f"{'-' if row.sign < 0 else '+'} {row.field}"
 
 
 def _check_rows(channel_map: ChannelMap, definitions: Sequence[Path], as_json: bool) -> None:
     """Compare the rows of a map with the message definitions of releases.
 
-    Rows that do not hold are shown.
+    The rows that do not hold are shown.
     """
     kinds = list(dict.fromkeys(kind for _, _, kind, *_ in channel_map.used_fields()))
     installed = installed_definitions(kinds)

@@ -105,9 +105,9 @@ def _options(
 
 
 def application(words: Collection[str]) -> typer.Typer:
-    """The command line with the commands among the words.
+    """Build the command line with those commands that occur among the words.
 
-    Further commands have name and help alone.
+    The other commands only have their name and help.
     """
     app = typer.Typer(
         cls=RiseDiGroup,

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di compare`: RISE-DI and further control laws on the same aircraft.
+"""`rise-di compare`: RISE-DI and other control laws on the same aircraft.
 
 The same procedure tunes every law.
 """
@@ -90,13 +90,13 @@ class Contest(NamedTuple):
     path: Path
 
     def untuned(self) -> list[tuple[str, str]]:
-        """Laws and objectives for which the file has no gains."""
+        """List laws and objectives for which the file has no gains."""
         tunings = tuned_gains.load(self.path)
         pairs = product(self.names, self.aims)
         return [(name, aim) for name, aim in pairs if aim not in tunings.get(name, {})]
 
     def tune(self, command: str, bar: Progress) -> None:
-        """Tune laws for an objective per law. The file is written after every law."""
+        """Tune laws, one for each objective; the file is written after every law."""
         benchmark = self.benchmark()
         for name, aim in self.untuned():
             law = self.entries[name]
@@ -117,14 +117,14 @@ class Contest(NamedTuple):
             tuned_gains.save(self.path, tunings, list(gain_tuning.OBJECTIVES), command)
 
     def benchmark(self, *seed: int) -> Benchmark:
-        """The winds and aircraft, with turbulence of a seed in place of the tuning's."""
+        """Build winds and aircraft, with turbulence of a seed in place of the tuning's."""
         build = gain_tuning.build_benchmark(self.scenario, *seed)
         return registered_laws.with_courses(build, self.controllers)
 
     def tuned(self) -> Gains:
-        """The gains by law and objective: those of a search, else those of a controller.
+        """Return the gains by law and objective: those of a search, or else of a controller.
 
-        Raises ParameterError without any.
+        Raises ParameterError if there are none.
         """
         tunings = tuned_gains.load(self.path)
         gains: Gains = {}
@@ -218,7 +218,7 @@ class Compare:
             write_text("--json", self.to_json, self._as_json(contest, results))
 
     def _contest(self, names: Sequence[str], aims: Sequence[str]) -> Contest:
-        """The laws; laws of scenario files by the name of the file."""
+        """Define the laws; a law of a scenario file has the name of the file."""
         scenario = find_scenario(self.scenario)
         if self.wind is not None:
             uncertainty = scenario.aircraft.uncertainty.model_dump() | {"wind": self.wind}
@@ -239,7 +239,7 @@ class Compare:
         )
 
     def _command(self) -> str:
-        """The command of another tuning, for the file of gains."""
+        """Return the command that tunes again, for the file of gains."""
         wind = "" if self.wind is None else f" --wind {self.wind}"
         return f"rise-di compare {self.scenario} --tune{wind}"
 
@@ -251,7 +251,7 @@ class Compare:
         benchmark: Benchmark,
         gains: Gains,
     ) -> None:
-        """Print a table an objective, and what the words mean."""
+        """Print a table per objective, and what the words mean."""
         scenario = contest.scenario
         for aim in contest.aims:
             if results_of_aim := [result for result in results if result.objective == aim]:
@@ -273,7 +273,7 @@ class Compare:
             console.print(f"without tuned gains (--tune finds them): {missing}")
 
     def _as_json(self, contest: Contest, results: Sequence[LawResult]) -> str:
-        """The figures of all laws as JSON, SI."""
+        """Write the figures of all laws as JSON, SI."""
         scenario = contest.scenario
         figures = {
             "scenario": scenario.name,
@@ -379,7 +379,7 @@ def _format_margins(margins: Margins) -> str:
 def _notes(
     scenario: Scenario, benchmark: Benchmark, laws: Mapping[str, Law], aims: Iterable[str]
 ) -> str:
-    """What the words of the table mean."""
+    """Say what the words of the table mean."""
     units = display_units(scenario)
     controller = scenario.controller
     errors = zip(controller.outputs, benchmark.unit.tolist(), strict=True)
@@ -413,7 +413,7 @@ def _notes(
 
 
 def _as_json(result: LawResult, law: Law, scenario: Scenario) -> dict[str, Any]:
-    """Figures of a law for JSON, in SI.
+    """Return the figures of a law for JSON, in SI.
 
     null stands for an infinite figure, and for the cost of gains that no search found.
     """
@@ -441,7 +441,7 @@ def _as_json(result: LawResult, law: Law, scenario: Scenario) -> dict[str, Any]:
 
 
 def _margins_as_json(margins: Margins) -> dict[str, Any]:
-    """The least margins of a stable loop, SI: phase in rad, gain as a factor."""
+    """Return the least margins of a stable loop, SI: phase in rad, gain as a factor."""
     least = {
         "phase": margins.phase.min(),
         "gain": margins.gain.min(),

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`rise-di engage`: bumpless engagement of the autopilot behind a running bridge.
 
-Disengagement, too.
+It also disengages.
 """
 
 from dataclasses import dataclass

@@ -114,7 +114,7 @@ class Export:
 
 
 def _as_json(exported: Exported) -> dict[str, Any]:
-    """Files, and the figures of the proof."""
+    """Return the files, and the figures of the proof."""
     proof = exported.proof
     files = {"files": [str(path) for path in exported.files]}
     if proof is None:

@@ -30,7 +30,7 @@ from flight_core.parameters import ParameterError
 
 
 def open_fleet(file: str, duration: float | None, *, use_sim_time: bool) -> Fleet:
-    """The fleet of a file, in an environment that can fly it. Raises ParameterError."""
+    """Open the fleet of a file, where it can be flown. Raises ParameterError."""
     require_package("rclpy", "")
     require_ros_environment()
     return read_fleet(file, duration, use_sim_time=use_sim_time)
@@ -72,7 +72,7 @@ def fly_fleet_file(fleet: Fleet, runs: Sequence[Path], *, as_json: bool) -> int:
 class _AircraftResult(NamedTuple):
     """The summary of an aircraft, and the fraction of its ticks with the controller ENGAGED.
 
-    None without ticks. `track`: where it was, None without a place.
+    The fraction is None without ticks. `track` is where it was; None without a place.
     """
 
     summary: dict[str, Any]
@@ -83,7 +83,7 @@ class _AircraftResult(NamedTuple):
 def _separated(
     fleet: Fleet, flights: Sequence[MemberFlight], reported: Mapping[str, _AircraftResult]
 ) -> dict[str, _AircraftResult]:
-    """Write the reports of the aircraft again that came nearer to another one than is asked."""
+    """Rewrite the reports of the aircraft that came nearer to another one than they may."""
     tracks = {name: result.track for name, result in reported.items() if result.track is not None}
     shortfalls = separation_shortfalls(tracks, fleet.separation)
     return {
@@ -96,7 +96,7 @@ def _separated(
 
 
 def _unreported(flight: MemberFlight) -> _AircraftResult:
-    """What is known of an aircraft before its report is written."""
+    """Return what is known of an aircraft before its report is written."""
     outcome = flight.outcome.as_json()
     outcome["sentence"] = f"{flight.outcome}, no report: rise-di report writes it"
     return _AircraftResult(
@@ -137,7 +137,7 @@ def _report(member_flight: MemberFlight) -> _AircraftResult:
 def _show(
     name: str, flights: Sequence[MemberFlight], results: Mapping[str, _AircraftResult]
 ) -> None:
-    """Print a line an aircraft, the folders of the runs, and what a busy host withheld."""
+    """Print a line per aircraft, the folders of the runs, and what a busy host withheld."""
     headings = ("aircraft", "flown (s)", "ticks", "engaged", "outcome")
     table = new_table(f"Fleet {name}", headings, ("aircraft", "outcome"), ("outcome",))
     lines = []
@@ -165,9 +165,9 @@ def _show(
 
 
 def foreign_samples(summaries: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Sentences on the samples on the topics of an aircraft from nodes outside of its namespace.
+    """Write sentences about samples on an aircraft's topics from nodes outside its namespace.
 
-    Empty without an account of processes.
+    There are none without an account of processes.
     """
     sentences = []
     total = 0

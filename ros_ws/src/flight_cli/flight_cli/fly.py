@@ -207,7 +207,7 @@ class Fly(RouteWords):
         raise typer.Exit(status)
 
     def _scenario(self) -> Scenario:
-        """The scenario with settings, route and fence.
+        """Return the scenario with settings, route and fence.
 
         Raises ParameterError for contradictory words.
         """
@@ -260,7 +260,7 @@ class Fly(RouteWords):
         )
 
     def _autopilot(self, *, stepping: bool) -> Autopilot | None:
-        """The autopilot in the aircraft's place. Raises ParameterError where none can fly."""
+        """Return the autopilot in the aircraft's place. Raises ParameterError if none can fly."""
         if self.bridge is None:
             expected = "the channel map of an autopilot: --bridge MAP"
             require_unused(self, ["send"], expected, "no --bridge")
@@ -276,7 +276,7 @@ class Fly(RouteWords):
         return autopilot
 
     def _with_files(self, scenario: Scenario) -> Scenario:
-        """The scenario with the route and the fence of files. Raises ParameterError."""
+        """Add the route and the fence of files to the scenario. Raises ParameterError."""
         above_sea = scenario.aircraft.is_jsbsim
         sections: dict[str, Any] = {}
         if self.fence is not None:
@@ -361,7 +361,7 @@ def _report(
     verbose: bool,
     quiet: bool,
 ) -> int:
-    """Write and print the report of a flight. Returns the exit status."""
+    """Write and print the report of a flight, and return the exit status."""
     unwritten = ""
     try:
         result = write_report(run, outcome)
@@ -399,7 +399,7 @@ def _report(
 
 
 def _require_flyable(scenario: Scenario, autopilot: Autopilot | None, *, in_process: bool) -> None:
-    """Raise ParameterError where the flight would fail, before anything is written."""
+    """Raise ParameterError if the flight would fail, before anything is written."""
     if not in_process:
         require_package("rclpy", "; without ROS fly with --in-process")
         require_ros_environment()
@@ -412,14 +412,14 @@ def _require_flyable(scenario: Scenario, autopilot: Autopilot | None, *, in_proc
 
 
 def _that_learns(scenario: Scenario) -> Scenario:
-    """The scenario with a learner. Raises ParameterError for one with a model."""
+    """Return the scenario with a learner. Raises ParameterError if it has a model."""
     from flight_design.learning.scenario_learner import that_learns  # noqa: PLC0415 - loads SciPy, which few flights need
 
     return that_learns(scenario)
 
 
 def _learner(scenario: Scenario) -> Learn | None:
-    """The learner of a scenario, for a flight in one process.
+    """Make the learner of a scenario, for a flight in one process.
 
     Raises ParameterError for one that cannot learn.
     """

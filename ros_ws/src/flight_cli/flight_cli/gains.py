@@ -120,7 +120,7 @@ class _GainsAnswer(NamedTuple):
 
     @property
     def titles(self) -> dict[str, Assessment]:
-        """The gain sets by the names that are shown: of a check that of the scenario."""
+        """Gain sets by the names that are shown; for a check, that of the scenario."""
         return {self.checked: self.first} if self.checked else self.answers
 
     @property
@@ -278,14 +278,14 @@ class Gains:
             raise typer.Exit(CONDITION_FAILS)
 
     def _result(self) -> _GainsAnswer:
-        """The gain sets with all conditions; selected ones are written."""
+        """Return the gain sets with all conditions; write those that were selected."""
         with Console(quiet=self.as_json).status("selecting gains on uncertain airframes") as status:
             if self.check:
                 return self._checked(status.update)
             return self._selected(status.update)
 
     def _checked(self, progress: Callable[[str], None]) -> _GainsAnswer:
-        """The gains of the scenario."""
+        """Check the gains of the scenario."""
         contradiction = "one of the two: --check selects nothing to write"
         require_unused(
             self, ("write", "feedforward", "observer"), contradiction, "--check beside it"
@@ -308,7 +308,7 @@ class Gains:
         return _GainsAnswer({"scenario": answer}, checked=name, promise=promise, written=lines)
 
     def _selected(self, progress: Callable[[str], None]) -> _GainsAnswer:
-        """Gains by Theorem 1 and by the procedure, or those beside an observer."""
+        """Select gains by Theorem 1 and by the procedure, or those beside an observer."""
         selection = select_gains(
             self.airframe,
             self.scenario,
@@ -349,7 +349,7 @@ class Gains:
 def _loop_of_px4(
     px4: Path | None, rate: float | None, delay: float | None
 ) -> tuple[float | None, float | None, str]:
-    """Rate and delay as given, or those of a parameter file, and what the latter come from."""
+    """Return rate and delay as given or from a parameter file, and where the latter come from."""
     if px4 is None:
         return rate, delay, ""
     require(delay is None, "px4", "--delay beside it", "one of the two")
@@ -368,7 +368,7 @@ def _write_page(path: Path, answer: Assessment) -> None:
 
 
 def _require_margins(selection: Selection, *, theorem: bool) -> None:
-    """Raises ParameterError for gains whose margins fall short of the requirement."""
+    """Refuse gains whose margins fall short of the requirement."""
     assessment = selection.theorem if theorem else selection.engineering
     short = "; ".join(row.sentence(assessment.controller.outputs) for row in assessment.unmet)
     if short and not theorem and assessment.controller.observer is None:
@@ -378,7 +378,7 @@ def _require_margins(selection: Selection, *, theorem: bool) -> None:
 
 
 def _show_trade(console: Console, selection: Selection) -> None:
-    """The error of the linear loop along the manoeuvre against the phase margin."""
+    """Show the error of the linear loop along the manoeuvre against the phase margin."""
     controller = selection.chosen
     frame = selection.study.airframe
     outputs = controller.outputs
@@ -452,7 +452,7 @@ def _show_verdicts(console: Console, result: _GainsAnswer) -> None:
 
 
 def _condition_table(answers: dict[str, Assessment], part: str, title: str) -> Table:
-    """The conditions of a part, a row each."""
+    """Make a table of the conditions of a part, one per row."""
     headings = ["condition"]
     for name in answers:
         headings += [f"{name}\nvalue and bound", "\nmargin"]
@@ -465,7 +465,7 @@ def _condition_table(answers: dict[str, Assessment], part: str, title: str) -> T
 
 
 def _gain_table(answers: dict[str, Assessment], aircraft: str) -> Table:
-    """K, Lambda and beta of RISE-DI, a row a channel."""
+    """Make a table of K, Lambda and beta of RISE-DI, one channel per row."""
     headings = []
     for name in answers:
         headings += [f"{name}\nK", "\nLambda", "\nbeta"]
@@ -490,7 +490,7 @@ def _gain_table(answers: dict[str, Assessment], aircraft: str) -> Table:
 
 
 def _own_gains(controller: ControllerConfig, aircraft: str) -> Table:
-    """The parameters of a law other than RISE-DI."""
+    """Make a table of the parameters of a law other than RISE-DI."""
     table = new_table(
         f"Law {controller.law} for {aircraft}",
         ("parameter", "value"),
@@ -518,7 +518,7 @@ def _format_delay_margin(study: Study, answer: Assessment) -> str:
 
 
 def speed_of_margin(study: Study, answer: Assessment) -> str:
-    """Up to which speed a delay margin above 0 lasts with fixed gains."""
+    """Say up to which speed a delay margin above 0 lasts with fixed gains."""
     if study.airframe.speed == 0.0:
         return "the airframe has no trim speed"
     ratio = gain_selection.stable_speed_ratio(study, answer.controller)
@@ -531,7 +531,7 @@ def speed_of_margin(study: Study, answer: Assessment) -> str:
 
 
 def _stable_speed_ratio(study: Study, answer: Assessment) -> float | None:
-    """The ratio; None where the literal sign has no linear loop, or without a limit."""
+    """Return the ratio; None if the literal sign has no linear loop, or if there is no limit."""
     if answer.delay_margin is None:
         return None
     ratio = gain_selection.stable_speed_ratio(study, answer.controller)

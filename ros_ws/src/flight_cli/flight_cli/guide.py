@@ -99,7 +99,7 @@ class Guide(RouteWords):
             return client.send_route(points) if points else client.call(command)
 
     def _points(self, file: str) -> list[tuple[float, float, float]]:
-        """The waypoints of a route file for a flight: north, east, altitude in m.
+        """Read a route file for a flight and return its waypoints: north, east, altitude in m.
 
         Raises ParameterError.
         """
@@ -119,7 +119,7 @@ class Guide(RouteWords):
 
 
 def _parse(text: str) -> tuple[str, float]:
-    """A channel of `guide` and its value, SI."""
+    """Return a channel of `guide` and its value in SI from NAME=VALUE."""
     name, _, number = text.partition("=")
     require(name in TARGETS, "guide", repr(text), f"NAME=VALUE with one of {', '.join(TARGETS)}")
     try:

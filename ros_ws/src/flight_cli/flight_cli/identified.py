@@ -131,7 +131,7 @@ def _show_flights(console: Console, aircraft: IdentifiedAircraft) -> None:
 
 
 def identified_as_json(aircraft: IdentifiedAircraft, path: Path) -> dict[str, Any]:
-    """What the identification gave, SI."""
+    """Return what the identification gave, SI."""
     linear = aircraft.linear
     trim = linear.trim
     outputs = aircraft.condition.paired_outputs()

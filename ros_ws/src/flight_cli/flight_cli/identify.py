@@ -196,7 +196,7 @@ class Identify:
         self._identify_log(log)
 
     def _log(self) -> Path | None:
-        """The log that the source is; None for an aircraft or no source."""
+        """Return the log that the source names, or None for an aircraft or no source."""
         if self.source is None or self.source.startswith(PREFIX):
             return None
         log = Path(self.source)
@@ -204,7 +204,7 @@ class Identify:
         return None if is_name else log
 
     def _needed(self) -> Requirement:
-        """The required margins."""
+        """Return the margins that the gains must have."""
         phase_margin = PHASE_MARGIN if self.phase_margin is None else self.phase_margin
         return requirement(phase_margin, accept=self.accept)
 
@@ -264,7 +264,7 @@ class Identify:
             raise ParameterError(f"identify: {lacking}; the gains are in {refusal}")
 
     def _scenario_path(self, name: str) -> Path:
-        """The file of the scenario; --write alone replaces a file."""
+        """Return the path for the scenario; it may replace a file only where --write names it."""
         path = self.write or Path(f"jsbsim_{Path(name).stem}.yaml")
         expected = "a file to write over, or another"
         is_new = self.write is not None or not path.exists()
@@ -275,7 +275,7 @@ class Identify:
     def _identified_aircraft(
         self, name: str, speed: float, altitude: float, console: Console
     ) -> IdentifiedAircraft:
-        """The aircraft by linearisation, with gains and a flight; exits without a trim."""
+        """Linearise an aircraft, select gains and fly it; exit if there is no trim."""
         margin = STEP_MARGIN if self.margin is None else self.margin
         texts: dict[str, str] = {}
         for text in self.command or []:
@@ -345,7 +345,7 @@ class Identify:
     def _identified_model(
         self, recorded_run: RecordedRun, scenario: StoredFile, nominal: Airframe
     ) -> Identification:
-        """The model by a search on the log, with a bar."""
+        """Search the model on the log, and show a progress bar."""
         controller = recorded_parameters(scenario)
         delay = controller.delay if self.delay is None else self.delay
         actuation = _actuation(controller, nominal, delay)
@@ -359,7 +359,7 @@ class Identify:
 
 
 def _jsbsim_name(aircraft: str) -> str:
-    """The name of an aircraft of JSBSim without its prefix. Raises ParameterError."""
+    """Return the name of an aircraft of JSBSim without its prefix. Raises ParameterError."""
     require(
         aircraft.startswith(PREFIX),
         "aircraft",
@@ -394,7 +394,7 @@ class _Reflight(NamedTuple):
 
 
 def _refly(scenario: Scenario, tape: Tape, model: Airframe, margin: float) -> _Reflight:
-    """The scenario of a log, flown in this process under feedforward and observer of a model."""
+    """Fly a log's scenario again in this process, with feedforward and observer of a model."""
     selected = selected_observer(scenario.rise_di(), scenario, model, margin)
     again = simulate(replace(scenario, controller=selected.controller))
     return _Reflight(

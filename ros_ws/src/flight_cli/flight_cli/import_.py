@@ -122,7 +122,7 @@ class Import:
 
 
 def _show_agreement(console: Console, rows: list[Agreement]) -> None:
-    """What log and map say of the same settings."""
+    """Show what the log and the channel map each say of the same settings."""
     headings = ("", "what the log says", "what the map says")
     table = new_table("", headings, headings, headings)
     for row in rows:
@@ -153,7 +153,7 @@ def _import_module(log: Path, scenario: Scenario, folder: Path) -> None:
 
 
 def _show_topics(console: Console, title: str, tape: Tape) -> None:
-    """Number, rate and gaps of the samples by topic."""
+    """Show number, rate and longest gap of the samples by topic."""
     table = new_table(title, ("topic", "samples", "Hz", "longest gap, s"))
     for topic, signal in tape.signals.items():
         gaps = np.diff(signal.stamp_ns) / NANOSECONDS

@@ -23,12 +23,12 @@ REMAP = "A topic of remapped nodes, as in y:=/sensors/y; may be repeated."
 
 
 def log_namespace() -> Any:
-    """The option --namespace of a command for a log."""
+    """Declare the option --namespace of a command that reads a log."""
     return option("Namespace of the aircraft, if the log holds several.")
 
 
 def log_scenario() -> Any:
-    """The option --scenario of a command for a log."""
+    """Declare the option --scenario of a command that reads a log."""
     text = "Scenario of the flight, a name or a file; by default that in the log."
     return option(text, autocompletion=scenario_names)
 
@@ -47,7 +47,7 @@ def remaps_of(words: list[str] | None) -> dict[str, str]:
 
 
 def scenario_file(name: str | None) -> Path | None:
-    """The file of a scenario by name or path, or one of a controller alone; None without a name.
+    """Find the file of a scenario, or of a controller alone, by name or path; None without a name.
 
     Raises ParameterError for an invalid scenario.
     """

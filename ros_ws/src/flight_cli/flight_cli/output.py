@@ -143,10 +143,10 @@ def new_table(
     left_aligned: Container[str] | None = None,
     wrapped: Container[str] = (),
 ) -> Table:
-    """An empty table.
+    """Return an empty table.
 
-    Columns outside `left_aligned`, by default the first, are aligned right. Columns outside
-    `wrapped` keep to one line.
+    Columns are aligned right, except those in `left_aligned`; by default, that is the first.
+    Columns keep to one line, except those in `wrapped`.
     """
     left_columns = headings[:1] if left_aligned is None else left_aligned
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
@@ -174,7 +174,7 @@ def print_table(console: Console, table: Table) -> None:
 
 
 def _plain(cell: RenderableType) -> str:
-    """The text of a cell as it is printed."""
+    """Return the text of a cell as it is printed, without markup."""
     return Text.from_markup(cell).plain if isinstance(cell, str) else str(cell)
 
 
@@ -189,12 +189,12 @@ CLOCK_COLUMNS = (TextColumn("{task.fields[clock]}"), BarColumn(), SHOWN_COLUMN)
 
 
 def progress_bar(*columns: ProgressColumn, quiet: bool = False) -> Progress:
-    """A progress bar on standard error."""
+    """Return a progress bar that draws on standard error."""
     return Progress(*columns, console=Console(stderr=True, quiet=quiet))
 
 
 def clock(t: float, duration: float) -> str:
-    """The flight time of a progress bar, s."""
+    """Return the text of a progress bar that shows the flight time, s."""
     return f"t = {t:5.1f} of {duration:g} s"
 
 
@@ -202,9 +202,10 @@ def clock(t: float, duration: float) -> str:
 def flight_progress(
     duration: float, *, quiet: bool
 ) -> Iterator[tuple[Callable[[float, str], None], Callable[[str], None]]]:
-    """The progress bar of a flight of `duration`, s.
+    """Show the progress bar of a flight of `duration`, s.
 
-    Yields a function for the flight time and the text beside it, and one for a line above.
+    Yields two functions: one takes the flight time and the text beside it, the other prints a line
+    above the bar.
     """
     with progress_bar(*CLOCK_COLUMNS, quiet=quiet) as bar:
         task = bar.add_task("flight", total=duration, clock="", shown="")
@@ -219,7 +220,7 @@ def flight_progress(
 
 
 def grouped_table(title: str, columns: Sequence[Column], rows: Iterable[Sequence[str]]) -> Table:
-    """A table whose adjacent columns of one group share a heading, after the names of the rows."""
+    """Return a table with the rows' names first; adjacent columns of one group share a heading."""
     table = Table(title=escape(title), title_justify="left", box=box.SIMPLE_HEAD, padding=0)
     table.show_header = any(column.label for column in columns)
     table.add_column("", no_wrap=True)
@@ -279,7 +280,7 @@ STDOUT = Path("-")
 
 
 def stdout_for(file: Path | None) -> AbstractContextManager[object]:
-    """Standard output is free for a file that is "-": what the block prints goes to the errors."""
+    """Keep standard output free for a file that is "-": the block prints on standard error."""
     return redirect_stdout(sys.stderr) if file == STDOUT else nullcontext()
 
 

@@ -38,9 +38,9 @@ class RouteWords:
     def read_waypoints(
         self, file: Path, *, above_sea: bool | None, fence: Path | None = None
     ) -> tuple[Waypoint, ...]:
-        """The waypoints of a route file; notes on the rest of the file go to standard error.
+        """Read the waypoints of a route file, and print notes on the rest of it on standard error.
 
-        `fence`: the file of the fence, which may be the same. Raises as `read_route_file`.
+        `fence` is the file of the fence; it may be the same file. Raises as `read_route_file`.
         """
         for key, value in (("altitude", self.altitude), ("simplify", self.simplify)):
             require(value is None or math.isfinite(value), f"--{key}", value, "a number")
@@ -65,7 +65,7 @@ def parse_origin(text: str) -> Origin: ...
 @overload
 def parse_origin(text: None) -> None: ...
 def parse_origin(text: str | None) -> Origin | None:
-    """The origin of a route, from "47.38,8.54"."""
+    """Parse the origin of a route, for example "47.38,8.54"."""
     if text is None:
         return None
     numbers = parse_numbers(text)

@@ -14,7 +14,7 @@ from flight_core.parameters import Config, flatten, nest, one_of, require
 
 
 def settings_option() -> Any:
-    """The option --set of parameters by key."""
+    """Declare the option --set, which sets parameters by key."""
     text = "A parameter to change, as in controller.k_g=2.0; may be repeated."
     return option(text, "--set", metavar="KEY=VALUE", autocompletion=setting_names)
 
@@ -36,10 +36,11 @@ def parse_settings(
     owner: str = "scenario",
     sections_with: Callable[[str], Sequence[str]] = lambda key: (),
 ) -> dict[str, Any]:
-    """The values by key, as controller.k_g.
+    """Parse the words of --set into values by key, for example controller.k_g.
 
-    `owner` is the only section, or the scenario; `sections_with` a key are named where the section
-    is left out. Raises ParameterError.
+    `owner` is the only section that a key can belong to, or else the scenario. `sections_with` a
+    key returns the sections that an error names if the user left the section out. Raises
+    ParameterError.
     """
     changes: dict[str, Any] = {}
     for text in settings or ():
@@ -63,7 +64,7 @@ def parse_settings(
 
 
 def with_settings(scenario: Scenario, settings: Sequence[str] | None) -> Scenario:
-    """The scenario with the parameters of --set. Raises ParameterError."""
+    """Return the scenario with the parameters of --set changed. Raises ParameterError."""
     sections: dict[str, dict[str, Any]] = defaultdict(dict)
     for name, value in parse_settings(settings, "scenario", scenario.sections_with).items():
         section, _, key = name.partition(".")
@@ -77,7 +78,7 @@ def with_settings(scenario: Scenario, settings: Sequence[str] | None) -> Scenari
 
 
 def _changed(section: object, changes: Mapping[str, Any]) -> dict[str, Any]:
-    """The parameters of a section that change, with all keys of a group of which one changes."""
+    """Return the parameters of a section that change; a group of keys changes as a whole."""
     if not isinstance(section, Config):
         return nest(changes)
     values = section.changed(changes)

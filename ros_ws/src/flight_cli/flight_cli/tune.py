@@ -191,7 +191,7 @@ class Tune:
             raise typer.Exit(UNPROVED)
 
     def _target(self) -> tuple[str, Path]:
-        """The autopilot and the folder. Raises ParameterError for none or both."""
+        """Return the autopilot and its folder. Raises ParameterError unless one is named."""
         folders = {"px4": self.px4, "ardupilot": self.ardupilot}
         named = {name: path for name, path in folders.items() if path is not None}
         if len(named) != 1:
@@ -202,7 +202,7 @@ class Tune:
         return autopilot, folder
 
     def _tuned(self, console: Console, autopilot: str, folder: Path) -> _Tuned:
-        """Everything but the code."""
+        """Identify, select the gains and bound them: all of the command except the export."""
         scenario = find_scenario(self.scenario)
         controller = scenario.rise_di()
         nominal = load_airframe(scenario.aircraft.airframe)
@@ -256,7 +256,7 @@ class Tune:
         )
 
     def _lags(self, scenario: Scenario, nominal: Airframe) -> FloatArray:
-        """The lags of the servos in the airframe's order, s. Raises ParameterError."""
+        """Return the lags of the servos in the airframe's order, s. Raises ParameterError."""
         channels = scenario.aircraft.channels().inputs
         lags = dict(zip(channels, scenario.aircraft.actuators.lag, strict=False))
         if self.lag is not None:
@@ -293,7 +293,7 @@ def _identified(
     recorded: FlightData,
     actuation: Actuation,
 ) -> Identification:
-    """The model by a search on the log, with a bar."""
+    """Search the model on the log, and show a progress bar."""
     controller = scenario.rise_di()
     pairing = ChannelPairing(controller.outputs, controller.inputs)
     unknown = Unknown(has_hidden_rows=False)
@@ -341,9 +341,9 @@ def _column(identification: Identification, output: str) -> int:
 
 
 def _kept(nominal: Airframe, identification: Identification) -> Airframe | None:
-    """The airframe with the parts that may be used; None where one must not be.
+    """Put the identified parts into the airframe, or return None if one of them must not be used.
 
-    A part whose nominal model explains the log better stays nominal.
+    If the nominal model of a part explains the log better, that part stays nominal.
     """
     used = []
     for part in identification.parts:
@@ -354,12 +354,12 @@ def _kept(nominal: Airframe, identification: Identification) -> Airframe | None:
 
 
 def _is_better(part: Part) -> bool:
-    """Whether the model of a part explains the held-out samples better than the nominal one."""
+    """Return whether a part's model explains the held-out samples better than the nominal one."""
     return part.after.log_likelihood > part.before.log_likelihood
 
 
 def _refusal(part: Part) -> str:
-    """What speaks against a part that is kept, and what flies; empty for nothing."""
+    """Say what speaks against a part and which of its models is used; "" if nothing does."""
     if not part.refusal:
         return ""
     kept = "is taken, as the likelier one" if _is_better(part) else "stays nominal"
@@ -377,7 +377,7 @@ def _uncertainty(identification: Identification) -> float:
 
 
 def _on_airframe(scenario: Scenario, airframe: Path, noise: FloatArray) -> Scenario:
-    """The scenario with the identified aircraft and the noise of the log's gyro, rad/s rms."""
+    """Return the scenario on the identified airframe; the log's gyro gives its noise, rad/s rms."""
     changes = {"airframe": str(airframe.resolve()), "sensors": {"noise": noise.tolist()}}
     return scenario.vary(aircraft=changes)
 
@@ -447,7 +447,7 @@ def _show(console: Console, tuned: _Tuned) -> None:
 
 
 def _page(tuned: _Tuned, log: str, autopilot: str) -> Page:
-    """What was identified, predicted and bounded, and what to do."""
+    """Make the page: what was identified, predicted and bounded, and what the pilot does next."""
     identification = tuned.identification
     entries = MetricTable(
         f"Identified from {log}",
@@ -486,7 +486,7 @@ def _page(tuned: _Tuned, log: str, autopilot: str) -> Page:
 
 
 def _what_to_do(tuned: _Tuned, autopilot: str) -> list[str]:
-    """What holds, what to set and switch, and how to go back."""
+    """Say what is guaranteed, what to set and switch, and how to go back."""
     part = f"A and B within {100 * tuned.uncertainty:.0f} %"
     holds = "every aircraft is stable" if tuned.promise.holds else "an aircraft may be unstable"
     return [

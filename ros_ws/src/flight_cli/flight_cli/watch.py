@@ -131,19 +131,19 @@ class Watch:
             require(not twice, f"--{name}", "--control beside it", "one of the two")
 
     def _runs_in_progress(self) -> list[Path]:
-        """The runs to watch without a RUN."""
+        """Return the runs to watch if the user named no RUN."""
         return _in_progress(self.runs) if self.fleet else [_newest(self.runs, self.namespace)]
 
 
 def _in_progress(runs: Path) -> list[Path]:
-    """The runs in recording, in the order of their names. Raises ParameterError without one."""
+    """Return the runs that are being recorded, by name. Raises ParameterError if there is none."""
     recording = runs_in_recording(runs)[::-1]
     require(bool(recording), f"--fleet: {runs}", "no run in recording", "each RUN by its name")
     return recording
 
 
 def _newest(runs: Path, namespace: str | None) -> Path:
-    """The run to watch without a RUN; a note names the other aircraft in flight."""
+    """Return the newest run, and note which other aircraft fly."""
     run = newest_run(runs, namespace)
     others = [display_path(folder) for folder in runs_in_recording(runs) if folder != run]
     if others and namespace is None:

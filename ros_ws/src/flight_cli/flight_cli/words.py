@@ -50,7 +50,7 @@ class Executable(Protocol):
 
 
 def option(text: str, *names: str, default: Any = None, **rules: Any) -> Any:
-    """An option of a command, with help; without `names` by the name of the field."""
+    """Declare an option with its help; if `names` is empty, it has the name of the field."""
     shown = escape(text)  # A[q,alpha] is no markup
     return _field(
         lambda name: typer.Option(
@@ -61,32 +61,32 @@ def option(text: str, *names: str, default: Any = None, **rules: Any) -> Any:
 
 
 def rare_option(text: str, *names: str, default: Any = None, **rules: Any) -> Any:
-    """An option that few need, in a panel of its own."""
+    """Declare an option that few users need; --help lists it in a panel of its own."""
     return option(text, *names, default=default, rich_help_panel="More options", **rules)
 
 
 def argument(text: str, default: Any = None, **rules: Any) -> Any:
-    """An argument of a command, with help."""
+    """Declare an argument with its help."""
     return _field(lambda _: typer.Argument(help=escape(text), **rules), default)
 
 
 def write_option(text: str, default: Any = None, **rules: Any) -> Any:
-    """The option of a file or folder to write: --write or --output."""
+    """Declare the option that names a file or folder to write: --write or --output."""
     return option(text, "--write", "--output", default=default, **rules)
 
 
 def json_option() -> Any:
-    """The option --json."""
+    """Declare the option --json."""
     return option("Print the result as JSON, nothing else.", "--json", default=False)
 
 
 def namespace_option() -> Any:
-    """The option --namespace of a command for a flight."""
+    """Declare the option --namespace of a command for a flight."""
     return option("Namespace of the aircraft.", default="")
 
 
 def _field(declare: Callable[[str], object], default: Any) -> Any:
-    """A field with a declaration for Typer."""
+    """Return a data-class field that carries its declaration for Typer."""
     metadata = {DECLARE: declare}
     if default is REQUIRED:
         return field(metadata=metadata)
@@ -94,7 +94,7 @@ def _field(declare: Callable[[str], object], default: Any) -> Any:
 
 
 def as_function(command: Callable[..., Executable]) -> Callable[..., None]:
-    """The function for Typer: a parameter a field, the help of the class."""
+    """Turn a command into a function for Typer, with the command's docstring as the help."""
     hints = get_type_hints(command)
 
     def execute(**values: Any) -> None:
@@ -109,7 +109,7 @@ def as_function(command: Callable[..., Executable]) -> Callable[..., None]:
 
 
 def _parameter(declared: Field[Any], hint: Any) -> Parameter:
-    """The parameter of a function for a field; a field without words is of Typer's own."""
+    """Turn a field into a parameter of the function; Typer declares a field without words."""
     default = Parameter.empty if declared.default is MISSING else declared.default
     if declared.metadata:
         hint = Annotated[hint, declared.metadata[DECLARE](declared.name)]
@@ -135,7 +135,7 @@ def warn(text: str) -> None:
 
 
 def _names_of(library: str) -> Callable[[str], list[str]]:
-    """The completion of the shell by the names in a library, MODULE:FOLDER."""
+    """Return a shell completion that offers the names in a library, MODULE:FOLDER."""
 
     def complete(incomplete: str) -> list[str]:
         from flight_core.files import names_in  # noqa: PLC0415 - --help does without
@@ -146,7 +146,7 @@ def _names_of(library: str) -> Callable[[str], list[str]]:
 
 
 def list_of(names: Iterable[str]) -> Callable[[str], list[str]]:
-    """The completion of the shell of the last name in a list with commas, each name once."""
+    """Return a shell completion for a comma-separated list, which offers each name once."""
 
     def complete(incomplete: str) -> list[str]:
         before, comma, begun = incomplete.rpartition(",")
@@ -198,7 +198,7 @@ def _typers_sentence(error: Any, command: str) -> ParameterError:
 
 
 def refused_value(error: typer.BadParameter, command: str) -> ParameterError:
-    """The refusal of a value as a sentence: ours, or else that of Typer."""
+    """Turn the refusal of a value into a sentence: the project's own, or else Typer's."""
     cause: Any = error.__cause__
     if cause is None or not hasattr(cause, "errors") or error.param is None:
         return _typers_sentence(error, command)
@@ -238,7 +238,7 @@ class RiseDiCommand(TyperCommand):
             raise refused_words(error, f"rise-di {self.name}", names) from None
 
     def _mend(self, name: str, names: Sequence[str]) -> str:
-        """What to type in place of an unknown option."""
+        """Suggest what to type in place of an unknown option."""
         if name[2:] in names:
             return f"give it without a name, rise-di {self.name} {name[2:].upper()}"
         near = [
