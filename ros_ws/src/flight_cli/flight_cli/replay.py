@@ -128,7 +128,7 @@ class Shown(NamedTuple):
     differences: tuple[str, ...] = ()  # of the aircraft from what the controller was told
 
     def notes(self) -> list[str]:
-        """Notes of the computation, and a note on ticks with other parameters than the log."""
+        """Return notes of the computation, and on ticks whose parameters are not the log's."""
         result = self.result
         notes = [*result.notes, *(() if self.guided is None else self.guided.notes)]
         rows = np.flatnonzero(result.other_parameters)
@@ -176,7 +176,7 @@ def _show_guidance(replay_of_guidance: GuidanceReplay) -> None:
 
 
 def _difference(first: ReplayDifference) -> str:
-    """A difference as a text."""
+    """Return a difference between recorded and computed value as text."""
     if first.ulps is None:
         distance = "which is not a number"
     else:
@@ -234,7 +234,7 @@ def _show(answer: Shown, notes: Sequence[str]) -> None:
 
 
 def _count_by_group(result: ReplayResult) -> dict[str, int]:
-    """Number of ticks in which each group of channels differs."""
+    """Count the ticks in which each group of channels differs."""
     different = result.different()
     groups = [name.split(".")[0] for name in result.names]
     ticks = {group: different[:, np.array(groups) == group].any(axis=1) for group in groups}
