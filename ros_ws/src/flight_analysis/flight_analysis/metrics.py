@@ -89,9 +89,9 @@ class Transient(NamedTuple):
     stop: float
 
     def excites(self, channel: str) -> bool:
-        """Whether a channel is excited.
+        """Return whether the transient excites a channel.
 
-        A command excites a channel, any further transient every channel.
+        A command excites its own channel; every other transient excites all channels.
         """
         return self.kind != "command" or self.name == channel
 
@@ -139,9 +139,9 @@ def tracking_error(tape: Tape) -> Signal:
 
 
 def _controlled(tape: Tape) -> tuple[str, ...]:
-    """The channels of y that y_m has: y may have more.
+    """Return the channels of y that y_m has too; y may have more.
 
-    Raises ParameterError where they share none.
+    Raises ParameterError if they share none.
     """
     names = tuple(name for name in tape["y"].names if name in tape["y_m"].names)
     require(
@@ -154,10 +154,10 @@ def _controlled(tape: Tape) -> tuple[str, ...]:
 
 
 def true_error(tape: Tape) -> Signal | None:
-    """True error C x - y_m at every sample of `truth`, shape (N, m), inside the time of y_m.
+    """Return the true error C x - y_m at every sample of `truth`, (N, m), within the time of y_m.
 
-    The channels are as in `tracking_error`. Errors of the sensors are excluded, lost samples
-    included. None unless `truth` has "x.output" for every channel, as in a simulation.
+    The channels are as in `tracking_error`. Errors of the sensors do not count, but lost samples
+    do. Returns None unless `truth` has "x.output" for every channel, as in a simulation.
     """
     if "truth" not in tape:
         return None
@@ -234,7 +234,7 @@ def engagements(tape: Tape) -> list[Transient]:
 
 
 def live_commands(tape: Tape) -> list[Transient]:
-    """Changes of a live command, from `u_m`.
+    """Return the changes of a live command, from `u_m`.
 
     Changes of a channel less than SETTLING_DWELL apart are a single transient.
     """
@@ -258,10 +258,10 @@ def live_commands(tape: Tape) -> list[Transient]:
 
 
 def guided_transients(tape: Tape) -> list[Transient]:
-    """Turns and captures of a guided flight, from `guidance`, as `parts_legend` says.
+    """Return the turns and captures of a guided flight, from `guidance`, as `parts_legend` says.
 
-    `u_m` never rests then. Transients of a kind less than SETTLING_DWELL apart are a single
-    transient.
+    `u_m` never rests in such a flight. Transients of a kind less than SETTLING_DWELL apart count as
+    one.
     """
     if "guidance" not in tape:
         return []

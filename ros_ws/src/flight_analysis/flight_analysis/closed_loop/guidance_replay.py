@@ -39,7 +39,7 @@ class GuidanceReplay(NamedTuple):
 
 
 def _waypoints(rows: FloatArray) -> list[Waypoint]:
-    """The waypoints of a route from its messages, a row each."""
+    """Return the waypoints of a route from its messages, one per row."""
     return [Waypoint(*row[1:]) for row in rows.tolist()]
 
 
@@ -111,7 +111,7 @@ class _Comparison:
         )
 
     def differences(self) -> Iterator[ReplayDifference]:
-        """The first different channel of each different step, in the order of the steps."""
+        """Yield the first different channel of each different step, in the order of the steps."""
         previous: GuidanceState | None = None
         failed_before = 0.0
         rows = zip(self._signal.stamp_ns.tolist(), self._signal.values, strict=True)
@@ -140,7 +140,7 @@ class _Comparison:
         *,
         goes_on: bool,
     ) -> FloatArray:
-        """The channels of a step after a state, then u_m. `goes_on`: a failed step."""
+        """Compute the channels of a step after a state, then u_m; `goes_on` marks a failed step."""
         route = int(channels["route"])
         if goes_on and previous is not None:
             state, commands = previous, StepCommands()
@@ -159,7 +159,7 @@ class _Comparison:
     def _difference(
         self, k: int, recorded: FloatArray, computed: FloatArray
     ) -> ReplayDifference | None:
-        """The first channel of step k with a different bit."""
+        """Return the first channel of step k with a different bit."""
         columns = np.flatnonzero(recorded.view(np.int64) != computed.view(np.int64))
         if len(columns) == 0:
             return None

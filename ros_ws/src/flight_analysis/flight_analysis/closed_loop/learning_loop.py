@@ -88,7 +88,7 @@ class Learned(NamedTuple):
 def learned_sample(
     entries: Iterable[Entry], outputs: tuple[str, ...], *, proposed: bool
 ) -> Learned:
-    """What an identification found, and whether it became a proposal."""
+    """Return what an identification found, and whether it became a proposal."""
     output_entries = [entry for entry in entries if entry.row in outputs]
     channels = {f"value.{entry.name}": entry.value for entry in output_entries}
     channels |= {
@@ -107,7 +107,7 @@ class Identifications:
         self._names: tuple[str, ...] = ()
 
     def next(self, proposal: LearnerResult) -> Learned | None:
-        """That of a proposal; None where nothing was identified."""
+        """Return the sample of a proposal's identification; None if there was no identification."""
         identification = getattr(self._learner, "identification", None)
         if identification is None or identification is self._last:
             return None
@@ -123,9 +123,9 @@ class Identifications:
 
 
 def as_received(proposal: LearnerResult, start: RiseDiConfig, end_ns: int, flown: int) -> Proposal:
-    """A proposal as the controller receives it.
+    """Return a proposal as the controller receives it.
 
-    The proposal has the end of the window, and the digest of the parameters in force there.
+    It carries the end of the window, and the digest of the parameters in force at that instant.
     """
     change = {} if proposal.controller is None else design_changes(start, proposal.controller)
     return Proposal(
@@ -140,7 +140,7 @@ def as_received(proposal: LearnerResult, start: RiseDiConfig, end_ns: int, flown
 def proposed(
     learner: Learner, learning: Learning, controller: Controller, t_ns: int
 ) -> LearnerResult:
-    """The proposal of the learner at a tick where one is due, also handed to the controller."""
+    """Let the learner propose at a tick, and hand the proposal to the controller."""
     proposal = learner.propose(controller.digest, outputs_without(controller.parameters))
     received = as_received(proposal, learning.start, t_ns, controller.digest)
     learning.receive(received, controller, t_ns)

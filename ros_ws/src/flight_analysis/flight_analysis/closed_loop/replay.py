@@ -91,7 +91,7 @@ class ReplayResult(NamedTuple):
         return not self.different().any() and not self.other_parameters.any()
 
     def first(self) -> ReplayDifference | None:
-        """The first difference in the first different tick; None without a difference.
+        """Return the first difference in the first different tick; None without a difference.
 
         A channel of u goes before a channel of `internals`.
         """
@@ -115,7 +115,7 @@ class ReplayResult(NamedTuple):
         )
 
     def group(self, values: FloatArray, prefix: str) -> Signal:
-        """The channels "prefix.name" of `recorded` or `computed`, with flight time as stamps.
+        """Return the channels "prefix.name" of `recorded` or `computed`, stamped with flight time.
 
         Args:
             values: `recorded` or `computed`, shape (N, k).
@@ -130,10 +130,10 @@ class ReplayResult(NamedTuple):
 
 
 def recorded_parameters(scenario: StoredFile, namespace: str | None = None) -> ControllerConfig:
-    """The parameters of the controller in the scenario of a log, or in a parameter file.
+    """Read the controller's parameters from the scenario of a log, or from a parameter file.
 
-    A file of the controller in this namespace is enough: further sections are not read. Raises
-    ParameterError.
+    A file of the controller in this namespace is enough: the function reads no other section.
+    Raises ParameterError.
     """
     path = Path(scenario.name)
     needed = {"controller": AnyLaw}
@@ -145,7 +145,7 @@ def recorded_parameters(scenario: StoredFile, namespace: str | None = None) -> C
 
 
 def is_controller_alone(scenario: StoredFile) -> bool:
-    """Whether a file has a section for the controller, and none for an aircraft of the stack.
+    """Return whether a file has a section for the controller, but none for an aircraft.
 
     Raises ParameterError.
     """
@@ -156,7 +156,7 @@ def is_controller_alone(scenario: StoredFile) -> bool:
 
 
 def recorded_scenario(run: RecordedRun | StoredFile | FilePath) -> Scenario:
-    """The scenario of a run, by the run as read, by its folder, or by its scenario as stored.
+    """Return the scenario of a run, given as read, as its folder, or as the stored scenario.
 
     Args:
         run: Folder or file of a run, a run as read, or a scenario as stored.
@@ -323,7 +323,7 @@ class _Steps:
                 state = ticks.state(k, in_force.limits, in_force.law, state)
 
     def _state_after_gap(self, k: int) -> ControllerState | None:
-        """The recorded state of an engaged tick, from which an open loop engages; None before."""
+        """Return the recorded state of an engaged tick, where an open loop engages; None before."""
         if not self._ticks.flies[k]:
             return None
         state = self._ticks.state(k, self._in_force.limits, self._in_force.law)
@@ -333,7 +333,7 @@ class _Steps:
 def _recorded(
     run: Tape | RecordedRun, parameters: ControllerConfig | None, changes: Sequence[Change] | None
 ) -> tuple[Tape, ControllerConfig, Sequence[Change]]:
-    """The tape of a run, with the parameters and the changes of the run for None.
+    """Return the tape of a run; the run fills in parameters and changes that are None.
 
     Raises ParameterError.
     """
@@ -353,9 +353,9 @@ def _recorded(
 
 
 def recorded_changes(run: RecordedRun, parameters: ControllerConfig) -> Sequence[Change]:
-    """The changes in flight of the parameters of the recorded controller, in order.
+    """Return the changes in flight of the recorded controller's parameters, in order.
 
-    Without a log the changes of the tape are taken.
+    If the run has no log, these are the changes of the tape.
     """
     if run.path is None:
         return run.tape.changes
@@ -386,7 +386,7 @@ def later_aircraft(run: RecordedRun, scenario: Scenario) -> tuple[AircraftConfig
 
 
 def _coverage_notes(ticks: Ticks, checked: NDArray[np.bool_]) -> Iterator[str]:
-    """Notes on what the log does not hold, and what was therefore not checked."""
+    """Note what the log does not hold, and what was therefore not checked."""
     if len(ticks.number) and not ticks.begins[0]:
         yield f"the log begins with sample {ticks.number[0]} of internals: earlier ones are missing"
     for start in ticks.starts:
@@ -410,9 +410,9 @@ def _coverage_notes(ticks: Ticks, checked: NDArray[np.bool_]) -> Iterator[str]:
 
 
 def _controller_at(processes: Mapping[str, Process], stamp_ns: int) -> str:
-    """The name of the last controller to begin before an instant, after a comma.
+    """Name the last controller that began before an instant, after a comma.
 
-    Empty where the log has no name.
+    Returns "" if the log has no name.
     """
     begins = [
         (process.first_ns, name)

@@ -59,7 +59,7 @@ class ParametersInForce:
         self.limits = parameters.guard()
 
     def notes(self) -> tuple[str, ...]:
-        """A note for each kind of change, by the names of the parameters."""
+        """Return a note for each kind of change, by the names of the parameters."""
         return tuple(
             f"parameters changed before tick {numbers[0]}"
             + (f" and {len(numbers) - 1:,} later ones" if len(numbers) > 1 else "")
@@ -141,16 +141,16 @@ class Ticks:
         self._copied = [names.index(name) for name in COPIED_CHANNELS]
 
     def begin(self, before: ControllerState | None = None) -> ControllerState:
-        """The state of a controller that was configured, with the u of a state before."""
+        """Return the state of a configured controller, with the u of an earlier state."""
         state = guard.initial_state(self.m, self._allocation)
         return state if before is None else state._replace(u=before.u, effectors=before.effectors)
 
     def state(
         self, k: int, limits: GuardParams, law: TunedLaw, computed: ControllerState | None = None
     ) -> ControllerState:
-        """The recorded state after a tick.
+        """Return the recorded state after a tick.
 
-        Values outside the log come from the computed state, if there is one.
+        Values that the log lacks come from the computed state, if there is one.
         """
         row = {name: values[k] for name, values in self._groups.items()}
         law_state = restored(law.control_law, row)
@@ -193,7 +193,7 @@ class Ticks:
     def tick(
         self, k: int, state: ControllerState, limits: GuardParams, law: TunedLaw
     ) -> tuple[ControllerState, FloatArray]:
-        """A tick: (state afterwards, row of `internals`).
+        """Compute a tick; return the state after it and the row of `internals`.
 
         The row is NaN for a tick without output.
         """
@@ -236,7 +236,7 @@ class Ticks:
 
 
 def _checked_internals(tape: Tape, names: Sequence[str]) -> Signal:
-    """The channels `names` of `internals`, in this order.
+    """Return the channels `names` of `internals`, in this order.
 
     Raises ParameterError for other channels or values.
     """
@@ -269,7 +269,7 @@ def _checked_internals(tape: Tape, names: Sequence[str]) -> Signal:
 def _tick_order(
     now_ns: NDArray[np.int64], number: FloatArray
 ) -> tuple[NDArray[np.int64], list[int]]:
-    """The order of the ticks by their instants, and where in this order a controller starts.
+    """Order the ticks by their instants; return also where in this order a controller starts.
 
     Ticks of one controller are in the order of their numbers, whichever was stored first.
     """
@@ -283,7 +283,7 @@ def _tick_order(
 def _as_published(
     tape: Tape, topic: str, names: Sequence[str], stamp_ns: NDArray[np.int64], otherwise: FloatArray
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Samples of a topic at these stamps, shape (N, m), and the mask of stamps with a sample.
+    """Return the samples of a topic at these stamps, (N, m), and a mask of stamps with a sample.
 
     A stamp without a sample has the values of `otherwise`.
     """

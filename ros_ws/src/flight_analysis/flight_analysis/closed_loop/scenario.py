@@ -70,7 +70,7 @@ class Scenario:
 
     @classmethod
     def from_parts(cls, name: str, **sections: Mapping[str, Any] | Config) -> "Scenario":
-        """A scenario without a file.
+        """Create a scenario without a file.
 
         The sections are flight, aircraft, reference_model, controller and, if any, recorder and
         guidance. The value of a section is a mapping of parameters, or a parameter set. Lists may
@@ -102,7 +102,7 @@ class Scenario:
         return scenario_of(name, Path(f"{name}.yaml"), values)
 
     def vary(self, **sections: Mapping[str, Any] | Config) -> "Scenario":
-        """A copy with some parameters replaced, as in scenario.vary(controller={"rate": 200.0}).
+        """Return a copy with parameters replaced, as in scenario.vary(controller={"rate": 200.0}).
 
         The value of a section is a mapping of new parameters, or a whole parameter set such as the
         `controller` of a second scenario. Lists may be arrays. A different `law` starts without the
@@ -125,7 +125,7 @@ class Scenario:
         return varied
 
     def _varied(self, name: str, changes: Mapping[str, Any] | Config) -> Any:
-        """A section with changes, validated."""
+        """Return a section with changes, validated."""
         schema = SCHEMAS.get(name)
         if schema is None:
             if owners := self.sections_with(name):
@@ -142,7 +142,7 @@ class Scenario:
         return schema.validate_mapping({**self._values(name, changes), **changes}, name)
 
     def sections_with(self, name: str) -> list[str]:
-        """The sections that have a parameter of this name.
+        """Return the sections that have a parameter of this name.
 
         Args:
             name: Name of a parameter, as k_g.
@@ -153,7 +153,7 @@ class Scenario:
         return [key for key in SCHEMAS if name in getattr(getattr(self, key), "model_fields", ())]
 
     def _values(self, name: str, changes: Mapping[str, Any]) -> dict[str, Any]:
-        """The parameters of a section that changes are added to."""
+        """Return the parameters of a section to which changes are added."""
         section: Config | None = getattr(self, name)
         if section is None:
             return guidance_by_rule(self.aircraft, self.reference_model, self.controller)
@@ -163,7 +163,7 @@ class Scenario:
         return values
 
     def rise_di(self) -> RiseDiConfig:
-        """The parameters of a controller with RISE-DI.
+        """Return the parameters of a controller with RISE-DI.
 
         Raises ParameterError for a different law.
         """
@@ -179,7 +179,7 @@ class Scenario:
         return isinstance(self.controller, RiseDiConfig) and self.controller.learn is not None
 
     def air(self) -> str:
-        """What is in the air beside gusts, of flight_analysis.metrics.AIRS: the most violent."""
+        """Name the most violent disturbance of the air beside gusts, one of metrics.AIRS."""
         aircraft = self.aircraft
         if aircraft.microburst is not None:
             return "microburst"
@@ -206,7 +206,7 @@ class Scenario:
 
 
 def as_scenario(value: object) -> Scenario:
-    """The value, a Scenario. Raises ParameterError for another value."""
+    """Return the value if it is a Scenario. Raises ParameterError otherwise."""
     return as_instance(
         value, Scenario, "scenario", "a Scenario, as find_scenario and recorded_scenario return one"
     )
@@ -246,12 +246,12 @@ def load_scenario(path: FilePath, *, with_route: bool = True) -> Scenario:
 
 
 def parse_scenario(content: bytes, path: Path) -> Scenario:
-    """The scenario in the content of a file or of a log, validated. Raises ParameterError."""
+    """Parse and validate the scenario in the content of a file or log. Raises ParameterError."""
     return scenario_of(path.stem, path, parse_scenario_sections(content, path))
 
 
 def scenario_of(name: str, path: Path, sections: Mapping[str, Mapping[str, Any]]) -> Scenario:
-    """The scenario of these sections, validated. Raises ParameterError."""
+    """Build the scenario from these sections and validate it. Raises ParameterError."""
     parameters: dict[str, Any] = {
         key: schema.validate_mapping(sections.get(key, {}), key)
         for key, schema in SCHEMAS.items()
@@ -264,12 +264,12 @@ def scenario_of(name: str, path: Path, sections: Mapping[str, Mapping[str, Any]]
 
 
 def parse_scenario_sections(content: bytes, path: Path, namespace: str | None = None) -> Sections:
-    """The sections in the content of a scenario file, not validated yet. Raises ParameterError.
+    """Parse the sections of a scenario file; they are not validated yet. Raises ParameterError.
 
     `namespace` belongs to the nodes, as in `parse_sections`.
 
-    A path of an airframe or of a recorded command that is none from the working folder is one from
-    the folder of the scenario, or that file itself lies there.
+    If the path of an airframe or of a recorded command names no file from the working folder, the
+    function looks for it from the scenario's folder, and for a file of its name in that folder.
     """
     sections = parse_sections(content, path, SCHEMAS, OPTIONAL, namespace)
     recorded = sections["reference_model"].get("recorded")
@@ -286,11 +286,11 @@ def parse_scenario_sections(content: bytes, path: Path, namespace: str | None = 
 def guidance_by_rule(
     aircraft: AircraftConfig, reference: ReferenceModelConfig, controller: ControllerConfig
 ) -> dict[str, Any]:
-    """Parameters of guidance that follow from the further sections.
+    """Compute the parameters of guidance that follow from the other sections.
 
-    The authorities of throttle and aileron are abs(Omega_ii) u of RISE-DI, Omega_ii = omega /
-    input_scale, with the limits of u from trim; none for a controller without these numbers. Raises
-    ParameterError for a model or an aircraft beyond guidance.
+    The authorities of throttle and aileron are abs(Omega_ii) u of RISE-DI, with Omega_ii = omega /
+    input_scale and the limits of u from trim. A controller without these numbers has none. Raises
+    ParameterError if the model or the aircraft does not suit guidance.
     """
     key = "reference_model.second_order"
     channels = aircraft.channels()
@@ -333,7 +333,7 @@ def guidance_by_rule(
 def scenario_yaml(
     scenario: Scenario, overrides: Mapping[str, Mapping[str, Any]] | None = None
 ) -> str:
-    """The text of a scenario file with every parameter, defaults included.
+    """Write a scenario file as text with every parameter, defaults included.
 
     `overrides` replace parameters by section. A parameter with the value None or empty, the
     default, is left out.
@@ -422,9 +422,9 @@ def check_together(scenario: Scenario) -> None:
 
 
 def limits_beyond_stops(scenario: Scenario) -> tuple[str, ...]:
-    """A sentence for each limit of the controller outside the end stops of the actuators.
+    """Warn of each limit of the controller outside the actuators' end stops, a sentence each.
 
-    There the anti-windup starts too late.
+    At such a limit, the anti-windup starts too late.
     """
     controller = scenario.controller
     actuators = scenario.aircraft.actuators
@@ -530,10 +530,10 @@ def _check_guidance(scenario: Scenario, guidance: GuidanceConfig) -> None:
 
 
 def opposite_signs(scenario: Scenario) -> tuple[str, ...]:
-    """A sentence where D contradicts the signs of C B of the airframe file.
+    """Warn, in a sentence, if D contradicts the signs of C B of the airframe file.
 
-    The law then drives y away from y_m. There is none beside an allocation, or without an airframe
-    file.
+    The law then drives y away from y_m. With an allocation, or without an airframe file, there is
+    no such sentence.
     """
     controller = scenario.controller
     aircraft = scenario.aircraft

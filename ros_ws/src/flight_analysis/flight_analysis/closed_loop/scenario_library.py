@@ -46,7 +46,7 @@ def scenarios() -> list[str]:
 def find_scenario(
     name: FilePath | Scenario, duration: float | None = None, *, with_route: bool = True
 ) -> Scenario:
-    """A scenario by its name in LIBRARY, or by the path of a file (.yaml), of a `duration` in s.
+    """Find a scenario by its name in LIBRARY or its .yaml file; set a `duration`, s, if given.
 
     Args:
         name: Name in the library, path of a scenario file (.yaml), or a Scenario.
@@ -76,12 +76,12 @@ def with_route(
     waypoints: Sequence[Waypoint],
     fence: Mapping[str, Any] = MappingProxyType({}),
 ) -> Scenario:
-    """The scenario with a route that guidance flies from the start.
+    """Return the scenario with a route that guidance flies from the start.
 
-    The route of the scenario and the program of targets give way. `fence`: further sections of
-    guidance, as of `read_fence_file`.
+    It replaces the scenario's route and program of targets. `fence` has more sections of guidance,
+    such as those of `read_fence_file`.
 
-    Raises ParameterError where it cannot be flown.
+    Raises ParameterError if the route cannot be flown.
     """
     leg_speeds = speeds(waypoints, scenario.aircraft.channels().speed)
     route: dict[str, list[Any]] = {
@@ -102,12 +102,12 @@ def with_route(
 
 
 def as_flown(scenario: Scenario, run: Path, namespace: str = "") -> Scenario:
-    """The scenario with a file from which the nodes in a namespace read the same.
+    """Return the scenario with a file from which the nodes in a namespace read the same.
 
-    It is its own file, or a new one in the folder `run`: with the values of recorded commands, so
-    that the log needs no other file to be flown again, or with sections for any namespace where
-    the file's are for another, as /uav7/controller. Raises ParameterError where it cannot be
-    written.
+    This is the scenario's own file, or a new one in the folder `run`. A new file holds the values
+    of recorded commands, so that the log needs no other file to be flown again, and has sections
+    for any namespace if those of the old file are for another one, such as /uav7/controller. Raises
+    ParameterError if the file cannot be written.
     """
     if not scenario.reference_model.recorded and _reaches_nodes(scenario.path, namespace):
         return scenario
@@ -115,9 +115,9 @@ def as_flown(scenario: Scenario, run: Path, namespace: str = "") -> Scenario:
 
 
 def with_parameters(scenario: Scenario, path: Path, namespace: str) -> Scenario:
-    """The scenario with what a parameter file says further to the nodes in a namespace.
+    """Add to the scenario what else a parameter file says to the nodes in a namespace.
 
-    Values replace those of their names. Raises ParameterError.
+    Values replace those of the same names. Raises ParameterError.
     """
     content = read_file(path, str(path), "a ROS parameter file")
     further = parse_sections(content, path, SCHEMAS, tuple(SCHEMAS), namespace, with_general=True)
@@ -134,7 +134,7 @@ def with_parameters(scenario: Scenario, path: Path, namespace: str) -> Scenario:
 
 
 def _reaches_nodes(path: Path, namespace: str) -> bool:
-    """Whether the nodes in a namespace get every section of a scenario file, and no other.
+    """Return whether the nodes in a namespace get every section of a scenario file, and no other.
 
     Overrides of a node join a section for all nodes, which rcl puts before that of the node.
     """
@@ -150,9 +150,9 @@ def _reaches_nodes(path: Path, namespace: str) -> bool:
 
 
 def save_scenario(scenario: Scenario, path: Path) -> Scenario:
-    """A scenario that differs from its file, as a file of its own.
+    """Save a scenario that differs from its file as a file of its own.
 
-    Raises ParameterError where it cannot be written.
+    Raises ParameterError if it cannot be written.
     """
     with writing("", path, "a folder that can"):
         write_file(path, scenario_yaml(scenario))

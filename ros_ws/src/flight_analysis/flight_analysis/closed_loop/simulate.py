@@ -63,7 +63,7 @@ def simulate(
     learn: Learn | None = None,
     announce: Callable[[Event], None] = lambda event: None,
 ) -> Tape:
-    """The tape of a flight in memory, SI and radians, with the reason of an early end.
+    """Simulate a flight in memory and return its tape, SI and radians, with why it ended early.
 
     Raises ParameterError for no Scenario, and for one that learns without `learn`. `progress` is
     called with the flight time, s, once per simulated second. `announce` takes the events of the

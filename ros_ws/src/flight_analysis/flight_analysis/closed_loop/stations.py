@@ -77,7 +77,7 @@ class Topics:
         self._names[topic] = tuple(names)
 
     def names(self, topic: str) -> tuple[str, ...]:
-        """The channels of a topic. Raises KeyError before it is advertised."""
+        """Return the channels of a topic. Raises KeyError before it is advertised."""
         return self._names[topic]
 
     def subscribe(self, topic: str, take: Take, channels: Sequence[str] | None = None) -> None:
@@ -88,7 +88,7 @@ class Topics:
         self._subscriptions[topic].append((channels, take))
 
     def is_taken(self, topic: str) -> bool:
-        """Whether a topic is recorded or taken by a station."""
+        """Return whether a topic is recorded or taken by a station."""
         return self._recorded or topic in self._subscriptions
 
     def publish(self, topic: str, sample: StampedVector, t_ns: int) -> None:
@@ -104,7 +104,7 @@ class Topics:
             take(StampedVector(sample.stamp_ns, values), t_ns)
 
     def pop_signals(self) -> dict[str, Signal]:
-        """The recorded samples since the last call, by topic."""
+        """Return the samples recorded since the last call, by topic."""
         signals = {}
         for topic, names in self._names.items():
             rows = self._rows.pop(topic, [])

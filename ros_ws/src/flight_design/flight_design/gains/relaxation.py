@@ -13,19 +13,19 @@ from flight_design.gains.requirement import ACCEPTED_PHASE_MARGIN, PHASE_MARGINS
 
 
 def binding(selection: Selection) -> GainCondition:
-    """The condition of the requirement that the engineering gains are farthest from."""
+    """Return the unmet condition that the engineering gains miss by the most."""
     return min(selection.engineering.unmet, key=lambda condition: condition.margin)
 
 
 def lacking(selection: Selection, *, options: Sequence[str] = ()) -> str:
-    """What binds the best gains of the search, in sentences; "" where nothing is unmet.
+    """Say in sentences what binds the best gains of the search; "" if every condition is met.
 
-    The sentences name the binding bound, every unmet condition, and every change of the loop to the
-    margins.
+    The sentences name the binding bound, every unmet condition, and every change of the loop that
+    reaches the margins.
 
-    A change is a smaller goal, half of the lags, no delay or twice the rate, and each is searched.
-    `options` are those of the command that calls, of phase_margin, lag, delay and rate: a
-    change is named by its option, where it has one.
+    A change is a smaller goal, half of the lags, no delay or twice the rate; the function searches
+    the gains for each. `options` are those of the calling command, out of phase_margin, lag, delay
+    and rate: a sentence names a change by its option if the command has one.
     """
     assessed = selection.engineering
     if not assessed.unmet:
@@ -44,7 +44,7 @@ def lacking(selection: Selection, *, options: Sequence[str] = ()) -> str:
 
 
 def _relaxed(selection: Selection, options: Sequence[str]) -> dict[str, LoopSetting]:
-    """The relaxed settings of a loop by the words of the change."""
+    """Return the relaxed settings of a loop, by the words that describe the change."""
     setting = selection.setting
     changes: dict[str, LoopSetting] = {}
     margins = selection.engineering.margins

@@ -66,9 +66,9 @@ WAIT = 30.0  # s before the first command of the flight: the time to engage
 
 
 def channel_pairs(channel_map: ChannelMap) -> tuple[ChannelPairing, FloatArray]:
-    """Outputs and driving inputs by the motions of the map, and the signs of the effects, (m,).
+    """Pair outputs with driving inputs by a map's motions; return the effects' signs, (m,).
 
-    Raises ParameterError for an output without an input, and for one with the opposite sign.
+    Raises ParameterError if an output has no input, or has one of the opposite sign.
     """
     drivers: dict[str, tuple[str, int]] = {}
     for name, row in channel_map.inputs.items():
@@ -97,12 +97,12 @@ def channel_pairs(channel_map: ChannelMap) -> tuple[ChannelPairing, FloatArray]:
 
 
 def motions(channel_map: ChannelMap) -> dict[str, str]:
-    """The motion of each output of a map, a key of UNITS: the name of q, p, r and V."""
+    """Return the motion of each output of a map, a key of UNITS; it names q, p, r and V."""
     return {name: row.motion[0] for name, row in channel_map.outputs.items()}
 
 
 def has_airspeed(channel_map: ChannelMap) -> bool:
-    """Whether a map has an airspeed: without one the aircraft hovers."""
+    """Return whether a map has an airspeed; an aircraft without one hovers."""
     return "V" in motions(channel_map).values()
 
 
@@ -139,9 +139,9 @@ def experiment(
     airframe_file: str,
     wait: float = WAIT,
 ) -> Experiment:
-    """The experiment of a channel map: every input at `amplitude` of the smaller limit.
+    """Plan the experiment of a channel map: every input at `amplitude` of its smaller limit.
 
-    `speed` in trim, m/s, None in hover.
+    `speed` is the airspeed in trim, m/s; it is None in hover.
     """
     pairing, sign = channel_pairs(channel_map)
     rows = [channel_map.inputs[name] for name in pairing.inputs]
@@ -210,13 +210,14 @@ def cut_short(engagements: Sequence[Engagement], duration: float) -> str:
 def channel_models(
     channel_map: ChannelMap, tape: Tape, spans: Spans, speed: float | None
 ) -> list[ChannelModel | None]:
-    """The models of the channels of a map from the log of an experiment; None for no model.
+    """Identify the channels of a map from the log of an experiment; None for one without a model.
 
     The aircraft is engaged in `spans`.
 
-    Arguments: `speed` in trim, m/s, None in hover. V has no model without a measured climb: the
-    phugoid, which thrust excites too, would be taken for a response to thrust. A climb in hover is
-    of first order. Source: G. D. Padfield, "Helicopter Flight Dynamics", 2007, 4.3 (heave).
+    `speed` is the airspeed in trim, m/s; it is None in hover. V gets no model unless a climb is
+    measured: thrust also excites the phugoid, which would be taken for a response to thrust. A
+    climb in hover is of first order. Source: G. D. Padfield, "Helicopter Flight Dynamics", 2007,
+    4.3 (heave).
     """
     pairing, sign = channel_pairs(channel_map)
     y = tape["y"].within(spans)
@@ -268,10 +269,10 @@ class IdentifiedChannels(NamedTuple):
 def join(
     channel_map: ChannelMap, response: Response, models: Sequence[ChannelModel | None]
 ) -> IdentifiedChannels:
-    """The models of the channels with a model, the step responses of the rest.
+    """Join the models of the channels with the step responses of those that have no model.
 
-    Raises ParameterError for a channel without a certain result, and for signs in contradiction to
-    the map or among themselves.
+    Raises ParameterError if a channel has no certain result, or if signs contradict the map or each
+    other.
     """
     pairing, sign = channel_pairs(channel_map)
     Omega = np.where(np.isfinite(response.Omega), response.Omega, 0.0)
@@ -336,9 +337,9 @@ def over_link(channels: IdentifiedChannels, link_delay: float) -> IdentifiedChan
 def measured_trims(
     channel_map: ChannelMap, would_send: Signal, engaged_ns: int
 ) -> dict[str, float]:
-    """The commands in trim by input, SI.
+    """Return the commands in trim by input, SI.
 
-    They are what the bridge sent in the pause after an engagement, when u was 0.
+    The bridge sent them in the pause after an engagement, while u was 0.
     """
     stamps = (would_send.stamp_ns - engaged_ns) / NANOSECONDS
     still = (stamps > 0.2 * PAUSE) & (stamps < 0.8 * PAUSE)
@@ -360,9 +361,9 @@ def measured_trims(
 def within_range(
     channel_map: ChannelMap, trims: Mapping[str, float]
 ) -> tuple[ChannelMap, list[str]]:
-    """A map whose limits around trims stay in the ranges of the fields.
+    """Return a map whose limits about the trims stay within the ranges of the fields.
 
-    A narrower limit has a sentence. Raises ParameterError for a trim at a stop.
+    A sentence reports each limit that it narrows. Raises ParameterError for a trim at a stop.
     """
     values = channel_map.model_dump(exclude_unset=True)
     sentences = []
@@ -393,7 +394,7 @@ def within_range(
 
 
 def map_text(channel_map: ChannelMap, trims: Mapping[str, float], source: str) -> str:
-    """The text of a channel map with measured trims.
+    """Write a channel map with measured trims as text.
 
     A captured trim is measured again at every engagement.
     """
@@ -422,7 +423,7 @@ def controller_values(channel_map: ChannelMap, pairing: ChannelPairing) -> dict[
 
 
 def _rounded(row: FloatArray) -> list[float]:
-    """The row to four digits."""
+    """Round a row to four digits."""
     return [float(f"{value:.4g}") for value in row]
 
 
@@ -433,7 +434,7 @@ def airframe_yaml(
     speed: float | None,
     source: str,
 ) -> str:
-    """The text of the airframe of identified channels, in units of the map's channels.
+    """Write the airframe of identified channels as text, in units of the map's channels.
 
     With z_i of the dimension of y_i dt:
 
@@ -490,7 +491,7 @@ def signs_alone(sign: FloatArray) -> IdentifiedChannels:
 def bridge_sections(
     airframe_file: str, commands: FirstCommands, controller: ControllerConfig
 ) -> dict[str, Mapping[str, Any]]:
-    """The sections of a scenario for the aircraft behind a bridge."""
+    """Return the sections of a scenario for the aircraft behind a bridge."""
     return {
         "flight": {"duration": float(commands.duration)},
         "aircraft": {"airframe": airframe_file, "rate": RATE, "step": 1.0 / RATE},
@@ -501,7 +502,7 @@ def bridge_sections(
 
 
 def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Lists for tuples, numbers with six digits."""
+    """Replace tuples by lists, and round numbers to six digits."""
 
     def plain(value: Any) -> Any:
         if isinstance(value, (list, tuple)):

@@ -169,18 +169,18 @@ class _Identified(NamedTuple):
         return first_commands(channels, self.speed, RATE, banks=True, wait=WAIT)
 
     def airframe_text(self, source: str) -> str:
-        """The text of the airframe file."""
+        """Write the airframe file as text."""
         return airframe_yaml(self.channel_map, self.pairing, self.channels, self.speed, source)
 
     def airframe(self, source: str) -> Airframe:
-        """The airframe."""
+        """Return the airframe."""
         return Airframe.validate_mapping(yaml.safe_load(self.airframe_text(source)), "airframe")
 
     def of_integrators(self, manoeuvre: Manoeuvre) -> Study:
-        """The study of y_dot = Omega u.
+        """Study y_dot = Omega u.
 
-        Over 1 s alone: the literal gain set needs more of the manoeuvre than the slew, and is not
-        used.
+        The study lasts 1 s only: the literal gain set, which needs more of the manoeuvre than its
+        slew, is not used.
         """
         none = np.zeros_like(self.channels.damping)
         channels = self.channels._replace(damping=none, stiffness=none, zero=none)
@@ -189,7 +189,7 @@ class _Identified(NamedTuple):
         return ideal_control.study_airframe(integrators, short, samples=1)
 
     def setting(self, requirement: Requirement) -> LoopSetting:
-        """What the gains are selected for; each gain is 1 before."""
+        """Return the loop that gains are selected for; every gain is 1 before the selection."""
         loop = self.loop
         lag = loop.lag.tolist()
         channels = controller_values(self.channel_map, self.pairing)
@@ -209,10 +209,10 @@ class _Identified(NamedTuple):
 def _within_margins(
     controller: RiseDiConfig, study: Study, requirement: Requirement
 ) -> tuple[RiseDiConfig, LoopMargins | None]:
-    """The controller with slower integrals and lower bandwidths where the loop lacks margins.
+    """Slow the integrals and lower the bandwidths of a controller until the loop keeps its margins.
 
-    The loop is around the airframe of a study. The margins are the second result. A bandwidth falls
-    with the input scale: K of (22) stays.
+    The loop is around the airframe of a study. The function returns the controller and the margins.
+    The input scale takes a lower bandwidth, so that K of (22) stays.
     """
     if controller.sampled_sign()[0] is not Sign.SOFT:
         return controller, None
@@ -260,13 +260,13 @@ def _with_integrals(
     channels: IdentifiedChannels,
     loop: LoopTiming,
 ) -> RiseDiConfig:
-    """The controller with integrals for a crossover of the modelled loops as of y_dot = Omega u.
+    """Give the controller the integrals that keep the crossover of y_dot = Omega u with the models.
 
-    Lambda and the slope of the softened sign, 1 / (softening total lag), are the integrals of K (s
-    + integral) / s. For first order the integral is the damping, and the loop is K / s. A stiff
-    channel answers u with a rate and needs a larger integral, but a lower integral where the
-    sensitivity would exceed MAX_SENSITIVITY. Source: K. J. Astrom, T. Hagglund, "Advanced PID
-    Control", 2006, 6.5 (lambda tuning), 4.6 (largest sensitivity).
+    The slope of the softened sign is 1 / (softening total lag). Lambda and this slope are the
+    integrals of K (s + integral) / s. For a first-order channel, the integral is the damping, and
+    the loop becomes K / s. A stiff channel answers u with a rate and needs a larger integral,
+    unless the sensitivity would exceed MAX_SENSITIVITY. Source: K. J. Astrom, T. Hagglund,
+    "Advanced PID Control", 2006, 6.5 (lambda tuning), 4.6 (largest sensitivity).
     """
     places = [pairing.outputs.index(name) for name in controller.outputs]
     params = controller.law_params()
@@ -280,14 +280,14 @@ def _with_integrals(
 
 
 def _integral(channels: IdentifiedChannels, i: int, crossover: float, total_lag: float) -> float:
-    """The integral of a channel, 1/s, for a crossover of the loop at `crossover`, rad/s.
+    """Return the integral of a channel, 1/s, for a loop that crosses over at `crossover`, rad/s.
 
     The largest safe integral is the upper bound.
     """
     omega = np.geomspace(0.1, 1e3, 400) * crossover
 
     def response(omega: Any) -> Any:
-        """Of K times the model, without the delay."""
+        """Return the response of K times the model, without the delay."""
         s = 1j * omega
         return (
             crossover

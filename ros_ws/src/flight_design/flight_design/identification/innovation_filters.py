@@ -66,7 +66,7 @@ class FlightData(NamedTuple):
 
 
 def coarser(recorded: FlightData, factor: int) -> FlightData:
-    """The means over `factor` periods; u between the middles of two means of y."""
+    """Average over `factor` periods; u lies between the middles of two means of y."""
     count = len(recorded.t) // factor
     leads = [
         np.concatenate([recorded.u[k:], np.repeat(recorded.u[-1:], k, axis=0)])
@@ -140,7 +140,7 @@ def recording(tape: Tape, airframe: Airframe) -> FlightData:
 
 
 def filter_model(airframe: Airframe, actuation: Actuation, recorded: FlightData) -> NominalModel:
-    """The model of an airframe for its filter, channels in the airframe's order."""
+    """Return the model that the filter of an airframe uses, channels in the airframe's order."""
     noise = measured_noise(recorded.y, airframe.matrix_c() @ unit_sizes(airframe.states.values()))
     loop = LoopTiming(actuation.lag, actuation.delay, recorded.period)
     return airframe_model(airframe, airframe.outputs, tuple(airframe.inputs), noise, loop)
@@ -174,7 +174,7 @@ class FilterBank(NamedTuple):
     period: float  # s
 
     def by_level(self) -> "FilterBank":
-        """The first model at the levels, as a model a level."""
+        """Return the first model at every level of the wind, as one model per level."""
         levels = self.L.shape[1]
         Phi, Gamma = (
             np.repeat(matrix[:1], levels, axis=0)
@@ -288,10 +288,10 @@ class Passage:
 
 
 def in_rolling_air(airframe: Airframe) -> Airframe:
-    """The airframe with the rotary gust in roll, where its span is known.
+    """Add the rotary gust in roll to an airframe whose span is known.
 
-    That in pitch follows the vertical wind, see `filter_bank`. That in yaw is small beside the
-    lateral wind.
+    The rotary gust in pitch follows the vertical wind, see `filter_bank`. The one in yaw is small
+    beside the lateral wind.
     """
     return airframe if airframe.span is None else airframe.with_rotary_gusts(ROTARY[:1])
 
@@ -343,7 +343,7 @@ class FilterAir:
         )
 
     def around(self, model: NominalModel) -> NominalModel:
-        """The models with the states of the winds, A (N, 1, s, s) and B (N, 1, s, m)."""
+        """Extend the models by the states of the winds: A (N, 1, s, s) and B (N, 1, s, m)."""
         (N, n, m), G = model.B.shape, model.wind.shape[-1]
         s = n + len(self.states)
         x, w, v, a, slow = np.split(np.arange(s), np.cumsum([n, G, *2 * [len(self._smooth)]]))
@@ -404,7 +404,7 @@ def filter_bank(
     span: float | None = None,
     shear: FloatArray | None = None,
 ) -> FilterBank:
-    """The filters of models with A (N, n, n), B (N, n, m) and wind (N, n, G).
+    """Design the filters of models with A (N, n, n), B (N, n, m) and wind (N, n, G).
 
     They are at the trim speed V0, m/s, z = [x, w, v, a, ..].
 
@@ -464,7 +464,7 @@ class Block(NamedTuple):
     winds: NDArray[np.int64]
 
     def named(self, airframe: Airframe) -> Names:
-        """The names of the indices."""
+        """Return the names that belong to the indices."""
         every: tuple[Iterable[str], ...] = (
             airframe.states,
             airframe.inputs,
@@ -478,7 +478,7 @@ class Block(NamedTuple):
         return Names(*parts)
 
     def restricted(self, model: NominalModel) -> NominalModel:
-        """The model of this part alone."""
+        """Restrict a model to this part."""
         x = self.states
         u = self.inputs
         y = self.outputs
@@ -497,14 +497,14 @@ class Block(NamedTuple):
 
 
 def _block(parts: Sequence[NDArray[np.int32]], label: np.int32) -> Block:
-    """The states, inputs, outputs and winds with a label."""
+    """Return the states, inputs, outputs and winds that have a label."""
     return Block(*(np.flatnonzero(part == label) for part in parts))
 
 
 def blocks(model: NominalModel) -> list[Block]:
-    """The parts of an aircraft that neither A, gravity, B, C nor the wind couple.
+    """Split an aircraft into the parts that neither A, gravity, B, C nor the wind couple.
 
-    A single part where a part is not square.
+    If a part has not as many inputs as outputs, the whole aircraft is one part.
     """
     (n, m), G = model.B.shape, model.wind.shape[1]
     coupled = np.zeros((n + 2 * m + G, n + 2 * m + G))

@@ -125,7 +125,7 @@ class IdentifiedAircraft(NamedTuple):
         )
 
     def scenario(self) -> Scenario:
-        """The content of the scenario file."""
+        """Load the scenario from its text."""
         return _load(self.text)
 
     @property
@@ -229,7 +229,7 @@ def identify_jsbsim(
 
 
 def _linear(condition: FlightCondition, progress: Callable[[str], None]) -> Linearization:
-    """The linear aircraft. Raises FlightEnded, with the nearest condition that has a trim."""
+    """Linearise the aircraft. Raises FlightEnded, which names the nearest condition with a trim."""
     progress("trim and linearisation")
     try:
         return linearize(condition)
@@ -260,9 +260,10 @@ def sideslip_zero(airframe: Airframe) -> float:
 
 
 def with_sideslip_held(airframe: Airframe, zero: float) -> Airframe:
-    """The airframe with a damping of sideslip beside it where its zero is on the right.
+    """Return the airframe with more damping of sideslip if its zero of sideslip is unstable.
 
-    The law holds p and r, which a feedback of sideslip alone, as guidance has it, lets fly then.
+    The law holds p and r. Without feedback of sideslip, which guidance gives, the sideslip would
+    then diverge.
     """
     if zero <= 0.0:
         return airframe
@@ -273,18 +274,18 @@ def with_sideslip_held(airframe: Airframe, zero: float) -> Airframe:
 
 
 def airspeed_slew(bandwidth: float, effect: float) -> float:
-    """The slew of the throttle behind beta, 1/s, for a bandwidth of V, rad/s, and an effect, m/s^2.
+    """Return the throttle slew behind beta, 1/s, for a bandwidth of V, rad/s, and an effect, m/s^2.
 
-    V holds the wind itself: beta = K bandwidth / 4 sigma, so that the sign moves the throttle no
-    faster than the Lambda of the rule would, bandwidth / 4, in light turbulence of LIGHT_SIGMA.
+    V holds the wind itself: with beta = K bandwidth / 4 sigma, the sign moves the throttle in light
+    turbulence of LIGHT_SIGMA no faster than the Lambda of the rule would, bandwidth / 4.
     """
     return bandwidth**2 / 4.0 * LIGHT_SIGMA / (gain_selection.BETA_TO_SLEW * effect)
 
 
 def _too_weak(linear: Linearization) -> str:
-    """The outputs whose own input is too weak, in sentences after a "; ".
+    """Say which outputs have too weak an input of their own, in sentences after a "; ".
 
-    At full travel the own input moves the output less than a tenth of what a further input does.
+    At full travel, the own input moves such an output less than a tenth of what another input does.
     """
     inputs = linear.condition.inputs()
     reach = linear.Omega * linear.travel()
@@ -303,12 +304,12 @@ def _too_weak(linear: Linearization) -> str:
 
 
 def slowest_trim(condition: FlightCondition) -> float:
-    """The slowest airspeed at which an aircraft trims in level flight at an altitude, m/s.
+    """Find the slowest airspeed at which an aircraft trims in level flight at an altitude, m/s.
 
-    The error is at most 1 % of the condition's.
+    The error is at most 1 % of the condition's speed.
 
-    Below it lift or thrust is not enough, so guidance takes it as the stall speed. By bisection,
-    from 0.2 of the condition's.
+    Below this speed, lift or thrust is not enough, so guidance takes it as the stall speed. The
+    search is a bisection from 0.2 of the condition's speed.
     """
     slow = 0.2 * condition.speed
     fast = condition.speed
@@ -323,7 +324,7 @@ def slowest_trim(condition: FlightCondition) -> float:
 
 
 def with_extended_state(selection: Selection, Omega: FloatArray, margin: float) -> Selection:
-    """The selection with an extended-state observer in its engineering gains.
+    """Add an extended-state observer to the engineering gains of a selection.
 
     Omega is in the aircraft's order.
     """
@@ -346,7 +347,7 @@ def _in_law_order(Omega: FloatArray, controller: RiseDiConfig) -> FloatArray:
 def learning_selection(
     selection: Selection, condition: FlightCondition, Omega: FloatArray, margin: float
 ) -> Selection:
-    """A selection with feedforward and observer of a sketch, not yet flying, and `learn`.
+    """Add `learn`, with feedforward and observer of a sketch that do not fly yet, to a selection.
 
     Omega is in the aircraft's order.
     """
@@ -360,10 +361,10 @@ def learning_selection(
 
 
 def _study(airframe: Airframe, commands: FirstCommands) -> Study:
-    """The study of an airframe along the commands and gusts, without uncertain ones beside it.
+    """Study an airframe along the commands and gusts, without uncertain aircraft beside it.
 
-    The equations are those that fly. Aircraft 30 % off besides, entry by entry, may have a zero of
-    sideslip on the right, whose outputs no gains hold.
+    The equations are those that fly. An aircraft whose entries are 30 % off may have an unstable
+    zero of sideslip, and then no gains hold its outputs.
     """
     reference = ReferenceModelConfig.validate_mapping(commands.reference, "reference_model")
     gusts = {
@@ -376,7 +377,7 @@ def _study(airframe: Airframe, commands: FirstCommands) -> Study:
 
 
 def _integrators(linear: Linearization) -> Airframe:
-    """The airframe y_dot = Omega u: the model of an extended-state observer, and of its gains."""
+    """Return y_dot = Omega u as an airframe, the model of an extended-state observer."""
     airframe = linear.airframe
     units = airframe.units_of_outputs()
     m = len(units)
@@ -404,7 +405,7 @@ def airspeed_bandwidth(authority: float, lag: float) -> float:
 
 
 def _setting(linear: Linearization, V_bandwidth: float) -> LoopSetting:
-    """The loop of the gains. The parameters to be selected are 1."""
+    """Return the loop that the gains are selected for; the parameters to select are 1."""
     inputs = list(linear.condition.inputs())
     trim = linear.trim
     base = RiseDiConfig.validate_mapping(
@@ -441,7 +442,7 @@ def _load(text: str) -> Scenario:
 
 
 def _commands(linear: Linearization, setting: LoopSetting) -> FirstCommands:
-    """The commands of a linear aircraft in the loop of its gains."""
+    """Return the commands of a linear aircraft in the loop of its gains."""
     condition = linear.condition
     products = setting.crossover_lag_products
     total = total_lag(linear.lag, setting.delay, 1.0 / setting.rate)
@@ -463,7 +464,7 @@ def _commands(linear: Linearization, setting: LoopSetting) -> FirstCommands:
 def _text(
     linear: Linearization, commands: FirstCommands, selection: Selection, stall: float | None
 ) -> str:
-    """The scenario file. `stall`: V_s, m/s; guided where it is not None."""
+    """Write the scenario file. `stall` is V_s, m/s; without one the flight is not guided."""
     condition = linear.condition
     learns = selection.chosen.learn is not None
     reference = dict(commands.reference)
@@ -511,7 +512,7 @@ def _text(
 
 
 def _heading(linear: Linearization, selection: Selection, stall: float | None) -> list[str]:
-    """The first lines of the scenario file."""
+    """Write the first lines of the scenario file."""
     condition = linear.condition
     learns = selection.chosen.learn is not None
     assessed = selection.engineering

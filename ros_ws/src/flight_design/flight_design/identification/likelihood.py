@@ -171,7 +171,7 @@ def units(model: NominalModel, *, coupled: bool = False) -> tuple[FloatArray, Fl
 
 
 def largest_error(entry: Entry) -> float:
-    """The upper bound of the relative error of an entry."""
+    """Return the upper bound of the relative error of an entry."""
     return MAX_FACTOR - 1.0 if entry.nominal else MAX_ERROR
 
 
@@ -192,12 +192,12 @@ class Likelihood:
         *,
         coupled: bool = False,
     ) -> None:
-        """The prior of each error of A is PRIOR; `believe` replaces it.
+        """Give each error of A the prior PRIOR; `believe` replaces it.
 
-        The delay of u is `delay`, s, where it is known.
+        `delay` is the delay of u, s, if it is known.
 
-        The starts of the search take means of `factor` periods, by default of the shortest lag. If
-        `coupled`, the entries that are 0 are identified too.
+        The starts of the search use means over `factor` periods; by default, over the shortest lag.
+        If `coupled`, the entries that are 0 are identified too.
         """
         if factor is None:
             factor = max(int(float(np.min(model.lag)) / recorded.period + 1e-9), 1)
@@ -282,7 +282,7 @@ class Likelihood:
         self._begin = slice(self._shear.stop, self._shear.stop + len(self._angles))
 
     def with_errors(self, thetas: FloatArray) -> NominalModel:
-        """The models of relative errors (N, p): A (N, n, n), B (N, n, m), and wind (N, n, G).
+        """Return the models of relative errors (N, p): A (N, n, n), B (N, n, m), wind (N, n, G).
 
         The wind acts by the model's own A.
         """
@@ -303,9 +303,9 @@ class Likelihood:
     def models(
         self, thetas: FloatArray, levels: NDArray[np.int64], *, near: bool = False
     ) -> Models:
-        """The filters of theta, (N, p), at the winds of some levels.
+        """Design the filters of theta, (N, p), at some levels of the wind.
 
-        All may be `near` the first theta.
+        All of them may be `near` the first theta.
         """
         levels = np.unique(levels)
         strength = np.exp(thetas[:, self._winds])
@@ -337,7 +337,7 @@ class Likelihood:
         return np.hstack([delayed(u[:, None], late) for u, late in columns])
 
     def delays(self, fit: Fit) -> tuple[FloatArray, FloatArray]:
-        """The delays of the inputs, s, and their standard deviations, (m,) each."""
+        """Return the delays of the inputs, s, and their standard deviations, (m,) each."""
         if not self._delay_deviation:
             return self._period * self._delay, 0.0 * self._delay
         late = self._delay + self._delay_deviation * fit.theta[self._late]
@@ -345,10 +345,10 @@ class Likelihood:
         return self._period * late, self._period * deviation
 
     def levels(self, theta: FloatArray) -> NDArray[np.int64]:
-        """The level of the wind in each span, (spans,), for theta, (p,).
+        """Return the level of the wind in each span, (spans,), for theta, (p,).
 
-        Every level predicts the span from the estimates at its begin. The calmest one is taken
-        whose log-likelihood is within CHANGE of the best.
+        Every level predicts the span from the estimates at its begin. The function takes the
+        calmest level whose log-likelihood is within CHANGE of the best.
         """
         models = self.models(theta[None], self._usable)
         bank = models.bank.by_level()
@@ -404,7 +404,7 @@ class Likelihood:
         return self.innovations(self.models(theta[None], levels), levels)
 
     def predicted(self, theta: FloatArray, levels: NDArray[np.int64]) -> Innovations:
-        """The innovations of a theta, (p,).
+        """Return the innovations of a theta, (p,).
 
             log p = -1/2 sum_i (e_i^2 / s_i + log s_i) - 1/2 log det S,   s_i = mean e_i^2
 
@@ -422,13 +422,13 @@ class Likelihood:
         used: NDArray[np.bool_],
         levels: NDArray[np.int64] | None = None,
     ) -> float:
-        """The cost of `fit` for a theta, (p,), in winds of some levels, or the best of theta."""
+        """Return the cost of `fit` for theta, (p,), at some wind levels or at the best ones."""
         levels = self.levels(theta) if levels is None else levels
         (cost,), _, _ = self._costs(self.passed(theta, levels), used, theta[None])
         return float(cost)
 
     def nominal_entries(self) -> list[Entry]:
-        """The entries of A and B that are identified, before the flight."""
+        """Return the entries of A and B to identify, with their values before the flight."""
         places = []
         for matrix, unit, columns in zip(
             "AB", self._units, (self.names.states, self.names.inputs), strict=True
@@ -479,7 +479,7 @@ class Likelihood:
         return theta
 
     def entries(self, fit: Fit) -> list[Entry]:
-        """The identified entries of A and B."""
+        """Return the identified entries of A and B."""
         # The winds follow the entries in theta.
         errors = zip(
             self.nominal_entries(), fit.theta.tolist(), fit.deviation.tolist(), strict=False
@@ -498,7 +498,7 @@ class Likelihood:
         return centred
 
     def strange_air(self, fit: Fit) -> str:
-        """The state that the slope of the wind moves most, if by the bound of the search.
+        """Name the state that the slope of the wind moves most, if the effect is at its bound.
 
         The wind then stands for a different aircraft.
         """

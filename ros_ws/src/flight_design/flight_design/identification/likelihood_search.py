@@ -57,20 +57,20 @@ class Search(Likelihood):
         begin: FloatArray | None = None,
         flown: FloatArray | None = None,
     ) -> Fit:
-        """The theta of the least cost where `used`, (T,).
+        """Find the theta of the least cost over the samples that are `used`, (T,).
 
         The cost is N/2 sum_i log mean r_i^2 + sum log det S / 2 + |theta / prior|^2 / 2.
 
         r are the normalised innovations, S their covariance, N the number of samples. The cost has
-        further minima: a wrong wind explains a wrong model. So the search begins several times,
-        with a level of STARTS in a span, and with either sign of what the slope of the wind does
-        to q, on means over the shortest lag. From the REFINED best starts, or 0, the search goes on
-        with the level of a span by theta, and the strengths of the winds are free. The level that
-        most spans have then stands for all, and the search goes on from the best end: turbulence
-        is the same in every span, and levels that change with theta leave the search at a worse
-        minimum. At last spans without a level to explain them do not count, nor a few gusts. A
-        theta to `begin` at, (p,), is the only start. The theta of the model that has `flown` is a
-        further start.
+        several minima, since a wrong wind explains a wrong model. So the search begins several
+        times on means over the shortest lag: with each level of STARTS in all spans, and with
+        either sign of the effect that the slope of the wind has on q. It goes on from the REFINED
+        best starts, or from 0; then theta decides the level of each span, and the strengths of the
+        winds are free. At last, the level that most spans have stands for all of them, and the
+        search goes on from the best end: turbulence is the same in every span, and levels that
+        change with theta leave the search at a worse minimum. Spans that no level explains do not
+        count then, nor do a few gusts. A theta to `begin` at, (p,), is the only start. The theta of
+        the model that has `flown` is one more start.
         """
         if begin is None:
             ends = self._ends(flown, used)
@@ -83,17 +83,17 @@ class Search(Likelihood):
         return self._fit_at(min(best, steady, key=lambda end: end.cost), same, used, flown)
 
     def fit_about(self, fit: Fit, used: NDArray[np.bool_], flown: FloatArray | None = None) -> Fit:
-        """The minimum of `fit` about the errors of an earlier fit, from there."""
+        """Find the minimum of `fit` from an earlier fit on, with its errors as the prior mean."""
         deviation = self.prior[self._errors]
         self.believe(deviation, fit.theta[self._errors])
         return self.fit(used, fit.theta, flown)
 
     def fit_alike(self, used: NDArray[np.bool_], flown: FloatArray | None = None) -> Fit | None:
-        """The minimum of `fit` in air as in every span, from a single start.
+        """Find the minimum of `fit` from a single start, in air that is the same in every span.
 
-        The start is the model that has `flown`, or the nominal one, in moderate turbulence.
+        The start is the model that has `flown`, or else the nominal one, in moderate turbulence.
 
-        None where fewer than ALIKE of the spans have the same level.
+        Returns None if fewer than ALIKE of the spans have the same level.
         """
         coarse = self.coarse
         begin = self._within(np.zeros(len(self.prior)) if flown is None else flown)
@@ -113,9 +113,9 @@ class Search(Likelihood):
         used: NDArray[np.bool_],
         flown: FloatArray | None,
     ) -> Fit:
-        """The fit at the end of a search, further models at their best levels.
+        """Return the fit at the end of a search; other models get their best levels.
 
-        These are the levels by theta, or the `same` level in every span where the cost is less.
+        Theta decides these levels, unless the `same` level in every span costs less.
         """
         theta = best.theta
         deviation = np.sqrt(np.diag(np.linalg.inv(best.hessian)))
@@ -139,7 +139,7 @@ class Search(Likelihood):
         )
 
     def _ends(self, flown: FloatArray | None, used: NDArray[np.bool_]) -> list[SearchEnd]:
-        """The ends of the search from the best starts."""
+        """Search from the best starts, and return where the searches end."""
         coarse = self.coarse
         fitted = coarse.fitted()
         zero = np.zeros(len(self.prior))
@@ -193,10 +193,10 @@ class Search(Likelihood):
         used: NDArray[np.bool_],
         unsettled: int = 1,
     ) -> SearchEnd:
-        """The end of the search from a start.
+        """Search from one start, and return the end.
 
-        The level of a span is by theta, or from `levels`. Every span counts in the first step and
-        in `unsettled` further steps, which never end the search.
+        `levels` gives the level of each span; without it, theta decides. Every span counts in the
+        first step and in `unsettled` more steps, which never end the search.
         """
         for iteration in range(STEPS):
             self.progress()
@@ -259,7 +259,7 @@ class Search(Likelihood):
         return best, hessian, progressed
 
     def flying(self, flown: FloatArray, parts: Iterable[tuple[Likelihood, Fit]]) -> Innovations:
-        """The innovations of a model that flies, theta (p,).
+        """Return the innovations of the model that flies, theta (p,).
 
         Winds, angles and delays come from the parts.
         """

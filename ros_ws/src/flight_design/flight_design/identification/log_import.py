@@ -73,7 +73,7 @@ class Imported(NamedTuple):
 
 
 def kind_of_map(channel_map: ChannelMap) -> str:
-    """The kind of vehicle of a map: a plane has an airspeed, a multicopter a climb."""
+    """Tell a plane, whose map has an airspeed, from a multicopter, whose map has a climb."""
     return PLANE if any(row.motion[0] == "V" for row in channel_map.outputs.values()) else COPTER
 
 
@@ -170,9 +170,9 @@ def _speed(
     stamps: Stamps,
     servos: bool,
 ) -> FloatArray | None:
-    """The airspeed, or a multicopter's thrust, as evidence of flight.
+    """Return the airspeed, or a multicopter's thrust, as evidence of flight.
 
-    None where the map has neither.
+    Returns None if the map has neither.
     """
     for name, row in channel_map.outputs.items():
         if row.motion[0] == "V":
@@ -192,7 +192,7 @@ def _tape(
     readers: Mapping[str, "_Reader"],
     ends: tuple[int, int],
 ) -> Tape:
-    """The signals between two instants."""
+    """Return the signals between two instants."""
     first, last = ends
     rows = channel_map.outputs
     stamps = log.tables[sources[channel_map.instant].message].stamp_ns
@@ -224,7 +224,7 @@ def _tape(
 
 
 def median_trims(commands: Signal) -> dict[str, float]:
-    """The commands in trim by input: the medians of an imported flight, SI."""
+    """Return the commands in trim by input: the medians over an imported flight, SI."""
     return {name: float(np.median(commands[name])) for name in commands.names}
 
 
@@ -240,7 +240,7 @@ def _measured(log: VehicleLog, quantity: str, key: str) -> LogField:
 
 
 def _messages(log: VehicleLog, quantity: str) -> str:
-    """The messages of a log's format that have a quantity, as a sentence."""
+    """Name the messages of a log's format that have a quantity."""
     from flight_log.vehicle_tables import ULOG_SOURCES  # noqa: PLC0415 - of this sentence alone
 
     sources = ULOG_SOURCES if log.format is None else log.format.sources
@@ -328,9 +328,9 @@ def _commands(
 
 
 def _torque(log: VehicleLog, name: str, row: InputRow, servos: bool) -> _Reader:
-    """The output of a multicopter's rate controller: no mode has sticks that are commands.
+    """Read the output of a multicopter's rate controller, normalised as PX4's.
 
-    It is normalised as PX4's.
+    There the sticks are in no mode the commands of the inputs.
     """
     quantity, sign = row.motion
     sources = log.format.torques.get(quantity, ()) if log.format else ()
@@ -413,7 +413,7 @@ def _flight(
 
 
 def _bridged(stamps: Stamps, keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """A mask (N,) with its gaps of at most BRIDGED between two kept samples closed."""
+    """Close the gaps of at most BRIDGED between two kept samples in a mask (N,)."""
     before = np.maximum.accumulate(np.where(keep, stamps, np.iinfo(np.int64).min // 2))
     after = np.minimum.accumulate(np.where(keep, stamps, np.iinfo(np.int64).max // 2)[::-1])[::-1]
     return keep | (after - before <= nanoseconds(BRIDGED))
@@ -447,10 +447,10 @@ def _other_flights(runs: Sequence[tuple[int, int]], taken: tuple[int, int], star
 
 
 def _complete(stamp_ns: Stamps, values: FloatArray, is_damaged: bool) -> tuple[Stamps, FloatArray]:
-    """The samples in which every channel is known.
+    """Return the samples in which every channel is known.
 
-    Lost bytes within a message leave other values. In a damaged log a value counts as one of them
-    where it lies outside the range of the medians of AROUND samples by more than that range.
+    Bytes that are lost within a message leave wrong values. In a damaged log, a value counts as
+    wrong if it lies outside the range of the medians of AROUND samples by more than that range.
     """
     is_known = np.isfinite(values).all(axis=1)
     stamp_ns, values = stamp_ns[is_known], values[is_known]
@@ -464,7 +464,7 @@ def _complete(stamp_ns: Stamps, values: FloatArray, is_damaged: bool) -> tuple[S
 
 
 def gap_sentence(name: str, stamp_ns: Stamps, start_ns: int) -> str:
-    """A sentence on the samples that a topic lacks, by its usual period; "" where it has all."""
+    """Say how many samples a topic lacks, judged by its usual period; "" if it has all."""
     gaps = np.diff(stamp_ns)
     period = float(np.median(gaps))
     expected = round(float(stamp_ns[-1] - stamp_ns[0]) / period) + 1
@@ -478,7 +478,7 @@ def gap_sentence(name: str, stamp_ns: Stamps, start_ns: int) -> str:
 
 
 def _pose(channel_map: ChannelMap, log: VehicleLog, first: int, last: int) -> Signal | None:
-    """The channels of the map's pose that the log has, NaN where one is not known yet."""
+    """Return the channels of the map's pose that the log has; NaN until a value is known."""
     sources = {
         name: source for name in channel_map.pose if (source := log.source(name)) is not None
     }
@@ -511,7 +511,7 @@ def require_map_of_import(channel_map: ChannelMap, recorded: RecordedRun) -> Non
 
 
 def _rows_of_import(channel_map: ChannelMap) -> dict[str, object]:
-    """What an import takes of a map, by key."""
+    """Return what an import uses of a map, by key."""
     keys = {
         "outputs": {"positive", "sign"},
         "inputs": {"field", "positive", "sign", "scale", "offset", "range"},

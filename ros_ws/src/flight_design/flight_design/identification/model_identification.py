@@ -128,7 +128,7 @@ class _Study(NamedTuple):
     step: Callable[[], None]
 
     def search(self, model: NominalModel, block: Block, *, coupled: bool = False) -> Search:
-        """The search of a block."""
+        """Set up the search of a block."""
         search = Search(
             recorded=self.recorded,
             model=model,
@@ -142,7 +142,7 @@ class _Study(NamedTuple):
         return search
 
     def part(self, search: Search, fit: Fit) -> Part:
-        """The model of a block, with the reason why the model must not be used."""
+        """Return the model of a block, with the reason if it must not be used."""
         outputs = search.names.outputs
         entries = search.entries(fit)
         before = prediction(fit.before, self.validating)
@@ -173,7 +173,7 @@ class _Study(NamedTuple):
     def identification(
         self, airframe: Airframe, parts: Sequence[Part], first: Innovations, last: Innovations
     ) -> Identification:
-        """The parts as one model, with the innovations of the nominal model and of this one."""
+        """Join the parts to one model, with the innovations of both nominal and new model."""
         return Identification(
             airframe=with_entries(airframe, chain.from_iterable(part.entries for part in parts)),
             recorded=self.recorded,
@@ -187,10 +187,11 @@ class _Study(NamedTuple):
     def again(
         self, search: Search, fit: Fit, used: NDArray[np.bool_], flown: Airframe | None
     ) -> Fit:
-        """A fit, or one about it where too many entries stand at a bound: the file was rough.
+        """Fit again about a fit with too many entries at a bound, because the file was rough.
 
-        Effects of inputs stay within the bounds about the file: with others no law of the file
-        flies, and a part that couples with another one looks so.
+        Effects of inputs stay within the bounds about the file. No law of the file flies with
+        effects beyond them, and a part that couples with another one looks as if it had such
+        effects.
         """
         for _ in range(AGAIN * self.searches_again):
             entries = search.about_centre(search.entries(fit))
@@ -203,7 +204,7 @@ class _Study(NamedTuple):
         return fit
 
     def is_beyond(self, entries: Sequence[Entry]) -> str:
-        """The entries at a bound, if too many."""
+        """Name the entries at a bound, if they are too many."""
         return another_airframe(entries, self.airframe.name, self.bound_count, self.unknown.factor)
 
     def fit(
@@ -214,7 +215,7 @@ class _Study(NamedTuple):
         *,
         quick: bool,
     ) -> tuple[Fit, Part]:
-        """The most probable theta of a block, and the model."""
+        """Find the most probable theta of a block, and its model."""
         also = None if flown is None else search.model_errors(flown)
         quick_fit = search.fit_alike(used, also) if quick else None
         if quick_fit is not None:
@@ -231,7 +232,7 @@ class _Study(NamedTuple):
         used: NDArray[np.bool_],
         apart: Innovations,
     ) -> tuple[Fit, Part] | None:
-        """The aircraft as one part, where this predicts better than its parts `apart`."""
+        """Fit the aircraft as one part; None unless this predicts better than its parts `apart`."""
         search = self.search(model, whole_aircraft(model), coupled=True)
         fit = self.again(search, search.fit(used, begin=search.joined(fits)), used, None)
         part = self.part(search, fit)
@@ -241,7 +242,7 @@ class _Study(NamedTuple):
         return (fit, part) if is_white and is_better and not part.refusal else None
 
     def advantage(self, flown: Innovations, nominal: Innovations) -> float:
-        """The advantage of the model `flown` over the nominal one in later samples."""
+        """Return the advantage of the model `flown` over the nominal one in later samples."""
         return advantage(flown, nominal, span_length(self.recorded), self.later)
 
 
@@ -260,17 +261,17 @@ def identify_model(
     quick: bool = False,
     searches_again: bool = False,
 ) -> Identification:
-    """The model of a flight, with the reason why it must not be used if there is one.
+    """Identify the model of a flight; the result says why it must not be used, if so.
 
-    Arguments: `airframe` the nominal one; `channels` in the law's order, whose D the model has to
-    keep, by default the airframe's order; `bound_count` how many entries of a part may lie at their
-    bound; `unknown` what else is identified; `flown` the model in flight, a further start, whose
-    advantage over the nominal one is that of the samples `after` a flight time, s; `may_couple`
-    whether parts may become one; `quick` whether the search of a part begins once, where the air is
-    the same in every span and the model may be used; `searches_again` whether a part with too many
-    entries of A at their bounds is searched again, about what was found; `progress` takes the
-    steps `completed` and their largest number `total`. Raises ParameterError for an output that
-    does not move.
+    Arguments: `airframe` is the nominal one. `channels` are in the law's order, and the model has
+    to keep their D; by default, they are in the airframe's order. `bound_count` is how many entries
+    of a part may lie at their bound. `unknown` says what else is identified. `flown` is the model
+    in flight, one more start; its advantage over the nominal one is that of the samples `after` a
+    flight time, s. `may_couple` allows parts to become one. With `quick`, the search of a part
+    begins only once if the air is the same in every span and the model may be used. With
+    `searches_again`, a part with too many entries of A at their bounds is searched again, about
+    what was found. `progress` takes the steps `completed` and their largest number `total`. Raises
+    ParameterError for an output that does not move.
     """
     blown = in_rolling_air(airframe)
     model = filter_model(blown, actuation, recorded)
@@ -317,7 +318,7 @@ def identify_model(
 def _counter(
     progress: Callable[..., None], parts: int, *, starts_at_flown: bool
 ) -> Callable[[], None]:
-    """A function to call at each step of the searches of some parts, which tells `progress`."""
+    """Return a function to call at each search step of some parts; it tells `progress`."""
     starts = len(STARTS) + len(SIGNS) + starts_at_flown
     total = parts * (starts * START_STEPS + REFINED * STEPS)
     total += (parts > 1) * (START_STEPS + STEPS)
@@ -335,7 +336,7 @@ def _follows(
     u: FloatArray,
     known: NDArray[np.bool_],
 ) -> float:
-    """The largest `correlation` of the innovations of a part with the u, (T, m), of another one."""
+    """Return the largest `correlation` of a part's innovations with another's u, (T, m)."""
     largest = 0.0
     for (_, fit), block in zip(fits, every, strict=True):
         of_others = np.delete(u, block.inputs, axis=1)
@@ -344,7 +345,7 @@ def _follows(
 
 
 def _couples(flown: Airframe, nominal: Airframe) -> bool:
-    """Whether a model has entries that are 0 in the nominal one."""
+    """Return whether a model has entries that are 0 in the nominal one."""
     new, old = (np.hstack([model.matrix_a(), model.matrix_b()]) for model in (flown, nominal))
     return bool(np.any((new != 0.0) & (old == 0.0)))
 
@@ -357,7 +358,7 @@ def _require_motion(outputs: Sequence[str], y: FloatArray) -> None:
 
 
 def with_entries(airframe: Airframe, entries: Iterable[Entry]) -> Airframe:
-    """The airframe with identified entries; wind acts by its own A."""
+    """Put identified entries into an airframe; wind acts by its own A."""
     A = airframe.matrix_a()
     B = airframe.matrix_b()
     for entry in entries:
@@ -378,9 +379,9 @@ def join_innovations(parts: Sequence[Innovations], blocks: Sequence[Block]) -> I
 
 
 def model_yaml(identified: Identification, origin: str) -> str:
-    """The identified airframe as the text of an airframe file.
+    """Write the identified airframe as the text of an airframe file.
 
-    The header has its origin, held-out figures and deviations.
+    The header has its origin, the held-out figures and the deviations.
     """
     lines = [f"The airframe {identified.airframe.name}, with A and B identified from {origin}.", ""]
     lines.append(

@@ -42,7 +42,7 @@ class Prediction(NamedTuple):
 
 
 def prediction(innovations: Innovations, held_out: NDArray[np.bool_]) -> Prediction:
-    """The prediction of the held-out samples, (T,)."""
+    """Assess how innovations predict the held-out samples, (T,)."""
     rms = np.sqrt(np.mean(innovations.r[held_out] ** 2, axis=0))
     likelihood = float(np.mean(innovations.log_likelihood[held_out]))
     return Prediction(rms, whiteness(innovations.normalised, held_out), likelihood)
@@ -101,7 +101,7 @@ def advantage(
 
 
 def best_known(entries: Iterable[Entry], outputs: Iterable[str]) -> list[Entry]:
-    """The best known effect of an input on each output."""
+    """Return the best known effect of an input on each output."""
     effects = [entry for entry in entries if entry.matrix == "B" and entry.nominal]
     best = []
     for output in outputs:
@@ -111,9 +111,9 @@ def best_known(entries: Iterable[Entry], outputs: Iterable[str]) -> list[Entry]:
 
 
 def too_little_excitation(entries: Iterable[Entry], outputs: Iterable[str]) -> str:
-    """The output whose inputs are known worst, or empty.
+    """Name the output whose inputs are known worst, if even its best known effect is uncertain.
 
-    The best known effect there has a deviation above MAX_DEVIATION.
+    An effect is uncertain if its deviation is above MAX_DEVIATION. Returns "" otherwise.
     """
     worst = max(best_known(entries, outputs), key=lambda effect: effect.deviation)
     if worst.deviation <= MAX_DEVIATION:
@@ -128,16 +128,17 @@ def too_little_excitation(entries: Iterable[Entry], outputs: Iterable[str]) -> s
 
 
 def excitation_factor(effect: Entry) -> float:
-    """The factor on the amplitude with which an effect is known to MAX_DEVIATION; 1 or less: it is.
+    """Return the factor on the amplitude with which an effect becomes known to MAX_DEVIATION.
 
-    Information adds up with the square of the amplitude.
+    Information grows with the square of the amplitude. A factor of 1 or less means that the effect
+    is already known so well.
     """
     information = effect.deviation**-2 - PRIOR**-2
     return float(np.sqrt((MAX_DEVIATION**-2 - PRIOR**-2) / max(information, 1e-2 * PRIOR**-2)))
 
 
 def at_bound(entries: Iterable[Entry], factor: float = MAX_FACTOR) -> list[Entry]:
-    """The entries at a bound of a search whose largest factor is `factor`."""
+    """Return the entries at a bound of a search whose largest factor is `factor`."""
     found = []
     for entry in entries:
         lower, upper = -MAX_ERROR, largest_error(entry)
@@ -151,9 +152,10 @@ def at_bound(entries: Iterable[Entry], factor: float = MAX_FACTOR) -> list[Entry
 def another_airframe(
     entries: Iterable[Entry], name: str, allowed: int = 0, factor: float = MAX_FACTOR
 ) -> str:
-    """The entries at a bound of the search, if more than `allowed`.
+    """Name the entries at a bound of the search, if more than `allowed`; "" otherwise.
 
-    One that the record shows, to half of its deviation before, is too many: the aircraft is beyond.
+    A single one is too many if the record shows it, with at most half of its deviation before: then
+    the aircraft lies beyond the bound.
     """
     found = at_bound(entries, factor)
     is_shown = any(entry.deviation < PRIOR / 2.0 for entry in found)
@@ -167,12 +169,12 @@ def another_airframe(
 
 
 def _minor_signs(Omega: FloatArray) -> list[float]:
-    """The signs of the leading minors."""
+    """Return the signs of the leading minors."""
     return [np.sign(np.linalg.det(Omega[:k, :k])) for k in range(1, len(Omega) + 1)]
 
 
 def other_signs(nominal: Airframe, identified: Airframe, channels: ChannelPairing) -> str:
-    """D of the law where the identified model has a different D.
+    """Refuse an identified model that gives the law another D; return "" if D stays.
 
     D follows from the signs of the leading minors of C B.
     """
@@ -186,9 +188,9 @@ def other_signs(nominal: Airframe, identified: Airframe, channels: ChannelPairin
 
 
 def no_better(before: Prediction, after: Prediction) -> str:
-    """A sentence where the model does not predict the held-out samples better.
+    """Say why a model predicts the held-out samples no better than before; "" if it does better.
 
-    There is a sentence too where the innovations are neither white nor whiter.
+    It also refuses a model whose innovations are neither white nor whiter than before.
     """
     if after.log_likelihood <= before.log_likelihood:
         return (

@@ -46,12 +46,12 @@ class ModuleFlight(NamedTuple):
 
 
 def module_flight(log: VehicleLog, controller: ControllerConfig) -> ModuleFlight:
-    """The ticks of a module, each stretch from its engagement on.
+    """Compute the ticks of a module again, each stretch from its engagement on.
 
-    Python steps the law from the u of the first tick of a stretch. e and u of `internals` are those
-    of the log, the states of the law those of Python. At low airspeed the torque of 1 limits u: a
-    change of the parameters. Raises ParameterError for a log without ticks, of other parameters, or
-    of a module in float.
+    Python steps the law from the u of the first tick of a stretch. In `internals`, e and u come
+    from the log, and the states of the law from Python. At low airspeed, a torque of 1 limits u;
+    that counts as a change of the parameters. Raises ParameterError if the log has no ticks, other
+    parameters, or a module in float.
     """
     require(STATUS in log.tables, "the log", f"no {STATUS}", EXPECTED)
     table = log.tables[STATUS]
@@ -102,7 +102,7 @@ class _Ticks:
         )
 
     def flown(self) -> list[list[int]]:
-        """The rows of the ticks by stretch, from an engagement of the law to a gap or the next."""
+        """Return the rows of the ticks by stretch: from an engagement to a gap or the next one."""
         stretches: list[list[int]] = []
         last: int | None = None  # number of the tick before; None: none to go on from
         for k in np.flatnonzero(self._ticked).tolist():
@@ -118,7 +118,7 @@ class _Ticks:
         return stretches
 
     def computed(self, stretches: list[list[int]]) -> ModuleFlight:
-        """The ticks with the states of Python."""
+        """Return the ticks with the states that Python computes."""
         controller = self._controller
         law = controller.tuned_law()
         limits = controller.guard()
@@ -167,7 +167,7 @@ class _Ticks:
         return self._flight(stretches, rows, changes, equal)
 
     def _limits(self, k: int) -> dict[str, tuple[float, ...]]:
-        """The limits of u in a tick: those of the scenario, or the u of the torque of 1."""
+        """Return the limits of u in a tick: the scenario's, or those of a torque of 1."""
         end = self._values["u_end"][k]
         exported = self._controller.guard().limits
         return {

@@ -127,11 +127,11 @@ def fit_channel(
     *,
     first_order: bool = False,
 ) -> ChannelModel | None:
-    """The model from the time of excitation of an input, of the lowest sufficient order.
+    """Fit a channel over the time of its excitation, with the lowest order that suffices.
 
-    None without excitation, or for a constant output. The search begins with an Omega of this sign,
-    and may end with the opposite sign. `gravity` is a measured part of y_dot without u, a channel:
-    then, and by `first_order`, the model is of first order.
+    Returns None without excitation, or for a constant output. The search begins with an Omega of
+    this sign, and may end with the opposite one. `gravity` is a channel that measures the part of
+    y_dot without u; with it, or with `first_order`, the model is of first order.
     """
     # The time of the excitation, with a little before and after.
     excited = np.flatnonzero(u[name] != 0.0)
@@ -187,16 +187,16 @@ def _settled(t: FloatArray) -> NDArray[np.bool_]:
 
 
 def _decay(t: FloatArray, damping: float) -> FloatArray:
-    """The third function of time beside a constant and t.
+    """Return the third function of time beside a constant and t.
 
-    The function is the decay of a first value, exp(-damping t), or t^2 for a damping of 0.
+    It is the decay of an initial value, exp(-damping t), or t^2 if the damping is 0.
     """
     x = damping * t
     return np.where(x > 1e-4, (np.expm1(-x) + x) / max(damping, 1e-9) ** 2, 0.5 * t**2)
 
 
 def _has_zero_of_its_own(theta: FloatArray) -> bool:
-    """Whether the zero of a second order is stable, and slow enough not to cancel the lag."""
+    """Return whether a second order's zero is stable, and too slow to cancel the lag."""
     _, lag, Omega, _, _, slow = theta
     return bool(0.0 <= slow * Omega * lag <= MAX_ZERO_LAG * Omega**2)
 
@@ -241,7 +241,7 @@ def _search(residuals: Any, values: FloatArray, order: int, amplitude: float) ->
 
 
 def _model(fit: Any, misfit: float, period: float) -> ChannelModel:
-    """The model of a fit, with standard errors by the correlation of the output error.
+    """Return the model of a fit, with standard errors that respect correlated output errors.
 
     Source: L. Ljung, 9.4 (coloured errors).
     """

@@ -46,7 +46,7 @@ class OwnLoop(NamedTuple):
     source: str  # the parameters
 
     def in_place(self, scenario: Scenario) -> Scenario:
-        """The scenario with the feedback of this loop, as the law pi: u = end torque."""
+        """Return the scenario with the feedback of this loop as the law `pi`: u = end torque."""
         controller = scenario.rise_di()
         end = _ends(scenario)
         gain = end * self.P / np.array(controller.input_scale)
@@ -107,9 +107,9 @@ def _ends(scenario: Scenario) -> FloatArray:
 
 
 def own_loop(parameters: Mapping[str, float], scenario: Scenario, autopilot: str) -> OwnLoop | None:
-    """The loop of an autopilot by the parameters of its log; None where they are not all there.
+    """Read the loop of an autopilot from its log's parameters; None unless all are there.
 
-    PX4 and ArduPlane scale P and I by the square of a speed over the airspeed, FF by the ratio:
+    PX4 and ArduPlane scale P and I by the square of a speed over the airspeed, and FF by the ratio:
     here the gains are those at the trim speed.
     """
     speed = scenario.aircraft.channels().speed

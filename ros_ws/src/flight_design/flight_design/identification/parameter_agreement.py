@@ -73,7 +73,7 @@ class Stick(NamedTuple):
         return self.axis != "THROTTLE"
 
     def parameters(self) -> dict[str, tuple[float, float]]:
-        """The parameters with which ArduPilot agrees with the map: value and tolerance by name."""
+        """Return value and tolerance of the parameters by which ArduPilot agrees with the map."""
         low, high = sorted(to_raw(raw, self.trim_line) for raw in self.raw_range)
         half = (high - low) / 2.0
         name = f"RC{self.channel}"
@@ -88,9 +88,9 @@ class Stick(NamedTuple):
         }
 
     def raw(self, deflection: FloatArray) -> FloatArray:
-        """The raw value of a part of full deflection.
+        """Return the raw value of a part of full deflection.
 
-        The part is -1 to 1 about the middle, for a throttle 0 to 1 from the lower end.
+        The part is -1 to 1 about the middle; for a throttle, it is 0 to 1 from the lower end.
         """
         low, high = self.raw_range
         part = (1.0 + self.raw_sign * deflection) / 2.0 if self.is_centred else deflection
@@ -98,7 +98,7 @@ class Stick(NamedTuple):
 
 
 def stick_of(channel_map: ChannelMap, name: str) -> Stick:
-    """What a map says of the channel of an input.
+    """Return what a map says of the channel of an input.
 
     Raises ParameterError for an input without a channel.
     """
@@ -133,7 +133,7 @@ class Servo(NamedTuple):
     is_reversed: bool
 
     def deflection(self, pulse: FloatArray, stick: Stick) -> FloatArray:
-        """The part of full deflection at a pulse, us: -1 to 1, for a throttle 0 to 1."""
+        """Return the part of full deflection at a pulse, us: -1 to 1, for a throttle 0 to 1."""
         if not stick.is_centred:
             part = (pulse - self.low) / (self.high - self.low)
             return 1.0 - part if self.is_reversed else part
@@ -142,9 +142,9 @@ class Servo(NamedTuple):
 
 
 def servo_of(stick: Stick, name: str, values: Mapping[str, float]) -> Servo:
-    """The first servo with the function of an input.
+    """Return the first servo with the function of an input.
 
-    `values`: the parameters at the samples. Raises ParameterError.
+    `values` are the parameters at the samples. Raises ParameterError.
     """
     function = FUNCTIONS[stick.axis]
     outputs = [
@@ -194,10 +194,10 @@ class Agreement(NamedTuple):
 def compared(
     sticks: Iterable[Stick], recorded: Parameters, values: Mapping[str, float]
 ) -> list[Agreement]:
-    """The parameters of the transmitter in a log, against a map; `values` are those at the samples.
+    """Compare the transmitter's parameters in a log with a map; `values` are those at the samples.
 
-    A parameter without a value at the samples is compared by the first record after the samples,
-    without a default.
+    If a parameter has no value at the samples, its first record after them is compared; no default
+    stands in for it.
     """
     parameters = {name: records[0].value for name, records in recorded.items()} | dict(values)
     rows = []
@@ -218,9 +218,9 @@ def compared(
 
 
 def require_agreement(name_of_map: str, rows: Iterable[Agreement]) -> str:
-    """The sentence on parameters without a value at the samples, empty where there is none.
+    """Return a sentence on the parameters without a value at the samples; "" if there is none.
 
-    Raises ParameterError for parameters unlike the map's.
+    Raises ParameterError if a parameter differs from the map's.
     """
     differing = [row for row in rows if row.differs]
     if differing:

@@ -50,10 +50,10 @@ class RatesLog(NamedTuple):
 
 
 def rates_map(scenario: Scenario, autopilot: str) -> ChannelMap:
-    """The channel map of an autopilot with the channels and the end stops of a scenario.
+    """Return the channel map of an autopilot with the channels and end stops of a scenario.
 
-    V stays for a fixed wing, as evidence of flight. Raises ParameterError for an input without a
-    row that moves its output, or without an end stop.
+    A fixed wing keeps V as evidence of flight. Raises ParameterError for an input without an end
+    stop, or without a row that moves its output.
     """
     base = load_map(MAPS[autopilot])
     controller = scenario.controller
@@ -120,7 +120,7 @@ def rates_of_log(
 
 
 def scaled_torques(parameters: Mapping[str, float]) -> list[str]:
-    """A sentence for each surface of PX4 whose end stop is at another torque than 1."""
+    """Say which surfaces of PX4 reach their end stop at another torque than 1, a sentence each."""
     sentences = []
     for name, value in sorted(parameters.items()):
         if re.fullmatch(r"CA_SV_CS\d+_TRQ_[RPY]", name) and abs(value) not in (0.0, 1.0):

@@ -96,7 +96,7 @@ class Response(NamedTuple):
     sign_ratio: FloatArray
 
     def sign_refusal(self, i: int) -> str:
-        """The reason of an uncertain sign of Omega_ii, a sentence; empty for a certain sign."""
+        """Say why the sign of Omega_ii is uncertain; "" if it is certain."""
         output = self.outputs[i]
         name = self.inputs[i]
         ratio = float(self.sign_ratio[i])
@@ -175,7 +175,7 @@ class Layout(NamedTuple):
 
     @classmethod
     def from_period(cls, period: float) -> "Layout":
-        """The layout for a period of y in s."""
+        """Return the layout for a period of y in s."""
 
         def windows(first: int, fine: float) -> tuple[tuple[int, int], ...]:
             width = max(round(WINDOW / period), 1)
@@ -193,7 +193,7 @@ class Layout(NamedTuple):
         return self.y_windows[-1][1]
 
     def y_decay(self) -> FloatArray:
-        """Standard deviations of the coefficients of y before the fit, relative."""
+        """Return the relative standard deviations of the coefficients of y before the fit."""
         middles = [*range(1, self.recent + 1), *((a + b + 1) / 2.0 for a, b in self.y_windows)]
         return np.asarray(np.exp(-self.period * np.array(middles) / MEMORY))
 
@@ -217,7 +217,7 @@ class _Rows(NamedTuple):
 def _within(
     signal: Signal, names: Sequence[str], span: tuple[int, int]
 ) -> tuple[FloatArray, FloatArray]:
-    """Times in s after the start of a span, and values of the named channels."""
+    """Return the times after the start of a span, s, and the values of the named channels."""
     inside = (signal.stamp_ns >= span[0]) & (signal.stamp_ns <= span[1])
     return (signal.stamp_ns[inside] - span[0]) / NANOSECONDS, np.stack(
         [signal[name][inside] for name in names], axis=1
@@ -227,7 +227,7 @@ def _within(
 def bridged(
     t: FloatArray, values: FloatArray, period: float
 ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-    """Samples (N, m) with straight lines over gaps of at most BRIDGED, and which were recorded."""
+    """Fill gaps of at most BRIDGED by straight lines; tell which samples (N, m) were recorded."""
     missing = np.rint(np.diff(t) / period).astype(np.int64) - 1
     counts = 1 + np.where(missing * period <= BRIDGED, np.maximum(missing, 0), 0)
     before = np.repeat(np.arange(len(counts)), counts)
@@ -405,7 +405,7 @@ def explained(signal: Signal, names: Sequence[str], excitation: Signal, spans: S
 
 
 def _moves(parts: Iterable[FloatArray]) -> bool:
-    """Whether a channel moves in any part of the log."""
+    """Return whether a channel moves in any part of the log."""
     return any(len(part) and np.ptp(part) > 0.0 for part in parts)
 
 
@@ -478,7 +478,7 @@ def _refusal(
 
 
 def _too_little_share(output: str, name: str, share: float) -> str:
-    """The sentence on a channel with too little share of the excitation.
+    """Say that a channel has too little share of the excitation, and how to get more.
 
     The share is P / (P + Q) with P the power of the excitation and Q the power of the disturbances.
     """

@@ -239,12 +239,11 @@ def check_effectors(
     effectors: tuple[str, ...],
     effect: FloatArray,
 ) -> SignCheck:
-    """The signs of the effectors against `effect` of an allocation, (m, p).
+    """Check the signs of the effectors against the `effect` of an allocation, (m, p).
 
-    The output with the largest motion by an effector decides.
+    The output that an effector moves most decides; an output counts by the largest effect on it.
 
-    `Omega` as in `check_signs`, (m, p). An output counts by the largest effect on it. D of a
-    channel is the sign of its effect.
+    `Omega` is as in `check_signs`, (m, p). D of a channel is the sign of its effect.
     """
     mapped = _through(channel_map, Omega, outputs, effectors)
     largest = np.argmax(np.abs(effect) / np.abs(effect).max(axis=1, keepdims=True), axis=0).tolist()

@@ -34,7 +34,7 @@ turbulence."""
 def sketch(
     name: str, Omega: FloatArray, outputs: Sequence[str], inputs: Sequence[str], speed: float
 ) -> Airframe:
-    """A rough airframe with the zeros of a rigid symmetric aircraft.
+    """Sketch a rough airframe that has the zeros of a rigid symmetric aircraft.
 
     The model comes from Omega = C B and the trim speed V0, m/s.
 
@@ -91,7 +91,7 @@ def sketch(
 
 
 def sketched(name: str, controller: ControllerConfig, speed: float) -> Airframe:
-    """The airframe with the matrices of a controller's feedforward; `speed` the trim speed V0, m/s.
+    """Return the airframe of a controller's feedforward; `speed` is the trim speed V0, m/s.
 
     Wind acts by the columns of A of V, alpha and beta. Raises ParameterError for a controller
     without feedforward, and for states other than those of a sketch.
@@ -136,9 +136,9 @@ def with_sketch(
     noise: FloatArray,
     margin: float,
 ) -> RiseDiConfig:
-    """A controller with feedforward and observer of a sketch, not yet flying.
+    """Return a controller with feedforward and observer of a sketch, which do not fly yet.
 
-    Omega (m, m) and `noise`, (m,), are in the law's order, `margin` is the least delay margin, s.
+    Omega (m, m) and `noise`, (m,), are in the law's order; `margin` is the least delay margin, s.
     Raises ParameterError.
     """
     rough = sketch(name, Omega, start.outputs, start.inputs, speed)
@@ -153,7 +153,7 @@ def with_sketch(
 
 
 def _positive(name: str) -> str:
-    """What a positive input does."""
+    """Say what a positive input does."""
     return INPUTS[name].positive if name in INPUTS else f"more {name}"
 
 
@@ -168,7 +168,7 @@ def _airframe(
     outputs: Sequence[str],
     inputs: Sequence[str],
 ) -> Airframe:
-    """The airframe of matrices in SI."""
+    """Build an airframe from matrices in SI."""
     gusts = {}
     for axis in AXES:
         state = AIR_STATE[axis]

@@ -46,7 +46,7 @@ class ResponseColumn(NamedTuple):
 
 
 def no_column(m: int) -> ResponseColumn:
-    """A column of NaN, for an input without a result."""
+    """Return a column of NaN for an input without a result."""
     return ResponseColumn(
         Omega=np.full(m, np.nan),
         deviation=np.full(m, np.nan),
@@ -128,10 +128,10 @@ def fitted_column(t: FloatArray, responses: FloatArray, j: int) -> ResponseColum
 
 
 def begins_with_Omega(t: FloatArray, theta: FloatArray) -> bool:  # noqa: N802 - the symbol
-    """Whether a fitted response has the sign of Omega up to EARLY after delay and lag.
+    """Return whether a fitted response has the sign of Omega up to EARLY after delay and lag.
 
-    Otherwise the slow part is the whole response, two poles are in the place of a pole and a lag,
-    and Omega is about 0.
+    Otherwise, the slow part is the whole response: two poles stand for a pole and a lag, and Omega
+    is about 0.
     """
     delay, lag, Omega, damping, stiffness, slow = theta
     first, second = second_order_response(

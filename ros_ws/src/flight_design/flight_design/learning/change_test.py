@@ -74,7 +74,7 @@ def change_test(
     delays: Mapping[tuple[str, ...], FloatArray] | None = None,
     drift: float = DRIFT,
 ) -> tuple[Change, ...]:
-    """The parts of the aircraft with the gain of log-likelihood G by a loss of effect.
+    """Test the parts for a loss of effect, by the gain of log-likelihood G that one brings.
 
         B[:, j] = (1 + kappa_j) B_flown[:, j]
         J(kappa) = N/2 sum_i log mean e_i^2 + 1/2 sum log det S + |kappa / FACTOR|^2 / 2
@@ -167,7 +167,7 @@ class Effects(Search):
         self.prior[self._begin] = np.where(turned, 1.0, FLOW / ANGLE)
 
     def with_errors(self, thetas: FloatArray) -> NominalModel:
-        """The flown model with other effects of its inputs, thetas (N, p)."""
+        """Return the flown model with other effects of its inputs, thetas (N, p)."""
         A, wind = (
             np.repeat(matrix, len(thetas), axis=0) for matrix in (self._flown.A, self._flown.wind)
         )
@@ -176,10 +176,10 @@ class Effects(Search):
         )
 
     def most_probable(self, lower: float = REVERSED) -> Least:
-        """The least J of kappa >= `lower`.
+        """Find the least J of kappa >= `lower`.
 
-        A loss looks like gusts to the flown model. So the search begins with the winds of this
-        model, with the same wind in every span, and with a dead input if CLOSE.
+        The flown model takes a loss for gusts. So the search begins with the winds of this model,
+        with the same wind in every span, and also with a dead input if its J is CLOSE.
         """
         same = self.least(lower=lower, levels=np.full(len(self._spans), TURBULENT))
         best = least_of(self.least(lower=lower), self.least(same.theta, lower))
@@ -196,9 +196,9 @@ class Effects(Search):
         dead: int | None = None,
         levels: NDArray[np.int64] | None = None,
     ) -> Least:
-        """The least J of kappa >= `lower`, or with an input dead, from theta, (p,), or 0 on.
+        """Minimise J from theta, (p,), or 0 on, for kappa >= `lower` or with one input dead.
 
-        The winds are those by theta, or of `levels`.
+        The winds are those by theta, unless `levels` gives them.
         """
         self._lower[: self.count] = lower
         self._upper[: self.count] = MOST
@@ -220,5 +220,5 @@ class Effects(Search):
 
 
 def least_of(first: Least, second: Least) -> Least:
-    """The lesser J."""
+    """Return the lesser J."""
     return min(first, second, key=lambda least: least.J)

@@ -36,27 +36,27 @@ class Goal(NamedTuple):
 
 
 def margin_of(controller: RiseDiConfig) -> float:
-    """The delay margin that a controller loads with, s."""
+    """Return the delay margin that a controller loads with, s."""
     assert controller.observer is not None  # noqa: S101 - a controller that learns has one
     return controller.observer.margin
 
 
 def asked_margin(start: RiseDiConfig) -> float:
-    """The delay margin of `learn.margin`, else that of the start, s."""
+    """Return the delay margin of `learn.margin`, or else that of the start, s."""
     asked = None if start.learn is None else start.learn.margin
     return margin_of(start) if asked is None else asked
 
 
 def is_late(start: RiseDiConfig, latest: Mapping[str, float]) -> bool:
-    """Whether the latest delay of an input asks for more than the margin of the start.
+    """Return whether the latest delay of an input asks for more than the margin of the start.
 
-    `latest` has the delay of each input, s, by name. With `learn.margin` that is the margin.
+    `latest` has the delay of each input, s, by name. If `learn.margin` is set, it is the margin.
     """
     return max(latest.values(), default=0.0) + DELAY_LEFT > asked_margin(start)
 
 
 def price(selected: SelectedObserver, margin: float, beside: SelectedObserver, kept: float) -> str:
-    """What the delay margin of a design, s, costs beside a design that keeps another."""
+    """Say what a design's delay margin, s, costs compared with a design that keeps another."""
     ratio = math.exp((selected.cost - beside.cost) / len(selected.relaxation))
     return (
         f"{ratio:.2f} times the error of {1e3 * kept:.0f} ms of delay margin, "
@@ -72,14 +72,14 @@ def goal(
     latest: Mapping[str, float],
     dead: Collection[str] = (),
 ) -> Goal:
-    """The goal of a design for a model of which some parts are learned.
+    """Return the goal of a design for a model of which some parts are learned.
 
-    A part keeps the delay margin that the loop of the file keeps around the model, at least
-    LEAST_MARGIN and at most that of the start; without a file that of the start; or the margin
-    that is asked for, `learn.margin`. Each input keeps at least DELAY_LEFT beyond its latest
-    delay, s, by name. A `dead` output flies without this design, and asks for nothing. With a file
-    the sensitivity is at most 2, or that of the loop of the file; phase and gain follow from it
-    (Astrom, Murray, "Feedback Systems", 10.5).
+    A part keeps the delay margin that the loop of the file has around the model, but at least
+    LEAST_MARGIN and at most that of the start. Without a file, it keeps the margin of the start; if
+    `learn.margin` asks for one, it keeps that. Each input keeps at least DELAY_LEFT beyond its
+    latest delay, s, by name. A `dead` output flies without this design, and asks for nothing. With
+    a file, the sensitivity is at most 2, or that of the loop of the file; phase and gain margin
+    follow from it (Astrom, Murray, "Feedback Systems", 10.5).
     """
     outputs = start.outputs
     margin = np.full(len(outputs), margin_of(start))
@@ -121,7 +121,7 @@ def goal(
 
 
 def with_own_margin(controller: RiseDiConfig, model: Airframe, most: float) -> RiseDiConfig:
-    """A controller that states the delay margin of its own loop around a model, at most `most`."""
+    """Set a controller's margin to the delay margin of its loop around a model, `most` at most."""
     linear = linear_loop(controller, model, model.matrix_a()[None], model.matrix_b()[None])
     undelayed = linear.loop._replace(delay=0.0)
     kept = delay_margin(linear.nominal, linear.law, undelayed) - RESOLUTION
@@ -131,9 +131,9 @@ def with_own_margin(controller: RiseDiConfig, model: Airframe, most: float) -> R
 
 
 def with_deviations(designed: RiseDiConfig, deviation: Mapping[str, float]) -> RiseDiConfig:
-    """A controller whose model of the feedforward has the standard deviations of B.
+    """Put the standard deviations of B into the model of a controller's feedforward.
 
-    They are relative to the entries, by name, and PRIOR for an entry that no flight has shown.
+    They are relative to the entries, by name; an entry that no flight has shown has PRIOR.
     """
     model = designed.feedforward
     assert model is not None  # noqa: S101 - a design has one

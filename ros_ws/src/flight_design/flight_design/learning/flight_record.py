@@ -34,7 +34,7 @@ class FlightRecord:
     """The last samples of a flight, over a window."""
 
     def __init__(self, controller: RiseDiConfig, airframe: Airframe, window: float) -> None:
-        """An empty record of a `window`, its length in s.
+        """Make an empty record of a `window`, its length in s.
 
         Samples have the order of the controller, recordings that of the airframe.
         """
@@ -79,9 +79,9 @@ class FlightRecord:
         self._samples = deque(self._after(stamp_ns))
 
     def recording(self, after_ns: int = -1) -> FlightData:
-        """The record after an instant in equal periods, in the airframe's order.
+        """Return the record after an instant in equal periods, in the airframe's order.
 
-        y of a lost tick is NaN, u is held.
+        If a tick was lost, its y is NaN and its u is held.
         """
         record = self._after(after_ns)
         stamp_ns = np.array([sample.stamp_ns for sample in record])
@@ -96,15 +96,15 @@ class FlightRecord:
         return FlightData(self.period, t, padded_y[:, self._rows], held[:, self._columns])
 
     def fell_back(self, after_ns: int, proposals: Collection[int]) -> bool:
-        """Whether the law fell back after an instant.
+        """Return whether the law fell back after an instant.
 
-        Other parameters than one of the proposals, by digest, then replaced those that flew.
+        Then parameters that are none of the proposals, by digest, replaced those that flew.
         """
         flown = [sample.flown for sample in self._after(after_ns)]
         return any(new != old and new not in proposals for old, new in pairwise(flown))
 
     def oscillated(self, after_ns: int) -> bool:
-        """Whether an output oscillated after an instant, over the whole time."""
+        """Return whether an output oscillated during the whole time after an instant."""
         y = np.array([sample.y for sample in self._after(after_ns)])
         return bool(divergence.oscillating(y, self._least).any())
 
@@ -113,10 +113,10 @@ class FlightRecord:
 
 
 def steady_end(recorded: FlightData, airframe: Airframe) -> tuple[FlightData, float]:
-    """The longest end of a record over which a linear model holds, and the mean airspeed over V0.
+    """Return the longest end of a record on which a linear model holds, and mean airspeed over V0.
 
-    The airspeed differs from the mean by SPREAD of the mean, rms, at most: effects of surfaces then
-    vary twice as much.
+    The rms deviation of the airspeed from its mean is at most SPREAD of the mean: the effects of
+    surfaces then vary twice as much.
     """
     V = recorded.y[:, airframe.outputs.index("V")] / airframe.speed
     known = np.isfinite(V)[::-1]
@@ -132,5 +132,5 @@ def steady_end(recorded: FlightData, airframe: Airframe) -> tuple[FlightData, fl
 
 
 def about(recorded: FlightData, airframe: Airframe, x: FloatArray, u: FloatArray) -> FlightData:
-    """A record as deviations from a trim, x (n,) and u (m,) in the airframe's order."""
+    """Return a record as deviations from a trim, x (n,) and u (m,) in the airframe's order."""
     return recorded._replace(y=recorded.y - airframe.matrix_c() @ x, u=recorded.u - u)

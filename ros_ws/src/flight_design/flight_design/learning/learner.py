@@ -121,14 +121,15 @@ class Learner:
         *,
         quick: bool = False,
     ) -> None:
-        """A learner without a record.
+        """Make a learner without a record.
 
-        `airframe` is the rough model, the prior; `delay` is the delay of the loop, s, beyond
-        sampling and lags. `design_of_rough` designs for a model with errors: the rough model flies
-        so from the start, and later in parts without a learned model; None: the law of the start.
+        `airframe` is the rough model, the prior. `delay` is the delay of the loop, s, beyond
+        sampling and lags. `design_of_rough` designs for a model with errors: with it, the rough
+        model flies from the start, and later in parts without a learned model. If it is None, these
+        fly by the law of the start.
 
-        `rough` has the deviation of B in the rough model, and the noise of the disturbances, of a
-        test for a change too. `quick` as for `identify`.
+        `rough` has the deviation of B in the rough model, and the noise of the disturbances, which
+        a test for a change uses too. `quick` is as for `identify`.
         """
         settings = controller.learn
         assert settings is not None  # noqa: S101 - `scenario_learner.learner` makes no other
@@ -213,7 +214,7 @@ class Learner:
             return LearnerResult(None, str(error))
 
     def _proposal(self, flown: int, given_up: Sequence[str]) -> LearnerResult:
-        """The proposal of `propose`. Raises ParameterError where there is none."""
+        """Make the proposal of `propose`. Raises ParameterError if there is none."""
         end_ns = self._record.end_ns
         self._note_given_up(flown, given_up)
         lost = flown != self._proposed
@@ -236,7 +237,7 @@ class Learner:
         return self._learned(end_ns, lost=lost)
 
     def _learned(self, end_ns: int, *, lost: bool) -> LearnerResult:
-        """The proposal of an identification. Raises ParameterError where there is none."""
+        """Identify, and return the proposal. Raises ParameterError if there is none."""
         length = self._record.length
         require(
             length > SHORTEST - self._record.period, "record", f"{length:.3g} s", f"{SHORTEST:g} s"
@@ -255,9 +256,10 @@ class Learner:
         return LearnerResult(self._last, "; ".join(filter(None, sentences + refused)))
 
     def _damaged(self, changes: Sequence[Change], end_ns: int) -> LearnerResult:
-        """What becomes of changed parts: a part flies without a dead input at once.
+        """Decide what becomes of changed parts: one with a dead input flies without it at once.
 
-        A part without is identified from the record since the change, about the flown model.
+        A part without a dead input is identified from the record since the change, about the flown
+        model.
         """
         self._record.forget_before(end_ns - nanoseconds(RECORD))
         self._prior = self._model
@@ -364,7 +366,7 @@ class Learner:
             self._design_of_rough = None
 
     def _rough_proposal(self) -> LearnerResult:
-        """The rough airframe by a design for one that errs. Raises ParameterError."""
+        """Propose the rough airframe, by a design for one that errs. Raises ParameterError."""
         name = self._rough.name
         try:
             proposed, _ = self._designed(self._rough, {}, self._dead)
@@ -398,10 +400,10 @@ class Learner:
             }
 
     def _is_due(self, end_ns: int, *, lost: bool) -> bool:
-        """Whether an identification is due: at `learn.updates`, then once a window.
+        """Return whether an identification is due: at `learn.updates`, then once a window.
 
-        Also RETRY after the last identification, where the last proposal does not fly, or a part
-        has changed; but not within AFTER_FALLBACK of a fallback.
+        One is also due RETRY after the last, if the last proposal does not fly or a part has
+        changed; but none within AFTER_FALLBACK of a fallback.
         """
         is_planned = False
         elapsed_ns = -1 if self._first_ns is None else end_ns - self._first_ns
@@ -417,10 +419,10 @@ class Learner:
         return is_planned or (is_wanted and is_rested and not has_fallen)
 
     def _identified(self) -> Identification:
-        """A and B from the record, about the prior; also from the flown model on.
+        """Identify A and B from the record, about the prior; also start at the flown model.
 
-        Beside models at several speeds record and prior have a steady speed, and the entries are
-        reduced to the trim speed. Raises ParameterError where the speed is not steady over
+        With models at several speeds, the record and the prior have a steady speed, and the entries
+        are reduced to the trim speed. Raises ParameterError if the speed is not steady over
         SHORTEST.
         """
         recorded, ratio = self._steady(self._record.recording())
@@ -456,9 +458,10 @@ class Learner:
         return identified._replace(parts=tuple(parts))
 
     def _steady(self, recorded: FlightData) -> tuple[FlightData, float]:
-        """The record, and the speed over V0.
+        """Return the record, and the speed over V0.
 
-        Beside models at several speeds it is the steady end of the record, about the trim there.
+        With models at several speeds, it is the steady end of the record, about the trim at that
+        speed.
         """
         if not self._has_speeds:
             return recorded, 1.0
@@ -466,7 +469,7 @@ class Learner:
         return about(steady, self._rough, *level_flight(self._model, ratio, self._thrust)), ratio
 
     def _at_speed(self, model: Airframe, ratio: float) -> Airframe:
-        """A model at a speed of `_steady`."""
+        """Return a model at a speed of `_steady`."""
         return at_speed(model, ratio, self._thrust) if self._has_speeds else model
 
     def _at_trim(self, entries: tuple[Entry, ...], ratio: float) -> tuple[Entry, ...]:
@@ -487,11 +490,11 @@ class Learner:
         )
 
     def _changes(self, end_ns: int) -> list[Change]:
-        """Changes of the parts with a learned model over the last RECORD.
+        """Find changes, over the last RECORD, of the parts that have a learned model.
 
-        Without a fallback an input without effect counts in the second test in a row. There is
-        none where the speed was not steady over the record, an output stood still, or one
-        oscillated over RETRY: a loop near instability moves y as no model with a stable loop says.
+        Unless the law fell back, an input counts as dead only in the second test in a row. There is
+        no change if the speed was not steady over the record, an output stood still, or one
+        oscillated over RETRY: a loop near instability moves y as no model with a stable loop does.
         """
         suspected, self._suspected = self._suspected, {}
         begin_ns = end_ns - nanoseconds(RECORD)
@@ -526,7 +529,7 @@ class Learner:
     def _designed(
         self, model: Airframe, known: Mapping[PartName, Known], dead: Mapping[PartName, str]
     ) -> tuple[RiseDiConfig, str]:
-        """The controller of a model, and what `learn.margin` costs, a sentence.
+        """Design the controller of a model, and say what `learn.margin` costs.
 
         Parts without a learned model have the law of the start, or the rough model while it flies.
         Raises ParameterError.
@@ -580,7 +583,7 @@ class Learner:
         latest: Mapping[str, float],
         dead: Collection[str],
     ) -> str:
-        """What `learn.margin` costs beside the margin of the file's loop; "" without either."""
+        """Say what `learn.margin` costs beside the margin of the file's loop; "" without either."""
         start = self._controller
         settings = start.learn
         if settings is None or settings.margin is None or self._design_of_rough is None:

@@ -21,19 +21,19 @@ DELAY_DEVIATION = 0.015
 
 
 def is_within(part: Iterable[str], outputs: Iterable[str]) -> bool:
-    """Whether the outputs of a part are among those of another."""
+    """Return whether the outputs of a part are among those of another."""
     return set(part) <= set(outputs)
 
 
 def change_sentence(change: Change) -> str:
-    """The part that has changed, and its weakest input."""
+    """Say which part has changed, and name its weakest input."""
     name, effectiveness = min(change.left.items(), key=lambda effect: effect[1])
     weakest = f"{name} has {100 * effectiveness:.0f} % of its effect"
     return f"{' and '.join(change.outputs)} changed, log-likelihood {change.gain:.3g}: {weakest}"
 
 
 def not_white(part: Part) -> str:
-    """The output with the least white innovations, if above MAX_WHITENESS."""
+    """Refuse the output with the least white innovations if it is above MAX_WHITENESS; else ""."""
     worst = int(np.argmax(part.after.whiteness))
     white = float(part.after.whiteness[worst])
     if white <= MAX_WHITENESS:
@@ -46,9 +46,9 @@ def not_white(part: Part) -> str:
 
 
 def too_late(part: Part, delay: float) -> str:
-    """The refusal of a part whose inputs are as late as the search goes.
+    """Refuse a part whose inputs are as late as the search goes; return "" for any other.
 
-    The search goes on from the known `delay` of the loop, s.
+    The search starts from the known `delay` of the loop, s.
     """
     bound = delay + MAX_DELAY_ERROR * DELAY_DEVIATION
     late = [
@@ -65,19 +65,19 @@ def too_late(part: Part, delay: float) -> str:
 
 
 def is_file_better(part: Part) -> bool:
-    """Whether the nominal model predicts later samples better than the one that flies.
+    """Return whether the nominal model predicts later samples better than the one that flies.
 
-    The probability of that is at most 5 % where both are as near to the aircraft.
+    If both models are as near to the aircraft, the probability of this answer is at most 5 %.
     """
     return part.advantage < -LIKELIER
 
 
 def unproven(part: Part, name: str, *, flies: bool) -> str:
-    """The refusal of a first model beside the airframe of a name.
+    """Refuse a first model that has not proved itself beside the airframe of a name.
 
-    The model before was chosen on the record up to then, and later samples count. A file that
-    `flies` needs an advantage over it, with a probability of at most 5 % where both are as near to
-    the aircraft. A sketch does not fly, and no such disadvantage is enough.
+    The model was chosen on the record up to then, so only later samples count. Against a file that
+    `flies`, it needs an advantage that two equally good models show with a probability of at most 5
+    %. A sketch does not fly, so the model only must not have such a disadvantage.
     """
     limit = LIKELIER if flies else -LIKELIER
     if part.advantage == 0.0:
@@ -92,7 +92,7 @@ def unproven(part: Part, name: str, *, flies: bool) -> str:
 
 
 def return_to_file(part: Part, name: str) -> str:
-    """What flies where the airframe file predicts better than the model that flew.
+    """Say what flies after the airframe file predicted better than the model that flew.
 
     That is the airframe of a name, or the law of the start.
     """
@@ -105,12 +105,12 @@ def _file_advantage(part: Part) -> str:
 
 
 def entries_of_file(part: Part) -> tuple[Entry, ...]:
-    """The entries of a part as in the airframe file."""
+    """Return the entries of a part as they are in the airframe file."""
     return tuple(entry._replace(error=0.0) for entry in part.entries)
 
 
 def uncoupled(part: Part, known: Iterable[tuple[str, ...]]) -> str:
-    """The refusal of a part alone where the flown model couples it with another; else empty."""
+    """Refuse a part alone if the flown model couples it with another; return "" otherwise."""
     if not any(is_within(part.outputs, outputs) for outputs in known if outputs != part.outputs):
         return ""
     return (
@@ -125,9 +125,9 @@ def forgotten_coupling(part: Part) -> str:
 
 
 def weaker(part: Part, flown: Airframe | None) -> str:
-    """The effect that a record of gusts has weaker than the model that flies, by MAX_DEVIATION.
+    """Name the effect that gusts make weaker than in the model that flies, by MAX_DEVIATION.
 
-    Gusts hide what the inputs do: the effects come out too weak, a design with them too strong.
+    Gusts hide what the inputs do: the effects come out too weak, and a design with them too strong.
     """
     if flown is None or not part.gusts:
         return ""
@@ -145,9 +145,9 @@ def weaker(part: Part, flown: Airframe | None) -> str:
 
 
 def effect_sentence(part: Part) -> str:
-    """The effects of inputs on outputs that the flight shows.
+    """Say which effects of inputs on outputs the flight shows.
 
-    They are relative to the rough airframe, with deviations.
+    The effects are relative to the rough airframe, and have deviations.
     """
     effects = (entry for entry in part.entries if entry.matrix == "B" and entry.row in part.outputs)
     known = (entry for entry in effects if entry.nominal and entry.deviation < PRIOR / 2.0)
@@ -158,7 +158,7 @@ def effect_sentence(part: Part) -> str:
 
 
 def without_effect(dead: Mapping[tuple[str, ...], str]) -> list[str]:
-    """The sentences about parts that fly without an input."""
+    """Say which parts fly without an input."""
     return [
         f"{name} has no effect: {' and '.join(part)} without it, by the law of the start"
         for part, name in dead.items()

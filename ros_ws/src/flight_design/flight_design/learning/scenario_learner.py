@@ -39,7 +39,7 @@ from rise_di_controller.rise_di_config import LearnConfig, PriorConfig, RiseDiCo
 
 
 def learner(scenario: Scenario, *, real_time: bool = False, quick: bool = False) -> Learn | None:
-    """What `simulate` and `fly_and_report` take as `learn`; None without learning.
+    """Return what `simulate` and `fly_and_report` take as `learn`; None without learning.
 
     The published airframe is the rough model, not the aircraft in flight. For an aircraft of JSBSim
     the rough model is the controller's feedforward. In real time the loop has the delay of the
@@ -100,7 +100,7 @@ def learner(scenario: Scenario, *, real_time: bool = False, quick: bool = False)
     of_rough: dict[RiseDiConfig, SelectedObserver] = {}
 
     def design_of_rough(start: RiseDiConfig) -> SelectedObserver:
-        """The airframe as one that errs; once for the learners of many aircraft."""
+        """Design for the airframe as one that errs, once for the learners of many aircraft."""
         if start not in of_rough:
             margin = asked_margin(controller)
             of_rough[start] = selected_observer(start, scenario, airframe, margin, speeds=speeds)
@@ -118,12 +118,12 @@ def learner(scenario: Scenario, *, real_time: bool = False, quick: bool = False)
 
 
 def that_learns(scenario: Scenario) -> Scenario:
-    """A scenario that learns with no model of its aircraft, from one of the law alone.
+    """Turn a scenario of the law alone into one that learns without a model of its aircraft.
 
         Omega = diag(D omega / input_scale),   V0 the trim speed
 
-    The signs and sizes are those of the law, and the rough model is the sketch by rule of Omega and
-    V0. Raises ParameterError for a controller with an observer, or for outputs beyond a sketch.
+    The law gives the signs and sizes; the rough model is the sketch of Omega and V0. Raises
+    ParameterError for a controller with an observer, or for outputs that a sketch lacks.
     """
     start = scenario.rise_di()
     expected = "none: a scenario of the law alone, whose signs and sizes are the rough model"
@@ -142,12 +142,12 @@ def that_learns(scenario: Scenario) -> Scenario:
 
 
 def quick_learner(scenario: Scenario) -> Learn | None:
-    """The learner of a campaign."""
+    """Return the learner of a campaign."""
     return learner(scenario, quick=True)
 
 
 def with_law_inputs(airframe: Airframe, controller: RiseDiConfig) -> Airframe:
-    """The airframe with the inputs of the law, in the order of its outputs."""
+    """Return the airframe with the inputs of the law, in the order of its outputs."""
     if controller.allocation is None:
         return airframe
     order = [controller.outputs.index(name) for name in airframe.outputs]
@@ -156,7 +156,7 @@ def with_law_inputs(airframe: Airframe, controller: RiseDiConfig) -> Airframe:
 
 
 def _speeds(controller: RiseDiConfig, airframe: Airframe) -> tuple[float, float] | None:
-    """The speeds of the models of a schedule, over the trim speed; None without one.
+    """Return the speeds of a schedule's models, over the trim speed; None without a schedule.
 
     Raises ParameterError for a schedule about another speed than that of the rough model.
     """
@@ -170,7 +170,7 @@ def _speeds(controller: RiseDiConfig, airframe: Airframe) -> tuple[float, float]
 
 
 def _prior(path: str, flown: Airframe) -> Airframe:
-    """The rough model of a file. Raises ParameterError for one of another airframe."""
+    """Load the rough model of a file. Raises ParameterError if it is of another airframe."""
     prior = load_airframe(path)
     for key in ("name", "states", "inputs", "outputs", "speed"):
         same = getattr(prior, key) == getattr(flown, key)
@@ -211,13 +211,13 @@ class _Ticks(NamedTuple):
     given_up: Signal
 
     def left(self, k: int) -> tuple[str, ...]:
-        """The outputs that the controller had given up at a tick."""
+        """Return the outputs that the controller had given up at a tick."""
         names = self.given_up.names
         return tuple(name for name in names if self.flown is not None and self.given_up[name][k])
 
 
 def _ticks(tape: Tape, controller: RiseDiConfig) -> _Ticks:
-    """The ticks of a log. Raises ParameterError for a log without internals."""
+    """Return the ticks of a log. Raises ParameterError for a log without internals."""
     flew = "internals" in tape and len(tape["internals"].stamp_ns) > 0
     require(flew, "the log", "no sample of internals", "a flight with a controller that engaged")
     ticks = tape["internals"]
@@ -293,7 +293,7 @@ def learn_again(tape: Tape, scenario: Scenario) -> LearnResult:
 
 
 def with_last_model(scenario: Scenario, run: RecordedRun) -> Scenario:
-    """A scenario that learns, with what flew last in one of its runs in place of `learn`.
+    """Return a scenario with what flew last in one of its runs in place of `learn`.
 
     Raises ParameterError for a run of another controller.
     """
@@ -308,7 +308,7 @@ def with_last_model(scenario: Scenario, run: RecordedRun) -> Scenario:
 
 
 def learned_yaml(result: LearnResult, origin: str) -> str:
-    """The model of a result as the text of an airframe file; the header has the steps.
+    """Write the model of a result as the text of an airframe file; its header lists the steps.
 
     Raises ParameterError without a model.
     """
