@@ -166,14 +166,14 @@ def _words_of_vehicle(autopilot: str, scenario: Scenario) -> Mapping[str, str]:
 
 
 def _with_words(text: str, words: Mapping[str, str]) -> str:
-    """A text with other words."""
+    """Replace words in a text."""
     for word, replacement in words.items():
         text = text.replace(word, replacement)
     return text
 
 
 def _axes(scenario: Scenario, suffix: str) -> str:
-    """The text of rise_di_axes.h: axes, torque of a unit of u, and the speed at which it holds."""
+    """Write rise_di_axes.h: axes, torque of a unit of u, and the speed at which it holds."""
     controller = scenario.controller
     channels = scenario.aircraft.channels()
     upper = dict(zip(channels.inputs, scenario.aircraft.actuators.upper or (), strict=False))

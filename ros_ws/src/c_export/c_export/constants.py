@@ -227,9 +227,9 @@ def _limits(name: str, limits: Limits) -> dict[str, FloatArray]:
 
 
 def packed(controller: RiseDiConfig, *, float32: bool) -> bytes:
-    """The bytes of struct rise_di_parameters.
+    """Return the bytes of struct rise_di_parameters.
 
-    They are whole numbers of 64 bits, then the reals without a gap, filled to 8 bytes.
+    The struct holds whole numbers of 64 bits, then the reals without a gap, padded to 8 bytes.
     """
     real = np.float32 if float32 else np.float64
     content = b"".join(
@@ -242,7 +242,7 @@ def packed(controller: RiseDiConfig, *, float32: bool) -> bytes:
 
 
 def _finite(values: FloatArray, real: type[np.floating]) -> FloatArray:
-    """The values, with the largest number of the type in place of infinity."""
+    """Replace infinity by the largest number of the type."""
     largest = float(np.finfo(real).max)
     return np.clip(values, -largest, largest)
 
@@ -269,9 +269,9 @@ def header(
     float32: bool,
     samples: int = SAMPLE_BUFFER_SIZE,
 ) -> str:
-    """The text of rise_di_parameters.h; without a reference model where `reference` is None.
+    """Write rise_di_parameters.h; without a reference model if `reference` is None.
 
-    `samples` of y and of y_m are kept.
+    The code keeps `samples` of y and of y_m.
     """
     r = 0 if reference is None else len(reference.model().A_m)
     suffix = "F" if float32 else ""
@@ -356,7 +356,7 @@ def _macro(name: str, parts: list[str], *, braces: bool = True) -> list[str]:
 
 
 def _rows(members: list[Constant], numbers: Callable[[FloatArray], str]) -> list[str]:
-    """Initialisers of the table of parameters, in the order of the reals of the struct."""
+    """Return the initialisers of the parameter table, in the order of the reals of the struct."""
     rows = []
     place = 0
     for name, value in members:
@@ -371,7 +371,7 @@ def _rows(members: list[Constant], numbers: Callable[[FloatArray], str]) -> list
 def _initialiser(
     name: str, value: int | tuple[int, ...] | FloatArray, numbers: Callable[[FloatArray], str]
 ) -> str:
-    """A number, or a list in braces, as C initialises it.
+    """Write a number, or a list in braces, as C initialises it.
 
     The first and the last list of a nested struct open and close the braces of the struct.
     """
@@ -387,10 +387,10 @@ def _initialiser(
 
 
 def _strings(names: tuple[str, ...]) -> str:
-    """String literals of C.
+    """Write string literals of C.
 
-    A character other than a letter, a digit or one of "_. " is the octal escape of each of its
-    bytes. Of names from a parameter set none has such a character.
+    Every byte of a character other than a letter, a digit or one of "_. " becomes an octal escape.
+    The names of a parameter set have no such character.
     """
     return ", ".join(f'"{"".join(map(_octal, name))}"' for name in names)
 

@@ -120,9 +120,9 @@ def _interval_ns(kind: float, size: float, period_ns: int) -> int:
 
 
 def _jumps(unit: FloatArray, rng: np.random.Generator) -> Iterator[FloatArray]:
-    """What is added to samples of y, (m,).
+    """Yield what is added to samples of y, (m,).
 
-    One sample of 50, and some samples after, get up to 10^5 units, and are lost.
+    One sample of 50, and some samples after it, get up to 10^5 units and are lost.
     """
     m = len(unit)
     offset = np.zeros_like(unit)
@@ -137,9 +137,9 @@ def _jumps(unit: FloatArray, rng: np.random.Generator) -> Iterator[FloatArray]:
 def drawn_standstill(
     sets: Sequence[RiseDiConfig], ticks: int, seed: int, samples: int = SAMPLE_BUFFER_SIZE
 ) -> Recording:
-    """Samples of y with noise, and stretches of up to twelve equal samples.
+    """Draw samples of y with noise, and stretches of up to twelve equal samples.
 
-    They come at the ticks and half a period before.
+    The samples come at the ticks and half a period before.
     """
     rng = np.random.default_rng(seed)
     period_ns = sets[0].guard().period_ns
@@ -249,7 +249,7 @@ def drawn_commands(reference: ReferenceModelConfig, steps: int, seed: int) -> Re
 
 
 def _rows(values: Mapping[str, FloatArray], groups: Sequence[str]) -> FloatArray:
-    """The values of groups (values, steps) as rows (steps, w) in the order of the groups."""
+    """Return the values of groups (values, steps) as rows (steps, w), in the groups' order."""
     return np.ascontiguousarray(np.vstack([values[name] for name in groups]).T)
 
 
@@ -379,9 +379,9 @@ def _feedforward_step(
 def _effector_values(
     u: FloatArray, before: FloatArray | None, dt: FloatArray, params: Allocation | None
 ) -> tuple[FloatArray, FloatArray | None]:
-    """The u of the effectors for a u, and the effectors, by column.
+    """Return the u of the effectors for a u, and the effectors, by column.
 
-    Without an allocation they are u and None.
+    Without an allocation, these are u and None.
     """
     if params is None or before is None:
         return u, None
@@ -399,7 +399,7 @@ def _columns(params: Any) -> Any:
 
 
 def _where(mask: NDArray[np.bool_], here: Any, otherwise: Any) -> Any:
-    """The state `here` where the mask is true, by step."""
+    """Choose, for each step, the state `here` if the mask is true, else `otherwise`."""
     if hasattr(here, "_asdict"):
         return type(here)(*(_where(mask, *pair) for pair in zip(here, otherwise, strict=True)))
     return np.where(mask, here, otherwise)

@@ -71,13 +71,13 @@ class Recording(NamedTuple):
 
 
 def event_type(m: int) -> np.dtype[np.void]:
-    """The struct `event` of proof.c."""
+    """Return the struct `event` of proof.c as a NumPy type."""
     integers = [(name, np.int64) for name in ("kind", "now_ns", "stamp_ns", "flag", "offset_ns")]
     return np.dtype([*integers, ("y", np.float64, m), ("y_m", np.float64, m)])
 
 
 def real_groups(controller: RiseDiConfig) -> dict[str, int]:
-    """Groups of reals in a state and their numbers of values, in the order of proof.c."""
+    """Return the groups of reals in a state with their sizes, in the order of proof.c."""
     m, p, n, s, schedule = sizes(controller)
     groups = dict.fromkeys(("u", "u_free", "u_trim", "u_ff", "u_failsafe"), m)
     groups |= {"effectors": p, "effectors_failsafe": p} if p else {}
@@ -150,7 +150,7 @@ class Recorder(Controller):
         self._events.append((kind, now_ns, stamp_ns, flag, offset_ns, *values))
 
     def begin(self) -> None:
-        """A new controller with the first parameters."""
+        """Begin a new controller with the first parameters."""
         self._reset(self.sets[0])
         self._refused = 0
         self._add(START)
@@ -192,7 +192,7 @@ class Recorder(Controller):
         super().restart()
 
     def tick(self, now_ns: int, late_ns: int = 0, *, active: bool = True) -> ControlOutput | None:
-        """A tick, after `before_tick`."""
+        """Compute a tick, after `before_tick`."""
         active = self._before_tick(self, now_ns) and active
         self._add(TICK, now_ns, flag=int(active))
         output = super().tick(now_ns, late_ns, active=active)
@@ -202,7 +202,7 @@ class Recorder(Controller):
     def guard_tick(
         self, now_ns: int, sample: tuple[int, FloatArray, FloatArray, int] | None, *, active: bool
     ) -> None:
-        """A tick with stamp, y, y_m at the stamp, and the distance of the newest y_m in ns.
+        """Record a tick: stamp, y, y_m at the stamp, and the distance of the newest y_m in ns.
 
         `sample` is None without samples.
         """
@@ -263,9 +263,9 @@ class Recorder(Controller):
 
 
 def parameter_sets(controller: RiseDiConfig) -> list[RiseDiConfig]:
-    """The controller, then valid changes of its parameters.
+    """Return the controller, then valid changes of its parameters.
 
-    They change gains, limits, signs, times, schedule, observer and stops.
+    The changes concern gains, limits, signs, times, schedule, observer and stops.
     """
     widths = np.array(controller.input_scale) * controller.law_params().eps
     bound = np.minimum(10.0 * widths, 0.1 * np.array(controller.upper or 10.0 * widths)).tolist()
@@ -326,7 +326,7 @@ def _flight(name: str, scenario: Scenario, recorder: Recorder) -> Recording:
 
 
 def _faults(duration: float, sets: Sequence[RiseDiConfig]) -> Callable[[Recorder, int], bool]:
-    """What happens before a tick of the flight with faults."""
+    """Return a function that injects the faults of a flight before a tick."""
     controller = sets[0]
     within_hold = controller.max_age + 0.5 * controller.hold
     in_ramp = controller.max_age + controller.hold + 0.5 * controller.ramp
@@ -361,10 +361,10 @@ def _faults(duration: float, sets: Sequence[RiseDiConfig]) -> Callable[[Recorder
 
 
 def run_recording(run: RecordedRun) -> tuple[list[RiseDiConfig], Recording, int]:
-    """The parameters of a log and their changes in flight, and the ticks of the log.
+    """Read a log: the parameters with their changes in flight, the ticks, and how many agree.
 
-    The third result is the number of ticks with the u of the log. Raises ParameterError for
-    parameters in force that the changes of the log do not lead to.
+    A tick agrees if its u is that of the log. Raises ParameterError if the changes of the log do
+    not lead to the parameters in force.
     """
     sets = [exportable(recorded_parameters(run.scenario_file()))]
     changes = [*recorded_changes(run, sets[0])]

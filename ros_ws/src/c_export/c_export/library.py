@@ -61,13 +61,13 @@ class CController:
         )
 
     def tick(self, now_ns: int, *, active: bool = True) -> tuple[FloatArray, int]:
-        """A tick: u, and the mode, -1 where no u is to be sent."""
+        """Compute a tick; return u, and the mode, which is -1 if no u must be sent."""
         arguments = (ctypes.c_int64(now_ns), ctypes.c_int64(active), _POINTER(self._u.ctypes.data))
         mode = int(self._library.library_tick(self._memory, *arguments))
         return self._u.copy(), mode
 
     def replay(self, recording: Recording) -> FloatArray:
-        """The u of each tick of a log, `events.run_recording`, shape (T, p)."""
+        """Return the u of each tick of a log, `events.run_recording`, (T, p)."""
         events = recording.events
         ticks = events[events["kind"] == GUARD_TICK]
         before = np.zeros(len(events), dtype=np.int64)  # what the event before a tick is
@@ -137,12 +137,12 @@ class Units(NamedTuple):
 
 
 def si_units(units: Sequence[str]) -> tuple[str, ...]:
-    """The SI units of units of airframe files, as "rad/s" of "deg/s"."""
+    """Return the SI units of an airframe file's units, for example "rad/s" for "deg/s"."""
     return tuple(_unit_name(quantity(unit).dimension) for unit in units)
 
 
 def _unit_name(dimension: tuple[int, int, int, int]) -> str:
-    """A name of the SI unit with these exponents of rad, m, s and kg."""
+    """Name the SI unit with these exponents of rad, m, s and kg."""
     parts = list(zip(("rad", "m", "s", "kg"), dimension, strict=True))
     above = [_power(name, exponent) for name, exponent in parts if exponent > 0]
     below = [_power(name, -exponent) for name, exponent in parts if exponent < 0]

@@ -63,9 +63,9 @@ class Comparison(NamedTuple):
     modes_equal: bool  # whether modes and times are equal
 
     def holds(self, *, float32: bool) -> bool:
-        """Whether every bit is equal, or the difference in float32 is within its bound.
+        """Return whether every bit is equal, or float32 is within its bound.
 
-        In float32 every mode is equal, and u within FLOAT32_BOUND.
+        In float32, every mode must be equal, and u within FLOAT32_BOUND.
         """
         return (
             self.modes_equal and self.deviation <= FLOAT32_BOUND if float32 else self.differing == 0
@@ -118,9 +118,9 @@ def compilers(names: Sequence[str] = ()) -> list[list[str]]:
 def words(
     command: str, option: str = "compiler", expected: str = "the command of a C compiler"
 ) -> list[str]:
-    """The words of a command, as a shell reads them.
+    """Split a command into words, as a shell does.
 
-    Raises ParameterError for what is no program.
+    Raises ParameterError if it names no program.
     """
     try:
         parts = shlex.split(command)
@@ -198,7 +198,7 @@ class Program:
         return words[:, :integers], words[:, integers:].view(np.float64), json.loads(process.stdout)
 
     def compare(self, recording: Recording) -> Comparison:
-        """The states of C beside the states of Python."""
+        """Compare the states of C with the states of Python."""
         integers, reals, _ = self.run(recording)
         m = len(self._sets[0].outputs)
         if len(integers) != recording.ticks:
@@ -299,7 +299,7 @@ FIGURES = {
 
 
 def proof_report(proof: Proof, scenario: str) -> str:
-    """The proof as text."""
+    """Write the proof as text."""
     precision = "float32" if proof.float32 else "float64"
     lines = [
         f"C code of the controller of {scenario}, {precision}, beside the controller in Python",
@@ -340,7 +340,7 @@ def build(command: Sequence[str], folder: Path) -> None:
 
 
 def version(compiler: Sequence[str]) -> str:
-    """The first line of what a compiler says of itself."""
+    """Return the first line of what a compiler says of itself."""
     process = subprocess.run([*compiler, "--version"], capture_output=True, text=True, check=False)  # noqa: S603 - as above
     return (process.stdout or process.stderr).partition("\n")[0].strip()
 

@@ -50,7 +50,7 @@ MARGIN_AIRCRAFT = 200  # aircraft of a case, the first ones, whose stability is 
 
 
 def _permitted_units(scenario: Scenario, units: Mapping[str, float]) -> dict[str, float]:
-    """The units of the score by output. Raises ParameterError for a unit beyond the scenario."""
+    """Return the units of the score by output. Raises ParameterError for an unfit unit."""
     outputs = scenario.controller.outputs
     stated_units = dict(units)
     for name, unit in stated_units.items():
@@ -88,12 +88,13 @@ def define(
     spread: Spread | None = None,
     units: Mapping[str, float] | None = None,
 ) -> Definition:
-    """The definition of a campaign over a scenario.
+    """Define a campaign over a scenario.
 
-    `wind` and `spread` None: those of the scenario's `aircraft.uncertainty`. `units` replaces units
-    of the score by output, SI. `chunk` None: what is fast on the device, or that of single flights.
+    If `wind` or `spread` is None, it is that of the scenario's `aircraft.uncertainty`. `units`
+    replaces units of the score by output, SI. If `chunk` is None, it is what is fast on the device,
+    or that of single flights.
 
-    Raises ParameterError if a campaign cannot fly it.
+    Raises ParameterError if a campaign cannot fly the scenario.
     """
     if sweep is not None:
         sweep.scaled(scenario.controller, 1.0)
@@ -196,7 +197,7 @@ def fly_chunk_figures(text: str, job: Job) -> Chunk:
 
 
 def _fly_at_once(text: str, case: int, first: int, count: int, size: int) -> Chunk:
-    """The first `count` of the `size` aircraft from number `first`, which fly at once."""
+    """Fly the first `count` of the `size` aircraft from number `first`, all at once."""
     from flight_campaign.batch import batch  # noqa: PLC0415 - JAX, which the command needs only for flights
     from flight_campaign.batch.device import turn  # noqa: PLC0415 - as above
     from flight_campaign.drawn_fleet import drawn_fleet  # noqa: PLC0415 - as above
@@ -233,7 +234,7 @@ class _Shared(NamedTuple):
 
 @lru_cache(maxsize=8)
 def _prepare(text: str, case: int) -> _Shared:
-    """Data that all chunks of a case share."""
+    """Prepare the data that all chunks of a case share."""
     from flight_campaign.batch import batch  # noqa: PLC0415 - as above
 
     scenario = Definition.model_validate_json(text).scenario(case)
@@ -256,7 +257,7 @@ class MonteCarlo:
 
     @classmethod
     def begin(cls, folder: Path, definition: Definition) -> "MonteCarlo":
-        """A new campaign in an existing, empty folder."""
+        """Begin a new campaign in an existing, empty folder."""
         campaign = cls(folder, definition)
         (folder / CHUNKS).mkdir()
         _write(folder / DEFINITION, definition.model_dump_json(indent=1))
@@ -264,7 +265,7 @@ class MonteCarlo:
 
     @classmethod
     def resume(cls, folder: Path) -> "MonteCarlo":
-        """The campaign of a folder. Raises ParameterError for a folder without one."""
+        """Load the campaign of a folder. Raises ParameterError for a folder without one."""
         try:
             definition = Definition.model_validate_json(
                 (folder / DEFINITION).read_text(encoding="utf-8")
@@ -278,7 +279,7 @@ class MonteCarlo:
         return cls(folder, definition)
 
     def missing(self) -> list[Job]:
-        """The chunks without a file."""
+        """Return the chunks without a file."""
         return [job for job in self.definition.jobs() if not self._path(job).exists()]
 
     def fly(self, engine: Engine, learner: MakeLearner | None = None) -> Iterator[int]:
@@ -304,9 +305,9 @@ class MonteCarlo:
         return total
 
     def rows(self, case: int | None = None) -> "pl.LazyFrame":
-        """The table of the completed chunks of a case or of all, ordered by case, then number.
+        """Return the table of the completed chunks of a case or of all, by case, then number.
 
-        `rows` has the columns.
+        The module `rows` lists the columns.
         """
         import polars as pl  # noqa: PLC0415 - some tenths of a second
 

@@ -182,7 +182,7 @@ def _influence(campaign: MonteCarlo, case: int, tally: Tally) -> dict[str, Any]:
 
 
 def _path(campaign: MonteCarlo, case: int, word: str) -> Path:
-    """The file of a scenario of a case."""
+    """Return the file of a scenario of a case."""
     definition = campaign.definition
     suffix = "" if definition.sweep is None else f"_{definition.factor(case):g}"
     return campaign.folder / f"{definition.name}{suffix}_{word}.yaml"
@@ -259,7 +259,7 @@ def write_page(
 
 
 def _guarantees(labels: Sequence[str], cases: Sequence[Mapping[str, Any]]) -> MetricTable:
-    """The guarantees that were computed for the loops of the cases."""
+    """Tabulate the guarantees that were computed for the loops of the cases."""
     rows = []
     for label, case in zip(labels, cases, strict=True):
         promise = case["guarantee"]
@@ -308,7 +308,7 @@ def _spread_of_entries(definition: Definition) -> str:
 
 
 def score_meaning(scenario: Scenario, score_units: Mapping[str, float] | None = None) -> str:
-    """What the score of a campaign counts; `score_units` replaces usual units by output, SI."""
+    """Say what a campaign's score counts; `score_units` replaces usual units by output, SI."""
     if scenario.guidance is not None:
         half = CAPTURE_TIME * scenario.guidance.speed
         return (
@@ -372,7 +372,7 @@ def _figures(label: str, tally: Tally, units: Mapping[str, DisplayUnit]) -> Metr
 
 
 def figure_rows(tally: Tally, units: Mapping[str, DisplayUnit]) -> list[list[str]]:
-    """A row for each figure of a tally: its label with the unit, and what FIGURE_HEADINGS name."""
+    """Return a row for each figure of a tally: label with unit, then what FIGURE_HEADINGS name."""
     rows = []
     for name, figure in tally.figures.items():
         label, factor = _label(name, units)
@@ -388,7 +388,7 @@ def figure_rows(tally: Tally, units: Mapping[str, DisplayUnit]) -> list[list[str
 
 
 def _label(name: str, units: Mapping[str, DisplayUnit]) -> tuple[str, float]:
-    """A figure's name with its unit, and the factor from SI."""
+    """Return a figure's name with its unit, and the factor from SI."""
     kind, _, channel = name.partition(".")
     if not channel:
         return OF_LEARNER.get(name, name), 1.0
@@ -412,7 +412,7 @@ def _worst(labels: Sequence[str], cases: Sequence[Mapping[str, Any]]) -> MetricT
 
 
 def influence_table(label: str, case: Mapping[str, Any]) -> MetricTable:
-    """The drawn entries whose size goes most with the score, of a case of the summary."""
+    """Tabulate, for a case, the drawn entries whose size correlates most with the score."""
     ranked = case["influence"]
     rows = [
         [

@@ -48,9 +48,9 @@ class Sweep(Config):
         return self.parameter.partition("[")[0]
 
     def scaled(self, controller: ControllerConfig, factor: float) -> float | tuple[float, ...]:
-        """The parameter times a factor, in the channel alone where one is named.
+        """Return the parameter times a factor; if a channel is named, only its value changes.
 
-        A channel of u means the channel of y that it is paired with. Raises ParameterError for
+        A channel of u stands for the channel of y that it is paired with. Raises ParameterError for
         another parameter or channel.
         """
         swept = swept_parameters(controller)
@@ -125,7 +125,7 @@ class Definition(Config):
         )
 
     def scenario(self, case: int = 0) -> Scenario:
-        """The scenario of a case of the sweep, the airframe as published."""
+        """Return the scenario of a case of the sweep, with the airframe as published."""
         scenario = scenario_of(self.name, Path(self.name), self.sections)
         if self.sweep is None:
             return scenario
@@ -133,7 +133,7 @@ class Definition(Config):
         return scenario.vary(controller={self.sweep.name: controller})
 
     def aircraft_scenario(self, number: int, case: int = 0) -> Scenario:
-        """The scenario of one aircraft of the campaign, as `rise-di fly` flies it."""
+        """Return the scenario of one aircraft of the campaign, as `rise-di fly` flies it."""
         uncertainty: dict[str, Any] = {
             "A": self.uncertainty,
             "B": self.uncertainty,
@@ -155,7 +155,7 @@ class Definition(Config):
         return equipped.vary(aircraft={"uncertainty": uncertainty})
 
     def score(self, rms: FloatArray) -> FloatArray:
-        """The scores of N aircraft, (N,), of their rms errors, (m, N)."""
+        """Return the scores of N aircraft, (N,), from their rms errors, (m, N)."""
         scenario = self.scenario()
         units = scenario.aircraft.channels().outputs
         return score(rms, score_units(scenario.controller.outputs, units, self.score_units))
@@ -170,16 +170,16 @@ class Definition(Config):
         return 1.0 if self.sweep is None else self.sweep.factors[case]
 
     def label(self, case: int) -> str:
-        """The name of a case in tables."""
+        """Return the name of a case in tables."""
         return (
             self.name if self.sweep is None else f"{self.sweep.parameter} x {self.factor(case):g}"
         )
 
     def size(self, job: Job) -> int:
-        """Number of aircraft of a chunk."""
+        """Return the number of aircraft in a chunk."""
         return min(self.chunk, self.aircraft - job[1] * self.chunk)
 
     def jobs(self) -> Iterator[Job]:
-        """The chunks, each (case, chunk)."""
+        """Return the chunks, each (case, chunk)."""
         chunks = -(-self.aircraft // self.chunk)
         return product(range(self.cases), range(chunks))

@@ -27,7 +27,7 @@ class DrawnFleet(NamedTuple):
     equipment: dict[str, FloatArray]  # by name, (N,) each
 
     def on_device(self, course: Course, vehicle: Vehicle) -> tuple[FleetMatrices, Vehicle]:
-        """The aircraft for the compiled loop, and the vehicle with their equipment."""
+        """Return the aircraft for the compiled loop, and the vehicle with their equipment."""
         delay = self.equipment.get(equipment.DELAY, np.zeros(1))
         fleet = batch_matrices.assemble(
             self.A,
@@ -40,13 +40,13 @@ class DrawnFleet(NamedTuple):
         return fleet, batch.with_equipment(vehicle, self.scenario, self.equipment)
 
     def entries(self) -> dict[str, FloatArray]:
-        """What was drawn, by name, shape (N,) each."""
+        """Return what was drawn, by name, (N,) each."""
         airframe = self.scenario.aircraft.nominal_airframe()
         return drawn_entries(airframe, self.A, self.B) | self.equipment
 
 
 def drawn_fleet(definition: Definition, scenario: Scenario, first: int, count: int) -> DrawnFleet:
-    """The `count` aircraft of a campaign from number `first`."""
+    """Draw the `count` aircraft of a campaign from number `first` on."""
     part = definition.uncertainty
     airframe = scenario.aircraft.nominal_airframe()
     A, B = sampled_matrices(airframe, part, part, definition.seed, first, count, definition.spread)

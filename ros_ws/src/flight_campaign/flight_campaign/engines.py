@@ -93,11 +93,11 @@ def threads(workers: int | None = None) -> Engine:
 def dask(
     workers: int | None = None, scheduler: str | None = None, *, on_devices: bool = True
 ) -> Engine:
-    """Processes of this machine, or the workers of a scheduler.
+    """Return an engine that flies in processes of this machine, or on the workers of a scheduler.
 
-    The chunks of a dead worker run again. A scheduler gets the lost chunks again when the scheduler
-    is back within RECONNECT. On a host with GPUs each process has a GPU of its own, unless
-    `on_devices` is False: single flights need cores.
+    The chunks of a dead worker run again. A scheduler that comes back within RECONNECT gets its
+    lost chunks again. On a host with GPUs, each process has a GPU of its own, unless `on_devices`
+    is False: single flights need cores.
     """
 
     def fly(work: Work, jobs: Iterable[Job]) -> Iterator[tuple[Job, Any]]:
@@ -140,9 +140,9 @@ def dask(
 def _connected(
     stack: ExitStack, scheduler: str | None, count: int, devices: Devices, patience: float
 ) -> tuple[Any, int]:
-    """A client of the scheduler, or of `count` processes of this machine.
+    """Connect to the scheduler, or to `count` processes of this machine.
 
-    Returns further the number of their threads.
+    Returns the client, and the number of threads that it has.
     """
     from distributed import Client  # noqa: PLC0415 - half a second
 
@@ -166,7 +166,7 @@ def _connected(
 def _results(
     client: Any, work: Work, first: Iterable[Job], waiting: Iterator[Job], underway: dict[Any, Job]
 ) -> Iterator[tuple[Job, Any]]:
-    """The first jobs and those that wait with their results; `underway` has the jobs by future."""
+    """Yield jobs with their results; `underway` holds the submitted jobs by future."""
     from distributed import as_completed  # noqa: PLC0415 - half a second
 
     for job in first:
@@ -189,7 +189,7 @@ def _separate_devices() -> Devices:
 
 
 def _one_device_each(devices: Devices) -> Any:
-    """A plugin that gives each worker of a local cluster a device, before its first chunk."""
+    """Return a plugin that gives each local worker a device before its first chunk."""
     from distributed import WorkerPlugin  # noqa: PLC0415 - half a second
 
     class OneDeviceEach(WorkerPlugin):
@@ -201,7 +201,7 @@ def _one_device_each(devices: Devices) -> Any:
 
 @contextmanager
 def _local_cluster(workers: int, devices: Devices) -> Iterator[Any]:
-    """Processes of this machine; on devices each has the threads that keep a device busy."""
+    """Start processes of this machine; each has the threads that keep a device busy."""
     import dask  # noqa: PLC0415 - half a second
     from distributed import LocalCluster  # noqa: PLC0415 - as above
 

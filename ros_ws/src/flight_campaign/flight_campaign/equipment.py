@@ -25,7 +25,7 @@ KINDS = ("lag", "noise", DELAY)
 
 
 def is_of_equipment(entry: str) -> bool:
-    """Whether an entry is a lag, a noise or the delay, not an entry of A or B."""
+    """Return whether an entry is a lag, a noise or the delay, not an entry of A or B."""
     return entry.partition("[")[0] in KINDS
 
 
@@ -35,12 +35,12 @@ def is_of_loop(entry: str) -> bool:
 
 
 def matrix_entries(entries: Mapping[str, float]) -> dict[str, float]:
-    """The entries of A and B alone."""
+    """Return the entries of A and B alone."""
     return {name: part for name, part in entries.items() if not is_of_equipment(name)}
 
 
 def published(scenario: Scenario) -> dict[str, float]:
-    """The lags above 0 and the noise above 0 of a scenario by name, SI."""
+    """Return the lags and the noise of a scenario that are above 0, by name, SI."""
     aircraft = scenario.aircraft
     channels = scenario.aircraft.channels()
     entries = (
@@ -58,10 +58,10 @@ def published(scenario: Scenario) -> dict[str, float]:
 
 
 def expanded(entries: Mapping[str, float], scenario: Scenario) -> dict[str, float]:
-    """The entries, with each channel in place of lag and noise.
+    """Replace the entries of lag and noise by one for each channel.
 
-    A channel's own entry counts, and the delay is in whole periods. Raises ParameterError for an
-    unknown entry.
+    A channel's own entry takes precedence, and the delay is in whole periods. Raises ParameterError
+    for an unknown entry.
     """
     entries_of_scenario = published(scenario)
     every = dict[str, float]()
@@ -124,9 +124,9 @@ def references(scenario: Scenario, entries: Mapping[str, float]) -> dict[str, fl
 def in_order(
     values: Mapping[str, Any], kind: str, names: tuple[str, ...], otherwise: tuple[float, ...]
 ) -> list[Any]:
-    """The values of a kind in the order of the channels.
+    """Return the values of a kind in the order of the channels.
 
-    `otherwise` where a channel has no value.
+    A channel without a value has that of `otherwise`.
     """
     return [
         values.get(f"{kind}[{name}]", value) for name, value in zip(names, otherwise, strict=True)
@@ -134,7 +134,7 @@ def in_order(
 
 
 def scenario_with_equipment(scenario: Scenario, values: Mapping[str, float]) -> Scenario:
-    """The scenario with lags, noise and a further delay of u by name."""
+    """Return the scenario with lags, noise and an additional delay of u, by name."""
     aircraft = scenario.aircraft
     channels = scenario.aircraft.channels()
     changes = {}

@@ -43,7 +43,7 @@ def rank_correlations(table: "pl.DataFrame", published: Mapping[str, float]) -> 
 
 
 def chance_level(aircraft: int, entries: int) -> float:
-    """The rank correlation that none of so many entries without effect exceeds.
+    """Return the rank correlation that none of so many entries without effect exceeds.
 
     This holds in 95 % of campaigns. Of independent values it has mean 0 and variance 1 / (N - 1),
     normal for large N. Source: Kendall, Rank Correlation Methods, 1948. The level counts the number

@@ -44,7 +44,7 @@ def join_chunks(parts: Sequence[Chunk]) -> Chunk:
 
 
 def encode_chunk(chunk: Chunk, seed: int, factor: float) -> bytes:
-    """The table of a chunk as Parquet (zstd), SI.
+    """Encode the table of a chunk as Parquet (zstd), SI.
 
     Figures of a diverged aircraft, and NaN, are null.
     """
@@ -72,7 +72,7 @@ def encode_chunk(chunk: Chunk, seed: int, factor: float) -> bytes:
 
 
 def entry_names(table: "pl.DataFrame") -> list[str]:
-    """The columns with drawn entries: of A and B, lags, noise and the delay of u."""
+    """Return the columns with drawn entries: of A and B, lags, noise and the delay of u."""
     return [
         name for name in table.columns if name.startswith(("A[", "B[")) or is_of_equipment(name)
     ]

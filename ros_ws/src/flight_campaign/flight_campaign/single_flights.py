@@ -62,7 +62,7 @@ def learned(tape: Tape, events: Sequence[Event]) -> LearningOutcome:
 
 
 def flies_alone(scenario: Scenario) -> bool:
-    """Whether the aircraft of a scenario fly one by one: beside a learner, or under guidance."""
+    """Return whether the aircraft fly one by one, because they learn or are guided."""
     return scenario.learns() or scenario.guidance is not None
 
 
@@ -110,7 +110,7 @@ def fly_single(scenario: Scenario, learner: MakeLearner | None = None) -> Single
 
 
 def _tracking_figures(tape: Tape, scenario: Scenario) -> dict[str, float]:
-    """True errors by output, and the mean abs(u_dot) by effector."""
+    """Return the true errors by output, and the mean abs(u_dot) by effector."""
     true = true_error(tape)
     assert true is not None  # noqa: S101 - simulated flights have the truth
     is_tick = true.stamp_ns % period_ns(scenario.controller.rate, "controller.rate") == 0

@@ -51,7 +51,7 @@ class FigureStatistics(Config):
 
     @classmethod
     def from_values(cls, values: FloatArray) -> Self:
-        """The figure of values >= 0, shape (N,); NaN does not count."""
+        """Collect values >= 0, (N,), into a figure; NaN does not count."""
         values = values[~np.isnan(values)]
         if not len(values):
             return cls()
@@ -65,7 +65,7 @@ class FigureStatistics(Config):
         return cls(count=len(values), mean=mean, squares=squares, largest=largest, bins=bins)
 
     def __add__(self, added: Self) -> Self:
-        """The figures together.
+        """Join two figures.
 
         Source: Chan, Golub, LeVeque, Updating formulae and a pairwise algorithm, 1979.
         """
@@ -87,7 +87,7 @@ class FigureStatistics(Config):
         return math.sqrt(self.squares / (self.count - 1)) if self.count > 1 else 0.0
 
     def quantile(self, share: float) -> float:
-        """The upper bound of a share of the flights, to the width of a bin (2.3 %)."""
+        """Return the upper bound of a share of the flights, to the width of a bin (2.3 %)."""
         rank = share * self.count
         below = 0
         for place, number in self.bins.items():
@@ -122,9 +122,9 @@ class Tally(Config):
     def from_flights(
         cls, first: int, diverged: FloatArray, figures: Mapping[str, FloatArray]
     ) -> Self:
-        """The tally of the aircraft first, first + 1, ...
+        """Tally the aircraft first, first + 1, ...
 
-        Every figure is of shape (N,), the "score" included.
+        Every figure has the shape (N,), and so has the "score".
         """
         bounded = ~np.asarray(diverged, dtype=bool)
         score = np.asarray(figures["score"])
@@ -163,13 +163,13 @@ class Tally(Config):
         )
 
     def without_model(self) -> int | None:
-        """Number of flights without a model, diverged ones excluded; None without learners."""
+        """Count the flights without a model, except diverged ones; None without learners."""
         if FIRST_MODEL in self.figures:
             return self.flights - self.diverged - self.figures[FIRST_MODEL].count
         return None
 
     def summary(self) -> dict[str, Any]:
-        """The statistics as figures of a file, SI."""
+        """Return the statistics as figures for a file, SI."""
         unmodelled = self.without_model()
         shares: dict[str, Any] = {} if unmodelled is None else {"without_model": unmodelled}
         for word, count in (("diverged", self.diverged), ("lost", self.lost)):
@@ -191,7 +191,7 @@ class Tally(Config):
         }
 
     def share(self, count: int) -> tuple[float, float, float]:
-        """A number of flights as a share, and the 95 % confidence interval, 0 to 1.
+        """Return a number of flights as a share, with its 95 % confidence interval, 0 to 1.
 
         The interval is that of Clopper and Pearson.
         """

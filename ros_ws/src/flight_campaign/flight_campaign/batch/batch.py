@@ -85,7 +85,7 @@ def shared(params: Any) -> Any:
 def with_equipment(
     vehicle: Vehicle, scenario: Scenario, values: Mapping[str, FloatArray]
 ) -> Vehicle:
-    """The vehicle with the lags and the noise of N aircraft, by name as from `equipment.drawn`."""
+    """Put the lags and noise of N aircraft, named as in `equipment.drawn`, into the vehicle."""
     channels = scenario.aircraft.channels()
     aircraft = scenario.aircraft
     if any(name.startswith("lag[") for name in values):
@@ -110,9 +110,9 @@ def _rows(values: Sequence[Any]) -> Array:
 
 
 def _reduced(aircraft: Aircraft) -> tuple[NDArray[np.int64], Aircraft]:
-    """Indices of the states in the remainder, and the aircraft reduced to them.
+    """Return the indices of the states in the remainder, and the aircraft reduced to them.
 
-    Reduced to `remainder_rows`, too.
+    It is reduced to `remainder_rows`, too.
     """
     rows = remainder_rows(aircraft)
     coupling = aircraft.coupling
@@ -171,7 +171,7 @@ def fly(
 
 
 def on_host(result: FleetResult) -> FleetResult:
-    """The figures as arrays of NumPy, after the flights."""
+    """Copy the figures to arrays of NumPy, after the flights."""
     return jax.tree.map(np.asarray, result)
 
 
@@ -207,7 +207,7 @@ class FleetStepper:
         return np.asarray(self._state.bounded)
 
     def sense(self) -> tuple[FloatArray, FloatArray]:
-        """The y and y_m of the present tick, each (m, N), in the law's order."""
+        """Sense the y and y_m of the present tick, each (m, N), in the law's order."""
         self._state, sample = _sense_once(self._state, self._segments, self._k, self._vehicle)
         y = np.asarray(sample.y)
         return y, np.broadcast_to(np.asarray(sample.y_m), y.shape)
@@ -233,7 +233,7 @@ class FleetStepper:
         self._state = jax.tree.map(partial(jnp.where, which), self._begin, self._state)
 
     def result(self) -> FleetResult:
-        """The figures after the last tick."""
+        """Return the figures after the last tick."""
         return figures(self._state, self.ticks, self._course.period)
 
 

@@ -15,7 +15,7 @@ from rise_di_controller.law.saturation import Limits, bounds
 
 
 def with_column_limits(params: Allocation) -> Allocation:
-    """The parameters with limits of shape (p, 1)."""
+    """Return the parameters with limits of shape (p, 1)."""
     return params._replace(limits=Limits(*(values[:, None] for values in params.limits)))
 
 
@@ -60,7 +60,7 @@ def allocate(v: Array, u_before: Array, dt: Array, params: Allocation) -> tuple[
 
 
 def _where_not(final: Array, value: Array, otherwise: Callable[[], Array]) -> Array:
-    """The value of the aircraft with a final value; the others, if any, get `otherwise`."""
+    """Keep final values; the aircraft without one, if any, get `otherwise`."""
     return jax.lax.cond(jnp.all(final), lambda: value, lambda: jnp.where(final, value, otherwise()))
 
 

@@ -71,7 +71,7 @@ class FleetResult(NamedTuple):
 
 
 def rows_of(array: Array, places: Sequence[int] | NDArray[np.int64]) -> Array:
-    """The rows at known places, as slices, which the compiler of a GPU fuses with their use."""
+    """Return the rows at known places as slices, which a GPU compiler fuses with their use."""
     if not len(places):
         return array[:0]
     return jnp.stack([jax.lax.index_in_dim(array, int(k), keepdims=False) for k in places])
@@ -131,7 +131,7 @@ class Constants(NamedTuple):
 def begin(
     constants: Constants, first: Segments, *, control_law: ControlLaw, timing: Timing
 ) -> LoopState:
-    """The state before the first tick, in trim, the law not yet engaged."""
+    """Return the state before the first tick, in trim and with the law not yet engaged."""
     fleet, vehicle, params = constants
     start = in_trim(fleet, vehicle, timing)
     none = 0.0 * start.u
@@ -156,7 +156,7 @@ def fly_run(
     control_law: ControlLaw,
     timing: Timing,
 ) -> LoopState:
-    """The state after the ticks of a run, the first of number `first`."""
+    """Fly the ticks of a run, the first of number `first`, and return the state after them."""
     size = len(run.pattern)
 
     def patterns(values: Array) -> Array:
@@ -175,7 +175,7 @@ def fly_run(
 def _chosen(
     constant: int | None, value: Array, branches: Sequence[Callable[..., Any]], *arguments: Any
 ) -> Any:
-    """The result of the branch `constant`; None: of the branch `value` of the tick."""
+    """Run the branch `constant`, or if it is None, the branch that the tick's `value` names."""
     if constant is None:
         return jax.lax.switch(value, branches, *arguments)
     return branches[constant](*arguments)
@@ -189,7 +189,7 @@ def tick(
     control_law: ControlLaw,
     timing: Timing,
 ) -> LoopState:
-    """The state at the next tick."""
+    """Compute the state at the next tick."""
     fleet, vehicle, params = constants
     measure = partial(_measured, fleet=fleet, vehicle=vehicle)
 
@@ -234,7 +234,7 @@ def tick(
 def _measured(
     now: LoopState, segment: Segments, sample: LoopSample, fleet: FleetMatrices, vehicle: Vehicle
 ) -> Measurements:
-    """What a law takes at a tick."""
+    """Collect what a law takes at a tick."""
     y, y_m, y_m_dot = sample
     by_output = dict(zip(vehicle.outputs, y, strict=True))
     x = jnp.stack([by_output.get(k, row) for k, row in enumerate(now.x)])
@@ -268,7 +268,7 @@ def _measured(
 
 
 def sense(now: LoopState, segment: Segments, vehicle: Vehicle) -> tuple[LoopState, LoopSample]:
-    """The sample of a tick for the law; the figures take the true error."""
+    """Sense a tick's sample for the law; the figures take the true error."""
     true = rows_of(now.x, vehicle.outputs)
     e = true - segment.y_m[:, None]
     y = true + segment.error[:, None]
@@ -298,7 +298,7 @@ def advance(
     timing: Timing,
     kind: TickKind = UNKNOWN,
 ) -> LoopState:
-    """The state at the next tick, with the command of this one."""
+    """Advance to the next tick with the command of this one."""
     blocks = timing.blocks
     u_late = timing.u_late
     # Places of the states in the order of the blocks.
@@ -338,7 +338,7 @@ def advance(
 def _actuated(
     position: Array, command: Array, times: Array, vehicle: Vehicle, *, unroll: bool
 ) -> tuple[Array, Array]:
-    """The positions of the actuators after the steps at some times, and their means in each."""
+    """Return the actuators' positions after the steps at some times, and the mean in each step."""
     ordered_command = rows_of(command, np.argsort(vehicle.inputs))
 
     def move(before: Array, t: Array) -> tuple[Array, Array]:
@@ -351,7 +351,7 @@ def _actuated(
 
 @partial(jax.jit, static_argnames=("ticks",))
 def figures(end: LoopState, ticks: int, period: Array) -> FleetResult:
-    """The figures of flights at their end."""
+    """Compute the figures of flights at their end."""
     return FleetResult(
         jnp.sqrt(end.squares / ticks),
         end.max,
@@ -361,7 +361,7 @@ def figures(end: LoopState, ticks: int, period: Array) -> FleetResult:
 
 
 def in_trim(fleet: FleetMatrices, vehicle: Vehicle, timing: Timing) -> LoopState:
-    """The state of the closed loop before the first tick, without that of the law."""
+    """Return the state of the closed loop before the first tick, without the law's state."""
     n = len(fleet.forced)
     count = len(fleet.wind)
     m = len(vehicle.outputs)
@@ -385,9 +385,9 @@ def in_trim(fleet: FleetMatrices, vehicle: Vehicle, timing: Timing) -> LoopState
 
 
 def _product(matrices: Array, vector: Any) -> Array:
-    """The matrix-vector product of each aircraft, compiled to one loop.
+    """Multiply each aircraft's matrix by its vector, compiled to one loop.
 
-    0 for matrices without a column.
+    The product is 0 for matrices without a column.
     """
     if matrices.shape[1]:
         return product(matrices, vector)

@@ -75,7 +75,7 @@ def assemble(
     late: Array = 0,
     gust_directions: FloatArray | None = None,
 ) -> FleetMatrices:
-    """The matrices of N aircraft, A of shape (N, n, n) and B of (N, n, p).
+    """Assemble the matrices of N aircraft from A, (N, n, n), and B, (N, n, p).
 
     With L = A + gravity, Phi and Gamma the matrices of one Runge-Kutta step of x_dot = L x + u with
     u held,
@@ -129,7 +129,7 @@ def assemble(
 
 
 def _last(array: Array) -> Array:
-    """The aircraft as the last axis."""
+    """Move the aircraft to the last axis."""
     return jnp.asarray(array_namespace(array).moveaxis(array, 0, -1))
 
 
@@ -186,7 +186,7 @@ def _compiled_matrices(*matrices: Any, **constants: Any) -> tuple[Array, Array, 
 
 
 def remainder_rows(aircraft: Aircraft) -> NDArray[np.int64]:
-    """Indices of the states that f_state acts on, (q,)."""
+    """Return the indices of the states that f_state acts on, (q,)."""
     acts = aircraft.gravity.any(axis=1)
     if aircraft.coupling is not None:
         acts = acts | aircraft.coupling.gain.any(axis=1)
@@ -196,9 +196,9 @@ def remainder_rows(aircraft: Aircraft) -> NDArray[np.int64]:
 
 
 def _blocks(moves: NDArray[np.bool_]) -> tuple[StateBlock, ...]:
-    """Connected components of the states, `moves` of shape (n, columns).
+    """Return the connected components of the states; `moves` has the shape (n, columns).
 
-    They are in general longitudinal and lateral motion.
+    They are usually the longitudinal and the lateral motion.
     """
     number, part = connected_components(moves[:, : len(moves)], directed=False)
     rows = [np.flatnonzero(part == k) for k in range(number)]
@@ -209,7 +209,7 @@ def _blocks(moves: NDArray[np.bool_]) -> tuple[StateBlock, ...]:
 
 
 def at(t: Array, fleet: FleetMatrices) -> FleetMatrices:
-    """The matrices at t."""
+    """Return the matrices at t."""
     change = fleet.change
     if change is None:
         return fleet

@@ -52,9 +52,10 @@ def with_branches(course: Course) -> Iterator[TickRun]:
 
 
 def without_branches(course: Course) -> Iterator[TickRun]:
-    """Runs of at most RUN ticks, so that few loops are compiled, each used many times.
+    """Split a course into runs of at most RUN ticks: few loops are compiled, each used often.
 
-    A run without a short pattern of phases, as one with dropouts, keeps the branch of the phase.
+    A run whose phases have no short pattern, for example because of dropouts, branches by the phase
+    at every tick.
     """
     phase = course.segments.phase
     ticks = len(phase)
@@ -71,7 +72,7 @@ def without_branches(course: Course) -> Iterator[TickRun]:
 
 
 def _pattern(kinds: list[TickKind]) -> tuple[TickKind, ...] | None:
-    """The shortest pattern of which the kinds are repetitions, None for one above LONGEST."""
+    """Return the shortest pattern that the kinds repeat; None if it is longer than LONGEST."""
     for length in range(1, min(len(kinds), LONGEST) + 1):
         repeats, rest = divmod(len(kinds), length)
         if not rest and kinds[:length] * repeats == kinds:

@@ -189,11 +189,11 @@ def _references(scenario: Scenario, ticks: int, tick_ns: int) -> tuple[FloatArra
 
 
 def build_course(scenario: Scenario) -> Course:
-    """The course of a scenario, with the feedforward of the controller.
+    """Build the course of a scenario, with the feedforward of the controller.
 
-    Raises ParameterError for a scenario beyond a campaign: an aircraft of JSBSim, a delay of y or u
-    by a part of a tick, dropouts of a y with a different rate than the ticks, or dropouts longer
-    than the age limit; for vanes with faults.
+    Raises ParameterError for a scenario that a campaign cannot fly: an aircraft of JSBSim, a delay
+    of y or u by a part of a tick, dropouts of a y whose rate is not that of the ticks, dropouts
+    longer than the age limit, or vanes with faults.
     """
     aircraft = scenario.aircraft
     controller = scenario.controller
@@ -252,7 +252,7 @@ def build_course(scenario: Scenario) -> Course:
 
 
 def _whole_ticks(delay_ns: int, tick_ns: int, key: str) -> int:
-    """A delay in ticks. Raises ParameterError for a part of a tick."""
+    """Convert a delay to ticks. Raises ParameterError for a part of a tick."""
     return divide(delay_ns, tick_ns, key, "a tick") if delay_ns else 0
 
 
@@ -378,7 +378,7 @@ def _reduced(
 
 
 def _forcing(ticks: int, steps: int, plant: PlantParams) -> tuple[_Forcing, _Forcing]:
-    """The wind along the G axes, m/s, and f_time without wind, n rows of x_dot."""
+    """Return the wind along the G axes, m/s, and f_time without wind, n rows of x_dot."""
     no_effect = np.zeros_like(plant.aircraft.gust_direction)
     forced = plant_model.forcing(
         0, ticks * steps, plant._replace(aircraft=plant.aircraft._replace(gust_direction=no_effect))

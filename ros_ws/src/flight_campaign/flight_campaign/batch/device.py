@@ -38,17 +38,17 @@ logging.getLogger("jax._src.xla_bridge").addFilter(_as_sentence)
 
 
 def is_cpu() -> bool:
-    """Whether JAX computes on the processor."""
+    """Return whether JAX computes on the processor."""
     return jax.default_backend() == "cpu"
 
 
 def device_name() -> str:
-    """The device, for people: NVIDIA H200, or the cores of the processor."""
+    """Name the device for people: NVIDIA H200, or the cores of the processor."""
     return f"{thread_count()} CPU cores" if is_cpu() else jax.devices()[0].device_kind
 
 
 def schedule_of_device() -> Schedule:
-    """The schedule that is fastest on the device."""
+    """Return the schedule that is fastest on the device."""
     return with_branches if is_cpu() else without_branches
 
 
@@ -58,7 +58,7 @@ def thread_count() -> int:
 
 
 def turn() -> AbstractContextManager[object]:
-    """The turn of a chunk on the device: one chunk flies, while others are drawn or written."""
+    """Wait for a chunk's turn on the device: one flies while others are drawn or written."""
     return nullcontext() if is_cpu() else _TURN
 
 

@@ -131,7 +131,7 @@ class _LawStudy(NamedTuple):
         objective: str,
         gains: TuningResult,
     ) -> LawResult:
-        """The figures of a law with a gain set."""
+        """Return the figures of a law with a gain set."""
         benchmark = self.benchmark
         params = law.params(as_gains(gains), benchmark.model)
         results = {}
@@ -162,14 +162,14 @@ class _LawStudy(NamedTuple):
 
 
 def _nominal_once(matrices: Sequence[FloatArray]) -> FloatArray:
-    """The matrices of all levels in order, with the nominal aircraft of the first level alone."""
+    """Join the matrices of all levels in order, with the nominal aircraft only once."""
     return np.concatenate([matrices[0], *(level[1:] for level in matrices[1:])])
 
 
 def score_cells(result: LawResult) -> list[str]:
-    """The scores of a law as cells of a table.
+    """Return the scores of a law as cells of a table.
 
-    By wind it is the score of the nominal aircraft, then mean (worst) by level.
+    For each wind, these are the score of the nominal aircraft, then mean (worst) by level.
     """
     cells = []
     for wind, nominal in result.scores.items():

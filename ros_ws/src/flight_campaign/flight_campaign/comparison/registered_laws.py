@@ -27,7 +27,7 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 
 
 def own_gains(controller: ControllerConfig) -> dict[str, list[float]]:
-    """The positive numbers of the law itself by name, without matrices."""
+    """Return the positive numbers of the law itself by name, without matrices."""
     names = (
         name for name in type(controller).model_fields if name not in ControllerConfig.model_fields
     )
@@ -40,7 +40,7 @@ def own_gains(controller: ControllerConfig) -> dict[str, list[float]]:
 
 
 def registered_law(controller: ControllerConfig, name: str) -> Law:
-    """The law of a controller, with the gains as the start of a search.
+    """Return the law of a controller, whose gains are the start of a search.
 
     The rest of the controller stays.
     """
@@ -81,9 +81,9 @@ def _value(gain: FloatArray, scalar: bool) -> float | list[float]:
 
 
 def _last(*leaves: Any) -> FloatArray:
-    """A parameter of N candidates, with the candidates in the last axis.
+    """Stack a parameter of N candidates, with the candidates in the last axis.
 
-    (m, 1) for equal values.
+    Equal values become (m, 1).
     """
     first = np.asarray(leaves[0], dtype=np.float64)
     if all(np.array_equal(first, leaf) for leaf in leaves):
@@ -133,7 +133,7 @@ def find_laws(
 
 
 def entries(controllers: Mapping[str, ControllerConfig | None]) -> dict[str, Law]:
-    """The laws by name: of the catalogue, or of a controller."""
+    """Return the laws by name, each from the catalogue or from a controller."""
     return {
         name: LAWS[name] if controller is None else registered_law(controller, name)
         for name, controller in controllers.items()
@@ -143,7 +143,7 @@ def entries(controllers: Mapping[str, ControllerConfig | None]) -> dict[str, Law
 def with_courses(
     benchmark: Benchmark, controllers: Mapping[str, ControllerConfig | None]
 ) -> Benchmark:
-    """The benchmark with the courses of the feedforwards of these controllers."""
+    """Add the courses of these controllers' feedforwards to the benchmark."""
     courses = {wind: dict(by_law) for wind, by_law in benchmark.courses.items()}
     for name, controller in controllers.items():
         if controller is not None and controller.feedforward is not None:
@@ -153,7 +153,7 @@ def with_courses(
 
 
 def as_tuned(controller: ControllerConfig) -> TuningResult:
-    """The gains of a controller in place of the result of a search: without a cost."""
+    """Present the gains of a controller as the result of a search, without a cost."""
     return TuningResult(
         gains=own_gains(controller), cost=float("nan"), seed=0, costs=[], evaluations=0
     )

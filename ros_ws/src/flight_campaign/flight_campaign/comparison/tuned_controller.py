@@ -39,15 +39,15 @@ DESIGNS = {
 
 
 def require_registered(name: str) -> None:
-    """Raises ParameterError for a law that no scenario flies."""
+    """Raise ParameterError for a law that no scenario flies."""
     require(name in REGISTERED, "--write", f"the law {name}", f"one of {', '.join(REGISTERED)}")
 
 
 def tuned_controller(name: str, result: TuningResult, benchmark: Benchmark) -> ControllerConfig:
-    """The controller that flies as a law of the catalogue with tuned gains.
+    """Return the controller that flies as a law of the catalogue with tuned gains.
 
-    The inputs of the benchmark: 1 / abs(Omega_ii). Topics have no delay, as in the benchmark.
-    Raises ParameterError for a law that no scenario flies.
+    Its inputs are those of the benchmark, 1 / abs(Omega_ii). Topics have no delay, as in the
+    benchmark. Raises ParameterError for a law that no scenario flies.
     """
     require_registered(name)
     model = benchmark.model
@@ -106,7 +106,7 @@ def _rise_di(gains: dict[str, FloatArray], input_scale: FloatArray) -> dict[str,
 
 
 def _feedforward(name: str, benchmark: Benchmark) -> FeedforwardConfig | None:
-    """The model of the feedforward of a law."""
+    """Return the model of a law's feedforward."""
     controller = benchmark.scenario.controller
     if LAWS[name].feedforward == AIRCRAFT:
         return with_feedforward(controller, benchmark.scenario.aircraft.load()[0]).feedforward
@@ -116,9 +116,9 @@ def _feedforward(name: str, benchmark: Benchmark) -> FeedforwardConfig | None:
 
 
 def _observer(name: str, result: TuningResult, benchmark: Benchmark) -> ObserverConfig:
-    """The observer of a law, with its bound of u_o.
+    """Return the observer of a law, with its bound of u_o.
 
-    The margin is that of the search, so none is required of it.
+    The search set the margin, so none is required of the observer.
     """
     controller = benchmark.scenario.controller
     airframe = benchmark.scenario.aircraft.load()[0]

@@ -119,11 +119,12 @@ class Benchmark(NamedTuple):
 
 
 def build_benchmark(scenario: Scenario, turbulence_seed: int = TUNING_TURBULENCE_SEED) -> Benchmark:
-    """The benchmark of a scenario: its manoeuvre, actuators and noise.
+    """Build the benchmark of a scenario: its manoeuvre, actuators and noise.
 
-    y, y_m and law are at one rate, topics without delay. The winds of the scenario, and turbulence
-    of `turbulence_seed` alone, `turbulence_of`. Raises ParameterError for a scenario that a
-    campaign cannot fly, and for outputs whose unit has no score.
+    y, y_m and the law run at one rate, and topics have no delay. The winds are those of the
+    scenario, and, separately, the turbulence of `turbulence_of` with `turbulence_seed`. Raises
+    ParameterError for a scenario that a campaign cannot fly, and for outputs whose unit has no
+    score.
     """
     require_flyable(scenario)
     scenario = scenario.vary(
@@ -178,9 +179,9 @@ def build_benchmark(scenario: Scenario, turbulence_seed: int = TUNING_TURBULENCE
 
 
 def turbulence_of(scenario: Scenario) -> dict[str, float]:
-    """The turbulence of a benchmark: altitude and intensity of that of the scenario.
+    """Return the turbulence of a benchmark: the scenario's altitude and intensity.
 
-    Moderate at 100 m where the scenario has none.
+    If the scenario has none, it is moderate at 100 m.
     """
     turbulence = scenario.aircraft.turbulence
     if turbulence is None:
@@ -189,9 +190,9 @@ def turbulence_of(scenario: Scenario) -> dict[str, float]:
 
 
 def _courses(scenario: Scenario) -> dict[str, Course]:
-    """The course of a scenario, by the model of its feedforward.
+    """Return the courses of a scenario, by the model of the feedforward.
 
-    The controller has the aircraft as that model.
+    The scenario's controller has the aircraft as that model.
     """
     course, controller, (airframe, _) = (
         build_course(scenario),
@@ -276,7 +277,7 @@ def evaluations(objective: Objective, benchmark: Benchmark) -> list[Evaluation]:
 
 
 def repeat_flights(flights: FleetMatrices, times: int) -> FleetMatrices:
-    """The same flights several times, one set after the other."""
+    """Repeat the same flights several times, one set after the other."""
     tiled = jax.tree.map(
         lambda array: np.tile(np.asarray(array), times), flights._replace(blocks=())
     )
@@ -297,7 +298,7 @@ def spread_over(params: Any, single: Any, flights: int) -> Any:
 
 
 def generation_count(law: Law, benchmark: Benchmark) -> int:
-    """Generations of a search."""
+    """Return the number of generations of a search."""
     return max(
         GENERATIONS,
         GENERATIONS_PER_GAIN * sum(map(len, initial_gains(law, benchmark.model).values())),
@@ -379,7 +380,7 @@ def _best_result(
     evaluation_count: int,
     gains_of: Callable[[FloatArray], Gains],
 ) -> TuningResult:
-    """The gains of the seed with the smallest cost; `best`: cost and logarithms by seed."""
+    """Return the gains of the seed with the least cost; `best` has cost and logarithms by seed."""
     winner = int(np.argmin([value for value, _ in best]))
     gains = _rounded(gains_of(best[winner][1][None]))
     lowest = [round(value, 4) for value, _ in best]
@@ -416,7 +417,7 @@ def _lacking(law: Law, objective: Objective, benchmark: Benchmark, gains: Gains)
 
 
 def _rounded(gains: Gains) -> dict[str, list[float]]:
-    """The gains of the first candidate, to five digits."""
+    """Round the gains of the first candidate to five digits."""
     first = {}
     for name, gain in gains.items():
         first[name] = [float(f"{value:.5g}") for value in gain[:, 0]]
@@ -426,7 +427,7 @@ def _rounded(gains: Gains) -> dict[str, list[float]]:
 def _after(
     search: Any, point: FloatArray, values: FloatArray, best: tuple[float, FloatArray]
 ) -> tuple[float, FloatArray]:
-    """The least cost so far and its candidate, after the search took the costs of those asked."""
+    """Tell the search the costs it asked for; return the least cost so far and its candidate."""
     search.tell(list(point), list(values))
     least = int(np.argmin(values))
     return (float(values[least]), point[least]) if values[least] < best[0] else best
