@@ -14,7 +14,7 @@ TESTS = SOURCES.parents[1] / "tests"
 
 
 def files_of(package: str) -> list[Path]:
-    """The test files of a package: those of tests/*/PACKAGE."""
+    """Return the test files of a package: those of tests/*/PACKAGE."""
     return sorted(TESTS.glob(f"*/{package}/**/test_*.py"))
 
 

@@ -89,9 +89,9 @@ class AutopilotLock:
         return is_new_sender
 
     def _start(self, since_boot_ns: int, now_ns: int) -> str:
-        """The name of the start to which a time since boot belongs.
+        """Name the start of the autopilot to which a time since boot belongs.
 
-        The locked start, or a new name by the instant of boot.
+        It is the locked start, or a new name from the instant of boot.
         """
         boot_ns = now_ns - since_boot_ns
         advances = (

@@ -44,7 +44,7 @@ class Phase(IntEnum):
 
 
 def trim_key(name: str) -> str:
-    """The name under which the bridge takes the source of an input's trim."""
+    """Return the name under which the bridge takes the source of an input's trim."""
     return f"trim of {name}"
 
 
@@ -180,17 +180,17 @@ class Bridge:
     # State
 
     def stale(self, now_ns: int) -> dict[str, str]:
-        """The stale channels of y and of the envelope, each with what is wrong.
+        """Return the stale channels of y and of the envelope, each with what is wrong.
 
-        For example "0.30 s old (/topic)".
+        An example is "0.30 s old (/topic)".
         """
         watched = dict.fromkeys((*self.outputs, *self.channel_map.envelope))
         return {name: reason for name in watched if (reason := self._staleness(name, now_ns))}
 
     def _staleness(self, name: str, now_ns: int) -> str:
-        """What is wrong with a channel.
+        """Say what is wrong with a channel.
 
-        Empty where it is fresh, and where its last value is held.
+        Returns "" if the channel is fresh, or if its last value is held.
         """
         row = self._rows[name]
         if isinstance(row, OutputRow) and row.held and name in self._readings:
@@ -198,9 +198,9 @@ class Bridge:
         return staleness(row.topic, self._readings.get(name), row.max_age, now_ns)
 
     def _outside(self, section: str = "envelope") -> str:
-        """The channels that are outside the limits of a section of the map, as a sentence.
+        """Say which channels are outside the limits of a section of the map.
 
-        Every channel was received.
+        Every channel must have been received.
         """
         what = "the envelope" if section == "envelope" else section
         values = (
@@ -214,10 +214,10 @@ class Bridge:
         )
 
     def _does_not_answer(self, now_ns: int) -> str:
-        """The inputs that stay at a limit for longer than their rows allow, as a sentence.
+        """Say which inputs stay at a limit for longer than their rows allow.
 
         The aircraft does not follow such an input. The limits of the law may be narrower than those
-        of the map: a large u that does not change is at one.
+        of the map, so a large u that does not change counts as being at one.
         """
         sentences = []
         inside, small = (
@@ -248,7 +248,7 @@ class Bridge:
         return self.conditions.is_active(name, now_ns, engaged=is_engaged)
 
     def _lacks(self, now_ns: int) -> str:
-        """What an engagement lacks, as a sentence."""
+        """Say what an engagement lacks."""
         ends = self._end_ns is not None and now_ns >= self._end_ns - END_WARNING_NS
         if ends:
             warning = f"max_engaged releases in {seconds(END_WARNING_NS):g} s, unless engaged again"
@@ -262,11 +262,11 @@ class Bridge:
         )
 
     def u_timed_out(self, now_ns: int) -> bool:
-        """Whether no u was received, or none for longer than its age limit."""
+        """Return whether no u was received yet, or none for longer than its age limit."""
         return self.u_lock.timed_out(now_ns, self._max_age_ns)
 
     def _u_timeout(self, now_ns: int) -> str:
-        """The reason why u has timed out, as a sentence; empty where u is fresh."""
+        """Say why u has timed out; "" if u is fresh."""
         if self.u_lock.publisher is None:
             return "u not received yet"
         if self.u_timed_out(now_ns):
@@ -302,7 +302,7 @@ class Bridge:
         return sentences(dry_run, next(filter(None, (check(now_ns) for check in checks)), ""))
 
     def _unfit_parameters(self) -> str:
-        """The parameters of the autopilot with which the bridge does not engage, as a sentence."""
+        """Say which parameters of the autopilot keep the bridge from engaging."""
         sentences = []
         for name, row in self.channel_map.parameters.items():
             value = self._parameters.get(name)
@@ -323,9 +323,9 @@ class Bridge:
         return f"pilot override active: {', '.join(active)}" if active else ""
 
     def _missing(self, now_ns: int) -> str:
-        """What is stale of the inputs of the bridge, as a sentence.
+        """Say which inputs of the bridge are stale.
 
-        They are y, envelope and engage_if, the trims' sources and u.
+        These are y, envelope and engage_if, the trims' sources and u.
         """
         keys = (*map(trim_key, self.channel_map.trims), *self.channel_map.engage_if)
         sources = {key: stale for key in keys if (stale := self._staleness(key, now_ns))}
@@ -467,9 +467,9 @@ class Bridge:
         )
 
     def _value(self, name: str) -> float:
-        """The newest value of a channel.
+        """Return the newest value of a channel.
 
-        A captured output is 0 until it is engaged, then its change since engagement.
+        A captured output is 0 until the bridge engages, then its change since the engagement.
         """
         value = self._readings[name].value
         row = self.channel_map.outputs.get(name)
@@ -478,18 +478,18 @@ class Bridge:
         return value - self._zero[name] if self._is_captured() else 0.0
 
     def _is_captured(self) -> bool:
-        """Whether the trims are those captured at engagement.
+        """Return whether the trims are those captured at engagement.
 
-        Otherwise they follow their sources.
+        Otherwise, they follow their sources.
         """
         return self.phase in {Phase.ENGAGED, Phase.NEUTRAL, Phase.RELEASE} and bool(
             self._zero or self._trim
         )
 
     def trim(self, name: str) -> float:
-        """The trim of an input.
+        """Return the trim of an input.
 
-        Where `trims` has its source, the trim follows the source, and is captured at engagement.
+        If `trims` has a source for it, the trim follows the source until an engagement captures it.
         """
         row = self.channel_map.inputs[name]
         source = self._readings.get(trim_key(name))
@@ -534,13 +534,13 @@ class Bridge:
         return np.array([self._resting(name, row) for name, row in self.channel_map.inputs.items()])
 
     def _resting(self, name: str, row: InputRow) -> float:
-        """The neutral or the release value of an input."""
+        """Return the neutral or the release value of an input."""
         if self.phase is not Phase.NEUTRAL:
             return math.nan if row.release is None else row.release
         return self._raw(name, 0.0) if row.neutral == "trim" else row.neutral
 
     def sends(self, name: str, now_ns: int) -> bool:
-        """Whether a message of the map is sent now. A dry run sends none."""
+        """Return whether a message of the map is sent now. A dry run sends none."""
         if self.dry_run:
             return False
         when = self.channel_map.messages[name].when

@@ -103,9 +103,9 @@ def _norm(vector: Any) -> float:
 
 
 def _airspeed_of_pressure(pressure: Any) -> float:
-    """Indicated airspeed sqrt(2 dp / rho_0), m/s, of a dynamic pressure in Pa.
+    """Return the indicated airspeed sqrt(2 dp / rho_0), m/s, for a dynamic pressure in Pa.
 
-    0 for a negative pressure, which is noise.
+    It is 0 for a negative pressure, which is noise.
     """
     return math.sqrt(2.0 * max(float(pressure), 0.0) / SEA_LEVEL_DENSITY)
 
@@ -203,9 +203,9 @@ def read_raw(message: Any, path: str, function: str, turned_by: str | None = Non
 
 
 def message_type(name: str, load: Callable[[str], Any] = importlib.import_module) -> type:
-    """The class of "package/msg/Type" or "package/srv/Type".
+    """Load the class of "package/msg/Type" or "package/srv/Type".
 
-    Raises ParameterError with the package to install.
+    Raises ParameterError, which names the package to install.
     """
     package, section, kind = name.split("/")
     try:
@@ -222,10 +222,10 @@ def message_type(name: str, load: Callable[[str], Any] = importlib.import_module
 
 
 def versioned_topic(topic: str, version: int) -> str:
-    """The topic of PX4 for a version of its definition, /fmu/.../NAME_vVERSION; other topics stay.
+    """Return PX4's topic for a version of its definition, /fmu/.../NAME_vVERSION; others stay.
 
-    Definitions state it as MESSAGE_VERSION, and version 0 has no suffix. Source: PX4 guide, PX4 ROS
-    2 message translation node.
+    A definition states its version as MESSAGE_VERSION; version 0 has no suffix. Source: PX4 guide,
+    PX4 ROS 2 message translation node.
     """
     if topic.startswith("/fmu/"):
         return VERSION.sub("", topic) + (f"_v{version}" if version else "")
@@ -233,7 +233,7 @@ def versioned_topic(topic: str, version: int) -> str:
 
 
 def version_fault(topic: str, message_class: Any) -> str:
-    """What is wrong with the version in a topic of PX4, as a sentence; empty where nothing is."""
+    """Say what is wrong with the version in a topic of PX4; "" if nothing is."""
     version = getattr(message_class, "MESSAGE_VERSION", None)
     if version is None:
         return ""

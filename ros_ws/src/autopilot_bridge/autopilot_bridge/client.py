@@ -113,7 +113,7 @@ class EngagementClient(Client):
         return self._phases
 
     def _settled(self, progress: Callable[[str], None]) -> bool:
-        """Whether the bridge has engaged, or has given up after it began to.
+        """Return whether the bridge has engaged, or has given up after it began to.
 
         Reports from before the request do not count.
         """

@@ -49,9 +49,9 @@ class Conditions:
         }
 
     def unmet(self, now_ns: int, *, awaited: bool) -> str:
-        """The conditions that do not hold, as a sentence.
+        """Say which conditions do not hold.
 
-        `awaited`: those of an engagement; else the rest.
+        `awaited` selects those of an engagement; otherwise, it is the rest.
         """
         rows = (
             (name, row)
@@ -69,10 +69,11 @@ class Conditions:
         return f"{row.sentence} ({row.field} is {reading.value:g})"
 
     def is_contradicted(self) -> bool:
-        """Whether a condition does not hold by its last value.
+        """Return whether the last value of a condition contradicts it.
 
-        The pilot or the autopilot chose another mode then, or has landed. A condition that tells
-        the loss of the transmitter does not count: the pilot cannot take over then.
+        Then the pilot or the autopilot chose another mode, or the aircraft has landed. A condition
+        that tells the loss of the transmitter does not count, because the pilot cannot take over
+        then.
         """
         rows = self._map.conditions.items()
         readings = ((row, self._conditions.get(name)) for name, row in rows if not row.transmitter)
@@ -81,9 +82,9 @@ class Conditions:
         )
 
     def is_active(self, name: str, now_ns: int, *, engaged: bool) -> bool:
-        """Whether a pilot override is active.
+        """Return whether a pilot override is active.
 
-        An override ends with the topic: an old override does not block an engagement.
+        An override ends with its topic: an old one does not block an engagement.
         """
         row = self._map.overrides[name]
         reading = self._overrides.get(name)
@@ -93,12 +94,12 @@ class Conditions:
         return row.is_active(reading.value, at_engagement)
 
     def _is_silent(self, name: str, now_ns: int) -> bool:
-        """Whether a pilot override could not act now: its topic was not received, or has ended."""
+        """Return whether an override cannot act now: its topic has ended or never came."""
         row = self._map.overrides[name]
         return bool(staleness(row.topic, self._overrides.get(name), row.max_age, now_ns))
 
     def silent_overrides(self, now_ns: int) -> str:
-        """The overrides without effect, as a sentence."""
+        """Say which overrides have no effect."""
         silent = [
             f"no message on {row.topic} for {row.max_age:g} s"
             for name, row in self._map.overrides.items()
@@ -107,9 +108,10 @@ class Conditions:
         return f"a pilot override has no effect: {'; '.join(silent)}" if silent else ""
 
     def blindness(self, *, bounded: bool) -> str:
-        """What an engagement lacks that does not see the loss of the transmitter, as a sentence.
+        """Say what an engagement lacks that does not see the loss of the transmitter.
 
-        The sentence also has what still releases. `bounded`: whether `max_engaged` ends it.
+        The sentence also names what still releases. `bounded` says whether `max_engaged` ends the
+        engagement.
         """
         if self.watches_transmitter and not self.blind:
             return ""
@@ -137,7 +139,7 @@ class Conditions:
 
 
 def staleness(topic: str, reading: Reading | None, max_age: float, now_ns: int) -> str:
-    """What is wrong with the age of a field; empty where it is fresh."""
+    """Say what is wrong with the age of a field; "" if it is fresh."""
     if reading is None:
         return f"not received yet ({topic})"
     age_ns = now_ns - reading.stamp_ns
@@ -145,7 +147,7 @@ def staleness(topic: str, reading: Reading | None, max_age: float, now_ns: int) 
 
 
 def joined_faults(faults: Mapping[str, str]) -> str:
-    """What is wrong with some channels, by name, as a sentence.
+    """Join what is wrong with some channels, by name, to a sentence.
 
     Channels with the same fault stand together.
     """

@@ -82,9 +82,10 @@ def definitions_below(folder: Path, kinds: Iterable[str]) -> Types:
 
 
 def installed_definitions(kinds: Iterable[str]) -> Types:
-    """The message types of the installed packages, and those of MAVLink in pymavlink.
+    """Return the message types of the installed packages, and those of MAVLink in pymavlink.
 
-    The rest is absent. Raises ParameterError for one of MAVLink without pymavlink.
+    Types that are not installed are absent. Raises ParameterError for a type of MAVLink without
+    pymavlink.
     """
     types: dict[str, tuple[Any, Any]] = {}
     for kind in kinds:
@@ -120,12 +121,12 @@ def check_map(channel_map: ChannelMap, releases: Iterable[Types]) -> list[Checke
 
 
 def is_known(types: Types, kind: str) -> bool:
-    """Whether a message is defined there, or in ROS 2 Jazzy."""
+    """Return whether a message is defined there, or in ROS 2 Jazzy."""
     return kind in types or kind in typestore().fielddefs
 
 
 def _parsed(text: str, kind: str) -> Types:
-    """The types of a definition, of a service that of its request."""
+    """Return the types of a definition; for a service, that of its request."""
     try:
         if "/srv/" in kind:
             (request,) = get_types_from_msg(REQUEST.split(text)[0], kind).values()
@@ -138,7 +139,7 @@ def _parsed(text: str, kind: str) -> Types:
 
 
 def _element(field: Any) -> tuple[Nodetype, Any]:
-    """The type of a field, of an array that of its elements."""
+    """Return the type of a field; for an array, that of its elements."""
     node, content = field
     return content[0] if node in {Nodetype.ARRAY, Nodetype.SEQUENCE} else (node, content)
 
@@ -169,9 +170,9 @@ def _fault(types: Types, topic: str, kind: str, path: str, components: str | Non
 
 
 def _has(definitions: Types, field: Any, components: str) -> bool:
-    """Whether a field has components, as members or in an array.
+    """Return whether a field has components, as members or in an array.
 
-    Without components: whether it is a number.
+    Without components, return whether it is a number.
     """
     node, content = field
     if node is Nodetype.NAME:

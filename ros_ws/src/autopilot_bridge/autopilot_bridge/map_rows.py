@@ -244,7 +244,7 @@ class WatchedRow(Config):
     )
 
     def masked(self, raw: float) -> float:
-        """The value of the bits that count."""
+        """Return the value of the bits that count."""
         return raw if self.bits is None else float(int(raw) & self.bits)
 
 
@@ -277,7 +277,7 @@ class ConditionRow(WatchedRow):
     )
 
     def holds(self, raw: float) -> bool:
-        """Whether the condition holds."""
+        """Return whether the condition holds."""
         value = self.masked(raw)
         if self.within is None:
             return value in self.one_of
@@ -307,9 +307,9 @@ class OverrideRow(WatchedRow):
     )
 
     def is_active(self, raw: float, at_engagement: float | None) -> bool:
-        """Whether the override is active.
+        """Return whether the override is active.
 
-        `at_engagement` is its value at engagement; None where it is not engaged.
+        `at_engagement` is its value at engagement, or None if the bridge is not engaged.
         """
         raw = self.masked(raw)
         if self.moved is not None:

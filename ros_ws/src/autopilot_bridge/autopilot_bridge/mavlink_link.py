@@ -78,9 +78,9 @@ class MavlinkMessage(NamedTuple):
 
 
 def mavlink_type(name: str) -> Any:
-    """A class with the numeric fields of a message, all zero; `fields` has the names.
+    """Return a class with a message's numeric fields, all zero; `fields` has their names.
 
-    Raises ParameterError for no message.
+    Raises ParameterError if there is no such message.
     """
     require_package("pymavlink")
     from pymavlink.dialects.v20 import ardupilotmega as dialect  # noqa: PLC0415 - an extra
@@ -108,7 +108,7 @@ def _zero(kind: str) -> Any:
 
 
 def _connection(config: LinkConfig) -> Any:
-    """The connection of pymavlink with MAVLink 2, signed where a passphrase is set.
+    """Connect by pymavlink with MAVLink 2, and sign if a passphrase is set.
 
     Raises ParameterError for an address that cannot be opened.
     """
@@ -198,7 +198,7 @@ class Link:
         return sentences(self._clash, second)
 
     def listen(self, name: str) -> deque[MavlinkMessage]:
-        """The queue in which messages of a name arrive."""
+        """Return the queue in which messages of a name arrive."""
         return self._queues.setdefault(name, deque(maxlen=QUEUE))
 
     def start(self) -> None:
@@ -223,7 +223,7 @@ class Link:
         self._connection.close()
 
     def problem(self, name: str = "") -> str:
-        """What is wrong with the link, or with a message of it."""
+        """Say what is wrong with the link, or with one of its messages."""
         now = time.monotonic()
         silent = now - max(self._alive, self._began) > SILENCE
         if silent or (self._refused and not self._alive):
@@ -253,7 +253,7 @@ class Link:
         return self.problem() or self._dropped_overrides() or rates
 
     def _station_numbers(self) -> range:
-        """The systems of which the autopilot takes RC overrides, by its parameters where known."""
+        """Return the systems whose RC overrides the autopilot takes, by its parameters if known."""
         first = self.parameters.get(STATION, self.parameters.get(OLD_STATION))
         if first is None:
             first = self._config.source_system
@@ -275,9 +275,9 @@ class Link:
         )
 
     def lost(self) -> str:
-        """What ends an engagement, as a sentence.
+        """Say what ends an engagement.
 
-        A rate stays slow, or the ground station is silent.
+        Either a rate stays slow, or the ground station is silent.
         """
         now = time.monotonic()
         limit = self._config.station_silence
@@ -292,9 +292,9 @@ class Link:
         return sentences(self._rates.lasting(now), station)
 
     def station(self) -> str:
-        """What the autopilot's failsafe FS_GCS_ENABL watches, as a sentence.
+        """Say what the autopilot's failsafe FS_GCS_ENABL watches.
 
-        The failsafe watches while RC overrides are sent.
+        It watches while RC overrides are sent.
         """
         system = self._stations_text()
         limit = self._config.station_silence
@@ -347,9 +347,9 @@ class Link:
                 self._take(message, address, received_ns)
 
     def _packet(self) -> tuple[bytes, Address]:
-        """The next bytes, empty after a silence of POLL, and their sender.
+        """Receive the next bytes, none after a silence of POLL, and their sender.
 
-        Over TCP and a serial line the sender is the URL.
+        Over TCP and a serial line, the sender is the URL.
         """
         if not self._connection.select(POLL):
             return b"", ()
@@ -359,9 +359,9 @@ class Link:
         return self._connection.recv(self._parser.bytes_needed()), (self._config.url,)
 
     def _parsed(self, data: bytes, address: Address) -> Sequence[Any]:
-        """The messages of a packet.
+        """Parse the messages of a packet.
 
-        Messages in several packets are read from the locked sender alone.
+        Messages that span several packets are read from the locked sender alone.
         """
         if not self._is_udp or _text(address) == self._lock.address:
             return self._parser.parse_buffer(data) or ()
@@ -443,9 +443,9 @@ class Link:
             queue.append(MavlinkMessage(message, received_ns))
 
     def _admits(self, message: Any, address: Address, now: float) -> bool:
-        """Whether a message of the autopilot is from the locked sender.
+        """Return whether a message of the autopilot is from the locked sender.
 
-        Rates are requested from a new sender.
+        The link requests rates from a new sender.
         """
         sender = _text(address)
         before = self._lock.address
@@ -547,7 +547,7 @@ class MavlinkReader:
         self._queue = link.listen(self.message_name)
 
     def take(self) -> list[MavlinkMessage]:
-        """The messages since the last call, oldest first."""
+        """Take the messages since the last call, oldest first."""
         return [self._queue.popleft() for _ in range(len(self._queue))]
 
 

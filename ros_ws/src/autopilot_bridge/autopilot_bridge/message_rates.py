@@ -63,18 +63,18 @@ class MessageRates:
         return {name: sentence for name, sentence in sentences.items() if sentence}
 
     def lasting(self, now: float) -> str:
-        """A sentence on messages that are slow for SLOW_ENDS or longer."""
+        """Say which messages have been slow for SLOW_ENDS or longer."""
         lasting = [
             rate.sentence(name, now) for name, rate in self._rates.items() if rate.lasts(now)
         ]
         return "; ".join([*lasting, f"for {SLOW_ENDS:g} s"]) if lasting else ""
 
     def comes(self, name: str, now: float) -> bool:
-        """Whether a message comes at the requested rate."""
+        """Return whether a message comes at the requested rate."""
         return self._rates[name].is_known(now) and not self._rates[name].sentence(name, now)
 
     def unknown(self, now: float) -> list[str]:
-        """The names of messages without a count of full length."""
+        """Name the messages that have not been counted for the full length yet."""
         return [name for name, rate in self._rates.items() if not rate.is_known(now)]
 
 
@@ -136,9 +136,9 @@ class _Rate:
             self._instants.popleft()
 
     def _present(self) -> float:
-        """The mean rate of the newest messages, Hz.
+        """Return the mean rate of the newest messages, Hz.
 
-        The count still has messages from before a fall.
+        The count over the whole window still has messages from before a fall of the rate.
         """
         if len(self._instants) <= GAPS:
             return len(self._instants) / self._window

@@ -143,7 +143,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         self._engagement = self.create_publisher(ENGAGEMENT.type, ENGAGEMENT.name, PUBLISH)
 
     def _open_link(self) -> mavlink_link.Link | None:
-        """The MAVLink link of the map; None without one."""
+        """Open the MAVLink link of the map; None without one."""
         if self._map.link is None:
             return None
         key = f"{self.get_name()}.use_sim_time"
@@ -265,7 +265,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         return self.simulated.time_ns()
 
     def _arrived_ns(self, arrival: Any, now_ns: int) -> int:
-        """The instant of a message that has no stamp, on the clock of the stamps."""
+        """Return the instant of a message that has no stamp, on the clock of the stamps."""
         if not arrival.received_ns:
             return now_ns + self.clock_step_ns()
         return int(

@@ -41,7 +41,7 @@ class OutgoingMessage:
         self._sent_ns = 0
 
     def due(self, now_ns: int, slack_ns: int) -> bool:
-        """Whether its period has passed since it was last sent, to within `slack_ns`."""
+        """Return whether its period has passed since it was last sent, to within `slack_ns`."""
         return now_ns - self._sent_ns >= self._period_ns - slack_ns
 
     def send(self, now_ns: int, raw: list[float]) -> None:
@@ -58,7 +58,7 @@ class OutgoingMessage:
 def prepare_message(
     channel_map: ChannelMap, name: str, row: MessageRow
 ) -> tuple[Any, list[tuple[int, InputRow]]]:
-    """A message of a map with its constant fields, and the rows of its inputs by their places in u.
+    """Prepare a message of a map: fill constant fields, and list its inputs by places in u.
 
     Raises ParameterError for a field that is missing, or that cannot have its values.
     """
@@ -86,7 +86,7 @@ def prepare_message(
 
 
 def field_type(name: str) -> Any:
-    """The class of a type of a map, of a message package or of MAVLink."""
+    """Return the class of a map's type, from a message package or from MAVLink."""
     package, _, kind = name.split("/")
     return mavlink_link.mavlink_type(kind) if package == MAVLINK else message_type(name)
 

@@ -330,7 +330,7 @@ class ChannelMap(Config):
         return [*self.topics, *dict.fromkeys(mavlink_topics)]
 
     def _readers(self) -> dict[str, Mapping[str, Any]]:
-        """The sections whose rows read a field of a topic."""
+        """Return the sections whose rows read a field of a topic."""
         kinds = ("outputs", "pose", "sensors", "trims", "conditions", "overrides")
         return {kind: getattr(self, kind) for kind in kinds}
 
@@ -380,7 +380,7 @@ def maps() -> list[str]:
 
 
 def find_map(name: str) -> Path:
-    """The file of a channel map, by its name in the library or by its path, which ends in .yaml.
+    """Find the file of a channel map by its name in the library, or by its path in .yaml.
 
     Raises ParameterError.
     """
@@ -388,7 +388,7 @@ def find_map(name: str) -> Path:
 
 
 def load_map(name: str) -> ChannelMap:
-    """A channel map by its name in the library, or by the path of a file. Raises ParameterError."""
+    """Load a channel map by its name in the library or its path. Raises ParameterError."""
     path = find_map(name)
     content = read_yaml(path, f"map {path}", "a channel map")
     require(isinstance(content, dict), f"map {path}", type(content).__name__, "a mapping")

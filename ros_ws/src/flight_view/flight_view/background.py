@@ -19,7 +19,7 @@ MAX_POINTS = 20_000
 
 
 def read_background(path: Path, origin: Origin | None) -> list[Line]:
-    """The lines of a GeoJSON, each ring of a polygon among them.
+    """Read the lines of a GeoJSON; each ring of a polygon is one of them.
 
     Raises ParameterError for an unreadable file, a coordinate system other than WGS84, a geometry
     of another type, no origin, and more than MAX_POINTS positions.

@@ -105,7 +105,7 @@ class FlightLink(Protocol):
 
 @contextmanager
 def _refusing() -> Iterator[None]:
-    """A ParameterError of the block as a refusal."""
+    """Turn a ParameterError of the block into a refusal."""
     try:
         yield
     except ParameterError as error:
@@ -113,7 +113,7 @@ def _refusing() -> Iterator[None]:
 
 
 def new_key() -> str:
-    """A key to type by hand: eight letters and digits, 40 bits."""
+    """Draw a key to type by hand: eight letters and digits, 40 bits."""
     text = "".join(secrets.choice("ABCDEFGHJKLMNPQRSTUVWXYZ23456789") for _ in range(8))
     return f"{text[:4]}-{text[4:]}"
 
@@ -354,7 +354,7 @@ class Control:
         self._digest = self._with(self._values).digest()
 
     def _with(self, values: Mapping[str, Any]) -> ControllerConfig:
-        """The controller's parameters with new values. Raises ParameterError."""
+        """Return the controller's parameters with new values. Raises ParameterError."""
         base = self._controller()
         content = {**dict(flatten(base.model_dump(exclude_none=True))), **values}
         return type(base).validate_mapping(nest(content), "controller")
@@ -411,11 +411,11 @@ class Control:
             return self._assess(self._flight.scenario, self._with(self._values | changes))
 
     def _map(self) -> str:
-        """The name of the channel map of the bridge."""
+        """Return the name of the channel map of the bridge."""
         return Path(str(self._link.parameters("bridge", ["map"]).get("map", ""))).stem
 
     def _sends(self) -> bool:
-        """Whether the bridge of the flight may send to an autopilot."""
+        """Return whether the bridge of the flight may send to an autopilot."""
         return self._link.parameters("bridge", ["dry_run"]).get("dry_run") is not True
 
     def _require_simulated(self) -> None:
@@ -497,9 +497,9 @@ class Control:
 
 
 def gains_of(controller: ControllerConfig) -> dict[str, Any]:
-    """The numeric parameters of a law tunable in flight, by name.
+    """Return the numeric parameters of a law that can be tuned in flight, by name.
 
-    A value is a number, or a number per channel.
+    A value is a number, or a number for each channel.
     """
     fields = type(controller).model_fields
     tunable = [
@@ -512,10 +512,10 @@ def gains_of(controller: ControllerConfig) -> dict[str, Any]:
 
 
 def _channels_of(count: int, controller: ControllerConfig) -> list[str]:
-    """The names of the values of a gain.
+    """Name the values of a gain.
 
-    A single value has no name. Several values have those of the outputs, of the outputs but the
-    last as for `k_d`, or of the inputs, else numbers from 1 on.
+    A single value has no name. Several values have the names of the outputs, of the outputs but the
+    last as for `k_d`, or of the inputs; otherwise, they are numbered from 1 on.
     """
     if count == 1:
         return [""]
@@ -530,7 +530,7 @@ def _is_numeric(value: object) -> bool:
 
 
 def _faults_of(scenario: Scenario) -> list[str]:
-    """The parameters of the aircraft tunable in flight, without the gusts and the drift."""
+    """Name the aircraft's parameters to tune in flight, without gusts and drift."""
     return sorted(
         name for name in scenario.aircraft.tunable() if not name.startswith(("gusts.", "drift."))
     )

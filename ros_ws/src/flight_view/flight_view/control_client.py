@@ -32,7 +32,7 @@ class ControlClient(Client):
         self._engagement: EngagementClient | None = None
 
     def nodes(self) -> list[str]:
-        """The nodes of the flight that can be commanded and are in the graph."""
+        """Return the nodes of the flight that can be commanded and are in the graph."""
         namespace = self._node.get_namespace()
         running = {
             name for name, where in self._node.get_node_names_and_namespaces() if where == namespace

@@ -97,7 +97,7 @@ def scenario_description(scenario: Scenario) -> dict[str, Any]:
 
 
 def mission(guidance: GuidanceConfig, waypoints: Sequence[Waypoint]) -> dict[str, Any]:
-    """What the map shows of guidance with a route: `mission_drawing` and the waypoints.
+    """Return what the map shows of a guided route: `mission_drawing` and the waypoints.
 
     A waypoint is north, east, altitude, m. Raises ParameterError for a route with no way to fly.
     """

@@ -167,9 +167,10 @@ class Flight:
         return (max(newest) - self.start_ns) / NANOSECONDS if newest else 0.0
 
     def state(self) -> str:
-        """What the recording does, in a word.
+        """Say in a word what the recording does.
 
-        "waiting", "reading" what is there, "recording", "no data", "interrupted" or "ended".
+        The words are "waiting", "reading" what is there, "recording", "no data", "interrupted" and
+        "ended".
         """
         if self._behind:
             return "reading"
@@ -300,7 +301,7 @@ class Flight:
         return RATES[name]
 
     def _shows(self, namespace: str) -> bool:
-        """Whether a namespace belongs to the aircraft on the page, or that is not known yet."""
+        """Return whether a namespace is the page's aircraft's, or that is not known yet."""
         return self._namespace in {None, namespace}
 
     def _note(self, sentence: str) -> None:
@@ -486,9 +487,9 @@ class Flight:
                 self._add_event(event)
 
     def _take_route(self, sent_ns: int, waypoints: Sequence[Waypoint]) -> None:
-        """A route received in flight replaces the route before.
+        """Replace the route by one received in flight.
 
-        Where guidance refuses the new route, the route before stays.
+        If guidance refuses the new route, the old one stays.
         """
         guidance = None if self.scenario is None else self.scenario.guidance
         if guidance is None:
@@ -508,7 +509,7 @@ class Flight:
             self._note(f"events after the first {MAX_EVENTS} are left out")
 
     def _update_bands(self) -> None:
-        """The settling bands, again whenever the ticks have grown by a tenth."""
+        """Update the settling bands whenever the ticks have grown by a tenth."""
         samples = self.samples.get("internals")
         if samples is None or samples.count < 1.1 * self._banded + 2:
             return
@@ -518,7 +519,7 @@ class Flight:
         self._banded = samples.count
 
     def _ticks(self, group: str) -> Signal:
-        """A group of channels of the ticks."""
+        """Return a group of channels of the ticks."""
         ticks = self.samples["internals"]
         columns = [k for k, name in enumerate(ticks.names) if name.startswith(f"{group}.")]
         names = tuple(ticks.names[k].removeprefix(f"{group}.") for k in columns)

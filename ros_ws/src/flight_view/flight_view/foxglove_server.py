@@ -81,9 +81,9 @@ def _channel(
     channels: dict[str, foxglove.Channel],
     context: foxglove.Context,
 ) -> foxglove.Channel | None:
-    """The channel of a topic, advertised with the first messages.
+    """Return the channel of a topic; advertise it with the first messages.
 
-    None for a record without messages.
+    Returns None for a record without messages.
     """
     if not isinstance(record, Messages):
         return None

@@ -36,12 +36,12 @@ def require_known(name: str, known: Collection[str], kind: str) -> None:
 
 
 def as_list(value: Any) -> Sequence[Any]:
-    """A value of a parameter as a sequence."""
+    """Return the value of a parameter as a sequence."""
     return value if isinstance(value, list | tuple) else [value]
 
 
 def permitted_range(value: float) -> list[float]:
-    """The least and the largest value of a gain, by the value in the scenario."""
+    """Return the least and the largest value of a gain, by the value in the scenario."""
     return sorted(factor * value for factor in RANGE)
 
 
@@ -57,7 +57,7 @@ def require_range(name: str, value: Any, base: Any) -> None:
 
 
 def like_parameter(name: str, base: Any, value: Any) -> Any:
-    """A value as a float or a list, by the type of the parameter."""
+    """Convert a value to a float or a list, by the type of the parameter."""
     values = as_list(finite_numbers(name, value))
     expected = len(as_list(base))
     require_form(
@@ -67,7 +67,7 @@ def like_parameter(name: str, base: Any, value: Any) -> Any:
 
 
 def values_by_name(request: Mapping[str, Any], key: str) -> dict[str, Any]:
-    """The mapping under a key of a request."""
+    """Return the mapping under a key of a request."""
     values = request.get(key)
     if not isinstance(values, dict) or not values:
         raise RefusedError(HTTPStatus.BAD_REQUEST, f"{key}: expected values by name")
@@ -75,7 +75,7 @@ def values_by_name(request: Mapping[str, Any], key: str) -> dict[str, Any]:
 
 
 def finite_number(name: str, value: Any) -> float:
-    """A finite number of a request."""
+    """Return a finite number of a request."""
     number = math.nan
     if isinstance(value, int | float) and not isinstance(value, bool):
         # An integer of hundreds of digits is beyond a float.
@@ -90,12 +90,12 @@ def finite_number(name: str, value: Any) -> float:
 
 
 def is_sentences(value: Any) -> bool:
-    """Whether a value is a list of sentences, as of faults."""
+    """Return whether a value is a list of sentences, for example of faults."""
     return isinstance(value, list) and all(isinstance(fault, str) for fault in value)
 
 
 def finite_numbers(name: str, value: Any) -> Any:
-    """A number, or a list of numbers; null in a list stands for never, infinity."""
+    """Return a number or a list of numbers; null in a list stands for never, infinity."""
     if not isinstance(value, list):
         return finite_number(name, value)
     return [math.inf if number is None else finite_number(name, number) for number in value]

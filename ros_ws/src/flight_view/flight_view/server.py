@@ -142,13 +142,13 @@ class Server:
         await self.http.close_all_connections()
 
     def knows(self, token: str | bytes) -> bool:
-        """Whether a peer has the token."""
+        """Return whether a peer has the token."""
         return hmac.compare_digest(
             token.encode() if isinstance(token, str) else token, self.token.encode()
         )
 
     def accepts(self, host: str) -> bool:
-        """Whether a Host header names this server, exactly."""
+        """Return whether a Host header names this server, exactly."""
         return host in {f"{name}:{self.port}" for name in (ADDRESS, "localhost", "[::1]")}
 
     async def follow(self) -> None:
@@ -173,9 +173,9 @@ class Server:
             await asyncio.sleep(pause)
 
     async def news(self, flight: Flight | FleetView, query: Mapping[str, str]) -> bytes:
-        """The answer to a browser whose `query` has the numbers of its rows by topic.
+        """Answer a browser whose `query` has the numbers of its rows by topic.
 
-        Waits up to MAX_WAIT s for news.
+        The answer waits up to MAX_WAIT s for news.
         """
         deadline = time.monotonic() + MAX_WAIT
         while not has_news(flight, query) and (remaining := deadline - time.monotonic()) > 0.0:
@@ -184,7 +184,7 @@ class Server:
         return self.answer(flight, query)
 
     def answer(self, flight: Flight | FleetView, query: Mapping[str, str]) -> bytes:
-        """The answer to a browser whose `query` has the numbers of its rows by topic.
+        """Answer a browser whose `query` has the numbers of its rows by topic, at once.
 
         Raises HTTPError for too long a number.
         """
@@ -200,7 +200,7 @@ class Server:
 
 
 def _epoch(flight: Flight | FleetView) -> str:
-    """A text that changes when rows known to a browser have changed.
+    """Return a text that changes when rows that a browser knows have changed.
 
     They change by thinning, or with the instant of flight time 0.
     """
@@ -208,7 +208,7 @@ def _epoch(flight: Flight | FleetView) -> str:
 
 
 def _first_rows(flight: Flight | FleetView, query: Mapping[str, str]) -> dict[str, int]:
-    """The first row unknown to a browser, by topic. Raises HTTPError for too long a number."""
+    """Return the first row a browser lacks, by topic. Raises HTTPError for too long a number."""
     is_same_epoch = query.get("epoch") == _epoch(flight)
     rows = {
         name: query.get(name, "") if is_same_epoch else "" for name in (*flight.samples, "events")
@@ -223,7 +223,7 @@ def _first_rows(flight: Flight | FleetView, query: Mapping[str, str]) -> dict[st
 
 
 def has_news(flight: Flight | FleetView, query: Mapping[str, str]) -> bool:
-    """Whether a browser lacks a row, an event, or the state."""
+    """Return whether a browser lacks a row, an event, or the state."""
     first = _first_rows(flight, query)
     return (
         any(samples.count > first[name] for name, samples in flight.samples.items())
@@ -241,7 +241,7 @@ def answer(
     fleet: int = 0,
     control: bool = False,
 ) -> bytes:
-    """Data unknown to a browser: a head, then the columns of each topic of the head.
+    """Encode the data that a browser lacks: a head, then the columns of each topic of the head.
 
     `fleet`: the number of the places of all aircraft; 0 without a fleet.
 

@@ -127,7 +127,7 @@ def _names(flight: Flight, group: str) -> Sequence[str]:
 
 
 def _newest_of(flight: Flight, group: str, name: str) -> float:
-    """The newest value of a channel in the ticks, in a log without ticks in the topic."""
+    """Return a channel's newest value in the ticks; in a log without ticks, in the topic."""
     if "internals" in flight.samples:
         return _newest(flight, "internals", f"{group}.{name}")
     return _newest(flight, group, name)
@@ -139,7 +139,7 @@ def _unit(flight: Flight, name: str) -> tuple[str, float]:
 
 
 def _newest(flight: Flight, topic: str, channel: str) -> float:
-    """The newest value of a channel; NaN where absent."""
+    """Return the newest value of a channel; NaN if it is absent."""
     samples = flight.samples.get(topic)
     if samples is None or not samples.count or channel not in samples.names:
         return math.nan

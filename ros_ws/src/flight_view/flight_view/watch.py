@@ -28,7 +28,7 @@ DEFAULT_PORT = 8077
 
 
 def runs_in_recording(runs: Path, namespace: str | None = None) -> list[Path]:
-    """The runs in recording, the newest first; with a namespace those that hold a topic of it."""
+    """Return the runs being recorded, newest first; with a namespace, those with a topic of it."""
     if is_folder(runs):
         # `latest` is a link to one of them.
         folders = sorted(
@@ -50,9 +50,9 @@ def runs_in_recording(runs: Path, namespace: str | None = None) -> list[Path]:
 
 
 def newest_run(runs: Path, namespace: str | None = None) -> Path:
-    """The newest run in recording, else the last run in the folder.
+    """Return the newest run being recorded, else the last run in the folder.
 
-    With a namespace it is one of that aircraft. Raises ParameterError.
+    With a namespace, it is a run of that aircraft. Raises ParameterError.
     """
     if recording := runs_in_recording(runs, namespace):
         return recording[0]
@@ -64,9 +64,9 @@ def newest_run(runs: Path, namespace: str | None = None) -> Path:
 
 
 def namespaces(run: Path) -> list[str | None]:
-    """The namespaces of the aircraft in the log of a run.
+    """Return the namespaces of the aircraft in the log of a run.
 
-    Of a log without aircraft it is None alone, the first aircraft to come.
+    For a log without aircraft, it is None alone, which stands for the first aircraft to come.
     """
     with suppress(ParameterError, OSError):
         return [*aircraft_namespaces(log_topics(run))] or [None]

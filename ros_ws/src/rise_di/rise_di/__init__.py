@@ -21,7 +21,7 @@ from pathlib import Path
 
 
 def _homes() -> Iterator[tuple[str, tuple[str | None, str]]]:
-    """Module and name there of each name of the interface, from the imports of __init__.pyi."""
+    """Yield each name of the interface with its module and its name there, from __init__.pyi."""
     stub = Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8")
     for statement in ast.parse(stub).body:
         if isinstance(statement, ast.ImportFrom):

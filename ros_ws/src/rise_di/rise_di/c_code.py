@@ -162,9 +162,9 @@ def export(
 
 
 def at_rate(scenario: Scenario, rate: float) -> Scenario:
-    """A scenario with law, reference model and y at another rate, Hz.
+    """Return a scenario with law, reference model and y at another rate, Hz.
 
-    Raises ParameterError where the observer has less than its delay margin there.
+    Raises ParameterError if the observer has less than its delay margin at that rate.
     """
     rate = as_number(rate, "rate", *RATES, "Hz")
     controller = exportable(scenario.controller)
@@ -220,9 +220,9 @@ def _sha256(text: str) -> str:
 
 
 def _certified(scenario: Scenario, constants: Path) -> tuple[str, str] | None:
-    """The certificate of the guarantee that was computed for a loop, and what it states.
+    """Return the certificate of the guarantee computed for a loop, and what it states.
 
-    None without a guarantee.
+    Returns None without a guarantee.
     """
     if scenario.aircraft.is_jsbsim or is_literal(scenario.controller):
         return None
@@ -262,7 +262,7 @@ def _units(scenario: Scenario, controller: RiseDiConfig) -> Units:
 
 
 def _logged(run: FilePath | RecordedRun, controller: RiseDiConfig, title: str) -> Material:
-    """The parameters and the ticks of a flight, and a line on their u.
+    """Return the parameters and the ticks of a flight, and a line on their u.
 
     Raises ParameterError for a flight with other parameters.
     """

@@ -42,7 +42,7 @@ class CampaignResult(NamedTuple):
     figures: dict[str, Any]
 
     def rows(self) -> "pl.DataFrame":
-        """A row an aircraft, SI.
+        """Return a table with a row for each aircraft, SI.
 
         The columns are seed, number, factor of the sweep, divergence, loss of track, figures, and
         drawn entries.

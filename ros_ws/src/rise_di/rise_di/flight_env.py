@@ -66,9 +66,9 @@ def _channels(scenario: Scenario) -> _Channels:
 
 
 def _without_models(scenario: Scenario) -> Scenario:
-    """The scenario with the law alone, in whose place the agent acts.
+    """Return the scenario with the law alone, in whose place the agent acts.
 
-    Models of a law, or a learner, bind no agent.
+    The models of a law, or a learner, do not bind the agent.
     """
     models = ("feedforward", "observer", "schedule", "learn")
     return scenario.vary(
@@ -110,7 +110,7 @@ def _is_newest_last(scenario: Scenario) -> bool:
 
 
 def _actions(values: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
-    """Inputs of a step.
+    """Return the inputs of a step as an array.
 
     Raises ParameterError for another shape, and for values that are not finite numbers.
     """
@@ -218,7 +218,7 @@ class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
         return self._observed(), {"error": self._error()}
 
     def render(self) -> str | None:
-        """A line of t, and of y and y_m by output, SI, in the mode "ansi"; else None."""
+        """Return a line of t, and of y and y_m by output, SI, in the mode "ansi"; else None."""
         if self.render_mode is None:
             return None
         rows = zip(self.outputs, self._y, self._y_m, strict=True)
@@ -274,7 +274,7 @@ class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
         return self._y - self._y_m
 
     def _drawn(self) -> Scenario:
-        """The scenario of the episode, drawn by the generator of the environment."""
+        """Return the episode's scenario, drawn by the generator of the environment."""
         if self._uncertainty is None:
             return self.scenario
         number, seed = (int(value) for value in self.np_random.integers(0, 2**31, 2))
@@ -428,7 +428,7 @@ class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray
         return self._observed(*self._sense())
 
     def _sense(self) -> tuple[FloatArray, FloatArray]:
-        """The newest y that has arrived, and y_m."""
+        """Return the newest y that has arrived, and y_m."""
         y, _ = self._flights.sense()
         if self._course.segments.phase[self._k] != HOLD:
             self._y = y
@@ -444,7 +444,7 @@ class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray
 def make_flight(
     scenario: str = "osprey_servo", duration: float | None = None, **options: Any
 ) -> FlightEnv:
-    """The environment rise_di/Flight-v0 of a scenario by name, with the options of FlightEnv."""
+    """Make the environment rise_di/Flight-v0 of a scenario, with the options of FlightEnv."""
     return FlightEnv(find_scenario(scenario, duration), **options)
 
 

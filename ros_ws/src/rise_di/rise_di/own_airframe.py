@@ -165,7 +165,7 @@ def new_airframe(
 
 
 def _pairing_sentence(airframe: Airframe) -> str:
-    """The pairing of inputs and outputs where an output has not the input of its place, else ""."""
+    """Say how inputs and outputs pair if an output has not the input of its place; else ""."""
     places = first_flight.pairing(airframe)
     if len(airframe.inputs) != len(airframe.outputs) or places == tuple(range(len(places))):
         return ""
@@ -177,13 +177,13 @@ def _pairing_sentence(airframe: Airframe) -> str:
 def _flying(
     airframe: Airframe, trial: Path, files: tuple[Path, Path], lag: Sequence[float]
 ) -> tuple[str, str]:
-    """The text of a scenario with selected gains whose flight ends as planned, and "".
+    """Write a scenario with selected gains whose flight ends as planned; return it and "".
 
-    The flight is clear of the end stops. Without such a flight: the text with the least commands,
-    and what this flight lacks.
+    The flight is clear of the end stops. If there is no such flight, return the scenario with the
+    least commands, and what its flight lacks.
 
-    `trial`: the airframe's file of the trial flights; `files`: airframe and scenario as the text
-    names them.
+    `trial` is the airframe's file of the trial flights; `files` are airframe and scenario as the
+    text names them.
     """
     shortfall = ""
     scenario = ""
@@ -211,18 +211,18 @@ def _flying(
 
 
 def _stop_shares(flight: Scenario, tape: Tape) -> dict[str, float]:
-    """The largest command of each input over its end stop."""
+    """Return the largest command of each input over its end stop."""
     stops = zip(flight.aircraft.channels().inputs, flight.aircraft.actuators.upper, strict=True)
     return {key: float(abs(tape["u"][key]).max()) / stop for key, stop in stops}
 
 
 def _shortfall(flight: Scenario, tape: Tape, hardest: str) -> str:
-    """What the flight of a scenario lacks.
+    """Say what the flight of a scenario lacks.
 
     The sentence names the input at a stop, whether commands or gusts ask for the travel, the state
     or gust with the largest share, and the share.
 
-    The input that holds y is u = -Omega^+ C (A x + f), f with the gusts.
+    The input that holds y is u = -Omega^+ C (A x + f); f includes the gusts.
     """
     airframe = flight.aircraft.load()[0]
     calm = simulate(flight.vary(aircraft={"gusts": {}}))

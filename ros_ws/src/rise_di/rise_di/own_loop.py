@@ -148,7 +148,7 @@ class Loop:
         self.config = controller
 
     def vector(self, value: ArrayLike, key: str, names: Sequence[str]) -> FloatArray:
-        """A sample of y or y_m as an array of its own, a value a name.
+        """Check a sample of y or y_m, and copy it to an array with a value for each name.
 
         Args:
             value: The sample, shape (k,), SI.
@@ -290,7 +290,7 @@ def _reference_model(
 def as_control(
     controller: ControllerConfig | Mapping[str, Any], *, linear: bool = False
 ) -> "control.NonlinearIOSystem":
-    """The engaged law as a discrete system of python-control: `y_NAME`, `y_m_NAME` -> `u_NAME`.
+    """Return the engaged law for python-control, discrete: `y_NAME`, `y_m_NAME` -> `u_NAME`.
 
     The law has limits and anti-windup.
 
@@ -371,7 +371,7 @@ def as_control(
 
 
 def _linear_matrices(config: ControllerConfig) -> tuple[FloatArray, ...]:
-    """A, B, C, D of the law near e = 0, from y to the effectors T u."""
+    """Return A, B, C, D of the law near e = 0, from y to the effectors T u."""
     m = len(config.outputs)
     near = linear_law(config.tuned_law(), m, 1.0 / config.rate)
     allocation = config.guard().allocation
