@@ -7,6 +7,7 @@ Gains, faults, a gust, the controller; in the log, and replayed.
 
 import json
 import re
+import time
 import urllib.request
 from collections.abc import Callable
 from http import HTTPStatus
@@ -14,11 +15,12 @@ from pathlib import Path
 from typing import Any
 from urllib.error import HTTPError
 
-from tests.ros.conftest import Process, Start
+from tests.ros.conftest import LONGEST_PAUSE, Process, Start
 from tests.ros.flight_bringup.test_lockstep import scenario_file
 from tests.ros.peer import Peer
-from tests.ros.waiting import until
+from tests.ros.waiting import HostDelays, until
 
+from flight_core.outcome import STATUS_SHORTFALL
 from flight_log.stored_messages import parameter_changes
 from flight_log.tape_reader import read_run
 from flight_view.flight import Flight
@@ -83,8 +85,9 @@ class Page:
 
 
 def test_flight_commanded_from_page_recorded_and_replayed(
-    start: Start, tmp_path: Path, peer_node: Peer
+    start: Start, tmp_path: Path, peer_node: Peer, host_delays: HostDelays
 ) -> None:
+    begin = time.time()
     # ended below
     flight = start(
         "flight_cli.cli", "fly", str(scenario_file(tmp_path, 1e4, "osprey_gust")), "--real-time"
@@ -151,5 +154,8 @@ def test_flight_commanded_from_page_recorded_and_replayed(
     assert abs(tape["truth"]["gust.vertical"]).max() > 2.0
     assert abs(tape["truth"]["noise.q"][-1] - 0.01) < 1e-9
     replayed = start("flight_cli.cli", "replay", str(run), "--json")
-    assert replayed.end() == 0, replayed.output
-    assert json.loads(replayed.output)["equal"]
+    status = replayed.end()
+    assert json.loads(replayed.output)["equal"], replayed.output
+    # A host that paused may have kept samples from the log: every tick that is there is equal.
+    starved = host_delays.longest(begin) > LONGEST_PAUSE
+    assert status == 0 or (status == STATUS_SHORTFALL and starved), replayed.output
