@@ -424,11 +424,16 @@ def test_plant_behind_lag_follows_continuous_model_to_second_order() -> None:
 
 
 # Flights through servos: scenario osprey_servo without its noise, with the gains of the prototype.
+# 200 Hz and steps of 5 ms, a quarter of the shortest lag.
+
+STEP = 0.005  # s
 
 
 @pytest.fixture(scope="module")
 def servo() -> Scenario:
-    return PROTOTYPE_SERVO.vary(aircraft={"sensors": {}})
+    return PROTOTYPE_SERVO.vary(
+        aircraft={"sensors": {}, "rate": 200.0, "step": STEP}, reference_model={"rate": 200.0}
+    )
 
 
 @pytest.fixture(scope="module")
@@ -460,5 +465,5 @@ def test_actuators_stay_inside_limits_in_flight(servo: Scenario, gusty: Tape) ->
     limits = servo.aircraft.actuators
     assert (positions >= limits.lower).all()
     assert (positions <= limits.upper).all()
-    assert (np.abs(np.diff(positions, axis=0)) <= np.array(limits.rate) * 0.002 * (1 + 1e-9)).all()
+    assert (np.abs(np.diff(positions, axis=0)) <= np.array(limits.rate) * STEP * (1 + 1e-9)).all()
     assert np.abs(positions).max() > 0.1  # thrust for 1.5 m/s: the flight uses the actuators

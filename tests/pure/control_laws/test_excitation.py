@@ -56,15 +56,18 @@ def controller(**changes: Any) -> ExcitationConfig:
     return ExcitationConfig.validate_mapping(values, "controller")
 
 
-def excited(params: ExcitationConfig) -> FloatArray:
+@pytest.fixture(scope="module")
+def excited() -> FloatArray:
     """The excitation every DT in units of the amplitude, (T, m)."""
+    params = controller()
     arrays = params.law_params()
     return np.array([excitation.signal(k * DT, arrays) for k in range(round(params.duration / DT))])
 
 
-def flight(**changes: Any) -> Scenario:
-    calm = find_scenario("osprey_servo", 12.0).vary(
-        aircraft={"gusts": {}}, reference_model={"pulses": {}, "coordinated_turn": None}
+def flight(duration: float, **changes: Any) -> Scenario:
+    calm = find_scenario("osprey_servo", duration).vary(
+        aircraft={"gusts": {}, "rate": 200.0, "step": 0.005},
+        reference_model={"pulses": {}, "coordinated_turn": None, "rate": 200.0},
     )
     return replace(calm, controller=controller(**changes))
 
@@ -73,9 +76,9 @@ def test_live_page_offers_no_gains_of_timetable() -> None:
     assert gains_of(controller()) == {}
 
 
-def test_inputs_are_excited_in_turn() -> None:
+def test_inputs_are_excited_in_turn(excited: FloatArray) -> None:
     """Not more than one input is excited at a time, and no input in a pause."""
-    active = excited(controller()) != 0.0
+    active = excited != 0.0
     assert active.sum(axis=1).max() == 1
     assert not active[: round(1.5 / DT)].any()
     assert not active[-round(1.4 / DT) :].any()
@@ -87,10 +90,10 @@ def test_excitation_lasts_as_long_as_parameters_say() -> None:
     assert controller().duration == approx(49.5)
 
 
-def test_doublets_and_multisine_have_no_mean() -> None:
+def test_doublets_and_multisine_have_no_mean(excited: FloatArray) -> None:
     # The second integral of the doublets alone is -3 w^2: 1 of the first, -4 of the second, which
     # is twice as wide.
-    u = excited(controller())[:, 0]
+    u = excited[:, 0]
     assert abs(u.sum() * DT) < 2.0 * DT
     doublets = u[round(1.5 / DT) : round(3.5 / DT)]
     assert np.cumsum(doublets).sum() * DT**2 == approx((1.0 - 4.0) * 0.25**2, rel=0.02)
@@ -113,7 +116,7 @@ def test_multisine_has_band_alone_and_low_peak() -> None:
 
 
 def test_flight_commands_timetable_whatever_y_does() -> None:
-    tape = simulate(flight())
+    tape = simulate(flight(12.0))  # the first input, and the begin of the second
     u = tape["u"]
     params = controller().law_params()
     t = (u.stamp_ns - u.stamp_ns[0]) * 1e-9
@@ -126,7 +129,7 @@ def test_flight_commands_timetable_whatever_y_does() -> None:
 
 
 def test_limits_act_on_the_excitation() -> None:
-    slow = simulate(flight(slew=[0.01, 0.01, 0.01, 0.01]))
+    slow = simulate(flight(4.0, slew=[0.01, 0.01, 0.01, 0.01]))  # the first doublet
     steps = np.abs(np.diff(slow["u"]["elevator"]))
     assert steps.max() <= 0.01 * 0.01 * (1.0 + 1e-9)  # 0.01 1/s at 100 Hz
 

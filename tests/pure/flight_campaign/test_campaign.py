@@ -60,7 +60,12 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 
 pytestmark = pytest.mark.slow
 
-SHORT = find_scenario("osprey_servo").vary(flight={"duration": 5.0})
+# 100 Hz and steps of 5 ms: what is shown of a campaign does not depend on them
+SHORT = find_scenario("osprey_servo").vary(
+    flight={"duration": 5.0},
+    aircraft={"rate": 100.0, "step": 0.005},
+    reference_model={"rate": 100.0},
+)
 VALUES = arrays(np.float64, st.integers(1, 60), elements=st.floats(1e-6, 1e4))
 
 
@@ -389,7 +394,7 @@ def test_quick_learner_of_campaign_finds_what_learner_of_node_finds(
 
 def test_campaign_flies_effect_of_wind_that_definition_names(tmp_path: Path) -> None:
     gust = {"vertical": {"start": 2.0, "speed": 10.12, "length": 15.24}}
-    gusty = find_scenario("osprey_servo").vary(flight={"duration": 4.0}, aircraft={"gusts": gust})
+    gusty = SHORT.vary(flight={"duration": 4.0}, aircraft={"gusts": gust})
     published = gusty.vary(aircraft={"uncertainty": {"A": 0.9, "wind": "published"}})
     of = {
         "own": define(gusty, 20, 0.5, 7, 20),
@@ -691,7 +696,7 @@ def test_ctrl_c_prints_the_command_to_resume(tmp_path: Path) -> None:
 
 def test_ctrl_c_ends_the_processes_of_missions(tmp_path: Path) -> None:
     """A terminal sends the signal to the workers too."""
-    short = ("osprey_route", "--duration", "3", "--aircraft", "400", "--chunk", "1")
+    short = ("osprey_route", "--duration", "1", "--aircraft", "400", "--chunk", "1")
     stopped = command(*short, "--runs", "part", "--workers", "2", cwd=tmp_path, group=True)
     wait_for_chunks(tmp_path / "part", 1, stopped)
     workers = psutil.Process(stopped.pid).children(recursive=True)
