@@ -187,7 +187,7 @@ def test_random_sequence_keeps_u_in_its_limits_and_is_replayed_to_the_bit(
     if probed and parameters.allocation is None:
         parameters = with_probe(parameters)
     sequence = Sequence(parameters, 7 + probed)
-    sequence.run(1500)
+    sequence.run(1000)
     result = replay(sequence.tape(), parameters, changes=sequence.changes)
     assert result.first() is None
     assert result.equal()
