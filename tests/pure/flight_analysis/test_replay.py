@@ -12,6 +12,7 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -70,6 +71,18 @@ SCENARIOS = {
 }
 
 
+@cache
+def flown(name: str) -> Tape:
+    """The flight of one of SCENARIOS, flown once for all tests that read it."""
+    return simulate(SCENARIOS[name])
+
+
+@cache
+def busy_flown(name: str) -> Tape:
+    """The same with the commands of BUSY."""
+    return simulate(SCENARIOS[name].vary(reference_model={"pulses": BUSY}))
+
+
 def equal(result: ReplayResult) -> bool:
     return result.equal() and bool(result.checked.all())
 
@@ -77,7 +90,7 @@ def equal(result: ReplayResult) -> bool:
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_replay_equals_flight_in_every_bit(name: str) -> None:
     scenario = SCENARIOS[name]
-    tape = simulate(scenario)
+    tape = flown(name)
     result = replay(tape, scenario.controller)
     assert equal(result), result.first()
     assert len(result.number) == len(tape["internals"].stamp_ns) > 100
@@ -212,10 +225,10 @@ def flipped(value: float) -> float:
 @pytest.mark.parametrize("name", ["osprey_gust", "osprey_servo", "feedforward"])
 @pytest.mark.parametrize("channel", range(4))
 def test_one_bit_of_one_gain_is_found(name: str, channel: int) -> None:
-    scenario = SCENARIOS[name].vary(reference_model={"pulses": BUSY})
+    scenario = SCENARIOS[name]
     gains = list(scenario.rise_di().Lambda)
     gains[channel] = flipped(gains[channel])
-    tape = simulate(scenario)
+    tape = busy_flown(name)
     assert equal(replay(tape, scenario.controller))
     for result in (
         replay(tape, vary(scenario.controller, {"Lambda": gains})),
@@ -264,7 +277,7 @@ BUSY = {
     ],
 )
 def test_one_bit_of_one_sample_found_and_only_there(topic: str, channels: list[str]) -> None:
-    tape = simulate(GUST.vary(reference_model={"pulses": BUSY}))
+    tape = busy_flown("osprey_gust")
     for channel in channels:
         row = np.searchsorted(tape[topic].stamp_ns, 1_000 * MS)
         values = tape[topic].values.copy()
@@ -320,7 +333,7 @@ def without(tape: Tape, keep: Callable[[FloatArray], Any]) -> Tape:
 @pytest.mark.parametrize("name", ["osprey_gust", "feedforward"])
 def test_log_without_beginning_checked_after_first_tick(name: str) -> None:
     scenario = SCENARIOS[name]
-    result = replay(without(simulate(scenario), lambda number: number > 100), scenario.controller)
+    result = replay(without(flown(name), lambda number: number > 100), scenario.controller)
     assert result.first() is None
     assert result.checked.tolist() == [False] + [True] * 300
     assert result.notes == (
@@ -392,7 +405,7 @@ def test_open_loop_equals_controller_on_recorded_inputs() -> None:
         GUST.controller,
         {"Lambda": [3.0, 3.0, 3.0, 1.0], "beta": [20.0, 20.0, 8.0, 6.0], "upper": [0.01] * 4},
     )
-    tape = simulate(GUST)
+    tape = flown("osprey_gust")
     controller = Controller(others)
     us = []
     for number, (stamp_ns, y) in enumerate(
