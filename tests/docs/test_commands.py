@@ -12,12 +12,14 @@ import shlex
 import shutil
 import sys
 from contextlib import suppress
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 from unittest.mock import patch
 
 import pytest
 import typer
+import typer.core
 from tests import launch_stand_in
 from tests.conftest import REPOSITORY, invoke
 
@@ -35,16 +37,25 @@ INDENTED = re.compile(r"^    (?:\$ )?(\S.*)$", re.MULTILINE)
 SPAN = re.compile(r"(?<!`)`rise-di (\w[\w-]*)([^`]*)`(?!`)")
 
 SOURCES = REPOSITORY / "ros_ws" / "src"
-RISE_DI = typer.main.get_command(application([*COMMANDS]))
+
+
+@cache
+def whole_command() -> typer.core.TyperGroup:
+    """`rise-di` with every command, whose modules are imported here."""
+    command = typer.main.get_command(application([*COMMANDS]))
+    assert isinstance(command, typer.core.TyperGroup)
+    return command
 
 
 def rise_di(words: list[str]) -> None:
     """The command and its options exist, and their values have the right types."""
     # --help and --version exit
-    with suppress(typer.Exit), RISE_DI.make_context("rise-di", [*words]) as context:
-        name, command, rest = RISE_DI.resolve_command(  # type: ignore[attr-defined]
+    group = whole_command()
+    with suppress(typer.Exit), group.make_context("rise-di", [*words]) as context:
+        name, command, rest = group.resolve_command(
             context, [*context._protected_args, *context.args]
         )
+        assert command is not None
         command.make_context(name, rest, parent=context)
 
 
@@ -142,7 +153,7 @@ def test_options_in_the_text_of_pages_exist() -> None:
     unknown = []
     for page in PAGES:
         for name, rest in SPAN.findall(page.read_text()):
-            command = RISE_DI.commands[name]  # type: ignore[attr-defined]
+            command = whole_command().commands[name]
             known = {option for parameter in command.params for option in parameter.opts}
             if options := set(re.findall(r"(?<!\S)--[a-z-]+", rest)) - known:
                 unknown.append(f"{page.relative_to(REPOSITORY)}: rise-di {name}: {options}")
