@@ -125,8 +125,12 @@ def export_case(name: str, folder: Path) -> Case:
     slow = {"rate": rate, "step": min(0.005, 1.0 / rate)}
     limits = {"bounds": {"q": 0.4, "p": 0.5}, "slew": {"p": 1.0, "r": 0.5}}
     model = {"rate": rate, "live": limits}
+    # a short ramp: every mode fits into five seconds
     scenario = SCENARIOS[name]().vary(
-        aircraft=slow, reference_model=model, flight={"duration": 8.0}
+        aircraft=slow,
+        reference_model=model,
+        controller={"ramp": 1.0},
+        flight={"duration": 5.0},
     )
     sets = parameter_sets(exportable(scenario.controller))
     write_code(sets[0], name, folder, scenario.reference_model, float32=False)
