@@ -32,9 +32,12 @@ GYRO = {"sensors": {"noise": [0.02, 0.0, 0.02, 0.02]}}  # rad/s rms per sample
 FINE = {"step": 0.0005}
 
 
-def servo_scenario(aircraft: dict[str, Any], controller: dict[str, Any]) -> Scenario:
+def servo_scenario(
+    aircraft: dict[str, Any], controller: dict[str, Any], duration: float
+) -> Scenario:
     """Scenario osprey_servo with the gains and under the conditions of the prototype."""
     return PROTOTYPE_SERVO.vary(
+        flight={"duration": duration},
         aircraft={"rate": 100.0, "step": 0.005, "sensors": {}} | aircraft,
         reference_model={"rate": 100.0},
         controller={"rate": 100.0, "delay": 0.0, "softening": 3.0} | controller,
@@ -42,21 +45,30 @@ def servo_scenario(aircraft: dict[str, Any], controller: dict[str, Any]) -> Scen
 
 
 @pytest.mark.parametrize(
-    "aircraft, controller, rms",
+    "aircraft, controller, rms, duration",
     [
-        pytest.param({}, {}, (7.6, 0.088, 9.9, 6.4), id="soft, gusts"),
-        pytest.param({}, NO_SIGN, (13.7, 0.178, 22.2, 14.0), id="PI, gusts"),
+        pytest.param({}, {}, (7.6, 0.088, 9.9, 6.4), 60.0, id="soft, gusts"),
+        pytest.param({}, NO_SIGN, (13.7, 0.178, 22.2, 14.0), 60.0, id="PI, gusts"),
         pytest.param(
-            CALM | FINE, LITERAL, (13.0, 0.179, 16.8, 18.4), id="literal, calm: a limit cycle"
+            CALM | FINE,
+            LITERAL,
+            (13.0, 0.179, 16.8, 18.4),
+            60.0,
+            id="literal, calm: a limit cycle",
         ),
-        pytest.param(CALM | GYRO, {}, (7.2,), id="soft, noisy gyros"),
-        pytest.param(CALM | GYRO, NO_SIGN, (7.2,), id="PI, noisy gyros"),
+        # the noise is stationary: half a flight has its rms
+        pytest.param(CALM | GYRO, {}, (7.2,), 30.0, id="soft, noisy gyros"),
+        # but a slow loop settles after each command
+        pytest.param(CALM | GYRO, NO_SIGN, (7.2,), 60.0, id="PI, noisy gyros"),
     ],
 )
 def test_a_flight_agrees_with_the_prototype(
-    aircraft: dict[str, Any], controller: dict[str, Any], rms: tuple[float, ...]
+    aircraft: dict[str, Any],
+    controller: dict[str, Any],
+    rms: tuple[float, ...],
+    duration: float,
 ) -> None:
-    errors = error(simulate(servo_scenario(aircraft, controller)))
+    errors = error(simulate(servo_scenario(aircraft, controller, duration)))
     units = (1e3, 1.0, 1e3, 1e3)
     measured = [
         unit * error_metrics(errors[name]).rms
