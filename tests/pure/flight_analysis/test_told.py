@@ -4,6 +4,7 @@
 
 import math
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ from flight_analysis.linear_loop.told import (
 )
 from flight_analysis.report.flown_models import UNKNOWN_AIRCRAFT, flown_loops
 from flight_core.known_keys import keys_of
+from flight_core.tape import Tape
 from rise_di_controller.law.linear_loop import is_stable
 
 OBSERVER = find_scenario("osprey_observer", 2.0)
@@ -285,11 +287,17 @@ def test_a_log_as_planned_names_nothing(facts: FlightFacts) -> None:
     assert not sentences(SERVO, facts)
 
 
+@cache
+def as_planned() -> Tape:
+    """The flight of SERVO."""
+    return simulate(SERVO)
+
+
 def test_an_aircraft_that_is_not_simulated_is_not_compared() -> None:
     """The aircraft of the scenario does not fly behind a bridge: the loop is as told."""
     slow = with_aircraft(SERVO, "actuators", lag=[0.1] * 4, faults=["elevator stuck 1"])
     assert not sentences(slow, FlightFacts(is_simulated=False))
-    tape = simulate(SERVO)
+    tape = as_planned()
     signals = {name: signal for name, signal in tape.signals.items() if name != "truth"}
     foreign = replace(tape, signals=signals, scenario=None)
     flown = flown_loops(foreign, slow, ())
@@ -305,12 +313,12 @@ def test_the_loops_of_a_flight_are_of_what_flew() -> None:
     known = slow.vary(controller={"lag": [0.05, 0.05, 0.05, 0.1]}).controller
     # the softened sign of the law is as wide as it was told: only the margins' loop is compared
     assert flown.loops[0].loop.loop.lag.tolist() == list(known.lag)
-    healthy = loop_margins(flown_loops(simulate(SERVO), SERVO, ()).loops[0].loop)
+    healthy = loop_margins(flown_loops(as_planned(), SERVO, ()).loops[0].loop)
     assert margins.delay < healthy.delay
 
 
 def test_ticks_of_another_period_have_no_loop() -> None:
-    tape = simulate(SERVO)
+    tape = as_planned()
     half = tape["internals"]
     slower = replace(half, stamp_ns=2 * half.stamp_ns)
     late = replace(tape, signals={**tape.signals, "internals": slower})

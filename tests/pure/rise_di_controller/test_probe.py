@@ -65,7 +65,13 @@ def test_surface_stuck_in_trim_in_calm_air_is_seen_and_no_other(surface: str) ->
 
 def test_healthy_surfaces_are_not_called_stuck_in_commands_and_gusts() -> None:
     """With the commands and the two gusts of the scenario: 80 tests of three surfaces."""
-    tape = simulate(find_scenario("osprey_servo", 48.0).vary(controller=with_probe()))
+    tape = simulate(
+        find_scenario("osprey_servo", 48.0).vary(
+            controller=with_probe(),
+            aircraft={"rate": 200.0, "step": 0.005},
+            reference_model={"rate": 200.0},
+        )
+    )
     assert len(tape["effects"].values) > 80
     assert alarms(tape) == []
 
