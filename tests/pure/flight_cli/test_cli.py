@@ -2,15 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command line: exit status, sentences, files."""
 
+import gc
 import json
 import os
 import re
 import signal
 import subprocess
 import sys
+from contextlib import redirect_stderr, redirect_stdout
 from importlib.metadata import version
+from io import StringIO
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+from unittest.mock import patch
 
 import pytest
 import typer
@@ -30,6 +34,31 @@ pytestmark = pytest.mark.slow
 def rise_di(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "flight_cli.cli", *arguments]
     return subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False)
+
+
+class Said(NamedTuple):
+    """What a command ended with and printed."""
+
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+def said(*arguments: str) -> Said:
+    """Run the entry point of `rise-di` in this process, which keeps its own settings."""
+    threshold, handler = gc.get_threshold(), signal.getsignal(signal.SIGINT)
+    try:
+        with (
+            patch.multiple(sys, argv=["rise-di", *arguments], unraisablehook=sys.unraisablehook),
+            redirect_stdout(StringIO()) as output,
+            redirect_stderr(StringIO()) as errors,
+            pytest.raises(SystemExit) as end,
+        ):
+            cli.main()
+    finally:
+        gc.set_threshold(*threshold)
+        signal.signal(signal.SIGINT, handler)
+    return Said(int(end.value.code or 0), output.getvalue(), errors.getvalue())
 
 
 @pytest.fixture(scope="module")
@@ -327,25 +356,23 @@ def test_other_option_is_refused_with_its_mend(words: str, mend: str) -> None:
         ("fly -q -v", "--quiet beside it, expected one of the two"),
     ],
 )
-def test_every_refusal_of_words_is_one_line_in_one_form(
-    words: str, refusal: str, tmp_path: Path
-) -> None:
-    process = rise_di(*words.split(), cwd=tmp_path)
-    assert process.returncode == 2
-    assert process.stderr.startswith("error: ")
-    assert refusal in process.stderr
-    assert len(process.stderr.splitlines()) == 1
-    assert process.stdout == ""
+def test_every_refusal_of_words_is_one_line_in_one_form(words: str, refusal: str) -> None:
+    command = said(*words.split())
+    assert command.returncode == 2
+    assert command.stderr.startswith("error: ")
+    assert refusal in command.stderr
+    assert len(command.stderr.splitlines()) == 1
+    assert command.stdout == ""
 
 
 @pytest.mark.parametrize(
     "words, same", [("-h", "--help"), ("help", "--help"), ("fly -h", "fly --help")]
 )
-def test_help_is_found_by_each_usual_word(words: str, same: str, tmp_path: Path) -> None:
-    asked, expected = (rise_di(*text.split(), cwd=tmp_path) for text in (words, same))
+def test_help_is_found_by_each_usual_word(words: str, same: str) -> None:
+    asked, expected = (said(*text.split()) for text in (words, same))
     assert (asked.returncode, asked.stdout) == (0, expected.stdout)
     if words == "fly -h":
-        assert rise_di("help", "fly", cwd=tmp_path).stdout == expected.stdout
+        assert said("help", "fly").stdout == expected.stdout
 
 
 def test_quiet_flight_prints_its_headline_alone(tmp_path: Path) -> None:
@@ -479,12 +506,12 @@ def test_help_shows_the_names_of_entries_whole() -> None:
     assert "'A[q,alpha]=0.6', or '1/lag[elevator]=0.3' of an" in words
 
 
-def test_every_command_of_help_has_help_of_own(tmp_path: Path) -> None:
+def test_every_command_of_help_has_help_of_own() -> None:
     for name in COMMANDS:
         answer = invoke(name, "--help", prog_name="rise-di")
         assert answer.exit_code == 0, name
         assert f"Usage: rise-di {name}" in answer.stdout
-    listed = rise_di("--help", cwd=tmp_path).stdout
+    listed = said("--help").stdout
     assert all(name in listed for name in COMMANDS)
 
 
