@@ -8,7 +8,7 @@
 # make docs   write the site of docs/ to site/; make docs ARGS=serve shows it while it is written
 # make pictures   draw the pictures of docs/ again from today's code     make pictures ARGS="report.png"
 # make pages   run every block of the tutorials as it stands, half an hour     make pages ARGS=landing
-# make mutants   change the law, the guard, the decomposition and the account in many places: each change must fail a test
+# make mutants   change the law, the guard, verdicts, certificate, fence and bridge in many places: each change must fail a test
 # make evidence   measure what has no file in docs/evidence/, write docs/evidence.md     make evidence ARGS="--again speed"
 # make source-proof   Frama-C and cppcheck on the exported C code; skipped where they are not installed
 # make foxglove   what `rise-di watch --foxglove` needs
@@ -66,9 +66,12 @@ test-fast: .venv/.all .venv/.workspace
 test-sitl: setup-all
 	$(BIN)/python -m pytest tests/sitl -m "not long" $(ARGS)
 
+# The packages of [tool.mutmut] in pyproject.toml.
+MUTATED := autopilot_bridge flight_analysis flight_guidance rise_di_controller
+
 mutants: setup-all
 	@rm -rf build/mutants && mkdir -p build/mutants
-	@cp -r ros_ws/src/rise_di_controller/rise_di_controller ros_ws/src/flight_analysis/flight_analysis benchmarks docs examples tests pyproject.toml build/mutants
+	@cp -r $(foreach package,$(MUTATED),ros_ws/src/$(package)/$(package)) benchmarks docs examples tests pyproject.toml build/mutants
 	cd build/mutants && OPENBLAS_NUM_THREADS=1 $(BIN)/mutmut run $(ARGS) && { $(BIN)/mutmut results | grep ": survived" || echo "no change survived"; }
 
 foxglove autopilot: setup
