@@ -53,6 +53,9 @@ fly: setup
 # The workers fill the processors: threads of OpenBLAS would only wait for each other.
 test test-fast: export OPENBLAS_NUM_THREADS = 1
 
+# pytest keeps the rewritten assertions of each file: else every worker rewrites all of them, a third of what collecting takes.
+test test-fast: export PYTHONDONTWRITEBYTECODE =
+
 # Files of tests/ros come first. They wait more than they compute: there is a worker more than processors.
 # Those that fly in real time and measure it come last, by themselves.
 test: check
