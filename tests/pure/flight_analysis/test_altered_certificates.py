@@ -26,6 +26,8 @@ from flight_analysis.linear_loop.certificate import certificate
 from flight_analysis.linear_loop.guarantee import guarantee
 from rise_di.c_code import certificate_sources
 
+pytestmark = pytest.mark.slow
+
 Alter = Callable[[Content], Any]
 NAN, INF = math.nan, math.inf
 TOP = math.pi / 0.01  # rad/s, the highest frequency of a loop of 100 Hz

@@ -26,6 +26,8 @@ from flight_analysis.linear_loop.loop_margins import LinearLoop, scenario_loop
 from flight_analysis.linear_loop.uncertain_loop import plants_at
 from rise_di_controller.law.linear_loop import closed_loop
 
+pytestmark = pytest.mark.slow
+
 CHECKER = REPOSITORY / "examples" / "check_certificate.py"
 Content = dict[str, Any]
 
