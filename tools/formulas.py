@@ -23,15 +23,15 @@ CONVERTER = LatexToMathML(fancy_error=False)
 
 
 def mathml(tex: str, displayed: bool) -> str:
-    r"""The MathML of a formula; a \tag becomes its number at the right. Raises LatexError."""
+    r"""Convert a formula to MathML; a \tag becomes its number at the right. Raises LatexError."""
     numbered = rf"\begin{{equation}}{tex}\end{{equation}}" if r"\tag" in tex else tex
     return CONVERTER.convert_with_local_state(numbered, displaystyle=displayed)
 
 
 def on_page_content(content: str, page: Any, **_: object) -> str:
-    """The HTML of a page with its formulas as MathML.
+    """Convert the formulas in a page's HTML to MathML.
 
-    Raises PluginError: the page and the formula that is no LaTeX.
+    Raises PluginError, which names the page and the formula that is no LaTeX.
     """
 
     def converted(match: re.Match[str]) -> str:

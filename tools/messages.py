@@ -55,7 +55,7 @@ class Source(NamedTuple):
 
 
 def find_sources(folders: Sequence[Path]) -> dict[str, Source]:
-    """The ROS packages below `folders`."""
+    """Find the ROS packages below `folders`."""
     sources = {}
     for folder in folders:
         if not folder.is_dir():
@@ -71,7 +71,7 @@ def find_sources(folders: Sequence[Path]) -> dict[str, Source]:
 
 
 def in_order(package: str, sources: Mapping[str, Source]) -> list[str]:
-    """The package and those of its dependencies that are among the sources.
+    """Return the package and those of its dependencies that are among the sources.
 
     Each comes after its dependencies.
     """
@@ -96,7 +96,7 @@ def in_order(package: str, sources: Mapping[str, Source]) -> list[str]:
 
 
 def specifications(package: str, path: Path) -> Iterator[MessageSpecification]:
-    """The messages of which an interface file consists."""
+    """Yield the messages of which an interface file consists."""
     if path.suffix == ".msg":
         yield parse_message_file(package, str(path))
     elif path.suffix == ".srv":
@@ -108,7 +108,7 @@ def specifications(package: str, path: Path) -> Iterator[MessageSpecification]:
 
 
 def closure(package: str, source: Path, names: Sequence[str]) -> set[str]:
-    """The named interfaces of a package, and those of the same package that they contain."""
+    """Return the named interfaces of a package, and those of the package that they contain."""
     files = {path.stem: path for kind in KINDS for path in (source / kind).glob(f"*.{kind}")}
     unknown = [name for name in names if name not in files]
     if unknown:
@@ -129,7 +129,7 @@ def closure(package: str, source: Path, names: Sequence[str]) -> set[str]:
 
 
 def copy_of_part(package: str, source: Path, names: Sequence[str], target: Path) -> Path:
-    """A copy of a package with the named interfaces and what they contain, alone."""
+    """Copy a package with only the named interfaces and what they contain."""
     packages = closure(package, source, names)
     shutil.rmtree(target, ignore_errors=True)
     shutil.copytree(source, target, ignore=shutil.ignore_patterns(".*"))

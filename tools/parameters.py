@@ -65,7 +65,7 @@ HEAD = ("| parameter | value | meaning |", "|---|---|---|")
 
 
 def page() -> str:
-    """The text of the page."""
+    """Write the page."""
     keys = {key: value for key, value, _ in _rows(AircraftConfig)}
     parts = [LEAD, "## Keys of several sections", "", *HEAD]
     parts += [f"| `{key}` | {keys[key]} | {text} |" for key, text in SHARED.items()]
@@ -131,7 +131,7 @@ def _rows(schema: type[Config], prefix: str = "") -> Iterator[tuple[str, str, st
 def _resolved(
     annotation: Any, rules: Mapping[str, Any] = MappingProxyType({})
 ) -> tuple[Any, Mapping[str, Any]]:
-    """A type without its rules and without the alternative None, and the rules."""
+    """Separate a type from its rules and from the alternative None; return both."""
     if get_origin(annotation) is Annotated:
         inner, *outer = get_args(annotation)
         return _resolved(
@@ -158,7 +158,7 @@ def _type(annotation: Any) -> str:
 
 
 def _bounds(rules: Mapping[str, Any]) -> str:
-    """The bounds of a number, without those of every number.
+    """Write the bounds of a number, without those that every number has.
 
     A smallest size says that the number is positive.
     """

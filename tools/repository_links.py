@@ -13,7 +13,7 @@ LINK = re.compile(r"\[(?P<text>[^\]]+)\]\((?P<target>\.\./[^)#\s]+)[^)]*\)")
 
 
 def on_page_markdown(markdown: str, page: Any, **_: object) -> str:
-    """The Markdown of a page with the paths of such files in the place of the links.
+    """Replace a page's links to files of the repository by the files' paths.
 
     The paths are from the root of the repository.
     """

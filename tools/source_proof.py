@@ -153,7 +153,7 @@ def eva(folder: Path, ticks: int) -> Result:
 
 
 def broken_rules(folder: Path) -> set[str]:
-    """The rules of MISRA C:2012 that cppcheck finds broken; further findings by their id."""
+    """Return the rules of MISRA C:2012 that cppcheck finds broken, and other findings by id."""
     command = ["cppcheck", "--enable=warning,performance,portability,style", "--std=c99"]
     command += ["--addon=misra", "--quiet", "--template={id}", "rise_di.c", "rise_di_table.c"]
     words = _output(command, folder).split()

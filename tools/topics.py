@@ -67,7 +67,7 @@ FURTHER = {"guidance": ["/tf"], "controller": ["~transition_event"]}  # topics o
 
 
 def table() -> str:
-    """The table of the page."""
+    """Write the table of the page."""
     return "\n".join([*HEAD, *map(_row, TOPICS), *FURTHER_ROWS])
 
 
@@ -78,14 +78,14 @@ def _row(topic: Topic) -> str:
 
 
 def page() -> str:
-    """The text of the page with the present table."""
+    """Write the page with the present table."""
     text = PAGE.read_text(encoding="utf-8")
     begin = text.index("| topic | from -> to |")
     return text[:begin] + table() + text[text.index("\n\n", begin) :]
 
 
 def policy() -> str:
-    """The text of the policy."""
+    """Write the policy."""
     root = ElementTree.Element("policy", version="0.2.0")
     enclaves = ElementTree.SubElement(root, "enclaves")
     for node in (*NODES, MONITOR):

@@ -124,7 +124,7 @@ def walk(number: int, drift: RandomWalk, params: Sensors) -> RandomWalk:
 
 
 def arrives(number: int, params: Sensors) -> bool:
-    """Whether sample `number` >= 0 is not dropped: v >= dropout.
+    """Return whether sample `number` >= 0 is not dropped: v >= dropout.
 
     v is uniform in [0, 1), independent of the noise.
     """

@@ -54,7 +54,7 @@ class FlightDynamicsModel(Protocol):
         """
 
     def diverged(self) -> bool:
-        """Whether the state is not finite or too large for a flight."""
+        """Return whether the state is not finite or too large for a flight."""
 
     def retune(self, t_ns: int, parameters: AircraftConfig) -> None:
         """Take the actuator faults and the gusts of these parameters from t on."""

@@ -120,7 +120,7 @@ class StateSpaceModel:
         return self._into @ (wind_field.body_axes(phi, theta, self._psi) @ self._wind_dot)
 
     def _drifts(self, t_ns: int) -> bool:
-        """Whether the aircraft at t differs from that of the block."""
+        """Return whether the aircraft at t differs from that of the block."""
         drift = self._plant.drift
         if drift is None:
             return False

@@ -159,7 +159,7 @@ def is_file(path: Path) -> bool:
 
 
 def is_folder(path: Path) -> bool:
-    """Whether the path is a folder; False also for an invalid path."""
+    """Return whether the path is a folder; False also for an invalid path."""
     return os.path.isdir(path)  # noqa: PTH112 - as above
 
 

@@ -50,11 +50,11 @@ class PublisherLock:
         return now_ns - self._received_ns
 
     def timed_out(self, now_ns: int, max_age_ns: int) -> bool:
-        """Whether there is no publisher, or the last sample is older than the age limit."""
+        """Return whether there is no publisher, or the last sample is older than the age limit."""
         return self.publisher is None or self.age_ns(now_ns) > max_age_ns
 
     def holds(self, sender: str, now_ns: int) -> bool:
-        """Whether this is the locked publisher and it has not timed out.
+        """Return whether this is the locked publisher and it has not timed out.
 
         That is so if its last sample is within the age limit of a restart.
         """

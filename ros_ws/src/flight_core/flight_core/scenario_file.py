@@ -99,7 +99,7 @@ def parse_sections(
 
 
 def names_node(content: bytes, path: Path, name: str, key: str, namespace: str) -> bool:
-    """Whether a section for this node, not one for all nodes, has the parameter `key`.
+    """Return whether a section for this node, not one for all nodes, has the parameter `key`.
 
     Raises ParameterError if the content is no ROS parameter file.
     """
@@ -118,7 +118,7 @@ def gives_all(content: bytes, path: Path, key: str) -> bool:
 
 
 def has_general(content: bytes, path: Path) -> bool:
-    """Whether there is a section for all nodes. Raises as `names_node` does."""
+    """Return whether there is a section for all nodes. Raises as `names_node` does."""
     return any(pattern.rpartition("/")[2] in WILDCARDS for pattern in _all_sections(content, path))
 
 
@@ -160,7 +160,7 @@ def _is_mapping(value: object) -> bool:
 
 
 def _matches(pattern: str, name: str, namespace: str | None) -> bool:
-    """Whether a section is for the node, in any namespace if `namespace` is None."""
+    """Return whether a section is for the node, in any namespace if `namespace` is None."""
     *_, last = pattern.split("/")
     if namespace is None:
         return last == name or last in WILDCARDS

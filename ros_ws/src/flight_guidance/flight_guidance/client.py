@@ -85,7 +85,7 @@ class GuidanceClient(Client):
             self._node.destroy_publisher(publisher)
 
     def _reaches_guidance(self, publisher: Publisher) -> bool:
-        """Whether guidance is among the subscribers in the graph.
+        """Return whether guidance is among the subscribers in the graph.
 
         Every subscriber must be matched, too.
         """
@@ -136,7 +136,7 @@ class GuidanceClient(Client):
         ]
 
     def _has_taken(self, values: Mapping[str, float]) -> bool:
-        """Whether a sample of guidance since the last call has taken these commands."""
+        """Return whether a sample of guidance since the last call has taken these commands."""
         mask = sum(1 << TARGETS.index(name) for name in values)
 
         def has_taken(sample: Mapping[str, float]) -> bool:

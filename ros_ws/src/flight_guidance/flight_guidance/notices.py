@@ -50,7 +50,7 @@ class Notice(NamedTuple):
 
 
 def is_blown_back(log: Mapping[str, Scalar]) -> Scalar:
-    """Whether an aircraft that flies ahead along a path goes back along it over ground.
+    """Return whether an aircraft that flies ahead along a path goes back along it over ground.
 
     It flies ahead through the air. `log` has the channels of `guidance`, as values or arrays.
     """
@@ -78,7 +78,7 @@ class _Lasting:
         self._said = False
 
     def due(self, t: float, *, holds: bool) -> bool:
-        """Whether a notice is due at the flight time t, s."""
+        """Return whether a notice is due at the flight time t, s."""
         if holds != self._holds:
             self._holds = holds
             self._since = t

@@ -189,7 +189,7 @@ def _begins(stamp_ns: NDArray[np.int64], offset_ns: NDArray[np.int64]) -> NDArra
 
 
 def _in_burst(stamp_ns: NDArray[np.int64], offset_ns: NDArray[np.int64]) -> bool:
-    """Whether the last samples were recorded in a burst, like the history of a publisher.
+    """Return whether the last samples were recorded in a burst, like the history of a publisher.
 
     The last samples span LEAP_NS of stamps. In a burst they were recorded in less than half of that
     time, because a recorder that starts late receives the history of the publisher at once. A pause
@@ -301,7 +301,7 @@ def _candidates(
 
 
 def _has_gap(signal: Signal, leap: Leap) -> bool:
-    """Whether no sample of a topic lies within a leap."""
+    """Return whether no sample of a topic lies within a leap."""
     after = int(np.searchsorted(signal.stamp_ns, leap.at_ns + STEP_NS, side="right"))
     if not 0 < after < len(signal.stamp_ns):
         return False

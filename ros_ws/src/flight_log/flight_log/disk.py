@@ -35,7 +35,7 @@ def try_lock(stream: IO[bytes] | int, kind: int = fcntl.LOCK_EX) -> bool:
 
 
 def is_locked(path: Path) -> bool:
-    """Whether a second process, such as a recorder, holds the lock of a file.
+    """Return whether a second process, such as a recorder, holds the lock of a file.
 
     Raises OSError if the file cannot be opened.
     """

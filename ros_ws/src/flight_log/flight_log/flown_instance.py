@@ -114,7 +114,7 @@ def _deviation(values: np.ndarray) -> float:
 
 
 def _agree(first: MessageTable, second: MessageTable, fields: Set[str]) -> bool:
-    """Whether the fields of two sensors differ by less than UNLIKE of their deviations."""
+    """Return whether the fields of two sensors differ by less than UNLIKE of their deviations."""
     for field in fields & first.fields.keys() & second.fields.keys():
         values = first.fields[field]
         difference = values - second.at(field, first.stamp_ns)
@@ -202,7 +202,7 @@ def _unused(sensors: Mapping[int, MessageTable], parameters: Parameters) -> str:
 
 
 def _has_estimate(instances: Instances) -> bool:
-    """Whether CTUN has an airspeed: the estimate by which ArduPlane flies."""
+    """Return whether CTUN has an airspeed: the estimate by which ArduPlane flies."""
     return any({"As", "Aspd"} & table.fields.keys() for table in instances.get("CTUN", {}).values())
 
 

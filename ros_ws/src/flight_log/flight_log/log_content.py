@@ -317,7 +317,7 @@ class TopicSamples:
         ]
 
     def overlap(self) -> bool:
-        """Whether publishers with samples sent at the same time."""
+        """Return whether publishers with samples sent at the same time."""
         spans = sorted(self.spans.values())
         return any(before[1] >= after[0] for before, after in pairwise(spans))
 

@@ -45,7 +45,7 @@ class StoredText(NamedTuple):
 
 
 def holds_texts(topic: str, type_name: str) -> bool:
-    """Whether the messages of a topic may be LogMessages."""
+    """Return whether the messages of a topic may be LogMessages."""
     return (
         (topic, type_name) in {(ROSOUT, LOG), (PARAMETER_EVENTS, PARAMETER_EVENT)}
         or (topic.endswith(f"/{LEARNING}") and type_name == DIAGNOSTIC_ARRAY)

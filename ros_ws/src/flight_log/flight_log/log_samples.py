@@ -111,7 +111,7 @@ def _columns(samples: Iterable[Sample], fields_of: Mapping[str, set[str]]) -> In
 
 
 def is_number(value: object) -> bool:
-    """Whether a value of a message is a number."""
+    """Return whether a value of a message is a number."""
     return isinstance(value, int | float)
 
 

@@ -96,7 +96,7 @@ def _what_is_there(run: Path, files: Sequence[Path], kinds: Sequence[str]) -> st
 
 
 def _is_bag(folder: Path) -> bool:
-    """Whether a folder holds the files of a single bag."""
+    """Return whether a folder holds the files of a single bag."""
     with suppress(ParameterError):
         return bool(bag_files(folder))
     return False

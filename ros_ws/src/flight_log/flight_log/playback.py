@@ -112,7 +112,7 @@ def _within(messages: Sequence[StoredMessage], namespace: str, where: str) -> li
 
 
 def _is_lockstep(messages: Iterable[StoredMessage]) -> bool:
-    """Whether most stamps of named vectors are flight time, as in lockstep."""
+    """Return whether most stamps of named vectors are flight time, as in lockstep."""
     votes = [
         _is_flight_time(message)
         for message in messages
@@ -196,7 +196,7 @@ def _definition(message: StoredMessage) -> str:
 
 
 def begins_with_stamp(text: str) -> bool:
-    """Whether the first field of a message type is a header or a time.
+    """Return whether the first field of a message type is a header or a time.
 
     `text` is the definition, ros2msg or ros2idl.
     """

@@ -282,7 +282,7 @@ def _publishers(senders: Sequence[str]) -> str:
 
 
 def _is_before_epoch(start_ns: int, spans: Mapping[str, SampleSpan]) -> bool:
-    """Whether processes stamped by /clock.
+    """Return whether processes stamped by /clock.
 
     Stamps by the host's time are since the epoch, and in lockstep a node leaves out its process id.
     """

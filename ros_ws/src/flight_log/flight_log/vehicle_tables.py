@@ -191,7 +191,7 @@ class VehicleLog(NamedTuple):
         return values
 
     def has(self, source: LogField) -> bool:
-        """Whether the log has samples of a field."""
+        """Return whether the log has samples of a field."""
         return source.message in self.tables and source.field in self.tables[source.message].fields
 
     def at(self, source: LogField, stamp_ns: NDArray[np.int64]) -> FloatArray:

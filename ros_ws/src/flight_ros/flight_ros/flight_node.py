@@ -123,7 +123,7 @@ class FlightNode(Node, Generic[P]):
         return ()
 
     def waits_for_start(self) -> bool:
-        """Whether the topic `start` gives the instant of tick 0."""
+        """Return whether the topic `start` gives the instant of tick 0."""
         return self._start_subscription is not None
 
     def has_time(self) -> bool:

@@ -97,7 +97,7 @@ def _without_global(
 
 
 def _is_global(node: Node, key: str, arguments: Sequence[str]) -> bool:
-    """Whether a parameter was given to all nodes and in no section for this one."""
+    """Return whether a parameter was given to all nodes and in no section for this one."""
     name = node.get_name()
     is_given = False
     for option, value in pairwise(arguments):

@@ -44,12 +44,12 @@ class SimulatedTime:
         self._jump_ns = 0
 
     def known(self) -> bool:
-        """Whether a message has come."""
+        """Return whether a message has come."""
         self._take()
         return bool(self._instants_ns)
 
     def silent(self) -> bool:
-        """Whether no message has come for SILENT_NS of the host."""
+        """Return whether no message has come for SILENT_NS of the host."""
         return not self.known() or time.time_ns() - self._received_ns[-1] > SILENT_NS
 
     def time_ns(self) -> int:

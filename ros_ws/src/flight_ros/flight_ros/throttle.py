@@ -16,7 +16,7 @@ class Throttle:
         self._passed_ns: dict[str, int] = {}  # by line
 
     def due(self, line: str) -> bool:
-        """Whether the line has not passed for a period; if so, it passes now."""
+        """Return whether the line has not passed for a period; if so, it passes now."""
         now_ns = time.monotonic_ns()
         due = now_ns - self._passed_ns.get(line, -self._period_ns) >= self._period_ns
         if due:

@@ -215,7 +215,7 @@ class JsbsimModel:
         return np.array([node.get_double_value() * si for node, si in self._pose_nodes[4:6]])
 
     def diverged(self) -> bool:
-        """Whether a state is not finite, or above DIVERGENCE_LIMIT in any component."""
+        """Return whether a state is not finite, or above DIVERGENCE_LIMIT in any component."""
         return not bool(np.all(np.abs(self._x) < DIVERGENCE_LIMIT))
 
     def retune(self, t_ns: int, parameters: AircraftConfig) -> None:

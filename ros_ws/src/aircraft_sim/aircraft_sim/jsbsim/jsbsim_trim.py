@@ -482,7 +482,7 @@ def _trim_failure(fdm: jsbsim.FGFDMExec, condition: FlightCondition) -> str:
 
 
 def _engines_start(condition: FlightCondition) -> bool:
-    """Whether every engine runs or gives thrust at half of the speed at sea level."""
+    """Return whether every engine runs or gives thrust at half of the speed at sea level."""
     fdm = _load(condition._replace(speed=0.5 * condition.speed, altitude=0.0))
     _start_engines(fdm, condition)
     return all(

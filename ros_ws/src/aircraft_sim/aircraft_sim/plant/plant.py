@@ -200,7 +200,7 @@ def advance(
 
 
 def diverged(state: AircraftState) -> bool:
-    """Whether a state is not finite, or above DIVERGENCE_LIMIT in any component."""
+    """Return whether a state is not finite, or above DIVERGENCE_LIMIT in any component."""
     # The comparison is false for NaN too.
     return not all(abs(x) < DIVERGENCE_LIMIT for x in state.x.tolist())
 

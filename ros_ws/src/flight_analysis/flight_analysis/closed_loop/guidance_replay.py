@@ -34,7 +34,7 @@ class GuidanceReplay(NamedTuple):
     notes: tuple[str, ...]
 
     def equal(self) -> bool:
-        """Whether every checked bit is equal."""
+        """Return whether every checked bit is equal."""
         return self.differing == 0
 
 

@@ -87,7 +87,7 @@ class ReplayResult(NamedTuple):
         return different
 
     def equal(self) -> bool:
-        """Whether every checked bit is equal, and recorded with these parameters."""
+        """Return whether every checked bit is equal, and recorded with these parameters."""
         return not self.different().any() and not self.other_parameters.any()
 
     def first(self) -> ReplayDifference | None:

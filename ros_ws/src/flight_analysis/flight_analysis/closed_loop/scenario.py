@@ -175,7 +175,7 @@ class Scenario:
         return self.controller
 
     def learns(self) -> bool:
-        """Whether the models of the controller are learned in flight."""
+        """Return whether the models of the controller are learned in flight."""
         return isinstance(self.controller, RiseDiConfig) and self.controller.learn is not None
 
     def air(self) -> str:

@@ -469,7 +469,7 @@ def distribution(airframe: Airframe, controller: ControllerConfig) -> FloatArray
 
 
 def _has_effectors(airframe: Airframe, controller: ControllerConfig) -> bool:
-    """Whether an allocation stands between the law and the inputs of an airframe.
+    """Return whether an allocation stands between the law and the inputs of an airframe.
 
     The model of an aircraft of JSBSim already has the inputs of the law.
     """
@@ -500,7 +500,7 @@ def delay_margins(
 
 
 def is_literal(controller: ControllerConfig) -> bool:
-    """Whether a controller samples the literal sign, which has no linear loop."""
+    """Return whether a controller samples the literal sign, which has no linear loop."""
     return isinstance(controller, RiseDiConfig) and controller.sampled_sign()[0] is Sign.LITERAL
 
 

@@ -201,7 +201,7 @@ class Centre(NamedTuple):
         return Centre(self.d + self.free @ step[:f], self.g + step[f:], self.free)
 
     def inside(self, N: ComplexArray, level: float) -> bool:
-        """Whether the inequality and the limits hold, and everything is finite."""
+        """Return whether the inequality and the limits hold, and everything is finite."""
         if not (self.d.min() > 0.0 and np.abs(self.g).max(initial=0.0) < LARGEST_G):
             return False
         F = self.inequality(N, level)

@@ -23,7 +23,7 @@ _TURN = Lock()
 
 
 def _as_sentence(record: logging.LogRecord) -> bool:
-    """Make a sentence of a plugin that fails, as that of a GPU on a host without one.
+    """Report a plugin that fails in a sentence, such as that of a GPU on a host without one.
 
     JAX logs its traceback, and flies on the other devices.
     """

@@ -247,7 +247,7 @@ def zero_dynamics(zeros: ComplexArray) -> ZeroDynamics:
 
 
 def controllable(A: FloatArray, B: FloatArray) -> bool:
-    """Whether Assumption 1 holds, by the test of Popov, Belevitch and Hautus.
+    """Return whether Assumption 1 holds, by the test of Popov, Belevitch and Hautus.
 
     The test is rank [A - s I, B] = n at every eigenvalue s of A. Shapes: A (n, n), B (n, m).
     """

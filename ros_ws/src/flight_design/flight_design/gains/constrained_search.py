@@ -40,7 +40,7 @@ class Trial(NamedTuple, Generic[Content]):
     content: Content
 
     def is_better(self, trial: "Trial[Content]") -> bool:
-        """Whether the shortage is less, or the cost if nothing is short, by GAIN."""
+        """Return whether the shortage is less, or the cost if nothing is short, by GAIN."""
         if self.shortage == 0.0 or trial.shortage == 0.0:
             return self.shortage < trial.shortage or self.cost < trial.cost - GAIN
         return self.shortage < trial.shortage - GAIN * min(trial.shortage, 1.0)

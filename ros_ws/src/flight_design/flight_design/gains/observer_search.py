@@ -247,7 +247,7 @@ class ObserverSearch(NamedTuple):
         return _Loops(controller, relaxation, around)
 
     def _is_tolerant(self, loops: _Loops) -> bool:
-        """Whether each loop is stable with the inputs late by their margins."""
+        """Return whether each loop is stable with the inputs late by their margins."""
         late = self.margin + RESOLUTION
         return all(is_stable(plant, law, self.loop, late) for plant, law in loops.around)
 

@@ -238,7 +238,7 @@ def _nearest(
 def _is_straight(
     fence: Fence, north: FloatArray, east: FloatArray, room: FloatArray, cell: float
 ) -> NDArray[np.bool_]:
-    """Whether the line onto the orbit round home has a cell of clearance.
+    """Return whether the line onto the orbit round home has a cell of clearance.
 
     If the ends have less, it must have the clearance of the ends.
     """

@@ -146,7 +146,7 @@ class Lander:
         return commands | self._along_line(pose, math.sin(course - landing.course) * ground_speed)
 
     def _misses(self, height: float, path_sink: float, pose: Mapping[str, float]) -> bool:
-        """Whether the aircraft would touch outside of the box."""
+        """Return whether the aircraft would touch outside of the box."""
         if self._landing.box is None:
             return False
         time = time_to_touch(height, path_sink, self._landing)

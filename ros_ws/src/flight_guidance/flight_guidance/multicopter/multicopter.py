@@ -254,7 +254,7 @@ def _is_near(state: GuidanceState, pose: Mapping[str, float], place: Point) -> b
 
 
 def _stops(route: Route, number: int) -> bool:
-    """Whether an aircraft stops at the end of a leg.
+    """Return whether an aircraft stops at the end of a leg.
 
     It stops before a hover, and if a corner has no fillet.
     """

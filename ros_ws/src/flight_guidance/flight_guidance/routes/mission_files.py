@@ -133,7 +133,7 @@ FIRST_FENCE = (
 
 
 def has_first_fence(tree: Any) -> bool:
-    """Whether a plan has a fence of version 1, with a polygon and no list of polygons."""
+    """Return whether a plan has a fence of version 1, with a polygon and no list of polygons."""
     fence = member(tree, "geoFence")
     return (
         any(member(place, "polygon") is not None for place in (fence, tree))

@@ -118,7 +118,7 @@ def geographic(north: float, east: float, origin: Origin) -> Origin:
 
 
 def _is_above(latitude: float, longitude: float, origin: Origin) -> bool:
-    """Whether a position is on the half of the Earth around the origin.
+    """Return whether a position is on the half of the Earth around the origin.
 
     The antipodal half has the same north and east.
     """

@@ -153,7 +153,7 @@ def _joined(lines: Sequence[Geometry]) -> list[Geometry]:
 
 
 def _meets(end: Place, begin: Place) -> bool:
-    """Whether both are one position on the antimeridian."""
+    """Return whether both are one position on the antimeridian."""
     try:
         return bool(
             abs(end.longitude) == 180.0
@@ -172,7 +172,7 @@ def number_of(text: str | None) -> float | str | None:
 
 
 def is_position(value: Any) -> bool:
-    """Whether a value is a list of two or three."""
+    """Return whether a value is a list of two or three."""
     return isinstance(value, list) and 2 <= len(value) <= 3
 
 

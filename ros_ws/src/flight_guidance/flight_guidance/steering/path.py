@@ -128,7 +128,7 @@ class Route(NamedTuple):
 
 
 def is_orbit(leg: Leg) -> bool:
-    """Whether a leg is a full circle, with a loiter or for good."""
+    """Return whether a leg is a full circle, with a loiter or for good."""
     return isinstance(leg, Arc) and (leg.end is None or leg.loiter is not None)
 
 
@@ -210,7 +210,7 @@ def is_passed(leg: Leg, position: Point) -> bool:
 
 
 def is_beyond(end: Point, course: Scalar, position: Point) -> Any:
-    """Whether a position lies beyond the half plane through a point across a course, rad."""
+    """Return whether a position lies beyond the half plane through a point across a course, rad."""
     xp = array_namespace(course)
     north = position[0] - end[0]
     east = position[1] - end[1]
@@ -218,7 +218,7 @@ def is_beyond(end: Point, course: Scalar, position: Point) -> Any:
 
 
 def is_entered(leg: Leg, following: Leg | None, position: Point) -> bool:
-    """Whether a position lies beyond the end of a leg, but not beyond a following arc."""
+    """Return whether a position lies beyond the end of a leg, but not beyond a following arc."""
     return is_passed(leg, position) and not (
         isinstance(following, Arc) and is_passed(following, position)
     )
@@ -300,7 +300,7 @@ def joining(
 def is_joined(
     point: Point, course: Scalar, near: Scalar, position: Point, course_flown: Scalar
 ) -> Any:
-    """Whether an aircraft is beyond a point of a leg, and near the leg.
+    """Return whether an aircraft is beyond a point of a leg, and near the leg.
 
     Near means within `near`, m, and within JOINED of the course of the leg.
     """
@@ -390,7 +390,7 @@ def distance_from(legs: Sequence[Leg], point: Point) -> float:
 
 
 def turns_back(leg: Leg, following: Leg | None) -> bool:
-    """Whether a corner between two lines is beyond SHARPEST."""
+    """Return whether a corner between two lines is beyond SHARPEST."""
     if not isinstance(leg, Line) or not isinstance(following, Line):
         return False
     return abs(math.remainder(end_course(following) - end_course(leg), 2.0 * math.pi)) > SHARPEST

@@ -453,7 +453,7 @@ def _engaged(
 
 
 def _is_finite(state: ControllerState) -> bool:
-    """Whether u and everything that the next u comes from are finite."""
+    """Return whether u and everything that the next u comes from are finite."""
     arrays = [state.u, state.u_free, state.u_ff, *fields(state.law).values()]
     if state.effectors is not None:
         arrays.append(state.effectors)

@@ -127,7 +127,7 @@ def _with_nominal(
 
 
 def _is_replaced(old: ObserverParams, new: ObserverParams) -> bool:
-    """Whether the model of the observer changes, or the observer is added or removed."""
+    """Return whether the model of the observer changes, or the observer is added or removed."""
     return not _same_model(old, new) or bool(np.any(old.limits.upper) != np.any(new.limits.upper))
 
 
