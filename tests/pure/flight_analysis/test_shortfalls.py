@@ -109,9 +109,13 @@ def test_effector_without_a_task_may_be_stuck() -> None:
     assert rise_di.simulate(with_faults(calm, "aileron stuck 5")).outcome == COMPLETED
 
 
-@pytest.mark.parametrize("fault", ["throttle failed 5", "elevator stuck 5"])
+@pytest.mark.parametrize("fault", ["throttle failed 5", "elevator stuck 5", "elevator stuck 10"])
 def test_airspeed_of_another_simulator_is_told(fault: str) -> None:
-    """The stuck elevator leaves the pulses of q unflown, and the aircraft 150 m lower."""
+    """The stuck elevator leaves the pulses of q unflown, and the aircraft 150 m lower.
+
+    After 10 s it stands at its trim. The aircraft then climbs by 5 deg where nobody asks it to, and
+    V, whose command stands still, is off by 0.6 m/s: 0.1 m/s without the fault.
+    """
     c172p = find_scenario("jsbsim_c172p", duration=30.0)
     (shortfall,) = rise_di.simulate(with_faults(c172p, fault)).outcome.shortfalls
     assert (shortfall.aim, shortfall.figures["output"]) == (Aim.ERROR, "V")

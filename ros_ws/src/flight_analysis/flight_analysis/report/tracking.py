@@ -13,7 +13,8 @@ shakes it. The floor is
 
 - HARMLESS of the least errors of a divergence, 0.02 rad/s and 0.2 m/s, and the noise of a measured
   error, at most MOST;
-- SPEED_PART of the trim speed where the model of the aircraft is unknown, and with it the drag;
+- SPEED_PART of the trim speed where the model of the aircraft is unknown, and with it the drag, in
+  a part in which y_m of V changes;
 - the least errors of a divergence, 0.1 rad/s and 1 m/s, where the wind is unknown.
 
 `rise_di_controller.learning.divergence` keeps a learned model below the least errors.
@@ -65,7 +66,8 @@ MOST_RATE = 0.05
 osprey, and twice that is allowed."""
 
 SPEED_PART = 0.0075
-"""Of the trim speed: what the drag of an unknown polar leaves while V changes by a few m/s."""
+"""Of the trim speed: what the drag of an unknown polar leaves while V changes by a few m/s. A law
+with an integral of e leaves nothing of it while V is constant."""
 
 SATURATED = 0.5  # of the ticks: a stable loop of the osprey has 0.14 at most in moderate gusts
 SIDE = 0.1  # of the ticks, on either side
@@ -137,7 +139,7 @@ def _verdict(pair: ErrorPair, aircraft: AircraftConfig | None) -> TrackingVerdic
         group = [
             k for k, output in enumerate(pair.names) if (output == AIRSPEED) is (name == AIRSPEED)
         ]
-        limits = _Limits(floor=_floor(pair, i, speed, unit), most=_most(unit))
+        limits = _Limits(floor=_floor(pair, i, unit), most=_most(unit), drag=_drag(pair, i, speed))
         excesses = _excesses(pair, i, group, limits)
         worst = max(excesses, key=lambda excess: excess.rms / excess.allowed)
         if worst.rms > worst.allowed:
@@ -154,6 +156,7 @@ class _Limits(NamedTuple):
 
     floor: float
     most: float  # of noise and wind
+    drag: float  # further, in a part in which y_m changes
 
 
 def _has_engaged(tape: Tape) -> bool:
@@ -161,15 +164,19 @@ def _has_engaged(tape: Tape) -> bool:
     return "internals" in tape and bool((tape["internals"]["mode"] == Mode.ENGAGED).any())
 
 
-def _floor(pair: ErrorPair, i: int, speed: float, unit: str) -> float:
-    """The floor of an output, SI; `speed`: V0, m/s; `unit`: of the output."""
+def _floor(pair: ErrorPair, i: int, unit: str) -> float:
+    """Return the floor of an output, SI; `unit`: of the output."""
     is_speed = quantity(unit).dimension == SPEED
     smallest = LEAST[AIRSPEED] if is_speed else LEAST_RATE
     if pair.knowledge.has_wind:
         smallest = HARMLESS * smallest
-    if pair.names[i] == AIRSPEED and not pair.knowledge.has_model:
-        smallest = max(smallest, SPEED_PART * speed)
     return smallest + min(FACTOR * float(pair.noise[i]), _most(unit))
+
+
+def _drag(pair: ErrorPair, i: int, speed: float) -> float:
+    """Return what an unknown drag leaves of an output while it changes, SI; `speed`: V0, m/s."""
+    is_known = pair.knowledge.has_model or pair.names[i] != AIRSPEED
+    return 0.0 if is_known else SPEED_PART * speed
 
 
 def _most(unit: str) -> float:
@@ -210,8 +217,11 @@ def _largest_excesses(
         return np.sqrt(np.maximum(squares, 0.0) / count)
 
     command = rms(pair.y_m)
+    mean = _sums(pair.y_m[start:stop, i], count) / count
+    changes = np.sqrt(np.maximum(command**2 - mean**2, 0.0)) > 0.5 * limits.floor
+    floor = np.where(changes, np.maximum(limits.drag, limits.floor), limits.floor)
     others = np.max([rms(pair.y_m, output) for output in group], axis=0)
-    has_command = (command >= 0.5 * others) & (command > 2.0 * limits.floor)
+    has_command = (command >= 0.5 * others) & (command > 2.0 * floor)
     by_noise = rms(pair.linear.noise)
     by_wind = rms(pair.linear.wind)
     # A gust that is harmless over WINDOW is as much larger over less.
@@ -219,7 +229,7 @@ def _largest_excesses(
     excuse = np.minimum(FACTOR * np.hypot(by_noise, by_wind), most)
     by_command = FACTOR * rms(pair.linear.command)
     by_command = np.where(has_command, np.minimum(by_command, COMMAND_PART * command), by_command)
-    allowed = np.minimum(by_command + excuse, FACTOR * rms(pair.linear.whole)) + limits.floor
+    allowed = np.minimum(by_command + excuse, FACTOR * rms(pair.linear.whole)) + floor
     error = rms(pair.e)
     return [
         Excess(
@@ -228,7 +238,7 @@ def _largest_excesses(
             stop=float(pair.t[start + k + count - 1]),
             rms=float(error[k]),
             allowed=float(allowed[k]),
-            excuse=float(max(allowed[k] - by_command[k] - limits.floor, 0.0)),
+            excuse=float(max(allowed[k] - by_command[k] - floor[k], 0.0)),
             is_noise=bool(by_noise[k] > by_wind[k]),
         )
         for k in (int(np.argmax(error / allowed)), int(np.argmax(error - by_command)))
