@@ -31,7 +31,6 @@ def osprey(tmp_path: Path) -> Path:
     varied = find_scenario("osprey_servo").vary(
         aircraft={"kinematics": "euler", "gusts": {}},
         reference_model={
-            "rate": 500.0,
             "live": {"speed": 25.0, "bounds": {"p": 1.0}},
             "pulses": {},
             "coordinated_turn": None,

@@ -30,7 +30,7 @@ Instants = NDArray[np.float64]
 @pytest.fixture(scope="module")
 def servo() -> Scenario:
     """Y and y_m at 500 Hz, u at 100 Hz, by the parameters."""
-    return find_scenario("osprey_servo").vary(reference_model={"rate": 500.0})
+    return find_scenario("osprey_servo")
 
 
 CHANNELS = {"u": ("elevator", "thrust", "aileron", "rudder")}
