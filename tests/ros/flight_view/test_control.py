@@ -7,7 +7,6 @@ Gains, faults, a gust, the controller; in the log, and replayed.
 
 import json
 import re
-import time
 import urllib.request
 from collections.abc import Callable
 from http import HTTPStatus
@@ -15,10 +14,10 @@ from pathlib import Path
 from typing import Any
 from urllib.error import HTTPError
 
-from tests.ros.conftest import LONGEST_PAUSE, Process, Start
+from tests.ros.conftest import Process, Start
 from tests.ros.flight_bringup.test_lockstep import scenario_file
 from tests.ros.peer import Peer
-from tests.ros.waiting import HostDelays, until
+from tests.ros.waiting import until
 
 from flight_core.outcome import STATUS_SHORTFALL
 from flight_log.stored_messages import parameter_changes
@@ -85,9 +84,8 @@ class Page:
 
 
 def test_flight_commanded_from_page_recorded_and_replayed(
-    start: Start, tmp_path: Path, peer_node: Peer, host_delays: HostDelays
+    start: Start, tmp_path: Path, peer_node: Peer
 ) -> None:
-    begin = time.time()
     # ended below
     flight = start(
         "flight_cli.cli", "fly", str(scenario_file(tmp_path, 1e4, "osprey_gust")), "--real-time"
@@ -155,7 +153,8 @@ def test_flight_commanded_from_page_recorded_and_replayed(
     assert abs(tape["truth"]["noise.q"][-1] - 0.01) < 1e-9
     replayed = start("flight_cli.cli", "replay", str(run), "--json")
     status = replayed.end()
-    assert json.loads(replayed.output)["equal"], replayed.output
-    # A host that paused may have kept samples from the log: every tick that is there is equal.
-    starved = host_delays.longest(begin) > LONGEST_PAUSE
-    assert status == 0 or (status == STATUS_SHORTFALL and starved), replayed.output
+    result = json.loads(replayed.output)
+    assert result["equal"], replayed.output
+    # On a busy host samples are missing, which the log says; every tick that is there is equal.
+    is_starved = any(note.startswith("this host is too busy") for note in result["notes"])
+    assert status in {0, STATUS_SHORTFALL if is_starved else 0}, replayed.output
