@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Client of the check of the network between hosts, and its profile."""
+"""Check the network between hosts, and write the profile that a host needs for it."""
 
 import os
 import time
@@ -18,15 +18,15 @@ from flight_ros.network import addresses, network_profile, own_address, ports
 from flight_ros.transport import DISCOVERY_VARIABLE
 
 EXCHANGE_PERIOD = 0.1  # s
-# s, of exchanges after every host has been received: the least delay of many counts.
+# s, for which we go on once every host was received: the least delay of many exchanges counts.
 SETTLE_TIME = 1.0
 
 
 def write_profile(peers: str, file: Path) -> tuple[str, tuple[str, ...], Mapping[str, str]]:
     """Write the profile of this host to a file. Raises ParameterError.
 
-    Returns the address of this host, those of all hosts, and the environment that selects the
-    profile.
+    Returns the address of this host, the addresses of all hosts, and the environment that selects
+    the profile.
     """
     hosts = addresses(peers)
     local = {entry.address for entry in chain.from_iterable(psutil.net_if_addrs().values())}
@@ -43,7 +43,7 @@ def write_profile(peers: str, file: Path) -> tuple[str, tuple[str, ...], Mapping
 
 
 def domain_ports() -> tuple[int, int]:
-    """The first and the last UDP port of the domain of this shell."""
+    """Return the first and the last UDP port of this shell's domain."""
     return ports(int(os.environ.get("ROS_DOMAIN_ID") or 0))
 
 
@@ -56,9 +56,9 @@ class NetworkClient(Client):
         self._clocks = PeerClocks(self._node, _instance(own_host), self._refused)
 
     def exchange(self, timeout: float) -> tuple[set[str], dict[str, ClockOfPeer]]:
-        """Exchange until every host is received and receives, at most `timeout` s.
+        """Exchange until each host receives all the others, for at most `timeout` s.
 
-        Returns the hosts that are received, and of those that also receive this host the clocks.
+        Returns the hosts that we receive, and the clocks of those that also receive us.
         """
         heard_hosts: set[str] = set()
         clocks: dict[str, ClockOfPeer] = {}

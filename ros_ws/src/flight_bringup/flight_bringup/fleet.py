@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A fleet: several aircraft at once over topics.
+"""Fly a fleet: several aircraft at once over topics.
 
-Every aircraft has a namespace, nodes, a log and a report.
+Every aircraft has its own namespace, nodes, log and report.
 """
 
 import signal
@@ -41,9 +41,9 @@ Overrides = dict[str, dict[str, object]]
 
 
 def is_fleet(name: FilePath) -> bool:
-    """Whether the path names the file of a fleet, with aircraft by name.
+    """Return whether the path names the file of a fleet, with its aircraft by name.
 
-    A scenario has sections of nodes, with `ros__parameters` in each.
+    A scenario has a section `aircraft` too, but with `ros__parameters` in it.
     """
     with suppress(ParameterError):
         content = read_yaml(Path(name), str(name), A_FLEET)
@@ -54,7 +54,7 @@ def is_fleet(name: FilePath) -> bool:
 
 
 class AircraftOfFleet(Config):
-    """An aircraft of a fleet."""
+    """An aircraft of a fleet, as in the file."""
 
     scenario: str | None = Field(
         default=None, description="name or path of a scenario; by default that of the fleet"
@@ -72,7 +72,7 @@ class AircraftOfFleet(Config):
 
 
 class FleetConfig(Config):
-    """A fleet as in the file. Paths are relative to the folder of the file."""
+    """A fleet, as in the file. Paths are relative to the folder of the file."""
 
     scenario: str = Field(
         default="osprey_route", description="scenario of the aircraft that name none"
@@ -105,9 +105,9 @@ class FleetConfig(Config):
 
 @dataclass(frozen=True)
 class Member:
-    """An aircraft of a fleet: name and namespace, scenario, and its t = 0.
+    """An aircraft of a fleet: its name, which is its namespace too, and its scenario.
 
-    t = 0 comes after t = 0 of the fleet, s.
+    Its t = 0 comes `delay` s after that of the fleet.
     """
 
     name: str
@@ -117,7 +117,7 @@ class Member:
 
 @dataclass(frozen=True)
 class Fleet:
-    """A fleet, read and validated."""
+    """A fleet that has been read and validated."""
 
     name: str
     members: tuple[Member, ...]
@@ -127,10 +127,10 @@ class Fleet:
     separation: float = SEPARATION  # m
 
     def participants(self) -> int:
-        """The DDS participants of a flight: the command, and the processes."""
+        """Return how many DDS participants a flight has: the command, and the processes."""
         scenarios = [member.scenario for member in self.members]
         if self.composed:
-            # A learner has a process of its own.
+            # A learner has a process of its own even then.
             return 1 + sum(1 + scenario.learns() for scenario in scenarios)
         return 1 + sum(len(FIRST_STAGE) + len(second_stage(scenario)) for scenario in scenarios)
 
@@ -140,8 +140,8 @@ def read_fleet(
 ) -> Fleet:
     """Read the file of a fleet.
 
-    `duration` in s replaces the duration of the file, `use_sim_time` is by /clock. Raises
-    ParameterError.
+    `duration`, s, replaces the duration in the file. With `use_sim_time` the fleet flies by /clock.
+    Raises ParameterError.
     """
     path = as_path(file, "fleet", A_FLEET)
     content = read_yaml(path, str(path), A_FLEET)
@@ -165,7 +165,7 @@ def read_fleet(
             f"{aircraft.delay:g} s",
             "0 in lockstep, which has no common time",
         )
-    # What holds for the fleet as a whole.
+    # The rest concerns the fleet as a whole.
     by_clock = use_sim_time or config.use_sim_time
     require(
         not (by_clock and config.lockstep),
@@ -195,7 +195,7 @@ def read_fleet(
 def _scenario(
     config: FleetConfig, aircraft: AircraftOfFleet, folder: Path, duration: float | None
 ) -> Scenario:
-    """The scenario of an aircraft. Raises ParameterError."""
+    """Return the scenario of an aircraft. Raises ParameterError."""
     name = aircraft.scenario or config.scenario
     scenario = find_scenario(
         folder / name if name.endswith(".yaml") else name, with_route=aircraft.route is None
@@ -216,7 +216,7 @@ def _scenario(
 def _nested(
     scenario: Scenario, changes: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, dict[str, Any]]:
-    """Changes by section in which a mapping changes some keys of a group, and keeps the others."""
+    """Return changes in which a mapping changes some keys of a group and keeps the others."""
 
     def merged(old: Any, new: Any) -> Any:
         if not (isinstance(new, Mapping) and isinstance(old, Config)):
@@ -235,7 +235,7 @@ def _nested(
 
 @dataclass
 class _Flight:
-    """The flight of an aircraft of a fleet."""
+    """The flight of one aircraft of a fleet."""
 
     member: Member
     run: Path
@@ -249,7 +249,7 @@ class _Flight:
     def start(self, fleet: Fleet, pause: Callable[[float], None]) -> None:
         """Start the processes, and in real time wait until they are ready.
 
-        A `pause` between two looks is due: a host does not start many at once.
+        This may `pause` between two looks: a host does not start many processes at once.
         """
         self.progress(0.0, "starting")
         try:
@@ -274,7 +274,7 @@ class _Flight:
     def begin(self, start: tuple[float, float]) -> None:
         """Begin with t = 0 at an instant of the system clock and of the monotonic clock, s.
 
-        In lockstep the flight has begun.
+        In lockstep the flight has begun already.
         """
         if self.processes is None or self.stopping is not None:
             return
@@ -285,7 +285,7 @@ class _Flight:
             self.steps = follow(self.processes, self.progress)
 
     def step(self) -> bool:
-        """Look at the flight once. Returns whether the flight goes on."""
+        """Look at the flight once, and return whether it goes on."""
         if self.steps is not None:
             try:
                 next(self.steps)
@@ -296,7 +296,7 @@ class _Flight:
     def end(self, outcome: Outcome) -> None:
         """Stop the processes, in another thread.
 
-        A recorder takes a while to close a log, and the fleet flies on.
+        A recorder takes a while to close its log, and meanwhile the fleet flies on.
         """
         self.outcome = outcome
         self.steps = None
@@ -336,11 +336,11 @@ def fly_fleet(
 ) -> list[MemberFlight]:
     """Fly a fleet over topics, with a run for each aircraft.
 
-    `progress` is called with the name of an aircraft, flight time, s, and a text.
+    `progress` is called with the name of an aircraft, its flight time, s, and a text.
 
-    In real time the aircraft share t = 0, set once every node is ready; an aircraft may begin later
-    by a delay. An aircraft that ends early, or never begins, leaves the others untouched. Ctrl-C
-    ends all. Raises ParameterError where none can begin.
+    In real time the aircraft share t = 0, which is set once every node is ready; an aircraft with a
+    delay begins that much later. If an aircraft ends early, or never begins, the others fly on.
+    Ctrl-C ends all. Raises ParameterError if none can begin.
     """
     require_ros_environment()
     from flight_bringup.monitor import FlightMonitor  # noqa: PLC0415 - loads rclpy, which other commands do not need
@@ -382,7 +382,7 @@ def fly_fleet(
 
 
 def _begin(flights: Sequence[_Flight], fleet: Fleet) -> None:
-    """Begin the flights in real time with a common t = 0."""
+    """Begin the flights with a common t = 0, if they are in real time."""
     if not fleet.lockstep:
         start = start_instants(LEAD + BEGIN_TIME * len(flights), flights[0].monitor)
         for flight in flights:

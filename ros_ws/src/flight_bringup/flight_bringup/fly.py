@@ -50,14 +50,14 @@ NUMBER = re.compile(r"-?\d+(\.\d+)?(e[-+]\d+)?")  # in a reason: "q is 0.30 s ol
 STAMP_ERROR = 1e-5  # s, of a time of day as a float
 
 STALL_TIMEOUT = 40.0
-"""s. A lockstep flight without progress for so long ends; lost contact with a node ends it within
-three seconds."""
+"""s. A lockstep flight ends if it makes no progress for so long. If contact with a node is lost, it
+ends within three seconds."""
 
 
 Progress = Callable[[float, str], None]  # flight time in s, and the text beside it
 
 Steps = Generator[None, None, Outcome]
-"""A flight that is followed: a step looks at it once. It returns the outcome."""
+"""A flight that we follow: each step looks at it once, and the last one returns the outcome."""
 
 
 def fly_over_topics(
@@ -73,16 +73,20 @@ def fly_over_topics(
     announce: Callable[[str], None] = lambda line: None,
     engaged_for: float = math.inf,
 ) -> Outcome:
-    """Fly over topics, as separate processes, and record the bag into `run`. Returns the outcome.
+    """Fly over topics, record the bag into `run`, and return the outcome.
 
-    Real time, or `lockstep` as fast as the machine allows. `one_process` holds all nodes in one
-    process. With `use_sim_time` the nodes and the flight are by /clock.
-    `autopilot` flies in the aircraft's place, in real time only. All nodes are in the
-    `namespace`, as "/uav1". `announce` gets a line for each change of engagement and of reason, but
-    not for a changed number, for what becomes of a proposal of a learner, and for processes that
-    had to be killed. With `engaged_for`, s, the flight ends so long after its first engagement, or
-    with it, or without one when too little time is left. The outcome is COMPLETED, LANDED,
-    INTERRUPTED (Ctrl-C, SIGTERM or SIGHUP), or names the process that ended early.
+    The nodes are separate processes, or share one if `one_process` is set. They fly in real time,
+    in `lockstep` as fast as the machine allows, or with `use_sim_time` by /clock. All of them are
+    in the `namespace`, as "/uav1". An `autopilot` takes the place of the aircraft, in real time
+    only.
+
+    `announce` gets a line when the engagement or its reason changes, though not if only a number in
+    it does; when it is known what became of a learner's proposal; and when a process had to be
+    killed. If `engaged_for`, s, is given, the flight ends that long after its first engagement, or
+    earlier: when the engagement ends, or when too little time is left for one.
+
+    The outcome is COMPLETED, LANDED, INTERRUPTED (by Ctrl-C, SIGTERM or SIGHUP), or names the
+    process that ended early.
     """
     require_ros_environment()
     from flight_bringup.monitor import FlightMonitor  # noqa: PLC0415 - loads rclpy, which other commands do not need
@@ -121,7 +125,7 @@ def fly_over_topics(
 
 
 def last(steps: Steps, pause: Callable[[float], None]) -> Outcome:
-    """Follow a flight to its end, with a `pause` between two steps. Returns the outcome."""
+    """Follow a flight to its end, with a `pause` between steps, and return the outcome."""
     while True:
         try:
             next(steps)
@@ -137,7 +141,10 @@ def follow(
     announce: Callable[[str], None] = lambda line: None,
     engaged_for: float = math.inf,
 ) -> Steps:
-    """Follow a flight that has begun, a step every POLL_PERIOD; as `fly_over_topics`."""
+    """Follow a flight that has begun, one step every POLL_PERIOD.
+
+    The arguments are those of `fly_over_topics`.
+    """
     if processes.lockstep:
         return _follow_lockstep(processes, progress, announce)
     scenario = processes.scenario
@@ -151,10 +158,11 @@ def follow(
 
 
 class _Span:
-    """Begin and end of a flight in real time.
+    """Tells when a flight in real time has begun, and when it is over.
 
-    The aircraft takes u, and the log holds y, y_m and u to the end. A flight with an autopilot, or
-    with a controller that a user activates, may fly without u: `begins` is False.
+    It has begun once the aircraft takes u, and is over once the log holds y, y_m and u to the end.
+    With an autopilot, or with a controller that a user activates, there may never be a u: then
+    `begins` is False.
     """
 
     def __init__(
@@ -175,7 +183,7 @@ class _Span:
         self.engaged = False  # the controller has published
 
     def outcome(self, t: float) -> Outcome | None:
-        """The outcome once the log holds the flight, or is not going to; None before."""
+        """Return the outcome once the log holds the flight, or will not any more; else None."""
         if (
             stamp := self._monitor.recorded()
         ) is not None and stamp - self._processes.start_time > self._until:
@@ -190,7 +198,7 @@ class _Span:
         return log_ends_at(self._until, self._duration) if self._begins else COMPLETED
 
     def failed(self, t: float) -> Outcome | None:
-        """Why the flight has not begun; None while it may begin, and from the first u on."""
+        """Return why the flight has not begun; None while it still may, and once it has."""
         self._flies = self._flies or self._processes.is_flying()
         if self._flies or t < FIRST_U:
             return None
@@ -253,7 +261,7 @@ def _announce_learned(
     start_time: float,
     announce: Callable[[str], None],
 ) -> None:
-    """Announce what became of proposals since the last call, and the end of the learner."""
+    """Announce what became of proposals since the last call, and if the learner has ended."""
     for instant, sentence in processes.monitor.learned():
         announce(f"t = {instant - start_time:.2f} s: {sentence}")
     if outcome := processes.learner_ended():
@@ -265,13 +273,13 @@ def _follow_lockstep(
     progress: Progress,
     announce: Callable[[str], None],
 ) -> Steps:
-    """The steps of a lockstep flight, from the first instant to the last.
+    """Follow a lockstep flight from its first instant to its last.
 
-    The real-time factor counts from the first instant in the log. The flight ends with the last u,
-    and a complete log.
+    The real-time factor counts from the first instant in the log. The flight ends when the aircraft
+    has taken the last u and the log is complete.
     """
     scenario = processes.scenario
-    # The last instant is the aircraft's last whole period.
+    # The last instant is the begin of the aircraft's last whole period.
     end = scenario.flight.duration - 1.0 / scenario.aircraft.rate
     t = 0.0
     last_change = time.monotonic()
@@ -305,10 +313,10 @@ def fly_in_process(
     learn: Learn | None = None,
     announce: Callable[[str], None] = lambda line: None,
 ) -> Outcome:
-    """Fly in one process without ROS, and write the bag into `run`; return the outcome.
+    """Fly in one process without ROS, write the bag into `run`, and return the outcome.
 
-    The flight is as fast as the machine allows. `learn` makes the learner of a scenario that
-    learns. What it does goes to `announce` and to log/learner.log, a line each.
+    The flight is as fast as the machine allows. `learn` makes the learner if the scenario has one.
+    What the learner does goes to `announce` and to log/learner.log, a line each.
     """
     interrupt = DeferredInterrupt()
 
@@ -386,7 +394,7 @@ def fly_and_report(
 
 
 def _is_its_file(scenario: Scenario) -> bool:
-    """Whether a scenario is what its file holds."""
+    """Return whether a scenario is what its file holds."""
     try:
         return load_scenario(scenario.path) == scenario
     except ParameterError:
@@ -394,9 +402,9 @@ def _is_its_file(scenario: Scenario) -> bool:
 
 
 def as_file(scenario: Scenario, run: Path, namespace: str = "") -> Scenario:
-    """The scenario with a file that holds it: its own, or a new one in the folder of the run.
+    """Return the scenario with a file that holds it: its own, or a new one in the run's folder.
 
-    Nodes in the namespace read the same from it, as of `as_flown`. Raises ParameterError.
+    Nodes in the namespace read from it what `as_flown` gives them. Raises ParameterError.
     """
     if _is_its_file(scenario):
         return as_flown(scenario, run, namespace)

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The graph of a flight: nodes, start order, parameter overrides.
+"""Say which nodes a flight has, in which order they start, and with which parameters.
 
-Launch files and process runner share the graph.
+The launch files and the process runner share this.
 """
 
 import re
@@ -26,7 +26,7 @@ class NodeSpec(NamedTuple):
 
     @property
     def module(self) -> str:
-        """The Python module behind the executable."""
+        """Return the Python module behind the executable."""
         return f"{self.package}.main"
 
 
@@ -41,20 +41,20 @@ BRIDGE = NodeSpec("autopilot_bridge", "bridge")
 # All nodes in one process. Each reads its own section of the scenario.
 ONE_PROCESS = NodeSpec("flight_bringup", "one_process")
 
-# The second stage starts once every node of the first is ready: the log then holds the whole
-# flight, and the aircraft always has a controller.
+# The second stage starts once every node of the first is ready, so that the log holds the whole
+# flight and the aircraft always has a controller.
 FIRST_STAGE = (RECORDER, CONTROLLER)
 SECOND_STAGE = (AIRCRAFT, REFERENCE_MODEL)
 SECOND_STAGE_WITH_BRIDGE = (BRIDGE, REFERENCE_MODEL)
 
-# A token of a namespace: stricter than ROS 2, which permits _ at the ends.
+# A word of a namespace. ROS 2 would permit _ at its ends too.
 NAME = re.compile(r"[A-Za-z](_?[A-Za-z0-9])*")
 
 
 def absolute_namespace(namespace: str) -> str:
-    """The namespace of an aircraft as "/uav1"; "" is the root.
+    """Return the namespace of an aircraft in the form "/uav1"; "" is the root.
 
-    Raises ParameterError for a name that ROS 2 does not permit.
+    Raises ParameterError if ROS 2 does not permit the name.
     """
     words = [word for word in namespace.split("/") if word]
     for word in words:
@@ -68,7 +68,7 @@ def absolute_namespace(namespace: str) -> str:
 
 
 class Autopilot(NamedTuple):
-    """An autopilot in the aircraft's place."""
+    """An autopilot that takes the aircraft's place."""
 
     channel_map: ChannelMap
     map_path: Path
@@ -76,22 +76,22 @@ class Autopilot(NamedTuple):
 
     @property
     def topics(self) -> list[str]:
-        """The topics to record: those of the map, and those of the bridge."""
+        """Return the topics to record: those of the map, and those of the bridge."""
         return [*self.channel_map.recorded_topics, *topics.recorded_with("bridge")]
 
 
 def find_autopilot(map_name: str, *, dry_run: bool) -> Autopilot:
-    """An autopilot by the name or the path of a channel map. Raises ParameterError."""
+    """Find an autopilot by the name or the path of its channel map. Raises ParameterError."""
     return Autopilot(load_map(map_name), find_map(map_name), dry_run)
 
 
 def require_limits(autopilot: Autopilot, scenario: Scenario) -> None:
-    """Raise ParameterError where the controller may command more than the map sends.
+    """Raise ParameterError if the controller may command more than the map sends.
 
-    A dry run sends nothing. The bridge would clip u, and the anti-windup of the law would not know.
-    The limits of the scenario are not narrowed here: the log holds the parameters that flew. A
-    controller with a held u while inactive is refused, too: the bridge engages only from a u near
-    trim.
+    The bridge would clip u, and the law's anti-windup would not know. We do not narrow the limits
+    of the scenario instead, because the log must hold the parameters that flew. A dry run sends
+    nothing, and passes. A controller that holds u while it is inactive is refused too: the bridge
+    engages only if u is near trim.
     """
     if autopilot.dry_run:
         return
@@ -110,7 +110,7 @@ def require_limits(autopilot: Autopilot, scenario: Scenario) -> None:
         controller.effectors, limits.lower.tolist(), limits.upper.tolist(), strict=True
     ):
         if (row := channel_map.inputs.get(name)) is None:
-            # Another check names the channels that differ.
+            # Another check refuses channels that differ, and names them.
             continue
         of_map = (
             f"of {name} in the map {channel_map.name}: what the bridge clips, the law's "
@@ -131,11 +131,11 @@ def require_limits(autopilot: Autopilot, scenario: Scenario) -> None:
 
 
 def second_stage(scenario: Scenario, *, bridge: bool = False) -> tuple[NodeSpec, ...]:
-    """The second stage of a scenario.
+    """Return the second stage of a scenario.
 
-    Aircraft or bridge, reference model, and guidance and learner where the scenario has them.
-    Raises ParameterError where guidance cannot fly the simulated aircraft, and for a bridge beside
-    a learner.
+    It has the aircraft or the bridge, the reference model, and guidance and a learner if the
+    scenario has them. Raises ParameterError if guidance cannot fly the simulated aircraft, and if a
+    bridge is to fly with a learner.
     """
     if not bridge:
         require_guidable(scenario)
@@ -147,7 +147,7 @@ def second_stage(scenario: Scenario, *, bridge: bool = False) -> tuple[NodeSpec,
 
 
 def _optional(scenario: Scenario) -> tuple[NodeSpec, ...]:
-    """The nodes that a scenario may have."""
+    """Return guidance and the learner if the scenario has them."""
     return tuple(
         node
         for node, has in ((GUIDANCE, scenario.guidance is not None), (LEARNER, scenario.learns()))
@@ -160,24 +160,24 @@ LEAD = 0.5  # s, from the sending of t = 0 on `start` to t = 0: a busy host deli
 
 
 def start_lead(startup: float) -> float:
-    """Time from the start of the second stage to t = 0, s.
+    """Return the time from the start of the second stage to t = 0, s.
 
-    `startup` is the time until the first stage was ready. The second stage gets half as long again
-    as the first stage took. The nodes get half a second for discovery.
+    `startup` is how long the first stage took until it was ready. The second stage gets half as
+    long again, and half a second more so that the nodes discover each other.
     """
     return 0.5 + 1.5 * startup
 
 
 def start_instant(lead: float, now: float) -> float:
-    """Time of t = 0, s, `lead` from `now`.
+    """Return the time of t = 0, s, which is `lead` from `now`.
 
-    A whole 0.01 s, so nodes with and without `start_time` tick together.
+    It is a whole 0.01 s, so that nodes with and without `start_time` tick together.
     """
     return round(now + lead, 2)
 
 
 def _airframe(scenario: Scenario) -> ParameterOverrides:
-    """The airframe that was found beside the scenario: a node does not know that folder."""
+    """Return the airframe if it was found beside the scenario: a node does not know that folder."""
     airframe = scenario.aircraft.airframe
     return {"airframe": airframe} if Path(airframe).is_absolute() else {}
 
@@ -192,15 +192,20 @@ def parameter_overrides(
     use_sim_time: bool = False,
     autopilot: Autopilot | None = None,
 ) -> ParameterOverrides:
-    """The parameters of a process beside the section of the scenario file.
+    """Return what a process gets beside its section of the scenario file.
 
-    For several nodes the keys are "node:name". Real time: the nodes with a t = 0 get the instant,
-    or ON_START. Lockstep: the aircraft gets the rate of u and the duration, controller and guidance
-    the rate of y, the reference model the rate of u_m. Guidance gets the numbers by rule, the
-    learner the scenario. The recorder gets the files to attach to the log; this function writes the
-    files into the folder of the run. With an autopilot the bridge gets the channel map, the
-    recorder the topics of the autopilot, and the controller starts inactive. With `use_sim_time`
-    every node ticks by /clock.
+    For several nodes in one process the keys are "node:name". Each parameter goes where it is
+    needed:
+
+    - In real time the nodes with a t = 0 get its instant, or ON_START.
+    - In lockstep the aircraft gets the rate of u and the duration, controller and guidance the
+      rate of y, the reference model the rate of u_m.
+    - Guidance gets the numbers that follow by rule, and the learner gets the scenario.
+    - The recorder gets the files to attach to the log. This function writes them into the
+      folder of the run.
+    - With an autopilot the bridge gets the channel map, the recorder the topics of the
+      autopilot, and the controller starts inactive.
+    - With `use_sim_time` every node ticks by /clock.
     """
     clock: ParameterOverrides = {"use_sim_time": True} if use_sim_time else {}
     if spec is BRIDGE:
@@ -215,7 +220,7 @@ def parameter_overrides(
     if lockstep:
         for node, rates in _lockstep_rates(scenario).items():
             overrides[node] |= rates
-        # A recorder in the same process never lags.
+        # A recorder in the same process never lags behind.
         overrides[AIRCRAFT]["recorded"] = not one_process
     if spec in (RECORDER, ONE_PROCESS):
         sections = {node.executable: values for node, values in overrides.items()}
@@ -235,7 +240,7 @@ def parameter_overrides(
 
 
 def _stage_overrides(scenario: Scenario, *, lockstep: bool) -> dict[NodeSpec, ParameterOverrides]:
-    """The parameters of both stages: the rules of guidance, the scenario of the learner."""
+    """Return the parameters of both stages, with guidance's by rule and the learner's scenario."""
     stages = (*FIRST_STAGE, *SECOND_STAGE, *_optional(scenario))
     overrides: dict[NodeSpec, ParameterOverrides] = {
         node: {"lockstep": lockstep} for node in stages
@@ -246,7 +251,7 @@ def _stage_overrides(scenario: Scenario, *, lockstep: bool) -> dict[NodeSpec, Pa
             name: list(value) if isinstance(value, tuple) else value
             for name, value in scenario.guidance.by_rule()
         }
-        # Without a learner no controller publishes `authority`, so that guidance must take none.
+        # Without a learner no controller publishes `authority`, and guidance must not wait for it.
         authority_rate = scenario.learns() * scenario.controller.rate / AUTHORITY_TICKS
         overrides[GUIDANCE]["authority_rate"] = authority_rate
     if scenario.learns():
@@ -255,7 +260,7 @@ def _stage_overrides(scenario: Scenario, *, lockstep: bool) -> dict[NodeSpec, Pa
 
 
 def _recording(scenario: Scenario, run: Path, autopilot: Autopilot | None) -> ParameterOverrides:
-    """The folder of the recorder, and its topics beside those of every flight."""
+    """Return the recorder's folder, and the topics beside those of every flight."""
     further: list[str] = []
     if scenario.guidance is not None:
         further += topics.recorded_with("guidance")
@@ -270,7 +275,7 @@ def _recording(scenario: Scenario, run: Path, autopilot: Autopilot | None) -> Pa
 
 
 def _lockstep_rates(scenario: Scenario) -> dict[NodeSpec, ParameterOverrides]:
-    """The rates of the inputs that a node waits for in lockstep, and the duration."""
+    """Return the rates of the inputs that nodes wait for in lockstep, and the duration."""
     guidance = scenario.guidance
     control_rate = scenario.controller.rate
     y_rate: ParameterOverrides = {"y_rate": scenario.aircraft.rate}
@@ -290,7 +295,7 @@ def _attachments(
     overrides: dict[str, ParameterOverrides],
     autopilot: Autopilot | None,
 ) -> ParameterOverrides:
-    """The files that the recorder attaches to the log; they are written into the folder."""
+    """Write the files that the recorder attaches to the log, and return their paths."""
     maps = () if autopilot is None else (autopilot.map_path,)
     files = attachments_for(scenario, run, overrides, maps)
     return {
@@ -306,14 +311,14 @@ def replayed_topics(
     namespace: str = "",
     autopilot: Autopilot | None = None,
 ) -> list[str]:
-    """The topics of a log without a publisher among the nodes; full names, in order.
+    """Return the topics of a log that none of the nodes publishes, as full names, in order.
 
-    `namespace` belongs to the nodes. A bridge among the nodes also publishes the messages of its
-    channel map.
+    `namespace` is that of the nodes. A bridge among them also publishes the messages of its channel
+    map.
     """
     prefix = f"/{namespace.strip('/')}/".replace("//", "/")
     names = {name for node in nodes for name in topics.published_by(node.executable)}
-    # Topics with an absolute name are not those of the nodes: others publish them, too.
+    # Topics with an absolute name do not belong to the nodes alone: others publish them too.
     topics_of_nodes = {prefix + name for name in names if not name.startswith("/")}
     if BRIDGE in nodes and autopilot is not None:
         setpoint_topics = (message.topic for message in autopilot.channel_map.messages.values())

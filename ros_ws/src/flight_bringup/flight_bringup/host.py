@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What a host gives to a flight in real time.
+"""Measure whether this host can fly in real time.
 
-As many processes spin as will fly, and each says which share of a core it got. The load of a host
-does not tell this, nor how late a sleeping process wakes: both look alike on a host that can fly
-and on one that cannot.
+We spin as many processes as will fly, and each says which share of a core it got. The load of a
+host does not tell, and neither does how late a sleeping process wakes: both look alike whether a
+host can fly or not.
 """
 
 import subprocess
@@ -20,12 +20,12 @@ from flight_core.parameters import require
 LOOK = 0.5  # s, that the processes spin: a hundred slices of the scheduler
 
 CORES_A_NODE = 0.35
-"""Cores that a node in a process of its own needs. The four of osprey_servo take 1.3 on two idle
-cores."""
+"""Cores that a node needs in a process of its own. The four nodes of osprey_servo take 1.3 on two
+idle cores."""
 
 CORES_A_PROCESS = 0.6
-"""Cores that all nodes of an aircraft in one process need: they take 0.35, but on a host without
-that much to spare one process gets a single share and the flight loses most of its samples."""
+"""Cores that all nodes of an aircraft need in one process. They take 0.35, but if a host has no
+more to spare, one process gets a single share and the flight loses most of its samples."""
 
 SPINNER = """\
 import sys, time
@@ -37,10 +37,10 @@ while time.monotonic() < begin + float(sys.argv[1]):
     pass
 print((time.process_time() - used) / (time.monotonic() - begin))
 """
-"""It says that it has started, waits for a byte, spins, and prints its share of a core."""
+"""Program that says it has started, waits for a byte, spins, and prints its share of a core."""
 
 CoresGiven = Callable[[int], float]
-"""How many cores the host gives to a number of processes together."""
+"""Returns how many cores the host gives to a number of processes together."""
 
 
 def processes_of(scenario: Scenario, *, composed: bool) -> int:
@@ -90,7 +90,7 @@ def cores_given(processes: int) -> float:
         for spinner in spinners:
             if spinner.stdout is not None:
                 spinner.stdout.read(1)
-        # All have started: their spans are the same.
+        # All have started, so they spin over the same time.
         for spinner in spinners:
             if spinner.stdin is not None:
                 spinner.stdin.write(".")

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""SIGINT, SIGTERM and SIGHUP as a KeyboardInterrupt at a place that permits one."""
+"""Turn SIGINT, SIGTERM and SIGHUP into a KeyboardInterrupt where one does no harm."""
 
 import os
 import signal
@@ -17,9 +17,9 @@ from flight_core.signals import handle_shutdown
 
 @contextmanager
 def handle_signals(handler: Any) -> Iterator[None]:
-    """Handle the signals of `handle_shutdown` in the block.
+    """Handle the signals of `handle_shutdown` within the block.
 
-    Python permits handlers in the main thread alone.
+    Python lets only the main thread set handlers: in another thread nothing changes.
     """
     before = (
         handle_shutdown(handler) if threading.current_thread() is threading.main_thread() else {}
@@ -32,10 +32,9 @@ def handle_signals(handler: Any) -> Iterator[None]:
 
 
 def interrupt(number: int, frame: FrameType | None) -> None:
-    """End the flight.
+    """End the flight by a KeyboardInterrupt, and ignore further signals.
 
-    A second signal would interrupt the clean-up, in which `subprocess` releases a lock of each
-    process.
+    A second signal would interrupt the clean-up while `subprocess` holds the lock of a process.
     """
     handle_shutdown(signal.SIG_IGN)
     # The terminal is lost: writing to it is an error.
@@ -47,11 +46,11 @@ def interrupt(number: int, frame: FrameType | None) -> None:
 
 
 class DeferredInterrupt:
-    """A signal handler that interrupts outside the blocks of `deferred`.
+    """Handles signals, but interrupts only outside the blocks of `deferred`.
 
-    A write of the log is a block of `deferred`. With `only_in_pauses` it interrupts in `pause`
-    alone: an exception in Python that a module in C has called, such as a message that rclpy makes,
-    becomes an error of that module.
+    While the log is written, for example, a signal waits. With `only_in_pauses` it interrupts only
+    in `pause`: if Python code is called from a module in C, as when rclpy makes a message, an
+    exception there becomes an error of that module.
     """
 
     def __init__(self, *, only_in_pauses: bool = False) -> None:
@@ -59,7 +58,7 @@ class DeferredInterrupt:
         self._pending: tuple[int, FrameType | None] | None = None
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
-        """Interrupt, or remember the signal where an interrupt is deferred."""
+        """Interrupt, or remember the signal while interrupts are deferred."""
         if self._is_deferred:
             self._pending = number, frame
         else:
@@ -67,7 +66,7 @@ class DeferredInterrupt:
 
     @contextmanager
     def deferred(self) -> Iterator[None]:
-        """Within the block a signal waits for its end."""
+        """Make a signal wait until the block ends."""
         self._is_deferred = True
         try:
             yield
@@ -76,7 +75,7 @@ class DeferredInterrupt:
         self._interrupt_if_pending()
 
     def pause(self, duration: float) -> None:
-        """Sleep for a duration, s. A signal up to its end raises KeyboardInterrupt here."""
+        """Sleep for a duration, s. Raises KeyboardInterrupt if a signal has come by the end."""
         time.sleep(duration)
         self._interrupt_if_pending()
 

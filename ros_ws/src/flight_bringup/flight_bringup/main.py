@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The nodes of a flight in one process, over the same topics.
+"""Run the nodes of a flight in one process, over the same topics as separate processes.
 
-Guidance and the learner are among them where the arguments name them.
+Guidance and the learner run too if the arguments name them.
 """
 
 import sys
@@ -11,7 +11,7 @@ from flight_ros.startup import start_nodes
 
 
 def main() -> None:
-    """Run them."""
+    """Run the nodes until they end."""
     has_guidance = "guidance" in sys.argv
     learns = "learner" in sys.argv
     start_nodes(

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Monitor of a flight: what `rise-di fly` sees of the nodes."""
+"""See a flight from outside: what `rise-di fly` learns of its nodes."""
 
 import time
 
@@ -32,9 +32,9 @@ from flight_ros.topics import (
     offered,
 )
 
-# s, until the publishers of another flight on this host are known, twice the measured 0.25 s.
+# s, until we know the publishers of another flight on this host: twice the measured 0.25 s.
 DISCOVERY_TIME = 0.5
-LOOP_INPUTS = (Y.name, Y_M.name)  # of which a controller makes u
+LOOP_INPUTS = (Y.name, Y_M.name)  # from which a controller computes u
 FREE_DOMAIN = (
     "a domain of its own for each flight: set ROS_DOMAIN_ID, or a namespace of its own: --namespace"
 )
@@ -43,9 +43,9 @@ MODES = {float(mode): mode.name for mode in Mode}
 
 
 class FlightMonitor(Client):
-    """Monitors a flight: the states of its nodes and the internals of the controller.
+    """Follows a flight by the states of its nodes and the internals of its controller.
 
-    In lockstep it also follows the progress of the log.
+    In lockstep it also follows how far the log has come.
     """
 
     def __init__(
@@ -81,15 +81,18 @@ class FlightMonitor(Client):
         self._decoder = Decoder(("mode", *(f"e.{output}" for output in outputs)))
 
     def has_time(self) -> bool:
-        """Whether the time of the flight is known: in simulated time from the first /clock on."""
+        """Return whether the time of the flight is known.
+
+        In simulated time it is known once the first /clock has arrived.
+        """
         return self._simulated is None or self._simulated.known()
 
     def ahead(self, lead: float) -> float:
-        """A time of the host as one of the flight, s: at least as long."""
+        """Convert a time of the host, s, to one of the flight that is at least as long."""
         return lead if self._simulated is None else lead * max(self._simulated.speed(), 1.0)
 
     def clock_ended(self) -> str:
-        """Why the simulation of the flight is over; else empty."""
+        """Return why the simulation behind /clock is over, or "" while it goes on."""
         if self._simulated is None or not self._simulated.known():
             return ""
         try:
@@ -101,26 +104,26 @@ class FlightMonitor(Client):
         return "ended early: /clock has no publisher: its simulator ended" if gone else ""
 
     def is_ready(self, node: str, pid: int) -> bool:
-        """Whether the loop of a node runs.
+        """Return whether the loop of a node runs.
 
-        The process id tells it from a node of that name in another flight.
+        The process id tells it from a node of the same name in another flight.
         """
         return self._state(node, pid) in {*NodeState}
 
     def is_matched(self, node: str, pid: int) -> bool:
-        """Whether each input of a node has a publisher."""
+        """Return whether each input of a node has a publisher."""
         return self._state(node, pid) in {*NodeState} - {NodeState.READY}
 
     def start(self, start_time: float) -> None:
-        """Give the nodes the system time of t = 0, s."""
+        """Tell the nodes the system time of t = 0, s."""
         self._publish_start(instant(nanoseconds(start_time)))
 
     def is_flying(self, node: str, pid: int) -> bool:
-        """Whether the aircraft has taken a u."""
+        """Return whether the aircraft has taken a u."""
         return self._state(node, pid) == NodeState.FLYING
 
     def is_completed(self, node: str, pid: int) -> bool:
-        """Whether the aircraft has completed a lockstep flight."""
+        """Return whether the aircraft has completed a lockstep flight."""
         return self._state(node, pid) == NodeState.COMPLETED
 
     def _state(self, node: str, pid: int) -> str:
@@ -129,7 +132,7 @@ class FlightMonitor(Client):
         return self._states.get(f"{self._namespace}/{node}#{pid}", "")
 
     def newest(self) -> tuple[str, FloatArray] | None:
-        """Mode and e of the controller's newest sample since the last call, None without one."""
+        """Return mode and e of the controller's newest sample since the last call, or None."""
         status = None
         for sample in self._decoded(self._internals, self._decoder.decode):
             if sample is not None:
@@ -137,16 +140,16 @@ class FlightMonitor(Client):
         return status
 
     def engagement(self) -> list[tuple[str, str]]:
-        """Phases of a bridge with their reasons, in order, since the last call."""
+        """Return the phases of a bridge and their reasons since the last call, in order."""
         messages = () if self._engagement is None else self._engagement.take()
         return [
             (bounded(arrival.message.key), bounded(arrival.message.value)) for arrival in messages
         ]
 
     def learned(self) -> list[tuple[float, str]]:
-        """What became of proposals of a learner since the last call.
+        """Return what has become of a learner's proposals since the last call.
 
-        Instants by the clock of the stamps, s, and sentences.
+        Each is an instant by the clock of the stamps, s, and a sentence.
         """
         return [
             (seconds(report.stamp_ns), bounded(report.sentence))
@@ -154,18 +157,18 @@ class FlightMonitor(Client):
         ]
 
     def recorded(self) -> float | None:
-        """The flight time up to which the log of a lockstep flight is complete, s.
+        """Return the flight time up to which the log of a lockstep flight is complete, s.
 
-        None without a change.
+        Returns None if nothing has changed since the last call.
         """
         stamps = self._decoded(self._recorded, stamp_of)
         return seconds(stamps[-1]) if stamps else None
 
     def require_free_domain(self) -> None:
-        """Raise ParameterError where the namespace already has an aircraft or a reference model.
+        """Raise ParameterError if the namespace already has an aircraft or a reference model.
 
-        Looks in this domain, and waits until the publishers are known, DISCOVERY_TIME after the
-        start.
+        It looks in this domain only, and first waits for DISCOVERY_TIME after the monitor was made,
+        because publishers are not known before.
         """
         remaining = self._created + DISCOVERY_TIME - time.monotonic()
         require_no_publishers(self._node, LOOP_INPUTS, FREE_DOMAIN, remaining)

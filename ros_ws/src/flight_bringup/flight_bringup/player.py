@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Player: publishes the messages of a log again, with their timing."""
+"""Publish the messages of a log again, with their timing."""
 
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping
@@ -28,14 +28,14 @@ CLOCK_NAME = f"/{CLOCK.name}"  # as simulated time has it
 PROGRESS_PERIOD_NS = 100_000_000
 
 Outgoing = tuple[int, str, bytes, bool]
-"""A message: its instant in the log, ns; its topic; its bytes; whether they begin with a stamp."""
+"""A message: instant in the log, ns; topic; bytes; and whether these begin with a stamp."""
 
 
 class Player(Client):
-    """Publishers on the topics of a log and on `/clock`.
+    """Publishes on the topics of a log and on `/clock`.
 
-    `shared` are topics that may have other publishers. Raises ParameterError if any other topic has
-    one, or if a message type is not installed.
+    Raises ParameterError if a topic already has a publisher, unless it is one of `shared`, or if a
+    message type is not installed.
     """
 
     def __init__(self, types: Mapping[str, str], shared: Collection[str]) -> None:
@@ -62,12 +62,13 @@ class Player(Client):
         stamps_now: bool,
         progress: Callable[[int], None] | None = None,
     ) -> None:
-        """Publish all messages with their timing over `rate`.
+        """Publish all messages with the timing of the log, divided by `rate`.
 
-        The first one is sent immediately, each other one at its time since the first one over
-        `rate`. Deadlines are absolute on the monotonic clock. `stamps_now` moves the stamps: the
-        age of a message against the system clock becomes its age in the log over `rate`. `progress`
-        is called with the instant of the log, ns, ten times a second.
+        The first message is sent at once. Each other one is sent when its time since the first,
+        divided by `rate`, has passed. Deadlines are absolute on the monotonic clock, so that delays
+        do not add up. `stamps_now` moves the stamps: the age of a message by the system clock
+        becomes its age in the log divided by `rate`. `progress` is called with the instant of the
+        log, ns, ten times a second.
         """
         begin_ns = begin_system_ns = first_ns = clock_ns = progress_ns = 0
         for due_ns, topic, message, has_stamp in messages:
@@ -95,7 +96,7 @@ def _restamped(data: bytes, begin_ns: int, first_ns: int, rate: float) -> bytes:
     try:
         since_ns = stamp_of(data) - first_ns
     except ChannelError:
-        # Too short for a stamp: sent as it is in the log.
+        # It is too short for a stamp: we send it as it is in the log.
         return data
     stamp_ns = begin_ns + (since_ns if rate == 1.0 else round(since_ns / rate))
     message = bytearray(data)
@@ -109,9 +110,9 @@ def _sleep_until(deadline_ns: int) -> None:
 
 
 def unsendable(types: Mapping[str, str]) -> dict[str, str]:
-    """The topics that cannot be sent, each with its type.
+    """Return the topics that cannot be sent, each with its type.
 
-    The message type is not installed, or no topic of ROS may have the name.
+    Either the message type is not installed, or ROS does not permit the name of the topic.
     """
     lacking = {}
     for topic, name in types.items():
@@ -128,7 +129,7 @@ def _message_type(topic: str, name: str) -> Any:
     try:
         return getattr(import_module(f"{package}.msg"), kind)
     except (ImportError, AttributeError, ValueError):
-        # The name may hold anything.
+        # We end up here whatever a log has in place of a name.
         raise ParameterError(
             f"{topic}: its type {name} is not installed, expected the package {package}"
         ) from None

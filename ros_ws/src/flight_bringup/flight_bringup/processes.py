@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The processes of a flight: start in two stages, watch, stop. No process outlives the command."""
+"""Start the processes of a flight in two stages, watch them and stop them.
+
+No process outlives the command.
+"""
 
 import json
 import math
@@ -56,7 +59,7 @@ if TYPE_CHECKING:
     from flight_bringup.monitor import FlightMonitor
 
 STOP_TIMEOUT = 2.5  # s, for all processes but the recorder together; a node needs 0.2 s
-# s, for the recorder, which needs 0.2 s: on a busy host or disk it still closes its log.
+# s, for the recorder: it needs 0.2 s, but must close its log on a busy host or disk too.
 CLOSE_TIMEOUT = 30.0
 SEARCH_TIMEOUT = 300.0  # s, for a learner in lockstep: a search takes 5 s of a core
 READY_TIMEOUT = 20.0  # s
@@ -69,44 +72,47 @@ POLL_PERIOD = 0.005  # s, while nodes start
 
 
 def end_with_parent() -> list[str]:
-    """Prefix of a command: SIGTERM when this process dies.
+    """Return the words before a command that send it SIGTERM when this process dies.
 
-    Empty without setpriv of util-linux.
+    There are none if the host has no setpriv of util-linux.
     """
     setpriv = shutil.which("setpriv")
     return [setpriv, "--pdeathsig", "TERM"] if setpriv else []
 
 
 def start_instants(lead: float, monitor: "FlightMonitor") -> tuple[float, float]:
-    """Time of the stamps and of the ticks of t = 0, s, `lead` of the host from now."""
+    """Return t = 0 by the clock of the stamps and by that of the ticks, s.
+
+    It is `lead` s of the host from now.
+    """
     clock = monitor.clock
     lead = monitor.ahead(lead)
     return start_instant(lead, seconds(clock.time_ns())), seconds(clock.monotonic_ns()) + lead
 
 
 def leave_outcome(run: Path, outcome: Outcome) -> None:
-    """Leave the outcome of a flight for the recorder; `Path()` records none.
+    """Leave the outcome of a flight for the recorder; nothing is recorded in `Path()`.
 
-    A full disk costs the log the outcome alone.
+    If the disk is full, the log lacks its outcome but nothing else.
     """
     if run.name:
         with suppress(OSError, ParameterError):
             write_file(run / OUTCOME_FILE, outcome.text())
 
 
-# Begins the line in which a node says why it ends.
+# How the line begins in which a node says why it ends.
 CAUSE = re.compile(r"\[FATAL\]|error: ")
 
 
 class NotReadyError(ParameterError):
-    """A node is not ready in time, or has ended before, and not by bad input."""
+    """A node was not ready in time, or ended before it was, though its input was good."""
 
 
 class NodeProcess:
     """One node as a process.
 
-    The output goes to a file; `lines` holds the last lines, `cause` the line with the reason of the
-    end, also before a long traceback.
+    Its output goes to a file. `lines` holds the last lines; `cause` is the line that says why it
+    ended, even if a long traceback follows it.
     """
 
     def __init__(
@@ -126,7 +132,7 @@ class NodeProcess:
         arguments = ["--ros-args", "--params-file", str(scenario_file)]
         if namespace:
             arguments += ["-r", f"__ns:={namespace}"]
-        # `-p node:name` would mean a node without a namespace.
+        # `-p node:name` would address a node without a namespace.
         if node is ONE_PROCESS:
             sections = nest({name.replace(":", ".", 1): value for name, value in overrides.items()})
             file = log.with_suffix(".yaml")
@@ -142,7 +148,7 @@ class NodeProcess:
             arguments = [*sections, *arguments, "--params-file", str(file)]
             overrides = {}
         for name, value in overrides.items():
-            # JSON is YAML, and quotes what needs quotes
+            # JSON is valid YAML, and quotes what needs quotes
             arguments += ["-p", f"{name}:={json.dumps(value)}"]
         self._log = log.open("x", encoding="utf-8")
         self.popen = subprocess.Popen(  # noqa: S603 - our own interpreter and modules
@@ -151,7 +157,7 @@ class NodeProcess:
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
-            # Ctrl-C reaches the command alone, which then stops the nodes in order
+            # Ctrl-C must reach only the command, which then stops the nodes in order
             process_group=0,
         )
         self._reader = threading.Thread(target=self._read, daemon=True)
@@ -170,7 +176,7 @@ class NodeProcess:
                 self._log.flush()
 
     def finish(self) -> int:
-        """Read the rest of the output; the exit status."""
+        """Read the rest of the output, and return the exit status."""
         status = self.popen.wait()
         self._reader.join(timeout=1.0)
         with suppress(OSError):
@@ -181,12 +187,12 @@ class NodeProcess:
 
 
 class FlightProcesses:
-    """All processes of one flight. A context manager: its exit stops them.
+    """All processes of one flight, as a context manager that stops them when it exits.
 
-    `monitor` reports the nodes that are ready, in the same `namespace`. With an autopilot the
-    bridge starts in the aircraft's place. A flight in real time with an aircraft has its t = 0 from
-    `begin`, once `match` has seen it ready. `announce` gets a line on processes that were killed.
-    `pause` sleeps for a duration, s, between two looks at nodes that start.
+    `monitor` reports which nodes are ready and must be in the same `namespace`. With an autopilot,
+    the bridge starts in the aircraft's place. A flight in real time with an aircraft gets its t = 0
+    from `begin`, once `match` has seen it ready. `announce` gets a line if processes had to be
+    killed. `pause` sleeps for a duration, s, between two looks at nodes that start.
     """
 
     def __init__(
@@ -212,7 +218,7 @@ class FlightProcesses:
         self.autopilot = autopilot
         self._first: tuple[NodeSpec, ...] = FIRST_STAGE
         self._second = second_stage(scenario, bridge=autopilot is not None)
-        # A search would delay ticks of its own process.
+        # In the same process a search would delay ticks.
         apart = (LEARNER,) if LEARNER in self._second and not lockstep else ()
         self._in_one_process = [
             spec.executable for spec in (*self._first, *self._second) if spec not in apart
@@ -223,14 +229,14 @@ class FlightProcesses:
         self.processes: list[NodeProcess] = []
         self.outcome = INTERRUPTED  # what the log says of the flight
         self.start_time = math.inf  # time of t = 0 by the stamps, s
-        # The same by the time of the ticks: a step of the system clock is none of t.
+        # The same by the clock of the ticks: when the system clock steps, t does not.
         self.started = math.inf
         self._on_start = not lockstep and autopilot is None
 
     def __enter__(self) -> Self:
         try:
-            # The check comes before any node: a controller would engage on the y and y_m of another
-            # flight.
+            # We check before any node starts: a controller would engage on the y and y_m of
+            # another flight.
             self.monitor.require_free_domain()
             begin = time.monotonic()
             for node in self._first:
@@ -255,7 +261,7 @@ class FlightProcesses:
     def match(self) -> Outcome | None:
         """Wait until each node is ready and each input has a publisher.
 
-        Returns the outcome of a flight that cannot begin.
+        Returns an outcome if the flight cannot begin, else None.
         """
         deadline = time.monotonic() + READY_TIMEOUT
         while self._on_start and (waiting := self._unmatched()):
@@ -267,10 +273,10 @@ class FlightProcesses:
         return None
 
     def begin(self, start: tuple[float, float] | None = None) -> Outcome | None:
-        """Set t = 0 after `match`. Returns the outcome of a flight that cannot begin.
+        """Set t = 0 after `match`. Returns an outcome if the flight cannot begin, else None.
 
-        `start`: system time and monotonic time of t = 0, s, of several flights at once; by default
-        LEAD from now.
+        `start` is the system time and the monotonic time of t = 0, s, for several flights at once.
+        By default it is LEAD from now.
         """
         leave_real_time_priority()  # the nodes have it
         outcome = self.match()
@@ -280,18 +286,18 @@ class FlightProcesses:
         return outcome
 
     def _names(self, process: NodeProcess) -> list[str]:
-        """Names of the nodes of a process."""
+        """Return the names of the nodes in a process."""
         return self._in_one_process if process.node is ONE_PROCESS else [process.node.executable]
 
     def _nodes(self) -> list[tuple[str, int]]:
-        """Names and process ids of the nodes."""
+        """Return the name and the process id of each node."""
         nodes: list[tuple[str, int]] = []
         for process in self.processes:
             nodes += [(name, process.popen.pid) for name in self._names(process)]
         return nodes
 
     def _unmatched(self) -> list[str]:
-        """What the flight waits for before t = 0, by node."""
+        """Return what the flight waits for before t = 0, a sentence for each node."""
         names = self._nodes()
         ready = {name: self.monitor.is_ready(name, pid) for name, pid in names}
         unmatched = [name for name, pid in names if not self.monitor.is_matched(name, pid)]
@@ -346,11 +352,11 @@ class FlightProcesses:
             self._pause(POLL_PERIOD)
 
     def ended(self) -> Outcome | None:
-        """The outcome by the first process that has ended, or by simulated time.
+        """Return the outcome if a process or the simulated time has ended, else None.
 
-        None while all run. In real time the law flies on without a learner. On a busy host several
-        may have ended since the last call. A landing is then the cause, and a process that lost
-        contact with another is not.
+        In real time the law flies on without a learner. On a busy host several processes may have
+        ended since the last call. Then a landing is the cause, and a process that lost contact with
+        another is not.
         """
         processes = [
             process for process in self.processes if self.lockstep or process.node is not LEARNER
@@ -364,7 +370,7 @@ class FlightProcesses:
         return ended_early(clock) if clock else None
 
     def learner_ended(self) -> str:
-        """How the learner has ended, told once; else empty."""
+        """Return how the learner has ended, once; "" at any other time."""
         for process in self.processes:
             if process.node is LEARNER and process.popen.poll() is not None:
                 self.processes.remove(process)
@@ -372,11 +378,11 @@ class FlightProcesses:
         return ""
 
     def waiting(self) -> list[str]:
-        """The nodes that are not ready."""
+        """Return the nodes that are not ready yet."""
         return [name for name, pid in self._nodes() if not self.monitor.is_ready(name, pid)]
 
     def is_flying(self) -> bool:
-        """Whether the aircraft has taken a u."""
+        """Return whether the aircraft has taken a u."""
         return any(
             self.monitor.is_flying(name, pid)
             for name, pid in self._nodes()
@@ -384,7 +390,7 @@ class FlightProcesses:
         )
 
     def is_completed(self) -> bool:
-        """Whether the aircraft has completed a lockstep flight, with the u of its last instant."""
+        """Return whether the aircraft has completed a lockstep flight, with the last u."""
         return any(
             self.monitor.is_completed(name, pid)
             for name, pid in self._nodes()
@@ -392,10 +398,7 @@ class FlightProcesses:
         )
 
     def last_words(self, node: NodeSpec) -> str:
-        """The last line of a node on a topic that it waits for, or on a refused sample.
-
-        Empty without one.
-        """
+        """Return the last line in which a node waits for a topic or refuses a sample, or ""."""
         lines: list[str] = []
         for process in self.processes:
             if node.executable in self._names(process):
@@ -408,8 +411,8 @@ class FlightProcesses:
     def stop(self) -> None:
         """Stop all processes, the recorder last.
 
-        SIGKILL follows after STOP_TIMEOUT, and for the recorder after CLOSE_TIMEOUT. At the end of
-        a lockstep flight a learner completes its search first.
+        A process that has not ended after STOP_TIMEOUT is killed, the recorder after CLOSE_TIMEOUT.
+        At the end of a lockstep flight a learner completes its search first.
         """
         # A second Ctrl-C must not interrupt this: it would truncate the log.
         with handle_signals(signal.SIG_IGN):
@@ -432,8 +435,7 @@ class FlightProcesses:
                 group = [process for process in self.processes if process.node in timeouts]
                 for process in group:
                     if process.popen.poll() is None:
-                        # SIGTERM and not SIGINT, which gives a traceback while Python still
-                        # imports.
+                        # SIGINT would print a traceback if Python is still importing.
                         process.popen.terminate()
                 for process in group:
                     try:
@@ -449,7 +451,7 @@ class FlightProcesses:
 
 
 def _outcome(process: NodeProcess) -> Outcome:
-    """The outcome of a flight by a process that has ended."""
+    """Return the outcome of a flight in which this process has ended."""
     name = process.node.executable
     status = process.finish()
     if status < 0:

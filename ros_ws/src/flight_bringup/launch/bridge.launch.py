@@ -4,10 +4,10 @@
 
 ros2 launch flight_bringup bridge.launch.py map:=ardupilot
 
-The graph of fly.launch.py with the bridge in the aircraft's place. The bridge sends to the
-autopilot only with dry_run:=false and once it is engaged (docs/autopilots.md). Refuses a map whose
-signs contradict the controller's. Ends with Ctrl-C or after `duration`; with exit status 1 when a
-node ends.
+The graph is that of fly.launch.py, with the bridge in the aircraft's place. The bridge sends to the
+autopilot only if dry_run:=false is given and once it is engaged (docs/autopilots.md). A map whose
+signs contradict the controller's is refused. The flight ends with Ctrl-C or after `duration`, and
+with exit status 1 if a node ends before.
 """
 
 import math
@@ -53,7 +53,7 @@ from launch import LaunchContext, LaunchDescription
 
 
 def generate_launch_description() -> LaunchDescription:
-    """The arguments and the flight."""
+    """Declare the arguments, and fly."""
     return LaunchDescription(
         [
             DeclareLaunchArgument(

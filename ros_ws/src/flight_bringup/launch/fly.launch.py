@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fly a scenario on a full ROS 2: ros2 launch flight_bringup fly.launch.py scenario:=osprey_servo.
 
-The same graph and the same scenario file as `rise-di fly`. The flight begins once each node is
-ready and matched. It ends once the log holds the scenario's duration, in lockstep when the aircraft
-completes it. It ends early with exit status 1 when a node ends, is not ready, or when no u reaches
-the aircraft. Included in another launch file, it ends its own nodes alone.
+The graph and the scenario file are those of `rise-di fly`. The flight begins once each node is
+ready and matched. It ends once the log holds the scenario's duration; in lockstep, when the
+aircraft has completed it. If a node ends or is not ready, or if no u reaches the aircraft, it ends
+early with exit status 1. When another launch file includes this one, it ends only its own nodes.
 """
 
 from collections.abc import Sequence
@@ -59,12 +59,12 @@ from flight_core.topics import published_by
 from flight_ros.topics import NodeState
 from launch import LaunchContext, LaunchDescription
 
-# Nodes that a flight may take from its user, and what they publish.
+# Nodes that users may replace by their own, and what they publish.
 OPTIONAL = {AIRCRAFT: "y", REFERENCE_MODEL: "y_m"}
 
 
 def generate_launch_description() -> LaunchDescription:
-    """The arguments and the flight."""
+    """Declare the arguments, and fly."""
     return LaunchDescription(
         [
             scenario_argument("osprey_servo"),
@@ -145,7 +145,7 @@ def _fly(context: LaunchContext) -> list[Action]:
                 flies=AIRCRAFT not in others,
             )
         else:
-            # A user activates the controller, or no user does.
+            # A user activates the controller, or nobody does.
             end = end_with_log(flight, lead, start_time + duration, duration, by_rosbag2=by_rosbag2)
         return [*end, *(node(spec, ON_START if begins else start_time) for spec in then)]
 
@@ -167,9 +167,9 @@ def _fly(context: LaunchContext) -> list[Action]:
 def _require_possible(
     own: Sequence[str], *, lockstep: bool, by_rosbag2: bool, is_simulated: bool
 ) -> None:
-    """Raise ParameterError for arguments that exclude each other.
+    """Raise ParameterError if arguments exclude each other.
 
-    `own` are those that give a flight nodes or values of its user.
+    `own` are the arguments by which users put nodes or values of their own into a flight.
     """
     require(
         not (by_rosbag2 and lockstep),

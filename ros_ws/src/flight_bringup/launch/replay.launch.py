@@ -4,10 +4,10 @@
 
 ros2 launch flight_bringup replay.launch.py run:=runs/latest
 
-As `rise-di play`: the topics of the log with their timing, and /clock with the time of the log. It
-plays the topics that none of the nodes publishes, so a controller answers the recorded y and y_m
-with its own u. Playing begins once all nodes are ready and ends with the log. It ends early with
-exit status 1 when a node ends.
+Like `rise-di play`, it publishes the topics of the log with their timing, and /clock with the time
+of the log. It plays only those topics that none of the nodes publishes, so that a controller
+answers the recorded y and y_m with its own u. It begins once all nodes are ready and ends with the
+log. If a node ends before, it ends with exit status 1.
 """
 
 from collections.abc import Sequence
@@ -53,7 +53,7 @@ OPTIONAL = (RECORDER, CONTROLLER, REFERENCE_MODEL, AIRCRAFT)
 
 
 def generate_launch_description() -> LaunchDescription:
-    """The arguments, the player and the nodes."""
+    """Declare the arguments, and start the player and the nodes."""
     return LaunchDescription(
         [
             DeclareLaunchArgument("run", description="folder of a run, or an MCAP file"),
@@ -114,7 +114,7 @@ def _play(context: LaunchContext) -> list[Action]:
         f"true with {', '.join(others)}",
         "controller and recorder alone",
     )
-    # Topics of the log that none of the nodes publishes are played.
+    # We play the topics of the log that none of the nodes publishes.
     types = read_playback(log).types
     recorded = types.keys() - unsendable(types)
     topics = argument(context, "topics") or ",".join(
@@ -147,7 +147,7 @@ def _play(context: LaunchContext) -> list[Action]:
 
 
 def _player(flight: Flight, topics: str) -> ExecuteProcess:
-    """`rise-di play` with the arguments of the launch; its end is that of the playback."""
+    """Run `rise-di play` with the arguments of the launch, which is complete when it ends."""
 
     def end(event: ProcessExited, context: LaunchContext) -> Sequence[Action] | None:
         if event.returncode != 0:

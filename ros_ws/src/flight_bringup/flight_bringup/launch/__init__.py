@@ -1,3 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Shared code of the launch files. Needs `launch` and `launch_ros`, which only a full ROS 2 has."""
+"""Share code between the launch files.
+
+It needs `launch` and `launch_ros`, which only a full ROS 2 has.
+"""

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A flight of a launch: what holds in its scope, its processes, its end."""
+"""Keep what belongs to one flight of a launch: its arguments, its processes, its end."""
 
 import shlex
 from collections.abc import Callable, Mapping, Sequence
@@ -29,12 +29,13 @@ from launch import LaunchContext
 
 
 class Flight:
-    """A flight of a launch: the arguments in its scope, its processes, its end.
+    """One flight of a launch: the arguments in its scope, its processes, its end.
 
-    A launch file may include several, in groups that have ended by the time a node starts. So the
-    launch configurations are taken once, and hold for whatever the flight starts later: arguments,
-    and what PushRosNamespace, SetParameter and SetRemap of the group say. At its end a flight stops
-    its own processes alone. A launch with nothing else to do then ends by itself.
+    A launch file may include several flights, in groups that have ended by the time a node starts.
+    We therefore copy the launch configurations once, and use the copy for whatever the flight
+    starts later: its arguments, and what PushRosNamespace, SetParameter and SetRemap of the group
+    say. At its end a flight stops only its own processes. If the launch has nothing else to do, it
+    then ends by itself.
     """
 
     _of_launch: ClassVar[WeakKeyDictionary[LaunchContext, list["Flight"]]] = WeakKeyDictionary()
@@ -43,7 +44,7 @@ class Flight:
         self.context = context
         self.run = Path()  # the folder of the run; Path() without a recorder
         self.configurations = dict(context.launch_configurations)
-        # Launch leaves processes running after an end by anything but SIGINT.
+        # If anything but SIGINT ends it, launch leaves its processes running.
         self.configurations.setdefault("launch-prefix", shlex.join(end_with_parent()))
         self.namespace = _namespace(context)
         self._processes: list[Action] = []
@@ -54,15 +55,15 @@ class Flight:
 
     @property
     def is_over(self) -> bool:
-        """Whether the flight has ended, or the launch has."""
+        """Return whether the flight has ended, or the launch has."""
         return self._is_stopped or bool(self.context.is_shutdown)
 
     def argument(self, name: str) -> str:
-        """The value of an argument in the scope of the flight."""
+        """Return the value of an argument in the scope of the flight."""
         return str(self.configurations[name])
 
     def in_scope(self, actions: Sequence[Action]) -> list[Action]:
-        """The actions with the launch configurations of the flight; its end stops the processes."""
+        """Run actions with the launch configurations of the flight, and stop them at its end."""
         self._processes += [each for each in actions if isinstance(each, (ExecuteProcess, Node))]
         restore = _Restore(self.configurations)
         return [PushLaunchConfigurations(), restore, *actions, PopLaunchConfigurations()]
@@ -70,7 +71,7 @@ class Flight:
     def after(
         self, period: float, function: Callable[[LaunchContext], Sequence[Action] | None]
     ) -> TimerAction:
-        """Call a function after a period, s, unless the flight has ended before."""
+        """Call a function after a period, s, unless the flight has ended by then."""
 
         def call(context: LaunchContext) -> list[Action] | None:
             return None if self.is_over else [*(function(context) or ())]
@@ -82,7 +83,7 @@ class Flight:
     def complete(
         self, reason: str = "flight completed", outcome: Outcome = COMPLETED
     ) -> list[Action]:
-        """The actions at the end of a flight that reached its end.
+        """Return the actions that end a flight which has reached its end.
 
         The recorder closes the log with the outcome.
         """
@@ -91,10 +92,10 @@ class Flight:
         return [LogInfo(msg=reason + (report if self.run.name else "")), *self._stop()]
 
     def fail(self, outcome: Outcome) -> list[Action]:
-        """End the flight early, with the outcome in the folder of the run.
+        """End the flight early, and leave the outcome in the folder of the run.
 
-        The last flight of a launch to end raises RuntimeError, so that the launch ends with exit
-        status 1; before that the other flights go on.
+        While other flights of the launch go on, they are not disturbed. When the last one ends,
+        this raises RuntimeError, so that the launch ends with exit status 1.
         """
         leave_outcome(self.run, outcome)
         self._failure = str(outcome)
@@ -103,7 +104,7 @@ class Flight:
     def _stop(self) -> list[Action]:
         """Stop what the flight has started.
 
-        Raises RuntimeError where no other flight goes on and one of them has failed.
+        Raises RuntimeError if no other flight goes on and one of them has failed.
         """
         self._is_stopped = True
         for timer in self._timers:
@@ -119,25 +120,25 @@ class Flight:
 
 
 class _Restore(Action):
-    """Restore the launch configurations of a scope that has ended."""
+    """Restores the launch configurations of a scope that has ended."""
 
     def __init__(self, configurations: Mapping[str, Any]) -> None:
         super().__init__()
         self.configurations = configurations
 
     def execute(self, context: LaunchContext) -> None:
-        """Replace those of the launch, which the caller has pushed."""
+        """Replace the configurations of the launch, which the caller has pushed."""
         context.launch_configurations.clear()
         context.launch_configurations.update(self.configurations)
 
 
 def argument(context: LaunchContext, name: str) -> str:
-    """The value of an argument."""
+    """Return the value of an argument."""
     return str(LaunchConfiguration(name).perform(context))
 
 
 def _namespace(context: LaunchContext) -> str:
-    """The absolute namespace of the nodes, as launch_ros.actions.Node has it; "" for the root."""
+    """Return the absolute namespace of the nodes, as launch_ros computes it; "" is the root."""
     base = context.launch_configurations.get("ros_namespace")
     own = context.launch_configurations.get("namespace", "")
     return str(make_namespace_absolute(prefix_namespace(base, own))).rstrip("/")

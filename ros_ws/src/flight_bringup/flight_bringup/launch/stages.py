@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Start the nodes of a launch in stages.
 
-A stage waits for the `node_state` "ready" of the stage before.
+A stage waits until each node of the stage before has published the `node_state` "ready".
 """
 
 import math
@@ -94,7 +94,7 @@ class FlownEvent(Event):
 
 
 def scenario_argument(default: str, otherwise: str = "") -> DeclareLaunchArgument:
-    """The argument `scenario`; `otherwise` describes an empty argument."""
+    """Declare the argument `scenario`; `otherwise` says what an empty one means."""
     description = (
         f"name of a scenario ({', '.join(scenarios())}), or path of a scenario file "
         f"(.yaml){otherwise}"
@@ -103,21 +103,21 @@ def scenario_argument(default: str, otherwise: str = "") -> DeclareLaunchArgumen
 
 
 def boolean_argument(name: str, default: bool, description: str) -> DeclareLaunchArgument:
-    """An argument "true" or "false"."""
+    """Declare an argument that is "true" or "false"."""
     return DeclareLaunchArgument(
         name, default_value=str(default).lower(), choices=BOOLEAN, description=description
     )
 
 
 def runs_argument() -> DeclareLaunchArgument:
-    """The argument `runs`."""
+    """Declare the argument `runs`."""
     return DeclareLaunchArgument(
         "runs", default_value="runs", description="folder in which the folder of the run is created"
     )
 
 
 def recorder_argument(*further: str) -> DeclareLaunchArgument:
-    """The argument `recorder`."""
+    """Declare the argument `recorder`; it may be `further` words too."""
     description = (
         "true: the stack's recorder; rosbag2: `ros2 bag record` into the folder rosbag2 of the run"
     )
@@ -130,12 +130,12 @@ def recorder_argument(*further: str) -> DeclareLaunchArgument:
 
 
 def watch_argument() -> DeclareLaunchArgument:
-    """The argument `watch`."""
+    """Declare the argument `watch`."""
     return boolean_argument("watch", False, "serve the live page of the flight: docs/live-view.md")
 
 
 def watch_page(flight: Flight) -> list[Action]:
-    """The process of the live page of a run, on demand.
+    """Return the process that serves the live page of a run, if the user asked for it.
 
     The flight does not depend on this process.
     """
@@ -149,12 +149,12 @@ def watch_page(flight: Flight) -> list[Action]:
 def namespace_argument(
     description: str = "namespace of all nodes, one an aircraft",
 ) -> DeclareLaunchArgument:
-    """The argument `namespace`."""
+    """Declare the argument `namespace`."""
     return DeclareLaunchArgument("namespace", default_value="", description=description)
 
 
 def log_level_argument() -> DeclareLaunchArgument:
-    """The argument `log_level`."""
+    """Declare the argument `log_level`."""
     return DeclareLaunchArgument(
         "log_level",
         default_value="info",
@@ -164,18 +164,18 @@ def log_level_argument() -> DeclareLaunchArgument:
 
 
 def sim_time_argument() -> DeclareLaunchArgument:
-    """The argument `use_sim_time`."""
+    """Declare the argument `use_sim_time`."""
     return boolean_argument(
         "use_sim_time", False, "run `rise-di fly` by the /clock of a simulator: docs/ros.md"
     )
 
 
 def by_rise_di(flight: Flight, file: str, *, has_own_time: bool = False) -> list[Action]:
-    """`rise-di fly` of a scenario or of a fleet, with the arguments of the launch.
+    """Run `rise-di fly` of a scenario or of a fleet, with the arguments of the launch.
 
     It keeps to real time, because a launch file flies beside other nodes, unless the fleet
-    `has_own_time`. Its exit status decides on that of the launch, 1 where a flight was not
-    completed.
+    `has_own_time`. If it ends with an error, because a flight was not completed, the launch ends
+    with exit status 1.
     """
 
     def end(event: ProcessExited, context: LaunchContext) -> Sequence[Action]:
@@ -202,10 +202,7 @@ def by_rise_di(flight: Flight, file: str, *, has_own_time: bool = False) -> list
 def flight_node(
     spec: NodeSpec, scenario: Scenario, overrides: ParameterOverrides, flight: Flight
 ) -> Node:
-    """A node of a flight.
-
-    The node gets a section of the scenario and parameter overrides.
-    """
+    """Return a node of a flight, with its section of the scenario and the overrides."""
     return Node(
         package=spec.package,
         executable=spec.executable,
@@ -220,10 +217,10 @@ def flight_node(
 
 
 def rosbag2(flight: Flight, scenario: Scenario, overrides: ParameterOverrides) -> ExecuteProcess:
-    """`ros2 bag record` in the place of the stack's recorder, with the same topics.
+    """Run `ros2 bag record` in place of the stack's recorder, with the same topics.
 
-    `overrides` belong to the recorder. The attachments of the recorder become a separate log in the
-    folder of the run.
+    `overrides` are the parameters that the recorder would get. What it would attach to its log
+    becomes a log of its own in the folder of the run.
     """
     run = Path(overrides["directory"])
     with BagWriter(run) as bag:
@@ -259,7 +256,7 @@ def fail_on_exit(
 ) -> Sequence[Action] | None:
     """End the flight when a process ends before it.
 
-    The exit status of a landing completes it.
+    If the exit status says that the aircraft has landed, the flight is complete.
     """
     if flight.is_over:
         return None
@@ -280,9 +277,9 @@ def say_on_exit(event: ProcessExited, context: LaunchContext, flight: Flight) ->
 def on_state(
     flight: Flight, spec: NodeSpec, state: NodeState, then: Callable[[], Sequence[Action]]
 ) -> RegisterEventHandler:
-    """Run the actions of `then` once, when a node of this launch publishes a state.
+    """Run the actions of `then` once, when a node of this launch reaches a state.
 
-    A later state counts, too.
+    A later state counts too.
     """
     node = f"{flight.namespace}/{spec.executable}"
     states = [*NodeState]
@@ -309,12 +306,12 @@ def start_in_stages(
     beside: Sequence[Action] = (),
     publishes: Collection[str] = LOOP_INPUTS,
 ) -> list[Action]:
-    """Start the first stage of a flight, and `beside`.
+    """Start the first stage of a flight, and `beside`; then run the actions of `second`.
 
-    Once the nodes are ready, run the actions of `second`. The arguments of `second` are the time
-    until t = 0 and the system time of t = 0, s. A node that is not ready after READY_TIMEOUT ends
-    the flight early, and so does another flight: a publisher of a topic among `publishes`, before
-    any node starts.
+    `second` is called once the nodes are ready, with the time until t = 0 and the system time of t
+    = 0, s. The flight ends early if a node is not ready after READY_TIMEOUT. It does too if another
+    flight is under way, which we see by a publisher of a topic in `publishes` before any node
+    starts.
     """
     _subscribe_states(flight)
     leave_outcome(flight.run, INTERRUPTED)  # until another outcome replaces it
@@ -354,9 +351,9 @@ def begin_when_matched(
 ) -> list[Action]:
     """Begin the flight once each node is ready and each input has a publisher.
 
-    t = 0 goes to the topic `start`. End the flight once the log holds y, y_m and u to the end; with
-    rosbag2 once u has the stamp of the end. A node that does not get so far ends the flight early,
-    and so does an aircraft that takes no u where it `flies` as a node of the stack.
+    t = 0 goes to the topic `start`. The flight ends once the log holds y, y_m and u to the end;
+    with rosbag2, once u has the stamp of the end. It ends early if a node does not get so far, or
+    if the aircraft `flies` as a node of the stack but takes no u.
     """
     begin = _Begin(flight, nodes, duration, flies=flies)
     return [
@@ -371,7 +368,7 @@ def begin_when_matched(
 
 
 class _Begin:
-    """The begin of a flight by the topic `start`, and the ends of a flight that does not begin."""
+    """Begins a flight by the topic `start`, and ends one that does not begin."""
 
     def __init__(
         self, flight: Flight, nodes: Sequence[NodeSpec], duration: float, *, flies: bool
@@ -399,17 +396,17 @@ class _Begin:
         ]
 
     def fly(self) -> Sequence[Action]:
-        """The aircraft has taken its first u."""
+        """Note that the aircraft has taken its first u."""
         self._flies = True
         return []
 
     def held(self, stamp_ns: int) -> bool:
-        """Whether a log up to a stamp holds the flight."""
+        """Return whether a log up to a stamp holds the whole flight."""
         self._held_ns = stamp_ns
         return self._start_ns > 0 and stamp_ns >= self._start_ns + nanoseconds(self._duration)
 
     def require_matched(self, context: LaunchContext) -> Sequence[Action] | None:
-        """End the flight for a node that waits too long."""
+        """End the flight if a node has waited too long."""
         if not self._waiting:
             return None
         names = ", ".join(spec.executable for spec in self._waiting)
@@ -433,8 +430,9 @@ def end_with_log(
 ) -> list[Action]:
     """End a flight once the log holds y, y_m and u to the system time `end_time`, s.
 
-    The flight of `duration` began with `lead`. A log without u, as of a bridge that is not engaged,
-    ends it after the duration; one that has stopped, LOG_TIMEOUT later.
+    The flight of `duration` began with `lead`. If the log gets no u, as when a bridge is not
+    engaged, the flight ends after the duration. If the log stops on the way, it ends LOG_TIMEOUT
+    later.
     """
     last = [-math.inf]  # monotonic time of the last change of the log, s
 
@@ -456,9 +454,9 @@ def end_with_log(
 def _complete_at(
     flight: Flight, held: Callable[[int], bool], *, by_rosbag2: bool
 ) -> RegisterEventHandler:
-    """Complete the flight once the stamp up to which the log is whole satisfies `held`.
+    """Complete the flight once `held` is true of the stamp up to which the log is whole.
 
-    The log holds y, y_m and u up to it; with rosbag2 the stamp is that of u.
+    Up to that stamp the log holds y, y_m and u; with rosbag2 it is the stamp of u.
     """
     context = flight.context
 
@@ -484,9 +482,9 @@ def _complete_at(
 
 
 def _subscribe_states(flight: Flight) -> None:
-    """Emit a NodeStateEvent for every published state of a node of this launch.
+    """Emit a NodeStateEvent whenever a node of this launch publishes its state.
 
-    See launch_ros.actions.LifecycleNode.
+    launch_ros.actions.LifecycleNode does likewise.
     """
 
     def receive(message: KeyValue) -> None:
@@ -502,15 +500,15 @@ def _subscribe_states(flight: Flight) -> None:
     ros_node.create_subscription(
         NODE_STATE.type, f"{flight.namespace}/{NODE_STATE.name}", receive, STATES
     )
-    # At shutdown launch_ros waits for its executor before it stops the nodes: up to 1 s, without a
-    # timer.
+    # At shutdown launch_ros waits for its executor before it stops the nodes, for up to 1 s unless
+    # a timer wakes it.
     ros_node.create_timer(SHUTDOWN_DELAY, lambda: None)
 
 
 def _is_descendant(pid: int) -> bool:
-    """Whether a process belongs to this launch, not to a second flight.
+    """Return whether this launch started a process, directly or behind a launch prefix.
 
-    Directly or behind a launch prefix.
+    A process of a second flight is not one of ours.
     """
     with suppress(psutil.Error):
         return os.getpid() in {parent.pid for parent in psutil.Process(pid).parents()}
