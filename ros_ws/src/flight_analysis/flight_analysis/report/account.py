@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The account of a flight: the parts that its log lacks, its processes, commands and legs."""
+"""Account for a flight: what its log lacks, its processes, its commands and its legs."""
 
 import math
 import re
@@ -28,13 +28,16 @@ from flight_core.rates import nanoseconds, seconds
 from flight_core.tape import Recording, Signal, Tape
 from flight_log.clock import LEAPS, SINCE_EPOCH_NS
 
-REPEATS = 0.01  # largest share of equal stamps of a topic whose stamps are all different
+REPEATS = 0.01  # share of repeated stamps in a topic, up to which we do not name them
 STEADY = ("y", "y_m", "truth", "pose")  # topics that no mode of the flight interrupts
 PARTS = (" and missing", LEAPS, " is truncated: ")  # in notes of a log on its parts and its clock
 
 
 class ProcessAccount(NamedTuple):
-    """A process of the flight. Flight times in s; None: unknown, or without output."""
+    """A process of the flight, in flight times, s.
+
+    A time is None if it is unknown, or if the process sent nothing.
+    """
 
     ready: float | None  # its event loop began
     first: float | None  # stamps of its first and last output
@@ -43,7 +46,7 @@ class ProcessAccount(NamedTuple):
 
 
 class Commands(NamedTuple):
-    """Commands of a flight, without the legs of a route."""
+    """The commands of a flight, without the legs of a route."""
 
     given: int  # edges of the scenario's commands and of u_m
     flown: int  # those that began before the end of the flight
@@ -52,7 +55,7 @@ class Commands(NamedTuple):
 
 
 class Account(NamedTuple):
-    """What the log of a flight holds. `lacks` are the sentences on the parts that are missing."""
+    """What the log of a flight holds. Each sentence in `lacks` names a part that is missing."""
 
     end: float  # s, flight time of the end
     topics: dict[str, TopicAccount]
@@ -68,11 +71,11 @@ class Account(NamedTuple):
 
     @property
     def starvation(self) -> Starvation:
-        """The spans in which the host starved the nodes."""
+        """Return the spans in which the host starved the nodes."""
         return Starvation(self.starved)
 
     def over(self, *topics: str) -> str:
-        """The part of these topics that a figure is taken over; empty for whole topics."""
+        """Return how much of these topics a figure is taken over; empty if all of them."""
         accounts = {name: self.topics[name] for name in topics if name in self.topics}
         parts = [
             f"{math.floor(100.0 * topic.share)} % of {name}"
@@ -82,14 +85,14 @@ class Account(NamedTuple):
         return f"over {', '.join(parts)}" if parts else ""
 
     def notes(self) -> tuple[str, ...]:
-        """Sentences for the user of a log."""
-        # notes tell of these
+        """Return the sentences that a user of the log should read."""
+        # The notes of the tape already tell of these.
         lacks = [lack for lack in self.lacks if not any(part in lack for part in PARTS)]
         busy = (self.busy,) if self.busy else ()
         return (*busy, *(f"the log lacks {lack}" for lack in lacks))
 
     def as_json(self) -> dict[str, Any]:
-        """The account for `summary.json`."""
+        """Return the account as `summary.json` holds it."""
         content = self._asdict()
         content["topics"] = {
             name: topic._asdict() | {"share": topic.share} for name, topic in self.topics.items()
@@ -100,14 +103,17 @@ class Account(NamedTuple):
 
 
 def best_error_over(tape: Tape) -> tuple[str, Signal]:
-    """Name and signal of the best error on a tape: the true error, or else the measured error.
+    """Return name and signal of the best error on a tape.
+
+    This is the true error if the tape has it, else the measured error.
 
     Args:
         tape: A flight with y and y_m.
 
     Returns:
-        "true error" or "measured error", of a log that lacks samples with the part of the flight,
-        as "true error, over 49 % of truth", and e = y - y_m, shape (N, m), SI.
+        "true error" or "measured error", and e = y - y_m, shape (N, m), SI. If the log lacks
+        samples, the name also says what part of the flight is left, as in "true error, over 49 %
+        of truth".
 
     Raises:
         ParameterError: `tape` is no Tape, or has no y and y_m.
@@ -126,7 +132,7 @@ def best_error_over(tape: Tape) -> tuple[str, Signal]:
 
 
 def planned_end_ns(tape: Tape) -> int | None:
-    """Stamp of the planned end; None where the log does not have it."""
+    """Return the stamp of the planned end, or None if the log does not tell it."""
     duration = tape.duration
     if isinstance(tape.scenario, Scenario):
         duration = tape.scenario.flight.duration
@@ -136,11 +142,11 @@ def planned_end_ns(tape: Tape) -> int | None:
 def account(
     tape: Tape, scenario: Scenario | None, outcome: Outcome = COMPLETED, *, simulated: bool = True
 ) -> Account:
-    """The account of a flight.
+    """Account for a flight.
 
-    The account begins at t = 0 and ends at the planned end where the log knows both, else from the
-    first sample of a topic to the last sample of any. `simulated`: the aircraft of the scenario
-    flew, no autopilot.
+    If the log tells both t = 0 and the planned end, the account covers the time between them. If
+    not, it begins with the first sample of a topic and ends with the last sample of any.
+    `simulated` says that the aircraft of the scenario flew, and no autopilot.
     """
     planned_ns = planned_end_ns(tape)
     span = _span(tape, planned_ns, outcome, simulated=simulated)
@@ -182,7 +188,7 @@ def account(
 
 
 def _span(tape: Tape, planned_ns: int | None, outcome: Outcome, *, simulated: bool) -> Span:
-    """The part of the flight that the account is over."""
+    """Return the part of the flight that the account covers."""
     lasts = [
         int(signal.stamp_ns.max())
         for name, signal in tape.signals.items()
@@ -196,10 +202,10 @@ def _span(tape: Tape, planned_ns: int | None, outcome: Outcome, *, simulated: bo
 
 
 def _processes(tape: Tape) -> dict[str, ProcessAccount]:
-    """The processes in flight time.
+    """Return the processes, in flight time.
 
-    In lockstep the stamps are no times of day, and when a process was ready is not known: one that
-    also sent nothing, as the recorder, is left out.
+    In lockstep the stamps are no times of day, so we do not know when a process was ready. A
+    process that sent nothing either, like the recorder, is left out.
     """
 
     def flight_time(stamp_ns: int | None) -> float | None:
@@ -224,9 +230,9 @@ def _too_busy(parts: Sequence[str]) -> str:
 
 
 def lost_log_parts(notes: Iterable[str], *, planned: bool) -> list[str]:
-    """Parts of a bag that are missing, and leaps of the clock.
+    """Return the parts of a bag that are missing, and the leaps of the clock.
 
-    A truncated end counts where no planned end does.
+    A truncated end counts only if no planned end is known, which would show it too.
     """
     kinds = PARTS if not planned else PARTS[:2]
     missing = re.compile("|".join(map(re.escape, kinds)))
@@ -238,10 +244,7 @@ def lost_log_parts(notes: Iterable[str], *, planned: bool) -> list[str]:
 
 
 def _absent(tape: Tape, scenario: Scenario | None) -> list[str]:
-    """The channels of the scenario that the samples of y, y_m and u do not have.
-
-    There is a sentence a topic.
-    """
+    """Return the channels of the scenario that y, y_m and u lack, a sentence for each topic."""
     if scenario is None:
         return []
     outputs = scenario.controller.outputs
@@ -257,10 +260,10 @@ def _absent(tape: Tape, scenario: Scenario | None) -> list[str]:
 def _late_first_u(
     tape: Tape, topics: Mapping[str, TopicAccount], scenario: Scenario | None
 ) -> float | None:
-    """Flight time of the first u that came more than SILENCE after the first y could.
+    """Return when the first u came, s, if that was more than SILENCE after the first y could.
 
-    None for a u in time. The numbers of the ticks tell of a first u before the log. A controller
-    that a user activates has none in time.
+    Returns None if u came in time. The numbers of the ticks tell whether there was a u before the
+    log began. If a user activates the controller, no time is too late.
     """
     if scenario is None or not (scenario.controller.autostart and scenario.controller.start_active):
         return None
@@ -277,9 +280,10 @@ def _late_first_u(
 
 
 def _lack(name: str, topic: TopicAccount, end: float, late: float, *, late_u: bool) -> str:
-    """What a topic lacks, as a sentence without a verb; empty for a whole topic.
+    """Return what a topic lacks, as a sentence without a verb; empty if it lacks nothing.
 
-    `late`: of the first and the last sample, s; `late_u`: the first u of the flight was late.
+    `late` is how long before the end the last sample may be stamped, s; the first may be as late.
+    `late_u` says that the first u of the flight was late.
     """
     facts = []
     missing = not topic.holds(topic.found + topic.unsent) or (
@@ -318,10 +322,10 @@ def _lack(name: str, topic: TopicAccount, end: float, late: float, *, late_u: bo
 def _is_of_host(
     tape: Tape, name: str, topic: TopicAccount, starved: Starvation, end: float
 ) -> bool:
-    """Whether the host alone is the cause of what a topic lacks.
+    """Return whether the host alone is the cause of what a topic lacks.
 
-    No message was lost and no stamp is wrong, so what is missing was never sent. The topic goes on
-    to the `end`, s, and a late begin lies in a starved span.
+    That is so if no message was lost and no stamp is wrong, so that what is missing was never sent;
+    if the topic goes on to the `end`, s; and if it began in time, or late in a starved span.
     """
     is_whole = tape.recording.get(name, Recording(0)).lost == 0
     has_stamps = not (topic.step or topic.unset or topic.left_out or topic.repeated)
@@ -334,7 +338,7 @@ def _is_of_host(
 
 
 def account_of_json(summary: Mapping[str, Any]) -> Account | None:
-    """The account in a summary; None for a summary without one."""
+    """Return the account in a summary, or None if it has none."""
     content = summary.get("account")
     if content is None:
         return None

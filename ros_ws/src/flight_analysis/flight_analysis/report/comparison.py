@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Comparison of several flights, channels matched by name.
+"""Compare several flights, with their channels matched by name.
 
-The comparison has ratios of metrics to the first flight, and the conditions that differ.
+We compute ratios of metrics to the first flight, and list the conditions that differ.
 """
 
 from collections.abc import Mapping, Sequence
@@ -30,11 +30,11 @@ from flight_core.parameters import flatten
 from flight_core.tape import Tape
 from flight_log.clock import SINCE_EPOCH_NS
 
-EQUAL_RATIO_TOLERANCE = 0.05  # metrics with a ratio closer to 1 count as equal
+EQUAL_RATIO_TOLERANCE = 0.05  # if a ratio is closer to 1, the metrics count as equal
 
 
 class ComparisonRow(NamedTuple):
-    """A metric of every flight and the ratio to the first flight; None without a ratio."""
+    """A metric of every flight, and its ratio to the first flight if there is one."""
 
     name: str
     texts: tuple[str, ...]
@@ -44,7 +44,10 @@ class ComparisonRow(NamedTuple):
     alike: tuple[bool, ...] = ()
 
     def verdict(self, flight: int) -> str:
-        """A flight beside the first: "better", "worse" or "same"; an unlike flight is "same"."""
+        """Return whether a flight is "better", "worse" or the "same" as the first.
+
+        A flight under other conditions counts as the "same".
+        """
         ratio = self.ratios[flight]
         if self.alike and not self.alike[flight]:
             return "same"
@@ -54,7 +57,7 @@ class ComparisonRow(NamedTuple):
 
 
 class ComparisonTable(NamedTuple):
-    """Metrics of a channel, or of the controller's ticks."""
+    """The metrics of a channel, or of the controller's ticks."""
 
     caption: str
     rows: tuple[ComparisonRow, ...]
@@ -65,14 +68,14 @@ class ComparisonTable(NamedTuple):
 
 
 class Condition(NamedTuple):
-    """A parameter that differs, by flight."""
+    """A parameter that differs, with its value in each flight."""
 
     key: str
     texts: tuple[str, ...]
 
 
 WINDS = tuple(f"aircraft.{key}" for key in ("gusts", "turbulence", "wind", "shear", "microburst"))
-COMPARED = ("controller.",)  # what a comparison may be of: the ratios keep their colours
+COMPARED = ("controller.",)  # if only this differs, it is what we compare, and ratios have colours
 NO_CONDITION = ("recorder.",)
 PACE = "flown"
 LONG = 40  # characters of a value, as of a matrix
@@ -80,7 +83,7 @@ UNLIKE = "the conditions differ: a ratio between unlike flights says nothing of 
 
 
 def conditions(flights: Sequence[RecordedFlight]) -> list[Condition]:
-    """The parameters with unlike values, wind first, and whether a flight was in real time."""
+    """Return the parameters that differ, wind first, and whether each flight was in real time."""
     values = [_parameters(flight) for flight in flights]
     keys = sorted(
         {key for key in chain.from_iterable(values) if not key.startswith(NO_CONDITION)},
@@ -91,7 +94,7 @@ def conditions(flights: Sequence[RecordedFlight]) -> list[Condition]:
 
 
 def _parameters(flight: RecordedFlight) -> dict[str, str]:
-    """The parameters of a flight as text, by full name."""
+    """Return the parameters of a flight as text, by full name."""
     if flight.scenario is None:
         return {}
     tree = {
@@ -103,7 +106,7 @@ def _parameters(flight: RecordedFlight) -> dict[str, str]:
 
 
 def _shortened(texts: Sequence[str]) -> tuple[str, ...]:
-    """The texts; of a long list of numbers the count, and whether the numbers differ."""
+    """Shorten a long list of numbers to its count, and say whether the numbers differ."""
     counts = [f"{text.count(',') + 1} values" if len(text) > LONG else text for text in texts]
     return tuple(
         f"{count}, others" if texts.index(text) and count in counts[: texts.index(text)] else count
@@ -126,9 +129,9 @@ def _text(value: object) -> str:
 def has_same_conditions(
     flights: Sequence[RecordedFlight], *, timed: bool = False
 ) -> tuple[bool, ...]:
-    """Whether each flight had the conditions of the first, but for the controller.
+    """Return whether each flight had the conditions of the first, except for the controller.
 
-    `timed`: with the same time.
+    If `timed`, it must have kept the same time too, real or not.
     """
     rows = [
         row
@@ -149,9 +152,9 @@ def comparison_tables(
     lower_is_better: bool,
     units: Mapping[str, DisplayUnit] | None = None,
 ) -> list[ComparisonTable]:
-    """Metrics of "errors" or "inputs" of the summaries: a table per channel.
+    """Return metrics of "errors" or "inputs" of the summaries, a table for each channel.
 
-    A table has a row per column with a value. `units`: those of the flights by default.
+    A table has a row for each column that has a value. `units` are those of the flights by default.
     """
     display = common_units(flights) if units is None else units
     same = has_same_conditions(flights)
@@ -171,7 +174,7 @@ def comparison_tables(
 def error_tables(
     flights: Sequence[RecordedFlight], units: Mapping[str, DisplayUnit] | None = None
 ) -> list[ComparisonTable]:
-    """Metrics of the error and settling times, by channel; `units` as in `comparison_tables`."""
+    """Return metrics of the error and settling times by channel, as `comparison_tables` does."""
     return [
         table._replace(rows=(*table.rows, *_settling_rows(flights, table.channel)))
         for table in comparison_tables(
@@ -195,7 +198,7 @@ def _settling_rows(flights: Sequence[RecordedFlight], channel: str) -> list[Comp
 
 
 def tick_tables(flights: Sequence[RecordedFlight]) -> list[ComparisonTable]:
-    """Timing metrics of the controllers as a table; none for zeros alone."""
+    """Return the timing of the controllers as a table, or none if all times are 0."""
     same = has_same_conditions(flights, timed=True)
     summaries = [flight.summary for flight in flights]
     rows = []
@@ -207,7 +210,7 @@ def tick_tables(flights: Sequence[RecordedFlight]) -> list[ComparisonTable]:
 
 
 def _row(figures: Sequence[Mapping[str, Any]], column: Column, unit: DisplayUnit) -> ComparisonRow:
-    """A metric of each flight; `unit`: of the row."""
+    """Return a metric of each flight in a row; `unit` is that of the row."""
     values = [column.value(each) for each in figures]
     first = values[0]
     ratios = tuple(None if value is None or not first else value / first for value in values)

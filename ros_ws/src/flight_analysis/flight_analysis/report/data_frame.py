@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A flight as a data frame of polars."""
+"""Turn a flight into a data frame of polars."""
 
 from typing import TYPE_CHECKING
 
@@ -9,16 +9,16 @@ import numpy as np
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Tape, as_tape
 
-if TYPE_CHECKING:  # it loads in some tenths of a second
+if TYPE_CHECKING:  # polars takes some tenths of a second to load
     import polars as pl
 
 
 def data_frame(tape: Tape) -> "pl.DataFrame":
-    """The signals as a table, SI: a column "topic.channel" per channel.
+    """Return the signals as a table, SI, with a column "topic.channel" for each channel.
 
-    There is a row per instant with a sample of any topic. The first columns are "stamp_ns" (int64)
-    and "t" = (stamp_ns - start) / 1e9. A topic without a sample at an instant has nulls there. Of
-    two samples with equal stamps the table holds the later.
+    There is a row for each instant at which any topic has a sample. The first columns are
+    "stamp_ns" (int64) and "t" = (stamp_ns - start) / 1e9. A topic that has no sample at an instant
+    has nulls there. If two samples have the same stamp, the table holds the later one.
 
     Args:
         tape: A flight.

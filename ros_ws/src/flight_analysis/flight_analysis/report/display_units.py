@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Units and numbers of tables and figures."""
+"""Choose units and digits for tables and figures."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -15,24 +15,24 @@ NO_VALUE = "-"
 
 
 class DisplayUnit(NamedTuple):
-    """Unit of tables and figures: displayed value = SI value * factor."""
+    """A unit of tables and figures: displayed value = SI value * factor."""
 
     unit: str
     factor: float
 
 
-NO_UNIT = DisplayUnit("", 1.0)  # for a channel of unknown unit: its SI value without a unit
+NO_UNIT = DisplayUnit("", 1.0)  # for a channel whose unit is unknown: it stays in SI
 
 
 QUANTITY_UNITS = {
     name: DisplayUnit("deg", 180.0 / math.pi) if unit == "rad" else DisplayUnit(unit, 1.0)
     for name, unit in UNITS.items()
 }
-"""Units of the quantities that guidance holds."""
+"""Units in which we show the quantities that guidance holds."""
 
 
 def channel_label(name: str, units: Mapping[str, DisplayUnit]) -> str:
-    """The name of a channel with the unit."""
+    """Return the name of a channel with its unit."""
     unit = units.get(name, NO_UNIT).unit
     return f"{name} ({unit})" if unit else name
 
@@ -42,16 +42,16 @@ DEGREES = {"rad": "deg", "rad/s": "deg/s"}
 
 
 def display_unit(unit: str) -> DisplayUnit:
-    """The display unit of a unit of the airframe file.
+    """Return the unit in which to show a unit of the airframe file.
 
-    Radians become deg, rad/s deg/s; any further unit stays.
+    Radians are shown in deg, and rad/s in deg/s. Any other unit stays.
     """
     shown = DEGREES.get(unit, unit)
     return DisplayUnit(shown, 1.0 / si_per_unit(shown))
 
 
 def display_units(scenario: Scenario) -> dict[str, DisplayUnit]:
-    """Units of tables and figures by channel of y and u, in the order of the controller."""
+    """Return units by channel of y and u, in the order of the controller."""
     channels = scenario.aircraft.channels()
     units = {
         name: display_unit(unit) for name, unit in {**channels.outputs, **channels.inputs}.items()
@@ -61,7 +61,7 @@ def display_units(scenario: Scenario) -> dict[str, DisplayUnit]:
 
 
 def in_radians(units: Mapping[str, DisplayUnit]) -> dict[str, DisplayUnit]:
-    """The units with rad in place of deg, also in deg/s."""
+    """Return the units with rad in place of deg, also in deg/s."""
     return {
         name: DisplayUnit(shown.unit.replace("deg", "rad"), 1.0)
         if shown.unit.startswith("deg")
@@ -103,23 +103,23 @@ STATES = {
 
 
 def state_units(scenario: Scenario) -> dict[str, DisplayUnit]:
-    """Units of the states of a simulated aircraft."""
+    """Return the units of the states of a simulated aircraft."""
     aircraft = scenario.aircraft
     states = STATES if aircraft.is_jsbsim else load_airframe(aircraft.airframe).states
     return {name: display_unit(unit) for name, unit in states.items()}
 
 
 def in_order(names: Iterable[str], units: Mapping[str, DisplayUnit]) -> list[str]:
-    """The channels in the order of their units, then the unknown ones as they come."""
+    """Sort channels as their units are; those without a known unit follow as they come."""
     places = {name: place for place, name in enumerate(units)}
     return sorted(names, key=lambda name: places.get(name, len(places)))
 
 
 def format_value(value: float | None, factor: float = 1.0) -> str:
-    """A value with three digits, or NO_VALUE."""
+    """Write a value with three digits, or NO_VALUE."""
     return NO_VALUE if value is None else f"{value * factor:#.3g}".rstrip(".")
 
 
 def format_seconds(time: float | None) -> str:
-    """A time in s with a digit, or that it is not known."""
+    """Write a time in s with one digit after the point, or that it is not known."""
     return "an unknown time" if time is None else f"{time:.1f} s"

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Export of flights: a wide table of the signals (CSV, Parquet), and a figure (PNG)."""
+"""Export flights: all signals as a wide table (CSV, Parquet), or as a figure (PNG)."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,7 +12,7 @@ from flight_analysis.report.summary import RecordedFlight, labels
 from flight_core.files import replacing
 from flight_core.parameters import require
 
-if TYPE_CHECKING:  # it loads in some tenths of a second, and most reports do not need it
+if TYPE_CHECKING:  # polars takes some tenths of a second to load, and few reports need it
     import polars as pl
 
 # inches
@@ -22,9 +22,9 @@ DPI = 120
 
 
 def signal_table(flights: Sequence[RecordedFlight]) -> "pl.DataFrame":
-    """The table of a flight, or of several flights.
+    """Return the table of a flight, or of several flights.
 
-    Of several flights the name of the flight is in a first column "run".
+    For several flights a first column "run" has the name of the flight.
     """
     import polars as pl  # noqa: PLC0415
 
@@ -38,7 +38,10 @@ def signal_table(flights: Sequence[RecordedFlight]) -> "pl.DataFrame":
 
 
 def write_csv(path: Path, flights: Sequence[RecordedFlight]) -> None:
-    """Write the wide table as CSV. Numbers read back to the last bit; a null is an empty cell."""
+    """Write the wide table as CSV.
+
+    Numbers read back to the last bit. A null is an empty cell.
+    """
     with replacing(path) as stream:
         signal_table(flights).write_csv(stream)
 
@@ -50,9 +53,9 @@ def write_parquet(path: Path, flights: Sequence[RecordedFlight]) -> None:
 
 
 def write_png(path: Path, flights: Sequence[RecordedFlight]) -> None:
-    """Write y over y_m, the best error, and u of a flight or several flights.
+    """Write a figure of y over y_m, the best error, and u of one or several flights.
 
-    There is a column a quantity, and a row a channel.
+    Each quantity has a column, and each channel a row.
     """
     from matplotlib.figure import Figure  # noqa: PLC0415
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The figures of a flight, drawn from the tape. A figure without signals on the tape is None.
+"""Draw the figures of a flight from its tape. A figure is None if the tape lacks its signals.
 
 The figures do not depend on the aircraft: channels are drawn under their own names.
 """
@@ -61,7 +61,7 @@ FLIGHTS = {
     "#7a6a00": "#d9c74a",
 }
 COLOURS = tuple(FLIGHTS)
-"""Colours of several flights."""
+"""Colours of flights that are compared."""
 DARK = FLIGHTS | {
     PLANT: "#9edbff",
     REFERENCE: "#8f5820",
@@ -71,7 +71,7 @@ DARK = FLIGHTS | {
     END_STOP: "#555c64",
     LIMIT: "#b9c0c7",
 }
-"""Colours of curves on a light page, and the colours that replace them on a dark page."""
+"""Colours of curves on a light page, with those that replace them on a dark page."""
 MODE_COLOURS = {
     Mode.WAITING: "#b0b0b0",
     Mode.HOLD: "#f2c230",
@@ -90,7 +90,7 @@ FREQUENCIES = [digit * 10.0**power for power, digit in product(range(-4, 4), (1,
 # share of the axis, about two pixels: shorter intervals are lengthened
 MIN_VISIBLE_FRACTION = 1 / 500
 MOST_MARKED = 100  # times of messages: plotly is slow with more shapes
-LIMIT_VIEW_RATIO = 3.0  # a limit is in view where it is at most this many times the largest u
+LIMIT_VIEW_RATIO = 3.0  # a limit is in view if it is at most this many times the largest u
 
 # lower and upper limit by input, SI; infinite without a limit
 Limits = Mapping[str, tuple[float, float]]
@@ -99,10 +99,10 @@ SAME_CURVE_TOLERANCE = 1e-3  # of the largest value: closer references are drawn
 
 
 def plot_context(flights: Sequence[RecordedFlight]) -> PlotContext:
-    """The context of a flight or of several flights.
+    """Return the context of a flight or of several flights.
 
-    Every figure shades the gusts and the failsafe modes of the controller. Of several flights it
-    shades common gusts alone.
+    Every figure shades the gusts and the failsafe modes of the controller; of several flights only
+    the gusts, and only if all had the same.
     """
     longest = max((flight.tape for flight in flights), key=flight_end)
     end = flight_end(longest)
@@ -124,7 +124,7 @@ def plot_context(flights: Sequence[RecordedFlight]) -> PlotContext:
 
 
 def runs_of(flights: Sequence[RecordedFlight]) -> dict[str, Run]:
-    """The flights of figures by label, each in its colour."""
+    """Return the flights of figures by label, each in its colour."""
     colours = cycle(COLOURS) if len(flights) > 1 else (PLANT,)
     return {
         label: Run(flight.tape, flight.period_ns, colour)
@@ -133,7 +133,7 @@ def runs_of(flights: Sequence[RecordedFlight]) -> dict[str, Run]:
 
 
 def flight_end(tape: Tape) -> float:
-    """The last instant of any signal, s; 0 for a tape without samples."""
+    """Return the last instant of any signal, s; 0 for a tape without samples."""
     return max(
         (float(tape.time(topic)[-1]) for topic in tape.signals if len(tape[topic].stamp_ns)),
         default=0.0,
@@ -141,7 +141,7 @@ def flight_end(tape: Tape) -> float:
 
 
 def gust_intervals(tape: Tape, gusts: Windows) -> list[Interval]:
-    """The gusts up to the end of the flight; a repeated gust has one label."""
+    """Return the gusts up to the end of the flight; a gust that repeats has one label."""
     end = flight_end(tape)
     return [
         Interval(
@@ -157,7 +157,7 @@ def gust_intervals(tape: Tape, gusts: Windows) -> list[Interval]:
 
 
 def mode_intervals(tape: Tape, min_length: float = 0.0) -> list[Interval]:
-    """Intervals of the modes of the controller except ENGAGED, by mode, from `internals`."""
+    """Return the intervals of the controller's modes except ENGAGED, by mode."""
     if "internals" not in tape:
         return []
     t = tape.time("internals")
@@ -175,7 +175,7 @@ def mode_intervals(tape: Tape, min_length: float = 0.0) -> list[Interval]:
 def _curves(
     context: PlotContext, name: str, signal: Callable[[Tape], Signal | None], **style: Any
 ) -> dict[str, Curve]:
-    """A curve of each flight with a signal, under its `name`; of several under their labels."""
+    """Return the curve of a flight that has a signal, as `name`, or of several by their labels."""
     curves = {}
     for label, run in context.runs.items():
         if (samples := signal(run.tape)) is not None:
@@ -187,7 +187,7 @@ def _curves(
 
 
 def _references(context: PlotContext) -> dict[str, Curve]:
-    """The distinct references: one for equal ones."""
+    """Return the references of the flights, with those that are equal as one."""
     references: dict[str, Curve] = {}
     for label, curve in _curves(context, "y_m", lambda tape: tape["y_m"]).items():
         equal = next(
@@ -206,9 +206,9 @@ def _references(context: PlotContext) -> dict[str, Curve]:
 
 
 def _is_same_curve(first: Curve, second: Curve) -> bool:
-    """Whether two references are the same curve over the common time.
+    """Return whether two references are the same curve as long as both last.
 
-    They differ by at most SAME_CURVE_TOLERANCE of the largest value.
+    They may differ by SAME_CURVE_TOLERANCE of the largest value.
     """
     one, two = first.signal, second.signal
     if set(one.names) != set(two.names) or not (len(one.stamp_ns) and len(two.stamp_ns)):
@@ -225,7 +225,7 @@ def _is_same_curve(first: Curve, second: Curve) -> bool:
 def tracking_figure(
     context: PlotContext, labels: Mapping[str, str] = MappingProxyType({})
 ) -> Figure:
-    """Y over y_m of every output; of several flights over the distinct references.
+    """Draw y over y_m for every output; of several flights y over each different reference.
 
     `labels` of axes replace those of their channels.
     """
@@ -234,10 +234,10 @@ def tracking_figure(
 
 
 def error_figure(context: PlotContext, floors: Mapping[str, float] | None = None) -> Figure:
-    """E = y - y_m of every output; of several flights the best error of each.
+    """Draw e = y - y_m of every output; of several flights the best error of each.
 
-    With errors of the sensors on the tape, the true error is drawn over the measured error. Noise
-    floors, by channel in SI, are lines above and below 0 where wide enough to see.
+    If the tape has errors of the sensors, the true error is drawn over the measured one. Noise
+    floors, by channel in SI, are lines above and below 0 if they are wide enough to see.
     """
     if context.is_comparison:
         errors = _curves(context, "e", lambda tape: best_error(tape)[1])
@@ -262,7 +262,7 @@ def error_figure(context: PlotContext, floors: Mapping[str, float] | None = None
 def input_figure(
     context: PlotContext, limits: Mapping[str, Limits] = MappingProxyType({})
 ) -> Figure | None:
-    """Actuator positions over the command u; of several flights u alone.
+    """Draw the actuator positions over the command u; of several flights only u.
 
     At most two kinds of limits are lines, and marks show where an input was saturated.
     """
@@ -314,10 +314,9 @@ def input_figure(
 
 
 def input_limits(scenario: Scenario, tape: Tape) -> dict[str, Limits]:
-    """Limits of u by kind and by input.
+    """Return the limits of u by kind and by input.
 
-    They are the end stops of the actuators where these are simulated, and the limits of the
-    controller.
+    These are the limits of the controller and, if the actuators are simulated, their end stops.
     """
     actuators = scenario.aircraft.actuators
     controller = scenario.controller
@@ -346,7 +345,7 @@ def _limit_pairs(names: Sequence[str], lower: Sequence[float], upper: Sequence[f
 
 
 def integral_figure(context: PlotContext) -> Figure | None:
-    """The integrals of the law, by output: of e and of the sign."""
+    """Draw the integrals of the law, of e and of the sign, for each output."""
     if "internals" not in context.tape:
         return None
     internals = context.tape["internals"]
@@ -366,9 +365,10 @@ def integral_figure(context: PlotContext) -> Figure | None:
 
 
 def spectrum_figure(context: PlotContext) -> Figure | None:
-    """Amplitude spectral density of u, logarithmic axes: a subplot per channel with the runs.
+    """Draw the amplitude spectral density of u, a subplot for each channel, with all runs.
 
-    A run with fewer than MIN_SPECTRUM_SAMPLES is left out; None without a run.
+    Both axes are logarithmic. A run with fewer than MIN_SPECTRUM_SAMPLES is left out; if none
+    remains, there is no figure.
     """
     units = context.units
     runs = {
@@ -402,7 +402,7 @@ def spectrum_figure(context: PlotContext) -> Figure | None:
 
 
 def _timing_samples(tape: Tape, period_ns: int) -> dict[str, FloatArray]:
-    """Samples of the controller's timing by quantity, ms, without quantities of zeros alone."""
+    """Return the samples of the controller's timing, ms, except quantities that are always 0."""
     samples: dict[str, FloatArray] = {}
     if "internals" in tape:
         periods = tick_periods(tape)
@@ -421,9 +421,9 @@ def _timing_samples(tape: Tape, period_ns: int) -> dict[str, FloatArray]:
 
 
 def timing_figure(context: PlotContext) -> Figure | None:
-    """Histograms of the controller's timing in ms; None for zeros alone.
+    """Draw histograms of the controller's timing, ms, unless all of it is 0.
 
-    They have common bins and a logarithmic axis. A quantity has a subplot with the runs.
+    Each quantity has a subplot, in which the runs share their bins. The counts are logarithmic.
     """
     runs = context.runs
     timing = {label: _timing_samples(run.tape, run.period_ns) for label, run in runs.items()}
@@ -458,7 +458,7 @@ def timing_figure(context: PlotContext) -> Figure | None:
 
 
 def wind_figure(context: PlotContext) -> Figure | None:
-    """Every nonzero component of the wind."""
+    """Draw each component of the wind that is not always 0."""
     wind = _nonzero_group(context.tape, "gust")
     if not wind.names:
         return None
@@ -469,7 +469,7 @@ def wind_figure(context: PlotContext) -> Figure | None:
 def state_figure(
     context: PlotContext, units: Mapping[str, DisplayUnit], labels: Mapping[str, str]
 ) -> Figure | None:
-    """The states of a simulated aircraft in these units, the outputs among them first.
+    """Draw the states of a simulated aircraft in these units, first those that are outputs.
 
     `labels` of axes replace those of their channels.
     """
@@ -482,7 +482,7 @@ def state_figure(
 
 
 def sensor_figure(context: PlotContext) -> Figure | None:
-    """Y less the true output, of every sensor with an error."""
+    """Draw y less the true output for every sensor that has an error."""
     noise = _nonzero_group(context.tape, "noise")
     if noise.names:
         return time_series_figure(
@@ -492,9 +492,9 @@ def sensor_figure(context: PlotContext) -> Figure | None:
 
 
 def tick_figure(context: PlotContext) -> Figure | None:
-    """Lateness, age of y and dt of the controller's ticks.
+    """Draw lateness, age of y and dt of the controller's ticks.
 
-    None for ticks in time with a fresh y alone.
+    Returns None if each tick was in time and had a fresh y.
     """
     tape = context.tape
     channels = ("late", "age", "dt")
@@ -512,14 +512,14 @@ def tick_figure(context: PlotContext) -> Figure | None:
 
 
 def _truth_group(tape: Tape, group: str) -> Signal:
-    """The channels "group.name" of `truth`; no channels on a tape without `truth`."""
+    """Return the channels "group.name" of `truth`; none if the tape lacks `truth`."""
     if "truth" in tape:
         return tape["truth"].group(group)
     return Signal(np.zeros(0, dtype=np.int64), (), np.zeros((0, 0)))
 
 
 def _nonzero_group(tape: Tape, group: str) -> Signal:
-    """The nonzero channels of `_truth_group`."""
+    """Return those channels of `_truth_group` that are not always 0."""
     signal = _truth_group(tape, group)
     nonzero = np.flatnonzero(signal.values.any(axis=0))
     return Signal(
@@ -528,7 +528,7 @@ def _nonzero_group(tape: Tape, group: str) -> Signal:
 
 
 def _saturated(tape: Tape, name: str, kind: Saturation) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """The instants of `internals`, and a mask of a kind of saturation of an input."""
+    """Return the instants of `internals`, and the mask of one kind of saturation of an input."""
     channel = f"limited.{name}"
     if "internals" not in tape or channel not in tape["internals"].names:
         return np.zeros(0), np.zeros(0, dtype=bool)
@@ -536,7 +536,7 @@ def _saturated(tape: Tape, name: str, kind: Saturation) -> tuple[FloatArray, NDA
 
 
 def _axis_range(values: FloatArray, bounds: FloatArray) -> tuple[float, float]:
-    """Range of an axis: the values, and near bounds."""
+    """Return the range of an axis: all values, and the bounds that are near them."""
     low = float(values.min(initial=0.0))
     high = float(values.max(initial=0.0))
     near = [

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The outcome of a flight by its log."""
+"""Find the outcome of a flight from its log."""
 
 from dataclasses import replace
 
@@ -15,11 +15,11 @@ NEVER_ENGAGED = never_flew("the controller never engaged")
 
 
 def outcome_of_log(tape: Tape, scenario: Scenario, *, simulated: bool) -> Outcome:
-    """The outcome of a flight without a recorded outcome, as of nodes started singly.
+    """Return the outcome of a flight that recorded none, as when nodes are started singly.
 
-    A part of a flight has UNKNOWN. The flight is completed where the log holds y, y_m and u for the
-    duration in the log, else that of the scenario. An autopilot may end the last engagement, and
-    with it u, before.
+    The flight is completed if the log holds y, y_m and u for the duration in the log, or if that is
+    missing, in the scenario. If only a part of the flight is in the log, its outcome is UNKNOWN. An
+    autopilot may end the last engagement, and u with it, before the end.
     """
     is_part = bool(lost_log_parts(tape.notes, planned=False)) or any(
         recording.step_ns for recording in tape.recording.values()
@@ -39,10 +39,10 @@ def outcome_of_log(tape: Tape, scenario: Scenario, *, simulated: bool) -> Outcom
 
 
 def until_last_tick(tape: Tape) -> Tape:
-    """The tape up to the controller's last tick.
+    """Cut the tape after the controller's last tick.
 
-    Later samples belong to the shutdown of the processes. A u that ends much earlier than y and
-    y_m, or before the end of a whole flight, is a gap of the log: nothing is cut there.
+    Later samples belong to the shutdown of the processes. But if u ends much earlier than y and
+    y_m, or before the end of a whole flight, this is a gap of the log, and we cut nothing there.
     """
     ticks = [
         int(tape[name].stamp_ns[-1]) for name in TICKS if name in tape and len(tape[name].stamp_ns)
@@ -54,7 +54,7 @@ def until_last_tick(tape: Tape) -> Tape:
     ]
     if not ticks:
         return tape
-    # one tick publishes u and internals
+    # One tick publishes both u and internals.
     end_ns = max(ticks)
     planned_ns = planned_end_ns(tape)
     if (

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The parameters of the controller that flew, with the linear loops.
+"""Find the parameters of the controller that flew, and their linear loops.
 
 A loop is around the aircraft of the file, or around the true aircraft of a simulation.
 """
@@ -39,7 +39,7 @@ TRUE = "true"
 
 
 class FlownController(NamedTuple):
-    """The parameters of a controller, and when they flew: first and last instants, s."""
+    """Parameters of a controller, and when they flew: first and last instants, s."""
 
     name: str  # "start", "file", "model 1"
     spans: tuple[tuple[float, float], ...]
@@ -47,12 +47,12 @@ class FlownController(NamedTuple):
 
     @property
     def times(self) -> str:
-        """The spans as text, in s."""
+        """Return the spans as text, in s."""
         return ", ".join(f"{start:.1f} to {stop:.1f}" for start, stop in self.spans)
 
 
 class FlownLoop(NamedTuple):
-    """The linear loop of flown parameters, around an aircraft."""
+    """The linear loop of parameters that flew, around an aircraft."""
 
     name: str  # of the parameters; empty for those of the whole flight
     times: str  # of the parameters, s
@@ -63,9 +63,9 @@ class FlownLoop(NamedTuple):
 def flown_controllers(
     tape: Tape, start: ControllerConfig, changes: Sequence[Change]
 ) -> tuple[FlownController, ...]:
-    """The parameters that flew in order: of the start and after the changes in flight.
+    """Return the parameters that flew, in order: at the start, and after each change in flight.
 
-    The digests of the ticks tell them.
+    The digests of the ticks tell which flew when.
     """
     by_digest = {start.digest(): start}
     latest = start
@@ -83,7 +83,7 @@ def flown_controllers(
 
 
 class FlownLoops(NamedTuple):
-    """The linear loops of a flight, and what is to be said of them."""
+    """The linear loops of a flight, and what we have to say about them."""
 
     loops: list[FlownLoop]  # none without a linear model, or where what flew is not known
     sentences: tuple[str, ...]  # how what flew differs from what the controller was told
@@ -103,7 +103,7 @@ def flown_loops(
 ) -> FlownLoops:
     """Return the linear loops of a flight.
 
-    Lags and delay are those that flew. `later` has the aircraft after each change in flight.
+    Their lags and delay are those that flew. `later` has the aircraft after each change in flight.
     """
     loops = []
     sentences: list[str] = []
@@ -134,7 +134,7 @@ def facts_of(
     controllers: Sequence[FlownController],
     later: Sequence[AircraftConfig] = (),
 ) -> FlightFacts:
-    """Return what the log of a flight tells beside its scenario."""
+    """Return what the log of a flight tells beyond its scenario."""
     known = {start.digest(), *(each.controller.digest() for each in controllers)}
     age = age_metrics(tape)
     return FlightFacts(
@@ -148,7 +148,7 @@ def facts_of(
 
 
 def _period_of_ticks(tape: Tape) -> float | None:
-    """Return the median time from a tick to the next, s; None for fewer than two in the log."""
+    """Return the median time from a tick to the next, s; None if the log has fewer than two."""
     if "internals" not in tape or "number" not in tape["internals"].names:
         return None
     steps = np.diff(tape["internals"]["number"])
@@ -159,14 +159,14 @@ def _period_of_ticks(tape: Tape) -> float | None:
 
 
 def _period_of(tape: Tape, topic: str) -> float | None:
-    """Return the median time between two samples of a topic, s; None for fewer than two."""
+    """Return the median time between two samples of a topic, s; None if it has fewer than two."""
     if topic not in tape or len(tape[topic].stamp_ns) < 2:
         return None
     return float(np.median(np.diff(tape[topic].stamp_ns))) / NANOSECONDS
 
 
 def true_airframe(tape: Tape, scenario: Scenario) -> Airframe | None:
-    """The simulated airframe before a drift, where unlike the file; else None."""
+    """Return the simulated airframe before a drift, or None if it is that of the file."""
     aircraft = scenario.aircraft
     uncertainty = aircraft.uncertainty
     differs = uncertainty.A > 0.0 or uncertainty.B > 0.0 or bool(uncertainty.entries)
@@ -184,10 +184,10 @@ def _loop_around(
 
 
 def learned_lines(tape: Tape, scenario: Scenario) -> dict[str, dict[str, float]]:
-    """The values of the entries in the topic `learned`, SI.
+    """Return known values of the entries in the topic `learned`, SI, by label.
 
-    The file has values, and the true aircraft where a simulation flew. Empty for an aircraft of
-    JSBSim.
+    They are those of the file and, if the flight was simulated, those of the true aircraft. For an
+    aircraft of JSBSim there are none.
     """
     if "learned" not in tape or scenario.aircraft.is_jsbsim:
         return {}
@@ -204,7 +204,7 @@ def learned_lines(tape: Tape, scenario: Scenario) -> dict[str, dict[str, float]]
 
 
 def _entry(airframe: Airframe, name: str) -> float | None:
-    """The value of an entry, SI; None where the airframe has no such entry."""
+    """Return the value of an entry, SI, or None if the airframe has no such entry."""
     parts = ENTRY.fullmatch(name)
     if parts is None:
         return None

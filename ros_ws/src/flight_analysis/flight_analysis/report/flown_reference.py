@@ -1,17 +1,17 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the y_m of a flight is that of the scenario.
+"""Tell whether the y_m of a flight is that of the scenario.
 
-The error e = y - y_m says nothing about a reference model that hangs, or that flies other
-commands: y follows whatever y_m is. So y_m is computed again, by the code of the node, from the
-commands of the scenario, and from the u_m of the log once there is one:
+The error e = y - y_m does not tell if the reference model hangs or flies other commands: y follows
+whatever y_m is. So we compute y_m again, by the code of the node, from the commands of the
+scenario, and from the u_m of the log once there is one:
 
     x_m+ = Phi x_m + Gamma [u_m(t), u_m(t + T/2), u_m(t + T)],  y_m = C x_m      (2)
 
-Every bit must be equal, but for ROUNDING. In real time the log does not say before which step a u_m
-arrived. It acted from the step on after which y_m has the right bits, if there is one within its
-age limit; where several steps give the right bits, all are followed until one is wrong. If the log
-lost a y_m or a u_m, an error below the harmless ones is not told.
+Every bit must be equal, except for ROUNDING. In real time the log does not say before which step a
+u_m arrived. It acted from the step after which y_m has the right bits, if there is one within its
+age limit; if several steps give the right bits, we follow all of them until one is wrong. If the
+log lost a y_m or a u_m, an error smaller than the harmless ones cannot be seen.
 """
 
 import copy
@@ -36,23 +36,23 @@ from reference_model.reference import Reference
 from rise_di_controller.learning.divergence import HARMLESS, LEAST, LEAST_RATE
 
 ROUNDING = 1e-9
-"""rad/s, m/s. Another build of NumPy may round the sine of a command otherwise; errors that mean
-something are a million times larger."""
+"""rad/s, m/s. Another build of NumPy may round the sine of a command differently; an error that
+means something is a million times larger."""
 
 AHEAD_NS = 5_000_000
-"""How far the clock of u_m may be ahead: nodes tell of clocks that differ by more."""
+"""How far the clock of u_m may be ahead: if clocks differ by more, the nodes say so."""
 
 FITTING = 0.5
-"""Part of the samples that must be right for an instant to count as t = 0 of a node that was
-started by itself."""
+"""Part of the samples that must be right for an instant to count as the t = 0 of a node that a user
+started singly."""
 
 
 MOST_PATHS = 16
-"""Orders of the u_m that are followed at once: guidance sends ten within their age limit."""
+"""Orders of the u_m that we follow at once: guidance sends ten within their age limit."""
 
 
 class NotCompared(Enum):
-    """Why y_m is not compared with the scenario."""
+    """Why y_m was not compared with the scenario."""
 
     FOREIGN = "y_m is of another reference model than that of the stack"
     NO_START = "the log does not hold the start of the reference model"
@@ -89,7 +89,7 @@ class _Path(NamedTuple):
 def reference_errors(tape: Tape, scenario: Scenario) -> ReferenceErrors | NotCompared | None:
     """Compute y_m again, and return how far that of the log is from it.
 
-    Returns None for a log without y_m.
+    Returns None if the log has no y_m.
     """
     if "y_m" not in tape or not len(tape["y_m"].stamp_ns):
         return None
@@ -118,11 +118,11 @@ def reference_errors(tape: Tape, scenario: Scenario) -> ReferenceErrors | NotCom
 
 
 def reference_shortfalls(tape: Tape, scenario: Scenario) -> list[Shortfall]:
-    """Return a shortfall for the y_m that is farthest from that of the scenario, if one is."""
+    """Return a shortfall for the y_m that is farthest from that of the scenario, if one is off."""
     errors = reference_errors(tape, scenario)
     if not isinstance(errors, ReferenceErrors):
         return []
-    # The comparison is false for NaN too.
+    # We negate, so that NaN counts as off too.
     is_off = ~(np.abs(errors.error) <= errors.allowed)
     if not is_off.any():
         return []
@@ -143,7 +143,7 @@ def reference_shortfalls(tape: Tape, scenario: Scenario) -> list[Shortfall]:
 
 
 def reference_notes(tape: Tape, scenario: Scenario) -> list[str]:
-    """Return the note on a y_m that cannot be compared with the scenario."""
+    """Return a note if y_m cannot be compared with the scenario."""
     if _is_planned(tape) and is_sent_by_stack(tape, "y_m"):
         return []
     errors = reference_errors(tape, scenario)
@@ -185,7 +185,7 @@ def _computed(
 ) -> FloatArray:
     """Return y_m of the reference model at the instants t_ns, (N, m).
 
-    `y_m` of the log, (N, m), only tells between which two samples a u_m arrived.
+    `y_m` of the log, (N, m), serves only to tell between which two samples a u_m arrived.
     """
     paths = [_Path(Reference(parameters), 0)]
     max_age_ns = nanoseconds(parameters.live.max_age)
@@ -199,11 +199,11 @@ def _computed(
             for trial in _next_paths(path, commands, before_ns, max_age_ns):
                 sample = trial.reference.sample(number)
                 error = float(np.max(np.abs(y_m[k] - sample)))
-                # min: an error that is not a number becomes the largest
+                # With this order of its arguments, min turns an error that is NaN into inf.
                 trials.append((min(np.inf, error), sample, trial))
         trials.sort(key=lambda each: each[0])
         least, expected[k], _ = trials[0]
-        # A wrong path has right bits only as long as the u_m that it took too early hardly differs.
+        # A wrong path has the right bits only while the u_m that it took too early hardly differs.
         bound = ROUNDING if 0.0 < least <= ROUNDING else least
         paths = _distinct([trial for error, _, trial in trials if error <= bound])[:MOST_PATHS]
         before_ns = number * period_ns
@@ -213,7 +213,7 @@ def _computed(
 def _next_paths(
     path: _Path, commands: Sequence[_Command], before_ns: int, max_age_ns: int
 ) -> list[_Path]:
-    """Return the paths from one: each u_m that may have arrived is the newest, or none is."""
+    """Return the paths that go on from one: any u_m that may have arrived, or none, is newest."""
     arrived = path.taken
     while arrived < len(commands) and commands[arrived].t_ns <= before_ns + AHEAD_NS:
         arrived += 1

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of merit of a guided flight.
+"""Compute the figures of merit of a guided flight.
 
-They are the segments, by mode and leg, with the errors of the held quantities.
+For each segment, by mode and leg, these are the errors of the quantities that guidance held.
 """
 
 import math
@@ -42,7 +42,7 @@ UNITS: Mapping[str, str] = {
     **dict.fromkeys(("xtrack", "altitude"), "m"),
     **dict.fromkeys(("climb", "V"), "m/s"),
 }
-"""SI unit by quantity that guidance holds."""
+"""SI unit of each quantity that guidance holds."""
 
 BANDS: Mapping[str, float] = {
     **dict.fromkeys(("phi", "theta"), math.radians(1.0)),
@@ -55,13 +55,13 @@ BANDS: Mapping[str, float] = {
 
 
 PATHS = (Lateral.ORBIT, Lateral.ROUTE, Lateral.PLACE)
-"""Modes with an error in m: beside a path, or from a place."""
+"""Modes whose error is in m: the distance beside a path, or from a place."""
 
 
 class HoldErrors(NamedTuple):
-    """Errors of a held quantity over a segment, in SI.
+    """The errors of a held quantity over a segment, in SI.
 
-    A segment with a begin outside the band has overshoot and settling.
+    Only a segment that begins outside the band has overshoot and settling.
     """
 
     quantity: str
@@ -72,11 +72,11 @@ class HoldErrors(NamedTuple):
 
 
 class FlownLeg(NamedTuple):
-    """A leg of a route in the flight."""
+    """A leg of a route, as flown."""
 
     leg: int  # number of the leg, from 0 as in `target`
-    start: float  # s, from then on the aircraft is under way to the leg
-    joined: float | None  # s, from then on the aircraft is on the leg; None: never
+    start: float  # s, when the aircraft begins to fly to the leg
+    joined: float | None  # s, when the aircraft has reached the line of the leg; None: never
     stop: float  # s
     # "flown", "missed", or "not ended": by another command, or by the end of the flight
     result: str
@@ -84,7 +84,7 @@ class FlownLeg(NamedTuple):
 
 
 class Segment(NamedTuple):
-    """A part of the flight with the same modes, commands and leg."""
+    """A part of the flight in which modes, commands and leg stay the same."""
 
     start: float  # s
     stop: float  # s
@@ -95,9 +95,9 @@ class Segment(NamedTuple):
 
 
 def segments(tape: Tape) -> list[Segment]:
-    """The segments of a guided flight, from `guidance`.
+    """Return the segments of a guided flight, from `guidance`.
 
-    Commands less than SETTLING_DWELL apart begin a single segment.
+    If commands come less than SETTLING_DWELL apart, they begin a single segment.
     """
     t = tape.time("guidance")
     errors = control_errors(tape)
@@ -146,11 +146,11 @@ def segments(tape: Tape) -> list[Segment]:
 
 
 def flown_legs(tape: Tape) -> list[FlownLeg]:
-    """The legs of a guided flight in order, from `guidance`: flown, missed, or not ended."""
+    """Return the legs of a guided flight in order, from `guidance`, each with its result."""
     t = tape.time("guidance")
     log = tape["guidance"]
     legs = np.where(log["mode.lateral"] == Lateral.ROUTE, log["leg"], -1.0)
-    # A leg that is commanded again begins again.
+    # If a leg is commanded again, it begins again.
     commands = log["given"].astype(np.int64) & bits(("leg",))
     edges = np.flatnonzero((np.diff(legs) != 0.0) | (commands[1:] != 0)) + 1
     result = []
@@ -176,11 +176,11 @@ def flown_legs(tape: Tape) -> list[FlownLeg]:
 
 
 def unflown_legs(tape: Tape, section: GuidanceConfig) -> range:
-    """Numbers of the legs ahead at the end of the flight, the leg under way among them.
+    """Return the numbers of the legs that are ahead when the flight ends.
 
-    The last leg of a route is an orbit without end and not among them. Empty where a command
-    replaced the route, and for a route outside the log. A route that the fence, a lost pose or a
-    lost link ended has its legs still ahead.
+    The leg under way is one of them; the last leg of a route is an orbit without an end, and is
+    not. The result is empty if a command replaced the route, or if the route is not in the log. If
+    the fence, a lost pose or a lost link ended the route, its legs are still ahead.
     """
     log = tape["guidance"]
     on_route = np.flatnonzero(log["mode.lateral"] == Lateral.ROUTE)
@@ -199,10 +199,10 @@ def unflown_legs(tape: Tape, section: GuidanceConfig) -> range:
 
 
 def orbit_missed_by(tape: Tape, section: GuidanceConfig) -> float:
-    """Distance from the circle of the last orbit at the end of the flight, m.
+    """Return how far the flight ends from the circle of its last orbit, m.
 
-    0 of an orbit that is joined, within the distance at which a leg counts as flown, and of a
-    flight that ends elsewhere.
+    This is 0 if the aircraft has joined the orbit, to within the distance at which a leg counts as
+    flown, and if the flight ends elsewhere.
     """
     log = tape["guidance"]
     if log["mode.lateral"][-1] != Lateral.ROUTE or log["joining"][-1] != 0.0:
@@ -216,9 +216,9 @@ def orbit_missed_by(tape: Tape, section: GuidanceConfig) -> float:
 
 
 def touched_beside(tape: Tape, section: GuidanceConfig) -> float:
-    """Return the distance from the touch-down zone at the end of the flight, m.
+    """Return how far from the touch-down zone the flight ends, m.
 
-    It is 0 inside of the zone, and without a zone.
+    This is 0 if it ends inside, and if there is no zone.
     """
     pose = best_pose(tape)
     if section.touchdown is None or pose is None:
@@ -228,11 +228,11 @@ def touched_beside(tape: Tape, section: GuidanceConfig) -> float:
 
 
 SCREEN = 15.24
-"""m, 50 ft. The height over the threshold of a runway at which 14 CFR 23.2130 counts a landing."""
+"""m, 50 ft: height over the threshold of a runway from which 14 CFR 23.2130 counts a landing."""
 
 
 class Touch(NamedTuple):
-    """How a landing ended, by the true pose where the log has it."""
+    """How a landing ended, by the true pose if the log has it."""
 
     sink: float  # m/s
     sideways: float  # m/s, across the heading
@@ -244,9 +244,9 @@ class Touch(NamedTuple):
 
 
 def landing_touch(tape: Tape, section: GuidanceConfig | None) -> Touch | None:
-    """The figures of a landing.
+    """Return the figures of a landing.
 
-    None without a section `landing`, and of a flight that did not land.
+    Returns None without a section `landing`, and if the flight did not end in a landing.
     """
     if section is None or section.landing is None or tape.outcome.end is not End.LANDED:
         return None
@@ -277,7 +277,7 @@ def landing_touch(tape: Tape, section: GuidanceConfig | None) -> Touch | None:
 
 
 class Outside(NamedTuple):
-    """The time outside of limits, while guidance flew."""
+    """How long and how far the aircraft was outside of limits while guidance flew."""
 
     outside_s: float
     farthest_m: float  # from the limits, m; 0 inside
@@ -286,7 +286,7 @@ class Outside(NamedTuple):
 def time_outside(tape: Tape, section: GuidanceConfig | None) -> Outside | None:
     """Return the time outside of the fence from the first step of guidance on.
 
-    Returns None without a fence, and without a pose then.
+    Returns None if there is no fence, and if there is no pose from then on.
     """
     fence = None if section is None else section.fence_zones()
     pose = _guided_pose(tape)
@@ -296,10 +296,10 @@ def time_outside(tape: Tape, section: GuidanceConfig | None) -> Outside | None:
 
 
 def altitude_excess(tape: Tape, section: GuidanceConfig | None) -> Outside | None:
-    """Return the time above the ceiling and below the altitude floor.
+    """Return the time above the ceiling or below the altitude floor.
 
-    It counts from the first step of guidance on. Returns None without limits, and without a pose
-    then.
+    It counts from the first step of guidance on. Returns None if there are no limits, and if there
+    is no pose from then on.
     """
     pose = _guided_pose(tape)
     if section is None or (section.ceiling is None and section.altitude_floor is None):
@@ -312,7 +312,7 @@ def altitude_excess(tape: Tape, section: GuidanceConfig | None) -> Outside | Non
 
 
 def _guided_pose(tape: Tape) -> Signal | None:
-    """Return the pose from the first step of guidance on, or None without either."""
+    """Return the pose from the first step of guidance on, or None if the log lacks either."""
     pose = best_pose(tape)
     if pose is None or "guidance" not in tape or not len(tape["guidance"].stamp_ns):
         return None
@@ -323,18 +323,18 @@ def _guided_pose(tape: Tape) -> Signal | None:
 
 
 def _outside(tape: Tape, pose: Signal, inside: FloatArray) -> Outside:
-    """The time with a negative distance from the limits, and the largest; `inside`: (N,), m."""
+    """Return how long and how far a distance from the limits is negative; `inside`: (N,), m."""
     t = (pose.stamp_ns - tape.start_ns) / NANOSECONDS
     lasted = float(np.sum(np.diff(t)[inside[:-1] < 0.0]))
     return Outside(lasted, max(float(-np.min(inside)), 0.0))
 
 
 def mission_drawing(section: GuidanceConfig, routes: Sequence[Route]) -> dict[str, Any]:
-    """What a map shows of a mission, ready for JSON, in m.
+    """Return what a map shows of a mission, ready for JSON, in m.
 
-    `route` and `legs` of the routes, points of the line and [number, north, east]; `to_end`, the
-    lengths after each leg of the last route up to its last orbit; `fence` and `home` as in the
-    section.
+    `route` has the points of the line, and `legs` has [number, north, east] for each leg. `to_end`
+    has the lengths after each leg of the last route up to its last orbit. `fence` and `home` are as
+    in the section.
     """
     legs: list[list[float]] = []
     outline: list[Any] = []
@@ -352,7 +352,7 @@ def mission_drawing(section: GuidanceConfig, routes: Sequence[Route]) -> dict[st
 
 
 def leg_results(legs: Sequence[Mapping[str, Any]]) -> str:
-    """The legs of a summary with their results; empty without legs.
+    """Return the legs of a summary with their results, or "" if it has none.
 
     An example is "legs: 0 flown, 1 missed by 321 m, 2 not ended".
     """
@@ -364,7 +364,7 @@ def leg_results(legs: Sequence[Mapping[str, Any]]) -> str:
 
 
 def landing_results(landing: Mapping[str, Any] | None) -> str:
-    """The figures of a `Touch` as a sentence; empty without one."""
+    """Return the figures of a `Touch` as a sentence, or "" if there was none."""
     if landing is None:
         return ""
     side = "right" if landing["beside"] > 0.0 else "left"
@@ -382,9 +382,9 @@ def landing_results(landing: Mapping[str, Any] | None) -> str:
 
 
 def control_errors(tape: Tape) -> dict[str, FloatArray]:
-    """Errors of the quantities of guidance, measured less commanded, shape (N,).
+    """Return the errors of the quantities of guidance, measured less commanded, shape (N,).
 
-    They are taken at the samples of `guidance`. The cross-track error comes from the log, positive
+    They are taken at the samples of `guidance`. The cross-track error is that of the log, positive
     to the right. Angles are within half a turn.
     """
     log = tape["guidance"]
@@ -406,7 +406,10 @@ def control_errors(tape: Tape) -> dict[str, FloatArray]:
 
 
 def distance(tape: Tape) -> float | None:
-    """Length of the path over ground, the integral of the speed over ground, m; None unlogged."""
+    """Return the length of the path over ground, m, or None if the log has no speed over ground.
+
+    It is the integral of that speed.
+    """
     pose = tape.signals.get("pose")
     if pose is None or not {"v_north", "v_east"} <= set(pose.names):
         return None
@@ -414,15 +417,15 @@ def distance(tape: Tape) -> float | None:
 
 
 def top_speed(tape: Tape, trim: float) -> float | None:
-    """Largest airspeed by y, m/s, with `trim` added; None without V in y."""
+    """Return the largest airspeed by y, m/s, with `trim` added, or None if y has no V."""
     y = tape.signals.get("y")
     return None if y is None or "V" not in y.names else trim + float(np.max(y["V"]))
 
 
 def flown_speed(tape: Tape, trim: float) -> FloatArray:
-    """Airspeed at the samples of `guidance`, m/s: `trim` and V of y.
+    """Return the airspeed at the samples of `guidance`, m/s: `trim` and V of y.
 
-    A multicopter has the speed over ground.
+    For a multicopter, which has no V in y, it is the speed over ground.
     """
     log = tape["guidance"]
     over_ground: FloatArray = np.hypot(log["pose.v_north"], log["pose.v_east"])
@@ -441,7 +444,7 @@ def _hold_errors(quantity: str, t: FloatArray, error: FloatArray, times: FloatAr
 
 
 def guidance_notices(tape: Tape, section: GuidanceConfig | None) -> list[str]:
-    """The notices of a guided flight with their times."""
+    """Return the notices of a guided flight with their times."""
     if section is None or "guidance" not in tape:
         return []
     log = tape["guidance"]
@@ -458,16 +461,16 @@ def guidance_notices(tape: Tape, section: GuidanceConfig | None) -> list[str]:
 
 
 def _segment_figures(segment: Segment) -> dict[str, Any]:
-    """The figures of a segment and of the held quantities."""
+    """Return the figures of a segment and of the quantities held in it."""
     return segment._asdict() | {
         name: getattr(segment, name)._asdict() for name in ("lateral", "vertical", "V")
     }
 
 
 def guidance_summary(tape: Tape, section: GuidanceConfig | None = None) -> dict[str, Any] | None:
-    """The figures of a guided flight as `summary.json` holds them, SI.
+    """Return the figures of a guided flight as `summary.json` holds them, SI.
 
-    None for a flight without guidance.
+    Returns None for a flight without guidance.
     """
     if "guidance" not in tape or len(tape["guidance"].stamp_ns) == 0:
         return None
@@ -491,7 +494,7 @@ def guidance_summary(tape: Tape, section: GuidanceConfig | None = None) -> dict[
 
 
 def _mean_wind(tape: Tape) -> dict[str, float]:
-    """Mean of the estimated wind to the north and to the east, m/s."""
+    """Return the mean of the estimated wind to the north and to the east, m/s."""
     log = tape["guidance"]
     return {name: float(np.mean(log[f"wind.{name}"])) for name in WIND}
 

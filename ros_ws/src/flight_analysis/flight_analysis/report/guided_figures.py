@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of a guided flight.
+"""Draw the figures of a guided flight.
 
-They are ground track, altitude, airspeed and attitude over their commands, and cross-track error.
+These are the ground track, altitude, airspeed and attitude over their commands, and the cross-track
+error.
 """
 
 import math
@@ -40,7 +41,7 @@ WIND_ARROWS = 8
 ARROW_PIXELS = 45.0  # of the strongest wind
 LEG = "leg"  # name of the annotation with the number of a leg
 LEAST_WIND = 0.3  # m/s, below which no arrow is drawn
-# in the same figures as MODE_COLOURS, and other colours than these
+# colours other than MODE_COLOURS, which are in the same figures
 MODE_SHADES = {
     GuidanceMode.DEAD_RECKONING: "#0072b2",
     GuidanceMode.POSE_LOST: "#cc79a7",
@@ -51,7 +52,7 @@ Bounds = Mapping[str, tuple[float, float]]
 
 
 def guided_context(context: PlotContext) -> PlotContext:
-    """The context with the units of the held quantities, and the times of a stale pose."""
+    """Return the context with units of the held quantities, and the times of a stale pose."""
     t = context.tape.time("guidance")
     mode = context.tape["guidance"]["mode"]
     stale = []
@@ -65,7 +66,7 @@ def guided_context(context: PlotContext) -> PlotContext:
 
 
 def bounds_of(scenario: Scenario | None) -> Bounds:
-    """Limits of the commands of guidance."""
+    """Return the limits of the commands of guidance."""
     if scenario is None or scenario.guidance is None:
         return {}
     limits = scenario.guidance.params().limits
@@ -78,7 +79,7 @@ def bounds_of(scenario: Scenario | None) -> Bounds:
 
 
 def flown_routes(scenario: Scenario | None, tape: Tape) -> list[Route]:
-    """The flown routes by the log: of the scenario and of the topic `route`."""
+    """Return the routes that flew, by the log: of the scenario and of the topic `route`."""
     if scenario is None or scenario.guidance is None:
         return []
     numbers = set(tape["guidance"]["route"].tolist())
@@ -92,10 +93,10 @@ def flown_routes(scenario: Scenario | None, tape: Tape) -> list[Route]:
 def track_figure(
     tape: Tape, routes: Sequence[Route], speed: float, fence: Fence | None = None
 ) -> Figure:
-    """Ground track over the routes with their fillets, equal axes, and arrows of the wind.
+    """Draw the ground track over the routes with their fillets, and arrows of the wind.
 
-    `speed`: trim speed V0, m/s. With the numbers of lines and circles, the start, the end, and the
-    fence with home.
+    The axes have the same scale. The legs are numbered, start and end are marked, and the fence is
+    drawn with home. `speed` is the trim speed V0, m/s.
     """
     figure = tracks_figure({"flown": (tape, PLANT)}, routes)
     pose = tape["guidance"].group("pose")
@@ -118,7 +119,7 @@ def _add_mark(
 
 
 def _add_numbers(figure: Figure, route: Route) -> None:
-    """Number the legs. The annotations added last lie over the arrows of the wind."""
+    """Write the numbers of the legs, last of all, so that they lie over the arrows of the wind."""
     for number, (north, east) in enumerate(leg_places(route)):
         place = {"x": east, "y": north, "text": f"{number}", "showarrow": False}
         box = {"bgcolor": PAPER, "bordercolor": REFERENCE, "borderwidth": 1.5, "borderpad": 2}
@@ -141,9 +142,9 @@ def _add_fence(figure: Figure, fence: Fence) -> None:
 
 
 def tracks_figure(tracks: Mapping[str, tuple[Tape, str]], routes: Sequence[Route]) -> Figure:
-    """Ground tracks over routes, equal axes.
+    """Draw ground tracks over routes, with the same scale on both axes.
 
-    `tracks`: the tape of a guided flight and the colour by label.
+    `tracks` holds the tape of a guided flight and its colour, by label.
     """
     figure = Figure(1, 1, TRACK_HEIGHT)
     for route in routes:
@@ -166,10 +167,10 @@ def tracks_figure(tracks: Mapping[str, tuple[Tape, str]], routes: Sequence[Route
 
 
 def mean_wind(tape: Tape, speed: float, parts: int = WIND_ARROWS) -> FloatArray:
-    """Mean wind over equal parts of the flight, north and east, m/s, shape (parts, 2).
+    """Return the mean wind over equal parts of the flight, north and east, m/s, shape (parts, 2).
 
-    The wind is the velocity over ground less the velocity through the air, V cos(gamma) along psi +
-    beta, with V = V0 + V of y.
+    The wind is the velocity over ground less the velocity through the air, which is V cos(gamma)
+    along psi + beta with V = V0 + V of y.
     """
     log = tape["guidance"]
     pose = log.group("pose")
@@ -212,9 +213,9 @@ AIRSPEED = "airspeed"  # absolute: V is the deviation from the trim speed
 
 
 def vertical_figure(context: PlotContext, speed: float, bounds: Bounds) -> Figure:
-    """Altitude and airspeed over their commands, with the limits of the commands.
+    """Draw altitude and airspeed over their commands, with the limits of the commands.
 
-    `speed`: trim speed V0, m/s.
+    `speed` is the trim speed V0, m/s.
     """
     log = context.tape["guidance"]
     commanded = np.where(
@@ -230,7 +231,7 @@ def vertical_figure(context: PlotContext, speed: float, bounds: Bounds) -> Figur
 
 
 def attitude_figure(context: PlotContext, bounds: Bounds) -> Figure:
-    """Bank and pitch over their commands, with the limits of the commands."""
+    """Draw bank and pitch over their commands, with the limits of the commands."""
     log = context.tape["guidance"]
     names = ("phi", "theta")
     return _over_commands(
@@ -242,9 +243,9 @@ def attitude_figure(context: PlotContext, bounds: Bounds) -> Figure:
 
 
 def cross_track_figure(context: PlotContext) -> Figure | None:
-    """Cross-track error while a path is followed, by leg of the route.
+    """Draw the cross-track error while a path is followed, by leg of the route.
 
-    None for a flight without a path.
+    Returns None if the flight followed no path.
     """
     log = context.tape["guidance"]
     lateral = log["mode.lateral"]

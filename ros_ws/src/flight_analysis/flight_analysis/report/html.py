@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The report as an HTML page without network access.
+"""Write the report as an HTML page that needs no network.
 
-The page has tables and figures of a flight, or a comparison of flights.
+The page has tables and figures of a flight, or compares several flights.
 """
 
 import base64
@@ -64,9 +64,9 @@ MOST_MESSAGES = 500  # messages of a log on a page
 
 
 class TitleLine(NamedTuple):
-    """A line under the title: colour, label and outcome of a flight, and text.
+    """A line under the title: colour and label of a flight, its outcome, and text.
 
-    Any part may be empty. The `details` of the outcome stand below it.
+    Any of them may be empty. The `details` of the outcome stand below the line.
     """
 
     text: str
@@ -82,7 +82,10 @@ Tables = Sequence[tables.MetricTable] | Sequence[comparison.ComparisonTable]
 
 
 class TableGroup(NamedTuple):
-    """Adjacent tables, the same in radians; with `colours` of the flights comparison tables."""
+    """Tables that stand together, and the same in radians.
+
+    Tables of a comparison have the `colours` of the flights.
+    """
 
     tables: Tables
     title: str = ""
@@ -92,7 +95,7 @@ class TableGroup(NamedTuple):
 
 
 class MessageLine(NamedTuple):
-    """A message of the log, as text."""
+    """A message of the log as text."""
 
     time: str
     kind: str
@@ -100,7 +103,7 @@ class MessageLine(NamedTuple):
 
 
 class Section(NamedTuple):
-    """A figure with a heading; left out without a figure."""
+    """A figure with a heading. If there is no figure, the section is left out."""
 
     title: str
     hint: str
@@ -110,7 +113,7 @@ class Section(NamedTuple):
 
 
 class Page(NamedTuple):
-    """Content of a page."""
+    """The content of a page."""
 
     title: str
     lines: Sequence[TitleLine]
@@ -124,12 +127,12 @@ class Page(NamedTuple):
 
     @property
     def has_angles(self) -> bool:
-        """Whether the page can show its angles in deg or in rad."""
+        """Return whether the page can show its angles both in deg and in rad."""
         return any(group.in_radians for group in self.tables)
 
 
 def write_page(path: Path, flights: Sequence[RecordedFlight]) -> None:
-    """Write the page of a flight, or the comparison of several."""
+    """Write the page of a flight, or of a comparison if there are several."""
     if len(flights) > 1:
         page = _comparison_page(flights)
     elif flights[0].scenario is None:
@@ -162,7 +165,7 @@ def write_loop_page(path: Path, title: str, loop: LinearLoop) -> None:
 
 
 def _imported_page(flight: RecordedFlight) -> Page:
-    """What was logged of y, u and the pose of an aircraft without a section in the log."""
+    """Return the page of y, u and pose of an aircraft that the log does not describe."""
     tape = flight.tape
     source = flight.summary["source"]
     context = figures.plot_context([flight])
@@ -235,7 +238,7 @@ def _flight_page(flight: RecordedFlight, scenario: Scenario) -> Page:
 
 
 def _message_lines(flight: RecordedFlight) -> list[MessageLine]:
-    """The messages of the log, at most MOST_MESSAGES."""
+    """Return the messages of the log, at most MOST_MESSAGES."""
     lines = [
         MessageLine(f"{time:.2f} s", message.kind, message.text)
         for time, message in zip(flight.message_times, flight.messages, strict=True)
@@ -250,7 +253,7 @@ def _parameter_table(scenario: Scenario) -> tables.MetricTable:
 
 
 def _outcome_line(text: str, flight: RecordedFlight) -> TitleLine:
-    """A line with the outcome of a flight."""
+    """Return a line with the outcome of a flight."""
     outcome = flight.summary["outcome"]
     return TitleLine(
         text,
@@ -265,7 +268,7 @@ def _comparison_page(flights: Sequence[RecordedFlight]) -> Page:
     context = figures.plot_context(flights)
     colours = {label: run.colour for label, run in context.runs.items()}
     scenarios = [flight.scenario for flight in flights if flight.scenario is not None]
-    # A line a flight, in its colour.
+    # Each flight has a line in its colour.
     lines = []
     for (label, colour), flight, scenario in zip(colours.items(), flights, scenarios, strict=True):
         text = f"{scenario.name}: {_description(flight, scenario)} ({flight.summary['error']})"
@@ -308,7 +311,7 @@ def _comparison_page(flights: Sequence[RecordedFlight]) -> Page:
 def _comparison_groups(
     flights: Sequence[RecordedFlight], context: plotting.PlotContext, colours: Mapping[str, str]
 ) -> list[TableGroup]:
-    """The tables of a comparison; `colours` of the flights by label."""
+    """Return the tables of a comparison; `colours` are those of the flights by label."""
     palette = list(colours.values())
     legend = ". ".join(
         dict.fromkeys(
@@ -332,7 +335,7 @@ def _comparison_groups(
 
 
 def _condition_group(flights: Sequence[RecordedFlight], labels: Sequence[str]) -> list[TableGroup]:
-    """The parameters with unlike values."""
+    """Return a table of the parameters that differ, if any do."""
     rows = comparison.conditions(flights)
     if not rows:
         return []
@@ -343,7 +346,7 @@ def _condition_group(flights: Sequence[RecordedFlight], labels: Sequence[str]) -
 
 
 def _description(flight: RecordedFlight, scenario: Scenario) -> str:
-    """Airframe, duration, distance and top speed."""
+    """Describe a flight by its airframe, duration, distance and top speed."""
     parts = [scenario.aircraft.airframe, time_flown(flight.summary)]
     distance = guided.distance(flight.tape)
     if distance is not None:
@@ -355,13 +358,13 @@ def _description(flight: RecordedFlight, scenario: Scenario) -> str:
 
 
 def _law(scenario: Scenario) -> str:
-    """The rate of the law, and how the law flies."""
+    """Return the rate of the law, and how the law flies."""
     controller = scenario.controller
     return f"At {controller.rate:g} Hz with the {controller.summary()}"
 
 
 def _about_trim(scenario: Scenario) -> dict[str, str]:
-    """What stands in place of V in a figure of y: the airspeed less that of trim."""
+    """Return what stands in place of V in a figure of y: the airspeed less that of trim."""
     channels = scenario.aircraft.channels()
     return {"V": f"V - {channels.speed:g} (m/s)"} if "V" in channels.outputs else {}
 
@@ -413,7 +416,7 @@ def _sections(
 
 
 def _margin_tables(flown: FlownLoops) -> list[tables.MetricTable]:
-    """The margins of a single loop by input, the least margins of several loops."""
+    """Return the margins of a single loop by input, or the least margins of several loops."""
     if not flown.loops:
         return []
     if len(flown.loops) > 1:
@@ -424,7 +427,7 @@ def _margin_tables(flown: FlownLoops) -> list[tables.MetricTable]:
 
 
 def _drawn_loops(loops: Sequence[FlownLoop]) -> dict[str, LinearLoop]:
-    """The loops of a flight by name, around the true aircraft if known."""
+    """Return the loops of a flight by name, around the true aircraft if it is known."""
     aircraft = TRUE if any(each.aircraft == TRUE for each in loops) else FILE
     return {each.name: each.loop for each in loops if each.aircraft == aircraft}
 
@@ -483,12 +486,12 @@ def _guidance_sections(
 
 
 def page_html(page: Page) -> str:
-    """The page as HTML, with plotly, the script and the samples inside."""
+    """Return the page as HTML, with plotly, the script and the samples inside."""
     return "".join(_parts(page))
 
 
 def _parts(page: Page) -> Iterator[str]:
-    """The text of a page in parts: that of a long flight has some 100 MB."""
+    """Return the text of a page in parts: the page of a long flight has some 100 MB."""
     environment = Environment(
         loader=FileSystemLoader(HERE),
         autoescape=True,
@@ -506,7 +509,7 @@ def _parts(page: Page) -> Iterator[str]:
 
 
 def script_json(value: Any) -> Markup:
-    """JSON for a script element: "<" occurs only in strings, as an escape."""
+    """Write JSON for a script element: "<" occurs only in strings, as an escape."""
     content = finite_or_null(
         {"data": value.data, "layout": value.layout} if isinstance(value, Figure) else value
     )
@@ -515,12 +518,12 @@ def script_json(value: Any) -> Markup:
 
 
 def _typed_array(array: FloatArray | NDArray[np.float32]) -> dict[str, str]:
-    """An array for plotly.js: type "f8" or "f4", and bytes, little endian."""
+    """Return an array for plotly.js: type "f8" or "f4", and bytes, little endian."""
     return {"dtype": array.dtype.str[1:], "bdata": base64.b64encode(array.tobytes()).decode()}
 
 
 def format_ratio(ratio: float | None) -> Markup:
-    """A ratio with three digits, or as a whole number from 100 on."""
+    """Write a ratio with three digits, or as a whole number from 100 on."""
     if ratio is None:
         return Markup()
     return Markup("&times;{}").format(format_value(ratio) if ratio < 100.0 else f"{ratio:.0f}")

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The figure of what was learned in a flight."""
+"""Draw what was learned in a flight."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -19,10 +19,10 @@ LEARNED_LINES: tuple[dict[str, Any], ...] = (
 
 
 def learned_figure(context: PlotContext, lines: Mapping[str, Mapping[str, float]]) -> Figure | None:
-    """Entries of A and B over time, as identified in flight, with bars of two deviations.
+    """Draw the entries of A and B as identified in flight, over time, with bars of two deviations.
 
-    An open mark has no proposed model. `lines`: known values by entry, by label. None without a
-    learner. An entry that is not among `known_entries` is left out.
+    A mark is open if no model was proposed then. `lines` are known values by entry, by label. Only
+    `known_entries` are drawn. Returns None if nothing was learned.
     """
     if "learned" not in context.tape:
         return None

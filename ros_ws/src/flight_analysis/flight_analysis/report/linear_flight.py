@@ -1,18 +1,18 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The linear loop flies the commands, the noise and the wind of a log: the error to expect.
+"""Fly the linear loop with the commands, noise and wind of a log, to know which error to expect.
 
     x+ = A x + B u + integral_0^T exp(A s) ds d,  e = C x - y_m,  u = law(e + noise)
 
-y_m, the noise of the sensors and d come from the log; d is the part of x_dot without x and u.
-Limits of u, faults of the effectors and the state-dependent part of f are left out. The error of a
-flight is 0.8 to 1.3 times this error in the scenarios of the package.
+y_m, the noise of the sensors and d come from the log; d is the part of x_dot that depends on
+neither x nor u. We leave out the limits of u, faults of the effectors and the state-dependent part
+of f. In the scenarios of the package, the error of a flight is 0.8 to 1.3 times this error.
 
-The loop is linear, so e is a sum of three: what the commands leave, what the noise leaves and what
-the wind leaves. A log must not excuse itself, so noise counts as far as the sensor is declared to
-have it, and as the actuators can follow the law's answer to it, and wind as far as their end stops
-can hold it. Gravity acts along the path of y_m: an aircraft that pitches where nobody asked it to
-is not excused by its own pitch.
+Because the loop is linear, e is a sum of three: what the commands leave, what the noise leaves and
+what the wind leaves. A log must not excuse itself. Noise therefore counts only as far as the sensor
+is declared to have it, and as far as the actuators can follow the law's answer to it; wind counts
+only as far as the travel of the actuators can hold it. Gravity acts along the path of y_m, so that
+an aircraft that pitches where nobody asked it to is not excused by its own pitch.
 """
 
 from typing import NamedTuple
@@ -54,25 +54,26 @@ AIRSPEED = "V"
 WIND = "gust.longitudinal"  # of `truth`: the wind along the axis of the aircraft, m/s
 
 NOISE_TIME = 1.0
-"""s, over which the mean error of a sensor is a bias or a drift: white noise at 100 Hz loses a
-hundredth of its variance."""
+"""s. The mean error of a sensor over this time counts as bias or drift; without it, white noise at
+100 Hz loses a hundredth of its variance."""
 
 DECLARED = 4.0
-"""Standard deviations of a sensor's noise that count: one normal sample in 16,000 is beyond."""
+"""Standard deviations of a sensor's noise up to which it counts: one normal sample in 16,000 is
+beyond."""
 
 NOISE_PEAK = 3.0
 """Standard deviations of the inputs by noise that the actuators have to follow: 99.7 % of them."""
 
 
 class Knowledge(NamedTuple):
-    """What is known of a flight."""
+    """What we know of a flight."""
 
     has_model: bool  # A and B of the aircraft
     has_wind: bool  # the log holds what moved the aircraft
 
 
 class ErrorPair(NamedTuple):
-    """The errors of a flight and of the linear loop at the ticks of the controller."""
+    """The errors of a flight and those of the linear loop, at the ticks of the controller."""
 
     t: FloatArray  # (N,) flight time, s
     names: tuple[str, ...]
@@ -86,9 +87,9 @@ class ErrorPair(NamedTuple):
 
 
 class LinearErrors(NamedTuple):
-    """Absolute errors of the linear loop, (N, m), SI; 0 where no linear loop is stable.
+    """Absolute errors of the linear loop, (N, m), SI; 0 if no linear loop is stable.
 
-    With a drift each is the larger one of the aircraft before and after it.
+    If the aircraft drifts, each is the larger one of the aircraft before and after the drift.
     """
 
     whole: FloatArray
@@ -98,7 +99,7 @@ class LinearErrors(NamedTuple):
 
 
 class Reach(NamedTuple):
-    """What the actuators allow each input of the law, (m,), in its unit; inf without a limit."""
+    """How far the actuators let each input of the law go, (m,), in its unit; inf if unlimited."""
 
     travel: FloatArray
     rate: FloatArray  # per s
@@ -111,10 +112,10 @@ def error_pair(
     *,
     may_pause: bool = True,
 ) -> ErrorPair | None:
-    """Return the errors of a flight and of the linear loop.
+    """Return the errors of a flight and those of the linear loop.
 
-    Returns None without an error, and for a law without feedback. `aircraft` is that of the
-    simulation, or None for an unknown plant. If the law `may_pause`, the ticks in which it is
+    Returns None if the log has no error, and if the law has no feedback. `aircraft` is the
+    simulated one, or None if the plant is unknown. If the law `may_pause`, the ticks in which it is
     inactive do not count.
     """
     kind, error = best_error(tape)
@@ -145,7 +146,7 @@ def error_pair(
 
 
 def _has_feedback(controller: ControllerConfig) -> bool:
-    """Whether u of a law depends on y, unlike the excitation of an identification."""
+    """Return whether u of a law depends on y, as in an identification it does not."""
     if is_literal(controller):
         return True
     law = linear_law(controller.tuned_law(), len(controller.outputs), 1.0 / controller.rate)
@@ -158,7 +159,7 @@ def _has_feedback(controller: ControllerConfig) -> bool:
 
 
 def _airframes(tape: Tape, aircraft: AircraftConfig | None) -> list[Airframe]:
-    """The simulated aircraft, before and after a drift; empty for an unknown aircraft."""
+    """Return the simulated aircraft, before and after a drift; none if it is unknown."""
     if aircraft is None or aircraft.is_jsbsim or "truth" not in tape:
         return []
     names = {f"{group}.{state}" for group in "xf" for state in aircraft.sampled_airframe().states}
@@ -170,7 +171,7 @@ def _airframes(tape: Tape, aircraft: AircraftConfig | None) -> list[Airframe]:
 
 
 def _has_wind(tape: Tape, aircraft: AircraftConfig | None) -> bool:
-    """Whether the log is of a simulation and holds the wind."""
+    """Return whether the log is of a simulation and holds the wind."""
     if aircraft is None or "truth" not in tape:
         return False
     return bool(_airframes(tape, aircraft)) or {"x.theta", WIND} <= set(tape["truth"].names)
@@ -188,7 +189,7 @@ def _linear_errors(
     """Fly the linear loop around the aircraft, and around the drifted one if there is one."""
     config = controller
     if is_literal(controller):
-        # the literal sign is the limit of the implicit one
+        # The literal sign is the limit of the implicit one, which has a linear law.
         config = controller.model_copy(update={"sign": "implicit"})
     noise = _noise(tape, controller, aircraft, ticks)
     still = np.zeros_like(y_m)
@@ -230,7 +231,7 @@ def _linear_errors(
 def _reach(controller: ControllerConfig, aircraft: AircraftConfig | None) -> Reach:
     """Return how far and how fast the actuators can follow each input of the law.
 
-    An input that an allocation distributes ends where its first effector does.
+    If an allocation distributes an input, the first effector that reaches its limit ends it.
     """
     m = len(controller.inputs)
     if aircraft is None:
@@ -252,7 +253,7 @@ def _reach(controller: ControllerConfig, aircraft: AircraftConfig | None) -> Rea
 
 
 def _share_within(reach: Reach, u: FloatArray, period: float) -> FloatArray:
-    """Return the part of u, (N, m), that the actuators can follow, (m,), at most 1.
+    """Return which part of u, (N, m), the actuators can follow, (m,), at most 1.
 
     NOISE_PEAK standard deviations have to lie within travel and rate.
     """
@@ -264,9 +265,10 @@ def _share_within(reach: Reach, u: FloatArray, period: float) -> FloatArray:
 
 
 def _share_within_travel(reach: Reach, u: FloatArray) -> FloatArray:
-    """Return the part of u, (N, m), that lies within the travel of the actuators, (m,), at most 1.
+    """Return which part of u, (N, m), lies within the travel of the actuators, (m,), at most 1.
 
-    A gust has a peak, not a deviation, and a slow engine cannot follow it: the rate is left out.
+    The rate is left out: a gust has a peak rather than a deviation, and a slow engine cannot follow
+    it.
     """
     return np.asarray(1.0 / np.maximum(np.abs(u).max(axis=0, initial=0.0) / reach.travel, 1.0))
 
@@ -274,7 +276,7 @@ def _share_within_travel(reach: Reach, u: FloatArray) -> FloatArray:
 def _known_loop(
     controller: ControllerConfig, airframe: Airframe
 ) -> tuple[LinearPlant, LinearLaw, LoopTiming]:
-    """The loop around the airframe of a simulation."""
+    """Return the loop around the airframe of a simulation."""
     A = airframe.matrix_a()[None]
     B = airframe.matrix_b()[None] @ distribution(airframe, controller)
     linear = linear_loop(controller, through_allocation(airframe, controller), A, B)
@@ -282,7 +284,10 @@ def _known_loop(
 
 
 def _bare_loop(controller: ControllerConfig) -> tuple[LinearPlant, LinearLaw, LoopTiming]:
-    """The loop around y_dot = Omega u, abs(Omega_ii) = omega / input_scale, of the controller."""
+    """Return the loop around y_dot = Omega u with abs(Omega_ii) = omega / input_scale.
+
+    Omega is what the controller was told, if the aircraft is unknown.
+    """
     if controller.vanes:
         controller = controller.without_vanes()
     m = len(controller.outputs)
@@ -295,7 +300,7 @@ def _bare_loop(controller: ControllerConfig) -> tuple[LinearPlant, LinearLaw, Lo
 
 
 class _LinearFlight(NamedTuple):
-    """The linear loop at the ticks."""
+    """What the linear loop does at the ticks."""
 
     e: FloatArray  # (N, m)
     u: FloatArray  # (N, m)
@@ -311,9 +316,9 @@ def _flight(
     y_m: FloatArray,
     e_0: FloatArray,
 ) -> _LinearFlight:
-    """Fly the linear loop, x_dot = A x + B u + d; d: (N, n), noise: (N, m).
+    """Fly the linear loop, x_dot = A x + B u + d, with d: (N, n) and noise: (N, m).
 
-    `probed` is the controller if its probe acts.
+    `probed` is the controller if its probe acts, else None.
     """
     plant, law, loop = parts
     n, m = plant.B.shape
@@ -321,7 +326,7 @@ def _flight(
     _, step = zero_order_hold(plant.A, np.eye(n), loop.period)
     drive = np.zeros((len(ticks), len(by_tick.A)))
     drive[:, :n] = d @ step.T
-    # vanes add columns to y, which see the motion alone
+    # Vanes add columns to y, which see the motion but neither noise nor y_m.
     vanes = len(by_tick.C) - m
     shift = np.concatenate([noise - y_m, np.zeros((len(ticks), vanes))], axis=1)
     probe = None if probed is None else probed.guard().probe
@@ -343,14 +348,14 @@ def _flight(
 
 
 def _at(tape: Tape, topic: str, name: str, ticks: FloatArray) -> FloatArray:
-    """A channel of a topic at the ticks, (N,), between its finite samples."""
+    """Return a channel of a topic at the ticks, (N,), interpolated between finite samples."""
     return _between(tape, tape[topic], tape[topic][name], ticks)
 
 
 def _between(tape: Tape, signal: Signal, values: FloatArray, ticks: FloatArray) -> FloatArray:
-    """Values at the samples of a signal, (K,), at the ticks, (N,), between the finite ones.
+    """Interpolate values at the samples of a signal, (K,), to the ticks, (N,).
 
-    They are 0 without any.
+    Only finite values count; without any the result is 0.
     """
     is_finite = np.isfinite(values)
     if not is_finite.any():
@@ -364,9 +369,9 @@ def _noise(
 ) -> FloatArray:
     """Return the errors of the sensors in the log less their mean over NOISE_TIME, (N, m).
 
-    They have the units of y, and are 0 where the log has none. A bias and a drift are no noise: the
-    law follows them, and the aircraft is off by as much. What is beyond the sensor's declaration is
-    a fault and no noise either.
+    The units are those of y; the result is 0 if the log has no errors of sensors. Bias and drift do
+    not count as noise: the law follows them, and the aircraft is off by as much. Whatever exceeds
+    the sensor's declaration is a fault, and does not count either.
     """
     from scipy.ndimage import uniform_filter1d  # noqa: PLC0415 - loads SciPy, which few flights need
 
@@ -385,9 +390,9 @@ def _noise(
 
 
 def _declared_noise(aircraft: AircraftConfig) -> list[float]:
-    """Return the largest error of each output that its sensor is declared to have, SI.
+    """Return the largest error that the sensor of each output is declared to have, SI.
 
-    DECLARED sqrt(noise^2 + drift^2 rate NOISE_TIME) + quantisation
+    It is DECLARED sqrt(noise^2 + drift^2 rate NOISE_TIME) + quantisation.
     """
     sensors = aircraft.sensor_arrays()
     steps = aircraft.rate * NOISE_TIME
@@ -400,7 +405,7 @@ def _declared_noise(aircraft: AircraftConfig) -> list[float]:
 def _disturbance(
     tape: Tape, aircraft: AircraftConfig | None, ticks: FloatArray, n: int
 ) -> FloatArray:
-    """The disturbance d = f(x, t) less the part that depends on x, (N, n), by `truth`."""
+    """Return the disturbance d = f(x, t) less the part that depends on x, (N, n), from `truth`."""
     truth: Signal = tape["truth"]
     d = np.zeros((len(ticks), n))
     if aircraft is None:
@@ -418,7 +423,7 @@ def _slope_of_wind(tape: Tape, controller: ControllerConfig, ticks: FloatArray) 
 
         V_dot = -W_dot
 
-    It is 0 for the rates, and without a wind in the log.
+    It is 0 for the rates, and if the log has no wind.
     """
     d = np.zeros((len(ticks), len(controller.outputs)))
     if _has_path(tape, controller) and len(ticks) > 1:
@@ -434,9 +439,9 @@ def _gravity_along_path(
 
         theta_dot = q_m cos(phi) - r_m sin(phi),   V_dot = -g sin(theta)
 
-    theta is a deviation from trim that begins as in the log. An aircraft without rudder has no r_m,
-    and turns by its r. A law with an integral of e keeps the
-    true theta within a hundredth of a radian of it, whatever the gusts. Phi is that of the log.
+    theta is the deviation from trim, and begins as in the log; phi is that of the log. An aircraft
+    without a rudder has no r_m, and turns by its own r. If the law has an integral of e, it keeps
+    the true theta within a hundredth of a radian of this one, whatever the gusts.
     """
     d = np.zeros((len(ticks), len(controller.outputs)))
     names = controller.outputs
@@ -466,8 +471,8 @@ def _has_path(tape: Tape, controller: ControllerConfig) -> bool:
 def _flown(tape: Tape, ticks: FloatArray, *, may_pause: bool) -> NDArray[np.bool_]:
     """Return the mask of the ticks from the first engagement on.
 
-    If the law `may_pause`, those of an inactive controller are left out. No tick counts without
-    `internals`.
+    If the law `may_pause`, the ticks of an inactive controller are left out. Without `internals` no
+    tick counts.
     """
     if "internals" not in tape:
         return np.zeros(len(ticks), dtype=bool)
@@ -482,6 +487,6 @@ def _flown(tape: Tape, ticks: FloatArray, *, may_pause: bool) -> NDArray[np.bool
 
 
 def _sampled(t: FloatArray, ticks: FloatArray) -> NDArray[np.bool_]:
-    """Mask of the ticks that lie in no gap between the samples at t."""
+    """Return the mask of the ticks that lie in no gap between the samples at t."""
     after = np.clip(np.searchsorted(t, ticks), 1, len(t) - 1)
     return t[after] - t[after - 1] <= LONGEST_INTERVAL

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Margins of a linear loop as a table, as figures of a file, and as plots.
-
-The plots are after Bode and Nyquist.
-"""
+"""Show the margins of a linear loop as a table, as JSON, and as Bode and Nyquist plots."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -30,7 +27,7 @@ MARGIN_COLUMNS = (
     Column("disk", ""),
     Column("delay", "ms"),
 )
-ALONE = ".3g"  # format of a column without the worst aircraft
+ALONE = ".3g"  # format of a column that does not show the worst aircraft
 FORMATS = (".0f", ALONE, ".2g", ".2f", ".2f", ".0f")  # of MARGIN_COLUMNS
 ALL_INPUTS = "all inputs"
 MARGIN_LEGEND = (
@@ -49,13 +46,13 @@ BOUND = "#444444"
 
 
 def decibels(factor: FloatArray | float) -> FloatArray:
-    """20 log10 of a factor."""
+    """Return 20 log10 of a factor."""
     with np.errstate(divide="ignore"):
         return np.asarray(20.0 * np.log10(factor))
 
 
 def margin_rows(margins: LoopMargins) -> list[list[str]]:
-    """A row an input, then ALL_INPUTS, with the cells of MARGIN_COLUMNS.
+    """Return a row for each input, then one for ALL_INPUTS, with the cells of MARGIN_COLUMNS.
 
     A cell reads: nominal (worst uncertain aircraft).
     """
@@ -81,7 +78,7 @@ def margin_rows(margins: LoopMargins) -> list[list[str]]:
 
 
 def _values(margins: Margins, delay: Sequence[float]) -> list[list[float]]:
-    """The values of MARGIN_COLUMNS by row, in the units of the columns; NaN for none."""
+    """Return the values of MARGIN_COLUMNS by row, in the units of the columns; NaN for none."""
     phase = np.append(margins.phase, disk_phase(margins.disk_all))
     gain = np.append(margins.gain, disk_gain(margins.disk_all))
     return [
@@ -95,7 +92,7 @@ def _values(margins: Margins, delay: Sequence[float]) -> list[list[float]]:
 
 
 def _cell(value: float, worst: float | None, form: str) -> str:
-    """A value, and the value of the worst aircraft in parentheses."""
+    """Write a value, and in parentheses that of the worst aircraft."""
 
     def text(number: float) -> str:
         if math.isnan(number):
@@ -115,12 +112,12 @@ LEAST_MARGINS = {
     "damping of slow modes": ".2f",
     "delay margin, ms": ".0f",
 }
-"""The least margins of a loop, each with its format: of the worst input, or of all inputs at
-once."""
+"""The least margins of a loop, each with its format. They are those of the worst input, or of all
+inputs at once."""
 
 
 def least_margins(margins: LoopMargins | None) -> list[str]:
-    """The values of LEAST_MARGINS: nominal (worst uncertain aircraft)."""
+    """Return the values of LEAST_MARGINS as text: nominal (worst uncertain aircraft)."""
     if margins is None:
         return [NO_VALUE] * len(LEAST_MARGINS)
     nominal = _least(margins.nominal, margins.delay)
@@ -131,7 +128,7 @@ def least_margins(margins: LoopMargins | None) -> list[str]:
 
 
 def _least(margins: Margins, delay: float) -> list[float]:
-    """LEAST_MARGINS of a set of margins, in the units of the names."""
+    """Return LEAST_MARGINS of a set of margins, in the units that their names say."""
     phase = np.degrees(margins.phase.min())
     gain = decibels(margins.gain.min())
     values = (
@@ -146,7 +143,7 @@ def _least(margins: Margins, delay: float) -> list[float]:
 
 
 def modes_text(margins: LoopMargins) -> str:
-    """The slow modes with little damping as a sentence."""
+    """Write the slow modes that have little damping as a sentence."""
     slow_modes = [(w, zeta) for w, zeta in zip(*margins.modes, strict=True) if zeta < SHOWN_DAMPING]
     modes = ", ".join(f"{w:.3g} rad/s {zeta:.2f}" for w, zeta in slow_modes)
     if margins.worst is not None:
@@ -161,7 +158,7 @@ def margin_table(
 ) -> MetricTable:
     """Return the margins of a flight's loop, and the guarantee that was computed for it.
 
-    `differences`: sentences on how the aircraft differs from what the controller was told.
+    `differences` are sentences on how the aircraft differs from what the controller was told.
     """
     sentences = [*differences, MARGIN_LEGEND, modes_text(margins)]
     sentences += [] if promise is None else guarantee_text(promise)
@@ -174,7 +171,7 @@ def margin_table(
 
 
 def flown_margin_table(flown: FlownLoops) -> MetricTable:
-    """The least margins of the loops of a flight, a row each."""
+    """Return the least margins of the loops of a flight, a row for each."""
     columns = [
         Column("flown", "from to (s)"),
         Column("", "aircraft"),
@@ -201,7 +198,7 @@ def flown_margin_table(flown: FlownLoops) -> MetricTable:
 
 
 def margins_as_json(margins: LoopMargins) -> dict[str, Any]:
-    """The margins in SI: phase in rad, gain as factors, delay in s. None for an infinite margin."""
+    """Return the margins in SI: phase in rad, gain as factors, delay in s; None if infinite."""
     nominal = _aircraft_as_json(margins.nominal, margins.inputs) | {
         "stable": bool(margins.nominal.stable)
     }
@@ -231,7 +228,7 @@ def _aircraft_as_json(margins: Margins, inputs: Sequence[str]) -> dict[str, Any]
 
 
 def guarantee_text(promise: Guarantee) -> list[str]:
-    """Say a guarantee in sentences, with what it means by stable and what it holds as exact."""
+    """Say a guarantee in sentences, with what it means by stable and what it takes as exact."""
     if promise.stable == 0.0:
         return ["guarantee: none, not even the aircraft of the file is proved stable"]
     stable = math.floor(1e3 * promise.stable) / 10.0
@@ -263,7 +260,7 @@ def guarantee_text(promise: Guarantee) -> list[str]:
 
 
 def guarantee_rows(promise: Guarantee, margins: LoopMargins) -> list[tuple[str, float, float]]:
-    """Input, guaranteed disk margin, and the least disk margin found, ALL_INPUTS last."""
+    """Return input, guaranteed disk margin and least disk margin found; ALL_INPUTS comes last."""
     worst = margins.worst
     least_disks = [math.nan] * (len(promise.disk) + 1)
     if worst is not None:
@@ -276,9 +273,9 @@ def guarantee_rows(promise: Guarantee, margins: LoopMargins) -> list[tuple[str, 
 
 
 def bode_figure(loops: Mapping[str, LinearLoop]) -> Figure:
-    """Gain and phase of L_i over the frequency, nominal aircraft.
+    """Draw gain and phase of L_i over the frequency for the nominal aircraft.
 
-    There is a column an input, with the loops by label.
+    Each input has a column, with a curve for each loop by label.
     """
     inputs = _inputs(loops)
     count = len(inputs)
@@ -312,9 +309,9 @@ def bode_figure(loops: Mapping[str, LinearLoop]) -> Figure:
 
 
 def nyquist_figure(loops: Mapping[str, LinearLoop]) -> Figure:
-    """L_i around the point -1, with the unit circle and the circle of sensitivity 2.
+    """Draw L_i around the point -1, with the unit circle and the circle of sensitivity 2.
 
-    There is a subplot an input, with the loops by label.
+    Each input has a subplot, with a curve for each loop by label.
     """
     inputs = _inputs(loops)
     figure = Figure(len(inputs), min(len(inputs), 2), 420, spacing=0.08)

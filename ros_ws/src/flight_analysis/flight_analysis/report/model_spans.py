@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The parameters of the controller over a flight, and the error under each set."""
+"""Find when the controller flew which parameters, and the error under each set."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -13,7 +13,7 @@ from flight_core.tape import Tape
 
 
 class ParameterSpan(NamedTuple):
-    """A span of a flight under the same parameters of the controller."""
+    """A span of a flight in which the controller had the same parameters."""
 
     digest: int
     name: str  # of `model_names`
@@ -22,7 +22,7 @@ class ParameterSpan(NamedTuple):
 
 
 class ModelSpan(NamedTuple):
-    """The error over a span of a flight under the same parameters of the controller."""
+    """The error over a span of a flight in which the controller had the same parameters."""
 
     name: str  # of `model_names`
     model: int  # 0: the parameters of the start
@@ -32,10 +32,10 @@ class ModelSpan(NamedTuple):
 
 
 def model_names(first: Sequence[float], proposals: Sequence[float]) -> list[str]:
-    """Names of parameters in the order of their first instants, s.
+    """Name sets of parameters by when they first flew, s, in that order.
 
-    They are "start", "file" before the first of the `proposals` of a model, s, then "model
-    1" and so on.
+    The first is "start". Until the first of the `proposals` of a model, s, others are "file", "file
+    2" and so on; from then on they are "model 1", "model 2" and so on.
     """
     names = ["start"]
     for time in first[1:]:
@@ -47,7 +47,7 @@ def model_names(first: Sequence[float], proposals: Sequence[float]) -> list[str]
 
 
 def parameter_spans(tape: Tape) -> list[ParameterSpan]:
-    """The spans of a flight by the parameters of the controller; empty without `internals`."""
+    """Return the spans of a flight by the controller's parameters; none without `internals`."""
     if "internals" not in tape or "parameters" not in tape["internals"].names:
         return []
     t = tape.time("internals")
@@ -70,9 +70,9 @@ def parameter_spans(tape: Tape) -> list[ParameterSpan]:
 
 
 def errors_by_model(tape: Tape) -> list[ModelSpan]:
-    """Rms of `best_error` before the first model of a learner and under every model.
+    """Return the rms of `best_error` before the first model of a learner, and under every model.
 
-    Empty for a tape without a learner. The time in which the law is not engaged does not count.
+    The result is empty if nothing was learned. Only the time in which the law is engaged counts.
     """
     if "learned" not in tape or "internals" not in tape:
         return []

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A figure of flights for a paper: vectors in the width of a column."""
+"""Draw a figure of flights for a paper, as vectors in the width of a column."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,7 +17,7 @@ from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
 from flight_core.units import FOOT, in_si
 
-if TYPE_CHECKING:  # it loads in some tenths of a second
+if TYPE_CHECKING:  # matplotlib takes some tenths of a second to load
     from matplotlib.axes import Axes
 
 FORMATS = ("pdf", "svg", "eps", "png")
@@ -50,7 +50,7 @@ def write_figure(
 ) -> None:
     """Write a figure for a paper in the width of a column.
 
-    A row is a channel: y over y_m, the error or u.
+    Each channel has a row: y over y_m, the error, or u.
 
     Args:
         path: File: .pdf, .svg and .eps have vectors and text, .png pixels.
@@ -59,7 +59,7 @@ def write_figure(
         channels: Names of outputs (y over y_m) and inputs (u), and "e.NAME" for the error of an
             output; empty: each output.
 
-    Raises ParameterError for a different ending, an unknown channel and a width that is not 30 mm
+    Raises ParameterError if the ending or a channel is unknown, or if the width is not 30 mm
     to 1 m.
     """
     import matplotlib as mpl  # noqa: PLC0415
@@ -104,7 +104,7 @@ def write_figure(
 
 
 def channels_by_title(flights: Sequence[RecordedFlight]) -> dict[str, list[str]]:
-    """Names of outputs, errors ("e.NAME") and inputs of all flights, by title."""
+    """Return the names of outputs, errors ("e.NAME") and inputs of all flights, by title."""
     names: dict[str, dict[str, None]] = {"y": {}, "y_m": {}, "u": {}}
     for flight in flights:
         for topic in names.keys() & flight.tape.signals.keys():
@@ -114,7 +114,7 @@ def channels_by_title(flights: Sequence[RecordedFlight]) -> dict[str, list[str]]
 
 
 def last_instant(flights: Sequence[RecordedFlight]) -> float:
-    """The end of the longest flight, s; 1 without samples."""
+    """Return the end of the longest flight, s; 1 if there are no samples."""
     return max(flight_end(flight.tape) for flight in flights) or 1.0
 
 
@@ -148,7 +148,7 @@ def draw_channel(
         if signal is None or channel not in signal.names:
             continue
         style = {} if is_output else {"drawstyle": "steps-post"}
-        # A single flight needs no name; its y is told from y_m.
+        # A single flight needs no name, but its y must be told from y_m.
         legend = label
         if len(flights) == 1:
             legend = "y" if is_output and not is_error else ""

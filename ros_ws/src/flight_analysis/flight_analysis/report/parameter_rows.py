@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The parameters of a flight that have no default, or another value."""
+"""List the parameters of a flight that differ from their defaults, or have none."""
 
 from collections.abc import Iterator
 
@@ -14,9 +14,9 @@ LEFT_OUT = ("recorder.", "flight.")  # of the log and of the executable, not of 
 
 
 def parameter_rows(scenario: Scenario) -> list[tuple[str, str, str]]:
-    """Name, flown value and default of each parameter that differs from its default, SI.
+    """Return name, flown value and default of each parameter that is not at its default, SI.
 
-    Those without a default follow, with NONE.
+    Those that have no default come last, with NONE.
     """
     rows: list[tuple[str, str, str]] = []
     for section in SCHEMAS:

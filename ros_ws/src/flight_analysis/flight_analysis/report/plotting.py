@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Time-series figures for plotly.js: a subplot per channel, shaded intervals over every subplot.
+"""Draw time series with plotly.js: a subplot for each channel, intervals shaded over all of them.
 
-The figures of a page share the time axis and the margins, so the subplots line up. A figure holds
-short curves. `SampleStore` holds the samples of longer curves: the page decimates the samples to
-the view. Of a curve of more than MAX_STORED samples the page has the smallest and the largest value
-of each bin of time alone; the figures in numbers are of all samples.
+The figures of a page share the time axis and the margins, so that their subplots line up. A figure
+holds short curves itself. `SampleStore` holds the samples of longer curves, and the page decimates
+them to the view. If a curve has more than MAX_STORED samples, the page gets only the smallest and
+the largest value of each bin of time; all figures in numbers are still taken over all samples.
 """
 
 import base64
@@ -26,12 +26,12 @@ from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 
 T = TypeVar("T", bound=np.generic)
-# points of a curve over the page's width; above, a pixel has the smallest and the largest value
+# points of a curve over the page's width; of more, a pixel shows the smallest and largest value
 MAX_POINTS = 2400
-LEVEL = 4  # of zlib: of the samples of a flight 1 % larger than with 6, in 60 % of the time
+LEVEL = 4  # of zlib: samples of a flight take 1 % more space than with 6, and 60 % of the time
 PACKERS = 2  # threads that pack: each holds a channel twice
-# samples of a curve on a page, of 120 s at 500 Hz, 25 times MAX_POINTS for zooms: with all of
-# them an hour of flight has 141 MB
+# samples of a curve on a page: 120 s at 500 Hz, or 25 times MAX_POINTS, so that we can zoom. With
+# all samples an hour of flight would take 141 MB
 MAX_STORED = 60_000
 # bits of a stored value, with the leading one: within 1 in 2^16, finer than a pixel and the 4
 # digits of a hover
@@ -51,11 +51,11 @@ INK = "#2b3640"
 GRID = "#e8ebee"
 ZERO = "#c8ced4"
 DARK = {PAPER: "#1b1f24", INK: "#d3d9df", GRID: "#2c323a", ZERO: "#4b545e"}
-"""Colours of the frame on a light page, and the colours that replace them on a dark page."""
+"""Colours of the frame on a light page, with those that replace them on a dark page."""
 
 
 class Instants(NamedTuple):
-    """The instants of a curve."""
+    """The instants at which a curve is drawn."""
 
     # since the start of the flight, with one more at the start of each gap; two of each bin
     t_ns: NDArray[np.int64]
@@ -64,27 +64,27 @@ class Instants(NamedTuple):
 
 
 class SampleStore:
-    """The samples of the long curves of a page, packed.
+    """The packed samples of the long curves of a page.
 
-    Equal arrays are stored once, under a hash of the content.
+    Equal arrays are stored once, under a hash of their content.
     """
 
     def __init__(self) -> None:
         self._packed: dict[str, Future[str]] = {}
-        # compression leaves the interpreter to the other threads
+        # Compression releases the interpreter, so that threads help.
         self._pool = ThreadPoolExecutor(PACKERS)
         self._instants: dict[tuple[str, int, bool], Instants] = {}
-        # digests of stamps by id, with the stamps, so that no id comes twice
+        # Digests of stamps by id. We keep the stamps too, so that Python reuses no id.
         self._digests: dict[int, tuple[str, NDArray[np.int64]]] = {}
         self._times: dict[int, tuple[str, NDArray[np.int64]]] = {}
 
     @property
     def packed(self) -> dict[str, str]:
-        """The arrays of a page, by name."""
+        """Return the arrays of a page, by name."""
         return {name: packed.result() for name, packed in self._packed.items()}
 
     def instants(self, stamp_ns: NDArray[np.int64], start_ns: int, *, steps: bool) -> Instants:
-        """The instants of a curve, once for equal stamps. A step curve has no gaps."""
+        """Return the instants of a curve, the same for equal stamps. A step curve has no gaps."""
         if id(stamp_ns) not in self._digests:
             self._digests[id(stamp_ns)] = _digest(stamp_ns), stamp_ns
         key = self._digests[id(stamp_ns)][0], start_ns, steps
@@ -104,8 +104,8 @@ class SampleStore:
     def values(self, values: FloatArray) -> str:
         """Store values as float32, rounded to MANTISSA bits.
 
-        Noise does not compress, and a pixel shows fewer digits. Their bits are stored as steps
-        modulo 2^32, the first from 0, since successive samples hardly differ.
+        We round because noise does not compress, and a pixel shows fewer digits. The bits are
+        stored as steps modulo 2^32, the first from 0, since successive samples hardly differ.
         """
         spare = 24 - MANTISSA
         bits = values.astype("<f4").view("<u4")
@@ -116,7 +116,7 @@ class SampleStore:
     def _add(self, kind: str, array: NDArray[Any]) -> str:
         name = kind + _digest(array)
         if name not in self._packed:
-            # each holds its array
+            # Each waiting job holds its array, so we limit how many there are.
             wait([packed for packed in self._packed.values() if not packed.done()][: 1 - PACKERS])
             self._packed[name] = self._pool.submit(pack, array, array.itemsize)
         return name
@@ -127,17 +127,17 @@ def _digest(array: NDArray[Any]) -> str:
 
 
 def pack(content: bytes | NDArray[Any], width: int = 1) -> str:
-    """Base64 of the zlib stream of bytes, after a byte shuffle of items of `width` bytes.
+    """Compress bytes by zlib after a byte shuffle of items of `width` bytes, and encode as base64.
 
-    The shuffle puts the first bytes of the items first, then the second bytes, and so on: high
-    bytes of small steps are equal.
+    The shuffle puts the first bytes of the items first, then the second bytes, and so on: the high
+    bytes of small steps are all equal.
     """
     shuffled = np.frombuffer(content, dtype=np.uint8).reshape(-1, width).T.tobytes()
     return base64.b64encode(zlib.compress(shuffled, LEVEL)).decode()
 
 
 class Interval(NamedTuple):
-    """A shaded interval of time, s."""
+    """An interval of time, s, that is shaded."""
 
     label: str
     start: float
@@ -155,7 +155,7 @@ class Run(NamedTuple):
 
 
 class PlotContext(NamedTuple):
-    """Common parts of the figures of a page."""
+    """What the figures of a page have in common."""
 
     runs: Mapping[str, Run]  # by label; one, or several that are compared
     units: Mapping[str, DisplayUnit]  # by channel
@@ -166,17 +166,17 @@ class PlotContext(NamedTuple):
 
     @property
     def tape(self) -> Tape:
-        """The tape of the flight; of several of the first."""
+        """Return the tape of the flight, or of the first of several."""
         return next(iter(self.runs.values())).tape
 
     @property
     def is_comparison(self) -> bool:
-        """Whether the figures have several flights."""
+        """Return whether the figures have several flights."""
         return len(self.runs) > 1
 
 
 class Curve(NamedTuple):
-    """A signal and a line style."""
+    """A signal and the style of its line."""
 
     signal: Signal
     colour: str
@@ -189,8 +189,8 @@ class Curve(NamedTuple):
 class Figure:
     """Subplots for plotly.js: the traces `data` and the `layout`.
 
-    `x` and `y` are the axes by subplot. `count` subplots are filled row by row, `height` pixels
-    high, with `spacing` between the rows as a fraction of the figure. Source of the names:
+    `x` and `y` are the axes by subplot. There are `count` subplots, filled row by row and `height`
+    pixels high, with `spacing` between the rows as a fraction of the figure. Source of the names:
     https://plotly.com/javascript/reference.
     """
 
@@ -198,7 +198,7 @@ class Figure:
         self.rows = -(-count // columns)
         self.height = height
         across = ACROSS / columns
-        # px, below which the labels of a column would cover its neighbour; the page then scrolls it
+        # px: on a narrower page labels would cover the next column, and the page scrolls instead
         self.least_width = sum(MARGIN.values()) + round(LABELS / across) if columns > 1 else 0
         between = min(0.14, 24.0 / (self.rows * height)) if spacing is None else spacing
         wide = (1.0 - across * (columns - 1)) / columns
@@ -229,7 +229,7 @@ class Figure:
 
 
 def axis(name: str, index: int) -> str:
-    """The name of an axis of a subplot counted from 0: x, x2, x3."""
+    """Return the name of an axis of a subplot counted from 0: x, x2, x3."""
     return name if index == 0 else f"{name}{index + 1}"
 
 
@@ -241,7 +241,7 @@ def time_series_figure(
     height: int = 150,
     labels: Mapping[str, str] = MappingProxyType({}),
 ) -> Figure:
-    """A subplot of `height` pixels per channel, with the curves of the channel.
+    """Draw a subplot of `height` pixels for each channel, with all curves that have it.
 
     Two columns are filled row by row. `labels` of axes replace those of their channels.
     """
@@ -258,7 +258,7 @@ def time_series_figure(
                 in_legend = len(curves) > 1 and first_in_legend(figure, label)
                 trace |= {
                     "name": label,
-                    # plotly stacks the entries of a legend with one group
+                    # If a legend has one group, plotly stacks its entries.
                     "legendgroup": label if len(curves) > 1 else "",
                     "showlegend": in_legend,
                     "hovertemplate": f"%{{y:.4g}} {unit}",
@@ -279,7 +279,8 @@ def time_series_figure(
 def set_layout(figure: Figure, labels: int = 6, below: int = 40) -> Figure:
     """Set size, margins and colours of a figure.
 
-    The legend and `labels` pixels are above the rows, `below` pixels for the axis under the rows.
+    Above the rows there is room for the legend and for `labels` pixels, and under them `below`
+    pixels for the axis.
     """
     above = 24 * any(trace.get("showlegend") for trace in figure.data) + labels
     rows = figure.height * figure.rows
@@ -290,10 +291,10 @@ def set_layout(figure: Figure, labels: int = 6, below: int = 40) -> Figure:
                 "zerolinecolor": ZERO,
                 "title": axis.get("title", {}) | {"standoff": standoff},
             }
-            # plotly reads the samples of an axis without a type
+            # Without a type plotly would read the samples to find one.
             axis |= {"type": axis.get("type", "linear")}
     for axis in figure.y:
-        # the margin has room for them: plotly does not measure each
+        # The margin has room for the labels, so plotly need not measure each.
         axis["ticklabeloverflow"] = "allow"
     figure.layout |= {
         "height": above + rows + below,
@@ -316,7 +317,7 @@ def set_layout(figure: Figure, labels: int = 6, below: int = 40) -> Figure:
 
 
 def first_in_legend(figure: Figure, label: str) -> bool:
-    """Whether the figure has no trace of a label yet; the legend shows a label once."""
+    """Return whether no trace has this label yet; the legend shows a label only once."""
     return all(trace["name"] != label for trace in figure.data)
 
 
@@ -346,7 +347,7 @@ def _trace(
         "width": curve.width,
         "shape": "hv" if curve.steps else "linear",
     }
-    # plotly's simplification cuts off peaks
+    # If plotly simplifies a line, it cuts off peaks.
     trace = {"type": "scatter", "mode": "lines", "line": style | {"simplify": False}} | (
         {"opacity": 0.35} if curve.faint else {}
     )
@@ -361,9 +362,9 @@ def _trace(
 
 
 def stored(context: PlotContext, signal: Signal, channel: str, factor: float) -> tuple[str, str]:
-    """Places of the times and the values of a channel, times a factor, on the page.
+    """Store times and values of a channel, times a factor, and return their places on the page.
 
-    A long curve is there once.
+    A long curve that is there already is not stored again.
     """
     t_ns, values = _drawn(context, Curve(signal, ""), channel, factor)
     return context.samples.times(t_ns), context.samples.values(values)
@@ -372,7 +373,7 @@ def stored(context: PlotContext, signal: Signal, channel: str, factor: float) ->
 def _drawn(
     context: PlotContext, curve: Curve, channel: str, factor: float
 ) -> tuple[NDArray[np.int64], FloatArray]:
-    """Instants and values of a channel times a factor, with a NaN at the start of a gap."""
+    """Return instants and values of a channel times a factor, with a NaN where a gap begins."""
     start_ns = context.tape.start_ns if curve.start_ns is None else curve.start_ns
     t_ns, gaps, width = context.samples.instants(curve.signal.stamp_ns, start_ns, steps=curve.steps)
     values = curve.signal[channel] * factor
@@ -381,9 +382,9 @@ def _drawn(
 
 
 def _extremes_of_bins(values: FloatArray, width: int) -> FloatArray:
-    """Smallest and largest value of each bin in their order, two a bin.
+    """Return the smallest and the largest value of each bin, two a bin, in their order.
 
-    A bin with a gap has a NaN in place of the second.
+    If a bin has a gap, its second value is NaN.
     """
     bins = _bins(values, width)
     gaps = np.isnan(bins)
@@ -396,7 +397,7 @@ def _extremes_of_bins(values: FloatArray, width: int) -> FloatArray:
 
 
 def _bins(values: NDArray[T], width: int) -> NDArray[T]:
-    """Values by bin, (N, width); the last value fills the last bin."""
+    """Return the values by bin, (N, width); the last value fills up the last bin."""
     return np.append(values, np.full(-len(values) % width, values[-1])).reshape(-1, width)
 
 
@@ -440,7 +441,7 @@ def _shade_intervals(figure: Figure, intervals: Sequence[Interval], columns: int
 
 
 def _mark_messages(figure: Figure, times: Sequence[float], columns: int) -> None:
-    """A dotted line over every subplot for each message of the log."""
+    """Draw a dotted line over every subplot for each message of the log."""
     for time, column in product(times, range(columns)):
         position = {"type": "line", "xref": axis("x", column), "yref": "paper", "y0": 0, "y1": 1}
         figure.layout["shapes"].append(

@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The 3-D replay of a report page: the scene of the live view, with the samples of the figures."""
+"""Build the 3-D replay of a report page from the scene of the live view.
+
+Its samples are those of the figures.
+"""
 
 import re
 from pathlib import Path
@@ -29,7 +32,7 @@ MAX_POSES = 6000
 
 
 class Replay(NamedTuple):
-    """Data of a page for the replay, except the samples."""
+    """What a page needs for the replay, except the samples."""
 
     data: dict[str, Any]
     code: str  # packed
@@ -37,9 +40,9 @@ class Replay(NamedTuple):
 
 
 def replay_of(flight: RecordedFlight, context: PlotContext) -> Replay | None:
-    """The replay of a flight with a logged attitude, else None.
+    """Return the replay of a flight, or None if its attitude is not logged.
 
-    Adds the poses to the samples of the page.
+    This adds the poses to the samples of the page.
     """
     tape = flight.tape
     topics = {}
@@ -79,9 +82,9 @@ def replay_of(flight: RecordedFlight, context: PlotContext) -> Replay | None:
 
 
 def _topic(context: PlotContext, signal: Signal, channels: dict[str, str]) -> dict[str, Any]:
-    """Where times and values of channels are, with the factors of their units.
+    """Return where the page has times and values of channels, and the factors of their units.
 
-    `channels` maps names to names of the units.
+    `channels` maps the channels to the names under which their units are known.
     """
     stored_channels = {}
     times = ""
@@ -94,7 +97,7 @@ def _topic(context: PlotContext, signal: Signal, channels: dict[str, str]) -> di
 
 
 def _thinned(pose: Signal) -> Signal:
-    """The channels of a pose at POSE_RATE, at most MAX_POSES rows."""
+    """Return the channels of a pose at POSE_RATE, but at most MAX_POSES rows."""
     count = len(pose.stamp_ns)
     span = (pose.stamp_ns[-1] - pose.stamp_ns[0]) / 1e9 if count > 1 else 0.0
     rows = np.unique(
@@ -107,9 +110,9 @@ def _thinned(pose: Signal) -> Signal:
 
 
 def _code() -> str:
-    """The scripts as a function with an immediate call.
+    """Return the scripts as a function that calls itself.
 
-    They are modules without imports, exports, comment lines and indentation.
+    It is made of modules: imports, exports, lines of comment and indentation are left out.
     """
     text = "\n".join(path.read_text(encoding="utf-8") for path in SCRIPTS)
     text = re.sub(r"^(import |\s*//).*\n|^\s+", "", text, flags=re.MULTILINE)

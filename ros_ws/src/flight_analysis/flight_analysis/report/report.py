@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The report of recorded runs.
-
-The outputs are the page of a run or of a comparison, and the data for further programs.
-"""
+"""Report recorded runs: write the page of a run or of a comparison, and data for others to read."""
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -25,7 +22,7 @@ A_FILE = "the path of a file"
 
 
 class File(NamedTuple):
-    """A file beside the page: the key in refusals, the path, and what writes flights to a path."""
+    """A file beside the page: its key in refusals, its path, and what writes flights to a path."""
 
     key: str
     path: Path
@@ -33,7 +30,7 @@ class File(NamedTuple):
 
 
 class Report(NamedTuple):
-    """A report that is written.
+    """A report that has been written.
 
     Attributes:
         page: Path of the page.
@@ -108,7 +105,7 @@ def report(
         )
         if path is not None
     ]
-    # One run has its own page; with `html`, as several runs, it has the page of a comparison.
+    # One run gets its own page; with `html` it gets the page of a comparison, as several runs do.
     is_single = len(folders) == 1 and html is None
     require(
         output is None or is_single,
@@ -143,9 +140,9 @@ def _unused_page(folder: Path) -> Path:
 
 
 def _require_comparable(folders: Sequence[Path], flights: Sequence[RecordedFlight]) -> None:
-    """Raise ParameterError for an imported log among several runs."""
+    """Raise ParameterError if an imported log is one of several runs."""
     expected = "a flight of the stack: a comparison is of tracking errors"
     for folder, flight in zip(folders, flights, strict=True):
-        # A single imported log is compared with nothing.
+        # A single log is not compared, so it may be imported.
         is_comparable = len(flights) == 1 or flight.scenario is not None
         require(is_comparable, str(folder), "an imported log", expected)

@@ -1,9 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The folder of a run.
+"""Create the folder of a run, read the run back and report it.
 
-The folder is created before a flight, with the attachments of the log. Afterwards the run is read
-back and reported.
+The folder is created before the flight, with the attachments of the log.
 """
 
 import json
@@ -66,7 +65,7 @@ PROVENANCE = "provenance.yaml"
 
 
 class FlightResult(NamedTuple):
-    """A finished flight.
+    """A flight that is over.
 
     Attributes:
         flight: The flight with tape and figures.
@@ -80,7 +79,7 @@ class FlightResult(NamedTuple):
 
 
 class UnwrittenReportError(ParameterError):
-    """The files of a report cannot be written, as on a full disk. `result` has the flight."""
+    """The files of a report could not be written, as on a full disk; `result` has the flight."""
 
     def __init__(self, sentence: str, result: FlightResult) -> None:
         super().__init__(sentence)
@@ -90,7 +89,7 @@ class UnwrittenReportError(ParameterError):
 def new_run(scenario: Scenario, runs: Path, kind: str = "") -> Path:
     """Create the folder of a new run, runs/<UTC stamp>-<kind><scenario>.
 
-    Raises ParameterError for a failure.
+    Raises ParameterError if it cannot.
     """
     place = str(runs.absolute())
     is_text = not any("\ud800" <= character <= "\udfff" for character in place)
@@ -110,9 +109,9 @@ def new_run(scenario: Scenario, runs: Path, kind: str = "") -> Path:
 
 
 def remove_empty(*runs: Path) -> None:
-    """Remove the folders of runs without a file.
+    """Remove those folders of runs that hold no file.
 
-    Such a flight was interrupted before the begin.
+    Their flights were interrupted before they began.
     """
     for run in runs:
         with suppress(OSError):
@@ -125,13 +124,12 @@ def attachments_for(
     overrides: Mapping[str, ParameterOverrides] | None = None,
     further: Sequence[Path] = (),
 ) -> LogAttachments:
-    """The attachments of the log of a flight.
+    """Return what is attached to the log of a flight.
 
-    They are written into the folder of the run where they are not files yet. These are the
-    scenario, the airframe or the user's own model of JSBSim, every parameter after validation,
-    `further` files, and the provenance. `overrides` are parameters of the scenario's nodes by the
-    node's name; None for a flight without nodes. Raises ParameterError where a file cannot be
-    written.
+    This is the scenario, the airframe or the user's own model of JSBSim, every parameter after
+    validation, the `further` files, and the provenance. What is not a file yet is written into the
+    folder of the run. `overrides` are parameters of the scenario's nodes by the name of the node,
+    or None for a flight without nodes. Raises ParameterError if a file cannot be written.
     """
     attached = [_write(run / PARAMETERS, scenario_yaml(scenario, overrides)), *further]
     if not scenario.aircraft.is_jsbsim:
@@ -196,10 +194,11 @@ def read_flight(
     scenario: FilePath | None = None,
     remaps: Mapping[str, str] = {},
 ) -> RecordedFlight:
-    """Read a recorded flight and summarise it. No file is written.
+    """Read a recorded flight and summarise it, without writing a file.
 
-    Without an outcome, the outcome in the run's summary is kept. Raises ParameterError where the
-    log cannot be read, or holds no scenario. `namespace`, `scenario` and `remaps` as in `read_run`.
+    If no outcome is given, the one in the run's summary is kept. `namespace`, `scenario` and
+    `remaps` are those of `read_run`. Raises ParameterError if the log cannot be read or holds no
+    scenario.
     """
     return _flight(read_run(run, namespace, scenario, remaps), run, outcome)
 
@@ -208,7 +207,7 @@ def _flight(recorded: RecordedRun, run: Path, outcome: Outcome | None) -> Record
     recorded.require()
     folder = _folder(run)
     name = printable(run.resolve().name if run.is_dir() else run.stem)
-    # An imported log has a summary of y and u alone.
+    # For an imported log we can summarise only y and u.
     if (source := recorded.metadata.get(IMPORTED)) is not None:
         recorded.require("y", "u")
         require(
@@ -236,7 +235,7 @@ def _flight(recorded: RecordedRun, run: Path, outcome: Outcome | None) -> Record
         outcome = NEVER_ENGAGED
     if "guidance" in log:
         require_channels(log["guidance"].names)
-    # The account is of the whole log, the figures are of the engaged part.
+    # The account covers the whole log, the figures only its engaged part.
     tape = until_last_tick(log)
     flight_account = account(log, scenario, outcome, simulated=engagements is None)
     engaged_part = _engaged(tape, engagements or [])
@@ -263,7 +262,7 @@ def _flight(recorded: RecordedRun, run: Path, outcome: Outcome | None) -> Record
 
 
 def _own_flight(recorded: RecordedRun, name: str, outcome: Outcome) -> RecordedFlight:
-    """A flight of an aircraft of one's own, of which the section of the controller is known."""
+    """Return the flight of a user's own aircraft, whose log describes only the controller."""
     recorded.require("y", "u")
     controller = recorded_parameters(recorded.scenario_file(), recorded.namespace)
     summary = summarise_own(recorded.tape, controller.law, name, outcome)
@@ -275,10 +274,10 @@ def _own_flight(recorded: RecordedRun, name: str, outcome: Outcome) -> RecordedF
 
 
 def _with_times_of_messages(recorded: RecordedRun) -> Tape:
-    """The tape with the times of messages as signals.
+    """Return the tape with the times of messages as signals.
 
-    In lockstep and in one process the nodes wait for each other, however long the host takes: there
-    is no time from y to u.
+    In lockstep and in one process the nodes wait for each other, however long the host takes, so
+    there is no time from y to u.
     """
     latency = recorded.latency if is_real_time(recorded.tape) else None
     timed = {"latency": latency, "age_of_u": recorded.age_of_u}
@@ -289,7 +288,7 @@ def _with_times_of_messages(recorded: RecordedRun) -> Tape:
 def _controllers(
     recorded: RecordedRun, tape: Tape, scenario: Scenario
 ) -> tuple[FlownController, ...]:
-    """The parameters that flew, where they changed in flight."""
+    """Return the parameters that flew, if they changed in flight."""
     if len({span.digest for span in parameter_spans(tape)}) < 2:
         return ()
     changes = recorded_changes(recorded, scenario.controller)
@@ -297,9 +296,9 @@ def _controllers(
 
 
 def log_account(recorded: RecordedRun) -> Account | None:
-    """What a log lacks.
+    """Return what a log lacks.
 
-    None for a log without a flight, and without a scenario that can be read.
+    Returns None if the log has no flight, or no scenario that can be read.
     """
     if not {*AIRCRAFT_TOPICS} & {*recorded.tape.signals}:
         return None
@@ -317,9 +316,9 @@ def log_account(recorded: RecordedRun) -> Account | None:
 
 
 def _engaged(tape: Tape, engagements: Sequence[Engagement]) -> Tape:
-    """The engaged part of a flight with a bridge, for the figures.
+    """Return the engaged part of a flight with a bridge, from which the figures are taken.
 
-    Without an engagement the whole tape counts, for the duration.
+    If there was no engagement, the whole tape counts, so that the duration is known.
     """
     end_ns = max(
         (int(signal.stamp_ns[-1]) for signal in tape.signals.values() if len(signal.stamp_ns)),
@@ -335,7 +334,7 @@ def _engaged(tape: Tape, engagements: Sequence[Engagement]) -> Tape:
 
 
 def _engagement(tape: Tape, engagement: Engagement) -> dict[str, Any]:
-    """Start and end of an engagement in flight time, s, and the reason of the end."""
+    """Return start and end of an engagement in flight time, s, and why it ended."""
     start, stop = (
         (time_ns - tape.start_ns) / NANOSECONDS if time_ns else None
         for time_ns in (engagement.start_ns, engagement.stop_ns)
@@ -344,9 +343,9 @@ def _engagement(tape: Tape, engagement: Engagement) -> dict[str, Any]:
 
 
 def extract_scenario(run: Path, namespace: str | None = None) -> Scenario:
-    """The scenario in a log, written beside the log.
+    """Write the scenario in a log beside the log, and return it.
 
-    Raises ParameterError where the log holds none.
+    Raises ParameterError if the log holds none.
     """
     recorded = read_run(run, namespace)
     scenario = _scenario_in(recorded, run)
@@ -355,7 +354,7 @@ def extract_scenario(run: Path, namespace: str | None = None) -> Scenario:
 
 
 def _scenario_in(recorded: RecordedRun, run: Path) -> Scenario:
-    """The scenario in a log, with a path beside the log. Raises ParameterError."""
+    """Return the scenario in a log, with a path beside the log. Raises ParameterError."""
     stored = recorded.scenario_file()
     return parse_scenario(stored.content, _folder(run) / stored.name)
 
@@ -363,7 +362,7 @@ def _scenario_in(recorded: RecordedRun, run: Path) -> Scenario:
 def _write_scenario(recorded: RecordedRun, path: Path) -> None:
     """Write the scenario of a log, once.
 
-    Raises ParameterError where a file with different content has the name.
+    Raises ParameterError if another file has the name already.
     """
     if recorded.scenario is None:
         return
@@ -390,9 +389,9 @@ def write_report(
     """Read the bag back and write scenario, summary.json and report.html.
 
     runs/latest becomes a link to the run. The files go beside the log, or into the new folder
-    `output`. Without an outcome the report of an old run is written again and runs/latest stays. A
-    `scenario` in place of the scenario in the log is not written. Raises ParameterError as
-    `read_flight` does, before any file is written, and UnwrittenReportError where a file cannot be
+    `output`. If no outcome is given, the report of an old run is written again and runs/latest
+    stays. A `scenario` that replaces the one in the log is not written. Raises ParameterError as
+    `read_flight` does, before any file is written, and UnwrittenReportError if a file cannot be
     written.
     """
     from flight_analysis.report.html import write_page  # noqa: PLC0415 - loads jinja2, which a flight does not need
@@ -417,7 +416,7 @@ def write_report(
 
 
 def write_empty_summary(run: Path, scenario: Scenario, outcome: Outcome) -> dict[str, Any]:
-    """Write summary.json of a flight with an end before the first sample.
+    """Write summary.json of a flight that ended before its first sample.
 
     The log does not change. Raises ParameterError.
     """
@@ -429,24 +428,24 @@ def write_empty_summary(run: Path, scenario: Scenario, outcome: Outcome) -> dict
 
 
 def _folder(run: Path) -> Path:
-    """The folder of a run, given as a folder, a log or a link such as runs/latest."""
+    """Return the folder of a run that is given as a folder, a log or a link such as runs/latest."""
     return run.resolve() if run.is_dir() else run.resolve().parent
 
 
 def _identity(recorded: RecordedRun) -> dict[str, Any]:
-    """What distinguishes a flight from others.
+    """Return what tells a flight from all others.
 
-    The stamp of t = 0, ns, and the time of day of the start, if logged, tell.
+    This is the stamp of t = 0, ns, and the time of day at which it started if that is logged.
     """
     started = recorded.metadata.get(FLIGHT, {}).get("start")
     return {"start_ns": recorded.tape.start_ns, "started": started}
 
 
 def _previous_outcome(recorded: RecordedRun, folder: Path | None, scenario: Scenario) -> Outcome:
-    """The outcome in the log, else in the summary of this flight, else from a launch.
+    """Return the outcome in the log, or else in the summary of this flight, or else of a launch.
 
-    A launch leaves the outcome beside a log with the name of the folder. The samples in the log
-    tell the outcome of nodes started by hand.
+    A launch leaves its outcome beside the log, if that has the name of the folder. If nodes were
+    started by hand, only the samples in the log tell.
     """
     tape = recorded.tape
     outcome = tape.outcome
@@ -455,7 +454,7 @@ def _previous_outcome(recorded: RecordedRun, folder: Path | None, scenario: Scen
             summary = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))
             if summary["flight"] == _identity(recorded):
                 before = read_outcome(summary["outcome"])
-                # What the log of one aircraft does not tell stays.
+                # We keep what the log of one aircraft cannot tell, as of a fleet.
                 outcome = replace(outcome, shortfalls=before.shortfalls)
                 outcome = before if outcome.end is End.UNKNOWN else outcome
     has_folder = folder is not None and (folder / f"{folder.name}_0.mcap").is_file()

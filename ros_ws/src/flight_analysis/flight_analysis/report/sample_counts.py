@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The samples of a flight by topic.
-
-An account has the planned samples, the samples in the log, and the samples never sent.
-"""
+"""Count the samples of a flight by topic: those planned, those in the log, those never sent."""
 
 import math
 import re
@@ -20,15 +17,15 @@ from flight_core.tape import Recording, Signal, Tape
 from flight_log.clock import SINCE_EPOCH_NS
 from flight_log.flight_processes import controller_starts
 
-# least share of the samples of a topic without a remark, unless a single one is missing
+# least share of the samples of a topic of which we say nothing; a single missing one is ignored too
 WHOLE = 0.99
-LEAST = 0.9  # a smaller share of a topic is a lack of the log, whatever the cause
-SILENCE = 1.0  # s: a longer gap is named, also where the share is large
+LEAST = 0.9  # if a topic has a smaller share, the log lacks it, whatever the cause
+SILENCE = 1.0  # s: we name a longer gap even if the share is large
 LATE_TICK_NS = NANOSECONDS // 10  # the last u of a whole flight may be so much older than its end
 GUIDED = ("guidance", "u_m")  # topics of guidance
 OF_AIRCRAFT = ("truth", "pose")  # topics of the aircraft beside y, with its stamps
-TICKS = ("u", "internals")  # topics of the controller: their stamps rest during a failsafe
-# topics with a rate, by the node of the stack that sends them
+TICKS = ("u", "internals")  # topics of the controller: during a failsafe their stamps stand still
+# the node of the stack that sends each topic with a rate
 SENDERS = {
     "y": "aircraft",
     "y_m": "reference_model",
@@ -37,12 +34,12 @@ SENDERS = {
     **dict.fromkeys(GUIDED, "guidance"),
 }
 RATED = tuple(SENDERS)
-STEADY_RUN = 60  # samples, of which a steady publisher always takes about the same time
-SHORT_RUN = 6  # samples; of a publisher that leaves out 30 % a tenth of such runs is whole
+STEADY_RUN = 60  # samples, for which a steady publisher always takes about the same time
+SHORT_RUN = 6  # samples: if a publisher leaves out 30 %, a tenth of such runs is still whole
 
 
 class TopicAccount(NamedTuple):
-    """The samples of a topic. Times in s of flight time; None without a sample."""
+    """The samples of a topic. Times are flight times, s, and None if there is no sample."""
 
     expected: int | None  # None: unknown, as in a log without the rates or the begin of its flight
     found: int
@@ -61,14 +58,14 @@ class TopicAccount(NamedTuple):
 
     @property
     def share(self) -> float | None:
-        """Share of the expected samples, at most 1; None where the number is unknown."""
+        """Return the share of the expected samples, at most 1; None if that number is unknown."""
         return None if self.expected is None else min(self.found / max(self.expected, 1), 1.0)
 
     def holds(self, count: int) -> bool:
-        """Whether `count` samples are the whole topic, or their expected number is unknown.
+        """Return whether `count` samples are the whole topic, or their expected number is unknown.
 
-        One missing sample is no lack of a short topic: the first or the last instant of a flight
-        may fall on either side of its begin or end.
+        One missing sample of a short topic does not count: the first or the last instant of a
+        flight may fall on either side of its begin or end.
         """
         return self.expected is None or count >= min(
             WHOLE * self.expected, max(self.expected - 1, 1)
@@ -76,7 +73,7 @@ class TopicAccount(NamedTuple):
 
 
 class Span(NamedTuple):
-    """The part of a flight that the account is over."""
+    """The part of a flight that an account covers."""
 
     end_ns: int  # stamp of the end
     from_start: bool  # from t = 0; else from the first sample of a topic
@@ -86,11 +83,12 @@ class Span(NamedTuple):
 def topic_accounts(
     tape: Tape, scenario: Scenario | None, span: Span
 ) -> tuple[dict[str, TopicAccount], dict[str, float]]:
-    """The accounts by topic, and how long before the end a last sample may be stamped, s.
+    """Return the accounts by topic, and how long before the end a last sample may be stamped, s.
 
-    The expected number of samples is rate times time: by the scenario for a node of the stack in
-    the host's time, else by the log. Ticks of the controller count from the first. Samples that a
-    controller or a foreign publisher left out do not count, up to a tenth.
+    The expected number of samples is rate times time. The rate is that of the scenario if a node of
+    the stack sends them in the host's time, else that of the log. Ticks of the controller count
+    from the first. If a controller or a foreign publisher leaves out samples, they do not count as
+    missing, up to a tenth.
     """
     periods = {} if scenario is None else _periods(tape, scenario, simulated=span.simulated)
     expected = {} if scenario is None else _expected(tape, scenario, span, periods)
@@ -116,8 +114,8 @@ def topic_accounts(
     if "internals" in tape and "mode" in tape["internals"].names:
         failsafe = int(np.count_nonzero(tape["internals"]["mode"] != Mode.ENGAGED))
     for name, topic in topics.items():
-        # Stamps rest during a failsafe. Further equal stamps are of a clock that stands, and no
-        # sample is known to be new.
+        # During a failsafe stamps stand still. If others are equal, the clock stood still, and we
+        # cannot know that a sample is new.
         repeated = max(topic.repeated - (failsafe if name in TICKS else 0), 0)
         topics[name] = topic._replace(found=max(topic.found - repeated, 0), repeated=repeated)
     return topics, late
@@ -126,7 +124,7 @@ def topic_accounts(
 def _expected(
     tape: Tape, scenario: Scenario, span: Span, periods: Mapping[str, int]
 ) -> dict[str, int]:
-    """The number of samples by topic that the log of a flight should hold, where this is known."""
+    """Return how many samples of each topic the log should hold, if we can know."""
     sensors = scenario.aircraft.sensors
     pose = scenario.aircraft.pose
     expected = {}
@@ -148,7 +146,7 @@ def _expected(
     if is_sent_by_stack(tape, "u"):
         ticks, engaged_time = _ticks(tape, scenario, span.end_ns)
         expected |= dict.fromkeys(TICKS, ticks)
-        # In lockstep and in one process guidance flies in every mode of the controller.
+        # In lockstep and in one process guidance flies whatever the mode of the controller is.
         if is_real_time(tape):
             guided_time = engaged_time
     if scenario.guidance is not None:
@@ -162,12 +160,12 @@ def _expected(
 
 
 def is_real_time(tape: Tape) -> bool:
-    """Whether the nodes flew by a clock: that of the host since the epoch, or /clock."""
+    """Return whether the nodes flew by a clock: that of the host since the epoch, or /clock."""
     return tape.is_by_clock or tape.start_ns > SINCE_EPOCH_NS
 
 
 def _periods(tape: Tape, scenario: Scenario, *, simulated: bool) -> dict[str, int]:
-    """Periods of the topics with a sample at each instant of a rate, ns.
+    """Return the periods of the topics that have a sample at each instant of a rate, ns.
 
     A foreign aircraft may have no truth and no pose. Foreign commands u_m have no rate.
     """
@@ -190,9 +188,9 @@ def _periods(tape: Tape, scenario: Scenario, *, simulated: bool) -> dict[str, in
 
 
 def is_sent_by_stack(tape: Tape, name: str) -> bool:
-    """Whether a node of the stack sent a topic, by the names of the processes.
+    """Return whether a node of the stack sent a topic, by the names of the processes.
 
-    A flight in one process has no names. A foreign controller has no `internals`.
+    A flight in one process has no such names. A foreign controller publishes no `internals`.
     """
     if name in TICKS and ("internals" in tape or "u" not in tape):
         return True
@@ -204,15 +202,15 @@ def is_sent_by_stack(tape: Tape, name: str) -> bool:
 
 
 def is_simulated(tape: Tape) -> bool:
-    """Whether the simulated aircraft of the stack flew, in the wind of the scenario."""
+    """Return whether the simulated aircraft of the stack flew, in the wind of the scenario."""
     return tape.scenario is not None or "truth" in tape or is_sent_by_stack(tape, "y")
 
 
 def _period(tape: Tape, name: str, nominal_ns: int) -> int:
-    """The period of the samples of a topic, ns.
+    """Return the period of the samples of a topic, ns.
 
-    In the host's time a node of the stack has the period of the parameters. By /clock a node leaves
-    out the instants between two messages of the clock.
+    In the host's time, a node of the stack has the period of its parameters. By /clock, a node
+    leaves out the instants between two messages of the clock.
     """
     is_of_stack = is_sent_by_stack(tape, name)
     if is_of_stack and not tape.is_by_clock:
@@ -225,11 +223,11 @@ def _period(tape: Tape, name: str, nominal_ns: int) -> int:
 
 
 def period_of(stamp_ns: NDArray[np.int64], lost: int, otherwise_ns: int) -> int:
-    """The period at which a publisher sent samples, ns, by their stamps, shape (N,).
+    """Return the period at which a publisher sent samples, ns, by their stamps, shape (N,).
 
-    `lost`: the number of lost messages. A steady publisher takes the same time for any STEADY_RUN
-    samples, within an interval: by a coarse clock the intervals differ. Where samples are missing
-    the times scatter, and the quickest tenth of short runs has the period.
+    `lost` is the number of lost messages. A steady publisher takes the same time for any STEADY_RUN
+    samples, to within an interval, even if a coarse clock makes the intervals differ. If samples
+    are missing, these times scatter; then the quickest tenth of short runs shows the period.
     """
     stamp_ns = np.unique(stamp_ns)
     intervals_ns = np.diff(stamp_ns)
@@ -250,10 +248,10 @@ def period_of(stamp_ns: NDArray[np.int64], lost: int, otherwise_ns: int) -> int:
 
 
 def _with_unsent(tape: Tape, name: str, topic: TopicAccount, step_ns: int) -> TopicAccount:
-    """The account of a topic with the instants that the publisher left out.
+    """Add to the account of a topic the instants that the publisher left out.
 
-    They lie between the first and the last sample. The numbers of the messages are the proof: no
-    number is missing beside lost messages and samples left out.
+    They lie between the first and the last sample. The numbers of the messages prove it: except for
+    lost messages and samples left out, no number is missing.
     """
     recording = tape.recording.get(name, Recording(0))
     if (
@@ -269,9 +267,10 @@ def _with_unsent(tape: Tape, name: str, topic: TopicAccount, step_ns: int) -> To
 
 
 def _of_foreign(topic: TopicAccount) -> TopicAccount:
-    """The account of a topic of a publisher with an unknown plan.
+    """Return the account of a topic whose publisher is not ours, so that we do not know its plan.
 
-    The samples sent are whole, up to a tenth below the rate, without a silence.
+    What it sent counts as the whole, if that is at most a tenth below the rate and without a
+    silence.
     """
     is_silent = topic.gap is not None and topic.gap > SILENCE
     if topic.expected is None or is_silent or topic.unsent > (1.0 - LEAST) * topic.expected:
@@ -280,9 +279,9 @@ def _of_foreign(topic: TopicAccount) -> TopicAccount:
 
 
 def ends_last(tape: Tape, name: str) -> bool:
-    """Whether a topic ends later than every further topic of the flight.
+    """Return whether a topic ends later than all other topics of the flight.
 
-    A leap of the clock may be the gap.
+    Then a leap of the clock may be the gap.
     """
     ends = {
         topic: int(signal.stamp_ns[-1])
@@ -294,11 +293,11 @@ def ends_last(tape: Tape, name: str) -> bool:
 
 
 def _unsent_rest(tape: Tape, name: str, step_ns: int, end_ns: int) -> int:
-    """The number of instants from the last sample of a topic to the end without a sample.
+    """Return how many instants after the last sample of a topic its publisher left out.
 
-    Only instants that the publisher left out count. The numbers of the messages are the proof:
-    the next sample comes after the end, or the aircraft sent y at further instants alone. A log
-    that ends with the topic proves nothing.
+    The numbers of the messages prove it: either the next sample comes after the end, or the
+    aircraft sent y at other instants only. If the log ends with the topic, nothing is proved, and
+    none counts.
     """
     signal = tape.signals.get(name)
     if signal is None or tape.recording.get(name, Recording(0)).lost != 0:
@@ -321,9 +320,9 @@ def _unsent_rest(tape: Tape, name: str, step_ns: int, end_ns: int) -> int:
 
 
 def _ticks(tape: Tape, scenario: Scenario, end_ns: int) -> tuple[int, float]:
-    """The number of ticks of the controller up to the end, and the engaged time, s.
+    """Return the number of the controller's ticks up to the end, and the engaged time, s.
 
-    The numbers of the ticks count for each publisher alone.
+    Each controller numbers its own ticks, so they are counted by publisher.
     """
     step_ns = period_ns(scenario.controller.rate, "controller.rate")
     begins = [
@@ -364,10 +363,11 @@ def _ticks(tape: Tape, scenario: Scenario, end_ns: int) -> tuple[int, float]:
 
 
 def _instants_with_y(tape: Tape, internals: Signal, step_ns: int) -> int:
-    """The number of ticks with a new y or in a failsafe.
+    """Return the number of ticks that have a new y or are in a failsafe.
 
-    A foreign aircraft has a rate of y of its own, and a sensor may be declared to drop samples: the
-    controller publishes u with a new y alone. What the log lacks of y is a lack of y.
+    The controller publishes u only if there is a new y. A foreign aircraft has its own rate of y,
+    and a sensor may be declared to drop samples. What the log lacks of y is not counted here, since
+    it is a lack of y.
     """
     age_ns = internals["age"] * NANOSECONDS
     first_tick_ns = internals.stamp_ns[0] + age_ns[0]
@@ -409,9 +409,9 @@ def _topic(
 
 
 def _latest(scenario: Scenario) -> dict[str, float]:
-    """How long before the end the last sample of a topic may be stamped, s.
+    """Return how long before the end the last sample of a topic may be stamped, s.
 
-    The delay counts, and the period of a slow pose.
+    This is its delay and, if the pose is slow, a period of the pose.
     """
     aircraft = scenario.aircraft
     return {

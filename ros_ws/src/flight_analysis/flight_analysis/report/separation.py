@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The separation of the aircraft of a fleet: how near they came to each other."""
+"""Find how near the aircraft of a fleet came to each other."""
 
 from collections.abc import Mapping
 from itertools import combinations
@@ -37,7 +37,7 @@ class Approach(NamedTuple):
 
 
 def place_of(tape: Tape) -> Signal | None:
-    """Return where an aircraft was, the true place where the log has it; None without a place."""
+    """Return where an aircraft was, by its true place if the log has it, or None."""
     pose = best_pose(tape)
     if pose is None or not set(PLACE) <= set(pose.names):
         return None
@@ -45,10 +45,11 @@ def place_of(tape: Tape) -> Signal | None:
 
 
 def approach(first: Signal, second: Signal) -> Approach | None:
-    """Return how near two aircraft came; None without a common time.
+    """Return how near two aircraft came, or None if they have no common time.
 
-    Between two samples each moves in a straight line. With d_0 and d_1 the distances of the ends of
-    a part and v = d_1 - d_0 the nearest point is at the fraction -d_0 v / v^2, within the part.
+    Between two samples each moves in a straight line. With d_0 and d_1 the differences of their
+    places at the ends of a part and v = d_1 - d_0, they are nearest at the fraction -d_0 v / v^2 of
+    it, if that is within the part.
     """
     begin_ns = max(int(first.stamp_ns[0]), int(second.stamp_ns[0]))
     end_ns = min(int(first.stamp_ns[-1]), int(second.stamp_ns[-1]))
@@ -58,7 +59,7 @@ def approach(first: Signal, second: Signal) -> Approach | None:
     stamps = np.union1d(
         stamps[(stamps >= begin_ns) & (stamps <= end_ns)], np.array([begin_ns, end_ns])
     )
-    # From one instant on, since float64 does not resolve 1 ns in a time of day.
+    # We count from an instant of the flight: float64 does not resolve 1 ns in a time of day.
     t = (stamps - begin_ns).astype(float)
     d = _at(first, t, begin_ns) - _at(second, t, begin_ns)
     v = np.diff(d, axis=0)
@@ -72,7 +73,7 @@ def approach(first: Signal, second: Signal) -> Approach | None:
 
 
 def _at(signal: Signal, t: FloatArray, begin_ns: int) -> FloatArray:
-    """The places at times in ns since an instant, shape (N, 3)."""
+    """Return the places at times in ns since an instant, shape (N, 3)."""
     own = (signal.stamp_ns - begin_ns).astype(float)
     return np.column_stack([np.interp(t, own, signal[name]) for name in PLACE])
 
@@ -80,7 +81,7 @@ def _at(signal: Signal, t: FloatArray, begin_ns: int) -> FloatArray:
 def separation_shortfalls(tracks: Mapping[str, Track], least: float) -> dict[str, Shortfall]:
     """Return the shortfall of each aircraft that came nearer to another one than `least`, m.
 
-    Aircraft on maps with different origins are not compared.
+    Aircraft are not compared if their maps have different origins.
     """
     near: dict[str, dict[str, Approach]] = {}
     for names in combinations(tracks, 2):

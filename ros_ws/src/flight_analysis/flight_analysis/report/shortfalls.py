@@ -1,20 +1,20 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What a completed or landed flight has to show, and the shortfalls.
+"""Judge a completed or landed flight by what it has to show, and name its shortfalls.
 
-A flight succeeds where
+A flight succeeds if
 
 - the law was engaged in ENGAGED of the ticks in which it was asked to fly,
 - y_m was that of the scenario (`flown_reference`),
-- the error of each output is allowed by the linear loop (`tracking`),
+- the linear loop allows the error of each output (`tracking`),
 - the airspeed stayed above the stall speed, and the aircraft above the ground and between the
   altitudes of guidance,
 - the aircraft stayed inside the fence, flew every leg of the route and joined the last orbit,
 - a landing ended in the touch-down zone,
 - and the log holds the whole flight.
 
-Where the host starved a flight in real time, the flight says nothing about the law. What it falls
-short of for that alone is no shortfall: its end is HOST.
+If the host starved a flight in real time, the flight says nothing about the law. If that alone is
+why it falls short, it has no shortfall: its end is HOST.
 """
 
 import math
@@ -45,11 +45,11 @@ from flight_core.tape import Tape
 from flight_guidance.params import GuidanceConfig
 from rise_di_controller.params import ControllerConfig
 
-FED = Starvation()  # of a host that gave a flight what it needs
+FED = Starvation()  # if the host gave a flight what it needs
 
 ENGAGED = 0.9
-"""Least share of the ticks with the law engaged: with u held or at trim for longer, no figure is of
-the law."""
+"""Least share of the ticks with the law engaged. If u is held or at trim for longer, the figures
+say nothing about the law."""
 
 
 def judge(
@@ -59,9 +59,9 @@ def judge(
     account: Account,
     controller: ControllerConfig | None = None,
 ) -> Outcome:
-    """The outcome of a flight with the shortfalls. An early end has none.
+    """Return the outcome of a flight with its shortfalls; a flight that ended early has none.
 
-    `controller`: of a flight without a scenario; None: the errors are not judged.
+    `controller` is that of a flight without a scenario; without either the errors are not judged.
     """
     starved = account.starvation
     seems_unflown = outcome.end is End.NEVER_FLEW or account.late is not None
@@ -90,10 +90,10 @@ def judge(
     of_path = _height(tape, aircraft, section)
     if section is not None:
         of_path += _guided(tape, section, has_landed=outcome.end is End.LANDED)
-    # The path of an aircraft adds up all that the host withheld.
+    # What the host withheld adds up in the path of the aircraft, long after a starved span.
     says_nothing_of_path = starved.length > (1.0 - ENGAGED) * account.end
     shortfalls = [
-        # The log of one aircraft does not tell of the others.
+        # The log of one aircraft does not tell where the others were, so we keep these.
         *(each for each in outcome.shortfalls if each.aim is Aim.SEPARATION),
         *engagement,
         *([] if scenario is None else reference_shortfalls(tape, scenario)),
@@ -125,8 +125,8 @@ def _never_flown_by_host(starved: Starvation, end: float) -> Outcome:
 def _may_pause(tape: Tape, scenario: Scenario | None) -> bool:
     """Return whether somebody else decides when the law flies.
 
-    Behind a bridge the autopilot does, with `start_active: false` the user. In any other simulated
-    flight the law has to fly from its first u to the end, whoever deactivates it.
+    Behind a bridge the autopilot does, and with `start_active: false` the user. In any other
+    simulated flight the law must fly from its first u to the end, whoever deactivates it.
     """
     if scenario is None or not is_simulated(tape):
         return True
@@ -136,7 +136,7 @@ def _may_pause(tape: Tape, scenario: Scenario | None) -> bool:
 def _engagement(tape: Tape, *, may_pause: bool, starved: Starvation = FED) -> list[Shortfall]:
     """Return a shortfall if the law was engaged in too few of the ticks.
 
-    Those in spans in which the host `starved` the flight do not count.
+    Ticks in spans in which the host `starved` the flight do not count.
     """
     if "internals" not in tape or "mode" not in tape["internals"].names:
         return []
@@ -178,7 +178,7 @@ def _height(
 
 
 def _guided(tape: Tape, section: GuidanceConfig, *, has_landed: bool) -> list[Shortfall]:
-    """The shortfalls of a guided flight."""
+    """Return the shortfalls of a guided flight."""
     shortfalls = [*_stall(tape, section)]
     altitude = altitude_excess(tape, section)
     if altitude is not None and altitude.outside_s:
@@ -206,7 +206,7 @@ def _guided(tape: Tape, section: GuidanceConfig, *, has_landed: bool) -> list[Sh
 
 
 def _failed_steps(tape: Tape) -> list[Shortfall]:
-    """The steps of guidance without commands: the commands of the step before went on."""
+    """Return a shortfall if steps of guidance failed, so that the commands before went on."""
     count = int(tape["guidance"]["failed"].max())
     if not count:
         return []
@@ -215,7 +215,7 @@ def _failed_steps(tape: Tape) -> list[Shortfall]:
 
 
 def _stall(tape: Tape, section: GuidanceConfig) -> list[Shortfall]:
-    """The time below the stall speed; the flare of a landing is left out."""
+    """Return a shortfall if V fell below the stall speed other than in the flare of a landing."""
     if section.stall_speed is None or "guidance" not in tape or section.drag is not None:
         return []
     log = tape["guidance"]
@@ -244,7 +244,7 @@ def _stall(tape: Tape, section: GuidanceConfig) -> list[Shortfall]:
 
 
 def _route(tape: Tape, section: GuidanceConfig, *, has_landed: bool) -> list[Shortfall]:
-    """The legs missed and not flown, and the last orbit not joined."""
+    """Return a shortfall for missed legs, for legs not flown, and for a last orbit not joined."""
     shortfalls = []
     for leg in flown_legs(tape):
         if leg.missed:
@@ -253,7 +253,7 @@ def _route(tape: Tape, section: GuidanceConfig, *, has_landed: bool) -> list[Sho
             shortfalls.append(Shortfall(aim=Aim.ROUTE, sentence=sentence, figures=figures))
     unflown = list(unflown_legs(tape, section))
     if has_landed:
-        # the legs after a landing are those of a go-around
+        # Legs after the landing are flown only in a go-around.
         landing = section.landing_on(section.plan(section.waypoints())) if section.landing else None
         unflown = [leg for leg in unflown if landing is None or leg < landing.leg]
     if unflown:

@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The spans of a flight in real time in which the host starved the nodes.
+"""Find the spans of a flight in real time in which its host starved the nodes.
 
 A node of the stack sends a sample at each instant of its rate, and numbers its messages. If an
-instant has no sample and no number is missing, the node did not send: the host did not let it run.
-The errors of the flight say nothing about that, and are not asked.
+instant has no sample and yet no number is missing, the node did not send: the host did not let it
+run. The errors of the flight say nothing about that, and we do not ask them.
 
-A law that computes for too long leaves out ticks too, so ticks count only where another node has
-left out samples as well. Where a publisher is replaced, or messages were lost, a gap is no proof.
+A law that computes for too long leaves out ticks too, so ticks count only if another node has left
+out samples as well. If a publisher was replaced, or if messages were lost, a gap proves nothing.
 """
 
 import math
@@ -23,13 +23,13 @@ from flight_analysis.report.sample_counts import TopicAccount, is_real_time, is_
 from flight_core.tape import Recording, Tape
 from flight_core.vectors import FloatArray
 
-BUSY = 0.05  # share of the ticks that a host leaves out that is too busy
+BUSY = 0.05  # share of the ticks: a host that leaves out more is too busy
 
-WINDOW = 1.0  # s, over which BUSY is taken: a single missing sample is no starvation
+WINDOW = 1.0  # s, over which BUSY counts: a single missing sample is no starvation
 
 RECOVERY = 5.0
-"""s, after a starved part, that its errors need to decay: the airspeed of the osprey settles within
-them."""
+"""s, after a starved part, until the errors that it caused have decayed: the airspeed of the osprey
+has settled by then."""
 
 
 class Starvation(NamedTuple):
@@ -39,7 +39,7 @@ class Starvation(NamedTuple):
 
     @property
     def length(self) -> float:
-        """How long the spans are together, s."""
+        """Return how long the spans are together, s."""
         return math.fsum(stop - start for start, stop in self.spans)
 
     def holds(self, t: FloatArray) -> NDArray[np.bool_]:
@@ -53,9 +53,9 @@ class Starvation(NamedTuple):
 def starvation(
     tape: Tape, scenario: Scenario, topics: Mapping[str, TopicAccount], end: float
 ) -> Starvation:
-    """Return the spans of a flight of `end` s in which its host starved the nodes.
+    """Return the spans in which the host starved the nodes of a flight that lasts `end` s.
 
-    A flight in lockstep, in one process or by the clock of a simulator has none.
+    There are none in lockstep, in one process or by the clock of a simulator.
     """
     if not is_real_time(tape) or tape.is_by_clock or end <= 0.0:
         return Starvation()
@@ -63,7 +63,7 @@ def starvation(
     count = math.ceil(end / step)
     drops = scenario.aircraft.sensors.dropout > 0.0
     rates = {
-        # A sensor may drop samples of y, and truth has an instant for each of them.
+        # If a sensor drops samples of y, truth still has a sample at each instant.
         "truth" if drops else "y": scenario.aircraft.rate,
         "y_m": scenario.reference_model.rate,
     }
@@ -76,7 +76,7 @@ def starvation(
     if not drops:
         is_missing |= _missing(tape, "internals", step, step, count)
     is_starved &= _windowed(is_missing, length) >= BUSY * length
-    # Each such instant is the middle of a part of WINDOW that was starved.
+    # Each such instant is in the middle of a WINDOW that was starved.
     t: FloatArray = step * np.arange(count, dtype=np.float64)
     spans: list[tuple[float, float]] = []
     for start, stop in mask_spans(t, is_starved):
@@ -92,7 +92,7 @@ def starvation(
 def _missing(tape: Tape, name: str, period: float, step: float, count: int) -> NDArray[np.bool_]:
     """Return the mask of the instants k step, (count,), that a node left out of a topic.
 
-    `period`: of the samples, at least a step, s.
+    `period` is that of the samples, s, and at least a step.
     """
     is_missing = np.zeros(count, dtype=bool)
     signal = tape.signals.get(name)
@@ -113,7 +113,7 @@ def _missing(tape: Tape, name: str, period: float, step: float, count: int) -> N
 
 
 def _windowed(is_missing: NDArray[np.bool_], length: int) -> FloatArray:
-    """Return how many instants are missing within a window around each, (N,)."""
+    """Return how many instants are missing in the window around each instant, (N,)."""
     total = np.concatenate([[0.0], np.cumsum(is_missing)])
     k = np.arange(len(is_missing))
     first = np.maximum(k - length // 2, 0)

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Metrics of a flight for `summary.json` and the tables.
+"""Summarise a flight: compute the metrics for `summary.json` and the tables.
 
-The tables have units and columns.
+The units and columns of the tables are in `summary_rows`.
 """
 
 import math
@@ -75,7 +75,10 @@ from flight_log.log_messages import LogMessage
 
 
 def command_edges(scenario: Scenario) -> list[Transient]:
-    """Edges of the scenario's pulses, doublets and ramps as transients, in order of time."""
+    """Return the edges of the scenario's commands as transients, in order of time.
+
+    These are the edges of its pulses, doublets and ramps.
+    """
     edges = [
         Transient("command", name, edge.start, edge.stop)
         for name, of_channel in scenario.reference_model.edges().items()
@@ -86,10 +89,10 @@ def command_edges(scenario: Scenario) -> list[Transient]:
 
 
 def transients(scenario: Scenario, tape: Tape) -> list[Transient]:
-    """Engagements, commands and gusts.
+    """Return engagements, commands and gusts.
 
-    From the first live command on, live commands replace the commands of the scenario. Turns and
-    captures replace the commands of a guided flight.
+    From the first live command on, live commands replace those of the scenario. In a guided flight,
+    turns and captures replace commands.
     """
     windows = scenario.gust_windows() if is_simulated(tape) else {}
     gusts = [Transient("gust", name, *window) for name, window in windows.items()]
@@ -106,7 +109,10 @@ def transients(scenario: Scenario, tape: Tape) -> list[Transient]:
 
 
 class RecordedFlight(NamedTuple):
-    """A flight under the name of its run: the input of figures, tables, exports and comparisons."""
+    """A flight under the name of its run.
+
+    Figures, tables, exports and comparisons are made from this.
+    """
 
     name: str
     scenario: Scenario | None  # None: an imported flight
@@ -120,33 +126,36 @@ class RecordedFlight(NamedTuple):
 
     @property
     def period_ns(self) -> int:
-        """Period of the controller's ticks, of an imported flight the median interval of u, ns."""
+        """Return the period of the controller's ticks, ns.
+
+        For an imported flight it is the median interval of u.
+        """
         if self.scenario is None:
             return max(int(np.median(np.diff(self.tape["u"].stamp_ns))), 1)
         return period_ns(self.scenario.controller.rate, "controller.rate")
 
     @property
     def units(self) -> dict[str, DisplayUnit]:
-        """Units of tables and figures by channel of y and u."""
+        """Return the units of tables and figures by channel of y and u."""
         if self.scenario is None:
             return {name: display_unit(unit) for name, unit in self.si_units.items()}
         return display_units(self.scenario)
 
     @property
     def message_times(self) -> list[float]:
-        """Flight times of the messages of the log, s."""
+        """Return the flight times of the messages of the log, s."""
         return [(message.stamp_ns - self.tape.start_ns) / NANOSECONDS for message in self.messages]
 
     @property
     def gusts(self) -> dict[str, tuple[float, float]]:
-        """Start and end of each gust of the scenario, s."""
+        """Return start and end of each gust of the scenario, s."""
         if self.scenario is None or not is_simulated(self.tape):
             return {}
         return self.scenario.gust_windows()
 
 
 def labels(flights: Sequence[RecordedFlight]) -> list[str]:
-    """Names of the flights; equal names get a number."""
+    """Return the names of the flights; equal names get a number."""
     names = [flight.name for flight in flights]
     return [
         f"{name} ({k})" if names.count(name) > 1 else name for k, name in enumerate(names, start=1)
@@ -154,7 +163,7 @@ def labels(flights: Sequence[RecordedFlight]) -> list[str]:
 
 
 def common_units(flights: Sequence[RecordedFlight]) -> dict[str, DisplayUnit]:
-    """Units by channel, of the first flight with the channel."""
+    """Return units by channel, each from the first flight that has the channel."""
     by_channel: dict[str, DisplayUnit] = {}
     for flight in reversed(flights):
         by_channel |= flight.units
@@ -167,9 +176,9 @@ def summarise(
     outcome: Outcome | None = None,
     flight_account: Account | None = None,
 ) -> dict[str, Any]:
-    """The metrics of a flight, SI, ready for JSON.
+    """Return the metrics of a flight, SI, ready for JSON.
 
-    docs/log.md, section Figures, explains the keys.
+    The section Figures of docs/log.md explains the keys.
 
     Args:
         tape: A flight with y and y_m.
@@ -239,7 +248,7 @@ def summarise(
 
 
 def _flown_scenario(tape: Tape, scenario: Scenario | None) -> Scenario:
-    """The scenario of a flight, else the scenario on the tape. Raises ParameterError without."""
+    """Return the scenario given or that of the tape. Raises ParameterError if there is neither."""
     of_flight = as_tape(tape).scenario if scenario is None else scenario
     require(
         of_flight is not None,
@@ -251,7 +260,7 @@ def _flown_scenario(tape: Tape, scenario: Scenario | None) -> Scenario:
 
 
 def _require_topics(tape: Tape) -> None:
-    """Raise ParameterError for a tape without y or y_m."""
+    """Raise ParameterError if a tape lacks y or y_m."""
     for topic in ("y", "y_m"):
         unset = " with a stamp" if topic in tape.recording and tape.recording[topic].unset else ""
         refusal = f" ({refusal_note(topic, tape.refused[topic])})" if topic in tape.refused else ""
@@ -260,15 +269,15 @@ def _require_topics(tape: Tape) -> None:
 
 
 def _finite(metrics: TickMetrics | LatencyMetrics | AgeMetrics | None) -> dict[str, Any] | None:
-    """Metrics by name; None unless all are finite."""
+    """Return metrics by name, or None unless all are finite."""
     return metrics._asdict() if metrics is not None and np.isfinite(metrics).all() else None
 
 
 def summarise_imported(tape: Tape, source: Mapping[str, str]) -> dict[str, Any]:
-    """The metrics of a flight that the stack did not fly.
+    """Return the metrics of a flight that the stack did not fly.
 
-    y and u about trim have metrics, and the topics an account. Such a flight has no reference, and
-    so no error. `source`: of `rise-di import`, the metadata record IMPORTED.
+    There are metrics of y and u about trim, and an account of the topics. Such a flight has no
+    reference, and so no error. `source` is the metadata record IMPORTED of `rise-di import`.
     """
     flight_account = account(tape, None)
     deviations = {}
@@ -290,9 +299,9 @@ def summarise_imported(tape: Tape, source: Mapping[str, str]) -> dict[str, Any]:
 
 
 def summarise_own(tape: Tape, law: str, log: str, outcome: Outcome) -> dict[str, Any]:
-    """The metrics of a flight of an aircraft of which the log has no section.
+    """Return the metrics of a flight of a user's aircraft that the log does not describe.
 
-    The errors are those of the measured y; nothing is judged by a model of the aircraft.
+    The errors are those of the measured y. Nothing is judged by a model of the aircraft.
     """
     source = {"log": log, "kind": f"an aircraft of its own under the law {law}"}
     summary = summarise_imported(tape, source) | {"outcome": outcome.as_json()}
@@ -305,11 +314,11 @@ def summarise_own(tape: Tape, law: str, log: str, outcome: Outcome) -> dict[str,
 
 
 def late_u(scenario: Scenario, age: AgeMetrics | None) -> list[str]:
-    """The sentence on u older at the aircraft than planned; empty for u as planned.
+    """Return the sentence on a u that is older at the aircraft than planned, if it is.
 
-    The sentence has the delay margin of the gains too. The linear loop has the delay of the
-    controller's parameters; further delay takes from the delay margin, computed where u is more
-    than a period older.
+    The linear loop is computed with the delay that the controller was told, and any further delay
+    takes from its delay margin. If u is more than a period older than planned, the sentence states
+    this margin too.
     """
     controller = scenario.controller
     if age is None or age.mean - controller.delay < 1.0 / controller.rate:
@@ -346,7 +355,7 @@ def _commands(tape: Tape, events: Sequence[Transient], end: float) -> Commands:
 
 
 def command_results(summary: Mapping[str, Any]) -> str:
-    """The commands that the flight did not fly, and the targets; empty without any.
+    """Return how many commands the flight flew, if not all, and the targets; "" if neither.
 
     An example is "8 of 24 commands flown".
     """
@@ -365,16 +374,16 @@ def command_results(summary: Mapping[str, Any]) -> str:
     return "; ".join(parts)
 
 
-STANDS_STILL = 5.0  # s, after which a vane at the end of a flight is named
+STANDS_STILL = 5.0  # s: if a vane stands still for longer at the end of a flight, we name it
 
 
 def _with_late_ticks(
     flight_account: Account, ticks: TickMetrics | None, scenario: Scenario
 ) -> Account:
-    """The account with the ticks that found no new y although the log has every y.
+    """Say in the account that the host is too busy, if ticks found no new y.
 
-    The host is too busy then. The rate of y is that of the scenario: a foreign aircraft and an
-    autopilot have their own.
+    This holds only if the log has every y, and if y has the rate of the scenario: a foreign
+    aircraft and an autopilot have their own.
     """
     log_complete = (
         not (flight_account.over("y", "internals") and not flight_account.busy)
@@ -399,7 +408,7 @@ def _with_late_ticks(
 
 
 def _duration(tape: Tape, flight_account: Account) -> float | None:
-    """Flight time of the last y, s; of a log that lacks y, the end of the flight."""
+    """Return the flight time of the last y, s, or if the log lacks y, of the end of the flight."""
     if not len(tape["y"].stamp_ns):
         return None
     return flight_account.end if flight_account.over("y") else float(tape.time("y")[-1])
@@ -414,14 +423,14 @@ FIGURES = {
     "latency": ("y", "u"),
     "age_of_u": ("u",),
 }
-"""Topics of the tables and lines of figures beside the error: the values, and the parts of the
-flight."""
+"""Topics that each table needs beside the error: those of its values, and those that tell the parts
+of the flight."""
 
 
 def taken_over(summary: Mapping[str, Any], table: str) -> str:
-    """The part of the flight over which the figures of a table are taken, after a comma.
+    """Return which part of the flight the figures of a table are taken over, after a comma.
 
-    Empty for the whole flight.
+    If it is all of the flight, this is "".
     """
     flight_account = account_of_json(summary)
     truth = ("truth",) if table == "errors" and summary["error"] == TRUE_ERROR else ()
@@ -430,14 +439,14 @@ def taken_over(summary: Mapping[str, Any], table: str) -> str:
 
 
 def time_flown(summary: Mapping[str, Any]) -> str:
-    """The duration of a flight and the part of the flight that the errors are of."""
+    """Return how long the flight was, and which part of it the errors are taken over."""
     return f"{format_seconds(summary['duration'])} flown{taken_over(summary, 'errors')}"
 
 
 def engagement_notes(engagements: Sequence[Mapping[str, Any]], *, has_figures: bool) -> list[str]:
-    """Sentences on the engagements of a flight with a bridge.
+    """Return sentences on the engagements of a flight with a bridge.
 
-    They have figures unless shorter than a sample.
+    If they are shorter than a sample, they have no figures of their own.
     """
     if not engagements:
         return ["never engaged: the figures are of an aircraft that this controller did not fly"]
@@ -458,10 +467,10 @@ def engagement_notes(engagements: Sequence[Mapping[str, Any]], *, has_figures: b
 
 
 def mode_notes(tape: Tape, part: str) -> list[str]:
-    """A sentence on a controller that did not fly the law for more than 1 % of the ticks.
+    """Return a sentence if the controller did not fly the law in more than 1 % of the ticks.
 
-    The ticks count from the first engagement on. `part`: the part of the ticks in the log, as "over
-    49 % of internals"; empty for all.
+    Ticks count from the first engagement on. `part` is the part of them in the log, as "over 49 %
+    of internals", or "" for all.
     """
     if "internals" not in tape:
         return []
@@ -481,7 +490,7 @@ def mode_notes(tape: Tape, part: str) -> list[str]:
 
 
 def vane_notes(tape: Tape) -> list[str]:
-    """Sentences on vanes of an observer at a standstill at the end of a flight."""
+    """Return sentences on vanes of an observer that stand still at the end of a flight."""
     if "internals" not in tape:
         return []
     measures = tape["internals"].group("vane_measures")
@@ -499,7 +508,7 @@ def vane_notes(tape: Tape) -> list[str]:
 
 
 def empty_summary(scenario: Scenario | None, outcome: Outcome) -> dict[str, Any]:
-    """The summary of a flight with an end before the first sample."""
+    """Return the summary of a flight that ended before its first sample."""
     return {
         "scenario": None if scenario is None else scenario.name,
         "outcome": outcome.as_json(),
@@ -536,7 +545,7 @@ def _errors(tape: Tape, events: Sequence[Transient], air: str) -> dict[str, Any]
 
 
 def _in_order(by_channel: Mapping[str, Any], scenario: Scenario) -> dict[str, Any]:
-    """Values by channel in the order of the controller."""
+    """Sort values by channel in the order of the controller."""
     return {name: by_channel[name] for name in in_order(by_channel, display_units(scenario))}
 
 
@@ -550,9 +559,9 @@ def _inputs(tape: Tape, events: Sequence[Transient], air: str) -> dict[str, Any]
 
 
 def finite_or_null(value: Any) -> Any:
-    """A value for JSON with None in place of NaN and infinity, also inside mappings and lists.
+    """Return a value for JSON, with None in place of NaN and infinity, at any depth.
 
-    A part of the flight without samples has NaN metrics, an overflow infinite metrics.
+    Metrics are NaN if their part of the flight has no samples, and infinite after an overflow.
     """
     if isinstance(value, Mapping):
         return {key: finite_or_null(entry) for key, entry in value.items()}
@@ -562,7 +571,7 @@ def finite_or_null(value: Any) -> Any:
 
 
 def summary_legend(summary: Mapping[str, Any]) -> str:
-    """Legend of the parts of a flight."""
+    """Return the legend of the parts of a flight."""
     is_guided = any("turn" in parts for parts in summary["errors"].values())
     air = summary["air"] or UNKNOWN_AIR
     meaning = ". ultimate bound: the largest error in calm" if air == CALM else ""

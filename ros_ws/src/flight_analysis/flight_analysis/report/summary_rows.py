@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The metrics of a summary, declared once, and the rows of tables, as text.
+"""Declare the metrics of a summary once, and turn them into rows of text for tables.
 
-A metric has a place in the summary, a heading, a unit and digits.
+Each metric has its place in the summary, a heading, a unit and a number of digits.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,8 +25,8 @@ MILLISECONDS = DisplayUnit("ms", 1e3)
 class Column(NamedTuple):
     """A column of a table, or a metric.
 
-    The fields are the heading, the common heading of neighbouring columns above, and the path in a
-    summary.
+    `head` is its heading, `group` the heading above that neighbouring columns share, and `path`
+    where the metric is in a summary.
     """
 
     group: str
@@ -37,18 +37,18 @@ class Column(NamedTuple):
 
     @property
     def label(self) -> str:
-        """The whole heading."""
+        """Return the whole heading."""
         return f"{self.group} {self.head}".strip()
 
     def value(self, figures: Mapping[str, Any]) -> float | None:
-        """The metric in the part of a summary that the path begins in, SI; None if missing."""
+        """Return the metric, SI, from the part of a summary in which the path begins, or None."""
         value: Any = figures
         for key in self.path:
             value = value.get(key) if isinstance(value, Mapping) else None
         return value if isinstance(value, float | int) else None
 
     def text(self, figures: Mapping[str, Any], row_unit: DisplayUnit = NO_UNIT) -> str:
-        """The metric as text, in its unit or that of the row."""
+        """Return the metric as text, in its own unit or in that of the row."""
         value = self.value(figures)
         factor = (self.unit or row_unit).factor
         if value is None or self.decimals is None:
@@ -75,7 +75,7 @@ ERROR_COLUMNS = (
     Column("max", "gust", ("gust", "max")),
     Column("ultimate", "bound", ("bound",)),
 )
-"""Columns of every table of errors; `columns_of` chooses those of a flight."""
+"""Columns that a table of errors may have; `columns_of` chooses those of a flight."""
 
 
 NOISE_FLOOR_COLUMN = Column("noise", "floor", ("floor",))
@@ -90,7 +90,7 @@ INPUT_COLUMNS = (
     Column("rate", "whole", ("whole", "rate")),
     *(Column("rate", air, (air, "rate")) for air in AIRS),
 )
-"""Columns of every table of inputs, before SATURATION_COLUMN; `columns_of` chooses those of a
+"""Columns that a table of inputs may have before SATURATION_COLUMN; `columns_of` chooses those of a
 flight."""
 
 
@@ -110,7 +110,7 @@ HELD_COLUMNS = (
 
 
 def _ms(group: str, topic: str, **heads: str) -> tuple[Column, ...]:
-    """Times of a topic of the summary, by key with the heading."""
+    """Return columns for times of one topic of the summary, with a heading for each key."""
     return tuple(
         Column(group=group, head=head, path=(topic, key), unit=MILLISECONDS, decimals=3)
         for key, head in heads.items()
@@ -137,7 +137,7 @@ TIMING_COLUMNS = (
 
 
 def columns_of(columns: Sequence[Column], channels: Mapping[str, Any]) -> tuple[Column, ...]:
-    """The columns with a value: a part of the flight that did not occur has none."""
+    """Return the columns that have a value: a part of the flight that did not occur has none."""
     return tuple(
         column
         for column in columns
@@ -148,7 +148,7 @@ def columns_of(columns: Sequence[Column], channels: Mapping[str, Any]) -> tuple[
 def model_rows(
     models: Sequence[Mapping[str, Any]], units: Mapping[str, DisplayUnit]
 ) -> tuple[list[str], list[list[str]]]:
-    """Headings and rows for "models" of a summary: model, times and rms of the errors."""
+    """Return headings and rows for "models" of a summary: model, times and rms of the errors."""
     channels = list(models[0]["rms"]) if models else []
     headings = ["from (s)", "to (s)", *(f"{name} ({units[name].unit})" for name in channels)]
     rows = []
@@ -161,9 +161,9 @@ def model_rows(
 def table_rows(
     channels: Mapping[str, Any], columns: Sequence[Column], units: Mapping[str, DisplayUnit]
 ) -> list[list[str]]:
-    """Rows for "errors" or "inputs" of a summary.
+    """Return the rows for "errors" or "inputs" of a summary.
 
-    A row has the channel with the unit, then a cell per column.
+    A row begins with the channel and its unit. A cell for each column follows.
     """
     rows = []
     for name, metrics in channels.items():
@@ -173,9 +173,9 @@ def table_rows(
 
 
 def timing_rows(summary: Mapping[str, Any]) -> list[tuple[str, str, str]]:
-    """The timing of the controller: a row for the metrics with a common heading.
+    """Return the timing of the controller, a row for all metrics with the same heading.
 
-    A row has the topic of the summary, the heading with the unit, and the values.
+    A row has the topic of the summary, the heading with its unit, and the values.
     """
     rows = []
     for group, metrics in groupby(TIMING_COLUMNS, key=lambda column: column.group):
@@ -193,7 +193,10 @@ def timing_rows(summary: Mapping[str, Any]) -> list[tuple[str, str, str]]:
 def segment_table(
     segments: Sequence[Mapping[str, Any]], units: Mapping[str, DisplayUnit]
 ) -> tuple[list[Column], list[list[str]]]:
-    """Columns and rows of what guidance held in each segment, in `units` or QUANTITY_UNITS."""
+    """Return columns and rows of what guidance held in each segment.
+
+    The units are `units` or, if these have none for a quantity, QUANTITY_UNITS.
+    """
     units = {**QUANTITY_UNITS, **units}
     columns = [Column("", head) for head in ("from (s)", "to (s)")]
     for group in ("lateral", "vertical"):
@@ -212,9 +215,9 @@ def segment_table(
 
 
 def input_rows(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -> list[list[str]]:
-    """Rows for the flight's INPUT_COLUMNS and SATURATION_COLUMN.
+    """Return rows with the flight's INPUT_COLUMNS and SATURATION_COLUMN.
 
-    Ticks with saturation are in percent, by magnitude / by rate.
+    Saturation is given in percent of the ticks, by magnitude / by rate.
     """
     rows = table_rows(summary["inputs"], columns_of(INPUT_COLUMNS, summary["inputs"]), units)
     for row, metrics in zip(rows, summary["inputs"].values(), strict=True):
@@ -228,10 +231,10 @@ def input_rows(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -> 
 
 
 def slowest_settling(summary: Mapping[str, Any], channel: str, kind: str) -> str:
-    """The longest settling time of a channel after transients of a kind, s.
+    """Return the longest settling time of a channel after transients of a kind, s.
 
-    "> x" where the error did not settle after a transient; x is then the longest time, settled or
-    not.
+    If the error did not settle after one of them, this is "> x", where x is the longest time of
+    all, settled or not.
     """
     times: list[float] = []
     unsettled: list[float] = []

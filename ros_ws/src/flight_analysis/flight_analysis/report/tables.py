@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The tables of a flight's report page as data; page.html.jinja makes HTML."""
+"""Build the tables of a flight's report page as data, which page.html.jinja turns into HTML."""
 
 from collections.abc import Mapping, Sequence
 from itertools import groupby, product
@@ -76,7 +76,7 @@ SATURATION_LEGEND = "; saturated: ticks with saturation by magnitude / by rate"
 
 
 class MetricTable(NamedTuple):
-    """A table with the names of the rows in the first column; `columns` follow."""
+    """A table whose first column has the names of the rows; `columns` follow."""
 
     caption: str
     columns: Sequence[Column]
@@ -85,7 +85,7 @@ class MetricTable(NamedTuple):
 
     @property
     def groups(self) -> list[tuple[str, int]]:
-        """Common headings of neighbouring columns, with the number of columns."""
+        """Return the headings that neighbouring columns share, each with their number."""
         return [
             (group, len(list(columns)))
             for group, columns in groupby(self.columns, key=lambda column: column.group)
@@ -93,7 +93,7 @@ class MetricTable(NamedTuple):
 
     @property
     def group_starts(self) -> list[bool]:
-        """Whether the columns start a group; a column without a group does."""
+        """Return whether each column starts a group; a column without a group does."""
         groups = [column.group for column in self.columns]
         return [
             not group or group != before
@@ -102,9 +102,9 @@ class MetricTable(NamedTuple):
 
 
 class EventInterval(NamedTuple):
-    """A gust, a fault, a failsafe mode, a saturation or a still vane.
+    """A gust, a fault, a failsafe mode, a saturation or a vane that stands still.
 
-    The span is from the first to the last instant in s.
+    It lasts from its first to its last instant, s.
     """
 
     name: str
@@ -114,9 +114,9 @@ class EventInterval(NamedTuple):
 
 
 def _stands_still(measures: FloatArray, tape: Tape, time: float) -> NDArray[np.bool_]:
-    """Ticks in which a vane stands still, shape (N,).
+    """Return the mask of the ticks in which a vane stands still, shape (N,).
 
-    They count from an engagement on once the vane has moved or `time` s have passed.
+    After each engagement a tick counts once the vane has moved, or once `time` s have passed.
     """
     internals = tape["internals"]
     t = tape.time("internals")
@@ -129,10 +129,10 @@ def _stands_still(measures: FloatArray, tape: Tape, time: float) -> NDArray[np.b
 
 
 def events(tape: Tape, gusts: Windows, scenario: Scenario | None = None) -> list[EventInterval]:
-    """Gusts, faults of effectors, modes but ENGAGED, saturations, and still vanes.
+    """Return gusts, faults, modes except ENGAGED, saturated inputs and vanes that stand still.
 
-    The order is that of the start. The saturations are of the inputs. The scenario comes from the
-    tape; the tape of a log has no scenario and needs the argument.
+    They are in the order of their starts. The scenario is that of the tape; the tape of a log has
+    none, and needs the argument.
     """
     of_flight = scenario if scenario is not None else tape.scenario
     listed = []
@@ -190,9 +190,9 @@ def events(tape: Tape, gusts: Windows, scenario: Scenario | None = None) -> list
 def metric_tables(
     summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]
 ) -> list[MetricTable]:
-    """Tables of the error, the inputs, guidance, the models and the ticks.
+    """Return the tables that have rows: error, inputs, guidance, models and ticks.
 
-    Page and terminal have these tables. A table without rows is left out.
+    The page and the terminal show them.
     """
     inputs = (*columns_of(INPUT_COLUMNS, summary["inputs"]), SATURATION_COLUMN)
     tables = (
@@ -215,7 +215,7 @@ def flight_tables(
     units: Mapping[str, DisplayUnit],
     event_list: Sequence[EventInterval],
 ) -> list[MetricTable]:
-    """The tables of metrics, and those of the events and the processes."""
+    """Return the tables of metrics, and those of events and processes."""
     times = [Column("", head) for head in ("from (s)", "to (s)", "")]
     rows = [
         (event.name, f"{event.start:.2f}", f"{event.stop:.2f}", event.extent)
@@ -231,7 +231,7 @@ def flight_tables(
 def imported_tables(
     summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]
 ) -> list[MetricTable]:
-    """Tables of y and u, and of the topics, of an imported flight."""
+    """Return tables of y, u and the topics of an imported flight."""
     tables = []
     titles = {
         "e": "Measured errors",
@@ -289,9 +289,9 @@ def _guidance_table(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]
 def model_table(
     models: Sequence[Mapping[str, Any]], units: Mapping[str, DisplayUnit], part: str
 ) -> MetricTable:
-    """The rms of the error before the first learned model and under every model.
+    """Return the rms of the error before the first learned model, and under every model.
 
-    `part`: what the log has of the flight, after a comma.
+    `part` says what the log has of the flight, after a comma.
     """
     headings, rows = model_rows(models, units)
     columns = [Column("", head) for head in headings]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Metrics of the timing of a flight: ticks of the controller, latency and age of u."""
+"""Measure the timing of a flight: ticks of the controller, latency and age of u."""
 
 from typing import NamedTuple
 
@@ -12,7 +12,7 @@ from flight_core.tape import Tape
 
 
 class TickMetrics(NamedTuple):
-    """Timing of the controller's ticks; times in s."""
+    """The timing of the controller's ticks; times in s."""
 
     ticks: int
     # periods without a step of the controller: no new y arrived, or the tick was missed
@@ -27,14 +27,14 @@ class TickMetrics(NamedTuple):
 
 
 class AgeMetrics(NamedTuple):
-    """Age of u at the aircraft, the delay of the whole loop from the instant of y to u, in s."""
+    """The age of u at the aircraft, s: the delay of the whole loop from the instant of y to u."""
 
     mean: float
     max: float
 
 
 class LatencyMetrics(NamedTuple):
-    """Time from sending y to sending the resulting u, in s."""
+    """The time from sending y to sending the u that answers it, s."""
 
     median: float
     p99: float
@@ -42,19 +42,19 @@ class LatencyMetrics(NamedTuple):
 
 
 def tick_periods(tape: Tape) -> NDArray[np.int64]:
-    """Time between successive ticks of the controller, ns, shape (N - 1,).
+    """Return the time between successive ticks of the controller, ns, shape (N - 1,).
 
-    The instant of a tick is stamp + "age", the deadline plus "late".
+    The instant of a tick is stamp + "age", which is its deadline plus "late".
     """
     internals = tape["internals"]
     return np.diff(internals.stamp_ns + np.round(internals["age"] * 1e9).astype(np.int64))
 
 
 def tick_metrics(tape: Tape, period_ns: int) -> TickMetrics | None:
-    """Metrics of the controller's ticks from `internals`; None for fewer than two ticks.
+    """Return the metrics of the controller's ticks, or None if there are fewer than two.
 
-    `internals` holds only ticks with a new y. A period without a tick therefore counts for a
-    missing y and for a missing tick.
+    `internals` holds only ticks with a new y. If a period has no tick there, either no y came or
+    the tick was missed; we count both.
     """
     internals = tape["internals"]
     if len(internals.stamp_ns) < 2:
@@ -76,7 +76,7 @@ def tick_metrics(tape: Tape, period_ns: int) -> TickMetrics | None:
 
 
 def latency_metrics(tape: Tape) -> LatencyMetrics | None:
-    """Metrics of the signal `latency`; None where the tape has none."""
+    """Return the metrics of the signal `latency`, or None if the tape has none."""
     if "latency" not in tape or len(tape["latency"].stamp_ns) == 0:
         return None
     latency = tape["latency"].values[:, 0]
@@ -86,7 +86,7 @@ def latency_metrics(tape: Tape) -> LatencyMetrics | None:
 
 
 def age_metrics(tape: Tape) -> AgeMetrics | None:
-    """Metrics of the signal `age_of_u`; None where the tape has none."""
+    """Return the metrics of the signal `age_of_u`, or None if the tape has none."""
     if "age_of_u" not in tape or len(tape["age_of_u"].stamp_ns) == 0:
         return None
     return AgeMetrics(float(tape["age_of_u"]["mean"].mean()), float(tape["age_of_u"]["max"].max()))

@@ -1,23 +1,23 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a flight tracks the reference as the linear loop does.
+"""Judge whether a flight tracks the reference as the linear loop does.
 
 The rms error over WINDOW, and over END at the end, may be
 
     FACTOR rms(e by commands) + excuse + floor,  of an output with a command of its own at most
     COMMAND_PART rms(y_m) + excuse + floor,      and never above FACTOR rms(e) + floor
 
-with e of the linear loop by `linear_flight.error_pair`. The excuse is what noise and wind leave,
-FACTOR times, and at most MOST over WINDOW: beyond, an aircraft that shakes is no success, whatever
-shakes it. The floor is
+with e of the linear loop by `linear_flight.error_pair`. The excuse is FACTOR times what noise and
+wind leave, and at most MOST over WINDOW: if an aircraft shakes more than that it is no success,
+whatever shakes it. The floor is
 
 - HARMLESS of the least errors of a divergence, 0.02 rad/s and 0.2 m/s, and the noise of a measured
   error, at most MOST;
-- SPEED_PART of the trim speed where the model of the aircraft is unknown, and with it the drag, in
-  a part in which y_m of V changes;
-- the least errors of a divergence, 0.1 rad/s and 1 m/s, where the wind is unknown.
+- SPEED_PART of the trim speed if the model of the aircraft is unknown, and with it the drag, in a
+  part in which y_m of V changes;
+- the least errors of a divergence, 0.1 rad/s and 1 m/s, if the wind is unknown.
 
-`rise_di_controller.learning.divergence` keeps a learned model below the least errors.
+`rise_di_controller.learning.divergence` keeps a learned model below these least errors.
 """
 
 import math
@@ -47,15 +47,15 @@ from rise_di_controller.learning.divergence import HARMLESS, LEAST, LEAST_RATE, 
 from rise_di_controller.params import ControllerConfig
 
 FACTOR = 2.0
-"""Of the error of the linear loop: an input of half the effect doubles the error. Healthy flights
-have at most 1.3."""
+"""Of the error of the linear loop. An input with half of its effect doubles the error; healthy
+flights have at most 1.3 times the error."""
 
 COMMAND_PART = 0.5
-"""Of a command: a weak law, whose linear loop does not follow it either, is no success. An output
-has a command of its own where no other one of its kind has twice as much."""
+"""Of a command. A law so weak that even its linear loop does not follow is no success. An output
+has a command of its own unless another one of its kind has twice as much."""
 
 END = 1.0
-"""s, length of the end of a flight: an error that grows is larger there than over WINDOW."""
+"""s, length of the end of a flight. If an error grows, it is larger there than over WINDOW."""
 
 MOST = {"V": 6.0}
 """m/s. Severe turbulence of MIL-F-8785C, sigma = 3.05 m/s at 4000 ft, leaves 3 m/s rms of V over a
@@ -66,15 +66,15 @@ MOST_RATE = 0.05
 osprey, and twice that is allowed."""
 
 SPEED_PART = 0.0075
-"""Of the trim speed: what the drag of an unknown polar leaves while V changes by a few m/s. A law
-with an integral of e leaves nothing of it while V is constant."""
+"""Of the trim speed: what the drag of an unknown polar leaves while V changes by a few m/s. While V
+is constant, a law with an integral of e leaves nothing of it."""
 
 SATURATED = 0.5  # of the ticks: a stable loop of the osprey has 0.14 at most in moderate gusts
 SIDE = 0.1  # of the ticks, on either side
 
 
 class Excess(NamedTuple):
-    """The rms error of an output over a part of a flight, beyond what is allowed, SI."""
+    """The rms error of an output over a part of a flight, and what was allowed there, SI."""
 
     output: str
     start: float  # s
@@ -101,11 +101,10 @@ def tracking_verdict(
     may_pause: bool = True,
     starved: Starvation | None = None,
 ) -> TrackingVerdict:
-    """Return the outputs with a larger error than allowed, and those that noise or wind excuses.
+    """Return the outputs whose error is larger than allowed, and those that noise or wind excuses.
 
     Each comes with the worst part of the flight. If the law `may_pause`, the ticks in which it is
-    inactive do not count. Nothing is said about the law in the spans in which the host `starved`
-    the flight.
+    inactive do not count. Spans in which the host `starved` the flight say nothing about the law.
     """
     nothing = TrackingVerdict([], [])
     if not {"y", "y_m"} <= set(tape.signals):
@@ -152,7 +151,7 @@ def _verdict(pair: ErrorPair, aircraft: AircraftConfig | None) -> TrackingVerdic
 
 
 class _Limits(NamedTuple):
-    """What an output may be off by beside the linear loop, SI."""
+    """How far an output may be off in addition to the linear loop, SI."""
 
     floor: float
     most: float  # of noise and wind
@@ -160,12 +159,12 @@ class _Limits(NamedTuple):
 
 
 def _has_engaged(tape: Tape) -> bool:
-    """Whether the law engaged."""
+    """Return whether the law engaged."""
     return "internals" in tape and bool((tape["internals"]["mode"] == Mode.ENGAGED).any())
 
 
 def _floor(pair: ErrorPair, i: int, unit: str) -> float:
-    """Return the floor of an output, SI; `unit`: of the output."""
+    """Return the floor of an output, SI; `unit` is that of the output."""
     is_speed = quantity(unit).dimension == SPEED
     smallest = LEAST[AIRSPEED] if is_speed else LEAST_RATE
     if pair.knowledge.has_wind:
@@ -174,7 +173,10 @@ def _floor(pair: ErrorPair, i: int, unit: str) -> float:
 
 
 def _drag(pair: ErrorPair, i: int, speed: float) -> float:
-    """Return what an unknown drag leaves of an output while it changes, SI; `speed`: V0, m/s."""
+    """Return what an unknown drag leaves of an output while it changes, SI.
+
+    `speed` is the trim speed V0, m/s.
+    """
     is_known = pair.knowledge.has_model or pair.names[i] != AIRSPEED
     return 0.0 if is_known else SPEED_PART * speed
 
@@ -187,7 +189,7 @@ def _most(unit: str) -> float:
 def _excesses(pair: ErrorPair, i: int, group: list[int], limits: _Limits) -> list[Excess]:
     """Return the worst parts of each span of a flight, and of its end.
 
-    `group`: the airspeed, or the rates.
+    `group` holds the outputs of the same kind: the airspeed, or the rates.
     """
     edges = np.flatnonzero(np.diff(np.concatenate([[False], pair.is_flown, [False]])))
     spans = list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
@@ -207,7 +209,8 @@ def _largest_excesses(
 ) -> list[Excess]:
     """Return the part of WINDOW in a span of ticks with the largest rms over the allowed error.
 
-    The part that needs the largest excuse follows. A shorter span is a single part.
+    After it comes the part that needs the largest excuse. If the span is shorter than WINDOW, it is
+    a single part.
     """
     start, stop = span
     count = min(_ticks(pair, WINDOW), stop - start)
@@ -224,7 +227,7 @@ def _largest_excesses(
     has_command = (command >= 0.5 * others) & (command > 2.0 * floor)
     by_noise = rms(pair.linear.noise)
     by_wind = rms(pair.linear.wind)
-    # A gust that is harmless over WINDOW is as much larger over less.
+    # If a span is shorter than WINDOW, a gust that is harmless has a larger rms over it.
     most = limits.most * math.sqrt(_ticks(pair, WINDOW) / count)
     excuse = np.minimum(FACTOR * np.hypot(by_noise, by_wind), most)
     by_command = FACTOR * rms(pair.linear.command)
@@ -246,18 +249,18 @@ def _largest_excesses(
 
 
 def _ticks(pair: ErrorPair, length: float) -> int:
-    """The ticks of a length, s."""
+    """Return how many ticks a length, s, has."""
     return max(round(length / (pair.t[1] - pair.t[0])), 1) if len(pair.t) > 1 else 1
 
 
 def _sums(values: FloatArray, count: int) -> FloatArray:
-    """Sums over each `count` values in a row."""
+    """Return the sum over each `count` values in a row."""
     total = np.concatenate([[0.0], np.cumsum(values)])
     return np.asarray(total[count:] - total[:-count])
 
 
 def _shortfall(excess: Excess, pair: ErrorPair, i: int, unit: DisplayUnit) -> Shortfall:
-    """The shortfall of an excess, with the period of a limit cycle."""
+    """Return the shortfall of an excess, with the period if it is a limit cycle."""
     rms, allowed = unlike_numbers(excess.rms * unit.factor, excess.allowed * unit.factor)
     brief = f"{excess.output} off by {rms} {unit.unit} rms, {allowed} allowed"
     sentence = f"{brief}, from t = {excess.start:.1f} to {excess.stop:.1f} s"
@@ -275,7 +278,7 @@ def _shortfall(excess: Excess, pair: ErrorPair, i: int, unit: DisplayUnit) -> Sh
 
 
 def _allowance(excess: Excess, unit: DisplayUnit) -> Allowance:
-    """Return the allowance for an error that is one of noise or wind."""
+    """Return the allowance for an error that noise or wind causes."""
     rms = plain_number(excess.rms * unit.factor)
     cause = "sensor noise" if excess.is_noise else "wind"
     sentence = f"{excess.output} off by {rms} {unit.unit} rms, allowed for {cause}"
@@ -283,10 +286,11 @@ def _allowance(excess: Excess, unit: DisplayUnit) -> Allowance:
 
 
 def saturation_notes(tape: Tape) -> list[str]:
-    """Sentences on inputs that went from limit to limit in SATURATED of the ticks of WINDOW.
+    """Return sentences on inputs that went from limit to limit in SATURATED of a WINDOW.
 
-    SIDE or more of these are on either side. A climb at full throttle stays on one side. A limit of
-    the rate does not count: noise reaches the rate of a slow engine to either side.
+    SIDE of the ticks or more must be at either limit: a climb at full throttle stays at one of
+    them. A limit of the rate does not count, because noise drives a slow engine to either of its
+    rates.
     """
     if "internals" not in tape:
         return []
@@ -309,7 +313,7 @@ def saturation_notes(tape: Tape) -> list[str]:
 
 
 def _windowed(signal: Signal, values: NDArray[np.generic]) -> FloatArray:
-    """Means over each whole WINDOW of samples."""
+    """Return the mean over each whole WINDOW of samples."""
     steps = np.diff(signal.stamp_ns)
     count = round(WINDOW / seconds(int(np.median(steps)))) if len(steps) else 1
     return _sums(values.astype(np.float64), count) / count if len(values) >= count else np.zeros(0)
