@@ -126,7 +126,7 @@ class Loop(NamedTuple):
 
 
 def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """The members of an object. Raises ValueError if a name stands twice."""
+    """Return the members of an object. Raises ValueError if a name stands twice."""
     members = dict(pairs)
     if len(members) != len(pairs):
         names = [name for name, _ in pairs]
@@ -136,7 +136,7 @@ def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def shown(value: Any) -> str:
-    """A value of a file in printable ASCII, cut short."""
+    """Write a value of a file in printable ASCII, cut short."""
     text = ascii(value)
     return text if len(text) <= 60 else text[:57] + "..."
 
@@ -148,7 +148,7 @@ def require(holds: bool, where: str, found: Any, expected: str) -> None:
 
 
 def integer(digits: str) -> int:
-    """A whole number. Raises ValueError for one of more digits than any number here has."""
+    """Return a whole number. Raises ValueError if it has more digits than any number here has."""
     require(len(digits) <= 20, "a number", len(digits), "at most 20 digits")
     return int(digits)
 
@@ -159,7 +159,10 @@ def no_number(word: str) -> float:
 
 
 def numbers(value: Any, where: str, kind: Numbers, sizes: dict[str, int]) -> Array:
-    """The array of a field. A size that is not known yet becomes known. Raises ValueError."""
+    """Return the array of a field. A size that is not known yet becomes known.
+
+    Raises ValueError if the array does not fit.
+    """
 
     def flat(part: Any, shape: tuple[str, ...]) -> list[float]:
         if not shape:
@@ -176,12 +179,12 @@ def numbers(value: Any, where: str, kind: Numbers, sizes: dict[str, int]) -> Arr
 
 
 def matches(value: Any, kind: str) -> bool:
-    """Whether a value is a text of a kind."""
+    """Return whether a value is a text of a kind."""
     return type(value) is str and re.fullmatch(TEXTS[kind], value) is not None
 
 
 def members(value: Any, where: str, known: Sequence[str], optional: set[str]) -> dict[str, Any]:
-    """An object that has these members and no other. Raises ValueError."""
+    """Return an object that has these members and no other. Raises ValueError."""
     require(type(value) is dict, where, value, "an object")
     unknown = sorted(set(value) - {*known})
     require(not unknown, where, unknown, f"{', '.join(known)} alone")
@@ -190,7 +193,7 @@ def members(value: Any, where: str, known: Sequence[str], optional: set[str]) ->
 
 
 def fields_of(value: Any, where: str, known: dict[str, Any], sizes: dict[str, int]) -> Any:
-    """The fields of an object by their kinds, arrays in place of lists. Raises ValueError."""
+    """Return the fields of an object by their kinds, with arrays for lists. Raises ValueError."""
     content = {}
     for name, kind in known.items():
         if name not in value:
@@ -214,7 +217,7 @@ def fields_of(value: Any, where: str, known: dict[str, Any], sizes: dict[str, in
 
 
 def parts_from(value: Any, entries: int, period: float) -> dict[tuple[int, ...], list[Any]]:
-    """The steps of each part by its entries. Raises ValueError."""
+    """Return the steps of each part by its entries. Raises ValueError."""
     require(type(value) is list, "parts", value, "a list")
     parts: dict[tuple[int, ...], list[Any]] = {}
     taken: set[int] = set()
@@ -258,9 +261,9 @@ def check_step(step: Any, where: str, entries: int, highest: float) -> None:
 
 
 def read(path: Path) -> dict[str, Any]:
-    """The content of a certificate: known members alone, each of its type, size and range.
+    """Return the content of a certificate: only known members, each of its type, size and range.
 
-    Raises ValueError for anything else, and OSError for a file that cannot be read.
+    Raises ValueError for anything else, and OSError if the file cannot be read.
     """
     text = path.read_bytes()
     require(len(text) <= LONGEST, "the file", len(text), f"up to {LONGEST} bytes")
@@ -286,7 +289,7 @@ def read(path: Path) -> dict[str, Any]:
 
 
 def exponential(M: Array) -> Array:
-    """Exp of a matrix: the series of M / 2^k, whose norm is below 1/4, then k squares."""
+    """Return exp of a matrix: the series of M / 2^k, whose norm is below 1/4, squared k times."""
     k = max(0, int(np.ceil(np.log2(max(np.abs(M).sum(axis=1).max(), 1e-300)))) + 2)
     term = total = np.eye(len(M))
     for i in range(1, 19):
@@ -296,7 +299,7 @@ def exponential(M: Array) -> Array:
 
 
 def loop_of(file: dict[str, Any]) -> Loop:
-    """The motion over a period from the numbers of a certificate."""
+    """Return the motion over a period from the numbers of a certificate."""
     A, B, C, E, F, G, lag = (file[key] for key in [*"ABCEFG", "lag"])
     law, T, (n, m), k = file["law"], float(file["period"]), B.shape, E.shape[1]
     size, has_lag = n + m, lag > 0.0
@@ -307,7 +310,7 @@ def loop_of(file: dict[str, Any]) -> Loop:
     chain[:size, :size] = T * np.block([[A, B * has_lag], [np.zeros((m, n)), -rate]])
 
     def over(s: float) -> list[Array]:
-        """X(s) = exp(motion T s), then the integrals of X(s - r) r^j / j! over r from 0 to s."""
+        """Return X(s) = exp(motion T s), then int X(s - r) r^j / j! dr over r from 0 to s."""
         return np.split(exponential(chain * s)[:size], TERMS + 1, axis=1)
 
     # The states are aircraft and actuators, u of earlier ticks, the newest first, and the law.
@@ -350,7 +353,7 @@ def loop_of(file: dict[str, Any]) -> Loop:
 
 
 def parts_of(loop: Loop) -> list[tuple[tuple[int, ...], Loop]]:
-    """The strongly connected parts and their entries: the modes of the loop are those of these."""
+    """Return the strongly connected parts and their entries: these have the modes of the loop."""
     n, k = loop.states, len(loop.K)
     total = n + k
     # of each row and column: the state, or the number of states + the entry
@@ -370,7 +373,7 @@ def parts_of(loop: Loop) -> list[tuple[tuple[int, ...], Loop]]:
 
 
 def is_stable(A: Array) -> bool:
-    """Whether every eigenvalue has abs(z) < RADIUS: P > 0 with P - A' P A / RADIUS^2 > 0."""
+    """Return whether abs(z) < RADIUS for each eigenvalue: P > 0, P - A' P A / RADIUS^2 > 0."""
     P, power = np.eye(len(A)), A / RADIUS
     for _ in range(40):
         with np.errstate(over="ignore", invalid="ignore"):
@@ -383,17 +386,17 @@ def is_stable(A: Array) -> bool:
 
 
 def norm(X: Array) -> float:
-    """The Frobenius norm, at least the largest singular value."""
+    """Return the Frobenius norm, which is at least the largest singular value."""
     return float(np.linalg.norm(X))
 
 
 def adjoint(X: Array) -> Array:
-    """X*."""
+    """Return X*."""
     return np.asarray(X.conj().T)
 
 
 def closed(big: Array, w: slice, c: Array) -> Array:
-    """The system from w - c z in place of w, z = big[w] (x, w, v)."""
+    """Return the system from w - c z in place of w, with z = big[w] (x, w, v)."""
     z = np.linalg.solve(np.eye(len(c)) - big[w, w] * c, big[w])
     return np.asarray(big + big[:, w] @ (c[:, None] * z))
 
@@ -418,7 +421,7 @@ class System(NamedTuple):
 def system_of(
     part: Loop, middle: Array, half: Array, step: dict[str, Any], frequency: float
 ) -> System:
-    """The system of a step. t of the coefficients without one balances those before it."""
+    """Return the system of a step. If t lacks coefficients, they balance those before them."""
     n, k, known = part.states, len(part.K), len(step["t"])
     p = TERMS * k
     w, rest, c = slice(n, n + p), slice(n + p, None), np.tile(middle, TERMS)
@@ -462,7 +465,7 @@ def system_of(
 
 
 def is_positive(X: Array) -> bool:
-    """Whether every eigenvalue is positive: a finite matrix that has a finite Cholesky factor."""
+    """Return whether a matrix is finite and has a finite Cholesky factor: X > 0."""
     try:
         return bool(np.isfinite(X).all() and np.isfinite(np.linalg.cholesky(X)).all())
     except np.linalg.LinAlgError:
@@ -470,7 +473,7 @@ def is_positive(X: Array) -> bool:
 
 
 def is_proved(system: System, period: float, w: float, x: float) -> bool:
-    """Whether the box has no mode at any frequency from w - x to w + x."""
+    """Return whether the box has no mode at any frequency from w - x to w + x."""
     A, W, V, Z, D, S, S_w, g, y_by_v, gy_by_v, rest_by_w, rest_by_v = system
     n, p = W.shape
     z, delta = RADIUS * np.exp(1j * w * period), RADIUS * x * period
@@ -491,7 +494,7 @@ def is_proved(system: System, period: float, w: float, x: float) -> bool:
     bend = delta * inverse * (wrong_right + delta * (norm(R @ right) + norm(R) * wrong_right))
 
     def moved(side: Array) -> tuple[float, float]:
-        """The norm of what is linear in the frequency of `side W`, and of what is left."""
+        """Return the norms of what is linear in the frequency of `side W`, and of the rest."""
         linear = delta * norm(side @ right)
         wrong_side = norm(np.abs(side) @ wrong) + 2.0 * error**2 * norm(side) * norm(W)
         return linear, x * period / 2.0 * linear + norm(side) * bend + wrong_side
@@ -553,7 +556,7 @@ def prove(part: Loop, steps: list[dict[str, Any]], size: float, count: int) -> i
 
 
 def require_range(file: dict[str, Any]) -> None:
-    """Raise ValueError for a motion to which the text above does not apply."""
+    """Raise ValueError if the text above does not apply to a motion."""
     lags = file["lag"][file["lag"] > 0.0]
     fastest = np.max(np.r_[np.abs(np.linalg.eigvals(file["A"])), 1.0 / lags])
     if not fastest * file["period"] <= FASTEST:
@@ -561,7 +564,7 @@ def require_range(file: dict[str, Any]) -> None:
 
 
 def is_equal(found: Array, expected: Array, part: float = EQUAL) -> bool:
-    """Whether two arrays are the same up to a part of their largest number."""
+    """Return whether two arrays are the same up to a part of their largest number."""
     if found.shape != expected.shape:
         return False
     largest, apart = (np.max(np.abs(x), initial=0.0) for x in (expected, found - expected))
@@ -569,10 +572,10 @@ def is_equal(found: Array, expected: Array, part: float = EQUAL) -> bool:
 
 
 def exact_entries(file: dict[str, Any]) -> list[str]:
-    """The entries of A and B that are the same number in every aircraft.
+    """Return the entries of A and B that are the same number in every aircraft.
 
-    Raises ValueError unless an entry NAME of `names` is one number of the aircraft: A[i,j] that
-    is off by `part` of itself, or B[i,j] of an effector, whose row of T multiplies it.
+    Raises ValueError unless an entry NAME of `names` is one number of the aircraft: A[i,j] that is
+    off by `part` of itself, or B[i,j] of an effector, whose row of T multiplies it.
     """
     states, effectors, T = file["states"], file["effectors"], file["T"]
     rest = {"A": file["A"].copy(), "B": file["B"].copy()}
@@ -595,7 +598,7 @@ def exact_entries(file: dict[str, Any]) -> list[str]:
         fits = fits and not changes["B" if letter == "A" else "A"].any()
         require(fits, name, changes[letter].tolist(), f"{part:g} of this entry of the file alone")
         rest[letter][i] -= value * along
-    # what is left of each entry is 0, or the whole entry
+    # Of each entry, either nothing is left or all of it.
     exact, own = [], effectors == file["inputs"]
     require(not own or np.array_equal(T, np.eye(len(T))), "T", T.tolist(), "1 and 0: its inputs")
     for letter, columns in (("A", states), ("B", file["inputs"])):
@@ -612,13 +615,13 @@ def exact_entries(file: dict[str, Any]) -> list[str]:
 
 
 def law_of(constants: str, inputs: int, size: int) -> tuple[dict[str, Any], float]:
-    """The law of rise_di_parameters.h near e = 0, and how exact its numbers are.
+    """Return the law of rise_di_parameters.h near e = 0, and how exact its numbers are.
 
     I += T (e + e_1) / 2,  Pi += T beta e / eps, or e_hat / (T omega) of the implicit sign,
     u = -scale D (K (e - e_0 + Lambda I) + Pi) - F zc,  zc = z + L (e - H z),  z+ = Phi zc + Gamma u
 
     with the states e_0, e_1, I, Pi, and those of an observer, z, u_o and the fade-in, which has
-    ended. Raises ValueError for a text without these constants, or with other sizes.
+    ended. Raises ValueError if the text lacks these constants, or has other sizes.
     """
     define = dict(re.findall(r"#define (RISE_DI_\w+) (.*)", constants))
     begin = constants.find("#define RISE_DI_PARAMETERS {")
@@ -679,7 +682,7 @@ def check_constants(file: dict[str, Any]) -> None:
 
 
 def digest_of(file: dict[str, Any]) -> str:
-    """SHA-256 of the loop in 10 digits, for a box whose largest part is 1."""
+    """Return SHA-256 of the loop in 10 digits, for a box whose largest part is 1."""
     size, law = np.max(file["part"]), [file["law"][key] for key in "ABCD"]
     loop = [*(file[key] for key in "ABC"), *law, *(file[key] for key in ("lag", "delay", "period"))]
     box = [np.array(file["part"]) / size, file["E"], *(np.array(file[key]) / size for key in "FG")]
@@ -688,7 +691,7 @@ def digest_of(file: dict[str, Any]) -> str:
 
 
 def check(file: dict[str, Any]) -> int:
-    """The number of bounds that prove a certificate. Raises ValueError for one that does not."""
+    """Return how many bounds prove a certificate. Raises ValueError if they do not."""
     require(file["part"].max() > 0.0, "part", 0.0, "an entry that may deviate")
     if digest_of(file) != file["loop"]:
         raise ValueError("the loop is not the one that its name says")
@@ -713,7 +716,7 @@ def check(file: dict[str, Any]) -> int:
 
 
 def report_of(file: dict[str, Any], count: int) -> str:
-    """What a proved certificate says."""
+    """Return what a proved certificate says."""
     lines = [f"PROVED by {count} bounds: stable for each deviation within"]
     for name, part in zip(file["names"], file["part"], strict=True):
         if part:

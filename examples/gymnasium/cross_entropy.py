@@ -27,7 +27,7 @@ DURATION = 20.0
 def returns(
     env: gymnasium.vector.VectorEnv[Any, Any, Any], gains: NDArray[np.float64], seed: int
 ) -> NDArray[np.float64]:
-    """The sum of the rewards of each aircraft under its own gains (FLEET, 4)."""
+    """Return the sum of the rewards of each aircraft under its own gains (FLEET, 4)."""
     observed, _ = env.reset(seed=seed)
     total = np.zeros(FLEET)
     is_flying = np.ones(FLEET, dtype=bool)

@@ -35,7 +35,7 @@ received = {"u": JointState()}
 
 
 def answered() -> int:
-    """The stamp of the last u, ns: that of its y."""
+    """Return the stamp of the last u, ns, which is that of its y."""
     stamp = received["u"].header.stamp
     return stamp.sec * SECOND + stamp.nanosec if received["u"].header.frame_id else -1
 

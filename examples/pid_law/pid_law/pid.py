@@ -56,7 +56,7 @@ def u_from_trim(state: PidState, params: PidParams) -> Array:
 
 
 def engage(measurements: Measurements, params: PidParams) -> PidState:
-    """The state at engagement: u = u_trim, however large the error is (bumpless transfer)."""
+    """Return the state at engagement: u = u_trim, however large e is (bumpless transfer)."""
     e = measurements.y - measurements.y_m
     zero = array_namespace(e).zeros_like(e)
     return PidState(e, e, zero, zero)
@@ -92,7 +92,7 @@ def limited(
 
 
 def retune(state: PidState, old: PidParams, new: PidParams) -> PidState:
-    """The same u with new parameters: e_0 takes the difference (bumpless transfer)."""
+    """Keep u under new parameters: e_0 takes the difference (bumpless transfer)."""
     terms = -new.D * u_from_trim(state, old) / (new.input_scale * new.K)
     return state._replace(
         e_0=state.e + new.Lambda * state.integral_e + new.lead * state.e_dot - terms
@@ -131,7 +131,7 @@ class PidConfig(ControllerConfig):
         return CONTROL_LAW
 
     def law_params(self) -> PidParams:
-        """The arrays of the law."""
+        """Return the arrays of the law."""
         return PidParams(
             K=np.array(self.K),
             Lambda=np.array(self.Lambda),
