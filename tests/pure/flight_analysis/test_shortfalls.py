@@ -134,6 +134,13 @@ def test_airspeed_in_turbulence_of_another_simulator_is_allowed_for() -> None:
     assert str(outcome).endswith(" m/s rms, allowed for wind")
 
 
+def test_unknown_drag_in_wind_is_allowed_for() -> None:
+    """The wind changes V, and so a drag that is not known: 0.7 m/s rms in the last second."""
+    turbulence = {"altitude": 1219.2, "sigma": 0.85, "seed": 6}
+    light = find_scenario("jsbsim_c172p", duration=15.0).vary(aircraft={"turbulence": turbulence})
+    assert rise_di.simulate(light).outcome == COMPLETED
+
+
 NOISY = {"p of 0.3": (2, 0.3), "p of 1.5": (2, 1.5), "q of 0.3": (0, 0.3), "r of 0.3": (3, 0.3)}
 
 

@@ -14,7 +14,7 @@ whatever shakes it. The floor is
 - HARMLESS of the least errors of a divergence, 0.02 rad/s and 0.2 m/s, and the noise of a measured
   error, at most MOST;
 - SPEED_PART of the trim speed if the model of the aircraft is unknown, and with it the drag, in a
-  part in which y_m of V changes;
+  part in which V changes by its command or by the wind;
 - the least errors of a divergence, 0.1 rad/s and 1 m/s, if the wind is unknown.
 
 `rise_di_controller.learning.divergence` keeps a learned model below these least errors.
@@ -155,7 +155,7 @@ class _Limits(NamedTuple):
 
     floor: float
     most: float  # of noise and wind
-    drag: float  # further, in a part in which y_m changes
+    drag: float  # the same in a part in which the output changes
 
 
 def _has_engaged(tape: Tape) -> bool:
@@ -220,13 +220,14 @@ def _largest_excesses(
         return np.sqrt(np.maximum(squares, 0.0) / count)
 
     command = rms(pair.y_m)
-    mean = _sums(pair.y_m[start:stop, i], count) / count
-    changes = np.sqrt(np.maximum(command**2 - mean**2, 0.0)) > 0.5 * limits.floor
-    floor = np.where(changes, np.maximum(limits.drag, limits.floor), limits.floor)
-    others = np.max([rms(pair.y_m, output) for output in group], axis=0)
-    has_command = (command >= 0.5 * others) & (command > 2.0 * floor)
     by_noise = rms(pair.linear.noise)
     by_wind = rms(pair.linear.wind)
+    mean = _sums(pair.y_m[start:stop, i], count) / count
+    change = np.sqrt(np.maximum(command**2 - mean**2, 0.0))
+    is_changing = np.maximum(change, by_wind) > 0.5 * limits.floor
+    floor = np.where(is_changing, np.maximum(limits.drag, limits.floor), limits.floor)
+    others = np.max([rms(pair.y_m, output) for output in group], axis=0)
+    has_command = (command >= 0.5 * others) & (command > 2.0 * floor)
     # If a span is shorter than WINDOW, a gust that is harmless has a larger rms over it.
     most = limits.most * math.sqrt(_ticks(pair, WINDOW) / count)
     excuse = np.minimum(FACTOR * np.hypot(by_noise, by_wind), most)
