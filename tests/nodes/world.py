@@ -300,7 +300,7 @@ class World:
 
     def begin(self, node: AnyNode) -> None:
         """Run a node that was made."""
-        self.loops[node] = RealTime(node, node.start_ns() or 0)
+        self.loops[node] = RealTime(node, node.start_ns() or 0, spin=False)
 
     @contextmanager
     def stopped(self, node: AnyNode) -> Iterator[None]:

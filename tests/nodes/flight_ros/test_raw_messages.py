@@ -121,7 +121,7 @@ def nodes_in_real_time(folder: Path, *, use_sim_time: bool = False) -> Iterator[
             for node in nodes:
                 waits = node not in world.loops and node.has_time()
                 if waits and (start_ns := node.start_ns()) is not None:
-                    world.loops[node] = RealTime(node, start_ns)
+                    world.loops[node] = RealTime(node, start_ns, spin=False)
             world.run(0.05)
 
         yield Attack(world, take)

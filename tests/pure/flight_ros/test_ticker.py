@@ -1,10 +1,12 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Ticks: deadlines on the monotonic clock, overruns, the wait before a deadline."""
+"""Ticks: deadlines on the monotonic clock, overruns, the busy-wait before a deadline."""
 
 import time
 
-from flight_ros.ticker import Ticker
+import pytest
+
+from flight_ros.ticker import MAX_SPIN_FRACTION, SPIN_TIME, Ticker
 
 PERIOD_NS = 10_000_000
 
@@ -46,26 +48,18 @@ def test_wait_ends_at_deadline_or_at_limit() -> None:
     assert time.thread_time() < begin + 0.5  # s: it does not wait for a deadline in the past
 
 
-def test_wait_before_a_deadline_takes_no_processor() -> None:
-    class Clock:
-        now_ns = 0
-        looks = 0
-
-        def monotonic_ns(self) -> int:
-            self.looks += 1
-            return self.now_ns
-
-        def time_ns(self) -> int:
-            return self.now_ns
-
-        def sleep(self, duration: float, /) -> None:
-            self.now_ns += round(duration * 1e9)
-
-    clock = Clock()
-    ticker = Ticker(PERIOD_NS, 0, clock)
+@pytest.mark.parametrize(
+    "period_ns, spin_time", [(PERIOD_NS, SPIN_TIME), (1_000_000, MAX_SPIN_FRACTION * 1e-3)]
+)
+def test_busy_wait_before_deadline_limited_to_fraction_of_period(
+    period_ns: int, spin_time: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slept: list[float] = []
+    monkeypatch.setattr(time, "sleep", slept.append)  # returns at once
+    monkeypatch.setattr(
+        time, "monotonic_ns", iter(range(0, 10 * period_ns, period_ns // 20)).__next__
+    )
+    ticker = Ticker(period_ns, 0)
     ticker.due()
-    clock.looks = 0
     ticker.wait(1.0)
-    assert clock.now_ns == PERIOD_NS
-    # one look says how long to sleep: a busy-wait looks until the deadline
-    assert clock.looks == 1
+    assert slept == [pytest.approx(0.95 * period_ns / 1e9 - spin_time)]

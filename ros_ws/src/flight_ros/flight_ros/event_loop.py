@@ -270,9 +270,9 @@ def require_input(nodes: Sequence[FlightNode[Any]], advance_ns: int, has_begun: 
 
 
 class RealTime:
-    """A node in real time: its ticks and its reports."""
+    """A node in real time: its ticks and its reports. `spin`: busy-wait before a deadline."""
 
-    def __init__(self, node: FlightNode[Any], start_ns: int) -> None:
+    def __init__(self, node: FlightNode[Any], start_ns: int, *, spin: bool) -> None:
         host = node.host
         if (age := host.time_ns() - start_ns) > MAX_START_AGE_NS:
             key = f"{node.get_name()}.start_time"
@@ -283,7 +283,7 @@ class RealTime:
         node.time_offset_ns = start_ns - begin_ns
         self.node = node
         self._start_ns = start_ns
-        self.ticker = Ticker(node.period_ns(), begin_ns, host)
+        self.ticker = Ticker(node.period_ns(), begin_ns, host, spin=spin and host is time)
         if (lead := start_ns - host.time_ns()) > nanoseconds(60):
             node.get_logger().warning(f"start_time is {seconds(lead):.0f} s ahead; waiting for it")
         self._report_ns = time.monotonic_ns()
@@ -345,7 +345,10 @@ def _run_real_time(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> None:
     """
     executor = _start(nodes)
     starts = _start_instants(nodes, executor, stop)
-    loops = [RealTime(node, start_ns) for node, start_ns in zip(nodes, starts, strict=False)]
+    loops = [
+        RealTime(node, start_ns, spin=len(nodes) == 1)
+        for node, start_ns in zip(nodes, starts, strict=False)
+    ]
     serve_ns = time.monotonic_ns()
     period_ns = nanoseconds(IDLE_POLL_PERIOD if len(nodes) == 1 else SERVICE_POLL_PERIOD)
     disable_timer_slack()

@@ -11,6 +11,10 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+# s of busy-wait before a deadline: the wake-up of a sleeping thread takes 20 to 250 us
+SPIN_TIME = 2.5e-4
+MAX_SPIN_FRACTION = 0.2  # maximum of the busy-wait, as a fraction of the period and so of a core
+
 
 class HostTime(Protocol):
     """What the ticks of a node need from the module `time`."""
@@ -41,12 +45,15 @@ class Tick(NamedTuple):
 class Ticker:
     """Deadlines start + k period, in ns of host.monotonic_ns().
 
-    `host` is the module `time` by default.
+    `host` is the module `time` by default. Without `spin` a wait does not busy-wait.
     """
 
-    def __init__(self, period_ns: int, start_ns: int, host: HostTime | None = None) -> None:
+    def __init__(
+        self, period_ns: int, start_ns: int, host: HostTime | None = None, *, spin: bool = True
+    ) -> None:
         self._host: HostTime = host or time
         self.period_ns = period_ns
+        self._spin_time = min(SPIN_TIME, MAX_SPIN_FRACTION * period_ns / 1e9) if spin else 0.0  # s
         self._start_ns = start_ns
         self._last = -1
 
@@ -59,11 +66,13 @@ class Ticker:
     def wait(self, most: float) -> None:
         """Sleep until the next deadline, at most `most` s.
 
-        Linux wakes a thread up 20 to 250 us late. No stamp depends on it, and a busy-wait that
-        hid it would take an eighth of a core at 500 Hz.
+        The last part before the deadline is a busy-wait.
         """
-        if (pause := self.remaining()) > 0.0:
-            self._host.sleep(min(pause, most))
+        pause = self.remaining()
+        if pause > self._spin_time:
+            self._host.sleep(min(pause - self._spin_time, most))
+        while 0.0 < self.remaining() <= self._spin_time:
+            pass
 
     def due(self) -> Tick | None:
         """Return the newest deadline that has passed and was not returned yet, else None."""
