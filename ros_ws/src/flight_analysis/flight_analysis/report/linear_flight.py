@@ -146,7 +146,7 @@ def error_pair(
 
 
 def _has_feedback(controller: ControllerConfig) -> bool:
-    """Return whether u of a law depends on y, as in an identification it does not."""
+    """Return whether u of a law depends on y; the excitation of an identification does not."""
     if is_literal(controller):
         return True
     law = linear_law(controller.tuned_law(), len(controller.outputs), 1.0 / controller.rate)
