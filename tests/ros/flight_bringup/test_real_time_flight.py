@@ -15,6 +15,7 @@ from flight_analysis.closed_loop.scenario import Scenario, load_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import tracking_error
 from flight_core.modes import Mode
+from flight_core.outcome import STATUS_HOST
 from flight_core.vectors import FloatArray
 from flight_log.tape_reader import read_run
 
@@ -60,10 +61,17 @@ def test_flight_over_topics_recorded_and_as_accurate_as_in_one_process(
     # The bounds are for the loop, not for the host. Such a flight is repeated, at most three times.
     # Host delays count that made the controller late by more than a quarter of its period, or the
     # aircraft or the reference model by more than a sample. Those of u on its way to the aircraft
-    # are in no topic, so that one flight beyond the bounds proves nothing.
+    # are in no topic, so that one flight beyond the bounds proves nothing. A flight that ends with the
+    # status of a busy host is not judged at all.
     delays = []
+    is_judged = False
     for _ in range(4):
-        start("flight_cli.cli", "fly", str(short_scenario), "--real-time").succeed()
+        flight = start("flight_cli.cli", "fly", str(short_scenario), "--real-time")
+        if flight.end() == STATUS_HOST:
+            delays.append(True)
+            continue
+        flight.succeed()
+        is_judged = True
         run = (tmp_path / "runs" / "latest").resolve()
         tape = read_run(run).tape
         ticks = json.loads((run / "summary.json").read_text())["ticks"]
@@ -86,6 +94,8 @@ def test_flight_over_topics_recorded_and_as_accurate_as_in_one_process(
         ]
         if accurate and not missing:
             break
+    if not is_judged:
+        pytest.skip("inconclusive: the host was too busy for real time in each of four flights")
     assert all(counts[topic] <= rate * (DURATION + 2.0) for topic, rate in RATES.items()), counts
     assert counts["/diagnostics"] >= 4 * (DURATION - 1)
     assert internals.name[:2] == ["mode", "dt"]
