@@ -10,8 +10,9 @@ import runpy
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, TypeVar
 
 import pytest
@@ -123,8 +124,18 @@ def begun(name: str, pushed: str = "", **given: object) -> tuple[list[Any], Laun
     return included(name, context, pushed, **given), context
 
 
-def included(name: str, context: LaunchContext, pushed: str = "", /, **given: object) -> list[Any]:
-    """The first actions of a launch file that another one includes, with its arguments alone."""
+def included(
+    name: str,
+    context: LaunchContext,
+    pushed: str = "",
+    scope: Mapping[str, Any] = MappingProxyType({}),
+    /,
+    **given: object,
+) -> list[Any]:
+    """The first actions of a launch file that another one includes, with its arguments alone.
+
+    `scope` is what actions of launch_ros have left in the launch configurations.
+    """
     entities = described(name)
     declared = {
         argument.name: argument.default_value
@@ -136,6 +147,7 @@ def included(name: str, context: LaunchContext, pushed: str = "", /, **given: ob
         {key: value for key, value in declared.items() if value is not None}
     )
     context.launch_configurations.update({key: str(value) for key, value in given.items()})
+    context.launch_configurations.update(scope)
     if pushed:
         context.launch_configurations["ros_namespace"] = pushed
     (preparation,) = every(OpaqueFunction, entities)
@@ -251,6 +263,47 @@ def test_every_argument_described_and_default_is_one_of_choices(path: Path) -> N
             assert argument.default_value in argument.choices, argument.name
         else:
             assert argument.default_value not in {"true", "false"}, f"{argument.name} needs choices"
+
+
+SIM_TIME = {"global_params": [("use_sim_time", True)]}  # as SetParameter leaves it
+
+
+def test_set_parameter_chooses_clock_as_argument_does(tmp_path: Path) -> None:
+    fleet = tmp_path / "fleet.yaml"
+    fleet.write_text("{composed: true, aircraft: {uav1: {}}}")
+    given: tuple[tuple[str, dict[str, object]], ...] = (("fly", {}), ("fleet", {"fleet": fleet}))
+    for name, arguments in given:
+        actions = included(name, LaunchContext(), "", SIM_TIME, **arguments)
+        by_argument = included(name, LaunchContext(), use_sim_time="true", **arguments)
+        (process,), (other,) = (every(ExecuteProcess, each) for each in (actions, by_argument))
+        assert "--use-sim-time" in process.cmd
+        assert [*map(str, process.cmd)] == [*map(str, other.cmd)]
+    with refusing("use_sim_time: found true by SetParameter, expected false"):
+        included("bridge", LaunchContext(), "", SIM_TIME, map="ardupilot")
+
+
+@pytest.mark.parametrize(
+    ("scope", "found"),
+    [
+        ({"global_params": [("k_g", 2.0), ("use_sim_time", True)]}, "SetParameter k_g"),
+        ({"global_params": ["own.yaml"], "use_sim_time": "true"}, "SetParametersFromFile own.yaml"),
+        ({"ros_remaps": [("y", "/imu")], "use_sim_time": "true"}, "SetRemap y"),
+    ],
+)
+def test_what_no_node_of_rise_di_fly_would_get_is_refused(
+    scope: Mapping[str, Any], found: str
+) -> None:
+    with refusing(f"found {found} of the launch, expected values in the file"):
+        included("fly", LaunchContext(), "", scope)
+
+
+def test_later_set_parameter_of_launch_reaches_no_node_of_flight(tmp_path: Path) -> None:
+    context = LaunchContext()
+    parameters = [("k_g", 2.0)]
+    actions = included("fly", context, "", {"global_params": parameters}, runs=tmp_path / "runs")
+    actions = discovered(actions, context)
+    parameters.append(("k_g", 3.0))  # as launch_ros does for the next group
+    assert restored(actions, context)["global_params"] == [("k_g", 2.0)]
 
 
 def test_fleet_is_a_process_and_its_end_ends_launch(tmp_path: Path) -> None:

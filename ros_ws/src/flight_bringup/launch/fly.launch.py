@@ -34,7 +34,7 @@ from flight_bringup.graph import (
     parameter_overrides,
     second_stage,
 )
-from flight_bringup.launch.flight import Flight, argument
+from flight_bringup.launch.flight import SIM_TIME, Flight, argument
 from flight_bringup.launch.stages import (
     BOOLEAN,
     begin_when_matched,
@@ -114,7 +114,9 @@ def _fly(context: LaunchContext) -> list[Action]:
     value = argument(context, "lockstep")
     lockstep = value == "true" or (value == "" and scenario.flight.lockstep)
     by_rosbag2 = argument(context, "recorder") == "rosbag2"
-    is_simulated = argument(context, "use_sim_time") == "true" or scenario.flight.use_sim_time
+    is_simulated = (
+        argument(context, SIM_TIME) == "true" or scenario.flight.use_sim_time or flight.has_sim_time
+    )
     own = [*(spec.executable for spec in others), *(["params_file"] * bool(further))]
     _require_possible(own, lockstep=lockstep, by_rosbag2=by_rosbag2, is_simulated=is_simulated)
     if is_simulated:
@@ -181,10 +183,10 @@ def _require_possible(
         require(not lockstep, name, "false in lockstep", "true: the nodes of the stack")
     if is_simulated:
         beside = f"true beside {' and '.join(own)} of your own"
-        require(not own, "use_sim_time", beside, "nodes by `ros2 run`")
+        require(not own, SIM_TIME, beside, "nodes by `ros2 run`")
         require(
             not (lockstep or by_rosbag2),
-            "use_sim_time",
+            SIM_TIME,
             f"true {'in lockstep' if lockstep else 'with rosbag2'}",
             "a flight in real time, recorded by the stack",
         )

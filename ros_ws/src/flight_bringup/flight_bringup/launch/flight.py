@@ -27,6 +27,8 @@ from flight_bringup.processes import end_with_parent, leave_outcome
 from flight_core.outcome import COMPLETED, Outcome
 from launch import LaunchContext
 
+SIM_TIME = "use_sim_time"
+
 
 class Flight:
     """One flight of a launch: the arguments in its scope, its processes, its end.
@@ -43,7 +45,11 @@ class Flight:
     def __init__(self, context: LaunchContext) -> None:
         self.context = context
         self.run = Path()  # the folder of the run; Path() without a recorder
-        self.configurations = dict(context.launch_configurations)
+        # A later SetParameter or SetRemap of the launch extends the list that it finds.
+        self.configurations: dict[str, Any] = {
+            name: [*value] if isinstance(value, list) else value
+            for name, value in context.launch_configurations.items()
+        }
         # If anything but SIGINT ends it, launch leaves its processes running.
         self.configurations.setdefault("launch-prefix", shlex.join(end_with_parent()))
         self.namespace = _namespace(context)
@@ -52,6 +58,31 @@ class Flight:
         self._is_stopped = False
         self._failure = ""
         self._of_launch.setdefault(context, []).append(self)
+
+    @property
+    def has_sim_time(self) -> bool:
+        """Return whether SetParameter of the scope gives all nodes the time of /clock."""
+        values = dict(each for each in self._given_parameters() if isinstance(each, tuple))
+        return values.get(SIM_TIME) is True
+
+    def given_to_nodes(self) -> list[str]:
+        """Name what the scope gives all its nodes, apart from their time.
+
+        SetParameter, SetParametersFromFile and SetRemap reach the nodes that the launch starts, and
+        no node that another process starts.
+        """
+        names = []
+        for each in self._given_parameters():
+            if not isinstance(each, tuple):
+                names.append(f"SetParametersFromFile {each}")
+            elif each[0] != SIM_TIME:
+                names.append(f"SetParameter {each[0]}")
+        return names + [f"SetRemap {name}" for name, _ in self.configurations.get("ros_remaps", ())]
+
+    def _given_parameters(self) -> Sequence[tuple[str, Any] | str]:
+        """Return the parameters of the scope as launch_ros keeps them: values or paths."""
+        given: Sequence[tuple[str, Any] | str] = self.configurations.get("global_params", ())
+        return given
 
     @property
     def is_over(self) -> bool:

@@ -32,7 +32,7 @@ from launch_ros.substitutions import ExecutableInPackage
 from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario
 from flight_analysis.closed_loop.scenario_library import scenarios
 from flight_bringup.graph import AIRCRAFT, LEAD, LEARNER, NodeSpec, start_instant, start_lead
-from flight_bringup.launch.flight import Flight
+from flight_bringup.launch.flight import SIM_TIME, Flight
 from flight_bringup.monitor import DISCOVERY_TIME, FREE_DOMAIN, LOOP_INPUTS
 from flight_bringup.processes import (
     FIRST_U,
@@ -49,7 +49,7 @@ from flight_core.outcome import (
     log_ends_at,
     never_flew,
 )
-from flight_core.parameters import ParameterError
+from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS, nanoseconds
 from flight_log.bag import BagWriter, LogAttachments
 from flight_log.open_log import ROSBAG2
@@ -166,7 +166,7 @@ def log_level_argument() -> DeclareLaunchArgument:
 def sim_time_argument() -> DeclareLaunchArgument:
     """Declare the argument `use_sim_time`."""
     return boolean_argument(
-        "use_sim_time", False, "run `rise-di fly` by the /clock of a simulator: docs/ros.md"
+        SIM_TIME, False, "run `rise-di fly` by the /clock of a simulator: docs/ros.md"
     )
 
 
@@ -176,6 +176,9 @@ def by_rise_di(flight: Flight, file: str, *, has_own_time: bool = False) -> list
     It keeps to real time, because a launch file flies beside other nodes, unless the fleet
     `has_own_time`. If it ends with an error, because a flight was not completed, the launch ends
     with exit status 1.
+
+    Raises ParameterError if the scope gives its nodes parameters or names, which would not reach
+    these.
     """
 
     def end(event: ProcessExited, context: LaunchContext) -> Sequence[Action]:
@@ -183,7 +186,14 @@ def by_rise_di(flight: Flight, file: str, *, has_own_time: bool = False) -> list
             return flight.fail(ended_early(f"rise-di fly ended with status {event.returncode}"))
         return flight.complete()
 
-    by_clock = flight.argument("use_sim_time") == "true"
+    given = flight.given_to_nodes()
+    require(
+        not given,
+        file,
+        f"{', '.join(given)} of the launch",
+        "values in the file: `rise-di fly` starts these nodes, and no launch reaches them",
+    )
+    by_clock = flight.argument(SIM_TIME) == "true" or flight.has_sim_time
     options = ["--runs", flight.argument("runs")]
     options += ["--use-sim-time"] * by_clock
     options += ["--real-time"] * (not (by_clock or has_own_time))
@@ -311,8 +321,14 @@ def start_in_stages(
     `second` is called once the nodes are ready, with the time until t = 0 and the system time of t
     = 0, s. The flight ends early if a node is not ready after READY_TIMEOUT. It does too if another
     flight is under way, which we see by a publisher of a topic in `publishes` before any node
-    starts.
+    starts. Raises ParameterError in simulated time, in which the instant of t = 0 is unknown here.
     """
+    require(
+        not flight.has_sim_time,
+        SIM_TIME,
+        "true by SetParameter",
+        "false: fly.launch.py and fleet.launch.py alone fly by /clock, and `rise-di fly --bridge`",
+    )
     _subscribe_states(flight)
     leave_outcome(flight.run, INTERRUPTED)  # until another outcome replaces it
     begin = time.monotonic() + DISCOVERY_TIME
