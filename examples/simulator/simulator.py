@@ -42,7 +42,8 @@ def answered() -> int:
 
 rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
 node = rclpy.create_node("simulator")
-clock_publisher = node.create_publisher(Clock, "/clock", KEPT)
+# by /clock all aircraft fly in one time; in lockstep each namespace has its own
+clock_publisher = node.create_publisher(Clock, "/clock" if speed else "clock", KEPT)
 y_publisher = node.create_publisher(JointState, "y", KEPT)
 node.create_subscription(JointState, "u", lambda message: received.update(u=message), KEPT)
 t, due = 0, time.monotonic()
