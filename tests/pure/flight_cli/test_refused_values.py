@@ -40,6 +40,13 @@ from flight_core.parameters import ParameterError
             ),
         ),
         (
+            ["gains", "osprey_servo", "--check"],
+            (
+                "airframe: found the scenario 'osprey_servo', expected the airframe that it "
+                "flies, with `--scenario osprey_servo` beside it"
+            ),
+        ),
+        (
             ["identify", "runs/none"],
             (
                 "runs/none: found no such file or folder, expected the folder of a run, an MCAP "

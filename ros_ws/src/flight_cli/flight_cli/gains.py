@@ -15,6 +15,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from aircraft_sim.airframes.airframe import airframes
+from flight_analysis.closed_loop.scenario_library import scenarios
 from flight_analysis.linear_loop.guarantee import Guarantee
 from flight_analysis.report.display_units import display_unit
 from flight_analysis.report.html import write_loop_page
@@ -37,6 +39,7 @@ from flight_cli.gains_verdicts import (
     HEADINGS,
     VERDICTS,
     condition_as_json,
+    condition_cells,
     condition_name,
     loop_verdict,
     milliseconds,
@@ -69,7 +72,6 @@ from flight_core.parameters import ParameterError, require
 from flight_core.units import quantity
 from flight_design.gains import gain_selection, gain_yaml
 from flight_design.gains.airframe_properties import airframe_facts, marginal_sentence
-from flight_design.gains.gain_conditions import GainCondition
 from flight_design.gains.gain_design import check_gains, select_gains
 from flight_design.gains.gain_selection import GainAssessment, Selection
 from flight_design.gains.ideal_control import Study
@@ -80,7 +82,6 @@ from flight_log.px4_parameters import rate_loop
 from rise_di_controller.params import ControllerConfig
 
 CONDITION_FAILS = 1
-SIDES = {"at least": ">=", "at most": "<=", "above": ">"}
 MEANINGS = {
     "lag product": "crossover lag product, bandwidth times the lag of the loop (actuator, 1.5 "
     "periods, delay), rad: times 57.3 it is the phase in deg that the lag costs at the crossover",
@@ -251,6 +252,13 @@ class Gains:
 
     def execute(self) -> None:
         """Select or check, write, show."""
+        is_scenario = self.airframe in set(scenarios()) - set(airframes())
+        require(
+            not is_scenario,
+            "airframe",
+            f"the scenario {self.airframe!r}",
+            f"the airframe that it flies, with `--scenario {self.airframe}` beside it",
+        )
         require(
             not self.theorem or (self.write is not None and not self.observer),
             "theorem",
@@ -459,7 +467,7 @@ def _condition_table(answers: dict[str, Assessment], part: str, title: str) -> T
     table = new_table(f"\n{title}", headings, left_aligned=("condition",), wrapped=("condition",))
     outputs = next(iter(answers.values())).controller.outputs
     for conditions in zip(*(getattr(answer, part) for answer in answers.values()), strict=True):
-        cells = chain.from_iterable(map(_cells, conditions))
+        cells = chain.from_iterable(map(condition_cells, conditions))
         table.add_row(condition_name(conditions, outputs), *cells)
     return table
 
@@ -536,15 +544,6 @@ def _stable_speed_ratio(study: Study, answer: Assessment) -> float | None:
         return None
     ratio = gain_selection.stable_speed_ratio(study, answer.controller)
     return ratio if math.isfinite(ratio) else None
-
-
-def _cells(condition: GainCondition) -> tuple[str, str]:
-    margin = "" if math.isnan(condition.margin) else f"{condition.margin:.2g}"
-    side = SIDES[condition.side]
-    return (
-        f"{condition.value:.4g} {side} {condition.bound:.4g}",
-        margin if condition.holds else f"[red]{margin} ![/red]",
-    )
 
 
 def _as_json(result: _GainsAnswer, seed: int) -> dict[str, Any]:

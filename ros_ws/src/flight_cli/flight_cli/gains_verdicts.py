@@ -98,6 +98,19 @@ def condition_name(row: tuple[GainCondition, ...], outputs: tuple[str, ...]) -> 
     return row[0].name + (f" of {channel}" if channel else "") + (" ~" if row[0].estimate else "")
 
 
+SIDES = {"at least": ">=", "at most": "<=", "above": ">"}
+
+
+def condition_cells(condition: GainCondition) -> tuple[str, str]:
+    """Return what was found beside its bound, and the margin, which is red if it fails."""
+    margin = "" if math.isnan(condition.margin) else f"{condition.margin:.2g}"
+    side = SIDES[condition.side]
+    return (
+        f"{condition.value:.4g} {side} {condition.bound:.4g}",
+        margin if condition.holds else f"[red]{margin} ![/red]",
+    )
+
+
 def condition_as_json(
     part: str, condition: GainCondition, outputs: tuple[str, ...]
 ) -> dict[str, Any]:
