@@ -23,12 +23,9 @@ from flight_core.tape import Tape
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray, StampedVector
 from flight_guidance.fence.fence import (
-    BACK,
-    HOME,
-    LEFT,
-    RIGHT,
     SHARES,
     Escape,
+    FenceAction,
     Motion,
     last_safe_turn,
     room_at_home,
@@ -40,6 +37,13 @@ from flight_guidance.guidance import Guidance, GuidanceOutput
 from flight_guidance.guidance_state import Lateral
 from flight_guidance.modes.modes import holding, motion_of
 from flight_guidance.params import GuidanceConfig
+
+RIGHT, LEFT, HOME, BACK = (
+    FenceAction.RIGHT,
+    FenceAction.LEFT,
+    FenceAction.HOME,
+    FenceAction.BACK,
+)
 
 pytestmark = pytest.mark.slow
 

@@ -14,6 +14,7 @@ from flight_core.parameters import require
 from flight_core.rates import nanoseconds, seconds
 from flight_core.vectors import FloatArray
 from flight_guidance import guidance_state
+from flight_guidance.fence.fence import FenceAction
 from flight_guidance.guidance_state import (
     TARGETS,
     Begin,
@@ -27,6 +28,7 @@ from flight_guidance.guidance_state import (
 )
 from flight_guidance.notices import FAILED, LEARNED, LINK_AGE
 from flight_guidance.reach import Authority
+from flight_guidance.steering.path import Side
 
 LIMITED = ("bank", "theta", "climb", "V", "slew")
 STATE = ("phi", "theta", "alpha", "alpha_trim", "slip", "psi")
@@ -85,10 +87,10 @@ def channels(outputs: Sequence[str]) -> tuple[LogChannels, ...]:
         LogChannels(["route"], "route"),
         LogChannels(["xtrack"], "commands.xtrack"),
         LogChannels(["to_go"], "commands.to_go"),
-        LogChannels(["joining"], "state.joining"),
+        LogChannels(["joining"], "state.joining", Side),
         LogChannels(["track"], "commands.track"),
         LogChannels(["missed"], "commands.missed"),
-        LogChannels(["fence.action"], "state.fence"),
+        LogChannels(["fence.action"], "state.fence", FenceAction),
         LogChannels(["fence.clearance"], "commands.clearance"),
         LogChannels(["fence.predicted"], "commands.predicted"),
         LogChannels(["phi_c"], "commands.phi_c"),

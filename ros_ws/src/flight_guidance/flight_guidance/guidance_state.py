@@ -7,12 +7,14 @@ from enum import IntEnum
 from typing import NamedTuple
 
 from flight_core.vectors import Scalar
+from flight_guidance.fence.fence import FenceAction
 from flight_guidance.fence.zones import Fence
 from flight_guidance.reach import Authority
 from flight_guidance.steering.attitude import AttitudeParams
 from flight_guidance.steering.lateral import (
     PathParams,
 )
+from flight_guidance.steering.path import Side
 from flight_guidance.steering.vertical import (
     VerticalParams,
 )
@@ -217,10 +219,9 @@ class GuidanceState(NamedTuple):
     climb_c: float  # m/s
     V_c: float  # m/s
     u_m: tuple[float, ...]
-    # Side of the circle onto the leg: 1 turns to the right, -1 to the left; 0 on the leg.
-    joining: float = 0.0
+    joining: Side = Side.NONE  # of the circle onto the leg
     wind: Wind = (0.0, 0.0)  # estimated, where the air moves to: north, east, m/s
-    fence: float = 0.0  # action of the fence: of `fence.Escape`
+    fence: FenceAction = FenceAction.NONE
     loitered: float = 0.0  # share of the turns or the wait of a loiter that is flown
     psi: Scalar = 0.0  # estimated heading, rad
     velocity: Wind = (0.0, 0.0)  # of the pose of the step, for the wind of a multicopter, m/s

@@ -15,7 +15,7 @@ import numpy as np
 
 from flight_core.failures import Failures
 from flight_core.vectors import Array, Scalar, array_namespace
-from flight_guidance.fence.fence import RIGHT
+from flight_guidance.fence.fence import FenceAction
 from flight_guidance.guidance_state import LARGEST, Lateral
 from flight_guidance.modes.landing import Landing
 from flight_guidance.reach import Authority
@@ -63,6 +63,9 @@ def is_blown_back(log: Mapping[str, Scalar]) -> Scalar:
     )
     on_path = (lateral == float(Lateral.ROUTE)) | (lateral == float(Lateral.ORBIT))
     return on_path & (along < 0.0) & (along > wind)
+
+
+TURNS = {FenceAction.RIGHT, FenceAction.LEFT}
 
 
 class _Lasting:
@@ -142,7 +145,7 @@ class Notices:
         self._blown = _Lasting()
         self._strong = _Lasting()
         self._leg = 0
-        self._action = 0.0
+        self._action = FenceAction.NONE
         # NaN while inside
         self._outside_from = math.nan
         self._farthest = 0.0
@@ -159,9 +162,9 @@ class Notices:
             box = "" if self._landing.box is None else " in guidance.touchdown"
             texts.append(f"goes around: no touch at the end of leg {before}{box}")
         action = self._action
-        self._action = log["fence.action"]
-        if abs(self._action) == RIGHT and self._action != action:
-            side = "right" if self._action == RIGHT else "left"
+        self._action = FenceAction(int(log["fence.action"]))
+        if self._action in TURNS and self._action is not action:
+            side = self._action.name.lower()
             texts.append(
                 f"fence {log['fence.clearance']:.0f} m away: turns to the {side}, then home"
             )

@@ -9,6 +9,7 @@ home. Functions take Python floats, or arrays with an element per aircraft of a 
 """
 
 import math
+from enum import IntEnum
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -149,26 +150,25 @@ def _integral(rate: Array, longest: Array) -> Array:
     return xp.concat([xp.zeros_like(rate[:, :1]), xp.cumsum(steps, axis=1)], axis=1)
 
 
+class FenceAction(IntEnum):
+    """What the fence makes the aircraft do. A turn has the sign of its bank."""
+
+    NONE = 0
+    RIGHT = 1
+    LEFT = -1
+    HOME = 2  # the way home in a straight line
+    BACK = 3  # the shortest way back from outside
+    AROUND = 4  # the way home around a zone or a corner
+
+
 class Escape(NamedTuple):
     """Result of `last_safe_turn`."""
 
-    action: Any  # RIGHT, LEFT, HOME, BACK, AROUND or 0
+    action: Any  # FenceAction, or an array of its values
     begins: Any  # whether the fence begins to act
     clearance: Any  # m, at present
     predicted: Any  # m, least clearance along the best way
     course: Any  # rad, over ground: of the way home
-
-
-RIGHT = 1.0
-LEFT = -1.0
-HOME = 2.0
-BACK = 3.0
-AROUND = 4.0
-"""Actions of the fence; 0 means none.
-
-They are a turn to the right or to the left, the way home in a straight line, the shortest way back
-from outside, and the way home around a zone or a corner.
-"""
 
 
 def last_safe_turn(fence: Fence, action: Scalar, motion: Motion) -> Escape:
@@ -191,12 +191,12 @@ def last_safe_turn(fence: Fence, action: Scalar, motion: Motion) -> Escape:
     *aim, straight = ways(fence).aim(fence, *place)
     bearing = xp.atan2(aim[1] - place[1], aim[0] - place[0])
     now = clearance(fence.zones, *place)
-    is_outside = (now < 0.0) | ((action == BACK) & (now < margin))
-    homeward = xp.where(straight, HOME, AROUND)
+    is_outside = (now < 0.0) | ((action == FenceAction.BACK) & (now < margin))
+    homeward = xp.where(straight, FenceAction.HOME, FenceAction.AROUND)
 
     right_turn, left_turn = turn_clearance(fence, motion)
     turn = xp.maximum(right_turn, left_turn)
-    flies_home = action != 0.0
+    flies_home = action != FenceAction.NONE
     along = flies_home & (xp.cos(bearing - course) > math.cos(AHEAD))
     way = xp.where(along, line_clearance(fence, *place, *aim), -math.inf)
     clearances = xp.maximum(turn, way)
@@ -204,17 +204,17 @@ def last_safe_turn(fence: Fence, action: Scalar, motion: Motion) -> Escape:
     must_turn = (clearances < least) & (turn > way)
     remaining = _remaining(action, bearing, course)
     ends = (remaining > math.pi) & (way >= least)
-    turns = (abs(action) == RIGHT) & (remaining >= HOMEWARD) & ~ends
+    turns = (abs(action) == FenceAction.RIGHT) & (remaining >= HOMEWARD) & ~ends
 
     after = xp.where(
         must_turn,
-        xp.where(right_turn >= left_turn, RIGHT, LEFT),
-        xp.where(flies_home, homeward, 0.0),
+        xp.where(right_turn >= left_turn, FenceAction.RIGHT, FenceAction.LEFT),
+        xp.where(flies_home, homeward, FenceAction.NONE),
     )
-    after = xp.where(turns, action, xp.where(is_outside, BACK, after))
+    after = xp.where(turns, action, xp.where(is_outside, FenceAction.BACK, after))
     return Escape(
         action=after,
-        begins=(action == 0.0) & (after != 0.0),
+        begins=(action == FenceAction.NONE) & (after != FenceAction.NONE),
         clearance=now,
         predicted=clearances,
         course=bearing,

@@ -22,7 +22,7 @@ from flight_guidance.guidance_state import GuidanceMode, GuidanceParams, Guidanc
 from flight_guidance.modes.legs import course_and_speed
 from flight_guidance.sections import LandingConfig
 from flight_guidance.steering import path
-from flight_guidance.steering.path import Line, Point, Route
+from flight_guidance.steering.path import Line, Point, Route, Side
 
 FLARE = 5.0
 """s of sink on the glide path, as height of the flare. The flight path lags the pitch by 2 s."""
@@ -130,7 +130,11 @@ class Lander:
         height = pose["altitude"] - landing.ground
         if state.mode is not GuidanceMode.ENGAGED:
             return {}
-        on_line = state.lateral is Lateral.ROUTE and state.leg == landing.leg and not state.joining
+        on_line = (
+            state.lateral is Lateral.ROUTE
+            and state.leg == landing.leg
+            and state.joining is Side.NONE
+        )
         self._flares = self._flares or (on_line and height <= landing.flare)
         if not self._flares:
             return {}

@@ -12,7 +12,7 @@ from typing import Any
 
 from flight_core.units import GRAVITY
 from flight_core.vectors import Scalar, array_namespace
-from flight_guidance.fence.fence import BACK, RIGHT, Escape
+from flight_guidance.fence.fence import Escape, FenceAction
 from flight_guidance.guidance_state import GuidanceMode, GuidanceParams, GuidanceState, Lateral
 from flight_guidance.modes.legs import EXIT, course_and_speed, has_loitered, leaves
 from flight_guidance.steering import path
@@ -23,7 +23,7 @@ from flight_guidance.steering.lateral import (
     path_acceleration,
     turn_towards,
 )
-from flight_guidance.steering.path import Arc, Point, Route
+from flight_guidance.steering.path import Arc, Point, Route, Side
 from flight_guidance.steering.vertical import path_angle
 
 STEEPEST = math.radians(89.0)
@@ -55,7 +55,7 @@ def lateral_bank(
         angle = path_angle(pose["climb"], speed)
         return bank_for(course_acceleration(*motion, params.k_chi), angle, STEEPEST), NOWHERE, 0.0
     if state.lateral is Lateral.ROUTE and route is not None:
-        if state.joining:
+        if state.joining is not Side.NONE:
             return _onto_leg(state, pose, speed, route, params)
         return _along_leg(state, pose, speed, route, params)
     target = state.target
@@ -169,5 +169,6 @@ def escaping_bank(
     xp = array_namespace(ground_speed)
     acceleration = params.k_chi * ground_speed * turn_towards(escape.course - course)
     towards = bank_for(acceleration, path_angle(pose["climb"], speed), STEEPEST)
-    bank = xp.where(escape.action >= BACK, towards, bank)
-    return xp.where(abs(escape.action) == RIGHT, escape.action * params.limits.bank, bank)
+    bank = xp.where(escape.action >= FenceAction.BACK, towards, bank)
+    turns = abs(escape.action) == FenceAction.RIGHT
+    return xp.where(turns, escape.action * params.limits.bank, bank)

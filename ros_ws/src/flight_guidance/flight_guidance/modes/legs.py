@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 
 from flight_core.vectors import Scalar, array_namespace
-from flight_guidance.fence.fence import HOME
+from flight_guidance.fence.fence import FenceAction
 from flight_guidance.guidance_state import (
     GuidanceMode,
     GuidanceState,
@@ -15,7 +15,7 @@ from flight_guidance.guidance_state import (
     Vertical,
 )
 from flight_guidance.steering import path
-from flight_guidance.steering.path import Arc, Leg, Loiter, Point, Route
+from flight_guidance.steering.path import Arc, Leg, Loiter, Point, Route, Side
 
 EXIT = 0.5
 """s of flight beyond the end of a circle within which an aircraft leaves it; later it flies another
@@ -36,7 +36,7 @@ def along_route(
     position = (pose["north"], pose["east"])
     leg = route.legs[state.leg]
     near = route.near(state.leg)
-    if state.joining:
+    if state.joining is not Side.NONE:
         start, course = route.start(state.leg, state.target.along)
         if path.is_joined(start, course, near, position, course_and_speed(pose)[0]):
             state = on_leg(state, state.leg, route)
@@ -67,7 +67,7 @@ def _loitering(
         path.error(leg, (pose["north"], pose["east"])),
         course_and_speed(pose),
     )
-    if not state.loitered and abs(error.e) > ground_speed:
+    if state.loitered == 0.0 and abs(error.e) > ground_speed:
         return state
     share = dt / loiter.wait if loiter.wait else 1.0
     if loiter.turns:
@@ -117,8 +117,9 @@ def with_commands(
     if not commands:
         return on_profile(state, pose, route), miss
     state = state._replace(target=state.target._replace(**commands))
-    if state.fence >= HOME and lateral_names:
-        state = state._replace(fence=0.0)
+    is_on_way = state.fence in {FenceAction.HOME, FenceAction.BACK, FenceAction.AROUND}
+    if is_on_way and lateral_names:
+        state = state._replace(fence=FenceAction.NONE)
     for name in commands:
         state = state._replace(
             lateral=channels.lateral.get(name, state.lateral),
@@ -139,7 +140,7 @@ def on_leg(state: GuidanceState, leg: int, route: Route) -> GuidanceState:
     """Put the state on a leg of the route, with the leg's altitude and airspeed."""
     target = state.target._replace(V=route.V[leg], along=0.0)
     return state._replace(
-        leg=leg, target=target, vertical=Vertical.PROFILE, joining=0.0, loitered=0.0
+        leg=leg, target=target, vertical=Vertical.PROFILE, joining=Side.NONE, loitered=0.0
     )
 
 
@@ -159,7 +160,8 @@ def on_profile(
         return state
     leg = route.legs[state.leg]
     climb = 0.0
-    if state.joining or (path.is_orbit(leg) and leg.end is not None and not state.loitered):
+    waits = path.is_orbit(leg) and leg.end is not None and state.loitered == 0.0
+    if state.joining is not Side.NONE or waits:
         altitude = route.joining_altitude(state.leg, state.target.along)
     else:
         altitude, slope = route.profile(state.leg, path.nearest(leg, (pose["north"], pose["east"])))
@@ -183,15 +185,18 @@ def joining_state(
         return state
     start, course = route.start(leg, along)
     position = (pose["north"], pose["east"])
-    side = path.joining(
-        start, course, route.radius, route.near(leg), position, course_and_speed(pose)[0]
+    course_flown, _ = course_and_speed(pose)
+    side = Side(
+        int(path.joining(start, course, route.radius, route.near(leg), position, course_flown))
     )
     # The joining circle is that of the arc itself.
-    if isinstance(leg_path, Arc) and side:
-        side = math.copysign(1.0, leg_path.radius)
-    if side and not along and route.from_V:
+    is_near = side is Side.NONE
+    if isinstance(leg_path, Arc) and not is_near:
+        side = Side.RIGHT if leg_path.radius > 0.0 else Side.LEFT
+    if not is_near and not along and route.from_V:
         state = state._replace(target=state.target._replace(V=route.from_V[leg]))
-    return state._replace(joining=side, target=state.target._replace(along=along if side else 0.0))
+    target = state.target._replace(along=0.0 if is_near else along)
+    return state._replace(joining=side, target=target)
 
 
 def course_and_speed(pose: Mapping[str, Scalar]) -> tuple[Scalar, Scalar]:

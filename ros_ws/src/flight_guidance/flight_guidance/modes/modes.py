@@ -19,7 +19,7 @@ from flight_core.kinematics import clip, euler_rates, heading_rate, tilt, turn_r
 from flight_core.rates import seconds
 from flight_core.units import GRAVITY
 from flight_core.vectors import Scalar, array_namespace
-from flight_guidance.fence.fence import AROUND, BACK, HOME, Escape, Motion, last_safe_turn
+from flight_guidance.fence.fence import Escape, FenceAction, Motion, last_safe_turn
 from flight_guidance.guidance_state import (
     LARGEST,
     Begin,
@@ -39,7 +39,7 @@ from flight_guidance.modes.targets import hold, home, permitted_speed, within_re
 from flight_guidance.steering import protection
 from flight_guidance.steering.attitude import BodyRates, body_rates, yaw_for_bank
 from flight_guidance.steering.lateral import heading_estimate, slip_estimate
-from flight_guidance.steering.path import Route
+from flight_guidance.steering.path import Route, Side
 from flight_guidance.steering.vertical import (
     alpha_estimate,
     climb_for,
@@ -286,7 +286,7 @@ def _with_attitude(
                 lateral=lateral,
                 vertical=Vertical.ALTITUDE,
                 target=state.target._replace(**after_loss),
-                fence=0.0,
+                fence=FenceAction.NONE,
             )
             state = begin(level, inputs._replace(begin=Begin.AGAIN), params)
         state = state._replace(mode=GuidanceMode.ENGAGED, phi=pose["phi"], theta=pose["theta"])
@@ -351,22 +351,24 @@ def _within_fence(
         return state, Escape(
             action=state.fence, begins=False, clearance=LARGEST, predicted=LARGEST, course=0.0
         )
+    found = last_safe_turn(params.fence, state.fence, motion_of(state, pose, y, speed, params))
     escape = Escape(
-        *map(
-            float,
-            last_safe_turn(params.fence, state.fence, motion_of(state, pose, y, speed, params)),
-        )
+        action=FenceAction(int(found.action)),
+        begins=bool(found.begins),
+        clearance=float(found.clearance),
+        predicted=float(found.predicted),
+        course=float(found.course),
     )
     bank = (
         state.lateral is not Lateral.ORBIT
         or (state.target.north, state.target.east) != params.home[:2]
     )
-    if bank and escape.action in {HOME, AROUND}:
-        escape = escape._replace(action=0.0)
-    elif escape.begins or (bank and escape.action == BACK):
+    if bank and escape.action in {FenceAction.HOME, FenceAction.AROUND}:
+        escape = escape._replace(action=FenceAction.NONE)
+    elif escape.begins or (bank and escape.action is FenceAction.BACK):
         target = state.target._replace(**home(pose, params))
         state = state._replace(
-            lateral=Lateral.ORBIT, vertical=Vertical.ALTITUDE, target=target, joining=0.0
+            lateral=Lateral.ORBIT, vertical=Vertical.ALTITUDE, target=target, joining=Side.NONE
         )
     return state._replace(fence=escape.action), escape
 

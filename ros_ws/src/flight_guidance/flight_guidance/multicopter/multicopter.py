@@ -18,12 +18,10 @@ from flight_core.kinematics import clip, euler_rates, heading_rate, thrust_axis,
 from flight_core.rates import seconds
 from flight_core.units import GRAVITY
 from flight_guidance.fence.fence import (
-    AROUND,
-    BACK,
-    HOME,
     MARGIN,
     Escape,
     Fence,
+    FenceAction,
     clearance,
 )
 from flight_guidance.fence.ways import line_clearance, ways
@@ -45,7 +43,7 @@ from flight_guidance.modes.legs import has_loitered, on_leg, with_commands
 from flight_guidance.modes.targets import home
 from flight_guidance.steering import path
 from flight_guidance.steering.lateral import PathError
-from flight_guidance.steering.path import Arc, Point, Route
+from flight_guidance.steering.path import Arc, Point, Route, Side
 from flight_guidance.steering.vertical import VerticalParams, climb_for, slewed
 
 NEAR = 0.5
@@ -136,7 +134,8 @@ def step(
         route,
         params.channels,
         lambda state, route: _along_route(state, pose, dt, route),
-        lambda state, leg, _, route: on_leg(state, leg, route)._replace(joining=1.0),
+        # It flies straight to the leg: either side says that it is on the way.
+        lambda state, leg, _, route: on_leg(state, leg, route)._replace(joining=Side.RIGHT),
     )
     state = _with_wind(state, pose, dt, params)
     state, escape = _within_fence(state, pose, params)
@@ -272,14 +271,14 @@ def _along_route(
     """
     position = (pose["north"], pose["east"])
     leg = route.legs[state.leg]
-    if state.joining:
+    if state.joining is not Side.NONE:
         start, _ = route.start(state.leg, state.target.along)
         joins = path.is_orbit(leg) or _is_near(state, pose, start)
         return (on_leg(state, state.leg, route) if joins else state), 0.0
     if leg.end is None:
         return state, 0.0
     if isinstance(leg, Arc) and leg.loiter is not None:
-        if state.loitered or _is_near(state, pose, leg.centre):
+        if state.loitered > 0.0 or _is_near(state, pose, leg.centre):
             share = dt / leg.loiter.wait
             state = state._replace(loitered=min(state.loitered + share, 1.0))
         ends = has_loitered(state, pose, route)
@@ -309,23 +308,25 @@ def _within_fence(
     now = float(clearance(fence.zones, *position))
     stop_clearance = float(line_clearance(fence, *position, *_parts(_stop(pose, _gains(params)))))
     action = _action(fence, position, now)
-    begins = state.fence == 0.0 and stop_clearance < margin
+    begins = state.fence is FenceAction.NONE and stop_clearance < margin
     if begins:
         target = state.target._replace(**home(pose, params))
         state = state._replace(
-            lateral=Lateral.PLACE, vertical=Vertical.ALTITUDE, target=target, joining=0.0
+            lateral=Lateral.PLACE, vertical=Vertical.ALTITUDE, target=target, joining=Side.NONE
         )
-    action_in_force = action if begins or state.fence != 0.0 else 0.0
+    is_acting = begins or state.fence is not FenceAction.NONE
+    action_in_force = action if is_acting else FenceAction.NONE
     return state._replace(fence=action_in_force), Escape(
         action=action_in_force, begins=begins, clearance=now, predicted=stop_clearance, course=0.0
     )
 
 
-def _action(fence: Fence, position: tuple[Any, Any], now: float) -> float:
+def _action(fence: Fence, position: tuple[Any, Any], now: float) -> FenceAction:
     """Choose the action of a fence that acts: home in a straight line or around, or back inside."""
     if now < 0.0:
-        return BACK
-    return HOME if bool(ways(fence).aim(fence, *position)[2]) else AROUND
+        return FenceAction.BACK
+    is_straight = bool(ways(fence).aim(fence, *position)[2])
+    return FenceAction.HOME if is_straight else FenceAction.AROUND
 
 
 def _wanted(
@@ -341,7 +342,7 @@ def _wanted(
     place = (target.north, target.east)
     if state.mode is not GuidanceMode.ENGAGED or state.lateral is Lateral.PHI:
         return MotionCommand()
-    if escape.action in {AROUND, BACK} and params.fence is not None:
+    if escape.action in {FenceAction.AROUND, FenceAction.BACK} and params.fence is not None:
         position = (np.float64(pose["north"]), np.float64(pose["east"]))
         north, east, _ = ways(params.fence).aim(params.fence, *position)
         place = (float(north), float(east))
@@ -350,7 +351,7 @@ def _wanted(
         return MotionCommand(velocity, velocity, error=PathError(0.0, target.course, 0.0))
     elif state.lateral is Lateral.ROUTE and route is not None:
         leg = route.legs[state.leg]
-        if not state.joining and not path.is_orbit(leg):
+        if state.joining is Side.NONE and not path.is_orbit(leg):
             return _on_path(state, pose, route, gains)
         place = route.start(state.leg, target.along)[0]
     return _to_place(complex(*place), state, pose, gains)

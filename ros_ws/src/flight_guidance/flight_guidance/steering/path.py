@@ -8,6 +8,7 @@ The corners of a route are fillets.
 import math
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
+from enum import IntEnum
 from itertools import pairwise
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -242,6 +243,14 @@ def to_go(leg: Leg, position: Point) -> float:
 # and round the circle onto it.
 
 
+class Side(IntEnum):
+    """The side of the joining circle: the sign of its radius."""
+
+    NONE = 0  # on the leg, or near its point: no circle
+    RIGHT = 1
+    LEFT = -1
+
+
 def joining_centre(point: Point, course: Scalar, radius: Scalar) -> Point:
     """Return the centre of the circle that touches a course, rad, at a point.
 
@@ -284,17 +293,18 @@ def joining(
 ) -> Scalar:
     """Choose the side of the shorter joining circle onto a course at a point.
 
-    1 turns to the right, -1 to the left, and 0 means that none is needed. None is needed within
-    `near`, m, and within OPPOSITE of the course.
+    Return a value of `Side` for each place. No circle is needed within `near`, m, and within
+    OPPOSITE of the course.
     """
     right_way, left_way = (
-        joining_length(point, course, side * radius, position, course_flown) for side in (1.0, -1.0)
+        joining_length(point, course, side * radius, position, course_flown)
+        for side in (Side.RIGHT, Side.LEFT)
     )
     xp = array_namespace(right_way)
     far = (xp.hypot(position[0] - point[0], position[1] - point[1]) > near) | (
         xp.cos(course_flown - course) < math.cos(OPPOSITE)
     )
-    return xp.where(far, xp.where(right_way <= left_way, 1.0, -1.0), 0.0)
+    return xp.where(far, xp.where(right_way <= left_way, Side.RIGHT, Side.LEFT), Side.NONE)
 
 
 def is_joined(
