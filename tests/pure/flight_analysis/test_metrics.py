@@ -3,6 +3,7 @@
 """Metrics of a flight against numbers worked by hand."""
 
 import math
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -27,7 +28,8 @@ def tape(**signals: Signal) -> Tape:
 
 def test_rms_and_max() -> None:
     # sqrt((9 + 16 + 0 + 0) / 4) = 2.5
-    assert metrics.error_metrics(np.array([3.0, -4.0, 0.0, 0.0])) == (2.5, 4.0)
+    errors = metrics.error_metrics(np.array([3.0, -4.0, 0.0, 0.0]))
+    assert (errors.rms, errors.max) == (2.5, 4.0)
 
 
 def test_error_formed_at_stamps_of_y_by_name() -> None:
@@ -128,8 +130,9 @@ def test_turns_and_captures_follow_from_commands_of_guidance(channels: Any, expe
 def test_errors_split_by_part_and_ultimate_bound_is_largest_undisturbed_error() -> None:
     flight = tape(y=signal([0, 1000, 2000], q=[3.0, 4.0, 0.0]), y_m=signal([0, 2000], q=[0.0, 0.0]))
     table = metrics.errors_by_part(flight, [Transient("gust", "g", 0.9, 1.1)], settle=0.0)
-    assert table["q"]["gust"] == (4.0, 4.0)
-    assert tuple(table["q"]["calm"]) == approx((math.sqrt(4.5), 3.0))
+    assert table["q"]["gust"] == metrics.ErrorMetrics(rms=4.0, max=4.0)
+    assert table["q"]["calm"].rms == approx(math.sqrt(4.5))
+    assert table["q"]["calm"].max == 3.0
     assert table["q"]["whole"].max == 4.0
 
 
@@ -185,12 +188,12 @@ def test_control_effort_is_rms_about_trim_and_mean_rate() -> None:
     # sqrt(3).
     flight = tape(u=signal([0, 100, 200, 300], elevator=[0.0, 2.0, -2.0, -2.0]))
     effort = metrics.inputs_by_part(flight, [])["elevator"]["whole"]
-    assert tuple(effort) == approx((math.sqrt(3.0), 2.0, 20.0))
+    assert asdict(effort) == approx({"rms": math.sqrt(3.0), "max": 2.0, "rate": 20.0})
     # The step into the gust and the one within it end there: 4 and 0 in 0.2 s.
     parts = metrics.inputs_by_part(flight, [Transient("gust", "g", 0.15, 0.35)], settle=0.0)[
         "elevator"
     ]
-    assert tuple(parts["gust"]) == approx((2.0, 2.0, 20.0))
+    assert asdict(parts["gust"]) == approx({"rms": 2.0, "max": 2.0, "rate": 20.0})
     assert parts["calm"].rate == approx(20.0)  # 2 in 0.1 s
     assert math.isnan(parts["command"].rms)
     assert math.isnan(parts["command"].rate)

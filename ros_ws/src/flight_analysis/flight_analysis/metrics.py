@@ -7,6 +7,7 @@ They are error, noise floor, ultimate bound, settling, saturation and ticks.
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from operator import attrgetter
 from typing import NamedTuple
 
@@ -96,18 +97,18 @@ class Transient(NamedTuple):
         return self.kind != "command" or self.name == channel
 
 
-class ErrorMetrics(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class ErrorMetrics:
     """Tracking error of a channel over some samples, in the unit of the channel."""
 
     rms: float
     max: float
 
 
-class InputMetrics(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class InputMetrics(ErrorMetrics):
     """An input over some samples: deviation from trim in the unit of the input, rate per s."""
 
-    rms: float
-    max: float
     rate: float
 
 
@@ -377,10 +378,10 @@ def error_metrics(errors: ArrayLike, times: FloatArray | None = None) -> ErrorMe
     e = as_array(errors, "errors", expected := "samples of one channel, (N,)")
     require(e.ndim == 1, "errors", f"an array of shape {e.shape}", expected)
     if len(e) == 0:
-        return ErrorMetrics(float("nan"), float("nan"))
+        return ErrorMetrics(rms=math.nan, max=math.nan)
     weighted = times is not None and np.ptp(times) > 0.0
     square = np.average(e**2, weights=times) if weighted else np.mean(e**2)
-    return ErrorMetrics(float(np.sqrt(square)), float(np.max(np.abs(e))))
+    return ErrorMetrics(rms=float(np.sqrt(square)), max=float(np.max(np.abs(e))))
 
 
 def known_entries(learned: Signal) -> list[str]:
@@ -524,7 +525,7 @@ def inputs_by_part(
         steps = mask[1:]
         time = float(np.diff(t)[steps].sum())
         rate = float(np.abs(np.diff(values))[steps].sum()) / time if time > 0 else float("nan")
-        return InputMetrics(*error_metrics(values[mask], times[mask]), rate)
+        return InputMetrics(**asdict(error_metrics(values[mask], times[mask])), rate=rate)
 
     by_input = {}
     for name in u.names:

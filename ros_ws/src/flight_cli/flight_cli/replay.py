@@ -253,14 +253,14 @@ def _u_figures(result: ReplayResult, inputs: tuple[str, ...]) -> dict[str, dict[
     figures = {}
     for name in inputs:
         difference = u_computed[name] - u_recorded[name]
-        rms, largest = error_metrics(difference)
+        errors = error_metrics(difference)
         if len(difference):
             t_max = float(result.t[is_finite][np.argmax(np.abs(difference))])
         else:
             t_max = math.nan
         figures[name] = {
-            "rms": rms,
-            "max": largest,
+            "rms": errors.rms,
+            "max": errors.max,
             "t_max": t_max,
             "rms_recorded": error_metrics(u_recorded[name]).rms,
         }

@@ -7,6 +7,7 @@ For each segment, by mode and leg, these are the errors of the quantities that g
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from flight_analysis.closed_loop.guidance_replay import known_routes
 from flight_analysis.metrics import (
     SETTLING_DWELL,
+    ErrorMetrics,
     best_pose,
     error_metrics,
     sample_times,
@@ -58,17 +60,17 @@ PATHS = (Lateral.ORBIT, Lateral.ROUTE, Lateral.PLACE)
 """Modes whose error is in m: the distance beside a path, or from a place."""
 
 
-class HoldErrors(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class HoldErrors(ErrorMetrics):
     """The errors of a held quantity over a segment, in SI.
 
     Only a segment that begins outside the band has overshoot and settling.
     """
 
     quantity: str
-    rms: float
-    max: float
-    overshoot: float | None  # largest error on the other side of the command
-    settling: float | None  # s from the start of the segment; None: not settled by its end
+    overshoot: float | None = None  # largest error on the other side of the command
+    # s from the start of the segment; None: not settled by its end
+    settling: float | None = None
 
 
 class FlownLeg(NamedTuple):
@@ -83,7 +85,8 @@ class FlownLeg(NamedTuple):
     missed: float  # m, distance from the end of a missed leg; else 0
 
 
-class Segment(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class Segment:
     """A part of the flight in which modes, commands and leg stay the same."""
 
     start: float  # s
@@ -433,14 +436,13 @@ def flown_speed(tape: Tape, trim: float) -> FloatArray:
 
 
 def _hold_errors(quantity: str, t: FloatArray, error: FloatArray, times: FloatArray) -> HoldErrors:
-    metrics = error_metrics(error, times)
+    errors = HoldErrors(quantity=quantity, **asdict(error_metrics(error, times)))
     first = float(error[0])
     if abs(first) <= BANDS[quantity]:
-        return HoldErrors(quantity, *metrics, None, None)
+        return errors
     overshoot = float(np.max(-error * math.copysign(1.0, first), initial=0.0))
-    return HoldErrors(
-        quantity, *metrics, overshoot, settling_time(t, error, BANDS[quantity], math.inf)
-    )
+    settling = settling_time(t, error, BANDS[quantity], math.inf)
+    return replace(errors, overshoot=overshoot, settling=settling)
 
 
 def guidance_notices(tape: Tape, section: GuidanceConfig | None) -> list[str]:
@@ -460,13 +462,6 @@ def guidance_notices(tape: Tape, section: GuidanceConfig | None) -> list[str]:
     return [f"guidance at t = {notice.t:.1f} s: {notice.text}" for notice in notices]
 
 
-def _segment_figures(segment: Segment) -> dict[str, Any]:
-    """Return the figures of a segment and of the quantities held in it."""
-    return segment._asdict() | {
-        name: getattr(segment, name)._asdict() for name in ("lateral", "vertical", "V")
-    }
-
-
 def guidance_summary(tape: Tape, section: GuidanceConfig | None = None) -> dict[str, Any] | None:
     """Return the figures of a guided flight as `summary.json` holds them, SI.
 
@@ -481,7 +476,7 @@ def guidance_summary(tape: Tape, section: GuidanceConfig | None = None) -> dict[
     touch = landing_touch(tape, section)
     return {
         "landing": None if touch is None else touch._asdict(),
-        "segments": [_segment_figures(segment) for segment in segments(tape)],
+        "segments": [asdict(segment) for segment in segments(tape)],
         "legs": [leg._asdict() for leg in flown_legs(tape)],
         "fence": None if outside is None else outside._asdict(),
         "altitude": None if altitude is None else altitude._asdict(),

@@ -7,7 +7,7 @@ The units and columns of the tables are in `summary_rows`.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -284,7 +284,7 @@ def summarise_imported(tape: Tape, source: Mapping[str, str]) -> dict[str, Any]:
     for key, topic in (("outputs", "y"), ("inputs", "u")):
         by_channel = inputs_by_part(tape, (), topic=topic)
         deviations[key] = {
-            name: {"whole": parts["whole"]._asdict()} for name, parts in by_channel.items()
+            name: {"whole": asdict(parts["whole"])} for name, parts in by_channel.items()
         }
     summary = (
         empty_summary(None, Outcome(End.IMPORTED))
@@ -309,7 +309,7 @@ def summarise_own(tape: Tape, law: str, log: str, outcome: Outcome) -> dict[str,
         return summary
     errors = replace(tape, signals={**tape.signals, "e": tracking_error(tape)})
     by_channel = inputs_by_part(errors, (), topic="e")
-    deviations = {name: {"whole": parts["whole"]._asdict()} for name, parts in by_channel.items()}
+    deviations = {name: {"whole": asdict(parts["whole"])} for name, parts in by_channel.items()}
     return summary | {key: finite_or_null(value) for key, value in {"e": deviations}.items()}
 
 
@@ -535,7 +535,7 @@ def _errors(tape: Tape, events: Sequence[Transient], air: str) -> dict[str, Any]
     switches = sign_switches(tape)
     figures = {}
     for channel, parts in errors_by_part(tape, events, air=air).items():
-        figures[channel] = {part: figures_of._asdict() for part, figures_of in parts.items()} | {
+        figures[channel] = {part: asdict(figures_of) for part, figures_of in parts.items()} | {
             "bound": parts[CALM].max if air == CALM else None,
             "band": bands[channel],
             "floor": floors[channel],
@@ -553,7 +553,7 @@ def _inputs(tape: Tape, events: Sequence[Transient], air: str) -> dict[str, Any]
     saturation = saturation_shares(tape)
     figures: dict[str, Any] = {}
     for name, parts in inputs_by_part(tape, events, air=air).items():
-        by_part: dict[str, Any] = {part: effort._asdict() for part, effort in parts.items()}
+        by_part: dict[str, Any] = {part: asdict(effort) for part, effort in parts.items()}
         figures[name] = by_part | {"limited": saturation.get(name)}
     return figures
 
