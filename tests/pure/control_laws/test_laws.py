@@ -1,193 +1,45 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The control laws of the controller through their one protocol.
+"""The control laws through their one protocol: engagement, limits, retuning, replay, JAX."""
 
-The tests are of engagement, limits, retuning, replay, observer and refusals.
-"""
-
-from collections.abc import Iterator
 from dataclasses import replace
-from functools import cache
-from importlib.metadata import EntryPoint, EntryPoints
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from tests.closed_loop import PROTOTYPE_SERVO
-from tests.conftest import REPOSITORY, refusing
-from tests.other_laws import COMMON, OWN_LAW, SECTIONS, example_installed
-from tests.pure.flight_analysis.test_replay import BUSY, equal
+from tests.conftest import refusing
+from tests.pure.control_laws.each_law import (
+    DT,
+    EVERY_LAW,
+    NAMES,
+    OBSERVED,
+    SERVO,
+    at,
+    bits,
+    controller,
+    first_change,
+    random_flight,
+    tick,
+)
+from tests.pure.flight_analysis.test_replay import equal
 
-from aircraft_sim.airframes.airframe import load_airframe
-from control_laws import lqg
-from control_laws.catalogue import LAWS
 from flight_analysis.closed_loop.replay import replay
 from flight_analysis.closed_loop.simulate import simulate
 from flight_core.modes import Mode
-from flight_core.parameters import ParameterError
-from flight_core.vectors import FloatArray, StampedVector
-from flight_design.gains.gain_selection import with_feedforward
-from flight_design.gains.observer_gains import gains_by_rule
-from flight_design.gains.observer_selection import model_for, with_aircraft_observer
-from rise_di_controller import laws
+from flight_core.vectors import FloatArray
 from rise_di_controller.controller import Controller
-from rise_di_controller.extensions.observer import ObserverParams, ObserverState
-from rise_di_controller.guard import guard, retuning
-from rise_di_controller.guard.guard import ControllerState, GuardParams
-from rise_di_controller.law.control_law import Measurements, TunedLaw, field_names, fields, restored
+from rise_di_controller.extensions.observer import ObserverState
+from rise_di_controller.guard import guard
+from rise_di_controller.law.control_law import Measurements, field_names, fields, restored
 from rise_di_controller.law.law import gain
 from rise_di_controller.law.linear_loop import linear_law
 from rise_di_controller.law.saturation import Limits
-from rise_di_controller.laws import AnyLaw
-from rise_di_controller.params import ControllerConfig
 
-# as the campaigns set it, also where they are not loaded
-jax.config.update("jax_enable_x64", True)  # type: ignore[no-untyped-call]
-
-AIRFRAME = load_airframe("osprey")
-SERVO = PROTOTYPE_SERVO.vary(
-    flight={"duration": 2.0},
-    aircraft={
-        "rate": 100.0,
-        "step": 0.005,
-        "gusts": {"vertical": {"start": 1.0, "speed": 10.12, "length": 15.24}},
-    },
-    reference_model={"rate": 100.0, "pulses": BUSY},
-)
-MS, DT = 1_000_000, 0.01  # ns; s, the period of the controller
-NOISE = np.array([0.0017, 0.0017, 0.0017, 0.03])  # of osprey_servo
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _example(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    with example_installed(tmp_path_factory.mktemp("installed")):
-        yield
-
-
-@cache
-def sections() -> dict[str, dict[str, Any]]:
-    """Sections of a controller by a name.
-
-    With "observer" in the name it is the observer for osprey_servo by rule, with 20 ms of margin.
-    """
-    rise = SERVO.rise_di()
-    leading = with_feedforward(rise, AIRFRAME).model_dump()
-    gains = gains_by_rule(model_for(AIRFRAME, rise, NOISE), tuple(AIRFRAME.gusts), speed=25.0)
-    observed = with_aircraft_observer(rise, AIRFRAME, [gains], NOISE, 0.02).controller.model_dump()
-    extended = {key: observed[key] for key in ("feedforward", "observer")}
-    pi = SECTIONS["pi"]
-    l1 = SECTIONS["l1"]
-    return {
-        "rise_di": rise.model_dump(),
-        "rise_di, implicit": rise.model_dump() | {"sign": "implicit"},
-        "pi": pi,
-        "l1": l1,
-        "l1, feedforward": l1 | {"feedforward": leading["feedforward"]},
-        "pid": SECTIONS["pid"],
-        "own": SECTIONS.get("own", {}),
-        "lqg, observer": COMMON | extended | {"law": "lqg"},
-        "rise_di, observer": observed,
-        "pi, observer": pi | extended | {"K": gains.K.tolist(), "Lambda": gains.Lambda.tolist()},
-    }
-
-
-NAMES = (
-    "rise_di",
-    "rise_di, implicit",
-    "pi",
-    "l1",
-    "l1, feedforward",
-    "pid",
-    *(["own"] if OWN_LAW else []),
-)
-OBSERVED = ("lqg, observer", "rise_di, observer", "pi, observer")
-EVERY_LAW = pytest.mark.parametrize("name", [*NAMES, *OBSERVED])
-
-
-def controller(name: str, **changes: Any) -> ControllerConfig:
-    return (
-        AnyLaw.validate_mapping(sections()[name] | changes, "controller")
-        if changes
-        else valid(name)
-    )
-
-
-@cache
-def valid(name: str) -> ControllerConfig:
-    return AnyLaw.validate_mapping(sections()[name], "controller")
-
-
-@cache
-def prepared(parameters: ControllerConfig) -> tuple[GuardParams, TunedLaw]:
-    return parameters.guard(), parameters.tuned_law()
-
-
-def at(y: Any, **others: Any) -> Measurements:
-    """Measurements of four channels; what is not given is 0."""
-    zero = np.zeros(4)
-    fields = {"y_m": zero, "y_m_dot": zero, "u_trim": zero, "u_before": zero} | others
-    return Measurements(y + zero, **{key: value + zero for key, value in fields.items()})
-
-
-def sample(ms: float, value: Any) -> StampedVector:
-    return StampedVector(round(ms * MS), value + np.zeros(4))
-
-
-def tick(
-    parameters: ControllerConfig, state: ControllerState, ms: float, y: Any, y_m: Any = 0.0
-) -> ControllerState:
-    """The state after a tick with fresh y and y_m."""
-    return guard.tick(
-        state, round(ms * MS), sample(ms, y), [sample(ms, y_m)], *prepared(parameters)
-    )[0]
-
-
-def random_flight(law: TunedLaw, size: float, ticks: int = 20) -> tuple[Any, Measurements]:
-    """A state of a law after some ticks without limits, and the measurements of the last one."""
-    generator = np.random.default_rng(1)
-    measurements = at(size * generator.standard_normal(4))
-    state = law.control_law.engage(measurements, law.params)
-    for _ in range(ticks):
-        y, y_m, y_m_dot, u_trim = size * generator.standard_normal((4, 4))
-        measurements = Measurements(
-            y=y, y_m=y_m, y_m_dot=y_m_dot, u_trim=u_trim, u_before=measurements.u_before
-        )
-        state, u = law.control_law.step(state, measurements, np.float64(DT), law.params)
-        measurements = measurements._replace(u_before=u)
-    return state, measurements
-
-
-def bits(state: Any) -> dict[str, bytes]:
-    return {name: np.asarray(value).tobytes() for name, value in fields(state).items()}
-
+pytestmark = pytest.mark.usefixtures("example_law")
 
 # Engagement, limits, retuning
-
-
-def first_change(name: str, parameters: Any, e: FloatArray, u: FloatArray) -> FloatArray:
-    """The largest change of u in the first tick after an engagement at a constant error.
-
-    It comes by the gains alone.
-    """
-    law = name.partition(",")[0]
-    if law == "lqg":
-        return np.zeros(4)
-    scale = np.array(parameters.input_scale)
-    # the filter releases -K e; the pole of the adaptation leaves dt / 2 of Omega u unestimated
-    if law == "l1":
-        decay = 1.0 - np.exp(-np.array(parameters.bandwidth) * DT)
-        Omega = np.reshape(parameters.Omega, (4, 4))
-        change = np.array(parameters.K) * np.abs(e) + DT / 2.0 * (np.abs(Omega) @ np.abs(u))
-        return np.asarray(np.abs(np.linalg.inv(Omega)) @ (decay * change))
-    K = (
-        gain(np.array(parameters.k_g), np.array(parameters.k_d))
-        if law == "rise_di"
-        else np.array(parameters.K)
-    )
-    sign = DT * np.array(parameters.beta) if law == "rise_di" else 0.0
-    return np.asarray(scale * (K * np.array(parameters.Lambda) * np.abs(e) * DT + sign))
 
 
 @EVERY_LAW
@@ -459,283 +311,3 @@ def test_law_is_same_under_jax(name: str) -> None:
                 singles[k], one, np.float64(DT), law.params, row
             )
             assert_allclose(u[:, k], of_one, rtol=1e-9, atol=1e-12)
-
-
-# The observer
-
-
-class Matrices(NamedTuple):
-    """Those of an observer."""
-
-    Phi: FloatArray
-    Gamma: FloatArray
-    H: FloatArray
-    L: FloatArray
-    F: FloatArray
-
-
-def matrices(parameters: ControllerConfig) -> Matrices:
-    nominal = parameters.nominal()
-    assert parameters.observer is not None
-    assert nominal is not None
-    return Matrices(*parameters.observer.matrices(nominal))
-
-
-def test_observer_is_kalman_filter_with_linear_feedback() -> None:
-    generator = np.random.default_rng(1)
-    s = 6
-    m = 2
-    wide = np.full(2, np.inf)
-    Phi, Gamma, L, F = (
-        0.3 * generator.standard_normal(shape) for shape in ((s, s), (s, m), (s, m), (m, s))
-    )
-    H = np.eye(m, s)
-    params = ObserverParams(
-        law=lqg.LqgParams(),
-        Phi=Phi,
-        Gamma=Gamma,
-        H=H,
-        L=L,
-        F=F,
-        limits=Limits(-wide, wide, wide),
-        fade_rate=np.float64(2.0),
-    )
-    law = controller("lqg, observer").tuned_law().control_law
-    zero = np.zeros(m)
-    e = generator.standard_normal((60, m))
-    state = law.engage(
-        Measurements(y=e[0], y_m=zero, y_m_dot=zero, u_trim=zero, u_before=zero), params
-    )
-    x = np.concatenate([e[0], np.zeros(s - m)])  # the outputs are the first states
-    u = zero
-    for k, error in enumerate(e):
-        state, commanded = law.step(
-            state,
-            Measurements(y=error, y_m=zero, y_m_dot=zero, u_trim=zero, u_before=u),
-            np.float64(DT),
-            params,
-        )
-        x = x + L @ (error - H @ x)  # measurement update
-        u = -min(1.0, (k + 1) * DT * 2.0) * (F @ x)
-        assert_allclose(commanded, u, rtol=1e-9, atol=1e-12)
-        x = Phi @ x + Gamma @ u  # time update
-        assert_allclose(state.z, x, rtol=1e-9, atol=1e-12)
-
-
-@pytest.mark.parametrize("name", OBSERVED)
-def test_a_re_engagement_restarts_the_observer(name: str) -> None:
-    parameters = controller(name)
-    state = guard.initial_state(4)
-    for k in range(100):
-        state = tick(parameters, state, 10 * k, 1e-3 * np.sin(k / 5.0))
-    law = parameters.tuned_law()
-    old = sample(990, 0.0)
-    after, _ = guard.tick(state, 1300 * MS, old, [old], parameters.guard(), law)
-    assert after.mode is Mode.HOLD
-    assert bits(after.law) == bits(state.law)  # nothing is estimated from what is not measured
-    again = tick(parameters, after, 1310, [0.01, 0.02, -0.01, 0.1])
-    assert again.u.tolist() == state.u.tolist() == again.u_trim.tolist()
-    H = matrices(parameters).H
-    assert again.law.z.tolist() == (H.T @ [0.01, 0.02, -0.01, 0.1]).tolist()
-    assert not again.law.u_o.any()
-    assert again.law.sigma.tolist() == [0.0]
-
-
-@pytest.mark.parametrize("name", OBSERVED)
-def test_observer_with_other_matrices_restarts_without_jump(name: str) -> None:
-    parameters = controller(name)
-    state = guard.initial_state(4)
-    e = 1e-3 * np.array([1.0, -1.0, 2.0, -2.0])
-    for k in range(50):
-        state = tick(parameters, state, 10 * k, e)
-    weaker = [0.9 * gain for gain in sections()[name]["observer"]["F"]]
-    new = controller(name, observer=sections()[name]["observer"] | {"F": weaker})
-    after = retuning.retune_state(state, parameters.tuned_law(), new.tuned_law())
-    assert state.law.u_o.any()
-    assert_allclose(after.u_trim, state.u_trim + state.law.u_o, rtol=1e-12)
-    assert after.law.z.tolist() == (matrices(new).H.T @ e).tolist()
-    assert not after.law.u_o.any()
-    assert after.law.sigma.tolist() == [0.0]
-    # the next tick changes u by what the law integrates in a tick and by one hundredth of the new
-    # u_o
-    next_tick = tick(new, after, 500, e)
-    assert (
-        np.abs(next_tick.u - state.u)
-        <= first_change(name, parameters, e, state.u) + np.abs(next_tick.law.u_o) + 1e-12
-    ).all()
-    assert np.abs(next_tick.law.u_o).max() < 0.02 * np.abs(matrices(new).F @ after.law.z).max()
-
-
-# Refusals
-
-
-def refused(sentence: str, values: dict[str, Any]) -> None:
-    with pytest.raises(ParameterError) as error:
-        AnyLaw.validate_mapping(values, "controller")
-    assert str(error.value).startswith(sentence), str(error.value)
-    assert len(str(error.value).splitlines()) == 1
-
-
-def test_page_names_every_registered_law_and_parameters() -> None:
-    page = (REPOSITORY / "docs" / "laws.md").read_text()
-    for name in laws.names():
-        own_section = (
-            []
-            if name in {"lqi", "indi", "mackunis"}
-            else set(laws.schema(name).model_fields) - set(ControllerConfig.model_fields)
-        )
-        for word in (name, *own_section):
-            assert f"`{word}`" in page, word
-
-
-def test_unregistered_law_refused() -> None:
-    """The sentence lists the registered laws."""
-    registered = "excitation, indi, l1, lqg, lqi, mackunis, pi, pid, rise_di"
-    refused(
-        f"controller.law: found 'adrc', expected a registered law: {registered}",
-        COMMON | {"law": "adrc"},
-    )
-    refused("controller.law: found ['pi'], expected a registered law", COMMON | {"law": ["pi"]})
-
-
-def test_law_of_more_than_y_refused() -> None:
-    topics = "expected a law of y and y_m: the topics have no more"
-    refused(
-        f"controller.law: found 'lqi', which needs the full state, {topics}",
-        COMMON | {"law": "lqi"},
-    )
-    refused(
-        f"controller.law: found 'indi', which needs the positions of the actuators, {topics}",
-        COMMON | {"law": "indi"},
-    )
-    refused(
-        f"controller.law: found 'mackunis', which needs the derivative of y, {topics}",
-        COMMON | {"law": "mackunis"},
-    )
-
-
-def test_compared_laws_are_those_that_a_scenario_names() -> None:
-    """The excitation controls nothing, and `pid` is a package of an example."""
-    assert {law.law for law in LAWS.values()} == {*laws.names()} - {"excitation", "pid"}
-
-
-def test_entry_point_that_is_no_law_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    values = {
-        "absent": ["absent_package.law:Parameters"],
-        "function": ["control_laws.pi:params_of"],
-        "twice": ["control_laws.pi:PiConfig", "control_laws.l1:L1Config"],
-    }
-    entries = EntryPoints(
-        EntryPoint(name, value, laws.GROUP) for name, targets in values.items() for value in targets
-    )
-    monkeypatch.setattr(laws, "_registered", lambda: entries)
-    for name, sentence in {
-        "absent": "found 'absent', which cannot be loaded (No module named 'absent_package'), "
-        "expected an installed package",
-        "function": "found 'function', registered as <function params_of",
-        "twice": "found 'twice', registered as control_laws.l1:L1Config and as "
-        "control_laws.pi:PiConfig, expected one",
-    }.items():
-        refused(f"controller.law: {sentence}", COMMON | {"law": name})
-
-
-def test_a_parameter_of_another_law_is_refused() -> None:
-    pi = sections()["pi"]
-    refused(
-        "controller.beta: found a parameter of rise_di, expected those of pi: K, Lambda",
-        pi | {"beta": [1.0] * 4},
-    )
-    refused("controller.K: unknown key", sections()["rise_di"] | {"K": [1.0] * 4})
-
-
-@pytest.mark.parametrize(
-    "name, changes, sentence",
-    [
-        (
-            "pi",
-            {"K": [1.0] * 3},
-            "controller.K: found 3 values, expected 4, one for each of q, p, r, V",
-        ),
-        ("l1", {"Omega": [1.0] * 16}, "controller.Omega: found a matrix without a D ("),
-        (
-            "pid",
-            {"filter_time": [0.0] * 4},
-            "controller.filter_time[0]: found 0.0, expected greater than 0",
-        ),
-        (
-            "lqg, observer",
-            {"observer": None},
-            (
-                "controller.observer: found none, expected a section: the observer is the feedback "
-                "of lqg"
-            ),
-        ),
-    ],
-)
-def test_invalid_parameter_of_law_refused(
-    name: str, changes: dict[str, Any], sentence: str
-) -> None:
-    refused(sentence, sections()[name] | changes)
-
-
-def test_an_invalid_observer_is_refused() -> None:
-    values = sections()["pi, observer"]
-    observer = values["observer"]
-    states = list(observer["states"])
-    s = len(observer["states"])
-
-    def observed(**changes: Any) -> dict[str, Any]:
-        return values | {"observer": observer | changes}
-
-    refused(
-        "controller.observer: found no feedforward beside it, expected that section too",
-        values | {"feedforward": None},
-    )
-    refused(
-        f"controller.observer.Phi: found {s} values, expected {s * s}: {s} rows of {s}",
-        observed(Phi=[1.0] * s),
-    )
-    others = [states[1], states[0], *states[2:]]
-    refused("controller.observer.states: found x.alpha, x.V, x.q", observed(states=others))
-    unstable = np.reshape(observer["Phi"], (s, s)) + 2.0 * np.eye(s)
-    refused(
-        "controller.observer.L: found a spectral radius of ",
-        observed(Phi=unstable.ravel().tolist()),
-    )
-    refused(
-        "controller.observer.F: found a spectral radius of ",
-        observed(F=[-3.0 * gain for gain in observer["F"]]),
-    )
-    refused(
-        "controller.observer.margin: found a nominal loop that is unstable with u ",
-        observed(margin=0.2),
-    )
-
-
-def test_unfit_feedforward_refused() -> None:
-    """A nominal model with a different D is refused.
-
-    So is a model with a zero in the right half plane.
-    """
-    values = sections()["pi, observer"]
-    B = np.reshape(values["feedforward"]["B"], (-1, 4))
-    negative = values | {"feedforward": values["feedforward"] | {"B": (-B).ravel().tolist()}}
-    refused(
-        "controller.feedforward.B: found a C B with D = [-1, -1, -1, -1], expected D = [1, 1, "
-        "1, 1]",
-        negative,
-    )
-    A = np.reshape(values["feedforward"]["A"], (len(B), len(B))).copy()
-    hidden = values["feedforward"]["states"].index("alpha")
-    A[hidden, hidden] += 20.0  # w diverges by itself
-    growing = values | {"feedforward": values["feedforward"] | {"A": A.ravel().tolist()}}
-    refused("controller.feedforward.A: found zero dynamics with an eigenvalue at ", growing)
-
-
-def test_digest_depends_on_law() -> None:
-    """Logs of versions without the key law keep the digest."""
-    digests = {name: controller(name).digest() for name in (*NAMES, *OBSERVED)}
-    assert len(set(digests.values())) == len(digests)
-    section = AnyLaw.validate_mapping(sections()["rise_di"] | {"law": "rise_di"}, "controller")
-    without_name = {key: value for key, value in sections()["rise_di"].items() if key != "law"}
-    assert section.digest() == AnyLaw.validate_mapping(without_name, "controller").digest()
