@@ -503,7 +503,7 @@ def test_scenarios_are_listed_with_their_sentence_aircraft_and_law() -> None:
 def test_help_shows_the_names_of_entries_whole() -> None:
     """Brackets are markup to Rich: A[q,alpha] was shown as A."""
     words = " ".join(invoke("gains", "--help").output.replace("│", " ").split())
-    assert "'A[q,alpha]=0.6', or '1/lag[elevator]=0.3' of an" in words
+    assert "'A[q,alpha]=0.6', or of an actuator '1/lag[elevator]=0.3'" in words
 
 
 def test_every_command_of_help_has_help_of_own() -> None:

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di airframes`: the assumptions of the theorem, on any airframe.
+"""`rise-di airframes`: check the assumptions of the theorem on any airframe.
 
-The airframe is one of the library or your own; a new one can be written.
+The airframe is one of the library or your own. The command can also write a new one.
 """
 
 from collections.abc import Sequence
@@ -36,31 +36,34 @@ from flight_design.gains.airframe_properties import (
 from rise_di.own_airframe import NewAirframe, new_airframe
 
 ROOTS = "Poles and zeros in 1/s, leading minors of C B in SI"
-FALLS_SHORT = 3  # exit status: an input at its stop in the first flight, or no end as planned
+FALLS_SHORT = (
+    3  # exit status: in the first flight an input was at its stop, or it did not end as planned
+)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Airframes:
-    """Show airframes: poles, zeros, the minors of Omega = C B, D as published and what gives D = I.
+    """Show airframes: poles, zeros, minors of Omega = C B, the published D and what gives D = I.
 
-    With --write FOLDER: make NAME.yaml, an airframe that is checked against physics, and
-    NAME_flight.yaml, a scenario with selected gains. It has been flown once in this process:
-    rise-di fly NAME_flight.yaml --in-process.
+    With --write FOLDER, make NAME.yaml, an airframe that is checked against physics, and
+    NAME_flight.yaml, a scenario with selected gains. The command flies it once in this process. You
+    fly it with: rise-di fly NAME_flight.yaml --in-process.
 
-    Exit status: 0, 2 for a file with a mistake, or 3 for files whose first flight falls short.
+    Exit status: 0, 2 if a file has a mistake, or 3 if the first flight of the files falls short.
     """
 
     names: list[str] | None = argument(
-        "Names, or airframe files (.yaml); by default the library. With --write one: "
-        "an airframe file, a MATLAB file"
-        " (.mat), or a text of AVL (system matrix, stability derivatives) or XFLR5.",
+        "Names, or airframe files (.yaml); by default the whole library. With --write, give "
+        "exactly one: an airframe file, a MATLAB file (.mat), or a text file of AVL (system "
+        "matrix, stability derivatives) or XFLR5.",
         metavar="[AIRFRAME]...",
         autocompletion=airframe_names,
     )
     write: Path | None = write_option(
-        "Write NAME.yaml and NAME_flight.yaml, an airframe that flies.", metavar="FOLDER"
+        "Write NAME.yaml, an airframe, and NAME_flight.yaml, a scenario that flies it.",
+        metavar="FOLDER",
     )
-    name: str = rare_option("Name of the airframe; by default that of the file.", default="")
+    name: str = rare_option("Name of the airframe; by default the name of the file.", default="")
     speed: str | None = rare_option('Trim speed, in m/s or with a unit: "176 ft/s".')
     states: str = option(
         'States in the order of A, with units: "u: ft/s, w: ft/s, q: rad/s, theta: rad".',
@@ -71,29 +74,37 @@ class Airframes:
         default="",
     )
     outputs: str = option(
-        'As many as inputs, or fewer: states, rows of C ("V: ft/s"), sums: "q, V = '
-        '0.987 u + 0.163 w".',
+        "Outputs, at most as many as inputs: a state, a row of C with its unit "
+        '("V: ft/s"), or a sum of states: "q, V = 0.987 u + 0.163 w".',
         default="",
     )
     thrust: bool = rare_option(
-        "Add an input thrust in units of the weight along the flight path.", default=False
+        "Add an input thrust along the flight path, in units of the weight.", default=False
     )
-    lag: str | None = option("Lags of the actuators in s, in the order of the inputs: 0.05,0.3")
-    mass: str | None = rare_option('Beside AVL\'s derivatives: "3.2 kg" or "85 slug".')
-    Ixx: str | None = rare_option('Body axes: "0.2 kg*m^2" or "1048 slug*ft^2".')
-    Iyy: str | None = rare_option("As Ixx.")
-    Izz: str | None = rare_option("As Ixx.")
-    Ixz: str | None = rare_option("As Ixx; by default 0.")
-    density: str | None = rare_option('"1.225 kg/m^3" or "0.002377 slug/ft^3".')
-    length: str | None = rare_option("Unit of length of AVL's file, by default m.")
-    source: str = rare_option("Where the figures come from: a book and a page.", default="")
+    lag: str | None = option(
+        "Lags of the actuators in s, in the order of the inputs, as in 0.05,0.3."
+    )
+    mass: str | None = rare_option(
+        'Mass, which the derivatives of AVL need: "3.2 kg" or "85 slug".'
+    )
+    Ixx: str | None = rare_option(
+        'Moment of inertia in body axes: "0.2 kg*m^2" or "1048 slug*ft^2".'
+    )
+    Iyy: str | None = rare_option("As --Ixx.")
+    Izz: str | None = rare_option("As --Ixx.")
+    Ixz: str | None = rare_option("Product of inertia, as --Ixx; by default 0.")
+    density: str | None = rare_option('Density of the air: "1.225 kg/m^3" or "0.002377 slug/ft^3".')
+    length: str | None = rare_option("Unit of length in the file of AVL; by default m.")
+    source: str = rare_option(
+        "Where the figures come from, for example a book and a page.", default=""
+    )
     replace: bool = rare_option(
-        "Replace files of these names.", "--replace", "--force", default=False
+        "Replace files that have these names.", "--replace", "--force", default=False
     )
     as_json: bool = json_option()
 
     def execute(self) -> None:
-        """Make an airframe, or show airframes by name."""
+        """Write a new airframe, or show airframes by name."""
         if self.write is not None:
             self._make(self.write)
             return
@@ -104,7 +115,7 @@ class Airframes:
             _show(Console(), facts)
 
     def _make(self, folder: Path) -> None:
-        """Write airframe and scenario, and show the first flight."""
+        """Write the airframe and the scenario, and show the first flight."""
         sources = self.names or []
         sources_text = f"{len(sources)} sources"
         require(len(sources) == 1, "airframes", sources_text, "one beside --write")
@@ -125,7 +136,7 @@ class Airframes:
 
 
 def _show(console: Console, facts: Sequence[AirframeFacts]) -> None:
-    """Print the assumptions of the theorem, a table each."""
+    """Print the assumptions of the theorem, one table for each group of them."""
     for title, headings, cells in (
         ("Signs and pairing", ("D", "for D = I", "coupling"), _signs),
         ("Assumptions 1 and 3", ("n, m", "controllable", "zeros", "integrated"), _assumptions),
@@ -147,7 +158,7 @@ def _show(console: Console, facts: Sequence[AirframeFacts]) -> None:
 
 
 def _show_draft(draft: NewAirframe) -> None:
-    """Show what was read, and the files that were written."""
+    """Show what was read, and which files were written."""
     frame = draft.airframe
     print(f"read:     {draft.note}")
     effects = (
@@ -181,7 +192,7 @@ def _roots(facts: AirframeFacts) -> tuple[str, str, str]:
 
 
 def _format_roots(roots: ComplexArray) -> str:
-    """Write roots: a conjugate pair once, a root that is zero to rounding as 0."""
+    """Write roots as text: a conjugate pair once, and a root that is zero to rounding as 0."""
     texts = []
     for root in roots:
         real, imaginary = (

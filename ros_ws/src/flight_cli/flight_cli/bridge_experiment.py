@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The part of `rise-di identify` that excites the aircraft behind a channel map.
 
-It writes a scenario that flies the aircraft.
+It writes a scenario that flies this aircraft.
 """
 
 import shlex
@@ -60,28 +60,28 @@ from flight_design.identification.response_identification import Response, ident
 from flight_design.identification.sign_check import OPEN_LOOP
 from flight_log.tape_reader import read_run
 
-GUIDED = 600.0  # s, of a flight under guidance
+GUIDED = 600.0  # s, the duration of a flight under guidance
 
 
 @dataclass(frozen=True, kw_only=True)
 class BridgeExperiment:
-    """An experiment behind a channel map, or a recorded one.
+    """An experiment on the aircraft behind a channel map, or the log of one.
 
-    `folder` takes what flies the aircraft. Gains from an imported log are for `link_delay`, s,
-    beyond the delay in the log; None for that of the map.
+    The files that fly the aircraft are written to `folder`. If the log was imported, the gains
+    allow for `link_delay`, s, beyond the delay in the log; None takes the delay of the map.
     """
 
     map_name: str
-    speed: float | None  # m/s in trim; None for the map's own airspeed, or in hover
+    speed: float | None  # m/s in trim; None takes the airspeed of the map, or hover
     folder: Path
-    amplitude: float  # a part of each input's limit
-    log: Path | None  # None to fly the experiment
+    amplitude: float  # as a fraction of each input's limit
+    log: Path | None  # None flies the experiment
     needed: Requirement
-    accept: bool  # gains whose margins fall short
+    accept: bool  # also gains whose margins fall short
     link_delay: float | None
 
     def identify(self, *, as_json: bool) -> None:
-        """Excite the aircraft, or read the log, and write what flies it."""
+        """Excite the aircraft, or read the log, and write the files that fly it."""
         channel_map = load_map(self.map_name)
         self._require_fit(channel_map)
         console = Console(quiet=as_json)
@@ -96,7 +96,9 @@ class BridgeExperiment:
         for sentence in narrower:
             say(console, sentence)
         flyable = self._flyable(channel_map, channels)
-        written_map = map_text(channel_map, trims, run.resolve().name)  # the run, not `latest`
+        written_map = map_text(
+            channel_map, trims, run.resolve().name
+        )  # the name of the run, not `latest`
         files = {"airframe": flyable.airframe, "scenario": flyable.scenario, "map": written_map}
         guidance_scenario = guided_scenario(flyable.scenario, channel_map, self.speed)
         if guidance_scenario:
@@ -117,8 +119,8 @@ class BridgeExperiment:
             say(console, f"under guidance: {path} in its place")
 
     def _require_fit(self, channel_map: ChannelMap) -> None:
-        """Raise ParameterError for a mistake about the map, before anything flies."""
-        expected = "above 0 and at most 1, a part of the limits of the map"
+        """Raise ParameterError if an option does not fit the map, before anything flies."""
+        expected = "above 0 and at most 1, a fraction of the limits of the map"
         require(0.0 < self.amplitude <= 1.0, "amplitude", self.amplitude, expected)
         has_speed = self.speed is not None or not has_airspeed(channel_map)
         require(has_speed, "--speed", "none", "the airspeed in trim, m/s: the map has one")
@@ -160,7 +162,7 @@ class BridgeExperiment:
         *,
         imported: bool,
     ) -> IdentifiedChannels:
-        """Add the delay of the link to the channels of an imported log."""
+        """Add the delay of the link to the channels if the log was imported."""
         expected = "a log of rise-di import: an experiment over the link contains its delay"
         require(imported or self.link_delay is None, "link_delay", self.link_delay, expected)
         if not imported:
@@ -170,7 +172,10 @@ class BridgeExperiment:
         return over_link(channels, later or 0.0)
 
     def _flyable(self, channel_map: ChannelMap, channels: IdentifiedChannels) -> Flyable:
-        """Make airframe and scenario with gains. Raises ParameterError for short margins."""
+        """Make the airframe and the scenario with gains.
+
+        Raises ParameterError if the margins fall short.
+        """
         airframe = str((self.folder / "airframe.yaml").resolve())
         flyable = flying_scenario(channel_map, channels, self.speed, airframe, self.needed)
         expected = "the margins, or --accept beside --bridge"
@@ -179,9 +184,9 @@ class BridgeExperiment:
 
 
 def guided_scenario(scenario: str, channel_map: ChannelMap, speed: float | None) -> str:
-    """Write a scenario under guidance in place of its commands.
+    """Write the scenario with guidance in place of its commands.
 
-    Returns "" if guidance cannot fly: a map without pose, or without the rates and the airspeed.
+    Returns "" if guidance cannot fly it, because the map lacks the pose, the rates or the airspeed.
     """
     if speed is None or not channel_map.pose or not {*RATES_AND_SPEED} <= {*channel_map.outputs}:
         return ""
@@ -204,9 +209,9 @@ def _identified(
     spans: list[tuple[int, int]],
     speed: float | None,
 ) -> tuple[dict[str, float], Response, IdentifiedChannels]:
-    """Show trims, step responses and channels of an experiment, and return them.
+    """Show the trims, the step responses and the channels of an experiment, and return them.
 
-    Raises ParameterError for a channel that is not certain.
+    Raises ParameterError if a channel is not certain.
     """
     pairing, _ = channel_pairs(channel_map)
     if COMMANDS in tape:
@@ -232,7 +237,7 @@ def _write(folder: Path, files: Mapping[str, str]) -> None:
 
 
 def _announce(console: Console, plan: Experiment, duration: float, *, hovers: bool) -> None:
-    """Show the whole experiment, before it begins."""
+    """Show the whole experiment before it begins."""
     controller = plan.controller
     table = new_table(
         f"Excitation, {controller.duration:.0f} s open loop after engagement, one input after "
@@ -260,11 +265,11 @@ def _announce(console: Console, plan: Experiment, duration: float, *, hovers: bo
 
 
 def _engaged(run: Path, channel_map: ChannelMap) -> tuple[Tape, list[tuple[int, int]], str]:
-    """Return the tape of an experiment, the engaged spans, ns, and a sentence on its end.
+    """Return the tape of an experiment, the spans in which it was engaged, ns, and how it ended.
 
-    The sentence is about an early end by the bridge, and is otherwise "". A flight of `rise-di
-    import` is a single span. Raises ParameterError for a log without an engagement, and for a
-    flight under feedback, where u follows y.
+    The sentence on the end is about an end that the bridge brought about early; otherwise it is "".
+    A log of `rise-di import` is one single span. Raises ParameterError if the log has no
+    engagement, or if the flight had feedback, because u then follows y.
     """
     recorded_run = read_run(run)
     warn_of_lacks(recorded_run)
@@ -304,7 +309,7 @@ def _engaged(run: Path, channel_map: ChannelMap) -> tuple[Tape, list[tuple[int, 
 
 
 def _digits(value: float, digits: int) -> str:
-    """Write a value with its leading digits, without an exponent up to 1e6.
+    """Write a value with its leading digits, and without an exponent up to 1e6.
 
     A narrow column would cut an exponent off.
     """
@@ -325,7 +330,7 @@ def _show_response(
         headings,
         left_aligned=("input", "moves"),
     )
-    table.collapse_padding = True  # nine columns in a terminal of 80
+    table.collapse_padding = True  # nine columns have to fit into a terminal of 80 characters
     for i, (name, output) in enumerate(zip(response.inputs, response.outputs, strict=True)):
         pairs = (
             (response.Omega[i, i], response.Omega_deviation[i, i]),
@@ -370,7 +375,7 @@ def _show_models(console: Console, response: Response, models: list[ChannelModel
             )
     print_table(console, table)
     print_table(console, loop)
-    # Channels without a certain model fly by their step response.
+    # A channel without a certain model flies by its step response.
     uncertain = [
         name
         for name, model in zip(response.outputs, models, strict=True)
@@ -387,7 +392,7 @@ def _show_models(console: Console, response: Response, models: list[ChannelModel
 
 
 def _show_link(console: Console, channel_map: ChannelMap, link_delay: float | None) -> None:
-    """State for which link the gains from a log of the autopilot's board are."""
+    """Say for which link the gains hold if the log is of the autopilot's own board."""
     if link_delay is None:
         sentence = (
             f"The map {channel_map.name} states no link_delay. Gains and margins are without the "

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di campaign`: a Monte Carlo campaign.
+"""`rise-di campaign`: fly a Monte Carlo campaign.
 
-A scenario is flown by thousands of uncertain aircraft.
+Thousands of uncertain aircraft fly one scenario.
 """
 
 import math
@@ -60,7 +60,7 @@ from flight_core.files import display_path, writing
 from flight_core.parameters import require
 from flight_design.learning.scenario_learner import quick_learner
 
-# Options of a new campaign.
+# Options that define a new campaign.
 OF_DEFINITION = (
     "aircraft",
     "uncertainty",
@@ -77,7 +77,7 @@ OF_DEFINITION = (
 
 
 class EngineName(StrEnum):
-    """Where chunks are computed."""
+    """Where the chunks of a campaign are computed."""
 
     THREADS = "threads"
     DASK = "dask"
@@ -87,16 +87,18 @@ class EngineName(StrEnum):
 class Campaign:
     """Fly a Monte Carlo campaign: thousands of uncertain aircraft around an airframe.
 
-    The airframe is that of a scenario, and many fly at once. Aircraft with a route or a learner fly
-    one by one: 7 s of a core a minute of flight, and up to 20 s with a learner.
+    The airframe is the one of the scenario, and many aircraft are computed at once. Aircraft with a
+    route or a learner fly one by one: a core needs 7 s for each minute of flight, and up to 20 s if
+    they learn.
 
-    Exit status: 0 all flown, 2 bad input, 130 interrupted; its folder continues it.
+    Exit status: 0 all flown, 2 bad input, 130 interrupted. You continue an interrupted campaign by
+    its folder.
     """
 
     context: typer.Context
     scenario: str = argument(
-        "Name of a scenario, or path of a scenario file (.yaml); or the folder of an "
-        "interrupted campaign to continue.",
+        "Name of a scenario, path of a scenario file (.yaml), or folder of an interrupted "
+        "campaign to continue.",
         default="osprey_servo",
         autocompletion=scenario_names,
     )
@@ -105,45 +107,50 @@ class Campaign:
         "Largest relative deviation of each entry of A and B, 0 to 1.", default=0.3
     )
     wind: WindEffect | None = rare_option(
-        "Effect of wind: by each aircraft's own A, or that of the airframe; by default "
-        "the scenario's."
+        "Whose A the wind acts through: that of each aircraft, or that of the airframe; by "
+        "default as in the scenario."
     )
     entry: list[str] | None = rare_option(
-        "An entry with a deviation of its own, once for each: 'B[V,thrust]=0.6', "
-        "lag=0.5, noise=0.5, delay=0.02 (s)."
+        "An entry with a deviation of its own: 'B[V,thrust]=0.6', lag=0.5, noise=0.5, "
+        "delay=0.02 (s); may be repeated."
     )
     distribution: Distribution | None = rare_option(
-        "Of the deviations: uniform, normal with three standard deviations at the "
-        "limit, or its two limits."
+        "Distribution of the deviations: uniform, normal with three standard deviations at "
+        "the limit, or only the two limits."
     )
     score: list[str] | None = rare_option(
-        "Unit of the rms error of an output in the score, SI, as q=0.02; once for each output."
+        "Unit that the score divides the rms error of an output by, SI, as in q=0.02; once for "
+        "each output."
     )
     seed: int = option("Seed of the aircraft.", default=1, min=0)
     sweep: str | None = option(
-        "A controller parameter, or its value in a channel, and factors: beta=0.5,1,2 "
-        "or 'beta[V]=0.5,1,2'."
+        "Repeat the campaign with a controller parameter, or its value in one channel, times "
+        "each factor: beta=0.5,1,2 or 'beta[V]=0.5,1,2'."
     )
-    duration: float | None = option("Seconds to fly, in place of the scenario's.")
+    duration: float | None = option("Duration of each flight, s; by default that of the scenario.")
     chunk: int | None = rare_option(
-        "Aircraft computed at once, by default 1000, on a GPU what its memory holds, with a "
-        "learner or a route 4.",
+        "Aircraft computed at once; by default 1000, on a GPU as many as its memory holds, and 4 "
+        "with a learner or a route.",
         min=1,
     )
     engine: EngineName | None = option(
-        "Threads of this process, or processes and hosts of dask; by default dask with a "
-        "learner or a route."
+        "Compute in threads of this process, or in processes and on hosts of dask; by default "
+        "dask if there is a learner or a route."
     )
-    workers: int | None = rare_option("Threads or processes; by default one a core.", min=1)
+    workers: int | None = rare_option(
+        "Number of threads or processes; by default one per core.", min=1
+    )
     scheduler: str | None = rare_option("Address of a dask scheduler, as in tcp://host:8786.")
-    runs: Path = rare_option("Folder that the campaign's folder is made in.", default=Path("runs"))
+    runs: Path = rare_option(
+        "Folder in which the folder of the campaign is made.", default=Path("runs")
+    )
     rows: Path | None = option(
-        "Write a row an aircraft as Parquet: figures, outcome, drawn entries."
+        "Parquet file to write, with one row for each aircraft: figures, outcome, drawn entries."
     )
     as_json: bool = json_option()
 
     def execute(self) -> None:
-        """Begin or continue the campaign, fly what is missing, show the figures."""
+        """Begin or continue the campaign, fly what is missing, and show the figures."""
         engines.require_jax(shared=self.engine is EngineName.DASK)
         if self.engine is not EngineName.DASK:
             require_unused(self, ["scheduler"], "--engine dask with it")
@@ -174,7 +181,7 @@ class Campaign:
         )
 
     def _continued(self) -> MonteCarlo:
-        """Load the campaign of a folder, and refuse options of a new campaign beside it."""
+        """Load the campaign of a folder, and refuse options that define a new campaign."""
         for name in OF_DEFINITION:
             source = self.context.get_parameter_source(name)
             is_default = source is None or source.name != "COMMANDLINE"
@@ -185,7 +192,7 @@ class Campaign:
     def _begun(self) -> MonteCarlo:
         """Define a new campaign of the scenario."""
         scenario = find_scenario(self.scenario, self.duration)
-        quick_learner(scenario)  # refuses what the aircraft could not learn with
+        quick_learner(scenario)  # refuses a scenario with which the aircraft could not learn
         spread = scenario.aircraft.uncertainty.spread()
         if self.entry is not None:
             entries = named_numbers("entry", self.entry, "A[q,alpha]=0.6")
@@ -206,7 +213,7 @@ class Campaign:
         return MonteCarlo.begin(new_run(scenario, self.runs, "campaign-"), definition)
 
     def _engine(self, *, is_single: bool) -> engines.Engine:
-        """Return the named engine, or dask for aircraft that fly one by one."""
+        """Return the engine that was named, or dask for aircraft that fly one by one."""
         engine_name = self.engine or (EngineName.DASK if is_single else EngineName.THREADS)
         if engine_name is EngineName.THREADS:
             return engines.threads(self.workers)
@@ -216,7 +223,7 @@ class Campaign:
 def _show_cases(
     console: Console, monte_carlo: MonteCarlo, cases: Sequence[dict[str, Any]], results: MetricTable
 ) -> None:
-    """Print the figures and the influences of every case, and the table of all."""
+    """Print the figures and the influences of each case, and the table of all cases."""
     definition = monte_carlo.definition
     for case, figures in enumerate(cases):
         _show(console, definition, case, monte_carlo.tally(case), figures)
@@ -243,9 +250,9 @@ def _parse_sweep(text: str) -> Sweep:
 def _fly_missing(
     monte_carlo: MonteCarlo, engine: engines.Engine, place: str, *, quiet: bool
 ) -> float | None:
-    """Fly the chunks that are missing; return aircraft-seconds per second, None if none is.
+    """Fly the chunks that are missing, and return how many aircraft-seconds were flown per second.
 
-    `place` says where, such as " on NVIDIA H200".
+    Returns None if no chunk was missing. `place` says where it computes, such as " on NVIDIA H200".
     """
     definition = monte_carlo.definition
     total = definition.aircraft * definition.cases

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di check`: a channel map beside the D of the controller.
+"""`rise-di check`: compare a channel map with the D of the controller.
 
-A map is also checked against a recorded flight, and against releases of an autopilot.
+It also checks a map against a recorded flight and against releases of an autopilot.
 """
 
 from collections.abc import Sequence
@@ -44,23 +44,23 @@ from flight_design.identification.sign_check import (
 )
 
 CONTRADICTS = 1
-INSTALLED = "installed"  # in place of a folder: the message packages of this host
+INSTALLED = "installed"  # a word in place of a folder: the message packages of this host
 
 
 @dataclass(frozen=True, kw_only=True)
 class Check:
     """Compare the D of the controller with the D of a channel map, and with a recorded flight.
 
-    With --definitions, tell for which releases of an autopilot the rows of the map hold: topic,
-    field and constants of each. Rows of MAVLink always stand against pymavlink.
+    With --definitions, tell for which releases of an autopilot the rows of the map hold: the topic,
+    the field and the constants of each row. Rows of MAVLink are always compared with pymavlink.
 
-    A sign without a certain measurement is no contradiction: a ? in the table, and a sentence with
-    the necessary excitation. Exit status: 0 agreement, 1 a contradiction or a row that does not
-    hold, 2 bad input.
+    A sign that was not measured with certainty is no contradiction: the table has a ? and a
+    sentence says which excitation is necessary. Exit status: 0 agreement, 1 a contradiction or a
+    row that does not hold, 2 bad input.
     """
 
     map_name: str = argument(
-        "Name of a channel map, or path of one (.yaml).",
+        "Name of a channel map, or path of its file (.yaml).",
         default=REQUIRED,
         metavar="MAP",
         autocompletion=map_names,
@@ -69,15 +69,16 @@ class Check:
         "Airframe; by default that of the scenario.", autocompletion=airframe_names
     )
     scenario: str = option(
-        "Scenario with the controller.", default="osprey_servo", autocompletion=scenario_names
+        "Scenario that has the controller.", default="osprey_servo", autocompletion=scenario_names
     )
     run: Path | None = option(
-        "A recorded flight with y and u, each input excited; with a bridge, its engaged time."
+        "A recorded flight with y and u in which each input was excited; with a bridge, only the "
+        "engaged time counts."
     )
     namespace: str | None = log_namespace()
     definitions: list[Path] | None = option(
-        "Check the rows instead: the sources of a message package, of one release; "
-        f"several, each a column; or {INSTALLED}."
+        "Check the rows of the map instead, against the sources of a message package of one "
+        f"release, or {INSTALLED} for this host; may be repeated, one column each."
     )
     as_json: bool = json_option()
 
@@ -142,7 +143,7 @@ def _show(console: Console, channel_map: ChannelMap, sign_check: SignCheck, airf
             )
         table.add_row(*cells)
     print_table(console, table)
-    # The second table has the fields of the map and their topics.
+    # The second table shows the fields of the map and their topics.
     headings = ("channel", "raw value", "topic")
     fields = new_table("", headings, left_aligned=headings)
     for channel in sign_check.channels:
@@ -165,14 +166,14 @@ def _show(console: Console, channel_map: ChannelMap, sign_check: SignCheck, airf
 
 
 def _format_field(row: OutputRow | InputRow) -> str:
-    """Write the field with the sign of the channel in front."""
+    """Write the name of a field with the sign of the channel in front."""
     return f"{'-' if row.sign < 0 else '+'} {row.field}"
 
 
 def _check_rows(channel_map: ChannelMap, definitions: Sequence[Path], as_json: bool) -> None:
     """Compare the rows of a map with the message definitions of releases.
 
-    The rows that do not hold are shown.
+    Show the rows that do not hold.
     """
     kinds = list(dict.fromkeys(kind for _, _, kind, *_ in channel_map.used_fields()))
     installed = installed_definitions(kinds)
@@ -206,7 +207,7 @@ def _check_rows(channel_map: ChannelMap, definitions: Sequence[Path], as_json: b
 
 
 def _show_rows(name: str, rows: Sequence[CheckedRow], releases: Sequence[str]) -> None:
-    """Print a row for each row of the map, and a sentence for each that does not hold."""
+    """Print one line for each row of the map, and a sentence for each row that does not hold."""
     faults: dict[str, list[dict[str, None]]] = {}
     for row in rows:
         by_release = faults.setdefault(row.key, [{} for _ in releases])

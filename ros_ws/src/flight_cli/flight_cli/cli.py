@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The `rise-di` command: what it can do.
+"""The `rise-di` command and what it can do.
 
-A command's module is imported when it runs, so that --help is quick.
+The module of a command is imported only when the command runs, so that --help is quick.
 """
 
 import signal
@@ -29,11 +29,12 @@ from flight_cli.words import RiseDiCommand, RiseDiGroup, as_function, without_he
 FAILED = 1
 BAD_INPUT = 2
 INTERRUPTED = 130
-NICE = 10  # of a command that may run beside a flight
-CONTROLS = frozenset({"--control", "--real"})  # options of a page that commands the flight
-# New objects before a collection, 700 by default: a flight keeps what it makes.
+NICE = 10  # niceness of a command that may run beside a flight
+CONTROLS = frozenset({"--control", "--real"})  # options with which a page commands the flight
+# Number of new objects before Python collects garbage, by default 700. A flight keeps what it
+# makes, so that frequent collections find nothing.
 GARBAGE_THRESHOLD = 100_000
-REPEATED_AFTER = 0.01  # s, of an interrupt that Python ignores
+REPEATED_AFTER = 0.01  # s, after which an interrupt that Python ignored is repeated
 
 GROUPS = MappingProxyType(
     {
@@ -56,22 +57,22 @@ GROUPS = MappingProxyType(
             "play": "Publish the topics of a recorded flight again with their timing.",
         },
         "Design": {
-            "airframes": "Show airframes and what the theorem asks of each, or make one of your "
-            "own that flies.",
+            "airframes": "Show airframes and whether they meet the assumptions of the theorem, or "
+            "make one of your own that flies.",
             "gains": "Select gains for an airframe, and check every condition on them.",
-            "identify": "Identify an aircraft of JSBSim with a scenario, or the model of an "
-            "airframe from a log.",
-            "learn": "Repeat the learner on the log of a flight, with other settings, and write "
-            "the model.",
-            "tune": "Identify the aircraft of an autopilot's log, and export the module with its "
-            "gains.",
+            "identify": "Identify an aircraft of JSBSim and write a scenario for it, or identify "
+            "the model of an airframe from a log.",
+            "learn": "Run the learner again on the log of a flight, with other settings if you "
+            "like, and write the model.",
+            "tune": "Identify an aircraft from the log of its autopilot, and export a module with "
+            "gains for it.",
             "export": "Write the controller of a scenario as C99, with a proof that C and "
             "Python give the same bits.",
         },
         "Autopilot": {
             "engage": "Engage or disengage the autopilot behind a running bridge.",
-            "check": "Compare the signs of a channel map with the D of the controller, its rows "
-            "with releases.",
+            "check": "Compare the signs of a channel map with the D of the controller, or its rows "
+            "with releases of an autopilot.",
             "import": "Make a bag from the log of an autopilot: DataFlash, tlog or ULog.",
         },
         "Study": {
@@ -80,8 +81,10 @@ GROUPS = MappingProxyType(
         },
     }
 )
-"""What each command does, by group. The class `Name` of the module `flight_cli.name` is the
-command; the module has _ after a keyword."""
+"""What each command does, by group.
+
+The command `name` is the class `Name` of the module `flight_cli.name`. If the name is a keyword of
+Python, the module has an underscore behind it."""
 COMMANDS = MappingProxyType(dict(ChainMap(*GROUPS.values())))
 
 
@@ -107,7 +110,7 @@ def _options(
 def application(words: Collection[str]) -> typer.Typer:
     """Build the command line with those commands that occur among the words.
 
-    The other commands only have their name and help.
+    All other commands only get their name and their help.
     """
     app = typer.Typer(
         cls=RiseDiGroup,
@@ -120,7 +123,7 @@ def application(words: Collection[str]) -> typer.Typer:
     for group, commands in GROUPS.items():
         for name, sentence in commands.items():
             module = f"{name}_" if iskeyword(name) else name
-            command: Callable[..., None] = lambda: None  # noqa: E731 - of a command that does not run
+            command: Callable[..., None] = lambda: None  # noqa: E731 - for a command that does not run
             if name in words:
                 command = as_function(resolve_name(f"flight_cli.{module}:{name.capitalize()}"))
             help_text = None if name in words else sentence
@@ -131,7 +134,7 @@ def application(words: Collection[str]) -> typer.Typer:
 def _repeat_interrupt(ignored: "sys.UnraisableHookArgs") -> None:
     """Repeat a Ctrl-C that came inside a destructor or a callback of a weak reference.
 
-    Python prints and ignores it there.
+    There, Python only prints it and goes on.
     """
     if issubclass(ignored.exc_type, KeyboardInterrupt):
         signal.signal(signal.SIGALRM, signal.default_int_handler)
@@ -141,20 +144,21 @@ def _repeat_interrupt(ignored: "sys.UnraisableHookArgs") -> None:
 
 
 def _looks_on(words: Sequence[str]) -> bool:
-    """Return whether a command only looks at a flight, which then goes first.
+    """Return whether a command only looks at a flight. It then gives way to the flight.
 
-    A page that deactivates and holds is not nice: it has to answer when the host is busy.
+    A page that can deactivate and hold does not give way, because it has to answer when the host is
+    busy.
     """
     return words[:1] == ["watch"] and CONTROLS.isdisjoint(words)
 
 
 def main() -> None:
-    """Entry point: bad input is one sentence and exit status 2, Ctrl-C is quiet."""
+    """Run a command. Bad input ends in one sentence and exit status 2; Ctrl-C is quiet."""
     gc.set_threshold(GARBAGE_THRESHOLD)
     if _looks_on(sys.argv[1:]):
         with suppress(OSError):
             os.nice(NICE)
-            # A batch process interrupts no node when it wakes up.
+            # A batch process does not interrupt a node when it wakes up.
             os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     words = [
         *without_help_word(sys.argv[1:])[:1],
@@ -164,7 +168,7 @@ def main() -> None:
         app = application(words)
         signal.signal(signal.SIGINT, signal.default_int_handler)
         sys.unraisablehook = _repeat_interrupt
-        # --help does without both
+        # Not at the top of the file: --help needs neither of them.
         from flight_core.outcome import FlightEnded  # noqa: PLC0415
         from flight_core.parameters import ParameterError  # noqa: PLC0415
 
@@ -186,14 +190,14 @@ def main() -> None:
     except OSError as error:
         if error.errno not in {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}:
             raise
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # Python writes the rest at its end
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # where Python writes the rest when it ends
         print(
             f"error: output: cannot be written ({error.strerror}), expected a disk with space",
             file=sys.stderr,
         )
         sys.exit(FAILED)
     except Exception as error:
-        # What a module in C makes of Ctrl-C: an ImportError while it loads, pybind11's TypeError.
+        # A module in C turns Ctrl-C into an ImportError while it loads, pybind11 into a TypeError.
         if not isinstance(error.__cause__, KeyboardInterrupt):
             raise
         sys.exit(INTERRUPTED)

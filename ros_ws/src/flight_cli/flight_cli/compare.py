@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di compare`: RISE-DI and other control laws on the same aircraft.
+"""`rise-di compare`: compare RISE-DI with other control laws on the same aircraft.
 
 The same procedure tunes every law.
 """
@@ -60,16 +60,16 @@ from rise_di_controller.params import ControllerConfig
 SEEDS = (1, 2, 3)
 NOTES = """
 {titles}
-sees: measurements beside y_m. y alone is gyros and airspeed; a full state is y and the other states without error;
+sees: what the law measures, apart from y_m. y alone is gyros and airspeed; a full state is y and the other states without error;
   vanes give alpha and beta relative to the air without error. No real sensor is as good
-knows: data of the nominal aircraft beside D; Omega_ii alone as the scale of the inputs
+knows: what the law knows of the nominal aircraft, apart from D; Omega_ii alone is the scale of the inputs
 gust: the wind of the scenario. turbulence: Dryden at {altitude:g} m, {intensity}
-score: sum of rms of the true error over {unit}; mean (worst) of the aircraft of a level, every entry of A and B off by up to
-  the level, rows of angles known; a few % are noise of the tuning
-lost: share of the aircraft that lose track in gusts, a score above 10; a diverged aircraft is lost and makes the mean infinite
-slew: mean abs(u_dot) in gusts, nominal aircraft, in the units of the airframe
-margins: least phase margin, deg, and largest sensitivity of the linear loop on the nominal aircraft, u in time, one input open;
-  none without a linear loop from y alone to u
+score: sum of the rms of the true error over {unit}; mean (worst) of the aircraft of a level. Every entry of A and B is off by
+  up to the level, except the rows of angles, which are known; differences of a few % are noise of the tuning
+lost: share of the aircraft that lose track in gusts: their score is above 10. A diverged aircraft is lost and makes the mean infinite
+slew: mean abs(u_dot) of the nominal aircraft in gusts, in the units of the airframe
+margins: least phase margin, deg, and largest sensitivity of the linear loop on the nominal aircraft, with u in time and one input
+  open; none if no linear loop leads from y alone to u
 cost: the least of {seeds} seeds of the tuning, and the difference to the largest. It is the mean of score + slew over
   {slew}, of the nominal and {uncertain} uncertain aircraft at +-{level:g} %, once with u in time and once late:
 {costs}
@@ -80,23 +80,23 @@ Gains = dict[str, dict[str, TuningResult]]
 
 
 class Contest(NamedTuple):
-    """The laws of a comparison, and the file of their tuned gains."""
+    """The laws of a comparison, and the file that holds their tuned gains."""
 
     scenario: Scenario
     names: Sequence[str]
-    aims: Sequence[str]  # objectives of the tuning
+    aims: Sequence[str]  # objectives that the gains are tuned on
     controllers: Mapping[str, ControllerConfig | None]  # None for a law that is tuned
     entries: Mapping[str, Law]
     path: Path
 
     def untuned(self) -> list[tuple[str, str]]:
-        """List laws and objectives for which the file has no gains."""
+        """List the pairs of law and objective for which the file has no gains."""
         tunings = tuned_gains.load(self.path)
         pairs = product(self.names, self.aims)
         return [(name, aim) for name, aim in pairs if aim not in tunings.get(name, {})]
 
     def tune(self, command: str, bar: Progress) -> None:
-        """Tune laws, one for each objective; the file is written after every law."""
+        """Tune each law for each objective, and write the file after every law."""
         benchmark = self.benchmark()
         for name, aim in self.untuned():
             law = self.entries[name]
@@ -117,14 +117,14 @@ class Contest(NamedTuple):
             tuned_gains.save(self.path, tunings, list(gain_tuning.OBJECTIVES), command)
 
     def benchmark(self, *seed: int) -> Benchmark:
-        """Build winds and aircraft, with turbulence of a seed in place of the tuning's."""
+        """Build winds and aircraft; a seed replaces the seed of the tuning's turbulence."""
         build = gain_tuning.build_benchmark(self.scenario, *seed)
         return registered_laws.with_courses(build, self.controllers)
 
     def tuned(self) -> Gains:
-        """Return the gains by law and objective: those of a search, or else of a controller.
+        """Return the gains by law and objective: found by a search, or else those of a controller.
 
-        Raises ParameterError if there are none.
+        Raises ParameterError if there are none at all.
         """
         tunings = tuned_gains.load(self.path)
         gains: Gains = {}
@@ -141,10 +141,10 @@ class Contest(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Compare:
-    """Fly RISE-DI and further laws side by side.
+    """Fly RISE-DI and other laws side by side.
 
-    Aircraft, reference, winds, noise, limits, uncertainty and tuning are the same for all. Exit
-    status: 0, or 2 bad input.
+    The aircraft, the reference, the winds, the noise, the limits, the uncertainty and the tuning
+    are the same for all. Exit status: 0, or 2 bad input.
     """
 
     scenario: str = argument(
@@ -152,18 +152,18 @@ class Compare:
         default="osprey_servo",
         autocompletion=scenario_names,
     )
-    aircraft: int = option("Uncertain aircraft at each level.", default=200, min=1)
+    aircraft: int = option("Number of uncertain aircraft at each level.", default=200, min=1)
     uncertainty: str = option(
-        "Largest relative deviations of A and B, as in 0.3,0.5", default="0.3,0.5"
+        "Levels: largest relative deviations of A and B, as in 0.3,0.5.", default="0.3,0.5"
     )
     seed: int = option("Seed of the uncertain aircraft.", default=1, min=0)
     wind: WindEffect | None = rare_option(
-        "Effect of wind: by each aircraft's own A, or that of the airframe; by default "
-        "the scenario's."
+        "Whose A the wind acts through: that of each aircraft, or that of the airframe; by "
+        "default as in the scenario."
     )
     laws: str | None = option(
-        "Laws to compare, by name: rise,pi,l1; all by default. A scenario file in "
-        "place of a name: its controller.",
+        "Names of the laws to compare, as in rise,pi,l1; by default all. A scenario file in place "
+        "of a name stands for its controller.",
         autocompletion=list_of(LAWS),
     )
     tuning: str = option(
@@ -171,22 +171,22 @@ class Compare:
         default="gust_turbulence",
     )
     tune: bool = option(
-        "First tune the laws that have no gains for this scenario: minutes a law.", default=False
+        "First tune the laws that have no gains for this scenario; each takes minutes.",
+        default=False,
     )
     turbulence_seed: int = rare_option(
-        "Seed of the turbulence, unlike that of the tuning.",
+        "Seed of the turbulence; it must differ from that of the tuning.",
         default=law_comparison.TURBULENCE_SEED,
         min=0,
     )
-    gains: Path | None = rare_option("File of tuned gains; by default the one of the stack.")
+    gains: Path | None = rare_option("File of tuned gains; by default the one that ships.")
     write: Path | None = write_option(
-        "File for the gains of one law as a section of a scenario, which flies with "
-        "the score shown."
+        "File for the gains of one law, as a section of a scenario that flies with the score shown."
     )
-    to_json: Path | None = option("File to write the figures to, SI.", "--json")
+    to_json: Path | None = option("File to write the figures to, in SI.", "--json")
 
     def execute(self) -> None:
-        """Tune what has no gains, fly every law, show and write."""
+        """Tune what has no gains, fly every law, show the figures and write them."""
         engines.require_jax()
         names = list(LAWS) if self.laws is None else self.laws.split(",")
         aims = self.tuning.split(",")
@@ -218,7 +218,7 @@ class Compare:
             write_text("--json", self.to_json, self._as_json(contest, results))
 
     def _contest(self, names: Sequence[str], aims: Sequence[str]) -> Contest:
-        """Define the laws; a law of a scenario file has the name of the file."""
+        """Define the laws; the law of a scenario file has the name of the file."""
         scenario = find_scenario(self.scenario)
         if self.wind is not None:
             uncertainty = scenario.aircraft.uncertainty.model_dump() | {"wind": self.wind}
@@ -239,7 +239,7 @@ class Compare:
         )
 
     def _command(self) -> str:
-        """Return the command that tunes again, for the file of gains."""
+        """Return the command that tunes again, which the file of gains states."""
         wind = "" if self.wind is None else f" --wind {self.wind}"
         return f"rise-di compare {self.scenario} --tune{wind}"
 
@@ -251,7 +251,7 @@ class Compare:
         benchmark: Benchmark,
         gains: Gains,
     ) -> None:
-        """Print a table per objective, and what the words mean."""
+        """Print a table for each objective, and say what the words mean."""
         scenario = contest.scenario
         for aim in contest.aims:
             if results_of_aim := [result for result in results if result.objective == aim]:
@@ -297,7 +297,7 @@ def _check_options(
         fits,
         "--uncertainty",
         repr(uncertainty),
-        "parts of each entry, each at least 0 and below 1: 0.3,0.5",
+        "fractions, each at least 0 and below 1: 0.3,0.5",
     )
     differs = turbulence_seed != gain_tuning.TUNING_TURBULENCE_SEED
     require(differs, "--turbulence-seed", turbulence_seed, "another seed than that of the tuning")
@@ -415,7 +415,7 @@ def _notes(
 def _as_json(result: LawResult, law: Law, scenario: Scenario) -> dict[str, Any]:
     """Return the figures of a law for JSON, in SI.
 
-    null stands for an infinite figure, and for the cost of gains that no search found.
+    An infinite figure is null, and so is the cost of gains that no search found.
     """
     controller = scenario.controller
     levels = []
@@ -441,7 +441,7 @@ def _as_json(result: LawResult, law: Law, scenario: Scenario) -> dict[str, Any]:
 
 
 def _margins_as_json(margins: Margins) -> dict[str, Any]:
-    """Return the least margins of a stable loop, SI: phase in rad, gain as a factor."""
+    """Return the least margins of a stable loop in SI: phase in rad, gain as a factor."""
     least = {
         "phase": margins.phase.min(),
         "gain": margins.gain.min(),

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di engage`: bumpless engagement of the autopilot behind a running bridge.
+"""`rise-di engage`: engage the autopilot behind a running bridge without a jump.
 
 It also disengages.
 """
@@ -19,16 +19,16 @@ REFUSED = 1
 class Engage:
     """Engage the autopilot behind a running bridge without a jump of u, or disengage it.
 
-    The command waits until u is at trim, and for a change of mode where the map asks for one. The
-    bridge activates the controller until the end of the engagement. The loss of the pilot's
-    transmitter ends the engagement where the map has a condition for it; elsewhere max_engaged of
-    the map ends the engagement, unless you engage again before. Exit status: 0 done, 1 refused with
-    the bridge's reason, 2 service not available.
+    The command waits until u is at trim, and for a change of mode if the map asks for one. The
+    bridge keeps the controller active until the engagement ends. If the pilot's transmitter is
+    lost, the engagement ends, provided that the map has a condition for it. If it has none, the
+    engagement ends after max_engaged of the map, unless you engage again before. Exit status: 0
+    done, 1 refused with the bridge's reason, 2 service not available.
     """
 
-    off: bool = option("Disengage: give the channels back to the autopilot.", default=False)
+    off: bool = option("Disengage, which gives the channels back to the autopilot.", default=False)
     blind: bool = option(
-        "Engage without regard to the pilot's transmitter, and without end by max_engaged.",
+        "Engage without regard to the pilot's transmitter; max_engaged does not end it either.",
         default=False,
     )
     namespace: str = namespace_option()

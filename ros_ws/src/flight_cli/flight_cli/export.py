@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di export`: the controller of a scenario as C99.
+"""`rise-di export`: write the controller of a scenario as C99.
 
 A proof shows that C and Python give the same bits.
 """
@@ -51,40 +51,41 @@ class Export:
     px4: Path | None = option("Folder to write an external module of PX4 to, in place of --c.")
     ardupilot: Path | None = option("Folder to write a fast task of ArduPlane to, in place of --c.")
     run: Path | None = option(
-        "Prove with the ticks of a recorded run, in place of flights; of a scenario that learns, "
+        "Prove with the ticks of a recorded run in place of flights. If its scenario learns, "
         "export the last model of the run."
     )
     float32: bool = option(
-        "Compute in float. The proof then bounds the difference of u.", default=False
+        "Compute in single precision. The proof then bounds the difference of u.", default=False
     )
     duration: float | None = rare_option(
-        "Duration of a flight of the proof, s; else the scenario's, at most 20 s.", min=1.0
+        "Duration of each flight of the proof, s; by default that of the scenario, at most 20 s.",
+        min=1.0,
     )
     drawn: int = rare_option(
-        "Number of drawn steps of the proof.", default=50_000, min=1, max=10_000_000
+        "Number of drawn steps in the proof.", default=50_000, min=1, max=10_000_000
     )
     seed: int = rare_option("Seed of the drawn inputs.", default=1, min=0)
     compiler: list[str] | None = option(
-        "Command of a C compiler, as 'python -m ziglang cc'; may be repeated. Else gcc "
-        "and clang, if there."
+        "Command of a C compiler, as in 'python -m ziglang cc'; may be repeated. By default gcc "
+        "and clang, if they are installed."
     )
     runner: str = rare_option(
-        "Command that starts what the compiler makes, as qemu-aarch64.", default=""
+        "Command that starts what the compiler makes, as in qemu-aarch64.", default=""
     )
     samples: int | None = rare_option(
-        "Samples of y and of y_m that the controller keeps; else 8 of a module, or 100.", min=4
+        "Number of samples of y and of y_m that the controller keeps; by default 8 in a module, "
+        "else 100.",
+        min=4,
     )
     rate: float | None = rare_option(
-        "Rate of law, reference model and y, Hz; the observer is discretised again."
+        "Rate of the law, the reference model and y, Hz; the observer is discretised for it."
     )
-    fmu: bool = option(
-        "Write a co-simulation unit of FMI 2.0 (rise_di.fmu) beside the code.", default=False
-    )
+    fmu: bool = option("Also write a co-simulation unit of FMI 2.0 (rise_di.fmu).", default=False)
     without_proof: bool = option("Write the code without a proof.", "--no-proof", default=False)
     as_json: bool = json_option()
 
     def execute(self) -> None:
-        """Write the code, prove it, show the proof."""
+        """Write the code, prove it, and show the proof."""
         folders = {None: self.folder, "px4": self.px4, "ardupilot": self.ardupilot}
         folder_of = {autopilot: path for autopilot, path in folders.items() if path is not None}
         if len(folder_of) != 1:
@@ -114,7 +115,7 @@ class Export:
 
 
 def _as_json(exported: Exported) -> dict[str, Any]:
-    """Return the files, and the figures of the proof."""
+    """Return the files and the figures of the proof."""
     proof = exported.proof
     files = {"files": [str(path) for path in exported.files]}
     if proof is None:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Several aircraft at once by `rise-di fly`, then a line an aircraft."""
+"""The flight of several aircraft at once by `rise-di fly`."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -30,16 +30,16 @@ from flight_core.parameters import ParameterError
 
 
 def open_fleet(file: str, duration: float | None, *, use_sim_time: bool) -> Fleet:
-    """Open the fleet of a file, where it can be flown. Raises ParameterError."""
+    """Read the fleet of a file. Raises ParameterError if it cannot be flown here."""
     require_package("rclpy", "")
     require_ros_environment()
     return read_fleet(file, duration, use_sim_time=use_sim_time)
 
 
 def fly_fleet_file(fleet: Fleet, runs: Sequence[Path], *, as_json: bool) -> int:
-    """Fly a fleet: every aircraft in a namespace, with nodes, a log and a report.
+    """Fly a fleet: each aircraft has a namespace, nodes, a log and a report of its own.
 
-    Returns the severest exit status.
+    Return the severest exit status.
     """
     totals = {member.name: member.scenario.flight.duration for member in fleet.members}
     with progress_bar(NAME_COLUMN, *CLOCK_COLUMNS, quiet=as_json) as bar:
@@ -70,9 +70,9 @@ def fly_fleet_file(fleet: Fleet, runs: Sequence[Path], *, as_json: bool) -> int:
 
 
 class _AircraftResult(NamedTuple):
-    """The summary of an aircraft, and the fraction of its ticks with the controller ENGAGED.
+    """The summary of an aircraft, and the share of its ticks with the controller ENGAGED.
 
-    The fraction is None without ticks. `track` is where it was; None without a place.
+    The share is None without ticks. `track` is where the aircraft was, or None without a pose.
     """
 
     summary: dict[str, Any]
@@ -112,7 +112,7 @@ def _report(member_flight: MemberFlight) -> _AircraftResult:
         flight = error.result.flight
         warn(f"error: {member_flight.member.name}: no report: {error}")
     except ParameterError as error:
-        # Before the first sample.
+        # The flight ended before the first sample.
         outcome = (
             never_flew(str(error)) if member_flight.outcome.status == 0 else member_flight.outcome
         )
@@ -137,7 +137,7 @@ def _report(member_flight: MemberFlight) -> _AircraftResult:
 def _show(
     name: str, flights: Sequence[MemberFlight], results: Mapping[str, _AircraftResult]
 ) -> None:
-    """Print a line per aircraft, the folders of the runs, and what a busy host withheld."""
+    """Print a line for each aircraft, the folders of the runs, and what a busy host withheld."""
     headings = ("aircraft", "flown (s)", "ticks", "engaged", "outcome")
     table = new_table(f"Fleet {name}", headings, ("aircraft", "outcome"), ("outcome",))
     lines = []
@@ -165,9 +165,9 @@ def _show(
 
 
 def foreign_samples(summaries: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Write sentences about samples on an aircraft's topics from nodes outside its namespace.
+    """Say how many samples on an aircraft's topics came from nodes outside its namespace.
 
-    There are none without an account of processes.
+    There are no sentences if the log has no account of processes.
     """
     sentences = []
     total = 0

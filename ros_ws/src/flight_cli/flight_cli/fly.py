@@ -65,8 +65,8 @@ from flight_core.parameters import ParameterError, require
 from flight_guidance.routes.route_file import ENDINGS, read_fence_file
 from flight_guidance.routes.route_formats import FENCES
 
-SPARE_CORES = 4  # with two the flight loses samples to a browser that draws without a GPU
-# Fields of a flight of one aircraft alone.
+SPARE_CORES = 4  # with two, a browser that draws without a GPU costs the flight samples
+# Options that only a flight of one aircraft can have.
 OF_AIRCRAFT = (
     "settings",
     "in_process",
@@ -86,71 +86,74 @@ OF_AIRCRAFT = (
 class Fly(RouteWords):
     """Fly a scenario or a fleet over ROS 2 topics.
 
-    In real time, with a process a node. If this host has too little to give for that, in lockstep
-    and one process an aircraft, and a sentence says so. Exit status: 0 completed or landed, 2 bad
-    input, 3 ended early or never flew, 4 completed or landed and short of something, which the
-    outcome names with its figure: the errors, the law engaged, speed, height, fence, route,
-    touch-down zone, log; 7 the host became too busy for real time, and nothing else is wrong; 130
-    interrupted. Of a fleet it is the severest of its aircraft.
+    The flight is in real time, with a process for each node. If this host has too little to give
+    for that, the flight is in lockstep with one process for each aircraft, and a sentence says so.
+
+    Exit status: 0 completed or landed; 2 bad input; 3 ended early or never flew; 4 completed or
+    landed, but short of something that the outcome names with its figure: the errors, the law
+    engaged, speed, height, fence, route, touch-down zone, log; 7 the host became too busy for real
+    time, and nothing else is wrong; 130 interrupted. For a fleet it is the severest status of its
+    aircraft.
     """
 
     context: typer.Context
     scenario: str = argument(
-        "Name of a scenario, or path of a scenario file (.yaml) or of the file of a fleet.",
+        "Name of a scenario, or path of a scenario file (.yaml) or of a fleet file.",
         default="osprey_servo",
         autocompletion=scenario_names,
     )
-    duration: float | None = option("Duration in s; by default that of the scenario.")
+    duration: float | None = option("Duration, s; by default that of the scenario.")
     settings: list[str] | None = settings_option()
     in_process: bool = option("Fly in one process without ROS, as fast as it goes.", default=False)
     lockstep: bool = option(
-        "Fly in lockstep over topics, as fast as possible, repeatable to the byte.", default=False
+        "Fly in lockstep over topics: as fast as possible, and repeatable to the byte.",
+        default=False,
     )
     real_time: bool = option(
-        "Fly in real time, also on a host that has too little to give for it.", default=False
+        "Fly in real time even if this host has too little to give for it.", default=False
     )
     composed: bool = rare_option(
-        "Fly with all nodes in one process: a third of the processor time, but a single share of a "
-        "busy host, which in real time is worse than four.",
+        "Fly with all nodes in one process. It takes a third of the processor time, but a busy "
+        "host gives one process less than four, which matters in real time.",
         default=False,
     )
     use_sim_time: bool = rare_option(
-        "Fly by the /clock of a simulator, at any speed of it, in place of real time.",
+        "Fly by the /clock of a simulator, which may run at any speed, in place of real time.",
         default=False,
     )
     bridge: str | None = option(
-        "Fly an autopilot in place of the aircraft, by a channel map; a dry run without --send.",
+        "Fly an autopilot by a channel map, in place of the aircraft; without --send a dry run.",
         metavar="MAP",
         autocompletion=map_names,
     )
     route: Path | None = option(
-        f"Fly a route: {', '.join(ENDINGS)}. Guidance starts with it.", metavar="FILE"
+        f"Route file to fly: {', '.join(ENDINGS)}. Guidance starts with it.", metavar="FILE"
     )
     fence: Path | None = rare_option(
-        f"Keep the fence of a file: {', '.join(FENCES)}. Rally points are home.",
+        f"File with a fence to keep: {', '.join(FENCES)}. Its rally points are home.",
         metavar="FILE",
     )
     learn: bool = rare_option(
-        "Learn A and B from the signs and sizes of the law alone, with no model of the aircraft.",
+        "Learn A and B in flight from the signs and sizes of the law, without any model.",
         default=False,
     )
     send: bool = option("Send commands to the autopilot once the bridge is engaged.", default=False)
     watch: bool = option("Serve the live page of the flight while it lasts.", default=False)
     namespace: str = rare_option(
-        "Namespace of all nodes, as uav1: one for each aircraft that flies in this domain.",
+        "Namespace of all nodes, as in uav1; each aircraft in this domain needs its own.",
         default="",
     )
-    runs: Path = rare_option("Folder that the run's folder is made in.", default=Path("runs"))
+    runs: Path = rare_option("Folder in which the folder of the run is made.", default=Path("runs"))
     verbose: bool = rare_option(
         "Print all tables and notes, as rise-di report does.", "--verbose", "-v", default=False
     )
     quiet: bool = rare_option(
-        "Print the headline of the outcome alone.", "--quiet", "-q", default=False
+        "Print only the headline of the outcome.", "--quiet", "-q", default=False
     )
     as_json: bool = json_option()
 
     def execute(self) -> None:
-        """Fly, write the report, show the figures."""
+        """Fly, write the report, and show the figures."""
         if is_fleet(self.scenario):
             expected = "a scenario, or the key in the file of the fleet"
             require_unused(self, OF_AIRCRAFT, expected, "a fleet beside it")
@@ -194,7 +197,7 @@ class Fly(RouteWords):
                     announce=announce,
                 )
             if outcome.end is End.COMPLETED:
-                # Whether it is a success is for the report to say, which is not written yet.
+                # The report says whether this is a success, and it is not written yet.
                 progress(scenario.flight.duration, "flown")
         status = _report(
             scenario,
@@ -207,9 +210,9 @@ class Fly(RouteWords):
         raise typer.Exit(status)
 
     def _scenario(self) -> Scenario:
-        """Return the scenario with settings, route and fence.
+        """Return the scenario with the settings, the route and the fence of the options.
 
-        Raises ParameterError for contradictory words.
+        Raises ParameterError if options contradict each other.
         """
         library_scenario = find_scenario(
             self.scenario, self.duration, with_route=self.route is None
@@ -227,7 +230,8 @@ class Fly(RouteWords):
     def _may_choose(self, scenario: Scenario) -> bool:
         """Return whether the host decides between real time and lockstep.
 
-        An autopilot, a simulator and a user who activates the controller have a time of their own.
+        It does not if an autopilot or a simulator has its own time, or if a user activates the
+        controller.
         """
         by_clock = self.use_sim_time or scenario.flight.use_sim_time
         has_own_time = by_clock or self.bridge is not None
@@ -236,12 +240,12 @@ class Fly(RouteWords):
         return begins and not (self.real_time or self.in_process or has_own_time)
 
     def _require_one_length(self) -> None:
-        """Raise ParameterError for two lengths of the answer at once."""
+        """Raise ParameterError if the answer would have two lengths at once."""
         if self.quiet:
             require_unused(self, ["verbose", "as_json"], "one of the two", "--quiet beside it")
 
     def _require_one_way(self, *, stepping: bool) -> None:
-        """Raise ParameterError for two ways to fly at once."""
+        """Raise ParameterError if there are two ways to fly at once."""
         other = self.in_process or self.use_sim_time or stepping
         contradiction = "a flight in lockstep, in one process or by /clock"
         require(not (self.real_time and other), "--real-time", contradiction, "one of the two")
@@ -260,7 +264,10 @@ class Fly(RouteWords):
         )
 
     def _autopilot(self, *, stepping: bool) -> Autopilot | None:
-        """Return the autopilot in the aircraft's place. Raises ParameterError if none can fly."""
+        """Return the autopilot that replaces the aircraft, if there is one.
+
+        Raises ParameterError if it cannot fly.
+        """
         if self.bridge is None:
             expected = "the channel map of an autopilot: --bridge MAP"
             require_unused(self, ["send"], expected, "no --bridge")
@@ -276,7 +283,7 @@ class Fly(RouteWords):
         return autopilot
 
     def _with_files(self, scenario: Scenario) -> Scenario:
-        """Add the route and the fence of files to the scenario. Raises ParameterError."""
+        """Add the route and the fence of the files to the scenario. Raises ParameterError."""
         above_sea = scenario.aircraft.is_jsbsim
         sections: dict[str, Any] = {}
         if self.fence is not None:
@@ -294,7 +301,7 @@ class Fly(RouteWords):
         return with_route(scenario, waypoints, sections)
 
     def _fly_fleet(self) -> NoReturn:
-        """Fly a fleet, with the page of all aircraft, and exit with the severest status."""
+        """Fly a fleet with the page of all aircraft, and exit with the severest status."""
         fleet = open_fleet(self.scenario, self.duration, use_sim_time=self.use_sim_time)
         has_own_time = fleet.lockstep or fleet.use_sim_time
         require(
@@ -311,7 +318,7 @@ class Fly(RouteWords):
         raise typer.Exit(fly_fleet_file(fleet, runs, as_json=self.as_json))
 
     def _watch(self, *runs: Path, fleet: bool = False) -> None:
-        """Serve the page of runs while the command lasts, with --watch."""
+        """Serve the page of the runs while the command lasts, if there is --watch."""
         if not self.watch:
             return
         from flight_cli.watch import watched  # noqa: PLC0415 - loads the server, which few flights need
@@ -321,9 +328,9 @@ class Fly(RouteWords):
 
 
 def _falls_back(lack: str, *, can_step: bool = True) -> bool:
-    """Return whether a flight leaves real time for what the host lacks, and tell the user.
+    """Tell the user if the host lacks what real time needs, and return whether to fly in lockstep.
 
-    If it cannot fly in lockstep, it stays in real time and the sentence is a warning.
+    If the flight cannot be in lockstep, it stays in real time and the sentence is a warning.
     """
     if lack and can_step:
         warn(f"this host {lack}: flying in lockstep; --real-time flies in real time all the same")
@@ -333,7 +340,7 @@ def _falls_back(lack: str, *, can_step: bool = True) -> bool:
 
 
 def _as_host_allows(fleet: Fleet) -> Fleet:
-    """Return the fleet as the host can fly it: in real time, or in lockstep and composed."""
+    """Return the fleet as this host can fly it: in real time, or in lockstep and composed."""
     scenarios = [member.scenario for member in fleet.members]
     lack = shortage(scenarios, cores_given, composed=fleet.composed)
     has_common_time = any(member.delay > 0.0 for member in fleet.members)
@@ -343,7 +350,7 @@ def _as_host_allows(fleet: Fleet) -> Fleet:
 
 
 def _warn_of_browser() -> None:
-    """On a host without cores to spare, say what a browser beside the flight takes."""
+    """Warn what a browser beside the flight takes, if the host has no cores to spare."""
     cores = len(os.sched_getaffinity(0))
     if cores < SPARE_CORES:
         warn(
@@ -366,7 +373,7 @@ def _report(
     try:
         result = write_report(run, outcome)
     except UnwrittenReportError as error:
-        # The flight is over: its outcome comes first.
+        # The flight is over, so that its outcome comes first.
         result = error.result
         unwritten = str(error)
     except ParameterError:

@@ -85,10 +85,10 @@ CONDITION_FAILS = 1
 MEANINGS = {
     "lag product": "crossover lag product, bandwidth times the lag of the loop (actuator, 1.5 "
     "periods, delay), rad: times 57.3 it is the phase in deg that the lag costs at the crossover",
-    "softening": "width of the softened sign in time, beside the lag of the loop: narrower than "
-    "that the loop is unstable",
+    "softening": "width of the softened sign as a time, compared with the lag of the loop: if it "
+    "is narrower, the loop is unstable",
     "beta": "for inputs scaled by 1 / abs(Omega_ii) in every table; a file has a smaller scale "
-    "where (22) asks for a larger K",
+    "if (22) asks for a larger K",
 }
 """Terms of the table and their meaning."""
 Assessment = GainAssessment[Any]
@@ -107,21 +107,21 @@ SELECTION = (
     "accept",
     "mixing",
 )
-"""Fields of a loop, of a check, and of a selection."""
+"""Options that describe a loop, options of a check, and options of a selection."""
 
 
 class _GainsAnswer(NamedTuple):
-    """Gain sets by name with their conditions: of a check, or of a `selection`."""
+    """Gain sets by name with their conditions: one that was checked, or a selection."""
 
     answers: dict[str, Assessment]
     selection: Selection | None = None
-    checked: str = ""  # the scenario of a check
+    checked: str = ""  # name of the scenario that was checked
     promise: Guarantee | None = None
     written: Sequence[str] = ()  # sentences about the files of a guarantee
 
     @property
     def titles(self) -> dict[str, Assessment]:
-        """Gain sets by the names that are shown; for a check, that of the scenario."""
+        """Gain sets by the names that are shown; that of a check has the scenario's name."""
         return {self.checked: self.first} if self.checked else self.answers
 
     @property
@@ -139,81 +139,78 @@ class _GainsAnswer(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Gains:
-    """Select gains by Theorem 1 and by the engineering procedure.
+    """Select gains by Theorem 1 and by the engineering procedure, or check the gains of a scenario.
 
-    Every condition on both is shown. With --check, show the margins and conditions of the
-    scenario's controller instead: of any law, with the law's own gains. The verdict on the loop
-    then decides the exit status; Theorem 1 is sufficient only.
+    Every condition on both gain sets is shown. With --check, the margins and the conditions are
+    those of the scenario's controller, of any law, with its own gains. The exit status then follows
+    the verdict on the loop, because the conditions of Theorem 1 are only sufficient.
 
-    Exit status: 0; 1 with --check unless the loop is stable with the margins that it needs, or an
-    aircraft within --uncertainty may be unstable with --guarantee; 2 bad input.
+    Exit status: 0; 1 with --check unless the loop is stable with the margins that it needs, or with
+    --guarantee if an aircraft within --uncertainty may be unstable; 2 bad input.
     """
 
     airframe: str = argument(
-        "Name or file (.yaml) of an airframe; with --check also jsbsim:NAME of the scenario.",
+        "Name or file (.yaml) of an airframe; with --check also jsbsim:NAME as in the scenario.",
         default=REQUIRED,
         autocompletion=airframe_names,
     )
     uncertainty: float = option("Largest relative deviation of each entry of A and B.", default=0.3)
     scenario: str = option(
-        "Scenario with the commands, the gusts and the loop; with --check also what --write wrote.",
+        "Scenario with the commands, the gusts and the loop; with --check also a file of --write.",
         default="osprey_servo",
         autocompletion=scenario_names,
     )
-    rate: float | None = rare_option("Rate of the law in Hz; by default that of the scenario.")
+    rate: float | None = rare_option("Rate of the law, Hz; by default that of the scenario.")
     y_rate: float | None = rare_option(
-        "Rate of y in Hz: a period above that of the law counts as delay, and y is "
-        "stale after three."
+        "Rate of y, Hz. If its period is longer than that of the law, the difference counts as "
+        "delay. y is stale after three periods."
     )
-    lag: str | None = option("Lags of the actuators in s, in the airframe's order: 0.02,0.1")
-    delay: float | None = option("Pure delay in s; by default that of the scenario.")
+    lag: str | None = option("Lags of the actuators in s, in the airframe's order: 0.02,0.1.")
+    delay: float | None = option("Pure delay, s; by default that of the scenario.")
     px4: Path | None = rare_option(
-        "Parameter file of QGroundControl or ULog of PX4, for the module of export --px4: "
-        "rate and delay of the body rates."
+        "Parameter file of QGroundControl or ULog of PX4, which gives the rate and the delay of "
+        "the body rates for a module of export --px4."
     )
     inputs: str | None = rare_option(
-        "Input of each output, in the airframe's order: rudder,aileron"
+        "Input that moves each output, in the order of the airframe, as in rudder,aileron."
     )
     gamma_2: float = rare_option(
-        "gamma_2 of Lemma 1 in 1/s. It is an assumption: nothing bounds it.", default=0.0
+        "gamma_2 of Lemma 1, 1/s. It is an assumption: nothing bounds it.", default=0.0
     )
     samples: int = rare_option(
-        "Number of uncertain airframes for the bounds of the theorem.",
-        default=100,
-        min=0,
-        max=10_000,
+        "Uncertain airframes for the bounds of the theorem.", default=100, min=0, max=10_000
     )
     seed: int = rare_option("Seed of the uncertain airframes.", default=1, min=0)
     write: Path | None = write_option("File for the engineering gains, as a section of a scenario.")
     feedforward: bool = rare_option(
-        "Write the airframe too, as the model of the feedforward (an extension).", default=False
+        "Also write the airframe, as the model of the feedforward (an extension).", default=False
     )
     observer: bool = option(
-        "Write feedforward and observer, and the gains beside them (an extension).", default=False
+        "Write a feedforward, an observer, and gains for them (an extension).", default=False
     )
     model: str | None = rare_option(
-        "Airframe that the observer takes as its model, as rise-di identify RUN writes it."
+        "Airframe that is the model of the observer, as rise-di identify RUN writes it."
     )
     margin: float = rare_option(
-        "Least delay margin of the nominal loop with the observer, s.", default=0.03
+        "Least delay margin that the nominal loop with the observer must have, s.", default=0.03
     )
     speeds: str | None = rare_option(
-        "With --observer: models at two parts of the trim speed too, as 0.7,1.4, and a "
-        "schedule that flies them."
+        "With --observer: also models at two fractions of the trim speed, as in 0.7,1.4, and a "
+        "schedule between them."
     )
     weights: Path | None = rare_option(
-        "With --observer: file of gains and weights in place of those of a search or a rule; "
-        "with accept they are taken as they are."
+        "With --observer: file of gains and weights in place of those that a search or a rule "
+        "finds; with accept they are taken as they are."
     )
     phase_margin: float = rare_option(
-        "Least phase margin of the loop behind servos, deg; 35 or less with the observer.",
+        "Least phase margin of the loop with its servos, deg; 35 or less with the observer.",
         default=PHASE_MARGIN,
     )
     theorem: bool = rare_option(
         "With --write: the gains of Theorem 1, for an ideal loop: --lag 0 --delay 0.", default=False
     )
     mixing: str = rare_option(
-        "diagonal: an input an output; full: inputs of the law, distributed by the inverse of C B.",
+        "diagonal: one input for each output; full: the inverse of C B distributes the inputs.",
         default="diagonal",
     )
     accept: bool = rare_option(
@@ -224,15 +221,14 @@ class Gains:
         "Check the gain set of the scenario instead of selecting one.", default=False
     )
     entry: list[str] | None = rare_option(
-        "With --check: an entry with a deviation of its own, once for each: 'A[q,alpha]=0.6', or "
-        "'1/lag[elevator]=0.3' of an actuator."
+        "With --check: an entry with a deviation of its own, 'A[q,alpha]=0.6', or of an actuator "
+        "'1/lag[elevator]=0.3'; may be repeated."
     )
     page: Path | None = rare_option(
-        "HTML file for the margins with Bode and Nyquist plots: of the engineering "
-        "gains, or with --check."
+        "HTML file for margins, Bode and Nyquist plots of the engineering gains, or with --check."
     )
     guaranteed: bool = option(
-        "With --check: what holds for every aircraft within --uncertainty, by a bound.",
+        "With --check: bound what holds for every aircraft within --uncertainty.",
         "--guarantee",
         default=False,
     )
@@ -240,18 +236,18 @@ class Gains:
         "With --guarantee: folder for the first unstable aircraft and one 1.2 times as far off."
     )
     late: float = rare_option(
-        "With --guarantee: u is late by 0 to this, s, by another time at each tick and in each "
-        "input.",
+        "With --guarantee: largest time by which u is late, s. It may differ at each tick and in "
+        "each input.",
         default=0.0,
     )
     certificate: Path | None = rare_option(
         "With --guarantee: file for its proof (JSON), which examples/check_certificate.py checks "
-        "with numpy alone."
+        "with nothing but numpy."
     )
     as_json: bool = json_option()
 
     def execute(self) -> None:
-        """Select or check, write, show."""
+        """Select or check gains, write them, and show them."""
         is_scenario = self.airframe in set(scenarios()) - set(airframes())
         require(
             not is_scenario,
@@ -286,7 +282,7 @@ class Gains:
             raise typer.Exit(CONDITION_FAILS)
 
     def _result(self) -> _GainsAnswer:
-        """Return the gain sets with all conditions; write those that were selected."""
+        """Return the gain sets with all conditions, and write them if they were selected."""
         with Console(quiet=self.as_json).status("selecting gains on uncertain airframes") as status:
             if self.check:
                 return self._checked(status.update)
@@ -316,7 +312,7 @@ class Gains:
         return _GainsAnswer({"scenario": answer}, checked=name, promise=promise, written=lines)
 
     def _selected(self, progress: Callable[[str], None]) -> _GainsAnswer:
-        """Select gains by Theorem 1 and by the procedure, or those beside an observer."""
+        """Select gains by Theorem 1 and by the procedure, or those that go with an observer."""
         selection = select_gains(
             self.airframe,
             self.scenario,
@@ -337,7 +333,7 @@ class Gains:
         return _GainsAnswer(answers, selection)
 
     def _show(self, console: Console, result: _GainsAnswer, origin: str) -> None:
-        """Print tables, the trade of a selection, origins and the paths of the files."""
+        """Print the tables, the trade of a selection, the origins and the paths of the files."""
         selection = result.selection
         _show_margins(console, result.study, result.titles)
         show_guarantee(console, result.promise, result.first)
@@ -357,7 +353,10 @@ class Gains:
 def _loop_of_px4(
     px4: Path | None, rate: float | None, delay: float | None
 ) -> tuple[float | None, float | None, str]:
-    """Return rate and delay as given or from a parameter file, and where the latter come from."""
+    """Return the rate and the delay, and where they come from.
+
+    They are as given or, if there is one, from a parameter file.
+    """
     if px4 is None:
         return rate, delay, ""
     require(delay is None, "px4", "--delay beside it", "one of the two")
@@ -386,13 +385,13 @@ def _require_margins(selection: Selection, *, theorem: bool) -> None:
 
 
 def _show_trade(console: Console, selection: Selection) -> None:
-    """Show the error of the linear loop along the manoeuvre against the phase margin."""
+    """Show how the error of the linear loop along the manoeuvre trades against the phase margin."""
     controller = selection.chosen
     frame = selection.study.airframe
     outputs = controller.outputs
     output_units = frame.units_of_outputs()
     unit_texts = [display_unit(output_units[name]) for name in outputs]
-    # A height has no score.
+    # A height has no unit of the score.
     have_scores = all(quantity(unit).dimension in SCORE_UNIT for unit in output_units.values())
     units = score_units(outputs, output_units) if have_scores else np.full(len(outputs), np.nan)
     headings = (f"{name},\n{unit.unit}" for name, unit in zip(outputs, unit_texts, strict=True))
@@ -411,7 +410,7 @@ def _show_trade(console: Console, selection: Selection) -> None:
 
 
 def _show_margins(console: Console, study: Study, answers: dict[str, Assessment]) -> None:
-    """Print gains and margins."""
+    """Print the gains and the margins."""
     first = next(iter(answers.values()))
     samples = len(study.A) - 1
     parts = {"A and B": study.uncertainty, **study.spread.entries}
@@ -438,7 +437,7 @@ def _show_margins(console: Console, study: Study, answers: dict[str, Assessment]
 
 
 def _show_verdicts(console: Console, result: _GainsAnswer) -> None:
-    """Print the conditions part by part, each with its verdict: the loop's decides."""
+    """Print the conditions part by part, each with its verdict. That on the loop decides."""
     answers = result.titles
     first = result.first
     for part, heading in HEADINGS.items():
@@ -460,7 +459,7 @@ def _show_verdicts(console: Console, result: _GainsAnswer) -> None:
 
 
 def _condition_table(answers: dict[str, Assessment], part: str, title: str) -> Table:
-    """Make a table of the conditions of a part, one per row."""
+    """Make a table of the conditions of a part, with one condition in each row."""
     headings = ["condition"]
     for name in answers:
         headings += [f"{name}\nvalue and bound", "\nmargin"]
@@ -473,7 +472,7 @@ def _condition_table(answers: dict[str, Assessment], part: str, title: str) -> T
 
 
 def _gain_table(answers: dict[str, Assessment], aircraft: str) -> Table:
-    """Make a table of K, Lambda and beta of RISE-DI, one channel per row."""
+    """Make a table of K, Lambda and beta of RISE-DI, with one channel in each row."""
     headings = []
     for name in answers:
         headings += [f"{name}\nK", "\nLambda", "\nbeta"]
@@ -526,7 +525,7 @@ def _format_delay_margin(study: Study, answer: Assessment) -> str:
 
 
 def speed_of_margin(study: Study, answer: Assessment) -> str:
-    """Say up to which speed a delay margin above 0 lasts with fixed gains."""
+    """Say up to which speed a positive delay margin lasts if the gains stay fixed."""
     if study.airframe.speed == 0.0:
         return "the airframe has no trim speed"
     ratio = gain_selection.stable_speed_ratio(study, answer.controller)
@@ -539,7 +538,10 @@ def speed_of_margin(study: Study, answer: Assessment) -> str:
 
 
 def _stable_speed_ratio(study: Study, answer: Assessment) -> float | None:
-    """Return the ratio; None if the literal sign has no linear loop, or if there is no limit."""
+    """Return up to which multiple of the trim speed the loop is stable.
+
+    Returns None if there is no limit, or if the literal sign has no linear loop.
+    """
     if answer.delay_margin is None:
         return None
     ratio = gain_selection.stable_speed_ratio(study, answer.controller)

@@ -37,8 +37,8 @@ from flight_design.gains.gain_selection import GainAssessment
 from rise_di.c_code import certificate_sources
 from rise_di_controller.params import ControllerConfig
 
-FARTHER = 1.2  # times the deviations of the first unstable aircraft: a loop that diverges
-FORMS = (".3f", ".1f", ".1f", ".3f")  # of the columns of a guarantee
+FARTHER = 1.2  # times the deviations of the first unstable aircraft, so that its loop diverges
+FORMS = (".3f", ".1f", ".1f", ".3f")  # formats of the columns of a guarantee
 
 
 def require_guarantee(
@@ -51,7 +51,7 @@ def require_guarantee(
     entries: Sequence[str],
     files: Mapping[str, Path | None],
 ) -> None:
-    """Raise ParameterError for a guarantee without --check, or its settings without a guarantee."""
+    """Raise ParameterError for a guarantee without --check, or for its options without it."""
     require(check or not is_wanted, "--guarantee", "no --check", "--check beside it")
     require(check or not entries, "entry", "no --check", "--check beside it")
     for name, path in files.items():
@@ -65,19 +65,19 @@ def require_guarantee(
         warn(f"note: {scenario} has a controller alone: {others}")
     path = files["certificate"]
     require(late == 0.0 or path is None, "certificate", f"--late {late:g} beside it", "u in time")
-    # the checker's bounds are too coarse for most actuators
+    # The bounds of the checker are too coarse for the lags of most actuators.
     lags = [text for text in entries if text.startswith("1/")]
     require(not lags or path is None, "certificate", f"{', '.join(lags)} beside it", "exact lags")
-    # before the proof, which takes up to minutes
+    # These come before the proof, which can take minutes.
     _require_worst(files["worst"], airframe, scenario)
     fits = path is None or (os.access(path.parent, os.W_OK) and not is_folder(path))
     require(fits, "certificate", path, "a file in a folder that can be written")
 
 
 def proved(loop: LinearLoop, late: float) -> Guarantee:
-    """Return the guarantee of a loop, which is kept for the pages of its flights.
+    """Return the guarantee of a loop, and keep it for the pages of its flights.
 
-    Raises ParameterError before the proof for an aircraft that no linear loop has.
+    Raises ParameterError before the proof if the aircraft has no linear loop.
     """
     for each in loop.differences:
         expected = "the aircraft of a linear loop for a guarantee"
@@ -92,7 +92,7 @@ def write_certificate(
 ) -> list[str]:
     """Write the certificate of a guarantee, if a path is named.
 
-    Returns a sentence if the law has no C constants from which a checker computes it.
+    Returns a sentence if the law has no C constants from which a checker could compute the loop.
     """
     if path is None:
         return []
@@ -106,7 +106,7 @@ def write_certificate(
 
 
 def _require_worst(folder: Path | None, airframe: str, scenario: str) -> None:
-    """Raise ParameterError unless a scenario flies the airframe of which it is to fly variants."""
+    """Raise ParameterError unless the scenario flies the airframe whose variants are written."""
     if folder is None:
         return
     base = find_scenario(scenario)
@@ -119,10 +119,10 @@ def _require_worst(folder: Path | None, airframe: str, scenario: str) -> None:
 def write_unstable(
     folder: Path | None, promise: Guarantee, airframe: str, scenario: str
 ) -> list[str]:
-    """Write the first unstable aircraft and one FARTHER off, if a folder is named.
+    """Write the first unstable aircraft, and one that is FARTHER off, if a folder is named.
 
-    Each is an airframe and the scenario that flies it. Returns a sentence about each: how far off
-    it is, and whether that is inside `--uncertainty`.
+    Each is an airframe and a scenario that flies it. Return a sentence about each: how far off it
+    is, and whether that is inside `--uncertainty`.
     """
     if folder is None:
         return []

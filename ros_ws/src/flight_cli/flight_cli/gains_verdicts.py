@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the conditions on a gain set come to: the loop decides, rules and theorem do not."""
+"""Verdicts on the conditions of a gain set. The loop decides; the rules and the theorem do not."""
 
 import math
 from typing import Any, NamedTuple
@@ -11,19 +11,19 @@ from flight_design.gains.gain_selection import GainAssessment
 
 
 def milliseconds(margin: float) -> str:
-    """Return a delay margin, s, as a text."""
+    """Write a delay margin, s, in milliseconds."""
     return f"{1e3 * margin:.0f} ms" if math.isfinite(margin) else "over 500 ms"
 
 
 class Verdict(NamedTuple):
-    """What a part of the conditions comes to; an empty sentence for a part without conditions."""
+    """What a part of the conditions comes to. A part without conditions has an empty sentence."""
 
     holds: bool
     sentence: str
 
 
 def loop_verdict(answer: GainAssessment[Any], promise: Guarantee | None) -> Verdict:
-    """Return whether a loop is stable with the margins and the guarantee that are asked of it."""
+    """Judge whether a loop is stable with the margins and the guarantee that are asked of it."""
     is_guaranteed = promise is None or promise.holds
     holds = answer.is_stable and not failing(answer.loop) and is_guaranteed
     margins = answer.margins
@@ -56,7 +56,7 @@ def loop_verdict(answer: GainAssessment[Any], promise: Guarantee | None) -> Verd
 
 
 def rules_verdict(answer: GainAssessment[Any], _: Guarantee | None) -> Verdict:
-    """Return how many rules of the engineering procedure a gain set keeps."""
+    """Count how many rules of the engineering procedure a gain set keeps."""
     rules = answer.rules
     if not rules:
         return Verdict(True, "")
@@ -69,7 +69,7 @@ def rules_verdict(answer: GainAssessment[Any], _: Guarantee | None) -> Verdict:
 
 
 def theorem_verdict(answer: GainAssessment[Any], _: Guarantee | None) -> Verdict:
-    """Return how many of the sufficient conditions of Theorem 1 a gain set meets."""
+    """Count how many of the sufficient conditions of Theorem 1 a gain set meets."""
     conditions = answer.theorem
     if not conditions:
         return Verdict(True, "")
@@ -85,14 +85,14 @@ def theorem_verdict(answer: GainAssessment[Any], _: Guarantee | None) -> Verdict
 HEADINGS = {
     "loop": "The loop: these conditions decide",
     "rules": "Rules of the engineering procedure",
-    "theorem": "Theorem 1: sufficient conditions, of a loop without servos in continuous time",
+    "theorem": "Theorem 1: sufficient conditions on a loop without servos in continuous time",
 }
 VERDICTS = {"loop": loop_verdict, "rules": rules_verdict, "theorem": theorem_verdict}
 """The parts of the conditions on a gain set, in the order in which they are shown."""
 
 
 def condition_name(row: tuple[GainCondition, ...], outputs: tuple[str, ...]) -> str:
-    """Name of a row, with the channel if it is the same in every gain set."""
+    """Name a row of conditions, with the channel if it is the same in every gain set."""
     where = {None if condition.channel is None else outputs[condition.channel] for condition in row}
     channel = where.pop() if len(where) == 1 else None
     return row[0].name + (f" of {channel}" if channel else "") + (" ~" if row[0].estimate else "")

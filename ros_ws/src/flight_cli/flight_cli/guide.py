@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di guide`: what a guided flight holds from now on.
+"""`rise-di guide`: change what a guided flight holds from now on.
 
-Services of guidance, the operator's link and a route, too.
+It also calls the services of guidance, keeps the operator's link and sends a route.
 """
 
 import math
@@ -39,20 +39,18 @@ LINK = "link"
 class Guide(RouteWords):
     """Command a running guided flight, as in: rise-di guide heading=90 altitude=1300.
 
-    What is not named stays. Exit status: 0 done, 1 refused, 2 bad input or no guidance.
+    What you do not name stays as it is. Exit status: 0 done, 1 refused, 2 bad input or no guidance.
     """
 
     commands: list[str] = argument(
-        "NAME=VALUE: one of phi, heading, course, leg, or north, east and radius of an "
-        "orbit; one of theta, climb,"
-        " altitude; V. phi, theta, heading and course in degrees, r (beside phi) in degrees "
-        "a second; else m and m/s."
-        " A multicopter takes phi and theta, course, north and east, or leg; climb or altitude; "
-        "heading; V over ground."
-        " Or hold: the heading, altitude and airspeed of now. skip: the waypoint ahead. "
-        "resume: the last leg. home: fly"
-        " home and orbit. link: keep the operator's link until Ctrl-C. Or a route file, "
-        "without airspeeds.",
+        "NAME=VALUE, several at once: one of phi, heading, course, leg, or an orbit by north, "
+        "east and radius; one of theta, climb, altitude; V. phi, theta, heading and course are in "
+        "degrees, r (together with phi) in degrees per second, all else in m and m/s. A "
+        "multicopter takes phi and theta, or course, or north and east, or leg; climb or "
+        "altitude; heading; V over ground. Or one word: hold keeps the present heading, altitude "
+        "and airspeed; skip leaves out the waypoint ahead; resume flies the last leg again; home "
+        "flies home and orbits there; link keeps the operator's link until Ctrl-C. Or a route "
+        "file without airspeeds.",
         default=REQUIRED,
         metavar="COMMAND...",
         autocompletion=list_of((*SERVICES, LINK, *(f"{name}=" for name in TARGETS))),
@@ -60,7 +58,7 @@ class Guide(RouteWords):
     namespace: str = namespace_option()
 
     def execute(self) -> None:
-        """Send what is asked, and print what holds then."""
+        """Send what is asked, and print what holds from then on."""
         command = self.commands[0]
         is_service = command in {*SERVICES, LINK}
         points: list[tuple[float, float, float]] = []

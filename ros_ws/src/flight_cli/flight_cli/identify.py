@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di identify`: an aircraft of JSBSim by linearisation, with its scenario.
+"""`rise-di identify`: identify an aircraft of JSBSim by linearisation, and write its scenario.
 
-From a flight's log it identifies A and B of an airframe.
+From the log of a flight it identifies A and B of an airframe.
 """
 
 import math
@@ -87,7 +87,7 @@ REFLY_MARGIN = 0.03  # s
 OF_LOG = ("scenario", "delay", "namespace", "refly")
 OF_JSBSIM = ("observer", "guidance", "learn", "command")
 OF_MARGINS = ("phase_margin", "accept")
-"""Fields for a log alone, for JSBSim alone, and of required margins."""
+"""Options that only a log has, that only JSBSim has, and that require margins."""
 BESIDE_BRIDGE = "none beside --bridge"
 
 
@@ -95,53 +95,59 @@ BESIDE_BRIDGE = "none beside --bridge"
 class Identify:
     """Identify an aircraft of JSBSim by linearisation, or A and B from the log of a flight.
 
-    Of JSBSim it also selects gains, flies the aircraft and writes a scenario for `rise-di fly`. A
-    model from a log is accepted if it predicts the part of the flight that it was not fitted to
-    better than the nominal airframe. With --bridge, each input of the aircraft behind a channel map
-    is excited by itself, open loop, and --write is the folder for a scenario that flies it.
+    For an aircraft of JSBSim it also selects gains, flies the aircraft and writes a scenario for
+    `rise-di fly`. A model from a log is accepted if it predicts the held-out part of the flight
+    better than the nominal airframe does. With --bridge, it excites each input of the aircraft
+    behind a channel map by itself, open loop; --write is then the folder for a scenario that flies
+    it.
 
     Exit status: 0, 2 bad input or a model that is refused, 3 the aircraft does not trim or does not
     fly.
     """
 
     source: str | None = argument(
-        "jsbsim:NAME or jsbsim:PATH, an aircraft of JSBSim; or a log: the folder of a "
-        "run, or an MCAP file. None with --bridge alone."
+        "jsbsim:NAME or jsbsim:PATH, an aircraft of JSBSim; or a log: the folder of a run, or an "
+        "MCAP file. Leave it out to fly the experiment of --bridge."
     )
-    speed: float | None = option("True airspeed to trim and fly at, m/s.")
-    altitude: float | None = option("Altitude above sea level to trim and fly at, m.")
+    speed: float | None = option("True airspeed at which to trim and fly, m/s.")
+    altitude: float | None = option("Altitude above sea level at which to trim and fly, m.")
     airframe: str | None = option(
-        "With a log: the nominal airframe, a name or a file (.yaml).", autocompletion=airframe_names
+        "With a log: name or file (.yaml) of the nominal airframe.", autocompletion=airframe_names
     )
     write: Path | None = write_option(
-        "Scenario file, by default jsbsim_NAME.yaml, which must not exist. With a log: "
-        "airframe file for the model, with a page. With --bridge: folder for what flies it."
+        "Scenario file; by default jsbsim_NAME.yaml, which must not exist yet. With a log: "
+        "airframe file for the model, beside which a page is written. With --bridge: folder for "
+        "the files that fly the aircraft."
     )
     scenario: str | None = rare_option(
-        "With a log: scenario with lags and delay of the controller; by default that in the log.",
+        "With a log: scenario with the lags and the delay of the controller; by default that in "
+        "the log.",
         autocompletion=scenario_names,
     )
     delay: float | None = rare_option(
-        "With a log: delay of u, s; by default that of the scenario. One process has none."
+        "With a log: delay of u, s; by default that of the scenario. A flight in one process has "
+        "none."
     )
     namespace: str | None = rare_option(
-        "With a log: namespace of the aircraft, if it holds several."
+        "With a log: namespace of the aircraft, if the log holds several."
     )
     refly: bool = rare_option(
-        "With a log: fly its scenario with feedforward and observer of the model, in process.",
+        "With a log: fly its scenario in this process with a feedforward and an observer of the "
+        "model.",
         default=False,
     )
     observer: bool = option(
-        "Of JSBSim: add an extended-state observer from Omega and lags.", default=False
+        "With JSBSim: add an extended-state observer from Omega and the lags.", default=False
     )
     guidance: bool = option(
-        "Of JSBSim: fly and write guidance by rule in place of the pulses.", default=False
+        "With JSBSim: fly and write guidance by rule in place of the pulses.", default=False
     )
     learn: bool = option(
-        "Of JSBSim: write a scenario that learns A and B in flight.", default=False
+        "With JSBSim: write a scenario that learns A and B in flight.", default=False
     )
     margin: float | None = rare_option(
-        "Least delay margin of the loop with an observer, s: 0.03, or 0.015 of JSBSim."
+        "Least delay margin that the loop with an observer must have, s; by default 0.03, with "
+        "JSBSim 0.015."
     )
     bridge: str | None = option(
         "Excite the aircraft behind a channel map, or read the log of such a flight.",
@@ -149,27 +155,28 @@ class Identify:
         autocompletion=map_names,
     )
     amplitude: float | None = rare_option(
-        "With --bridge: amplitude of the excitation, a part of each input's limit; 0.2."
+        "With --bridge: amplitude of the excitation as a fraction of each input's limit; by "
+        "default 0.2."
     )
     phase_margin: float | None = rare_option(
-        "Of JSBSim, or with --bridge: least phase margin of the loop, deg; 45."
+        "With JSBSim or --bridge: least phase margin of the loop, deg; by default 45."
     )
     accept: bool = rare_option(
         "Accept a phase margin below 40 deg, and gains whose margins fall short.", default=False
     )
     command: list[str] | None = rare_option(
-        "Of JSBSim: a model's own property for an input, and its value at full "
-        "command; repeat for more.",
+        "With JSBSim: a property of the model that takes an input, and its value at full command; "
+        "may be repeated.",
         metavar="INPUT:PROPERTY=VALUE",
     )
     link_delay: float | None = rare_option(
-        "With --bridge and a log of rise-di import: delay of the link beyond the log, s; "
-        "by default that of the map."
+        "With --bridge and a log of rise-di import: delay that the link adds to that in the log, "
+        "s; by default that of the map."
     )
     as_json: bool = json_option()
 
     def execute(self) -> None:
-        """Identify by what the source is."""
+        """Identify an aircraft of JSBSim, one behind a bridge, or a log."""
         log = self._log()
         if self.bridge is not None:
             self._identify_behind_bridge(self.bridge, log)
@@ -196,7 +203,7 @@ class Identify:
         self._identify_log(log)
 
     def _log(self) -> Path | None:
-        """Return the log that the source names, or None for an aircraft or no source."""
+        """Return the log that the source names, or None for an aircraft or without a source."""
         if self.source is None or self.source.startswith(PREFIX):
             return None
         log = Path(self.source)
@@ -246,7 +253,8 @@ class Identify:
         identified_aircraft = self._identified_aircraft(name, self.speed, self.altitude, console)
         lacking = ""
         if not self.accept and not identified_aircraft.failure:
-            # As long as all before it: what comes after the tables would be taken for the end.
+            # It takes as long as everything before. If it came after the tables, one would think
+            # that the command has ended.
             with console.status("what would meet the margins"):
                 lacking = what_lacks(identified_aircraft.selection)
         write_text("write", path, identified_aircraft.text)
@@ -264,7 +272,7 @@ class Identify:
             raise ParameterError(f"identify: {lacking}; the gains are in {refusal}")
 
     def _scenario_path(self, name: str) -> Path:
-        """Return the path for the scenario; it may replace a file only where --write names it."""
+        """Return the path of the scenario, which may replace a file only if --write names it."""
         path = self.write or Path(f"jsbsim_{Path(name).stem}.yaml")
         expected = "a file to write over, or another"
         is_new = self.write is not None or not path.exists()
@@ -275,7 +283,7 @@ class Identify:
     def _identified_aircraft(
         self, name: str, speed: float, altitude: float, console: Console
     ) -> IdentifiedAircraft:
-        """Linearise an aircraft, select gains and fly it; exit if there is no trim."""
+        """Linearise an aircraft, select its gains and fly it, or exit if it has no trim."""
         margin = STEP_MARGIN if self.margin is None else self.margin
         texts: dict[str, str] = {}
         for text in self.command or []:
@@ -301,7 +309,7 @@ class Identify:
     def _identify_log(self, log: Path) -> None:
         """Identify a model from a log, show it and write it.
 
-        Raises ParameterError for a model that is refused.
+        Raises ParameterError if the model is refused.
         """
         require_unused(self, ("speed", "altitude", *OF_JSBSIM, *OF_MARGINS), "none beside a log")
         require(
@@ -345,7 +353,7 @@ class Identify:
     def _identified_model(
         self, recorded_run: RecordedRun, scenario: StoredFile, nominal: Airframe
     ) -> Identification:
-        """Search the model on the log, and show a progress bar."""
+        """Search for the model on the log, and show a progress bar."""
         controller = recorded_parameters(scenario)
         delay = controller.delay if self.delay is None else self.delay
         actuation = _actuation(controller, nominal, delay)
@@ -369,12 +377,12 @@ def _jsbsim_name(aircraft: str) -> str:
     try:
         return require_aircraft(aircraft)
     except ParameterError as error:
-        # The option --airframe is that of a log.
+        # The option --airframe belongs to a log.
         raise ParameterError(f"aircraft{str(error).removeprefix('airframe')}") from None
 
 
 def _write_model(console: Console, identification: Identification, log: Path, path: Path) -> None:
-    """Write the airframe file and the page of the innovations."""
+    """Write the airframe file, and the page of the innovations."""
     write_text("--write", path, model_yaml(identification, str(log)))
     page = path.with_suffix(".html")
     write_text("--write", page, page_html(_innovation_page(identification, log.name)))
@@ -382,19 +390,19 @@ def _write_model(console: Console, identification: Identification, log: Path, pa
 
 
 class _Reflight(NamedTuple):
-    """Rms errors of a recorded flight and of the same one with another model, SI, by output.
+    """Rms errors of a recorded flight and of the same flight with another model, SI, by output.
 
-    The second flight has feedforward and observer of that model.
+    The second flight has the feedforward and the observer of that model.
     """
 
-    origin: str  # of the observer's gains
+    origin: str  # where the observer's gains come from
     recorded: dict[str, float]
     again: dict[str, float]
     outcome: str
 
 
 def _refly(scenario: Scenario, tape: Tape, model: Airframe, margin: float) -> _Reflight:
-    """Fly a log's scenario again in this process, with feedforward and observer of a model."""
+    """Fly a log's scenario again in this process, with the feedforward and observer of a model."""
     selected = selected_observer(scenario.rise_di(), scenario, model, margin)
     again = simulate(replace(scenario, controller=selected.controller))
     return _Reflight(
@@ -414,7 +422,7 @@ def _show_flights_of_model(
 
 
 def _actuation(controller: ControllerConfig, nominal: Airframe, delay: float) -> Actuation:
-    """Lags and delay of a controller's loop, in the airframe's order."""
+    """Return the lags and the delay of a controller's loop, in the order of the airframe."""
     require(0.0 <= delay < math.inf, "--delay", delay, "0 s or more")
     for key, names, expected in (
         ("controller.outputs", controller.outputs, nominal.outputs),
@@ -453,7 +461,7 @@ def _units(identification: Identification) -> dict[str, DisplayUnit]:
 
 
 def _innovation_page(identification: Identification, name: str) -> Page:
-    """Innovations of the nominal and of the identified model over the flight.
+    """Make a page of the innovations of the nominal and of the identified model over the flight.
 
     The held-out seconds are shaded.
     """
@@ -480,7 +488,7 @@ def _innovation_page(identification: Identification, name: str) -> Page:
     figure = time_series_figure(context, curves)
     section = Section(
         "Innovations",
-        "y less its prediction from the samples before; shaded: not in the fit",
+        "y minus its prediction from the samples before; shaded: not used in the fit",
         figure,
     )
     likelihoods = (

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di import`: a bag of y, u and pose from the log of an autopilot."""
+"""`rise-di import`: make a bag of y, u and pose from the log of an autopilot."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -36,10 +36,10 @@ from flight_log.vehicle_tables import Choice
 class Import:
     """Make a bag of y, u and pose from the log of an autopilot that the stack did not fly.
 
-    By default it takes the longest stretch in the air, for sticks in MANUAL. `check --run`,
-    `identify --bridge`, `report` and `watch` read the bag. u is the deviation from the median of
-    the stretch, `commands` is the whole. With --scenario `replay` computes each tick of the module
-    again.
+    By default it takes the longest stretch in the air; u from the sticks needs MANUAL. `check
+    --run`, `identify --bridge`, `report` and `watch` read the bag. u is the deviation from the
+    median of the stretch, and `commands` is the whole command. With --scenario, `replay` computes
+    each tick of the module again.
 
     Exit status: 0, or 2 bad input.
     """
@@ -49,34 +49,36 @@ class Import:
         default=REQUIRED,
     )
     map_name: str | None = option(
-        "Channel map: its channels of y and u, trims, scales.",
+        "Channel map that has the channels of y and u, the trims and the scales.",
         "--map",
         metavar="MAP",
         autocompletion=map_names,
     )
     scenario: str | None = option(
-        "Scenario of the module of export --px4 that flew, in place of --map: its ticks, for "
-        "replay.",
+        "Scenario of a module of export --px4 that flew, in place of --map; replay then computes "
+        "its ticks again.",
         autocompletion=scenario_names,
     )
     output: Path | None = option(
-        "Folder to create; by default runs/ with the name of the log.", "--output", "--write"
+        "Folder to create; by default the name of the log in runs/.", "--output", "--write"
     )
-    start: float | None = option("Begin, s since the begin of the log.", "--from")
-    stop: float | None = option("End, s since the begin of the log.", "--until")
+    start: float | None = option("Time to begin at, s since the begin of the log.", "--from")
+    stop: float | None = option("Time to end at, s since the begin of the log.", "--until")
     servos: bool = option(
-        "u from the servos of ArduPilot, in any mode; without, from the sticks in MANUAL.",
+        "Take u from the servos of ArduPilot, in any mode; by default from the sticks in MANUAL.",
         default=False,
     )
-    system: int | None = option("MAVLink system of a tlog of several; without, the one that flew.")
+    system: int | None = option(
+        "MAVLink system, if a tlog has several; by default the one that flew."
+    )
     instances: list[str] | None = option(
-        "Sensor or instance of several, as IMU=1; repeat for more.",
+        "Sensor or instance to take, if there are several, as in IMU=1; may be repeated.",
         "--instance",
         metavar="MESSAGE=NUMBER",
     )
 
     def execute(self) -> None:
-        """Read the log, write the bag, show its topics."""
+        """Read the log, write the bag, and show its topics."""
         for name, value in (("from", self.start), ("until", self.stop)):
             require(value is None or value >= 0.0, name, value, "0 s or more")
         if (self.map_name is None) == (self.scenario is None):
@@ -90,7 +92,7 @@ class Import:
             self._import_by_map(self.map_name, folder)
 
     def _import_by_map(self, map_name: str, folder: Path) -> None:
-        """Write y, u and pose by the rows of a channel map."""
+        """Write y, u and pose according to the rows of a channel map."""
         channel_map = load_map(map_name)
         console = Console()
         choice = Choice(self.system, _numbers(self.instances or []), kind_of_map(channel_map))
@@ -122,7 +124,7 @@ class Import:
 
 
 def _show_agreement(console: Console, rows: list[Agreement]) -> None:
-    """Show what the log and the channel map each say of the same settings."""
+    """Show what the log and the channel map each say about the same settings."""
     headings = ("", "what the log says", "what the map says")
     table = new_table("", headings, headings, headings)
     for row in rows:
@@ -153,7 +155,7 @@ def _import_module(log: Path, scenario: Scenario, folder: Path) -> None:
 
 
 def _show_topics(console: Console, title: str, tape: Tape) -> None:
-    """Show number, rate and longest gap of the samples by topic."""
+    """Show the number, the rate and the longest gap of the samples of each topic."""
     table = new_table(title, ("topic", "samples", "Hz", "longest gap, s"))
     for topic, signal in tape.signals.items():
         gaps = np.diff(signal.stamp_ns) / NANOSECONDS
@@ -164,7 +166,7 @@ def _show_topics(console: Console, title: str, tape: Tape) -> None:
 
 
 def _numbers(instances: list[str]) -> dict[str, int]:
-    """Numbers by message of MESSAGE=NUMBER. Raises ParameterError."""
+    """Parse MESSAGE=NUMBER into numbers by message. Raises ParameterError."""
     numbers = {}
     for text in instances:
         message, _, number = text.partition("=")

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di learn`: repeat the learner on the log of a flight, and write the model.
+"""`rise-di learn`: run the learner again on the log of a flight, and write the model.
 
-The learner may have other settings.
+The learner may have other settings than in the flight.
 """
 
 from dataclasses import dataclass
@@ -41,23 +41,23 @@ NOTHING_LEARNED = 1
 
 @dataclass(frozen=True, kw_only=True)
 class Learn:
-    """Repeat the learner on the log of a flight.
+    """Run the learner again on the log of a flight.
 
-    The settings are those of its scenario or, by --set controller.learn.*, others. y and u are
-    those of the log: a flight without a learner can be learned from too, if its controller has an
-    observer. With --write the model becomes an airframe file, from which `controller.learn.prior`
-    starts the next flight. Exit status: 0 a model, 1 none, 2 bad input.
+    The settings are those of its scenario, unless --set controller.learn.* changes them. y and u
+    are those of the log: a flight without a learner can be learned from too, if its controller has
+    an observer. With --write, the model becomes an airframe file, and `controller.learn.prior` lets
+    the next flight start from it. Exit status: 0 a model, 1 none, 2 bad input.
     """
 
     run: Path = argument("Folder of a run, or an MCAP file.", default=LATEST)
     settings: list[str] | None = settings_option()
-    write: Path | None = write_option("File for the learned model, an airframe file.")
+    write: Path | None = write_option("Airframe file to write the learned model to.")
     scenario: str | None = log_scenario()
     namespace: str | None = log_namespace()
     as_json: bool = json_option()
 
     def execute(self) -> None:
-        """Learn again, show the steps, write the model."""
+        """Learn again, show the steps, and write the model."""
         if self.write is not None:
             require_yaml("--write", self.write)
         recorded_run = read_run(self.run, self.namespace, scenario_file(self.scenario))

@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the commands that read a log share.
 
-The scenario of a log without one, the aircraft of several, and what the log lacks.
+They need a scenario if the log has none, one aircraft if the log has several, and a word on what
+the log lacks.
 """
 
 from contextlib import suppress
@@ -19,7 +20,7 @@ from flight_core.scenario_file import A_SCENARIO
 from flight_log.bag import COMPARED, IMPORTED
 from flight_log.tape_reader import RecordedRun, read_run, stored_scenario
 
-REMAP = "A topic of remapped nodes, as in y:=/sensors/y; may be repeated."
+REMAP = "Topic that a remapped node uses, as in y:=/sensors/y; may be repeated."
 
 
 def log_namespace() -> Any:
@@ -29,12 +30,12 @@ def log_namespace() -> Any:
 
 def log_scenario() -> Any:
     """Declare the option --scenario of a command that reads a log."""
-    text = "Scenario of the flight, a name or a file; by default that in the log."
+    text = "Name or file of the flight's scenario; by default that in the log."
     return option(text, autocompletion=scenario_names)
 
 
 def remaps_of(words: list[str] | None) -> dict[str, str]:
-    """Topics of a log by names of the stack. Raises ParameterError."""
+    """Return the topics of a log by their names in the stack. Raises ParameterError."""
     remaps = [word.partition(":=") for word in words or ()]
     for name, _, topic in remaps:
         require(
@@ -47,9 +48,9 @@ def remaps_of(words: list[str] | None) -> dict[str, str]:
 
 
 def scenario_file(name: str | None) -> Path | None:
-    """Find the file of a scenario, or of a controller alone, by name or path; None without a name.
+    """Find the file of a scenario or of a controller alone, by name or path.
 
-    Raises ParameterError for an invalid scenario.
+    Returns None without a name. Raises ParameterError if the scenario is invalid.
     """
     if name is None:
         return None
@@ -62,9 +63,9 @@ def scenario_file(name: str | None) -> Path | None:
 
 
 def warn_of_lacks(recorded_run: RecordedRun) -> None:
-    """Print what a log lacks, a warning each on standard error.
+    """Print a warning on standard error for everything that a log lacks.
 
-    So no result stands for more than was recorded.
+    Nobody then takes a result for more than was recorded.
     """
     account = log_account(recorded_run)
     import_note = recorded_run.metadata.get(IMPORTED, {}).get(COMPARED, "")
@@ -77,6 +78,6 @@ def warn_of_lacks(recorded_run: RecordedRun) -> None:
 
 
 def warn_of_lacks_in(run: Path, namespace: str | None) -> None:
-    """As `warn_of_lacks`, of a log that need not hold a flight."""
+    """Do as `warn_of_lacks` does, for a log that need not hold a flight."""
     with suppress(ParameterError):
         warn_of_lacks(read_run(run, namespace))

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di network`: the profile of the middleware for nodes on several hosts.
+"""`rise-di network`: write the profile of the middleware for nodes on several hosts.
 
-The network between the hosts is checked, too.
+It can also check the network between the hosts.
 """
 
 import os
@@ -23,12 +23,12 @@ FAILED = 1
 class Network:
     """Write the profile of the middleware for nodes on several hosts.
 
-    They communicate by unicast between their addresses, without multicast. Exit status: 0 written,
-    and with --check every host receives and is received; 1 a host does not; 2 bad input.
+    The nodes then communicate by unicast between their addresses, without multicast. Exit status: 0
+    written and, with --check, every host receives and is received; 1 a host does not; 2 bad input.
     """
 
     peers: str = option(
-        "IPv4 addresses of all hosts, this one's among them; the same on each host.",
+        "IPv4 addresses of all hosts, including this one. Give the same on each host.",
         default=REQUIRED,
         metavar="A,B",
     )
@@ -36,7 +36,8 @@ class Network:
         "File to write the profile to.", default=Path("network.xml"), metavar="FILE"
     )
     check: bool = option(
-        "Then wait for the same command on the other hosts: who receives whom, delays, clocks.",
+        "Then wait for the same command on the other hosts, and show who receives whom, the delays "
+        "and the clocks.",
         default=False,
     )
     timeout: float = option(
@@ -44,7 +45,7 @@ class Network:
     )
 
     def execute(self) -> None:
-        """Write the profile, and check the network where the user asks."""
+        """Write the profile, and check the network if the user asks for it."""
         require_package("rclpy", "")
         require_ros_environment()
         from flight_bringup.client import write_profile  # noqa: PLC0415 - loads rclpy
@@ -60,7 +61,7 @@ class Network:
             self._exchange(own_host, hosts)
 
     def _exchange(self, own_host: str, hosts: Sequence[str]) -> None:
-        """Wait for the other hosts, and say of each whether both receive."""
+        """Wait for the other hosts, and say for each whether both receive."""
         from flight_bringup.client import NetworkClient, domain_ports  # noqa: PLC0415 - loads rclpy
 
         others = [address for address in hosts if address != own_host]

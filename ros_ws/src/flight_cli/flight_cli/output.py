@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the commands share: tables, JSON, paths, exit statuses."""
+"""What the commands share: tables, JSON, paths and exit statuses."""
 
 import json
 import os
@@ -37,13 +37,13 @@ from flight_core.parameters import require
 if TYPE_CHECKING:
     from flight_analysis.report.tables import MetricTable as PageTable
 
-# Exit status; bad input is 2 (`flight_cli.cli`).
+# Exit status. That of bad input is 2 (`flight_cli.cli`).
 INTERRUPTED = 130
-# The head of a written file.
+# The head of each file that a command writes.
 LICENCE = (
     "# SPDX-FileCopyrightText: RISE-DI contributors\n# SPDX-License-Identifier: Apache-2.0\n#\n"
 )
-LATEST = Path("runs/latest")  # the run of a command that is given none
+LATEST = Path("runs/latest")  # the run that a command takes if it is given none
 
 
 def has_desktop() -> bool:
@@ -53,7 +53,7 @@ def has_desktop() -> bool:
 
 
 def show_outcome(console: Console, outcome: Mapping[str, Any]) -> None:
-    """Print the headline of an outcome, and below it what does not stand in it."""
+    """Print the headline of an outcome, and below it the details that are not in it."""
     style = {0: "bold", STATUS_HOST: "bold yellow"}.get(outcome["status"], "bold red")
     say(console, f"outcome: {outcome['sentence']}", style=style)
     for detail in outcome["details"]:
@@ -61,7 +61,7 @@ def show_outcome(console: Console, outcome: Mapping[str, Any]) -> None:
 
 
 def show_errors(console: Console, flight: RecordedFlight) -> None:
-    """Print the first table of a flight: the errors, or those that an imported log has."""
+    """Print the first table of a flight: its errors, or what an imported log has of them."""
     first, *_ = _tables(flight)
     print_table(console, grouped_table(first.caption, first.columns, first.rows))
 
@@ -90,7 +90,7 @@ def show_flight(console: Console, flight: RecordedFlight) -> None:
 
 
 def _show_margins(console: Console, flight: RecordedFlight, scenario: Scenario) -> None:
-    """Print the margins under the parameters that flew, where these changed in flight."""
+    """Print the margins under the parameters that flew, if they changed in flight."""
     from flight_analysis.report import margin_figures  # noqa: PLC0415 - loads SciPy
 
     flown = flown_loops(flight.tape, scenario, flight.controllers, flight.later_aircraft)
@@ -106,24 +106,25 @@ def show_table(console: Console, table: "PageTable") -> None:
 
 
 def entry_table(title: str, entries: Iterable[Entry]) -> Table:
-    """Entries of A and B, nominal and identified, with the standard deviation of the change."""
+    """Make a table of entries of A and B: nominal, identified, and how far they changed."""
     headings = ("entry", "nominal", "identified", "change %", "deviation %")
-    table = new_table(f"{title}, SI; deviation: of the change, standard", headings)
+    table = new_table(f"{title}, SI; deviation: standard deviation of the change", headings)
     for entry in entries:
         values = f"{entry.nominal:.4g}", f"{entry.value:.4g}"
         if entry.nominal:
             percent = f"{100 * entry.error:+.1f}", f"{100 * entry.deviation:.1f}"
         else:
-            # It is new: there is no change in %.
+            # The nominal entry is zero, so that there is no change in %.
             percent = "", f"{100 * entry.deviation / abs(entry.error or 1.0):.1f}"
         table.add_row(escape(entry.name), *values, *percent)
     return table
 
 
 def entries_as_json(entries: Iterable[Entry]) -> dict[str, dict[str, float]]:
-    """Entries of A and B by name, nominal and identified in SI.
+    """Return entries of A and B by name, nominal and identified, in SI.
 
-    The change and its deviation are in units, the deviation of an entry in SI.
+    The change and its deviation are fractions of the nominal entry. If that is zero, they are in
+    SI.
     """
     return {
         entry.name: {
@@ -145,8 +146,8 @@ def new_table(
 ) -> Table:
     """Return an empty table.
 
-    Columns are aligned right, except those in `left_aligned`; by default, that is the first.
-    Columns keep to one line, except those in `wrapped`.
+    Columns are aligned right, except those in `left_aligned`, by default the first. Columns keep to
+    one line, except those in `wrapped`.
     """
     left_columns = headings[:1] if left_aligned is None else left_aligned
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
@@ -157,9 +158,9 @@ def new_table(
 
 
 def print_table(console: Console, table: Table) -> None:
-    """Print a table at the width that its figures need.
+    """Print a table as wide as its figures need.
 
-    A narrow terminal folds the lines, and no cell is cut.
+    A narrow terminal folds the lines, but no cell is cut.
     """
     for column in table.columns:
         if column.no_wrap:
@@ -174,7 +175,7 @@ def print_table(console: Console, table: Table) -> None:
 
 
 def _plain(cell: RenderableType) -> str:
-    """Return the text of a cell as it is printed, without markup."""
+    """Return the text of a cell as it is printed, without its markup."""
     return Text.from_markup(cell).plain if isinstance(cell, str) else str(cell)
 
 
@@ -185,7 +186,7 @@ NAME_COLUMN = TextColumn("{task.description}")
 COUNT_COLUMNS = (NAME_COLUMN, BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
 SHOWN_COLUMN = TextColumn("{task.fields[shown]}")
 CLOCK_COLUMNS = (TextColumn("{task.fields[clock]}"), BarColumn(), SHOWN_COLUMN)
-"""Columns of progress bars: a count and the time that is left, a text, a clock with a text."""
+"""Columns of progress bars: a count with the time that is left, a text, a clock with a text."""
 
 
 def progress_bar(*columns: ProgressColumn, quiet: bool = False) -> Progress:
@@ -220,7 +221,10 @@ def flight_progress(
 
 
 def grouped_table(title: str, columns: Sequence[Column], rows: Iterable[Sequence[str]]) -> Table:
-    """Return a table with the rows' names first; adjacent columns of one group share a heading."""
+    """Return a table that begins with the names of the rows.
+
+    Adjacent columns of the same group share a heading.
+    """
     table = Table(title=escape(title), title_justify="left", box=box.SIMPLE_HEAD, padding=0)
     table.show_header = any(column.label for column in columns)
     table.add_column("", no_wrap=True)
@@ -234,7 +238,7 @@ def grouped_table(title: str, columns: Sequence[Column], rows: Iterable[Sequence
 
 
 def parse_numbers(text: str) -> list[float]:
-    """Numbers separated by commas; an empty list where one of them is none."""
+    """Parse numbers that commas separate; return an empty list if one of them is none."""
     try:
         return [float(part) for part in text.split(",")]
     except ValueError:
@@ -242,7 +246,7 @@ def parse_numbers(text: str) -> list[float]:
 
 
 def named_numbers(option: str, texts: Sequence[str], example: str) -> dict[str, float]:
-    """Numbers by name from texts as NAME=NUMBER."""
+    """Parse texts such as NAME=NUMBER into numbers by name."""
     numbers = {}
     for text in texts:
         name, _, value = text.rpartition("=")
@@ -260,14 +264,14 @@ def named_numbers(option: str, texts: Sequence[str], example: str) -> dict[str, 
 
 
 def parse_lags(text: str) -> list[float]:
-    """Lags from "0.02,0.1", or from one value for all. Raises ParameterError."""
+    """Parse lags from "0.02,0.1", or one value for all. Raises ParameterError."""
     values = parse_numbers(text)
     require(bool(values), "--lag", repr(text), "seconds separated by commas")
     return values
 
 
 def say(console: Console, text: str, style: str = "") -> None:
-    """Print a text as it is, also where it is longer than a line."""
+    """Print a text as it is, even if it is longer than a line."""
     console.print(text, style=style, highlight=False, soft_wrap=True)
 
 
@@ -285,9 +289,9 @@ def stdout_for(file: Path | None) -> AbstractContextManager[object]:
 
 
 def write_text(option: str, path: Path, text: str) -> None:
-    """Write a file that an option names, "-" for standard output.
+    """Write a file that an option names; "-" stands for standard output.
 
-    Raises ParameterError where it cannot be written.
+    Raises ParameterError if it cannot be written.
     """
     if path == STDOUT:
         print(text, end="")

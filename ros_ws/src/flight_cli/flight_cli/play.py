@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`rise-di play`: publish the topics of a recorded flight again with their timing.
 
-For a node under test.
+A node under test can then receive them.
 """
 
 import math
@@ -21,7 +21,7 @@ from flight_log.tape_reader import topics_text
 
 
 class Stamps(StrEnum):
-    """Stamps of the messages."""
+    """The stamps that the messages get."""
 
     NOW = "now"
     RECORDED = "recorded"
@@ -31,19 +31,22 @@ class Stamps(StrEnum):
 class Play:
     """Publish the topics of a recorded flight again with their timing.
 
-    /clock has the time of the log. The bytes of the log are sent, with new stamps. A domain with a
-    publisher on a topic of the log is refused. A warning names the skipped topics: without CDR, or
-    of a message type that is not installed. Exit status: 0 played to the end, 2 bad input, 130
-    interrupted.
+    /clock has the time of the log. The bytes are those of the log, with new stamps. The command
+    refuses to play if the domain already has a publisher on one of the topics. A warning names the
+    topics that are skipped, because they are not in CDR or because their message type is not
+    installed. Exit status: 0 played to the end, 2 bad input, 130 interrupted.
     """
 
     run: Path = argument("Folder of a run, or an MCAP file.", default=REQUIRED)
-    topics: str = option("Topics, as in y,y_m; by default all but those of every node.", default="")
-    rate: float = option("Factor to real time.", default=1.0, min=0.01, max=100.0)
+    topics: str = option(
+        "Topics to play, as in y,y_m; by default all, except those that every node has.", default=""
+    )
+    rate: float = option("Speed as a multiple of real time.", default=1.0, min=0.01, max=100.0)
     start: float = option("Flight time to start at, s.", default=0.0, min=0.0)
     loop: bool = option("Repeat until Ctrl-C.", default=False)
     stamps: Stamps = option(
-        "now: moved to the present, as a controller in real time needs them; recorded: unchanged.",
+        "Stamps of the messages. now: moved to the present, as a controller in real time needs "
+        "them; recorded: unchanged.",
         default=Stamps.NOW,
     )
     namespace: str | None = log_namespace()
@@ -51,7 +54,9 @@ class Play:
     def execute(self) -> None:
         """Play until the end of the log, or until Ctrl-C."""
         for name, value in (("--rate", self.rate), ("--start", self.start)):
-            require(math.isfinite(value), name, value, "a number")  # NaN passes the ranges above
+            require(
+                math.isfinite(value), name, value, "a number"
+            )  # the ranges above do not refuse NaN
         names = [name.strip() for name in self.topics.split(",") if name.strip()]
         playback = read_playback(self.run, names, self.start, self.namespace)
         warn_of_lacks_in(self.run, self.namespace)
@@ -78,9 +83,9 @@ class Play:
                     break
 
     def _sendable(self, playback: Playback, *, every: bool) -> dict[str, str]:
-        """Message types by topic for sending; a warning names the skipped topics.
+        """Return the message types of the topics that can be sent; warn which topics are skipped.
 
-        Raises ParameterError without a topic.
+        Raises ParameterError if none can be sent.
         """
         from flight_bringup.player import unsendable  # noqa: PLC0415 - as above
 

@@ -18,7 +18,7 @@ from flight_log.tape_reader import read_run
 
 
 def repair_log(run: Path) -> None:
-    """Rebuild the log of a run whose recorder was killed, or that is damaged.
+    """Rebuild the log of a run if its recorder was killed or if it is damaged.
 
     An intact log stays as it is.
     """
@@ -40,9 +40,9 @@ def repair_log(run: Path) -> None:
 
 
 def _missing_at_end(run: Path, last: FileRepair) -> str:
-    """Time missing at the end of the log, as a sentence.
+    """Say how much time is missing at the end of the log.
 
-    The files say their end, else the duration of the scenario does.
+    The files say when they end. If they do not, the duration of the scenario does.
     """
     if (missing := seconds(last.known_end_ns - last.last_ns)) > 0:
         return f"{missing:.3f} s are missing at its end"

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`rise-di replay`: compute a recorded flight again and compare it bit by bit.
 
-With other gains it computes the flight in open loop.
+With other gains, it computes the flight in open loop.
 """
 
 import io
@@ -54,9 +54,9 @@ class Replay:
     """Compute every tick of a recorded flight again and compare it with the log bit by bit.
 
     Every step of guidance is computed and compared, too. --set computes u from the recorded y and
-    y_m with other parameters. That is an open loop: the aircraft did not fly this u. Exit status: 0
-    every bit equal, 1 a tick differs or flew with other parameters, 2 bad input, 4 every bit equal,
-    and less than 99 % of the ticks are in the log with y and u.
+    y_m with other parameters. That is an open loop, because the aircraft did not fly this u. Exit
+    status: 0 every bit is equal; 1 a tick differs or flew with other parameters; 2 bad input; 4
+    every bit is equal, but less than 99 % of the ticks are in the log with y and u.
     """
 
     run: Path = argument("Folder of a run, or an MCAP file.", default=LATEST)
@@ -64,11 +64,11 @@ class Replay:
     scenario: str | None = log_scenario()
     namespace: str | None = log_namespace()
     remap: list[str] | None = option(REMAP, metavar="NAME:=TOPIC")
-    csv: Path | None = option("CSV file for u as recorded and as computed; - for standard output.")
+    csv: Path | None = option("CSV file for u as recorded and as computed; - is standard output.")
     as_json: bool = json_option()
 
     def execute(self) -> None:
-        """Compute every tick again, show what differs, exit with the status."""
+        """Compute every tick again, show what differs, and exit with the status."""
         changes = parse_settings(self.settings, "controller")
         controller_changes = {
             name.removeprefix("controller."): value for name, value in changes.items()
@@ -117,18 +117,18 @@ class Replay:
 
 
 class Shown(NamedTuple):
-    """Ticks computed again, and steps of guidance of a guided flight."""
+    """The ticks that were computed again, and the steps of guidance of a guided flight."""
 
     result: ReplayResult
     inputs: tuple[str, ...]
-    ticks: int  # flown; the log may lack some
-    open_loop: bool  # with other parameters
+    ticks: int  # that were flown; the log may lack some of them
+    open_loop: bool  # u was computed with other parameters
     guided: GuidanceReplay | None
-    promise: Guarantee | None  # that was computed for the loop of the flight
-    differences: tuple[str, ...] = ()  # of the aircraft from what the controller was told
+    promise: Guarantee | None  # if one was computed for the loop of the flight
+    differences: tuple[str, ...] = ()  # how the aircraft differs from what the controller was told
 
     def notes(self) -> list[str]:
-        """Return notes of the computation, and on ticks whose parameters are not the log's."""
+        """Return notes on the computation, and on ticks with other parameters than the log's."""
         result = self.result
         notes = [*result.notes, *(() if self.guided is None else self.guided.notes)]
         rows = np.flatnonzero(result.other_parameters)
@@ -147,8 +147,8 @@ class Shown(NamedTuple):
 def _claims_of(run: RecordedRun) -> tuple[Guarantee | None, tuple[str, ...]]:
     """Return the guarantee of the loop of a flight, and how its aircraft differs.
 
-    The guarantee is None without one, without a linear model, where the parameters changed in
-    flight, and where it does not hold for the aircraft that flew.
+    The guarantee is None if there is none, if there is no linear model, if the parameters changed
+    in flight, or if it does not hold for the aircraft that flew.
     """
     if len({span.digest for span in parameter_spans(run.tape)}) > 1:
         return None, ()
@@ -176,7 +176,7 @@ def _show_guidance(replay_of_guidance: GuidanceReplay) -> None:
 
 
 def _difference(first: ReplayDifference) -> str:
-    """Return a difference between recorded and computed value as text."""
+    """Describe the difference between a recorded and a computed value."""
     if first.ulps is None:
         distance = "which is not a number"
     else:
@@ -243,9 +243,10 @@ def _count_by_group(result: ReplayResult) -> dict[str, int]:
 
 
 def _u_figures(result: ReplayResult, inputs: tuple[str, ...]) -> dict[str, dict[str, float]]:
-    """Difference of u by input, in its unit.
+    """Return figures of the difference of u for each input, in the input's unit.
 
-    The figures are the rms, the largest, its time, and the rms of the recorded u; NaN without a u.
+    They are the rms, the largest difference, its time, and the rms of the recorded u. They are NaN
+    if there is no u.
     """
     is_finite = np.isfinite(result.computed).all(axis=1)
     u_recorded = result.group(result.recorded[is_finite], "u")
@@ -291,9 +292,9 @@ def _as_json(answer: Shown, notes: Sequence[str], settings: list[str]) -> dict[s
 
 
 def _write_csv(path: Path, result: ReplayResult, inputs: tuple[str, ...]) -> None:
-    """Write a row a tick: number, t, then each input as recorded and as computed.
+    """Write a row for each tick: its number, t, then each input as recorded and as computed.
 
-    The digits restore every bit.
+    The digits are enough to restore every bit.
     """
     columns = [result.names.index(f"u.{name}") for name in inputs]
     text = io.StringIO(newline="")

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di report`: tables, report page, figures and data of recorded runs."""
+"""`rise-di report`: write tables, the report page, figures and data of recorded runs."""
 
 import webbrowser
 from collections.abc import Sequence
@@ -41,44 +41,45 @@ FILES = ("html", "output", "png", "parquet", "figure")
 class Report:
     """Write the report page of a recorded run again, and print its tables.
 
-    With several runs the page compares them. A log of --repair holds every message that could be
-    read, an index and, in the folder of a run, metadata.yaml. The damaged file stays as *.damaged,
-    an intact log as it is, and metadata.yaml of another program is never replaced. Exit status: 0,
-    2 bad input, 4 a log is incomplete.
+    If there are several runs, the page compares them. A log that --repair has rebuilt holds every
+    message that could be read, an index and, in the folder of a run, metadata.yaml. The damaged
+    file is kept as *.damaged, an intact log stays as it is, and metadata.yaml of another program is
+    never replaced. Exit status: 0, 2 bad input, 4 a log is incomplete.
     """
 
     runs: list[Path] | None = argument(
-        "Folder of a run, by default runs/latest; several are compared with the first."
+        "Folder of a run; by default runs/latest. Several runs are compared with the first."
     )
     html: Path | None = rare_option(
-        "Page of a comparison; by default a new comparison.html beside run 1.", "--page"
+        "Page of a comparison; by default a new comparison.html beside the first run.", "--page"
     )
     output: Path | None = rare_option(
-        "Folder for the report of one run, by default that of its log: for archives."
+        "Folder for the report of one run; by default that of its log. Use it for archives."
     )
-    png: Path | None = option("Write y over y_m, e and u as one PNG figure.")
+    png: Path | None = option("PNG file to write, with y over y_m, e and u.")
     csv: Path | None = option(
-        "Write all signals as CSV, one row an instant, one column a channel; - for standard output."
+        "CSV file to write, with a row for each instant and a column for each channel; - is "
+        "standard output."
     )
-    parquet: Path | None = option("Write the same table as Parquet.")
+    parquet: Path | None = option("Parquet file to write, with the same table.")
     repair: bool = option(
-        "Rebuild each log whose recorder was killed, or that is damaged, and write no report.",
+        "Rebuild each log that is damaged or whose recorder was killed, and write no report.",
         default=False,
     )
     scenario: str | None = log_scenario()
     namespace: str | None = log_namespace()
     remap: list[str] | None = option(REMAP, metavar="NAME:=TOPIC")
     figure: Path | None = option(
-        "Write a figure for a paper: .pdf, .svg, .eps as vectors, or .png."
+        "File to write with a figure for a paper: .pdf, .svg, .eps as vectors, or .png."
     )
-    width: str = rare_option("Width of the figure: 88mm, 3.5in.", default=WIDTH)
+    width: str = rare_option("Width of the figure, as in 88mm or 3.5in.", default=WIDTH)
     channels: str = rare_option(
-        "Channels of the figure: outputs, inputs, errors, as in q,V,e.q,elevator; by "
-        "default each output.",
+        "Channels of the figure: outputs, inputs and errors, as in q,V,e.q,elevator; by default "
+        "each output.",
         default="",
     )
     opens: bool | None = rare_option(
-        "Open the page in the browser; by default on a desktop, from a terminal.",
+        "Open the page in the browser; by default if you are at a terminal on a desktop.",
         "--open/--no-open",
     )
     as_json: bool = json_option()
@@ -125,7 +126,7 @@ def _show(flights: Sequence[RecordedFlight]) -> None:
 
 
 def show_comparison(console: Console, flights: Sequence[RecordedFlight]) -> None:
-    """Print the errors of several flights with their ratios to the first."""
+    """Print the errors of several flights, with their ratios to the first flight."""
     for k, (label, flight) in enumerate(zip(labels(flights), flights, strict=True), start=1):
         result = f"{flight.summary['outcome']['sentence']}{taken_over(flight.summary, 'errors')}"
         say(console, f"{k}: {label}, {result}")

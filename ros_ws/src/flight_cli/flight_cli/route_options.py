@@ -16,22 +16,23 @@ from flight_guidance.routes.route_file import Origin, Waypoint, read_route_file
 
 @dataclass(frozen=True, kw_only=True)
 class RouteWords:
-    """The words of the commands that read a route file."""
+    """The options of the commands that read a route file."""
 
     origin: str | None = rare_option(
-        "Where north = east = 0 for a route in latitudes, degrees; else the file's home.",
+        "Place of north = east = 0 for a route in latitude and longitude, degrees; by default the "
+        "home of the file.",
         metavar="LAT,LON",
     )
     altitude: float | None = rare_option(
-        "Altitude of a route without, or of the ground or home that it counts from, m.",
+        "Altitude of a route that has none, or of the ground or home from which it counts, m.",
     )
     simplify: float = rare_option(
-        "Leave out positions of a route within this distance of the line without them, m.",
+        "Leave out positions that are within this distance of the line through the others, m.",
         default=0.0,
         min=0.0,
     )
     line: str | None = rare_option(
-        "Which line of a file with several: a number from 1 on, or a name.",
+        "Which line to fly, if the file has several: a number from 1 on, or a name.",
         metavar="LINE",
     )
 
@@ -40,7 +41,8 @@ class RouteWords:
     ) -> tuple[Waypoint, ...]:
         """Read the waypoints of a route file, and print notes on the rest of it on standard error.
 
-        `fence` is the file of the fence; it may be the same file. Raises as `read_route_file`.
+        `fence` is the file of the fence, which may be the same file. Raises what `read_route_file`
+        raises.
         """
         for key, value in (("altitude", self.altitude), ("simplify", self.simplify)):
             require(value is None or math.isfinite(value), f"--{key}", value, "a number")
@@ -53,7 +55,7 @@ class RouteWords:
             line=self.line,
         )
         for note in route.notes:
-            # A fence that is given is kept.
+            # The flight keeps a fence that is given.
             if note == FENCE_NOTE and fence is not None and fence.samefile(file):
                 continue
             warn(f"note: {note}")

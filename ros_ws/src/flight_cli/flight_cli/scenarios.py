@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di scenarios`: the scenarios by name."""
+"""`rise-di scenarios`: list the scenarios by name."""
 
 from dataclasses import dataclass
 from itertools import dropwhile, takewhile
@@ -15,7 +15,7 @@ from flight_cli.words import argument, json_option, scenario_names
 def first_sentences(text: str) -> str:
     """Return the first sentences of the comment at the head of a file.
 
-    They end with the first line that ends with a full stop, or with the paragraph.
+    They end at the first line that ends with a full stop, or with the paragraph.
     """
     head = takewhile(lambda line: line.startswith("#") or not line.strip(), text.splitlines())
     comment = (line.removeprefix("#").strip() for line in head)
@@ -36,14 +36,14 @@ class Scenarios:
     """
 
     names: list[str] | None = argument(
-        "Names, or scenario files (.yaml); by default all that ship.",
+        "Names, or scenario files (.yaml); by default all scenarios that ship.",
         metavar="[SCENARIO]...",
         autocompletion=scenario_names,
     )
     as_json: bool = json_option()
 
     def execute(self) -> None:
-        """Print a row a scenario."""
+        """Print a row for each scenario."""
         rows = []
         for name in self.names or sorted(path.stem for path in LIBRARY.glob("*.yaml")):
             scenario = find_scenario(name)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The option --set: parameters of a scenario by their keys."""
+"""The option --set, which changes parameters of a scenario by their keys."""
 
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
@@ -15,12 +15,12 @@ from flight_core.parameters import Config, flatten, nest, one_of, require
 
 def settings_option() -> Any:
     """Declare the option --set, which sets parameters by key."""
-    text = "A parameter to change, as in controller.k_g=2.0; may be repeated."
+    text = "Parameter to change, as in controller.k_g=2.0; may be repeated."
     return option(text, "--set", metavar="KEY=VALUE", autocompletion=setting_names)
 
 
 def setting_names(incomplete: str) -> list[str]:
-    """Complete a key of --set: those of the shipped scenarios, as the shell asks for them."""
+    """Complete a key of --set, when the shell asks for it, from the shipped scenarios."""
     keys: set[str] = set()
     for path in LIBRARY.glob("*.yaml"):
         scenario = find_scenario(path.stem)
@@ -38,9 +38,9 @@ def parse_settings(
 ) -> dict[str, Any]:
     """Parse the words of --set into values by key, for example controller.k_g.
 
-    `owner` is the only section that a key can belong to, or else the scenario. `sections_with` a
-    key returns the sections that an error names if the user left the section out. Raises
-    ParameterError.
+    `owner` is the only section to which a key can belong; "scenario" allows every section. If the
+    user left the section out, the error names the sections that `sections_with` returns for the
+    key. Raises ParameterError.
     """
     changes: dict[str, Any] = {}
     for text in settings or ():
@@ -78,7 +78,7 @@ def with_settings(scenario: Scenario, settings: Sequence[str] | None) -> Scenari
 
 
 def _changed(section: object, changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the parameters of a section that change; a group of keys changes as a whole."""
+    """Return the parameters of a section that change. A group of keys changes as a whole."""
     if not isinstance(section, Config):
         return nest(changes)
     values = section.changed(changes)

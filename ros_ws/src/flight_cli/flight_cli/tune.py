@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di tune`: from the log of an autopilot to the module that flies better.
+"""`rise-di tune`: make a module that flies better from the log of an autopilot.
 
-Import, identification, gains, guarantee and export are those of the commands of these names.
+It imports, identifies, selects gains, bounds and exports, as the commands of these names do.
 """
 
 import math
@@ -74,12 +74,12 @@ from flight_log.vehicle_log import read_foreign_log
 from rise_di.c_code import export
 
 UNPROVED = 1
-LEAST, MOST = 0.05, 0.3  # of A and B, of which the margins are asked
+LEAST, MOST = 0.05, 0.3  # bounds on the uncertainty of A and B that the margins must cover
 SAMPLES = 60  # uncertain aircraft
-DELAY_MARGIN = 0.01  # s, beside the observer, as of examples/px4_airplane/rates_observer.yaml
-FEWEST = 3  # doublets of an axis
-LENGTH = 0.5  # s of a half of a doublet where the scenario has none
-APART = 2.0  # s
+DELAY_MARGIN = 0.01  # s, with the observer, as in examples/px4_airplane/rates_observer.yaml
+FEWEST = 3  # doublets on an axis
+LENGTH = 0.5  # s, of half a doublet if the scenario has none
+APART = 2.0  # s between doublets
 STEPS = {
     "px4": (
         (
@@ -107,14 +107,14 @@ STEPS = {
 
 
 class Predicted(NamedTuple):
-    """What a loop does on the identified aircraft: rms of e, (m,), and margins."""
+    """What a loop does on the identified aircraft: the rms of e, (m,), and the margins."""
 
     rms: FloatArray
     margins: LoopMargins
 
 
 class _Tuned(NamedTuple):
-    """The steps of a tuning."""
+    """The results of the steps of a tuning."""
 
     identification: Identification
     uncertainty: float
@@ -131,39 +131,42 @@ class Tune:
     """Identify the aircraft of a log, select its gains, and export the module that flies them.
 
     The log is a ULog of PX4, or a DataFlash log of ArduPlane, in which the autopilot or an earlier
-    module flew doublets of each rate. The scenario has the rates, the end stops and the commands;
-    that in the folder of an earlier tuning is better. A log with too little motion names the
-    doublets to fly.
+    module flew doublets on each rate. The scenario has the rates, the end stops and the commands;
+    if you tuned before, take the one in the folder of that tuning. If the log has too little
+    motion, the command says which doublets to fly.
 
-    Exit status: 0; 1 if an aircraft within the errors of the identification may be unstable, or a
-    bit of the code differs; 2 bad input, a model that is refused, or short margins.
+    Exit status: 0; 1 if an aircraft within the errors of the identification may be unstable, or if
+    a bit of the code differs; 2 bad input, a model that is refused, or margins that fall short.
     """
 
     log: Path = argument("ULog of PX4, or DataFlash log of ArduPlane.", default=REQUIRED)
     scenario: str = option(
-        "Scenario of body rates, as of export --px4: name, or path of a file (.yaml).",
+        "Scenario of body rates, as for export --px4: name, or path of a file (.yaml).",
         default=REQUIRED,
         autocompletion=scenario_names,
     )
-    px4: Path | None = option("Folder for a module of PX4, what it was made of, and a page.")
+    px4: Path | None = option(
+        "Folder for a module of PX4, the files that it was made from, and a page."
+    )
     ardupilot: Path | None = option("Folder for a task of ArduPlane, in place of --px4.")
     lag: str | None = option(
-        "Lags of the servos in s, in the airframe's order: 0.02,0.1; by default those of the "
-        "aircraft in the scenario."
+        "Lags of the servos in s, in the order of the airframe, as in 0.02,0.1; by default those "
+        "of the aircraft in the scenario."
     )
-    start: float | None = option("Begin, s since the begin of the log.", "--from")
-    stop: float | None = option("End, s since the begin of the log.", "--until")
+    start: float | None = option("Time to begin at, s since the begin of the log.", "--from")
+    stop: float | None = option("Time to end at, s since the begin of the log.", "--until")
     calm: bool = option(
-        "Without an observer, which hands on the noise of the gyro in calm air.", default=False
+        "Do without an observer, which passes the noise of the gyro on to u in calm air.",
+        default=False,
     )
-    float32: bool = option("Compute in float.", default=False)
-    accept: bool = rare_option("Write gains whose margins fall short.", default=False)
+    float32: bool = option("Compute in single precision.", default=False)
+    accept: bool = rare_option("Write gains even if their margins fall short.", default=False)
     without_proof: bool = rare_option(
         "Write the code without a proof.", "--no-proof", default=False
     )
 
     def execute(self) -> None:
-        """Identify, select, bound, export, show."""
+        """Identify, select, bound, export and show."""
         autopilot, folder = self._target()
         console = Console()
         try:
@@ -202,7 +205,7 @@ class Tune:
         return autopilot, folder
 
     def _tuned(self, console: Console, autopilot: str, folder: Path) -> _Tuned:
-        """Identify, select the gains and bound them: all of the command except the export."""
+        """Identify, select the gains and bound them: the whole command except the export."""
         scenario = find_scenario(self.scenario)
         controller = scenario.rise_di()
         nominal = load_airframe(scenario.aircraft.airframe)
@@ -256,7 +259,7 @@ class Tune:
         )
 
     def _lags(self, scenario: Scenario, nominal: Airframe) -> FloatArray:
-        """Return the lags of the servos in the airframe's order, s. Raises ParameterError."""
+        """Return the lags of the servos in the order of the airframe, s. Raises ParameterError."""
         channels = scenario.aircraft.channels().inputs
         lags = dict(zip(channels, scenario.aircraft.actuators.lag, strict=False))
         if self.lag is not None:
@@ -266,7 +269,10 @@ class Tune:
     def _selection(
         self, console: Console, airframe: Airframe, flight: Scenario, uncertainty: float
     ) -> Selection:
-        """Gains for the identified airframe. Raises ParameterError for short margins."""
+        """Select gains for the identified airframe.
+
+        Raises ParameterError if the margins fall short.
+        """
         with console.status("selecting gains") as status:
             selection = select_gains(
                 airframe,
@@ -293,7 +299,7 @@ def _identified(
     recorded: FlightData,
     actuation: Actuation,
 ) -> Identification:
-    """Search the model on the log, and show a progress bar."""
+    """Search for the model on the log, and show a progress bar."""
     controller = scenario.rise_di()
     pairing = ChannelPairing(controller.outputs, controller.inputs)
     unknown = Unknown(has_hidden_rows=False)
@@ -315,7 +321,7 @@ def _identified(
 
 
 def _what_to_fly(identification: Identification, scenario: Scenario, log: Path) -> str:
-    """Why the model is refused, and the doublets that would show what is missing."""
+    """Say why the model is refused, and which doublets would show what is missing."""
     y = identification.recorded.y
     reference = scenario.reference_model
     texts = []
@@ -343,7 +349,7 @@ def _column(identification: Identification, output: str) -> int:
 def _kept(nominal: Airframe, identification: Identification) -> Airframe | None:
     """Put the identified parts into the airframe, or return None if one of them must not be used.
 
-    If the nominal model of a part explains the log better, that part stays nominal.
+    If the nominal model of a part explains the log better, this part stays nominal.
     """
     used = []
     for part in identification.parts:
@@ -367,9 +373,9 @@ def _refusal(part: Part) -> str:
 
 
 def _uncertainty(identification: Identification) -> float:
-    """Twice the largest standard deviation of the best known effects, from LEAST to MOST.
+    """Return twice the largest standard deviation of the best known effects, from LEAST to MOST.
 
-    In parts of the value that was found.
+    The deviation of an effect is a fraction of the value that was found.
     """
     effects = best_known(identification.entries, identification.airframe.outputs)
     parts = [effect.deviation * abs(effect.nominal / effect.value) for effect in effects]
@@ -377,7 +383,10 @@ def _uncertainty(identification: Identification) -> float:
 
 
 def _on_airframe(scenario: Scenario, airframe: Path, noise: FloatArray) -> Scenario:
-    """Return the scenario on the identified airframe; the log's gyro gives its noise, rad/s rms."""
+    """Return the scenario on the identified airframe.
+
+    Its sensors have the noise of the gyro in the log, rad/s rms.
+    """
     changes = {"airframe": str(airframe.resolve()), "sensors": {"noise": noise.tolist()}}
     return scenario.vary(aircraft=changes)
 
@@ -385,9 +394,9 @@ def _on_airframe(scenario: Scenario, airframe: Path, noise: FloatArray) -> Scena
 def _predicted(
     scenario: Scenario, airframe: Airframe, own: OwnLoop | None, uncertainty: float
 ) -> tuple[Predicted, Predicted | None]:
-    """RISE-DI and the autopilot's own loop along the commands of the scenario.
+    """Fly RISE-DI, and compute the autopilot's own loop, along the commands of the scenario.
 
-    Both follow y_m on the identified aircraft, with the noise of the log's gyro.
+    Both follow y_m on the identified aircraft, with the noise of the gyro in the log.
     """
     controller = scenario.rise_di()
     tape = simulate(scenario)
@@ -420,7 +429,7 @@ def _rms(e: FloatArray) -> FloatArray:
 
 
 def _error_rows(tuned: _Tuned) -> list[list[str]]:
-    """Output, rms of RISE-DI and of the own loop, mrad/s, and the ratio."""
+    """Return for each output the rms of RISE-DI and of the own loop, mrad/s, and the ratio."""
     outputs = tuned.scenario.controller.outputs
     rows = []
     for i, name in enumerate(outputs):
@@ -461,7 +470,7 @@ def _page(tuned: _Tuned, log: str, autopilot: str) -> Page:
             ]
             for entry in identification.entries
         ],
-        "deviation: standard, of the change",
+        "deviation: standard deviation of the change",
     )
     own = "no parameters of it in the log" if tuned.own is None else tuned.own.source
     errors = MetricTable(

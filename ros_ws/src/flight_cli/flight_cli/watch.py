@@ -36,24 +36,27 @@ from flight_view.watch import (
 class Watch:
     """See a flight on a page, live while it is recorded, or again later.
 
-    The page has charts, horizon, scene and timeline. It is served on this host alone, until Ctrl-C.
-    Exit status: 0 ended, 2 bad input, 130 interrupted in the terminal.
+    The page has charts, a horizon, a scene and a timeline. It is served on this host alone, until
+    Ctrl-C. Exit status: 0 ended, 2 bad input, 130 interrupted in the terminal.
     """
 
     run: list[Path] | None = argument(
-        "Folder of a run, or an MCAP file; by default the run in progress, else the "
-        "last one. The second is a ghost.",
+        "Folder of a run, or an MCAP file; by default the run in progress, else the last one. A "
+        "second run is shown as a ghost.",
         metavar="[RUN]...",
     )
     fleet: bool = option(
-        "Show the aircraft of each RUN on one map, and a choice of them; by default "
-        "the runs in progress.",
+        "Show the aircraft of all RUNs on one map, where you choose one of them; by default the "
+        "runs in progress.",
         default=False,
     )
     port: int | None = option(
-        "Port on this host; 0 takes any free one.", min=0, max=65535, show_default=f"{DEFAULT_PORT}"
+        "Port on this host; 0 takes any free port.",
+        min=0,
+        max=65535,
+        show_default=f"{DEFAULT_PORT}",
     )
-    wait: bool = option("Wait for the log of RUN where there is none yet.", default=False)
+    wait: bool = option("Wait for the log of RUN if there is none yet.", default=False)
     text: bool = option("Show the flight in the terminal, without a browser.", default=False)
     foxglove: bool = option(
         "Serve a flight in progress to Foxglove, Lichtblick and PlotJuggler instead.", default=False
@@ -62,18 +65,19 @@ class Watch:
         "Let the page command the flight, with a key that this command prints.", default=False
     )
     real: bool = rare_option(
-        "As --control, and gains also while a bridge sends to an autopilot.", default=False
+        "As --control, but gains may also change while a bridge sends to an autopilot.",
+        default=False,
     )
     scenario: str | None = log_scenario()
     namespace: str | None = option(
-        "Namespace of the aircraft: by default the first in the log, with --control the root."
+        "Namespace of the aircraft; by default the first in the log, with --control the root."
     )
     remap: list[str] | None = rare_option(REMAP, metavar="NAME:=TOPIC")
     background: Path | None = rare_option(
-        "GeoJSON of lines, polygons and points for the map, with --origin.", metavar="FILE"
+        "GeoJSON file with lines, polygons and points for the map; needs --origin.", metavar="FILE"
     )
     origin: str | None = rare_option(
-        "Where north and east are 0, for the background.", metavar="LAT,LON"
+        "Place where north and east are 0, for the background.", metavar="LAT,LON"
     )
     runs: Path = rare_option("Folder of the runs.", default=Path("runs"))
 
@@ -109,7 +113,7 @@ class Watch:
             serve(flights, ports, _announce, fleet=self.fleet)
 
     def _require_one_view(self) -> None:
-        """Raise ParameterError for contradictory words."""
+        """Raise ParameterError if options contradict each other."""
         runs = len(self.run or ())
         controlled = self.control or self.real
         require(
@@ -136,7 +140,7 @@ class Watch:
 
 
 def _in_progress(runs: Path) -> list[Path]:
-    """Return the runs that are being recorded, by name. Raises ParameterError if there is none."""
+    """Return the runs that are being recorded, by name. Raises ParameterError without any."""
     recording = runs_in_recording(runs)[::-1]
     require(bool(recording), f"--fleet: {runs}", "no run in recording", "each RUN by its name")
     return recording
@@ -180,7 +184,7 @@ def _serve_with_control(
     require_ros_environment()
     from flight_view.control_client import ControlClient  # noqa: PLC0415 - loads rclpy, which a page without control lacks
 
-    # the aircraft of a bridge is not the one in the scenario
+    # The aircraft behind a bridge is not the one in the scenario.
     assess = partial(delay_margins, flight=FlightFacts(is_simulated=not real))
     with ControlClient(namespace) as client:
         key = new_key()
@@ -196,7 +200,7 @@ def _serve_with_control(
 def watched(*runs: Path, fleet: bool = False) -> Iterator[list[str]]:
     """Serve the page of runs that another process will record during the block.
 
-    Yields its lines for the user.
+    Yields the lines that the user is to see.
     """
     options = ["--wait", *(["--fleet"] if fleet else [])]
     command = [
@@ -209,8 +213,8 @@ def watched(*runs: Path, fleet: bool = False) -> Iterator[list[str]]:
         *map(str, runs),
         *options,
     ]
-    # In a process group of its own: Ctrl-C reaches the flight alone, whose end the page still
-    # shows.
+    # The page has a process group of its own. Ctrl-C then only reaches the flight, whose end the
+    # page still shows.
     with subprocess.Popen(  # noqa: S603
         command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True, process_group=0
     ) as server:

@@ -20,11 +20,11 @@ from typer.exceptions import TyperException
 
 from flight_core.parameters import ParameterError, require
 
-DECLARE = "declare"  # key of what declares a field to Typer
-ALIKE = 0.85  # of a misspelt option: --run is near to --runs, --seed not to --send
-ALIKE_COMMANDS = 0.6  # of a misspelt command, which flies nothing by mistake
+DECLARE = "declare"  # key of the function that declares a field to Typer
+ALIKE = 0.85  # of a misspelt option: --run is close to --runs, but --seed is not to --send
+ALIKE_COMMANDS = 0.6  # of a misspelt command, since a wrong suggestion flies nothing
 REQUIRED = MISSING
-"""The default of a field without a default."""
+"""The default of a field that the user must give."""
 
 OTHER_NAMES: Mapping[str, Sequence[str]] = MappingProxyType(
     {
@@ -39,11 +39,11 @@ OTHER_NAMES: Mapping[str, Sequence[str]] = MappingProxyType(
         "--gui": ("--watch",),
     }
 )
-"""Names of options in other tools, and those of the same meaning here."""
+"""Names that options have in other tools, and the options of the same meaning here."""
 
 
 class Executable(Protocol):
-    """A command: a data class of the words, with the help as docstring."""
+    """A command: a data class of its options, whose docstring is its help."""
 
     def execute(self) -> None:
         """Do what the command does."""
@@ -51,7 +51,7 @@ class Executable(Protocol):
 
 def option(text: str, *names: str, default: Any = None, **rules: Any) -> Any:
     """Declare an option with its help; if `names` is empty, it has the name of the field."""
-    shown = escape(text)  # A[q,alpha] is no markup
+    shown = escape(text)  # A[q,alpha] is not markup
     return _field(
         lambda name: typer.Option(
             *(names or (f"--{name.replace('_', '-')}",)), help=shown, **rules
@@ -77,7 +77,7 @@ def write_option(text: str, default: Any = None, **rules: Any) -> Any:
 
 def json_option() -> Any:
     """Declare the option --json."""
-    return option("Print the result as JSON, nothing else.", "--json", default=False)
+    return option("Print the result as JSON and nothing else.", "--json", default=False)
 
 
 def namespace_option() -> Any:
@@ -101,7 +101,7 @@ def as_function(command: Callable[..., Executable]) -> Callable[..., None]:
         command(**values).execute()
 
     execute.__doc__ = command.__doc__
-    # The command's own words before those of its base.
+    # The command's own options come before those of its base.
     words = sorted(fields(command), key=lambda word: word.name not in command.__annotations__)  # type: ignore[arg-type]
     parameters = [_parameter(word, hints[word.name]) for word in words]
     execute.__signature__ = Signature(parameters)  # type: ignore[attr-defined]
@@ -109,7 +109,7 @@ def as_function(command: Callable[..., Executable]) -> Callable[..., None]:
 
 
 def _parameter(declared: Field[Any], hint: Any) -> Parameter:
-    """Turn a field into a parameter of the function; Typer declares a field without words."""
+    """Turn a field into a parameter of the function. Typer declares a field without help."""
     default = Parameter.empty if declared.default is MISSING else declared.default
     if declared.metadata:
         hint = Annotated[hint, declared.metadata[DECLARE](declared.name)]
@@ -117,14 +117,14 @@ def _parameter(declared: Field[Any], hint: Any) -> Parameter:
 
 
 def values_of(command: Executable, *names: str) -> dict[str, Any]:
-    """Fields of a command by name."""
+    """Return the values of a command's fields by name."""
     return {name: getattr(command, name) for name in names}
 
 
 def require_unused(
     command: Executable, names: Iterable[str], expected: str, found: str = ""
 ) -> None:
-    """Raise ParameterError for the first used field."""
+    """Raise ParameterError for the first field that is used."""
     for name, value in values_of(command, *names).items():
         require(value in (None, False, "", []), name, found or f"{value}", expected)
 
@@ -176,11 +176,11 @@ EXPECTED: Mapping[str, str] = MappingProxyType(
     | dict.fromkeys(("bool_parsing", "bool_type"), "true or false")
     | dict.fromkeys(("path_type", "string_type"), "a text")
 )
-"""What a value of the command line has to be, by the type of pydantic's error."""
+"""What a value of the command line must be, by the type of pydantic's error."""
 
 
 def refused_words(error: Any, command: str, names: Sequence[str]) -> ParameterError:
-    """Return the refusal of words of a command as a sentence: ours, or else that of Typer."""
+    """Turn the refusal of a command's words into a sentence: the project's own, or Typer's."""
     if isinstance(error, typer.BadParameter):
         return refused_value(error, command)
     option = getattr(error, "option_name", "")
@@ -192,7 +192,7 @@ def refused_words(error: Any, command: str, names: Sequence[str]) -> ParameterEr
 
 
 def _typers_sentence(error: Any, command: str) -> ParameterError:
-    """Return what Typer says of words, in the form of the other refusals."""
+    """Return what Typer says about the words, in the form of the other refusals."""
     text = error.format_message().strip().rstrip(".")
     return ParameterError(f"{command}: {text[:1].lower()}{text[1:]}; {command} --help shows more")
 
@@ -215,7 +215,7 @@ def refused_value(error: typer.BadParameter, command: str) -> ParameterError:
 
 
 class RiseDiCommand(TyperCommand):
-    """A command whose refusals name the option as it is typed."""
+    """A command whose refusals name the option as the user types it."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the words after the name. Raises ParameterError for an unknown option."""
@@ -252,7 +252,7 @@ class RiseDiCommand(TyperCommand):
         return f"rise-di {self.name} --help lists them{key}"
 
     def invoke(self, ctx: Any) -> Any:
-        """Call the function. Raises ParameterError with the option for its name."""
+        """Call the function. A ParameterError names the option in place of the field."""
         try:
             return super().invoke(ctx)
         except ParameterError as error:
@@ -264,15 +264,15 @@ class RiseDiCommand(TyperCommand):
 
 
 def without_help_word(words: Sequence[str]) -> list[str]:
-    """Return the words with the option --help in place of a first word help."""
+    """Return the words with the option --help in place of a first word `help`."""
     return [*words[1:2], "--help"] if [*words[:1]] == ["help"] else [*words]
 
 
 class RiseDiGroup(TyperGroup):
-    """The commands, whose refusals have the form of those of an option."""
+    """The group of all commands, whose refusals have the same form as those of an option."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the words. Raises ParameterError for an unknown option before the command."""
+        """Parse the words. Raises ParameterError if an option before the command is unknown."""
         if not args:
             return super().parse_args(ctx, args)
         args = without_help_word(args)
@@ -283,7 +283,7 @@ class RiseDiGroup(TyperGroup):
             raise refused_words(error, "rise-di", names) from None
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Return the command of a word. Raises ParameterError for a word that is none."""
+        """Return the command of a word. Raises ParameterError if there is none of that name."""
         word = args[0]
         if word not in self.commands and not ctx.resilient_parsing:
             near = get_close_matches(word, self.commands, n=1, cutoff=ALIKE_COMMANDS)
