@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Learning in flight: A and B from the ticks of the controller, their design, and the node.
+"""Learning in flight: identify A and B from the ticks of the controller, design for them, propose.
 
-The aircraft is tested for damage between two identifications.
+Between two identifications the aircraft is tested for damage.
 """

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Whether inputs have lost effect since the model was identified: a likelihood ratio."""
+"""Test by a likelihood ratio whether inputs have lost effect since the model was identified."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -30,36 +30,39 @@ from flight_design.identification.likelihood_search import (
 )
 from flight_design.identification.model_quality import MAX_DEVIATION
 
-# s, of the flight that is tested: with 10 s losses showed up to 4 s later, and halved effects not
+# s, length of the flight that is tested. With 10 s, losses showed up to 4 s later, and halved
+# effects did not show at all.
 RECORD = 4.0
-# 1, of the effect of an input: up to two deviations of an accepted model are no change
+# Share of an input's effect: up to two deviations of an accepted model, a loss is no change.
 LOSS = 2.0 * MAX_DEVIATION
-# of log-likelihood: 4.9 standard deviations, see `change_test`. Healthy surfaces in a gust every
-# 3 s had up to 10.3, once 17.4, for a gust is no normal process; those of half effect from 18 on
+# Gain of log-likelihood, 4.9 standard deviations, see `change_test`. Healthy surfaces with a gust
+# every 3 s had gains up to 10.3, and once 17.4, because a gust is no normal process. Surfaces with
+# half their effect had gains of 18 and more.
 MAX_GAIN = 12.0
-# rad, standard deviation of pitch and bank at the begin of the record, which may lie in a turn
+# rad, standard deviation of pitch and bank at the begin of the record, which may be in a turn
 ANGLE = 0.3
-# rad, the same of alpha and beta: with 0.3 a gust before the record passed for a loss of effect
+# rad, the same for alpha and beta. With 0.3, a gust before the record looked like a loss of effect.
 FLOW = 0.03
-# 1, standard deviation of a change of effect, in both hypotheses: half of it and none are as
-# probable
+# Standard deviation of the relative change of an effect, in both hypotheses: half of the effect
+# and none of it are about as probable.
 FACTOR = 1.0
-REVERSED = -2.0  # 1, the least change of effect: the input acts the other way
-DEAD = -1.0  # 1
-MOST = 2.0  # 1, the largest change of effect
-NONE = MAX_DEVIATION  # 1, of an effect: what is known no better is none
-# of log-likelihood: so close to the best loss an input without effect explains the flight as well
+REVERSED = -2.0  # least relative change of an effect: the input acts the other way
+DEAD = -1.0  # relative change of an effect that is lost
+MOST = 2.0  # largest relative change of an effect
+NONE = MAX_DEVIATION  # share of an effect that counts as none: it is known no better than that
+# Log-likelihood: if an input without effect is this close to the best loss, it explains the flight
+# as well.
 DEAD_WITHIN = 4.0
 
 
 class Change(NamedTuple):
-    """The test of a part of the aircraft without coupling with the rest."""
+    """The test of a part of the aircraft that does not couple with the rest."""
 
     outputs: tuple[str, ...]
-    gain: float  # of log-likelihood by a loss of effect beyond LOSS
-    # 1, the most probable effect of each input in parts of that of the model
+    gain: float  # of log-likelihood, if an effect may be lost by more than LOSS
+    # the most probable effect of each input, as a share of that in the model
     left: Mapping[str, float]
-    dead: str  # the input without any effect; empty where there is none
+    dead: str  # the input without any effect; empty if there is none
 
     @property
     def is_found(self) -> bool:
@@ -74,23 +77,24 @@ def change_test(
     delays: Mapping[tuple[str, ...], FloatArray] | None = None,
     drift: float = DRIFT,
 ) -> tuple[Change, ...]:
-    """Test the parts for a loss of effect, by the gain of log-likelihood G that one brings.
+    """Test each part for a loss of effect, by the log-likelihood G that such a loss would gain.
 
         B[:, j] = (1 + kappa_j) B_flown[:, j]
         J(kappa) = N/2 sum_i log mean e_i^2 + 1/2 sum log det S + |kappa / FACTOR|^2 / 2
         G = min J(kappa_j >= -LOSS) - min J(kappa_j >= -2)
 
-    with e the normalised innovations and S their covariance, as in `Search.fit`. A fault of an
-    effector changes a column by a factor, so a part has as many unknowns as inputs. A is known.
-    Winds, and angles at the begin, are free in the two J, which have the same winds. G is 0 while
-    the losses are within LOSS. For a loss z standard deviations beyond, 2 G = z^2, by S. S. Wilks
-    (Ann. Math. Statist. 9(1), 1938): an input with a loss of LOSS exceeds G = 12 with a probability
-    of 5e-7, and a lesser loss more seldom.
+    with the normalised innovations e and their covariance S, as in `Search.fit`. A fault of an
+    effector changes its column by a factor, so that a part has as many unknowns as inputs. A is
+    known. The winds and the angles at the begin are free in both J, which have the same winds.
 
-    The input j is dead if abs(kappa_j + 1) <= NONE has a J lower than the first J by more than
-    MAX_GAIN, and at most DEAD_WITHIN above the second. Arguments: `delays` of u by the outputs of a
-    part, s, by default the delay of `actuation`; `drift` is the noise of the disturbances, as in
-    `Unknown`.
+    G is 0 while the losses are within LOSS. If a loss lies z standard deviations beyond, 2 G = z^2,
+    by S. S. Wilks (Ann. Math. Statist. 9(1), 1938). An input with a loss of LOSS exceeds G = 12
+    with a probability of 5e-7, and an input with a smaller loss does so even more seldom.
+
+    The input j is dead if J with abs(kappa_j + 1) <= NONE is lower than the first J by more than
+    MAX_GAIN, and at most DEAD_WITHIN above the second. Arguments: `delays` are the delays of u by
+    the outputs of a part, s, by default the delay of `actuation`; `drift` is the noise of the
+    disturbances, as in `Unknown`.
     """
     changes = []
     flown = in_rolling_air(flown)
@@ -103,7 +107,7 @@ def change_test(
         dead = ""
         lost = effects.most_probable()
         if lost.theta[: len(inputs)].min() < -LOSS:
-            # what another wind explains is no change
+            # If another wind explains it, it is no change.
             kept = least_of(
                 effects.most_probable(-LOSS), effects.least(lost.theta, -LOSS, levels=lost.levels)
             )
@@ -120,16 +124,16 @@ def change_test(
 
 
 class Least(NamedTuple):
-    """The least J of a hypothesis."""
+    """The least J of a hypothesis, and where it lies."""
 
     J: float
     # (p,) kappa of the inputs, logarithms of the strengths of the winds, angles at the begin
     theta: FloatArray
-    levels: NDArray[np.int64]  # (spans,) of the wind
+    levels: NDArray[np.int64]  # (spans,) levels of the wind
 
 
 class Effects(Search):
-    """The search for a factor of every column of B of a part."""
+    """The search for a factor on every column of B of a part."""
 
     def __init__(
         self,
@@ -140,7 +144,7 @@ class Effects(Search):
         delay: float | FloatArray,
         drift: float = DRIFT,
     ) -> None:
-        """`delay` of u, s, and the noise of the disturbances."""
+        """Set up the search: `delay` is that of u, s, and `drift` the noise of the disturbances."""
         model = filter_model(flown, actuation, recorded)
         unknown = Unknown(angle=ANGLE, drift=drift)
         super().__init__(recorded, model, block, flown, delay, unknown, factor=1)
@@ -176,10 +180,11 @@ class Effects(Search):
         )
 
     def most_probable(self, lower: float = REVERSED) -> Least:
-        """Find the least J of kappa >= `lower`.
+        """Find the least J with kappa >= `lower`.
 
-        The flown model takes a loss for gusts. So the search begins with the winds of this model,
-        with the same wind in every span, and also with a dead input if its J is CLOSE.
+        The flown model takes a loss of effect for gusts. So the search begins with the winds of
+        this model, then with the same wind in every span, and also with a dead input if its J is
+        CLOSE.
         """
         same = self.least(lower=lower, levels=np.full(len(self._spans), TURBULENT))
         best = least_of(self.least(lower=lower), self.least(same.theta, lower))
@@ -196,9 +201,9 @@ class Effects(Search):
         dead: int | None = None,
         levels: NDArray[np.int64] | None = None,
     ) -> Least:
-        """Minimise J from theta, (p,), or 0 on, for kappa >= `lower` or with one input dead.
+        """Minimise J from theta, (p,), or from 0, with kappa >= `lower` or with one input dead.
 
-        The winds are those by theta, unless `levels` gives them.
+        Theta decides the winds, unless `levels` gives them.
         """
         self._lower[: self.count] = lower
         self._upper[: self.count] = MOST
@@ -220,5 +225,5 @@ class Effects(Search):
 
 
 def least_of(first: Least, second: Least) -> Least:
-    """Return the lesser J."""
+    """Return the one with the lesser J."""
     return min(first, second, key=lambda least: least.J)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What a design takes from the learner: margins and deviations."""
+"""What a design needs from the learner: the margins to keep, and the deviations of B."""
 
 import math
 from collections.abc import Collection, Mapping, Sequence
@@ -18,45 +18,46 @@ from flight_design.gains.requirement import OBSERVER_REQUIREMENT, Requirement
 from flight_design.identification.likelihood import PRIOR
 from rise_di_controller.rise_di_config import LEAST_MARGIN, RiseDiConfig
 
-# s, delay margin beyond the latest delay: a loop of 30 ms flew well with u 20 ms late
+# s, delay margin beyond the latest delay. A loop with 30 ms flew well while u was 20 ms late.
 DELAY_LEFT = 0.01
-# 1, weight of the activity of u in the cost of a learned model, beside 1 for one that errs: with 1
-# its loops kept 5 ms more than that of the file, and had 2 % more error; 0 gained nothing more
+# Weight of the activity of u in the cost of a learned model; a model with errors has 1. With 1, the
+# loops kept 5 ms more than that of the file and had 2 % more error; 0 gained nothing beyond 0.5.
 ACTIVITY = 0.5
-ROUNDED = 1.001  # of the margins of a loop: the loop itself has them in spite of rounding
+ROUNDED = 1.001  # factor on the margins of a loop, so that the loop keeps them despite rounding
 
 
 class Goal(NamedTuple):
-    """What the design of a learned model has to keep."""
+    """What the design of a learned model must keep."""
 
     margin: FloatArray  # (m,) delay margin of each input, s
     needed: Requirement
-    beside: SelectedObserver | None = None  # the design of the file, where the search begins
-    is_free: Sequence[bool] | None = None  # (m,) the channels that leave its gains; None: all
+    beside: SelectedObserver | None = None  # the design for the file, from which the search begins
+    is_free: Sequence[bool] | None = None  # (m,) channels whose gains may change; None: all
 
 
 def margin_of(controller: RiseDiConfig) -> float:
-    """Return the delay margin that a controller loads with, s."""
+    """Return the delay margin that a controller must have when it loads, s."""
     assert controller.observer is not None  # noqa: S101 - a controller that learns has one
     return controller.observer.margin
 
 
 def asked_margin(start: RiseDiConfig) -> float:
-    """Return the delay margin of `learn.margin`, or else that of the start, s."""
+    """Return the delay margin of `learn.margin`, or else that of the controller at the start, s."""
     asked = None if start.learn is None else start.learn.margin
     return margin_of(start) if asked is None else asked
 
 
 def is_late(start: RiseDiConfig, latest: Mapping[str, float]) -> bool:
-    """Return whether the latest delay of an input asks for more than the margin of the start.
+    """Return whether the latest delay of an input needs more than the margin of the start.
 
-    `latest` has the delay of each input, s, by name. If `learn.margin` is set, it is the margin.
+    `latest` has the delay of each input, s, by name. If `learn.margin` is set, it replaces the
+    margin of the start.
     """
     return max(latest.values(), default=0.0) + DELAY_LEFT > asked_margin(start)
 
 
 def price(selected: SelectedObserver, margin: float, beside: SelectedObserver, kept: float) -> str:
-    """Say what a design's delay margin, s, costs compared with a design that keeps another."""
+    """Say what a design's delay margin, s, costs compared with a design that keeps another one."""
     ratio = math.exp((selected.cost - beside.cost) / len(selected.relaxation))
     return (
         f"{ratio:.2f} times the error of {1e3 * kept:.0f} ms of delay margin, "
@@ -75,11 +76,11 @@ def goal(
     """Return the goal of a design for a model of which some parts are learned.
 
     A part keeps the delay margin that the loop of the file has around the model, but at least
-    LEAST_MARGIN and at most that of the start. Without a file, it keeps the margin of the start; if
-    `learn.margin` asks for one, it keeps that. Each input keeps at least DELAY_LEFT beyond its
-    latest delay, s, by name. A `dead` output flies without this design, and asks for nothing. With
-    a file, the sensitivity is at most 2, or that of the loop of the file; phase and gain margin
-    follow from it (Astrom, Murray, "Feedback Systems", 10.5).
+    LEAST_MARGIN and at most that of the start. Without a file it keeps the margin of the start, and
+    if `learn.margin` is set it keeps that. Each input keeps at least DELAY_LEFT beyond its latest
+    delay, s, by name. A `dead` output flies without this design, so that it asks for nothing. With
+    a file, the sensitivity is at most 2, or that of the loop of the file; this bounds the phase
+    margin and the gain margin (Astrom, Murray, "Feedback Systems", 10.5).
     """
     outputs = start.outputs
     margin = np.full(len(outputs), margin_of(start))
@@ -100,7 +101,7 @@ def goal(
             if part in parts:
                 kept = max(kept, min(LEAST_MARGIN, margin_of(start)))
             else:
-                kept -= RESOLUTION  # its gains stay: it has what it has
+                kept -= RESOLUTION  # Its gains stay, so that its margin stays what it is.
             margin = np.where(share > 0.0, max(kept, 0.0), margin)
         margins = input_margins(linear.nominal, linear.law, linear.loop, together=False)
         if margins.stable:
@@ -115,13 +116,13 @@ def goal(
     if asked is not None:
         margin = np.full(len(outputs), asked)
     margin = np.where([output in dead for output in outputs], 0.0, margin)
-    # 0.1 ms, as few digits as the file of a scenario
+    # 0.1 ms, as few digits as the file of a scenario has
     late = [round(latest[name] + DELAY_LEFT, 4) if name in latest else 0.0 for name in start.inputs]
     return Goal(np.maximum(margin, late), needed, file, is_free)
 
 
 def with_own_margin(controller: RiseDiConfig, model: Airframe, most: float) -> RiseDiConfig:
-    """Set a controller's margin to the delay margin of its loop around a model, `most` at most."""
+    """Set a controller's margin to that of its loop around a model, but to `most` at most."""
     linear = linear_loop(controller, model, model.matrix_a()[None], model.matrix_b()[None])
     undelayed = linear.loop._replace(delay=0.0)
     kept = delay_margin(linear.nominal, linear.law, undelayed) - RESOLUTION
@@ -133,7 +134,8 @@ def with_own_margin(controller: RiseDiConfig, model: Airframe, most: float) -> R
 def with_deviations(designed: RiseDiConfig, deviation: Mapping[str, float]) -> RiseDiConfig:
     """Put the standard deviations of B into the model of a controller's feedforward.
 
-    They are relative to the entries, by name; an entry that no flight has shown has PRIOR.
+    They are relative to the entries, and have their names. An entry that no flight has shown has
+    PRIOR.
     """
     model = designed.feedforward
     assert model is not None  # noqa: S101 - a design has one

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The record of a learner: y, u and the flown parameters of the ticks of the last seconds."""
+"""The record of a learner: y, u and the flown parameters of the ticks in the last seconds."""
 
 from collections import deque
 from collections.abc import Collection
@@ -16,13 +16,13 @@ from flight_design.identification.innovation_filters import FlightData
 from rise_di_controller.learning import divergence
 from rise_di_controller.rise_di_config import RiseDiConfig
 
-# 1, rms of the airspeed about its mean in a record of one speed: effects of surfaces then vary by 4
-# %
+# Largest rms of the airspeed about its mean, relative, in a record of one speed: the effects of the
+# surfaces then vary by 4 %.
 SPREAD = 0.02
 
 
 class Sample(NamedTuple):
-    """A tick of the record; y and u in the law's order."""
+    """A tick of the record, with y and u in the law's order."""
 
     stamp_ns: int
     y: FloatArray  # (m,)
@@ -31,12 +31,12 @@ class Sample(NamedTuple):
 
 
 class FlightRecord:
-    """The last samples of a flight, over a window."""
+    """The last samples of a flight, within a window."""
 
     def __init__(self, controller: RiseDiConfig, airframe: Airframe, window: float) -> None:
-        """Make an empty record of a `window`, its length in s.
+        """Make an empty record that is `window` s long.
 
-        Samples have the order of the controller, recordings that of the airframe.
+        Samples come in the controller's order, recordings are in the airframe's.
         """
         self._rows = [controller.outputs.index(name) for name in airframe.outputs]
         self._columns = [controller.inputs.index(name) for name in airframe.inputs]
@@ -47,12 +47,12 @@ class FlightRecord:
 
     @property
     def end_ns(self) -> int:
-        """Stamp of the last sample, 0 without one."""
+        """Stamp of the last sample, or 0 if there is none."""
         return self._samples[-1].stamp_ns if self._samples else 0
 
     @property
     def flown(self) -> int | None:
-        """Digest of the parameters of the last sample; None without one."""
+        """Digest of the parameters of the last sample, or None if there is none."""
         return self._samples[-1].flown if self._samples else None
 
     @property
@@ -68,14 +68,14 @@ class FlightRecord:
         return nanoseconds(self.length + self.period / 2.0) >= self._window_ns
 
     def take(self, sample: Sample) -> None:
-        """Take a sample, if later than the last one, and forget what is older than the window."""
+        """Take a sample, if it is later than the last, and forget those older than the window."""
         if not self._samples or sample.stamp_ns > self.end_ns:
             self._samples.append(sample)
         while sample.stamp_ns - self._samples[0].stamp_ns >= self._window_ns:
             self._samples.popleft()
 
     def forget_before(self, stamp_ns: int) -> None:
-        """Keep what is later than an instant alone."""
+        """Keep only what is later than an instant."""
         self._samples = deque(self._after(stamp_ns))
 
     def recording(self, after_ns: int = -1) -> FlightData:
@@ -98,7 +98,8 @@ class FlightRecord:
     def fell_back(self, after_ns: int, proposals: Collection[int]) -> bool:
         """Return whether the law fell back after an instant.
 
-        Then parameters that are none of the proposals, by digest, replaced those that flew.
+        It did if the parameters that flew changed to others than those of a proposal; `proposals`
+        has their digests.
         """
         flown = [sample.flown for sample in self._after(after_ns)]
         return any(new != old and new not in proposals for old, new in pairwise(flown))
@@ -113,10 +114,10 @@ class FlightRecord:
 
 
 def steady_end(recorded: FlightData, airframe: Airframe) -> tuple[FlightData, float]:
-    """Return the longest end of a record on which a linear model holds, and mean airspeed over V0.
+    """Return the longest end of a record on which a linear model holds, and its airspeed over V0.
 
-    The rms deviation of the airspeed from its mean is at most SPREAD of the mean: the effects of
-    surfaces then vary twice as much.
+    The rms deviation of the airspeed from its mean is at most SPREAD of the mean. The effects of
+    the surfaces vary twice as much.
     """
     V = recorded.y[:, airframe.outputs.index("V")] / airframe.speed
     known = np.isfinite(V)[::-1]

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Learning in the air: A and B from the last seconds of a flight, checked, and their design.
+"""Learning in the air: identify A and B from the last seconds of a flight, check and design.
 
-A log is identified alike (`model_identification.identify_model`), about a rough airframe. The
-design is an observer and a feedforward. A model is refused with a sentence where a check fails. The
-controller refuses parameters by the checks at load.
+A log is identified in the same way (`model_identification.identify_model`), about a rough airframe.
+The design is an observer and a feedforward. If a check fails, the model is refused with a sentence.
+The controller checks the parameters again when it loads them, and may refuse them.
 """
 
 from collections import deque
@@ -64,22 +64,22 @@ from rise_di_controller.learning.learned_channels import (
 from rise_di_controller.learning.proposals import UNVERIFIED
 from rise_di_controller.rise_di_config import RiseDiConfig
 
-# entries at their bound: the right model may have one that hardly shows, wrong ones have two to six
+# entries that may lie at their bound: the right model may have one, wrong models have two to six
 AT_BOUND = 1
-# s, of a record: two held-out seconds of the six that `identify` needs at least
+# s, of a record: it then has two held-out seconds of the six that `identify` needs
 SHORTEST = 20.0 * TRANSIENT
-# s, from a fallback to the next identification: of what flies since then
+# s, from a fallback to the next identification, which is about what flies since then
 AFTER_FALLBACK = 4.0
-# s, from one identification to the next that no plan asks for; and of a record that oscillates
+# s, from one identification to an unplanned one; and of a record that is tested for oscillation
 RETRY = 10.0
-# of log-likelihood beside a fallback, where the model may be wrong: dead surfaces had 46 to 656
+# Gain of log-likelihood after a fallback, when the model may be wrong: dead surfaces had 46 to 656.
 SURE_GAIN = 40.0
 
 Design = Callable[[RiseDiConfig, Airframe, Goal], SelectedObserver]
-"""A controller with the feedforward and the observer of a model. Raises ParameterError."""
+"""Designs the feedforward and the observer for a model. Raises ParameterError."""
 
 DesignOfFile = Callable[[RiseDiConfig], SelectedObserver]
-"""The design of the rough model as one that errs. Raises ParameterError."""
+"""Designs for the rough model as one that errs. Raises ParameterError."""
 
 PartName = tuple[str, ...]
 """The outputs of a part of the aircraft that does not couple with the rest."""
@@ -88,8 +88,8 @@ PartName = tuple[str, ...]
 class Known(NamedTuple):
     """A part of the aircraft whose model flies."""
 
-    deviation: Mapping[str, float]  # of its entries by name, 1
-    latest: Mapping[str, float]  # of each input, delay and two standard deviations, s
+    deviation: Mapping[str, float]  # relative, of its entries by name
+    latest: Mapping[str, float]  # delay of each input plus two standard deviations, s
     delays: tuple[float, ...]  # of each input, s
 
 
@@ -100,14 +100,14 @@ class Verdict(NamedTuple):
     known: dict[PartName, Known]
     sentences: list[str]
     refusals: list[str]
-    tried: Airframe  # the model, with those that later samples have to show as better
+    tried: Airframe  # the model, and what later samples must show to be better
 
 
 class Learner:
-    """The record of y and u over a window, and proposals from it.
+    """The record of y and u over a window, and the proposals made from it.
 
-    The parts of the aircraft are learned one by one. A part without a model flies the airframe
-    file with a design for errors, or the law of the start.
+    The parts of the aircraft are learned one by one. A part without a model flies either the
+    airframe file, by a design that allows for errors, or the law of the start.
     """
 
     def __init__(
@@ -121,12 +121,12 @@ class Learner:
         *,
         quick: bool = False,
     ) -> None:
-        """Make a learner without a record.
+        """Make a learner with an empty record.
 
         `airframe` is the rough model, the prior. `delay` is the delay of the loop, s, beyond
-        sampling and lags. `design_of_rough` designs for a model with errors: with it, the rough
-        model flies from the start, and later in parts without a learned model. If it is None, these
-        fly by the law of the start.
+        sampling and lags. `design_of_rough` designs for a model with errors. With it, the rough
+        model flies from the start, and later in the parts that have no learned model. If it is
+        None, these parts fly by the law of the start.
 
         `rough` has the deviation of B in the rough model, and the noise of the disturbances, which
         a test for a change uses too. `quick` is as for `identify`.
@@ -136,7 +136,7 @@ class Learner:
         self._controller = controller
         self._rough = airframe
         self._design = design
-        # None too once the rough model has not flown, or the law fell back
+        # It becomes None once the rough model did not fly, or the law fell back.
         self._design_of_rough = design_of_rough
         self._has_proposed_rough = False
         self._believed = rough
@@ -150,26 +150,26 @@ class Learner:
         self._window_ns = nanoseconds(settings.window)
         self._latency_ns = nanoseconds(settings.latency)
         self._planned = deque(map(nanoseconds, settings.updates))
-        self._tolerance_ns = nanoseconds(settings.check / 2.0)  # of a plan: y may be old
+        self._tolerance_ns = nanoseconds(settings.check / 2.0)  # of a plan, because y may be old
         self._first_ns: int | None = None
         self._prior = airframe  # of the next identification
         self._model = airframe  # what flies
         self._tried = airframe  # what the next identification tests
         self._tried_ns = -nanoseconds(RETRY)  # end of the record of the last identification
         self._known: dict[PartName, Known] = {}
-        # Parts that fly the law of the start for good: their inputs without effect, "" for outputs
-        # of `learn.without`
+        # Parts that fly the law of the start for good, with their dead input; "" for outputs of
+        # `learn.without`.
         self._dead: dict[PartName, str] = {}
         self._start = controller  # with the `learn.without` of what flies
-        # inputs without effect by the last test: a gust alone hides an effect once
+        # Inputs without effect in the last test. A gust alone can hide an effect once.
         self._suspected: dict[PartName, str] = {}
         self._has_ended = False
         self._give_up(outputs_without(controller))
-        self._changed: set[PartName] = set()  # parts whose model is that of before a change
+        self._changed: set[PartName] = set()  # parts whose model is from before a change
         self._last = controller  # the last proposal
-        self._proposed = controller.digest()  # of the last proposal
+        self._proposed = controller.digest()  # digest of the last proposal
         self._proposed_ns = -self._latency_ns  # end of its record
-        self._proposals = set[int]()  # digests of all of them
+        self._proposals = set[int]()  # digests of all proposals
         self.identification: Identification | None = None  # the last one
 
     @property
@@ -178,7 +178,7 @@ class Learner:
         return self._model if self._known else None
 
     def take(self, stamp_ns: int, y: FloatArray, u: FloatArray, flown: int) -> None:
-        """Record a tick: y and u, after its limits, (m,), in the law's order.
+        """Record a tick: y, and u after its limits, (m,), in the law's order.
 
         `flown` is the digest of its parameters.
         """
@@ -186,23 +186,23 @@ class Learner:
         self._record.take(Sample(stamp_ns, y, u, flown))
 
     def propose(self, flown: int, given_up: Sequence[str] = ()) -> LearnerResult:
-        """Parameters with the design of what was identified, or the sentence of a refusal.
+        """Propose parameters for what was identified, or give the sentence of a refusal.
 
-        The first proposal, before any record, is the rough airframe by a design for errors. Parts
-        refused later fly so, too. The law of the start follows where this proposal does not fly, or
-        the law falls back.
+        The first proposal comes before any record: it is the rough airframe, by a design that
+        allows for errors. Parts that are refused later fly by it, too. If this proposal does not
+        fly, or the law falls back, they fly the law of the start.
 
-        The last RECORD seconds are tested for a loss of effect of inputs. A part with an input
-        without effect flies the law of the start, without this input. After a loss the older record
-        is left out, and the flown model is the prior. The sentence is empty where nothing is due.
+        The last RECORD seconds are tested for a loss of effect. If an input has no effect any more,
+        its part flies the law of the start without it. After a loss, the older record is left out
+        and the flown model is the prior. If nothing is due, the sentence is empty.
 
-        While the rough model flies, a first model of a part only tests: the next identification
-        proposes a model where the samples since then show an advantage over the rough model.
+        While the rough model flies, the first model of a part is only on trial. The next
+        identification proposes one if the samples since then show an advantage over the rough one.
 
-        Where the last proposal does not fly after the latency, by the digest `flown`, an
-        identification is due: the proposal was refused, or the controller fell back. `given_up` are
-        outputs given up by the controller, not proposed again. Without a part left nothing is
-        identified, and the sentence says so once.
+        If the last proposal does not fly after the latency, by the digest `flown`, an
+        identification is due: it was refused, or the controller fell back. Outputs that the
+        controller has `given_up` are not proposed again. If no part is left, nothing is identified,
+        and the sentence says so once.
         """
         is_first = not self._has_proposed_rough
         self._has_proposed_rough = True
@@ -218,10 +218,10 @@ class Learner:
         end_ns = self._record.end_ns
         self._note_given_up(flown, given_up)
         lost = flown != self._proposed
-        # a proposal beside parameters from which the law fell back does not act
+        # A proposal does not act if the law fell back from the parameters that it was made beside.
         has_fallen = self._record.fell_back(self._proposed_ns, self._proposals)
         if lost and end_ns < self._proposed_ns + self._latency_ns and not has_fallen:
-            return LearnerResult(None, "")  # the last proposal is yet to act
+            return LearnerResult(None, "")  # the last proposal has yet to act
         self._distrust(lost=lost)
         if is_within(self._controller.outputs, chain.from_iterable(self._dead)) and not lost:
             ended, self._has_ended = self._has_ended, True
@@ -273,7 +273,7 @@ class Learner:
         try:
             price_text = self._adopt(self._model, known, self._dead | dead)
         except ParameterError as error:
-            # the loss is told although no controller without the input can be proposed
+            # Tell the loss, although no controller without the input can be proposed.
             self._changed |= set(dead)
             losses = [f"{name} has no effect" for name in dead.values()]
             return LearnerResult(None, "; ".join([*losses, *weaker_parts, f"refused: {error}"]))
@@ -360,7 +360,7 @@ class Learner:
         self._proposals.add(self._proposed)
 
     def _distrust(self, *, lost: bool) -> None:
-        """No longer fly the rough model where it was refused, or the law fell back."""
+        """Stop flying the rough model if it was refused or the law fell back from it."""
         is_rough_alone = not self._known and not self._dead
         if lost and (is_rough_alone or self._record.fell_back(-1, self._proposals)):
             self._design_of_rough = None
@@ -377,9 +377,10 @@ class Learner:
         return LearnerResult(proposed, f"the airframe {name} as it is, {UNVERIFIED}")
 
     def _note_given_up(self, flown: int, outputs: Sequence[str]) -> None:
-        """Give up the outputs that the controller gave up.
+        """Note that the controller gave up outputs.
 
-        The rest of what flies is the last proposal, or it was refused.
+        If the rest of what flies is the last proposal, that proposal flies. Otherwise it was
+        refused.
         """
         if set(outputs) <= set(outputs_without(self._start)):
             return
@@ -400,10 +401,10 @@ class Learner:
             }
 
     def _is_due(self, end_ns: int, *, lost: bool) -> bool:
-        """Return whether an identification is due: at `learn.updates`, then once a window.
+        """Return whether an identification is due: at `learn.updates`, then once in every window.
 
-        One is also due RETRY after the last, if the last proposal does not fly or a part has
-        changed; but none within AFTER_FALLBACK of a fallback.
+        One is also due RETRY after the last one, if the last proposal does not fly or a part has
+        changed. None is due within AFTER_FALLBACK of a fallback.
         """
         is_planned = False
         elapsed_ns = -1 if self._first_ns is None else end_ns - self._first_ns
@@ -419,7 +420,7 @@ class Learner:
         return is_planned or (is_wanted and is_rested and not has_fallen)
 
     def _identified(self) -> Identification:
-        """Identify A and B from the record, about the prior; also start at the flown model.
+        """Identify A and B from the record, about the prior, and also start at the flown model.
 
         With models at several speeds, the record and the prior have a steady speed, and the entries
         are reduced to the trim speed. Raises ParameterError if the speed is not steady over
@@ -458,7 +459,7 @@ class Learner:
         return identified._replace(parts=tuple(parts))
 
     def _steady(self, recorded: FlightData) -> tuple[FlightData, float]:
-        """Return the record, and the speed over V0.
+        """Return the record, and its speed over V0.
 
         With models at several speeds, it is the steady end of the record, about the trim at that
         speed.
@@ -473,7 +474,7 @@ class Learner:
         return at_speed(model, ratio, self._thrust) if self._has_speeds else model
 
     def _at_trim(self, entries: tuple[Entry, ...], ratio: float) -> tuple[Entry, ...]:
-        """Entries reduced to the trim speed: relative errors and deviations stay."""
+        """Reduce entries to the trim speed. Their relative errors and deviations stay."""
         powers = exponents(self._rough, self._thrust)
         states = list(self._rough.states)
         columns = {"A": states, "B": list(self._rough.inputs)}
@@ -490,10 +491,10 @@ class Learner:
         )
 
     def _changes(self, end_ns: int) -> list[Change]:
-        """Find changes, over the last RECORD, of the parts that have a learned model.
+        """Find changes, over the last RECORD, in the parts that have a learned model.
 
-        Unless the law fell back, an input counts as dead only in the second test in a row. There is
-        no change if the speed was not steady over the record, an output stood still, or one
+        An input counts as dead only in the second test in a row, unless the law fell back. There is
+        no change if the speed was not steady over the record, if an output stood still, or if one
         oscillated over RETRY: a loop near instability moves y as no model with a stable loop does.
         """
         suspected, self._suspected = self._suspected, {}
@@ -529,7 +530,7 @@ class Learner:
     def _designed(
         self, model: Airframe, known: Mapping[PartName, Known], dead: Mapping[PartName, str]
     ) -> tuple[RiseDiConfig, str]:
-        """Design the controller of a model, and say what `learn.margin` costs.
+        """Design the controller for a model, and say what `learn.margin` costs.
 
         Parts without a learned model have the law of the start, or the rough model while it flies.
         Raises ParameterError.
@@ -568,7 +569,7 @@ class Learner:
             [name in dead.values() for name in start.inputs],
         )
         if dead and proposed.observer is not None:
-            # the parts of the law of the start have a margin of their own
+            # Parts that fly the law of the start have a margin of their own.
             proposed = with_own_margin(proposed, model, margin_of(start))
         checked = RiseDiConfig.validate_mapping(
             proposed.model_dump() | {"learn": self._start.model_dump()["learn"]}, "proposal"

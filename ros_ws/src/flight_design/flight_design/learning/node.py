@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The learner node: from the ticks of the controller to proposals of feedforward and observer.
+"""The learner node: it makes proposals of feedforward and observer from the controller's ticks.
 
-The search runs in a thread of low priority. The loop does not wait for it in real time.
+The search runs in a thread of low priority. In real time the loop does not wait for it.
 """
 
 import os
@@ -31,16 +31,16 @@ from rise_di_controller.internals import GIVEN_UP
 from rise_di_controller.learning.proposals import Updates
 
 PERIOD_NS = NANOSECONDS // 10
-NICE = 10  # of a search in real time, above the nodes of the loop: it takes a core for seconds
+NICE = 10  # of a search in real time: it takes a core for seconds, and must not delay the loop
 
 
 class LearnerNode(FlightNode[LearnerConfig]):
     """Takes y and u of each tick from `internals`, and publishes the proposals that are due.
 
-    While a search runs, the samples wait in the queue of the subscription: the record of a search
-    does not change, and in lockstep the proposals are those of the loop in one process. In real
-    time a search begins with the newest sample: of identifications that became due meanwhile the
-    last is made.
+    While a search runs, the samples wait in the queue of the subscription. So the record of a
+    search does not change, and in lockstep the proposals equal those of the loop in one process. In
+    real time a search begins with the newest sample. If several identifications became due
+    meanwhile, only the last is made.
     """
 
     def __init__(self) -> None:
@@ -63,7 +63,7 @@ class LearnerNode(FlightNode[LearnerConfig]):
             INTERNALS,
             Decoder(names).decode,
             self._take,
-            max_age_ns=None,  # the samples wait for a search
+            max_age_ns=None,  # samples wait while a search runs
             lock=self.publisher_lock(self._timeouts_ns),
             qos=LOCKSTEP if lockstep else RECORD_FOREIGN,
         )
@@ -101,7 +101,7 @@ class LearnerNode(FlightNode[LearnerConfig]):
     def _advance(self, now_ns: int) -> bool:
         """Publish the proposal of a search that has ended, and take samples until the next search.
 
-        Returns whether there was a sample or a proposal.
+        Return whether there was a sample or a proposal.
         """
         advanced = False
         if self._search is not None and not self._search.is_alive():
@@ -126,10 +126,10 @@ class LearnerNode(FlightNode[LearnerConfig]):
         return advanced
 
     def _begin_search(self) -> None:
-        """Begin the search that is due, if any, on the record so far."""
+        """Begin the search that is due, if there is one, on the record so far."""
         if self._is_due and self._search is None:
             self._is_due = False
-            # it does not delay the end of the node
+            # A daemon thread does not delay the end of the node.
             self._search = threading.Thread(target=self._propose, daemon=True)
             self._search.start()
 
@@ -155,16 +155,16 @@ class LearnerNode(FlightNode[LearnerConfig]):
             os.nice(NICE)  # Linux: of this thread alone
         try:
             self._proposal = self._learner.propose(self._flown, self._given_up)
-        except Exception as error:  # the flight goes on, and in lockstep waits for a proposal
+        except Exception as error:  # the flight goes on; in lockstep it waits for a proposal
             self.get_logger().error(f"unexpected exception: {traceback.format_exc()}")
             self._proposal = LearnerResult(
                 None, f"the identification failed: {' '.join(str(error).split())}"
             )
 
     def close(self) -> None:
-        """In lockstep complete the searches that are due.
+        """In lockstep, complete the searches that are due.
 
-        The log then has their entries, as that of one process.
+        The log then has their entries, as a log of one process has.
         """
         if self.parameters.lockstep:
             self._advance(0)

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameters of the learner.
 
-What it identifies, and when, is the section `learn` of the controller in its scenario.
+The section `learn` of the controller in its scenario says what it identifies, and when.
 """
 
 from flight_core.fields import Field
@@ -13,5 +13,5 @@ class LearnerConfig(NodeConfig):
     """The learner's parameters."""
 
     scenario_file: str = Field(
-        description="path of the scenario that flies: its airframe file is the rough model"
+        description="path of the scenario that flies; its airframe file is the rough model"
     )

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The learner of a scenario: its airframe file is the rough model.
+"""The learner of a scenario, whose airframe file is the rough model.
 
 Its observers have the gains of `rise-di gains`.
 """
@@ -39,20 +39,20 @@ from rise_di_controller.rise_di_config import LearnConfig, PriorConfig, RiseDiCo
 
 
 def learner(scenario: Scenario, *, real_time: bool = False, quick: bool = False) -> Learn | None:
-    """Return what `simulate` and `fly_and_report` take as `learn`; None without learning.
+    """Return what `simulate` and `fly_and_report` take as `learn`, or None without learning.
 
-    The published airframe is the rough model, not the aircraft in flight. For an aircraft of JSBSim
-    the rough model is the controller's feedforward. In real time the loop has the delay of the
-    controller's section; in one process and in lockstep u acts at once.
+    The rough model is the published airframe, not the aircraft in flight. For an aircraft of JSBSim
+    it is the feedforward of the controller. In real time the loop has the delay in the section of
+    the controller; in one process and in lockstep u acts at once.
 
     Args:
         scenario: The flight.
         real_time: Whether the learner works beside a controller in real time.
-        quick: Whether an identification begins its search once where the air is the same in every
-            second, as in a campaign.
+        quick: Whether an identification begins its search only once if the air is the same in
+            every second, as in a campaign.
 
     Returns:
-        A function from the parameters of the controller to a learner, or None.
+        A function that makes a learner from the parameters of the controller, or None.
 
     Raises:
         ParameterError: The schedule or the rough model does not fit the airframe.
@@ -118,12 +118,12 @@ def learner(scenario: Scenario, *, real_time: bool = False, quick: bool = False)
 
 
 def that_learns(scenario: Scenario) -> Scenario:
-    """Turn a scenario of the law alone into one that learns without a model of its aircraft.
+    """Turn a scenario with the law alone into one that learns without a model of its aircraft.
 
         Omega = diag(D omega / input_scale),   V0 the trim speed
 
     The law gives the signs and sizes; the rough model is the sketch of Omega and V0. Raises
-    ParameterError for a controller with an observer, or for outputs that a sketch lacks.
+    ParameterError if the controller has an observer, or if a sketch lacks an output.
     """
     start = scenario.rise_di()
     expected = "none: a scenario of the law alone, whose signs and sizes are the rough model"
@@ -132,7 +132,7 @@ def that_learns(scenario: Scenario) -> Scenario:
     channels = aircraft.channels()
     measured = aircraft.sensors.noise or (0.0,) * len(channels.outputs)
     by_name = dict(zip(channels.outputs, measured, strict=True))
-    # with_sketch refuses an output that NOISE lacks
+    # An output that NOISE lacks is refused by with_sketch.
     noise = np.array([by_name[name] or NOISE.get(name, 0.0) for name in start.outputs])
     Omega = np.diag(np.array(start.D) * start.omega / start.input_scale)
     name = Path(aircraft.airframe.removeprefix(PREFIX)).stem
@@ -156,9 +156,9 @@ def with_law_inputs(airframe: Airframe, controller: RiseDiConfig) -> Airframe:
 
 
 def _speeds(controller: RiseDiConfig, airframe: Airframe) -> tuple[float, float] | None:
-    """Return the speeds of a schedule's models, over the trim speed; None without a schedule.
+    """Return the speeds of a schedule's models over the trim speed, or None without a schedule.
 
-    Raises ParameterError for a schedule about another speed than that of the rough model.
+    Raises ParameterError if the schedule is about another speed than the rough model.
     """
     if controller.schedule is None:
         return None
@@ -170,7 +170,7 @@ def _speeds(controller: RiseDiConfig, airframe: Airframe) -> tuple[float, float]
 
 
 def _prior(path: str, flown: Airframe) -> Airframe:
-    """Load the rough model of a file. Raises ParameterError if it is of another airframe."""
+    """Load the rough model from a file. Raises ParameterError if it is of another airframe."""
     prior = load_airframe(path)
     for key in ("name", "states", "inputs", "outputs", "speed"):
         same = getattr(prior, key) == getattr(flown, key)
@@ -192,22 +192,22 @@ class LearnStep(NamedTuple):
 
 
 class LearnResult(NamedTuple):
-    """The learner's steps over a log, and the model at its end; None where nothing was learned."""
+    """The learner's steps over a log, and the model at its end; None if nothing was learned."""
 
     steps: tuple[LearnStep, ...]
     model: Airframe | None
-    entries: tuple[Entry, ...]  # of the last identification
+    entries: tuple[Entry, ...]  # those of the last identification
 
 
 class _Ticks(NamedTuple):
-    """The ticks of a log, and what flew there."""
+    """The ticks of a log, and what flew at each."""
 
     stamp_ns: NDArray[np.int64]
     instant_ns: NDArray[np.int64]
     mode: FloatArray
     y: FloatArray  # (N, m)
     u: FloatArray  # (N, m)
-    flown: FloatArray | None  # digests; None where the log has other settings of the learner
+    flown: FloatArray | None  # digests; None if the log has other settings of the learner
     given_up: Signal
 
     def left(self, k: int) -> tuple[str, ...]:
@@ -217,7 +217,7 @@ class _Ticks(NamedTuple):
 
 
 def _ticks(tape: Tape, controller: RiseDiConfig) -> _Ticks:
-    """Return the ticks of a log. Raises ParameterError for a log without internals."""
+    """Return the ticks of a log. Raises ParameterError if the log has no internals."""
     flew = "internals" in tape and len(tape["internals"].stamp_ns) > 0
     require(flew, "the log", "no sample of internals", "a flight with a controller that engaged")
     ticks = tape["internals"]
@@ -244,11 +244,11 @@ def _ticks(tape: Tape, controller: RiseDiConfig) -> _Ticks:
 def learn_again(tape: Tape, scenario: Scenario) -> LearnResult:
     """Step the learner of a scenario with y and u of the engaged ticks of a log.
 
-    A deactivated law ends a record, as in flight. Where the log has other settings of the learner
-    than the scenario, or none, each proposal is taken as flown. Raises ParameterError for a log
-    that cannot teach.
+    If the law is deactivated, the record ends, as in flight. If the log has no settings of the
+    learner, or others than the scenario, each proposal is taken as flown. Raises ParameterError if
+    nothing can be learned from the log.
     """
-    # simulated time begins at 0
+    # Simulated time begins at 0.
     make = learner(scenario, real_time=tape.start_ns > 0)
     controller = scenario.rise_di()
     require(make is not None, "controller.learn", "no section", "one")
@@ -282,7 +282,7 @@ def learn_again(tape: Tape, scenario: Scenario) -> LearnResult:
             proposal = learned.propose(flown, ticks.left(k))
             proposed = proposed if proposal.controller is None else proposal.controller.digest()
             t = (now_ns - tape.start_ns) / NANOSECONDS
-            # the rough model, proposed before there is a record, teaches nothing
+            # The rough model is proposed before there is a record, and teaches nothing.
             if proposal.sentence and now_ns > begin_ns:
                 steps.append(LearnStep(t, proposal.controller is not None, proposal.sentence))
     first = f"{settings.updates[0]:g} s or more, the first of learn.updates"
@@ -293,9 +293,9 @@ def learn_again(tape: Tape, scenario: Scenario) -> LearnResult:
 
 
 def with_last_model(scenario: Scenario, run: RecordedRun) -> Scenario:
-    """Return a scenario with what flew last in one of its runs in place of `learn`.
+    """Return a scenario that has what flew last in one of its runs, in place of `learn`.
 
-    Raises ParameterError for a run of another controller.
+    Raises ParameterError if the run had another controller.
     """
     start = scenario.rise_di()
     recorded = recorded_parameters(run.scenario_file())
@@ -308,9 +308,9 @@ def with_last_model(scenario: Scenario, run: RecordedRun) -> Scenario:
 
 
 def learned_yaml(result: LearnResult, origin: str) -> str:
-    """Write the model of a result as the text of an airframe file; its header lists the steps.
+    """Write the model of a result as the text of an airframe file, whose header lists the steps.
 
-    Raises ParameterError without a model.
+    Raises ParameterError if there is no model.
     """
     require(result.model is not None, "the learner", "no model", "one")
     assert result.model is not None  # noqa: S101 - for the type checker
