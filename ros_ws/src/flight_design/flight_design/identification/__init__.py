@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Effects of inputs and models of an aircraft from flights.
+"""Identification of the effects of inputs, and of models of an aircraft, from flights.
 
-The flights are in simulation, over a bridge, or in logs of autopilots.
+The flights are simulated, flown over a bridge, or recorded in logs of autopilots.
 """

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""From a channel map to gains without a model.
+"""The way from a channel map to gains, without a model.
 
-The results are the scenario of an experiment, and a scenario for the aircraft.
+It leads over the scenario of an experiment to a scenario that flies the aircraft.
 
 The experiment excites the inputs in turn, open loop. `identify_response` estimates Omega, lags and
-delays from the log. The airframe of the scenarios is y_dot = Omega u: nothing further is known of
-the aircraft.
+delays from its log. The airframe of the scenarios is y_dot = Omega u, because nothing else is known
+about the aircraft.
 """
 
 import math
@@ -35,9 +35,9 @@ from flight_design.identification.sign_check import motion_as_channel_grows, out
 from flight_log.engagements import Engagement
 from rise_di_controller.params import ControllerConfig
 
-RATE = 100.0  # Hz, of law and reference model by default
+RATE = 100.0  # Hz, default rate of the law and the reference model
 
-AMPLITUDE = 0.2  # of the smaller limit of an input, by default
+AMPLITUDE = 0.2  # default amplitude as a share of the smaller limit of an input
 
 
 class Excitation(NamedTuple):
@@ -50,25 +50,27 @@ class Excitation(NamedTuple):
 
 
 EXCITATIONS: Mapping[str, Excitation] = {
-    # Engines take longer.
+    # Engines respond slowly.
     "V": Excitation(width=1.0, period=12.0, lowest=0.1, highest=0.8),
     # The climb is an integral: slow commands move it more than its noise.
     "climb": Excitation(width=0.8, period=10.0, lowest=0.1, highest=1.5),
 }
-"""By the motion that the input causes; another input turns the aircraft."""
+"""Excitations by the motion that the input causes. Any other input turns the aircraft."""
 PAUSE = 1.5  # s, between the inputs
 
-# Failsafe of the controller: its age limit over the largest one of the bridge, which acts first.
+# Failsafe of the controller: ratio of its age limit to the largest one of the bridge, which acts
+# first.
 AGE = 1.5
 HOLD = 0.5  # s
 RAMP = 2.0  # s
-WAIT = 30.0  # s before the first command of the flight: the time to engage
+WAIT = 30.0  # s before the first command of the flight, in which the user engages
 
 
 def channel_pairs(channel_map: ChannelMap) -> tuple[ChannelPairing, FloatArray]:
-    """Pair outputs with driving inputs by a map's motions; return the effects' signs, (m,).
+    """Pair each output with the input that drives it, and return the signs of the effects, (m,).
 
-    Raises ParameterError if an output has no input, or has one of the opposite sign.
+    The motions of the map decide. Raises ParameterError if an output has no input, or one of the
+    opposite sign.
     """
     drivers: dict[str, tuple[str, int]] = {}
     for name, row in channel_map.inputs.items():
@@ -97,19 +99,19 @@ def channel_pairs(channel_map: ChannelMap) -> tuple[ChannelPairing, FloatArray]:
 
 
 def motions(channel_map: ChannelMap) -> dict[str, str]:
-    """Return the motion of each output of a map, a key of UNITS; it names q, p, r and V."""
+    """Return the motion of each output of a map: a key of UNITS, such as q, p, r or V."""
     return {name: row.motion[0] for name, row in channel_map.outputs.items()}
 
 
 def has_airspeed(channel_map: ChannelMap) -> bool:
-    """Return whether a map has an airspeed; an aircraft without one hovers."""
+    """Return whether a map has an airspeed. An aircraft without one hovers."""
     return "V" in motions(channel_map).values()
 
 
 def require_envelope(channel_map: ChannelMap) -> None:
-    """Raise ParameterError for a map without limits of the speeds, and of a measured attitude.
+    """Raise ParameterError unless the map limits the speeds and the attitude that it measures.
 
-    Nothing further guards.
+    Nothing else guards an experiment.
     """
     needed: list[str] = [name for name in ("phi", "theta") if name in channel_map.pose]
     needed += [name for name, motion in motions(channel_map).items() if UNITS[motion] == "m/s"]
@@ -127,7 +129,7 @@ def require_envelope(channel_map: ChannelMap) -> None:
 class Experiment(NamedTuple):
     """The files of an experiment."""
 
-    airframe: str  # text of the airframe file: signs alone
+    airframe: str  # text of the airframe file, which has nothing but signs
     scenario: str  # text of the scenario file
     controller: ExcitationConfig
 
@@ -139,9 +141,9 @@ def experiment(
     airframe_file: str,
     wait: float = WAIT,
 ) -> Experiment:
-    """Plan the experiment of a channel map: every input at `amplitude` of its smaller limit.
+    """Plan the experiment of a channel map, with every input at `amplitude` of its smaller limit.
 
-    `speed` is the airspeed in trim, m/s; it is None in hover.
+    `speed` is the airspeed in trim, m/s, or None in hover.
     """
     pairing, sign = channel_pairs(channel_map)
     rows = [channel_map.inputs[name] for name in pairing.inputs]
@@ -184,7 +186,7 @@ def experiment(
     )
 
 
-WHOLE = 0.95  # of the planned duration: reports of the engagement are late by less than the rest
+WHOLE = 0.95  # share of the planned duration; reports of the engagement are late by less than 5 %
 
 
 def cut_short(engagements: Sequence[Engagement], duration: float) -> str:
@@ -210,14 +212,12 @@ def cut_short(engagements: Sequence[Engagement], duration: float) -> str:
 def channel_models(
     channel_map: ChannelMap, tape: Tape, spans: Spans, speed: float | None
 ) -> list[ChannelModel | None]:
-    """Identify the channels of a map from the log of an experiment; None for one without a model.
+    """Identify the channels of a map from the log of an experiment, in `spans` of engagement.
 
-    The aircraft is engaged in `spans`.
-
-    `speed` is the airspeed in trim, m/s; it is None in hover. V gets no model unless a climb is
-    measured: thrust also excites the phugoid, which would be taken for a response to thrust. A
-    climb in hover is of first order. Source: G. D. Padfield, "Helicopter Flight Dynamics", 2007,
-    4.3 (heave).
+    A channel without a model is None. `speed` is the airspeed in trim, m/s, or None in hover. V
+    gets no model unless a climb is measured: thrust also excites the phugoid, which would be taken
+    for a response to thrust. A climb in hover is of first order. Source: G. D. Padfield,
+    "Helicopter Flight Dynamics", 2007, 4.3 (heave).
     """
     pairing, sign = channel_pairs(channel_map)
     y = tape["y"].within(spans)
@@ -229,7 +229,7 @@ def channel_models(
     models: list[ChannelModel | None] = []
     for output, name, direction in zip(pairing.outputs, pairing.inputs, sign.tolist(), strict=True):
         motion = motion_by_output[output]
-        # Without gravity along the path V shows the phugoid in place of the thrust.
+        # If gravity along the path is not known, V shows the phugoid instead of the thrust.
         if motion == "V" and gravity is None:
             models.append(None)
             continue
@@ -242,7 +242,10 @@ def channel_models(
 
 
 def gravity_along_path(pose: Signal, speed: float) -> Signal | None:
-    """V_dot by gravity, -g climb / speed, m/s^2, at the stamps of a pose; None without a climb."""
+    """Return V_dot by gravity, -g climb / speed, m/s^2, at the stamps of a pose.
+
+    Returns None if the pose has no climb.
+    """
     if "climb" not in pose.names:
         return None
     is_finite = np.isfinite(pose["climb"])
@@ -253,16 +256,16 @@ def gravity_along_path(pose: Signal, speed: float) -> Signal | None:
 
 
 class IdentifiedChannels(NamedTuple):
-    """What is known of m channels, output i driven by input i; SI."""
+    """What is known about m channels, where input i drives output i; SI."""
 
     Omega: FloatArray  # (m, m)
     Omega_deviation: FloatArray  # (m,) of its diagonal
     lag: FloatArray  # (m,) s
     delay: FloatArray  # (m,) s
-    damping: FloatArray  # (m,) 1/s; 0 where none is known
+    damping: FloatArray  # (m,) 1/s; 0 if none is known
     stiffness: FloatArray  # (m,) 1/s^2
     zero: FloatArray  # (m,) 1/s, slow / Omega
-    # (m,) rms of the output error / rms of y; NaN where the step response alone is known
+    # (m,) rms of the output error / rms of y; NaN if only the step response is known
     misfit: FloatArray
 
 
@@ -327,9 +330,9 @@ def join(
 
 
 def over_link(channels: IdentifiedChannels, link_delay: float) -> IdentifiedChannels:
-    """Channels identified from a log of the autopilot's board, as met by the law over the link.
+    """Return channels from a log of the autopilot's board as the law meets them over the link.
 
-    Their delay is delay + link_delay, s.
+    Their delay becomes delay + link_delay, s.
     """
     return channels._replace(delay=channels.delay + link_delay)
 
@@ -363,7 +366,7 @@ def within_range(
 ) -> tuple[ChannelMap, list[str]]:
     """Return a map whose limits about the trims stay within the ranges of the fields.
 
-    A sentence reports each limit that it narrows. Raises ParameterError for a trim at a stop.
+    A sentence reports each limit that it narrows. Raises ParameterError if a trim is at a stop.
     """
     values = channel_map.model_dump(exclude_unset=True)
     sentences = []
@@ -383,7 +386,7 @@ def within_range(
             ("upper", row.upper, high - trim),
         ):
             if abs(limit) > abs(room):
-                # the trim is rounded too
+                # the trim is rounded, too
                 values["inputs"][name][side] = float(f"{room * (1.0 - 1e-4):.5g}")
                 narrower = (
                     f"{name}: its trim is {trim:.3g}, so that the {side} limit is "
@@ -394,9 +397,9 @@ def within_range(
 
 
 def map_text(channel_map: ChannelMap, trims: Mapping[str, float], source: str) -> str:
-    """Write a channel map with measured trims as text.
+    """Write a channel map with the measured trims as text.
 
-    A captured trim is measured again at every engagement.
+    A trim that is captured is measured again at every engagement.
     """
     values = channel_map.model_dump(exclude_unset=True)
     values["source"] = f"{values['source']}; trims measured in {source}"
@@ -407,14 +410,14 @@ def map_text(channel_map: ChannelMap, trims: Mapping[str, float], source: str) -
 
 
 class _WholeRows(yaml.SafeDumper):
-    """Rows without shared references."""
+    """A dumper that writes rows in full, without shared references."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True
 
 
 def controller_values(channel_map: ChannelMap, pairing: ChannelPairing) -> dict[str, Any]:
-    """Parameters of the controller by the map."""
+    """Return the parameters of the controller that follow from the map."""
     rows = [channel_map.inputs[name] for name in pairing.inputs]
     limits = {"lower": [row.lower for row in rows], "upper": [row.upper for row in rows]}
     common = {"rate": RATE, "outputs": list(pairing.outputs), "inputs": list(pairing.inputs)}
@@ -434,13 +437,15 @@ def airframe_yaml(
     speed: float | None,
     source: str,
 ) -> str:
-    """Write the airframe of identified channels as text, in units of the map's channels.
+    """Write the airframe of identified channels as text, in the units of the map's channels.
 
     With z_i of the dimension of y_i dt:
 
-    y_i_dot = -(damping_i - zero_i) y_i + (damping_i zero_i - stiffness_i - zero_i^2) z_i + sum_j
-    Omega_ij u_j
-    z_i_dot = y_i - zero_i z_i  only where stiffness or zero are not 0
+        y_i_dot = -(damping_i - zero_i) y_i + (damping_i zero_i - stiffness_i - zero_i^2) z_i
+                  + sum_j Omega_ij u_j
+        z_i_dot = y_i - zero_i z_i
+
+    z_i only exists if stiffness_i or zero_i is not 0.
     """
     m = len(pairing.outputs)
     second = [i for i in range(m) if channels.stiffness[i] or channels.zero[i]]
@@ -474,7 +479,7 @@ def airframe_yaml(
 
 
 def signs_alone(sign: FloatArray) -> IdentifiedChannels:
-    """Channels with a known sign alone."""
+    """Return channels of which only the signs are known."""
     none = 0.0 * sign
     return IdentifiedChannels(
         Omega=np.diag(sign),

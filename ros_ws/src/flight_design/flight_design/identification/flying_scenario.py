@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A scenario for an aircraft with identified channels: gains, commands and margins."""
+"""A scenario for an aircraft with identified channels: its gains, commands and margins."""
 
 from typing import Any, NamedTuple
 
@@ -50,23 +50,26 @@ from rise_di_controller.law.law import Sign
 from rise_di_controller.law.linear_loop import LoopTiming
 from rise_di_controller.rise_di_config import RiseDiConfig
 
-# s: u may cross from trim to its limit in that time, which bounds beta from below
+# s, in which u may move from trim to its limit; this bounds beta from below
 FULL_RANGE_TIME = 1.0
-# deviation of the uncertain aircraft whose phase margin counts
+# relative deviation of the uncertain aircraft whose phase margin counts
 UNCERTAINTY = 0.3
 SAMPLES = 20
-# of the loop of a channel with its integral: a gain margin of 2, a phase margin of 29 deg
+# largest sensitivity of the loop of a channel with its integral: it leaves a gain margin of 2 and a
+# phase margin of 29 deg
 MAX_SENSITIVITY = 2.0
-INTEGRALS = np.append(np.geomspace(1.0, 0.01, 40), 0.0)  # of the wanted one, those that are tried
+INTEGRALS = np.append(
+    np.geomspace(1.0, 0.01, 40), 0.0
+)  # shares of the wanted integral that are tried
 
 
 class Flyable(NamedTuple):
-    """A controller for an identified aircraft, and the files for a flight."""
+    """A controller for an identified aircraft, and the files for its flight."""
 
     controller: RiseDiConfig
-    # s, of the identified channels with the lags and the delay; None without a softened sign
+    # s, around the identified channels with lags and delay; None without a softened sign
     delay_margin: float | None
-    lacking: str  # margins that the requirement asks for and the loop does not have, "" for none
+    lacking: str  # required margins that the loop does not have; "" if it has all
     airframe: str  # text of the airframe file
     scenario: str  # text of the scenario file
 
@@ -78,12 +81,12 @@ def flying_scenario(
     airframe_file: str,
     requirement: Requirement = REQUIREMENT,
 ) -> Flyable:
-    """Gains for identified channels, and the texts of airframe and scenario.
+    """Select gains for identified channels, and write the texts of the airframe and the scenario.
 
     The bandwidths follow from lag, delay and rate by the engineering procedure, for y_dot = Omega
-    u. The integrals follow from damping and stiffness. Integrals and bandwidths fall until the loop
-    around the identified channels meets `requirement`. The feedforward has the airframe as model,
-    in coordinated turns without sideslip.
+    u. The integrals follow from damping and stiffness. Both are lowered until the loop around the
+    identified channels meets `requirement`. The model of the feedforward is the airframe in
+    coordinated turns without sideslip.
     """
     identified = _Identified(channel_map, channels, speed)
     commands = identified.commands()
@@ -121,7 +124,7 @@ def flying_scenario(
 
 
 class _Identified(NamedTuple):
-    """The identified channels of a map, and the trim speed, m/s, None in hover."""
+    """The identified channels of a map, and the trim speed, m/s, or None in hover."""
 
     channel_map: ChannelMap
     channels: IdentifiedChannels
@@ -129,12 +132,12 @@ class _Identified(NamedTuple):
 
     @property
     def pairing(self) -> ChannelPairing:
-        """Outputs and their inputs."""
+        """Outputs and the inputs that drive them."""
         return channel_pairs(self.channel_map)[0]
 
     @property
     def loop(self) -> LoopTiming:
-        """The loop with one delay: what a channel has beyond it counts as its lag."""
+        """The loop with one delay. What a channel has beyond it counts as its lag."""
         channels = self.channels
         delay = float(np.min(channels.delay))
         return LoopTiming(channels.lag + channels.delay - delay, delay, 1.0 / RATE)
@@ -154,7 +157,7 @@ class _Identified(NamedTuple):
         return np.array([min(-row.lower, row.upper) for row in rows])
 
     def commands(self) -> FirstCommands:
-        """Commands within reach of the loop, after WAIT: `first_commands`."""
+        """Return commands within reach of the loop, which begin after WAIT: `first_commands`."""
         crossover = bandwidths(self.loop, np.array(list(self.products.values())))
         authority = np.abs(np.diag(self.channels.Omega)) * self.reach
         channels = {
@@ -179,8 +182,8 @@ class _Identified(NamedTuple):
     def of_integrators(self, manoeuvre: Manoeuvre) -> Study:
         """Study y_dot = Omega u.
 
-        The study lasts 1 s only: the literal gain set, which needs more of the manoeuvre than its
-        slew, is not used.
+        The study lasts only 1 s. It would have to be longer for the literal gain set, which needs
+        more of the manoeuvre than its slew but is not used.
         """
         none = np.zeros_like(self.channels.damping)
         channels = self.channels._replace(damping=none, stiffness=none, zero=none)
@@ -189,7 +192,7 @@ class _Identified(NamedTuple):
         return ideal_control.study_airframe(integrators, short, samples=1)
 
     def setting(self, requirement: Requirement) -> LoopSetting:
-        """Return the loop that gains are selected for; every gain is 1 before the selection."""
+        """Return the loop that gains are selected for. Before the selection every gain is 1."""
         loop = self.loop
         lag = loop.lag.tolist()
         channels = controller_values(self.channel_map, self.pairing)
@@ -209,10 +212,10 @@ class _Identified(NamedTuple):
 def _within_margins(
     controller: RiseDiConfig, study: Study, requirement: Requirement
 ) -> tuple[RiseDiConfig, LoopMargins | None]:
-    """Slow the integrals and lower the bandwidths of a controller until the loop keeps its margins.
+    """Slow the integrals and lower the bandwidths of a controller until its loop has the margins.
 
-    The loop is around the airframe of a study. The function returns the controller and the margins.
-    The input scale takes a lower bandwidth, so that K of (22) stays.
+    The loop is around the airframe of a study. Return the controller and the margins. A lower
+    bandwidth goes into the input scale, so that the K of (22) stays.
     """
     if controller.sampled_sign()[0] is not Sign.SOFT:
         return controller, None
@@ -238,12 +241,10 @@ def _within_margins(
 
 
 def _without_sideslip(channels: IdentifiedChannels, pairing: ChannelPairing) -> IdentifiedChannels:
-    """Channels of r with damping alone.
+    """Return the channels with nothing but damping in r.
 
-    The stiffness of a straight flight would skid in a coordinated turn.
-
-    The stiffness of r is N_beta, and beta_dot = -r + g / V phi is 0 there: a rudder against the
-    stiffness would skid.
+    The stiffness of r is N_beta, which acts in straight flight. In a coordinated turn beta_dot = -r
+    + g / V phi is 0: a rudder that works against the stiffness would skid.
     """
     turns = np.array([name == "r" for name in pairing.outputs])
     damping = np.where(turns, channels.damping - channels.zero, channels.damping)
@@ -260,12 +261,12 @@ def _with_integrals(
     channels: IdentifiedChannels,
     loop: LoopTiming,
 ) -> RiseDiConfig:
-    """Give the controller the integrals that keep the crossover of y_dot = Omega u with the models.
+    """Give the controller integrals that keep the crossover of y_dot = Omega u with the models.
 
     The slope of the softened sign is 1 / (softening total lag). Lambda and this slope are the
-    integrals of K (s + integral) / s. For a first-order channel, the integral is the damping, and
+    integrals of K (s + integral) / s. In a first-order channel, the integral is the damping, and
     the loop becomes K / s. A stiff channel answers u with a rate and needs a larger integral,
-    unless the sensitivity would exceed MAX_SENSITIVITY. Source: K. J. Astrom, T. Hagglund,
+    unless the sensitivity would then exceed MAX_SENSITIVITY. Source: K. J. Astrom, T. Hagglund,
     "Advanced PID Control", 2006, 6.5 (lambda tuning), 4.6 (largest sensitivity).
     """
     places = [pairing.outputs.index(name) for name in controller.outputs]
@@ -282,12 +283,12 @@ def _with_integrals(
 def _integral(channels: IdentifiedChannels, i: int, crossover: float, total_lag: float) -> float:
     """Return the integral of a channel, 1/s, for a loop that crosses over at `crossover`, rad/s.
 
-    The largest safe integral is the upper bound.
+    It is at most the largest safe integral.
     """
     omega = np.geomspace(0.1, 1e3, 400) * crossover
 
     def response(omega: Any) -> Any:
-        """Return the response of K times the model, without the delay."""
+        """Return the response of the model times K, without the delay."""
         s = 1j * omega
         return (
             crossover

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The observer's Kalman filter over a recorded flight.
+"""The Kalman filter of the observer over a recorded flight.
 
-y and u come in equal periods, and the innovations of many models side by side.
+y and u come in equal periods. The innovations of many models are computed side by side.
 """
 
 from collections.abc import Iterable, Sequence
@@ -27,29 +27,34 @@ from flight_core.vectors import FloatArray
 from flight_design.gains.nominal import airframe_model, unit_sizes
 from rise_di_controller.law.linear_loop import LoopTiming
 
-# s at the begin of a recording whose innovations do not count: the filter starts from y alone
+# s at the begin of a recording in which innovations do not count, because the filter starts from y
+# alone
 TRANSIENT = 0.5
-MOST_GAPS = 10.0  # span of a log, times that of the samples of u: the gaps are filled
-DRIFT = 0.003  # noises of the filter beside the wind
-LOOSE = 1.5e-4  # as `observer_design.Weights` has them: small
-# 1, noise of y in the filter, in units of 1 m/s or 0.1 rad/s: what the model leaves out of a
-# perfect sensor
+MOST_GAPS = 10.0  # largest length of a log, gaps included, as a multiple of its samples of u
+# Small noises of the filter apart from the wind, as in `observer_design.Weights`.
+DRIFT = 0.003
+LOOSE = 1.5e-4
+# Least noise of y in the filter, in units of 1 m/s or 0.1 rad/s. Even with a perfect sensor the
+# model leaves something out.
 MIN_NOISE = 1e-2
-LEAK = 1e-3  # 1, of observer_design.LEAK: over a minute the filter must not forget its angles
-HOLD = 5  # periods of a block, for which sin(x) - x is held: it changes slowly
+LEAK = 1e-3  # times observer_design.LEAK: the filter must not forget its angles within a minute
+HOLD = 5  # periods of a block, over which sin(x) - x is held, because it changes slowly
 # s, decay of the rate of a gust, and of the change of that rate
 GUST_TIME = 0.5
 RATE_TIME = 0.2
-LEAST_RATE = 1e-4  # m/s^3 per root s, noise of that change where there is no gust: negligible
+LEAST_RATE = 1e-4  # m/s^3 per root s, negligible noise of that change if there is no gust
 LEVELS = np.array(
     [(strength, 0.0, 0.0) for strength in (0.002, 0.03, 0.1, 0.3, 1.0, 3.0)]
     + [(strength, 0.0, strength) for strength in (0.1, 0.3, 1.0, 3.0)]
     + [(0.03, strength, 0.0) for strength in (20.0, 40.0, 80.0, 160.0, 320.0)]
 )
-"""Winds of the filter, a row a level, from calm air to gusts: noise of the wind in parts of that of
-moderate turbulence, noise of the change of its rate, m/s^3 per root s, and noise of the rotary gust
-in parts of that of moderate turbulence. A gust is smooth: with noise of the wind, or of its rate,
-the model has gusts as fast as the inputs, and the effects of the inputs come out too weak."""
+"""Winds of the filter, one row for each level, from calm air to gusts.
+
+The columns are the noise of the wind relative to moderate turbulence, the noise of the change of
+its rate, m/s^3 per root s, and the noise of the rotary gust relative to moderate turbulence. A gust
+is smooth. If the wind or its rate had the noise, the model would have gusts as fast as the inputs,
+and the effects of the inputs would come out too weak.
+"""
 
 
 SHEARED = ("alpha", "q")
@@ -66,7 +71,10 @@ class FlightData(NamedTuple):
 
 
 def coarser(recorded: FlightData, factor: int) -> FlightData:
-    """Average over `factor` periods; u lies between the middles of two means of y."""
+    """Average a flight over `factor` periods.
+
+    u lies between the middles of two means of y.
+    """
     count = len(recorded.t) // factor
     leads = [
         np.concatenate([recorded.u[k:], np.repeat(recorded.u[-1:], k, axis=0)])
@@ -87,11 +95,11 @@ class Actuation(NamedTuple):
 
 
 def recording(tape: Tape, airframe: Airframe) -> FlightData:
-    """Y and u of a tape at the rate of u, from the first u on.
+    """Return y and u of a tape at the rate of u, from the first u on.
 
-    y is the sample nearest to the instant, within half a period; u is the last one. Raises
-    ParameterError for a log without the channels of the airframe, or one shorter than ten times the
-    transient, or with gaps beyond MOST_GAPS.
+    y is the sample nearest to the instant, within half a period, and u is the last one. Raises
+    ParameterError if the log lacks a channel of the airframe, is shorter than ten times the
+    transient, or has gaps beyond MOST_GAPS.
     """
     y = tape["y"]
     u = tape["u"]
@@ -147,7 +155,10 @@ def filter_model(airframe: Airframe, actuation: Actuation, recorded: FlightData)
 
 
 def delayed(u: FloatArray, periods: float) -> FloatArray:
-    """u, (T, m), some periods later: between two samples the mean that acts in a period."""
+    """Return u, (T, m), some periods later.
+
+    Between two samples it is the mean that acts within a period.
+    """
     full_periods = int(periods)
     part = periods % 1.0
     late = np.concatenate([np.repeat(u[:1], full_periods + 1, axis=0), u])
@@ -155,17 +166,18 @@ def delayed(u: FloatArray, periods: float) -> FloatArray:
 
 
 def measured_noise(y: FloatArray, size: FloatArray) -> FloatArray:
-    """Noise of each channel a sample, rms, from the third differences of y, shape (T, m).
+    """Estimate the noise of each channel, rms of a sample, from the third differences of y, (T, m).
 
-    Their variance is 20 times that of y. At least MIN_NOISE of `size`, the unit of the channel.
+    Their variance is 20 times that of y. The noise is at least MIN_NOISE of `size`, the unit of the
+    channel.
     """
     third = np.diff(y, n=3, axis=0)
-    spread = np.nanmedian(np.abs(third), axis=0) / 0.6745  # of a normal distribution
+    spread = np.nanmedian(np.abs(third), axis=0) / 0.6745  # for a normal distribution
     return np.asarray(np.maximum(spread / np.sqrt(20.0), MIN_NOISE * size))
 
 
 class FilterBank(NamedTuple):
-    """Stationary Kalman filters of N models at each of the levels of the wind."""
+    """Stationary Kalman filters of N models at each level of the wind."""
 
     sampled: ObserverModel  # Phi (N, 1, s, s), Gamma (N, 1, s, m)
     L: FloatArray  # (N, levels, s, m)
@@ -174,7 +186,7 @@ class FilterBank(NamedTuple):
     period: float  # s
 
     def by_level(self) -> "FilterBank":
-        """Return the first model at every level of the wind, as one model per level."""
+        """Return the first model at every level of the wind, as one model for each level."""
         levels = self.L.shape[1]
         Phi, Gamma = (
             np.repeat(matrix[:1], levels, axis=0)
@@ -188,7 +200,7 @@ class FilterBank(NamedTuple):
         )
 
     def lifted(self, level: int, seen: Sequence[bool]) -> FloatArray:
-        """HOLD periods as a step, (N, HOLD m + s, ..).
+        """Return HOLD periods as one step, (N, HOLD m + s, ..).
 
         The map leads from z, then y and u of the periods, then sin(x) - x, to r and z.
         """
@@ -211,13 +223,13 @@ class FilterBank(NamedTuple):
 
 
 class Passage:
-    """The filters of a bank over y, (T, m), and u, (T, m) or (N, T, m) with inputs a model.
+    """The filters of a bank over y, (T, m), and u, (T, m), or (N, T, m) if each model has its own.
 
         r = y - H z,  z+ = Phi (z + L r) + Gamma u + period gravity (sin(x) - x)
 
-    with no update where y is lost. A block of HOLD periods has a `level`, (T / HOLD,). sin(x) - x
-    is held over a block, so the blocks are linear: with the same level and the same lost samples
-    they have the same matrix.
+    without an update if y is lost. A block of HOLD periods has a `level`, (T / HOLD,). sin(x) - x
+    is held over a block, so that blocks are linear: those with the same level and the same lost
+    samples have the same matrix.
     """
 
     def __init__(
@@ -225,7 +237,7 @@ class Passage:
     ) -> None:
         (T, m), (N, _, s, _), blocks = y.shape, bank.L.shape, len(level)
         self._angles = np.flatnonzero(bank.gravity.any(axis=0))
-        # the last block is filled with lost samples
+        # Fill the last block with lost samples.
         short = blocks * HOLD - T
         self._shape = (N, m, s)
         y = np.vstack([y, np.full((short, m), np.nan)])
@@ -246,7 +258,7 @@ class Passage:
         )
         state_columns = np.r_[:s, s + 2 * HOLD * m : lifted[0].shape[-1]]
         driven = slice(s, s + 2 * HOLD * m)
-        # z, and again its angles, in place of sin(x) - x
+        # z, and its angles once more in place of sin(x) - x
         following = HOLD * m + np.append(np.arange(s), self._angles)
         for k, matrix in enumerate(lifted):
             columns = np.flatnonzero(self._kind == k)
@@ -261,9 +273,9 @@ class Passage:
     def run(
         self, z: FloatArray, first: int = 0, last: int | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """Innovations in some blocks, (N, periods, m), from z, (N, s), on; and z afterwards.
+        """Return the innovations in some blocks, (N, periods, m), and the z after them.
 
-        They are NaN where y is lost.
+        The filters start from z, (N, s). The innovations are NaN where y is lost.
         """
         (N, m, s), steps = self._shape, self._steps
         kind = self._kind[first:last]
@@ -271,7 +283,7 @@ class Passage:
         states[0, ..., 0] = np.concatenate([z, z[:, self._angles]], axis=1)
         sine = np.empty(states[0, :, s:].shape)
         next_state = np.empty(states[0].shape)
-        # the loop is half of a search: no array is made in it
+        # This loop takes half of a search, so that it makes no arrays.
         for k, now, turned, following in zip(
             kind.tolist(), states[:-1], states[:-1, :, s:], states[1:], strict=True
         ):
@@ -290,8 +302,8 @@ class Passage:
 def in_rolling_air(airframe: Airframe) -> Airframe:
     """Add the rotary gust in roll to an airframe whose span is known.
 
-    The rotary gust in pitch follows the vertical wind, see `filter_bank`. The one in yaw is small
-    beside the lateral wind.
+    The rotary gust in pitch follows the vertical wind, see `filter_bank`. That in yaw is small
+    compared with the lateral wind.
     """
     return airframe if airframe.span is None else airframe.with_rotary_gusts(ROTARY[:1])
 
@@ -299,15 +311,15 @@ def in_rolling_air(airframe: Airframe) -> Airframe:
 def wind_model(
     axes: Sequence[str], speed: float, span: float | None = None
 ) -> tuple[FloatArray, FloatArray]:
-    """Time constants, s, and noises, m/s per root s, of winds of first order, (G,) each.
+    """Return time constants, s, and noises, m/s per root s, of winds of first order, (G,) each.
 
-    The winds are like Dryden's moderate turbulence. They have its spectrum at low and at high
+    The winds resemble Dryden's moderate turbulence: they have its spectrum at low and at high
     frequencies. With T = L / V0 that is 2 sigma^2 T / (1 + (T omega)^2) along the flight and
     sigma^2 T (1 + 3 (T omega)^2) / (1 + (T omega)^2)^2 across it. The rotary gust in roll, rad/s,
-    is that of `roll_gust`. Arguments: `speed` V0 and `span` in SI.
+    is that of `roll_gust`. `speed` is V0 and `span` the span, both in SI.
     """
     if not axes:
-        # a multicopter hovers at a speed of 0
+        # A multicopter hovers at a speed of 0.
         return np.zeros(0), np.zeros(0)
     spectrum = dryden(**MODERATE, sigma=0.0)
     along = np.array([axis == "longitudinal" for axis in AXES])
@@ -323,7 +335,7 @@ def wind_model(
 
 
 class FilterAir:
-    """The winds of a filter and how the winds move the aircraft, see `filter_bank`."""
+    """The winds of a filter and how they move the aircraft, see `filter_bank`."""
 
     def __init__(
         self, names: Names, speed: float, span: float | None, shear: FloatArray | None
@@ -379,7 +391,7 @@ class FilterAir:
         )
 
     def noises(self, strength: FloatArray, levels: NDArray[np.int64] | slice) -> FloatArray:
-        """Noises of all states at some levels, (N, levels, s), of winds of a strength, (N, G)."""
+        """Return the noises of all states, (N, levels, s), for winds of some strength, (N, G)."""
         winds, changes, rolls = (LEVELS[levels, None, k] for k in range(3))
         noise = self._noise
         smooth = self._smooth
@@ -406,21 +418,21 @@ def filter_bank(
 ) -> FilterBank:
     """Design the filters of models with A (N, n, n), B (N, n, m) and wind (N, n, G).
 
-    They are at the trim speed V0, m/s, z = [x, w, v, a, ..].
+    The models are at the trim speed V0, m/s, and z = [x, w, v, a, ..].
 
         w_dot = v - w / wind_time + noise,  v_dot = a - v / GUST_TIME,
             a_dot = -a / RATE_TIME + noise
 
-    A rotary gust has neither v nor a. With a `shear` (N, 2) the vertical wind w turns the air, by
-    the slope of w behind the lag T = 4b / (pi V0) of the span b:
+    A rotary gust has neither v nor a. With a `shear` (N, 2), the vertical wind w also turns the
+    air: its slope acts behind the lag T = 4b / (pi V0) of the span b.
 
         q_g = (w - l) / (V0 T),  l_dot = (w - l) / T
         alpha_dot -= shear_1 q_g,  q_dot -= shear_2 A[q, q] q_g
 
-    A frozen field of wind has (0, -1); the specification's sign is the other one, and other
-    models of the air move alpha, too. The noises are of `levels` of LEVELS, times `strength` (N,
-    G); `drift` as in `observer_design.Weights`. Models `near` the first one have gains exact to
-    first order.
+    A frozen field of wind has the shear (0, -1). The specification has the opposite sign, and other
+    models of the air move alpha, too. The noises are those of `levels` of LEVELS times `strength`
+    (N, G); `drift` is as in `observer_design.Weights`. If the models are `near` the first one,
+    their gains are exact to first order.
     """
     air = FilterAir(names, speed, span, shear)
     m = model.B.shape[-1]
@@ -439,7 +451,7 @@ def filter_bank(
     L = observer_design.aircraft_correction(
         sampled, each, weights, corrections_near if near else correction_of
     )
-    # L = S H'(H S H' + R)^-1 leaves I - H L = R (H S H' + R)^-1
+    # Since L = S H'(H S H' + R)^-1, I - H L = R (H S H' + R)^-1.
     covariance = np.linalg.solve(
         np.eye(m) - sampled.H @ L, np.broadcast_to(np.diag(model.noise**2), (*L.shape[:2], m, m))
     )
@@ -452,7 +464,14 @@ def filter_bank(
     )
 
 
-OF_INPUTS = ("input_scale", "D", "lag", "total_lag", "lower", "upper")  # vectors of a model
+OF_INPUTS = (
+    "input_scale",
+    "D",
+    "lag",
+    "total_lag",
+    "lower",
+    "upper",
+)  # vectors of a model, by input
 
 
 class Block(NamedTuple):
@@ -502,7 +521,7 @@ def _block(parts: Sequence[NDArray[np.int32]], label: np.int32) -> Block:
 
 
 def blocks(model: NominalModel) -> list[Block]:
-    """Split an aircraft into the parts that neither A, gravity, B, C nor the wind couple.
+    """Split an aircraft into the parts that A, gravity, B, C and the wind do not couple.
 
     If a part has not as many inputs as outputs, the whole aircraft is one part.
     """
@@ -518,6 +537,6 @@ def blocks(model: NominalModel) -> list[Block]:
 
 
 def whole_aircraft(model: NominalModel) -> Block:
-    """All of an aircraft as one part."""
+    """Return the whole aircraft as one part."""
     (n, m), G = model.B.shape, model.wind.shape[1]
     return Block(*map(np.arange, (n, m, m, G)))

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Identification of an aircraft of JSBSim: its linear airframe, gains, and a scenario.
+"""Identification of an aircraft of JSBSim: its linear airframe, its gains and a scenario.
 
-The airframe is the linearisation of JSBSim about the trim. Its gains are those that
-`rise-di gains` selects for an airframe. No number in this module is specific to an aircraft.
+The airframe is the linearisation of JSBSim about the trim. Its gains are those that `rise-di gains`
+would select for it. No number in this module is specific to an aircraft.
 """
 
 from collections.abc import Callable
@@ -67,31 +67,33 @@ from rise_di_controller.rise_di_config import LearnConfig, PriorConfig, RiseDiCo
 
 CONTROL_RATE = 100.0
 STEP = 0.005
-# s, topics: y is at most 5 ms old at a tick, u waits at most 5 ms; half of both, and 1 ms of
-# transport
+# s, delay over topics. At a tick y is up to 5 ms old, and u waits up to 5 ms. This is half of both,
+# and 1 ms of transport.
 DELAY = 0.006
 
 THROTTLE = list(INPUTS).index("throttle")
 
-# unit of an output over the noise that an observer expects: 1 mrad/s, 0.01 m/s
+# ratio of an output's unit to the noise that an observer expects: 1 mrad/s, 0.01 m/s
 NOISE_SHARE = 100.0
 
-# s, least delay margin: without A the model of an observer has no damping, and less margin than the
-# aircraft
+# s, least delay margin. Without A, the model of an observer has no damping, and less margin than
+# the aircraft has.
 STEP_MARGIN = 0.015
 LATERAL = ("beta", "p", "r")
-HELD_FACTOR = 2.0  # of a zero of sideslip on the right: as stable as it was unstable
-APART = 5.0  # s, from a gust to the next
+HELD_FACTOR = 2.0  # times an unstable zero of sideslip: it becomes as stable as it was unstable
+APART = 5.0  # s, from one gust to the next
 
 NOISE = {"q": 0.001, "V": 0.05, "p": 0.001, "r": 0.001}
-"""rad/s and m/s, rms a sample, of the sensors of an aircraft that learns, assumed: those of a first
-flight."""
+"""Assumed noise of the sensors of an aircraft that learns, rms of a sample, rad/s and m/s.
+
+A first flight has the same.
+"""
 
 
 # The manoeuvre: one rule for all aircraft
 
-# rad, bandwidth of V times the lag of its loop: it costs 26 degrees of phase, for an engine is no
-# lag alone
+# rad, bandwidth of V times the lag of its loop. It costs 26 degrees of phase, because an engine is
+# more than a lag.
 FASTEST_V = 0.46
 LIGHT_SIGMA = 1.52  # m/s, of light turbulence at high altitude: 5 ft/s, MIL-F-8785C 3.7.2
 
@@ -100,20 +102,22 @@ LIGHT_SIGMA = 1.52  # m/s, of light turbulence at high altitude: 5 ft/s, MIL-F-8
 
 
 class IdentifiedAircraft(NamedTuple):
-    """An identified aircraft with a scenario."""
+    """An identified aircraft and its scenario."""
 
     linear: Linearization
-    coupling: float  # max abs(U - I), inputs of unit response, outputs in units of the manoeuvre
+    coupling: (
+        float  # max abs(U - I), for inputs of unit response and outputs in units of the manoeuvre
+    )
     selection: Selection
     text: str  # of the scenario file
     sideslip_zero: (
-        float  # 1/s, of sideslip with p and r held; Assumption 3 does not hold if it is positive
+        float  # 1/s, of sideslip while p and r are held; Assumption 3 fails if it is positive
     )
     flights: dict[str, ManoeuvreResult]  # "calm", "gust", "turbulence"
 
     @property
     def condition(self) -> FlightCondition:
-        """The flight condition, without a rudder that moves nothing."""
+        """The flight condition. A rudder that moves nothing is not in it."""
         return self.linear.condition
 
     @property
@@ -159,24 +163,29 @@ def identify_jsbsim(
     requirement: Requirement = REQUIREMENT,
     named: tuple[tuple[str, NamedProperties], ...] = (),
 ) -> IdentifiedAircraft:
-    """Identify an aircraft of JSBSim in a flight condition and select gains.
+    """Identify an aircraft of JSBSim in a flight condition, select gains, and fly it.
 
-    The speed is in m/s, the altitude in m.
+    The speed is in m/s, the altitude in m. There are four steps.
 
-    1. Trim, first in another process, and the airframe: `linearize`. 2. The pairing, with outputs
-    in units of the manoeuvre, and D from the minors. 3. Gains by the engineering procedure for the
-    airframe behind the lags, along the commands and gusts: `gain_selection.gain_sets`. The sign of
-    V is that of `airspeed_slew`. With `observer_margin`, the delay margin in s of the loop on y_dot
-    = Omega u, the gains are those for y_dot = Omega u with an extended-state observer beside them.
-    The margins of that loop meet `requirement`, with 35 degrees of phase. 4. Simulations of the
-    result: in calm air, with a gust, in turbulence. With `guided` the scenario has guidance by rule
-    in place of the pulses: a turn by 90 degrees and a climb by 100 m. Its stall speed is that of
-    `slowest_trim`, and its sideslip feedback flies an aircraft whose `sideslip_zero` is positive,
-    too. With `learns` the scenario learns in moderate turbulence: the gains begin alone,
-    `observer_margin` is the margin of the designs, and the rough model is the `sketch` of Omega and
-    speed.
+    1. Trim, first in another process, and linearise: `linearize` gives the airframe.
 
-    Raises FlightEnded if the aircraft does not trim or does not respond, ParameterError if its
+    2. Pair the channels, with outputs in units of the manoeuvre, and take D from the minors.
+
+    3. Select gains by the engineering procedure for the airframe behind the lags, along the
+    commands and gusts: `gain_selection.gain_sets`. The sign of V is that of `airspeed_slew`. With
+    `observer_margin`, the delay margin in s of the loop on y_dot = Omega u, the gains are those
+    that go with an extended-state observer for y_dot = Omega u. The margins of that loop meet
+    `requirement`, with 35 degrees of phase.
+
+    4. Simulate the result in calm air, with a gust, and in turbulence.
+
+    If `guided`, the scenario has guidance by rule in place of the pulses: a turn by 90 degrees and
+    a climb by 100 m. Its stall speed is that of `slowest_trim`. Its sideslip feedback can also fly
+    an aircraft whose `sideslip_zero` is positive. If the scenario `learns`, it does so in moderate
+    turbulence: it begins with the gains alone, `observer_margin` is the margin of the designs, and
+    the rough model is the `sketch` of Omega and speed.
+
+    Raises FlightEnded if the aircraft does not trim or does not respond, and ParameterError if its
     outputs and inputs cannot be paired, or if the speed is below guidance's speed floor.
     """
     condition = FlightCondition(
@@ -229,7 +238,10 @@ def identify_jsbsim(
 
 
 def _linear(condition: FlightCondition, progress: Callable[[str], None]) -> Linearization:
-    """Linearise the aircraft. Raises FlightEnded, which names the nearest condition with a trim."""
+    """Linearise the aircraft.
+
+    Raises FlightEnded, which names the nearest condition that has a trim.
+    """
     progress("trim and linearisation")
     try:
         return linearize(condition)
@@ -242,11 +254,11 @@ def _linear(condition: FlightCondition, progress: Callable[[str], None]) -> Line
 
 
 def sideslip_zero(airframe: Airframe) -> float:
-    """Rate of decay (negative) or growth of sideslip while p and r are held, 1/s: a zero.
+    """Return the rate at which sideslip decays (negative) or grows while p and r are held, 1/s.
 
-    Gravity is left out: the coupling of bank to sideslip is much slower.
-    Where the rate is positive, Assumption 3 does not hold. Without a rudder the aileron holds p,
-    and r follows.
+    It is a zero of the aircraft. Gravity is left out, because the coupling of bank to sideslip is
+    much slower. If the rate is positive, Assumption 3 does not hold. Without a rudder, the aileron
+    holds p, and r follows.
     """
     states = [airframe.index(name) for name in LATERAL]
     inputs = [i for i, name in enumerate(airframe.inputs) if name in {"aileron", "rudder"}]
@@ -262,8 +274,8 @@ def sideslip_zero(airframe: Airframe) -> float:
 def with_sideslip_held(airframe: Airframe, zero: float) -> Airframe:
     """Return the airframe with more damping of sideslip if its zero of sideslip is unstable.
 
-    The law holds p and r. Without feedback of sideslip, which guidance gives, the sideslip would
-    then diverge.
+    The law holds p and r. Without the feedback of sideslip that guidance gives, sideslip would then
+    diverge.
     """
     if zero <= 0.0:
         return airframe
@@ -276,16 +288,16 @@ def with_sideslip_held(airframe: Airframe, zero: float) -> Airframe:
 def airspeed_slew(bandwidth: float, effect: float) -> float:
     """Return the throttle slew behind beta, 1/s, for a bandwidth of V, rad/s, and an effect, m/s^2.
 
-    V holds the wind itself: with beta = K bandwidth / 4 sigma, the sign moves the throttle in light
-    turbulence of LIGHT_SIGMA no faster than the Lambda of the rule would, bandwidth / 4.
+    V contains the wind itself. With beta = K bandwidth / 4 sigma, the sign moves the throttle in
+    light turbulence of LIGHT_SIGMA no faster than the Lambda of the rule would, bandwidth / 4.
     """
     return bandwidth**2 / 4.0 * LIGHT_SIGMA / (gain_selection.BETA_TO_SLEW * effect)
 
 
 def _too_weak(linear: Linearization) -> str:
-    """Say which outputs have too weak an input of their own, in sentences after a "; ".
+    """Say which outputs are moved too weakly by their own input, in sentences after a "; ".
 
-    At full travel, the own input moves such an output less than a tenth of what another input does.
+    At full travel, their own input moves them less than a tenth as much as another input does.
     """
     inputs = linear.condition.inputs()
     reach = linear.Omega * linear.travel()
@@ -306,10 +318,9 @@ def _too_weak(linear: Linearization) -> str:
 def slowest_trim(condition: FlightCondition) -> float:
     """Find the slowest airspeed at which an aircraft trims in level flight at an altitude, m/s.
 
-    The error is at most 1 % of the condition's speed.
-
-    Below this speed, lift or thrust is not enough, so guidance takes it as the stall speed. The
-    search is a bisection from 0.2 of the condition's speed.
+    Below this speed, lift or thrust is not enough, so that guidance takes it as the stall speed.
+    The search is a bisection from 0.2 of the condition's speed, and errs by at most 1 % of that
+    speed.
     """
     slow = 0.2 * condition.speed
     fast = condition.speed
@@ -347,9 +358,9 @@ def _in_law_order(Omega: FloatArray, controller: RiseDiConfig) -> FloatArray:
 def learning_selection(
     selection: Selection, condition: FlightCondition, Omega: FloatArray, margin: float
 ) -> Selection:
-    """Add `learn`, with feedforward and observer of a sketch that do not fly yet, to a selection.
+    """Add `learn` to a selection, with the feedforward and observer of a sketch.
 
-    Omega is in the aircraft's order.
+    They do not fly yet. Omega is in the aircraft's order.
     """
     start = selection.chosen
     name = Path(condition.name).stem
@@ -361,10 +372,10 @@ def learning_selection(
 
 
 def _study(airframe: Airframe, commands: FirstCommands) -> Study:
-    """Study an airframe along the commands and gusts, without uncertain aircraft beside it.
+    """Study an airframe along the commands and gusts, without any uncertain aircraft.
 
     The equations are those that fly. An aircraft whose entries are 30 % off may have an unstable
-    zero of sideslip, and then no gains hold its outputs.
+    zero of sideslip, and then no gains could hold its outputs.
     """
     reference = ReferenceModelConfig.validate_mapping(commands.reference, "reference_model")
     gusts = {
@@ -377,7 +388,7 @@ def _study(airframe: Airframe, commands: FirstCommands) -> Study:
 
 
 def _integrators(linear: Linearization) -> Airframe:
-    """Return y_dot = Omega u as an airframe, the model of an extended-state observer."""
+    """Return y_dot = Omega u as an airframe, which is the model of an extended-state observer."""
     airframe = linear.airframe
     units = airframe.units_of_outputs()
     m = len(units)
@@ -390,13 +401,12 @@ def _integrators(linear: Linearization) -> Airframe:
 
 
 def airspeed_bandwidth(authority: float, lag: float) -> float:
-    """Bandwidth of V, rad/s, for an authority of the throttle (m/s^2) behind its lag (s).
+    """Return the bandwidth of V, rad/s, for a throttle with an authority, m/s^2, and a lag, s.
 
-    The bandwidth is min(0.46 / total, authority / sigma).
-
-    The airspeed holds the wind along the path itself. In moderate turbulence, sigma = 3.05 m/s rms,
-    the throttle then moves by its authority rms; with more it goes from stop to stop, and V is off
-    by twice the wind (737).
+    It is min(0.46 / total, authority / sigma). V contains the wind along the path itself. In
+    moderate turbulence, sigma = 3.05 m/s rms, the throttle then moves by its authority rms. With
+    more bandwidth it would go from stop to stop, and V would be off by twice the wind, as on the
+    737.
     """
     return min(
         FASTEST_V / float(total_lag(np.array(lag), DELAY, 1.0 / CONTROL_RATE)),
@@ -405,7 +415,7 @@ def airspeed_bandwidth(authority: float, lag: float) -> float:
 
 
 def _setting(linear: Linearization, V_bandwidth: float) -> LoopSetting:
-    """Return the loop that the gains are selected for; the parameters to select are 1."""
+    """Return the loop for which the gains are selected. The parameters to select are 1."""
     inputs = list(linear.condition.inputs())
     trim = linear.trim
     base = RiseDiConfig.validate_mapping(
@@ -464,7 +474,7 @@ def _commands(linear: Linearization, setting: LoopSetting) -> FirstCommands:
 def _text(
     linear: Linearization, commands: FirstCommands, selection: Selection, stall: float | None
 ) -> str:
-    """Write the scenario file. `stall` is V_s, m/s; without one the flight is not guided."""
+    """Write the scenario file. `stall` is V_s, m/s; without it the flight is not guided."""
     condition = linear.condition
     learns = selection.chosen.learn is not None
     reference = dict(commands.reference)

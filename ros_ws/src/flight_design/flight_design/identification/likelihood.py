@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The likelihood of A and B over one block of a flight.
 
-The observer's filter gives the innovations at the levels of the wind.
+The filter of the observer gives the innovations at each level of the wind.
 """
 
 from collections.abc import Iterable, Sequence
@@ -32,62 +32,63 @@ from flight_design.identification.innovation_filters import (
     filter_bank,
 )
 
-PRIOR = 0.29  # 1, standard deviation of a relative error before the flight: that of +-50 %, uniform
-SHEAR_PRIOR = 1.0  # 1, the same of the effects of the slope of the vertical wind
-WIND_PRIOR = 1.0  # 1, the same of the logarithm of the strength of the wind along an axis
-MAX_ERROR = 0.6  # 1, lower bound of a relative error: two standard deviations
-# standard deviations, bound of the error of the delay: 60 ms for one of 15 ms
+PRIOR = 0.29  # standard deviation of a relative error before the flight: uniform within +-50 %
+SHEAR_PRIOR = 1.0  # the same for the effects of the slope of the vertical wind
+WIND_PRIOR = 1.0  # the same for the logarithm of the strength of the wind along an axis
+MAX_ERROR = 0.6  # lower bound of a relative error is minus this: two standard deviations
+# bound of the error of the delay in standard deviations: 60 ms for one of 15 ms
 MAX_DELAY_ERROR = 4.0
-# 1, of a value over the nominal one: 1 / (1 - MAX_ERROR), for a rough model errs by a factor either
-# way
+# Largest ratio of a value to the nominal one, 1 / (1 - MAX_ERROR): a rough model errs by a factor
+# either way.
 MAX_FACTOR = 2.5
-# unit of an entry that is 0, over the largest effect on the row: a deviation of 10 % before the
-# flight
+# Unit of an entry that is 0, relative to the largest effect on its row. It gives a deviation of
+# 10 % before the flight.
 COUPLING = 0.34
-CHANGE = 3.0  # of log-likelihood that a span has to gain by a stronger wind: odds of 20 to 1
-# 1, mean square of the innovations of a span in parts of the median one: no level explains it
+CHANGE = 3.0  # of log-likelihood that a span must gain by a stronger wind: odds of 20 to 1
+# Mean square of the innovations of a span relative to the median one, above which no level of the
+# wind explains the span.
 UNEXPLAINED = 5.0
-FEW = 0.25  # of the spans: so few gusts do not count, for a gust is no noise
-RECOVERY = 2  # spans after such a one that do not count either: the estimates recover
-SPAN = 1.0  # s, within which the level is constant
-# Every third span is held out: each command and gust is then in both parts. A last third has no
-# command.
+FEW = 0.25  # share of the spans: so few gusts do not count, because a gust is not noise
+RECOVERY = 2  # spans after such a one that do not count either, while the estimates recover
+SPAN = 1.0  # s, within which the level of the wind is constant
+# Every third span is held out, so that each command and gust is in both parts. The last third of a
+# flight may have no command.
 HELD_OUT = 3
 
 
 def span_length(recorded: FlightData) -> int:
-    """Periods of a span: whole blocks of the filters."""
+    """Return the periods of a span, which are whole blocks of the filters."""
     return HOLD * max(round(SPAN / recorded.period / HOLD), 1)
 
 
 def held_out(periods: int, span: int) -> NDArray[np.bool_]:
-    """Mask of the validation's periods, every HELD_OUT-th span."""
+    """Return the mask of the periods that validate, every HELD_OUT-th span."""
     return np.asarray(np.arange(periods) // span % HELD_OUT == HELD_OUT - 1)
 
 
 class Innovations(NamedTuple):
     """Innovations of a model over a recording.
 
-    A span has the level of the wind with the best prediction.
+    Each span has the level of the wind that predicts it best.
     """
 
     r: FloatArray  # (T, m) in units of y, NaN where y is lost
-    normalised: FloatArray  # (T, m) of covariance I where the model is right
-    log_likelihood: FloatArray  # (T,) of a sample, up to a constant, see `predicted`
+    normalised: FloatArray  # (T, m) of covariance I if the model is right
+    log_likelihood: FloatArray  # (T,) of each sample, up to a constant, see `predicted`
 
 
 class Normalised(NamedTuple):
     """Innovations of N models."""
 
     r: FloatArray  # (N, T, m) in units of y, NaN where y is lost
-    e: FloatArray  # (N, T, m) of covariance I where a model is right
+    e: FloatArray  # (N, T, m) of covariance I if a model is right
     half_log_det: FloatArray  # (N, T) of the covariance of r
 
 
 def normalised(r: FloatArray, covariance: FloatArray, place: NDArray[np.int64]) -> Normalised:
-    """Normalised innovations r, (N, T, m), with covariances (N, levels, m, m).
+    """Normalise innovations r, (N, T, m), by covariances (N, levels, m, m).
 
-    `place` is the level of a sample among these, (T,).
+    `place` is the level of each sample among these, (T,).
     """
     root = np.linalg.cholesky(covariance)
     inverse = np.linalg.inv(root)
@@ -102,17 +103,16 @@ class Models(NamedTuple):
     """The filters of N models, and their inputs."""
 
     bank: FilterBank
-    levels: NDArray[np.int64]  # (levels of the bank,), those of LEVELS
-    begin: FloatArray  # (N, s) estimates at the begin
-    u: FloatArray  # (T, m), or (N, T, m) where the delay is identified
+    levels: NDArray[np.int64]  # (levels of the bank,) their places in LEVELS
+    begin: FloatArray  # (N, s) estimates at the begin of the flight
+    u: FloatArray  # (T, m), or (N, T, m) if the delay is identified
 
 
 class Unknown(NamedTuple):
-    """Standard deviations of what else is identified, 0 where known.
+    """Standard deviations of what else is identified; 0 if it is known.
 
-    The fields are the deviations of B, and the noise of the disturbances. The rows of hidden
-    states, such as alpha, are known where they follow from mass and lift, and y has the rates
-    alone.
+    They are the deviations of B and the noise of the disturbances. The rows of hidden states, such
+    as alpha, are known if they follow from mass and lift while y has nothing but the rates.
     """
 
     delay: float = 0.0  # s, of u
@@ -120,11 +120,11 @@ class Unknown(NamedTuple):
     effect: float = PRIOR  # 1, of an entry of B before the flight
     error: float = PRIOR  # 1, of an entry of A
     drift: float = DRIFT  # sizes/s per root s, of the disturbances
-    has_hidden_rows: bool = True  # whether those of states that are no output are identified
+    has_hidden_rows: bool = True  # whether the rows of states that are no outputs are identified
 
     @property
     def factor(self) -> float:
-        """Largest factor of an entry over the nominal one, either way: MAX_FACTOR at PRIOR."""
+        """Largest ratio of an entry to the nominal one, either way: MAX_FACTOR at PRIOR."""
         roughness = max(self.error, self.effect, PRIOR) / PRIOR
         return float(MAX_FACTOR**roughness)
 
@@ -137,22 +137,21 @@ class Fit(NamedTuple):
 
     theta: FloatArray
     """(p,) relative errors of the uncertain entries of A, then of B; logarithms of the strengths of
-    the winds; where they are identified, the shear, the angles at the begin and the errors of the
-    delays, in units of their deviations."""
+    the winds; then, if they are identified, the shear, the angles at the begin and the errors of
+    the delays, in units of their deviations."""
     deviation: FloatArray  # (p,) standard deviations after the flight
-    before: Innovations  # of the nominal model in these winds
-    after: Innovations  # of the identified one
-    levels: NDArray[np.int64]  # (spans,) of the wind, with the identified model
-    flown: Innovations | None = None  # of the model that flies, in its best winds
+    before: Innovations  # those of the nominal model in these winds
+    after: Innovations  # those of the identified model
+    levels: NDArray[np.int64]  # (spans,) levels of the wind, with the identified model
+    flown: Innovations | None = None  # those of the model that flies, in its best winds
 
 
 def units(model: NominalModel, *, coupled: bool = False) -> tuple[FloatArray, FloatArray]:
-    """Units of the errors of A and B, SI, 0 for a known entry.
+    """Return the units of the errors of A and B, SI; 0 for a known entry.
 
-    They are the nominal values, and 0 in the rows of angles.
-
-    If `coupled`, an entry that is 0 has the unit COUPLING of the largest effect on its row, in
-    units of motion; the columns of angles stay 0.
+    They are the nominal values, and 0 in the rows of angles. If `coupled`, an entry that is 0 has
+    the unit COUPLING times the largest effect on its row, in units of motion; the columns of angles
+    stay 0.
     """
     free = model.kinematic[:, None] == 0.0
     is_dynamic = model.kinematic == 0.0
@@ -178,7 +177,7 @@ def largest_error(entry: Entry) -> float:
 class Likelihood:
     """The data of one block, and the functions of theta over them."""
 
-    coarse: "Likelihood"  # of means over the shortest lag
+    coarse: "Likelihood"  # the same for means over the shortest lag
 
     def __init__(
         self,
@@ -192,12 +191,11 @@ class Likelihood:
         *,
         coupled: bool = False,
     ) -> None:
-        """Give each error of A the prior PRIOR; `believe` replaces it.
+        """Set up the likelihood; each error of A has the prior PRIOR until `believe` replaces it.
 
-        `delay` is the delay of u, s, if it is known.
-
-        The starts of the search use means over `factor` periods; by default, over the shortest lag.
-        If `coupled`, the entries that are 0 are identified too.
+        `delay` is the delay of u, s, if it is known. The search starts on means over `factor`
+        periods, by default over the shortest lag. If `coupled`, the entries that are 0 are
+        identified, too.
         """
         if factor is None:
             factor = max(int(float(np.min(model.lag)) / recorded.period + 1e-9), 1)
@@ -234,17 +232,17 @@ class Likelihood:
             units_A, units_B = self._units
             self._units = units_A * is_output, units_B * is_output
         count_A, count_B = map(np.count_nonzero, self._units)
-        # theta, levels and innovations of `levels`
+        # theta, levels and innovations from the last call of `levels`
         self._passed: tuple[bytes, NDArray[np.int64], Normalised] | None = None
-        self.count = int(count_A + count_B)  # of the entries that are identified
+        self.count = int(count_A + count_B)  # number of the entries that are identified
         self._factor = unknown.factor
         self.believe(np.repeat([unknown.error, unknown.effect], [count_A, count_B]))
 
     def believe(self, deviation: FloatArray, centre: FloatArray | None = None) -> None:
         """Take these standard deviations of the relative errors before the flight, (p - G,).
 
-        The errors lie about a `centre`, (p - G,), by default 0: deviations and bounds are then
-        relative to the values there.
+        The errors lie about a `centre`, (p - G,), by default 0. Deviations and bounds are relative
+        to the values there.
         """
         delay_prior = np.ones(len(self._block.inputs) if self._delay_deviation else 0)
         wind_prior = np.full(len(self._block.winds), WIND_PRIOR)
@@ -273,7 +271,7 @@ class Likelihood:
             for bounds in (self._lower, self._upper):
                 bounds[self._errors] = centre + scale * bounds[self._errors]
             self.prior[self._errors] *= scale
-        if len(delay_prior):  # no u acts before it is sent
+        if len(delay_prior):  # no u can act before it is sent
             earliest = -self._delay / self._delay_deviation
             self._lower[self._late] = np.maximum(-MAX_DELAY_ERROR, earliest)
             self._upper[self._late] = MAX_DELAY_ERROR
@@ -282,9 +280,9 @@ class Likelihood:
         self._begin = slice(self._shear.stop, self._shear.stop + len(self._angles))
 
     def with_errors(self, thetas: FloatArray) -> NominalModel:
-        """Return the models of relative errors (N, p): A (N, n, n), B (N, n, m), wind (N, n, G).
+        """Return the models with relative errors (N, p): A (N, n, n), B (N, n, m), wind (N, n, G).
 
-        The wind acts by the model's own A.
+        The wind acts through each model's own A.
         """
         matrices = []
         parts = np.split(thetas, [np.count_nonzero(self._units[0]), self.count], axis=1)[:2]
@@ -303,7 +301,7 @@ class Likelihood:
     def models(
         self, thetas: FloatArray, levels: NDArray[np.int64], *, near: bool = False
     ) -> Models:
-        """Design the filters of theta, (N, p), at some levels of the wind.
+        """Design the filters for theta, (N, p), at some levels of the wind.
 
         All of them may be `near` the first theta.
         """
@@ -332,7 +330,7 @@ class Likelihood:
         return Models(bank, levels, begin, np.array([late[tuple(row)] for row in periods.tolist()]))
 
     def _delayed(self, periods: FloatArray) -> FloatArray:
-        """u, (T, m), each input some periods later, (m,)."""
+        """Return u, (T, m), with each input some periods later, (m,)."""
         columns = zip(self._u.T, np.maximum(periods, 0.0).tolist(), strict=True)
         return np.hstack([delayed(u[:, None], late) for u, late in columns])
 
@@ -347,8 +345,8 @@ class Likelihood:
     def levels(self, theta: FloatArray) -> NDArray[np.int64]:
         """Return the level of the wind in each span, (spans,), for theta, (p,).
 
-        Every level predicts the span from the estimates at its begin. The function takes the
-        calmest level whose log-likelihood is within CHANGE of the best.
+        Every level predicts the span from the estimates at its begin. The calmest level is taken
+        whose log-likelihood is within CHANGE of the best.
         """
         models = self.models(theta[None], self._usable)
         bank = models.bank.by_level()
@@ -379,11 +377,11 @@ class Likelihood:
         return levels
 
     def _of_span(self, values: Sequence[int] | NDArray[np.int64]) -> NDArray[np.int64]:
-        """Values of the spans for the samples, (T,)."""
+        """Spread values of the spans over their samples, (T,)."""
         return np.repeat(np.asarray(values), self._spans[0].stop)[: len(self._y)]
 
     def innovations(self, models: Models, levels: NDArray[np.int64]) -> Normalised:
-        """Innovations of N models at given levels."""
+        """Return the innovations of N models at given levels."""
         place = self._of_span(np.searchsorted(models.levels, levels))
         r = Passage(models.bank, self._y, models.u, place[::HOLD]).run(models.begin)[0][
             :, : len(self._y)
@@ -391,9 +389,9 @@ class Likelihood:
         return normalised(r, models.bank.covariance, place)
 
     def passed(self, theta: FloatArray, levels: NDArray[np.int64]) -> Normalised:
-        """Innovations of a theta, (p,), at some levels.
+        """Return the innovations of a theta, (p,), at some levels.
 
-        There is no new passage after `levels` of this theta.
+        If `levels` was just called with this theta, they are not computed again.
         """
         if (
             self._passed is not None
@@ -404,11 +402,11 @@ class Likelihood:
         return self.innovations(self.models(theta[None], levels), levels)
 
     def predicted(self, theta: FloatArray, levels: NDArray[np.int64]) -> Innovations:
-        """Return the innovations of a theta, (p,).
+        """Return the innovations of a theta, (p,), with their log-likelihood.
 
             log p = -1/2 sum_i (e_i^2 / s_i + log s_i) - 1/2 log det S,   s_i = mean e_i^2
 
-        The means s_i are over the samples that fit the model, as in the cost: the noise of the
+        The means s_i are over the samples that fit the model, as in the cost. The noise of the
         filter is a guess, and a model must not gain by a better guess.
         """
         (r,), (e,), (half_log_det,) = self.passed(theta, levels)
@@ -422,7 +420,7 @@ class Likelihood:
         used: NDArray[np.bool_],
         levels: NDArray[np.int64] | None = None,
     ) -> float:
-        """Return the cost of `fit` for theta, (p,), at some wind levels or at the best ones."""
+        """Return the cost of `fit` for theta, (p,), at some levels of the wind or the best."""
         levels = self.levels(theta) if levels is None else levels
         (cost,), _, _ = self._costs(self.passed(theta, levels), used, theta[None])
         return float(cost)
@@ -452,9 +450,9 @@ class Likelihood:
         ]
 
     def named(self) -> list[str]:
-        """Names of the parameters theta, (p,).
+        """Return the names of the parameters theta, (p,).
 
-        The order is entries, winds, angles, delay.
+        Their order is entries, winds, shears, angles, delays.
         """
         angles = [self.names.states[k] for k in self._angles]
         names = [entry.name for entry in self.nominal_entries()]
@@ -464,7 +462,7 @@ class Likelihood:
         return names + others[: len(self.prior) - len(names)]
 
     def model_errors(self, airframe: Airframe) -> FloatArray:
-        """Theta, (p,), of a model in the winds and with the delay of theta = 0."""
+        """Return the theta, (p,), of a model in the winds and with the delay of theta = 0."""
         A = airframe.matrix_a()
         B = airframe.matrix_b()
         inputs = list(airframe.inputs)
@@ -480,7 +478,7 @@ class Likelihood:
 
     def entries(self, fit: Fit) -> list[Entry]:
         """Return the identified entries of A and B."""
-        # The winds follow the entries in theta.
+        # In theta, the winds follow the entries.
         errors = zip(
             self.nominal_entries(), fit.theta.tolist(), fit.deviation.tolist(), strict=False
         )
@@ -489,7 +487,7 @@ class Likelihood:
         ]
 
     def about_centre(self, entries: Iterable[Entry]) -> list[Entry]:
-        """Entries with their errors and deviations relative to the centre of the search."""
+        """Return entries whose errors and deviations are relative to the centre of the search."""
         centred = []
         for entry, centre in zip(entries, self.centre.tolist(), strict=False):
             scale = 1.0 + centre if entry.nominal else 1.0
@@ -514,26 +512,29 @@ class Likelihood:
         )
 
     def known(self) -> NDArray[np.bool_]:
-        """Mask of the samples that count, (T,): with a y, after the transient of the filter."""
+        """Return the mask of the samples that count, (T,).
+
+        They have a y, and come after the transient of the filter.
+        """
         return np.isfinite(self._y).all(axis=1) & (
             np.arange(len(self._y)) >= TRANSIENT / self._period - 0.5
         )
 
     def fitted(self) -> NDArray[np.bool_]:
-        """Mask of the samples that fit the model, (T,)."""
+        """Return the mask of the samples to which the model is fitted, (T,)."""
         return self.known() & ~held_out(len(self._y), self._spans[0].stop)
 
     def _counted(self, theta: FloatArray, levels: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Mask of the samples to count, (T,).
+        """Return the mask of the samples that count in the fit, (T,).
 
-        Spans without an explaining level do not count, nor gusts if these are FEW. RECOVERY spans
-        afterwards do not count either.
+        Spans that no level explains do not count, nor do gusts if they are FEW, nor do the RECOVERY
+        spans after either.
         """
         _, (e,), _ = self.passed(theta, levels)
         square = np.array(
             [np.nansum(e[span] ** 2) / max(np.isfinite(e[span]).sum(), 1) for span in self._spans]
         )
-        # 0 at rest, without noise
+        # At rest, without noise, it is 0.
         largest = UNEXPLAINED * np.median(square[square > 0.0]) if square.any() else np.inf
         unexplained, gusts = (
             np.convolve(spans, np.ones(RECOVERY + 1))[: len(levels)] > 0.0
@@ -545,7 +546,7 @@ class Likelihood:
     def _costs(
         self, innovations: Normalised, used: NDArray[np.bool_], thetas: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Costs of some models, the normalised innovations used, and their sum log det S / 2.
+        """Return the costs of some models, the normalised innovations used, and sum log det S / 2.
 
         The innovations are (N, samples, m).
         """

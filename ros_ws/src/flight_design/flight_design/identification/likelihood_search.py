@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The search of the most probable A and B of one block.
+"""The search for the most probable A and B of one block.
 
 The method is Gauss-Newton with damping, from several starts.
 """
@@ -14,24 +14,24 @@ from numpy.typing import NDArray
 from flight_core.vectors import FloatArray
 from flight_design.identification.likelihood import Fit, Innovations, Likelihood
 
-DIFFERENCE = 1e-4  # 1, of a parameter, for the derivatives
-# share of the decrease by the quadratic model: the undamped step is taken, and no damped one is
-# tried
+DIFFERENCE = 1e-4  # of a parameter, for the derivatives
+# Share of the decrease that the quadratic model predicts. From this on, the undamped step is taken
+# and no damped one is tried.
 GOOD = 0.7
-# dampings of the steps that are tried side by side
+# dampings of the steps that are tried side by side, and fractions of the undamped step
 DAMPINGS = (0.0, 0.01, 0.1, 1.0, 10.0)
 FRACTIONS = (0.5, 0.25)
 # levels with which the search begins: calm air, light and moderate turbulence, gusts
 STARTS = (0, 3, 4, 13)
 TURBULENT = STARTS[2]
-ALIKE = 0.8  # of the spans: so many have the same level where `fit_alike` takes it for all
-SIGNS = (-1.0, 1.0)  # of the effect of the slope of the vertical wind on q, in two further starts
-# most steps of a start, and of the search from one of the best
+ALIKE = 0.8  # share of the spans that must have the same level for `fit_alike` to take it for all
+SIGNS = (-1.0, 1.0)  # of the effect of the vertical wind's slope on q, in two more starts
+# largest number of steps of a start, and of the search from one of the best starts
 START_STEPS = 8
 STEPS = 12
-REFINED = 2  # most starts from which the search goes on
-CLOSE = 100.0  # most cost of such a start above the cost of the best one
-# decrease of the cost, a log-likelihood, in a step below which a start ends, or the search
+REFINED = 2  # largest number of starts from which the search goes on
+CLOSE = 100.0  # by which the cost of such a start may exceed that of the best one
+# A start, or the search, ends when a step lowers the cost, a log-likelihood, by less than this.
 START_PROGRESS = 5.0
 PROGRESS = 0.3
 
@@ -42,11 +42,11 @@ class SearchEnd(NamedTuple):
     cost: float
     theta: FloatArray  # (p,)
     hessian: FloatArray  # (p, p)
-    levels: NDArray[np.int64]  # (spans,) of the wind
+    levels: NDArray[np.int64]  # (spans,) levels of the wind
 
 
 class Search(Likelihood):
-    """The search of the most probable theta of one block."""
+    """The search for the most probable theta of one block."""
 
     coarse: "Search"
     progress: Callable[[], None] = staticmethod(lambda: None)  # called before each step
@@ -59,18 +59,20 @@ class Search(Likelihood):
     ) -> Fit:
         """Find the theta of the least cost over the samples that are `used`, (T,).
 
-        The cost is N/2 sum_i log mean r_i^2 + sum log det S / 2 + |theta / prior|^2 / 2.
+        The cost is N/2 sum_i log mean r_i^2 + sum log det S / 2 + |theta / prior|^2 / 2. r are the
+        normalised innovations, S their covariance, N the number of samples. It has several minima,
+        because a wrong wind can explain a wrong model.
 
-        r are the normalised innovations, S their covariance, N the number of samples. The cost has
-        several minima, since a wrong wind explains a wrong model. So the search begins several
-        times on means over the shortest lag: with each level of STARTS in all spans, and with
-        either sign of the effect that the slope of the wind has on q. It goes on from the REFINED
-        best starts, or from 0; then theta decides the level of each span, and the strengths of the
-        winds are free. At last, the level that most spans have stands for all of them, and the
-        search goes on from the best end: turbulence is the same in every span, and levels that
-        change with theta leave the search at a worse minimum. Spans that no level explains do not
-        count then, nor do a few gusts. A theta to `begin` at, (p,), is the only start. The theta of
-        the model that has `flown` is one more start.
+        So the search begins several times on means over the shortest lag: with each level of STARTS
+        in all spans, and with either sign of the effect that the slope of the wind has on q. It
+        goes on from the REFINED best starts, or from 0. Then theta decides the level of each span,
+        and the strengths of the winds are free. At last, the level that most spans have stands for
+        all of them, and the search goes on from the best end. Turbulence is the same in every span,
+        and levels that change with theta would leave the search at a worse minimum. In this stage,
+        spans that no level explains do not count, nor do a few gusts.
+
+        If there is a theta to `begin` at, (p,), it is the only start. The theta of the model that
+        has `flown` is one more start.
         """
         if begin is None:
             ends = self._ends(flown, used)
@@ -92,7 +94,6 @@ class Search(Likelihood):
         """Find the minimum of `fit` from a single start, in air that is the same in every span.
 
         The start is the model that has `flown`, or else the nominal one, in moderate turbulence.
-
         Returns None if fewer than ALIKE of the spans have the same level.
         """
         coarse = self.coarse
@@ -115,7 +116,7 @@ class Search(Likelihood):
     ) -> Fit:
         """Return the fit at the end of a search; other models get their best levels.
 
-        Theta decides these levels, unless the `same` level in every span costs less.
+        Theta decides these levels, unless it costs less to have the `same` level in every span.
         """
         theta = best.theta
         deviation = np.sqrt(np.diag(np.linalg.inv(best.hessian)))
@@ -146,7 +147,7 @@ class Search(Likelihood):
         candidates = [(coarse.cost(zero, fitted), zero)]
         begins = [(zero, level) for level in STARTS]
         if self._is_sheared:
-            # with the wrong sign of the slope's effect the search ends at another model
+            # With the wrong sign of the slope's effect, the search ends at another model.
             for sign in SIGNS:
                 begin = zero.copy()
                 begin[self._shear.stop - 1] = sign
@@ -163,15 +164,16 @@ class Search(Likelihood):
         ]
 
     def _within(self, theta: FloatArray) -> FloatArray:
-        """Theta, (p,), within the bounds of the search."""
+        """Return theta, (p,), within the bounds of the search."""
         return np.clip(theta, self._lower, self._upper)
 
     def _started(
         self, theta: FloatArray, levels: NDArray[np.int64] | None, *, winds: bool
     ) -> FloatArray:
-        """Theta, (p,), after steps on means over the shortest lag.
+        """Return theta, (p,), after some steps on means over the shortest lag.
 
-        The level of a span is by theta or from `levels`. `winds`: whether their strengths are free.
+        `levels` gives the level of each span; without it, theta decides. `winds` says whether the
+        strengths of the winds are free.
         """
         free = np.ones(len(theta), dtype=bool)
         free[self._winds] = winds
@@ -193,7 +195,7 @@ class Search(Likelihood):
         used: NDArray[np.bool_],
         unsettled: int = 1,
     ) -> SearchEnd:
-        """Search from one start, and return the end.
+        """Search from one start, and return where it ends.
 
         `levels` gives the level of each span; without it, theta decides. Every span counts in the
         first step and in `unsettled` more steps, which never end the search.
@@ -217,13 +219,11 @@ class Search(Likelihood):
         used: NDArray[np.bool_],
         free: NDArray[np.bool_],
     ) -> tuple[FloatArray, FloatArray, float]:
-        """Theta after a step of Gauss-Newton with damping, and the Hessian before.
+        """Return theta after a step of Gauss-Newton with damping, and the Hessian before it.
 
-        The third result is by how much the cost is less.
-
-        The derivatives are differences, the filters side by side. The Hessian is J'J + prior^-2,
-        with J the derivatives of the innovations over their rms. Source: L. Ljung, "System
-        Identification", 7.4 and 10.2.
+        The third result is the decrease of the cost. The derivatives are differences, with the
+        filters side by side. The Hessian is J'J + prior^-2, where J has the derivatives of the
+        innovations over their rms. Source: L. Ljung, "System Identification", 7.4 and 10.2.
         """
         size = len(theta)
         indices = np.flatnonzero(free)
@@ -267,9 +267,9 @@ class Search(Likelihood):
         return self.predicted(theta, self.levels(theta))
 
     def joined(self, parts: Iterable[tuple[Likelihood, Fit]]) -> FloatArray:
-        """Theta, (p,), without errors, with winds, angles and delay of parts: means over the parts.
+        """Return a theta, (p,), without errors, with the parts' mean winds, angles and delays.
 
-        A part that is searched apart from the parts with which it couples has wrong errors.
+        A part that is searched apart from those with which it couples has wrong errors.
         """
         values: dict[str, list[float]] = {}
         for part, fit in parts:
@@ -288,10 +288,10 @@ def damped_steps(
     upper: FloatArray,
     free: NDArray[np.bool_],
 ) -> FloatArray:
-    """Damped steps -(hessian + d diag hessian)^-1 slope, and fractions of the first, (k, p).
+    """Return damped steps -(hessian + d diag hessian)^-1 slope, and fractions of the first, (k, p).
 
-    A damping d has a step. Only the free parameters move, mask (p,), and none outwards at its
-    bound. Source: D. W. Marquardt, J. SIAM 11(2), 1963.
+    Each damping d gives one step. Only the free parameters move, mask (p,), and none moves outwards
+    at its bound. Source: D. W. Marquardt, J. SIAM 11(2), 1963.
     """
     steps = np.zeros((len(DAMPINGS), len(theta)))
     while True:

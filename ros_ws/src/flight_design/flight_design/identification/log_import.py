@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""y, u and pose of a channel map, from the log of an autopilot that the stack did not fly."""
+"""Import y, u and pose by a channel map, from an autopilot's log that the stack did not fly."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
@@ -33,15 +33,15 @@ from flight_log.tape_reader import RecordedRun
 from flight_log.vehicle_tables import COPTER, PLANE, ULOG_TORQUES, LogField, VehicleLog
 
 COMMANDS = "commands"  # the topic with trim + u, by input
-# share of the typical airspeed, of a multicopter the typical thrust: below, the aircraft is on the
-# ground
+# Share of the typical airspeed, or for a multicopter of the typical thrust, below which the
+# aircraft is on the ground.
 AIRBORNE = 0.5
-# percentile of either in a log, which may have more time on the ground than in the air
+# Percentile that is typical in a log, which may have more time on the ground than in the air.
 TYPICAL = 90.0
-LEAST = 2.0  # s of flight that are worth a bag
-# s below that speed, for which an aircraft is still in the air: no landing is as short
+LEAST = 2.0  # s of flight that make a bag worth while
+# s below that speed for which an aircraft counts as in the air: no landing is as short
 BRIDGED = 1.0
-AROUND = 5  # samples, of which the median is no damaged one
+AROUND = 5  # samples whose median is not a damaged one
 
 FLOWN_AS = LogField("vehicle_status", "vehicle_type")
 VEHICLE_TYPES = {COPTER: 1.0, PLANE: 2.0}  # PX4, VehicleStatus.msg
@@ -54,7 +54,7 @@ Stamps = NDArray[np.int64]
 class Window(NamedTuple):
     """What is taken of a log, s since its first sample of the output `instant`.
 
-    None: the flight that is found.
+    None means the begin or the end of the flight that is found.
     """
 
     start: float | None
@@ -64,7 +64,8 @@ class Window(NamedTuple):
 class Imported(NamedTuple):
     """The tape of a log, and what is known of its autopilot.
 
-    The parameters of the autopilot are from the first sample. Sentences name what stays unknown.
+    The parameters of the autopilot are those at the first sample. The notes are sentences on what
+    stays unknown.
     """
 
     tape: Tape
@@ -85,16 +86,18 @@ def imported(
     *,
     servos: bool,
 ) -> Imported:
-    """y, u, `commands` and the pose of a log, as the bridge would have published them.
+    """Return y, u, `commands` and the pose of a log, as the bridge would have published them.
 
-    y and the pose hold the newest values at the stamps of the map's `instant` and of the first
-    channel of the pose. u is the command less its median: the setpoint of the map (PX4) or of the
-    rate controllers (ArduCopter), else the stick in MANUAL, or with `servos` the servo's position,
-    scaled as the stick. Without a window the longest stretch in the air is taken, for sticks in
-    MANUAL. `show` gets the comparison of the log with the map before each check of the comparison.
-    Raises ParameterError for a channel that the log does not have, for another vehicle, without
-    such a stretch, and for parameters of the log that differ from the map or change between the
-    samples. The sentence ends with what the log has lost.
+    y and the pose hold the newest values, at the stamps of the map's `instant` and of the first
+    channel of the pose. u is the command minus its median. The command is the setpoint of the map
+    (PX4) or of the rate controllers (ArduCopter), or else the stick in MANUAL; with `servos` it is
+    the position of the servo, scaled as the stick. Without a window the longest stretch in the air
+    is taken; for sticks it must be in MANUAL. `show` gets the comparison of the log with the map
+    before anything is refused because of it.
+
+    Raises ParameterError if the log lacks a channel, is of another vehicle or has no such stretch,
+    or if its parameters differ from the map or change between the samples. The sentence ends with
+    what the log has lost.
     """
     start_ns = log.start_ns(channel_map.outputs[channel_map.instant].motion[0])
     losses = [] if log.loss is None else [log.loss.sentence(start_ns)]
@@ -155,7 +158,7 @@ def _imported(
 
 
 def _require_kind(vehicle: str, channel_map: ChannelMap) -> None:
-    """Raise ParameterError for a log of another kind of vehicle than that of the map."""
+    """Raise ParameterError if the log is of another kind of vehicle than the map."""
     vehicle_found = f"one of a {vehicle}"
     require(vehicle in {PLANE, COPTER}, "the log", vehicle_found, "one of a plane or a multicopter")
     kind = kind_of_map(channel_map)
@@ -170,7 +173,7 @@ def _speed(
     stamps: Stamps,
     servos: bool,
 ) -> FloatArray | None:
-    """Return the airspeed, or a multicopter's thrust, as evidence of flight.
+    """Return the airspeed, or a multicopter's thrust, which shows when it flies.
 
     Returns None if the map has neither.
     """
@@ -328,9 +331,9 @@ def _commands(
 
 
 def _torque(log: VehicleLog, name: str, row: InputRow, servos: bool) -> _Reader:
-    """Read the output of a multicopter's rate controller, normalised as PX4's.
+    """Read the output of a multicopter's rate controller, normalised as PX4's is.
 
-    There the sticks are in no mode the commands of the inputs.
+    In no mode are the sticks of a multicopter the commands of its inputs.
     """
     quantity, sign = row.motion
     sources = log.format.torques.get(quantity, ()) if log.format else ()
@@ -353,9 +356,9 @@ def _torque(log: VehicleLog, name: str, row: InputRow, servos: bool) -> _Reader:
 def _flight(
     log: VehicleLog, stamps: Stamps, speed: FloatArray | None, window: Window, *, needs_manual: bool
 ) -> tuple[tuple[int, int], str]:
-    """Return the first and last instant that are taken, and a sentence on further flights.
+    """Return the first and the last instant that are taken, and a sentence on other flights.
 
-    The window is taken, or the longest stretch in the air, for sticks in MANUAL.
+    The window is taken, or else the longest stretch in the air; for sticks it must be in MANUAL.
     """
     start_ns = int(stamps[0])
     keep = np.ones(len(stamps), dtype=bool)
@@ -370,7 +373,7 @@ def _flight(
         "no sample",
         f"a part of the {1e-9 * (stamps[-1] - start_ns):.0f} s of the log",
     )
-    # Without a window the flight is where the speed is that of flight.
+    # Without a window, the flight is where the speed is that of a flight.
     if speed is not None and window.start is None and window.stop is None:
         require(
             bool(np.isfinite(speed).any()),
@@ -380,7 +383,7 @@ def _flight(
         )
         in_air = speed > AIRBORNE * np.nanpercentile(speed, TYPICAL)
         keep &= _bridged(stamps, in_air)
-    if log.has(FLOWN_AS):  # a VTOL flies as both
+    if log.has(FLOWN_AS):  # A VTOL flies as both.
         keep &= log.at(FLOWN_AS, stamps) == VEHICLE_TYPES[log.vehicle]
     require(
         bool(keep.any()),
@@ -388,7 +391,7 @@ def _flight(
         f"no time in the air {where}",
         "a flight, or --from and --until",
     )
-    # The sticks are the commands in MANUAL alone.
+    # The sticks are the commands only in MANUAL.
     if needs_manual:
         expected = "it, for only there the sticks are the commands, or --servos"
         if log.format is not None:
@@ -420,7 +423,7 @@ def _bridged(stamps: Stamps, keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _runs(stamps: Stamps, keep: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Return first and last instant of each stretch that is kept, mask (N,)."""
+    """Return the first and the last instant of each stretch that a mask (N,) keeps."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], keep, [False]]).astype(np.int8)))
     return [
         (int(stamps[first]), int(stamps[end - 1]))
@@ -491,7 +494,7 @@ def _pose(channel_map: ChannelMap, log: VehicleLog, first: int, last: int) -> Si
 
 
 def require_map_of_import(channel_map: ChannelMap, recorded: RecordedRun) -> None:
-    """Raise ParameterError for an imported log whose u is by rows of another map."""
+    """Raise ParameterError if u of an imported log comes from rows of another map."""
     source = recorded.metadata.get(IMPORTED)
     if source is None:
         return

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The flights of an identified aircraft in calm air, with a gust and in turbulence."""
+"""The flights of an identified aircraft: in calm air, with a gust and in turbulence."""
 
 import math
 from collections.abc import Callable
@@ -16,21 +16,21 @@ from flight_core.tape import Tape
 
 RATE = 200.0  # Hz, of y and y_m
 HEIGHTS = {"q": 0.05, "V": 2.0, "p": 0.15, "r": 0.05}
-"""Units of the outputs in the coupling, and the largest errors of a flight in calm air, SI."""
-# m/s down, and m to the peak: 100 ft, within the 30 to 350 ft of FAR/CS 25.341
+"""Units of the outputs in the coupling; also the largest errors of a flight in calm air, SI."""
+# m/s down, and m to the peak: 100 ft, which is within the 30 to 350 ft of FAR/CS 25.341
 GUST_SPEED = 5.0
 GUST_LENGTH = 30.48
 TURN = math.pi / 2.0  # rad
-CLIMB = 100.0  # m: the targets of guidance in place of the pulses
-# s
+CLIMB = 100.0  # m; turn and climb are the targets of guidance in place of the pulses
+# s, when they begin
 TURN_START = 2.0
 CLIMB_START = 30.0
 
 
 def moderate_turbulence(altitude: float) -> dict[str, Any]:
-    """Parameters of moderate turbulence at an altitude, m.
+    """Return the parameters of moderate turbulence at an altitude, m.
 
-    At high altitude the intensity is 10 ft/s.
+    At high altitude its intensity is 10 ft/s.
     """
     values: dict[str, Any] = {"altitude": max(altitude, LOWEST), "seed": 1}
     if altitude < HIGH:
@@ -41,16 +41,16 @@ def moderate_turbulence(altitude: float) -> dict[str, Any]:
 
 
 LEAST_SHARE = 0.01
-"""Of the ticks: 0.6 s of a flight of a minute, more than the begin of a step takes."""
+"""Share of the ticks: 0.6 s of a flight of a minute, more than the begin of a step takes."""
 
 
 class ManoeuvreResult(NamedTuple):
-    """Result of a simulation of the manoeuvre in one process."""
+    """The result of a simulation of the manoeuvre in one process."""
 
     outcome: str
     rms: dict[str, float]  # of the error by output, SI
     largest: dict[str, float]  # abs(u) by input
-    # by input, the share of the ticks with the input at its limit, from LEAST_SHARE on
+    # by input, the share of the ticks with the input at its limit, if LEAST_SHARE or more
     at_stop: dict[str, float]
 
     @property
@@ -69,7 +69,7 @@ def fly_all(
 ) -> dict[str, ManoeuvreResult]:
     """Fly a scenario of `identify` three times.
 
-    The flights are "calm", with its "gust", and in moderate "turbulence" without the gust.
+    The flights are in "calm" air, with its "gust", and in moderate "turbulence" without the gust.
     """
     turbulence = moderate_turbulence(scenario.aircraft.flight_condition().altitude)
     flights = {}
@@ -84,7 +84,7 @@ def fly_all(
 
 
 def manoeuvre_result(tape: Tape) -> ManoeuvreResult:
-    """Rms errors, the largest commands and the inputs at their limits of a tape."""
+    """Return the rms errors, the largest commands and the inputs at their limits in a tape."""
     _, error = best_error(tape)
     rms = {name: error_metrics(error[name]).rms for name in error.names}
     largest = {

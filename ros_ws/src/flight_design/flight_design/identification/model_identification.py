@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Identification of A and B from the log of one flight.
 
-The estimate is maximum a posteriori over the innovations of the observer's filter.
+The estimate is the maximum a posteriori over the innovations of the observer's filter.
 
-It takes y and u alone, u after its limits. Two of three seconds fit the model, and every third one,
-held out, validates it. The scale of alpha or beta cannot be told from y; such entries stay near
-their nominal values. No number in this module is specific to an aircraft.
+It uses nothing but y, and u after its limits. Two of three seconds fit the model, and every third
+one is held out to validate it. y does not show the scale of alpha or beta, so that entries which
+depend on it stay near their nominal values. No number in this module is specific to an aircraft.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -66,12 +66,11 @@ from flight_design.identification.model_quality import (
     too_little_excitation,
 )
 
-# 1, of innovations that follow the u of another part, see `correlation`: uncoupled aircraft have up
-# to 3
+# `correlation` from which innovations follow the u of another part: uncoupled aircraft have up to 3
 FOLLOWS = 10.0
-# gain in log-likelihood of held-out samples by coupling: uncoupled aircraft have -20
+# gain in log-likelihood of held-out samples that coupling must bring: uncoupled aircraft have -20
 COUPLED_GAIN = 20.0
-# searches about what was found, at most: a factor of 2.5 each
+# largest number of searches about what was found; each allows a factor of 2.5
 AGAIN = 2
 
 
@@ -81,12 +80,12 @@ class Part(NamedTuple):
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
     entries: tuple[Entry, ...]
-    before: Prediction  # of the nominal model
+    before: Prediction  # that of the nominal model
     after: Prediction
     refusal: str  # why this part must not be used, one sentence; empty if it may
-    latest: tuple[float, ...]  # s, of each input, its delay and two standard deviations
-    gusts: bool  # whether FEW of its seconds, or more, are of gusts
-    delays: tuple[float, ...] = ()  # s, of each input
+    latest: tuple[float, ...]  # s, the delay of each input plus two standard deviations
+    gusts: bool  # whether a share of FEW or more of its seconds has gusts
+    delays: tuple[float, ...] = ()  # s, the delay of each input
     advantage: float = 0.0  # of the model `flown` over the nominal one, see `identify_model`
 
 
@@ -96,7 +95,7 @@ class Identification(NamedTuple):
     airframe: Airframe
     recorded: FlightData
     held_out: NDArray[np.bool_]  # (T,)
-    # (T, m) each, of the nominal model and of this one, units of y
+    # (T, m) each, those of the nominal model and of this one, units of y
     innovations: tuple[FloatArray, FloatArray]
     before: Prediction
     after: Prediction
@@ -104,12 +103,12 @@ class Identification(NamedTuple):
 
     @property
     def entries(self) -> tuple[Entry, ...]:
-        """Those of all parts."""
+        """The identified entries of all parts."""
         return tuple(chain.from_iterable(part.entries for part in self.parts))
 
     @property
     def refusal(self) -> str:
-        """Why this model must not be used, a sentence a part; empty if it may."""
+        """Why this model must not be used, one sentence for each part; empty if it may."""
         return "; ".join(part.refusal for part in self.parts if part.refusal)
 
 
@@ -123,7 +122,7 @@ class _Study(NamedTuple):
     validating: NDArray[np.bool_]  # (T,)
     later: NDArray[np.bool_]  # (T,) samples on which the model `flown` is tested
     channels: ChannelPairing
-    bound_count: int  # of entries that may lie at their bound
+    bound_count: int  # how many entries may lie at their bound
     searches_again: bool
     step: Callable[[], None]
 
@@ -173,7 +172,7 @@ class _Study(NamedTuple):
     def identification(
         self, airframe: Airframe, parts: Sequence[Part], first: Innovations, last: Innovations
     ) -> Identification:
-        """Join the parts to one model, with the innovations of both nominal and new model."""
+        """Join the parts to one model, with the innovations of the nominal and the new model."""
         return Identification(
             airframe=with_entries(airframe, chain.from_iterable(part.entries for part in parts)),
             recorded=self.recorded,
@@ -187,7 +186,7 @@ class _Study(NamedTuple):
     def again(
         self, search: Search, fit: Fit, used: NDArray[np.bool_], flown: Airframe | None
     ) -> Fit:
-        """Fit again about a fit with too many entries at a bound, because the file was rough.
+        """Fit again about a fit that has too many entries at a bound, because the file was rough.
 
         Effects of inputs stay within the bounds about the file. No law of the file flies with
         effects beyond them, and a part that couples with another one looks as if it had such
@@ -232,7 +231,10 @@ class _Study(NamedTuple):
         used: NDArray[np.bool_],
         apart: Innovations,
     ) -> tuple[Fit, Part] | None:
-        """Fit the aircraft as one part; None unless this predicts better than its parts `apart`."""
+        """Fit the aircraft as one part.
+
+        Returns None unless this predicts better than its parts `apart`.
+        """
         search = self.search(model, whole_aircraft(model), coupled=True)
         fit = self.again(search, search.fit(used, begin=search.joined(fits)), used, None)
         part = self.part(search, fit)
@@ -261,17 +263,28 @@ def identify_model(
     quick: bool = False,
     searches_again: bool = False,
 ) -> Identification:
-    """Identify the model of a flight; the result says why it must not be used, if so.
+    """Identify the model of a flight. If the model must not be used, the result says why.
 
-    Arguments: `airframe` is the nominal one. `channels` are in the law's order, and the model has
-    to keep their D; by default, they are in the airframe's order. `bound_count` is how many entries
-    of a part may lie at their bound. `unknown` says what else is identified. `flown` is the model
-    in flight, one more start; its advantage over the nominal one is that of the samples `after` a
-    flight time, s. `may_couple` allows parts to become one. With `quick`, the search of a part
-    begins only once if the air is the same in every span and the model may be used. With
-    `searches_again`, a part with too many entries of A at their bounds is searched again, about
-    what was found. `progress` takes the steps `completed` and their largest number `total`. Raises
-    ParameterError for an output that does not move.
+    Args:
+        recorded: The flight.
+        airframe: The nominal airframe.
+        actuation: What lies between u and the aircraft.
+        channels: Channels in the law's order, whose D the model must keep; by default they are in
+            the airframe's order.
+        progress: Takes the steps `completed` and their largest number `total`.
+        bound_count: How many entries of a part may lie at their bound.
+        unknown: What else is identified.
+        flown: The model in flight, which is one more start. Its advantage over the nominal model is
+            computed.
+        after: The advantage counts only samples after this flight time, s.
+        may_couple: Whether parts may become one.
+        quick: Whether the search of a part begins only once, provided that the air is the same in
+            every span and the model may be used.
+        searches_again: Whether a part with too many entries of A at their bounds is searched again,
+            about what was found.
+
+    Raises:
+        ParameterError: An output does not move.
     """
     blown = in_rolling_air(airframe)
     model = filter_model(blown, actuation, recorded)
@@ -318,7 +331,7 @@ def identify_model(
 def _counter(
     progress: Callable[..., None], parts: int, *, starts_at_flown: bool
 ) -> Callable[[], None]:
-    """Return a function to call at each search step of some parts; it tells `progress`."""
+    """Return a function to call at each search step of some parts, which tells `progress`."""
     starts = len(STARTS) + len(SIGNS) + starts_at_flown
     total = parts * (starts * START_STEPS + REFINED * STEPS)
     total += (parts > 1) * (START_STEPS + STEPS)
@@ -358,7 +371,7 @@ def _require_motion(outputs: Sequence[str], y: FloatArray) -> None:
 
 
 def with_entries(airframe: Airframe, entries: Iterable[Entry]) -> Airframe:
-    """Put identified entries into an airframe; wind acts by its own A."""
+    """Put identified entries into an airframe. The wind acts through the new A."""
     A = airframe.matrix_a()
     B = airframe.matrix_b()
     for entry in entries:
@@ -371,7 +384,7 @@ def with_entries(airframe: Airframe, entries: Iterable[Entry]) -> Airframe:
 
 
 def join_innovations(parts: Sequence[Innovations], blocks: Sequence[Block]) -> Innovations:
-    """Innovations of all outputs from those of the blocks."""
+    """Join the innovations of the blocks to those of all outputs."""
     order = np.argsort(np.concatenate([block.outputs for block in blocks]))
     r = np.concatenate([part.r for part in parts], axis=1)[:, order]
     normalised = np.concatenate([part.normalised for part in parts], axis=1)[:, order]
@@ -381,7 +394,7 @@ def join_innovations(parts: Sequence[Innovations], blocks: Sequence[Block]) -> I
 def model_yaml(identified: Identification, origin: str) -> str:
     """Write the identified airframe as the text of an airframe file.
 
-    The header has its origin, the held-out figures and the deviations.
+    The header has the origin, the figures of the held-out samples and the deviations.
     """
     lines = [f"The airframe {identified.airframe.name}, with A and B identified from {origin}.", ""]
     lines.append(

@@ -24,19 +24,19 @@ from flight_design.identification.likelihood import (
     largest_error,
 )
 
-# deviation of the best known effect of an input on each output: two deviations are then a fifth of
-# the loop gain
+# Largest deviation of the best known effect of an input on each output: two deviations are a fifth
+# of the loop gain.
 MAX_DEVIATION = 0.1
-# 1 for white innovations, with a deviation of 0.3: a model with more leaves out what the aircraft
-# does
+# White innovations have 1, with a deviation of 0.3. A model with more than this leaves out
+# something that the aircraft does.
 MAX_WHITENESS = 3.0
-LAGS = 20  # of the autocorrelation in the figure of whiteness: 0.2 s at 100 Hz
+LAGS = 20  # lags of the autocorrelation in the figure of whiteness: 0.2 s at 100 Hz
 
 
 class Prediction(NamedTuple):
     """How well a model predicts the held-out samples a period ahead."""
 
-    rms: FloatArray  # (m,) of the innovations, units of y
+    rms: FloatArray  # (m,) rms of the innovations, units of y
     whiteness: FloatArray  # (m,) 1 for white noise, see `whiteness`
     log_likelihood: float  # mean of a sample, up to a constant
 
@@ -49,24 +49,20 @@ def prediction(innovations: Innovations, held_out: NDArray[np.bool_]) -> Predict
 
 
 def whiteness(e: FloatArray, held_out: NDArray[np.bool_]) -> FloatArray:
-    """Mean of n_k rho_k^2 over the lags k = 1 .. LAGS, (m,).
+    """Return the mean of n_k rho_k^2 over the lags k = 1 .. LAGS, (m,).
 
-    rho_k is the autocorrelation of n_k pairs of held-out samples.
-
-    It is 1 for white noise, with a standard deviation of sqrt(2 / LAGS). Arguments: e (T, m),
-    held_out (T,). Source: G. M. Ljung, G. E. P. Box, Biometrika 65(2), 1978, here for the pairs
-    within the held-out spans.
+    rho_k is the autocorrelation of n_k pairs of held-out samples. For white noise the mean is 1,
+    with a standard deviation of sqrt(2 / LAGS). e is (T, m), held_out (T,). Source: G. M. Ljung, G.
+    E. P. Box, Biometrika 65(2), 1978, here for the pairs within the held-out spans.
     """
     return np.diag(correlation(e, e, held_out))
 
 
 def correlation(e: FloatArray, before: FloatArray, used: NDArray[np.bool_]) -> FloatArray:
-    """Mean of n_k rho_k^2 over the lags k = 1 .. LAGS, (m, k).
+    """Return the mean of n_k rho_k^2 over the lags k = 1 .. LAGS, (m, k).
 
-    rho_k is the correlation of e with what was k samples `before`.
-
-    It is 1 for independent white noises. Arguments: e (T, m), before (T, k), `used` (T,), mask of n
-    samples.
+    rho_k is the correlation of e with `before` k samples earlier. For independent white noises the
+    mean is 1. e is (T, m), before (T, k), and `used` (T,) is the mask of n samples.
     """
     now, then = (np.where(used[:, None], values, 0.0) for values in (e, before))
     power = np.outer(*(np.sum(values**2, axis=0) / used.sum() for values in (now, then)))
@@ -80,15 +76,15 @@ def correlation(e: FloatArray, before: FloatArray, used: NDArray[np.bool_]) -> F
 def advantage(
     first: Innovations, second: Innovations, span: int, counts: NDArray[np.bool_]
 ) -> float:
-    """By how many standard deviations one model predicts a record better than another one.
+    """Return by how many standard deviations one model predicts a record better than another.
 
         t = sum d_k / sqrt(K var d),  d_k the difference of log-likelihood of span k of K
         z = Phi^-1(F_(K-1)(t)),  F of Student's distribution, Phi of the normal one
 
-    Where both models are equally far from the aircraft, z has a standard normal distribution,
+    If both models are equally far from the aircraft, z has a standard normal distribution,
     whichever is simpler, and even if both are wrong. Source: Q. H. Vuong, Econometrica 57(2), 1989,
     here with spans of `span` samples, whose d_k are nearly independent. K is small, hence Student's
-    t. Only samples of the mask `counts`, (T,), count; z is 0 for less than two spans.
+    t. Only samples of the mask `counts`, (T,), count. With fewer than two spans z is 0.
     """
     end = len(counts) // span * span
     d = np.where(counts, first.log_likelihood - second.log_likelihood, 0.0)[:end]
@@ -130,8 +126,8 @@ def too_little_excitation(entries: Iterable[Entry], outputs: Iterable[str]) -> s
 def excitation_factor(effect: Entry) -> float:
     """Return the factor on the amplitude with which an effect becomes known to MAX_DEVIATION.
 
-    Information grows with the square of the amplitude. A factor of 1 or less means that the effect
-    is already known so well.
+    Information grows with the square of the amplitude. If the factor is 1 or less, the effect is
+    already known that well.
     """
     information = effect.deviation**-2 - PRIOR**-2
     return float(np.sqrt((MAX_DEVIATION**-2 - PRIOR**-2) / max(information, 1e-2 * PRIOR**-2)))

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A flight of the exported controller inside PX4, from the topic rise_di_status of a ULog.
 
-The ticks become `internals`, and replay computes the ticks again.
+The ticks become `internals`, and replay computes them again.
 """
 
 from collections.abc import Mapping
@@ -36,7 +36,7 @@ class ModuleChange(NamedTuple):
 class ModuleFlight(NamedTuple):
     """y, y_m, u and `internals` of the ticks of a module.
 
-    `equal` of the ticks have the u of Python to the bit, `lost` ticks follow a gap of the log.
+    `equal` of the ticks have the u of Python to the bit, and `lost` ticks follow a gap of the log.
     """
 
     tape: Tape
@@ -49,9 +49,9 @@ def module_flight(log: VehicleLog, controller: ControllerConfig) -> ModuleFlight
     """Compute the ticks of a module again, each stretch from its engagement on.
 
     Python steps the law from the u of the first tick of a stretch. In `internals`, e and u come
-    from the log, and the states of the law from Python. At low airspeed, a torque of 1 limits u;
-    that counts as a change of the parameters. Raises ParameterError if the log has no ticks, other
-    parameters, or a module in float.
+    from the log, and the states of the law come from Python. At low airspeed a torque of 1 limits
+    u, which counts as a change of the parameters. Raises ParameterError if the log has no ticks or
+    other parameters, or if the module computes in single precision.
     """
     require(STATUS in log.tables, "the log", f"no {STATUS}", EXPECTED)
     table = log.tables[STATUS]
@@ -104,7 +104,7 @@ class _Ticks:
     def flown(self) -> list[list[int]]:
         """Return the rows of the ticks by stretch: from an engagement to a gap or the next one."""
         stretches: list[list[int]] = []
-        last: int | None = None  # number of the tick before; None: none to go on from
+        last: int | None = None  # number of the tick before; None if the stretch has ended
         for k in np.flatnonzero(self._ticked).tolist():
             number = int(self._number[k])
             if number == 1:
@@ -126,13 +126,13 @@ class _Ticks:
         changes: list[ModuleChange] = []
         rows: list[FloatArray] = []
         equal = 0
-        number = 1  # the first tick of a stretch cannot be checked: its number leaves a gap
+        number = 1  # the first tick of a stretch cannot be checked, so that its number leaves a gap
         for stretch in stretches:
             state = guard.initial_state(len(controller.inputs), None)
             state = state._replace(u=self._values["u"][stretch[0]].copy())
             number += 1
             for k in stretch:
-                # The limits of a row may be others than before: then the parameters changed.
+                # If the limits of a row differ from those before, the parameters changed.
                 change = self._limits(k)
                 if any(getattr(controller, key) != value for key, value in change.items()):
                     controller = vary(controller, change)
@@ -143,7 +143,7 @@ class _Ticks:
                     law = new_law
                     limits = new_limits
                     digest = controller.digest()
-                # The tick from the logged y and y_m, compared with the logged u.
+                # Compute the tick from the logged y and y_m, and compare it with the logged u.
                 stamp_ns = int(self._stamp_ns[k])
                 y_m = [StampedVector(stamp_ns, self._values["y_m"][k])]
                 if self._offset_ns[k] > 0:

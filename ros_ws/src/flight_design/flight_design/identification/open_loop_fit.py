@@ -1,16 +1,16 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A low-order model per channel from a log of an open-loop excitation of the inputs in turn.
+"""A low-order model for each channel, from a log in which each input was excited by itself.
 
     lag v_dot = u(t - delay) - v,    z'' + damping z' + stiffness z = v,    y = Omega z' + slow z
 
-The output error is fitted: the model is simulated from u alone, with the least squares of y less
-the output. Without stiffness the response does not tell lag from 1 / damping: the lag is the
-smaller of the two, of the faster pole. Source: L. Ljung, "System Identification", 1999, 4.2 and
-10.2.
+The excitation is open loop. The output error is fitted: the model is simulated from u alone, and
+the squares of y minus its output are minimised. Without stiffness the response does not tell lag
+from 1 / damping; the lag is then the smaller of the two, that of the faster pole. Source: L. Ljung,
+"System Identification", 1999, 4.2 and 10.2.
 
-Thrust also moves the airspeed by the following climb, the phugoid. With a measured climb the model
-of V excludes the phugoid:
+Thrust also moves the airspeed through the climb that follows, the phugoid. If the climb is
+measured, the model of V excludes the phugoid:
 
     V_dot = -damping V + Omega v - g climb / speed
 
@@ -31,48 +31,48 @@ from flight_core.tape import Signal
 from flight_core.vectors import FloatArray
 from flight_design.identification.response_identification import BRIDGED
 
-STEP = 0.004  # s, of the simulation
-# s around the excitation of an input
+STEP = 0.004  # s, step of the simulation
+# s around the excitation of an input that count, too
 BEFORE = 0.3
 AFTER = 0.5
-MIN_CERTAINTY = 5.0  # standard errors: those from which on a sign of Omega is certain too
-LOOP_FREQUENCY = 0.5  # of 1 / (delay + lag): about where the loops of `rise-di gains` cross 1
-MAX_ZERO_LAG = 0.5  # zero times lag; at 1 they cancel
+MIN_CERTAINTY = 5.0  # standard errors: from as many on, the sign of Omega is certain
+LOOP_FREQUENCY = 0.5  # times 1 / (delay + lag): about where loops of `rise-di gains` cross 1
+MAX_ZERO_LAG = 0.5  # largest product of zero and lag; at 1 they cancel
 # 1/s: a feedforward of 100 Hz follows no faster one (rise_di_controller.params, _check_nominal)
 FASTEST_ZERO = 25.0
-# factor by which a second order has to lower the misfit: noise alone does not in 10 s
+# A second order must lower the misfit to this share, which noise alone does not achieve in 10 s.
 MIN_GAIN = 0.85
 # Delay s, lag s, damping 1/s, stiffness 1/s^2, zero 1/s: a slow response to slow servos, a
 # short-period or Dutch roll mode of a transport and that of a model aircraft
 STARTS = ((0.03, 0.03, 5.0, 30.0, 6.0), (0.1, 0.1, 5.0, 30.0, 6.0), (0.03, 0.01, 30.0, 400.0, 1.0))
-# Of delay s, lag s, Omega, damping 1/s, stiffness 1/s^2, slow
+# Bounds of delay s, lag s, Omega, damping 1/s, stiffness 1/s^2, slow.
 LOWER = np.array([0.0, 0.003, -np.inf, 0.0, 0.0, -np.inf])
 UPPER = np.array([0.4, 1.0, np.inf, 120.0, 3000.0, np.inf])
-ORDERS = (4, 6)  # parameters of the first and of the second order
-SETTLED = 2.0  # s after a gap, in which the response to the unknown u of the gap decays
-CORRELATION = 0.5  # s, over which errors of neighbouring samples are taken as correlated
+ORDERS = (4, 6)  # numbers of parameters of the first and of the second order
+SETTLED = 2.0  # s after a gap, while the response to the unknown u in the gap decays
+CORRELATION = 0.5  # s over which errors of neighbouring samples count as correlated
 
 
 class Estimate(NamedTuple):
-    """A value and a standard error."""
+    """A value and its standard error."""
 
     value: float
     deviation: float
 
     @property
     def is_certain(self) -> bool:
-        """Whether the value is MIN_CERTAINTY standard errors or more."""
+        """Whether the value is at least MIN_CERTAINTY standard errors."""
         return self.value >= MIN_CERTAINTY * self.deviation
 
 
 class ChannelModel(NamedTuple):
-    """The model of a channel, SI, and the covariance of the parameters in their order."""
+    """The model of a channel, SI, and the covariance of its parameters in their order."""
 
     delay: float  # s
     lag: float  # s
     Omega: float
     damping: float  # 1/s
-    stiffness: float  # 1/s^2; 0 where the first order is enough
+    stiffness: float  # 1/s^2; 0 if the first order is enough
     slow: float
     covariance: FloatArray  # (6, 6)
     misfit: float  # rms of the output error / rms of y
@@ -81,16 +81,17 @@ class ChannelModel(NamedTuple):
     def usable(self) -> bool:
         """Whether gain and phase of the loop are certain, and a feedforward can fly the zero.
 
-        Noise may be as large as y.
+        The noise may even be as large as y.
         """
         gain, phase = self.at_loop_frequency()
         is_certain = gain.is_certain and phase.deviation <= 1.0 / MIN_CERTAINTY
         return is_certain and 0.0 <= self.slow / self.Omega <= FASTEST_ZERO
 
     def at_loop_frequency(self) -> tuple[Estimate, Estimate]:
-        """abs(y / u), and the phase lag of y behind u, rad, at LOOP_FREQUENCY.
+        """Return abs(y / u) and the phase lag of y behind u, rad, at LOOP_FREQUENCY.
 
-        Omega, damping, lag and delay are interchangeable in a fit; the loop needs gain and phase.
+        In a fit, Omega, damping, lag and delay can stand in for each other. The loop only needs the
+        gain and the phase.
         """
         theta = np.array(self[:6])
         s = 1j * LOOP_FREQUENCY / (self.delay + self.lag)
@@ -129,11 +130,11 @@ def fit_channel(
 ) -> ChannelModel | None:
     """Fit a channel over the time of its excitation, with the lowest order that suffices.
 
-    Returns None without excitation, or for a constant output. The search begins with an Omega of
-    this sign, and may end with the opposite one. `gravity` is a channel that measures the part of
-    y_dot without u; with it, or with `first_order`, the model is of first order.
+    Returns None if there is no excitation, or if the output is constant. The search begins with an
+    Omega of this sign, and may end with the opposite one. `gravity` is a channel that measures the
+    part of y_dot without u. With it, or with `first_order`, the model is of first order.
     """
-    # The time of the excitation, with a little before and after.
+    # Take the time of the excitation, and a little before and after it.
     excited = np.flatnonzero(u[name] != 0.0)
     if not len(excited):
         return None
@@ -146,7 +147,7 @@ def fit_channel(
         return None
     t = (y_of_channel.stamp_ns[is_settled] - first) / NANOSECONDS
     t_u = (u.stamp_ns - first) / NANOSECONDS
-    # u and gravity act by their integrals.
+    # u and gravity act through their integrals.
     impulse = np.concatenate([[0.0], np.cumsum(u[name][:-1] * np.diff(t_u))])
     trend = [np.ones(len(t)), t]
     if gravity is not None:
@@ -154,7 +155,7 @@ def fit_channel(
         gained = np.concatenate([[0.0], np.cumsum(gravity.values[:-1, 0] * np.diff(t_g))])
 
     def response(theta: FloatArray) -> FloatArray:
-        """Of the model to u, less the response to gravity."""
+        """Return the response of the model to u, minus the response to gravity."""
         to_u = _simulated(t, t_u, impulse, np.concatenate([theta, np.zeros(6 - len(theta))]))
         if gravity is None:
             return to_u
@@ -166,7 +167,7 @@ def fit_channel(
         e = measured - response(theta)
         return np.asarray(e - q @ (q.T @ e))
 
-    # A second order has to lower the misfit.
+    # A second order must lower the misfit.
     orders = ORDERS[:1] if first_order or gravity is not None else ORDERS
     values = residuals(np.array([0.0, 1.0, 0.0, 0.0]))
     fits = [
@@ -178,7 +179,7 @@ def fit_channel(
 
 
 def _settled(t: FloatArray) -> NDArray[np.bool_]:
-    """Mask (N,) of the samples that are SETTLED or more after each long gap of the log."""
+    """Return the mask (N,) of the samples that are SETTLED or more after each long gap."""
     if len(t) < 2:
         return np.ones(len(t), dtype=bool)
     gaps = np.diff(t)
@@ -187,7 +188,7 @@ def _settled(t: FloatArray) -> NDArray[np.bool_]:
 
 
 def _decay(t: FloatArray, damping: float) -> FloatArray:
-    """Return the third function of time beside a constant and t.
+    """Return the third function of time, next to a constant and t.
 
     It is the decay of an initial value, exp(-damping t), or t^2 if the damping is 0.
     """
@@ -204,9 +205,9 @@ def _has_zero_of_its_own(theta: FloatArray) -> bool:
 def _simulated(
     t: FloatArray, t_u: FloatArray, impulse: FloatArray, theta: FloatArray
 ) -> FloatArray:
-    """Output of the model from rest at the instants t, (N,).
+    """Return the output of the model from rest at the instants t, (N,).
 
-    `impulse` is the integral of u, held between t_u.
+    `impulse` is the integral of u, which is held between the instants t_u.
     """
     delay, lag, Omega, damping, stiffness, slow = theta
     grid = np.arange(0.0, t[-1] + 2.0 * STEP, STEP)
@@ -241,7 +242,7 @@ def _search(residuals: Any, values: FloatArray, order: int, amplitude: float) ->
 
 
 def _model(fit: Any, misfit: float, period: float) -> ChannelModel:
-    """Return the model of a fit, with standard errors that respect correlated output errors.
+    """Return the model of a fit, with standard errors that allow for correlated output errors.
 
     Source: L. Ljung, 9.4 (coloured errors).
     """

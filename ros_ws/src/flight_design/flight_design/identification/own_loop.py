@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The rate loop of an autopilot by its parameters: margins, and errors on a simulated aircraft.
+"""The rate loop of an autopilot, from its parameters: its margins, and its errors in simulation.
 
     torque = FF r + P (r - y) + I integral of (r - y),  abs(I integral) <= IMAX
 
@@ -20,9 +20,9 @@ from aircraft_sim.airframes.airframe import Airframe
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_core.vectors import FloatArray
 
-STEPS = 8  # of the aircraft in a period of the law
+STEPS = 8  # steps of the aircraft in a period of the law
 SCALING_SPEED = 15.0  # m/s, the default of ArduPlane
-END = math.radians(45.0)  # of a full deflection of ArduPlane, whose gains give an angle
+END = math.radians(45.0)  # a full deflection of ArduPlane, whose gains give an angle
 FIXED_WING = {name: (f"FW_{k}R_", f"FW_{k}R_IMAX") for name, k in zip("pqr", "RPY", strict=True)}
 MULTICOPTER = {
     "p": ("MC_ROLLRATE_", "MC_RR_INT_LIM"),
@@ -33,17 +33,20 @@ ARDUPLANE = {
     name: (f"{axis}_RATE_", f"{axis}_RATE_IMAX")
     for name, axis in zip("pqr", ("RLL", "PTCH", "YAW"), strict=True)
 }
-"""Prefix of the gains and limit of the integral of an axis, by firmware."""
+"""Prefix of the gains, and name of the limit of the integral, of each axis by firmware."""
 
 
 class OwnLoop(NamedTuple):
-    """Gains of an autopilot's rate loop in the order of a law, torque a rad/s, rad/s, rad."""
+    """Gains of an autopilot's rate loop in the order of a law.
+
+    The gains turn rad/s and rad into a torque.
+    """
 
     FF: FloatArray
     P: FloatArray
     I: FloatArray  # noqa: E741 - as the parameters are named
     imax: FloatArray
-    source: str  # the parameters
+    source: str  # the parameters from which they come
 
     def in_place(self, scenario: Scenario) -> Scenario:
         """Return the scenario with the feedback of this loop as the law `pi`: u = end torque."""
@@ -62,10 +65,10 @@ class OwnLoop(NamedTuple):
     def flown(
         self, scenario: Scenario, airframe: Airframe, y_m: FloatArray, noise: FloatArray
     ) -> FloatArray:
-        """Y less y_m, (N, m), of the aircraft under this loop, with y_m (N, m) as the setpoint.
+        """Return y - y_m, (N, m), of the aircraft under this loop, with y_m (N, m) as the setpoint.
 
-        A row is a period of the controller. y has the noise, (m,) rms, and is late by the delay of
-        the scenario less a period; u acts from the next period on.
+        A row is a period of the controller. y has the noise, (m,) rms. It is late by the delay of
+        the scenario minus a period, and u acts from the next period on.
         """
         controller = scenario.rise_di()
         period = 1.0 / controller.rate
@@ -98,7 +101,7 @@ class OwnLoop(NamedTuple):
 
 
 def _ends(scenario: Scenario) -> FloatArray:
-    """U of the torque of 1 by input of the law, with the sign of D."""
+    """Return u at a torque of 1, by input of the law, with the sign of D."""
     controller = scenario.rise_di()
     inputs = scenario.aircraft.channels().inputs
     upper = dict(zip(inputs, scenario.aircraft.actuators.upper or (), strict=False))
@@ -107,10 +110,10 @@ def _ends(scenario: Scenario) -> FloatArray:
 
 
 def own_loop(parameters: Mapping[str, float], scenario: Scenario, autopilot: str) -> OwnLoop | None:
-    """Read the loop of an autopilot from its log's parameters; None unless all are there.
+    """Read the loop of an autopilot from the parameters in its log; None unless all are there.
 
-    PX4 and ArduPlane scale P and I by the square of a speed over the airspeed, and FF by the ratio:
-    here the gains are those at the trim speed.
+    PX4 and ArduPlane scale P and I by the square of a speed over the airspeed, and FF by this
+    ratio. Here the gains are those at the trim speed.
     """
     speed = scenario.aircraft.channels().speed
     names = ARDUPLANE if autopilot == "ardupilot" else FIXED_WING if speed > 0.0 else MULTICOPTER

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The parameters of ArduPilot in a log, against what a channel map says of the transmitter.
+"""Compare the parameters of ArduPilot in a log with what a channel map says of the transmitter.
 
 Sources: ArduPilot, RC_Channel.cpp and SRV_Channel.cpp (ends, trim, reversal), RCMapper.cpp,
-SRV_Channel.h (functions of servos); ArduPlane, mode_fbwa.cpp (high is roll right, nose up, more
-thrust, nose right where RCn_REVERSED is 0).
+SRV_Channel.h (functions of servos); ArduPlane, mode_fbwa.cpp (if RCn_REVERSED is 0, high is roll
+right, nose up, more thrust, nose right).
 """
 
 import re
@@ -22,29 +22,31 @@ from flight_core.rates import seconds
 from flight_core.vectors import FloatArray
 from flight_log.vehicle_tables import SERVOS, Parameters
 
-# channel of a transmitter: Rc.msg from 0, MAVLink from 1
+# Channel of a transmitter. Rc.msg counts from 0, MAVLink from 1.
 CHANNEL = re.compile(r"channels\[(\d+)\]|chan(\d+)_raw")
-# axis of RCMAP, by what responds
+# axis of RCMAP, by the output that responds
 AXES: Mapping[str, str] = {"p": "ROLL", "q": "PITCH", "V": "THROTTLE", "r": "YAW"}
 # SERVOn_FUNCTION: aileron, elevator, throttle, rudder
 FUNCTIONS = {"ROLL": 4, "PITCH": 19, "THROTTLE": 70, "YAW": 21}
 SAME_LINE = LinearConversion(1, 1.0, 0.0)
 
-# share of half the range: the effect differs by as much, below the standard errors of `identify`
+# Share of half the range. The effect differs by as much, less than the standard errors of
+# `identify`.
 END_TOLERANCE = 0.01
-# share of half the range: the effects on the two sides of the trim differ from their mean by as
-# much
+# Share of half the range. The effects on either side of the trim differ from their mean by as much.
 TRIM_TOLERANCE = 0.05
 
 DECISIVE = re.compile(r"RCMAP_\w+|(RC|SERVO)\d+_(FUNCTION|MIN|MAX|TRIM|REVERSED)|(CA|PWM)_\w+")
-"""Parameters of ArduPilot and PX4 between a command and the surface: where one changes, so does the
-sign or the effect."""
+"""Parameters of ArduPilot and PX4 between a command and the surface.
+
+If one of them changes, so does the sign or the effect.
+"""
 
 CALIBRATE = (
     "change `range`, `scale` and `offset` of the rows of `inputs` and `trims`, or "
     "calibrate the transmitter and fly again"
 )
-MENDS = {  # by a part of the name of the parameter; no mend reverses what the pilot's stick does
+MENDS = {  # by part of the parameter's name; no remedy reverses what the pilot's stick does
     "REVERSED": "change `positive` of the row of `inputs`, and not the parameter",
     "TRIM": "calibrate the transmitter with its trims in the middle and fly again",
     "MIN": CALIBRATE,
@@ -54,7 +56,7 @@ MENDS = {  # by a part of the name of the parameter; no mend reverses what the p
 
 
 class Stick(NamedTuple):
-    """What a map says of an input and of the transmitter's channel.
+    """What a map says of an input and of its channel of the transmitter.
 
     `trim_line` turns the pulse, us, into the raw value.
     """
@@ -63,17 +65,15 @@ class Stick(NamedTuple):
     channel: int  # from 1
     trim_line: LinearConversion
     raw_range: tuple[float, float]
-    raw_sign: (
-        int  # +1 where an increasing raw value is roll right, nose up, more thrust, nose right
-    )
+    raw_sign: int  # +1 if an increasing raw value is roll right, nose up, more thrust, nose right
 
     @property
     def is_centred(self) -> bool:
-        """Whether ArduPilot measures the channel from the trim, and not from the lower end."""
+        """Whether ArduPilot measures the channel from its trim, and not from the lower end."""
         return self.axis != "THROTTLE"
 
     def parameters(self) -> dict[str, tuple[float, float]]:
-        """Return value and tolerance of the parameters by which ArduPilot agrees with the map."""
+        """Return value and tolerance of the parameters with which ArduPilot agrees with the map."""
         low, high = sorted(to_raw(raw, self.trim_line) for raw in self.raw_range)
         half = (high - low) / 2.0
         name = f"RC{self.channel}"
@@ -88,9 +88,9 @@ class Stick(NamedTuple):
         }
 
     def raw(self, deflection: FloatArray) -> FloatArray:
-        """Return the raw value of a part of full deflection.
+        """Return the raw value of a fraction of full deflection.
 
-        The part is -1 to 1 about the middle; for a throttle, it is 0 to 1 from the lower end.
+        The fraction is -1 to 1 about the middle; for a throttle it is 0 to 1 from the lower end.
         """
         low, high = self.raw_range
         part = (1.0 + self.raw_sign * deflection) / 2.0 if self.is_centred else deflection
@@ -100,7 +100,7 @@ class Stick(NamedTuple):
 def stick_of(channel_map: ChannelMap, name: str) -> Stick:
     """Return what a map says of the channel of an input.
 
-    Raises ParameterError for an input without a channel.
+    Raises ParameterError if the input has no channel.
     """
     row = channel_map.inputs[name]
     trim = channel_map.trims.get(name)
@@ -124,7 +124,7 @@ def stick_of(channel_map: ChannelMap, name: str) -> Stick:
 
 
 class Servo(NamedTuple):
-    """A servo of ArduPilot: output from 1, ends and trim, us."""
+    """A servo of ArduPilot: its output, which counts from 1, and its ends and trim, us."""
 
     output: int
     low: float
@@ -133,7 +133,7 @@ class Servo(NamedTuple):
     is_reversed: bool
 
     def deflection(self, pulse: FloatArray, stick: Stick) -> FloatArray:
-        """Return the part of full deflection at a pulse, us: -1 to 1, for a throttle 0 to 1."""
+        """Return the fraction of full deflection at a pulse, us: -1 to 1, for a throttle 0 to 1."""
         if not stick.is_centred:
             part = (pulse - self.low) / (self.high - self.low)
             return 1.0 - part if self.is_reversed else part
@@ -142,9 +142,10 @@ class Servo(NamedTuple):
 
 
 def servo_of(stick: Stick, name: str, values: Mapping[str, float]) -> Servo:
-    """Return the first servo with the function of an input.
+    """Return the first servo that has the function of an input.
 
-    `values` are the parameters at the samples. Raises ParameterError.
+    `values` are the parameters at the samples. Raises ParameterError if there is none, or if a
+    parameter of it is missing.
     """
     function = FUNCTIONS[stick.axis]
     outputs = [
@@ -184,20 +185,20 @@ def servo_of(stick: Stick, name: str, values: Mapping[str, float]) -> Servo:
 class Agreement(NamedTuple):
     """A line of the comparison of a log with a map."""
 
-    what: str  # the parameter, or what is taken of the log
-    logged: str  # "" where the log has no record
-    mapped: str  # "" where the map has none
+    what: str  # the parameter, or what is taken from the log
+    logged: str  # "" if the log has no record
+    mapped: str  # "" if the map has none
     differs: bool = False
-    is_known: bool = True  # at the samples, by a record before
+    is_known: bool = True  # whether an earlier record gives its value at the samples
 
 
 def compared(
     sticks: Iterable[Stick], recorded: Parameters, values: Mapping[str, float]
 ) -> list[Agreement]:
-    """Compare the transmitter's parameters in a log with a map; `values` are those at the samples.
+    """Compare the transmitter's parameters in a log with a map.
 
-    If a parameter has no value at the samples, its first record after them is compared; no default
-    stands in for it.
+    `values` are those at the samples. If a parameter has no value there, its first record after
+    them is compared; no default stands in for it.
     """
     parameters = {name: records[0].value for name, records in recorded.items()} | dict(values)
     rows = []
@@ -242,10 +243,10 @@ def require_agreement(name_of_map: str, rows: Iterable[Agreement]) -> str:
 
 
 def change_sentences(recorded: Parameters, start_ns: int, first_ns: int, last_ns: int) -> list[str]:
-    """Sentences on the decisive parameters that change beside the samples.
+    """Say which decisive parameters change before or after the samples.
 
-    They change before `first_ns` or after `last_ns`, the first and the last sample. `start_ns` is
-    the begin of the log. Raises ParameterError for a change between the samples.
+    `first_ns` and `last_ns` are the first and the last sample, and `start_ns` is the begin of the
+    log. Raises ParameterError if one changes between the samples.
     """
     between = []
     outside = []

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The rates and the torque of an autopilot's log, as y and u of a scenario of body rates.
+"""Take the rates and the torque of an autopilot's log as y and u of a scenario of body rates.
 
 A torque of 1 is u at the upper end stop, as in the module of `rise-di export`.
 """
@@ -26,18 +26,21 @@ from flight_design.identification.parameter_agreement import Agreement
 from flight_log.vehicle_tables import VehicleLog
 
 MAPS: Mapping[str, str] = MappingProxyType({"px4": "px4", "ardupilot": "ardupilot"})
-"""The channel map with the topics of an autopilot."""
+"""The channel map that has the topics of an autopilot."""
 CUTOFFS: Mapping[str, str] = MappingProxyType(
     {"px4": "IMU_GYRO_CUTOFF", "ardupilot": "INS_GYRO_FILTER"}
 )
-"""The parameter with the cut-off of the gyro's low-pass."""
-SLOWEST, FASTEST = 0.6, 1.6  # of the trim speed, as c_export.autopilots clips the dynamic pressure
-PERIOD = 0.008  # s, of the identification at least: a search over more samples takes longer
-SPARSE = 1.5  # periods of the law, above which a log does not have each of its u
-# Hz: with a filter of this cut-off the noise of samples a PERIOD apart is white
+"""The parameter that holds the cut-off frequency of the gyro's low-pass."""
+SLOWEST, FASTEST = (
+    0.6,
+    1.6,
+)  # times the trim speed: c_export.autopilots clips the dynamic pressure there
+PERIOD = 0.008  # s, least period of the identification: more samples make the search longer
+SPARSE = 1.5  # periods of the law; a log with a longer period does not have every u
+# Hz. Behind a filter with this cut-off, the noise of samples a PERIOD apart is white.
 BROAD = 90.0
-OVER = 2.2  # of a cut-off, the least rate of a log from which its filter can be taken
-PERIODS = 6.0  # of a cut-off, after which the impulse response of its filter is below 1e-5
+OVER = 2.2  # times a cut-off: the least rate of a log from which the filter can be removed
+PERIODS = 6.0  # of a cut-off; then the impulse response of the filter is below 1e-5
 
 
 class RatesLog(NamedTuple):
@@ -45,15 +48,15 @@ class RatesLog(NamedTuple):
 
     recorded: FlightData
     taken: Imported
-    cutoff: float  # of the gyro's low-pass of second order, Hz; 0 where the log names none
-    advance: float  # s, by which y is earlier than behind that filter
+    cutoff: float  # of the gyro's second-order low-pass, Hz; 0 if the log names none
+    advance: float  # s, by which y comes earlier than behind that filter
 
 
 def rates_map(scenario: Scenario, autopilot: str) -> ChannelMap:
     """Return the channel map of an autopilot with the channels and end stops of a scenario.
 
-    A fixed wing keeps V as evidence of flight. Raises ParameterError for an input without an end
-    stop, or without a row that moves its output.
+    A fixed wing keeps V, which shows when it flies. Raises ParameterError if an input has no end
+    stop, or no row that moves its output.
     """
     base = load_map(MAPS[autopilot])
     controller = scenario.controller
@@ -87,11 +90,11 @@ def rates_of_log(
     window: Window,
     show: Callable[[list[Agreement]], None] = lambda _: None,
 ) -> RatesLog:
-    """Y and u of a log for the identification of an airframe, and what was imported.
+    """Return y and u of a log for the identification of an airframe, and what was imported.
 
         u = sign(D) end torque (V / V0)^2
 
-    with V clipped as in the module. u of ArduPlane is that of its servos. Raises ParameterError.
+    V is clipped as in the module. For ArduPlane, u is that of the servos. Raises ParameterError.
     """
     channel_map = rates_map(scenario, autopilot)
     taken = imported(channel_map, log, window, show, servos=autopilot == "ardupilot")
@@ -108,7 +111,8 @@ def rates_of_log(
     }
     recorded = recording(Tape(signals, tape.start_ns), airframe)
     if recorded.period > SPARSE / scenario.controller.rate:
-        # the loop changes u between two samples: its mean, where it is linear
+        # The loop changes u between two samples. The mean of both is exact if u is linear between
+        # them.
         following = np.vstack([recorded.u[1:], recorded.u[-1:]])
         recorded = recorded._replace(u=(recorded.u + following) / 2.0)
     cutoff = taken.parameters.get(CUTOFFS[autopilot], 0.0)
@@ -120,7 +124,7 @@ def rates_of_log(
 
 
 def scaled_torques(parameters: Mapping[str, float]) -> list[str]:
-    """Say which surfaces of PX4 reach their end stop at another torque than 1, a sentence each."""
+    """Say which surfaces of PX4 reach their end stop at another torque than 1."""
     sentences = []
     for name, value in sorted(parameters.items()):
         if re.fullmatch(r"CA_SV_CS\d+_TRQ_[RPY]", name) and abs(value) not in (0.0, 1.0):
@@ -132,12 +136,12 @@ def scaled_torques(parameters: Mapping[str, float]) -> list[str]:
 
 
 def broadened(recorded: FlightData, cutoff: float) -> tuple[FlightData, float]:
-    """Y as of a low-pass at BROAD in place of one at `cutoff`, Hz, and how much earlier, s.
+    """Exchange the gyro's low-pass at `cutoff` for one at BROAD, Hz; tell how much earlier y is, s.
 
         y' = F_BROAD(z) / F_cutoff(z) y,  F of Butterworth's, of second order
 
     Behind a narrow filter the noise of y is coloured, and so are the innovations. The zeros of both
-    filters at z = -1 cancel. Samples that a lost one reaches are lost.
+    filters at z = -1 cancel. Samples that a lost one reaches count as lost.
     """
     rate = 1.0 / recorded.period
     narrow = signal.butter(2, cutoff, fs=rate)
@@ -154,7 +158,7 @@ def broadened(recorded: FlightData, cutoff: float) -> tuple[FlightData, float]:
 
 
 def _pressure(log: VehicleLog, scenario: Scenario, u: Signal) -> FloatArray:
-    """(V / V0)^2 at the stamps of u, (N,); 1 in hover, or where the airspeed is not known."""
+    """Return (V / V0)^2 at the stamps of u, (N,); 1 in hover, or if the airspeed is unknown."""
     speed = scenario.aircraft.channels().speed
     source = log.source("V")
     if speed <= 0.0 or source is None:

@@ -1,16 +1,15 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Input-output response of an aircraft from a log of y and u, without a model.
+"""The input-output response of an aircraft, from a log of y and u, without a model.
 
 Omega, lags and delays have standard errors.
 
-A predictor of every sample of y from earlier samples and from u is fitted by least squares, long
-enough to include the disturbances. The step response of the predictor is the step response of the
-aircraft. A second-order response with a delay and a lag, fitted to the begin of the step response,
-has Omega, the lag and the delay. Sources: L. Ljung, "System Identification", 1999, 7.3 and 13.4
-(direct identification in closed loop); U. Forssell, L. Ljung, Automatica 35, 1999; Y. Zhu,
-"Multivariable System Identification for Process Control", 2001, 6 (a high-order ARX model, then a
-reduced one).
+A predictor of every sample of y from earlier samples and from u is fitted by least squares. It is
+long enough to include the disturbances. Its step response is the step response of the aircraft. A
+second-order response with a delay and a lag is fitted to the begin of the step response, and has
+Omega, the lag and the delay. Sources: L. Ljung, "System Identification", 1999, 7.3 and 13.4 (direct
+identification in closed loop); U. Forssell, L. Ljung, Automatica 35, 1999; Y. Zhu, "Multivariable
+System Identification for Process Control", 2001, 6 (a high-order ARX model, then a reduced one).
 """
 
 import math
@@ -33,49 +32,51 @@ from flight_design.identification.step_response_fit import (
     no_column,
 )
 
-# s, width of the windows over which u and older y are averaged: shorter than a servo's lag
+# s, width of the windows over which u and older y are averaged; it is shorter than a servo's lag
 WINDOW = 0.02
-RECENT = 4  # samples of y that the predictor has one by one
-# s before a sample that are covered by windows of equal width: the longest delay and a lag
+RECENT = 4  # newest samples of y, which the predictor takes one by one
+# s before a sample that windows of equal width cover: the longest delay and a lag
 FINE_Y = 0.2
 FINE_U = 0.45
-# s before a sample that are covered by windows that double: the memory of disturbances and of a
+# s before a sample that windows of doubling width cover: the memory of disturbances and of a
 # controller
 FAR = 2.0
 HORIZON = 0.8  # s of the step response
-DRAWS = 200  # of the predictor's coefficients, for the covariance of the step response
-# size of a coefficient: it turns a typical y or u into so many typical changes of y within a window
+DRAWS = 200  # draws of the predictor's coefficients, for the covariance of the step response
+# Size of a coefficient before the fit: it turns a typical y or u into this many typical changes of
+# y within a window.
 PRIOR = 10.0
 MEMORY = 0.2  # s, decay of the coefficients of the predictor before the fit
 MIN_ROWS_PER_COEFFICIENT = 5.0
-# share of the motion in a closed loop: then feedback of disturbances is too little to be taken for
-# a response
+# Share of the motion in a closed loop that the excitation must explain. The feedback of
+# disturbances is then too small to be taken for a response.
 MIN_SHARE = 0.9
-# times as large as estimated: up to a tenth of the motion is feedback, a bias as large as the
-# errors
+# Factor on the estimated errors in a closed loop: up to a tenth of the motion is feedback, which
+# gives a bias as large as the errors.
 CLOSED_LOOP_ERRORS = 2.0
-LOOP_MEMORY = 8.0  # s before an instant that the excitation has an effect
-LOOP_FINE = 6  # windows of PERIOD
+LOOP_MEMORY = 8.0  # s before an instant in which the excitation has an effect on it
+LOOP_FINE = 6  # number of windows of PERIOD
 PERIOD = 0.05  # s
-FOLDS = 6  # the better ridge counts: few commands need the one
-RIDGES = (1e-4, 1e-2)  # many disturbances the other
-# s, in a closed loop: an earlier response is the reaction of u to y, for no servo is as fast
+FOLDS = 6  # parts of a flight, each of which is predicted from the others
+# The better ridge counts. Few commands need the first one, many disturbances the other.
+RIDGES = (1e-4, 1e-2)
+# s, in a closed loop. An earlier response is the reaction of u to y, because no servo is as fast.
 LEAST_DELAY = 0.01
-ITERATIONS = 3  # of the variance of a prediction and the coefficients
-# s without a sample of y, over which a straight line serves; no prediction looks over a longer gap
+ITERATIONS = 3  # of estimating the variance of a prediction and the coefficients in turn
+# s without a sample of y that a straight line bridges; no prediction looks across a longer gap
 BRIDGED = 0.1
-MIN_RATIO = 5.0  # standard errors from which on the sign of Omega is certain
+MIN_RATIO = 5.0  # standard errors: from as many on, the sign of Omega is certain
 
 
 Spans = Sequence[tuple[int, int]]
 
 
 class Response(NamedTuple):
-    """Response of m outputs to m inputs, output i driven by input i; SI.
+    """The response of m outputs to m inputs, where input i drives output i; SI.
 
-    A refused channel has a row of NaN in the results.
+        y_i_dot = sum_j Omega_ij v_j + slower terms,   lag_j v_j_dot = u_j(t - delay_j) - v_j
 
-    y_i_dot = sum_j Omega_ij v_j + slower terms,   lag_j v_j_dot = u_j(t - delay_j) - v_j
+    A channel that is refused has NaN in its rows.
     """
 
     outputs: tuple[str, ...]
@@ -87,12 +88,10 @@ class Response(NamedTuple):
     delay: FloatArray  # (m,) s, from u to the stamp of y
     delay_deviation: FloatArray  # (m,)
     refusal: tuple[str, ...]  # (m,) why Omega_ii must not be used, one sentence; empty if it may
-    seconds: float  # of the log that were used
-    share: (
-        FloatArray  # (m,) of the motion of y_i and u_i that the excitation explains; 1 in open loop
-    )
-    # (m,) response i to input i in standard errors: the sign of Omega_ii is certain from MIN_RATIO
-    # on
+    seconds: float  # how many seconds of the log were used
+    share: FloatArray  # (m,) share of the motion that the excitation explains; 1 in open loop
+    # (m,) response i to input i in standard errors; from MIN_RATIO on, the sign of Omega_ii is
+    # certain
     sign_ratio: FloatArray
 
     def sign_refusal(self, i: int) -> str:
@@ -120,15 +119,19 @@ def identify_response(
     excitation: Signal | None = None,
     engaged: Spans | None = None,
 ) -> Response:
-    """Omega, lag and delay of every channel of a log, or a refusal of the channel.
+    """Return Omega, lag and delay of every channel of a log with standard errors, or a refusal.
 
-    They have standard errors.
+    Args:
+        y: The outputs at their stamps of a clock, regular or not.
+        u: The inputs after their limits, likewise.
+        outputs: The outputs of the channels.
+        inputs: The inputs of the channels, in pairs with the outputs.
+        excitation: What moves u from outside in a closed loop, such as y_m. It is None if u
+            itself is the excitation, as in an open-loop experiment.
+        engaged: The spans in ns in which u acts on the aircraft; by default the whole log.
 
-    Arguments: `y`, `u` (after limits) at their stamps of a clock, regular or not; `outputs` and
-    `inputs` the channels in pairs; `excitation` what moves u from outside in a closed loop, such as
-    y_m, None where u itself is the excitation, as in an open-loop experiment; `engaged` the spans
-    in ns in which u acts on the aircraft, by default the whole log. Raises ParameterError for a
-    missing channel, or too few samples for any result.
+    Raises:
+        ParameterError: A channel is missing, or there are too few samples for any result.
     """
     for topic, signal, names in (("y", y, outputs), ("u", u, inputs)):
         missing = [name for name in names if name not in signal.names]
@@ -162,20 +165,20 @@ def identify_response(
 
 
 class Layout(NamedTuple):
-    """What the predictor of y(k) has: samples of y and windows of samples before k.
+    """What the predictor of y(k) takes: samples of y, and windows of samples before k.
 
-    Ends are in sample periods.
+    The ends of the windows are in sample periods.
     """
 
     period: float  # s, of y
-    recent: int  # samples of y one by one
+    recent: int  # number of the newest samples of y, taken one by one
     y_windows: tuple[tuple[int, int], ...]  # (a, b): the mean of y(k - a - 1) to y(k - b)
     # (a, b): the mean of u from t_k - b period to t_k - a period
     u_windows: tuple[tuple[int, int], ...]
 
     @classmethod
     def from_period(cls, period: float) -> "Layout":
-        """Return the layout for a period of y in s."""
+        """Return the layout for a period of y, s."""
 
         def windows(first: int, fine: float) -> tuple[tuple[int, int], ...]:
             width = max(round(WINDOW / period), 1)
@@ -189,7 +192,7 @@ class Layout(NamedTuple):
 
     @property
     def past(self) -> int:
-        """Samples of y before the first predicted sample."""
+        """How many samples of y come before the first one that is predicted."""
         return self.y_windows[-1][1]
 
     def y_decay(self) -> FloatArray:
@@ -198,10 +201,10 @@ class Layout(NamedTuple):
         return np.asarray(np.exp(-self.period * np.array(middles) / MEMORY))
 
     def u_root(self) -> FloatArray:
-        """Root of the covariance of the coefficients of u before the fit, relative.
+        """Return a root of the relative covariance of the coefficients of u before the fit.
 
-        They are smooth and decay. The kernel is exp(-max(s, t) / MEMORY) over window times s and t.
-        Source: T. Chen, H. Ohlsson, L. Ljung, Automatica 48, 2012.
+        The coefficients are smooth and decay. The kernel is exp(-max(s, t) / MEMORY) over window
+        times s and t. Source: T. Chen, H. Ohlsson, L. Ljung, Automatica 48, 2012.
         """
         ends = np.array(self.u_windows)
         late = self.period * np.mean(ends, axis=1)
@@ -240,7 +243,7 @@ def bridged(
 
 
 def _integral(t: FloatArray, steps: FloatArray, instants: FloatArray) -> FloatArray:
-    """Integral from t[0] to the `instants` of a signal with the means `steps` from t to t."""
+    """Integrate a signal, with the means `steps` between the times t, from t[0] to `instants`."""
     sums = np.concatenate(
         [np.zeros((1, steps.shape[1])), np.cumsum(steps * np.diff(t)[:, None], axis=0)]
     )
@@ -255,7 +258,7 @@ def _rows(
     layout: Layout,
     span: tuple[int, int],
 ) -> _Rows:
-    """Regressors and predicted samples of a span."""
+    """Return the regressors and the predicted samples of a span."""
     (t, values), (t_u, u_values), m = (
         _within(y, outputs, span),
         _within(u, inputs, span),
@@ -287,9 +290,10 @@ class _Predictor(NamedTuple):
     roots: FloatArray  # (m, m lags, m lags) roots of the covariance of each column
 
     def step_responses(self) -> FloatArray:
-        """Responses of every output to a unit step of every input, (1 + DRAWS, K, m, m).
+        """Return the responses of every output to a step of every input, (1 + DRAWS, K, m, m).
 
-        The estimate comes first, then draws. At K whole periods after the step, up to HORIZON.
+        The step has size 1. The estimate comes first, then the draws, at K whole periods after the
+        step, up to HORIZON.
         """
         m = self.coefficients.shape[1]
         layout = self.layout
@@ -312,7 +316,7 @@ class _Predictor(NamedTuple):
 
 
 def _fit(rows: Sequence[_Rows], layout: Layout, m: int) -> _Predictor:
-    """Least squares over the spans, with a constant per span."""
+    """Fit the predictor by least squares over the spans, with a constant for each span."""
     parts = [part for part in rows if len(part.y)]
     samples = sum(len(part.y) for part in parts)
     coefficients = m * (layout.recent + len(layout.y_windows) + len(layout.u_windows))
@@ -351,13 +355,12 @@ def _fit(rows: Sequence[_Rows], layout: Layout, m: int) -> _Predictor:
 
 
 def explained(signal: Signal, names: Sequence[str], excitation: Signal, spans: Spans) -> FloatArray:
-    """Share of the variance of the channels explained by the excitation, (k,).
+    """Return the share of the variance of the channels that the excitation explains, (k,).
 
-    The share is 1 without disturbances.
-
-    The channel is a sum of means of the excitation over windows before, up to LOOP_MEMORY. FOLDS
-    parts of the flight are predicted with coefficients from the rest. Source of the
-    cross-validation: M. Stone, J. Royal Statistical Society B 36, 1974.
+    Without disturbances it is 1. The channel is modelled as a sum of means of the excitation over
+    earlier windows, up to LOOP_MEMORY. FOLDS parts of the flight are each predicted with
+    coefficients from the rest. Source of the cross-validation: M. Stone, J. Royal Statistical
+    Society B 36, 1974.
     """
     residual = np.zeros((len(RIDGES), len(names)))
     total = np.zeros(len(names))
@@ -370,7 +373,7 @@ def explained(signal: Signal, names: Sequence[str], excitation: Signal, spans: S
         t_w = t_w + seconds(before - span[0])
         if len(t) < 2 or len(t_w) < 2 or t_w[-1] - t[0] < FOLDS * PERIOD:
             continue
-        # Means of the excitation over windows before each instant.
+        # Take the means of the excitation over windows before each instant.
         instants = np.arange(t[0], min(t[-1], t_w[-1]), PERIOD)
         edges = [0.0]
         while edges[-1] < LOOP_MEMORY:
@@ -385,7 +388,7 @@ def explained(signal: Signal, names: Sequence[str], excitation: Signal, spans: S
         Z = Z / np.maximum(np.linalg.norm(Z, axis=0), np.finfo(float).tiny)
         X = values[np.searchsorted(t, instants, side="right") - 1]
         X = X - X.mean(axis=0)
-        # Each fold is predicted from the others, by both ridges.
+        # Predict each fold from the others, with both ridges.
         fold = np.arange(len(instants)) * FOLDS // len(instants)
         for number in range(FOLDS):
             others = Z[fold != number]
@@ -478,9 +481,9 @@ def _refusal(
 
 
 def _too_little_share(output: str, name: str, share: float) -> str:
-    """Say that a channel has too little share of the excitation, and how to get more.
+    """Say that the excitation explains too little of a channel, and how to get more.
 
-    The share is P / (P + Q) with P the power of the excitation and Q the power of the disturbances.
+    The share is P / (P + Q), with the power P of the excitation and Q of the disturbances.
     """
     factor = math.sqrt((1.0 - share) / max(share, 0.05) / (1.0 / MIN_SHARE - 1.0))
     excited = (
@@ -492,6 +495,9 @@ def _too_little_share(output: str, name: str, share: float) -> str:
 
 
 def _more_excitation(name: str, ratio: float) -> str:
-    """Errors fall with the excitation, and with the root of time."""
+    """Say how much more excitation is needed.
+
+    Errors fall with the excitation, and with the root of time.
+    """
     factor = MIN_RATIO / max(ratio, 0.5)
     return f"excite {name} {factor:.1f} times as strongly, or for {factor**2:.1f} times as long"

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Sign check: D of the controller against what moves the aircraft.
+"""Check the signs: does D of the controller agree with what moves the aircraft?
 
-The signs of a channel map, an airframe and a recorded flight are compared with D.
+D is compared with the signs of a channel map, an airframe and a recorded flight.
 """
 
 from collections.abc import Iterable, Sequence
@@ -32,32 +32,32 @@ OPEN_LOOP = "excitation"  # the law that does not use y
 
 
 class ChannelSign(NamedTuple):
-    """A channel of the law, through the map."""
+    """The signs of a channel of the law, through the map."""
 
     output: str
     input: str
     effect: float  # Omega_ii of the controller's channels, SI
-    D: int  # of the airframe and the map
+    D: int  # by the airframe and the map
     D_controller: int
-    measured: float | None  # Omega_ii of a recorded flight, NaN where the input never moves
-    # response of the recorded flight in standard errors: the sign is certain from MIN_RATIO on
+    measured: float | None  # Omega_ii of a recorded flight, NaN if the input never moves
+    # response in the recorded flight in standard errors; from MIN_RATIO on, the sign is certain
     ratio: float | None
 
 
 class SignCheck(NamedTuple):
-    """Result of the check."""
+    """The result of the check."""
 
     channels: tuple[ChannelSign, ...]
     contradictions: tuple[str, ...]  # sentences
     # sentences on the channels whose sign the recorded flight does not show
     uncertain: tuple[str, ...]
-    seconds: float  # of the recorded flight that were used
+    seconds: float  # how many seconds of the recorded flight were used
 
 
 def require_signs(channel_map: ChannelMap, scenario: Scenario) -> None:
     """Raise ParameterError if a map contradicts the D of a scenario's controller.
 
-    The check is for the scenario's airframe.
+    The effects are those of the scenario's airframe.
     """
     contradictions = check_scenario(
         channel_map, scenario, load_airframe(scenario.aircraft.airframe), None
@@ -75,8 +75,8 @@ def check_scenario(
 ) -> SignCheck:
     """Check a channel map against a scenario's controller, for an airframe.
 
-    A recorded flight, if any, is checked too. `namespace` selects the aircraft of a log with
-    several.
+    A recorded flight is checked too, if there is one. `namespace` selects the aircraft if its log
+    has several.
     """
     controller = scenario.controller
     outputs = controller.outputs
@@ -116,14 +116,12 @@ def recorded_response(
     namespace: str | None = None,
     channel_map: ChannelMap | None = None,
 ) -> Response:
-    """Response of the aircraft in a log, from the time of an acting u.
+    """Identify the response of the aircraft in a log, from the time in which u acted.
 
-    The time is the whole flight, or the engagements of a bridge.
-
-    y_m excites the loop of a flight under a law. Without y_m, and under the law `excitation`, u
-    itself is the excitation. Raises ParameterError for a log without y and u, for a bridge without
-    engagement, for a flight under guidance, whose y_m follows y, and for a log whose import had
-    other rows than `channel_map`.
+    That is the whole flight, or the engagements of a bridge. In a flight under a law, y_m excites
+    the loop. Without y_m, and under the law `excitation`, u itself is the excitation. Raises
+    ParameterError if the log has no y and u, if its bridge was never engaged, if it was under
+    guidance, whose y_m follows y, or if it was imported by other rows than those of `channel_map`.
     """
     recorded = read_run(bag, namespace)
     tape = recorded.tape
@@ -174,12 +172,11 @@ def check_signs(
     D: tuple[int, ...],
     measured: Response | None = None,
 ) -> SignCheck:
-    """D of diag(output signs) Omega diag(input signs) against the controller's.
+    """Compare D of diag(output signs) Omega diag(input signs) with the controller's D.
 
-    A recorded flight is compared too.
-
-    Arguments: Omega = C B of the airframe, (m, m), in the map's order; the channels and D in the
-    controller's. Raises ParameterError if the map does not fit the airframe, or if Omega has no D.
+    A recorded flight is compared too, if there is one. Omega = C B of the airframe, (m, m), is in
+    the map's order; the channels and D are in the controller's. Raises ParameterError if the map
+    does not fit the airframe, or if Omega has no D.
     """
     mapped = _through(channel_map, Omega, outputs, inputs)
     D_mapped = [int(sign) for sign in signs(mapped)]
@@ -241,9 +238,8 @@ def check_effectors(
 ) -> SignCheck:
     """Check the signs of the effectors against the `effect` of an allocation, (m, p).
 
-    The output that an effector moves most decides; an output counts by the largest effect on it.
-
-    `Omega` is as in `check_signs`, (m, p). D of a channel is the sign of its effect.
+    For each effector the output that it moves most decides, where each output counts by the largest
+    effect on it. `Omega` is as in `check_signs`, (m, p). D of a channel is the sign of its effect.
     """
     mapped = _through(channel_map, Omega, outputs, effectors)
     largest = np.argmax(np.abs(effect) / np.abs(effect).max(axis=1, keepdims=True), axis=0).tolist()
@@ -276,7 +272,7 @@ def check_effectors(
 def _through(
     channel_map: ChannelMap, Omega: FloatArray, outputs: Sequence[str], inputs: Sequence[str]
 ) -> FloatArray:
-    """`through` the map, between some of its channels."""
+    """Return Omega `through` the map, between some of its channels."""
     rows = _places(outputs, channel_map.outputs)
     columns = _places(inputs, channel_map.inputs)
     return through(channel_map, Omega)[np.ix_(rows, columns)]
@@ -287,13 +283,12 @@ def _places(names: Iterable[str], among: Iterable[str]) -> list[int]:
 
 
 def output_signs(channel_map: ChannelMap) -> FloatArray:
-    """+1 for an output with the sign of the stack, otherwise -1.
+    """Return +1 for each output with the sign of the stack and -1 for any other, (m,).
 
-    The signs of the stack are q nose up, p roll right, r nose right, V faster, climb up.
-
-    Shape (m,) in the map's order. The motion of a row says what a channel of another name is.
-    Raises ParameterError where the motion of q, p, r or V is that of another channel, and for two
-    channels of one motion.
+    The signs of the stack are q nose up, p roll right, r nose right, V faster, climb up. The order
+    is the map's. If a channel has another name, the motion of its row says what it is. Raises
+    ParameterError if q, p, r or V has the motion of another channel, or if two channels have the
+    same motion.
     """
     signs: dict[str, int] = {}
     for name, row in channel_map.outputs.items():
@@ -316,10 +311,10 @@ def output_signs(channel_map: ChannelMap) -> FloatArray:
 
 
 def input_signs(channel_map: ChannelMap, Omega: FloatArray) -> FloatArray:
-    """+1 for an input with an effect of the sign of Omega = C B, otherwise -1; shape (m,).
+    """Return +1 for each input whose effect has the sign of Omega = C B, and -1 for others, (m,).
 
-    Arguments: Omega (m, m), rows and columns in the map's order. Raises ParameterError for an input
-    without effect on the output.
+    Omega (m, m) has rows and columns in the map's order. Raises ParameterError if an input has no
+    effect on its output.
     """
     signs = []
     for j, (name, row) in enumerate(channel_map.inputs.items()):
@@ -336,14 +331,14 @@ def input_signs(channel_map: ChannelMap, Omega: FloatArray) -> FloatArray:
 
 
 def through(channel_map: ChannelMap, Omega: FloatArray) -> FloatArray:
-    """Omega between the channels of the map, shape (m, m).
+    """Return Omega between the channels of the map, (m, m).
 
-    The result is diag(output signs) Omega diag(input signs).
+    It is diag(output signs) Omega diag(input signs).
     """
     return output_signs(channel_map)[:, None] * Omega * input_signs(channel_map, Omega)
 
 
 def motion_as_channel_grows(row: OutputRow | InputRow) -> str:
-    """Motion of the aircraft as the channel, not the raw value, grows."""
-    motions = list(MOTIONS)  # a motion beside its opposite
+    """Return how the aircraft moves as the channel grows, not its raw value."""
+    motions = list(MOTIONS)  # each motion stands next to its opposite
     return row.positive if row.sign > 0 else motions[motions.index(row.positive) ^ 1]

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The sketch of an aircraft without an airframe file.
 
-A sketch is a rough model from Omega and the trim speed, for a learner.
+It is a rough model from Omega and the trim speed, for a learner.
 """
 
 from collections.abc import Sequence
@@ -25,10 +25,12 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 PARTS = (("q",), ("V",), ("p", "r"))  # outputs that couple through B
 
 ROUGH = Unknown(effect=0.1, drift=0.5)
-"""Standard deviation of an entry of B, 1, and noise of the disturbances, sizes/s
-per root s, beside a sketch. The sketch leaves out slipstream and the change of the trim with
-dynamic pressure: 0.03 to 0.1 rad/s^2 rms over some seconds on the c172p of JSBSim in moderate
-turbulence."""
+"""What is unknown about a sketch.
+
+The deviation of an entry of B is relative; the noise of the disturbances is in sizes/s per root s.
+A sketch leaves out slipstream and the change of the trim with dynamic pressure. On the c172p of
+JSBSim in moderate turbulence these are 0.03 to 0.1 rad/s^2 rms over some seconds.
+"""
 
 
 def sketch(
@@ -36,7 +38,7 @@ def sketch(
 ) -> Airframe:
     """Sketch a rough airframe that has the zeros of a rigid symmetric aircraft.
 
-    The model comes from Omega = C B and the trim speed V0, m/s.
+    It comes from Omega = C B and the trim speed V0, m/s.
 
         V_dot     = -0.26 n V + Omega_V u                          n = g / V0
         alpha_dot = -11 n alpha + q                                lift slope over lift coefficient
@@ -45,11 +47,11 @@ def sketch(
         p_dot     = -2.3 |Omega_p| beta - P p + 0.37 P r + Omega_p u,  P = 1.4 sqrt(11 n |Omega_p|)
         r_dot     = 6 |Omega_r| beta - 0.05 P p - R r + Omega_r u,  R = 0.95 sqrt(11 n |Omega_r|)
 
-    V stands apart: an airspeed holds the wind itself, beside which y hardly shows what alpha and
-    theta do to V. The factors are geometric means over the twelve aircraft of
-    `benchmarks.jsbsim_gains`, from differences of their accelerations in trim; the entries of one
-    aircraft differ from them by a factor of 1.3 to 3. Arguments: Omega (m, m), rows `outputs`,
-    columns `inputs`; input i drives output i. Raises ParameterError for outputs other than q, V, p,
+    V stands apart, because the airspeed contains the wind itself, next to which y hardly shows what
+    alpha and theta do to V. The factors are geometric means over the twelve aircraft of
+    `benchmarks.jsbsim_gains`, from differences of their accelerations in trim. The entries of a
+    single aircraft differ from them by a factor of 1.3 to 3. Omega (m, m) has rows `outputs` and
+    columns `inputs`; input i drives output i. Raises ParameterError for other outputs than q, V, p,
     r.
     """
     require(
@@ -93,8 +95,8 @@ def sketch(
 def sketched(name: str, controller: ControllerConfig, speed: float) -> Airframe:
     """Return the airframe of a controller's feedforward; `speed` is the trim speed V0, m/s.
 
-    Wind acts by the columns of A of V, alpha and beta. Raises ParameterError for a controller
-    without feedforward, and for states other than those of a sketch.
+    Wind acts through the columns V, alpha and beta of A. Raises ParameterError if the controller
+    has no feedforward, or if its states are not those of a sketch.
     """
     model = controller.feedforward
     require(
@@ -136,7 +138,7 @@ def with_sketch(
     noise: FloatArray,
     margin: float,
 ) -> RiseDiConfig:
-    """Return a controller with feedforward and observer of a sketch, which do not fly yet.
+    """Return a controller with the feedforward and observer of a sketch, which do not fly yet.
 
     Omega (m, m) and `noise`, (m,), are in the law's order; `margin` is the least delay margin, s.
     Raises ParameterError.

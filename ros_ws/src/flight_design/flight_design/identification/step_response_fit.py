@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The fit of a second-order response with a delay and a lag to the begin of a step response."""
+"""Fit a second-order response with a delay and a lag to the begin of a step response."""
 
 import math
 from typing import Any, NamedTuple
@@ -11,26 +11,26 @@ from scipy.optimize import least_squares
 from flight_core.vectors import FloatArray
 
 MAX_DELAY = 0.3  # s
-RANK = 1e-10  # of the largest eigenvalue of the normal equations: smaller ones are rounding
+RANK = 1e-10  # times the largest eigenvalue of the normal equations: smaller ones are rounding
 MAX_LAG = 1.0  # s
 RESOLUTION = 0.025  # s between the points of the step response that are fitted
-FLOOR = 0.01  # of the largest value of a step response: what windows and a linear model leave out
+FLOOR = 0.01  # of a step response's largest value, which windows and a linear model leave out
 STARTS_DELAY = (0.02, 0.1, 0.2)  # s
-STARTS_LAG = (0.03, 0.2)  # of the search
-# Of delay s, lag s, Omega, damping 1/s, stiffness 1/s^2, slow part; Omega and slow part per largest
-# value of the step response
+STARTS_LAG = (0.03, 0.2)  # s; the search starts from each pair
+# Bounds of delay s, lag s, Omega, damping 1/s, stiffness 1/s^2 and slow part. Omega and the slow
+# part are relative to the largest value of the step response.
 LOWER = np.array([0.0, 0.003, -np.inf, -2.0, -20.0, -np.inf])
 UPPER = np.array([MAX_DELAY, MAX_LAG, np.inf, 300.0, 5000.0, np.inf])
 SCALE = np.array([0.05, 0.05, 5.0, 5.0, 50.0, 50.0])
-SPREAD = np.array([1.0, 0.2, 1e3, 50.0, 2500.0, 5000.0])  # before the fit
-# an integrator, first order, second order
+SPREAD = np.array([1.0, 0.2, 1e3, 50.0, 2500.0, 5000.0])  # standard deviations before the fit
+# Which of them are free: for an integrator, for the first and for the second order.
 ORDERS = ((1, 1, 1, 0, 0, 0), (1, 1, 1, 1, 0, 0), (1, 1, 1, 1, 1, 1))
-MIN_GAIN = 6.0  # of chi squared per parameter that a higher order has to gain
-# relative change of chi squared at which a search ends: far below what MIN_GAIN or a standard error
-# can show
+MIN_GAIN = 6.0  # of chi squared that a higher order must gain for each more parameter
+# Relative change of chi squared at which a search ends. It is far below what MIN_GAIN or a standard
+# error can show.
 TOLERANCE = 1e-6
-EARLY = 0.3  # s after delay and lag in which the sign of a response shows
-COUPLING_SPAN = 0.25  # s after delay and lag in which other outputs respond by Omega
+EARLY = 0.3  # s after delay and lag, in which the sign of a response shows
+COUPLING_SPAN = 0.25  # s after delay and lag, in which Omega shows in other outputs
 
 
 class ResponseColumn(NamedTuple):
@@ -61,14 +61,18 @@ def no_column(m: int) -> ResponseColumn:
 def second_order_response(
     t: FloatArray, delay: float, lag: float, damping: float, stiffness: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Step responses y of y'' + damping y' + stiffness y = v' and = v, from rest.
+    """Return the step responses of a second order behind a lag and a delay, from rest, (N,) each.
 
-    lag v' = u(t - delay) - v. Shapes (N,).
+        y'' + damping y' + stiffness y = v' and = v,   lag v' = u(t - delay) - v
+
+    The first has v' on the right, the second v.
     """
     begin = np.maximum(t - delay, 0.0)
     # z, z', v; y = z' or z
     A = np.array([[0.0, 1.0, 0.0], [-stiffness, -damping, 1.0], [0.0, 0.0, -1.0 / lag]])
-    values, vectors = np.linalg.eig(A + np.diag([0.0, 1e-3, 2e-3]))  # distinct eigenvalues
+    values, vectors = np.linalg.eig(
+        A + np.diag([0.0, 1e-3, 2e-3])
+    )  # the eigenvalues are then distinct
     parts = np.linalg.solve(vectors, np.array([0.0, 0.0, 1.0 / lag]))
     product = values[:, None] * begin
     small = np.abs(product) < 1e-6
@@ -80,11 +84,10 @@ def second_order_response(
 
 
 def fitted_column(t: FloatArray, responses: FloatArray, j: int) -> ResponseColumn:
-    """Delay, lag and Omega_jj of input j from output j, then Omega_ij of the further outputs.
+    """Fit delay, lag and Omega_jj of input j to output j, then Omega_ij to the other outputs.
 
-    These have the same delay and lag.
-
-    Arguments: t (N,); responses (1 + DRAWS, N, m), the estimate first.
+    The other outputs have the same delay and lag. t is (N,); responses are (1 + DRAWS, N, m), with
+    the estimate first.
     """
     step = responses[0]
     size = max(float(np.max(np.abs(step[:, j]))), np.finfo(float).tiny)
@@ -130,8 +133,8 @@ def fitted_column(t: FloatArray, responses: FloatArray, j: int) -> ResponseColum
 def begins_with_Omega(t: FloatArray, theta: FloatArray) -> bool:  # noqa: N802 - the symbol
     """Return whether a fitted response has the sign of Omega up to EARLY after delay and lag.
 
-    Otherwise, the slow part is the whole response: two poles stand for a pole and a lag, and Omega
-    is about 0.
+    If not, the slow part is the whole response: two poles stand for a pole and a lag, and Omega is
+    about 0.
     """
     delay, lag, Omega, damping, stiffness, slow = theta
     first, second = second_order_response(
@@ -141,9 +144,9 @@ def begins_with_Omega(t: FloatArray, theta: FloatArray) -> bool:  # noqa: N802 -
 
 
 def _significance(t: FloatArray, responses: FloatArray, theta: FloatArray, size: float) -> float:
-    """Chi squared of no response against the fitted response, less the parameters.
+    """Return chi squared of no response against the fitted one, minus the number of parameters.
 
-    Time counts up to EARLY after delay and lag.
+    The time up to EARLY after delay and lag counts.
     """
     early = t <= theta[0] + theta[1] + EARLY
     first, second = second_order_response(t[early], *theta[[0, 1, 3, 4]])
@@ -157,9 +160,9 @@ def _significance(t: FloatArray, responses: FloatArray, theta: FloatArray, size:
 
 
 def _whitener(responses: FloatArray) -> FloatArray:
-    """W with W (s - true s) of covariance I, (N, N), of responses (1 + DRAWS, N).
+    """Return W such that W (s - true s) has covariance I, (N, N), for responses (1 + DRAWS, N).
 
-    W is exact to FLOOR of the largest value. 0 for the responses of a constant output.
+    W is exact to FLOOR of the largest value. It is 0 for the responses of a constant output.
     """
     values, vectors = np.linalg.eigh(np.atleast_2d(np.cov(responses[1:].T)))
     floor = (FLOOR * np.max(np.abs(responses[0]))) ** 2 + RANK * values[-1]
@@ -168,10 +171,10 @@ def _whitener(responses: FloatArray) -> FloatArray:
 
 
 class _Curve(NamedTuple):
-    """A fitted step response: delay, lag, Omega, damping, stiffness, slow part."""
+    """A fitted step response. theta is delay, lag, Omega, damping, stiffness, slow part."""
 
     theta: FloatArray
-    free: tuple[int, ...]  # 1 where an entry is fitted
+    free: tuple[int, ...]  # 1 if the entry of theta is fitted
     chi_squared: float
     jacobian: FloatArray
 
@@ -184,7 +187,7 @@ def _search(
     free: tuple[int, ...],
     start: FloatArray | None,
 ) -> _Curve:
-    """Least squares over the free entries, from several delays and lags and from `start`."""
+    """Fit the free entries by least squares, from several delays and lags and from `start`."""
     fitted = np.array(free, dtype=bool)
 
     def expanded(theta: FloatArray) -> FloatArray:
@@ -199,7 +202,7 @@ def _search(
             [size * (whiten @ (Omega * first + slow * second - step)), theta / SPREAD[fitted]]
         )
 
-    # A start for each pair of delay and lag, its slope by least squares.
+    # Start at each pair of delay and lag, with the slope by least squares.
     starts = [] if start is None else [start]
     for delay in STARTS_DELAY:
         for lag in STARTS_LAG:
@@ -210,7 +213,7 @@ def _search(
             )
             starts.append(np.array([delay, lag, slope, 2.0, 0.0, 0.0]))
     bounds = LOWER[fitted], UPPER[fitted]
-    # The best end of all starts.
+    # Take the best end of all starts.
     best: Any = min(
         (
             least_squares(
