@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Metrics of a flight as pure functions of the tape.
+"""Metrics of a flight, which are pure functions of its tape.
 
-They are error, noise floor, ultimate bound, settling, saturation and ticks.
+They are the error, the noise floor, the ultimate bound, settling, saturation and ticks.
 """
 
 import math
@@ -24,7 +24,7 @@ from rise_di_controller.internals import Saturation
 Windows = Mapping[str, tuple[float, float]]
 
 SETTLING_DWELL = 1.0
-"""s. A transient lasts this long beyond its end. An error has settled once it stays in the band for
+"""s. A transient counts this long beyond its end. An error has settled once it has been in the band
 this long."""
 
 SETTLING_BAND = 0.01  # half-width of the settling band as a fraction of the largest abs(y_m)
@@ -33,32 +33,33 @@ MIN_BAND_NOISE_FLOORS = 4.0
 """Least half-width of the settling band of a measured error, in noise floors. 500 samples of normal
 noise stay within 4 with a probability of 97 %."""
 
-# share of the value of an entry that the flight shows: half of the deviation before the flight
+# Largest deviation of an entry, relative to its value, that a flight shows. It is half of the
+# deviation before the flight.
 MAX_DEVIATION = 0.15
 
 LONGEST_INTERVAL = 1.0
-"""s. A sample stands for no longer time: a longer interval is a gap of the log, over which no
+"""s. A sample stands for at most this time. A longer interval is a gap of the log, over which no
 figure is taken."""
 
 # names that `best_error` returns
 TRUE_ERROR = "true error"
 MEASURED_ERROR = "measured error"
 
-TURN_BANK = math.radians(5.0)  # rad: a turn commands more bank
-CAPTURE_ANGLE = math.radians(1.0)  # rad: a capture commands a steeper flight path
-CAPTURE_TIME = 0.5  # s: a capture is farther beside its path than the aircraft flies in this time
+TURN_BANK = math.radians(5.0)  # rad; a turn commands more bank
+CAPTURE_ANGLE = math.radians(1.0)  # rad; a capture commands a steeper flight path
+CAPTURE_TIME = 0.5  # s; in a capture, the path is farther away than the aircraft flies in this time
 
 CALM = "calm"
 UNKNOWN_AIR = "other"
 AIRS = (CALM, "wind", "shear", "turbulence", "microburst", UNKNOWN_AIR)
-"""What was in the air beside gusts: the name of the part of a flight without a gust, a command and
-an engagement. UNKNOWN_AIR: no simulated aircraft flew."""
+"""What was in the air apart from gusts. It names the part of a flight without gust, command and
+engagement. UNKNOWN_AIR means that no simulated aircraft flew."""
 
 
 def parts_legend(air: str, *, is_guided: bool) -> str:
-    """Legend of the tables: the parts of a flight.
+    """Write the legend of the tables, which explains the parts of a flight.
 
-    The keys are "whole", `air`, "command" and "gust"; of a guided flight "turn" and "capture"
+    The parts are "whole", `air`, "command" and "gust". In a guided flight, "turn" and "capture"
     replace "command".
     """
     after = f"to {SETTLING_DWELL:g} s after its end"
@@ -85,7 +86,7 @@ class Transient(NamedTuple):
     """
 
     kind: str  # "engagement", "command", "gust", "turn" or "capture"
-    name: str  # of the commanded channel, or of the gust
+    name: str  # name of the commanded channel, or of the gust
     start: float
     stop: float
 
@@ -107,16 +108,16 @@ class ErrorMetrics:
 
 @dataclass(frozen=True, kw_only=True)
 class InputMetrics(ErrorMetrics):
-    """An input over some samples: deviation from trim in the unit of the input, rate per s."""
+    """An input over some samples: deviation from trim in the input's unit, rate in units per s."""
 
     rate: float
 
 
 def best_pose(tape: Tape) -> Signal | None:
-    """Return the true pose if the simulation has logged it, else the measured pose, if any.
+    """Return the true pose if the simulation has logged it, else the measured one, if any.
 
     The channels are `flight_core.channels.POSE`. A sensor that is off, or a pose that somebody else
-    publishes, moves the measured pose and not the aircraft.
+    publishes, moves the measured pose but not the aircraft.
     """
     if "truth" in tape and len(tape["truth"].stamp_ns):
         pose = tape["truth"].group("pose")
@@ -128,10 +129,10 @@ def best_pose(tape: Tape) -> Signal | None:
 
 
 def tracking_error(tape: Tape) -> Signal:
-    """Measured error e = y - y_m at every y inside the time range of y_m, shape (N, m).
+    """Return the measured error e = y - y_m at every y within the time of y_m, (N, m).
 
-    Channels of y outside of y_m are left out. y_m is interpolated linearly. The law sees this error
-    with the sensors' noise.
+    Channels that y_m lacks are left out. y_m is interpolated linearly. This is the error that the
+    law sees, with the noise of the sensors.
     """
     names = _controlled(tape)
     return _minus_reference(
@@ -171,10 +172,10 @@ def true_error(tape: Tape) -> Signal | None:
 
 
 def best_error(tape: Tape) -> tuple[str, Signal]:
-    """Name and signal of the best error on a tape: the true error, or else the measured error.
+    """Return the best error on a tape, with its name: the true error, or else the measured one.
 
-    "true error" or "measured error", and e = y - y_m, shape (N, m), SI. Raises ParameterError for a
-    tape without y and y_m.
+    The name is "true error" or "measured error", and e = y - y_m, (N, m), is in SI. Raises
+    ParameterError if the tape has no y and y_m.
     """
     error = true_error(as_tape(tape))
     return (MEASURED_ERROR, tracking_error(tape)) if error is None else (TRUE_ERROR, error)
@@ -189,7 +190,8 @@ def _minus_reference(y: Signal, y_m: Signal) -> Signal:
     values = y.values[first:end]
     if np.array_equal(stamps, y_m.stamp_ns):
         return Signal(stamps, y.names, values - _columns(y_m, y.names))
-    # float64 represents stamps exactly relative to the first one, but not ns since the epoch.
+    # float64 represents stamps exactly if they are relative to the first one, but not ns since the
+    # epoch.
     instants = (stamps - y_m.stamp_ns[0]).astype(float)
     knots = (y_m.stamp_ns - y_m.stamp_ns[0]).astype(float)
     reference = np.stack([np.interp(instants, knots, y_m[name]) for name in y.names]).T
@@ -201,14 +203,13 @@ def _columns(signal: Signal, names: Sequence[str]) -> FloatArray:
 
 
 def noise_floor(tape: Tape) -> dict[str, float]:
-    """Noise floor of y by channel, SI.
+    """Return the noise floor of y by channel, SI.
 
-    A smaller measured error cannot be distinguished from noise. A true error can be smaller.
-
-    The floor is the rms of "noise.channel" of `truth` on the tape, else the estimate of white noise
-    from second differences d_k = y_(k+1) - 2 y_k + y_(k-1): rms = median(abs(d)) / (0.6745
-    sqrt(6)). d has 6 times the variance of the noise, and half of a normal distribution lies within
-    0.6745 rms. The floor is at least the rounding of the largest y.
+    A measured error below it cannot be told from noise. A true error can be smaller. The floor is
+    the rms of "noise.channel" of `truth`, if the tape has it. Otherwise it is an estimate of white
+    noise from the second differences d_k = y_(k+1) - 2 y_k + y_(k-1): rms = median(abs(d)) /
+    (0.6745 sqrt(6)). d has 6 times the variance of the noise, and half of a normal distribution
+    lies within 0.6745 rms. The floor is at least the rounding of the largest y.
     """
     noise = tape["truth"].group("noise") if "truth" in tape else None
     floor = {}
@@ -226,7 +227,7 @@ def noise_floor(tape: Tape) -> dict[str, float]:
 
 
 def engagements(tape: Tape) -> list[Transient]:
-    """Instants of engagement of the controller, from the modes in `internals`."""
+    """Return the instants at which the controller engaged, from the modes in `internals`."""
     if "internals" not in tape:
         return []
     is_engaged = tape["internals"]["mode"] == Mode.ENGAGED
@@ -237,14 +238,14 @@ def engagements(tape: Tape) -> list[Transient]:
 def live_commands(tape: Tape) -> list[Transient]:
     """Return the changes of a live command, from `u_m`.
 
-    Changes of a channel less than SETTLING_DWELL apart are a single transient.
+    Changes of a channel that are less than SETTLING_DWELL apart are one transient.
     """
     if "u_m" not in tape:
         return []
     t = tape.time("u_m")
     u_m = tape["u_m"]
     commands: list[Transient] = []
-    # the attitude, which never rests
+    # Leave out the attitude, which never rests.
     attitude = () if "y_m" not in tape else set(u_m.names) - set(tape["y_m"].names)
     for name in [name for name in u_m.names if name not in attitude]:
         is_change = np.concatenate([u_m[name][:1] != 0.0, np.diff(u_m[name]) != 0.0])
@@ -261,8 +262,8 @@ def live_commands(tape: Tape) -> list[Transient]:
 def guided_transients(tape: Tape) -> list[Transient]:
     """Return the turns and captures of a guided flight, from `guidance`, as `parts_legend` says.
 
-    `u_m` never rests in such a flight. Transients of a kind less than SETTLING_DWELL apart count as
-    one.
+    `u_m` never rests in such a flight. Transients of the same kind that are less than
+    SETTLING_DWELL apart count as one.
     """
     if "guidance" not in tape:
         return []
@@ -285,10 +286,10 @@ def guided_transients(tape: Tape) -> list[Transient]:
 def mask_spans(
     t: FloatArray, mask: NDArray[np.bool_], min_length: float = 0.0
 ) -> list[tuple[float, float]]:
-    """Start and stop of the runs of True in a mask of shape (N,), s.
+    """Return the start and the stop of each run of True in a mask of shape (N,), s.
 
-    A run stops at the next False sample. Spans less than `min_length` apart are merged, and shorter
-    spans are lengthened to `min_length`.
+    A run stops at the next False sample. Spans that are less than `min_length` apart are merged,
+    and spans that are shorter are lengthened to `min_length`.
     """
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]])))
     spans: list[tuple[float, float]] = []
@@ -304,7 +305,7 @@ def mask_spans(
 def in_spans(
     t: FloatArray, spans: Iterable[tuple[float, float]], settle: float = 0.0
 ) -> NDArray[np.bool_]:
-    """Mask of the ascending instants t inside a span or up to `settle` s later, shape (N,)."""
+    """Return which of the ascending instants t are in a span or up to `settle` s after it, (N,)."""
     inside = np.zeros(len(t), dtype=bool)
     for start, stop in spans:
         inside[np.searchsorted(t, start) : np.searchsorted(t, stop + settle, side="right")] = True
@@ -317,10 +318,10 @@ def part_masks(
     settle: float = SETTLING_DWELL,
     air: str = CALM,
 ) -> dict[str, NDArray[np.bool_]]:
-    """Masks of the instants t of shape (N,) by part of the flight.
+    """Return masks of the instants t, (N,), by part of the flight.
 
-    The parts are "whole", `air`, "command" and "gust". Of a guided flight "capture" and "turn"
-    replace "command". An instant counts to the last matching part in this order. `air` has no
+    The parts are "whole", `air`, "command" and "gust". In a guided flight, "capture" and "turn"
+    replace "command". An instant counts to the last part in this order that matches. `air` has no
     transient of any kind.
     """
     kinds = {transient.kind for transient in transients}
@@ -341,10 +342,11 @@ def part_masks(
 
 
 def sample_times(stamp_ns: NDArray[np.int64]) -> FloatArray:
-    """Time that a sample stands for, s, shape (N,).
+    """Return the time that each sample stands for, s, (N,).
 
-    A sample has half of the intervals to the neighbours, at most LONGEST_INTERVAL long. The first
-    and the last sample stand for a whole interval, so that equal intervals give equal times.
+    It is half of the intervals to both neighbours, where an interval counts at most
+    LONGEST_INTERVAL. The first and the last sample stand for a whole interval, so that equal
+    intervals give equal times.
     """
     if len(stamp_ns) < 2:
         return np.ones(len(stamp_ns))
@@ -356,14 +358,14 @@ def sample_times(stamp_ns: NDArray[np.int64]) -> FloatArray:
 
 
 def error_metrics(errors: ArrayLike, times: FloatArray | None = None) -> ErrorMetrics:
-    """Root mean square and max abs(e) of samples of shape (N,); NaN where N = 0.
+    """Compute the root mean square and the max abs(e) of samples, (N,); NaN if N = 0.
 
-    rms = sqrt(sum t e^2 / sum t) with the `times` t of the samples, (N,), of equal times sqrt(mean
-    e^2).
+    rms = sqrt(sum t e^2 / sum t) with the `times` t of the samples, (N,); with equal times it is
+    sqrt(mean e^2).
 
     Args:
         errors: Samples e of a channel, shape (N,), in any unit.
-        times: Time that a sample stands for, shape (N,), s; None: equal times.
+        times: Time that each sample stands for, shape (N,), s; None stands for equal times.
 
     Returns:
         `rms` and `max`, in the unit of the errors.
@@ -385,7 +387,7 @@ def error_metrics(errors: ArrayLike, times: FloatArray | None = None) -> ErrorMe
 
 
 def known_entries(learned: Signal) -> list[str]:
-    """Entries of A and B in samples of `learned` that the flight shows.
+    """Return the entries of A and B, in samples of `learned`, that the flight shows.
 
     Their least deviation is below MAX_DEVIATION of the value.
     """
@@ -404,7 +406,7 @@ def errors_by_part(
     settle: float = SETTLING_DWELL,
     air: str = CALM,
 ) -> dict[str, dict[str, ErrorMetrics]]:
-    """Metrics of `best_error` by channel and part of the flight.
+    """Return the metrics of `best_error` by channel and part of the flight.
 
     The max of "calm" is the ultimate bound: the largest abs(e) at least `settle` s after the end of
     every transient, in calm air.
@@ -421,10 +423,10 @@ def errors_by_part(
 
 
 def settling_bands(tape: Tape) -> dict[str, float]:
-    """Half-width of the settling band by channel, SI: SETTLING_BAND max abs(y_m).
+    """Return the half-width of the settling band by channel, SI: SETTLING_BAND max abs(y_m).
 
-    Where y_m is zero max abs(e) takes the place of max abs(y_m). The band of a measured error is at
-    least MIN_BAND_NOISE_FLOORS noise floors wide, else noise alone leaves it.
+    If y_m is zero, max abs(e) replaces max abs(y_m). The band of a measured error is at least
+    MIN_BAND_NOISE_FLOORS noise floors wide, because noise alone would leave a narrower one.
     """
     kind, error = best_error(tape)
     floors = noise_floor(tape) if kind == MEASURED_ERROR else {}
@@ -444,10 +446,11 @@ def settling_bands(tape: Tape) -> dict[str, float]:
 def settling_time(
     t: FloatArray, e: FloatArray, band: float, leaves: float, dwell: float = SETTLING_DWELL
 ) -> float | None:
-    """Time from t[0] until abs(e) <= band holds for `dwell` s or to the last sample, s.
+    """Return the time from t[0] until abs(e) <= band holds for `dwell` s or to the last sample, s.
 
-    Shapes (N,). 0 where abs(e) stays in the band for the first `leaves` s: a later excursion has a
-    different cause. None where abs(e) does not return to the band, or there is no sample.
+    The shapes are (N,). The time is 0 if abs(e) stays in the band for the first `leaves` s, because
+    an excursion after that has another cause. It is None if abs(e) does not return to the band, or
+    if there is no sample.
     """
     if len(t) == 0:
         return None
@@ -462,7 +465,7 @@ def settling_time(
 
 
 class Settling(NamedTuple):
-    """Settling after a transient, by excited channel."""
+    """How the channels that a transient excites settle after it."""
 
     transient: Transient
     until: dict[str, float]  # start of the next transient of the channel, or end of the flight, s
@@ -470,11 +473,11 @@ class Settling(NamedTuple):
 
 
 def settling_times(tape: Tape, transients: Sequence[Transient]) -> list[Settling]:
-    """Settling times of `best_error` into `settling_bands`, by excited channel.
+    """Return the settling times of `best_error` into `settling_bands`, by excited channel.
 
-    A time begins with the start of a transient. The time counts up to the next transient of the
-    channel. Transients after the end of the flight are left out, and turns and captures, whose
-    commands move to the end.
+    A time begins with the start of a transient, and counts up to the next transient of the channel.
+    Transients after the end of the flight are left out. So are turns and captures, whose commands
+    move to their end.
     """
     _, error = best_error(tape)
     t = (error.stamp_ns - tape.start_ns) / 1e9
@@ -509,10 +512,10 @@ def inputs_by_part(
     topic: str = "u",
     air: str = CALM,
 ) -> dict[str, dict[str, InputMetrics]]:
-    """Control effort by input and part: rms and max abs(u) about trim, and mean abs(u_dot).
+    """Return the control effort by input and part: rms and max abs(u) about trim, mean abs(u_dot).
 
-    With `topic` y the metrics are of y. mean abs(u_dot) = sum abs(u_k - u_(k-1)) / sum (t_k -
-    t_(k-1)) over the steps with an end in the part; NaN without a step.
+    If the `topic` is y, the metrics are those of y. mean abs(u_dot) = sum abs(u_k - u_(k-1)) / sum
+    (t_k - t_(k-1)) over the steps that end in the part; it is NaN if there is no step.
     """
     if topic not in tape:
         return {}
@@ -534,7 +537,7 @@ def inputs_by_part(
 
 
 def saturation_shares(tape: Tape) -> dict[str, dict[str, float]]:
-    """Fraction of the ticks with a saturated input, by input and by kind of saturation.
+    """Return the share of the ticks with a saturated input, by input and kind of saturation.
 
     The kinds are "magnitude" and "rate".
     """
@@ -549,10 +552,10 @@ def saturation_shares(tape: Tape) -> dict[str, dict[str, float]]:
 
 
 def sign_switches(tape: Tape) -> dict[str, float]:
-    """Switching rate of the sign term by output, 1/s.
+    """Return the rate at which the sign term switches, by output, 1/s.
 
-    The count is of changes of sign between successive nonzero increments of Pi, per time of the
-    ticks. On a tape without `internals` the count is of changes of sign of the measured error.
+    It counts the changes of sign between successive nonzero increments of Pi, over the time of the
+    ticks. If the tape has no `internals`, it counts the changes of sign of the measured error.
     """
     if "internals" in tape:
         signal = tape["internals"].group("Pi")

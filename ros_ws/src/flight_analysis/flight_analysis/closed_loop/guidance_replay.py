@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Replay of guidance from the log: every step is computed again.
 
-A step has the logged inputs and the state of the sample before.
+A step starts from the logged inputs and the state of the sample before it.
 """
 
 from collections.abc import Iterator, Mapping
@@ -44,7 +44,10 @@ def _waypoints(rows: FloatArray) -> list[Waypoint]:
 
 
 def known_routes(tape: Tape, parameters: GuidanceConfig) -> dict[int, Route]:
-    """Routes of the section and of the topic `route`, by digest as in the log of guidance."""
+    """Return the routes of the section and of the topic `route`.
+
+    Their keys are digests, as in the log of guidance.
+    """
     lists = [list(parameters.waypoints())]
     if "route" in tape:
         received = tape["route"]
@@ -52,17 +55,17 @@ def known_routes(tape: Tape, parameters: GuidanceConfig) -> dict[int, Route]:
         lists += [_waypoints(rows) for rows in np.split(received.values, starts)]
     routes = []
     for waypoints in filter(None, lists):
-        with suppress(ParameterError):  # guidance has refused it, too
+        with suppress(ParameterError):  # guidance refused it, too
             routes.append(parameters.plan(waypoints))
     return {guidance.digest(route): route for route in routes}
 
 
 def replay_guidance(tape: Tape, parameters: GuidanceConfig | None) -> GuidanceReplay:
-    """Compute every step of the topic `guidance` again, and the published u_m of the instant.
+    """Compute every step of the topic `guidance` again, and the u_m published at its instant.
 
-    After a failed step the state before stays and the last u_m goes on, which is checked.
-    Steps on a route outside the log are not checked, nor steps of a log with other channels.
-    Raises ParameterError for a log without the scenario's section of guidance.
+    After a failed step the state stays as it was and the last u_m goes on, which is checked. Steps
+    on a route that is not in the log are not checked, nor are steps of a log with other channels.
+    Raises ParameterError if the log lacks the scenario's section of guidance.
     """
     if parameters is None:
         raise ParameterError("the log: found guidance, expected its section in the scenario too")
@@ -94,7 +97,7 @@ def replay_guidance(tape: Tape, parameters: GuidanceConfig | None) -> GuidanceRe
 
 
 class _Comparison:
-    """The steps of guidance in a log, and the published u_m of their instants."""
+    """The steps of guidance in a log, and the u_m that was published at their instants."""
 
     def __init__(self, tape: Tape, parameters: GuidanceConfig) -> None:
         self.checked = 0
@@ -111,7 +114,7 @@ class _Comparison:
         )
 
     def differences(self) -> Iterator[ReplayDifference]:
-        """Yield the first different channel of each different step, in the order of the steps."""
+        """Yield the first channel that differs in each step, in the order of the steps."""
         previous: GuidanceState | None = None
         failed_before = 0.0
         rows = zip(self._signal.stamp_ns.tolist(), self._signal.values, strict=True)
@@ -119,7 +122,7 @@ class _Comparison:
             channels = dict(zip(self._names, row.tolist(), strict=True))
             inputs, recorded = guidance_log.restored(stamp_ns, channels, self._outputs)
             begins = previous is not None or inputs.begin is Begin.HOLD
-            # After a failed step without a sample in the log the filters begin again.
+            # The filters begin again after a failed step that has no sample in the log.
             failed = channels[FAILED]
             goes_on = failed > failed_before and inputs.begin is Begin.NO
             failed_before = failed
@@ -140,7 +143,10 @@ class _Comparison:
         *,
         goes_on: bool,
     ) -> FloatArray:
-        """Compute the channels of a step after a state, then u_m; `goes_on` marks a failed step."""
+        """Compute the channels of a step after a state, then u_m.
+
+        If it `goes_on`, the step failed and the last u_m went on.
+        """
         route = int(channels["route"])
         if goes_on and previous is not None:
             state, commands = previous, StepCommands()
@@ -159,7 +165,7 @@ class _Comparison:
     def _difference(
         self, k: int, recorded: FloatArray, computed: FloatArray
     ) -> ReplayDifference | None:
-        """Return the first channel of step k with a different bit."""
+        """Return the first channel of step k that has a different bit."""
         columns = np.flatnonzero(recorded.view(np.int64) != computed.view(np.int64))
         if len(columns) == 0:
             return None

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What a learner is, and the stations of a learner in a flight in one process."""
+"""What a learner is, and its stations in a flight in one process."""
 
 from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple, Protocol
@@ -22,26 +22,26 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 
 
 class LearnerResult(NamedTuple):
-    """Result of an identification in flight: parameters to fly with, or why there are none."""
+    """The result of an identification in flight: parameters to fly, or why there are none."""
 
     controller: RiseDiConfig | None
     sentence: str
 
 
 class Learner(Protocol):
-    """What learns from a flight. Channels in the law's order."""
+    """What learns from a flight. Its channels are in the law's order."""
 
     def take(self, stamp_ns: int, y: FloatArray, u: FloatArray, flown: int) -> None:
         """Take y and u, (m,), and the digest of the parameters of a tick of the engaged law.
 
-        u is after the limits.
+        u is after its limits.
         """
 
     def propose(self, flown: int, given_up: Sequence[str]) -> LearnerResult:
-        """Parameters from the record so far.
+        """Propose parameters from the record so far.
 
-        `flown` is the digest of the parameters at its end, `given_up` the outputs that have no
-        model to the end of the engagement.
+        `flown` is the digest of the parameters at its end. `given_up` are the outputs that have no
+        model until the engagement ends.
         """
 
 
@@ -49,10 +49,10 @@ Learn = Callable[[RiseDiConfig], Learner]
 
 
 class Entry(NamedTuple):
-    """An entry of A or B with the error by the flight.
+    """An entry of A or B, and how far the flight shows it to be off.
 
-    The fields are the nominal value in SI, the relative error, and the standard deviation of the
-    error after the flight. Where the nominal value is 0 both are in parts of another `unit`.
+    It has the nominal value in SI, the relative error, and the standard deviation of the error
+    after the flight. If the nominal value is 0, both are relative to another `unit`.
     """
 
     matrix: str
@@ -61,23 +61,23 @@ class Entry(NamedTuple):
     nominal: float
     error: float
     deviation: float
-    unit: float  # of error and deviation, SI: the nominal value where it is not 0
+    unit: float  # of error and deviation, SI: the nominal value unless it is 0
 
     @property
     def name(self) -> str:
-        """Such as B[q, elevator]."""
+        """The name of the entry, such as B[q, elevator]."""
         return f"{self.matrix}[{self.row}, {self.column}]"
 
     @property
     def value(self) -> float:
-        """After the flight, SI."""
+        """The value after the flight, SI."""
         return self.nominal + self.unit * self.error
 
 
 class Learned(NamedTuple):
-    """Channels of the topic `learned`.
+    """The channels of the topic `learned`.
 
-    They are `proposed`, and the value and the deviation of entries of A and B in the rows of the
+    They are `proposed`, and the values and deviations of the entries of A and B in the rows of the
     outputs.
     """
 
@@ -98,7 +98,7 @@ def learned_sample(
 
 
 class Identifications:
-    """The identifications of a learner that has them, each once."""
+    """The identifications of a learner, if it has any; each comes once."""
 
     def __init__(self, learner: Learner, outputs: tuple[str, ...]) -> None:
         self._learner = learner
@@ -107,13 +107,13 @@ class Identifications:
         self._names: tuple[str, ...] = ()
 
     def next(self, proposal: LearnerResult) -> Learned | None:
-        """Return the sample of a proposal's identification; None if there was no identification."""
+        """Return the sample of a proposal's identification, or None if there was none."""
         identification = getattr(self._learner, "identification", None)
         if identification is None or identification is self._last:
             return None
         self._last = identification
         entries = {entry.name: entry for entry in identification.entries if entry.nominal}
-        # a topic keeps its channels: those of the rough airframe
+        # A topic keeps its channels, those of the rough airframe.
         self._names = self._names or tuple(entries)
         return learned_sample(
             (entries[name] for name in self._names),
@@ -125,7 +125,7 @@ class Identifications:
 def as_received(proposal: LearnerResult, start: RiseDiConfig, end_ns: int, flown: int) -> Proposal:
     """Return a proposal as the controller receives it.
 
-    It carries the end of the window, and the digest of the parameters in force at that instant.
+    It carries the end of the window, and the digest of the parameters that were in force then.
     """
     change = {} if proposal.controller is None else design_changes(start, proposal.controller)
     return Proposal(
@@ -148,7 +148,7 @@ def proposed(
 
 
 class ProposalStation:
-    """Lets the due proposals act, falls back where the law diverges, and publishes `authority`."""
+    """Makes proposals that are due act, falls back if the law diverges, publishes `authority`."""
 
     def __init__(self, controller: Controller, learning: Learning, topics: Topics) -> None:
         self._controller = controller
@@ -167,9 +167,9 @@ class ProposalStation:
 
 
 class LearnerStation:
-    """The learner: records of the ticks of the controller, and proposals.
+    """Records the ticks of the controller for a learner.
 
-    A proposal is made where an identification is due.
+    When an identification is due, it asks for a proposal.
     """
 
     def __init__(
@@ -189,7 +189,7 @@ class LearnerStation:
         if output is None or not controller.has_internals:
             return
         if controller.mode is Mode.ENGAGED:
-            # u of the law: with an allocation `output` has that of the effectors
+            # This is the u of the law. With an allocation, `output` has that of the effectors.
             u = controller.state.u
             self._learner.take(output.stamp_ns, output.inputs.y, u, controller.digest)
         if not self._learning.ticked(controller, t_ns):

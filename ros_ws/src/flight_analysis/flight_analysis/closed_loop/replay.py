@@ -34,7 +34,7 @@ from rise_di_controller.guard.guard import ControllerState
 from rise_di_controller.laws import AnyLaw
 from rise_di_controller.params import ControllerConfig, as_controller
 
-# prefixes of the channels of u, from `internals` and from the topic `u`
+# Prefixes of the channels of u, in `internals` and on the topic `u`.
 U_PREFIXES = ("u.", "published.")
 OPEN_LOOP = "open loop: the recorded aircraft did not fly this u"
 
@@ -42,15 +42,15 @@ OPEN_LOOP = "open loop: the recorded aircraft did not fly this u"
 class ReplayDifference(NamedTuple):
     """A channel of a tick whose recorded and computed values differ."""
 
-    number: int  # of the tick's sample in `internals`
+    number: int  # number of the tick's sample in `internals`
     t: float  # flight time of its stamp, s
     channel: str
     recorded: float
-    computed: float  # NaN where the tick computes no value
+    computed: float  # NaN if the tick computes no value
 
     @property
     def ulps(self) -> int | None:
-        """Distance of the values in units in the last place (ULP); None for a NaN."""
+        """Distance of the values in units in the last place (ULP), or None for a NaN."""
         if np.isnan(self.recorded) or np.isnan(self.computed):
             return None
         return abs(_ordinal(self.computed) - _ordinal(self.recorded))
@@ -59,7 +59,7 @@ class ReplayDifference(NamedTuple):
 class ReplayResult(NamedTuple):
     """The N ticks of a log as recorded and as computed, in k channels.
 
-    First come the channels of `internals`, then the channels of u.
+    The channels of `internals` come first, then those of u.
     """
 
     names: tuple[str, ...]
@@ -91,7 +91,7 @@ class ReplayResult(NamedTuple):
         return not self.different().any() and not self.other_parameters.any()
 
     def first(self) -> ReplayDifference | None:
-        """Return the first difference in the first different tick; None without a difference.
+        """Return the first difference in the first tick that differs, or None without a difference.
 
         A channel of u goes before a channel of `internals`.
         """
@@ -119,10 +119,10 @@ class ReplayResult(NamedTuple):
 
         Args:
             values: `recorded` or `computed`, shape (N, k).
-            prefix: Group of channels, as "u".
+            prefix: Group of channels, such as "u".
 
         Returns:
-            The signal of the group, stamps in ns of flight time.
+            The signal of the group, with stamps in ns of flight time.
         """
         return Signal(np.round(self.t * NANOSECONDS).astype(np.int64), self.names, values).group(
             prefix
@@ -132,20 +132,20 @@ class ReplayResult(NamedTuple):
 def recorded_parameters(scenario: StoredFile, namespace: str | None = None) -> ControllerConfig:
     """Read the controller's parameters from the scenario of a log, or from a parameter file.
 
-    A file of the controller in this namespace is enough: the function reads no other section.
-    Raises ParameterError.
+    A file for nothing but the controller in this namespace is enough, because no other section is
+    read. Raises ParameterError.
     """
     path = Path(scenario.name)
     needed = {"controller": AnyLaw}
     try:
         sections = parse_sections(scenario.content, path, needed, (), namespace)
-    except ParameterError:  # of a log whose namespace is another than in the file
+    except ParameterError:  # the namespace of the log is not that of the file
         sections = parse_sections(scenario.content, path, needed)
     return AnyLaw.validate_mapping(sections["controller"], "controller")
 
 
 def is_controller_alone(scenario: StoredFile) -> bool:
-    """Return whether a file has a section for the controller, but none for an aircraft.
+    """Return whether a file has a section for the controller but none for an aircraft.
 
     Raises ParameterError.
     """
@@ -188,30 +188,32 @@ def replay(
 ) -> ReplayResult:
     """Compute every tick of `internals` again: (state, now, y, y_m) -> (state, u) by `guard.tick`.
 
-    A tick takes y from the topic `y` at the stamp of the tick; y_m, the instant of y_m and the
-    activity of the controller come from `internals`. The results are dt, mode, e, the integrals, Pi
-    and u.
+    A tick takes y from the topic `y` at its stamp. y_m, the instant of y_m, and whether the
+    controller was active come from `internals`. The results are dt, mode, e, the integrals, Pi and
+    u.
 
-    The state comes from the computation of the previous tick, after a different tick from the log,
-    so a tick is judged alone. After a gap the state is the logged state of the first engaged tick.
-    The ticks up to the first engaged tick are not checked, nor is u_ff until the next engagement.
+    The state comes from the computation of the tick before. If that tick differs from the log, the
+    state comes from the log, so that each tick is judged by itself. After a gap, the state is the
+    logged state of the first engaged tick. The ticks up to that one are not checked, and u_ff is
+    not checked until the next engagement.
 
     Args:
         run: Folder or file of a run, a run as read, or a tape.
-        parameters: Parameters of the recorded controller; None: from the log, or from the
-            scenario of a simulated tape.
-        others: Parameters of an open loop: the same inputs with these parameters, and the computed
-            state throughout. Where the log does not begin with the flight, the law engages in the
-            first tick, at the recorded u.
-        changes: Parameter changes in flight, in order; None: from the log, none beside `others`. A
-            tick applies the changes up to the parameters of the channel "parameters".
+        parameters: Parameters of the recorded controller. If None, they come from the log, or from
+            the scenario of a simulated tape.
+        others: Parameters of an open loop. The inputs are the same, and the state is the computed
+            one throughout. If the log does not begin with the flight, the law engages in the first
+            tick, at the recorded u.
+        changes: Parameter changes in flight, in order. If None, they come from the log; with
+            `others` there are none. A tick applies the changes up to the parameters of the channel
+            "parameters".
 
     Returns:
         N ticks of k channels, as recorded and as computed, shape (N, k), SI.
 
     Raises:
-        ParameterError: `internals` has different channels or a version with fewer channels, the
-            changes are invalid, or the provenance of the log names a different arithmetic.
+        ParameterError: `internals` has other channels or comes from a version with fewer channels,
+            the changes are invalid, or the log was recorded with another arithmetic.
 
     Examples:
         >>> tape = rise_di.simulate(rise_di.find_scenario("osprey_servo", duration=0.1))
@@ -259,8 +261,8 @@ def _replay(
     steps.compute()
     opened = () if others is None else (OPEN_LOOP,)
     notes = (*opened, *in_force.notes(), *_coverage_notes(ticks, steps.checked))
-    # A tick without a y on the topic is computed from the y in `internals`; a u that is not on the
-    # topic is not compared.
+    # If the y of a tick is not on the topic, it comes from `internals`. If its u is not on the
+    # topic, it is not compared.
     missing = np.flatnonzero(~ticks.u_found)
     steps.computed[missing, -ticks.p :] = ticks.values[missing, -ticks.p :]
     return ReplayResult(
@@ -277,7 +279,7 @@ def _replay(
 
 
 def _require_same_channels(recorded: ControllerConfig, others: ControllerConfig) -> None:
-    """Raise ParameterError for parameters with other channels than the recorded ones."""
+    """Raise ParameterError if parameters have other channels than the recorded ones."""
     for key, names in (("outputs", "measured"), ("inputs", "inputs"), ("effectors", "effectors")):
         before = getattr(recorded, names)
         after = getattr(others, names)
@@ -290,7 +292,7 @@ def _require_same_channels(recorded: ControllerConfig, others: ControllerConfig)
 
 
 class _Steps:
-    """The computation of all ticks: row by row, with the parameters in force."""
+    """The computation of all ticks, row by row, with the parameters in force."""
 
     def __init__(self, ticks: Ticks, in_force: ParametersInForce, *, open_loop: bool) -> None:
         self._ticks = ticks
@@ -301,7 +303,7 @@ class _Steps:
         self.other_parameters = self.checked.copy()
 
     def compute(self) -> None:
-        """Compute every tick whose state before is known."""
+        """Compute every tick whose previous state is known."""
         ticks = self._ticks
         in_force = self._in_force
         state: ControllerState | None = None
@@ -323,7 +325,10 @@ class _Steps:
                 state = ticks.state(k, in_force.limits, in_force.law, state)
 
     def _state_after_gap(self, k: int) -> ControllerState | None:
-        """Return the recorded state of an engaged tick, where an open loop engages; None before."""
+        """Return the recorded state of an engaged tick, or None before it.
+
+        An open loop engages in this tick.
+        """
         if not self._ticks.flies[k]:
             return None
         state = self._ticks.state(k, self._in_force.limits, self._in_force.law)
@@ -333,7 +338,7 @@ class _Steps:
 def _recorded(
     run: Tape | RecordedRun, parameters: ControllerConfig | None, changes: Sequence[Change] | None
 ) -> tuple[Tape, ControllerConfig, Sequence[Change]]:
-    """Return the tape of a run; the run fills in parameters and changes that are None.
+    """Return the tape of a run; parameters and changes that are None come from the run.
 
     Raises ParameterError.
     """
@@ -355,7 +360,7 @@ def _recorded(
 def recorded_changes(run: RecordedRun, parameters: ControllerConfig) -> Sequence[Change]:
     """Return the changes in flight of the recorded controller's parameters, in order.
 
-    If the run has no log, these are the changes of the tape.
+    If the run has no log, they are the changes of the tape.
     """
     if run.path is None:
         return run.tape.changes
@@ -377,7 +382,7 @@ def later_aircraft(run: RecordedRun, scenario: Scenario) -> tuple[AircraftConfig
     changes: dict[str, Any] = {}
     for change in parameter_changes(run.path, node, dict.fromkeys(AircraftConfig.tunable())):
         changes |= change
-        # The keys of a gust come one by one: it is one with the last of them.
+        # The keys of a gust come one by one. The gust is complete with the last of them.
         with suppress(ParameterError):
             later.append(
                 AircraftConfig.validate_mapping(scenario.aircraft.changed(changes), "aircraft")
@@ -427,6 +432,6 @@ def _bits(values: FloatArray) -> NDArray[np.int64]:
 
 
 def _ordinal(value: float) -> int:
-    """Index of a float64 in the ordered float64 numbers; 0 has index 0."""
+    """Return the index of a float64 among all float64 numbers in order; 0 has index 0."""
     bits = int(np.float64(value).view(np.int64))
     return bits if bits >= 0 else -(bits & 0x7FFF_FFFF_FFFF_FFFF)

@@ -23,15 +23,15 @@ from rise_di_controller.laws import AnyLaw
 from rise_di_controller.params import ControllerConfig
 
 COPIED_CHANNELS = ("y_m_offset", "number", "parameters")
-"""Channels of `internals` that are copied, for a tick does not compute them."""
+"""Channels of `internals` that are copied, because a tick does not compute them."""
 
 
-# parameters of the controller by dotted name that were changed in flight at one instant
+# Parameters of the controller, by dotted name, that changed at one instant in flight.
 Change = Mapping[str, Any]
 
 
 def vary(parameters: ControllerConfig, changes: Mapping[str, Any]) -> ControllerConfig:
-    """Parameters with changes by dotted name, validated; None removes a parameter.
+    """Return parameters with changes by dotted name, validated; None removes a parameter.
 
     Raises ParameterError.
     """
@@ -39,7 +39,7 @@ def vary(parameters: ControllerConfig, changes: Mapping[str, Any]) -> Controller
 
 
 class ParametersInForce:
-    """The parameters in force at a tick, and the later changes."""
+    """The parameters in force at a tick, and the changes that follow."""
 
     def __init__(self, parameters: ControllerConfig, changes: Sequence[Change]) -> None:
         self._changed: dict[str, list[int]] = {}  # ticks by names of the parameters
@@ -48,7 +48,7 @@ class ParametersInForce:
         self.begin()
 
     def begin(self) -> None:
-        """Restore the parameters at the start of a controller."""
+        """Restore the parameters that a controller starts with."""
         self._unmatched: set[int] = set()
         self._apply(self._first)
 
@@ -70,9 +70,9 @@ class ParametersInForce:
     def change(
         self, digest: int, number: int, state: ControllerState | None
     ) -> ControllerState | None:
-        """Apply the changes up to the parameters with a digest, if any.
+        """Apply the changes up to the parameters with a digest, if there are any.
 
-        Returns the state afterwards.
+        Return the state after them.
         """
         if digest == self.digest or digest in self._unmatched:
             return state
@@ -103,7 +103,7 @@ class ParametersInForce:
 
 
 class Ticks:
-    """`internals` of a log in order of the controller's ticks, and the inputs of the ticks."""
+    """`internals` of a log in the order of the controller's ticks, and the inputs of the ticks."""
 
     def __init__(self, tape: Tape, parameters: ControllerConfig) -> None:
         groups = parameters.logged_groups()
@@ -112,7 +112,8 @@ class Ticks:
         self.m = len(parameters.inputs)
         self.p = len(parameters.effectors)
         self._allocation = parameters.guard().allocation
-        # Stamps of an earlier version may decrease: a late y was older than the failsafe before it.
+        # In logs of an earlier version stamps may decrease: a late y was older than the failsafe u
+        # before it.
         now_ns = signal.stamp_ns + np.round(signal["age"] * NANOSECONDS).astype(np.int64)
         order, self.starts = _tick_order(now_ns, signal["number"])
         self.stamp_ns = signal.stamp_ns[order]
@@ -141,7 +142,7 @@ class Ticks:
         self._copied = [names.index(name) for name in COPIED_CHANNELS]
 
     def begin(self, before: ControllerState | None = None) -> ControllerState:
-        """Return the state of a configured controller, with the u of an earlier state."""
+        """Return the state of a configured controller, with the u of an earlier state, if any."""
         state = guard.initial_state(self.m, self._allocation)
         return state if before is None else state._replace(u=before.u, effectors=before.effectors)
 
@@ -193,15 +194,15 @@ class Ticks:
     def tick(
         self, k: int, state: ControllerState, limits: GuardParams, law: TunedLaw
     ) -> tuple[ControllerState, FloatArray]:
-        """Compute a tick; return the state after it and the row of `internals`.
+        """Compute a tick; return the state after it and its row of `internals`.
 
-        The row is NaN for a tick without output.
+        If the tick has no output, the row is NaN.
         """
         stamp_ns = int(self.stamp_ns[k])
         y = None
         y_m = []
         if not self.flies[k] and stamp_ns == state.stamp_ns:
-            # A stamp that rests tells of a y from before it, which engaged nothing.
+            # If the stamp stays the same, y came from before it and engaged nothing.
             y = StampedVector(stamp_ns - 1, self._y[k])
             y_m = [StampedVector(stamp_ns - 1, self._groups["y_m"][k])]
         elif self.flies[k]:
@@ -210,10 +211,10 @@ class Ticks:
             if (offset_ns := int(self._offset_ns[k])) > 0:
                 y_m.append(y_m[0]._replace(stamp_ns=stamp_ns + offset_ns))
         if self._engages[k] and state.mode is Mode.ENGAGED:
-            # As `Controller.restart`: the law has engaged again by itself, and the rest goes on.
+            # As in `Controller.restart`, the law has engaged again by itself, and the rest goes on.
             state = state._replace(mode=Mode.WAITING)
-        # After a gap the log has the feedforward's output but not its state: only the law is
-        # computed.
+        # After a gap, the log has the output of the feedforward but not its state, so that only
+        # the law is computed.
         only_law = (
             limits.nominal is not None and state.mode is Mode.ENGAGED and state.feedforward is None
         )
@@ -238,7 +239,7 @@ class Ticks:
 def _checked_internals(tape: Tape, names: Sequence[str]) -> Signal:
     """Return the channels `names` of `internals`, in this order.
 
-    Raises ParameterError for other channels or values.
+    Raises ParameterError if the channels or values are others.
     """
     require(
         "internals" in tape,
@@ -271,7 +272,7 @@ def _tick_order(
 ) -> tuple[NDArray[np.int64], list[int]]:
     """Order the ticks by their instants; return also where in this order a controller starts.
 
-    Ticks of one controller are in the order of their numbers, whichever was stored first.
+    The ticks of one controller are in the order of their numbers, whichever was stored first.
     """
     order = np.argsort(now_ns, kind="stable")
     starts = controller_starts(number[order])
@@ -283,7 +284,7 @@ def _tick_order(
 def _as_published(
     tape: Tape, topic: str, names: Sequence[str], stamp_ns: NDArray[np.int64], otherwise: FloatArray
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Return the samples of a topic at these stamps, (N, m), and a mask of stamps with a sample.
+    """Return the samples of a topic at these stamps, (N, m), and which stamps have one.
 
     A stamp without a sample has the values of `otherwise`.
     """
@@ -296,7 +297,7 @@ def _as_published(
     for row, stamp in enumerate(tape[topic].stamp_ns.tolist()):
         rows.setdefault(stamp, []).append(row)
     for k, stamp in enumerate(stamp_ns.tolist()):
-        # two if a failsafe u has the stamp of a y that arrived later
+        # There are two if a failsafe u has the stamp of a y that arrived later.
         candidates = rows.get(stamp, [])
         matched[k] = bool(candidates)
         if candidates and not any(

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A scenario: a file with the parameters of every node, validated by section and together."""
+"""A scenario: a file with the parameters of every node, validated by section and as a whole."""
 
 import math
 from collections.abc import Mapping
@@ -29,10 +29,10 @@ from rise_di_controller.laws import AnyLaw
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di_config import RiseDiConfig
 
-STOP_TOLERANCE = 1e-3  # relative: files hold limits and end stops with few digits
+STOP_TOLERANCE = 1e-3  # relative, because files give limits and end stops with few digits
 
 ParameterOverrides = dict[str, str | float | bool | list[str] | list[float]]
-"""Parameters of one node by name that replace those of its section in the scenario."""
+"""Parameters of one node, by name, that replace those of its section in the scenario."""
 
 
 class FlightConfig(Config):
@@ -41,11 +41,11 @@ class FlightConfig(Config):
     duration: Annotated[float, Field(gt=0, le=1e6)] = Field(description="how long to fly, s")
     lockstep: bool = Field(
         default=False,
-        description="fly as fast as the machine allows, in lockstep, instead of real time",
+        description="fly in lockstep, as fast as the machine allows, instead of in real time",
     )
     use_sim_time: bool = Field(
         default=False,
-        description="fly by the /clock of a simulator, also where any section of a node says so",
+        description="fly by the /clock of a simulator; any section of a node may also ask for it",
     )
 
 
@@ -66,15 +66,15 @@ class Scenario:
     reference_model: ReferenceModelConfig
     controller: ControllerConfig
     recorder: RecorderConfig
-    guidance: GuidanceConfig | None = None  # None: the commands are those of the reference model
+    guidance: GuidanceConfig | None = None  # if None, the reference model has the commands
 
     @classmethod
     def from_parts(cls, name: str, **sections: Mapping[str, Any] | Config) -> "Scenario":
         """Create a scenario without a file.
 
-        The sections are flight, aircraft, reference_model, controller and, if any, recorder and
-        guidance. The value of a section is a mapping of parameters, or a parameter set. Lists may
-        be arrays. Without `recorder` it has its defaults.
+        The sections are flight, aircraft, reference_model and controller; recorder and guidance are
+        optional. A section is a mapping of parameters, or a parameter set. Lists may be arrays.
+        Without `recorder`, the recorder has its defaults.
 
         Args:
             name: Name of the scenario.
@@ -104,10 +104,10 @@ class Scenario:
     def vary(self, **sections: Mapping[str, Any] | Config) -> "Scenario":
         """Return a copy with parameters replaced, as in scenario.vary(controller={"rate": 200.0}).
 
-        The value of a section is a mapping of new parameters, or a whole parameter set such as the
-        `controller` of a second scenario. Lists may be arrays. A different `law` starts without the
-        gains of the former law. The copy is validated. A missing section of guidance begins with
-        the numbers by rule.
+        A section is a mapping of new parameters, or a whole parameter set, such as the `controller`
+        of a second scenario. Lists may be arrays. If the `law` changes, the gains of the former law
+        are dropped. The copy is validated. If the scenario has no section of guidance, a new one
+        begins with the numbers by rule.
 
         Args:
             sections: New parameters, or a whole parameter set, by section.
@@ -145,10 +145,10 @@ class Scenario:
         """Return the sections that have a parameter of this name.
 
         Args:
-            name: Name of a parameter, as k_g.
+            name: Name of a parameter, such as k_g.
 
         Returns:
-            Names of sections, none for an unknown parameter.
+            Names of sections; none if the parameter is unknown.
         """
         return [key for key in SCHEMAS if name in getattr(getattr(self, key), "model_fields", ())]
 
@@ -165,7 +165,7 @@ class Scenario:
     def rise_di(self) -> RiseDiConfig:
         """Return the parameters of a controller with RISE-DI.
 
-        Raises ParameterError for a different law.
+        Raises ParameterError if the law is another one.
         """
         if not isinstance(self.controller, RiseDiConfig):
             expected = "rise_di, which has the gains of (20) to (22)"
@@ -179,7 +179,7 @@ class Scenario:
         return isinstance(self.controller, RiseDiConfig) and self.controller.learn is not None
 
     def air(self) -> str:
-        """Name the most violent disturbance of the air beside gusts, one of metrics.AIRS."""
+        """Name the most violent disturbance of the air, gusts apart: one of metrics.AIRS."""
         aircraft = self.aircraft
         if aircraft.microburst is not None:
             return "microburst"
@@ -190,14 +190,14 @@ class Scenario:
         return "wind" if any(aircraft.wind) else "calm"
 
     def gust_windows(self) -> dict[str, tuple[float, float]]:
-        """Start and stop of the gusts, s: entry and entry + 2 H / V0.
+        """Return the start and the stop of each gust, s: entry and entry + 2 H / V0.
 
-        A repeated gust has a number from the second time on.
+        A gust that is repeated has a number from the second time on.
         """
         speed = self.aircraft.channels().speed
         windows = {}
         for name, gust in self.aircraft.gusts.items():
-            again = (self.flight.duration - gust.start) / gust.every  # 0 of a single gust
+            again = (self.flight.duration - gust.start) / gust.every  # 0 for a single gust
             entries = gust.start + gust.every * np.arange(1.0, max(math.ceil(again), 1))
             for number, entry in enumerate([gust.start, *entries.tolist()], 1):
                 label = name if number == 1 else f"{name} {number}"
@@ -221,13 +221,13 @@ SCHEMAS: dict[str, type[Config]] = {
     "guidance": GuidanceConfig,
 }
 OPTIONAL = ("recorder", "guidance")
-"""Sections that a file may leave out: the recorder by its defaults, and no guidance."""
+"""Sections that a file may leave out: then the recorder has its defaults, and nothing is guided."""
 
 
 def load_scenario(path: FilePath, *, with_route: bool = True) -> Scenario:
     """Read and validate a scenario file. Raises ParameterError with a sentence.
 
-    Without `with_route` the route and the program of guidance are left out before the check, for a
+    Without `with_route`, the route and the program of guidance are left out before the check, for a
     flight of another route.
     """
     path = as_path(path, "scenario", A_SCENARIO)
@@ -259,17 +259,16 @@ def scenario_of(name: str, path: Path, sections: Mapping[str, Mapping[str, Any]]
     }
     scenario = Scenario(name=name, path=path, **parameters)
     check_together(scenario)
-    # Its numbers by rule follow from the further sections.
+    # The numbers of guidance by rule follow from the other sections.
     return scenario.vary(guidance=sections["guidance"]) if "guidance" in sections else scenario
 
 
 def parse_scenario_sections(content: bytes, path: Path, namespace: str | None = None) -> Sections:
-    """Parse the sections of a scenario file; they are not validated yet. Raises ParameterError.
+    """Parse the sections of a scenario file, without validating them. Raises ParameterError.
 
-    `namespace` belongs to the nodes, as in `parse_sections`.
-
-    If the path of an airframe or of a recorded command names no file from the working folder, the
-    function looks for it from the scenario's folder, and for a file of its name in that folder.
+    `namespace` is that of the nodes, as in `parse_sections`. A path of an airframe or of a recorded
+    command that names no file from the working folder is tried from the scenario's folder, and then
+    by its file name in that folder.
     """
     sections = parse_sections(content, path, SCHEMAS, OPTIONAL, namespace)
     recorded = sections["reference_model"].get("recorded")
@@ -288,7 +287,7 @@ def guidance_by_rule(
 ) -> dict[str, Any]:
     """Compute the parameters of guidance that follow from the other sections.
 
-    The authorities of throttle and aileron are abs(Omega_ii) u of RISE-DI, with Omega_ii = omega /
+    The authorities of throttle and aileron are abs(Omega_ii) u for RISE-DI, with Omega_ii = omega /
     input_scale and the limits of u from trim. A controller without these numbers has none. Raises
     ParameterError if the model or the aircraft does not suit guidance.
     """
@@ -335,8 +334,8 @@ def scenario_yaml(
 ) -> str:
     """Write a scenario file as text with every parameter, defaults included.
 
-    `overrides` replace parameters by section. A parameter with the value None or empty, the
-    default, is left out.
+    `overrides` replace parameters by section. A parameter is left out if its value is None or
+    empty, because that is the default.
 
     Args:
         scenario: The scenario to write.
@@ -362,7 +361,7 @@ def scenario_yaml(
         merged = schema.validate_mapping(
             section.model_dump() | dict((overrides or {}).get(name, {})), name
         )
-        # The start time is known only once all nodes run; `truth` holds it.
+        # The start time is known only when all nodes run. `truth` holds it.
         sections[f"/**/{name}"] = {
             "ros__parameters": _yaml_values(merged.model_dump(exclude={"start_time"}))
         }
@@ -370,7 +369,10 @@ def scenario_yaml(
 
 
 def _yaml_values(values: Any) -> Any:
-    """Values with lists for tuples, and without None and empty texts, lists and mappings."""
+    """Return values with lists in place of tuples.
+
+    None, and empty texts, lists and mappings, are left out.
+    """
     if isinstance(values, Mapping):
         converted = {key: _yaml_values(value) for key, value in values.items()}
         return {key: value for key, value in converted.items() if value not in (None, "", [], {})}
@@ -378,7 +380,7 @@ def _yaml_values(values: Any) -> Any:
 
 
 def check_together(scenario: Scenario) -> None:
-    """Check the channels and rates of the sections together. Raises ParameterError."""
+    """Check that the channels and rates of the sections fit together. Raises ParameterError."""
     channels = scenario.aircraft.channels()
     controller = scenario.controller
     reference = scenario.reference_model
@@ -422,9 +424,9 @@ def check_together(scenario: Scenario) -> None:
 
 
 def limits_beyond_stops(scenario: Scenario) -> tuple[str, ...]:
-    """Warn of each limit of the controller outside the actuators' end stops, a sentence each.
+    """Warn of each limit of the controller that is beyond an end stop of the actuators.
 
-    At such a limit, the anti-windup starts too late.
+    At such a limit the anti-windup starts too late.
     """
     controller = scenario.controller
     actuators = scenario.aircraft.actuators
@@ -456,10 +458,10 @@ def limits_beyond_stops(scenario: Scenario) -> tuple[str, ...]:
 
 
 def require_guidable(scenario: Scenario) -> None:
-    """Raise ParameterError for a scenario that guidance cannot fly.
+    """Raise ParameterError if guidance cannot fly a scenario.
 
-    A bank does not turn the simulated airframe, or the flight begins outside of a fence. Behind a
-    bridge the airframe of the scenario does not fly.
+    It cannot if a bank does not turn the simulated airframe, or if the flight begins outside a
+    fence. Behind a bridge, the airframe of the scenario does not fly.
     """
     aircraft = scenario.aircraft
     guidance = scenario.guidance
@@ -532,8 +534,8 @@ def _check_guidance(scenario: Scenario, guidance: GuidanceConfig) -> None:
 def opposite_signs(scenario: Scenario) -> tuple[str, ...]:
     """Warn, in a sentence, if D contradicts the signs of C B of the airframe file.
 
-    The law then drives y away from y_m. With an allocation, or without an airframe file, there is
-    no such sentence.
+    The law then drives y away from y_m. With an allocation, or without an airframe file, nothing is
+    compared.
     """
     controller = scenario.controller
     aircraft = scenario.aircraft

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The scenarios of the stack, the file of a scenario's name, and scenarios with a route."""
+"""The scenarios that ship, the files that their names stand for, and scenarios with a route."""
 
 from collections.abc import Mapping, Sequence
 from importlib.resources import files
@@ -31,7 +31,7 @@ LIBRARY = Path(str(files("flight_analysis"))) / "scenarios"
 
 
 def scenarios() -> list[str]:
-    """Names of the scenarios in LIBRARY.
+    """List the names of the scenarios in LIBRARY.
 
     Returns:
         The names, sorted.
@@ -79,9 +79,7 @@ def with_route(
     """Return the scenario with a route that guidance flies from the start.
 
     It replaces the scenario's route and program of targets. `fence` has more sections of guidance,
-    such as those of `read_fence_file`.
-
-    Raises ParameterError if the route cannot be flown.
+    such as those of `read_fence_file`. Raises ParameterError if the route cannot be flown.
     """
     leg_speeds = speeds(waypoints, scenario.aircraft.channels().speed)
     route: dict[str, list[Any]] = {
@@ -104,10 +102,10 @@ def with_route(
 def as_flown(scenario: Scenario, run: Path, namespace: str = "") -> Scenario:
     """Return the scenario with a file from which the nodes in a namespace read the same.
 
-    This is the scenario's own file, or a new one in the folder `run`. A new file holds the values
-    of recorded commands, so that the log needs no other file to be flown again, and has sections
-    for any namespace if those of the old file are for another one, such as /uav7/controller. Raises
-    ParameterError if the file cannot be written.
+    That is the scenario's own file, unless it has recorded commands or sections for another
+    namespace, such as /uav7/controller. Otherwise it is a new file in the folder `run`, which holds
+    the values of the recorded commands, so that the log needs no other file to be flown again, and
+    has sections for any namespace. Raises ParameterError if the file cannot be written.
     """
     if not scenario.reference_model.recorded and _reaches_nodes(scenario.path, namespace):
         return scenario
@@ -117,7 +115,7 @@ def as_flown(scenario: Scenario, run: Path, namespace: str = "") -> Scenario:
 def with_parameters(scenario: Scenario, path: Path, namespace: str) -> Scenario:
     """Add to the scenario what else a parameter file says to the nodes in a namespace.
 
-    Values replace those of the same names. Raises ParameterError.
+    Its values replace those of the same names. Raises ParameterError.
     """
     content = read_file(path, str(path), "a ROS parameter file")
     further = parse_sections(content, path, SCHEMAS, tuple(SCHEMAS), namespace, with_general=True)
@@ -136,7 +134,8 @@ def with_parameters(scenario: Scenario, path: Path, namespace: str) -> Scenario:
 def _reaches_nodes(path: Path, namespace: str) -> bool:
     """Return whether the nodes in a namespace get every section of a scenario file, and no other.
 
-    Overrides of a node join a section for all nodes, which rcl puts before that of the node.
+    Overrides of a node are written into a section for all nodes, which rcl puts before that of the
+    node.
     """
     content = read_file(path, str(path), A_SCENARIO)
     if has_general(content, path):

@@ -63,11 +63,11 @@ def simulate(
     learn: Learn | None = None,
     announce: Callable[[Event], None] = lambda event: None,
 ) -> Tape:
-    """Simulate a flight in memory and return its tape, SI and radians, with why it ended early.
+    """Simulate a flight in memory and return its tape, which also says how the flight ended.
 
-    Raises ParameterError for no Scenario, and for one that learns without `learn`. `progress` is
-    called with the flight time, s, once per simulated second. `announce` takes the events of the
-    learning.
+    The tape is in SI and radians. `progress` is called with the flight time, s, once per simulated
+    second. `announce` takes the events of the learning. Raises ParameterError if `scenario` is no
+    Scenario, or if it learns and `learn` is None.
     """
     as_scenario(scenario)
     change = (
@@ -106,14 +106,14 @@ def fly(
     """Fly a scenario and return the outcome.
 
     `record` takes the samples once per simulated second and at the end. `progress` is called with
-    the flight time after `record`. `guide` makes the guidance of a scenario with guidance; the
-    default receives the true pose. `control` makes the controller. `learn` makes the learner of a
-    scenario that learns, and `announce` takes the events of the learning. Raises ParameterError for
-    such a scenario without `learn`.
+    the flight time after `record`. `guide` makes the guidance of a scenario that has one; the
+    default gets the true pose. `control` makes the controller. `learn` makes the learner of a
+    scenario that learns, and `announce` takes the events of the learning. Raises ParameterError if
+    the scenario learns and `learn` is None.
 
-    Order at an instant: y of the aircraft, y_m of the reference model, u_m of guidance, proposals
-    of the learner, u of the controller. A flight that diverges or is interrupted (Ctrl-C) ends
-    early.
+    The order at an instant is: y of the aircraft, y_m of the reference model, u_m of guidance,
+    proposals of the learner, u of the controller. A flight ends early if it diverges or is
+    interrupted (Ctrl-C).
     """
     require_guidable(scenario)
     topics = Topics()

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The loop of a flight in one process.
 
-Stations with the code of the nodes step in the order of the data flow.
+Stations, which have the code of the nodes, step in the order of the data flow.
 """
 
 import math
@@ -32,18 +32,18 @@ Take = Callable[[StampedVector, int], object]
 
 
 class Station(Protocol):
-    """A part of a flight, acting at the multiples of a period."""
+    """A part of a flight that acts at the multiples of its period."""
 
     @property
     def period_ns(self) -> int:
         """The period."""
 
     def step(self, t_ns: int) -> None:
-        """Act at flight time t. Raises FlightEnded or ChannelError where the flight ends."""
+        """Act at flight time t. Raises FlightEnded or ChannelError if the flight ends."""
 
 
 class FlightLoop:
-    """Steps the due stations of each instant in simulated time, in the order of the list."""
+    """Steps the stations that are due at each instant, in the order of the list."""
 
     def __init__(self, stations: Sequence[Station]) -> None:
         self._stations = stations
@@ -63,7 +63,7 @@ class FlightLoop:
 
 
 class Topics:
-    """The samples of the topics, handed to the subscribers and, if `recorded`, kept."""
+    """The samples of the topics. Subscribers get them and, if `recorded`, they are kept."""
 
     def __init__(self, *, recorded: bool = True) -> None:
         self._recorded = recorded
@@ -83,18 +83,21 @@ class Topics:
     def subscribe(self, topic: str, take: Take, channels: Sequence[str] | None = None) -> None:
         """Hand each sample of a topic to `take`.
 
-        `channels` of the topic come in this order; None: every channel.
+        `channels` of the topic come in this order; None stands for all channels.
         """
         self._subscriptions[topic].append((channels, take))
 
     def is_taken(self, topic: str) -> bool:
-        """Return whether a topic is recorded or taken by a station."""
+        """Return whether a topic is recorded, or a station takes it."""
         return self._recorded or topic in self._subscriptions
 
     def publish(self, topic: str, sample: StampedVector, t_ns: int) -> None:
-        """Record a sample, then call the subscribers. Raises ChannelError for a missing channel."""
+        """Record a sample, then call the subscribers.
+
+        Raises ChannelError if a channel is missing.
+        """
         if self._recorded:
-            # first: an interrupt before the next line leaves a stamp without a row
+            # The stamp comes first: an interrupt before the next line leaves a stamp without a row.
             self._stamps[topic].append(sample.stamp_ns)
             self._rows[topic].append(sample.value)
         for channels, take in self._subscriptions.get(topic, ()):
@@ -126,10 +129,10 @@ def _or_refuse(take: Take) -> Take:
 
 
 class AircraftStation:
-    """The simulated aircraft: y, pose and truth with the last u held.
+    """The simulated aircraft: it publishes y, pose and truth, and holds the last u.
 
-    A lost sample of y is not published; a delayed sample keeps the stamp. `every_ns`: a period
-    above the period of the sensors.
+    A lost sample of y is not published, and a delayed sample keeps its stamp. `every_ns` is a
+    period above that of the sensors.
     """
 
     def __init__(
@@ -148,7 +151,7 @@ class AircraftStation:
 
     @cached_property
     def _simulator(self) -> Simulator:
-        """In trim at t = 0. Raises FlightEnded for a flight condition without trim."""
+        """The simulator, in trim at t = 0. Raises FlightEnded if there is no trim."""
         simulator = Simulator(self._parameters)
         self._topics.advertise("truth", simulator.truth_names)
         self._topics.advertise("pose", POSE)
@@ -167,7 +170,7 @@ class AircraftStation:
 
 
 class ReferenceStation:
-    """The reference model: y_m. A u_m acts from the next step on."""
+    """The reference model: it publishes y_m. A u_m acts from the next step on."""
 
     def __init__(
         self, parameters: ReferenceModelConfig, topics: Topics, every_ns: int | None = None
@@ -189,7 +192,7 @@ class ReferenceStation:
 
 
 class GuidanceStation:
-    """Guidance: u_m and the log of the steps."""
+    """Guidance: it publishes u_m and the log of its steps."""
 
     def __init__(self, guidance: Guidance, parameters: GuidanceConfig, topics: Topics) -> None:
         self._guidance = guidance
@@ -215,7 +218,7 @@ class GuidanceStation:
 
 
 class ControllerStation:
-    """The controller: u and the log of the ticks. `output` is from the last tick."""
+    """The controller: it publishes u and the log of its ticks. `output` is the last tick's."""
 
     def __init__(self, controller: Controller, topics: Topics) -> None:
         parameters = controller.parameters
