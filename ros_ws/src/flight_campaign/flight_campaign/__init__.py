@@ -2,5 +2,5 @@
 # SPDX-License-Identifier: Apache-2.0
 """Monte Carlo campaigns over thousands of uncertain aircraft.
 
-Control laws are tuned and compared, too.
+The package also tunes control laws and compares them.
 """

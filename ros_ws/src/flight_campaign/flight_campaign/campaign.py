@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Monte Carlo campaign: thousands of uncertain aircraft in one scenario, in chunks.
+"""A Monte Carlo campaign: thousands of uncertain aircraft fly one scenario, in chunks.
 
 An interrupted campaign can be resumed. The folder of a campaign holds its definition, a table for
-each completed chunk, and at the end its figures and its report.
+each chunk that is complete, and at the end its figures and its report.
 """
 
 import logging
@@ -43,14 +43,14 @@ if TYPE_CHECKING:
 
 DEFINITION = "campaign.json"
 CHUNKS = "chunks"
-OUT_OF_MEMORY = "RESOURCE_EXHAUSTED"  # in an error of JAX
+OUT_OF_MEMORY = "RESOURCE_EXHAUSTED"  # word in an error of JAX
 LOGGER = logging.getLogger(__name__)
-_FITTING: dict[str, int] = {}  # aircraft at once by definition, where a chunk did not fit
-MARGIN_AIRCRAFT = 200  # aircraft of a case, the first ones, whose stability is counted
+_FITTING: dict[str, int] = {}  # aircraft at once by definition, if a chunk did not fit
+MARGIN_AIRCRAFT = 200  # number of first aircraft of a case whose stability is counted
 
 
 def _permitted_units(scenario: Scenario, units: Mapping[str, float]) -> dict[str, float]:
-    """Return the units of the score by output. Raises ParameterError for an unfit unit."""
+    """Return the units of the score by output. Raises ParameterError if a unit does not fit."""
     outputs = scenario.controller.outputs
     stated_units = dict(units)
     for name, unit in stated_units.items():
@@ -91,10 +91,9 @@ def define(
     """Define a campaign over a scenario.
 
     If `wind` or `spread` is None, it is that of the scenario's `aircraft.uncertainty`. `units`
-    replaces units of the score by output, SI. If `chunk` is None, it is what is fast on the device,
-    or that of single flights.
-
-    Raises ParameterError if a campaign cannot fly the scenario.
+    replaces units of the score by output, SI. If `chunk` is None, it is the size that is fast on
+    the device, or that of single flights. Raises ParameterError if a campaign cannot fly the
+    scenario.
     """
     if sweep is not None:
         sweep.scaled(scenario.controller, 1.0)
@@ -141,7 +140,7 @@ def define(
 
 
 def _default_chunk(scenario: Scenario, aircraft: int) -> int:
-    """How many aircraft fly at once."""
+    """Return how many aircraft fly at once by default."""
     if aircraft < 1:
         return 1
     if single_flights.flies_alone(scenario):
@@ -152,10 +151,10 @@ def _default_chunk(scenario: Scenario, aircraft: int) -> int:
 
 
 def fly_chunk(text: str, job: Job, learner: MakeLearner | None = None) -> bytes:
-    """Fly a chunk of a campaign: its definition as JSON, the job -> its rows as Parquet.
+    """Fly a chunk of a campaign, and return its rows as Parquet.
 
-    Definition and job are the only inputs. `learner` makes the learner of a scenario. Raises
-    ParameterError for an aircraft that does not fit into memory.
+    `text` is the definition as JSON; it and the job are the only inputs. `learner` makes the
+    learner of a scenario. Raises ParameterError if an aircraft does not fit into memory.
     """
     definition = Definition.model_validate_json(text)
     if single_flights.flies_alone(definition.scenario()):
@@ -166,7 +165,7 @@ def fly_chunk(text: str, job: Job, learner: MakeLearner | None = None) -> bytes:
 
 
 def fly_chunk_figures(text: str, job: Job) -> Chunk:
-    """Fly a chunk of a campaign, in parts where the memory is too small for a chunk at once."""
+    """Fly a chunk of a campaign, in parts if it does not fit into memory at once."""
     definition = Definition.model_validate_json(text)
     case, chunk = job
     first = chunk * definition.chunk
@@ -174,13 +173,13 @@ def fly_chunk_figures(text: str, job: Job) -> Chunk:
     size = _FITTING.get(text, definition.chunk)
     parts: list[Chunk] = []
     while first < end:
-        # The last part has the size of the others, so that nothing is compiled again; surplus
+        # The last part is as large as the others, so that nothing is compiled again. Surplus
         # aircraft are dropped.
         count = min(size, end - first)
         try:
             parts.append(_fly_at_once(text, case, first, count, size))
         except (MemoryError, RuntimeError) as error:
-            # RuntimeError: of JAX.
+            # JAX raises a RuntimeError.
             if isinstance(error, RuntimeError) and OUT_OF_MEMORY not in str(error):
                 raise
             if size == 1:
@@ -197,14 +196,14 @@ def fly_chunk_figures(text: str, job: Job) -> Chunk:
 
 
 def _fly_at_once(text: str, case: int, first: int, count: int, size: int) -> Chunk:
-    """Fly the first `count` of the `size` aircraft from number `first`, all at once."""
+    """Fly `count` of the `size` aircraft from number `first` on, all at once."""
     from flight_campaign.batch import batch  # noqa: PLC0415 - JAX, which the command needs only for flights
     from flight_campaign.batch.device import turn  # noqa: PLC0415 - as above
     from flight_campaign.drawn_fleet import drawn_fleet  # noqa: PLC0415 - as above
 
     definition = Definition.model_validate_json(text)
     scenario, course, vehicle, law = _prepare(text, case)
-    fleet_of_chunk = drawn_fleet(definition, scenario, first, size)  # while the chunk before flies
+    fleet_of_chunk = drawn_fleet(definition, scenario, first, size)  # while another chunk flies
     with turn():
         fleet, equipped = fleet_of_chunk.on_device(course, vehicle)
         flight_result = batch.fly(fleet, equipped, course, law.control_law, law.params)
@@ -224,7 +223,7 @@ def _fly_at_once(text: str, case: int, first: int, count: int, size: int) -> Chu
 
 
 class _Shared(NamedTuple):
-    """Data that all chunks of a case share."""
+    """What all chunks of a case share."""
 
     scenario: Scenario
     course: Course
@@ -234,7 +233,7 @@ class _Shared(NamedTuple):
 
 @lru_cache(maxsize=8)
 def _prepare(text: str, case: int) -> _Shared:
-    """Prepare the data that all chunks of a case share."""
+    """Prepare what all chunks of a case share."""
     from flight_campaign.batch import batch  # noqa: PLC0415 - as above
 
     scenario = Definition.model_validate_json(text).scenario(case)
@@ -265,7 +264,7 @@ class MonteCarlo:
 
     @classmethod
     def resume(cls, folder: Path) -> "MonteCarlo":
-        """Load the campaign of a folder. Raises ParameterError for a folder without one."""
+        """Load the campaign of a folder. Raises ParameterError if the folder has none."""
         try:
             definition = Definition.model_validate_json(
                 (folder / DEFINITION).read_text(encoding="utf-8")
@@ -279,11 +278,11 @@ class MonteCarlo:
         return cls(folder, definition)
 
     def missing(self) -> list[Job]:
-        """Return the chunks without a file."""
+        """Return the chunks that have no file yet."""
         return [job for job in self.definition.jobs() if not self._path(job).exists()]
 
     def fly(self, engine: Engine, learner: MakeLearner | None = None) -> Iterator[int]:
-        """Fly the missing chunks; yields the number of flights of each completed one.
+        """Fly the missing chunks, and yield the number of flights of each one that is complete.
 
         `learner` makes the learner of a scenario.
         """
@@ -294,9 +293,9 @@ class MonteCarlo:
             yield self.definition.size(job)
 
     def tally(self, case: int) -> Tally:
-        """Statistics of a case, summed in the order of the chunks.
+        """Return the statistics of a case, summed in the order of the chunks.
 
-        Raises ParameterError for a damaged file.
+        Raises ParameterError if a file is damaged.
         """
         total = Tally()
         for job in self._flown():
@@ -305,9 +304,9 @@ class MonteCarlo:
         return total
 
     def rows(self, case: int | None = None) -> "pl.LazyFrame":
-        """Return the table of the completed chunks of a case or of all, by case, then number.
+        """Return the table of the completed chunks of a case, or of all cases, by case and number.
 
-        The module `rows` lists the columns.
+        The module `flight_campaign.rows` says which columns it has.
         """
         import polars as pl  # noqa: PLC0415 - some tenths of a second
 
@@ -321,9 +320,9 @@ class MonteCarlo:
             self.rows().sink_parquet(stream)
 
     def margins(self, case: int) -> LoopMargins | None:
-        """Margins of the nominal aircraft and the worst found in the box of a case.
+        """Return the margins of the nominal aircraft, and the worst found in the box of a case.
 
-        None without a linear loop.
+        Returns None if there is no linear loop.
         """
         definition = self.definition
         scenario = self.definition.scenario(case)
@@ -341,7 +340,8 @@ class MonteCarlo:
     def guarantee(self, case: int) -> Guarantee | None:
         """Return the guarantee that was computed for the loop of a case.
 
-        None without one, and where lags or delays are drawn, which the guarantee takes as exact.
+        Returns None if there is none, or if lags or delays are drawn, which a guarantee takes as
+        exact.
         """
         definition = self.definition
         if any(equipment.is_of_loop(entry) for entry in definition.entries):
@@ -360,7 +360,7 @@ class MonteCarlo:
         return [job for job in self.definition.jobs() if self._path(job).exists()]
 
     def influence(self, case: int, worst: int) -> dict[str, Any]:
-        """Rank correlations of the drawn entries with the score of a case.
+        """Return the rank correlations of the drawn entries with the score of a case.
 
         `worst` is the number of its worst aircraft.
         """

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The campaign report: tables, then histograms of the errors, and the score over the swept gain."""
+"""The report of a campaign: tables, histograms of the errors, and the score over the swept gain."""
 
 import json
 import shlex
@@ -53,7 +53,7 @@ from flight_core.files import display_path, write_file, writing
 from flight_core.units import ANGULAR_RATE, SPEED
 from flight_core.vectors import FloatArray
 
-COARSE = PER_DECADE // 50  # bins of the statistics in one bin of a figure, 5 % wide
+COARSE = PER_DECADE // 50  # bins of the statistics in one bin of a figure, which is 5 % wide
 WIND_EFFECTS: dict[WindEffect, str] = {
     "air_relative": "by each aircraft's own A",
     "published": "that of the airframe",
@@ -61,8 +61,8 @@ WIND_EFFECTS: dict[WindEffect, str] = {
 SPREAD = {"median": 0.5, "95 %": 0.95, "99 %": 0.99}
 ENTRIES_SHOWN = 6
 STATED = ("aircraft", "uncertainty", "entries", "distribution", "score_units", "wind", "seed")
-"""Keys of the definition in the summary."""
-RERUN = 3  # scenarios are written for so many of the worst aircraft of a case
+"""Keys of the definition that the summary repeats."""
+RERUN = 3  # number of worst aircraft of a case for which scenarios are written
 FIGURE_HEADINGS = ("mean", *SPREAD, "worst")
 OF_LEARNER = {
     FIRST_MODEL: "first model (s)",
@@ -74,20 +74,21 @@ OF_LEARNER = {
 OVERVIEW_LEGEND = (
     "phase and gain margin, sensitivity: of the worst input, the others closed; disk and delay "
     "margin: of all inputs at once."
-    " Nominal aircraft, in parentheses the worst found by a search over the box of A and B; lags "
-    "and delay of the controller's section. Uniform samples miss the corners of the box: "
-    "distribution corners flies these, rise-di gains --check --guarantee bounds every aircraft"
+    " Nominal aircraft, and in parentheses the worst found by a search over the box of A and B; "
+    "lags and delay are those of the controller's section. Uniform samples miss the corners of the "
+    "box: the distribution corners flies these, and rise-di gains --check --guarantee bounds every "
+    "aircraft"
 )
 
 
 GUARANTEE_LEGEND = (
-    "largest deviation of each entry of A and B, u in time, no saturation; computed before by "
-    "rise-di gains --check --guarantee for this loop"
+    "largest deviation of each entry of A and B, with u in time and no saturation, as "
+    "rise-di gains --check --guarantee has computed for this loop"
 )
 
 
 LEARNER_LEGEND = (
-    "first model: when it flew; models refused: by the learner, which tells why in the flight, "
+    "first model: when it flew; models refused: by the learner, which says why during the flight, "
     "or by the controller; fallbacks:"
     " to the law of the start, in all outputs or in some. The margins above are those of the "
     "law of the start"
@@ -97,7 +98,7 @@ LEARNER_LEGEND = (
 def write_results(campaign: MonteCarlo) -> tuple[dict[str, Any], MetricTable]:
     """Write the summary, the report and the scenarios of the worst aircraft.
 
-    Returns the summary and the overview. Raises ParameterError.
+    Return the summary and the overview. Raises ParameterError.
     """
     definition = campaign.definition
     tallies = [campaign.tally(case) for case in range(definition.cases)]
@@ -126,7 +127,7 @@ def write_results(campaign: MonteCarlo) -> tuple[dict[str, Any], MetricTable]:
 
 
 def _write_worst(campaign: MonteCarlo, case: int, tally: Tally) -> list[dict[str, Any]]:
-    """Write the scenarios of the worst aircraft; returns them with the command that flies each."""
+    """Write the scenarios of the worst aircraft; return them with the commands that fly them."""
     definition = campaign.definition
     again = []
     for aircraft in tally.worst[:RERUN]:
@@ -139,9 +140,9 @@ def _write_worst(campaign: MonteCarlo, case: int, tally: Tally) -> list[dict[str
 
 
 def _influence(campaign: MonteCarlo, case: int, tally: Tally) -> dict[str, Any]:
-    """Rank correlations of a case.
+    """Return the rank correlations of a case.
 
-    Writes the airframe and the scenario of the worst corner where there is one.
+    If there is a worst corner, write its airframe and its scenario.
     """
     definition = campaign.definition
     ranked = campaign.influence(case, tally.worst[0].number)
@@ -169,7 +170,7 @@ def _influence(campaign: MonteCarlo, case: int, tally: Tally) -> dict[str, Any]:
         ),
     )
     learn = getattr(scenario.controller, "learn", None)
-    # The learner begins with the airframe, not with the corner.
+    # The learner begins with the airframe and not with the corner.
     if learn is not None and (learn.prior is None or learn.prior.file is None):
         scenario = scenario.vary(
             controller={"learn": {"prior": {"file": scenario.aircraft.airframe}}}
@@ -182,7 +183,7 @@ def _influence(campaign: MonteCarlo, case: int, tally: Tally) -> dict[str, Any]:
 
 
 def _path(campaign: MonteCarlo, case: int, word: str) -> Path:
-    """Return the file of a scenario of a case."""
+    """Return the path for a scenario of a case."""
     definition = campaign.definition
     suffix = "" if definition.sweep is None else f"_{definition.factor(case):g}"
     return campaign.folder / f"{definition.name}{suffix}_{word}.yaml"
@@ -215,7 +216,7 @@ def write_page(
         f" Score: {score_meaning(scenario, definition.score_units)}; loss of track: a score "
         f"above {LOSS_OF_TRACK_SCORE:g}."
     )
-    # Tables of all cases, then of each case.
+    # First come the tables of all cases, then those of each case.
     tables = [overview(definition, tallies, margins), _ends(labels, cases)]
     if any(case["guarantee"] for case in cases):
         tables.append(_guarantees(labels, cases))
@@ -275,7 +276,7 @@ def _guarantees(labels: Sequence[str], cases: Sequence[Mapping[str, Any]]) -> Me
 def overview(
     definition: Definition, tallies: Sequence[Tally], margins: Sequence[LoopMargins | None]
 ) -> MetricTable:
-    """Scores, lost aircraft and margins, a column for each case."""
+    """Tabulate scores, lost aircraft and margins, with a column for each case."""
     columns = []
     for tally, loop_margins in zip(tallies, margins, strict=True):
         score = tally.figures.get("score", FigureStatistics())
@@ -300,7 +301,7 @@ def overview(
 
 
 def _spread_of_entries(definition: Definition) -> str:
-    """Uncertainties by entry, and a distribution beside the uniform."""
+    """Write the uncertainties by entry, and the distribution unless it is uniform."""
     parts = [f"{name} ±{100 * part:g} %" for name, part in definition.entries.items()]
     if definition.distribution != "uniform":
         parts.append(definition.distribution)
@@ -372,7 +373,10 @@ def _figures(label: str, tally: Tally, units: Mapping[str, DisplayUnit]) -> Metr
 
 
 def figure_rows(tally: Tally, units: Mapping[str, DisplayUnit]) -> list[list[str]]:
-    """Return a row for each figure of a tally: label with unit, then what FIGURE_HEADINGS name."""
+    """Return a row for each figure of a tally.
+
+    It has the label with its unit, then the figures that FIGURE_HEADINGS names.
+    """
     rows = []
     for name, figure in tally.figures.items():
         label, factor = _label(name, units)
@@ -465,7 +469,7 @@ def _spread(
 
 
 def _density(figure: FigureStatistics) -> tuple[FloatArray, FloatArray]:
-    """Centres of coarse bins and the share of the flights in each."""
+    """Return the centres of coarse bins, and the share of the flights in each."""
     if not figure.count:
         return np.zeros(0), np.zeros(0)
     places = np.array(list(figure.bins)) // COARSE

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The definition of a campaign: all inputs of its figures."""
+"""The definition of a campaign, which has all inputs of its figures."""
 
 from collections.abc import Iterator
 from itertools import product
@@ -25,7 +25,7 @@ from rise_di_controller.params import ControllerConfig
 
 
 def swept_parameters(controller: ControllerConfig) -> list[str]:
-    """Parameters that a sweep may multiply: the numbers of the law itself, and input_scale."""
+    """Return the parameters that a sweep may multiply: numbers of the law itself, input_scale."""
     names = [
         name for name in type(controller).model_fields if name not in ControllerConfig.model_fields
     ]
@@ -34,12 +34,14 @@ def swept_parameters(controller: ControllerConfig) -> list[str]:
 
 
 class Sweep(Config):
-    """Factors of one parameter of the controller, or of its value in a channel.
+    """Factors on one parameter of the controller, or on its value in one channel.
 
     Every aircraft flies with each of them.
     """
 
-    parameter: str = Field(description="its name, as beta, or with a channel of y or u, as beta[V]")
+    parameter: str = Field(
+        description="its name, as in beta, or with a channel of y or u, as in beta[V]"
+    )
     factors: Positives
 
     @property
@@ -50,8 +52,8 @@ class Sweep(Config):
     def scaled(self, controller: ControllerConfig, factor: float) -> float | tuple[float, ...]:
         """Return the parameter times a factor; if a channel is named, only its value changes.
 
-        A channel of u stands for the channel of y that it is paired with. Raises ParameterError for
-        another parameter or channel.
+        A channel of u stands for the channel of y with which it is paired. Raises ParameterError if
+        the parameter or the channel is another one.
         """
         swept = swept_parameters(controller)
         require(
@@ -66,7 +68,7 @@ class Sweep(Config):
                 return tuple(factor * number for number in value)
             return factor * float(value)
         m = len(controller.outputs)
-        # k_d of (22) has none for the last.
+        # k_d of (22) has none for the last channel.
         by_channel = isinstance(value, tuple) and len(value) in (m - 1, m)
         require(
             by_channel, "sweep", self.parameter, f"{self.name}: it does not have a value a channel"
@@ -88,29 +90,31 @@ class Sweep(Config):
 class Definition(Config):
     """All inputs of a campaign's figures.
 
-    The version of the stack and the arithmetic of the CPU are not among them.
+    Not among them are the version of the stack and the arithmetic of the CPU.
     """
 
-    name: str  # of the scenario
-    sections: dict[str, dict[str, object]]  # of the scenario, every parameter
+    name: str  # name of the scenario
+    sections: dict[str, dict[str, object]]  # sections of the scenario, with every parameter
     aircraft: int = Field(ge=1, le=2**32, description="how many aircraft fly")
     uncertainty: float = Field(
-        ge=0, lt=1, description="the largest part by which an entry of A and of B differs"
+        ge=0, lt=1, description="the largest relative deviation of an entry of A and of B"
     )
     wind: WindEffect = Field(
-        description="the effect of wind: by each aircraft's own A, or that of the airframe"
+        description="whose A the wind acts through: that of each aircraft, or of the airframe"
     )
     seed: int = Field(ge=0, lt=2**63, description="the seed of the aircraft")
-    chunk: int = Field(ge=1, le=1_000_000, description="how many of them fly at once")
+    chunk: int = Field(ge=1, le=1_000_000, description="how many aircraft fly at once")
     sweep: Sweep | None = None
     entries: dict[str, Annotated[float, Field(ge=0, lt=1)]] = Field(
-        default={}, description="the largest part of entries with one of their own, by name"
+        default={},
+        description="the largest relative deviation of entries that have their own, by name",
     )
     distribution: Distribution = Field(
-        default="uniform", description="of the parts, within the largest"
+        default="uniform", description="how the deviations are distributed, up to the largest"
     )
     score_units: dict[str, Positive] = Field(
-        default={}, description="unit of an rms error in the score by output, SI, if its own"
+        default={},
+        description="units of rms errors in the score by output, SI, that differ from the usual",
     )
 
     @property
@@ -119,7 +123,7 @@ class Definition(Config):
         return Spread(equipment.matrix_entries(self.entries), self.distribution)
 
     def drawn_equipment(self, scenario: Scenario, first: int, count: int) -> dict[str, FloatArray]:
-        """Lags, noise and delays of aircraft of a case, as `equipment.drawn`."""
+        """Draw lags, noise and delays of aircraft of a case, as `equipment.drawn` does."""
         return equipment.drawn(
             scenario, Spread(self.entries, self.distribution), self.seed, first, count
         )

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The drawn aircraft of a campaign: on the host, then as arrays of the device."""
+"""The drawn aircraft of a campaign, on the host and then as arrays on the device."""
 
 from typing import NamedTuple
 
@@ -18,12 +18,12 @@ from flight_core.vectors import FloatArray
 
 
 class DrawnFleet(NamedTuple):
-    """Aircraft of a campaign on the host: the device may fly others meanwhile."""
+    """Aircraft of a campaign on the host. Meanwhile the device may fly others."""
 
     scenario: Scenario
     A: FloatArray  # (N, n, n)
     B: FloatArray  # (N, n, m)
-    gust_directions: FloatArray  # (N, n, G), of `gust_directions`
+    gust_directions: FloatArray  # (N, n, G), see `gust_directions`
     equipment: dict[str, FloatArray]  # by name, (N,) each
 
     def on_device(self, course: Course, vehicle: Vehicle) -> tuple[FleetMatrices, Vehicle]:

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Engines for the chunks of a campaign, with equal results.
+"""Engines that compute the chunks of a campaign, with equal results.
 
-They are threads of this process, or dask workers.
+They are threads of this process, or workers of dask.
 """
 
 import logging
@@ -18,31 +18,32 @@ from flight_core.parameters import ParameterError
 
 CONNECT = 10.0
 RECONNECT = 60.0
-"""s to wait for a scheduler at the start, and after its loss."""
+"""s to wait for a scheduler at the start, and after it was lost."""
 
 LOST_WORKER_TIMEOUT = {"distributed.deploy.lost-worker-timeout": "10 minutes"}
-"""After the default, 15 s, a cluster gives up a dead worker that starts again. On a busy host a
-start may take longer, and the campaign would wait for ever for a cluster without workers."""
+"""By default a cluster gives up a dead worker after 15 s, even if it is just starting again. On a
+busy host a start may take longer, and the campaign would wait for ever for a cluster without
+workers."""
 
-AHEAD = 2  # queued chunks a worker: enough to keep it busy, few enough for constant memory
+AHEAD = 2  # queued chunks per worker: enough to keep it busy, and few enough to save memory
 
 Job = tuple[int, ...]
 Work = Callable[[Job], Any]
 
 
 Engine = Callable[[Work, Iterable[Job]], Iterator[tuple[Job, Any]]]
-"""Runs jobs in any order: each job with its result, in the order of completion."""
+"""Runs jobs, and yields each with its result in the order in which they are complete."""
 
 
 Devices = Sequence[Mapping[str, str]]
-"""Environments of processes that see one device each."""
+"""Environments of processes, each of which sees one device."""
 
 
 def require_jax(*, shared: bool = False) -> None:
-    """Raise ParameterError where JAX is not installed or finds no device.
+    """Raise ParameterError if JAX is not installed or finds no device.
 
-    As with JAX_PLATFORMS of another host. With `shared` the process leaves the memory of its device
-    to other processes.
+    It finds none, for example, with the JAX_PLATFORMS of another host. If `shared`, the process
+    leaves the memory of its device to other processes.
     """
     require_package("jax")
     if shared:
@@ -60,9 +61,9 @@ def require_jax(*, shared: bool = False) -> None:
 
 
 def threads(workers: int | None = None) -> Engine:
-    """Threads of this process, None: as many as keep the device busy.
+    """Return an engine of threads of this process; None stands for as many as keep the device busy.
 
-    The loop is compiled once and releases the interpreter lock, so threads run in parallel.
+    The loop is compiled once and releases the interpreter lock, so that threads run in parallel.
     """
 
     def fly(work: Work, jobs: Iterable[Job]) -> Iterator[tuple[Job, Any]]:
@@ -95,9 +96,9 @@ def dask(
 ) -> Engine:
     """Return an engine that flies in processes of this machine, or on the workers of a scheduler.
 
-    The chunks of a dead worker run again. A scheduler that comes back within RECONNECT gets its
-    lost chunks again. On a host with GPUs, each process has a GPU of its own, unless `on_devices`
-    is False: single flights need cores.
+    The chunks of a dead worker run again. If a scheduler comes back within RECONNECT, it gets its
+    lost chunks again. On a host with GPUs each process has a GPU of its own, unless `on_devices` is
+    False, because single flights need cores.
     """
 
     def fly(work: Work, jobs: Iterable[Job]) -> Iterator[tuple[Job, Any]]:
@@ -108,7 +109,7 @@ def dask(
         devices = _separate_devices() if on_devices and scheduler is None else []
         count = workers or len(devices) or os.cpu_count() or 1
         patience = CONNECT
-        # These loggers write the loss of a peer as tracebacks.
+        # These loggers would write tracebacks if a peer is lost.
         for part in ("", ".client", ".nanny", ".scheduler", ".worker"):
             logging.getLogger(f"distributed{part}").setLevel(logging.CRITICAL)
         lost_jobs: list[Job] = []
@@ -142,7 +143,7 @@ def _connected(
 ) -> tuple[Any, int]:
     """Connect to the scheduler, or to `count` processes of this machine.
 
-    Returns the client, and the number of threads that it has.
+    Return the client, and the number of threads that it has.
     """
     from distributed import Client  # noqa: PLC0415 - half a second
 
@@ -154,7 +155,7 @@ def _connected(
         workers = client.scheduler_info()["workers"].values()
         return client, sum(worker["nthreads"] for worker in workers)
     except (OSError, ValueError) as error:
-        # ValueError: no address at all.
+        # A ValueError means that it is no address at all.
         if scheduler is None:
             raise ParameterError(
                 f"--engine dask: its workers did not start on this host ({error})"
@@ -170,7 +171,9 @@ def _results(
     from distributed import as_completed  # noqa: PLC0415 - half a second
 
     for job in first:
-        underway[client.submit(work, job, pure=False)] = job  # never a cached result
+        underway[client.submit(work, job, pure=False)] = (
+            job  # pure=False: never take a cached result
+        )
     finished = as_completed(list(underway))
     for future in finished:
         result = future.result()
@@ -211,13 +214,13 @@ def _local_cluster(workers: int, devices: Devices) -> Iterator[Any]:
         cluster = LocalCluster(
             n_workers=workers,
             threads_per_worker=THREADS if devices else 1,
-            dashboard_address=":0",  # a port that no other cluster of the host has
-            silence_logs=logging.CRITICAL,  # of workers that end in a chunk, as after Ctrl-C
+            dashboard_address=":0",  # any free port, which no other cluster of the host has
+            silence_logs=logging.CRITICAL,  # about workers that end in a chunk, as after Ctrl-C
         )
         try:
             yield cluster
         finally:
-            # A worker that is just starting again cannot be joined yet; its outcome is no outcome
-            # of the campaign.
+            # A worker that is just starting again cannot be joined yet. What becomes of it does not
+            # matter to the campaign.
             with suppress(TimeoutError, AssertionError):
                 cluster.close()

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Lags of the actuators, noise of the sensors and delay of u of the aircraft of a campaign.
+"""The lags of the actuators, the noise of the sensors and the delay of u of a campaign's aircraft.
 
-They are drawn as the entries of A and B. An entry is lag[INPUT], a time constant in s,
-noise[OUTPUT], a standard deviation in SI, or delay, s; lag and noise alone mean all. The entry
-delay is the largest delay of u beyond that of the scenario, drawn in whole periods of the
-controller.
+They are drawn like the entries of A and B. An entry is lag[INPUT], a time constant in s,
+noise[OUTPUT], a standard deviation in SI, or delay, s. lag and noise without a channel mean all of
+them. The entry delay is the largest delay of u beyond that of the scenario, and is drawn in whole
+periods of the controller.
 """
 
 import math
@@ -25,17 +25,17 @@ KINDS = ("lag", "noise", DELAY)
 
 
 def is_of_equipment(entry: str) -> bool:
-    """Return whether an entry is a lag, a noise or the delay, not an entry of A or B."""
+    """Return whether an entry is a lag, a noise or the delay, and not an entry of A or B."""
     return entry.partition("[")[0] in KINDS
 
 
 def is_of_loop(entry: str) -> bool:
-    """Return whether an entry is a lag or the delay, which the linear loop has."""
+    """Return whether an entry is a lag or the delay, which belong to the linear loop."""
     return is_of_equipment(entry) and not entry.startswith("noise")
 
 
 def matrix_entries(entries: Mapping[str, float]) -> dict[str, float]:
-    """Return the entries of A and B alone."""
+    """Return only the entries of A and B."""
     return {name: part for name, part in entries.items() if not is_of_equipment(name)}
 
 
@@ -58,10 +58,10 @@ def published(scenario: Scenario) -> dict[str, float]:
 
 
 def expanded(entries: Mapping[str, float], scenario: Scenario) -> dict[str, float]:
-    """Replace the entries of lag and noise by one for each channel.
+    """Replace the entries lag and noise by one for each channel.
 
     A channel's own entry takes precedence, and the delay is in whole periods. Raises ParameterError
-    for an unknown entry.
+    if an entry is unknown.
     """
     entries_of_scenario = published(scenario)
     every = dict[str, float]()
@@ -90,11 +90,11 @@ def expanded(entries: Mapping[str, float], scenario: Scenario) -> dict[str, floa
 def drawn(
     scenario: Scenario, spread: Spread, seed: int, first: int, count: int
 ) -> dict[str, FloatArray]:
-    """Drawn lags, noise and delays of aircraft of a seed by entry, (count,) each.
+    """Draw lags, noise and delays of aircraft of a seed, by entry, (count,) each.
 
     The aircraft are first, first + 1, ... A lag and a noise are multiplied by 1 + d, as an entry of
-    A. A delay is (1 + d) / 2 of the largest one, in whole periods. A value depends on seed and
-    number alone. The entries of `spread` are those of `expanded`.
+    A is. A delay is (1 + d) / 2 of the largest one, in whole periods. A value depends on nothing
+    but seed and number. The entries of `spread` are those of `expanded`.
     """
     published_values = published(scenario)
     rate = scenario.controller.rate
@@ -114,7 +114,7 @@ def drawn(
 
 
 def references(scenario: Scenario, entries: Mapping[str, float]) -> dict[str, float]:
-    """Values of which a deviation is a part.
+    """Return the values to which a deviation is relative.
 
     They are `published`, and half of the largest delay, which is drawn within +-100 %.
     """

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Which drawn entries of A and B decide the score of a campaign.
+"""Find which drawn entries of A and B decide the score of a campaign.
 
-They are told by rank correlations, and the corner that these point to.
+Rank correlations show them, and the corner of the box to which they point.
 """
 
 import math
@@ -16,17 +16,18 @@ from flight_campaign.rows import entry_names
 if TYPE_CHECKING:
     import polars as pl
 
-RANKED = 10_000  # aircraft of a case, the first ones, that are ranked: a standard error of 0.01
-LEAST_RANKED = 10  # fewer aircraft show chance alone
-CHANCE = 0.05  # part of the campaigns in which an entry without effect exceeds the level of chance
+RANKED = 10_000  # first aircraft of a case that are ranked, for a standard error of 0.01
+LEAST_RANKED = 10  # fewer aircraft show nothing but chance
+CHANCE = 0.05  # share of campaigns in which an entry without effect exceeds the level of chance
 
 
 def rank_correlations(table: "pl.DataFrame", published: Mapping[str, float]) -> dict[str, float]:
-    """Rank correlation (Spearman) of the size of each entry with the score.
+    """Return the rank correlation (Spearman) of the size of each entry with the score.
 
-    The size is over its published value; the strongest comes first. +1: the score grows (the
-    aircraft flies worse) with the size of the entry. A diverged aircraft has the worst rank. Empty
-    for fewer than LEAST_RANKED aircraft, or equal ones.
+    The size is relative to the published value, and the strongest correlation comes first. +1 means
+    that the score grows, and the aircraft flies worse, with the size of the entry. A diverged
+    aircraft has the worst rank. The result is empty if there are fewer than LEAST_RANKED aircraft,
+    or if all are equal.
     """
     from scipy.stats import rankdata  # noqa: PLC0415 - half a second, only for this
 
@@ -43,11 +44,11 @@ def rank_correlations(table: "pl.DataFrame", published: Mapping[str, float]) -> 
 
 
 def chance_level(aircraft: int, entries: int) -> float:
-    """Return the rank correlation that none of so many entries without effect exceeds.
+    """Return the rank correlation that no entry without effect exceeds in 95 % of campaigns.
 
-    This holds in 95 % of campaigns. Of independent values it has mean 0 and variance 1 / (N - 1),
-    normal for large N. Source: Kendall, Rank Correlation Methods, 1948. The level counts the number
-    of entries (Bonferroni).
+    For independent values it has mean 0 and variance 1 / (N - 1), and is normal for large N.
+    Source: Kendall, Rank Correlation Methods, 1948. The level allows for the number of entries
+    (Bonferroni).
     """
     from scipy.stats import norm  # noqa: PLC0415 - as above
 
@@ -60,12 +61,12 @@ def influence(
     published: Mapping[str, float],
     uncertainty: Mapping[str, float],
 ) -> dict[str, Any]:
-    """Rank correlations of a case as figures of a file.
+    """Return the rank correlations of a case as figures for a file.
 
-    They are of `table`, beside the entries of the row `worst`, the worst aircraft. `uncertainty` is
-    the largest part by entry. "worst_aircraft" and "worst_corner" are parts of the published entry:
-    of the worst aircraft, and the limit of the uncertainty on the side of the higher score, 0 for
-    an entry within chance.
+    They are those of `table`, with the entries of the row `worst`, the worst aircraft.
+    `uncertainty` is the largest deviation by entry. "worst_aircraft" and "worst_corner" are
+    relative to the published entry: the deviation of the worst aircraft, and the limit of the
+    uncertainty on the side of the higher score, which is 0 if the entry is within chance.
     """
     correlations = rank_correlations(table, published)
     level = chance_level(table.height, len(correlations)) if correlations else None

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A campaign as a table: a row an aircraft with its figures, its outcome, and the drawn entries."""
+"""A campaign as a table, whose rows have an aircraft's figures, outcome and drawn entries."""
 
 import io
 from collections.abc import Sequence
@@ -12,26 +12,26 @@ from flight_campaign.equipment import is_of_equipment
 from flight_campaign.statistics import Tally, lost_track
 from flight_core.vectors import FloatArray
 
-if TYPE_CHECKING:  # it loads in some tenths of a second
+if TYPE_CHECKING:  # it takes some tenths of a second to load
     import polars as pl
 
 KEYS = ("seed", "number", "factor", "diverged", "lost")
-"""Columns of every table; "factor" is that of the sweep, 1 without one. Figures follow, then the
-drawn entries."""
+"""Columns of every table. "factor" is that of the sweep, or 1 without one. The figures follow, then
+the drawn entries."""
 
 
 class Chunk(NamedTuple):
     """Results of the aircraft of a chunk."""
 
-    first: int  # number of the first
+    first: int  # number of the first aircraft
     diverged: FloatArray  # (N,)
     figures: dict[str, FloatArray]  # (N,) each, by name
-    # (N,) each, by name, of `uncertainty.drawn_entries` and `equipment.drawn`
+    # (N,) each, by name, see `uncertainty.drawn_entries` and `equipment.drawn`
     entries: dict[str, FloatArray]
 
 
 def join_chunks(parts: Sequence[Chunk]) -> Chunk:
-    """Consecutive parts of a chunk as one."""
+    """Join consecutive parts of a chunk."""
     first, *others = parts
     if not others:
         return first
@@ -46,7 +46,7 @@ def join_chunks(parts: Sequence[Chunk]) -> Chunk:
 def encode_chunk(chunk: Chunk, seed: int, factor: float) -> bytes:
     """Encode the table of a chunk as Parquet (zstd), SI.
 
-    Figures of a diverged aircraft, and NaN, are null.
+    Figures of a diverged aircraft are null, and so is NaN.
     """
     import polars as pl  # noqa: PLC0415
 
@@ -72,14 +72,14 @@ def encode_chunk(chunk: Chunk, seed: int, factor: float) -> bytes:
 
 
 def entry_names(table: "pl.DataFrame") -> list[str]:
-    """Return the columns with drawn entries: of A and B, lags, noise and the delay of u."""
+    """Return the columns with drawn entries: A and B, lags, noise and the delay of u."""
     return [
         name for name in table.columns if name.startswith(("A[", "B[")) or is_of_equipment(name)
     ]
 
 
 def tally_of(table: "pl.DataFrame") -> Tally:
-    """Statistics of the rows of a chunk."""
+    """Return the statistics of the rows of a chunk."""
     figures = [name for name in table.columns if name not in {*KEYS, *entry_names(table)}]
     columns = {name: table[name].to_numpy() for name in figures}
     return Tally.from_flights(table["number"][0], table["diverged"].to_numpy(), columns)

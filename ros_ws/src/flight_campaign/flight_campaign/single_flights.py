@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Flights of a campaign one by one, as those of `rise-di fly --in-process`.
+"""Flights of a campaign one by one, like those of `rise-di fly --in-process`.
 
-Aircraft that learn, and aircraft on a route.
+Aircraft that learn, and aircraft on a route, fly this way.
 """
 
 import math
@@ -29,24 +29,25 @@ from flight_guidance.params import GuidanceConfig
 from rise_di_controller.learning.proposals import UNVERIFIED, Event, EventKind
 
 MakeLearner = Callable[[Scenario], Learn | None]
-"""Makes the learner of a scenario, as `flight_design.learning.scenario_learner.learner`. Raises
-ParameterError."""
+"""Makes the learner of a scenario, as `flight_design.learning.scenario_learner.learner` does.
+Raises ParameterError."""
 
 CHUNK = 4
-"""Aircraft of a chunk: the progress moves every minute, and few leave no core idle at the end."""
+"""Aircraft in a chunk. With so few, the progress moves every minute and no core idles at the end.
+"""
 
 
 class LearningOutcome(NamedTuple):
-    """Outcomes of the identifications of a flight."""
+    """What became of the identifications of a flight."""
 
     first_model: float  # s, when the first model flew; NaN without one
-    models: int  # proposals that flew, without the rough model
-    refused: int  # identifications refused by the learner, and proposals refused by the controller
-    fallbacks: int  # to the law of the start, in all channels or in some
+    models: int  # proposals that flew, not counting the rough model
+    refused: int  # identifications that the learner refused, and proposals that the controller did
+    fallbacks: int  # how often the law of the start took over, in all channels or in some
 
 
 def learned(tape: Tape, events: Sequence[Event]) -> LearningOutcome:
-    """Outcomes of the identifications of a flight, from its tape and its events."""
+    """Return what became of the identifications of a flight, from its tape and its events."""
     proposed = tape["learned"]["proposed"] if "learned" in tape else np.ones(0)
     models = [
         event.stamp_ns
@@ -67,7 +68,7 @@ def flies_alone(scenario: Scenario) -> bool:
 
 
 def require_single_flights(scenario: Scenario) -> None:
-    """Raise ParameterError for a scenario of single flights beyond a campaign."""
+    """Raise ParameterError if a campaign of single flights cannot fly a scenario."""
     aircraft = scenario.aircraft
     require(
         not aircraft.is_jsbsim,
@@ -84,14 +85,14 @@ def require_single_flights(scenario: Scenario) -> None:
 
 
 class SingleFlight(NamedTuple):
-    """A flight of a campaign."""
+    """The result of a flight of a campaign."""
 
     diverged: bool
     figures: dict[str, float]  # SI, by name
 
 
 def fly_single(scenario: Scenario, learner: MakeLearner | None = None) -> SingleFlight:
-    """Fly a scenario; the errors are the true ones at the ticks of the controller.
+    """Fly a scenario. The errors are the true ones at the ticks of the controller.
 
     Raises ParameterError.
     """
@@ -124,12 +125,13 @@ def _tracking_figures(tape: Tape, scenario: Scenario) -> dict[str, float]:
 
 
 def mission_figures(tape: Tape, guidance: GuidanceConfig) -> dict[str, float]:
-    """Score, cross-track and altitude error on the route, largest bank, legs missed, SI.
+    """Return the figures of a mission, SI.
 
-    With a fence it has the distance flown beyond it and the last distance from home. The score is
-    the largest cross-track error in half seconds of flight at V0. The orbit round the last
-    waypoint, which begins at the centre, and the ways onto a leg are left out. NaN where no leg was
-    flown.
+    They are the score, cross-track and altitude error on the route, the largest bank and the legs
+    that were missed. With a fence there are also the distance flown beyond it and the last distance
+    from home. The score is the largest cross-track error in half seconds of flight at V0. The orbit
+    round the last waypoint, which begins at its centre, and the ways onto a leg are left out. If no
+    leg was flown, figures are NaN.
     """
     log = tape["guidance"]
     last_leg = len(guidance.plan(guidance.waypoints()).legs) - 1

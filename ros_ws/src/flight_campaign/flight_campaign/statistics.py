@@ -20,33 +20,36 @@ from flight_core.vectors import FloatArray
 
 PER_DECADE = 100
 DECADES = (-8, 6)
-"""Bins of the histograms: 2.3 % wide, from 1e-8 to 1e6 in SI, the range of all errors of a
+"""Bins of the histograms. They are 2.3 % wide, from 1e-8 to 1e6 in SI, the range of all errors of a
 flight."""
 
 EDGES = 10.0 ** (np.arange(DECADES[0] * PER_DECADE, DECADES[1] * PER_DECADE + 1) / PER_DECADE)
 
 SCORE_UNIT = {ANGULAR_RATE: 0.010, SPEED: 0.1}  # rad/s, m/s
-"""Unit of an rms error in the score, by dimension of the channel. p counts half, since its commands
-are larger."""
+"""Unit of an rms error in the score, by dimension of the channel. p counts half, because its
+commands are larger."""
 
-SCORE_UNIT_OF = {"p": 0.020}  # rad/s, by channel; it replaces that of its unit
+SCORE_UNIT_OF = {"p": 0.020}  # rad/s, by channel, in place of the unit above
 
 FIRST_MODEL = "first_model"
 """A figure of aircraft with a learner; NaN without a model."""
 
-LOSS_OF_TRACK_SCORE = 10.0  # a higher score is a loss of track; 1 to 4 is usual
+LOSS_OF_TRACK_SCORE = 10.0  # a higher score counts as a loss of track; 1 to 4 is usual
 QUANTILES = (0.5, 0.95, 0.99)
 WORST_KEPT = 10  # number of worst flights in a tally
 
 
 class FigureStatistics(Config):
-    """A figure over many flights. Sums have a fixed order: the same chunks give the same bits."""
+    """A figure over many flights.
+
+    The order of the sums is fixed, so that the same chunks give the same bits.
+    """
 
     count: int = 0
     mean: float = 0.0
     squares: float = 0.0  # sum of (value - mean)^2
-    largest: float = -1.0  # none yet
-    # Counts by index in EDGES, -1 below and len(EDGES) - 1 above; without empty ones.
+    largest: float = -1.0  # there is none yet
+    # Counts by index in EDGES, without empty ones; -1 is below, len(EDGES) - 1 above.
     bins: dict[int, int] = Field(default={})
 
     @classmethod
@@ -83,7 +86,7 @@ class FigureStatistics(Config):
 
     @property
     def deviation(self) -> float:
-        """Standard deviation of the sample, 0 of fewer than two."""
+        """Standard deviation of the sample, or 0 if it has fewer than two values."""
         return math.sqrt(self.squares / (self.count - 1)) if self.count > 1 else 0.0
 
     def quantile(self, share: float) -> float:
@@ -102,7 +105,7 @@ class FigureStatistics(Config):
 
 
 class Worst(Config):
-    """A flight among the worst: number of the aircraft and score, None for divergence."""
+    """One of the worst flights: number of the aircraft, and its score or None if it diverged."""
 
     number: int
     score: float | None
@@ -113,8 +116,8 @@ class Tally(Config):
 
     flights: int = 0
     diverged: int = 0
-    lost: int = 0  # loss of track: did not diverge, score above LOSS_OF_TRACK_SCORE
-    # "score", "rms.q", "max.q", "slew.elevator", of those that did not diverge
+    lost: int = 0  # did not diverge, but the score is above LOSS_OF_TRACK_SCORE
+    # "score", "rms.q", "max.q", "slew.elevator", ... of the flights that did not diverge
     figures: dict[str, FigureStatistics] = Field(default={})
     worst: tuple[Worst, ...] = ()  # the worst first
 
@@ -202,9 +205,9 @@ class Tally(Config):
 
 
 def lost_track(diverged: FloatArray, score: FloatArray) -> NDArray[np.bool_]:
-    """Which flights lost track, shape (N,).
+    """Return which flights lost track, (N,).
 
-    Flights that did not diverge with a score above LOSS_OF_TRACK_SCORE.
+    They did not diverge, but have a score above LOSS_OF_TRACK_SCORE.
     """
     return np.asarray(~np.asarray(diverged, dtype=bool) & (score > LOSS_OF_TRACK_SCORE))
 
@@ -212,10 +215,10 @@ def lost_track(diverged: FloatArray, score: FloatArray) -> NDArray[np.bool_]:
 def score_units(
     outputs: Sequence[str], units: Mapping[str, str], stated: Mapping[str, float] | None = None
 ) -> FloatArray:
-    """Units of the rms errors of the channels in the score, SI, shape (m,).
+    """Return the units of the channels' rms errors in the score, SI, (m,).
 
-    `stated` replaces usual units by output. Raises ParameterError for an output without a unit in
-    the score.
+    `stated` replaces usual units by output. Raises ParameterError if an output has no unit in the
+    score.
     """
     units_of_score = SCORE_UNIT_OF | dict(stated or {})
     for name in outputs:
@@ -237,8 +240,8 @@ def score_units(
 
 
 def score(rms: FloatArray, unit: FloatArray) -> FloatArray:
-    """Sum over the channels of rms / unit, shape (N,), from (m, N) and (m,).
+    """Return the sum over the channels of rms / unit, (N,), from (m, N) and (m,).
 
-    1 a channel is 10 mrad/s or 0.1 m/s, 20 in p.
+    A channel counts 1 if its error is 10 mrad/s or 0.1 m/s, for p 20 mrad/s.
     """
     return np.asarray(np.sum(rms / unit[:, None], axis=0))

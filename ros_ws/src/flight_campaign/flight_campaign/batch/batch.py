@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Vectorised Monte Carlo simulation: N uncertain aircraft through one course under any law.
+"""Vectorised Monte Carlo simulation: N uncertain aircraft fly one course under any law.
 
 The loop is that of a single process. The last axis of every array is the aircraft, so that one line
 of a law or of the actuators acts on all of them.
@@ -72,9 +72,9 @@ def vehicle(scenario: Scenario) -> Vehicle:
 
 
 def shared(params: Any) -> Any:
-    """Parameters of a law for one aircraft, (m,), as those of a fleet, (m, 1).
+    """Turn the parameters of a law for one aircraft, (m,), into those of a fleet, (m, 1).
 
-    Matrices stay, which all aircraft share.
+    Matrices stay as they are, because all aircraft share them.
     """
     return jax.tree.map(
         lambda value: np.asarray(value)[:, None] if np.ndim(value) == 1 else np.asarray(value),
@@ -105,14 +105,14 @@ def with_equipment(
 
 
 def _rows(values: Sequence[Any]) -> Array:
-    """Numbers, and arrays of shape (N,), as rows."""
+    """Return numbers, and arrays of shape (N,), as rows."""
     return jnp.stack(jnp.broadcast_arrays(*map(jnp.asarray, values)))
 
 
 def _reduced(aircraft: Aircraft) -> tuple[NDArray[np.int64], Aircraft]:
     """Return the indices of the states in the remainder, and the aircraft reduced to them.
 
-    It is reduced to `remainder_rows`, too.
+    The rows of the reduced aircraft are `remainder_rows`.
     """
     rows = remainder_rows(aircraft)
     coupling = aircraft.coupling
@@ -148,12 +148,14 @@ def fly(
 ) -> FleetResult:
     """Fly N aircraft through the course under one law, from trim at rest.
 
-    At each tick: sensors, step of the law (or engagement, or a missed sample, by the course's
-    phase), actuators over the K steps to the next tick, aircraft. The remainder s at the middle of
-    a tick is extrapolated from this tick and the previous. Arguments: `params` of the law, (m, 1)
-    or (m, N); of one aircraft, (m,), where all fly the same, as `shared` makes them. `schedule`
-    divides the ticks into compiled loops; None: as is fastest on the device. The figures stay the
-    same.
+    Each tick has four parts: the sensors, a step of the law (or its engagement, or a missed sample,
+    as the phase of the course says), the actuators over the K steps to the next tick, and the
+    aircraft. The remainder s at the middle of a tick is extrapolated from this tick and the one
+    before.
+
+    `params` of the law are (m, 1) or (m, N). If all aircraft fly the same, `shared` makes them from
+    those of one aircraft, (m,). `schedule` divides the ticks into compiled loops; None takes the
+    one that is fastest on the device. It does not change the figures.
     """
     timing = _timing(fleet, course)
     constants = batch_loop.Constants(fleet._replace(blocks=()), vehicle, params)
@@ -163,7 +165,7 @@ def fly(
     state = batch_loop.begin(constants, first, **compiled)
     k = 0
     for run in (schedule or schedule_of_device())(course):
-        # The branches of an allocation stay; unrolled they would compile for minutes.
+        # The branches of an allocation are not unrolled, since they would then compile for minutes.
         looped = run if vehicle.allocation is None else run._replace(unroll=1)
         state = batch_loop.fly_run(state, constants, segments, k, run=looped, **compiled)
         k += run.length
@@ -183,7 +185,7 @@ def _timing(fleet: FleetMatrices, course: Course) -> Timing:
 class FleetStepper:
     """The flights of `fly` tick by tick, with u from outside.
 
-    `sense`, then `advance`, for each tick of the course.
+    Call `sense`, then `advance`, for each tick of the course.
     """
 
     def __init__(self, fleet: FleetMatrices, vehicle: Vehicle, course: Course) -> None:
@@ -213,7 +215,7 @@ class FleetStepper:
         return y, np.broadcast_to(np.asarray(sample.y_m), y.shape)
 
     def advance(self, u: FloatArray) -> None:
-        """To the next tick with the command u, (p, N).
+        """Advance to the next tick with the command u, (p, N).
 
         u is in the order of the controller's effectors.
         """
@@ -229,7 +231,7 @@ class FleetStepper:
         self._k += 1
 
     def restart(self, which: NDArray[np.bool_]) -> None:
-        """Set some aircraft, (N,), into trim at the present tick. Their figures begin again."""
+        """Put some aircraft, (N,), into trim at the present tick. Their figures begin again."""
         self._state = jax.tree.map(partial(jnp.where, which), self._begin, self._state)
 
     def result(self) -> FleetResult:

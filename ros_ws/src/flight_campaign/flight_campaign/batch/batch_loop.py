@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The closed loop of N aircraft from tick to tick, compiled: sensors, law, actuators, aircraft.
 
-Between two ticks of the controller an aircraft is linear up to a small remainder: all steps of its
-integration are one matrix product.
+Between two ticks of the controller an aircraft is linear up to a small remainder, so that all steps
+of its integration are one matrix product.
 """
 
 from collections.abc import Callable, Sequence
@@ -40,21 +40,23 @@ from rise_di_controller.law.saturation import Limits, saturate
 )
 @dataclass(frozen=True)
 class Vehicle:
-    """Properties that all aircraft of a fleet share."""
+    """What all aircraft of a fleet share."""
 
-    # Constants of the compiled loop: a device then takes rows without looking up where they are.
+    # These are constants of the compiled loop, so that a device takes rows without looking up where
+    # they are.
     outputs: tuple[int, ...]  # (m,) indices of the outputs in the state, in the law's order
     inputs: tuple[int, ...]  # (p,) indices of the effectors in the airframe's order
     remainder_states: tuple[int, ...]  # (c,) indices of the states in the nonlinear remainder
     vanes: tuple[int, ...]  # indices in the state of what the vanes read
-    # Reduced to the remainder: f_state of x[remainder_states] gives the rows `remainder_rows`.
+    # The aircraft reduced to the remainder: f_state of x[remainder_states] gives the rows
+    # `remainder_rows`.
     remainder: Aircraft
     actuators: Actuators  # (p, 1), airframe's order
-    limits: Limits  # (m, 1), law's order: of u, as the controller has them
+    limits: Limits  # (m, 1), law's order: limits of u, as in the controller
     quantum: Array | None  # (m, 1), law's order
-    dt: float  # s, of a step of the integration
+    dt: float  # s, a step of the integration
     allocation: Allocation | None  # None: the inputs of the law are the effectors
-    # (m, N), law's order: noise in parts of the noise of the course, less 1; None: 0
+    # (m, N), law's order: noise relative to that of the course, minus 1; None stands for 0
     noisier: Array | None = None
 
 
@@ -78,20 +80,20 @@ def rows_of(array: Array, places: Sequence[int] | NDArray[np.int64]) -> Array:
 
 
 def remainder_of(states: Array, aircraft: Aircraft) -> Array:
-    """Nonlinear remainder of f_state, (q, N).
+    """Return the nonlinear remainder of f_state, (q, N).
 
-    gravity @ (sin(x) - x) + gain @ (x[first] x[second]) + kinematics(x).
+    It is gravity @ (sin(x) - x) + gain @ (x[first] x[second]) + kinematics(x).
     """
     return dynamics.f_state(states, aircraft) - aircraft.gravity @ states
 
 
 class Timing(NamedTuple):
-    """Constants of the compiled loop. Hashable."""
+    """Constants of the compiled loop. They are hashable."""
 
     blocks: tuple[StateBlock, ...]
-    steps: int  # of the integration in a tick
+    steps: int  # steps of the integration in a tick
     y_late: int  # ticks
-    u_late: int  # ticks, the largest
+    u_late: int  # ticks, the largest of all aircraft
 
 
 class LoopSample(NamedTuple):
@@ -107,24 +109,24 @@ class LoopState(NamedTuple):
 
     x: Array  # (n, N)
     position: Array  # (p, N) airframe's order
-    remainder: Array  # (q, N) of the previous tick
+    remainder: Array  # (q, N) that of the tick before
     law: Any
     u: Array  # (m, N) law's order
-    command: Array  # (p, N) the effectors; u without an allocation
+    command: Array  # (p, N) of the effectors; it is u without an allocation
     y_before: Array  # (y_late, m, N) newest first
     command_before: Array  # (u_late, p, N)
-    squares: Array  # (m, N) sums over the ticks
+    squares: Array  # (m, N) sums of squared errors over the ticks
     max: Array
     travel: Array  # (p, N) sum of abs(command - previous command)
     bounded: Array  # (N,) whether the state stayed below DIVERGENCE_LIMIT
 
 
 class Constants(NamedTuple):
-    """Inputs that stay from tick to tick: arguments, so that the compiler folds no arrays."""
+    """Inputs that stay from tick to tick, as arguments, so that the compiler folds no arrays."""
 
     fleet: FleetMatrices  # without its blocks
     vehicle: Vehicle
-    params: Any  # of the law
+    params: Any  # those of the law
 
 
 @partial(jax.jit, static_argnames=("control_law", "timing"))
@@ -156,7 +158,7 @@ def fly_run(
     control_law: ControlLaw,
     timing: Timing,
 ) -> LoopState:
-    """Fly the ticks of a run, the first of number `first`, and return the state after them."""
+    """Fly the ticks of a run, whose first has the number `first`; return the state after them."""
     size = len(run.pattern)
 
     def patterns(values: Array) -> Array:
@@ -175,7 +177,7 @@ def fly_run(
 def _chosen(
     constant: int | None, value: Array, branches: Sequence[Callable[..., Any]], *arguments: Any
 ) -> Any:
-    """Run the branch `constant`, or if it is None, the branch that the tick's `value` names."""
+    """Run the branch `constant`. If it is None, run the branch that the tick's `value` names."""
     if constant is None:
         return jax.lax.switch(value, branches, *arguments)
     return branches[constant](*arguments)
@@ -193,8 +195,8 @@ def tick(
     fleet, vehicle, params = constants
     measure = partial(_measured, fleet=fleet, vehicle=vehicle)
 
-    # Each branch calls `measure`: the compiler then removes the measurements that its law does not
-    # use.
+    # Each branch calls `measure`, so that the compiler removes the measurements that its law does
+    # not use.
     def engage(now: LoopState, *measured: Any) -> tuple[Any, Array, Array]:
         started = control_law.engage(measure(now, *measured), params)
         law = jax.tree.map(
@@ -211,7 +213,7 @@ def tick(
         if allocation is None:
             law, _, u = control_law.limited(now.law, measurements, segment.dt, params, limits)
             return law, u, u
-        # As the guard: what the effectors give limits the law.
+        # As in the guard, what the effectors give limits the law.
         _, u_free = control_law.step(now.law, measurements, segment.dt, params)
         _, reachable = allocate(
             saturate(u_free, now.u, segment.dt, limits), now.command, segment.dt, allocation
@@ -284,7 +286,7 @@ def sense(now: LoopState, segment: Segments, vehicle: Vehicle) -> tuple[LoopStat
         squares=now.squares + e * e,
         max=jnp.maximum(now.max, jnp.abs(e)),
         bounded=now.bounded
-        & (jnp.max(jnp.abs(now.x), axis=0) < DIVERGENCE_LIMIT),  # False for NaN too
+        & (jnp.max(jnp.abs(now.x), axis=0) < DIVERGENCE_LIMIT),  # also False for NaN
     )
     return sensed, LoopSample(y, segment.sampled_y_m[:, None], segment.sampled_y_m_dot[:, None])
 
@@ -301,7 +303,7 @@ def advance(
     """Advance to the next tick with the command of this one."""
     blocks = timing.blocks
     u_late = timing.u_late
-    # Places of the states in the order of the blocks.
+    # Find the places of the states in the order of the blocks.
     places = np.argsort([*chain.from_iterable(block.rows for block in blocks)])
     history = jnp.concatenate([command[None], now.command_before])
     if not u_late:
@@ -344,8 +346,8 @@ def _actuated(
     def move(before: Array, t: Array) -> tuple[Array, Array]:
         return actuators.move(t, before, ordered_command, vehicle.dt, vehicle.actuators)
 
-    # A loop of its own: without one the compiler of a CPU computes all mean positions again for
-    # each state that they act on.
+    # This is a loop of its own. Without it, the compiler of a CPU computes all mean positions again
+    # for each state that they act on.
     return jax.lax.scan(move, position, times, unroll=unroll)
 
 
@@ -387,7 +389,7 @@ def in_trim(fleet: FleetMatrices, vehicle: Vehicle, timing: Timing) -> LoopState
 def _product(matrices: Array, vector: Any) -> Array:
     """Multiply each aircraft's matrix by its vector, compiled to one loop.
 
-    The product is 0 for matrices without a column.
+    If the matrices have no column, the product is 0.
     """
     if matrices.shape[1]:
         return product(matrices, vector)

@@ -22,9 +22,9 @@ from flight_core.vectors import Array, FloatArray, array_namespace
 
 
 class StateBlock(NamedTuple):
-    """Coupled states and the signals that act on them.
+    """Coupled states and the signals that act on them. It is hashable.
 
-    They are indices in x and in [x, p_1, ..., p_K, s]. Hashable.
+    They are indices in x and in [x, p_1, ..., p_K, s].
     """
 
     rows: tuple[int, ...]
@@ -32,9 +32,9 @@ class StateBlock(NamedTuple):
 
 
 class DriftMatrices(NamedTuple):
-    """A drift of N aircraft: differences of the matrices of Fleet.
+    """A drift of N aircraft: by how much the matrices of their fleet change.
 
-    Differences after `duration`, linear in time before.
+    The change is complete after `duration`, and linear in time before that.
     """
 
     start: float  # s
@@ -46,23 +46,23 @@ class DriftMatrices(NamedTuple):
 
 
 class FleetMatrices(NamedTuple):
-    """N aircraft over one tick of the controller, in K steps of the integration.
+    """N aircraft over one tick of the controller, which has K steps of the integration.
 
-    q rows of the remainder, r of the forcing. With p_k the actuators' mean positions over step k,
-    the remainder s and the course's forcing w_k in step k, one tick is
+    The remainder has q rows, the forcing r. With the actuators' mean positions p_k over step k, the
+    remainder s and the course's forcing w_k in step k, one tick is
 
         x+ = tick @ [x, p_1, ..., p_K, s] + wind forced @ [w_1, ..., w_K]
     """
 
     blocks: tuple[StateBlock, ...]
-    # (n, n + K p + q, N), by blocks, without entries that are 0 in all aircraft
+    # (n, n + K p + q, N) in blocks, without the entries that are 0 in all aircraft
     tick: tuple[Array, ...]
     forced: Array  # (n, K r, N)
     # (m, n + p, N): C x_dot = rate @ [x, p] + wind forced_rate @ w_1, up to the remainder
     rate: Array
     forced_rate: Array  # (m, r, N)
-    wind: Array  # (N,) factor of the course's gusts and turbulence
-    late: Array  # (N,) delay of u, whole ticks
+    wind: Array  # (N,) factor on the course's gusts and turbulence
+    late: Array  # (N,) delay of u in whole ticks
     change: DriftMatrices | None = None
 
 
@@ -77,18 +77,20 @@ def assemble(
 ) -> FleetMatrices:
     """Assemble the matrices of N aircraft from A, (N, n, n), and B, (N, n, p).
 
-    With L = A + gravity, Phi and Gamma the matrices of one Runge-Kutta step of x_dot = L x + u with
-    u held,
+    With L = A + gravity, and Phi and Gamma the matrices of one Runge-Kutta step of x_dot = L x + u
+    while u is held,
 
         tick = [Phi^K, Phi^(K-1) Gamma B, ..., Gamma B, (Phi^(K-1) + ... + 1) Gamma remainder]
         forced = [Phi^(K-1) Gamma F, ..., Gamma F],
             F = [gust_directions[course.axes], course.basis]
 
     The steps, and the actuators' mean positions in them, are those of `plant.advance`. The
-    remainder is held over a tick, and the forcing over a step. `wind` and `late` have a value for
-    all or N; `late` is beyond the delay of the course. `gust_directions` of shape (N, n, G) are the
-    effects of wind on x_dot, of `uncertainty.gust_directions`; None: the plant's, for all aircraft.
-    The drift of the plant multiplies the entries of all aircraft alike; the matrices above are then
+    remainder is held over a tick, and the forcing over a step.
+
+    `wind` and `late` have one value for all aircraft or N values; `late` is added to the delay of
+    the course. `gust_directions`, (N, n, G), are the effects of wind on x_dot, as in
+    `uncertainty.gust_directions`; None takes those of the plant for all aircraft. A drift of the
+    plant multiplies the entries of all aircraft alike, and the matrices above are then
     interpolated.
     """
     aircraft = plant.aircraft
@@ -134,11 +136,11 @@ def _last(array: Array) -> Array:
 
 
 class _Places(NamedTuple):
-    """Constants of the compiled matrices. Hashable."""
+    """Constants of the compiled matrices. They are hashable."""
 
-    steps: int  # K of a tick
-    axes: tuple[int, ...]  # of the gusts along which there is wind
-    rows: tuple[int, ...]  # of the remainder
+    steps: int  # K, steps of a tick
+    axes: tuple[int, ...]  # axes of the gusts along which there is wind
+    rows: tuple[int, ...]  # rows of the remainder
 
 
 def _matrices(
@@ -151,7 +153,7 @@ def _matrices(
     dt: float,
     places: _Places,
 ) -> tuple[Array, Array, Array, Array]:
-    """tick, forced, rate and forced_rate of `FleetMatrices`, the aircraft first.
+    """Compute tick, forced, rate and forced_rate of `FleetMatrices`, with the aircraft first.
 
     C is in the law's order.
     """
@@ -179,7 +181,10 @@ def _matrices(
 
 @partial(jax.jit, static_argnames=("places",))
 def _compiled_matrices(*matrices: Any, **constants: Any) -> tuple[Array, Array, Array, Array]:
-    """As `_matrices`, on the device: NumPy on the host takes 17 s for 1,000,000 aircraft."""
+    """Do as `_matrices` does, on the device.
+
+    NumPy on the host takes 17 s for 1,000,000 aircraft.
+    """
     # A GPU may round the factors of a product to fewer bits.
     with jax.default_matmul_precision("highest"):
         return _matrices(*matrices, **constants)
@@ -209,7 +214,7 @@ def _blocks(moves: NDArray[np.bool_]) -> tuple[StateBlock, ...]:
 
 
 def at(t: Array, fleet: FleetMatrices) -> FleetMatrices:
-    """Return the matrices at t."""
+    """Return the matrices at time t."""
     change = fleet.change
     if change is None:
         return fleet

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """How the loop over the ticks of a course is compiled: with branches, or in runs of known ticks.
 
-A GPU waits for the host at each branch. Phase and forcing are known before the flight, so each run
-of ticks has a loop without a branch. A CPU is faster with one loop.
+A GPU waits for the host at each branch. Since phase and forcing are known before the flight, each
+run of ticks gets a loop without a branch. A CPU is faster with one loop.
 """
 
 from collections.abc import Callable, Iterator
@@ -15,17 +15,17 @@ import numpy as np
 from flight_campaign.batch.campaign_course import ENGAGE, Course
 
 RUN = 120
-"""Ticks of a run. A run is forced if a tick of it is."""
+"""Ticks of a run. A run is forced if one of its ticks is."""
 
 UNROLL = 4
-"""Ticks of a step of the loop. On one H200, 250,000 aircraft of 60 s took 3.3 s with 1, 1.8 s with
-4 and with 8, which compile for 3, 7 and 14 s."""
+"""Ticks in a step of the loop. On one H200, 250,000 flights of 60 s took 3.3 s with 1, and 1.8 s
+with 4 or 8. These compile for 3, 7 and 14 s."""
 
-LONGEST = 20  # ticks of a pattern, which is compiled tick by tick
+LONGEST = 20  # ticks of the longest pattern, which is compiled tick by tick
 
 
 class TickKind(NamedTuple):
-    """What is known of a tick when the loop is compiled; None: a branch asks at the tick."""
+    """What is known of a tick when the loop is compiled; if None, a branch asks at the tick."""
 
     phase: int | None
     forced: bool | None  # whether biases, gusts or turbulence act
@@ -35,27 +35,27 @@ UNKNOWN = TickKind(None, None)  # a branch asks for both at the tick
 
 
 class TickRun(NamedTuple):
-    """Ticks in one loop: a pattern of kinds again and again. Hashable."""
+    """Ticks in one loop: a pattern of kinds that repeats. It is hashable."""
 
     length: int  # ticks, a multiple of the pattern
     pattern: tuple[TickKind, ...]
-    unroll: int  # patterns a step of the loop
+    unroll: int  # patterns in a step of the loop
 
 
 Schedule = Callable[[Course], Iterator[TickRun]]
-"""The runs of a course."""
+"""Splits a course into runs."""
 
 
 def with_branches(course: Course) -> Iterator[TickRun]:
-    """One loop, whose branches ask at each tick."""
+    """Yield one single loop, whose branches ask at each tick."""
     yield TickRun(len(course.segments.t), (UNKNOWN,), 1)
 
 
 def without_branches(course: Course) -> Iterator[TickRun]:
-    """Split a course into runs of at most RUN ticks: few loops are compiled, each used often.
+    """Split a course into runs of at most RUN ticks, so that few loops are compiled and reused.
 
-    A run whose phases have no short pattern, for example because of dropouts, branches by the phase
-    at every tick.
+    If the phases of a run have no short pattern, for example because of dropouts, its loop branches
+    by the phase at every tick.
     """
     phase = course.segments.phase
     ticks = len(phase)

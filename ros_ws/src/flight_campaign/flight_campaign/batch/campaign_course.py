@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The course of the aircraft of a campaign, tick by tick.
 
-Reference, wind, errors of the sensors, feedforward. The course does not depend on the aircraft and
-is computed once, with the functions of the simulation in one process.
+It has the reference, the wind, the errors of the sensors and the feedforward. It does not depend on
+the aircraft, so that it is computed once, with the functions of the simulation in one process.
 """
 
 from typing import NamedTuple
@@ -30,12 +30,12 @@ from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 HOLD, ENGAGE, STEP = range(3)
-"""Action of a controller at a tick: it holds u without a new y, it engages, or it takes a step of
-its law."""
+"""What a controller does at a tick: it holds u because there is no new y, it engages, or it takes a
+step of its law."""
 
 
 class Segments(NamedTuple):
-    """The changing parts of a course, tick by tick."""
+    """The parts of a course that change from tick to tick."""
 
     t: FloatArray  # (T,) s
     phase: NDArray[np.int32]  # (T,) HOLD, ENGAGE or STEP
@@ -48,17 +48,16 @@ class Segments(NamedTuple):
     u_ff: FloatArray  # (T, m) feedforward
     error: FloatArray  # (T, m) sensor error of the y of the tick
     noise: FloatArray  # (T, m) noise in it
-    # (T, K r) mean over each of the steps from here to the next tick: wind along `axes`, basis' @
-    # the rest
+    # (T, K r) mean over each step to the next tick: wind along `axes`, then basis' @ the rest
     forcing: FloatArray
     forcing_now: FloatArray  # (T, r) at the tick
-    air: FloatArray  # (T, n) wind's contribution to alpha and beta, rad
+    air: FloatArray  # (T, n) what the wind adds to alpha and beta, rad
     vane_m: FloatArray  # (T, k) readings of the vanes in the reference motion, rad
     vane_error: FloatArray  # (T, k) sensor error of the vanes, rad
 
 
 class Course(NamedTuple):
-    """T ticks of the controller, the last at the end of the flight.
+    """T ticks of the controller, the last one at the end of the flight.
 
     Channels are in the law's order, states in the airframe's.
     """
@@ -71,8 +70,8 @@ class Course(NamedTuple):
     order: NDArray[np.int64]  # (m,) indices of the law's outputs in y
     late: int  # delay of y, ticks
     u_late: int  # delay of u, ticks
-    period: float  # s, of the ticks
-    steps: int  # of the integration from tick to tick
+    period: float  # s, from tick to tick
+    steps: int  # steps of the integration from tick to tick
 
 
 FLOWN = frozenset(
@@ -91,24 +90,24 @@ FLOWN = frozenset(
         *(f"uncertainty.{key}" for key in ("entries", "parts", "distribution", "wind")),
     }
 )
-"""Keys of the aircraft that a campaign flies as the simulator does; `build_course` refuses some of
+"""Keys of the aircraft that a campaign flies as the simulator does. `build_course` refuses some of
 their values."""
 
 IDLE = frozenset(
     {
         # Every aircraft of a campaign has a draw of its own.
         *(f"uncertainty.{key}" for key in ("A", "B", "seed", "number")),
-        # No law, no command and no figure depends on the place: guidance flies one at a time.
+        # No law, command or figure depends on the place, since guided aircraft fly one at a time.
         *(f"start.{key}" for key in ("north", "east", "heading")),
         "wind",
         *(f"pose.{key}" for key in ("rate", "delay", "bias", "drift", "noise", "seed")),
-        # A u comes with every tick, so that none times out.
+        # Every tick has a u, so that none times out.
         *("max_age", "hold", "ramp"),
-        # How the node runs.
+        # These say how the node runs.
         *("start_time", "lockstep", "control_rate", "duration", "recorded"),
     }
 )
-"""Keys of the aircraft without effect in a campaign."""
+"""Keys of the aircraft that have no effect in a campaign."""
 
 FLOWN_CONTROLLER = frozenset(
     {
@@ -128,26 +127,26 @@ FLOWN_RISE_DI = frozenset(
     {"k_g", "k_d", "Lambda", "beta", "omega", "sign", "softening", "schedule.speed"}
     | {"schedule.time"}
 )
-"""Keys of RISE-DI that a campaign flies. The keys of another law reach its step unread."""
+"""Keys of RISE-DI that a campaign flies. The keys of any other law go to its step unread."""
 
 IDLE_CONTROLLER = frozenset(
     {
-        # y is never older than max_age, which `build_course` sees to, and the law stays active.
+        # `build_course` makes sure that y is never older than max_age, and the law stays active.
         *("max_age", "hold", "ramp", "on_deactivate"),
-        # How the node runs.
+        # These say how the node runs.
         *("lockstep", "y_rate"),
         # Only a learner reads how well the model is known.
         "feedforward.deviation",
     }
 )
-"""Keys of a controller without effect in a campaign."""
+"""Keys of a controller that have no effect in a campaign."""
 
 
 ONE_AT_A_TIME = "flights of many at once do not have it, those of rise-di fly do"
 
 
 def require_flyable(scenario: Scenario) -> None:
-    """Raise ParameterError for an aircraft or a controller beyond a campaign.
+    """Raise ParameterError if a campaign cannot fly an aircraft or a controller.
 
     A campaign flies the keys of FLOWN and FLOWN_CONTROLLER. Any other key that has a value and is
     not idle is refused by its name.
@@ -177,7 +176,7 @@ def require_flyable(scenario: Scenario) -> None:
 
 
 def _references(scenario: Scenario, ticks: int, tick_ns: int) -> tuple[FloatArray, FloatArray]:
-    """y_m and its derivative at the ticks, in the law's order, each (T, m)."""
+    """Return y_m and its derivative at the ticks, in the law's order, (T, m) each."""
     reference = Reference(scenario.reference_model)
     places = [scenario.reference_model.outputs.index(name) for name in scenario.controller.outputs]
     y_m = np.zeros((ticks, len(places)))
@@ -191,8 +190,8 @@ def _references(scenario: Scenario, ticks: int, tick_ns: int) -> tuple[FloatArra
 def build_course(scenario: Scenario) -> Course:
     """Build the course of a scenario, with the feedforward of the controller.
 
-    Raises ParameterError for a scenario that a campaign cannot fly: an aircraft of JSBSim, a delay
-    of y or u by a part of a tick, dropouts of a y whose rate is not that of the ticks, dropouts
+    Raises ParameterError if a campaign cannot fly the scenario: an aircraft of JSBSim, a delay of y
+    or u by a fraction of a tick, dropouts of a y whose rate is not that of the ticks, dropouts
     longer than the age limit, or vanes with faults.
     """
     aircraft = scenario.aircraft
@@ -213,7 +212,7 @@ def build_course(scenario: Scenario) -> Course:
     u_late = _whole_ticks(nanoseconds(aircraft.actuators.delay), tick_ns, "actuators.delay")
     vanes = [outputs.index(name) for name in controller.vanes]
     _require_plain_vanes(scenario, late)
-    # What does not depend on the aircraft, tick by tick.
+    # Compute, tick by tick, what does not depend on the aircraft.
     error, noise = _sensor_errors(errors, ticks, tick_ns // sample_ns, len(outputs))
     y_m, y_m_dot = _references(scenario, ticks, tick_ns)
     arrives = [sensors.arrives(k, errors) for k in range(ticks)]
@@ -252,12 +251,12 @@ def build_course(scenario: Scenario) -> Course:
 
 
 def _whole_ticks(delay_ns: int, tick_ns: int, key: str) -> int:
-    """Convert a delay to ticks. Raises ParameterError for a part of a tick."""
+    """Convert a delay to ticks. Raises ParameterError if they are not whole."""
     return divide(delay_ns, tick_ns, key, "a tick") if delay_ns else 0
 
 
 def _require_lossless(scenario: Scenario, errors: sensors.Sensors) -> None:
-    """Raise ParameterError for dropouts of a y with a different rate than the ticks."""
+    """Raise ParameterError if y has dropouts and another rate than the ticks."""
     y_rate = scenario.aircraft.rate
     rate = scenario.controller.rate
     has_same_rate = period_ns(rate, "controller.rate") == period_ns(y_rate, "aircraft.rate")
@@ -290,7 +289,7 @@ def _phases(
 
 
 def _require_plain_vanes(scenario: Scenario, late: int) -> None:
-    """Raise ParameterError for vanes beyond a campaign: late, frozen, with losses or steps."""
+    """Raise ParameterError if vanes are late, freeze, lose readings or have steps."""
     vanes = scenario.aircraft.vanes
     sensors_of = scenario.aircraft.sensors
     key = "aircraft.vanes"
@@ -321,9 +320,9 @@ def _feedforward(
     y_m: FloatArray,
     period: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """u_ff at the ticks, (T, m), and the state of the nominal model, (T, n).
+    """Return u_ff at the ticks, (T, m), and the state of the nominal model, (T, n).
 
-    n = 0 without a model.
+    Without a model n is 0.
     """
     u_ff = np.zeros_like(y_m)
     if nominal is None:
@@ -345,7 +344,7 @@ def _feedforward(
 def _sensor_errors(
     errors: Sensors, ticks: int, samples: int, channels: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Errors of y at the ticks, each `samples` samples, and the noise in them, (T, channels)."""
+    """Return the errors of y at the ticks, `samples` apart, and their noise, (T, channels)."""
     error = np.zeros((ticks, channels))
     noise = np.zeros_like(error)
     drift = sensors.initial_drift(errors)
@@ -357,7 +356,7 @@ def _sensor_errors(
 
 
 class _Forcing(NamedTuple):
-    """A part of the forcing in time."""
+    """A part of the forcing over time."""
 
     over_step: FloatArray  # (T K, ...) mean over each step of the integration
     at_tick: FloatArray  # (T, ...)
@@ -366,7 +365,7 @@ class _Forcing(NamedTuple):
 def _reduced(
     wind: _Forcing, forcing_over_time: _Forcing
 ) -> tuple[NDArray[np.int64], FloatArray, tuple[FloatArray, FloatArray]]:
-    """`axes` and `basis` of a course, and the forcing along both over steps and at ticks."""
+    """Return `axes` and `basis` of a course, and the forcing along both over steps and at ticks."""
     axes = np.flatnonzero(wind.over_step.any(axis=0))
     _, sizes, rows = np.linalg.svd(forcing_over_time.over_step, full_matrices=False)
     basis = rows[sizes > 1e-12 * max(sizes[0], 1e-300)].T
@@ -400,9 +399,9 @@ def _forcing(ticks: int, steps: int, plant: PlantParams) -> tuple[_Forcing, _For
 
 
 def _air_angles(wind: FloatArray, airframe: Airframe) -> FloatArray:
-    """Contribution of the wind at the ticks, shape (T, G), to alpha and beta, rad.
+    """Return what the wind at the ticks, (T, G), adds to alpha and beta, rad.
 
-    In the order of the states, shape (T, n).
+    It is in the order of the states, (T, n).
     """
     angles = np.zeros((len(wind), len(airframe.states)))
     for place, axis in enumerate(airframe.gusts):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The device of JAX that aircraft fly on, and what follows from its kind and its memory."""
+"""The device on which JAX flies aircraft, and what follows from its kind and its memory."""
 
 import logging
 import os
@@ -11,21 +11,22 @@ import jax
 
 from flight_campaign.batch.batch_schedule import Schedule, with_branches, without_branches
 
-CPU_CHUNK = 1000  # aircraft at once; with their matrices, 2 MB, they stay in the caches of a core
-LARGEST_CHUNK = 250_000  # of a device: more at once were not faster on one H200
-BYTES = 16_384  # of memory an aircraft; osprey_servo needed 11,300 on one H200 (JAX 0.11.2)
-THREADS = 3  # of a device: a chunk is drawn, one flies, one is written
+CPU_CHUNK = 1000  # aircraft at once; their matrices, 2 MB, stay in the caches of a core
+LARGEST_CHUNK = 250_000  # aircraft at once on a device; more were not faster on one H200
+BYTES = 16_384  # of memory per aircraft; osprey_servo needed 11,300 on one H200 (JAX 0.11.2)
+THREADS = 3  # for a device: while one chunk flies, one is drawn and one is written
 
 VISIBLE = {"cuda": "CUDA_VISIBLE_DEVICES", "rocm": "HIP_VISIBLE_DEVICES"}
-"""Variables of the environment that name the devices of a process, by a word of the platform."""
+"""Environment variables that name the devices of a process, by a word in the name of the platform.
+"""
 
 _TURN = Lock()
 
 
 def _as_sentence(record: logging.LogRecord) -> bool:
-    """Report a plugin that fails in a sentence, such as that of a GPU on a host without one.
+    """Report in a sentence that a plugin fails, such as that of a GPU on a host without one.
 
-    JAX logs its traceback, and flies on the other devices.
+    JAX would log a traceback, and fly on the other devices.
     """
     if record.exc_info and (error := record.exc_info[1]):
         record.msg = "warning: a plugin of JAX is left out (%s): the other devices fly"
@@ -53,17 +54,17 @@ def schedule_of_device() -> Schedule:
 
 
 def thread_count() -> int:
-    """How many threads keep the device busy: one a core of a CPU."""
+    """Return how many threads keep the device busy: one for each core of a CPU."""
     return os.cpu_count() or 1 if is_cpu() else THREADS
 
 
 def turn() -> AbstractContextManager[object]:
-    """Wait for a chunk's turn on the device: one flies while others are drawn or written."""
+    """Wait for a chunk's turn on the device. One flies while others are drawn or written."""
     return nullcontext() if is_cpu() else _TURN
 
 
 def chunk_of_device(aircraft: int) -> int:
-    """How many of these aircraft fly at once: what fits into the memory, in chunks of one size."""
+    """Return how many of these aircraft fly at once: equal chunks that fit into the memory."""
     if is_cpu():
         return CPU_CHUNK
     memory = (jax.devices()[0].memory_stats() or {}).get("bytes_limit", BYTES * LARGEST_CHUNK)
@@ -73,7 +74,7 @@ def chunk_of_device(aircraft: int) -> int:
 
 
 def separate_devices() -> list[dict[str, str]]:
-    """Environments of processes, of which each sees one device of this host; [] for a CPU."""
+    """Return environments in which each process sees one device of this host; [] for a CPU."""
     devices = jax.local_devices()
     platform = devices[0].client.platform_version
     variable = next((VISIBLE[word] for word in VISIBLE if word in platform), None)

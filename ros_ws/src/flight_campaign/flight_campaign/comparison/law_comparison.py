@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Comparison of tuned laws on the same aircraft, winds, noise and limits.
 
-The aircraft are nominal, uncertain, and with delayed inputs.
+The aircraft are nominal, uncertain, or have late inputs.
 """
 
 import os
@@ -33,7 +33,7 @@ from flight_design.gains.tuned_gains import TuningResult
 from rise_di_controller.law.control_law import ControlLaw
 
 DELAY_TICKS = (1, 2, 3, 4, 6)  # delays of u: 10 to 60 ms at 100 Hz
-TURBULENCE_SEED = 3  # of a comparison, unlike that of the tuning
+TURBULENCE_SEED = 3  # seed of a comparison, which is not that of the tuning
 
 
 class Scores(NamedTuple):
@@ -41,12 +41,12 @@ class Scores(NamedTuple):
 
     mean: float  # infinite if one diverged
     worst: float
-    # Fraction with loss of track, a score above LOSS_OF_TRACK_SCORE; includes diverged ones.
+    # Share that lost track, with a score above LOSS_OF_TRACK_SCORE; diverged ones are included.
     lost: float
 
 
 class Level(NamedTuple):
-    """Results of a law on the uncertain aircraft of a level, u in time."""
+    """Results of a law on the uncertain aircraft of a level, with u in time."""
 
     uncertainty: float
     scores: dict[str, Scores]  # by wind
@@ -57,14 +57,14 @@ class LawResult(NamedTuple):
 
     law: str
     objective: str  # what it was tuned on
-    costs: list[float]  # of the seeds of its tuning; empty for gains of a scenario
+    costs: list[float]  # one for each seed of its tuning; empty for gains of a scenario
     scores: dict[str, float]  # on the nominal aircraft, by wind
     levels: tuple[Level, ...]
-    # By delay of u in s: fraction of the aircraft of the first level that lose track in gusts.
+    # By delay of u in s: share of the aircraft of the first level that lose track in gusts.
     lost_late: dict[float, float]
-    rms: FloatArray  # (m,) of the true error, nominal aircraft in gusts
+    rms: FloatArray  # (m,) rms of the true error, nominal aircraft in gusts
     slew: FloatArray  # (m,) mean abs(u_dot), nominal aircraft in gusts
-    # Margins of the nominal aircraft; None for a law without a linear loop from y to u.
+    # Margins of the nominal aircraft; None if the law has no linear loop from y to u.
     margins: Margins | None
 
 
@@ -77,11 +77,11 @@ def compare(
     delays: Sequence[int] = DELAY_TICKS,
     laws: Mapping[str, Law] = LAWS,
 ) -> Iterator[LawResult]:
-    """Simulate the laws with their gain sets on the same flights; a thread flies a law.
+    """Simulate the laws with their gain sets on the same flights, one law in each thread.
 
-    The flights, by wind: the nominal aircraft and `aircraft` uncertain aircraft of `seed` per
-    level. In gusts also the aircraft of the first level with u late by `delays`, ticks. Raises
-    ParameterError for an uncertainty outside [0, 1).
+    In each wind, the nominal aircraft and `aircraft` uncertain aircraft of `seed` fly for each
+    level. In gusts, the aircraft of the first level also fly with u late by `delays`, ticks. Raises
+    ParameterError if an uncertainty is outside [0, 1).
     """
     airframe, _ = benchmark.scenario.aircraft.load()
     sampled = [nominal_and_sampled(airframe, level, aircraft, seed) for level in levels]
@@ -103,7 +103,9 @@ def compare(
     )
 
     def results(name: str) -> list[LawResult]:
-        control_law = laws[name].control_law(benchmark.model)  # of all gain sets: compiled once
+        control_law = laws[name].control_law(
+            benchmark.model
+        )  # one for all gain sets, so that it is compiled once
         return [
             study.result(name, laws[name], control_law, objective, gains)
             for objective, gains in gains_by_law[name].items()
@@ -169,7 +171,7 @@ def _nominal_once(matrices: Sequence[FloatArray]) -> FloatArray:
 def score_cells(result: LawResult) -> list[str]:
     """Return the scores of a law as cells of a table.
 
-    For each wind, these are the score of the nominal aircraft, then mean (worst) by level.
+    For each wind they are the score of the nominal aircraft, then mean (worst) by level.
     """
     cells = []
     for wind, nominal in result.scores.items():

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Registered laws beside the laws of the catalogue.
+"""Registered laws, next to those of the catalogue.
 
-They are the controller of a scenario and the gains in the scenario.
+Such a law is the controller of a scenario, with its gains in the scenario.
 """
 
 from collections.abc import Iterable, Mapping
@@ -27,7 +27,7 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 
 
 def own_gains(controller: ControllerConfig) -> dict[str, list[float]]:
-    """Return the positive numbers of the law itself by name, without matrices."""
+    """Return the positive numbers that belong to the law itself, by name, without matrices."""
     names = (
         name for name in type(controller).model_fields if name not in ControllerConfig.model_fields
     )
@@ -42,7 +42,7 @@ def own_gains(controller: ControllerConfig) -> dict[str, list[float]]:
 def registered_law(controller: ControllerConfig, name: str) -> Law:
     """Return the law of a controller, whose gains are the start of a search.
 
-    The rest of the controller stays.
+    The rest of the controller stays as it is.
     """
     start = own_gains(controller)
     scalars = {key for key in start if not isinstance(getattr(controller, key), tuple)}
@@ -83,7 +83,7 @@ def _value(gain: FloatArray, scalar: bool) -> float | list[float]:
 def _last(*leaves: Any) -> FloatArray:
     """Stack a parameter of N candidates, with the candidates in the last axis.
 
-    Equal values become (m, 1).
+    If all are equal, the result is (m, 1).
     """
     first = np.asarray(leaves[0], dtype=np.float64)
     if all(np.array_equal(first, leaf) for leaf in leaves):
@@ -94,11 +94,11 @@ def _last(*leaves: Any) -> FloatArray:
 def find_laws(
     names: Iterable[str], scenario: Scenario, others: Mapping[str, Scenario]
 ) -> dict[str, ControllerConfig | None]:
-    """For each name the controller that flies, None for a law of the catalogue.
+    """Return the controller that flies for each name, or None for a law of the catalogue.
 
-    Beside the catalogue a name may be the law of the scenario's own controller, or a key of
-    `others`: scenarios given in place of a law. Raises ParameterError for an unknown name, for an
-    allocation, and for a controller with a different rate or order of the channels.
+    Besides those of the catalogue, a name may be the law of the scenario's own controller, or a key
+    of `others`, which are scenarios that stand for a law. Raises ParameterError if a name is
+    unknown, or if a controller has an allocation, another rate or another order of the channels.
     """
     effectors = "none: the laws that are compared command the effectors"
     require(scenario.controller.allocation is None, "controller.allocation", "a section", effectors)
@@ -127,13 +127,13 @@ def find_laws(
                 getattr(controller, key),
                 f"{expected}, as in {scenario.name}",
             )
-        # In a benchmark topics have no delay.
+        # In a benchmark, topics have no delay.
         controllers[name] = controller.model_copy(update={"delay": 0.0})
     return controllers
 
 
 def entries(controllers: Mapping[str, ControllerConfig | None]) -> dict[str, Law]:
-    """Return the laws by name, each from the catalogue or from a controller."""
+    """Return the laws by name, from the catalogue or from a controller."""
     return {
         name: LAWS[name] if controller is None else registered_law(controller, name)
         for name, controller in controllers.items()
@@ -153,7 +153,7 @@ def with_courses(
 
 
 def as_tuned(controller: ControllerConfig) -> TuningResult:
-    """Present the gains of a controller as the result of a search, without a cost."""
+    """Return the gains of a controller as the result of a search, without a cost."""
     return TuningResult(
         gains=own_gains(controller), cost=float("nan"), seed=0, costs=[], evaluations=0
     )

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Tuned gains of a comparison as the controller of a scenario.
+"""Turn the tuned gains of a comparison into the controller of a scenario.
 
 The registered law has the same equations.
 """
@@ -26,8 +26,8 @@ from rise_di_controller.params import ControllerConfig
 
 FROM_Y = ("rise_di", "pi", "l1", "lqg")
 REGISTERED = {name: law.law for name, law in LAWS.items() if law.law in FROM_Y}
-"""The registered law of a law of the catalogue: of those that measure y alone and that a scenario
-can fly."""
+"""The registered law for a law of the catalogue, if it measures nothing but y and a scenario can
+fly it."""
 
 RISE_DI_GAINS = ("K", "Lambda", "beta", "softening", "omega")
 DESIGNS = {
@@ -39,15 +39,15 @@ DESIGNS = {
 
 
 def require_registered(name: str) -> None:
-    """Raise ParameterError for a law that no scenario flies."""
+    """Raise ParameterError if no scenario can fly a law."""
     require(name in REGISTERED, "--write", f"the law {name}", f"one of {', '.join(REGISTERED)}")
 
 
 def tuned_controller(name: str, result: TuningResult, benchmark: Benchmark) -> ControllerConfig:
-    """Return the controller that flies as a law of the catalogue with tuned gains.
+    """Return the controller that flies like a law of the catalogue with tuned gains.
 
     Its inputs are those of the benchmark, 1 / abs(Omega_ii). Topics have no delay, as in the
-    benchmark. Raises ParameterError for a law that no scenario flies.
+    benchmark. Raises ParameterError if no scenario can fly the law.
     """
     require_registered(name)
     model = benchmark.model
@@ -84,9 +84,10 @@ def tuned_controller(name: str, result: TuningResult, benchmark: Benchmark) -> C
 
 
 def _rise_di(gains: dict[str, FloatArray], input_scale: FloatArray) -> dict[str, Any]:
-    """Parameters of RISE-DI.
+    """Return the parameters of RISE-DI.
 
-    A K that (22) does not have is a larger one with a smaller input scale, the same loop.
+    If (22) does not allow a K, it becomes a larger one with a smaller input scale, which is the
+    same loop.
     """
     K = gains["K"]
     least = max(MIN_K, float(K[-1]))
@@ -116,9 +117,9 @@ def _feedforward(name: str, benchmark: Benchmark) -> FeedforwardConfig | None:
 
 
 def _observer(name: str, result: TuningResult, benchmark: Benchmark) -> ObserverConfig:
-    """Return the observer of a law, with its bound of u_o.
+    """Return the observer of a law, with its bound on u_o.
 
-    The search set the margin, so none is required of the observer.
+    The search set the margin, so that the observer must not meet one.
     """
     controller = benchmark.scenario.controller
     airframe = benchmark.scenario.aircraft.load()[0]

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """One tuning procedure for every law: CMA-ES over the logarithms of its gains.
 
-On the nominal aircraft and around.
+Its flights are those of the nominal aircraft and of uncertain ones around it.
 """
 
 import os
@@ -40,9 +40,9 @@ from rise_di_controller.law.linear_loop import LinearPlant, LoopTiming, linear_l
 
 GUST = "gust"
 TURBULENCE = "turbulence"
-"""The winds of a benchmark: that of its scenario, and turbulence in its place."""
+"""The winds of a benchmark: that of its scenario, and turbulence instead of it."""
 
-TUNING_TURBULENCE_SEED = 40  # of the turbulence in a cost; a comparison flies another one
+TUNING_TURBULENCE_SEED = 40  # seed of the turbulence in a cost; a comparison has another one
 
 
 class Objective(NamedTuple):
@@ -50,12 +50,12 @@ class Objective(NamedTuple):
 
     title: str
     weights: dict[str, float]  # by wind
-    delay: int  # of the late u, in multiples of `Benchmark.delay`
-    all_late: bool  # u is late on all aircraft, not on the nominal one alone
-    requirement: Requirement | None = None  # of the nominal loop of a law that has margins
+    delay: int  # delay of the late u, in multiples of `Benchmark.delay`
+    all_late: bool  # whether u is late on all aircraft, and not only on the nominal one
+    requirement: Requirement | None = None  # on the nominal loop of a law that has margins
 
 
-# Turbulence has half the weight, since scores in it are about twice those in the gusts.
+# Turbulence has half the weight, because scores in it are about twice those in gusts.
 OBJECTIVES = {
     "gust": Objective("gusts", {GUST: 1.0}, 1, all_late=False),
     "gust_turbulence": Objective(
@@ -76,12 +76,12 @@ OBJECTIVES = {
 UNCERTAIN_AIRCRAFT = 12
 UNCERTAINTY = 0.4
 UNCERTAINTY_SEED = 40
-"""Number, +-fraction and seed of the uncertain aircraft. Campaigns and comparisons use other seeds
-by default."""
+"""Number, +-fraction and seed of the uncertain aircraft. By default, campaigns and comparisons have
+other seeds."""
 
 DELAY_TICKS = 2
-"""Delay of u in the late flights of a cost: 20 ms at 100 Hz. Without actuators it is one tick: the
-loop's lag is 15 ms."""
+"""Delay of u in the late flights of a cost: 20 ms at 100 Hz. Without actuators it is one tick,
+because the lag of the loop is 15 ms."""
 
 POPULATION = 16
 GENERATIONS = 88
@@ -90,13 +90,13 @@ INITIAL_SIGMA = 0.4
 """A search has GENERATIONS, or GENERATIONS_PER_GAIN times its gains if that is more: from 15 gains
 on. INITIAL_SIGMA is the first standard deviation of log(gain)."""
 
-# Parts of the candidates of a generation, flown side by side. A flight in a smaller part takes more
-# processor time.
+# Parts of the candidates of a generation, which fly side by side. A flight in a smaller part takes
+# more processor time.
 PARTS = 2
 
-# Cost of a flight that diverged, of a loop without any margin, and upper bound of every other cost.
+# Cost of a flight that diverged and of a loop without any margin. It bounds every other cost.
 MAX_COST = 1000.0
-# s. Step of the integration, or one tick if that is shorter. The scores are within 1 % of those of
+# s, step of the integration, or one tick if that is shorter. The scores are within 1 % of those of
 # a finer step.
 STEP = 0.005
 
@@ -109,8 +109,8 @@ class Benchmark(NamedTuple):
 
     scenario: Scenario
     model: NominalModel
-    unit: FloatArray  # (m,) of the errors in a score
-    activity_unit: FloatArray  # (m,) of the mean abs(u_dot) in a cost
+    unit: FloatArray  # (m,) units of the errors in a score
+    activity_unit: FloatArray  # (m,) units of the mean abs(u_dot) in a cost
     plant: PlantParams
     vehicle: Vehicle
     scenarios: dict[str, Scenario]  # by wind
@@ -122,9 +122,8 @@ def build_benchmark(scenario: Scenario, turbulence_seed: int = TUNING_TURBULENCE
     """Build the benchmark of a scenario: its manoeuvre, actuators and noise.
 
     y, y_m and the law run at one rate, and topics have no delay. The winds are those of the
-    scenario, and, separately, the turbulence of `turbulence_of` with `turbulence_seed`. Raises
-    ParameterError for a scenario that a campaign cannot fly, and for outputs whose unit has no
-    score.
+    scenario and, in other flights, the turbulence of `turbulence_of` with `turbulence_seed`. Raises
+    ParameterError if a campaign cannot fly the scenario, or if the unit of an output has no score.
     """
     require_flyable(scenario)
     scenario = scenario.vary(
@@ -135,7 +134,7 @@ def build_benchmark(scenario: Scenario, turbulence_seed: int = TUNING_TURBULENCE
         reference_model={"rate": scenario.controller.rate},
         controller={"delay": 0.0, "feedforward": None, "observer": None},
     )
-    # The scenario in two winds, with the aircraft as the model of the feedforward.
+    # Put the scenario into two winds, with the aircraft as the model of the feedforward.
     airframe, _ = scenario.aircraft.load()
     controller = scenario.controller
     with_model = scenario.vary(controller=with_feedforward(controller, airframe).model_dump())
@@ -149,7 +148,7 @@ def build_benchmark(scenario: Scenario, turbulence_seed: int = TUNING_TURBULENCE
         values = list(limits) or [default] * m
         return np.array([values[column] for column in columns])
 
-    # The nominal model in the order of the law, with its timing and its limits.
+    # Build the nominal model in the order of the law, with its timing and its limits.
     unit = score_units(controller.outputs, airframe.units_of_outputs())
     noise = scenario.aircraft.sensor_arrays().noise[rows]
     loop = LoopTiming(np.array(controller.lag), 0.0, 1.0 / controller.rate)
@@ -190,9 +189,9 @@ def turbulence_of(scenario: Scenario) -> dict[str, float]:
 
 
 def _courses(scenario: Scenario) -> dict[str, Course]:
-    """Return the courses of a scenario, by the model of the feedforward.
+    """Return the courses of a scenario by the model of the feedforward.
 
-    The scenario's controller has the aircraft as that model.
+    The controller of the scenario has the aircraft as this model.
     """
     course, controller, (airframe, _) = (
         build_course(scenario),
@@ -213,18 +212,18 @@ def _courses(scenario: Scenario) -> dict[str, Course]:
 
 
 def result_score(result: FleetResult, unit: FloatArray) -> FloatArray:
-    """Sum over the channels of rms of the true error / unit, shape (N,).
+    """Sum the rms of the true error over its unit, over the channels, (N,).
 
-    Infinite if a flight diverged.
+    It is infinite if a flight diverged.
     """
     total = statistics.score(np.asarray(result.rms), unit)
     return np.where(np.asarray(result.diverged) | ~np.isfinite(total), np.inf, total)
 
 
 def cost(result: FleetResult, benchmark: Benchmark) -> FloatArray:
-    """Score + sum over the channels of mean abs(u_dot) / activity_unit, shape (N,).
+    """Return score + sum over the channels of mean abs(u_dot) / activity_unit, (N,).
 
-    At most MAX_COST.
+    It is at most MAX_COST.
     """
     activity = np.sum(np.asarray(result.slew) / benchmark.activity_unit[:, None], axis=0)
     total = result_score(result, benchmark.unit) + activity
@@ -234,7 +233,10 @@ def cost(result: FleetResult, benchmark: Benchmark) -> FloatArray:
 def benchmark_fleet(
     A: FloatArray, B: FloatArray, late: Array, wind: str, benchmark: Benchmark
 ) -> FleetMatrices:
-    """Aircraft in a wind of the benchmark, u late by whole ticks; shapes as in `fleet.assemble`."""
+    """Return aircraft in a wind of the benchmark, with u late by whole ticks.
+
+    The shapes are as in `batch_matrices.assemble`.
+    """
     aircraft = benchmark.scenario.aircraft
     directions = gust_directions(aircraft.sampled_airframe(), A, aircraft.uncertainty.wind)
     return batch_matrices.assemble(
@@ -247,18 +249,17 @@ class Evaluation(NamedTuple):
 
     wind: str
     fleet: FleetMatrices
-    weight: FloatArray  # (F,) of their costs in the sum
+    weight: FloatArray  # (F,) weights of their costs in the sum
 
 
 def evaluations(objective: Objective, benchmark: Benchmark) -> list[Evaluation]:
-    """Flights of one evaluation of the cost, by wind.
+    """Return the flights of one evaluation of the cost, by wind.
 
-    Aircraft with u in time, and late aircraft.
+        cost = sum over the winds of weight (mean over the aircraft with u in time
+                                            + mean over those with u late)
 
-        cost = sum over the winds of weight (mean over the aircraft with u in time + mean over the
-        late ones)
-
-    No flight is in calm air: in the flights with gusts the manoeuvre comes first, in calm air.
+    No flight is in calm air only, because in the flights with gusts the manoeuvre comes first, in
+    calm air.
     """
     airframe, _ = benchmark.scenario.aircraft.load()
     A, B = nominal_and_sampled(airframe, UNCERTAINTY, UNCERTAIN_AIRCRAFT, UNCERTAINTY_SEED)
@@ -285,10 +286,10 @@ def repeat_flights(flights: FleetMatrices, times: int) -> FleetMatrices:
 
 
 def spread_over(params: Any, single: Any, flights: int) -> Any:
-    """Parameters of several candidates, each for all of its flights.
+    """Spread the parameters of several candidates over all of their flights.
 
-    (.., candidates) -> (.., candidates flights). `single` are the parameters of one candidate. What
-    has the same shape in both is common to all candidates, and stays.
+    (.., candidates) becomes (.., candidates flights). `single` are the parameters of one candidate.
+    A parameter that has the same shape in both is common to all candidates, and stays.
     """
 
     def spread(leaf: FloatArray, single_leaf: FloatArray) -> FloatArray:
@@ -313,13 +314,14 @@ def tune(
     generations: int | None = None,
     progress: Callable[[int, float], None] | None = None,
 ) -> TuningResult:
-    """Gains of the smallest cost that CMA-ES finds from the initial ones.
+    """Find the gains of the smallest cost, by CMA-ES from the initial ones.
 
-    They are the best of several seeds; all seeds run together. The cost of a candidate is the
-    weighted sum over the flights of `evaluations`. A loop with a part of the margins that the
-    objective requires costs MAX_COST times the rest. Threads fly a part of the candidates in one
-    wind each. `progress` receives the generation and the smallest cost so far. Source: N. Hansen,
-    A. Ostermeier, Evolutionary Computation 9(2), 2001; the package `cma`.
+    They are the best of several seeds, which run together. The cost of a candidate is the weighted
+    sum over the flights of `evaluations`. If a loop has only a fraction of the margins that the
+    objective requires, the fraction that is missing costs MAX_COST times its size. Each thread
+    flies a part of the candidates in one wind. `progress` receives the generation and the smallest
+    cost so far. Source: N. Hansen, A. Ostermeier, Evolutionary Computation 9(2), 2001; the package
+    `cma`.
     """
     import cma  # noqa: PLC0415 - it imports matplotlib, which nothing here uses
 
@@ -328,7 +330,7 @@ def tune(
     ends = np.cumsum([len(gain) for gain in begin.values()])[:-1]
 
     def gains_of(vectors: FloatArray) -> Gains:
-        """Gains by name, shape (size, N), of logarithms (N, d)."""
+        """Return the gains by name, (size, N), for logarithms (N, d)."""
         return dict(zip(begin, np.split(np.exp(vectors.T), ends), strict=True))
 
     together = POPULATION * len(seeds) // PARTS
@@ -341,13 +343,13 @@ def tune(
     single = law.params(begin, benchmark.model)
 
     def costs(job: tuple[Any, Evaluation]) -> FloatArray:
-        """Costs of a part of the candidates in one wind, (together,)."""
+        """Return the costs of a part of the candidates in one wind, (together,)."""
         params, evaluation = job
         course = benchmark.courses[evaluation.wind][law.feedforward]
         result = batch.fly(evaluation.fleet, benchmark.vehicle, course, control_law, params)
         return cost(result, benchmark).reshape(together, each) @ evaluation.weight
 
-    # Each seed is a search of its own; all fly together, part by part.
+    # Each seed has its own search. All of them fly together, part by part.
     lacking = partial(_lacking, law, objective, benchmark)
     options = {"popsize": POPULATION, "verbose": -9}
     searches = [
@@ -394,10 +396,10 @@ def _best_result(
 
 
 def nominal_margins(law: Law, gains: Gains, model: NominalModel) -> Margins:
-    """Margins of a law around the nominal aircraft for N sets of gains, (m, N) or (1, N).
+    """Return the margins of a law around the nominal aircraft, for N sets of gains.
 
-    Their shapes are (N, m) and (N,), without those of all inputs at once. u has no delay, as in a
-    benchmark.
+    The gains are (m, N) or (1, N); the margins are (N, m) and (N,), and lack those of all inputs at
+    once. u has no delay, as in a benchmark.
     """
     tuned_law = TunedLaw(law.control_law(model), law.params(gains, model))
     count = max((gain.shape[-1] for gain in gains.values()), default=1)
@@ -408,7 +410,7 @@ def nominal_margins(law: Law, gains: Gains, model: NominalModel) -> Margins:
 
 
 def _lacking(law: Law, objective: Objective, benchmark: Benchmark, gains: Gains) -> FloatArray:
-    """Costs of the missing margins of N candidates, (N,)."""
+    """Return what the missing margins of N candidates cost, (N,)."""
     if objective.requirement is None or not law.has_margins:
         return np.zeros(next(iter(gains.values())).shape[-1])
     margins = nominal_margins(law, gains, benchmark.model)
@@ -434,5 +436,5 @@ def _after(
 
 
 def as_gains(result: TuningResult) -> Gains:
-    """Gains of shape (m, 1) and (1, 1)."""
+    """Return gains of shape (m, 1) and (1, 1)."""
     return {name: np.array(values)[:, None] for name, values in result.gains.items()}
