@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The controller of body rates inside an autopilot.
 
-The parts are the exported C code, source/rates that decides which controller flies, and the
-autopilot's shell, source/px4 or source/ardupilot.
+It has three parts: the exported C code, source/rates, which decides which controller flies, and the
+shell for the autopilot, source/px4 or source/ardupilot.
 """
 
 from collections.abc import Mapping
@@ -18,17 +18,17 @@ from flight_core.files import write_file, writing
 from flight_core.parameters import require
 
 AXES: Mapping[str, int] = MappingProxyType({"p": 0, "q": 1, "r": 2})
-"""Channels of y and the axes of autopilots: roll, pitch, yaw."""
+"""Channels of y, and the axes of autopilots that they are: roll, pitch, yaw."""
 
-SAMPLES = 8  # kept: y_m is stepped past each y, so a tick needs the newest y and two of y_m
-SLOWEST, FASTEST = 0.6, 1.6  # of the trim speed: where the dynamic pressure is clipped
+SAMPLES = 8  # kept; y_m is stepped past each y, so that a tick needs the newest y and two y_m
+SLOWEST, FASTEST = 0.6, 1.6  # times the trim speed, where the dynamic pressure is clipped
 
 HOOKS = """ArduPlane/Plane.h, in class Plane, beside void stabilize();
     void rise_di();
 ArduPlane/Plane.cpp, in scheduler_tasks, behind FAST_TASK(stabilize),
     FAST_TASK(rise_di),
 """
-"""The two lines that ArduPlane needs beside the files."""
+"""The two lines that ArduPlane needs in its own files."""
 
 MESSAGE = """# Rate controller of RISE-DI: a cycle, in the order {channels}
 uint8 ORB_QUEUE_LENGTH = 16  # the logger misses no tick
@@ -57,7 +57,7 @@ PX4 = {
 MULTICOPTER: Mapping[str, str] = MappingProxyType(
     {"fw_rate_control": "mc_rate_control", "virtual_fw": "virtual_mc"}
 )
-"""The module and topics of PX4 for a multicopter, in place of those of the fixed wing."""
+"""Module and topics of PX4 for a multicopter, which replace those for a fixed wing."""
 TORQUES = {"roll", "pitch", "yaw"}  # inputs of a multicopter
 
 
@@ -79,10 +79,10 @@ HEADER = """/* Axes, signs and sizes of the autopilot for the channels of the sc
 class Shell(NamedTuple):
     """How the code becomes a part of an autopilot; its files are in source/NAME."""
 
-    place: str  # of the code in the folder
-    axes: str  # outputs that it may have
+    place: str  # where the code goes in the folder
+    axes: str  # outputs that the controller may have
     reason: str
-    texts: Mapping[str, str]  # further files, with `{channels}` and `{m}` filled in
+    texts: Mapping[str, str]  # other files; `{channels}` and `{m}` are filled in
 
 
 SHELLS = {
@@ -106,12 +106,12 @@ def write_module(
 ) -> list[Path]:
     """Write the module of an autopilot to a folder.
 
-    For PX4 the folder is EXTERNAL_MODULES_LOCATION, for ArduPlane files for the tree, with two
-    lines of the tree in hooks.txt. Raises ParameterError.
+    For PX4 the folder is EXTERNAL_MODULES_LOCATION. For ArduPlane it has files for the source tree,
+    and hooks.txt with two lines to add to the tree. Raises ParameterError.
 
-    The outputs are body rates. An input of u at the upper end stop of its actuator is a torque of
-    1, in ArduPlane a deflection of 45 degrees, with the sign of D. The spare in PX4 is
-    fw_rate_control, or mc_rate_control for a multicopter.
+    The outputs are body rates. If u of an input is at the upper end stop of its actuator, that is a
+    torque of 1, in ArduPlane a deflection of 45 degrees, with the sign of D. In PX4, the controller
+    that stands by is fw_rate_control, or mc_rate_control for a multicopter.
     """
     shell = SHELLS[autopilot]
     controller = exportable(scenario.controller)
@@ -142,10 +142,10 @@ def write_module(
 
 
 def _words_of_vehicle(autopilot: str, scenario: Scenario) -> Mapping[str, str]:
-    """Words of the shell to replace: those of a multicopter, none for a fixed wing.
+    """Return words of the shell to replace: those of a multicopter, or none for a fixed wing.
 
-    A fixed wing has a trim speed, a multicopter none, and torques about the axes as inputs. Raises
-    ParameterError for what is neither.
+    A fixed wing has a trim speed. A multicopter has none, and its inputs are torques about the
+    axes. Raises ParameterError if the aircraft is neither.
     """
     channels = scenario.aircraft.channels()
     has_torques = set(scenario.controller.inputs) <= TORQUES
@@ -173,7 +173,7 @@ def _with_words(text: str, words: Mapping[str, str]) -> str:
 
 
 def _axes(scenario: Scenario, suffix: str) -> str:
-    """Write rise_di_axes.h: axes, torque of a unit of u, and the speed at which it holds."""
+    """Write rise_di_axes.h: the axes, the torque per unit of u, and the speed at which it holds."""
     controller = scenario.controller
     channels = scenario.aircraft.channels()
     upper = dict(zip(channels.inputs, scenario.aircraft.actuators.upper or (), strict=False))

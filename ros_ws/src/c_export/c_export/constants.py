@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of controller and reference model in C.
+"""The parameters of the controller and the reference model in C.
 
-They are rise_di_parameters.h, and struct rise_di_parameters as bytes.
+They become rise_di_parameters.h, or the bytes of struct rise_di_parameters.
 """
 
 import math
@@ -33,10 +33,10 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 SCALARS = frozenset(
     {"period", "dt_least", "dt_largest", "speed", "time", "V_least", "V_largest", "fade_rate"}
 )
-"""Reals that are no list."""
+"""Reals that are not lists."""
 
 LEAST, LARGEST = -math.inf, math.inf
-POSITIVE = float(np.finfo(np.float32).tiny)  # of float32, so of both
+POSITIVE = float(np.finfo(np.float32).tiny)  # positive in float32, and so in float64
 TABLE: Mapping[str, tuple[str, float, float]] = MappingProxyType(
     dict.fromkeys(("period", "dt_least", "dt_largest", "time"), ("s", POSITIVE, LARGEST))
     | dict.fromkeys(("K", "Lambda"), ("1/s", POSITIVE, LARGEST))
@@ -63,8 +63,8 @@ TABLE: Mapping[str, tuple[str, float, float]] = MappingProxyType(
         "effect": ("v/effector", LEAST, LARGEST),
     }
 )
-"""Unit and bounds of the reals; a matrix of the model, which has no row here, has any finite values
-in SI."""
+"""Unit and bounds of the reals. A matrix of the model has no row here, since it has any finite
+values in SI."""
 
 REALS: Mapping[str, float] = MappingProxyType(
     {
@@ -78,13 +78,13 @@ REALS: Mapping[str, float] = MappingProxyType(
         "MEMORY": MEMORY,
     }
 )
-"""Reals of the algorithms, equal for every scenario."""
+"""Reals of the algorithms, which are the same for every scenario."""
 
 
 class Constant(NamedTuple):
     """A member of struct rise_di_parameters.
 
-    The value is whole numbers (int, tuple) or reals (array), of a matrix row by row.
+    Its value is whole numbers (int, tuple) or reals (array); a matrix comes row by row.
     """
 
     name: str
@@ -92,7 +92,7 @@ class Constant(NamedTuple):
 
 
 class Sizes(NamedTuple):
-    """Dimensions of the exported controller.
+    """The dimensions of the exported controller.
 
     They are 0 without an allocation, a feedforward or an observer.
     """
@@ -121,20 +121,20 @@ IN_C = frozenset(
 
 IDLE_IN_C = frozenset(
     {
-        # How the node runs: the caller of the C code configures and activates it.
+        # These say how the node runs. The caller of the C code configures and activates it.
         *("lockstep", "y_rate", "autostart", "start_active"),
         # Only a learner reads how well the model is known.
         "feedforward.deviation",
     }
 )
-"""Keys of a controller without effect on the C code."""
+"""Keys of a controller that have no effect on the C code."""
 
 
 def exportable(controller: ControllerConfig) -> RiseDiConfig:
-    """Return the controller, under RISE-DI.
+    """Return the controller if it is RISE-DI.
 
-    Raises ParameterError for a different law, and for a key that has a value and that the C code
-    does not know, as models that are learned or off.
+    Raises ParameterError if it has another law, or a key that the C code does not know, such as
+    models that are learned or off.
     """
     require(
         isinstance(controller, RiseDiConfig),
@@ -158,7 +158,7 @@ def exportable(controller: ControllerConfig) -> RiseDiConfig:
 
 
 def sizes(controller: RiseDiConfig) -> Sizes:
-    """Dimensions of a controller."""
+    """Return the dimensions of a controller."""
     n = 0 if controller.feedforward is None else len(controller.feedforward.states)
     s = 0 if controller.observer is None else len(controller.observer.states)
     p = 0 if controller.allocation is None else len(controller.allocation.effectors)
@@ -166,9 +166,9 @@ def sizes(controller: RiseDiConfig) -> Sizes:
 
 
 def constants(controller: RiseDiConfig) -> list[Constant]:
-    """Members of struct rise_di_parameters in the order of rise_di.h.
+    """Return the members of struct rise_di_parameters in the order of rise_di.h.
 
-    They are infinite where there is no limit.
+    If there is no limit, they are infinite.
     """
     guard = controller.guard()
     law = controller.law_params()
@@ -195,7 +195,7 @@ def constants(controller: RiseDiConfig) -> list[Constant]:
     }
     reals |= {"y_max": guard.samples.largest, "y_reach": guard.samples.reach}
     reals |= _limits("limits", guard.limits)
-    # The extensions, where there are any.
+    # The extensions, if there are any.
     if (allocation := guard.allocation) is not None:
         integers["order"] = allocation.order
         reals |= {name: getattr(allocation, name) for name in ("T", "effect", "exchange")}
@@ -229,7 +229,7 @@ def _limits(name: str, limits: Limits) -> dict[str, FloatArray]:
 def packed(controller: RiseDiConfig, *, float32: bool) -> bytes:
     """Return the bytes of struct rise_di_parameters.
 
-    The struct holds whole numbers of 64 bits, then the reals without a gap, padded to 8 bytes.
+    The struct has whole numbers of 64 bits, then the reals without a gap, and is padded to 8 bytes.
     """
     real = np.float32 if float32 else np.float64
     content = b"".join(
@@ -248,7 +248,7 @@ def _finite(values: FloatArray, real: type[np.floating]) -> FloatArray:
 
 
 def reference_constants(reference: ReferenceModelConfig) -> list[Constant]:
-    """Members of struct rise_di_reference_parameters in the order of rise_di.h."""
+    """Return the members of struct rise_di_reference_parameters in the order of rise_di.h."""
     live = reference.live_params()
     model = reference.model()
     period = period_ns(reference.rate, "rate")
@@ -269,7 +269,7 @@ def header(
     float32: bool,
     samples: int = SAMPLE_BUFFER_SIZE,
 ) -> str:
-    """Write rise_di_parameters.h; without a reference model if `reference` is None.
+    """Write rise_di_parameters.h. If `reference` is None, it has no reference model.
 
     The code keeps `samples` of y and of y_m.
     """
@@ -325,7 +325,7 @@ def header(
 
 
 def _names_and_sizes(controller: RiseDiConfig, r: int, samples: int, *, float32: bool) -> list[str]:
-    """Lines of the header: names of the channels, dimensions, and what is compiled."""
+    """Write the lines with the names of the channels, the dimensions, and what is compiled."""
     m, p, n, s, schedule = sizes(controller)
     effectors = [f"#define RISE_DI_EFFECTORS {_strings(controller.effectors)}"] if p else []
     return [
@@ -373,7 +373,7 @@ def _initialiser(
 ) -> str:
     """Write a number, or a list in braces, as C initialises it.
 
-    The first and the last list of a nested struct open and close the braces of the struct.
+    The first and the last list of a nested struct also open and close the braces of the struct.
     """
     if isinstance(value, int):
         return str(value)
@@ -389,8 +389,8 @@ def _initialiser(
 def _strings(names: tuple[str, ...]) -> str:
     """Write string literals of C.
 
-    Every byte of a character other than a letter, a digit or one of "_. " becomes an octal escape.
-    The names of a parameter set have no such character.
+    Every byte of a character that is not a letter, a digit or one of "_. " becomes an octal escape.
+    The names of a parameter set have no such characters.
     """
     return ", ".join(f'"{"".join(map(_octal, name))}"' for name in names)
 
@@ -403,5 +403,5 @@ def _octal(character: str) -> str:
 
 
 def _comment(names: tuple[str, ...]) -> str:
-    """Names in a comment of C, with the escapes of `_strings`: none ends the comment."""
+    """Write names for a comment of C, with the escapes of `_strings`, so that none can end it."""
     return ", ".join("".join(map(_octal, name)) for name in names)

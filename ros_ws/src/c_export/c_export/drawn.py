@@ -38,14 +38,14 @@ from rise_di_controller.law.control_law import Measurements, fields, restored
 from rise_di_controller.law.saturation import saturate
 from rise_di_controller.rise_di_config import RiseDiConfig
 
-# start of the drawn stamps: float64 does not resolve 1 ns there
+# Start of the drawn stamps, where float64 does not resolve 1 ns.
 EPOCH_NS = 1_795_000_000_000_000_000
 
 
 def drawn_calls(
     sets: Sequence[RiseDiConfig], ticks: int, seed: int, samples: int = SAMPLE_BUFFER_SIZE
 ) -> Recording:
-    """Drawn calls of a controller with faults of every kind.
+    """Draw calls of a controller with faults of every kind.
 
     They have jitter, lost, late and early samples, repeated stamps, errors of any size, jumps, new
     parameters and deactivation.
@@ -70,7 +70,7 @@ def drawn_calls(
     for k in range(ticks):
         draw = rng.random(10)
         now_ns += _interval_ns(draw[0], draw[1], period_ns)
-        # The size of the error, and the silence of both topics.
+        # Draw the size of the error, and the silence of both topics.
         if k % 50 == 0:
             size = unit * 10.0 ** rng.uniform(-3.0, 2.5, m) * (rng.random(m) < 0.9)
         silence = int(draw[2] * 100.0) if draw[3] < 0.005 else max(silence - 1, 0)
@@ -79,19 +79,19 @@ def drawn_calls(
             if draw[4] < 0.92 and not silence:
                 late = rng.uniform(-0.1, 0.4 * draw[6])
                 first = 2 - int(3.0 * draw[5])
-                for distance in (0.3, 0.02, 0.0)[first:]:  # closer than a slope of y_m takes, too
+                for distance in (0.3, 0.02, 0.0)[first:]:  # also closer than a slope of y_m allows
                     stamp_m_ns = now_ns - round(period_ns * (late + distance))
                     recorder.take_y_m(
                         StampedVector(stamp_m_ns, y_m * rng.uniform(0.9, 1.1)), now_ns
                     )
         with suppress(ChannelError):
-            # A sample of y: late, far too late, or with the stamp of y_m.
+            # Draw a sample of y that is late, far too late, or has the stamp of y_m.
             if draw[7] < 0.95 and not 0 < silence < 30:
                 late = rng.uniform(-0.05, 0.6) if draw[8] < 0.97 else rng.uniform(-300.0, 30.0)
                 stamp_ns = stamp_m_ns if draw[8] < 0.1 else now_ns - round(period_ns * late)
                 y = y_m + size * rng.normal(size=m) + airspeed * rng.uniform(-1.0, 1.0)
                 recorder.take_y(StampedVector(stamp_ns, y + next(jumps)), now_ns)
-        # New parameters, an engagement, a new begin, or a deactivation.
+        # Draw new parameters, an engagement, a new begin, or a deactivation.
         if draw[9] < 0.01:
             recorder.retune_to(int(rng.integers(len(sets))))
         elif draw[9] < 0.02:
@@ -107,9 +107,10 @@ def drawn_calls(
 
 
 def _interval_ns(kind: float, size: float, period_ns: int) -> int:
-    """Time to the next tick, ns: a period with jitter, far from one, or a long pause.
+    """Return the time to the next tick, ns.
 
-    `kind` and `size` are drawn from 0 to 1.
+    It is a period with jitter, far from a period, or a long pause. `kind` and `size` are drawn from
+    0 to 1.
     """
     if kind < 0.9:
         return round(period_ns * (1.0 + 0.2 * (size - 0.5)))
@@ -122,7 +123,7 @@ def _interval_ns(kind: float, size: float, period_ns: int) -> int:
 def _jumps(unit: FloatArray, rng: np.random.Generator) -> Iterator[FloatArray]:
     """Yield what is added to samples of y, (m,).
 
-    One sample of 50, and some samples after it, get up to 10^5 units and are lost.
+    One sample in 50, and some samples after it, get up to 10^5 units, so that they are lost.
     """
     m = len(unit)
     offset = np.zeros_like(unit)
@@ -139,7 +140,7 @@ def drawn_standstill(
 ) -> Recording:
     """Draw samples of y with noise, and stretches of up to twelve equal samples.
 
-    The samples come at the ticks and half a period before.
+    The samples come at the ticks and half a period before them.
     """
     rng = np.random.default_rng(seed)
     period_ns = sets[0].guard().period_ns
@@ -160,12 +161,11 @@ def drawn_standstill(
 
 
 def drawn_steps(sets: Sequence[RiseDiConfig], index: int, steps: int, seed: int) -> Recording:
-    """Single steps of an engaged controller from drawn states, computed at once.
+    """Draw single steps of an engaged controller from any state, and compute them at once.
 
-    The parameters are the set of an index.
-
-    Errors from 0.001 to 300 widths of the softened sign. dt from 0.2 to 10 periods, so with up to 9
-    missed samples, where no gap engages the law again.
+    The parameters are those with the `index` in `sets`. Errors are 0.001 to 300 widths of the
+    softened sign. dt is 0.2 to 10 periods, so that up to 9 samples are missing, as long as no gap
+    makes the law engage again.
     """
     rng = np.random.default_rng(seed)
     guard = sets[index].guard()
@@ -206,7 +206,7 @@ def drawn_steps(sets: Sequence[RiseDiConfig], index: int, steps: int, seed: int)
 
 
 def drawn_commands(reference: ReferenceModelConfig, steps: int, seed: int) -> Recording:
-    """Live commands for the reference model.
+    """Draw live commands for the reference model.
 
     They are of any size, beyond the bounds, late, repeated, and lost for longer than `max_age`.
     """
@@ -256,7 +256,7 @@ def _rows(values: Mapping[str, FloatArray], groups: Sequence[str]) -> FloatArray
 def _drawn_states(
     controller: RiseDiConfig, rng: np.random.Generator, dt_ns: NDArray[np.int64]
 ) -> tuple[dict[str, FloatArray], FloatArray, FloatArray]:
-    """States by group, y and y_m, of shape (values, steps)."""
+    """Draw states by group, y and y_m, each of shape (values, steps)."""
     m = len(controller.outputs)
     steps = len(dt_ns)
     eps = controller.law_params().eps[:, None]
@@ -301,7 +301,7 @@ def _states_after(
     y_m: FloatArray,
     dt_ns: NDArray[np.int64],
 ) -> dict[str, FloatArray]:
-    """States after a step of the guard, by the functions of the guard over all columns."""
+    """Return the states after a step of the guard, by its functions over all columns."""
     guard = controller.guard()
     law = controller.tuned_law()
     period = seconds(guard.period_ns)
@@ -318,14 +318,14 @@ def _states_after(
         u_trim=before["u_trim"] + before["u_ff"],
         u_before=u_before,
     )
-    # The prediction over lost periods.
+    # Predict over lost periods.
     lost_periods = np.round(dt / period) - 1.0
     for k in range(round(lost_periods.max())):
         state = _where(k < lost_periods, law.control_law.missed(state, at_last_y, params), state)
     u_ff, model_state = _feedforward_step(guard.nominal, before, y_m, dt)
     u_trim = before["u_trim"] if guard.nominal is None else before["u_trim"] + u_ff
     measurements = Measurements(y=y, y_m=y_m, y_m_dot=zero, u_trim=u_trim, u_before=u_before)
-    # The step of the law, and the step inside the limits where one acts.
+    # Step the law, and step it inside the limits if one of them acts.
     law_state, u_free = law.control_law.step(state, measurements, dt, params)
     last = before.get("effectors")
     u, _ = _effector_values(saturate(u_free, u_before, dt, limits), last, dt, guard.allocation)
@@ -335,7 +335,7 @@ def _states_after(
         state, measurements, dt, params, limits
     )
     u, effectors = _effector_values(np.where(is_limited, u_limited, u), last, dt, guard.allocation)
-    # The state afterwards, and the output of the tick.
+    # Collect the state afterwards, and the output of the tick.
     after = {
         **before,
         "u": u,
@@ -360,7 +360,7 @@ def _feedforward_step(
     y_m: FloatArray,
     dt: FloatArray,
 ) -> tuple[FloatArray, dict[str, FloatArray]]:
-    """u_ff after a step of the feedforward, and the states of its model, by column."""
+    """Return u_ff after a step of the feedforward, and the states of its model, by column."""
     if nominal is None:
         return before["u_ff"], {}
     x, u, dt_before, ticks, u_0 = (
@@ -392,7 +392,7 @@ def _effector_values(
 
 
 def _columns(params: Any) -> Any:
-    """Parameters of a controller with columns in place of vectors, for many steps at once."""
+    """Turn the vectors of a controller's parameters into columns, for many steps at once."""
     if hasattr(params, "_asdict"):
         return type(params)(*map(_columns, params))
     return params[:, None] if isinstance(params, np.ndarray) and params.ndim == 1 else params

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Calls of a controller in order, as events, with the state after each tick.
 
-The flights are those with faults, or that of a log.
+They come from flights with faults, or from a log.
 """
 
 from collections import deque
@@ -34,7 +34,7 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 START, TAKE_Y, TAKE_Y_M, TICK, RETUNE, RESTART, GUARD_TICK, LOAD, TAKE_U_M, STEP_REFERENCE = range(
     10
 )
-REFUSALS = 1 << 20  # 20 samples since the last tick, a bit a sample
+REFUSALS = 1 << 20  # a bit for each of 20 samples since the last tick
 INTEGERS = (
     "published",
     "refused",
@@ -54,15 +54,15 @@ NOTHING = np.zeros(0)
 class Recording(NamedTuple):
     """Events, and the state of the controller or reference model after each of the T ticks.
 
-    The Python code has the state.
+    The states are those of the Python code.
     """
 
     name: str
-    names: tuple[str, ...]  # of the integers and the reals
+    names: tuple[str, ...]  # names of the integers and the reals
     events: NDArray[np.void]  # of `event_type`
     integers: NDArray[np.int64]  # (T, i)
-    reals: FloatArray  # (T, w), u or y_m first
-    loaded: FloatArray = NOTHING  # reals of the states before the ticks, for LOAD
+    reals: FloatArray  # (T, w), with u or y_m first
+    loaded: FloatArray = NOTHING  # reals of the states before the ticks, which LOAD takes
 
     @property
     def ticks(self) -> int:
@@ -94,12 +94,12 @@ def real_groups(controller: RiseDiConfig) -> dict[str, int]:
 
 
 def state_names(controller: RiseDiConfig) -> tuple[str, ...]:
-    """Names of the integers and the reals in a state."""
+    """Return the names of the integers and the reals in a state."""
     return (*INTEGERS, *numbered(real_groups(controller)))
 
 
 def numbered(groups: Mapping[str, int]) -> Iterator[str]:
-    """Names of the values of groups: u[0], u[1], ..."""
+    """Yield the names of the values of groups: u[0], u[1], ..."""
     for group, count in groups.items():
         yield from (f"{group}[{i}]" for i in range(count))
 
@@ -107,9 +107,9 @@ def numbered(groups: Mapping[str, int]) -> Iterator[str]:
 class Recorder(Controller):
     """A controller that records its calls and its states.
 
-    `sets` are the parameters that `retune` may take, the first at first. `before_tick` is called
-    with the recorder and the instant before each tick, and returns whether the controller is
-    active. `samples` of y and of y_m are kept.
+    `sets` are the parameters that `retune` may take, and the first of them are those at the start.
+    `before_tick` is called with the recorder and the instant before each tick, and returns whether
+    the controller is active. `samples` of y and of y_m are kept.
     """
 
     def __init__(
@@ -122,7 +122,7 @@ class Recorder(Controller):
         self._reset(sets[0])
         self.sets = sets
         self._before_tick = before_tick
-        self.silent: frozenset[str] = frozenset()  # samples that get lost: y, y_m
+        self.silent: frozenset[str] = frozenset()  # topics whose samples get lost: y, y_m
         self._events: list[tuple[Any, ...]] = []
         self._integers: list[tuple[int, ...]] = []
         self._reals: list[FloatArray] = []
@@ -204,7 +204,7 @@ class Recorder(Controller):
     ) -> None:
         """Record a tick: stamp, y, y_m at the stamp, and the distance of the newest y_m in ns.
 
-        `sample` is None without samples.
+        `sample` is None if there are no samples.
         """
         y = None
         y_m = []
@@ -253,7 +253,7 @@ class Recorder(Controller):
         self._reals.append(row)
 
     def recording(self, name: str) -> Recording:
-        """Events and states so far."""
+        """Return the events and states so far."""
         events = np.array(self._events, dtype=event_type(len(self._none)))
         integers = np.array(self._integers, dtype=np.int64).reshape(-1, len(INTEGERS))
         reals = np.array(self._reals).reshape(len(integers), -1)
@@ -265,7 +265,7 @@ class Recorder(Controller):
 def parameter_sets(controller: RiseDiConfig) -> list[RiseDiConfig]:
     """Return the controller, then valid changes of its parameters.
 
-    The changes concern gains, limits, signs, times, schedule, observer and stops.
+    The changes concern gains, limits, signs, times, the schedule, the observer and stops.
     """
     widths = np.array(controller.input_scale) * controller.law_params().eps
     bound = np.minimum(10.0 * widths, 0.1 * np.array(controller.upper or 10.0 * widths)).tolist()
@@ -274,7 +274,7 @@ def parameter_sets(controller: RiseDiConfig) -> list[RiseDiConfig]:
         "upper": tuple(bound),
         "slew": tuple(4.0 * value for value in bound),
     }
-    # Changes of each parameter of the law and of the guard.
+    # Change each parameter of the law and of the guard.
     changes: list[Mapping[str, Any]] = [
         {"k_g": 0.8 * controller.k_g, "Lambda": tuple(0.9 * value for value in controller.Lambda)},
         {"beta": tuple(0.7 * value for value in controller.beta)},
@@ -286,9 +286,9 @@ def parameter_sets(controller: RiseDiConfig) -> list[RiseDiConfig]:
         {"hold": 0.03, "ramp": 0.07, "max_age": 0.05},
         {"on_deactivate": "hold"},
     ]
-    # Changes of the extensions.
+    # Change the extensions.
     if controller.schedule is not None:
-        changes.append({"schedule.time": 5.0 / controller.rate})  # below the longest dt
+        changes.append({"schedule.time": 5.0 / controller.rate})  # shorter than the longest dt
     if controller.observer is not None:
         changes.append({"observer.F": tuple(0.9 * value for value in controller.observer.F)})
         changes.append({"observer.fade": 0.0})
@@ -299,7 +299,7 @@ def parameter_sets(controller: RiseDiConfig) -> list[RiseDiConfig]:
         changes.append({name: tuple(value.tolist()) for name, value in bind.items()})
     sets = [controller]
     for change in changes:
-        with suppress(ParameterError):  # an observer without a margin under these gains
+        with suppress(ParameterError):  # the observer may have no margin under these gains
             sets.append(exportable(vary(controller, change)))
     return sets
 
@@ -307,10 +307,10 @@ def parameter_sets(controller: RiseDiConfig) -> list[RiseDiConfig]:
 def flight_recordings(
     scenario: Scenario, sets: Sequence[RiseDiConfig], samples: int = SAMPLE_BUFFER_SIZE
 ) -> Iterator[Recording]:
-    """Flights in one process: as the scenario says, with a tenth of y lost, and with faults.
+    """Fly in one process: as the scenario says, with a tenth of y lost, and with faults.
 
-    Faults: new parameters, y or y_m lost within hold, within ramp and beyond, deactivation,
-    engagement, tight limits.
+    The faults are new parameters, y or y_m lost within hold, within ramp and beyond, deactivation,
+    engagement and tight limits.
     """
     sensors = scenario.aircraft.sensors.model_dump() | {"dropout": 0.1}
     yield _flight("the flight", scenario, Recorder(sets, samples=samples))
@@ -392,7 +392,7 @@ def run_recording(run: RecordedRun) -> tuple[list[RiseDiConfig], Recording, int]
                 recorder.restart()
             sample = (int(log.stamp_ns[k]), groups["y"][k], groups["y_m"][k], offset_ns)
         elif log.stamp_ns[k] == recorder.state.stamp_ns:
-            # A stamp that rests tells of a y from before it, which engaged nothing.
+            # If the stamp stays the same, y came from before it and engaged nothing.
             sample = (int(log.stamp_ns[k]) - 1, groups["y"][k], groups["y_m"][k], 0)
         recorder.guard_tick(int(now_ns[k]), sample, active=log["mode"][k] != Mode.INACTIVE)
         equal += recorder.state.command.tobytes() == groups[command][k].tobytes()

@@ -24,11 +24,11 @@ from flight_core.vectors import FloatArray
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 _POINTER = ctypes.c_void_p
-MOST = float(np.finfo(np.float64).max)  # in place of infinity, as in the C code
+MOST = float(np.finfo(np.float64).max)  # stands for infinity, as in the C code
 
 
 class CController:
-    """A controller in C, with the calls of `rise_di_controller.controller.Controller`.
+    """A controller in C that has the calls of `rise_di_controller.controller.Controller`.
 
     u has p values.
     """
@@ -46,7 +46,7 @@ class CController:
             )
 
     def take_y(self, stamp_ns: int, value: FloatArray, now_ns: int) -> int:
-        """Take a sample of y; returns rise_di_status, 0 for a sample taken."""
+        """Take a sample of y, and return rise_di_status, which is 0 if the sample was taken."""
         return self._take(1, stamp_ns, value, now_ns)
 
     def take_y_m(self, stamp_ns: int, value: FloatArray, now_ns: int) -> int:
@@ -67,10 +67,10 @@ class CController:
         return self._u.copy(), mode
 
     def replay(self, recording: Recording) -> FloatArray:
-        """Return the u of each tick of a log, `events.run_recording`, (T, p)."""
+        """Return the u of each tick of a log, see `events.run_recording`, (T, p)."""
         events = recording.events
         ticks = events[events["kind"] == GUARD_TICK]
-        before = np.zeros(len(events), dtype=np.int64)  # what the event before a tick is
+        before = np.zeros(len(events), dtype=np.int64)  # which event comes before each tick
         before[1:] = 4 * (events["kind"] == START)[:-1] + 8 * (events["kind"] == RESTART)[:-1]
         flags = ticks["flag"] + before[events["kind"] == GUARD_TICK]
         integers = [
@@ -111,8 +111,8 @@ VALUE_REFERENCES = {
     "mode": 400,
     "parameter": 1000,
 }
-"""Value references of the first channel of each group, those of fmu.c; of the parameters by their
-place."""
+"""Value references of the first channel of each group, as in fmu.c. Those of the parameters follow
+their places."""
 
 TUNABLE: Mapping[str, str] = MappingProxyType(
     {
@@ -126,11 +126,12 @@ TUNABLE: Mapping[str, str] = MappingProxyType(
         "limits.rate": "limit of the rate of u, per s",
     }
 )
-"""Parameters that may change between two steps, and what each is; with a value a channel."""
+"""Parameters that may change between two steps, with a value for each channel, and what they are.
+"""
 
 
 class Units(NamedTuple):
-    """SI units of the outputs and of the commands, in their order."""
+    """The SI units of the outputs and of the commands, in their order."""
 
     outputs: Sequence[str]
     commands: Sequence[str]
@@ -154,7 +155,7 @@ def _power(name: str, exponent: int) -> str:
 
 
 def _definitions(units: Units) -> list[str]:
-    """UnitDefinitions of the units."""
+    """Write the UnitDefinitions of the units."""
     lines = []
     for name in sorted({*units.outputs, *units.commands}):
         dimension = quantity(name).dimension
@@ -165,7 +166,7 @@ def _definitions(units: Units) -> list[str]:
 
 
 def _channels(controller: RiseDiConfig, units: Units) -> list[str]:
-    """Variables of y, y_m, u, the flags and the mode."""
+    """Write the variables of y, y_m, u, the flags and the mode."""
     groups = {
         "y": (controller.outputs, units.outputs),
         "y_m": (controller.outputs, units.outputs),
@@ -191,7 +192,7 @@ def _channels(controller: RiseDiConfig, units: Units) -> list[str]:
 
 
 def _parameters(controller: RiseDiConfig) -> list[str]:
-    """Variables of the parameters TUNABLE, a channel each."""
+    """Write the variables of the parameters in TUNABLE, one for each channel."""
     variables = []
     place = VALUE_REFERENCES["parameter"]
     for member in constants(controller):
@@ -245,10 +246,10 @@ DESCRIPTION = """<?xml version="1.0" encoding="UTF-8"?>
 
 
 def model_description(controller: RiseDiConfig, scenario: str, units: Units) -> str:
-    """modelDescription.xml of the unit.
+    """Write modelDescription.xml of the unit.
 
-    The inputs are y, y_m, active, y_new, y_m_new, the outputs u and mode, the parameters TUNABLE. A
-    step is a tick.
+    Its inputs are y, y_m, active, y_new and y_m_new, its outputs u and mode, and its parameters
+    TUNABLE. A step is a tick.
     """
     variables = _channels(controller, units)
     begin = 2 * len(controller.outputs) + 1
@@ -274,7 +275,7 @@ def build_fmu(
 ) -> Path:
     """Compile exported code to a co-simulation unit of FMI 2.0 for this machine (linux64).
 
-    The unit has the sources for others. Raises ParameterError.
+    The unit also has the sources, for other machines. Raises ParameterError.
     """
     with tempfile.TemporaryDirectory(prefix="rise_di_fmu_") as name:
         library = _shared(code, compiler, "fmu.c", Path(name) / "rise_di.so")

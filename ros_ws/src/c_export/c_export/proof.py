@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The exported C code, compiled and compared with the Python controller.
+"""Compile the exported C code, and compare it with the controller in Python.
 
 Every u and every state is compared bit by bit.
 """
@@ -29,43 +29,44 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 SOURCE = Path(str(files("c_export"))) / "source"
 CODE = ("rise_di.h", "rise_di.c", "rise_di_table.c")
 PARAMETERS = "rise_di_parameters.h"
-# beside the code
+# Files that are written with the code.
 REPORT = "proof.txt"
 FMU = "rise_di.fmu"
-CERTIFICATE = "certificate.json"  # of the guarantee of the loop
+CERTIFICATE = "certificate.json"  # that of the guarantee of the loop
 COMPILERS = ("gcc", "clang")
 FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic", "-ffp-contract=off")
 COUNTING_FLAGS = ("-x", "c++", "-std=c++20", "-O2", "-include", "counting.h")
-LEAST_SAMPLES = 4  # kept: the slope of y_m spans two periods
+LEAST_SAMPLES = 4  # to keep, because the slope of y_m spans two periods
 
 FLOAT32_BOUND = 2.0**-10
-"""Largest difference of u in float32 along a flight, as a part of the range of u in the flight."""
+"""Largest difference of u in float32 along a flight, as a fraction of the range of u in the flight.
+"""
 
 
 class Difference(NamedTuple):
     """The first value of a recording that differs."""
 
-    tick: int  # from 0
+    tick: int  # counts from 0
     channel: str
     python: float
     c: float
 
 
 class Comparison(NamedTuple):
-    """A recording computed by C: T ticks."""
+    """A recording of T ticks that C has computed, compared with Python."""
 
     name: str
     ticks: int
-    values: int  # compared
-    differing: int  # values
+    values: int  # how many were compared
+    differing: int  # how many differ
     first: Difference | None
-    deviation: float  # largest difference of u as a part of the range of u, largest of the inputs
+    deviation: float  # largest difference of u over the range of u, of all inputs
     modes_equal: bool  # whether modes and times are equal
 
     def holds(self, *, float32: bool) -> bool:
-        """Return whether every bit is equal, or float32 is within its bound.
+        """Return whether every bit is equal, or in float32 whether u is within its bound.
 
-        In float32, every mode must be equal, and u within FLOAT32_BOUND.
+        In float32, every mode must be equal, and u must be within FLOAT32_BOUND.
         """
         return (
             self.modes_equal and self.deviation <= FLOAT32_BOUND if float32 else self.differing == 0
@@ -99,9 +100,9 @@ def write_code(
 
 
 def compilers(names: Sequence[str] = ()) -> list[list[str]]:
-    """Commands of the C compilers: `names`, or the COMPILERS on the PATH.
+    """Return the commands of the C compilers: `names`, or those of COMPILERS on the PATH.
 
-    Raises ParameterError for none.
+    Raises ParameterError if there is none.
     """
     commands = [words(command) for command in names] or [
         [name] for name in COMPILERS if shutil.which(name)
@@ -124,7 +125,7 @@ def words(
     """
     try:
         parts = shlex.split(command)
-    except ValueError as error:  # a quotation without an end
+    except ValueError as error:  # a quotation mark is missing
         raise ParameterError(
             f"{option}: found {command!r} ({error}), expected {expected}"
         ) from None
@@ -138,16 +139,17 @@ def words(
 
 
 class Program:
-    """proof.c beside the exported code, compiled in a folder of its own."""
+    """proof.c and the exported code, compiled in a folder of its own."""
 
     def __init__(
         self, code: Path, compiler: Sequence[str], sets: Sequence[RiseDiConfig], folder: Path, *,
         float32: bool = False,
         flags: Sequence[str] = FLAGS, source: str | None = None, runner: Sequence[str] = (),
     ) -> None:  # fmt: skip
-        """Compile; `source` replaces the text of rise_di.c, `runner` starts the program.
+        """Compile the program.
 
-        Raises ParameterError.
+        `source` replaces the text of rise_di.c, and `runner` starts the program. Raises
+        ParameterError.
         """
         self._folder = folder
         self._runner = runner
@@ -165,13 +167,13 @@ class Program:
         build([*compiler, *flags, "-o", "proof", "proof.c"], folder)
 
     def take(self, sets: Sequence[RiseDiConfig]) -> None:
-        """Replace the parameter sets; the first is that of the exported header all the same."""
+        """Replace the parameter sets. The first one still is that of the exported header."""
         self._sets = sets
         content = b"".join(packed(controller, float32=self._float32) for controller in sets)
         (self._folder / "sets").write_bytes(content)
 
     def run(self, recording: Recording) -> tuple[np.ndarray, FloatArray, Mapping[str, int]]:
-        """Integers and reals of the states of C, as the recording has them.
+        """Return the integers and the reals of the states of C, in the form of the recording.
 
         The third result is what the program prints.
         """
@@ -217,7 +219,7 @@ class Program:
                 tick, recording.names[column], float(python[column]), float(c[column])
             )
         u = recording.reals[:, :m]
-        with np.errstate(over="ignore", invalid="ignore"):  # C that is wrong may give any number
+        with np.errstate(over="ignore", invalid="ignore"):  # wrong C code may give any number
             parts = np.abs(reals[:, :m] - u).max(axis=0) / np.maximum(
                 np.ptp(u, axis=0), np.finfo(float).tiny
             )
@@ -236,8 +238,8 @@ class Proof(NamedTuple):
     """What was compiled, compared and measured."""
 
     compilers: tuple[str, ...]  # their versions
-    comparisons: tuple[Comparison, ...]  # of the recordings, each with every compiler in turn
-    figures: Mapping[str, int]  # bytes and operations by name
+    comparisons: tuple[Comparison, ...]  # of each recording with every compiler in turn
+    figures: Mapping[str, int]  # numbers of bytes and of operations, by name
     float32: bool
 
     @property
@@ -257,10 +259,9 @@ def prove(
 ) -> Proof:
     """Compile the code in a folder with each compiler, and compare it with the recordings.
 
-    The states of C are compared. `runner` starts the programs of a compiler for a different
-    machine, as qemu does.
-
-    With g++ a program whose reals count gives the largest number of operations of a call.
+    The states of C are compared. `runner` starts the programs of a compiler for another machine, as
+    qemu does. With g++, a program whose reals count their operations gives the largest number of
+    operations in a call.
     """
     comparisons: list[Comparison] = []
     with tempfile.TemporaryDirectory(prefix="rise_di_export_") as name:
@@ -332,7 +333,7 @@ def proof_report(proof: Proof, scenario: str) -> str:
 
 
 def build(command: Sequence[str], folder: Path) -> None:
-    """Run a compiler in a folder. Raises ParameterError with what it says."""
+    """Run a compiler in a folder. Raises ParameterError with what the compiler says."""
     process = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)  # noqa: S603 - the user's compiler
     if process.returncode:
         said = (process.stderr or process.stdout).strip() or f"exit status {process.returncode}"
@@ -346,16 +347,16 @@ def version(compiler: Sequence[str]) -> str:
 
 
 def footprint(code: Path, compiler: Sequence[str], folder: Path) -> dict[str, int]:
-    """Bytes of machine code and constants, and of the stack: the sum of all frames.
+    """Return the bytes of machine code and constants, and of the stack: the sum of all frames.
 
-    What is unknown is left out. No function calls itself, so no chain of calls needs more stack
-    than the sum.
+    What is unknown is left out. No function calls itself, so that no chain of calls needs more
+    stack than the sum.
     """
     for name in (*CODE, PARAMETERS):
         shutil.copyfile(code / name, folder / name)
     try:
         build([*compiler, *FLAGS, "-fstack-usage", "-c", "-o", "rise_di.o", "rise_di.c"], folder)
-    except ParameterError:  # a compiler without -fstack-usage
+    except ParameterError:  # the compiler has no -fstack-usage
         build([*compiler, *FLAGS, "-c", "-o", "rise_di.o", "rise_di.c"], folder)
     sizes = {}
     usage = folder / "rise_di.su"
@@ -366,7 +367,7 @@ def footprint(code: Path, compiler: Sequence[str], folder: Path) -> dict[str, in
         process = subprocess.run(  # noqa: S603 - of binutils
             [size, "rise_di.o"], cwd=folder, capture_output=True, text=True, check=False
         )
-        if not process.returncode:  # not of a file for a different machine
+        if not process.returncode:  # it fails for a file for another machine
             text, data, bss = (int(word) for word in process.stdout.splitlines()[1].split()[:3])
             sizes |= {"code_bytes": text, "data_bytes": data + bss}
     return sizes

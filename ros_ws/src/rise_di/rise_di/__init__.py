@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The Python interface of the RISE-DI flight stack, in one import.
 
-A name loads its module at its first use; none needs ROS.
+A name loads its module when it is first used, and none needs ROS.
 
     import rise_di
 
@@ -52,7 +52,8 @@ def __dir__() -> list[str]:
     return [*__all__, "__version__"]
 
 
-# gymnasium takes longer to load than all else here; who makes environments by name has it.
+# gymnasium takes longer to load than everything else here. Whoever makes environments by name has
+# loaded it.
 if "gymnasium" in sys.modules:
     from rise_di.environment_ids import register
 

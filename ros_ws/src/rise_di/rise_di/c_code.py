@@ -43,17 +43,17 @@ from flight_log.tape_reader import RecordedRun, read_run
 from rise_di_controller.guard.guard import SAMPLE_BUFFER_SIZE
 from rise_di_controller.rise_di_config import RiseDiConfig
 
-PART = 50_000  # drawn steps of a recording
-RATES = (1.0, 1000.0)  # Hz, the lowest and the highest
-LONGEST = 20.0  # s, of a flight without a duration
+PART = 50_000  # drawn steps in a recording
+RATES = (1.0, 1000.0)  # Hz, the lowest and the highest rate
+LONGEST = 20.0  # s, the longest flight if no duration is given
 
 
 class Material(NamedTuple):
     """What a proof compares."""
 
-    sets: list[RiseDiConfig]  # the parameters, the first those of the code
+    sets: list[RiseDiConfig]  # the parameters; the first are those of the code
     recordings: Iterator[Recording]
-    line: str  # of the report
+    line: str  # a line for the report
 
 
 class Exported(NamedTuple):
@@ -87,27 +87,29 @@ def export(
     rate: float | None = None,
     proof: bool = True,
 ) -> Exported:
-    """Write the controller of a scenario as C99, compile and prove the code.
+    """Write the controller of a scenario as C99, compile the code and prove it.
 
-    The proof is that C and Python give the same bits.
+    The proof shows that C and Python give the same bits.
 
     Args:
         scenario: Name, path of a scenario file (.yaml), or a Scenario.
         folder: Where the code and the report of the proof go.
-        run: A recorded flight whose ticks are the proof, in place of flights and drawn inputs. Of a
-            scenario that learns, the last model of this flight is exported.
-        float32: Compute in float; the proof then bounds the difference of u.
-        duration: Of a flight of the proof, s; None: that of the scenario, at most 20 s.
-        drawn: Number of drawn steps of the proof.
+        run: A recorded flight whose ticks are the proof, in place of flights and drawn inputs. If
+            the scenario learns, the last model of this flight is exported.
+        float32: Whether to compute in single precision; the proof then bounds the difference of u.
+        duration: Duration of each flight of the proof, s; None takes that of the scenario, at most
+            20 s.
+        drawn: Number of drawn steps in the proof.
         seed: Seed of the drawn inputs.
-        compiler: Commands of C compilers; gcc and clang where none is named.
-        runner: Command that starts a program of the compiler, as qemu-aarch64 for a cross compiler.
-        fmu: Write a co-simulation unit of FMI 2.0 too.
-        autopilot: "px4" or "ardupilot": write the code as a part of this autopilot.
-        samples: Samples of y and of y_m that the controller keeps, 4 or more; None: 8 inside an
-            autopilot, else 100.
-        rate: Of law, reference model and y, Hz, in place of the scenario's: the observer is
-            discretised again.
+        compiler: Commands of C compilers; if empty, gcc and clang.
+        runner: Command that starts a program of the compiler, such as qemu-aarch64 for a cross
+            compiler.
+        fmu: Whether to write a co-simulation unit of FMI 2.0, too.
+        autopilot: "px4" or "ardupilot", to write the code as a part of this autopilot.
+        samples: Number of samples of y and of y_m that the controller keeps, 4 or more; None takes
+            8 inside an autopilot, else 100.
+        rate: Rate of the law, the reference model and y, Hz, in place of the scenario's. The
+            observer is discretised for it.
         proof: Whether to prove.
 
     Returns:
@@ -125,11 +127,11 @@ def export(
     source = find_scenario(scenario)
     if run is not None and source.learns():
         source = with_last_model(source, run if isinstance(run, RecordedRun) else read_run(run))
-        run = None  # several models flew in its ticks: the proof flies the last one
+        run = None  # several models flew in its ticks, and the proof needs the last one alone
     if rate is not None:
         source = at_rate(source, rate)
     folder = as_path(folder, "c", "the path of a folder")
-    title = printable(source.name)  # of a file, whose name may hold any character
+    title = printable(source.name)  # the name of a file may have any character
     controller = exportable(source.controller)
     commands = compilers(compiler) if proof or fmu else []
     starter = words(runner, "runner", "a command such as qemu-aarch64") if runner else []
@@ -162,7 +164,7 @@ def export(
 
 
 def at_rate(scenario: Scenario, rate: float) -> Scenario:
-    """Return a scenario with law, reference model and y at another rate, Hz.
+    """Return a scenario with the law, the reference model and y at another rate, Hz.
 
     Raises ParameterError if the observer has less than its delay margin at that rate.
     """
@@ -184,17 +186,18 @@ def at_rate(scenario: Scenario, rate: float) -> Scenario:
 
 
 class CertificateSources(NamedTuple):
-    """What the loop of a certificate is of."""
+    """What the loop of a certificate was made from."""
 
-    texts: dict[str, str]  # SHA-256 of "airframe" and "scenario", and the text of "constants"
+    texts: dict[str, str]  # SHA-256 of "airframe" and "scenario"; text of "constants"
     without: str = ""  # why there are no constants, a sentence
 
 
 def certificate_sources(airframe: Airframe, scenario: FilePath | Scenario) -> CertificateSources:
-    """Find what the loop of a certificate is of.
+    """Find what the loop of a certificate was made from.
 
-    The constants are the text of rise_di_parameters.h as `export` writes it by default. A law that
-    C cannot express has none, nor has a section controller alone, which has no scenario either.
+    The constants are the text of rise_di_parameters.h as `export` writes it by default. There are
+    none for a law that C cannot express. There are none either for a section controller alone,
+    which has no scenario.
     """
     texts = {"airframe": _sha256(as_yaml(airframe))}
     if controller_alone(scenario) is not None:
@@ -220,9 +223,9 @@ def _sha256(text: str) -> str:
 
 
 def _certified(scenario: Scenario, constants: Path) -> tuple[str, str] | None:
-    """Return the certificate of the guarantee computed for a loop, and what it states.
+    """Return the certificate of the guarantee that was computed for a loop, and what it states.
 
-    Returns None without a guarantee.
+    Returns None if there is no guarantee.
     """
     if scenario.aircraft.is_jsbsim or is_literal(scenario.controller):
         return None
@@ -239,7 +242,10 @@ def _certified(scenario: Scenario, constants: Path) -> tuple[str, str] | None:
 def _write(
     scenario: Scenario, folder: Path, autopilot: str | None, samples: int | None, *, float32: bool
 ) -> tuple[Path, list[Path], int]:
-    """Write the code, alone or for an autopilot: its folder, all files, and the samples kept."""
+    """Write the code, alone or for an autopilot.
+
+    Return the folder of the code, all files, and how many samples are kept.
+    """
     if autopilot is None:
         buffer_size = samples or SAMPLE_BUFFER_SIZE
         controller = exportable(scenario.controller)
@@ -254,7 +260,7 @@ def _write(
 
 
 def _units(scenario: Scenario, controller: RiseDiConfig) -> Units:
-    """SI units of the outputs and of the commands of a scenario."""
+    """Return the SI units of the outputs and of the commands of a scenario."""
     channels = scenario.aircraft.channels()
     outputs = [channels.outputs[name] for name in controller.outputs]
     commands = [channels.inputs[name] for name in controller.effectors]
@@ -264,7 +270,7 @@ def _units(scenario: Scenario, controller: RiseDiConfig) -> Units:
 def _logged(run: FilePath | RecordedRun, controller: RiseDiConfig, title: str) -> Material:
     """Return the parameters and the ticks of a flight, and a line on their u.
 
-    Raises ParameterError for a flight with other parameters.
+    Raises ParameterError if the flight had other parameters.
     """
     sets, recording, equal = run_recording(run if isinstance(run, RecordedRun) else read_run(run))
     same = sets[0].digest() == controller.digest()
@@ -274,7 +280,7 @@ def _logged(run: FilePath | RecordedRun, controller: RiseDiConfig, title: str) -
 
 
 def _flights(scenario: Scenario, drawn: int, seed: int, samples: int) -> Material:
-    """Flights of a scenario and drawn inputs, with changes of the parameters."""
+    """Return flights of a scenario and drawn inputs, with changes of the parameters."""
     sets = parameter_sets(exportable(scenario.controller))
     return Material(sets, _recordings(scenario, sets, drawn, seed, samples), "")
 
@@ -282,9 +288,9 @@ def _flights(scenario: Scenario, drawn: int, seed: int, samples: int) -> Materia
 def _recordings(
     scenario: Scenario, sets: Sequence[RiseDiConfig], drawn: int, seed: int, samples: int
 ) -> Iterator[Recording]:
-    """Flights, drawn commands; `drawn` steps and a tenth as many calls.
+    """Yield flights and drawn commands, then `drawn` steps and a tenth as many calls.
 
-    The parts fit in memory.
+    They come in parts that fit into memory.
     """
     yield from flight_recordings(scenario, sets, samples)
     yield drawn_commands(scenario.reference_model, max(drawn // 10, 1000), seed)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     import polars as pl
 
 Progress = Callable[[int, int], None]
-"""Takes the number of flights so far and of all flights of a campaign."""
+"""Takes the number of flights so far, and that of all flights of a campaign."""
 
 
 class CampaignResult(NamedTuple):
@@ -44,11 +44,10 @@ class CampaignResult(NamedTuple):
     def rows(self) -> "pl.DataFrame":
         """Return a table with a row for each aircraft, SI.
 
-        The columns are seed, number, factor of the sweep, divergence, loss of track, figures, and
-        drawn entries.
-
-        The entries have names as "A[q,alpha]", "B[V,thrust]", "lag[elevator]", "noise[q]" and
-        "delay". The figures of a diverged aircraft are null.
+        The columns are the seed, the number, the factor of the sweep, divergence, loss of track,
+        the figures and the drawn entries. The entries have names such as "A[q,alpha]",
+        "B[V,thrust]", "lag[elevator]", "noise[q]" and "delay". The figures of a diverged aircraft
+        are null.
         """
         return MonteCarlo.resume(self.folder).rows().collect()
 
@@ -72,37 +71,38 @@ def fly_campaign(
 ) -> CampaignResult:
     """Fly thousands of uncertain aircraft around the airframe of a scenario.
 
-    The report of the campaign is written too. After Ctrl-C `resume_campaign` continues.
+    The report of the campaign is written, too. After Ctrl-C, `resume_campaign` continues.
 
     Args:
         scenario: Name, path of a scenario file (.yaml), or a Scenario.
-        aircraft: How many uncertain aircraft.
+        aircraft: Number of uncertain aircraft.
         uncertainty: Largest relative deviation of each entry of A and B, 0 to 1.
-        entries: Entries with a deviation of their own: {"A[q,alpha]": 0.6, "lag[elevator]": 0.5,
-            "noise[q]": 0.5}; "lag" and "noise" mean all without their own. {"delay": 0.02} is the
-            largest further delay of u, s. Lags, noise and delay without an entry are those of the
-            scenario.
-        distribution: Of the deviations: "uniform", "normal" with three standard deviations at the
-            limit, or "corners".
+        entries: Entries that have their own deviation: {"A[q,alpha]": 0.6, "lag[elevator]": 0.5,
+            "noise[q]": 0.5}; "lag" and "noise" mean all that have no entry of their own. {"delay":
+            0.02} is the largest delay of u beyond the scenario's, s. Lags, noise and delay without
+            an entry are those of the scenario.
+        distribution: Distribution of the deviations: "uniform", "normal" with three standard
+            deviations at the limit, or "corners".
         score: Units of the rms errors in the score by output, SI: {"q": 0.02}.
-        wind: Effect of wind: "air_relative", by the A of each aircraft, or "published", by the
-            airframe; None: the scenario's.
+        wind: Whose A the wind acts through: "air_relative", that of each aircraft, or "published",
+            that of the airframe; None takes the scenario's.
         seed: Seed of the aircraft.
-        sweep: A parameter of the controller, or its value in a channel, and its factors:
+        sweep: A parameter of the controller, or its value in one channel, and its factors:
             {"beta[V]": [0.5, 1.0, 2.0]}.
-        duration: Seconds to fly; None: those of the scenario.
-        chunk: Aircraft computed at once; None: 1000, on a GPU what its memory holds, with a
-            learner or a route 4.
-        workers: Threads, with a learner or a route processes; None: one a core. A script with
-            processes calls the function under `if __name__ == "__main__":`.
-        runs: Folder that the folder of the campaign is made in.
+        duration: Duration of each flight, s; None takes that of the scenario.
+        chunk: Aircraft computed at once; None takes 1000, on a GPU as many as its memory holds, and
+            4 with a learner or a route.
+        workers: Number of threads, or of processes with a learner or a route; None takes one per
+            core. A script with processes must call this function under `if __name__ ==
+            "__main__":`.
+        runs: Folder in which the folder of the campaign is made.
         progress: Called with the flights so far and all flights, after each chunk.
 
     Returns:
         The folder, the report and the figures of the campaign.
 
     Raises:
-        ParameterError: A campaign cannot fly the scenario or the arguments.
+        ParameterError: A campaign cannot fly the scenario, or cannot have these arguments.
 
     Examples:
         >>> scenario = rise_di.find_scenario("osprey_servo", duration=0.1)
@@ -122,7 +122,7 @@ def fly_campaign(
     definition = define(
         source, aircraft, uncertainty, seed, chunk, _sweep(sweep), wind, spread, units
     )
-    quick_learner(source)  # refuses what the aircraft could not learn with
+    quick_learner(source)  # refuses a scenario with which the aircraft could not learn
     flies = _engine(definition, workers)
     report = _progress(progress)
     folder = new_run(source, as_path(runs, "runs", "the path of a folder"), "campaign-")
@@ -136,7 +136,8 @@ def resume_campaign(
 
     Args:
         folder: The folder of the campaign.
-        workers: Threads, with a learner or a route processes; None: as many as cores.
+        workers: Number of threads, or of processes with a learner or a route; None takes one per
+            core.
         progress: Called with the flights so far and all flights, after each chunk.
 
     Returns:
@@ -157,7 +158,7 @@ def resume_campaign(
 
 
 def _engine(definition: Definition, workers: int | None) -> engines.Engine:
-    """Threads of this process; with a learner or a route, processes of this machine."""
+    """Return threads of this process, or processes of this machine with a learner or a route."""
     count = None if workers is None else as_count(workers, "workers", 1)
     is_single = flies_alone(definition.scenario())
     return engines.dask(count, on_devices=False) if is_single else engines.threads(count)

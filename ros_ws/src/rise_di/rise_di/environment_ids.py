@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The identifiers of gymnasium, which has had no entry point for them since 1.0."""
+"""The identifiers of the environments. gymnasium has had no entry point for them since 1.0."""
 
 ID = "rise_di/Flight-v0"
 

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The aircraft of a scenario as environments of gymnasium.
 
-The agent takes the place of the controller, a tick a step.
+The agent takes the place of the controller, and a step is a tick.
 """
 
 from typing import Any, NamedTuple
@@ -34,12 +34,12 @@ from rise_di.environment_ids import register
 require_package("gymnasium")
 import gymnasium  # noqa: E402 - an extra
 
-# SI, bound of an action that the controller does not limit: 57 deg, or the weight as thrust
+# Bound of an action that the controller does not limit, SI: 57 deg, or the weight as thrust.
 UNLIMITED = 1.0
 
 
 class _Channels(NamedTuple):
-    """Spaces of an aircraft, and the units of the score by output."""
+    """The spaces of an aircraft, and the units of the score by output."""
 
     action: gymnasium.spaces.Space[FloatArray]
     observation: gymnasium.spaces.Space[FloatArray]
@@ -47,9 +47,9 @@ class _Channels(NamedTuple):
 
 
 def _channels(scenario: Scenario) -> _Channels:
-    """Spaces of u within the limits of the controller, and of y then y_m.
+    """Return the space of u within the controller's limits, and the space of y, then y_m.
 
-    The bounds of y and y_m are those beyond which an aircraft is lost.
+    The bounds of y and y_m are those beyond which an aircraft counts as lost.
     """
     controller = scenario.controller
     limits = controller.effector_limits()
@@ -66,7 +66,7 @@ def _channels(scenario: Scenario) -> _Channels:
 
 
 def _without_models(scenario: Scenario) -> Scenario:
-    """Return the scenario with the law alone, in whose place the agent acts.
+    """Return the scenario with nothing but the law, whose place the agent takes.
 
     The models of a law, or a learner, do not bind the agent.
     """
@@ -96,14 +96,15 @@ BY_TICK = frozenset(
         *("start_time", "lockstep", "control_rate", "duration", "recorded"),
     }
 )
-"""Keys of the aircraft with which its flight, and the sample at a tick, do not depend on whether
+"""Keys of the aircraft with which its flight, and the sample at a tick, are the same whether or not
 the samples before that tick were measured."""
 
 
 def _is_newest_last(scenario: Scenario) -> bool:
     """Return whether the last sample of a tick is the newest y in every tick.
 
-    Earlier samples need no measurement then. With any key outside BY_TICK each sample is measured.
+    If so, earlier samples need not be measured. With any key outside BY_TICK, each sample is
+    measured.
     """
     aircraft = scenario.aircraft
     return not unknown_keys(aircraft, BY_TICK) and not scenario.controller.vanes
@@ -112,7 +113,7 @@ def _is_newest_last(scenario: Scenario) -> bool:
 def _actions(values: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
     """Return the inputs of a step as an array.
 
-    Raises ParameterError for another shape, and for values that are not finite numbers.
+    Raises ParameterError if the shape is another one, or if a value is not finite.
     """
     expected = f"finite numbers of shape {shape}"
     u = as_array(values, "action", expected)
@@ -121,25 +122,30 @@ def _actions(values: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
 
 
 class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
-    """Simulator and reference model of a scenario; the agent gives u.
+    """The simulator and the reference model of a scenario; the agent gives u.
 
-    Observation: y then y_m, shape (2 m,), SI, deviations from trim, outputs in the order of the
-    controller; the newest y that has arrived. Action: u, shape (p,), SI, deviation from trim, in
-    the order of the controller's inputs, or of the effectors of its allocation, within their
-    limits. Reward of a step: -T sum_i abs(y_i - y_m_i) / unit_i, T the period of the controller and
-    unit_i the unit of the score, 10 mrad/s (p 20) or 0.1 m/s. An aircraft that diverges terminates
-    the episode: LOSS_OF_TRACK_SCORE for each second left. The end of the flight's duration
-    truncates the episode. `info` has the error y - y_m, shape (m,), and at the end the outcome, a
-    sentence.
+    Observation: y then y_m, shape (2 m,), SI, as deviations from trim, with the outputs in the
+    order of the controller. y is the newest that has arrived.
+
+    Action: u, shape (p,), SI, as a deviation from trim, in the order of the controller's inputs, or
+    of the effectors of its allocation, within their limits.
+
+    Reward of a step: -T sum_i abs(y_i - y_m_i) / unit_i, with the period T of the controller and
+    the unit unit_i of the score, 10 mrad/s (p 20) or 0.1 m/s. If the aircraft diverges, the episode
+    terminates and costs LOSS_OF_TRACK_SCORE for each second that is left. The end of the flight's
+    duration truncates the episode.
+
+    `info` has the error y - y_m, shape (m,), and at the end the outcome, a sentence.
 
     Args:
-        scenario: The aircraft, the reference model, and rate, channels and limits of the
-            controller. Guidance is left out.
-        uncertainty: Every reset draws noise, turbulence, and an aircraft whose A and B are off by
-            up to this fraction, 0 to 1, with the entries and the distribution of
-            `aircraft.uncertainty`. None: every episode has the aircraft, the noise and the
+        scenario: The aircraft, the reference model, and the rate, the channels and the limits of
+            the controller. Guidance is left out.
+        uncertainty: With a fraction, 0 to 1, every reset draws noise, turbulence, and an aircraft
+            whose A and B are off by up to this fraction, with the entries and the distribution of
+            `aircraft.uncertainty`. With None, every episode has the aircraft, the noise and the
             turbulence of the scenario.
-        render_mode: "ansi": `render` returns a line of t, y and y_m. None: it returns nothing.
+        render_mode: With "ansi", `render` returns a line of t, y and y_m. With None, it returns
+            nothing.
 
     Raises:
         ParameterError: gymnasium is missing, an aircraft of JSBSim has an uncertainty, or an output
@@ -192,12 +198,12 @@ class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[FloatArray, dict[str, Any]]:
-        """Trim at t = 0.
+        """Put the aircraft into trim at t = 0.
 
-        A seed repeats the aircraft, the noise and the turbulence of an episode.
+        The same seed gives the same aircraft, noise and turbulence.
 
         Args:
-            seed: Seed of the draws; None: the draws go on.
+            seed: Seed of the draws; with None the draws go on.
             options: Unused; gymnasium has the argument.
 
         Returns:
@@ -238,7 +244,8 @@ class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
             action: u, shape (p,), SI, deviation from trim.
 
         Returns:
-            Observation (2 m,), reward, whether terminated, whether truncated, and further facts.
+            The observation (2 m,), the reward, whether terminated, whether truncated, and more
+            facts.
 
         Raises:
             ParameterError: No episode runs, or the action is not p finite numbers.
@@ -270,7 +277,7 @@ class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
         return self._observed(), reward, False, is_over, info
 
     def _error(self) -> FloatArray:
-        """Y - y_m, (m,)."""
+        """Return y - y_m, (m,)."""
         return self._y - self._y_m
 
     def _drawn(self) -> Scenario:
@@ -297,21 +304,20 @@ class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
 class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray[Any]]):
     """N uncertain aircraft of a scenario on one course, compiled.
 
-    Observations have the shape (N, 2 m), actions (N, p) and rewards (N,), with the rows of
-    FlightEnv. The aircraft share commands, wind and the noise of the sensors, and end together.
-    Every `reset` draws N aircraft. A diverged aircraft terminates. The next step starts the same
-    aircraft from trim at the present time of the course, and the step after the end of the flight
-    draws N aircraft again: `AutoresetMode.NEXT_STEP`.
+    Observations have the shape (N, 2 m), actions (N, p) and rewards (N,), with rows like those of
+    FlightEnv. The aircraft share the commands, the wind and the noise of the sensors, and end
+    together. Every `reset` draws N aircraft. If an aircraft diverges, it terminates. The next step
+    then starts the same aircraft from trim, at the present time of the course. The step after the
+    end of the flight draws N aircraft again: `AutoresetMode.NEXT_STEP`.
 
     Args:
-        scenario: As that of FlightEnv, of an airframe with matrices.
+        scenario: As for FlightEnv, but of an airframe with matrices.
         num_envs: N.
-        uncertainty: The largest part by which the entries of A and B of an aircraft are off, 0 to
-            1.
+        uncertainty: Largest relative deviation of the entries of A and B of an aircraft, 0 to 1.
 
     Raises:
-        ParameterError: gymnasium is missing, or a campaign cannot fly the scenario, as an aircraft
-            of JSBSim.
+        ParameterError: gymnasium is missing, or a campaign cannot fly the scenario, for example an
+            aircraft of JSBSim.
 
     Examples:
         >>> env = rise_di.FlightVectorEnv(rise_di.find_scenario("osprey_servo", duration=0.1), 2)
@@ -358,10 +364,10 @@ class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[FloatArray, dict[str, Any]]:
-        """N new aircraft in trim at t = 0. A seed repeats them.
+        """Draw N aircraft in trim at t = 0. The same seed draws the same aircraft.
 
         Args:
-            seed: Seed of the draws; None: the draws go on.
+            seed: Seed of the draws; with None the draws go on.
             options: Unused; gymnasium has the argument.
 
         Returns:
@@ -383,7 +389,7 @@ class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray
             actions: u, shape (N, p), SI, deviations from trim.
 
         Returns:
-            Observations (N, 2 m), rewards (N,), terminated (N,), truncated (N,), and further facts.
+            Observations (N, 2 m), rewards (N,), terminated (N,), truncated (N,), and more facts.
 
         Raises:
             ParameterError: The shape is wrong, or a value is not finite.
@@ -435,7 +441,7 @@ class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray
         return self._y, np.broadcast_to(self._course.segments.y_m[self._k][:, None], y.shape)
 
     def _observed(self, y: FloatArray, y_m: FloatArray) -> FloatArray:
-        # nan of a diverged aircraft counts as its bound
+        # The nan of a diverged aircraft counts as its bound.
         known = np.nan_to_num(np.concatenate([y, y_m]), nan=np.inf)
         beyond = np.tile(self._largest, (2, 1))
         return np.asarray(np.clip(known, -beyond, beyond).T)
@@ -454,7 +460,7 @@ def make_flights(
     duration: float | None = None,
     **options: Any,
 ) -> FlightVectorEnv:
-    """N aircraft of rise_di/Flight-v0, with the options of FlightVectorEnv."""
+    """Make N aircraft of rise_di/Flight-v0, with the options of FlightVectorEnv."""
     return FlightVectorEnv(find_scenario(scenario, duration), num_envs, **options)
 
 

@@ -26,14 +26,14 @@ def simulate(
     learn: Learn | None = None,
     announce: Callable[[Event], None] = lambda event: None,
 ) -> Tape:
-    """Fly a scenario in memory. A flight that diverges or is interrupted (Ctrl-C) ends early.
+    """Fly a scenario in memory. The flight ends early if it diverges or is interrupted (Ctrl-C).
 
     Args:
         scenario: The flight.
         progress: Called with the flight time, s, once per simulated second.
-        guide: Makes the guidance of a scenario with guidance.
+        guide: Makes the guidance of a scenario that has guidance.
         control: Makes the controller from the parameters.
-        learn: Makes the learner of a scenario with a learner, as `learner` returns.
+        learn: Makes the learner of a scenario that learns, as `learner` returns it.
         announce: Takes the events of the learning.
 
     Returns:
@@ -41,7 +41,7 @@ def simulate(
         the flight ended, and what it falls short of.
 
     Raises:
-        ParameterError: `scenario` is no Scenario, or learns and `learn` is None.
+        ParameterError: `scenario` is no Scenario, or it learns and `learn` is None.
 
     Examples:
         >>> tape = rise_di.simulate(rise_di.find_scenario("osprey_servo", duration=0.1))

@@ -29,23 +29,23 @@ from flight_design.gains.effectors import lags_by_input
 from flight_design.gains.first_scenario import LICENCE
 from flight_design.gains.gain_design import select_gains
 
-SIZES = (1.0, 0.5, 0.25, 0.125)  # of the commands: the first that flies clear of the end stops
-CLEAR = 0.9  # part of an end stop that u reaches at most
-ANGLE_OF_GUST = {"lateral": "sideslip", "vertical": "angle of attack"}  # of a gust over V0
+SIZES = (1.0, 0.5, 0.25, 0.125)  # of the commands; the first that keeps off the stops is taken
+CLEAR = 0.9  # largest fraction of an end stop that u may reach
+ANGLE_OF_GUST = {"lateral": "sideslip", "vertical": "angle of attack"}  # that a gust over V0 is
 SAMPLES = 20  # uncertain airframes for the bounds of the theorem
 
 
 class NewAirframe(NamedTuple):
-    """An airframe that is written.
+    """An airframe that was written.
 
     Attributes:
         airframe_file: Path of the airframe file.
         scenario_file: Path of the scenario file.
         airframe: The airframe.
-        note: The source of the airframe, and a pairing of inputs and outputs that is not their
-            order, in sentences.
-        shortfall: What the first flight lacks, as the first line of the scenario file says; ""
-            where the flight ends as planned, clear of the end stops.
+        note: Sentences on the source of the airframe, and on the pairing of inputs and outputs if
+            it is not their order.
+        shortfall: What the first flight lacks, as the first line of the scenario file says; "" if
+            the flight ends as planned, clear of the end stops.
     """
 
     airframe_file: Path
@@ -79,23 +79,23 @@ def new_airframe(
             airframe file (.yaml), or of a text of AVL (system matrix, or stability derivatives) or
             XFLR5 (state matrices).
         folder: Folder of both files.
-        name: Name of the airframe; empty: that of the file.
+        name: Name of the airframe; if empty, that of the file.
         speed: Trim speed, a number in m/s or with a unit: "176 ft/s".
         states: Names of the states in the order of A, with units: "u: ft/s, w: ft/s, q: rad/s,
             theta: rad".
         inputs: Names of the inputs in the order of B, with units and effects: "elevator: rad nose
             down, thrust: 1 more thrust".
-        outputs: As many as inputs, or fewer: names of states or of rows of C with units ("V:
-            ft/s"), or sums: "q, V = 0.987 u + 0.163 w".
-            Empty: q, V, p, r by elevator, thrust, aileron, rudder.
+        outputs: Outputs, at most as many as inputs: names of states, of rows of C with units ("V:
+            ft/s"), or sums: "q, V = 0.987 u + 0.163 w". If empty, they are q, V, p, r by elevator,
+            thrust, aileron, rudder.
         thrust: Whether to add an input thrust in units of the weight along the flight path, for a
             model without a thrust.
         text: Where the figures come from.
-        lag: Lags of the actuators in s, one or one an input; None: 0.05 s of a control surface, 0.3
-            s of an engine.
+        lag: Lags of the actuators in s, one for all or one for each input; None takes 0.05 s for a
+            control surface and 0.3 s for an engine.
         replace: Whether files of these names may be replaced.
-        body: mass, Ixx, Iyy, Izz, Ixz, density of the aircraft of AVL's derivatives, and its unit
-            of length, `length`.
+        body: mass, Ixx, Iyy, Izz, Ixz and density, which the derivatives of AVL need, and AVL's
+            unit of length, `length`.
 
     Returns:
         The paths of the files, the airframe, and a note on the source.
@@ -165,7 +165,10 @@ def new_airframe(
 
 
 def _pairing_sentence(airframe: Airframe) -> str:
-    """Say how inputs and outputs pair if an output has not the input of its place; else ""."""
+    """Say how inputs and outputs pair, if an output does not have the input of its place.
+
+    Returns "" otherwise.
+    """
     places = first_flight.pairing(airframe)
     if len(airframe.inputs) != len(airframe.outputs) or places == tuple(range(len(places))):
         return ""
@@ -179,11 +182,9 @@ def _flying(
 ) -> tuple[str, str]:
     """Write a scenario with selected gains whose flight ends as planned; return it and "".
 
-    The flight is clear of the end stops. If there is no such flight, return the scenario with the
-    least commands, and what its flight lacks.
-
-    `trial` is the airframe's file of the trial flights; `files` are airframe and scenario as the
-    text names them.
+    The flight keeps clear of the end stops. If there is no such flight, return the scenario with
+    the smallest commands, and what its flight lacks. `trial` is the airframe's file for the trial
+    flights. `files` are airframe and scenario as the text names them.
     """
     shortfall = ""
     scenario = ""
@@ -219,10 +220,9 @@ def _stop_shares(flight: Scenario, tape: Tape) -> dict[str, float]:
 def _shortfall(flight: Scenario, tape: Tape, hardest: str) -> str:
     """Say what the flight of a scenario lacks.
 
-    The sentence names the input at a stop, whether commands or gusts ask for the travel, the state
-    or gust with the largest share, and the share.
-
-    The input that holds y is u = -Omega^+ C (A x + f); f includes the gusts.
+    The sentence names the input that is at a stop, whether commands or gusts ask for the travel,
+    the state or gust that has the largest share in it, and this share. The input that holds y is u
+    = -Omega^+ C (A x + f), where f includes the gusts.
     """
     airframe = flight.aircraft.load()[0]
     calm = simulate(flight.vary(aircraft={"gusts": {}}))

@@ -37,17 +37,17 @@ if TYPE_CHECKING:
     import control
 
 Plant = Callable[[float, FloatArray, float], ArrayLike]
-"""plant(t, u, dt) -> y: advances from t to t + dt with u (p,) held, and measures y (m,) then; SI,
+"""plant(t, u, dt) -> y: advances from t to t + dt with u (p,) held, and then measures y (m,); SI,
 deviations from trim."""
 
 
 class Loop:
-    """The controller behind its guard, a call a tick.
+    """The controller behind its guard, with a call for each tick.
 
-    The node runs the same `Controller`, so u has the same bits.
+    The node runs the same `Controller`, so that u has the same bits.
 
     Args:
-        controller: Parameters of the controller, or a mapping of these as in the section
+        controller: Parameters of the controller, or a mapping of them as in the section
             `controller` of a scenario.
 
     Raises:
@@ -68,16 +68,16 @@ class Loop:
         self.inputs = self.config.effectors
         self.measured = self.config.measured
         self.period = seconds(self._controller.period_ns)
-        self._now_ns = -1  # of the last tick
-        # output of the last tick; None where nothing is to be sent
+        self._now_ns = -1  # instant of the last tick
+        # Output of the last tick; None if nothing is to be sent.
         self.output: ControlOutput | None = None
-        self.lost = ""  # why a sample of the last tick is lost; empty where none is
+        self.lost = ""  # why a sample of the last tick is lost; empty if none is
 
     @property
     def mode(self) -> Mode:
         """Mode of the guard.
 
-        WAITING until y and y_m are fresh, then ENGAGED; a failsafe where they are old.
+        It is WAITING until y and y_m are fresh, then ENGAGED, and a failsafe if they are old.
         """
         return self._controller.mode
 
@@ -89,18 +89,19 @@ class Loop:
     def step(self, t: float, y: ArrayLike | None, y_m: ArrayLike | None) -> FloatArray:
         """Compute u of a tick at t.
 
-        A sample that no aircraft can give is lost, as None is: `lost` has the reason, and the first
-        of a row is a RuntimeWarning. y and y_m belong to t. t may jitter; it never goes
-        back. The failsafe of the guard starts where samples are older than `max_age`.
+        A sample that no aircraft can give is lost, and so is None. `lost` then has the reason, and
+        the first of several in a row also gives a RuntimeWarning. y and y_m belong to t, which may
+        jitter but never goes back. The failsafe of the guard starts when samples are older than
+        `max_age`.
 
         Args:
             t: Instant of the tick, s.
-            y: Outputs, shape (m,), SI, deviations from trim, in the order of `outputs`; with vanes
-                of an observer in the order of `measured`. None is a lost sample.
+            y: Outputs, shape (m,), SI, deviations from trim, in the order of `outputs`; if the
+                observer has vanes, in the order of `measured`. None is a lost sample.
             y_m: Reference, shape (m,), SI, in the order of `outputs`. None is a lost sample.
 
         Returns:
-            u, shape (m,), with an allocation (p,), SI, deviation from trim, in the order of
+            u, shape (m,), or (p,) with an allocation, SI, deviation from trim, in the order of
             `inputs`; 0 before the engagement.
 
         Raises:
@@ -142,7 +143,7 @@ class Loop:
             controller: The new parameters, of the same law.
 
         Raises:
-            ParameterError: As of `Controller.retune`.
+            ParameterError: As in `Controller.retune`.
         """
         self._controller.retune(controller)
         self.config = controller
@@ -177,12 +178,10 @@ def fly_plant(
 ) -> Tape:
     """Fly a plant of the user's own under the controller and return the tape.
 
-    The tape has y, y_m, u and internals.
-
     `plant(t, u, dt)` advances by dt with u held and returns y; the first call has t = dt = 0.
-    Outputs and inputs have the order of the controller. A plant that raises FlightEnded ends the
-    flight early, with the reason in `outcome` of the tape, which also tells of errors that the
-    linear loop of y_dot = Omega u does not allow.
+    Outputs and inputs have the order of the controller. If the plant raises FlightEnded, the flight
+    ends early and `outcome` of the tape has the reason. It also says whether errors are larger than
+    the linear loop of y_dot = Omega u allows.
 
     Args:
         plant: plant(t, u, dt) -> y: t, dt in s, u (p,), y (m,), SI, deviations from trim.
@@ -228,7 +227,7 @@ def fly_plant(
 
 
 class _PlantStation:
-    """A plant of the user's own: y with the last u held."""
+    """A plant of the user's own: it publishes y, and holds the last u."""
 
     def __init__(self, plant: Plant, loop: Loop, topics: stations.Topics) -> None:
         self._plant = plant
@@ -251,7 +250,7 @@ class _PlantStation:
 
 
 class _LoopStation:
-    """A `Loop` that steps with the y and y_m of its instant: u and internals."""
+    """A `Loop` that steps with the y and y_m of its instant, and publishes u and internals."""
 
     def __init__(self, loop: Loop, topics: stations.Topics) -> None:
         self._loop = loop
@@ -279,7 +278,10 @@ class _LoopStation:
 def _reference_model(
     config: ReferenceModelConfig | Mapping[str, Any], loop: Loop
 ) -> ReferenceModelConfig:
-    """Parameters of a reference model with the outputs of a loop. Raises ParameterError."""
+    """Return the parameters of a reference model with the outputs of a loop.
+
+    Raises ParameterError.
+    """
     if not isinstance(config, ReferenceModelConfig):
         config = ReferenceModelConfig.validate_mapping(config, "reference_model")
     expected = "the outputs of the controller"
@@ -292,23 +294,23 @@ def as_control(
 ) -> "control.NonlinearIOSystem":
     """Return the engaged law for python-control, discrete: `y_NAME`, `y_m_NAME` -> `u_NAME`.
 
-    The law has limits and anti-windup.
+    The law has its limits, its anti-windup and the period of the controller. The state is that of
+    the law, then u and y_m of the last tick; from 0, the flight starts in trim. With an allocation
+    the outputs are the effectors, which are also at the end of the state.
 
-    The period is that of the controller. The state is that of the law, then u and y_m of the last
-    tick; from 0 the flight starts in trim. With an allocation the outputs are the effectors, at the
-    end of the state. With `linear` the law near e = 0 as a StateSpace from `y_NAME`, for Bode plots
-    and margins: inside the limits the effectors are T u.
+    If `linear`, the result is the law near e = 0 as a StateSpace from `y_NAME`, for Bode plots and
+    margins. Inside the limits, the effectors are then T u.
 
     Args:
         controller: Parameters of the controller, or a mapping as in a scenario.
         linear: Whether to return the law near e = 0 as a StateSpace.
 
     Returns:
-        The system, inputs and outputs in SI, with the period of the controller.
+        The system, with inputs and outputs in SI and the period of the controller.
 
     Raises:
         ParameterError: python-control is missing, the controller has a feedforward, whose model is
-            beside the law, or `linear` meets the literal sign.
+            not part of the law, or `linear` meets the literal sign.
 
     Examples:
         >>> law = rise_di.as_control(rise_di.find_scenario("osprey_servo").controller, linear=True)
@@ -340,7 +342,7 @@ def as_control(
     in_trim = Measurements(y=zero, y_m=zero, y_m_dot=zero, u_trim=zero, u_before=zero)
     start = fields(law.engage(in_trim, params))
     sizes = [value.size for value in start.values()]
-    # an offset, so that x = 0 is the engagement in trim
+    # With this offset, x = 0 is the engagement in trim.
     offset = np.concatenate([value.ravel() for value in start.values()])
     ends = np.cumsum(sizes)
 

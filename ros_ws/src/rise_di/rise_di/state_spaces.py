@@ -35,7 +35,7 @@ def linear_systems(scenario: Scenario) -> LinearSystems:
     """Return the linear loop of a scenario for python-control: plant, law, and both closed.
 
     The margins of `margins` and of `rise-di gains --check` are those of this loop, at y_m = 0 and
-    inside all limits. With an allocation `u_NAME` are the channels of the law.
+    inside all limits. With an allocation, `u_NAME` are the channels of the law.
 
     Args:
         scenario: The aircraft and the controller.
@@ -44,7 +44,7 @@ def linear_systems(scenario: Scenario) -> LinearSystems:
         The three systems.
 
     Raises:
-        ParameterError: python-control is missing, or as of `margins`.
+        ParameterError: python-control is missing, or as in `margins`.
 
     Examples:
         >>> systems = rise_di.linear_systems(rise_di.find_scenario("osprey_servo"))
@@ -59,7 +59,7 @@ def linear_systems(scenario: Scenario) -> LinearSystems:
     linear = scenario_loop(flight, controller)
     A, B, C = sampled_plant(linear.nominal, linear.loop, np.zeros(len(linear.inputs)))
     law = linear.law
-    # With vanes the law has further measurements.
+    # With vanes, the law has more measurements.
     measured = [*controller.outputs, *controller.vanes][: len(C)]
     y = [f"y_{name}" for name in measured]
     u = [f"u_{name}" for name in linear.inputs]
