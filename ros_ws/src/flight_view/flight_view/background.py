@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The background of the map: lines and points of a GeoJSON of the user.
+"""The background of the map: the lines and points of a GeoJSON file of the user.
 
 They are in the plane of the flight.
 """
@@ -15,14 +15,14 @@ from flight_guidance.steering.path import Point
 Line = list[Point]  # north, east, m; a single point is a mark
 
 MAX_POINTS = 20_000
-"""Positions of a background: the page draws each of them in each picture."""
+"""Largest number of positions in a background, because the page draws all of them each time."""
 
 
 def read_background(path: Path, origin: Origin | None) -> list[Line]:
     """Read the lines of a GeoJSON; each ring of a polygon is one of them.
 
-    Raises ParameterError for an unreadable file, a coordinate system other than WGS84, a geometry
-    of another type, no origin, and more than MAX_POINTS positions.
+    Raises ParameterError if the file is unreadable, its coordinates are not WGS84, a geometry is of
+    another type, there is no origin, or there are more than MAX_POINTS positions.
     """
     if origin is None:
         raise ParameterError(

@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Control of a flight from the page: permission, range and order of commands, without ROS.
 
-A `FlightLink` reaches the nodes. A single page at a time holds the lease. Requests run in sequence
-on a separate thread; to deactivate the controller or disengage the bridge ends the running request.
+A `FlightLink` reaches the nodes. Only one page at a time holds the lease. Requests run one after
+another on a thread of their own. A request to deactivate the controller or to disengage the bridge
+ends the running one.
 """
 
 import asyncio
@@ -40,18 +41,22 @@ from flight_view.request_values import (
 )
 from rise_di_controller.params import ControllerConfig
 
-LEASE = 5.0  # s that a page controls after its last request
-RATE = 5.0  # requests a second
+LEASE = 5.0  # s for which a page has control after its last request
+RATE = 5.0  # requests per second
 BURST = 10.0  # requests at once
 KEY_PERIOD = 1.0  # s between two wrong keys
 MAX_WAYPOINTS = 200
-AXES = ("north", "east", "altitude")  # of a waypoint
+AXES = ("north", "east", "altitude")  # coordinates of a waypoint
 GUIDED = ("hold", "skip", "resume", "home")  # services of guidance without arguments
 AT_ONCE = ("deactivate", "disengage")  # actions that do not queue
-OVER = ("ended", "interrupted")  # states of a recording: the flight can be commanded no more
-# s, from the request to the begin of a gust. A busy host may set the first late: then the second.
+OVER = (
+    "ended",
+    "interrupted",
+)  # states of a recording in which the flight can no longer be commanded
+# s, from the request to the begin of a gust. If a busy host sets the first too late, the second is
+# tried.
 GUST_LEADS = (0.2, 1.0)
-# Larger stamps are of the system clock; stamps of a lockstep flight begin at 0.
+# Larger stamps come from the system clock. Those of a flight in lockstep begin at 0.
 SYSTEM_TIME_NS = 10**17
 
 Assess = Callable[[Scenario, ControllerConfig], dict[str, Any]]
@@ -64,13 +69,13 @@ class FlightLink(Protocol):
     """
 
     def nodes(self) -> list[str]:
-        """Nodes under command: the running nodes among aircraft, bridge, controller, guidance."""
+        """Return the running nodes that can be commanded."""
 
     def parameters(self, node: str, names: Sequence[str]) -> dict[str, Any]:
-        """Values of the parameters set."""
+        """Return the values of those parameters that are set."""
 
     def set_parameters(self, node: str, values: Mapping[str, Any]) -> str:
-        """Set parameters together, or none."""
+        """Set all of these parameters, or none."""
 
     def activate(self, *, active: bool) -> str:
         """Activate or deactivate the controller."""
@@ -113,13 +118,13 @@ def _refusing() -> Iterator[None]:
 
 
 def new_key() -> str:
-    """Draw a key to type by hand: eight letters and digits, 40 bits."""
+    """Draw a key that can be typed by hand: eight letters and digits, 40 bits."""
     text = "".join(secrets.choice("ABCDEFGHJKLMNPQRSTUVWXYZ23456789") for _ in range(8))
     return f"{text[:4]}-{text[4:]}"
 
 
 class Control:
-    """Answers the requests of the controlling page. Values are SI."""
+    """Answers the requests of the page that has control. Values are in SI."""
 
     def __init__(
         self,
@@ -145,9 +150,9 @@ class Control:
         self._requests = BURST
         self._refilled = now()
         self._cancellations = 0
-        self._undo: list[dict[str, Any]] = []  # earlier values, the last change at the end
-        self._digest = 0  # of the controller's parameters, as far as known
-        self._values: dict[str, Any] = {}  # the controller's tunable parameters that are set
+        self._undo: list[dict[str, Any]] = []  # earlier values; those of the last change come last
+        self._digest = 0  # digest of the controller's parameters, as far as known
+        self._values: dict[str, Any] = {}  # tunable parameters of the controller that are set
         self._faults: dict[str, Any] = {}  # parameters of the aircraft, without gusts
         self._actions: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
             "state": self._refresh,
@@ -178,7 +183,7 @@ class Control:
                 HTTPStatus.BAD_REQUEST,
                 f"do: found {short_repr(action)}, expected one of {', '.join(self._actions)}",
             )
-        # A later flight in this domain is a new flight.
+        # A later flight in this domain is a new flight with a page of its own.
         if action not in {"state", "check", *AT_ONCE} and self._flight.state() in OVER:
             raise RefusedError(
                 HTTPStatus.CONFLICT,
@@ -186,10 +191,10 @@ class Control:
             )
         self._take_lease(lease)
         loop = asyncio.get_running_loop()
-        # A check takes a while, and reaches no node.
+        # A check takes a while, but reaches no node.
         if action == "check":
             return await loop.run_in_executor(self._assessor, self._check, request)
-        # A request of AT_ONCE goes first while another one runs, or waits for its turn.
+        # A request of AT_ONCE overtakes one that runs or waits for its turn.
         if action in AT_ONCE:
             self._cancellations += 1
             self._link.cancel()
@@ -198,7 +203,7 @@ class Control:
         )
 
     def close(self) -> None:
-        """End the running request, and take no further request."""
+        """End the running request, and take no more requests."""
         self._link.cancel()
         for executor in (self._worker, self._assessor):
             executor.shutdown(cancel_futures=True)
@@ -206,7 +211,7 @@ class Control:
     # Who may command
 
     def _require_key(self, key: str, lease: str) -> None:
-        """Refuse a wrong key. For KEY_PERIOD after a wrong key, accept only the page in control."""
+        """Refuse a wrong key. For KEY_PERIOD after one, accept only the page that has control."""
         holds = bool(self._lease) and hmac.compare_digest(lease.encode(), self._lease.encode())
         if not holds and self._now() - self._wrong_key < KEY_PERIOD:
             raise RefusedError(
@@ -245,9 +250,9 @@ class Control:
     def _carry_out(
         self, action: str, request: Mapping[str, Any], cancellations: int
     ) -> dict[str, Any]:
-        """Carry out a request and write a line in the log.
+        """Carry out a request and write a line to the log.
 
-        A cancellation later than `cancellations` refuses the request.
+        If there were cancellations after `cancellations`, the request is refused.
         """
         self._link.resume()
         self._link.keep_link()
@@ -274,9 +279,10 @@ class Control:
             return self.state()
 
     def state(self) -> dict[str, Any]:
-        """State for the page.
+        """Return the state for the page.
 
-        Lease, nodes, gains with their ranges, digests, faults and bridge.
+        It has the lease, the nodes, the gains with their ranges, the digests, the faults and the
+        bridge.
         """
         nodes = self._link.nodes()
         scenario = self._flight.scenario
@@ -286,7 +292,7 @@ class Control:
             "undo": len(self._undo),
             "targets": list(TARGETS),
         }
-        # Before the first refresh the digest is 0 and no gain is known.
+        # Before the first refresh, the digest is 0 and no gain is known.
         are_gains_known = self._digest and "controller" in nodes
         if scenario is not None and are_gains_known and gains_of(scenario.controller):
             page_state |= {
@@ -336,9 +342,9 @@ class Control:
     def _refresh(self, request: Mapping[str, Any]) -> str:
         """Read the faults.
 
-        At first, and where the digest in the log differs, also read the controller's parameters.
+        Also read the controller's parameters at first, and whenever the digest in the log differs.
         """
-        # The digest of the flight is 0 before the first tick.
+        # Before the first tick, the digest of the flight is 0.
         is_stale = not self._digest or self._flight.digest not in {0, self._digest}
         scenario = self._flight.scenario
         nodes = self._link.nodes()
@@ -378,7 +384,7 @@ class Control:
         return refusal
 
     def _apply(self, request: Mapping[str, Any], values: Mapping[str, Any], *, undo: bool) -> str:
-        """Compare and set: refused where the parameters differ from the parameters on the page."""
+        """Set values, unless the parameters differ from those on the page."""
         self._require_simulated()
         self._read()
         if request.get("digest") != f"{self._digest:012x}":
@@ -397,7 +403,7 @@ class Control:
         return ""
 
     def _check(self, request: Mapping[str, Any]) -> dict[str, Any]:
-        """Margins of the gains in flight with some changed."""
+        """Return the margins of the gains in flight, with some of them changed."""
         if self._assess is None or self._flight.scenario is None:
             return {}
         values = values_by_name(request, "values")
@@ -428,7 +434,7 @@ class Control:
     def _activate(self, *, active: bool) -> str:
         """Activate or deactivate the controller.
 
-        With a bridge this is refused: the bridge does so with engagement.
+        With a bridge this is refused, because the bridge does it when it engages or disengages.
         """
         if "bridge" in self._link.nodes():
             return "the bridge activates and deactivates the controller: engage or disengage it"
@@ -451,7 +457,7 @@ class Control:
 
     def _begin_gust(self, request: Mapping[str, Any]) -> str:
         axis = request.get("axis")
-        # ROS has no name for half a surrogate pair.
+        # Half a surrogate pair cannot be part of a name in ROS.
         require_form(
             isinstance(axis, str) and axis.isidentifier(),
             f"axis: found {short_repr(axis)}, expected the name of an axis",
@@ -499,7 +505,7 @@ class Control:
 def gains_of(controller: ControllerConfig) -> dict[str, Any]:
     """Return the numeric parameters of a law that can be tuned in flight, by name.
 
-    A value is a number, or a number for each channel.
+    A value is a number, or one number for each channel.
     """
     fields = type(controller).model_fields
     tunable = [
@@ -514,8 +520,8 @@ def gains_of(controller: ControllerConfig) -> dict[str, Any]:
 def _channels_of(count: int, controller: ControllerConfig) -> list[str]:
     """Name the values of a gain.
 
-    A single value has no name. Several values have the names of the outputs, of the outputs but the
-    last as for `k_d`, or of the inputs; otherwise, they are numbered from 1 on.
+    A single value has no name. Several values have the names of the outputs, of all outputs but the
+    last (`k_d`), or of the inputs. Otherwise they are numbered from 1 on.
     """
     if count == 1:
         return [""]
@@ -530,7 +536,7 @@ def _is_numeric(value: object) -> bool:
 
 
 def _faults_of(scenario: Scenario) -> list[str]:
-    """Name the aircraft's parameters to tune in flight, without gusts and drift."""
+    """Name the parameters of the aircraft that can be tuned in flight, without gusts and drift."""
     return sorted(
         name for name in scenario.aircraft.tunable() if not name.startswith(("gusts.", "drift."))
     )

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Client of all nodes of a flight: the link of a live page with control."""
+"""The client of all nodes of a flight, which is the link of a live page that has control."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -32,7 +32,7 @@ class ControlClient(Client):
         self._engagement: EngagementClient | None = None
 
     def nodes(self) -> list[str]:
-        """Return the nodes of the flight that can be commanded and are in the graph."""
+        """Return the nodes of the flight that are in the graph and can be commanded."""
         namespace = self._node.get_namespace()
         running = {
             name for name, where in self._node.get_node_names_and_namespaces() if where == namespace
@@ -40,12 +40,12 @@ class ControlClient(Client):
         return [name for name in self.NODES if name in running]
 
     def parameters(self, node: str, names: Sequence[str]) -> dict[str, Any]:
-        """Values of a node's parameters and groups of parameters, without those not set."""
+        """Return the values of a node's parameters and groups of parameters that are set."""
         everything = ListParameters.Request(depth=ListParameters.Request.DEPTH_RECURSIVE)
         declared_names = self._call(
             ListParameters, f"{node}/list_parameters", everything
         ).result.names
-        # An undeclared name among others empties the answer.
+        # A single undeclared name would empty the answer.
         selection = [
             name for name in declared_names if name in names or name.split(".")[0] in names
         ]
@@ -65,7 +65,7 @@ class ControlClient(Client):
     def set_parameters(self, node: str, values: Mapping[str, Any]) -> str:
         """Set parameters of a node together, or none of them."""
         request = SetParametersAtomically.Request()
-        # rclpy takes an empty list for bytes; the one list that may be empty is of faults.
+        # rclpy takes an empty list for bytes. The only list that may be empty is that of faults.
         request.parameters = [
             Parameter(name, STRINGS if value == [] else None, value).to_parameter_msg()
             for name, value in values.items()
@@ -85,7 +85,7 @@ class ControlClient(Client):
         return f"the controller is {'active' if active else 'inactive'} already"
 
     def send_target(self, values: Mapping[str, float]) -> str:
-        """Command guidance, as `rise-di guide`."""
+        """Command guidance, as `rise-di guide` does."""
         return self._operator().send(values)
 
     def send_route(self, points: Sequence[Sequence[float]]) -> str:
@@ -93,9 +93,9 @@ class ControlClient(Client):
         return self._operator().send_route(points)
 
     def keep_link(self) -> None:
-        """Tell guidance, where there is one, that an operator is there.
+        """Tell guidance, if there is one, that an operator is there.
 
-        `guidance.home.link_timeout` counts from now.
+        `guidance.home.link_timeout` counts from now on.
         """
         if "guidance" in self.nodes():
             self._operator().keep_link()
@@ -109,7 +109,7 @@ class ControlClient(Client):
         return self._targets
 
     def engage(self) -> str:
-        """Engage the bridge, as `rise-di engage`."""
+        """Engage the bridge, as `rise-di engage` does."""
         return self._bridge().engage(lambda reason: None)
 
     def disengage(self) -> str:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the page shows of a scenario beside the samples, ready for JSON."""
+"""What the page shows of a scenario apart from the samples, ready for JSON."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -26,7 +26,7 @@ KINDS: dict[str, type[IntEnum]] = {
     "mode.vertical": guidance_state.Vertical,
 }
 MODES = {channel: {str(int(mode)): mode.name for mode in kind} for channel, kind in KINDS.items()}
-"""Names of the modes of the controller and of guidance by channel and number."""
+"""Names of the modes of the controller and of guidance, by channel and number."""
 
 
 class ParameterTicks(NamedTuple):
@@ -35,8 +35,8 @@ class ParameterTicks(NamedTuple):
     digest: float
     start_ns: int
     stop_ns: int
-    ticks: int  # engaged
-    squares: Mapping[str, float]  # of these, sums of e^2 by output
+    ticks: int  # number of engaged ticks
+    squares: Mapping[str, float]  # sums of e^2 over the engaged ticks, by output
 
 
 def rms_by_model(
@@ -45,7 +45,7 @@ def rms_by_model(
     scenario: Scenario | None,
     proposed_ns: Sequence[int],
 ) -> dict[str, Any]:
-    """Headings and rows of the rms of the measured error by model.
+    """Return the headings and rows of the rms of the measured error by model.
 
     They come from the ticks of a flight and the stamps of proposed models.
     """
@@ -74,9 +74,10 @@ def _finite_or_none(value: float) -> float | None:
 
 
 def scenario_description(scenario: Scenario) -> dict[str, Any]:
-    """Units, what a positive input does, limits, gusts, commands and route of a scenario.
+    """Return what the page shows of a scenario.
 
-    Raises ParameterError where the airframe cannot be read.
+    This is its units, what a positive input does, limits, gusts, commands and route. Raises
+    ParameterError if the airframe cannot be read.
     """
     controller = scenario.controller
     guidance = scenario.guidance
@@ -99,7 +100,7 @@ def scenario_description(scenario: Scenario) -> dict[str, Any]:
 def mission(guidance: GuidanceConfig, waypoints: Sequence[Waypoint]) -> dict[str, Any]:
     """Return what the map shows of a guided route: `mission_drawing` and the waypoints.
 
-    A waypoint is north, east, altitude, m. Raises ParameterError for a route with no way to fly.
+    A waypoint is north, east, altitude, m. Raises ParameterError if the route cannot be flown.
     """
     drawing = mission_drawing(guidance, [guidance.plan(waypoints)] if waypoints else [])
     return drawing | {"waypoints": [[*waypoint.point, waypoint.altitude] for waypoint in waypoints]}

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The places of all aircraft of a fleet, for the map of a page.
 
-The page has the flight of a single aircraft.
+The rest of the page shows the flight of one aircraft.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,7 +15,7 @@ from flight_view.series import Series
 
 
 class FleetView:
-    """The poses of several flights as topics of a single `Flight`, "0" the first."""
+    """The poses of several flights as topics of a single `Flight`, of which "0" is the first."""
 
     def __init__(self, flights: Sequence[Flight]) -> None:
         self.flights = flights
@@ -36,13 +36,13 @@ class FleetView:
     def start_ns(self) -> int:
         """Stamp of flight time 0 of the first aircraft that has begun.
 
-        The clock of the stamps is common.
+        All aircraft have the same clock.
         """
         return min((flight.start_ns for flight in self.flights if flight.samples), default=0)
 
     @property
     def description(self) -> dict[str, Any]:
-        """Name and flight time 0 of each aircraft, by the clock of the stamps, s."""
+        """Name and flight time 0 of each aircraft, on the clock of the stamps, s."""
         return {
             "aircraft": [
                 [flight.aircraft, flight.start_ns / NANOSECONDS] for flight in self.flights
@@ -51,13 +51,13 @@ class FleetView:
 
     @property
     def described(self) -> int:
-        """Changes with `description`."""
+        """A number that changes with `description`."""
         return hash(tuple(map(tuple, self.description["aircraft"])))
 
     def state(self) -> str:
-        """Nothing: each flight has a state."""
+        """Return nothing, because each flight has its own state."""
         return ""
 
     def faults(self) -> list[str]:
-        """Nothing: each flight has faults."""
+        """Return nothing, because each flight has its own faults."""
         return []

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Follows the log of a run, live or recorded.
 
-Samples by topic, events and the state of the recording are kept.
+It keeps the samples by topic, the events and the state of the recording.
 """
 
 import math
@@ -61,18 +61,18 @@ from flight_view.description import (
 from flight_view.page_topics import GROUPS, IN_TICKS, LEARNED, RATES
 from flight_view.series import Series
 
-SHARED = (ROSOUT, PARAMETER_EVENTS)  # topics of all aircraft
+SHARED = (ROSOUT, PARAMETER_EVENTS)  # topics that all aircraft share
 POSE = "pose"
 ROUTE = "route"
 ROUTE_TYPE = "nav_msgs/msg/Path"
-# bytes of the log, about 1 s, that a busy host may leave unread: above it the state is "reading".
+# Bytes of the log, about 1 s, that a busy host may leave unread. Above it the state is "reading".
 LIVE_BACKLOG = 200_000
 MAX_EVENTS = 5000
 MAX_NOTES = 50
 MAX_CHANNELS = 200
 MAX_SPANS = 200
 BATCH = 2000  # messages that are decoded together
-SILENT = 1.0  # s without a sample after which the state is "no data"
+SILENT = 1.0  # s without a sample; then the state is "no data"
 
 
 @dataclass
@@ -80,16 +80,16 @@ class _Topic:
     name: str  # without the namespace
     decode: Decoder
     messages: list[bytes] = field(default_factory=list)  # not decoded yet
-    names: tuple[str, ...] = ()  # of all channels
-    columns: NDArray[np.intp] | None = None  # of the kept channels
+    names: tuple[str, ...] = ()  # names of all channels
+    columns: NDArray[np.intp] | None = None  # columns of the channels that are kept
 
 
 class Flight:
     """A flight in a log. `update` reads new messages.
 
     `namespace` selects an aircraft, by default the first in the log. `scenario` replaces the
-    scenario in the log. `background`: lines of the map, of `background.read_background`. `remaps`
-    as in `read_run`.
+    scenario in the log. `background` has lines for the map, see `background.read_background`.
+    `remaps` is as in `read_run`.
     """
 
     def __init__(
@@ -106,8 +106,8 @@ class Flight:
         self.name = printable(run.stem if run.is_file() else run.resolve().name)
         self.samples: dict[str, Series] = {}  # by topic
         self.events: list[LogMessage] = []
-        # What a page shows beside the samples, ready for JSON: the names of modes; `described`
-        # once the scenario is read.
+        # What a page shows apart from the samples, ready for JSON: the names of the modes, and the
+        # rest once the scenario is read.
         self.description: dict[str, Any] = {
             "name": self.name,
             "modes": MODES,
@@ -115,8 +115,8 @@ class Flight:
         }
         self.notes: list[str] = []
         self.described = 0  # counts the changes of `description`
-        self.scenario: Scenario | None = None  # once read
-        self.digest = 0  # of the controller's parameters in the newest tick; exact, unlike float32
+        self.scenario: Scenario | None = None  # None until it is read
+        self.digest = 0  # digest of the parameters in the newest tick; exact, unlike float32
         self.bands: dict[str, float] = {}  # half-widths of the settling bands, SI
         self._follower = Follower(run, self._rate_of, full_names(remaps))
         self._topics: dict[str, _Topic] = {}  # by full name
@@ -124,11 +124,11 @@ class Flight:
         self._namespace = None if namespace is None else f"/{namespace.strip('/')}".rstrip("/")
         self._kinds: dict[str, str] = {}  # types of the topics of the log, by full name
         self._unreadable = 0
-        self._start_ns: int | None = None  # by `truth`
-        self._reference_ns: int | None = None  # of the first y_m
+        self._start_ns: int | None = None  # as `truth` tells it
+        self._reference_ns: int | None = None  # stamp of the first y_m
         self._first_ns: int | None = None
         self._mode = -1
-        self._banded = 0  # rows of internals behind the bands
+        self._banded = 0  # rows of internals from which the bands were computed
         self._flown: list[ParameterTicks] = []
         self._now = now
         self._changed = now()
@@ -143,8 +143,8 @@ class Flight:
     def start_ns(self) -> int:
         """Stamp of flight time 0.
 
-        `truth` tells the stamp, else the first y_m, the origin of commands, else the earliest
-        stamp.
+        It is the one that `truth` tells, else that of the first y_m, which is the origin of
+        commands, else the earliest stamp.
         """
         return next(
             (
@@ -157,20 +157,20 @@ class Flight:
 
     @property
     def aircraft(self) -> str:
-        """The namespace of the aircraft; without namespace the name of the run."""
+        """The namespace of the aircraft; without a namespace, the name of the run."""
         return (self._namespace or "").strip("/") or self.name
 
     @property
     def end(self) -> float:
-        """Flight time of the newest sample, s; 0 without samples."""
+        """Flight time of the newest sample, s; 0 if there are no samples."""
         newest = [int(samples.stamp_ns[-1]) for samples in self.samples.values() if samples.count]
         return (max(newest) - self.start_ns) / NANOSECONDS if newest else 0.0
 
     def state(self) -> str:
         """Say in a word what the recording does.
 
-        The words are "waiting", "reading" what is there, "recording", "no data", "interrupted" and
-        "ended".
+        The words are "waiting", "reading" (what is there), "recording", "no data", "interrupted"
+        and "ended".
         """
         if self._behind:
             return "reading"
@@ -190,7 +190,7 @@ class Flight:
     def models(self) -> dict[str, Any]:
         """Headings and rows of the rms of the measured error by model, as in the report.
 
-        Empty without a learner.
+        They are empty without a learner.
         """
         if LEARNED not in self.samples or not self._flown:
             return {}
@@ -200,7 +200,7 @@ class Flight:
         return rms_by_model(self._flown, self.start_ns, self.scenario, proposed_ns)
 
     def faults(self) -> list[str]:
-        """Sentences on what the log lacks."""
+        """Say what the log lacks, in sentences."""
         follower = self._follower
         sentences = [*self.notes, *self._lacks]
         if follower.complete and not self.samples:
@@ -221,10 +221,10 @@ class Flight:
         return sentences
 
     def update(self, budget: float = math.inf) -> bool:
-        """Read for at most about `budget` s.
+        """Read for about `budget` s at most.
 
-        Returns whether there was anything to read; the next call reads on. Raises ParameterError
-        where the log cannot be read, or for a folder with several bags.
+        Return whether there was anything to read; the next call goes on reading. Raises
+        ParameterError if the log cannot be read, or if the folder has several bags.
         """
         deadline = time.monotonic() + budget
         news = False
@@ -261,7 +261,7 @@ class Flight:
     def _count(self) -> None:
         """Find what an ended log lacks.
 
-        The page reads a part of the samples; this reads the whole log.
+        The page reads only a part of the samples, but this reads the whole log.
         """
         try:
             run = read_run(self.run, self._namespace, None, self._remaps)
@@ -273,7 +273,7 @@ class Flight:
         except (ParameterError, OSError):
             return
         except RuntimeError as error:
-            # the process ends meanwhile, and the reader has no thread of its own any more
+            # The process is ending, so that the reader cannot have a thread of its own any more.
             if "shutdown" not in str(error):
                 raise
 
@@ -301,7 +301,7 @@ class Flight:
         return RATES[name]
 
     def _shows(self, namespace: str) -> bool:
-        """Return whether a namespace is the page's aircraft's, or that is not known yet."""
+        """Return whether a namespace is that of the page's aircraft, or that is not known yet."""
         return self._namespace in {None, namespace}
 
     def _note(self, sentence: str) -> None:
@@ -327,7 +327,7 @@ class Flight:
             path = Path("scenario.yaml")
             self.scenario = parse_scenario(content, path)
             self.described += 1
-            # `described` reads the airframe, maybe a file of another machine.
+            # This reads the airframe, which may be a file of another machine.
             self.description |= scenario_description(self.scenario)
         except ParameterError as error:
             self._note(f"units, limits and commands are unknown: {error}")
@@ -348,7 +348,7 @@ class Flight:
             self._decode(topic)
 
     def _decode(self, topic: _Topic) -> None:
-        """Decode the messages read of a topic together: single messages are slow."""
+        """Decode the messages of a topic together, because one by one would be slow."""
         messages = topic.messages
         topic.messages = []
         for decoded in map(topic.decode, tables(messages)):
@@ -358,11 +358,11 @@ class Flight:
 
     def _take_samples(self, topic: _Topic, decoded: Samples) -> None:
         names, stamp_ns, values, _ = decoded
-        # A pose has the channels that a bridge has received so far: poses with fewer than the
-        # widest pose are left out.
+        # A pose has the channels that a bridge has received so far. Poses with fewer channels than
+        # the widest pose are left out.
         if topic.name == POSE and set(names) > set(topic.names):
             topic.columns = None
-        # A second publisher may have another order: values are matched by name.
+        # A second publisher may have another order, so that values are matched by name.
         if names != topic.names and sorted(names) == sorted(topic.names):
             names, values = topic.names, values[:, [names.index(name) for name in topic.names]]
         if topic.columns is None:
@@ -382,7 +382,7 @@ class Flight:
             samples = self.samples[topic.name] = Series(
                 tuple(bounded(names[i]) for i in topic.columns)
             )
-            # Pages read the topic again.
+            # Pages then read the topic again.
             samples.thinned = 0 if narrower is None else narrower.thinned + 1
         samples = self.samples[topic.name]
         if topic.name == POSE and set(names) < set(topic.names):
@@ -416,7 +416,7 @@ class Flight:
     def _take_errors(
         self, stamp_ns: NDArray[np.int64], names: Sequence[str], values: FloatArray
     ) -> None:
-        """Sum the squares of e in the engaged ticks under each set of parameters."""
+        """Sum the squares of e over the engaged ticks, for each set of parameters."""
         digests = values[:, names.index("parameters")]
         is_engaged = values[:, names.index("mode")] == Mode.ENGAGED
         errors = {
@@ -487,7 +487,7 @@ class Flight:
                 self._add_event(event)
 
     def _take_route(self, sent_ns: int, waypoints: Sequence[Waypoint]) -> None:
-        """Replace the route by one received in flight.
+        """Replace the route by one that was received in flight.
 
         If guidance refuses the new route, the old one stays.
         """
@@ -497,7 +497,7 @@ class Flight:
         try:
             self.description |= mission(guidance, waypoints)
         except ParameterError:
-            # Guidance says so in the log.
+            # Guidance says in the log that it refuses it.
             return
         self.described += 1
         self._add_event(LogMessage(sent_ns, ROUTE, f"{len(waypoints)} waypoints"))
@@ -509,7 +509,7 @@ class Flight:
             self._note(f"events after the first {MAX_EVENTS} are left out")
 
     def _update_bands(self) -> None:
-        """Update the settling bands whenever the ticks have grown by a tenth."""
+        """Update the settling bands each time the ticks have grown by a tenth."""
         samples = self.samples.get("internals")
         if samples is None or samples.count < 1.1 * self._banded + 2:
             return

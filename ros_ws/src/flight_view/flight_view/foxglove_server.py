@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Serves a flight in progress to viewers of the Foxglove protocol.
 
-Foxglove, Lichtblick and PlotJuggler are such viewers. The messages are copies from the log, byte
-for byte, from the connection on. A viewer can send nothing.
+Such viewers are Foxglove, Lichtblick and PlotJuggler. From the connection on, they get copies of
+the messages in the log, byte for byte. A viewer cannot send anything.
 """
 
 import math
@@ -18,21 +18,21 @@ from flight_core.parameters import ParameterError, require
 from flight_log.follow import Follower, Messages
 from flight_view.server import ADDRESS, POLL_PERIOD
 
-DEFAULT_PORT = 8765  # of the protocol
+DEFAULT_PORT = 8765  # that of the protocol
 BACKLOG = 4096  # messages that wait for a slow viewer; the oldest is dropped
 
 
 def serve_foxglove(run: Path, port: int, announce: Callable[[str], None]) -> None:
     """Serve a run until the end of the recording, SIGINT or SIGTERM.
 
-    `announce` gets a line for the user. Raises ParameterError where the port is taken, or the
-    recording has ended before.
+    `announce` gets a line for the user. Raises ParameterError if the port is taken, or if the
+    recording has already ended.
     """
     end = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: end.set())
     follower = Follower(run, lambda topic, type_name: math.inf)
-    # A record without data defines a channel.
+    # A record without data only defines a channel.
     before = {
         record.topic: record._replace(data=[])
         for record in follower.read()
@@ -81,9 +81,9 @@ def _channel(
     channels: dict[str, foxglove.Channel],
     context: foxglove.Context,
 ) -> foxglove.Channel | None:
-    """Return the channel of a topic; advertise it with the first messages.
+    """Return the channel of a topic, and advertise it with the first messages.
 
-    Returns None for a record without messages.
+    Returns None if a record has no messages.
     """
     if not isinstance(record, Messages):
         return None

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the page reads of a log: topics with their highest rate, and the channels that it keeps."""
+"""What the page reads of a log: topics with their highest rates, and the channels that it keeps."""
 
 import math
 
@@ -11,10 +11,14 @@ RATES = {
     LEARNED: math.inf,
     **dict.fromkeys(("guidance", "pose", "truth", "u", "y", "y_m"), RATE),
 }
-"""Topics that are read, and the highest rate. Ticks are all read: a peak between two drawn samples
-would be hidden."""
+"""Topics that are read, and the highest rate of each. All ticks are read, because a peak between
+two drawn samples would be hidden otherwise."""
 
-IN_TICKS = ("u", "y", "y_m")  # topics that the ticks have, too: not read from the first tick on
+IN_TICKS = (
+    "u",
+    "y",
+    "y_m",
+)  # topics that the ticks contain, so that they are not read from the first tick on
 
 GROUPS = {
     "internals": ("mode", "late", "y", "y_m", "e", "u_free", "u", "limited"),
@@ -37,4 +41,4 @@ GROUPS = {
         "fence",
     ),
 }
-"""Channels and groups of channels that are kept; of the other topics all."""
+"""Channels and groups of channels that are kept. Other topics keep all of theirs."""

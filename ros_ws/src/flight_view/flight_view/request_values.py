@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Values of a request of the controlling page: refused unless well formed and in range."""
+"""Values in a request of the page that has control: refused unless well formed and in range."""
 
 import math
 from collections.abc import Collection, Mapping, Sequence
@@ -10,11 +10,11 @@ from typing import Any
 from flight_core.fields import short_repr
 
 RANGE = (0.5, 2.0)
-"""Factors on a gain of the scenario: what the page may set."""
+"""Factors on a gain of the scenario between which the page may set it."""
 
 
 class RefusedError(Exception):
-    """A refused request: the status and a sentence."""
+    """A request that is refused, with the status and a sentence."""
 
     def __init__(self, status: HTTPStatus, sentence: str) -> None:
         super().__init__(sentence)
@@ -41,12 +41,12 @@ def as_list(value: Any) -> Sequence[Any]:
 
 
 def permitted_range(value: float) -> list[float]:
-    """Return the least and the largest value of a gain, by the value in the scenario."""
+    """Return the least and the largest value of a gain, given its value in the scenario."""
     return sorted(factor * value for factor in RANGE)
 
 
 def require_range(name: str, value: Any, base: Any) -> None:
-    """Refuse a gain outside of `permitted_range` of `base`, the gain in the scenario."""
+    """Refuse a gain outside `permitted_range` of `base`, the gain in the scenario."""
     for number, middle in zip(as_list(value), as_list(base), strict=True):
         low, high = permitted_range(middle)
         require_form(
@@ -78,7 +78,7 @@ def finite_number(name: str, value: Any) -> float:
     """Return a finite number of a request."""
     number = math.nan
     if isinstance(value, int | float) and not isinstance(value, bool):
-        # An integer of hundreds of digits is beyond a float.
+        # A float cannot hold an integer of hundreds of digits.
         try:
             number = float(value)
         except OverflowError:
@@ -90,12 +90,12 @@ def finite_number(name: str, value: Any) -> float:
 
 
 def is_sentences(value: Any) -> bool:
-    """Return whether a value is a list of sentences, for example of faults."""
+    """Return whether a value is a list of sentences, such as faults."""
     return isinstance(value, list) and all(isinstance(fault, str) for fault in value)
 
 
 def finite_numbers(name: str, value: Any) -> Any:
-    """Return a number or a list of numbers; null in a list stands for never, infinity."""
+    """Return a number or a list of numbers; null in a list means never, that is, infinity."""
     if not isinstance(value, list):
         return finite_number(name, value)
     return [math.inf if number is None else finite_number(name, number) for number in value]

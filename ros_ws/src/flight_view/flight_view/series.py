@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The samples of a topic in bounded memory: a long flight becomes coarser, and keeps the peaks."""
+"""The samples of a topic in bounded memory. A long flight becomes coarser, but keeps its peaks."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,14 +8,14 @@ from numpy.typing import NDArray
 from flight_core.vectors import FloatArray
 
 MAX_ROWS = 100_000
-"""Rows of a topic. 30 channels then need 12 MB; 100 Hz last 17 min before the samples become
-coarser, 50 Hz 33 min."""
+"""Rows of a topic. 30 channels then need 12 MB. The samples become coarser after 17 min at 100 Hz,
+and after 33 min at 50 Hz."""
 
 DISORDER_NS = 1_000_000_000
-"""A controller that recovers from an overrun has ticks a few ms older than the tick before."""
+"""When a controller recovers from an overrun, a tick may be a few ms older than the one before."""
 
 FIRST_ROWS = 4096
-BLOCK = 4096  # rows that are thinned together; whole groups of four
+BLOCK = 4096  # rows that are thinned together, in whole groups of four
 
 
 class Series:
@@ -43,8 +43,8 @@ class Series:
     def append(self, stamp_ns: NDArray[np.int64], values: FloatArray) -> None:
         """Append rows.
 
-        A row up to DISORDER_NS older than an earlier row takes the newer stamp; an older row is
-        refused.
+        A row that is up to DISORDER_NS older than an earlier row takes the newer stamp. An older
+        row is refused.
         """
         earliest = (
             self._stamp_ns[self.count - 1] if self.count else np.iinfo(np.int64).min + DISORDER_NS
@@ -71,20 +71,20 @@ class Series:
                 [self.values, np.zeros((size - self.count, len(self.names)), dtype=np.float32)]
             )
         self._stamp_ns[self.count : end] = stamp_ns
-        # Beyond float32 a value is drawn as infinite.
+        # A value beyond float32 is drawn as infinite.
         with np.errstate(over="ignore"):
             self._values[self.count : end] = values
         self.count = end
 
     def _thin(self) -> None:
-        """Replace groups of four rows by two, the minima and the maxima per channel.
+        """Replace each group of four rows by two: the minima and the maxima of each channel.
 
-        A plot keeps the peaks.
+        So a plot keeps its peaks.
         """
         grouped = self.count - self.count % 4
         k = len(self.names)
-        # Rows are thinned in place: temporary arrays of all rows would stay in the heap of the
-        # process.
+        # Rows are thinned in place, because temporary arrays of all rows would stay in the heap of
+        # the process.
         for start in range(0, grouped, BLOCK):
             groups = self._values[start : min(start + BLOCK, grouped)].reshape(-1, 4, k)
             thin = np.stack(

@@ -2,13 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Serves the page and the samples of flights to browsers on this host, over HTTP.
 
-A browser asks for news, and draws the answer before the next request: nothing queues for a slow
-browser. After the first answer the browser asks by a WebSocket, with two fifths of the processor
-time of an HTTP request. Only GET is answered, for a fixed list of names. The Host header has to
-name this host, against DNS rebinding. The files of the page hold no flight and need no token.
-Samples need the token, against foreign users of this host: in a header, or as the first message of
-a WebSocket, which has to come from the page. A cookie would go to the servers on all ports of this
-host. With `Control` there is a single POST, with a second key and the origin of the page.
+A browser asks for news, and draws the answer before its next request, so that nothing queues up for
+a slow browser. After the first answer it asks over a WebSocket, which takes two fifths of the
+processor time of an HTTP request.
+
+Only GET is answered, for a fixed list of names. The Host header must name this host, as a
+protection against DNS rebinding. The files of the page hold no flight and need no token. Samples
+need the token, as a protection against other users of this host. It comes in a header, or as the
+first message of a WebSocket, which must come from the page. A cookie would go to the servers on all
+ports of this host. With `Control` there is one single POST, which needs a second key and the origin
+of the page.
 """
 
 import asyncio
@@ -59,32 +62,32 @@ HEADERS = {
     "X-Content-Type-Options": "nosniff",
 }
 MAX_CONNECTIONS = 64  # with the token; a browser holds up to six
-# Further connections: for requests of control, and for the first request of a connection.
+# Connections beyond these, for requests of control and for the first request of a connection.
 RESERVED = 8
-# s, for a request to arrive in full, for the next request to begin, and for the peer to take the
+# s that a request may take to arrive in full, the next request to begin, or the peer to take the
 # answer.
 REQUEST_TIMEOUT = 10.0
 MAX_REQUEST_BYTES = 8192
-MAX_WAIT = 2.0  # s that a request for samples waits for new samples
+MAX_WAIT = 2.0  # s for which a request waits for new samples
 MAX_ROWS = 10_000  # of a topic in one answer
-MAX_DIGITS = 18  # of a number of rows: below 2^63
+MAX_DIGITS = 18  # digits of a number of rows, which keep it below 2^63
 # Status of a closed WebSocket, RFC 6455, 7.4.1, and the registry of IANA.
 POLICY_VIOLATION = 1008
 TRY_AGAIN_LATER = 1013
 TOKEN_HEADER = "X-Page-Token"  # noqa: S105 - a name
 NO_TOKEN = "Open the whole address that rise-di watch printed"  # noqa: S105 - a sentence
 FULL = f"{MAX_CONNECTIONS} connections are open"
-REST = 0.09  # s, after a chunk: the recorder closes a chunk each 0.1 s
-POLL_PERIOD = 0.03  # s, until the next chunk
+REST = 0.09  # s of rest after a chunk; the recorder closes a chunk every 0.1 s
+POLL_PERIOD = 0.03  # s between two looks for the next chunk
 STATE_PERIOD = 0.25  # s, between two looks at the state of the recording
 BUDGET = 0.05  # s of reading between two answers
 
 
 class Server:
-    """The server of flights, and the task to follow the logs.
+    """The server of flights, and the task that follows their logs.
 
-    A second flight is a ghost. With `fleet` each flight is an aircraft of a fleet, and the last
-    number has the places of all aircraft.
+    A second flight is a ghost. If there is a `fleet`, each flight is an aircraft of it, and the
+    last number has the places of all aircraft.
     """
 
     def __init__(
@@ -127,7 +130,7 @@ class Server:
     def listen(self, port: int) -> None:
         """Listen on this host alone; port 0 takes any free port.
 
-        Raises OSError where the port is taken.
+        Raises OSError if the port is taken.
         """
         listener = socket.create_server((ADDRESS, port), backlog=MAX_CONNECTIONS)
         listener.setblocking(False)
@@ -154,7 +157,7 @@ class Server:
     async def follow(self) -> None:
         """Read the logs, and answer the WebSockets, until cancelled.
 
-        Raises as `Flight.update` does.
+        Raises what `Flight.update` raises.
         """
         last_look = -math.inf
         while True:
@@ -175,7 +178,7 @@ class Server:
     async def news(self, flight: Flight | FleetView, query: Mapping[str, str]) -> bytes:
         """Answer a browser whose `query` has the numbers of its rows by topic.
 
-        The answer waits up to MAX_WAIT s for news.
+        The answer waits for news, up to MAX_WAIT s.
         """
         deadline = time.monotonic() + MAX_WAIT
         while not has_news(flight, query) and (remaining := deadline - time.monotonic()) > 0.0:
@@ -184,9 +187,9 @@ class Server:
         return self.answer(flight, query)
 
     def answer(self, flight: Flight | FleetView, query: Mapping[str, str]) -> bytes:
-        """Answer a browser whose `query` has the numbers of its rows by topic, at once.
+        """Answer at once a browser whose `query` has the numbers of its rows by topic.
 
-        Raises HTTPError for too long a number.
+        Raises HTTPError if a number is too long.
         """
         has_ghost = len(self.followed) > 1
         fleet = len(self.followed) if self.fleet else 0
@@ -200,9 +203,9 @@ class Server:
 
 
 def _epoch(flight: Flight | FleetView) -> str:
-    """Return a text that changes when rows that a browser knows have changed.
+    """Return a text that changes whenever rows that a browser knows have changed.
 
-    They change by thinning, or with the instant of flight time 0.
+    They change when they are thinned, or when the instant of flight time 0 changes.
     """
     return f"{flight.start_ns}.{sum(samples.thinned for samples in flight.samples.values())}"
 
@@ -241,13 +244,13 @@ def answer(
     fleet: int = 0,
     control: bool = False,
 ) -> bytes:
-    """Encode the data that a browser lacks: a head, then the columns of each topic of the head.
+    """Encode the data that a browser lacks: a head, then the columns of each topic in the head.
 
-    `fleet`: the number of the places of all aircraft; 0 without a fleet.
+    `fleet` is the number under which the places of all aircraft are, or 0 without a fleet.
 
-    The head is its length as uint32, then JSON. Little endian; the head ends at a multiple of 8
-    bytes. Columns of a topic with `count` rows: flight time in s as float64, then the channels as
-    float32, filled up to a multiple of 8 bytes. At most MAX_ROWS rows of a topic.
+    The head is its length as uint32, then JSON. It is little endian, and ends at a multiple of 8
+    bytes. The columns of a topic with `count` rows are the flight time in s as float64, then the
+    channels as float32, filled up to a multiple of 8 bytes. A topic has at most MAX_ROWS rows.
     """
     first = _first_rows(flight, query)
     topics = []
@@ -288,15 +291,14 @@ def answer(
 
 
 class _LimitedServer(HTTPServer):
-    """Holds at most MAX_CONNECTIONS connections with the token, and RESERVED further ones.
+    """Holds at most MAX_CONNECTIONS connections that have the token, and RESERVED others.
 
-    WebSockets are included. A new connection takes the place of the oldest connection that has not
-    shown the token.
+    These include WebSockets. A new connection replaces the oldest one that has not shown the token.
     """
 
     def initialize(self, *args: Any, **kwargs: Any) -> None:
         super().initialize(*args, **kwargs)
-        # Whether a connection has a place for long, in the order of arrival.
+        # Connections in the order of arrival, and whether each may stay.
         self._admitted: dict[IOStream, bool] = {}
 
     def handle_stream(self, stream: IOStream, address: tuple[Any, ...]) -> None:
@@ -311,9 +313,9 @@ class _LimitedServer(HTTPServer):
         super().handle_stream(stream, address)
 
     def admit(self, stream: IOStream) -> bool:
-        """Keep a connection that has shown the token.
+        """Keep a connection that has shown the token, and return whether it is kept.
 
-        False where MAX_CONNECTIONS connections are kept already.
+        It is not if there are MAX_CONNECTIONS already.
         """
         self._leave_out_closed()
         if sum(self._admitted.values()) < MAX_CONNECTIONS:
@@ -329,9 +331,9 @@ class _LimitedServer(HTTPServer):
 class _Handler(RequestHandler):
     """Checks the Host header and the token of a request.
 
-    Answers 404, not found, where no subclass answers. A connection without the token, or beyond
-    MAX_CONNECTIONS, is closed after the answer. A connection whose peer does not take the answer
-    within REQUEST_TIMEOUT is closed, too.
+    If no subclass answers, the answer is 404, not found. A connection without the token, or beyond
+    MAX_CONNECTIONS, is closed after the answer. So is one whose peer does not take the answer
+    within REQUEST_TIMEOUT.
     """
 
     _is_kept = False
@@ -363,7 +365,7 @@ class _Handler(RequestHandler):
             raise HTTPError(HTTPStatus.SERVICE_UNAVAILABLE, reason=FULL)
 
     def finish(self, chunk: str | bytes | dict[str, Any] | None = None) -> "Future[None]":
-        """Send the answer, and close the connection as the class says."""
+        """Send the answer, and close the connection if it is not to be kept."""
         stream = self.stream
         stays_open = self._is_kept or self.get_status() == HTTPStatus.SWITCHING_PROTOCOLS
         if not stays_open:
@@ -380,7 +382,7 @@ class _Handler(RequestHandler):
         return future
 
     def require_page(self) -> None:
-        """Refuse a request from a foreign page."""
+        """Refuse a request that comes from another page."""
         if self.request.headers.get_list("Origin") != [f"http://{self.request.host}"]:
             raise HTTPError(HTTPStatus.FORBIDDEN, reason="A request of another page")
 
@@ -392,7 +394,7 @@ class _Handler(RequestHandler):
         self.finish(f"{status_code}: {self._reason}\n")
 
     def compute_etag(self) -> None:
-        """No hash of an answer: nothing is to be kept."""
+        """Compute no hash of an answer, because nothing is to be kept."""
 
     def log_exception(self, *args: Any) -> None:
         if not isinstance(args[1], HTTPError):
@@ -400,7 +402,7 @@ class _Handler(RequestHandler):
 
 
 class _File(_Handler):
-    """The page and the files of the page: they need no token."""
+    """The page and its files, which need no token."""
 
     def require_token(self) -> None:
         """Answer without the token."""
@@ -416,7 +418,7 @@ class _File(_Handler):
 class _Data(_Handler):
     """The samples of a flight.
 
-    The query holds the numbers of rows known to the browser, by topic.
+    The query holds the numbers of the rows that the browser knows, by topic.
     """
 
     async def get(self, *names: str) -> None:
@@ -437,8 +439,8 @@ class _Data(_Handler):
 class _News(_Handler, WebSocketHandler):
     """The samples of a flight, again and again.
 
-    A message holds a query as for `_Data` and gets the same answer. The first message is the token:
-    a page sets no header of a WebSocket.
+    A message holds a query as for `_Data` and gets the same answer. The first message is the token,
+    because a page cannot set a header of a WebSocket.
     """
 
     def require_token(self) -> None:
@@ -458,7 +460,7 @@ class _News(_Handler, WebSocketHandler):
         self._await_request()
 
     def _await_request(self) -> None:
-        self._query: dict[str, str] | None = None  # by the request that waits for an answer
+        self._query: dict[str, str] | None = None  # that of the request that waits for an answer
         self._since = time.monotonic()
 
     def on_message(self, message: str | bytes) -> Awaitable[None] | None:
@@ -474,22 +476,23 @@ class _News(_Handler, WebSocketHandler):
             parse_qsl(message if isinstance(message, str) else "", keep_blank_values=True)
         )
         self._since = time.monotonic()
-        # Done once the answer is in the buffers of the network.
+        # It is done once the answer is in the buffers of the network.
         self._answered = asyncio.get_running_loop().create_future()
         self.look()
-        # Before it is done, the next message is not read.
+        # The next message is not read before that.
         return self._answered
 
     def look(self) -> None:
-        """Answer the request on news or after MAX_WAIT.
+        """Answer the request when there is news, or after MAX_WAIT.
 
-        Close after REQUEST_TIMEOUT without a request, or without a peer that takes the answer.
+        Close the connection after REQUEST_TIMEOUT without a request, or if the peer does not take
+        the answer.
         """
         waited = time.monotonic() - self._since
         if self._query is None:
             if waited > REQUEST_TIMEOUT:
                 self.close()
-                # The peer does not read the end of the answer either.
+                # The peer does not even read the end of the answer.
                 if self._sending is not None and not self._sending.done():
                     self._peer.close()
             return
@@ -499,7 +502,7 @@ class _News(_Handler, WebSocketHandler):
             content = self.server.answer(self.flight, self._query)
         except HTTPError as error:
             self.close(POLICY_VIOLATION, error.reason)
-            content = b""  # nothing is sent any more
+            content = b""  # nothing more is sent
         self._await_request()
         self._sending = asyncio.ensure_future(self._send(content))
 
@@ -516,7 +519,7 @@ class _News(_Handler, WebSocketHandler):
 class _Control(_Handler):
     """Requests of a page to command the flight.
 
-    They are JSON, from the page's own origin, with the key typed by the user.
+    They are JSON, come from the page's own origin, and have the key that the user typed.
     """
 
     def get(self, *_: str) -> None:
@@ -544,5 +547,5 @@ class _Control(_Handler):
 
 
 def _refuse_constant(text: str) -> float:
-    # NaN and Infinity are no JSON.
+    # NaN and Infinity are not JSON.
     raise ValueError(text)

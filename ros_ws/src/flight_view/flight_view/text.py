@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A flight in the terminal.
 
-The picture has state, mode, outputs over their references, inputs, attitude and the last events.
+It shows the state, the mode, the outputs over their references, the inputs, the attitude and the
+last events.
 """
 
 import math
@@ -20,7 +21,7 @@ from flight_view.flight import Flight
 from rise_di_controller.internals import Saturation
 
 REFRESH = 10.0  # Hz
-EVENTS = 6  # the last events
+EVENTS = 6  # how many of the last events are shown
 SATURATED = {float(kind): kind.name.lower() for kind in (Saturation.MAGNITUDE, Saturation.RATE)}
 STYLES = {
     "recording": "bold green",
@@ -31,9 +32,9 @@ STYLES = {
 
 
 def show(flight: Flight) -> None:
-    """Show a flight until the recording ends or is interrupted, or Ctrl-C.
+    """Show a flight until its recording ends or is interrupted, or until Ctrl-C.
 
-    Raises as `Flight.update`.
+    Raises what `Flight.update` raises.
     """
     with Live(picture(flight), refresh_per_second=REFRESH, transient=False) as live:
         while True:
@@ -48,7 +49,7 @@ def show(flight: Flight) -> None:
 
 
 def picture(flight: Flight) -> RenderableType:
-    """Text of a flight at the newest samples."""
+    """Draw a flight as text at the newest samples."""
     mode = flight.description["modes"][""].get(f"{_newest(flight, 'internals', 'mode'):.0f}", "")
     head = Text.assemble(
         (flight.name, "bold"),
@@ -116,7 +117,7 @@ def _table(first: str, *others: str) -> Table:
 
 
 def _names(flight: Flight, group: str) -> Sequence[str]:
-    """Names of the channels "group.name" of the ticks, in a log without ticks of the topic."""
+    """Return the names of the channels "group.name" in the ticks; without ticks, on the topic."""
     if "internals" not in flight.samples:
         return flight.samples[group].names if group in flight.samples else ()
     return [
@@ -127,7 +128,7 @@ def _names(flight: Flight, group: str) -> Sequence[str]:
 
 
 def _newest_of(flight: Flight, group: str, name: str) -> float:
-    """Return a channel's newest value in the ticks; in a log without ticks, in the topic."""
+    """Return a channel's newest value in the ticks; without ticks, on the topic."""
     if "internals" in flight.samples:
         return _newest(flight, "internals", f"{group}.{name}")
     return _newest(flight, group, name)

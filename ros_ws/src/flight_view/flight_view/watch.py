@@ -28,9 +28,12 @@ DEFAULT_PORT = 8077
 
 
 def runs_in_recording(runs: Path, namespace: str | None = None) -> list[Path]:
-    """Return the runs being recorded, newest first; with a namespace, those with a topic of it."""
+    """Return the runs that are being recorded, the newest first.
+
+    With a namespace, return those that have a topic in it.
+    """
     if is_folder(runs):
-        # `latest` is a link to one of them.
+        # The link `latest` points to one of them.
         folders = sorted(
             (folder for folder in runs.iterdir() if is_folder(folder) and not folder.is_symlink()),
             reverse=True,
@@ -50,7 +53,7 @@ def runs_in_recording(runs: Path, namespace: str | None = None) -> list[Path]:
 
 
 def newest_run(runs: Path, namespace: str | None = None) -> Path:
-    """Return the newest run being recorded, else the last run in the folder.
+    """Return the newest run that is being recorded, else the last run in the folder.
 
     With a namespace, it is a run of that aircraft. Raises ParameterError.
     """
@@ -66,7 +69,7 @@ def newest_run(runs: Path, namespace: str | None = None) -> Path:
 def namespaces(run: Path) -> list[str | None]:
     """Return the namespaces of the aircraft in the log of a run.
 
-    For a log without aircraft, it is None alone, which stands for the first aircraft to come.
+    If the log has no aircraft yet, return None alone, which stands for the first one to come.
     """
     with suppress(ParameterError, OSError):
         return [*aircraft_namespaces(log_topics(run))] or [None]
@@ -74,7 +77,7 @@ def namespaces(run: Path) -> list[str | None]:
 
 
 def require_log(run: Path, namespace: str | None = None, remaps: Mapping[str, str] = {}) -> None:
-    """Raise ParameterError unless a run has the log of a flight, or a log in recording.
+    """Raise ParameterError unless a run has the log of a flight, or is being recorded.
 
     The flight is that of an aircraft in the namespace.
     """
@@ -103,9 +106,8 @@ def serve(
 ) -> None:
     """Serve flights, as `Server` does, on the first free port, until SIGINT or SIGTERM.
 
-    `announce` gets two lines for the user. `control` lets the page command the first flight.
-
-    Raises ParameterError where no port is free, or a log is unreadable.
+    `announce` gets two lines for the user. `control` lets the page command the first flight. Raises
+    ParameterError if no port is free, or if a log is unreadable.
     """
     server = Server(flights, secrets.token_urlsafe(16), control, fleet=fleet)
     asyncio.run(_serve(server, ports, announce))
@@ -116,7 +118,7 @@ async def _serve(server: Server, ports: Sequence[int], announce: Callable[[str],
         try:
             server.listen(port)
         except OSError as error:
-            # The sentence of `strerror` may hold the address.
+            # The text in `strerror` may contain the address.
             reason = os.strerror(error.errno or 0)
         else:
             break
@@ -131,7 +133,8 @@ async def _serve(server: Server, ports: Sequence[int], announce: Callable[[str],
     )
     follow = asyncio.ensure_future(server.follow())
     loop = asyncio.get_running_loop()
-    # The signals end the page also when a shell started it in the background, with SIGINT ignored.
+    # The signals also end the page if a shell started it in the background, where SIGINT is
+    # ignored.
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, follow.cancel)
     try:
