@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Bridge to an autopilot, in place of the simulated aircraft.
+"""The bridge to an autopilot, which replaces the simulated aircraft.
 
-Channel maps, conversion, engagement, failsafe and node are here.
+It has the channel maps, their conversion, the engagement, the failsafe and the node.
 """

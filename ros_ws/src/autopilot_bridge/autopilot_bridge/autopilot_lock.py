@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Lock of a MAVLink link to the first autopilot.
+"""The lock of a MAVLink link to the first autopilot.
 
 An autopilot is known by the address of its packets and by the time since boot in its messages.
 """
@@ -9,24 +9,24 @@ from flight_core.publisher_lock import SENDER, PublisherLock
 from flight_core.rates import NANOSECONDS
 from flight_core.vectors import ChannelError
 
-CLOCK_TOLERANCE_NS = NANOSECONDS  # autopilots that were switched on within it are not told apart
+CLOCK_TOLERANCE_NS = NANOSECONDS  # autopilots that were switched on within this time look the same
 
 
 class AutopilotLock:
-    """Locks to the first autopilot until silence, then to the next one, as a topic to a publisher.
+    """Locks to the first autopilot until it is silent, then to the next, as a topic to a publisher.
 
-    Two autopilots behind the same address differ by the time since boot in their messages. The time
-    since boot of an autopilot never goes back, and advances by the time that passes here at most. A
-    message may come late. An autopilot after a new start is a second sender until messages of the
-    start before have been missing for the same silence.
+    Two autopilots behind the same address differ by the time since boot in their messages. This
+    time never goes back, and advances by at most the time that passes here, although a message may
+    come late. If an autopilot starts again, it counts as a second sender until the messages of the
+    earlier start have been missing for the same silence.
     """
 
     def __init__(self, silence_ns: int) -> None:
         self._silence_ns = silence_ns
         self._addresses, self._starts = self._new_lock(), self._new_lock()
         self._newest_ns = 0  # the largest time since boot
-        # The earliest instant of the boot, by the messages so far: that of the message with the
-        # least delay.
+        # The earliest instant of the boot by the messages so far. It comes from the message with
+        # the least delay.
         self._boot_ns = 0
 
     def _new_lock(self) -> PublisherLock:
@@ -34,16 +34,16 @@ class AutopilotLock:
 
     @property
     def address(self) -> str | None:
-        """The address of the autopilot; None before the first message."""
+        """The address of the autopilot; None until the first message."""
         return self._addresses.publisher
 
     def overran(self, duration_ns: int) -> None:
-        """Leave a time out of the silences: the receiver did not run."""
+        """Do not count a time as silence in which the receiver did not run."""
         self._addresses.overran(duration_ns)
         self._starts.overran(duration_ns)
 
     def check(self, address: str, since_boot_ns: int | None, now_ns: int) -> None:
-        """Raise ChannelError, reason "sender", for a second sender before the silence of the first.
+        """Raise ChannelError, reason "sender", if a second sender comes before the first is silent.
 
         `since_boot_ns` is None for a message without the time since boot.
         """
@@ -69,7 +69,7 @@ class AutopilotLock:
     def refresh(self, address: str, since_boot_ns: int | None, now_ns: int) -> bool:
         """Lock to the sender of a message after `check`.
 
-        Returns whether the sender is new, or has started again.
+        Return whether the sender is new, or has started again.
         """
         is_new_sender = self._addresses.refresh(address, now_ns)
         if is_new_sender:
@@ -91,7 +91,7 @@ class AutopilotLock:
     def _start(self, since_boot_ns: int, now_ns: int) -> str:
         """Name the start of the autopilot to which a time since boot belongs.
 
-        It is the locked start, or a new name from the instant of boot.
+        It is the start to which the lock holds, or a new name from the instant of boot.
         """
         boot_ns = now_ns - since_boot_ns
         advances = (

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Bridge to an autopilot, without ROS: y from its messages, setpoints for u to it.
+"""The bridge to an autopilot, without ROS: it makes y from its messages, and setpoints from u.
 
-Engagement, pilot override and failsafe are here. No clock is read: every instant is an argument, in
-ns of a single clock. The watchdogs of y and u end an engagement.
+It has the engagement, the pilot override and the failsafe. It reads no clock: every instant is an
+argument, in ns on the same clock. The watchdogs of y and u can end an engagement.
 """
 
 import math
@@ -27,19 +27,19 @@ UNBOUNDED = (
     "the loss of the transmitter cannot be seen over this link: set max_engaged in the "
     "map, or engage with --blind"
 )
-# Share of the limits beyond which a u that rests is at a limit of the law. The amplitudes of
-# experiments are below.
+# If a u beyond this share of its limits does not change, it is at a limit of the law. The
+# amplitudes of experiments are smaller.
 LARGE = 0.5
-END_WARNING_NS = 10 * NANOSECONDS  # before the end of an engagement by `max_engaged`
+END_WARNING_NS = 10 * NANOSECONDS  # warning before `max_engaged` ends an engagement
 
 
 class Phase(IntEnum):
-    """Phase of the engagement: what the autopilot is sent."""
+    """The phase of the engagement, which says what the autopilot is sent."""
 
     DISENGAGED = 0  # nothing
     ENGAGED = 1  # u
-    NEUTRAL = 2  # failsafe: u timed out, the neutral values are sent
-    RELEASE = 3  # the release values, which return the channels to the autopilot
+    NEUTRAL = 2  # failsafe: u has timed out, and the neutral values are sent
+    RELEASE = 3  # release values, which return the channels to the autopilot
     ENGAGING = 4  # heartbeats and requests, until the awaited conditions hold
 
 
@@ -51,7 +51,7 @@ def trim_key(name: str) -> str:
 class Bridge:
     """The newest y and u, the phase and the pilot override.
 
-    Only `engage` engages: the bridge never re-engages by itself.
+    Only `engage` engages. The bridge never engages again by itself.
     """
 
     def __init__(self, channel_map: ChannelMap, *, dry_run: bool) -> None:
@@ -60,13 +60,13 @@ class Bridge:
         self.outputs = tuple(channel_map.outputs)
         self.inputs = tuple(channel_map.inputs)
         self.phase = Phase.DISENGAGED
-        # Why the bridge is not engaged, what an engagement waits for, or lacks.
+        # Why the bridge is not engaged, or what an engagement waits for or lacks.
         self.reason = "not engaged yet"
-        # What refuses and ends an engagement, such as another publisher, as a sentence; set by the
-        # node.
+        # What refuses and ends an engagement, such as another publisher, as a sentence. The node
+        # sets it.
         self.conflict = ""
-        # What refuses an engagement and does not end one yet, as a rate of the link; set by the
-        # node.
+        # What refuses an engagement but does not end one yet, such as a rate of the link. The node
+        # sets it.
         self.problem = ""
         sources = {trim_key(name): row for name, row in channel_map.trims.items()}
         self._rows: dict[str, MeasuredRow] = {
@@ -86,11 +86,11 @@ class Bridge:
         self.u_lock = PublisherLock(self._u_timeouts_ns)
         self.conditions = Conditions(channel_map)
         self._parameters: dict[str, float] = {}
-        self._phase_ns = 0  # start of the phase
-        # Whether a release leaves the mode: a pilot requested it, or nothing was flown.
+        self._phase_ns = 0  # when the phase began
+        # Whether a release leaves the mode as it is, since a pilot requested it or nothing flew.
         self._keeps_mode = True
         self._limit_ns: dict[str, int] = {}  # since when inputs are at a limit
-        self._end_ns: int | None = None  # of the engagement by `max_engaged`
+        self._end_ns: int | None = None  # when `max_engaged` ends the engagement
         rows = channel_map.inputs.values()
         self._lower = np.array([row.lower for row in rows])
         self._upper = np.array([row.upper for row in rows])
@@ -102,9 +102,9 @@ class Bridge:
     def take_output(self, name: str, raw: float, stamp_ns: int, now_ns: int) -> None:
         """Take a value of a channel of y, of the pose or of a trim's source.
 
-        The channel becomes sign scale raw + offset. Raises ChannelError: reason "stamp" where the
-        stamp differs from now by more than the age limit, reason "order" where it is not later than
-        the previous one.
+        The channel becomes sign scale raw + offset. Raises ChannelError, reason "stamp" if the
+        stamp differs from now by more than the age limit, and reason "order" if it is not later
+        than the one before.
         """
         row = self._rows[name]
         if abs(now_ns - stamp_ns) > nanoseconds(row.max_age):
@@ -128,28 +128,28 @@ class Bridge:
         self._readings[name] = Reading(stamp_ns, value)
 
     def _u_timeouts_ns(self) -> tuple[int, int]:
-        """Timeouts of the publisher of u.
+        """Return the timeouts of the publisher of u.
 
-        While engaged every second publisher conflicts, also after a timeout: its u would jump. The
-        timeout ends the engagement.
+        While the bridge is engaged, every second publisher conflicts, even after a timeout, because
+        its u would jump. The timeout ends the engagement.
         """
         takeover_ns = sys.maxsize if self.phase is Phase.ENGAGED else self._max_age_ns
         return takeover_ns, takeover_ns
 
     def max_u_age_ns(self) -> int:
-        """Age limit of a u by the stamp, the instant of a y.
+        """Return the age limit of a u by its stamp, which is the instant of a y.
 
-        By this limit a played log does not begin to fly the autopilot.
+        Because of this limit, a log that is played cannot begin to fly the autopilot.
         """
         return self._max_age_ns + self._max_y_age_ns
 
     def take_u(self, sample: StampedVector, now_ns: int) -> None:
-        """Take u, shape (m,) in the map's order, of the publisher of `u_lock`."""
+        """Take u, shape (m,) in the map's order, from the publisher of `u_lock`."""
         self._moves = sample.value != self._u
         self._u = sample.value
 
     def take_effects(self, sample: StampedVector, now_ns: int) -> None:
-        """Take the effects of the inputs by the probe of the controller, (m,) in the map's order.
+        """Take the effects of the inputs as the controller's probe found them, (m,), map's order.
 
         An input without effect ends an engagement.
         """
@@ -160,7 +160,7 @@ class Bridge:
     def take_condition(self, name: str, raw: float, now_ns: int) -> None:
         """Take the field of a condition.
 
-        A condition that is lost ends an engagement at the next step.
+        If the condition is lost, the next step ends an engagement.
         """
         self.conditions.take_condition(name, raw, now_ns)
 
@@ -171,7 +171,7 @@ class Bridge:
     def take_override(self, name: str, raw: float, now_ns: int) -> None:
         """Take the field of a pilot override.
 
-        Beyond its threshold the bridge disengages at once.
+        If it is beyond its threshold, the bridge disengages at once.
         """
         self.conditions.take_override(name, raw, now_ns)
         if self._is_active(name, now_ns):
@@ -384,7 +384,7 @@ class Bridge:
     def _continue_engagement(self, now_ns: int) -> None:
         """Engage once the awaited conditions hold.
 
-        Give up after their time, or where something else would refuse.
+        Give up after their time, or if something else would refuse.
         """
         self.reason = self.conditions.unmet(now_ns, awaited=True)
         timed_out = now_ns - self._phase_ns > nanoseconds(self.channel_map.engage_timeout)
@@ -403,9 +403,9 @@ class Bridge:
             self._enter(Phase.ENGAGED, now_ns)
 
     def disengage(self, reason: str, now_ns: int, *, by_pilot: bool = False) -> None:
-        """Disengage from any phase: return the channels to the autopilot.
+        """Disengage from any phase, which returns the channels to the autopilot.
 
-        `by_pilot`: the pilot requested it, and the mode stays as it is.
+        If it is `by_pilot`, the pilot requested it and the mode stays as it is.
         """
         self._keeps_mode |= by_pilot
         if self.phase not in {Phase.DISENGAGED, Phase.RELEASE}:
@@ -413,12 +413,12 @@ class Bridge:
             self._enter(Phase.RELEASE, now_ns)
 
     def step(self, now_ns: int) -> Phase:
-        """Phase at an instant.
+        """Return the phase at an instant.
 
-        A stale y or u, a value outside the envelope, an input that stays at its limit, a lost
-        condition, a conflicting publisher or `max_engaged` ends an engagement. The phases ENGAGING,
-        NEUTRAL and RELEASE end after their times, NEUTRAL also with a lost condition or a
-        conflicting publisher.
+        An engagement ends if y or u is stale, a value is outside the envelope, an input stays at
+        its limit, a condition is lost, a publisher conflicts, or `max_engaged` is over. The phases
+        ENGAGING, NEUTRAL and RELEASE end after their times. NEUTRAL also ends if a condition is
+        lost or a publisher conflicts.
         """
         if self.phase is Phase.ENGAGING:
             self._continue_engagement(now_ns)
@@ -450,9 +450,9 @@ class Bridge:
     # Outputs
 
     def y(self, now_ns: int) -> StampedVector | None:
-        """Sample of y at the stamp of the map's output `instant`.
+        """Return the sample of y at the stamp of the map's output `instant`.
 
-        None where it was returned before or a channel is stale.
+        Returns None if it was returned before, or if a channel is stale.
         """
         newest = self._readings.get(self.channel_map.instant)
         if (
@@ -469,7 +469,7 @@ class Bridge:
     def _value(self, name: str) -> float:
         """Return the newest value of a channel.
 
-        A captured output is 0 until the bridge engages, then its change since the engagement.
+        A captured output is 0 until the bridge engages, and then its change since the engagement.
         """
         value = self._readings[name].value
         row = self.channel_map.outputs.get(name)
@@ -478,9 +478,9 @@ class Bridge:
         return value - self._zero[name] if self._is_captured() else 0.0
 
     def _is_captured(self) -> bool:
-        """Return whether the trims are those captured at engagement.
+        """Return whether the trims are those that the engagement captured.
 
-        Otherwise, they follow their sources.
+        If not, they follow their sources.
         """
         return self.phase in {Phase.ENGAGED, Phase.NEUTRAL, Phase.RELEASE} and bool(
             self._zero or self._trim
@@ -498,10 +498,10 @@ class Bridge:
         return row.trim if source is None else to_channel(source.value, row.line)
 
     def pose(self, now_ns: int) -> tuple[tuple[str, ...], StampedVector] | None:
-        """Names and values of the fresh channels of the pose, at the stamp of its first row.
+        """Return the names and values of the pose's fresh channels, at the stamp of its first row.
 
-        None where that stamp is not new. psi is in -pi..pi. A channel that was not received or is
-        stale is left out.
+        Returns None if that stamp is not new. psi is in -pi..pi. A channel is left out if it is
+        stale or has not been received yet.
         """
         first = next(iter(self.channel_map.pose), None)
         newest = None if first is None else self._readings.get(first)
@@ -515,7 +515,7 @@ class Bridge:
         return names, StampedVector(newest.stamp_ns, np.array(list(values.values())))
 
     def raw_u(self) -> FloatArray:
-        """Raw values of the newest u after saturation, shape (m,).
+        """Return the raw values of the newest u after saturation, (m,).
 
         They are the raw values of trim + min(max(u, lower), upper).
         """
@@ -528,7 +528,7 @@ class Bridge:
         return to_raw(self.trim(name) + u, self.channel_map.inputs[name].line)
 
     def raw(self) -> FloatArray:
-        """Raw values that are sent in this phase, shape (m,)."""
+        """Return the raw values that are sent in this phase, (m,)."""
         if self.phase is Phase.ENGAGED:
             return self.raw_u()
         return np.array([self._resting(name, row) for name, row in self.channel_map.inputs.items()])

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Conversion between a field of a message, given by its path, and a channel of y or u.
+"""Convert between a field of a message, given by its path, and a channel of y or u.
 
-It works on any object with the published field names, so it needs no message package. Arrays of a
-message may be lists, array.array or NumPy arrays.
+This works on any object that has the published field names, so that it needs no message package.
+Arrays of a message may be lists, array.array or NumPy arrays.
 """
 
 import importlib
@@ -21,16 +21,16 @@ from flight_core.installation import missing
 from flight_core.parameters import ParameterError
 from flight_core.vectors import ChannelError
 
-# The path of a field: names separated by dots, each with an optional index in brackets.
+# The path of a field: names separated by dots, each of which may have an index in brackets.
 PATH = re.compile(r"[A-Za-z]\w*(\[\d+\])?(\.[A-Za-z]\w*(\[\d+\])?)*")
 STEP = re.compile(r"(\w+)(?:\[(\d+)\])?")
 VERSION = re.compile(r"_v\d+$")  # at the end of a topic of PX4
-# kg/m^3, ISO 2533. With it the speed of a dynamic pressure is the indicated airspeed.
+# kg/m^3, ISO 2533. With it, the speed of a dynamic pressure is the indicated airspeed.
 SEA_LEVEL_DENSITY = 1.225
 
 
 class LinearConversion(NamedTuple):
-    """Channel = sign scale raw + offset.
+    """channel = sign scale raw + offset.
 
     The channel is in SI and radians, the raw value in the autopilot's unit.
     """
@@ -41,19 +41,19 @@ class LinearConversion(NamedTuple):
 
 
 def to_channel(raw: float, line: LinearConversion) -> float:
-    """Channel = sign scale raw + offset."""
+    """Return channel = sign scale raw + offset."""
     return line.sign * line.scale * raw + line.offset
 
 
 def to_raw(channel: float, line: LinearConversion) -> float:
-    """Raw = sign (channel - offset) / scale, the inverse of `to_channel`."""
+    """Return raw = sign (channel - offset) / scale, the inverse of `to_channel`."""
     return line.sign * (channel - line.offset) / line.scale
 
 
 def get_field(message: Any, path: str) -> Any:
-    """Value at a path such as "twist.angular.y" or "axes[1]".
+    """Return the value at a path such as "twist.angular.y" or "axes[1]".
 
-    Raises ChannelError, reason "field", where there is none.
+    Raises ChannelError, reason "field", if there is none.
     """
     value = message
     for name, place in STEP.findall(path):
@@ -77,7 +77,7 @@ def set_field(message: Any, path: str, value: Any) -> None:
         if not math.isfinite(value):
             raise ChannelError("range", f"{path} takes integers, not {value:g}")
         value = round(value)
-    # NumPy 1.26 wraps a value beyond the range.
+    # NumPy 1.26 would wrap a value beyond the range.
     if (
         isinstance(current, np.integer)
         and not np.iinfo(current).min <= value <= np.iinfo(current).max
@@ -97,7 +97,7 @@ def set_field(message: Any, path: str, value: Any) -> None:
 
 
 def _norm(vector: Any) -> float:
-    """sqrt(x^2 + y^2 + z^2) of a vector with members x, y, z or with three elements."""
+    """Return sqrt(x^2 + y^2 + z^2) of a vector with members x, y, z or with three elements."""
     parts = (vector.x, vector.y, vector.z) if hasattr(vector, "x") else vector
     return math.hypot(*(float(part) for part in parts))
 
@@ -105,13 +105,13 @@ def _norm(vector: Any) -> float:
 def _airspeed_of_pressure(pressure: Any) -> float:
     """Return the indicated airspeed sqrt(2 dp / rho_0), m/s, for a dynamic pressure in Pa.
 
-    It is 0 for a negative pressure, which is noise.
+    For a negative pressure, which is noise, it is 0.
     """
     return math.sqrt(2.0 * max(float(pressure), 0.0) / SEA_LEVEL_DENSITY)
 
 
 def _quaternion(field: Any) -> tuple[float, float, float, float]:
-    """(w, x, y, z), of length 1, of a quaternion.
+    """Return (w, x, y, z) of a quaternion, scaled to the length 1.
 
     The field has members w, x, y, z, or four elements in this order, as PX4 publishes them.
     """
@@ -124,7 +124,7 @@ def _quaternion(field: Any) -> tuple[float, float, float, float]:
 
 
 def _roll(field: Any) -> float:
-    """Roll angle of a quaternion, rad.
+    """Return the roll angle of a quaternion, rad.
 
     Roll is the last of the rotations about z, y, x from the world to the body.
     """
@@ -133,13 +133,13 @@ def _roll(field: Any) -> float:
 
 
 def _pitch(field: Any) -> float:
-    """Pitch angle of a quaternion, rad, in -pi/2..pi/2."""
+    """Return the pitch angle of a quaternion, rad, in -pi/2..pi/2."""
     w, x, y, z = _quaternion(field)
     return math.asin(max(-1.0, min(1.0, 2.0 * (w * y - x * z))))
 
 
 def _yaw(field: Any) -> float:
-    """Yaw angle of a quaternion, rad."""
+    """Return the yaw angle of a quaternion, rad."""
     w, x, y, z = _quaternion(field)
     return math.atan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)
 
@@ -156,9 +156,9 @@ DERIVED: Mapping[str, Callable[[Any], float]] = MappingProxyType(
 )
 """Functions from a field to the raw value.
 
-The number itself, the length of a vector, the airspeed of a dynamic pressure, the Euler angles (z,
-y, x) of a quaternion. The angles of body FLU in ENU are roll, -pitch and pi/2 - yaw of body FRD in
-NED: the row states it by its sign and offset.
+They give the number itself, the length of a vector, the airspeed for a dynamic pressure, or the
+Euler angles (z, y, x) of a quaternion. The angles of body FLU in ENU are roll, -pitch and pi/2 -
+yaw of body FRD in NED, which the row states by its sign and offset.
 """
 
 QUATERNION = "wxyz"
@@ -167,14 +167,14 @@ COMPONENTS: Mapping[str, str] = MappingProxyType(
     | {name: QUATERNION for name in DERIVED if name.endswith("quaternion")}
     | {"norm": "xyz"}
 )
-"""The members that the field of a function has; none for a number."""
+"""The members that the field must have for each function; none if it is a number."""
 
 
 def _turned(message: Any, path: str, attitude: str) -> float:
-    """Component of R(q) v: the vector v turned from the body to the world.
+    """Return a component of R(q) v, the vector v turned from the body to the world.
 
-    v is that of the path VECTOR.x, .y or .z. `attitude`: the path of the quaternion q. R(q) v = v +
-    2 (w r x v + r x (r x v)) with q = (w, r), |q| = 1.
+    v is that of the path VECTOR.x, .y or .z, and `attitude` is the path of the quaternion q. R(q) v
+    = v + 2 (w r x v + r x (r x v)) with q = (w, r), |q| = 1.
     """
     vector, _, axis = path.rpartition(".")
     v = np.array([float(get_field(message, f"{vector}.{name}")) for name in "xyz"])
@@ -185,9 +185,9 @@ def _turned(message: Any, path: str, attitude: str) -> float:
 
 
 def read_raw(message: Any, path: str, function: str, turned_by: str | None = None) -> float:
-    """Raw value of a row.
+    """Return the raw value of a row.
 
-    Raises ChannelError: reason "field" where the field is missing, "finite" where it is not finite.
+    Raises ChannelError, reason "field" if the field is missing, and "finite" if it is not finite.
     """
     value = get_field(message, path)
     try:
@@ -224,7 +224,7 @@ def message_type(name: str, load: Callable[[str], Any] = importlib.import_module
 def versioned_topic(topic: str, version: int) -> str:
     """Return PX4's topic for a version of its definition, /fmu/.../NAME_vVERSION; others stay.
 
-    A definition states its version as MESSAGE_VERSION; version 0 has no suffix. Source: PX4 guide,
+    A definition states its version as MESSAGE_VERSION. Version 0 has no suffix. Source: PX4 guide,
     PX4 ROS 2 message translation node.
     """
     if topic.startswith("/fmu/"):
@@ -249,9 +249,9 @@ def version_fault(topic: str, message_class: Any) -> str:
 def version_faults(
     topics: Iterable[tuple[str, str]], load: Callable[[str], Any] = importlib.import_module
 ) -> list[str]:
-    """`version_fault` of topics and types, for the message packages that are installed.
+    """Return `version_fault` of topics and types whose message packages are installed.
 
-    The rest is not known.
+    Nothing is known about the rest.
     """
     faults = []
     for topic, kind in dict.fromkeys(topics):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Client of a bridge, for `rise-di engage` and the live page."""
+"""The client of a bridge, for `rise-di engage` and the live page."""
 
 from collections.abc import Callable
 
@@ -13,13 +13,13 @@ from flight_ros.messages import NamedDecoder
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.topics import ENGAGEMENT, NEWEST_SAMPLES, PUBLISH, U
 
-# Services.
+# The services of the bridge.
 ENGAGE = "bridge/engage"
 ENGAGE_BLIND = "bridge/engage_blind"
 WITHDRAW_TIMEOUT = 1.0  # s
-# s: the nodes of a flight start, and the autopilot may send its first messages late.
+# s, while the nodes of a flight start; the autopilot may send its first messages late.
 U_TIMEOUT = 30.0
-TRIM_SAMPLES = 20  # equal samples of u in a row: u has reached trim
+TRIM_SAMPLES = 20  # equal samples of u in a row, which show that u has reached trim
 
 
 class EngagementClient(Client):
@@ -89,7 +89,7 @@ class EngagementClient(Client):
         )
 
     def _withdraw(self) -> None:
-        """Request to disengage, and wait for an answer at most WITHDRAW_TIMEOUT.
+        """Ask the bridge to disengage, and wait for an answer at most WITHDRAW_TIMEOUT.
 
         A bridge that is stopped answers later.
         """
@@ -105,7 +105,7 @@ class EngagementClient(Client):
         return self._u
 
     def _received_phases(self) -> list[tuple[str, str]]:
-        """Phases of the bridge with their reasons, since the request."""
+        """Return the phases of the bridge with their reasons, since the request."""
         self._phases += [
             (bounded(arrival.message.key), bounded(arrival.message.value))
             for arrival in self._engagement_subscription.take()

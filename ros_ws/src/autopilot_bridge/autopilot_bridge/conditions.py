@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Conditions and pilot overrides of a channel map: what the autopilot and the pilot allow now."""
+"""The conditions and pilot overrides of a channel map: what autopilot and pilot allow now."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -12,7 +12,7 @@ from flight_core.text import sentences
 
 
 class Reading(NamedTuple):
-    """The newest value of a field and the instant to which it belongs."""
+    """The newest value of a field, and the instant to which it belongs."""
 
     stamp_ns: int
     value: float
@@ -21,7 +21,7 @@ class Reading(NamedTuple):
 class Conditions:
     """The newest fields of the conditions and overrides of a map.
 
-    `blind`: whether an engagement goes on without the transmitter.
+    `blind` says whether an engagement goes on without the transmitter.
     """
 
     def __init__(self, channel_map: ChannelMap) -> None:
@@ -29,7 +29,7 @@ class Conditions:
         self.blind = False
         self._conditions: dict[str, Reading] = {}
         self._overrides: dict[str, Reading] = {}
-        self._at_engagement: dict[str, float] = {}  # the overrides
+        self._at_engagement: dict[str, float] = {}  # values of the overrides
         self.watches_transmitter = any(row.transmitter for row in channel_map.conditions.values())
 
     def take_condition(self, name: str, raw: float, now_ns: int) -> None:
@@ -41,7 +41,7 @@ class Conditions:
         self._overrides[name] = Reading(now_ns, raw)
 
     def engage(self, now_ns: int) -> None:
-        """Keep the overrides as they are: one that is `moved` acts by its change since then."""
+        """Keep the overrides as they are now. One that is `moved` acts by its change since then."""
         self._at_engagement = {
             name: reading.value
             for name, reading in self._overrides.items()
@@ -71,9 +71,9 @@ class Conditions:
     def is_contradicted(self) -> bool:
         """Return whether the last value of a condition contradicts it.
 
-        Then the pilot or the autopilot chose another mode, or the aircraft has landed. A condition
-        that tells the loss of the transmitter does not count, because the pilot cannot take over
-        then.
+        If so, the pilot or the autopilot chose another mode, or the aircraft has landed. A
+        condition that tells the loss of the transmitter does not count, because the pilot cannot
+        take over then.
         """
         rows = self._map.conditions.items()
         readings = ((row, self._conditions.get(name)) for name, row in rows if not row.transmitter)
@@ -84,7 +84,7 @@ class Conditions:
     def is_active(self, name: str, now_ns: int, *, engaged: bool) -> bool:
         """Return whether a pilot override is active.
 
-        An override ends with its topic: an old one does not block an engagement.
+        An override ends with its topic, so that an old one does not block an engagement.
         """
         row = self._map.overrides[name]
         reading = self._overrides.get(name)
@@ -94,7 +94,7 @@ class Conditions:
         return row.is_active(reading.value, at_engagement)
 
     def _is_silent(self, name: str, now_ns: int) -> bool:
-        """Return whether an override cannot act now: its topic has ended or never came."""
+        """Return whether an override cannot act now, because its topic has ended or never came."""
         row = self._map.overrides[name]
         return bool(staleness(row.topic, self._overrides.get(name), row.max_age, now_ns))
 

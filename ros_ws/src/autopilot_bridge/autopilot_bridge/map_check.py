@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Which rows of a channel map hold for a release of an autopilot, by its message definitions.
+"""Check which rows of a channel map hold for a release of an autopilot.
 
-A row holds where the definition has its field, with the components that its function takes, where
-its topic has the version of the definition (PX4), and where a constant that the source of a
-condition names is one of the values.
+A row holds if the message definition has its field, with the components that its function takes,
+and if its topic has the version of the definition (PX4). If the source of a condition names a
+constant, this constant must be one of the values.
 """
 
 import re
@@ -26,20 +26,20 @@ from flight_log.message_definitions import definition, read_definition
 from flight_log.named_vectors import typestore
 
 Types = Mapping[str, tuple[Any, Any]]
-"""Constants (name, type, value) and fields (name, type) by the full name of a message, as of
-rosbags."""
+"""Constants (name, type, value) and fields (name, type) by the full name of a message, as rosbags
+has them."""
 
 PACKAGE = re.compile(rb"<name>\s*(\w+)\s*</name>")  # of a package.xml (REP 149)
 CONSTANT = re.compile(r"\b[A-Z][A-Z0-9]*_[A-Z0-9_]+\b")
-# What ends the request in the definition of a service.
+# The line that ends the request in the definition of a service.
 REQUEST = re.compile(r"^---\s*$", re.MULTILINE)
-VERSION = "MESSAGE_VERSION"  # the constant of PX4's definitions
+VERSION = "MESSAGE_VERSION"  # the constant in definitions of PX4
 
 
 class CheckedRow(NamedTuple):
     """A field that a row of a map reads or sets, and its faults by release.
 
-    A fault is why the row does not hold; empty where it holds.
+    A fault says why the row does not hold; it is empty if the row holds.
     """
 
     key: str
@@ -49,9 +49,9 @@ class CheckedRow(NamedTuple):
 
 
 def definitions_below(folder: Path, kinds: Iterable[str]) -> Types:
-    """Message types of the packages below a folder, and those that they contain.
+    """Return the message types of the packages below a folder, and those that they contain.
 
-    Raises ParameterError where it has none.
+    Raises ParameterError if there is no package.
     """
     expected = (
         "a folder with the sources of a message package: package.xml, msg/*.msg and srv/*.srv"
@@ -84,8 +84,8 @@ def definitions_below(folder: Path, kinds: Iterable[str]) -> Types:
 def installed_definitions(kinds: Iterable[str]) -> Types:
     """Return the message types of the installed packages, and those of MAVLink in pymavlink.
 
-    Types that are not installed are absent. Raises ParameterError for a type of MAVLink without
-    pymavlink.
+    Types that are not installed are absent. Raises ParameterError for a type of MAVLink if
+    pymavlink is not installed.
     """
     types: dict[str, tuple[Any, Any]] = {}
     for kind in kinds:
@@ -105,7 +105,7 @@ def installed_definitions(kinds: Iterable[str]) -> Types:
 
 
 def check_map(channel_map: ChannelMap, releases: Iterable[Types]) -> list[CheckedRow]:
-    """Each field that a map uses, against the definitions of some releases.
+    """Check each field that a map uses against the definitions of some releases.
 
     A definition without a version has version 0.
     """

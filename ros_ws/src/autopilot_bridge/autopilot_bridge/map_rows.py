@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Rows of a channel map: one channel, message, condition or parameter each."""
+"""The rows of a channel map. Each is a channel, a message, a condition or a parameter."""
 
 from collections.abc import Mapping
 from itertools import product
@@ -11,7 +11,7 @@ from autopilot_bridge.channel_map import PATH, LinearConversion
 from flight_core.fields import Field
 from flight_core.parameters import Config, NonNegative, Number, Numbers, Positive, require
 
-MAVLINK = "mavlink"  # the package of the types of MAVLink messages, and the begin of their topics
+MAVLINK = "mavlink"  # package of the types of MAVLink messages, and first part of their topics
 
 Motion = Literal[
     "nose up",
@@ -31,13 +31,13 @@ Motion = Literal[
 MOTIONS: Mapping[str, tuple[str, int]] = MappingProxyType(
     dict(zip(get_args(Motion), product(("q", "p", "r", "V", "V", "climb"), (1, -1)), strict=True))
 )
-"""What responds to a motion, and its sign: FRD, q nose up +, p roll right +, r nose right +, V
+"""The output that shows a motion, and its sign: FRD, q nose up +, p roll right +, r nose right +, V
 faster +, climb up +."""
 
 UNITS: Mapping[str, str] = MappingProxyType(
     dict.fromkeys(("q", "p", "r"), "rad/s") | dict.fromkeys(("V", "climb"), "m/s")
 )
-"""The unit of what responds to a motion."""
+"""The unit of the output that shows a motion."""
 
 Rate = Annotated[float, Field(ge=1, le=1000)]
 Function = Literal[
@@ -52,18 +52,18 @@ MessageType = Annotated[str, Field(pattern=r"^[a-z]\w*/msg/[A-Z]\w*$")]
 SentType = Annotated[str, Field(pattern=r"^[a-z]\w*/(msg|srv)/[A-Z]\w*$")]
 TopicName = Annotated[str, Field(pattern=r"^/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*$")]
 SystemId = Annotated[int, Field(ge=1, le=255)]
-# A value of a message field, which may be NaN, infinite or FLT_MAX for "no value".
+# A value of a message field. NaN, infinity or FLT_MAX may mean "no value".
 Raw = Annotated[float, Field(allow_inf_nan=True)]
-Integer = Annotated[int, Field(ge=-(2**63), lt=2**64)]  # of a message field: from int64 to uint64
+Integer = Annotated[int, Field(ge=-(2**63), lt=2**64)]  # a message field may be int64 to uint64
 Mask = Annotated[int, Field(gt=0, lt=2**64)]
-# The least of termios, the highest of the USB converter FT232H.
+# The lowest rate of termios, and the highest of the USB converter FT232H.
 Baud = Annotated[int, Field(ge=50, le=12_000_000)]
 Limits = tuple[Number, Number]
 Value = bool | Integer | Raw | str | tuple[Integer, ...] | tuple[Raw, ...]
 
 
 class Row(Config):
-    """Common part of the rows of a map: channel = sign scale raw + offset.
+    """What the rows of a map have in common: channel = sign scale raw + offset.
 
     A row has a frame and a source.
     """
@@ -75,13 +75,13 @@ class Row(Config):
         description="the frame and the unit of the raw value, as a note for the reader"
     )
     sign: Literal[-1, 1] = Field(
-        description="+1, or -1 where the channel decreases for an increasing raw value"
+        description="+1, or -1 if the channel decreases while the raw value increases"
     )
     scale: Positive = Field(
         description="units of the channel (SI, radians) per unit of the raw value"
     )
     offset: Number = Field(description="the value of the channel at raw = 0, SI")
-    source: str = Field(min_length=1, description="where the row is from")
+    source: str = Field(min_length=1, description="where the row comes from")
 
     @property
     def line(self) -> LinearConversion:
@@ -96,25 +96,25 @@ class MovingRow(Row):
 
     @property
     def motion(self) -> tuple[str, int]:
-        """What responds to an increasing channel, a key of UNITS, and the sign of its response."""
+        """The output that an increasing channel moves, a key of UNITS, and its sign."""
         output, sign = MOTIONS[self.positive]
         return output, sign * self.sign
 
 
 class MeasuredRow(Row):
-    """A channel that the autopilot publishes: topic and field of its source."""
+    """A channel that the autopilot publishes, with the topic and the field that it comes from."""
 
     topic: TopicName = Field(description="the autopilot's topic")
     type: MessageType = Field(description="its type, package/msg/Type")
     function: Function = Field(
         default="value",
-        description="conversion of the field to the raw value: none, vector length, airspeed of "
-        "a pressure, an Euler angle",
+        description="how the field becomes the raw value: as it is, by the length of a vector, the "
+        "airspeed of a pressure, or an Euler angle",
     )
     turned_by: str | None = Field(
         default=None,
-        description="the path of the quaternion that turns a vector in body axes to the world; "
-        "`field` is a component of it",
+        description="the path of the quaternion that turns a vector from body axes to the world; "
+        "`field` is a component of this vector",
     )
     stamp: Literal["header", "arrival"] = Field(
         description="stamp of the sample: that of the message header, or its arrival"
@@ -140,41 +140,41 @@ class MeasuredRow(Row):
 
 
 class PoseRow(MeasuredRow):
-    """A channel of the pose, an absolute value.
+    """A channel of the pose, as an absolute value.
 
-    `sign` and `offset` bring it to FRD, north, east, up from the frame it has.
+    `sign` and `offset` turn it from the frame that it has into FRD, north, east, up.
     """
 
 
 class OutputRow(MeasuredRow, MovingRow):
-    """A channel of y, the deviation from trim."""
+    """A channel of y, as the deviation from trim."""
 
     captured: bool = Field(
         default=False,
-        description="whether the channel begins at 0 at each engagement, in place of the trim "
+        description="whether the channel begins at 0 at each engagement, instead of with the trim "
         "in `offset`",
     )
     held: bool = Field(
         default=False,
-        description="whether y repeats the last value of a stale channel: for a vane, which the "
-        "observer then leaves out",
+        description="whether y repeats the last value of a stale channel; use it for a vane, which "
+        "the observer then leaves out",
     )
     low_pass: NonNegative = Field(
         default=0.0,
-        description="time constant of a low-pass filter of first order, s: y is later by it; 0 "
-        "without",
+        description="time constant of a first-order low-pass filter, by which y is later, s; 0 for "
+        "no filter",
     )
 
 
 class InputRow(MovingRow):
-    """A channel of u, the deviation from trim: trim + u = sign scale raw + offset.
+    """A channel of u, as the deviation from trim: trim + u = sign scale raw + offset.
 
     The row has the message and the field of its setpoint.
     """
 
-    message: str = Field(description="the message with the field, one of `messages`")
+    message: str = Field(description="the message that has the field, one of `messages`")
     trim: Number = Field(
-        description="the command in trim, to which u is added, SI; a row of `trims` replaces it"
+        description="the command in trim, to which u is added, SI; a row in `trims` replaces it"
     )
     lower: Annotated[Number, Field(le=0)] = Field(
         description="the lower limit of u around trim, SI"
@@ -186,12 +186,11 @@ class InputRow(MovingRow):
     )
     at_limit: Positive | None = Field(
         default=None,
-        description="how long u may stay at one of its limits while engaged, s: then the bridge "
-        "disengages",
+        description="how long u may stay at a limit while engaged, s; then the bridge disengages",
     )
     release: Raw | None = Field(
         description="the raw value that returns the channel to the autopilot, for example NaN; "
-        "null where nothing is sent"
+        "null if nothing is sent"
     )
 
 
@@ -205,12 +204,10 @@ class MessageRow(Config):
     type: SentType = Field(description="its type, package/msg/Type or package/srv/Type")
     rate: Rate = Field(description="the rate at which it is sent, Hz")
     when: Literal["engaged", "heartbeat", "engaging", "release", "failsafe"] = Field(
-        description="engaged: from engagement to the end of the release; heartbeat: from the "
-        "request to the release; engaging:"
-        " while the engagement waits for a condition; release: during the release while the "
-        "conditions hold; failsafe: the same"
-        " after a release that no pilot requested, also where the conditions are not reported "
-        "any more"
+        description="when it is sent. engaged: from the engagement to the end of the release; "
+        "heartbeat: from the request to the release; engaging: while the engagement waits for a "
+        "condition; release: during the release while the conditions hold; failsafe: like release, "
+        "after a release that no pilot requested, even if the conditions are no longer reported"
     )
     stamped: bool = Field(description="whether header.stamp is set to the instant of sending")
     values: dict[str, Value] = Field(
@@ -233,12 +230,12 @@ class MessageRow(Config):
 
 
 class WatchedRow(Config):
-    """A field of the autopilot that decides on the engagement."""
+    """A field of the autopilot on which the engagement depends."""
 
     topic: TopicName = Field(description="the topic")
     type: MessageType = Field(description="its type, package/msg/Type")
     field: str = Field(description="the path of the field")
-    source: str = Field(min_length=1, description="where the row is from")
+    source: str = Field(min_length=1, description="where the row comes from")
     bits: Mask | None = Field(
         default=None, description="for a bit field: mask of the bits that count"
     )
@@ -249,9 +246,9 @@ class WatchedRow(Config):
 
 
 class ConditionRow(WatchedRow):
-    """A condition of the engagement: the field has one of some values.
+    """A condition of the engagement: the field must have one of some values.
 
-    The bridge disengages where it has not.
+    If it has another one, the bridge disengages.
     """
 
     one_of: Numbers = Field(
@@ -259,21 +256,19 @@ class ConditionRow(WatchedRow):
         description="the values with which the condition holds; false is 0 and true is 1",
     )
     within: Limits | None = Field(
-        default=None, description="in place of `one_of`: the limits within which it holds"
+        default=None, description="instead of `one_of`, the limits within which it holds"
     )
-    sentence: str = Field(
-        min_length=1, description="what is wrong where the condition does not hold"
-    )
+    sentence: str = Field(min_length=1, description="what is wrong if the condition does not hold")
     max_age: Positive = Field(description="the age above which the field is stale, s")
     awaited: bool = Field(
         default=False,
         description="whether an engagement waits for the condition, up to `engage_timeout`, "
-        "instead of a refusal",
+        "instead of being refused",
     )
     transmitter: bool = Field(
         default=False,
-        description="whether the field tells the loss of the pilot's transmitter: an engagement "
-        "with `--blind` ignores the row",
+        description="whether the field tells the loss of the pilot's transmitter; an engagement "
+        "with `--blind` ignores such a row",
     )
 
     def holds(self, raw: float) -> bool:
@@ -285,21 +280,21 @@ class ConditionRow(WatchedRow):
 
 
 class OverrideRow(WatchedRow):
-    """A pilot override: the bridge disengages at once where the field is beyond the threshold."""
+    """A pilot override: if the field is beyond the threshold, the bridge disengages at once."""
 
     above: Number | None = Field(
-        default=None, description="the override is active where the field is above this"
+        default=None, description="the override is active if the field is above this"
     )
     below: Number | None = Field(
-        default=None, description="the override is active where the field is below this"
+        default=None, description="the override is active if the field is below this"
     )
     moved: Positive | None = Field(
         default=None,
-        description="the override is active where the field has moved by more than this since "
+        description="the override is active if the field has moved by more than this since the "
         "engagement",
     )
     max_age: Positive = Field(
-        default=1.0, description="the age above which the override is not active any more, s"
+        default=1.0, description="the age above which the override is no longer active, s"
     )
     transmitter: bool = Field(
         default=True,
@@ -325,8 +320,10 @@ class ParameterRow(Config):
     within: Limits = Field(
         description="the least and the greatest value with which the bridge engages"
     )
-    sentence: str = Field(min_length=1, description="what another value does, and how to mend it")
-    source: str = Field(min_length=1, description="where the row is from")
+    sentence: str = Field(
+        min_length=1, description="what another value does, and how to correct it"
+    )
+    source: str = Field(min_length=1, description="where the row comes from")
 
 
 class QosRow(Config):
@@ -350,27 +347,26 @@ class LinkConfig(Config):
     )
     source_system: SystemId = Field(
         default=255,
-        description="the system of the map's messages: ArduPilot takes RC overrides of its "
-        "ground station alone, MAV_GCS_SYSID,"
-        " 255 by default. All else is sent as the autopilot's companion computer",
+        description="the system that the map's messages come from: ArduPilot takes RC overrides "
+        "only from its ground station, MAV_GCS_SYSID, by default 255. Everything else is sent as "
+        "the autopilot's companion computer",
     )
     station_silence: Positive | None = Field(
         default=None,
-        description="how long the ground station with the number `source_system` may be silent, "
-        "once it was heard, s: then the"
-        " bridge disengages, because the autopilot takes the RC overrides for heartbeats of the "
-        "station; null: without end",
+        description="how long the ground station with the number `source_system` may be silent "
+        "once it was heard, s. Then the bridge disengages, because the autopilot takes the RC "
+        "overrides for heartbeats of the station. null: for any time",
     )
     passphrase_file: str | None = Field(
         default=None,
-        description="a file with the passphrase of an autopilot that signs; its key is the "
-        "SHA-256 of the passphrase",
+        description="a file with the passphrase of an autopilot that signs; the key is the SHA-256 "
+        "of the passphrase",
     )
     rates: dict[str, Rate] = Field(default={}, description="requested rates by message, Hz")
 
 
 class SilenceConfig(Config):
-    """Failsafe for a u that times out while engaged.
+    """The failsafe if u times out while engaged.
 
     The bridge sends neutral values, then release values, then nothing.
     """

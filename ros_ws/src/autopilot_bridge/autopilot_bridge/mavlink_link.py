@@ -3,12 +3,12 @@
 """A MAVLink link to an autopilot, as a source and a sink of messages of a channel map.
 
 A thread receives, sends a heartbeat each second, requests the rates of messages and reads
-parameters. All of these it sends as a companion computer of the autopilot. The messages of the map
-alone have the number of the ground station, because ArduPilot takes RC overrides of no other. Its
-failsafe FS_GCS_ENABL counts overrides as heartbeats of the station; those of a companion do not
-count. Source: MAVLink guide (heartbeat and parameter protocols, SET_MESSAGE_INTERVAL), common.xml
-and ardupilotmega.xml as pymavlink has them; ArduPilot, GCS_Common.cpp, handle_rc_channels_override
-and handle_heartbeat; tried with ArduPlane in SITL.
+parameters. It sends all of these as a companion computer of the autopilot. Only the messages of the
+map have the number of the ground station, because ArduPilot takes RC overrides from nobody else.
+Its failsafe FS_GCS_ENABL counts overrides as heartbeats of the station, but not those of a
+companion. Source: MAVLink guide (heartbeat and parameter protocols, SET_MESSAGE_INTERVAL),
+common.xml and ardupilotmega.xml as pymavlink has them; ArduPilot, GCS_Common.cpp,
+handle_rc_channels_override and handle_heartbeat; tried with ArduPlane in SITL.
 """
 
 import hashlib
@@ -55,23 +55,23 @@ ANSWER = 1.0  # s, for an answer to a request, which is then repeated
 # s without the autopilot, after which all rates are requested again, and another sender may take
 # its place.
 SILENCE = 3.0
-READ_AGAIN = 5.0  # s, after which a parameter is requested again: a ground station may have set it
+READ_AGAIN = 5.0  # s, then a parameter is read again, since a ground station may have set it
 QUEUE = 256  # messages between two ticks
 TAKEN = (
     "requested again; a ground station on this link requests rates of its own (MAVProxy: set "
     "streamrate -1), or the link is too slow: give the bridge a port of its own"
 )
-RETRIES = 2  # of a connection by TCP, 1 s each
+RETRIES = 2  # of a connection over TCP, 1 s each
 POLL = 0.1  # s, the longest wait for a packet
 PACKET = 65535  # bytes, the largest of UDP
 
 
 Address = tuple[Any, ...]
-"""Host and port of a sender over UDP, else the URL."""
+"""Host and port of a sender over UDP; otherwise the URL."""
 
 
 class MavlinkMessage(NamedTuple):
-    """A message and its arrival, ns of the system clock."""
+    """A message and when it arrived, ns on the system clock."""
 
     message: Any
     received_ns: int
@@ -110,7 +110,7 @@ def _zero(kind: str) -> Any:
 def _connection(config: LinkConfig) -> Any:
     """Connect by pymavlink with MAVLink 2, and sign if a passphrase is set.
 
-    Raises ParameterError for an address that cannot be opened.
+    Raises ParameterError if the address cannot be opened.
     """
     require_package("pymavlink")
     from pymavlink import mavutil  # noqa: PLC0415 - an extra
@@ -125,7 +125,7 @@ def _connection(config: LinkConfig) -> Any:
             dialect=DIALECT,
             autoreconnect=True,
             retries=RETRIES,
-            force_connected=True,  # a serial device that comes later
+            force_connected=True,  # the serial device may come later
         )
     except (OSError, ValueError) as error:
         expected = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or a serial device"
@@ -146,13 +146,12 @@ def _connection(config: LinkConfig) -> Any:
 class Link:
     """A connection, which receives from `start` on.
 
-    `problem` and `conflict` are sentences, empty where there is none. Messages of the sender in
-    `AutopilotLock` alone are taken, and over UDP no other address gets messages. `parameters` are
-    names of parameters of the autopilot that are read; `further` are those that some releases lack.
-
-    With a passphrase each message is signed, and messages without a valid signature are refused.
-    Source: MAVLink guide, message signing; the key of a passphrase is that of MAVProxy and Mission
-    Planner.
+    `problem` and `conflict` are sentences, empty if there is none. Only messages of the sender in
+    `AutopilotLock` are taken, and over UDP no other address gets messages. `parameters` are the
+    names of parameters of the autopilot that are read; `further` are others, which some releases
+    lack. If there is a passphrase, each message is signed, and messages without a valid signature
+    are refused. Source: MAVLink guide, message signing; the key of a passphrase is that of MAVProxy
+    and Mission Planner.
     """
 
     def __init__(
@@ -163,16 +162,16 @@ class Link:
         self._connection = _connection(config)
         self._parser = self._new_parser(self._connection.mav.signing)
         self._lock = AutopilotLock(nanoseconds(SILENCE))
-        self._clash = ""  # what ends with another configuration alone
+        self._clash = ""  # a conflict that only another configuration can end
         self._second = ""  # the sentence on a second sender
         self._second_at = 0.0  # and when it sent last
-        self.stations: set[int] = set()  # systems of ground stations beside this bridge
+        self.stations: set[int] = set()  # systems of other ground stations
         self._refused = ""  # why the last message was refused, for its signature
         self._queues: dict[str, deque[MavlinkMessage]] = {}
-        self.parameters: dict[str, float] = {}  # of the autopilot, as it last told
+        self.parameters: dict[str, float] = {}  # of the autopilot, as it told them last
         self._to_read = tuple(parameters)
         self._further = tuple(further)
-        self._systems: set[int] = set()  # of autopilots beside that of the map
+        self._systems: set[int] = set()  # systems of other autopilots than that of the map
         self._to_request = dict(config.rates)
         # The message whose interval was requested, and when.
         self._requested: tuple[str, float] | None = None
@@ -320,7 +319,7 @@ class Link:
                 self._connection.mav.srcSystem = system
                 self._connection.mav.send(message)
             except OSError:
-                # The cable is out: the ages of what is received say so.
+                # The cable is out, which shows in the ages of what is received.
                 return
 
     def _receive(self) -> None:
@@ -347,7 +346,7 @@ class Link:
                 self._take(message, address, received_ns)
 
     def _packet(self) -> tuple[bytes, Address]:
-        """Receive the next bytes, none after a silence of POLL, and their sender.
+        """Receive the next bytes and their sender; there are none after a silence of POLL.
 
         Over TCP and a serial line, the sender is the URL.
         """
@@ -361,12 +360,12 @@ class Link:
     def _parsed(self, data: bytes, address: Address) -> Sequence[Any]:
         """Parse the messages of a packet.
 
-        Messages that span several packets are read from the locked sender alone.
+        Messages that span several packets are only read from the locked sender.
         """
         if not self._is_udp or _text(address) == self._lock.address:
             return self._parser.parse_buffer(data) or ()
-        # A copy: a forged signature with a late time would make each later one of the autopilot
-        # count as replayed.
+        # This needs a copy. A forged signature with a late time would make each later one of the
+        # autopilot count as replayed.
         return self._new_parser(deepcopy(self._connection.mav.signing)).parse_buffer(data) or ()
 
     def _new_parser(self, signing: Any) -> Any:
@@ -403,7 +402,7 @@ class Link:
         is_station = name == "HEARTBEAT" and message.type == GCS
         joystick = name in STICKS and system in self._station_numbers()
         namesake = name == "HEARTBEAT" and system == self._config.source_system
-        # Other senders on the link: a joystick, another bridge, a ground station, an autopilot.
+        # There may be other senders: a joystick, another bridge, a ground station, an autopilot.
         if joystick or (namesake and not is_station):
             self._clash = (
                 f"another sender on {self._config.url} has system {system} too, and the "
@@ -420,7 +419,7 @@ class Link:
             self._systems.add(system)
         if name == "BAD_DATA" and "signature" in str(message.reason):
             self._refused = self._signature_fault(bytes(message.data))
-        # From here on only messages of the autopilot count, from the locked sender.
+        # From here on, only messages of the autopilot count, and only from the locked sender.
         if (message.get_srcSystem(), message.get_srcComponent()) != (
             self._config.system,
             AUTOPILOT,
@@ -482,7 +481,8 @@ class Link:
     def _request(self, now: float) -> None:
         """Request one rate after another, and slow ones again.
 
-        An answer does not say to which message it belongs.
+        They cannot be requested together, because an answer does not say to which message it
+        belongs.
         """
         self._to_request |= self._rates.step(now)
         if (
@@ -536,7 +536,7 @@ class Link:
 
 
 class MavlinkReader:
-    """A message of a link in the place of a subscription."""
+    """A message of a link, in place of a subscription."""
 
     def __init__(self, link: Link, topic: Any) -> None:
         self.link = link
@@ -547,12 +547,12 @@ class MavlinkReader:
         self._queue = link.listen(self.message_name)
 
     def take(self) -> list[MavlinkMessage]:
-        """Take the messages since the last call, oldest first."""
+        """Take the messages since the last call, the oldest first."""
         return [self._queue.popleft() for _ in range(len(self._queue))]
 
 
 class MavlinkPublisher:
-    """A message of a link in the place of a publisher."""
+    """A message of a link, in place of a publisher."""
 
     def __init__(self, link: Link, topic: str) -> None:
         self._link = link

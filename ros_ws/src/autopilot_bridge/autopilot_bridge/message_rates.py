@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the messages of a link come at their requested rates.
+"""Check whether the messages of a link come at their requested rates.
 
 No clock is read: every instant is an argument, in s.
 """
@@ -8,20 +8,20 @@ No clock is read: every instant is an argument, in s.
 from collections import deque
 from collections.abc import Mapping
 
-# s over which messages are counted: a host that pauses for half a second does not make a rate slow.
+# s over which messages are counted. If the host pauses for half a second, no rate becomes slow.
 COUNTED = 2.0
-MESSAGES = 4  # counted at least, where COUNTED has fewer
-GRANTED = 0.7  # of a requested rate: below, the rate is slow
-# s: an engagement ends after a slow rate of this length. A rate that is requested again comes back
+MESSAGES = 4  # least number of messages to count, if COUNTED has fewer
+GRANTED = 0.7  # share of a requested rate below which it is slow
+# s for which a rate must be slow to end an engagement. A rate that is requested again comes back
 # sooner.
 SLOW_ENDS = 2.0
-# s after a rate was taken, in which an engagement is refused: MAVProxy requests its own rates every
+# s after a rate was slow in which an engagement is refused. MAVProxy requests its own rates every
 # 15 s.
 REMEMBERED = 20.0
 REPEATED = 1.0  # s between two requests of a slow rate
-JUDGED = 0.1  # s between two judgements
-PAUSE = 0.4  # s without a judgement: the host paused
-GAPS = 3  # between the newest messages: their mean is the rate now
+JUDGED = 0.1  # s between two judgements of the rates
+PAUSE = 0.4  # s without a judgement, which show that the host paused
+GAPS = 3  # gaps between the newest messages, whose mean gives the present rate
 
 
 class MessageRates:
@@ -32,7 +32,7 @@ class MessageRates:
         self.begin(now)
 
     def begin(self, now: float) -> None:
-        """Begin again: the autopilot may have started again, and the rates are requested."""
+        """Begin again. The autopilot may have started again, and the rates are requested."""
         self._rates = {name: _Rate(rate, now) for name, rate in self._requested.items()}
         self._last_step = now
 
@@ -42,9 +42,9 @@ class MessageRates:
             rate.take(now)
 
     def step(self, now: float) -> dict[str, float]:
-        """Judge each rate every JUDGED. Returns the rates to request again, Hz by name.
+        """Judge each rate every JUDGED, and return the rates to request again, Hz by name.
 
-        After a pause of the host the messages that have come meanwhile are counted first.
+        After a pause of the host, the messages that came in the meantime are counted first.
         """
         elapsed = now - self._last_step
         if elapsed < JUDGED:
@@ -55,9 +55,10 @@ class MessageRates:
         return {name: rate.requested for name, rate in self._rates.items() if rate.step(now)}
 
     def slow(self, now: float) -> dict[str, str]:
-        """Sentences on slow messages by name.
+        """Return sentences on slow messages, by name.
 
-        A message is slow now, or was less than REMEMBERED ago after a granted rate.
+        A message is slow if it is slow now, or if it was less than REMEMBERED ago after it had its
+        rate.
         """
         sentences = {name: rate.sentence(name, now) for name, rate in self._rates.items()}
         return {name: sentence for name, sentence in sentences.items() if sentence}
@@ -86,10 +87,10 @@ class _Rate:
         self._window = max(COUNTED, MESSAGES / requested)  # s
         self._began = now
         self._instants: deque[float] = deque()  # of its messages within the window
-        self._lowest = requested  # Hz, since it is slow
+        self._lowest = requested  # Hz, lowest rate since it is slow
         self._slow_since: float | None = None
         self._was_reached = False
-        # When it was slow last, after it had been reached.
+        # When it was slow last, if it had been reached before.
         self._last_slow: float | None = None
         self._repeated: float | None = None  # when it was requested again
 
@@ -104,7 +105,7 @@ class _Rate:
         return self._slow_since is not None and now - self._slow_since >= SLOW_ENDS
 
     def step(self, now: float) -> bool:
-        """Judge the rate. Returns whether it is to be requested again."""
+        """Judge the rate, and return whether it must be requested again."""
         if not self.is_known(now):
             return False
         self._drop_old(now)
@@ -138,7 +139,7 @@ class _Rate:
     def _present(self) -> float:
         """Return the mean rate of the newest messages, Hz.
 
-        The count over the whole window still has messages from before a fall of the rate.
+        The count over the whole window still has messages from before the rate fell.
         """
         if len(self._instants) <= GAPS:
             return len(self._instants) / self._window

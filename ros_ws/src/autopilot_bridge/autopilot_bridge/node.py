@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The bridge node, in place of the aircraft node.
+"""The bridge node, which replaces the aircraft node.
 
-A channel map makes y of the messages of an autopilot, and its setpoints of u.
+By a channel map, it makes y from the messages of an autopilot, and the autopilot's setpoints from
+u.
 """
 
 import os
@@ -61,21 +62,21 @@ LEFT = (
     "no publisher any more. Where the autopilot flies on, its client may not come back by "
     "itself: start its agent again"
 )
-RC_OVERRIDE = f"{MAVLINK}/RC_CHANNELS_OVERRIDE"  # the topic
-# Messages with release values at the end of the node; a single one may be lost.
+RC_OVERRIDE = f"{MAVLINK}/RC_CHANNELS_OVERRIDE"  # topic of the overrides
+# Number of messages with release values when the node ends, since a single one may be lost.
 RELEASES_AT_SHUTDOWN = 5
 
-# ns, for the activation of the controller at engagement: the controller answers within some ticks.
+# ns to wait until the controller is active at an engagement. It answers within some ticks.
 ACTIVATION_TIMEOUT_NS = NANOSECONDS
 
 NamedRow = tuple[str, MeasuredRow | WatchedRow]
 
 
 class BridgeNode(FlightNode[BridgeConfig]):
-    """The node of `Bridge`: at each tick it polls the topics, publishes y and sends setpoints.
+    """The node of `Bridge`.
 
-    A tick polls the autopilot's topics, publishes a new y, takes the newest u and sends the due
-    messages.
+    At each tick it polls the autopilot's topics, publishes a new y, takes the newest u and sends
+    the messages that are due.
     """
 
     def __init__(self) -> None:
@@ -90,9 +91,11 @@ class BridgeNode(FlightNode[BridgeConfig]):
             message.topic == RC_OVERRIDE for message in self._map.messages.values()
         )
         self._link = self._open_link()
-        self._known_stations: set[int] = set()  # systems of ground stations that were told
-        self._conflict = ""  # the topics that have two publishers, as a sentence
-        # What comes over MAVLink, as named vectors.
+        self._known_stations: set[int] = (
+            set()
+        )  # systems of ground stations that were already reported
+        self._conflict = ""  # which topics have two publishers, as a sentence
+        # Publishers and encoders of what comes over MAVLink, as named vectors.
         self._recorded: dict[str, tuple[Callable[[bytes], None], Encoder]] = {}
         self._readers = self._read_topics()
         self._outgoing = {name: self._make(name, row) for name, row in self._map.messages.items()}
@@ -114,14 +117,14 @@ class BridgeNode(FlightNode[BridgeConfig]):
         self._advertise_all()
         self._first_y = False
         self._start_ns = 0
-        self._report_ns = 0  # of the last report on the engagement
+        self._report_ns = 0  # when the engagement was last reported
         self._controller = self.create_client(ChangeState, "controller/change_state")
         self._controller_state = self.create_client(GetState, "controller/get_state")
         self._controller_ready = False
         self._u_sender: str | None = None
         self._activation: Any = None  # the pending activation of the controller
         self._activation_ns = 0
-        self._awaits_controller = False  # engaged before the service of the controller was found
+        self._awaits_controller = False  # engaged before the controller's service was found
         if self._link is not None:
             self._link.start()
         waits = f"disengaged, waiting for {self.get_name()}/engage"
@@ -129,12 +132,12 @@ class BridgeNode(FlightNode[BridgeConfig]):
         self.get_logger().info(f"map {self._map.name}: {state}")
 
     def _advertise_all(self) -> None:
-        """Create the publishers, with their encoders, and the services."""
+        """Create the publishers with their encoders, and the services."""
         self._publish_y = self.advertise(Y)
         self._publish_would_send = self.advertise(WOULD_SEND)
         self._y_encoder = self.encoder(self._bridge.outputs)
         self._publish_pose = self.advertise(POSE) if self._map.pose else None
-        # Encoders by the names of the fresh channels.
+        # Encoders, by the names of the channels that are fresh.
         self._pose_encoders: dict[tuple[str, ...], Encoder] = {}
         names = [f"{row.message}.{row.field}" for row in self._map.inputs.values()]
         self._would_send_encoder = self.encoder(names)
@@ -143,7 +146,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         self._engagement = self.create_publisher(ENGAGEMENT.type, ENGAGEMENT.name, PUBLISH)
 
     def _open_link(self) -> mavlink_link.Link | None:
-        """Open the MAVLink link of the map; None without one."""
+        """Open the MAVLink link of the map, or return None if it has none."""
         if self._map.link is None:
             return None
         key = f"{self.get_name()}.use_sim_time"
@@ -153,7 +156,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         return mavlink_link.Link(self._map.link, tuple(self._map.parameters), further)
 
     def _read_topics(self) -> list[tuple[PolledSubscription | MavlinkReader, list[NamedRow]]]:
-        """Subscribe to the topics of the map. Returns each with its rows."""
+        """Subscribe to the topics of the map, and return each with its rows."""
         named_rows: list[NamedRow] = [
             *self._map.outputs.items(),
             *self._map.pose.items(),
@@ -238,13 +241,13 @@ class BridgeNode(FlightNode[BridgeConfig]):
         self._log_phase()
         if now_ns - self._report_ns >= NANOSECONDS:
             self._report(now_ns)
-        # After a longer pause the tick was stopped half-way, and its u is old.
+        # After a longer pause, the tick was stopped half-way and its u is old.
         if self._pause_ns() <= self._longest_pause_ns:
             self._send(now_ns, self.period_ns() // 2)
         self._warn_stale_inputs(now_ns)
 
     def _take_effects(self, sample: StampedVector, now_ns: int) -> None:
-        """Take the effects by the probe of the controller whose u flies."""
+        """Take the effects that the probe of the controller whose u flies has found."""
         controller = self._bridge.u_lock.publisher
         if controller is None:
             # Nothing flies yet.
@@ -253,9 +256,9 @@ class BridgeNode(FlightNode[BridgeConfig]):
         self._bridge.take_effects(sample, now_ns)
 
     def _pause_ns(self) -> int:
-        """Time since the tick before began.
+        """Return the time since the tick before began.
 
-        The time of a suspended host counts, in which the clock of the ticks stands still.
+        The time for which a host was suspended counts, although the clock of the ticks stood still.
         """
         return self._boot_ns() - self._began_ns
 
@@ -275,9 +278,9 @@ class BridgeNode(FlightNode[BridgeConfig]):
         )
 
     def _disengage_after_pause(self, now_ns: int) -> None:
-        """Disengage where the bridge did not run.
+        """Disengage if the bridge did not run for a while.
 
-        The autopilot, or its pilot, may fly on its own law since then.
+        The autopilot or its pilot may have flown on their own since then.
         """
         pause_ns = self._pause_ns()
         self._began_ns += pause_ns
@@ -295,7 +298,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
     ) -> None:
         """Give the fields of a message to the bridge.
 
-        The system clock, of which its stamps are, is ahead by `step_ns`.
+        The system clock, to which its stamps belong, is ahead by `step_ns`.
         """
         if isinstance(subscription, MavlinkReader):
             message = raw
@@ -363,13 +366,13 @@ class BridgeNode(FlightNode[BridgeConfig]):
         return response
 
     def _activate(self, active: bool) -> None:
-        """Request that the controller is active.
+        """Ask the controller to be active, or not to be.
 
-        Active only while engaged: the integrals do not wind up.
+        It is active only while engaged, so that its integrals do not wind up.
         """
         self._awaits_controller = active and not self._controller.service_is_ready()
         if not self._controller.service_is_ready():
-            # Not discovered yet, or u of another node, which has no lifecycle.
+            # It is not discovered yet, or u comes from another node, which has no lifecycle.
             return
         transition = Transition.TRANSITION_ACTIVATE if active else Transition.TRANSITION_DEACTIVATE
         future = self._controller.call_async(
@@ -378,7 +381,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         self._activation, self._activation_ns = (future, self.now_ns()) if active else (None, 0)
 
     def _check_activation(self, now_ns: int) -> None:
-        """Disengage where the controller did not activate: its u would stay at trim."""
+        """Disengage if the controller did not activate, because its u would stay at trim."""
         if self._activation is None:
             return
         if self._activation.done():
@@ -402,7 +405,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         ready = self._controller.service_is_ready() and self._controller_state.service_is_ready()
         before = self._u_sender
         self._u_sender = bridge.u_lock.publisher
-        # A restart can take less time than the loss of the service.
+        # A restart can take less time than the loss of the service takes to show.
         restarted = bool(before) and self._u_sender != before
         if (
             ready
@@ -417,7 +420,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
             self._activate(active=True)
 
     def _deactivate_unengaged(self, state: Future) -> None:
-        """Deactivate a controller that was found active: with `ros2 run` it starts so."""
+        """Deactivate a controller that was found active, as it is with `ros2 run`."""
         if (
             state.result().current_state.id == State.PRIMARY_STATE_ACTIVE
             and self._bridge.phase is not Phase.ENGAGED
@@ -462,7 +465,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
             self.warn_no_publisher(self._u.subscription)
 
     def _require_first_y(self, now_ns: int) -> None:
-        """Raise FlightEnded with the reasons where y does not become complete in time."""
+        """Raise FlightEnded with the reasons if y is not complete in time."""
         self._start_ns = self._start_ns or now_ns
         limit = self.parameters.first_y
         if self._first_y or limit == 0.0 or now_ns - self._start_ns < nanoseconds(limit):
@@ -499,10 +502,10 @@ class BridgeNode(FlightNode[BridgeConfig]):
         return next(iter((*faults, *refusal)), "no sample of its publisher arrives")
 
     def graph_checks(self) -> list[Callable[[], None]]:
-        """Also report a topic to which the autopilot cannot be connected.
+        """Return the checks of the graph, with one for topics that the autopilot cannot take.
 
-        The autopilot subscribes to it with another type or an incompatible quality of service. A
-        topic with another publisher ends the engagement.
+        It cannot if it subscribes with another type or an incompatible quality of service. A topic
+        with another publisher ends the engagement.
         """
         outgoing = (
             partial(self.endpoints.check_subscribers, outgoing_message.publisher)
@@ -514,9 +517,9 @@ class BridgeNode(FlightNode[BridgeConfig]):
     def _find_conflicts(self) -> None:
         """Tell the bridge which topics have two publishers.
 
-        Of two autopilots y would be mixed, and both would be flown. Checked are the topics that the
-        bridge reads, and the topics of setpoints. Several transmitters may override, and any node
-        may request a mode.
+        With two autopilots, y would be mixed and both would be flown. So the topics that the bridge
+        reads are checked, and the topics of setpoints. Several transmitters may override, and any
+        node may request a mode.
         """
         read_topics = set()
         for subscription, rows in self._readers:
@@ -527,7 +530,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         setpoints = {
             publisher.topic_name for publisher in publishers if isinstance(publisher, Publisher)
         }
-        # Two messages may share a topic.
+        # Two messages may share one topic.
         publishers_here = Counter(
             outgoing.publisher.topic_name for outgoing in self._outgoing.values()
         )

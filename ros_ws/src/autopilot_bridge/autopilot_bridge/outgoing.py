@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Messages to an autopilot, and the fields of its messages, for the bridge node."""
+"""The messages to an autopilot, and the fields of its messages, for the bridge node."""
 
 from typing import Any
 
@@ -14,14 +14,14 @@ from flight_core.vectors import ChannelError
 
 
 class ServiceCaller:
-    """A service of the autopilot in the place of a publisher."""
+    """A service of the autopilot, in place of a publisher."""
 
     def __init__(self, client: Any) -> None:
         self._client = client
         self.topic_name = str(client.srv_name)
 
     def publish(self, request: Any) -> None:
-        """Request it, without regard to the answer. Raises ChannelError without the service."""
+        """Request it, whatever the answer is. Raises ChannelError if there is no such service."""
         if not self._client.service_is_ready():
             raise ChannelError("service", f"{self.topic_name}: no such service")
         self._client.call_async(request)
@@ -41,11 +41,11 @@ class OutgoingMessage:
         self._sent_ns = 0
 
     def due(self, now_ns: int, slack_ns: int) -> bool:
-        """Return whether its period has passed since it was last sent, to within `slack_ns`."""
+        """Return whether its period has passed since it was last sent, within `slack_ns`."""
         return now_ns - self._sent_ns >= self._period_ns - slack_ns
 
     def send(self, now_ns: int, raw: list[float]) -> None:
-        """Send it. `raw` holds the raw values of all inputs; the message takes its own."""
+        """Send it. `raw` holds the raw values of all inputs, of which the message takes its own."""
         for number, row in self._inputs:
             set_field(self._message, row.field, raw[number])
         if self.row.stamped:
@@ -58,9 +58,9 @@ class OutgoingMessage:
 def prepare_message(
     channel_map: ChannelMap, name: str, row: MessageRow
 ) -> tuple[Any, list[tuple[int, InputRow]]]:
-    """Prepare a message of a map: fill constant fields, and list its inputs by places in u.
+    """Prepare a message of a map: fill its constant fields, and list its inputs with places in u.
 
-    Raises ParameterError for a field that is missing, or that cannot have its values.
+    Raises ParameterError if a field is missing, or cannot have its values.
     """
     kind = field_type(row.type)
     message = kind.Request() if row.is_service else kind()
@@ -92,9 +92,9 @@ def field_type(name: str) -> Any:
 
 
 def require_field(empty: Any, name: str, row: MeasuredRow | WatchedRow) -> None:
-    """Raise ParameterError for a field that is missing.
+    """Raise ParameterError if a field is missing.
 
-    A field inside a sequence is checked with the first message only.
+    A field inside a sequence is only checked with the first message.
     """
     if "[" in row.field:
         return

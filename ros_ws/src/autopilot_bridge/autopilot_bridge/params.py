@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Schema of a channel map file, and the parameters of the bridge node."""
+"""The schema of a channel map file, and the parameters of the bridge node."""
 
 import re
 from collections.abc import Mapping
@@ -32,22 +32,23 @@ from flight_core.files import find_file, names_in, read_yaml
 from flight_core.parameters import Config, Name, NodeConfig, NonNegative, Positive, require
 
 LIBRARY = Path(str(files("autopilot_bridge"))) / "maps"
-# The name of a parameter; common.xml, PARAM_VALUE: 16 characters.
+# The name of a parameter, which has up to 16 characters (common.xml, PARAM_VALUE).
 PARAMETER = re.compile(r"[A-Z][A-Z0-9_]{0,15}")
 
 
 class ChannelMap(Config):
-    """A channel map: the topic and field of each channel of y and u."""
+    """A channel map, which has the topic and the field of each channel of y and u."""
 
     name: str
     source: str = Field(
-        min_length=1, description="where the map is from, and the releases for which it is valid"
+        min_length=1, description="where the map comes from, and for which releases it is valid"
     )
     dry_run: bool = Field(
-        default=True, description="publish what would be sent, and send nothing to the autopilot"
+        default=True,
+        description="whether to publish what would be sent, and send nothing to the autopilot",
     )
     rate: Rate = Field(
-        description="the rate at which the topics are polled, Hz; the highest rate of y"
+        description="the rate at which the topics are polled, Hz, which is the highest rate of y"
     )
     instant: str = Field(description="the output whose newest stamp is the stamp of y")
     engage_within: Annotated[float, Field(gt=0, le=1)] = Field(
@@ -56,19 +57,19 @@ class ChannelMap(Config):
     )
     engage_timeout: Positive = Field(
         default=5.0,
-        description="how long an engagement waits for its awaited conditions, s; then it is "
-        "refused",
+        description="how long an engagement waits for its awaited conditions before it is refused, "
+        "s",
     )
     max_engaged: Positive | None = Field(
         default=None,
-        description="how long an engagement lasts, s; needed without `--blind` where no "
-        "condition tells the transmitter's loss",
+        description="how long an engagement lasts, s; needed, unless there is `--blind`, if no "
+        "condition tells the loss of the transmitter",
     )
-    silence: SilenceConfig = Field(description="failsafe for a u that times out")
+    silence: SilenceConfig = Field(description="the failsafe if u times out")
     link_delay: NonNegative | None = Field(
         default=None,
-        description="delay from y on the autopilot's board to u on the surface by way of the "
-        "link, beyond the delay in a log of the board, s; gains from such a log are for both",
+        description="what the link adds to the delay from y on the autopilot's board to u on the "
+        "surface, beyond the delay in a log of the board, s; gains from such a log allow for both",
     )
     outputs: Annotated[dict[Name, OutputRow], Field(min_length=1)] = Field(
         description="the channels of y"
@@ -80,25 +81,25 @@ class ChannelMap(Config):
     )
     sensors: dict[Name, PoseRow] = Field(
         default={},
-        description="further measured channels, absolute values, for `envelope` and `engage_if` "
-        "alone",
+        description="other measured channels, as absolute values, only for `envelope` and "
+        "`engage_if`",
     )
     envelope: dict[str, Limits] = Field(
         default={},
-        description="limits of channels of the pose, of y or of the sensors: the bridge "
-        "disengages beyond them",
+        description="limits of channels of the pose, of y or of the sensors, beyond which the "
+        "bridge disengages",
     )
     engage_if: dict[str, Limits] = Field(
         default={},
-        description="limits of the same channels at an engagement alone: outside it is refused",
+        description="limits of the same channels outside which an engagement is refused",
     )
     inputs: Annotated[dict[Name, InputRow], Field(min_length=1)] = Field(
         description="the channels of u"
     )
     trims: dict[str, MeasuredRow] = Field(
         default={},
-        description="sources of the raw values of inputs in trim, by input: captured at each "
-        "engagement",
+        description="sources of the raw values of inputs in trim, by input; they are captured at "
+        "each engagement",
     )
     messages: Annotated[dict[str, MessageRow], Field(min_length=1)] = Field(
         description="the messages to the autopilot"
@@ -142,7 +143,7 @@ class ChannelMap(Config):
     def _check_inputs(self) -> None:
         """Check the fields of the inputs, and their values against the range of the field.
 
-        In trim and at the limits.
+        The values are those in trim and at the limits.
         """
         owners: dict[tuple[str, str], str] = {}
         for name, row in self.inputs.items():
@@ -321,7 +322,7 @@ class ChannelMap(Config):
     def recorded_topics(self) -> list[str]:
         """The topics that the log has.
 
-        Topics with a quality of service, and what comes over MAVLink.
+        They are those with a quality of service, and what comes over MAVLink.
         """
         rows = chain.from_iterable(
             rows_by_name.values() for rows_by_name in self._readers().values()
@@ -335,7 +336,7 @@ class ChannelMap(Config):
         return {kind: getattr(self, kind) for kind in kinds}
 
     def used_topics(self) -> list[tuple[str, str, str]]:
-        """(key of the row, topic, type) of each row that names a topic."""
+        """Return (key of the row, topic, type) for each row that names a topic."""
         rows = self._readers() | {"messages": self.messages}
         topics: list[tuple[str, str, str]] = []
         for kind, rows_by_name in rows.items():
@@ -345,9 +346,9 @@ class ChannelMap(Config):
         return topics
 
     def used_fields(self) -> list[tuple[str, str, str, str, str | None]]:
-        """Each field that is read or set, as (key of the row, topic, type, path, components).
+        """Return each field that is read or set: (key of the row, topic, type, path, components).
 
-        The components are those of `COMPONENTS` for a field that a function reads, else None.
+        The components are those of `COMPONENTS` if a function reads the field, else None.
         """
         fields: list[tuple[str, str, str, str, str | None]] = []
         for kind, rows_by_name in self._readers().items():
@@ -371,11 +372,11 @@ class ChannelMap(Config):
         return fields
 
 
-ROUNDING = 1e-6  # tolerance for limits with six digits that are the ends of a range
+ROUNDING = 1e-6  # tolerance for limits with six digits that are ends of a range
 
 
 def maps() -> list[str]:
-    """Names of the channel maps of the library."""
+    """Return the names of the channel maps in the library."""
     return names_in(LIBRARY)
 
 
@@ -398,9 +399,13 @@ def load_map(name: str) -> ChannelMap:
 class BridgeConfig(NodeConfig):
     """All parameters of the bridge node."""
 
-    map: str = Field(description="the name of the library, or path of a file ending in .yaml")
-    dry_run: bool | None = Field(default=None, description="replaces dry_run of the map")
-    first_y: NonNegative = Field(default=0.0, description="wait for the first y, s; 0: without end")
+    map: str = Field(description="the name of a channel map, or path of its .yaml file")
+    dry_run: bool | None = Field(
+        default=None, description="whether to send nothing; replaces dry_run of the map"
+    )
+    first_y: NonNegative = Field(
+        default=0.0, description="how long to wait for the first y, s; 0: for any time"
+    )
 
     def _check(self) -> None:
         require(not self.lockstep, "lockstep", "true", "false: a real autopilot does not wait")
