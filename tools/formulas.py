@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A hook of MkDocs: the formulas of a page become MathML.
+"""A hook of MkDocs that turns the formulas of a page into MathML.
 
-Browsers draw it without a script and without another host.
+Browsers draw MathML without a script and without another host.
 """
 
 import html
@@ -16,8 +16,8 @@ FORMULA = re.compile(
     r'(?P<opening><(?P<tag>span|div) class="arithmatex">)\\[(\[](?P<tex>.*?)\\[)\]]</(?P=tag)>',
     re.DOTALL,
 )
-"""A formula as pymdownx.arithmatex leaves it: in the line as a span, on a line of its own as a
-div."""
+"""A formula as pymdownx.arithmatex leaves it: a span inside a line, or a div on a line of its own.
+"""
 
 CONVERTER = LatexToMathML(fancy_error=False)
 

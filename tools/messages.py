@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Builds ROS 2 message packages for this interpreter from their sources.
+"""Build ROS 2 message packages for this interpreter from their sources.
 
 ROS 2 itself comes from PyPI.
 
@@ -9,8 +9,8 @@ ROS 2 itself comes from PyPI.
         # the package, and what it depends on
     make messages PACKAGE=px4_msgs SOURCE=../px4_msgs MESSAGES="VehicleOdometry AirspeedValidated"
 
-It installs into the virtual environment, so that every process of the stack finds the package.
-Needs a C and a C++ compiler and the headers of Python. Where ROS 2 is installed in full, `colcon
+It installs into the virtual environment, so that every process of the stack finds the package. It
+needs a C and a C++ compiler and the headers of Python. If ROS 2 is installed in full, `colcon
 build` does the same.
 """
 
@@ -38,17 +38,17 @@ from rosidl_adapter.parser import (
 
 BUILD = Path(__file__).resolve().parents[1] / "build" / "messages"
 KINDS = ("msg", "srv", "action")
-# of CMake's find_package
+# what CMake's find_package says if a package is missing
 MISSING = re.compile(r'package configuration\s+file\s+provided\s+by\s+"(\w+)"')
-LAST_LINES = 15  # of a failed step
+LAST_LINES = 15  # of a failed step that are shown
 
 
 class MessagesError(Exception):
-    """The packages cannot be built; the sentence says what to change."""
+    """The packages cannot be built. The sentence says what to change."""
 
 
 class Source(NamedTuple):
-    """A ROS package in source."""
+    """A ROS package with its sources."""
 
     folder: Path
     dependencies: frozenset[str]
@@ -73,7 +73,7 @@ def find_sources(folders: Sequence[Path]) -> dict[str, Source]:
 def in_order(package: str, sources: Mapping[str, Source]) -> list[str]:
     """Return the package and those of its dependencies that are among the sources.
 
-    Each comes after its dependencies.
+    Each comes after its own dependencies.
     """
     if package not in sources:
         raise MessagesError(
@@ -150,7 +150,7 @@ def copy_of_part(package: str, source: Path, names: Sequence[str], target: Path)
 def point_at_this_python(prefix: Path) -> None:
     """Replace the headers of Python in the CMake files of the wheels.
 
-    Those of the Python that built them become those of this one.
+    Those of the Python that built the wheels become those of this one.
     """
     include = sysconfig.get_path("include")
     if not Path(include, "Python.h").is_file():
@@ -167,11 +167,11 @@ def point_at_this_python(prefix: Path) -> None:
 
 
 def run(log: Path, prefix: Path, *command: str) -> None:
-    """Run a step of a build with the packages of this environment alone.
+    """Run a step of a build, with no packages but those of this environment.
 
     Its output goes to a log.
     """
-    # A ROS 2 that is sourced too would mix two.
+    # If another ROS 2 were sourced, too, the two would mix.
     environment = {
         name: value
         for name, value in os.environ.items()
@@ -211,7 +211,7 @@ def build(package: str, source: Path, prefix: Path, jobs: int) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Build a package and those that it needs; 2 and a sentence where it cannot be built."""
+    """Build a package and those that it needs; return 2, with a sentence, if that fails."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

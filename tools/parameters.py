@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Writes docs/reference/parameters.md: every parameter of every node.
+"""Write docs/reference/parameters.md, which has every parameter of every node.
 
 They come from the classes that validate them.
 """
@@ -24,26 +24,28 @@ from rise_di_controller.params import ControllerConfig
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "reference" / "parameters.md"
 LEAD = """# Parameters
 
-For you who write or change a scenario file: every key, by section. [Get started](../get-started.md) has those that you meet first. Two sections of a
-file:
+For you if you write or change a scenario file: every key, by section. [Get started](../get-started.md) has those that you meet first. Two sections
+of a file:
 
 ```yaml
 /**/flight: {ros__parameters: {duration: 60.0}}
 /**/aircraft: {ros__parameters: {airframe: osprey, rate: 500.0, step: 0.002, sensors: {noise: [0.0017, 0.03, 0.0017, 0.0017]}}}
 ```
 
-Units are SI and radians. Without a type a value is a number. `= 0.2` is a default. A key without a default and without *optional* is required.
-A list has an entry a channel. NAME is a name of yours. No number is above 1e9, no time limit above 1e6 s. The instant `.inf` is never.
-Optional keys of `guidance` follow [rules](guidance.md#numbers-by-rule). `examples/scenarios/` sets the rarer keys.
-The node `bridge` has no section: `-p` sets its keys. `python -m tools.parameters` writes this page.
+Units are SI and radians. If no type is named, a value is a number. `= 0.2` is a default. A key is required if it has neither a default nor the word
+*optional*. A list has one entry for each channel. NAME stands for a name of your own. No number may be above 1e9, and no time limit above 1e6 s. The
+instant `.inf` means never. What stands behind `none:` holds if you leave the key out.
+
+If you leave out an optional key of `guidance`, it follows a [rule](guidance.md#numbers-by-rule). `examples/scenarios/` has examples of the rarer keys.
+The node `bridge` has no section; set its keys by `-p`. `python -m tools.parameters` writes this page.
 """  # noqa: E501 - a text as it is written
 SHARED = {
     "lockstep": "run in lockstep with the other nodes",
-    "start_time": "system time of t = 0, s; 0: at once; -1: by the topic `start`",
+    "start_time": "system time of t = 0, s; 0: at once; -1: when the topic `start` says so",
 }
-"""Keys of several nodes, which `rise-di fly` and the launch files set."""
+"""Keys that several nodes have, and that `rise-di fly` and the launch files set."""
 UNBOUNDED = 1e6
-"""A bound from here on is said once for all keys."""
+"""Bounds from here on are stated once for all keys."""
 SECTIONS: Mapping[str, type[Config]] = {
     "flight": FlightConfig,
     "aircraft": AircraftConfig,
@@ -74,7 +76,7 @@ def page() -> str:
     for name in laws.names():
         try:
             schema = laws.schema(name)
-        except ParameterError:  # a law that needs the full state cannot be flown over topics
+        except ParameterError:  # a law that needs the full state cannot fly over topics
             continue
         parts.append(
             _section(f"`controller` with `law: {name}`", schema, set(ControllerConfig.model_fields))
@@ -92,9 +94,9 @@ def _section(title: str, schema: type[Config], known: Set[str] = frozenset()) ->
 
 
 def _rows(schema: type[Config], prefix: str = "") -> Iterator[tuple[str, str, str]]:
-    """Key, permitted value and meaning of each parameter of a set.
+    """Yield key, permitted value and meaning of each parameter of a set.
 
-    Those of a group are under a dotted key, once for each class.
+    Those of a group have a dotted key, and come once for each class.
     """
     places: dict[type[Config], str] = {}
     for name, field in schema.model_fields.items():
@@ -160,7 +162,7 @@ def _type(annotation: Any) -> str:
 def _bounds(rules: Mapping[str, Any]) -> str:
     """Write the bounds of a number, without those that every number has.
 
-    A smallest size says that the number is positive.
+    If there is a smallest size, the number is positive.
     """
     signs = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
     limits = {rule: rules[rule] for rule in signs if rule in rules and abs(rules[rule]) < UNBOUNDED}

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A hook of MkDocs: a link to a file of the repository becomes the name of that file.
+"""A hook of MkDocs that turns a link to a file of the repository into the name of that file.
 
-Links to pages of the site stay.
+Links to pages of the site stay as they are.
 """
 
 import posixpath

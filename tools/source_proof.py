@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Proves the source of the exported controllers: `python -m tools.source_proof [SCENARIO ...]`.
+"""Prove the source of the exported controllers: `python -m tools.source_proof [SCENARIO ...]`.
 
-Frama-C Eva follows all values of y and y_m within BOUND, any loss of y, over some ticks. It reports
-each access out of bounds, read before a write, overflow, division by zero, NaN or infinity that is
-not excluded. cppcheck names the rules of MISRA C:2012 that the source breaks. Source: A. Blanchard,
-"Introduction to C program proof with Frama-C"; the manual of Eva.
+Frama-C Eva follows all values of y and y_m within BOUND, with any loss of y, over some ticks. It
+reports each access out of bounds, each read before a write, overflow, division by zero, and each
+NaN or infinity that is not excluded. cppcheck names the rules of MISRA C:2012 that the source
+breaks. Source: A. Blanchard, "Introduction to C program proof with Frama-C"; the manual of Eva.
 """
 
 import os
@@ -24,7 +24,7 @@ from c_export.proof import write_code
 from flight_analysis.closed_loop.scenario_library import find_scenario
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-BOUND = 1000.0  # of abs(y) and abs(y_m), SI
+BOUND = 1000.0  # on abs(y) and abs(y_m), SI
 EXPORTS: Mapping[str, int] = MappingProxyType(
     {
         "osprey_servo": 3,
@@ -34,11 +34,11 @@ EXPORTS: Mapping[str, int] = MappingProxyType(
         str(REPOSITORY / "examples/px4_airplane/rates_observer.yaml"): 2,
     }
 )
-"""Scenarios and the ticks that Eva follows: engagement is the first, the law steps from the second
-on."""
+"""Scenarios, and how many ticks Eva follows. The first is the engagement, and from the second on
+the law steps."""
 
 SELF_TEST = "is_rounded_once() && is_nan_told()"
-"""Left out: the self-test makes infinity and NaN on purpose."""
+"""The self-test, which is left out because it makes infinity and NaN on purpose."""
 
 DEVIATIONS: Mapping[str, str] = MappingProxyType(
     {
@@ -101,8 +101,8 @@ ALLOCATION = [
     "allocate",
     "is_inside",
 ]
-"""Functions whose paths Eva joins: a path for each effector at each stop is too many. The bounds of
-the effectors need none apart."""
+"""Functions whose paths Eva joins, because one path for each effector at each stop would be too
+many. The bounds of the effectors do not need separate paths."""
 
 JOINED = (
     "-eva-slevel-function", ",".join(f"{name}:0" for name in ALLOCATION),
@@ -113,7 +113,7 @@ JOINED = (
 class Result(NamedTuple):
     """What Eva says of an export."""
 
-    functions: int  # analysed
+    functions: int  # how many were analysed
     alarms: tuple[str, ...]
 
 
@@ -164,7 +164,7 @@ def _output(command: list[str], folder: Path) -> str:
     process = subprocess.run(  # noqa: S603 - a tool of the user
         command,
         cwd=folder,
-        env=os.environ | {"PWD": str(folder)},  # which Frama-C takes for its folder
+        env=os.environ | {"PWD": str(folder)},  # Frama-C takes this for its folder
         capture_output=True,
         text=True,
         check=False,
@@ -173,7 +173,7 @@ def _output(command: list[str], folder: Path) -> str:
 
 
 def main(scenarios: list[str]) -> int:
-    """Print a line a scenario; 1 for an alarm or a rule without a reason."""
+    """Print a line for each scenario; return 1 for an alarm or a rule without a reason."""
     tools = {name: shutil.which(name) is not None for name in ("frama-c", "cppcheck")}
     for name, package in (("frama-c", "frama-c-base of Debian"), ("cppcheck", "cppcheck")):
         if not tools[name]:

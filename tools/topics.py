@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Writes the table of topics in docs/topics.md, and the access control policy of DDS Security.
+"""Write the table of topics in docs/topics.md, and the access control policy of DDS Security.
 
 Both come from flight_core.topics.
 """
@@ -130,9 +130,9 @@ def _list(profile: ElementTree.Element, kind: str, verb: str, names: list[str]) 
 
 
 def _of_maps() -> tuple[list[str], list[str], list[str]]:
-    """Topics that the bridge sends and receives, and services.
+    """Return the topics that the bridge sends and receives, and the services that it requests.
 
-    They are those of each map of the library and of the examples.
+    They are those of each map in the library and in the examples.
     """
     files = (
         path
@@ -148,7 +148,7 @@ def _of_maps() -> tuple[list[str], list[str], list[str]]:
         is_mavlink = kind.startswith(f"{MAVLINK}/")
         if "/srv/" in kind:
             requested.add(topic)
-        elif is_mavlink and not is_sent:  # published for the recorder
+        elif is_mavlink and not is_sent:  # the bridge publishes it for the recorder
             sent_topics.add(topic)
         elif not is_mavlink:
             (sent_topics if is_sent else received).add(topic)

@@ -127,7 +127,7 @@ class AircraftConfig(NodeConfig):
     wind: Annotated[Numbers, Field(min_length=2, max_length=2)] = Field(
         default=(0.0, 0.0), description="steady wind, m/s, towards which the air moves: north, east"
     )
-    shear: ShearConfig | None = Field(default=None, description="steady wind over the height")
+    shear: ShearConfig | None = Field(default=None, description="steady wind by height")
     microburst: MicroburstConfig | None = Field(default=None, description="a microburst, if any")
     uncertainty: UncertaintyConfig = Field(
         default=UncertaintyConfig(), description="how the aircraft deviates from the airframe file"
@@ -144,10 +144,10 @@ class AircraftConfig(NodeConfig):
     )
     sensors: SensorConfig = Field(default=SensorConfig(), description="sensors; ideal if left out")
     vanes: VaneSensorsConfig = Field(
-        default=VaneSensorsConfig(), description="vanes beside the outputs; none if left out"
+        default=VaneSensorsConfig(), description="vanes besides the outputs; none if left out"
     )
     pose: PoseConfig = Field(
-        default=PoseConfig(), description="how pose is measured; ideally if left out"
+        default=PoseConfig(), description="how the pose is measured; exactly if left out"
     )
 
     control_rate: float = Field(

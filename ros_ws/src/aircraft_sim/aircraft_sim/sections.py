@@ -85,13 +85,13 @@ class ShearConfig(Config):
     Either `aircraft.wind` holds at `reference`, or a table gives the wind.
     """
 
-    law: Literal["log", "power", "table"] = Field(description="law of the wind over the height")
+    law: Literal["log", "power", "table"] = Field(description="how the wind depends on the height")
     ground: Number = Field(description="altitude of the ground, m, as in `pose`")
     reference: Positive | None = Field(
         default=None, description="for log and power: height at which `aircraft.wind` holds, m"
     )
     roughness: Positive | None = Field(default=None, description="for log: roughness length, m")
-    exponent: Positive | None = Field(default=None, description="for power: exponent, 1")
+    exponent: Positive | None = Field(default=None, description="for power: exponent, no unit")
     height: tuple[Number, ...] = Field(default=(), description="for table: rising heights, m")
     north: tuple[Number, ...] = Field(
         default=(), description="for table: wind to the north at each height, m/s"
@@ -195,8 +195,8 @@ class SineConfig(Config):
 class DrawConfig(Config):
     """Entries of A and B are multiplied by 1 + d, with d drawn from a seed."""
 
-    A: float = Field(default=0.0, ge=0, lt=1, description="largest d of an entry of A")
-    B: float = Field(default=0.0, ge=0, lt=1, description="largest d of an entry of B")
+    A: float = Field(default=0.0, ge=0, lt=1, description="largest relative d of an entry of A")
+    B: float = Field(default=0.0, ge=0, lt=1, description="largest relative d of an entry of B")
     seed: int = Field(default=1, ge=0, lt=2**63, description="seed of the draw")
     number: int = Field(default=0, ge=0, lt=2**32, description="number of the draw with this seed")
 
@@ -208,7 +208,7 @@ class UncertaintyConfig(DrawConfig):
     """
 
     entries: tuple[str, ...] = Field(
-        default=(), description="entries with a largest d of their own, such as A[q,alpha]"
+        default=(), description="entries that have their own largest d, such as A[q,alpha]"
     )
     parts: tuple[Annotated[float, Field(ge=0, lt=1)], ...] = Field(
         default=(), description="largest d of each of these entries"
@@ -220,7 +220,7 @@ class UncertaintyConfig(DrawConfig):
     )
     wind: WindEffect = Field(
         default=AIR_RELATIVE,
-        description="whether wind acts by the aircraft's own A, or as published",
+        description="whose A the wind acts through: the aircraft's own, or the published one",
     )
 
     def _check(self) -> None:
@@ -281,7 +281,7 @@ class ActuatorConfig(Config):
     """
 
     lag: NonNegativesOrNone = Field(
-        default=(), description="time constants of first order, s; 0 for none"
+        default=(), description="time constants of first-order lags, s; 0 for none"
     )
     lower: Lower = Field(default=(), description="lower end stops, deviations from trim, SI")
     upper: Upper = Field(default=(), description="upper end stops, deviations from trim, SI")
@@ -289,7 +289,7 @@ class ActuatorConfig(Config):
     dead_zone: NonNegativesOrNone = Field(default=(), description="half-widths of the dead zones")
     faults: tuple[str, ...] = Field(
         default=(),
-        description="INPUT KIND AT, with AT in s, and how strong if need be: aileron lost 60",
+        description="INPUT KIND AT, AT in s, and a strength if the kind has one: aileron lost 60",
     )
     delay: float = Field(
         default=0.0,
@@ -312,15 +312,15 @@ class ActuatorConfig(Config):
 class SensorConfig(Config):
     """The sensors. The defaults are ideal sensors."""
 
-    bias: NumbersOrNone = Field(default=(), description="constant errors")
+    bias: NumbersOrNone = Field(default=(), description="constant errors, SI")
     drift: NonNegativesOrNone = Field(
         default=(), description="standard deviation of the random walks, SI per sqrt(s)"
     )
     noise: NonNegativesOrNone = Field(
-        default=(), description="standard deviation of the noise per sample"
+        default=(), description="standard deviation of the noise per sample, SI"
     )
     quantisation: NonNegativesOrNone = Field(
-        default=(), description="steps of the quantised values; 0 for none"
+        default=(), description="steps of the quantised values, SI; 0 for none"
     )
     delay: float = Field(
         default=0.0,
@@ -343,7 +343,7 @@ class PoseConfig(Config):
 
     rate: Positive | None = Field(
         default=None,
-        description="rate, Hz, a whole fraction of the aircraft's; none: at most 50 Hz",
+        description="rate, Hz, a whole fraction of the aircraft's rate; none: at most 50 Hz",
     )
     delay: float = Field(
         default=0.0,
@@ -351,12 +351,12 @@ class PoseConfig(Config):
         le=10,
         description="delay, s; a whole number of the aircraft's periods",
     )
-    bias: PerPose = Field(default={}, description="constant errors")
+    bias: PerPose = Field(default={}, description="constant errors, SI")
     drift: dict[str, NonNegative] = Field(
         default={}, description="standard deviation of the random walks, SI per sqrt(s)"
     )
     noise: dict[str, NonNegative] = Field(
-        default={}, description="standard deviation of the noise per sample"
+        default={}, description="standard deviation of the noise per sample, SI"
     )
     seed: int = Field(default=1, ge=0, lt=2**63, description="seed of noise and drift")
 

@@ -98,7 +98,7 @@ class SteeringConfig(NodeConfig):
         default=None,
         description="largest rate of the bank p_max, rad/s",
     )
-    load: Positive = Field(default=0.3, description="largest change of the load factor by pitch, 1")
+    load: Positive = Field(default=0.3, description="largest change of the load factor by pitch")
     pitch: Annotated[Numbers, Field(min_length=2, max_length=2)] = Field(
         default=(math.radians(-15.0), math.radians(25.0)),
         description="least and largest pitch, rad",
@@ -119,7 +119,7 @@ class SteeringConfig(NodeConfig):
     )
     period: Positive | None = Field(default=None, description="period of path following, s")
     damping: Annotated[float, Field(ge=0.5, le=1.0)] = Field(
-        default=0.8, description="damping of path following, 1"
+        default=0.8, description="damping ratio of path following"
     )
     capture: Annotated[float, Field(gt=0, le=math.pi / 2.0)] = Field(
         default=math.radians(60.0), description="largest angle at which a path is approached, rad"

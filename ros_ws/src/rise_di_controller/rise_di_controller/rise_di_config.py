@@ -64,10 +64,10 @@ class ScheduleConfig(Config):
     time: Positive = Field(default=1.0, description="time constant at which input_scale follows, s")
     slow: SpeedConfig | None = Field(
         default=None,
-        description="models below the trim speed, beside an observer; interpolated in between",
+        description="models below the trim speed, with an observer; interpolated in between",
     )
     fast: SpeedConfig | None = Field(
-        default=None, description="models above the trim speed, beside an observer"
+        default=None, description="models above the trim speed, with an observer"
     )
 
     @property
@@ -109,7 +109,7 @@ class LearnConfig(Config):
     )
     updates: Positives = Field(
         default=(10.0, 15.0, 20.0, 30.0, 60.0),
-        description="when identifications begin, s from the first tick; then once a window",
+        description="when identifications begin, s from the first tick; then once per window",
     )
     check: Annotated[float, Field(ge=1, le=600)] = Field(
         default=2.0, description="period of the test for a changed aircraft, s"
@@ -170,7 +170,7 @@ class RiseDiConfig(ControllerConfig):
     omega: Positives = Field(
         default=(),
         description="abs(Omega_ii) in scaled inputs, or an over-estimate (implicit sign); by "
-        "default 1 an output",
+        "default 1 for each output",
     )
     # the lag decides which of the two is stable
     sign: Literal["auto", "literal", "implicit", "soft"] = Field(

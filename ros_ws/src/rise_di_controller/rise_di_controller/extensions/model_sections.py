@@ -123,7 +123,7 @@ class VanesConfig(Config):
     channels: Names = Field(
         description="channels of y that are also states of the feedforward, such as alpha"
     )
-    H: Numbers = Field(description="H z = reading less that of the reference, one row per vane")
+    H: Numbers = Field(description="H z = reading minus that of the reference, one row per vane")
     L: Numbers = Field(
         description="added to L for each vane: one row per estimate, columns for outputs and vane"
     )
@@ -180,7 +180,7 @@ class ObserverConfig(Config):
     margin: Annotated[float, Field(ge=0, le=0.5)] = Field(
         default=0.03, description="least delay margin of the nominal loop, including `delay`, s"
     )
-    vanes: VanesConfig | None = Field(default=None, description="vanes beside y")
+    vanes: VanesConfig | None = Field(default=None, description="vanes in addition to y")
 
     def matrices(self, nominal: Nominal) -> tuple[FloatArray, ...]:
         """Return Phi, Gamma, H, L and F, or raise ParameterError if their sizes do not match."""
