@@ -202,9 +202,8 @@ def test_with_K_too_small_V2_rises_at_every_period() -> None:
         )
         assert np.linalg.eigvalsh(decay_matrix(case.plant, params)).min() < -6.0
         assert largest_rise(signals.V2) > 2.5
-        assert (
-            tail(signals.e, signals.t, 15.0) < 1e-3
-        )  # the conditions are sufficient, not necessary
+        # The conditions are sufficient, not necessary.
+        assert tail(signals.e, signals.t, 15.0) < 1e-3
 
 
 def test_literal_sign_lets_V2_rise_by_chatter_that_fades_with_period() -> None:

@@ -61,8 +61,8 @@ def test_flight_over_topics_recorded_and_as_accurate_as_in_one_process(
     # The bounds are for the loop, not for the host. Such a flight is repeated, at most three times.
     # Host delays count that made the controller late by more than a quarter of its period, or the
     # aircraft or the reference model by more than a sample. Those of u on its way to the aircraft
-    # are in no topic, so that one flight beyond the bounds proves nothing. A flight that ends with the
-    # status of a busy host is not judged at all.
+    # are in no topic, so that one flight beyond the bounds proves nothing. A flight that ends
+    # with the status of a busy host is not judged at all.
     delays = []
     is_judged = False
     for _ in range(4):

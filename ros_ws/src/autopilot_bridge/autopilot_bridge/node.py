@@ -91,9 +91,8 @@ class BridgeNode(FlightNode[BridgeConfig]):
             message.topic == RC_OVERRIDE for message in self._map.messages.values()
         )
         self._link = self._open_link()
-        self._known_stations: set[int] = (
-            set()
-        )  # systems of ground stations that were already reported
+        # Systems of ground stations that were already reported.
+        self._known_stations: set[int] = set()
         self._conflict = ""  # which topics have two publishers, as a sentence
         # Publishers and encoders of what comes over MAVLink, as named vectors.
         self._recorded: dict[str, tuple[Callable[[bytes], None], Encoder]] = {}

@@ -114,9 +114,7 @@ def _fly(context: LaunchContext) -> list[Action]:
     value = argument(context, "lockstep")
     lockstep = value == "true" or (value == "" and scenario.flight.lockstep)
     by_rosbag2 = argument(context, "recorder") == "rosbag2"
-    is_simulated = (
-        argument(context, SIM_TIME) == "true" or scenario.flight.use_sim_time or flight.has_sim_time
-    )
+    is_simulated = flight.is_by_clock or scenario.flight.use_sim_time
     own = [*(spec.executable for spec in others), *(["params_file"] * bool(further))]
     _require_possible(own, lockstep=lockstep, by_rosbag2=by_rosbag2, is_simulated=is_simulated)
     if is_simulated:

@@ -171,9 +171,8 @@ def _results(
     from distributed import as_completed  # noqa: PLC0415 - half a second
 
     for job in first:
-        underway[client.submit(work, job, pure=False)] = (
-            job  # pure=False: never take a cached result
-        )
+        # With pure=False dask never takes a cached result.
+        underway[client.submit(work, job, pure=False)] = job
     finished = as_completed(list(underway))
     for future in finished:
         result = future.result()

@@ -36,9 +36,8 @@ from flight_design.gains.airframe_properties import (
 from rise_di.own_airframe import NewAirframe, new_airframe
 
 ROOTS = "Poles and zeros in 1/s, leading minors of C B in SI"
-FALLS_SHORT = (
-    3  # exit status: in the first flight an input was at its stop, or it did not end as planned
-)
+# Exit status: in the first flight an input was at its stop, or it did not end as planned.
+FALLS_SHORT = 3
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -96,9 +96,8 @@ class BridgeExperiment:
         for sentence in narrower:
             say(console, sentence)
         flyable = self._flyable(channel_map, channels)
-        written_map = map_text(
-            channel_map, trims, run.resolve().name
-        )  # the name of the run, not `latest`
+        # The name of the run, not `latest`.
+        written_map = map_text(channel_map, trims, run.resolve().name)
         files = {"airframe": flyable.airframe, "scenario": flyable.scenario, "map": written_map}
         guidance_scenario = guided_scenario(flyable.scenario, channel_map, self.speed)
         if guidance_scenario:

@@ -54,9 +54,8 @@ class Play:
     def execute(self) -> None:
         """Play until the end of the log, or until Ctrl-C."""
         for name, value in (("--rate", self.rate), ("--start", self.start)):
-            require(
-                math.isfinite(value), name, value, "a number"
-            )  # the ranges above do not refuse NaN
+            # The ranges above do not refuse NaN.
+            require(math.isfinite(value), name, value, "a number")
         names = [name.strip() for name in self.topics.split(",") if name.strip()]
         playback = read_playback(self.run, names, self.start, self.namespace)
         warn_of_lacks_in(self.run, self.namespace)

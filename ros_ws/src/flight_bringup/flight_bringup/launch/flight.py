@@ -65,6 +65,11 @@ class Flight:
         values = dict(each for each in self._given_parameters() if isinstance(each, tuple))
         return values.get(SIM_TIME) is True
 
+    @property
+    def is_by_clock(self) -> bool:
+        """Return whether the argument `use_sim_time` or SetParameter asks for /clock."""
+        return self.argument(SIM_TIME) == "true" or self.has_sim_time
+
     def given_to_nodes(self) -> list[str]:
         """Name what the scope gives all its nodes, apart from their time.
 

@@ -193,10 +193,9 @@ def by_rise_di(flight: Flight, file: str, *, has_own_time: bool = False) -> list
         f"{', '.join(given)} of the launch",
         "values in the file: `rise-di fly` starts these nodes, and no launch reaches them",
     )
-    by_clock = flight.argument(SIM_TIME) == "true" or flight.has_sim_time
     options = ["--runs", flight.argument("runs")]
-    options += ["--use-sim-time"] * by_clock
-    options += ["--real-time"] * (not (by_clock or has_own_time))
+    options += ["--use-sim-time"] * flight.is_by_clock
+    options += ["--real-time"] * (not (flight.is_by_clock or has_own_time))
     for name, value in (
         ("duration", flight.argument("duration")),
         ("namespace", flight.namespace),

@@ -103,9 +103,8 @@ def compare(
     )
 
     def results(name: str) -> list[LawResult]:
-        control_law = laws[name].control_law(
-            benchmark.model
-        )  # one for all gain sets, so that it is compiled once
+        # One for all gain sets, so that it is compiled once.
+        control_law = laws[name].control_law(benchmark.model)
         return [
             study.result(name, laws[name], control_law, objective, gains)
             for objective, gains in gains_by_law[name].items()

@@ -58,9 +58,8 @@ SAMPLES = 20
 # largest sensitivity of the loop of a channel with its integral: it leaves a gain margin of 2 and a
 # phase margin of 29 deg
 MAX_SENSITIVITY = 2.0
-INTEGRALS = np.append(
-    np.geomspace(1.0, 0.01, 40), 0.0
-)  # shares of the wanted integral that are tried
+# Shares of the wanted integral that are tried.
+INTEGRALS = np.append(np.geomspace(1.0, 0.01, 40), 0.0)
 
 
 class Flyable(NamedTuple):

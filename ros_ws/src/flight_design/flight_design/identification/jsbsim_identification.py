@@ -105,9 +105,8 @@ class IdentifiedAircraft(NamedTuple):
     """An identified aircraft and its scenario."""
 
     linear: Linearization
-    coupling: (
-        float  # max abs(U - I), for inputs of unit response and outputs in units of the manoeuvre
-    )
+    # max abs(U - I), for inputs of unit response and outputs in units of the manoeuvre
+    coupling: float
     selection: Selection
     text: str  # of the scenario file
     sideslip_zero: (

@@ -70,9 +70,8 @@ def second_order_response(
     begin = np.maximum(t - delay, 0.0)
     # z, z', v; y = z' or z
     A = np.array([[0.0, 1.0, 0.0], [-stiffness, -damping, 1.0], [0.0, 0.0, -1.0 / lag]])
-    values, vectors = np.linalg.eig(
-        A + np.diag([0.0, 1e-3, 2e-3])
-    )  # the eigenvalues are then distinct
+    # The eigenvalues are then distinct.
+    values, vectors = np.linalg.eig(A + np.diag([0.0, 1e-3, 2e-3]))
     parts = np.linalg.solve(vectors, np.array([0.0, 0.0, 1.0 / lag]))
     product = values[:, None] * begin
     small = np.abs(product) < 1e-6
