@@ -42,48 +42,48 @@ def retune_state(
     before, after = (
         (None, None) if guards is None else (nominal_at_speed(guard, law) for guard in guards)
     )
-    other_nominal = not _same_arrays(before, after)
-    observing = law
+    has_new_nominal = not _same_arrays(before, after)
+    inner = law  # the state inside a schedule
     observers = (old.params, new.params)
     if isinstance(law, ScheduleState):
-        observing, observers = law.law, tuple(law_at(params, law.scale) for params in observers)
-    other_model = isinstance(
-        observing, (ObserverState, observer.VaneObserverState)
+        inner, observers = law.law, tuple(law_at(params, law.scale) for params in observers)
+    has_new_observer = isinstance(
+        inner, (ObserverState, observer.VaneObserverState)
     ) and _is_replaced(*observers)
     if (
         len(state.history) > 1
-        and isinstance(observing, ObserverState)
-        and isinstance(observing.law, LawState)
+        and isinstance(inner, ObserverState)
+        and isinstance(inner.law, LawState)
     ):
         # With a history, the observer and the feedforward continue in the same motion.
         change: Array = np.zeros_like(state.u)  # of u_ff
-        if other_nominal:
+        if has_new_nominal:
             state, change = _with_nominal(state, y_m, after)
-        if other_model or other_nominal:
+        if has_new_observer or has_new_nominal:
             filters = observers_of(new.params, [tick.scale for tick in state.history])
             z = observer.estimates_after(state.history, change, filters)
-            observing = _with_estimates(state, observing, z, change, observers)
+            inner = _with_estimates(state, inner, z, change, observers)
     else:
         # Without one they begin again, and what they gave becomes part of u_trim.
-        if other_model and not _same_model(*observers):
+        if has_new_observer and not _same_model(*observers):
             z = observer.initial_estimates(y.value - y_m, observers[1])
-            state = state._replace(u_trim=state.u_trim + observing.u_o)
-            observing = observing._replace(
-                z=z, u_o=np.zeros_like(observing.u_o), sigma=np.zeros_like(observing.sigma)
+            state = state._replace(u_trim=state.u_trim + inner.u_o)
+            inner = inner._replace(
+                z=z, u_o=np.zeros_like(inner.u_o), sigma=np.zeros_like(inner.sigma)
             )
-        if other_nominal:
+        if has_new_nominal:
             start = None if after is None else feedforward.initial_state(y_m, after)
             state = state._replace(
                 u_trim=state.u_trim + state.u_ff, u_ff=np.zeros_like(state.u_ff), feedforward=start
             )
     if isinstance(law, ScheduleState):
-        observing = law._replace(law=observing)
-    return state._replace(law=observing)
+        inner = law._replace(law=inner)
+    return state._replace(law=inner)
 
 
 def _with_estimates(
     state: ControllerState,
-    observing: ObserverState,
+    observer_state: ObserverState,
     z: Array,
     change: Array,
     observers: tuple[ObserverParams, ...],
@@ -98,13 +98,17 @@ def _with_estimates(
     """
     law_part = state.u - state.u_trim - state.u_ff
     limits = observers[1].limits
-    acted, acts = ((params.limits.upper > 0.0) & np.any(params.F, axis=1) for params in observers)
-    goes_on = np.where(acted, observing.u_o - change, law_part)
-    u_o = np.where(acts, np.clip(goes_on, limits.lower, limits.upper), 0.0)
-    inner = shifted(
-        observing.law, law_part - u_o - (law_part + change - observing.u_o), observers[1].law
+    was_acting, is_acting = (
+        (params.limits.upper > 0.0) & np.any(params.F, axis=1) for params in observers
     )
-    return ObserverState(inner, z, u_o, np.ones_like(observing.sigma))
+    continued = np.where(was_acting, observer_state.u_o - change, law_part)
+    u_o = np.where(is_acting, np.clip(continued, limits.lower, limits.upper), 0.0)
+    law_state = shifted(
+        observer_state.law,
+        law_part - u_o - (law_part + change - observer_state.u_o),
+        observers[1].law,
+    )
+    return ObserverState(law_state, z, u_o, np.ones_like(observer_state.sigma))
 
 
 def _with_nominal(
@@ -115,15 +119,15 @@ def _with_nominal(
     The second result is the change of u_ff, (m,).
     """
     u_ff = np.zeros_like(state.u)
-    goes_on = None
+    continued = None
     if nominal is not None:
         earlier = state.history[-2]
         last = state.history[-1]
-        goes_on = feedforward.with_new_model(
+        continued = feedforward.with_new_model(
             state.feedforward, y_m, (last.y_m - earlier.y_m) / last.dt, last.dt, nominal
         )
-        u_ff = feedforward.of_active_inputs(goes_on.u - goes_on.u_0, nominal)
-    return state._replace(u_ff=u_ff, feedforward=goes_on), u_ff - state.u_ff
+        u_ff = feedforward.of_active_inputs(continued.u - continued.u_0, nominal)
+    return state._replace(u_ff=u_ff, feedforward=continued), u_ff - state.u_ff
 
 
 def _is_replaced(old: ObserverParams, new: ObserverParams) -> bool:
