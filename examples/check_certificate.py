@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Check a certificate of `rise-di gains --guarantee --certificate FILE` with numpy alone.
+"""Check a certificate of `rise-di gains guarantee --certificate FILE` with numpy alone.
 
     python check_certificate.py certificate.json [rise_di_parameters.h]
 

@@ -100,7 +100,13 @@ FILES = [*ODD, *FILE_NAMES, "../../x", "x" * 5000 + ".yaml", "\x1b[2J"]
 @pytest.mark.parametrize("name", FILES, ids=range(len(FILES)))
 @pytest.mark.parametrize(
     "command",
-    [["fly", "--in-process"], ["fly"], ["gains"], ["check"], ["gains", "osprey", "--scenario"]],
+    [
+        ["fly", "--in-process"],
+        ["fly"],
+        ["gains", "select"],
+        ["check"],
+        ["gains", "check", "osprey", "--scenario"],
+    ],
     ids=str,
 )
 def test_an_invalid_file_is_rejected(command: list[str], name: str, garbage: Path) -> None:
@@ -109,14 +115,14 @@ def test_an_invalid_file_is_rejected(command: list[str], name: str, garbage: Pat
 
 OPTIONS = {
     "fly osprey_gust --in-process --duration": ["nan", "inf", "0", "x", "1e7"],
-    "gains osprey --samples 0 --rate": ["nan", "1e9", "333.3"],
-    "gains osprey --uncertainty": ["nan", "2"],
-    "gains osprey --delay": ["inf", "-1"],
-    "gains osprey --gamma-2": ["nan"],
-    "gains osprey --lag": ["nan", "1,2", ","],
-    "gains osprey --samples 0 --inputs": ["rudder,x"],
-    "gains osprey --samples": ["-1", "1000000000"],
-    "gains osprey --seed": ["x"],
+    "gains select osprey --samples 0 --rate": ["nan", "1e9", "333.3"],
+    "gains select osprey --uncertainty": ["nan", "2"],
+    "gains select osprey --delay": ["inf", "-1"],
+    "gains select osprey --gamma-2": ["nan"],
+    "gains select osprey --lag": ["nan", "1,2", ","],
+    "gains select osprey --samples 0 --inputs": ["rudder,x"],
+    "gains select osprey --samples": ["-1", "1000000000"],
+    "gains select osprey --seed": ["x"],
     "play cut --rate": ["nan", "0", "1e9"],
     "play cut --start": ["inf", "-1"],
     "play cut --topics": ["nothing", "\x1b"],

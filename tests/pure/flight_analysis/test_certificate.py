@@ -241,19 +241,15 @@ def test_certificate_with_the_name_of_another_loop_is_refused(
 
 def test_command_writes_a_certificate_and_refuses_what_it_cannot_state(tmp_path: Path) -> None:
     path = tmp_path / "certificate.json"
-    words = ["gains", "osprey", "--check", "--samples", "1", "--certificate", str(path)]
-    refusals = {
-        (): "found no --guarantee, expected --guarantee beside it",
-        ("--guarantee", "--late", "0.01"): "found --late 0.01 beside it, expected u in time",
-    }
-    for more, sentence in refusals.items():
-        assert sentence in str(invoke(*words, *more).exception)
-        assert not path.exists()
+    words = ["gains", "guarantee", "osprey", "--samples", "1", "--certificate", str(path)]
+    refused = invoke(*words, "--late", "0.01")
+    assert "found --late 0.01 beside it, expected u in time" in str(refused.exception)
+    assert not path.exists()
     for place in (tmp_path, tmp_path / "none" / "certificate.json"):
-        refused = invoke(*words[:-1], str(place), "--guarantee")
+        refused = invoke(*words[:-1], str(place))
         sentence = f"certificate: found {place}, expected a file in a folder that can be written"
         assert sentence in str(refused.exception)
-    done = invoke(*words, "--guarantee")
+    done = invoke(*words)
     assert done.exit_code == 0, done.output
     assert "certificate.json" in done.output
     content = json.loads(path.read_text())
@@ -290,15 +286,14 @@ def test_section_that_gains_wrote_has_margins_and_a_certificate(tmp_path: Path) 
     frame, section = tmp_path / "one.yaml", tmp_path / "gains.yaml"
     path = tmp_path / "certificate.json"
     frame.write_text(ONE_CHANNEL)
-    written = invoke("gains", str(frame), "--samples", "4", "--write", str(section))
+    written = invoke("gains", "select", str(frame), "--samples", "4", "--write", str(section))
     assert written.exit_code == 0, written.output
     selected = rise_di.select_gains(frame, samples=4).engineering
     again = rise_di.check_gains(frame, section, samples=4)
     for part in ("theorem", "rules", "loop"):
         found = [condition.value for condition in getattr(again, part)]
         assert found == approx([condition.value for condition in getattr(selected, part)], rel=1e-4)
-    words = ["gains", str(frame), "--check", "--scenario", str(section), "--samples", "4"]
-    words += ["--guarantee"]
+    words = ["gains", "guarantee", str(frame), "--scenario", str(section), "--samples", "4"]
     refused = invoke(*words, "--worst", str(tmp_path / "worst"))
     assert "worst: found no aircraft in" in str(refused.exception)
     done = invoke(*words, "--certificate", str(path))
@@ -342,12 +337,12 @@ def test_command_certifies_an_aircraft_of_jsbsim_or_refuses_before_the_work(
 ) -> None:
     """The loop is y_dot = Omega u: four entries of B, and the name of the loop of the scenario."""
     path = tmp_path / "certificate.json"
-    words = ["gains", "jsbsim:c172p", "--check", "--scenario", "jsbsim_c172p", "--samples", "1"]
-    refused = invoke(*words, "--guarantee", "--worst", str(tmp_path / "worst"))
+    words = ["gains", "guarantee", "jsbsim:c172p", "--scenario", "jsbsim_c172p", "--samples", "1"]
+    refused = invoke(*words, "--worst", str(tmp_path / "worst"))
     assert "worst: found jsbsim:c172p, expected an aircraft of an airframe" in str(
         refused.exception
     )
-    words += ["--guarantee", "--certificate", str(path)]
+    words += ["--certificate", str(path)]
     done = invoke(*words)
     content = json.loads(path.read_text())
     assert content["loop"] == loop_of("jsbsim_c172p").digest, done.output
@@ -360,8 +355,8 @@ def test_command_certifies_an_aircraft_of_jsbsim_or_refuses_before_the_work(
 def test_law_without_c_code_has_a_certificate_without_constants(tmp_path: Path) -> None:
     """Vanes are no condition of the proof, only of the C code."""
     path = tmp_path / "certificate.json"
-    words = ["gains", "osprey", "--check", "--scenario", "osprey_vanes", "--samples", "1"]
-    done = invoke(*words, "--guarantee", "--certificate", str(path))
+    words = ["gains", "guarantee", "osprey", "--scenario", "osprey_vanes", "--samples", "1"]
+    done = invoke(*words, "--certificate", str(path))
     said = " ".join(done.output.split())
     assert "certificate without constants: controller.observer.vanes: found a section" in said
     proved = run(json.loads(path.read_text()), tmp_path)

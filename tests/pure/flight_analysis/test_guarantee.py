@@ -388,7 +388,7 @@ def test_report_shows_the_guarantee_that_was_computed_for_its_loop(tmp_path: Pat
 def test_command_fails_below_uncertainty_and_writes_unstable_aircraft(tmp_path: Path) -> None:
     """The first unstable one is inside the box, 1.2 times as far off is outside."""
     folder = tmp_path / "first"
-    arguments = ["gains", "osprey", "--check", "--guarantee", "--uncertainty", "0.75"]
+    arguments = ["gains", "guarantee", "osprey", "--uncertainty", "0.75"]
     arguments += ["--worst", str(folder), "--samples", "1"]
     said = " ".join(invoke(*arguments).output.split())
     assert re.search(r"scenario\.yaml, 74\.\d % off, inside the 75 % of --uncertainty", said), said
@@ -421,7 +421,7 @@ def test_command_bounds_the_effectors_behind_an_allocation() -> None:
     The box of the file is larger than that of the law's inputs, and an aircraft of it is unstable
     earlier.
     """
-    words = ["gains", "x8_elevons", "--scenario", "x8_elevons", "--check", "--guarantee", "--json"]
+    words = ["gains", "guarantee", "x8_elevons", "--scenario", "x8_elevons", "--json"]
     run = invoke(*words, "--samples", "2")
     assert run.exit_code == 1
     promise = kept_guarantee(boxed("x8_elevons"))  # of the same loop and box

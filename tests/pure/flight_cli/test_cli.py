@@ -24,7 +24,7 @@ from flight_analysis.closed_loop.replay import recorded_scenario
 from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario
 from flight_analysis.closed_loop.scenario_library import LIBRARY, find_scenario
 from flight_cli import cli
-from flight_cli.cli import COMMANDS, application
+from flight_cli.cli import COMMANDS, VERBS, application
 from flight_cli.scenarios import first_sentences
 from rise_di_controller.rise_di_config import RiseDiConfig
 
@@ -242,16 +242,27 @@ def test_the_version_is_that_of_the_package(tmp_path: Path) -> None:
     assert rise_di("--version", cwd=tmp_path).stdout == f"rise-di {version('rise-di')}\n"
 
 
-def options_of(name: str) -> list[Any]:
-    """The options of a command."""
-    command = typer.main.get_command(application([name])).commands[name]  # type: ignore[attr-defined]
-    return [each for each in command.params if each.param_type_name == "option"]
+def command_of(*words: str) -> Any:
+    """A command, or the verb of one."""
+    command: Any = typer.main.get_command(application(words[:1]))
+    for word in words:
+        command = command.commands[word]
+    return command
+
+
+def options_of(*words: str) -> list[Any]:
+    """The options of a command or of a verb."""
+    return [each for each in command_of(*words).params if each.param_type_name == "option"]
+
+
+EVERY_COMMAND: list[tuple[str, ...]] = [(name,) for name in COMMANDS if name not in VERBS]
+EVERY_COMMAND += [(name, verb) for name, verbs in VERBS.items() for verb in verbs]
 
 
 def test_commands_are_few_and_so_are_options_beside_the_panel_of_rare_ones() -> None:
     assert len(COMMANDS) <= 20
-    for name in COMMANDS:
-        assert sum(each.rich_help_panel is None for each in options_of(name)) <= 10, name
+    for words in EVERY_COMMAND:
+        assert sum(each.rich_help_panel is None for each in options_of(*words)) <= 10, words
 
 
 def test_option_is_a_name_in_small_letters_joined_by_hyphens() -> None:
@@ -259,8 +270,8 @@ def test_option_is_a_name_in_small_letters_joined_by_hyphens() -> None:
 
     Two have a letter too, as in other tools.
     """
-    for name in COMMANDS:
-        spellings = [spelling for each in options_of(name) for spelling in each.opts]
+    for words in EVERY_COMMAND:
+        spellings = [spelling for each in options_of(*words) for spelling in each.opts]
         letters = {text for text in spellings if not re.fullmatch(r"--[a-zI][a-z0-9-]*", text)}
         assert letters <= {"-q", "-v"}
 
@@ -271,13 +282,13 @@ def test_what_a_command_writes_is_its_output() -> None:
         "airframes",
         "compare",
         "export",
-        "gains",
+        "gains select",
         "identify",
         "import",
         "learn",
         "network",
     ):
-        assert any("--output" in option.opts for option in options_of(name)), name
+        assert any("--output" in option.opts for option in options_of(*name.split())), name
 
 
 @pytest.mark.parametrize(
@@ -285,9 +296,10 @@ def test_what_a_command_writes_is_its_output() -> None:
     [
         "fly --runs there --duration 3 --composed --use-sim-time --learn --fence a.plan",
         "fly --route a.gpx --origin 47.4,8.5 --altitude 400 --simplify 50 --line 2",
-        "gains osprey --rate 100 --y-rate 50 --margin 0.04 --page a.html --accept --write g.yaml",
-        "gains osprey --phase-margin 45 --seed 2 --samples 20 --output g.yaml --json",
-        "gains osprey --check --guarantee --late 0.01 --worst folder",
+        "gains select osprey --rate 100 --y-rate 50 --margin 0.04 --page a.html --accept",
+        "gains select osprey --px4 a.params --write g.yaml",
+        "gains select osprey --phase-margin 45 --seed 2 --samples 20 --output g.yaml --json",
+        "gains guarantee osprey --late 0.01 --worst folder",
         "identify log --airframe osprey --scenario osprey_gust --delay 0 --refly --margin 0.03",
         "identify --bridge px4 --amplitude 0.4 --phase-margin 40 --link-delay 0.1 --output folder",
         "campaign --runs there --workers 2 --aircraft 9 --seed 3 --wind published --chunk 2",
@@ -305,8 +317,8 @@ def test_what_a_command_writes_is_its_output() -> None:
 )
 def test_natural_options_are_taken(words: str) -> None:
     name, *rest = words.split()
-    command = typer.main.get_command(application([name])).commands[name]  # type: ignore[attr-defined]
-    command.make_context(name, rest)
+    verb = [rest.pop(0)] if name in VERBS else []
+    command_of(name, *verb).make_context(name, rest)
 
 
 KEY = ", or set a key of the scenario, --set SECTION.KEY=VALUE"
@@ -315,9 +327,9 @@ KEY = ", or set a key of the scenario, --set SECTION.KEY=VALUE"
 @pytest.mark.parametrize(
     "words, mend",
     [
-        ("gains osprey --rates 3", "did you mean --rate?"),
-        ("gains osprey --y_rate 50", "did you mean --y-rate?"),
-        ("gains osprey --phase_margin=45", "did you mean --phase-margin?"),
+        ("gains select osprey --rates 3", "did you mean --rate?"),
+        ("gains select osprey --y_rate 50", "did you mean --y-rate?"),
+        ("gains select osprey --phase_margin=45", "did you mean --phase-margin?"),
         ("campaign --run x", "did you mean --runs?"),
         ("campaign --worker 3", "did you mean --workers?"),
         ("campaign --jobs 3", "did you mean --workers?"),
@@ -326,7 +338,7 @@ KEY = ", or set a key of the scenario, --set SECTION.KEY=VALUE"
         ("report --html a.html", "did you mean --page?"),
         ("import log.bin --out bag", "did you mean --output?"),
         ("play runs/latest --speed 2", "did you mean --rate?"),
-        ("gains osprey --set rate=100", "rise-di gains --help lists them"),
+        ("gains select osprey --set rate=100", "rise-di gains select --help lists them"),
         ("fly --run x", "did you mean --runs?"),
         ("fly --out x", "did you mean --runs?"),
         ("fly --scenario osprey_gust", "give it without a name, rise-di fly SCENARIO"),
@@ -339,7 +351,9 @@ KEY = ", or set a key of the scenario, --set SECTION.KEY=VALUE"
 def test_other_option_is_refused_with_its_mend(words: str, mend: str) -> None:
     error = invoke(*words.split()).exception
     option = next(word for word in words.split() if word.startswith("--")).partition("=")[0]
-    assert str(error) == f"{option} is no option of rise-di {words.split(maxsplit=1)[0]}: {mend}"
+    name, verb, *_ = words.split()
+    command = f"{name} {verb}" if name in VERBS else name
+    assert str(error) == f"{option} is no option of rise-di {command}: {mend}"
 
 
 @pytest.mark.parametrize(
@@ -416,9 +430,9 @@ def test_number_of_runs_is_no_folder(
 @pytest.mark.parametrize(
     "words, refusal",
     [
-        ("gains osprey --observer --margin 0.9", "--margin: found 0.9, expected 0 to 0.5 s"),
-        ("gains osprey --rate nan", "--rate: found nan, expected 1 to 1000 Hz"),
-        ("gains osprey --late 0.1", "--late: found no --guarantee, expected --guarantee beside it"),
+        ("gains select osprey --observer --margin 0.9", "--margin: found 0.9, expected 0 to 0.5 s"),
+        ("gains select osprey --rate nan", "--rate: found nan, expected 1 to 1000 Hz"),
+        ("gains guarantee osprey --late 9", "--late: found 9.0, expected 0 to 0.5 s"),
         ("identify log --link-delay 1", "--link-delay: found 1.0, expected --bridge beside it"),
         ("campaign --score q", "--score: found 'q', expected a name and a number: q=0.02"),
         ("fly --in-process --composed", "--in-process: found --composed too, expected one of the"),
@@ -436,7 +450,7 @@ def test_refusal_names_the_option_as_it_is_typed(words: str, refusal: str) -> No
 @pytest.mark.parametrize(
     "words, expected",
     [
-        ("gains osprey --scenario osprey_s", "osprey_servo"),
+        ("gains select osprey --scenario osprey_s", "osprey_servo"),
         ("replay runs/latest --set controller.k_g=2 --scenario osprey_s", "osprey_servo"),
         ("fly osprey_s", "osprey_servo"),
         ("fly osprey_servo --ru", "--runs"),
@@ -444,7 +458,8 @@ def test_refusal_names_the_option_as_it_is_typed(words: str, refusal: str) -> No
         ("fly osprey_servo --set controller.k_", "controller.k_g="),
         ("fly --set aircraft.sensors.no", "aircraft.sensors.noise="),
         ("campaign --wo", "--workers"),
-        ("gains os", "osprey"),
+        ("gains check os", "osprey"),
+        ("gains sel", "select"),
         ("airframes osprey x", "x8_elevons"),
         ("identify runs/latest --airframe os", "osprey"),
         ("check px4", "px4"),
@@ -502,7 +517,7 @@ def test_scenarios_are_listed_with_their_sentence_aircraft_and_law() -> None:
 
 def test_help_shows_the_names_of_entries_whole() -> None:
     """Brackets are markup to Rich: A[q,alpha] was shown as A."""
-    words = " ".join(invoke("gains", "--help").output.replace("│", " ").split())
+    words = " ".join(invoke("gains", "check", "--help").output.replace("│", " ").split())
     assert "'A[q,alpha]=0.6', or of an actuator '1/lag[elevator]=0.3'" in words
 
 
@@ -513,6 +528,9 @@ def test_every_command_of_help_has_help_of_own() -> None:
         assert f"Usage: rise-di {name}" in answer.stdout
     listed = said("--help").stdout
     assert all(name in listed for name in COMMANDS)
+    for name, verbs in VERBS.items():
+        for verb in verbs:
+            assert f"Usage: rise-di {name} {verb}" in said("help", name, verb).stdout
 
 
 def test_interrupt_inside_destructor_ends_command_without_traceback() -> None:

@@ -40,7 +40,7 @@ from flight_core.parameters import ParameterError
             ),
         ),
         (
-            ["gains", "osprey_servo", "--check"],
+            ["gains", "check", "osprey_servo"],
             (
                 "airframe: found the scenario 'osprey_servo', expected the airframe that it "
                 "flies, with `--scenario osprey_servo` beside it"

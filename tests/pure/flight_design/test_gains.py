@@ -414,7 +414,9 @@ def rise_di(*arguments: str) -> Result:
 def test_the_command_writes_gains_that_load(tmp_path: Path) -> None:
     path = tmp_path / "gain_conditions.yaml"
     loop = ("--lag", "0.02,0.1,0.02,0.02", "--delay", "0")
-    result = rise_di("gains", "osprey", "--samples", "2", "--json", *loop, "--write", str(path))
+    result = rise_di(
+        "gains", "select", "osprey", "--samples", "2", "--json", *loop, "--write", str(path)
+    )
     assert result.exit_code == 0, result.output
     output = json.loads(result.stdout)
     section = yaml.safe_load(path.read_text())["/**/controller"]["ros__parameters"]
@@ -425,7 +427,7 @@ def test_the_command_writes_gains_that_load(tmp_path: Path) -> None:
 
 def test_check_of_the_default_flight_succeeds_by_its_loop_and_tells_the_theorem_apart() -> None:
     """No gains behind servos meet (29) and step 2, and the loop is as good as its margins."""
-    words = ("gains", "osprey", "--check", "--samples", "4")
+    words = ("gains", "check", "osprey", "--samples", "4")
     told = rise_di(*words)
     assert told.exit_code == 0, told.output
     loop, theorem = told.output.index("the loop is stable"), told.output.index("Theorem 1:")
@@ -443,12 +445,12 @@ def test_check_fails_by_a_loop_without_its_margins_although_the_theorem_holds(
     """Behind the servos of the osprey the gains of Theorem 1 make the loop grow."""
     gains, flight = tmp_path / "gains.yaml", tmp_path / "theorem_gains.yaml"
     ideal = ("--lag", "0", "--delay", "0", "--theorem", "--accept")
-    written = rise_di("gains", "osprey", "--samples", "2", *ideal, "--write", str(gains))
+    written = rise_di("gains", "select", "osprey", "--samples", "2", *ideal, "--write", str(gains))
     assert written.exit_code == 0, written.output
     section = yaml.safe_load(gains.read_text())["/**/controller"]["ros__parameters"]
     lags = {"sign": "soft", "lag": [0.02, 0.02, 0.02, 0.1]}
     flight.write_text(yaml.safe_dump({"/**/controller": {"ros__parameters": section | lags}}))
-    answer = rise_di("gains", "osprey", "--check", "--samples", "2", "--scenario", str(flight))
+    answer = rise_di("gains", "check", "osprey", "--samples", "2", "--scenario", str(flight))
     assert answer.exit_code == 1, answer.output
     assert "theorem_gains: the loop is unstable" in answer.output
 
@@ -486,7 +488,7 @@ def test_y_that_is_slower_than_law_counts_as_delay_and_may_be_three_messages_old
     ],
 )
 def test_an_invalid_loop_is_refused(option: str, value: str, expected: str) -> None:
-    result = rise_di("gains", "osprey", option, value)
+    result = rise_di("gains", "select", "osprey", option, value)
     assert isinstance(result.exception, ParameterError)
     assert str(result.exception) == expected
 

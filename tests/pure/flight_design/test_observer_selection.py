@@ -82,7 +82,7 @@ def Omega() -> FloatArray:  # noqa: N802 - the paper's name
 
 def test_shipped_scenarios_have_observer_that_command_writes(tmp_path: Path) -> None:
     path = tmp_path / "gains.yaml"
-    result = invoke("gains", "osprey", "--observer", "--write", path)
+    result = invoke("gains", "select", "osprey", "--observer", "--write", path)
     assert result.exit_code == 0, result.output
     assert "gains of a search in osprey_servo" in result.output
     section = yaml.safe_load(path.read_text())["/**/controller"]["ros__parameters"]
@@ -240,7 +240,6 @@ def test_models_that_do_not_fit_are_refused(monkeypatch: pytest.MonkeyPatch) -> 
             ["--model", "osprey"],
             "error: --model: found osprey, expected an observer too",
         ),
-        (["--observer", "--check"], "error: --observer: found --check beside it"),
         (
             ["--observer", "--margin", "0.9"],
             "error: --margin: found 0.9, expected 0 to 0.5 s",
@@ -251,7 +250,7 @@ def test_command_refuses_options_that_contradict_each_other(
     arguments: list[str], sentence: str
 ) -> None:
     with pytest.raises(ParameterError) as refused:
-        invoke("gains", "osprey", *arguments, catch_exceptions=False)
+        invoke("gains", "select", "osprey", *arguments, catch_exceptions=False)
     assert f"error: {refused.value}".startswith(sentence)
 
 

@@ -312,6 +312,7 @@ def test_command_shows_trade_and_writes_margins(tmp_path: Path) -> None:
     page = tmp_path / "loop.html"
     result = rise_di(
         "gains",
+        "select",
         "osprey",
         "--samples",
         "2",

@@ -104,8 +104,8 @@ def test_gains_take_the_loop_of_a_parameter_file(
 
     monkeypatch.setattr(gains, "select_gains", select)
     with refusing("stop"):
-        gains.Gains(airframe="osprey", px4=path).execute()
+        gains.Select(airframe="osprey", px4=path).execute()
     assert asked[0]["rate"] == 250.0
     assert asked[0]["delay"] == approx(0.00963, abs=1e-5)
     with refusing("px4: found --delay beside it"):
-        gains.Gains(airframe="osprey", px4=path, delay=0.01).execute()
+        gains.Select(airframe="osprey", px4=path, delay=0.01).execute()

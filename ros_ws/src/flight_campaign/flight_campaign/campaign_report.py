@@ -76,14 +76,14 @@ OVERVIEW_LEGEND = (
     "margin: of all inputs at once."
     " Nominal aircraft, and in parentheses the worst found by a search over the box of A and B; "
     "lags and delay are those of the controller's section. Uniform samples miss the corners of the "
-    "box: the distribution corners flies these, and rise-di gains --check --guarantee bounds every "
+    "box: the distribution corners flies these, and rise-di gains guarantee bounds every "
     "aircraft"
 )
 
 
 GUARANTEE_LEGEND = (
     "largest deviation of each entry of A and B, with u in time and no saturation, as "
-    "rise-di gains --check --guarantee has computed for this loop"
+    "rise-di gains guarantee has computed for this loop"
 )
 
 

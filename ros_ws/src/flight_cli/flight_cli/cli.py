@@ -20,7 +20,7 @@ from contextlib import suppress
 from keyword import iskeyword
 from pkgutil import resolve_name
 from types import MappingProxyType
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -59,7 +59,8 @@ GROUPS = MappingProxyType(
         "Design": {
             "airframes": "Show airframes and whether they meet the assumptions of the theorem, or "
             "make one of your own that flies.",
-            "gains": "Select gains for an airframe, and check every condition on them.",
+            "gains": "Select gains for an airframe, check those of a scenario, or bound them for "
+            "every aircraft.",
             "identify": "Identify an aircraft of JSBSim and write a scenario for it, or identify "
             "the model of an airframe from a log.",
             "learn": "Run the learner again on the log of a flight, with other settings if you "
@@ -85,6 +86,17 @@ GROUPS = MappingProxyType(
 
 The command `name` is the class `Name` of the module `flight_cli.name`. If the name is a keyword of
 Python, the module has an underscore behind it."""
+VERBS = MappingProxyType(
+    {
+        "gains": {
+            "select": "Select gains by Theorem 1 and by the engineering procedure.",
+            "check": "Check the gains of a scenario, of any law: margins and conditions.",
+            "guarantee": "Bound what holds for every aircraft within --uncertainty.",
+        },
+    }
+)
+"""The commands that are groups, and what each of their verbs does: `rise-di gains check` is the
+class `Check` of the module `flight_cli.gains`."""
 COMMANDS = MappingProxyType(dict(ChainMap(*GROUPS.values())))
 
 
@@ -107,27 +119,44 @@ def _options(
     """Fly, record and analyse RISE dynamic inversion."""
 
 
+def _group(**rules: Any) -> typer.Typer:
+    """Make a group of commands."""
+    return typer.Typer(
+        cls=RiseDiGroup,
+        no_args_is_help=True,
+        pretty_exceptions_enable=False,
+        context_settings={"help_option_names": ["--help", "-h"]},
+        **rules,
+    )
+
+
 def application(words: Collection[str]) -> typer.Typer:
     """Build the command line with those commands that occur among the words.
 
     All other commands only get their name and their help.
     """
-    app = typer.Typer(
-        cls=RiseDiGroup,
-        no_args_is_help=True,
-        pretty_exceptions_enable=False,
-        context_settings={"help_option_names": ["--help", "-h"]},
-        epilog="rise-di help COMMAND and rise-di COMMAND -h show the options of a command.",
+    app = _group(
+        epilog="rise-di help COMMAND and rise-di COMMAND -h show the options of a command."
     )
     app.callback()(_options)
     for group, commands in GROUPS.items():
         for name, sentence in commands.items():
             module = f"{name}_" if iskeyword(name) else name
-            command: Callable[..., None] = lambda: None  # noqa: E731 - for a command that does not run
-            if name in words:
-                command = as_function(resolve_name(f"flight_cli.{module}:{name.capitalize()}"))
-            help_text = None if name in words else sentence
-            app.command(name, help=help_text, rich_help_panel=group, cls=RiseDiCommand)(command)
+            verbs = VERBS.get(name, {})
+            # A command without verbs is itself what the module has.
+            target = _group() if verbs else app
+            for verb, meaning in (verbs or {name: sentence}).items():
+                command: Callable[..., None] = lambda: None  # noqa: E731 - for one that does not run
+                if name in words:
+                    command = as_function(resolve_name(f"flight_cli.{module}:{verb.capitalize()}"))
+                target.command(
+                    verb,
+                    help=None if name in words else meaning,
+                    rich_help_panel=None if verbs else group,
+                    cls=RiseDiCommand,
+                )(command)
+            if verbs:
+                app.add_typer(target, name=name, help=sentence, rich_help_panel=group)
     return app
 
 

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What `rise-di gains --check --guarantee` shows and writes."""
+"""What `rise-di gains guarantee` shows and writes."""
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,8 @@ from aircraft_sim.airframes.airframe import load_airframe
 from aircraft_sim.uncertainty import as_yaml, with_entries
 from flight_analysis.closed_loop.scenario import scenario_yaml
 from flight_analysis.closed_loop.scenario_library import find_scenario
-from flight_analysis.linear_loop.certificate import certificate, keep, unstated
+from flight_analysis.linear_loop import certificate as certificates
+from flight_analysis.linear_loop.certificate import keep, unstated
 from flight_analysis.linear_loop.delay_margin import MAX_DELAY_MARGIN
 from flight_analysis.linear_loop.guarantee import LARGEST, Guarantee, guarantee
 from flight_analysis.linear_loop.input_margins import disk_gain, disk_phase
@@ -41,37 +42,40 @@ FARTHER = 1.2  # times the deviations of the first unstable aircraft, so that it
 FORMS = (".3f", ".1f", ".1f", ".3f")  # formats of the columns of a guarantee
 
 
+def warn_of_controller_alone(scenario: str) -> None:
+    """Say which aircraft is taken beside a file that has a controller alone."""
+    if controller_alone(scenario) is not None:
+        others = f"commands and gusts of {COMMANDED}, lags and delay as it was told"
+        warn(f"note: {scenario} has a controller alone: {others}")
+
+
 def require_guarantee(
     *,
-    check: bool,
-    is_wanted: bool,
     airframe: str,
     scenario: str,
     late: float,
     entries: Sequence[str],
-    files: Mapping[str, Path | None],
+    worst: Path | None,
+    certificate: Path | None,
 ) -> None:
-    """Raise ParameterError for a guarantee without --check, or for its options without it."""
-    require(check or not is_wanted, "--guarantee", "no --check", "--check beside it")
-    require(check or not entries, "entry", "no --check", "--check beside it")
-    for name, path in files.items():
-        require(is_wanted or path is None, name, "no --guarantee", "--guarantee beside it")
-    require(is_wanted or late == 0.0, "late", "no --guarantee", "--guarantee beside it")
+    """Raise ParameterError for options that exclude each other, or that cannot be met."""
     as_number(late, "late", 0.0, MAX_DELAY_MARGIN, "s")
-    if check and controller_alone(scenario) is not None:
-        worst = files["worst"]
+    if controller_alone(scenario) is not None:
         require(worst is None, "worst", f"no aircraft in {scenario}", "a scenario that flies one")
-        others = f"commands and gusts of {COMMANDED}, lags and delay as it was told"
-        warn(f"note: {scenario} has a controller alone: {others}")
-    path = files["certificate"]
-    require(late == 0.0 or path is None, "certificate", f"--late {late:g} beside it", "u in time")
+    is_certified = certificate is not None
+    require(
+        late == 0.0 or not is_certified, "certificate", f"--late {late:g} beside it", "u in time"
+    )
     # The bounds of the checker are too coarse for the lags of most actuators.
     lags = [text for text in entries if text.startswith("1/")]
-    require(not lags or path is None, "certificate", f"{', '.join(lags)} beside it", "exact lags")
+    found = f"{', '.join(lags)} beside it"
+    require(not lags or not is_certified, "certificate", found, "exact lags")
     # These come before the proof, which can take minutes.
-    _require_worst(files["worst"], airframe, scenario)
-    fits = path is None or (os.access(path.parent, os.W_OK) and not is_folder(path))
-    require(fits, "certificate", path, "a file in a folder that can be written")
+    _require_worst(worst, airframe, scenario)
+    fits = certificate is None or (
+        os.access(certificate.parent, os.W_OK) and not is_folder(certificate)
+    )
+    require(fits, "certificate", certificate, "a file in a folder that can be written")
 
 
 def proved(loop: LinearLoop, late: float) -> Guarantee:
@@ -81,7 +85,7 @@ def proved(loop: LinearLoop, late: float) -> Guarantee:
     """
     for each in loop.differences:
         expected = "the aircraft of a linear loop for a guarantee"
-        require(each.standing is Standing.TAKEN, "--guarantee", each.fact, expected)
+        require(each.standing is Standing.TAKEN, "guarantee", each.fact, expected)
     promise = guarantee(loop, late)
     keep(promise)
     return promise
@@ -101,7 +105,7 @@ def write_certificate(
     require(promise.stable > 0.0, "--certificate", found, "a loop with a guarantee")
     frame = airframe_to_check(airframe, scenario_to_check(scenario))
     sources = certificate_sources(frame, scenario)
-    write_text("certificate", path, certificate(loop, promise, sources.texts))
+    write_text("certificate", path, certificates.certificate(loop, promise, sources.texts))
     return [f"certificate without constants: {sources.without}"] if sources.without else []
 
 

@@ -214,6 +214,15 @@ def refused_value(error: typer.BadParameter, command: str) -> ParameterError:
     return ParameterError(f"{key}: found {first['input']}, expected {expected}")
 
 
+def _path(ctx: Any) -> str:
+    """Return the command of a context as it is typed, rise-di in front."""
+    names = []
+    while ctx.parent is not None:
+        names.append(str(ctx.info_name))
+        ctx = ctx.parent
+    return " ".join(["rise-di", *reversed(names)])
+
+
 class RiseDiCommand(TyperCommand):
     """A command whose refusals name the option as the user types it."""
 
@@ -224,8 +233,8 @@ class RiseDiCommand(TyperCommand):
         for word, value in zip_longest(words, words[1:], fillvalue=""):
             name, equals, text = word.partition("=")
             if name.startswith("--") and name not in names:
-                mend = self._mend(name, names)
-                raise ParameterError(f"{name} is no option of rise-di {self.name}: {mend}")
+                mend = self._mend(name, names, _path(ctx))
+                raise ParameterError(f"{name} is no option of {_path(ctx)}: {mend}")
             folder = text if equals else value
             if name == "--runs" and folder.isdecimal() and not Path(folder).is_dir():
                 raise ParameterError(
@@ -235,12 +244,12 @@ class RiseDiCommand(TyperCommand):
         try:
             return super().parse_args(ctx, args)
         except TyperException as error:
-            raise refused_words(error, f"rise-di {self.name}", names) from None
+            raise refused_words(error, _path(ctx), names) from None
 
-    def _mend(self, name: str, names: Sequence[str]) -> str:
+    def _mend(self, name: str, names: Sequence[str], command: str) -> str:
         """Suggest what to type in place of an unknown option."""
         if name[2:] in names:
-            return f"give it without a name, rise-di {self.name} {name[2:].upper()}"
+            return f"give it without a name, {command} {name[2:].upper()}"
         near = [
             *(known for known in names if known.lower() == name.lower()),
             *get_close_matches(name, names, n=1, cutoff=ALIKE),
@@ -249,7 +258,7 @@ class RiseDiCommand(TyperCommand):
         if near:
             return f"did you mean {near[0]}?"
         key = ", or set a key of the scenario, --set SECTION.KEY=VALUE" * ("--set" in names)
-        return f"rise-di {self.name} --help lists them{key}"
+        return f"{command} --help lists them{key}"
 
     def invoke(self, ctx: Any) -> Any:
         """Call the function. A ParameterError names the option in place of the field."""
@@ -265,7 +274,7 @@ class RiseDiCommand(TyperCommand):
 
 def without_help_word(words: Sequence[str]) -> list[str]:
     """Return the words with the option --help in place of a first word `help`."""
-    return [*words[1:2], "--help"] if [*words[:1]] == ["help"] else [*words]
+    return [*words[1:], "--help"] if [*words[:1]] == ["help"] else [*words]
 
 
 class RiseDiGroup(TyperGroup):
@@ -280,13 +289,13 @@ class RiseDiGroup(TyperGroup):
         try:
             return super().parse_args(ctx, args)
         except TyperException as error:
-            raise refused_words(error, "rise-di", names) from None
+            raise refused_words(error, _path(ctx), names) from None
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Return the command of a word. Raises ParameterError if there is none of that name."""
         word = args[0]
         if word not in self.commands and not ctx.resilient_parsing:
             near = get_close_matches(word, self.commands, n=1, cutoff=ALIKE_COMMANDS)
-            mend = f"did you mean {near[0]}?" if near else "rise-di --help lists them"
-            raise ParameterError(f"{word} is no command of rise-di: {mend}")
+            mend = f"did you mean {near[0]}?" if near else f"{_path(ctx)} --help lists them"
+            raise ParameterError(f"{word} is no command of {_path(ctx)}: {mend}")
         return super().resolve_command(ctx, args)

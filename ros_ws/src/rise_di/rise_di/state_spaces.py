@@ -34,7 +34,7 @@ class LinearSystems(NamedTuple):
 def linear_systems(scenario: Scenario) -> LinearSystems:
     """Return the linear loop of a scenario for python-control: plant, law, and both closed.
 
-    The margins of `margins` and of `rise-di gains --check` are those of this loop, at y_m = 0 and
+    The margins of `margins` and of `rise-di gains check` are those of this loop, at y_m = 0 and
     inside all limits. With an allocation, `u_NAME` are the channels of the law.
 
     Args:

@@ -285,7 +285,7 @@ class RiseDiConfig(ControllerConfig):
             return
         both = self.observer is not None and len(schedule.models) == len(("slow", "fast"))
         expected = (
-            "an observer with slow and fast, as rise-di gains --observer "
+            "an observer with slow and fast, as rise-di gains select --observer "
             "--speeds LOW,HIGH writes them"
         )
         require(

@@ -340,7 +340,7 @@ def late_u(scenario: Scenario, age: AgeMetrics | None) -> list[str]:
     return [
         (
             f"{late}, {designed}: {'more than' if late_past_margin > 0.0 else 'within'} the "
-            "margin; see rise-di gains --delay"
+            "margin; see rise-di gains select --delay"
         )
     ]
 

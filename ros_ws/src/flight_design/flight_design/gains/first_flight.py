@@ -83,7 +83,7 @@ def first_flight(
         shortfall,
         f"The airframe {airframe.name} at {V0:.6g} m/s: every channel, servos, noise{with_gusts}.",
         f"Lags, end stops, rates and noise are assumed: {assumed}",
-        f"rise-di gains {path} --scenario {scenario} --write gains.yaml",
+        f"rise-di gains select {path} --scenario {scenario} --write gains.yaml",
     ]
     aircraft = {
         "airframe": path,

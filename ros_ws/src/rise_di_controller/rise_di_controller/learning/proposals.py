@@ -41,7 +41,7 @@ DESIGNED = frozenset(
         "schedule",
     }
 )
-"""Parameters, or groups of them, that a proposal may change: what `rise-di gains --observer`
+"""Parameters, or groups of them, that a proposal may change: what `rise-di gains select --observer`
 designs at every speed."""
 
 OPTIONAL = ("feedforward.inputs", "feedforward.gravity", "feedforward.deviation")
