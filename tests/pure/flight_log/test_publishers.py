@@ -123,6 +123,25 @@ def test_own_messages_without_a_usable_stamp_still_count(tmp_path: Path) -> None
     assert len(tape["y"].stamp_ns) == 951
 
 
+@pytest.mark.parametrize("lost", [0.1, 0.3, 0.5, 0.8])
+def test_sensor_that_drops_samples_in_lockstep_is_no_step_of_the_clock(
+    lost: float, tmp_path: Path
+) -> None:
+    """An instant without a sample has a message without channels, which is shorter.
+
+    The flight is ten times as fast as the reception.
+    """
+    is_lost = np.random.default_rng(1).random(2001) < lost
+    sent = flight(duration=20, since_ns=0, log=lambda ns: EPOCH + ns // 10)
+    for k, message in enumerate(sent):
+        number = message.number - 1
+        if message.topic == "y" and is_lost[number]:
+            sent[k] = message._replace(data=vector(10 * MS * number, (), [], OWN["y"]))
+    tape = written(tmp_path, sent)
+    assert tape["y"].stamp_ns.tolist() == (10 * MS * np.flatnonzero(~is_lost)).tolist()
+    assert (tape.recording["y"].step_ns, tape.recording["y"].unset) == (0, 0)
+
+
 @pytest.mark.parametrize("late", [0.106, 0.25, 0.6])
 @pytest.mark.parametrize("topic", ["u", "y"])
 def test_late_samples_are_no_step_of_the_clock(topic: str, late: float, tmp_path: Path) -> None:

@@ -87,7 +87,10 @@ class StampClock:
             jump_ns, is_ahead = self._jump_to(
                 int(stamps[first]), int(offsets[first]), has_time=bool(has_time[first])
             )
-            if after - first < (CONFIRMED_AT_END if is_last and end else CONFIRMED):
+            # The clock goes on, so that nothing is to be confirmed.
+            goes_on = bool(self._last_ns is not None and not (back | forth)[first] and not is_ahead)
+            is_short = after - first < (CONFIRMED_AT_END if is_last and end else CONFIRMED)
+            if is_short and not (goes_on and jump_ns >= 0):
                 if is_last and more and first > 0:
                     return self._taken(stamp_ns, keep[: places[first]], int(places[first]))
                 if jump_ns < -STRAY_NS or is_ahead:
