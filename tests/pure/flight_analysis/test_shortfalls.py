@@ -279,6 +279,13 @@ def test_fault_of_y_is_told(fault: Sample) -> None:
     assert outcome.status in {3, 4}
 
 
+def test_law_that_gets_no_y_in_time_never_flew() -> None:
+    """Each y is 0.15 s old, and `max_age` is 0.1 s."""
+    late = servo().vary(flight={"duration": 2.0}, aircraft={"sensors": {"delay": 0.15}})
+    outcome = rise_di.simulate(late).outcome
+    assert (outcome.status, str(outcome)) == (3, "never flew: the controller never engaged")
+
+
 def test_bounds_of_y_that_keep_the_law_from_flying_are_told() -> None:
     """Y beyond its bounds most of the time: the aircraft flies in trim."""
     narrow = servo().vary(controller={"y_max": [0.004, 0.004, 0.004, 0.08]})

@@ -9,7 +9,9 @@ from flight_analysis.closed_loop.learning_loop import Learn
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate as fly_in_memory
 from flight_analysis.report.account import account
+from flight_analysis.report.flight_outcome import NEVER_ENGAGED, has_ticks
 from flight_analysis.report.shortfalls import judge
+from flight_core.outcome import End
 from flight_core.tape import Tape
 from flight_guidance.guidance import Guidance
 from flight_guidance.params import GuidanceConfig
@@ -49,5 +51,8 @@ def simulate(
         ('completed', (51,))
     """
     tape = fly_in_memory(scenario, progress, guide, control, learn, announce)
-    flight_account = account(tape, scenario, tape.outcome)
-    return replace(tape, outcome=judge(tape.outcome, tape, scenario, flight_account))
+    outcome = tape.outcome
+    if outcome.end is End.COMPLETED and not has_ticks(tape):
+        outcome = NEVER_ENGAGED
+    flight_account = account(tape, scenario, outcome)
+    return replace(tape, outcome=judge(outcome, tape, scenario, flight_account))

@@ -14,6 +14,11 @@ from flight_core.tape import Tape
 NEVER_ENGAGED = never_flew("the controller never engaged")
 
 
+def has_ticks(tape: Tape) -> bool:
+    """Return whether the controller engaged, so that the log holds a u or a tick."""
+    return any(name in tape and len(tape[name].stamp_ns) for name in TICKS)
+
+
 def outcome_of_log(tape: Tape, scenario: Scenario, *, simulated: bool) -> Outcome:
     """Return the outcome of a flight that recorded none, as when nodes are started singly.
 
@@ -24,7 +29,7 @@ def outcome_of_log(tape: Tape, scenario: Scenario, *, simulated: bool) -> Outcom
     is_part = bool(lost_log_parts(tape.notes, planned=False)) or any(
         recording.step_ns for recording in tape.recording.values()
     )
-    if simulated and not {*TICKS} & {*tape.signals}:
+    if simulated and not has_ticks(tape):
         return UNKNOWN if is_part else NEVER_ENGAGED
     names = ("y", "y_m", "u") if simulated else ("y", "y_m")
     stamps = [tape[name].stamp_ns for name in names if name in tape]

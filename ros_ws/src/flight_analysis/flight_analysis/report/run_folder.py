@@ -28,7 +28,12 @@ from flight_analysis.closed_loop.scenario import (
     scenario_yaml,
 )
 from flight_analysis.report.account import Account, account
-from flight_analysis.report.flight_outcome import NEVER_ENGAGED, outcome_of_log, until_last_tick
+from flight_analysis.report.flight_outcome import (
+    NEVER_ENGAGED,
+    has_ticks,
+    outcome_of_log,
+    until_last_tick,
+)
 from flight_analysis.report.flown_models import FlownController, flown_controllers
 from flight_analysis.report.model_spans import parameter_spans
 from flight_analysis.report.sample_counts import is_real_time
@@ -230,8 +235,7 @@ def _flight(recorded: RecordedRun, run: Path, outcome: Outcome | None) -> Record
     log = _with_times_of_messages(recorded)
     engagements = recorded.engagements
     outcome = outcome or _previous_outcome(recorded, folder, scenario)
-    never_engaged = engagements is None and not {"u", "internals"} & set(log.signals)
-    if outcome.end is End.COMPLETED and never_engaged:
+    if outcome.end is End.COMPLETED and engagements is None and not has_ticks(log):
         outcome = NEVER_ENGAGED
     if "guidance" in log:
         require_channels(log["guidance"].names)
