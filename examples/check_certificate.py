@@ -614,6 +614,65 @@ def exact_entries(file: dict[str, Any]) -> list[str]:
     return exact
 
 
+# The rows of RISE_DI_PARAMETERS in the order in which C reads them, by the size without which they
+# are left out; = marks a number among the lists.
+ROWS = (
+    ("M", "digest= period_ns= max_age_ns= hold_ns= ramp_ns= slope_ns= deactivation_holds= sign="),
+    ("P", "order"),
+    ("M", "period= dt_least= dt_largest= K Lambda beta D input_scale omega eps y_max y_reach"),
+    ("M", "limits.lower limits.upper limits.rate"),
+    ("P", "T effect exchange stops.lower stops.upper stops.rate"),
+    ("SCHEDULE", "speed= airspeed time= V_least= V_largest="),
+    ("N", "A B C gravity inverse path_A path_gravity lead has_sine"),
+    ("S", "Phi Gamma H L F observer_limits.lower observer_limits.upper observer_limits.rate"),
+    ("S", "fade_rate="),
+)
+REAL = r"-?(?:0|[1-9]\d*)(?:\.\d+)?(?:e[+-]?\d+)?F?"
+LIST = rf"\{{{REAL}(?:, {REAL})*\}}"
+WORDS = r'"[^"\\?]*"(?:, "[^"\\?]*")*'
+# The lines of rise_di_parameters.h behind its first comment.
+LINES = "|".join(
+    (
+        r"|\}|#(?:ifndef|define) RISE_DI_PARAMETERS_H|#endif|#define RISE_DI_\w+ (?:\{ )?\\",
+        rf"#define RISE_DI_\w+ (?:{REAL}|{LIST}|{WORDS})(?: /\* [^*/\\?]* \*/)?",
+        rf"    /\* [\w.]+ \*/ (?:{REAL}|\{{?{LIST}\}}?),? \\",
+        rf"    \{{{WORDS}(?:, {REAL})*\}}(?:, \\)?",
+    )
+)
+
+
+def read_constants(constants: str) -> tuple[dict[str, str], dict[str, Array]]:
+    """Return the macros of rise_di_parameters.h and its rows, by their names.
+
+    Raises ValueError unless a C compiler reads the same: a second definition, a line that is left
+    out, a row elsewhere, or a name that is not that of its row would be constants of another law.
+    """
+    comment, _, body = constants.partition("\n */\n")
+    require("*/" not in comment, "constants", comment, "one comment before them")
+    require("\\" not in comment and "??" not in comment, "constants", comment, "plain words")
+    for line in body.split("\n"):
+        require(re.fullmatch(LINES, line) is not None, "constants", line, "a line of an export")
+    macros = re.findall(r"^#define (RISE_DI_\w+) ?(.*)$", body, re.MULTILINE)
+    define = dict(macros)
+    require(len(define) == len(macros), "constants", [*define], "each macro once")
+    block = body.partition("#define RISE_DI_PARAMETERS { \\\n")[2].partition("\n}\n")[0]
+    found = re.findall(r"^    /\* ([\w.]+) \*/ ([^\\]*?),? \\$", block, re.MULTILINE)
+    expected, rows = [], []
+    for size, names in ROWS:
+        if define[f"RISE_DI_{size}"].split()[0] == "0":
+            continue
+        for name in names.split():
+            is_list = not name.endswith("=")
+            opened, closed = is_list + name.endswith(".lower"), is_list + name.endswith(".rate")
+            expected.append((name.rstrip("="), opened, closed))
+    for name, row in found:
+        rows.append((name, row.count("{"), row.count("}")))
+    require(rows == expected, "constants", [row[0] for row in rows], "the rows of rise_di.h")
+    return define, {
+        name: np.array([float(x.strip(" {}F")) for x in row.split(",")]) for name, row in found
+    }
+
+
 def law_of(constants: str, inputs: int, size: int) -> tuple[dict[str, Any], float]:
     """Return the law of rise_di_parameters.h near e = 0, and how exact its numbers are.
 
@@ -623,23 +682,22 @@ def law_of(constants: str, inputs: int, size: int) -> tuple[dict[str, Any], floa
     with the states e_0, e_1, I, Pi, and those of an observer, z, u_o and the fade-in, which has
     ended. Raises ValueError if the text lacks these constants, or has other sizes.
     """
-    define = dict(re.findall(r"#define (RISE_DI_\w+) (.*)", constants))
-    begin = constants.find("#define RISE_DI_PARAMETERS {")
-    text = constants[begin : constants.find("\n\n", begin)] if begin >= 0 else ""
-    found = dict(re.findall(r"/\* ([\w.]+) \*/ ([^\\\n]*)", text))
     try:
-        known = {
-            name: np.array([float(x.strip(" {}").rstrip("F")) for x in row.split(",") if x.strip()])
-            for name, row in found.items()
-        }
-        K, Lambda, beta, D, scale, omega, eps = (
+        define, known = read_constants(constants)
+        gains = [
             known[name] for name in ("K", "Lambda", "beta", "D", "input_scale", "omega", "eps")
-        )
+        ]
+        sizes = {len(gain) for gain in gains} | {int(define["RISE_DI_M"].split()[0])}
+        require(len(sizes) == 1, "constants", sorted(sizes), "a value for each channel")
+        K, Lambda, beta, D, scale, omega, eps = gains
         T, sign, m = known["period_ns"][0] / 1e9, known["sign"][0], len(K)
-        s = round(len(known.get("Phi", ())) ** 0.5)
+        s = int(define["RISE_DI_S"].split()[0])
         one = EQUAL if define["RISE_DI_FLOAT32"].startswith("0 ") else FLOAT32
         tail = s + m + 1 if s else 0
         require((m, 4 * m + tail) == (inputs, size), "constants", m, "the inputs of the law")
+        steps = [known[name][0] for name in ("dt_least", "period", "dt_largest")]
+        is_step = steps[0] <= T <= steps[2] and abs(steps[1] - T) <= one * T
+        require(is_step, "constants", steps, "steps of one period")
         require(sign in {1, 2}, "constants sign", sign, "1 or 2, which are linear near e = 0")
         e_0, e_1, I_1, Pi, z, _, e = np.split(
             np.eye(4 * m + tail + m), np.cumsum([m, m, m, m, s, tail - s])

@@ -31,6 +31,7 @@ pytestmark = pytest.mark.slow
 Alter = Callable[[Content], Any]
 NAN, INF = math.nan, math.inf
 TOP = math.pi / 0.01  # rad/s, the highest frequency of a loop of 100 Hz
+LINE = "a line of an export"
 
 
 @pytest.fixture(scope="module")
@@ -192,6 +193,32 @@ def constants(old: str, new: str) -> Alter:
     return lambda content: content.update(constants=content["constants"].replace(old, new))
 
 
+def compiled(text: str) -> Alter:
+    """Constants with a text for their rows: {0} are the rows, {1} the same with other gains."""
+
+    def alter(content: Content) -> None:
+        header = content["constants"]
+        begin = header.index("#define RISE_DI_PARAMETERS {")
+        rows = header[begin : header.index("\n}\n", begin) + 3]
+        others = rows.replace("/* K */ {", "/* K */ {1")
+        content["constants"] = header.replace(rows, text.format(rows, others))
+
+    return alter
+
+
+def exchanged(pattern: str) -> Alter:
+    """Exchange the two groups of a pattern in the constants."""
+    return lambda content: content.update(
+        constants=re.sub(pattern, r"\2\1", content["constants"], count=1)
+    )
+
+
+def only_the_first(name: str) -> Alter:
+    """Leave out all but the first value of a row of the constants."""
+    pattern = rf"(/\* {name} \*/ \{{[\d.]+)[^}}]*"
+    return lambda content: content.update(constants=re.sub(pattern, r"\1", content["constants"]))
+
+
 def of_zeros(content: Content) -> None:
     drop("constants")(content)
     for key in "ABCD":
@@ -304,11 +331,26 @@ REFUSED: dict[str, tuple[Alter, str]] = {
     "an airframe of a number": (put(0, "airframe"), "SHA-256"),
     # the law beside its constants
     "another gain in the constants": (constants("/* K */ {", "/* K */ {1"), "law is not that"),
-    "a NaN in the constants": (constants("/* K */ {", "/* K */ {nan, "), "the inputs of the law"),
-    "a NaN as a gain": (constants("/* D */ {1.0", "/* D */ {nan"), "law is not that"),
-    "constants without a gain": (constants("/* Lambda */", "/* L */"), "found no"),
+    "a NaN in the constants": (constants("/* K */ {", "/* K */ {nan, "), LINE),
+    "a NaN as a gain": (constants("/* D */ {1.0", "/* D */ {nan"), LINE),
+    "constants without a gain": (constants("/* Lambda */", "/* L */"), "the rows of"),
     "the literal sign": (constants("/* sign */ 2", "/* sign */ 0"), "linear near e = 0"),
-    "constants of another rate": (constants("/* period_ns */ 1", "/* period_ns */ 2"), "law is"),
+    "constants of another rate": (constants("/* period_ns */ 1", "/* period_ns */ 2"), "steps of"),
+    "a step that is cut": (constants("0.11, ", "0.001, "), "steps of"),
+    # constants of which a compiler reads others
+    "rows that are left out": (compiled("#if 0\n{0}\n#endif\n{1}"), LINE),
+    "rows in a comment": (compiled("/*\n{0}*/\n{1}"), LINE),
+    "a definition behind": (compiled("{0}\n#undef RISE_DI_PARAMETERS\n{1}"), LINE),
+    "two definitions": (compiled("{0}\n{1}"), "each macro once"),
+    "a comment that ends early": (constants(" * SPDX", " */ int x; /* SPDX"), "one comment"),
+    "two rows exchanged": (exchanged(r"(    /\* K .*\n)(    /\* Lambda .*\n)"), "the rows of"),
+    "a name at another row": (
+        both(constants("/* K */", "/* x */"), constants("/* Lambda */", "/* K */")), "the rows of"
+    ),
+    "a number more before the gains": (constants("0.11, ", "0.11, 18.0, "), LINE),
+    "a list in place of a number": (constants("0.11, ", "{0.11}, "), "the rows of"),
+    "an octal number": (constants("/* sign */ 2", "/* sign */ 02"), LINE),
+    "a list of one value": (only_the_first("eps"), "a value for each channel"),
     "no constants in the text": (put("x", "constants"), "found no"),
     "an empty text": (put("", "constants"), "a text"),
     "constants of a number": (put(1, "constants"), "a text"),
