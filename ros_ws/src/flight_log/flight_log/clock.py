@@ -61,16 +61,15 @@ class StampClock:
         a gap.
         """
         latest = np.maximum.accumulate(np.append(self._last_ns or 0, stamp_ns))[:-1]
-        unset = (stamp_ns == 0) & (latest > STEP_NS)
         if self._step_ns:
             return self._taken(stamp_ns, self._after_step(stamp_ns), len(stamp_ns), 0)
-        places = np.flatnonzero(~unset)
+        keep = (stamp_ns != 0) | (latest <= STEP_NS)
+        places = np.flatnonzero(keep)
         stamps = stamp_ns[places]
-        offsets = stamp_ns[places] - log_ns[places]
+        offsets = stamps - log_ns[places]
         has_time = log_ns[places] != 0
-        before = stamps[:1] if self._last_ns is None else self._last_ns
         offset_before = offsets[:1] if self._last_ns is None else self._last_offset_ns
-        jumps = np.diff(stamps, prepend=before)
+        jumps = np.diff(stamps, prepend=stamps[:1] if self._last_ns is None else self._last_ns)
         leads = np.diff(offsets, prepend=offset_before)
         numbers = np.ones(len(stamps), dtype=np.int64) if steps is None else steps[places]
         back = (jumps < -STEP_NS) & ((numbers >= 0) | (np.abs(leads) > STEP_NS))
@@ -81,16 +80,15 @@ class StampClock:
         # Places where the messages of a clock begin.
         starts = np.flatnonzero(back | forth)
         edges = [0, *starts[starts > 0].tolist(), len(stamps)]
-        keep = ~unset
         for first, after in pairwise(edges if len(stamps) else []):
             is_last = after == len(stamps)
             jump_ns, is_ahead = self._jump_to(
                 int(stamps[first]), int(offsets[first]), has_time=bool(has_time[first])
             )
-            # The clock goes on, so that nothing is to be confirmed.
-            goes_on = bool(self._last_ns is not None and not (back | forth)[first] and not is_ahead)
+            # Nothing is to be confirmed if the clock goes on.
+            goes_on = self._last_ns is not None and jump_ns >= 0 and not is_ahead
             is_short = after - first < (CONFIRMED_AT_END if is_last and end else CONFIRMED)
-            if is_short and not (goes_on and jump_ns >= 0):
+            if is_short and not (goes_on and first not in starts):
                 if is_last and more and first > 0:
                     return self._taken(stamp_ns, keep[: places[first]], int(places[first]))
                 if jump_ns < -STRAY_NS or is_ahead:
