@@ -396,12 +396,12 @@ def test_wrong_samples_are_lost_as_by_controller(
             + (5.0 * rng.normal(size=4) if 400 <= k < 450 else 0.0)
         )
         y_m = y_m + (1e9 if k == 350 else 0.0)
-        for sentence, status in (
+        for refusal, status in (
             (python.take_y_m(StampedVector(now_ns, y_m), now_ns), c.take_y_m(now_ns, y_m, now_ns)),
             (python.take_y(StampedVector(now_ns, y), now_ns), c.take_y(now_ns, y, now_ns)),
         ):
-            assert status == (IMPLAUSIBLE if sentence else TAKEN)
-            count += bool(sentence)
+            assert status == (IMPLAUSIBLE if refusal else TAKEN)
+            count += refusal is not None
         output = python.tick(now_ns)
         u, mode = c.tick(now_ns)
         assert mode == (-1 if output is None else python.mode)

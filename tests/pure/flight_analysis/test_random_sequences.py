@@ -127,7 +127,7 @@ class Sequence:
         limits = self.parameters.effector_limits()
         late_ns = int(self.rng.integers(0, 10**6))
         output = controller.tick(self.now_ns, late_ns, active=self.active)
-        self.restarts += bool(controller.restarted())
+        self.restarts += controller.pop_restart_reason() is not None
         u = controller.state.command
         move = np.abs(u - state.command)
         assert np.isfinite(u).all()

@@ -22,7 +22,7 @@ from flight_analysis.report.linear_flight import error_pair
 from flight_analysis.report.shortfalls import judge
 from flight_analysis.report.tracking import saturation_notes
 from flight_core.modes import Mode
-from flight_core.outcome import COMPLETED, Aim, End, Outcome
+from flight_core.outcome import COMPLETED, Aim, End, Outcome, Refusal
 from flight_core.rates import seconds
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray, StampedVector
@@ -269,9 +269,9 @@ SENSORS: dict[str, Sample] = {
 @pytest.mark.parametrize("fault", SENSORS.values(), ids=SENSORS)
 def test_fault_of_y_is_told(fault: Sample) -> None:
     class Faulty(Controller):
-        def take_y(self, sample: StampedVector, now_ns: int) -> str:
+        def take_y(self, sample: StampedVector, now_ns: int) -> Refusal | None:
             sample_with_fault = fault(seconds(now_ns), sample)
-            return "" if sample_with_fault is None else super().take_y(sample_with_fault, now_ns)
+            return None if sample_with_fault is None else super().take_y(sample_with_fault, now_ns)
 
     outcome = rise_di.simulate(servo(), control=Faulty).outcome
     aims = {shortfall.aim for shortfall in outcome.shortfalls}
@@ -413,10 +413,10 @@ def test_error_before_a_late_engagement_hides_nothing() -> None:
     """The law engages 0.2 s late, and the flight is hardly longer than the part that is judged."""
 
     class Late(Controller):
-        def take_y(self, sample: StampedVector, now_ns: int) -> str:
+        def take_y(self, sample: StampedVector, now_ns: int) -> Refusal | None:
             t = seconds(now_ns)
             if t < 0.2:
-                return ""
+                return None
             if 2.0 <= t < 6.0:
                 wrong = sample.value * np.array([1.0, 1.0, -1.0, 1.0]) + 0.5
                 sample = sample._replace(value=wrong)

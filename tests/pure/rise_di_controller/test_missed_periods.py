@@ -41,7 +41,7 @@ def flown(lost: int) -> tuple[ControllerState, ControllerState, FloatArray]:
         before = controller.state
         controller.take_y_m(StampedVector(now_ns, y_m_at(k)), now_ns)
         if not LAST < k <= LAST + lost:
-            assert controller.take_y(StampedVector(now_ns, y[k]), now_ns) == ""
+            assert controller.take_y(StampedVector(now_ns, y[k]), now_ns) is None
         controller.tick(now_ns)
     return before, controller.state, y[-1]
 

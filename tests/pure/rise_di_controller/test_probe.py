@@ -15,7 +15,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_campaign.batch.batch import vehicle
-from flight_core.channels import LEAST_EFFECT, UNKNOWN, without_effect
+from flight_core.channels import LEAST_EFFECT, UNKNOWN, reason_against_inputs
 from flight_core.parameters import ParameterError
 from flight_core.rates import nanoseconds
 from flight_core.tape import Tape
@@ -50,9 +50,9 @@ def jammed(surface: str) -> Tape:
 def alarms(tape: Tape) -> list[tuple[float, str]]:
     """(t, sentence) of each test that finds an input without effect."""
     effects = tape["effects"]
-    sentences = (without_effect(effects.names, row) for row in effects.values.tolist())
-    rows = zip(tape.time("effects").tolist(), sentences, strict=True)
-    return [(t, sentence) for t, sentence in rows if sentence]
+    reasons = (reason_against_inputs(effects.names, row) for row in effects.values.tolist())
+    rows = zip(tape.time("effects").tolist(), reasons, strict=True)
+    return [(t, str(reason)) for t, reason in rows if reason]
 
 
 @pytest.mark.parametrize("surface", SURFACES)

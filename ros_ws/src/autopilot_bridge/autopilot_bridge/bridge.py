@@ -17,7 +17,7 @@ from autopilot_bridge.channel_map import to_channel, to_raw
 from autopilot_bridge.conditions import Conditions, Reading, joined_faults, staleness
 from autopilot_bridge.map_rows import InputRow, MeasuredRow, OutputRow
 from autopilot_bridge.params import ROUNDING, ChannelMap
-from flight_core.channels import without_effect
+from flight_core.channels import reason_against_inputs
 from flight_core.publisher_lock import PublisherLock
 from flight_core.rates import NANOSECONDS, nanoseconds, seconds
 from flight_core.text import sentences
@@ -153,9 +153,9 @@ class Bridge:
 
         An input without effect ends an engagement.
         """
-        stuck = without_effect(self.inputs, sample.value.tolist())
+        stuck = reason_against_inputs(self.inputs, sample.value.tolist())
         if stuck and self.phase is Phase.ENGAGED:
-            self.disengage(stuck, now_ns)
+            self.disengage(str(stuck), now_ns)
 
     def take_condition(self, name: str, raw: float, now_ns: int) -> None:
         """Take the field of a condition.

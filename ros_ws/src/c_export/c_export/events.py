@@ -19,6 +19,7 @@ from flight_analysis.closed_loop.replay_ticks import vary
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_core.modes import Mode
+from flight_core.outcome import Refusal
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS
 from flight_core.text import printable
@@ -155,31 +156,34 @@ class Recorder(Controller):
         self._refused = 0
         self._add(START)
 
-    def take_y(self, sample: StampedVector, now_ns: int) -> str:
+    def take_y(self, sample: StampedVector, now_ns: int) -> Refusal | None:
         """As the controller does, unless y is silent."""
         if "y" in self.silent:
-            return ""
+            return None
         self._add(TAKE_Y, now_ns, sample.stamp_ns, y=sample.value)
         return self._note_refusal(super().take_y, sample, now_ns)
 
-    def take_y_m(self, sample: StampedVector, now_ns: int) -> str:
+    def take_y_m(self, sample: StampedVector, now_ns: int) -> Refusal | None:
         """As the controller does, unless y_m is silent."""
         if "y_m" in self.silent:
-            return ""
+            return None
         self._add(TAKE_Y_M, now_ns, sample.stamp_ns, y_m=sample.value)
         return self._note_refusal(super().take_y_m, sample, now_ns)
 
     def _note_refusal(
-        self, take: Callable[[StampedVector, int], str], sample: StampedVector, now_ns: int
-    ) -> str:
+        self,
+        take: Callable[[StampedVector, int], Refusal | None],
+        sample: StampedVector,
+        now_ns: int,
+    ) -> Refusal | None:
         self._refused = 2 * self._refused % REFUSALS
         try:
-            reason = take(sample, now_ns)
+            refusal = take(sample, now_ns)
         except ChannelError:
             self._refused += 1
             raise
-        self._refused += bool(reason)
-        return reason
+        self._refused += refusal is not None
+        return refusal
 
     def retune_to(self, index: int) -> None:
         """Take the parameters of an index of `sets`."""

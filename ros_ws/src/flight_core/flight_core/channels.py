@@ -4,6 +4,8 @@
 
 from collections.abc import Sequence
 
+from flight_core.outcome import Refusal
+
 RATES_AND_SPEED = ("q", "V", "p", "r")
 """Channels of y, y_m and u_m in a guided flight: rad/s in body axes, and m/s from trim."""
 
@@ -36,13 +38,14 @@ LEAST_EFFECT = 0.4
 two thirds of the trim speed."""
 
 
-def without_effect(names: Sequence[str], effects: Sequence[float]) -> str:
-    """Name the inputs below LEAST_EFFECT in a sample of `effects`, in a sentence; "" if none."""
-    return "; ".join(
+def reason_against_inputs(names: Sequence[str], effects: Sequence[float]) -> Refusal | None:
+    """Refuse the inputs below LEAST_EFFECT in a sample of `effects`."""
+    stuck = [
         f"{name} does not answer the probe: it has at most {100.0 * effect:.0f} % of its effect"
         for name, effect in zip(names, effects, strict=True)
         if effect < LEAST_EFFECT
-    )
+    ]
+    return Refusal("; ".join(stuck)) if stuck else None
 
 
 POSE = ("phi", "theta", "psi", "north", "east", "altitude", "v_north", "v_east", "climb", "beta")

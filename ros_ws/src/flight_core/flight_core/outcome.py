@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The outcome of a flight as a record: end, reason and shortfalls.
+"""The outcome of a flight as a record: end, reason and shortfalls; and a reason as a value.
 
 The sentence and the exit status follow from the record, so that nothing has to be read back from a
 sentence.
@@ -78,6 +78,20 @@ class Shortfall:
     brief: str = ""
     times: float = 1.0
     figures: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """A reason against something: a sample, a model, an engagement, or going on.
+
+    `str` gives the sentence for the user. A function that finds no reason returns None.
+    """
+
+    sentence: str
+
+    def __str__(self) -> str:
+        """Return the sentence."""
+        return self.sentence
 
 
 @dataclass(frozen=True, kw_only=True)

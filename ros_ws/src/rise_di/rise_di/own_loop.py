@@ -20,7 +20,7 @@ from flight_analysis.report.shortfalls import judge
 from flight_core.arguments import as_number
 from flight_core.installation import require_package
 from flight_core.modes import Mode
-from flight_core.outcome import COMPLETED, FlightEnded
+from flight_core.outcome import COMPLETED, FlightEnded, Refusal
 from flight_core.parameters import require, require_channels
 from flight_core.rates import nanoseconds, period_ns, seconds
 from flight_core.tape import Signal, Tape
@@ -71,7 +71,7 @@ class Loop:
         self._now_ns = -1  # instant of the last tick
         # Output of the last tick; None if nothing is to be sent.
         self.output: ControlOutput | None = None
-        self.lost = ""  # why a sample of the last tick is lost; empty if none is
+        self.lost: Refusal | None = None  # why a sample of the last tick is lost, if one is
 
     @property
     def mode(self) -> Mode:
@@ -117,7 +117,7 @@ class Loop:
         )
         self._now_ns = now_ns
         before = self.lost
-        self.lost = ""
+        self.lost = None
         for key, value, take in (
             ("y", y, self._controller.take_y),
             ("y_m", y_m, self._controller.take_y_m),
@@ -127,12 +127,12 @@ class Loop:
                 self.lost = (
                     take(StampedVector(now_ns, self.vector(value, key, names)), now_ns) or self.lost
                 )
-        if self.lost and not before:
+        if self.lost is not None and before is None:
             warnings.warn(f"sample lost at t = {t:g} s: {self.lost}", RuntimeWarning, stacklevel=2)
         self.output = self._controller.tick(now_ns)
-        if restarted := self._controller.restarted():
+        if (reason := self._controller.pop_restart_reason()) is not None:
             warnings.warn(
-                f"the law engages again at t = {t:g} s: {restarted}", RuntimeWarning, stacklevel=2
+                f"the law engages again at t = {t:g} s: {reason}", RuntimeWarning, stacklevel=2
             )
         return self._controller.state.command.copy()
 

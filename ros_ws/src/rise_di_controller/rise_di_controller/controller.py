@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flight_core.modes import Mode
+from flight_core.outcome import Refusal
 from flight_core.parameters import require
 from flight_core.rates import seconds
 from flight_core.vectors import FloatArray, StampedVector, require_newer, require_not_future
@@ -95,7 +96,7 @@ class Controller:
         >>> controller = rise_di.Controller(rise_di.find_scenario("osprey_servo").controller)
         >>> sample = rise_di.StampedVector(10_000_000, np.zeros(4))
         >>> controller.take_y(sample, 10_000_000), controller.take_y_m(sample, 10_000_000)
-        ('', '')
+        (None, None)
         >>> controller.tick(10_000_000).u.tolist()
         [0.0, 0.0, 0.0, 0.0]
     """
@@ -119,7 +120,7 @@ class Controller:
         self._engaged_ns = 0
         self._vanes_moved = self._vanes_still = np.zeros(len(parameters.vanes), dtype=bool)
         self._samples: samples.SampleState | None = None  # None before the first y
-        self._restarted = ""  # why the law has engaged again by itself, as a sentence
+        self._restart_reason: Refusal | None = None  # why the law has engaged again by itself
         self._y: deque[StampedVector] = deque(maxlen=guard.SAMPLE_BUFFER_SIZE)
         self._y_m: deque[StampedVector] = deque(maxlen=guard.SAMPLE_BUFFER_SIZE)
 
@@ -266,7 +267,7 @@ class Controller:
     def _has_first_model(self, parameters: ControllerConfig) -> bool:
         return parameters.models() == self._first.models()
 
-    def take_y(self, sample: StampedVector, now_ns: int) -> str:
+    def take_y(self, sample: StampedVector, now_ns: int) -> Refusal | None:
         """Buffer a sample of y, in the law's order.
 
         A sample that no aircraft can give (`samples`) is lost: it counts as one that never arrived.
@@ -278,7 +279,7 @@ class Controller:
             now_ns: The clock, ns.
 
         Returns:
-            Why the sample is lost, as a sentence; empty if it is taken.
+            Why the sample is lost; None if it is taken.
 
         Raises:
             ChannelError: Reason "future": the stamp is more than the age limit ahead of the clock.
@@ -286,7 +287,8 @@ class Controller:
         """
         m = len(self._parameters.outputs)
         outputs = sample._replace(value=sample.value[:m])
-        if reason := self._lost(self._samples and self._samples.far, outputs, now_ns):
+        last_compared = self._samples and self._samples.far
+        if (reason := self._reason_against(outputs, last_compared, now_ns)) is not None:
             return reason
         if self._samples is None:
             self._samples = samples.first_state(outputs)
@@ -298,13 +300,13 @@ class Controller:
             if change is not samples.SampleChange.NEAR:
                 jump = samples.jump(last, outputs, self._parameters.outputs)
                 if change is samples.SampleChange.FAR:
-                    return jump
-                self._restarted = f"{jump}, and stays there"
+                    return Refusal(jump)
+                self._restart_reason = Refusal(f"{jump}, and stays there")
                 self.restart()
         self._y.append(sample)
-        return ""
+        return None
 
-    def take_y_m(self, sample: StampedVector, now_ns: int) -> str:
+    def take_y_m(self, sample: StampedVector, now_ns: int) -> Refusal | None:
         """Buffer a sample of y_m, (m,), as `take_y` does, except that y_m may jump.
 
         Args:
@@ -312,19 +314,22 @@ class Controller:
             now_ns: The clock, ns.
 
         Returns:
-            Why the sample is lost, as a sentence; empty if it is taken.
+            Why the sample is lost; None if it is taken.
 
         Raises:
             ChannelError: Reason "future": the stamp is more than the age limit ahead of the clock.
                 Reason "order": the stamp is not later than the stamp of the sample taken before.
         """
-        if reason := self._lost(self._y_m[-1] if self._y_m else None, sample, now_ns):
+        last = self._y_m[-1] if self._y_m else None
+        if (reason := self._reason_against(sample, last, now_ns)) is not None:
             return reason
         self._y_m.append(sample)
-        return ""
+        return None
 
-    def _lost(self, last: StampedVector | None, sample: StampedVector, now_ns: int) -> str:
-        """Say why a sample of m values is beyond the bounds; return "" if it is inside.
+    def _reason_against(
+        self, sample: StampedVector, last: StampedVector | None, now_ns: int
+    ) -> Refusal | None:
+        """Refuse a sample of m values that is beyond the bounds.
 
         Raises ChannelError if its stamp is in the future or not newer than the last.
         """
@@ -333,14 +338,13 @@ class Controller:
             require_newer(sample.stamp_ns, last.stamp_ns)
         return samples.bound_violation(sample.value, self._parameters.outputs, self._guard.samples)
 
-    def restarted(self) -> str:
-        """Say why the law has engaged again by itself since the last call, as a sentence.
+    def pop_restart_reason(self) -> Refusal | None:
+        """Return why the law has engaged again by itself since the last call.
 
-        Returns "" if it has not.
+        Returns None if it has not.
         """
-        sentence = self._restarted
-        self._restarted = ""
-        return sentence
+        reason, self._restart_reason = self._restart_reason, None
+        return reason
 
     def tick(self, now_ns: int, late_ns: int = 0, *, active: bool = True) -> ControlOutput | None:
         """Advance the controller by a tick at `now_ns`, which is `late_ns` after its deadline.
@@ -364,7 +368,7 @@ class Controller:
         # a step has a dt above 0, an engagement has 0
         if was_engaged and self._state.mode is Mode.ENGAGED and inputs.dt == 0.0:
             gap_ns = 0 if last is None else inputs.stamp_ns - last.stamp_ns
-            self._restarted = (
+            self._restart_reason = Refusal(
                 f"a gap of y of {seconds(gap_ns):g} s, longer than max_age"
                 if gap_ns > self._guard.longest_ns
                 else "u or the state of the law was not finite"

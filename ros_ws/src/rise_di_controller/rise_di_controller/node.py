@@ -11,8 +11,9 @@ from collections.abc import Callable, Sequence
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
 
-from flight_core.channels import without_effect
+from flight_core.channels import reason_against_inputs
 from flight_core.modes import Mode
+from flight_core.outcome import Refusal
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns, seconds
 from flight_core.text import bounded
 from flight_core.vectors import ChannelError, StampedVector
@@ -94,7 +95,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         self._internals_encoder = self.encoder(self._controller.names)
         self._publish_effects = self.advertise(EFFECTS) if self.parameters.probe else None
         self._effects_encoder = self.encoder(self.parameters.inputs)
-        self._stuck = ""  # the inputs without effect, as a sentence
+        self._stuck: Refusal | None = None  # the inputs without effect
         self._learning = self._new_learning()
         if self.parameters.lockstep:
             self._empty_encoder = self.encoder(())
@@ -187,7 +188,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
             self._warn_stale_inputs(now_ns)
 
     def _taking(
-        self, take: Callable[[StampedVector, int], str]
+        self, take: Callable[[StampedVector, int], Refusal | None]
     ) -> Callable[[StampedVector, int], None]:
         """Wrap `take` so that it raises ChannelError for a sample that is lost.
 
@@ -195,29 +196,27 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         """
 
         def taking(sample: StampedVector, now_ns: int) -> None:
-            if reason := take(sample, now_ns):
-                raise ChannelError("implausible", reason)
+            if (refusal := take(sample, now_ns)) is not None:
+                raise ChannelError("implausible", str(refusal))
 
         return taking
 
     def _tell_restart(self) -> None:
         """Log and count that the law has engaged again by itself, at most once in 2 s."""
-        if restarted := self._controller.restarted():
+        if (reason := self._controller.pop_restart_reason()) is not None:
             self._restarts += 1
-            self.get_logger().warning(
-                f"the law engages again: {restarted}", throttle_duration_sec=2.0
-            )
+            self.get_logger().warning(f"the law engages again: {reason}", throttle_duration_sec=2.0)
 
     def _tell_effects(self, output: ControlOutput) -> None:
         """Publish the effects of the inputs after a test, and log which inputs are stuck."""
         if output.effects is None or self._publish_effects is None:
             return
         self._publish_effects(self._effects_encoder.encode(output.stamp_ns, output.effects))
-        before = bool(self._stuck)
-        self._stuck = without_effect(self.parameters.inputs, output.effects.tolist())
-        if self._stuck:
-            self.get_logger().warning(self._stuck, throttle_duration_sec=5.0)
-        elif before:
+        before = self._stuck
+        self._stuck = reason_against_inputs(self.parameters.inputs, output.effects.tolist())
+        if self._stuck is not None:
+            self.get_logger().warning(str(self._stuck), throttle_duration_sec=5.0)
+        elif before is not None:
             self.get_logger().info("every probed input answers again")
 
     def _tell_vanes(self) -> None:
@@ -418,7 +417,8 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         else:
             still = {}
         restarts = {"restarts of the law": self._restarts}
-        effects = {"without effect": self._stuck or "none"} if self.parameters.probe else {}
+        stuck = "none" if self._stuck is None else str(self._stuck)
+        effects = {"without effect": stuck} if self.parameters.probe else {}
         return (
             level,
             mode.name,

@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flight_core import plausible
+from flight_core.outcome import Refusal
 from flight_core.rates import NANOSECONDS, seconds
 from flight_core.vectors import FloatArray, StampedVector
 
@@ -108,16 +109,15 @@ def sample_limits(
     return SampleLimits(bounds, reach, period_ns)
 
 
-def bound_violation(value: FloatArray, names: Sequence[str], limits: SampleLimits) -> str:
-    """Name the first of the m values that is NaN or beyond its bound, in a sentence.
-
-    Returns "" if all values are inside.
-    """
+def bound_violation(
+    value: FloatArray, names: Sequence[str], limits: SampleLimits
+) -> Refusal | None:
+    """Refuse the first of the m values that is NaN or beyond its bound."""
     is_inside = np.abs(value) <= limits.largest
     if is_inside.all():
-        return ""
+        return None
     i = int(np.argmin(is_inside))
-    return (
+    return Refusal(
         f"{names[i]} = {value[i]:g} is beyond {limits.largest[i]:g}, the bound of {names[i]} "
         "(controller.y_max)"
     )
@@ -130,10 +130,12 @@ def jump(before: StampedVector, sample: StampedVector, names: Sequence[str]) -> 
     return f"a jump of y in {seconds(sample.stamp_ns - before.stamp_ns):g} s: {moves}"
 
 
-def standstill(state: SampleState, sample: StampedVector) -> str:
-    """Describe the standstill of y, in a sentence."""
+def standstill(state: SampleState, sample: StampedVector) -> Refusal:
+    """Refuse a sample because y stands still."""
     span = seconds(sample.stamp_ns - state.stillness.since_ns)
-    return f"y: found every value as before for {span:g} s, expected an aircraft that moves"
+    return Refusal(
+        f"y: found every value as before for {span:g} s, expected an aircraft that moves"
+    )
 
 
 def first_state(sample: StampedVector) -> SampleState:
