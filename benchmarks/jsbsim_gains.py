@@ -132,7 +132,7 @@ def main() -> None:
             row += [
                 verdict(selection),
                 *figures(identified),
-                identified.failure or "completed",
+                str(identified.failure or "completed"),
                 verdict(more),
             ]
             print(", ".join(row), file=sys.stderr)

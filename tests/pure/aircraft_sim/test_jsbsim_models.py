@@ -367,13 +367,13 @@ def test_nearest_trim_is_the_first_neighbour_that_trims(monkeypatch: pytest.Monk
 
     monkeypatch.setattr(jsbsim_trim, "trim_solution", trims)
 
-    def near(speed: float, altitude: float) -> str:
+    def near(speed: float, altitude: float) -> str | None:
         return nearest_trim(FlightCondition("plane", speed, altitude, STEP_NS))
 
     assert near(25.0, 1000.0) == "it trims at 27.5 m/s and 1000 m"
     assert near(22.0, 1000.0) == "it trims at 29.7 m/s and 1000 m"
     assert near(40.0, 5000.0) == "it trims at 40 m/s and 2500 m"
-    assert near(15.0, 1000.0) == ""
-    assert near(40.0, 9000.0) == ""
+    assert near(15.0, 1000.0) is None
+    assert near(40.0, 9000.0) is None
     # A refusal waits for at most six conditions.
     assert max(seconds) <= 3.0

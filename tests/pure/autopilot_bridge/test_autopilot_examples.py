@@ -72,13 +72,15 @@ def test_copy_of_scenario_takes_the_airframe_beside(
 def test_identified_scenario_flies_under_guidance_where_map_has_a_pose(tmp_path: Path) -> None:
     text = (REPOSITORY / "examples" / "arduplane" / "scenario.yaml").read_text()
     path = tmp_path / "guided.yaml"
-    path.write_text(guided_scenario(text, load_map("ardupilot_mavlink"), 23.9))
+    written = guided_scenario(text, load_map("ardupilot_mavlink"), 23.9)
+    assert written is not None
+    path.write_text(written)
     guided = find_scenario(str(path))
     assert guided.guidance is not None
     assert guided.guidance.speed == 23.9
     assert guided.reference_model.pulses == {}
     assert guided.controller == find_scenario(str(REPOSITORY / EXAMPLE)).controller
-    assert guided_scenario(text, load_map(EXAMPLES["px4_quadrotor"]), None) == ""
+    assert guided_scenario(text, load_map(EXAMPLES["px4_quadrotor"]), None) is None
 
 
 def test_limits_of_u_beyond_those_of_map_refused_before_flight_that_sends() -> None:

@@ -26,6 +26,7 @@ from flight_analysis.closed_loop.scenario import Scenario, load_scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import best_error, error_metrics
+from flight_core.outcome import Refusal
 from flight_core.parameters import ParameterError
 from flight_core.tape import Signal, Tape
 from flight_core.units import GRAVITY
@@ -207,7 +208,7 @@ def test_channel_of_which_nothing_is_certain_refused(identified: Identified) -> 
     response = identified.response
     models = identified.models
     refusals = response._replace(
-        refusal=("", "V by thrust: found no movement, expected one", "", "")
+        refusal=(None, Refusal("V by thrust: found no movement, expected one"), None, None)
     )
     unusable = [*models[:1], None, *models[2:]]
     with refusing(r"^V by thrust: found no movement, expected one$"):

@@ -51,7 +51,7 @@ def test_signs_and_pairing_of_aircraft_found(cessna: IdentifiedAircraft) -> None
     # about a second.
     assert cessna.linear.lag[[0, 2, 3]] == approx([0.005] * 3, abs=1e-3)
     assert 0.5 < cessna.linear.lag[1] < 2.0
-    assert cessna.failure == ""
+    assert cessna.failure is None
 
 
 def test_margins_are_those_of_the_linear_aircraft(cessna: IdentifiedAircraft) -> None:

@@ -31,7 +31,7 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.linear_loop.loop_margins import linear_loop, loop_margins
 from flight_bringup.fly import fly_in_process
 from flight_core.modes import Mode
-from flight_core.outcome import COMPLETED
+from flight_core.outcome import COMPLETED, Refusal
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
@@ -40,7 +40,11 @@ from flight_design.gains.gain_design import selected_observer
 from flight_design.gains.observer_search import SelectedObserver
 from flight_design.identification.likelihood import Innovations
 from flight_design.identification.model_identification import Part
-from flight_design.identification.model_quality import Prediction, advantage, another_airframe
+from flight_design.identification.model_quality import (
+    Prediction,
+    advantage,
+    reason_against_airframe,
+)
 from flight_design.learning import learner as design_learner
 from flight_design.learning import part_checks
 from flight_design.learning.change_test import Change
@@ -322,7 +326,7 @@ def test_the_rough_model_flies_until_it_fell_back(monkeypatch: pytest.MonkeyPatc
     assert rough.feedforward.inputs is None  # of all parts
     assert made.model is None  # nothing is learned
     entry = Entry("B", "q", "elevator", 56.15, 0.1, 0.01, 56.15)
-    refused = lateral()._replace(refusal="none")
+    refused = lateral()._replace(refusal=Refusal("none"))
     unproven = lateral()._replace(outputs=("q", "V"), entries=(entry,))
     learned = unproven._replace(advantage=1.7)
     parts = [(unproven, refused), (learned, refused), (learned, refused)]
@@ -400,9 +404,11 @@ def test_advantage_has_the_probability_of_the_t_test_of_the_spans(begin: int) ->
 def test_entry_that_the_record_shows_at_its_bound_is_refused() -> None:
     """One that hardly shows, with half of its deviation before or more, may lie there."""
     hidden = Entry("B", "p", "rudder", 1.0, -0.6, 0.2, 1.0)
-    assert another_airframe([hidden], "osprey", allowed=1) == ""
+    assert reason_against_airframe([hidden], "osprey", allowed=1) is None
     shown = hidden._replace(deviation=0.06)
-    assert "found B[p, rudder] at a bound" in another_airframe([shown], "osprey", allowed=1)
+    assert "found B[p, rudder] at a bound" in str(
+        reason_against_airframe([shown], "osprey", allowed=1)
+    )
 
 
 def test_a_rougher_file_widens_the_bounds_of_the_search() -> None:
@@ -410,8 +416,10 @@ def test_a_rougher_file_widens_the_bounds_of_the_search() -> None:
     made = made_learner(scenario(learn={"prior": {"off": 0.58}}))
     assert made._believed.factor == approx(2.5**2)
     far = [Entry("B", "q", "elevator", 56.15, 3.0, 0.05, 56.15)]
-    assert "at a bound of the search, 0.4 or 2.5 times" in another_airframe(far, "osprey")
-    assert another_airframe(far, "osprey", factor=made._believed.factor) == ""
+    assert "at a bound of the search, 0.4 or 2.5 times" in str(
+        reason_against_airframe(far, "osprey")
+    )
+    assert reason_against_airframe(far, "osprey", factor=made._believed.factor) is None
 
 
 def test_model_with_coupling_is_not_replaced_by_one_of_a_part(
@@ -570,14 +578,14 @@ def test_effect_that_gusts_hide_does_not_replace_a_stronger_one() -> None:
         Entry("B", "V", "thrust", 6.0, 0.0, 0.01, 6.0),
     )
     part = lateral()._replace(outputs=("q", "V"), entries=effects, gusts=True)
-    assert part_checks.weaker(part, flown).startswith(
+    assert str(part_checks.reason_against_effects(part, flown)).startswith(
         "B[q, elevator]: found 70 % of that of the model that flies"
     )
     # a first model, one without gusts, and one that is within the deviation that is allowed
-    assert part_checks.weaker(part, None) == ""
-    assert part_checks.weaker(part._replace(gusts=False), flown) == ""
+    assert part_checks.reason_against_effects(part, None) is None
+    assert part_checks.reason_against_effects(part._replace(gusts=False), flown) is None
     near = effects[0]._replace(error=-0.09), effects[1]
-    assert part_checks.weaker(part._replace(entries=near), flown) == ""
+    assert part_checks.reason_against_effects(part._replace(entries=near), flown) is None
 
 
 @pytest.mark.parametrize("whiteness, refused", [(2.9, False), (3.1, True), (3.6, True)])
@@ -585,9 +593,9 @@ def test_part_with_coloured_innovations_is_refused_from_the_limit_on(
     whiteness: float, refused: bool
 ) -> None:
     """The limit is 3: a factor of 1.2 beyond it is refused as well."""
-    sentence = part_checks.not_white(lateral(whiteness=whiteness))
-    assert bool(sentence) is refused
-    assert not refused or sentence == (
+    refusal = part_checks.reason_against_innovations(lateral(whiteness=whiteness))
+    assert (refusal is not None) is refused
+    assert not refused or str(refusal) == (
         f"innovations of r: found a whiteness of {whiteness:g}, expected at most 3, 1 being white"
     )
 
@@ -605,7 +613,7 @@ def lateral(*, whiteness: float = 1.0, latest: float = 0.0) -> Part:
     before = Prediction(np.ones(2), np.full(2, 9.0), 1.0)
     after = Prediction(np.ones(2), np.array([1.0, whiteness]), 2.0)
     inputs = ("aileron", "rudder")
-    return Part(inputs, ("p", "r"), LATERAL, before, after, "", (latest, latest), gusts=False)
+    return Part(inputs, ("p", "r"), LATERAL, before, after, None, (latest, latest), gusts=False)
 
 
 def learner_that_finds(part: Part, monkeypatch: pytest.MonkeyPatch, **learn: Any) -> Learner:
@@ -720,10 +728,11 @@ def test_price_of_a_margin_that_is_asked_for_is_told() -> None:
     assert proposed.observer is not None
     assert proposed.observer.margin == 0.04
     sentence = r"^([\d.]+) times the error of 29 ms of delay margin, since 40 ms are asked for$"
+    assert price is not None
     times = re.search(sentence, price)
     assert times is not None, price
     assert 1.0 <= float(times[1]) < 1.5
-    assert made_learner(scenario())._designed(OSPREY, known, {})[1] == ""
+    assert made_learner(scenario())._designed(OSPREY, known, {})[1] is None
 
 
 def test_margin_that_is_asked_for_flies_where_that_of_the_file_has_no_design(
@@ -741,7 +750,7 @@ def test_margin_that_is_asked_for_flies_where_that_of_the_file_has_no_design(
     monkeypatch.setattr(made, "_design", only_asked)
     proposed, price = made._designed(OSPREY, known, {})
     assert proposed.observer is not None
-    assert (proposed.observer.margin, price) == (0.025, "")
+    assert (proposed.observer.margin, price) == (0.025, None)
 
 
 @pytest.mark.parametrize("latest", [(0.004, 0.05), (0.03, 0.004)])

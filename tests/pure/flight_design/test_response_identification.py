@@ -94,7 +94,8 @@ def test_only_time_in_which_u_acts_on_aircraft_counts() -> None:
 def test_input_that_hardly_moves_refused_with_excitation_that_it_needs() -> None:
     response = identified(*flown(2e-4))
     assert all(
-        "excite" in sentence and "times as strongly" in sentence for sentence in response.refusal
+        "excite" in sentence and "times as strongly" in sentence
+        for sentence in map(str, response.refusal)
     )
 
 

@@ -33,6 +33,7 @@ from flight_core.files import (
     write_file,
     writing,
 )
+from flight_core.outcome import Refusal
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Tape
@@ -43,13 +44,13 @@ from flight_design.identification.bridge_identification import (
     IdentifiedChannels,
     channel_models,
     channel_pairs,
-    cut_short,
     experiment,
     has_airspeed,
     join,
     map_text,
     measured_trims,
     over_link,
+    reason_against_experiment,
     require_envelope,
     within_range,
 )
@@ -86,11 +87,11 @@ class BridgeExperiment:
         self._require_fit(channel_map)
         console = Console(quiet=as_json)
         run = self._excite(console, channel_map) if self.log is None else self.log
-        tape, spans, end_sentence = _engaged(run, channel_map)
+        tape, spans, early_end = _engaged(run, channel_map)
         try:
             trims, response, channels = _identified(console, channel_map, tape, spans, self.speed)
         except ParameterError as error:
-            raise ParameterError(sentences(str(error), end_sentence)) from None
+            raise ParameterError(sentences(str(error), early_end)) from None
         channels = self._with_link(console, channel_map, channels, imported=COMMANDS in tape)
         channel_map, narrower = within_range(channel_map, trims)
         for sentence in narrower:
@@ -100,11 +101,11 @@ class BridgeExperiment:
         written_map = map_text(channel_map, trims, run.resolve().name)
         files = {"airframe": flyable.airframe, "scenario": flyable.scenario, "map": written_map}
         guidance_scenario = guided_scenario(flyable.scenario, channel_map, self.speed)
-        if guidance_scenario:
+        if guidance_scenario is not None:
             files["guided"] = guidance_scenario
         _write(self.folder, files)
         load_scenario(self.folder / "scenario.yaml")
-        if guidance_scenario:
+        if guidance_scenario is not None:
             load_scenario(self.folder / "guided.yaml")
         if as_json:
             print_json(_as_json(response, channels, flyable, trims, self.folder))
@@ -113,7 +114,7 @@ class BridgeExperiment:
         scenario = shlex.quote(str(self.folder / "scenario.yaml"))
         map_copy = shlex.quote(str(self.folder / "map.yaml"))
         say(console, f"to fly it: rise-di fly {scenario} --bridge {map_copy} --send")
-        if guidance_scenario:
+        if guidance_scenario is not None:
             path = shlex.quote(str(self.folder / "guided.yaml"))
             say(console, f"under guidance: {path} in its place")
 
@@ -182,13 +183,14 @@ class BridgeExperiment:
         return flyable
 
 
-def guided_scenario(scenario: str, channel_map: ChannelMap, speed: float | None) -> str:
+def guided_scenario(scenario: str, channel_map: ChannelMap, speed: float | None) -> str | None:
     """Write the scenario with guidance in place of its commands.
 
-    Returns "" if guidance cannot fly it, because the map lacks the pose, the rates or the airspeed.
+    Returns None if guidance cannot fly it, because the map lacks the pose, the rates or the
+    airspeed.
     """
     if speed is None or not channel_map.pose or not {*RATES_AND_SPEED} <= {*channel_map.outputs}:
-        return ""
+        return None
     content = parse_yaml(scenario.encode(), "scenario", "a scenario")
     commands = content["/**/reference_model"]["ros__parameters"]
     for key in ("pulses", "coordinated_turn"):
@@ -263,10 +265,11 @@ def _announce(console: Console, plan: Experiment, duration: float, *, hovers: bo
     )
 
 
-def _engaged(run: Path, channel_map: ChannelMap) -> tuple[Tape, list[tuple[int, int]], str]:
-    """Return the tape of an experiment, the spans in which it was engaged, ns, and how it ended.
+def _engaged(
+    run: Path, channel_map: ChannelMap
+) -> tuple[Tape, list[tuple[int, int]], Refusal | None]:
+    """Return the tape of an experiment, the engaged spans, ns, and why the bridge ended it early.
 
-    The sentence on the end is about an end that the bridge brought about early; otherwise it is "".
     A log of `rise-di import` is one single span. Raises ParameterError if the log has no
     engagement, or if the flight had feedback, because u then follows y.
     """
@@ -277,7 +280,7 @@ def _engaged(run: Path, channel_map: ChannelMap) -> tuple[Tape, list[tuple[int, 
     if COMMANDS in tape:
         require_map_of_import(channel_map, recorded_run)
         recorded_run.require("y", "u")
-        return tape, [(int(tape["u"].stamp_ns[0]), int(tape["u"].stamp_ns[-1]))], ""
+        return tape, [(int(tape["u"].stamp_ns[0]), int(tape["u"].stamp_ns[-1]))], None
     parameters = (
         None if recorded_run.scenario is None else recorded_parameters(recorded_run.scenario)
     )
@@ -298,13 +301,10 @@ def _engaged(run: Path, channel_map: ChannelMap) -> tuple[Tape, list[tuple[int, 
         (engagement.start_ns, engagement.stop_ns or int(tape["u"].stamp_ns[-1]))
         for engagement in engagements
     ]
-    return (
-        tape,
-        spans,
-        cut_short(engagements, parameters.duration)
-        if isinstance(parameters, ExcitationConfig)
-        else "",
-    )
+    early_end = None
+    if isinstance(parameters, ExcitationConfig):
+        early_end = reason_against_experiment(engagements, parameters.duration)
+    return tape, spans, early_end
 
 
 def _digits(value: float, digits: int) -> str:

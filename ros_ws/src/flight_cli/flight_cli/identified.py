@@ -158,7 +158,7 @@ def identified_as_json(aircraft: IdentifiedAircraft, path: Path) -> dict[str, An
         "without_effect": list(linear.still),
         "coupling": aircraft.coupling,
         "sideslip_zero": aircraft.sideslip_zero,
-        "lost": aircraft.failure,
+        "lost": str(aircraft.failure or ""),
         "delay_margin": aircraft.selection.engineering.delay_margin,
         "controller": aircraft.scenario().controller.model_dump(exclude_defaults=True),
         "flights": {title: flight._asdict() for title, flight in aircraft.flights.items()},

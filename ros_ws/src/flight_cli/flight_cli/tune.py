@@ -63,9 +63,9 @@ from flight_design.identification.model_identification import (
     with_entries,
 )
 from flight_design.identification.model_quality import (
+    NoBetter,
     best_known,
     excitation_factor,
-    no_better,
 )
 from flight_design.identification.own_loop import OwnLoop, own_loop
 from flight_design.identification.rates_log import rates_of_log, scaled_torques
@@ -229,8 +229,9 @@ class Tune:
         airframe = _kept(nominal, identification)
         if airframe is None:
             raise ParameterError(_what_to_fly(identification, scenario, self.log))
-        for part in filter(_refusal, identification.parts):
-            warn(f"warning: {', '.join(part.outputs)}: {_refusal(part)}")
+        for part in identification.parts:
+            if part.refusal is not None:
+                warn(f"warning: {', '.join(part.outputs)}: {part.refusal}; {_kept_model(part)}")
         uncertainty = _uncertainty(identification)
         taken_parts = tuple(filter(_is_better, identification.parts))
         identification = identification._replace(airframe=airframe, parts=taken_parts)
@@ -353,7 +354,7 @@ def _kept(nominal: Airframe, identification: Identification) -> Airframe | None:
     """
     used = []
     for part in identification.parts:
-        if part.refusal and part.refusal != no_better(part.before, part.after):
+        if part.refusal and not isinstance(part.refusal, NoBetter):
             return None
         used += [*part.entries] if _is_better(part) else []
     return with_entries(nominal, used)
@@ -364,12 +365,10 @@ def _is_better(part: Part) -> bool:
     return part.after.log_likelihood > part.before.log_likelihood
 
 
-def _refusal(part: Part) -> str:
-    """Say what speaks against a part and which of its models is used; "" if nothing does."""
-    if not part.refusal:
-        return ""
+def _kept_model(part: Part) -> str:
+    """Say which model of a refused part is used."""
     kept = "is taken, as the likelier one" if _is_better(part) else "stays nominal"
-    return f"{part.refusal}; the model {kept}"
+    return f"the model {kept}"
 
 
 def _uncertainty(identification: Identification) -> float:

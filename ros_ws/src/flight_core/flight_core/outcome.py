@@ -7,7 +7,7 @@ sentence.
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
@@ -92,6 +92,12 @@ class Refusal:
     def __str__(self) -> str:
         """Return the sentence."""
         return self.sentence
+
+
+def joined(refusals: Iterable[Refusal | None]) -> Refusal | None:
+    """Join the reasons that there are into one; return None if there is none."""
+    found = [str(refusal) for refusal in refusals if refusal is not None]
+    return Refusal("; ".join(found)) if found else None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -26,6 +26,6 @@ def bounded(text: str) -> str:
     return printable(text)
 
 
-def sentences(*parts: str) -> str:
-    """Join the parts that are not empty into one text."""
-    return "; ".join(filter(None, parts))
+def sentences(*parts: object) -> str:
+    """Join the parts that are neither None nor empty into one text; a reason is its sentence."""
+    return "; ".join(str(part) for part in parts if part)

@@ -8,6 +8,7 @@ import tempfile
 from functools import cache
 from itertools import chain
 from pathlib import Path
+from typing import NamedTuple
 
 import jsbsim
 import numpy as np
@@ -82,7 +83,6 @@ HIGHEST = (0.5, 1.0, 1.0, 1.0, 1.0, 0.5)
 # m/s^2, rad/s^2: a tenth of a degree of attitude.
 TOLERANCE = np.array([0.02, 0.02, 0.02, 0.002, 0.002, 0.002])
 
-NOT_BALANCED = "are left at best"  # words of a trim that the solver does not reach
 AXES_OF_RESIDUALS = ("forward", "sideways", "up or down", "in roll", "in pitch", "in yaw")
 NEIGHBOURS = ((0.9, 1.0), (1.1, 1.0), (0.75, 1.0), (1.35, 1.0), (1.0, 0.5), (0.75, 0.5))
 """Factors on speed and altitude to try if a condition has no trim, by distance."""
@@ -128,6 +128,16 @@ class _Log(jsbsim.FGLogger):
             self.last = (*self.last[-1:], " ".join(self._message.split()).rstrip("."))
 
 
+class Unbalanced(NamedTuple):
+    """A trim that the solver does not reach, with the sentence about what is left."""
+
+    sentence: str
+
+
+class NotBalanced(FlightEnded):
+    """Raised if the solver does not reach a trim; a condition near this one may have one."""
+
+
 @cache
 def trim_solution(condition: FlightCondition, timeout: float = TIMEOUT) -> TrimSolution:
     """Find the trim and make a short test flight in an isolated process.
@@ -139,6 +149,8 @@ def trim_solution(condition: FlightCondition, timeout: float = TIMEOUT) -> TrimS
         unknowns = isolated.call(solve_and_probe, *condition, timeout=timeout, foreign=foreign)
     except isolated.IsolatedCallError as error:
         raise FlightEnded(f"{condition.title} cannot be flown: JSBSim {error}") from None
+    if isinstance(unknowns, Unbalanced):
+        raise NotBalanced(unknowns.sentence)
     return None if unknowns is None else tuple(unknowns)
 
 
@@ -148,15 +160,17 @@ def solve_and_probe(
     altitude: float,
     step_ns: int,
     named: tuple[tuple[str, NamedProperties], ...] = (),
-) -> TrimSolution:
+) -> TrimSolution | Unbalanced:
     """Find and apply the trim, and fly with one command after the next moved by PROBE_SIZE.
 
-    Raises FlightEnded.
+    Raises FlightEnded, except for a trim that the solver does not reach.
     """
     condition = FlightCondition(
         name=name, speed=speed, altitude=altitude, step_ns=step_ns, named=named
     )
     solution = _solve_trim(condition)
+    if isinstance(solution, Unbalanced):
+        return solution
     fdm, _ = trimmed_fdm(condition, solution)
     try:
         for command in condition.commands().values():
@@ -235,14 +249,14 @@ def error_text(error: jsbsim.BaseError) -> str:
     return f"its model needs the property {missing[1]}, which JSBSim alone does not have"
 
 
-def _solve_trim(condition: FlightCondition) -> TrimSolution:
+def _solve_trim(condition: FlightCondition) -> TrimSolution | Unbalanced:
     """Find the trim: level, straight, sideslip 0, with the bank angle that this needs.
 
     JSBSim's own trim comes first. It assumes settled engines and flight control systems, so these
     get time in frozen flight, where everything runs except position, velocity and attitude. If
     JSBSim's trim fails, or does not last, a solver finds the six unknowns (alpha, throttle, pitch
     trim, aileron, rudder, bank) in frozen flight, where everything has settled. Raises FlightEnded
-    with one sentence if there is no trim.
+    with one sentence if there is no trim, unless the solver only does not reach one.
     """
     fdm = _load(condition)
     try:
@@ -251,7 +265,7 @@ def _solve_trim(condition: FlightCondition) -> TrimSolution:
         _require_effect(condition)
         nearest = np.inf
         residual = np.inf
-        problem = ""
+        problem: str | Unbalanced | None = None
         for settling, spin_up, by_elevator in ATTEMPTS:
             if spin_up == SLOW_SPIN_UP and residual > NEAR:
                 continue
@@ -264,17 +278,20 @@ def _solve_trim(condition: FlightCondition) -> TrimSolution:
             if _is_trimmed(attempt, condition):
                 return solution
             residual = float(np.max(np.abs(residuals(attempt)) / TOLERANCE))
-            if residual < nearest or not problem:
+            if residual < nearest or problem is None:
                 nearest = residual
                 problem = _trim_failure(attempt, condition)
             # A solver that ends far from a trim may have left numbers that are not finite.
             fdm = _load(condition)
     except jsbsim.BaseError as error:
         problem = error_text(error)
-    raise FlightEnded(
-        f"{condition.title} does not trim at {condition.speed:g} m/s and {condition.altitude:g} "
-        f"m: {problem}{hysteresis_of(foreign_model(condition.name))}"
+    begin = (
+        f"{condition.title} does not trim at {condition.speed:g} m/s and {condition.altitude:g} m: "
     )
+    end = hysteresis_of(foreign_model(condition.name))
+    if isinstance(problem, Unbalanced):
+        return Unbalanced(f"{begin}{problem.sentence}{end}")
+    raise FlightEnded(f"{begin}{problem}{end}")
 
 
 def _require_effect(condition: FlightCondition) -> None:
@@ -453,8 +470,8 @@ def _is_trimmed(fdm: jsbsim.FGFDMExec, condition: FlightCondition) -> bool:
     return inside and bool(np.all(np.abs(residuals(fdm)) <= TOLERANCE))
 
 
-def _trim_failure(fdm: jsbsim.FGFDMExec, condition: FlightCondition) -> str:
-    """Say why the solver's result is no trim, in a sentence."""
+def _trim_failure(fdm: jsbsim.FGFDMExec, condition: FlightCondition) -> str | Unbalanced:
+    """Say why the solver's result is no trim: an engine does not start, or what is left."""
     engines = range(engine_count(fdm))
     paths = command_paths(condition.commands()["throttle"], len(engines))
     idle = [fdm[path] < IDLE * at_one for path, at_one in paths]
@@ -475,8 +492,8 @@ def _trim_failure(fdm: jsbsim.FGFDMExec, condition: FlightCondition) -> str:
     ]
     at_stops = f", with {' and '.join(stopped_inputs)} beyond the stops" if stopped_inputs else ""
     idle_text = f"; engine {', '.join(stopped)} gives no thrust there" if stopped else ""
-    return (
-        f"accelerations of {linear:.2g} m/s^2 and {angular:.2g} rad/s^2 {NOT_BALANCED}, most "
+    return Unbalanced(
+        f"accelerations of {linear:.2g} m/s^2 and {angular:.2g} rad/s^2 are left at best, most "
         f"{axis}{at_stops}{idle_text}"
     )
 
@@ -490,11 +507,8 @@ def _engines_start(condition: FlightCondition) -> bool:
     )
 
 
-def nearest_trim(condition: FlightCondition) -> str:
-    """Name the nearest speed and altitude of NEIGHBOURS at which an aircraft trims, in words.
-
-    Returns "" if there is none.
-    """
+def nearest_trim(condition: FlightCondition) -> str | None:
+    """Name the nearest speed and altitude of NEIGHBOURS at which an aircraft trims, in words."""
     for speed, altitude in NEIGHBOURS:
         near = condition._replace(
             speed=speed * condition.speed, altitude=altitude * condition.altitude
@@ -504,4 +518,4 @@ def nearest_trim(condition: FlightCondition) -> str:
         except FlightEnded:
             continue
         return f"it trims at {near.speed:.4g} m/s and {near.altitude:.4g} m"
-    return ""
+    return None

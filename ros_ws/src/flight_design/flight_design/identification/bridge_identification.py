@@ -22,6 +22,7 @@ from autopilot_bridge.map_rows import UNITS
 from autopilot_bridge.params import ChannelMap
 from control_laws.excitation import ExcitationConfig
 from flight_core.files import dump_yaml
+from flight_core.outcome import Refusal, joined
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
@@ -189,10 +190,8 @@ def experiment(
 WHOLE = 0.95  # share of the planned duration; reports of the engagement are late by less than 5 %
 
 
-def cut_short(engagements: Sequence[Engagement], duration: float) -> str:
-    """When and why the bridge released before the end of an experiment, as a sentence.
-
-    Empty for a whole experiment.
+def reason_against_experiment(engagements: Sequence[Engagement], duration: float) -> Refusal | None:
+    """Say when and why the bridge released before the end of an experiment.
 
     Arguments: the engagements of the log; the planned duration, s.
     """
@@ -202,8 +201,8 @@ def cut_short(engagements: Sequence[Engagement], duration: float) -> str:
     ]
     length = max(lengths)
     if length > WHOLE * duration:
-        return ""
-    return (
+        return None
+    return Refusal(
         f"the bridge released after {length:.0f} of {duration:.0f} s: "
         f"{engagements[lengths.index(length)].reason}"
     )
@@ -303,8 +302,8 @@ def join(
             stiffness[i] = model.stiffness
             zero[i] = model.slow / model.Omega
             misfit[i] = model.misfit
-        elif response.refusal[i] or response.sign_ratio[i] < MIN_RATIO:
-            refusals.append(response.refusal[i] or response.sign_refusal(i))
+        elif refusal := response.refusal[i] or response.reason_against_sign(i):
+            refusals.append(refusal)
             continue
         else:
             Omega[i, i] = response.Omega[i, i]
@@ -316,7 +315,7 @@ def join(
             "the opposite: change `sign`",
         )
     if refusals:
-        raise ParameterError("; ".join(refusals))
+        raise ParameterError(str(joined(refusals)))
     return IdentifiedChannels(
         Omega=Omega,
         Omega_deviation=deviation,

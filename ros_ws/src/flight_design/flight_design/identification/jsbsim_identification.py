@@ -24,10 +24,10 @@ from aircraft_sim.jsbsim.jsbsim_aircraft import (
     require_aircraft,
 )
 from aircraft_sim.jsbsim.jsbsim_linearization import Linearization, linearize
-from aircraft_sim.jsbsim.jsbsim_trim import NOT_BALANCED, nearest_trim, trim_solution
+from aircraft_sim.jsbsim.jsbsim_trim import NotBalanced, nearest_trim, trim_solution
 from aircraft_sim.sections import Gust
 from flight_analysis.closed_loop.scenario import Scenario, parse_scenario
-from flight_core.outcome import COMPLETED, FlightEnded
+from flight_core.outcome import COMPLETED, FlightEnded, Refusal
 from flight_core.parameters import ParameterError
 from flight_core.rates import nanoseconds
 from flight_core.vectors import FloatArray, selection_matrix
@@ -132,22 +132,22 @@ class IdentifiedAircraft(NamedTuple):
         return _load(self.text)
 
     @property
-    def failure(self) -> str:
-        """Reason of a failure, or "".
+    def failure(self) -> Refusal | None:
+        """Why the aircraft does not fly.
 
-        Without a failure every flight completes, and in calm air the errors are below the commands.
+        It flies if every flight completes, and in calm air the errors are below the commands.
         """
         for title, flight in self.flights.items():
             if flight.outcome != str(COMPLETED):
-                return f"{title}: {flight.outcome}"
+                return Refusal(f"{title}: {flight.outcome}")
         pulses = self.scenario().reference_model.pulses.items()
         largest = HEIGHTS | {name: max(map(abs, pulse.value)) for name, pulse in pulses}
         too_large = [
             name for name, value in self.flights["calm"].rms.items() if not value < largest[name]
         ]
         if too_large:
-            return f"calm: the error of {', '.join(too_large)} is larger than the command"
-        return ""
+            return Refusal(f"calm: the error of {', '.join(too_large)} is larger than the command")
+        return None
 
 
 def identify_jsbsim(
@@ -244,9 +244,7 @@ def _linear(condition: FlightCondition, progress: Callable[[str], None]) -> Line
     progress("trim and linearisation")
     try:
         return linearize(condition)
-    except FlightEnded as error:
-        if NOT_BALANCED not in str(error):
-            raise
+    except NotBalanced as error:
         progress("trim beside the condition")
         nearest = nearest_trim(condition) or "no speed or altitude near it has a trim"
         raise FlightEnded(f"{error}; {nearest}") from None

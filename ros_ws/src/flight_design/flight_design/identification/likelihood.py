@@ -16,6 +16,7 @@ from aircraft_sim.atmosphere.disturbance import ROTARY
 from aircraft_sim.uncertainty import AIR_RELATIVE, gust_directions
 from control_laws.nominal_model import NominalModel
 from flight_analysis.closed_loop.learning_loop import Entry
+from flight_core.outcome import Refusal
 from flight_core.vectors import FloatArray
 from flight_design.identification.innovation_filters import (
     DRIFT,
@@ -495,8 +496,8 @@ class Likelihood:
             centred.append(entry._replace(error=error, deviation=entry.deviation / scale))
         return centred
 
-    def strange_air(self, fit: Fit) -> str:
-        """Name the state that the slope of the wind moves most, if the effect is at its bound.
+    def reason_against_air(self, fit: Fit) -> Refusal | None:
+        """Refuse a fit in which the effect of the slope of the wind on a state is at its bound.
 
         The wind then stands for a different aircraft.
         """
@@ -504,9 +505,9 @@ class Likelihood:
         bounds = self._upper[self._shear]
         at_bound = np.flatnonzero(effects >= bounds)
         if not len(at_bound):
-            return ""
+            return None
         names = " and ".join(SHEARED[k] for k in at_bound)
-        return (
+        return Refusal(
             f"air: found an effect of the slope of the vertical wind on {names} at a bound of the "
             f"search, {bounds[0]:.2g}, expected less"
         )

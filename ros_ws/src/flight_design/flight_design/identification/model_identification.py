@@ -21,6 +21,7 @@ from aircraft_sim.uncertainty import AIR_RELATIVE, as_yaml, wind_factors
 from control_laws.nominal_model import NominalModel
 from flight_analysis.closed_loop.learning_loop import Entry
 from flight_core.files import comment
+from flight_core.outcome import Refusal, joined
 from flight_core.parameters import require
 from flight_core.vectors import FloatArray
 from flight_design.gains.ideal_control import ChannelPairing
@@ -57,13 +58,13 @@ from flight_design.identification.model_quality import (
     MAX_WHITENESS,
     Prediction,
     advantage,
-    another_airframe,
     at_bound,
     correlation,
-    no_better,
-    other_signs,
     prediction,
-    too_little_excitation,
+    reason_against_airframe,
+    reason_against_excitation,
+    reason_against_prediction,
+    reason_against_signs,
 )
 
 # `correlation` from which innovations follow the u of another part: uncoupled aircraft have up to 3
@@ -82,7 +83,7 @@ class Part(NamedTuple):
     entries: tuple[Entry, ...]
     before: Prediction  # that of the nominal model
     after: Prediction
-    refusal: str  # why this part must not be used, one sentence; empty if it may
+    refusal: Refusal | None  # why this part must not be used
     latest: tuple[float, ...]  # s, the delay of each input plus two standard deviations
     gusts: bool  # whether a share of FEW or more of its seconds has gusts
     delays: tuple[float, ...] = ()  # s, the delay of each input
@@ -107,9 +108,9 @@ class Identification(NamedTuple):
         return tuple(chain.from_iterable(part.entries for part in self.parts))
 
     @property
-    def refusal(self) -> str:
-        """Why this model must not be used, one sentence for each part; empty if it may."""
-        return "; ".join(part.refusal for part in self.parts if part.refusal)
+    def refusal(self) -> Refusal | None:
+        """Why this model must not be used, one sentence for each part."""
+        return joined(part.refusal for part in self.parts)
 
 
 class _Study(NamedTuple):
@@ -146,14 +147,14 @@ class _Study(NamedTuple):
         entries = search.entries(fit)
         before = prediction(fit.before, self.validating)
         after = prediction(fit.after, self.validating)
-        sentences = (
-            self.is_beyond(search.about_centre(entries)),
-            search.strange_air(fit),
-            too_little_excitation(entries, outputs),
-            other_signs(self.airframe, with_entries(self.airframe, entries), self.channels),
-            no_better(before, after),
+        identified = with_entries(self.airframe, entries)
+        reasons = (
+            self.reason_against_airframe(search.about_centre(entries)),
+            search.reason_against_air(fit),
+            reason_against_excitation(entries, outputs),
+            reason_against_signs(self.airframe, identified, self.channels),
+            reason_against_prediction(before, after),
         )
-        refusal = next(filter(None, sentences), "")
         delays, deviations = search.delays(fit)
         gusts = bool(np.mean(LEVELS[fit.levels, 1] > 0.0) >= FEW)
         return Part(
@@ -162,7 +163,7 @@ class _Study(NamedTuple):
             entries=tuple(entries),
             before=before,
             after=after,
-            refusal=refusal,
+            refusal=next(filter(None, reasons), None),
             latest=tuple((delays + 2.0 * deviations).tolist()),
             gusts=gusts,
             delays=tuple(delays.tolist()),
@@ -195,16 +196,18 @@ class _Study(NamedTuple):
         for _ in range(AGAIN * self.searches_again):
             entries = search.about_centre(search.entries(fit))
             found = at_bound(entries, self.unknown.factor)
-            is_beyond = self.is_beyond(entries)
-            if not is_beyond or any(entry.matrix == "B" for entry in found):
+            is_inside = self.reason_against_airframe(entries) is None
+            if is_inside or any(entry.matrix == "B" for entry in found):
                 break
             also = None if flown is None else search.model_errors(flown)
             fit = search.fit_about(fit, used, also)
         return fit
 
-    def is_beyond(self, entries: Sequence[Entry]) -> str:
-        """Name the entries at a bound, if they are too many."""
-        return another_airframe(entries, self.airframe.name, self.bound_count, self.unknown.factor)
+    def reason_against_airframe(self, entries: Sequence[Entry]) -> Refusal | None:
+        """Refuse the airframe if too many entries are at a bound."""
+        return reason_against_airframe(
+            entries, self.airframe.name, self.bound_count, self.unknown.factor
+        )
 
     def fit(
         self,

@@ -1,11 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How well a model predicts held-out samples, and the reasons against a model.
-
-A reason is a sentence, or empty.
-"""
+"""How well a model predicts held-out samples, and the reasons against a model."""
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +12,7 @@ from scipy import stats
 
 from aircraft_sim.airframes.airframe import Airframe
 from flight_analysis.closed_loop.learning_loop import Entry
+from flight_core.outcome import Refusal
 from flight_core.vectors import FloatArray
 from flight_design.gains.ideal_control import ChannelPairing
 from flight_design.identification.likelihood import (
@@ -106,16 +105,16 @@ def best_known(entries: Iterable[Entry], outputs: Iterable[str]) -> list[Entry]:
     return best
 
 
-def too_little_excitation(entries: Iterable[Entry], outputs: Iterable[str]) -> str:
-    """Name the output whose inputs are known worst, if even its best known effect is uncertain.
+def reason_against_excitation(entries: Iterable[Entry], outputs: Iterable[str]) -> Refusal | None:
+    """Refuse the output whose inputs are known worst, if even its best known effect is uncertain.
 
-    An effect is uncertain if its deviation is above MAX_DEVIATION. Returns "" otherwise.
+    An effect is uncertain if its deviation is above MAX_DEVIATION.
     """
     worst = max(best_known(entries, outputs), key=lambda effect: effect.deviation)
     if worst.deviation <= MAX_DEVIATION:
-        return ""
+        return None
     factor = excitation_factor(worst)
-    return (
+    return Refusal(
         f"excitation of {worst.row}: found {worst.name} known to {100 * worst.deviation:.3g} %, "
         "expected"
         f" {100 * MAX_DEVIATION:.2g} %: {worst.row} needs {factor:.3g} times the amplitude, or "
@@ -145,10 +144,10 @@ def at_bound(entries: Iterable[Entry], factor: float = MAX_FACTOR) -> list[Entry
     return found
 
 
-def another_airframe(
+def reason_against_airframe(
     entries: Iterable[Entry], name: str, allowed: int = 0, factor: float = MAX_FACTOR
-) -> str:
-    """Name the entries at a bound of the search, if more than `allowed`; "" otherwise.
+) -> Refusal | None:
+    """Refuse the airframe of a name if more than `allowed` entries are at a bound of the search.
 
     A single one is too many if the record shows it, with at most half of its deviation before: then
     the aircraft lies beyond the bound.
@@ -156,8 +155,8 @@ def another_airframe(
     found = at_bound(entries, factor)
     is_shown = any(entry.deviation < PRIOR / 2.0 for entry in found)
     if len(found) <= allowed and not is_shown:
-        return ""
-    return (
+        return None
+    return Refusal(
         f"airframe {name}: found {', '.join(entry.name for entry in found)} at a bound of the "
         f"search, {1.0 / factor:.2g} or {factor:.2g} times the nominal value, expected a log of "
         "this airframe, in calm air if its effect of wind is not known"
@@ -169,8 +168,10 @@ def _minor_signs(Omega: FloatArray) -> list[float]:
     return [np.sign(np.linalg.det(Omega[:k, :k])) for k in range(1, len(Omega) + 1)]
 
 
-def other_signs(nominal: Airframe, identified: Airframe, channels: ChannelPairing) -> str:
-    """Refuse an identified model that gives the law another D; return "" if D stays.
+def reason_against_signs(
+    nominal: Airframe, identified: Airframe, channels: ChannelPairing
+) -> Refusal | None:
+    """Refuse an identified model that gives the law another D.
 
     D follows from the signs of the leading minors of C B.
     """
@@ -179,17 +180,24 @@ def other_signs(nominal: Airframe, identified: Airframe, channels: ChannelPairin
     before = _minor_signs((nominal.matrix_c() @ nominal.matrix_b())[order])
     after = _minor_signs((identified.matrix_c() @ identified.matrix_b())[order])
     if before == after:
-        return ""
-    return "C B: found other signs of its minors than in the nominal airframe, expected the same D"
+        return None
+    return Refusal(
+        "C B: found other signs of its minors than in the nominal airframe, expected the same D"
+    )
 
 
-def no_better(before: Prediction, after: Prediction) -> str:
-    """Say why a model predicts the held-out samples no better than before; "" if it does better.
+@dataclass(frozen=True)
+class NoBetter(Refusal):
+    """The only reason against a model is that it predicts no better than the nominal one."""
 
-    It also refuses a model whose innovations are neither white nor whiter than before.
+
+def reason_against_prediction(before: Prediction, after: Prediction) -> NoBetter | None:
+    """Refuse a model that predicts the held-out samples no better than before.
+
+    A model whose innovations are neither white nor whiter than before is refused, too.
     """
     if after.log_likelihood <= before.log_likelihood:
-        return (
+        return NoBetter(
             f"held-out samples: found a log-likelihood of {after.log_likelihood:.4g} a sample, "
             "expected more than the"
             f" {before.log_likelihood:.4g} of the nominal airframe, which explains this flight "
@@ -199,9 +207,9 @@ def no_better(before: Prediction, after: Prediction) -> str:
         np.sum(after.whiteness) >= np.sum(before.whiteness)
         and np.max(after.whiteness) > MAX_WHITENESS
     ):
-        return (
+        return NoBetter(
             "held-out samples: found innovations with a whiteness of "
             f"{np.mean(after.whiteness):.3g}, expected less than the"
             f" {np.mean(before.whiteness):.3g} of the nominal airframe"
         )
-    return ""
+    return None

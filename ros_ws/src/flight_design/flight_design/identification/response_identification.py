@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from flight_core.outcome import Refusal
 from flight_core.parameters import require
 from flight_core.rates import NANOSECONDS, seconds
 from flight_core.tape import Signal
@@ -87,27 +88,27 @@ class Response(NamedTuple):
     lag_deviation: FloatArray  # (m,)
     delay: FloatArray  # (m,) s, from u to the stamp of y
     delay_deviation: FloatArray  # (m,)
-    refusal: tuple[str, ...]  # (m,) why Omega_ii must not be used, one sentence; empty if it may
+    refusal: tuple[Refusal | None, ...]  # (m,) why Omega_ii must not be used
     seconds: float  # how many seconds of the log were used
     share: FloatArray  # (m,) share of the motion that the excitation explains; 1 in open loop
     # (m,) response i to input i in standard errors; from MIN_RATIO on, the sign of Omega_ii is
     # certain
     sign_ratio: FloatArray
 
-    def sign_refusal(self, i: int) -> str:
-        """Say why the sign of Omega_ii is uncertain; "" if it is certain."""
+    def reason_against_sign(self, i: int) -> Refusal | None:
+        """Refuse the sign of Omega_ii if it is uncertain."""
         output = self.outputs[i]
         name = self.inputs[i]
         ratio = float(self.sign_ratio[i])
-        if ratio == 0.0 and self.refusal[i]:
+        if ratio == 0.0 and self.refusal[i] is not None:
             return self.refusal[i]
         if ratio >= MIN_RATIO:
-            return ""
+            return None
         uncertain = (
             f"{output} by {name}: found a response of {ratio:.1f} standard errors, "
             f"expected {MIN_RATIO:g} or more"
         )
-        return f"{uncertain}: {_more_excitation(name, ratio)}"
+        return Refusal(f"{uncertain}: {_more_excitation(name, ratio)}")
 
 
 def identify_response(
@@ -430,12 +431,14 @@ def _responses(
             inputs[j]: [part.u[:, j] for part in rows],
             outputs[j]: [part.y[:, j] for part in rows],
         }
-        still = next((name for name, parts in recorded.items() if not _moves(parts)), "")
-        usable = not still and bool(np.isfinite(responses[..., j]).all())
+        still = next((name for name, parts in recorded.items() if not _moves(parts)), None)
+        usable = still is None and bool(np.isfinite(responses[..., j]).all())
         columns.append(
             fitted_column(t, responses[..., j], j) if usable else no_column(len(outputs))
         )
-        refusal.append(_refusal(outputs[j], inputs[j], columns[-1], j, still, float(share[j])))
+        refusal.append(
+            _reason_against_channel(outputs[j], inputs[j], columns[-1], j, still, float(share[j]))
+        )
     lag, lag_deviation, delay, delay_deviation, sign_ratio = (
         np.array([getattr(column, name) for column in columns])
         for name in ResponseColumn._fields[2:]
@@ -458,26 +461,26 @@ def _responses(
     )
 
 
-def _refusal(
-    output: str, name: str, column: ResponseColumn, j: int, still: str, share: float
-) -> str:
-    if still:
-        return f"{output} by {name}: found {still} constant, expected it to move"
+def _reason_against_channel(
+    output: str, name: str, column: ResponseColumn, j: int, still: str | None, share: float
+) -> Refusal | None:
+    if still is not None:
+        return Refusal(f"{output} by {name}: found {still} constant, expected it to move")
     if not np.isfinite(column.Omega[j]):
-        return (
+        return Refusal(
             f"{output} by {name}: found a response that grows beyond all bounds, expected a "
             "flight that does not diverge"
         )
     if share < MIN_SHARE:
-        return f"{output} by {name}: {_too_little_share(output, name, share)}"
+        return Refusal(f"{output} by {name}: {_too_little_share(output, name, share)}")
     ratio = abs(column.Omega[j]) / column.deviation[j]
     if ratio >= MIN_RATIO:
-        return ""
+        return None
     inaccurate = (
         f"found Omega within {100.0 / max(ratio, 0.1):.0f} %, expected "
         f"{100.0 / MIN_RATIO:.0f} % or less"
     )
-    return f"{output} by {name}: {inaccurate}: {_more_excitation(name, ratio)}"
+    return Refusal(f"{output} by {name}: {inaccurate}: {_more_excitation(name, ratio)}")
 
 
 def _too_little_share(output: str, name: str, share: float) -> str:

@@ -211,9 +211,8 @@ def check_signs(
         if measured is None or effect is None or ratio is None:
             continue
         if ratio < MIN_RATIO:
-            uncertain.append(
-                f"the recorded flight does not show the sign of {name}: {measured.sign_refusal(i)}"
-            )
+            reason = measured.reason_against_sign(i)
+            uncertain.append(f"the recorded flight does not show the sign of {name}: {reason}")
         elif effect * mapped[i, i] < 0.0:
             sentences.append(
                 f"the recorded flight has {output}_dot {'rise' if effect > 0.0 else 'fall'} "

@@ -10,6 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from aircraft_sim.airframes.airframe import Airframe
+from aircraft_sim.airframes.airspeed import Exponents
+from flight_analysis.closed_loop.learning_loop import Entry
 from flight_core.rates import nanoseconds, seconds
 from flight_core.vectors import FloatArray
 from flight_design.identification.innovation_filters import FlightData
@@ -135,3 +137,25 @@ def steady_end(recorded: FlightData, airframe: Airframe) -> tuple[FlightData, fl
 def about(recorded: FlightData, airframe: Airframe, x: FloatArray, u: FloatArray) -> FlightData:
     """Return a record as deviations from a trim, x (n,) and u (m,) in the airframe's order."""
     return recorded._replace(y=recorded.y - airframe.matrix_c() @ x, u=recorded.u - u)
+
+
+def at_trim(
+    entries: tuple[Entry, ...], airframe: Airframe, powers: Exponents, ratio: float
+) -> tuple[Entry, ...]:
+    """Reduce entries at a ratio to the trim speed to this speed.
+
+    Their relative errors and deviations stay.
+    """
+    states = list(airframe.states)
+    columns = {"A": states, "B": list(airframe.inputs)}
+    factors = [
+        ratio
+        ** getattr(powers, entry.matrix)[
+            states.index(entry.row), columns[entry.matrix].index(entry.column)
+        ].item()
+        for entry in entries
+    ]
+    return tuple(
+        entry._replace(nominal=entry.nominal / factor, unit=entry.unit / factor)
+        for entry, factor in zip(entries, factors, strict=True)
+    )

@@ -17,8 +17,10 @@ import numpy as np
 from aircraft_sim.airframes.airframe import Airframe
 from aircraft_sim.airframes.airspeed import at_speed, exponents, level_flight
 from flight_analysis.closed_loop.learning_loop import Entry, LearnerResult
+from flight_core.outcome import Refusal, joined
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import nanoseconds, seconds
+from flight_core.text import sentences
 from flight_core.vectors import FloatArray
 from flight_design.gains.ideal_control import ChannelPairing
 from flight_design.gains.observer_search import SelectedObserver
@@ -39,7 +41,14 @@ from flight_design.learning.designs import (
     with_deviations,
     with_own_margin,
 )
-from flight_design.learning.flight_record import SPREAD, FlightRecord, Sample, about, steady_end
+from flight_design.learning.flight_record import (
+    SPREAD,
+    FlightRecord,
+    Sample,
+    about,
+    at_trim,
+    steady_end,
+)
 from flight_design.learning.part_checks import (
     DELAY_DEVIATION,
     change_sentence,
@@ -48,12 +57,12 @@ from flight_design.learning.part_checks import (
     forgotten_coupling,
     is_file_better,
     is_within,
-    not_white,
+    reason_against_delays,
+    reason_against_effects,
+    reason_against_first_model,
+    reason_against_innovations,
+    reason_against_part_alone,
     return_to_file,
-    too_late,
-    uncoupled,
-    unproven,
-    weaker,
     without_effect,
 )
 from rise_di_controller.learning.learned_channels import (
@@ -96,10 +105,10 @@ class Known(NamedTuple):
 class Verdict(NamedTuple):
     """What shall fly after an identification, and what is said about its parts."""
 
-    model: Airframe
+    model: Airframe  # the flown one itself if no part has another model
     known: dict[PartName, Known]
     sentences: list[str]
-    refusals: list[str]
+    refusals: list[Refusal]
     tried: Airframe  # the model, and what later samples must show to be better
 
 
@@ -243,17 +252,19 @@ class Learner:
             length > SHORTEST - self._record.period, "record", f"{length:.3g} s", f"{SHORTEST:g} s"
         )
         self.identification = self._identified()
-        sentences = without_effect(self._dead) if lost else []
         verdict = self._verdict(self.identification, lost=lost)
         self._tried = verdict.tried
         self._tried_ns = end_ns
-        sentences += verdict.sentences
-        if not sentences:
-            nothing = "each part flies the law of the start from before on"
-            return LearnerResult(None, "; ".join(verdict.refusals) or nothing)
-        sentences.append(self._adopt(verdict.model, verdict.known, self._dead))
+        # a proposal that was lost has to leave out the dead inputs again
+        leaves_out_again = lost and any(self._dead.values())
+        if verdict.model is self._model and not leaves_out_again:
+            nothing = Refusal("each part flies the law of the start from before on")
+            return LearnerResult(None, str(joined(verdict.refusals) or nothing))
+        left_out = without_effect(self._dead) if lost else []
+        price_text = self._adopt(verdict.model, verdict.known, self._dead)
         refused = [f"refused: {refusal}" for refusal in verdict.refusals]
-        return LearnerResult(self._last, "; ".join(filter(None, sentences + refused)))
+        told = sentences(*left_out, *verdict.sentences, price_text, *refused)
+        return LearnerResult(self._last, told)
 
     def _damaged(self, changes: Sequence[Change], end_ns: int) -> LearnerResult:
         """Decide what becomes of changed parts: one with a dead input flies without it at once.
@@ -277,15 +288,15 @@ class Learner:
             self._changed |= set(dead)
             losses = [f"{name} has no effect" for name in dead.values()]
             return LearnerResult(None, "; ".join([*losses, *weaker_parts, f"refused: {error}"]))
-        sentences = [*without_effect(dead), *weaker_parts, price_text]
-        return LearnerResult(self._last, "; ".join(filter(None, sentences)))
+        told = sentences(*without_effect(dead), *weaker_parts, price_text)
+        return LearnerResult(self._last, told)
 
     def _verdict(self, identified: Identification, *, lost: bool) -> Verdict:
         """Which parts of an identification shall fly."""
         known = dict(self._known)
         model = self._model
-        sentences = []
-        refusals = []
+        told = list[str]()
+        refusals = list[Refusal]()
         tried = list[Entry]()
         is_about_file = self._prior is self._rough
         flies_file = self._design_of_rough is not None
@@ -296,23 +307,26 @@ class Learner:
                 for outputs in self._dead
             ):
                 continue
-            if is_about_file and uncoupled(part, known) and is_file_better(part):
+            alone = reason_against_part_alone(part, known)
+            if is_about_file and alone and is_file_better(part):
+                alone = None
                 known = {}
                 model = self._rough
-                sentences.append(forgotten_coupling(part))
+                told.append(forgotten_coupling(part))
             is_learned = part.outputs in known and part.outputs not in self._changed
-            reason = part.refusal or not_white(part)
+            reason = part.refusal or reason_against_innovations(part)
             if is_learned and not lost:
-                reason = reason or weaker(part, model)
+                reason = reason or reason_against_effects(part, model)
             if not (reason or is_learned) and is_first:
-                reason = unproven(part, self._rough.name, flies=flies_file)
+                reason = reason_against_first_model(part, self._rough.name, flies=flies_file)
                 tried += part.entries
-            if refusal := uncoupled(part, known) or too_late(part, self._actuation.delay) or reason:
+            late = reason_against_delays(part, self._actuation.delay)
+            if refusal := alone or late or reason:
                 refusals.append(refusal)
                 if is_learned and is_about_file and is_file_better(part):
                     model = with_entries(model, entries_of_file(part))
                     del known[part.outputs]
-                    sentences.append(return_to_file(part, self._rough.name if flies_file else ""))
+                    told.append(return_to_file(part, self._rough.name if flies_file else None))
                 continue
             model = with_entries(model, part.entries)
             deviation = {
@@ -323,19 +337,19 @@ class Learner:
             known = {old: value for old, value in known.items() if not is_within(old, part.outputs)}
             latest = dict(zip(part.inputs, part.latest, strict=True))
             known[part.outputs] = Known(deviation, latest, part.delays)
-            sentences.append(effect_sentence(part))
+            told.append(effect_sentence(part))
         return Verdict(
             model=model,
             known=known,
-            sentences=sentences,
+            sentences=told,
             refusals=refusals,
             tried=with_entries(model, tried) if tried else model,
         )
 
     def _adopt(
         self, model: Airframe, known: dict[PartName, Known], dead: dict[PartName, str]
-    ) -> str:
-        """Design for a model, and take it as proposed: what `learn.margin` costs.
+    ) -> str | None:
+        """Design for a model, take it as proposed, and say what `learn.margin` costs.
 
         Raises ParameterError without a design.
         """
@@ -453,8 +467,10 @@ class Learner:
         )
         if not self._has_speeds:
             return identified
+        powers = exponents(self._rough, self._thrust)
         parts = (
-            part._replace(entries=self._at_trim(part.entries, ratio)) for part in identified.parts
+            part._replace(entries=at_trim(part.entries, self._rough, powers, ratio))
+            for part in identified.parts
         )
         return identified._replace(parts=tuple(parts))
 
@@ -472,23 +488,6 @@ class Learner:
     def _at_speed(self, model: Airframe, ratio: float) -> Airframe:
         """Return a model at a speed of `_steady`."""
         return at_speed(model, ratio, self._thrust) if self._has_speeds else model
-
-    def _at_trim(self, entries: tuple[Entry, ...], ratio: float) -> tuple[Entry, ...]:
-        """Reduce entries to the trim speed. Their relative errors and deviations stay."""
-        powers = exponents(self._rough, self._thrust)
-        states = list(self._rough.states)
-        columns = {"A": states, "B": list(self._rough.inputs)}
-        factors = [
-            ratio
-            ** getattr(powers, entry.matrix)[
-                states.index(entry.row), columns[entry.matrix].index(entry.column)
-            ].item()
-            for entry in entries
-        ]
-        return tuple(
-            entry._replace(nominal=entry.nominal / factor, unit=entry.unit / factor)
-            for entry, factor in zip(entries, factors, strict=True)
-        )
 
     def _changes(self, end_ns: int) -> list[Change]:
         """Find changes, over the last RECORD, in the parts that have a learned model.
@@ -529,7 +528,7 @@ class Learner:
 
     def _designed(
         self, model: Airframe, known: Mapping[PartName, Known], dead: Mapping[PartName, str]
-    ) -> tuple[RiseDiConfig, str]:
+    ) -> tuple[RiseDiConfig, str | None]:
         """Design the controller for a model, and say what `learn.margin` costs.
 
         Parts without a learned model have the law of the start, or the rough model while it flies.
@@ -543,7 +542,7 @@ class Learner:
             file = self._design_of_rough(without_learning)
             flying = set(start.outputs) - set(chain.from_iterable(dead))
         designed = without_learning
-        price_text = ""
+        price_text = None
         if file is not None and not known:
             designed = file.controller
         elif flying:
@@ -583,12 +582,12 @@ class Learner:
         parts: list[PartName],
         latest: Mapping[str, float],
         dead: Collection[str],
-    ) -> str:
-        """Say what `learn.margin` costs beside the margin of the file's loop; "" without either."""
+    ) -> str | None:
+        """Say what `learn.margin` costs beside the margin of the file's loop, if both are there."""
         start = self._controller
         settings = start.learn
         if settings is None or settings.margin is None or self._design_of_rough is None:
-            return ""
+            return None
         plain = start.model_copy(update={"learn": settings.model_copy(update={"margin": None})})
         without_learning = start.model_copy(update={"learn": None})
         file = self._design_of_rough(without_learning)
@@ -596,5 +595,5 @@ class Learner:
         try:
             beside = self._design(without_learning, model, kept)
         except ParameterError:  # what was asked for flies: there is nothing to compare with
-            return ""
+            return None
         return price(selected, settings.margin, beside, float(kept.margin.min()))

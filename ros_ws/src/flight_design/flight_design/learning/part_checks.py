@@ -8,6 +8,7 @@ import numpy as np
 
 from aircraft_sim.airframes.airframe import Airframe
 from flight_analysis.closed_loop.learning_loop import Entry
+from flight_core.outcome import Refusal
 from flight_design.identification.likelihood import MAX_DELAY_ERROR, PRIOR
 from flight_design.identification.model_identification import Part
 from flight_design.identification.model_quality import MAX_DEVIATION, MAX_WHITENESS, best_known
@@ -32,21 +33,21 @@ def change_sentence(change: Change) -> str:
     return f"{' and '.join(change.outputs)} changed, log-likelihood {change.gain:.3g}: {weakest}"
 
 
-def not_white(part: Part) -> str:
-    """Refuse the output with the least white innovations if it is above MAX_WHITENESS; else ""."""
+def reason_against_innovations(part: Part) -> Refusal | None:
+    """Refuse the output with the least white innovations if it is above MAX_WHITENESS."""
     worst = int(np.argmax(part.after.whiteness))
     white = float(part.after.whiteness[worst])
     if white <= MAX_WHITENESS:
-        return ""
+        return None
     name = part.outputs[worst]
-    return (
+    return Refusal(
         f"innovations of {name}: found a whiteness of {white:.3g}, expected at most "
         f"{MAX_WHITENESS:g}, 1 being white"
     )
 
 
-def too_late(part: Part, delay: float) -> str:
-    """Refuse a part whose inputs are as late as the search goes; return "" for any other.
+def reason_against_delays(part: Part, delay: float) -> Refusal | None:
+    """Refuse a part whose inputs are as late as the search goes.
 
     The search starts from the known `delay` of the loop, s.
     """
@@ -57,8 +58,8 @@ def too_late(part: Part, delay: float) -> str:
         if delay >= bound - 1e-6  # s, of rounding
     ]
     if not late:
-        return ""
-    return (
+        return None
+    return Refusal(
         f"{' and '.join(late)}: found u {1e3 * bound:.0f} ms late or later, expected less: a servo "
         "may be slower than its lag says"
     )
@@ -72,7 +73,7 @@ def is_file_better(part: Part) -> bool:
     return part.advantage < -LIKELIER
 
 
-def unproven(part: Part, name: str, *, flies: bool) -> str:
+def reason_against_first_model(part: Part, name: str, *, flies: bool) -> Refusal | None:
     """Refuse a first model that has not proved itself beside the airframe of a name.
 
     The model was chosen on the record up to then, so only later samples count. Against a file that
@@ -81,22 +82,24 @@ def unproven(part: Part, name: str, *, flies: bool) -> str:
     """
     limit = LIKELIER if flies else -LIKELIER
     if part.advantage == 0.0:
-        return f"{' and '.join(part.outputs)}: a first model, which later seconds have to prove"
+        return Refusal(
+            f"{' and '.join(part.outputs)}: a first model, which later seconds have to prove"
+        )
     if part.advantage > limit:
-        return ""
-    return (
+        return None
+    return Refusal(
         f"{' and '.join(part.outputs)}: found an advantage over the airframe {name} of "
         f"{part.advantage:.2g} standard deviations in the seconds since the model before, "
         f"expected more than {limit:g}"
     )
 
 
-def return_to_file(part: Part, name: str) -> str:
+def return_to_file(part: Part, name: str | None) -> str:
     """Say what flies after the airframe file predicted better than the model that flew.
 
-    That is the airframe of a name, or the law of the start.
+    That is the airframe of a name, or the law of the start if the name is None.
     """
-    flies = f"the airframe {name} as it is" if name else "the law of the start"
+    flies = "the law of the start" if name is None else f"the airframe {name} as it is"
     return f"{' and '.join(part.outputs)} by {flies}: {_file_advantage(part)}"
 
 
@@ -109,11 +112,11 @@ def entries_of_file(part: Part) -> tuple[Entry, ...]:
     return tuple(entry._replace(error=0.0) for entry in part.entries)
 
 
-def uncoupled(part: Part, known: Iterable[tuple[str, ...]]) -> str:
-    """Refuse a part alone if the flown model couples it with another; return "" otherwise."""
+def reason_against_part_alone(part: Part, known: Iterable[tuple[str, ...]]) -> Refusal | None:
+    """Refuse a part alone if the flown model couples it with another."""
     if not any(is_within(part.outputs, outputs) for outputs in known if outputs != part.outputs):
-        return ""
-    return (
+        return None
+    return Refusal(
         f"{' and '.join(part.outputs)}: found no model with coupling, expected one, as that "
         "which flies"
     )
@@ -124,24 +127,24 @@ def forgotten_coupling(part: Part) -> str:
     return f"no coupling any more: {_file_advantage(part)}"
 
 
-def weaker(part: Part, flown: Airframe | None) -> str:
-    """Name the effect that gusts make weaker than in the model that flies, by MAX_DEVIATION.
+def reason_against_effects(part: Part, flown: Airframe | None) -> Refusal | None:
+    """Refuse the effect that gusts make weaker than in the model that flies, by MAX_DEVIATION.
 
     Gusts hide what the inputs do: the effects come out too weak, and a design with them too strong.
     """
     if flown is None or not part.gusts:
-        return ""
+        return None
     for entry in best_known(part.entries, part.outputs):
         share = (
             entry.value
             / flown.matrix_b()[flown.index(entry.row), list(flown.inputs).index(entry.column)]
         )
         if share < 1.0 - MAX_DEVIATION:
-            return (
+            return Refusal(
                 f"{entry.name}: found {100 * share:.0f} % of that of the model that flies, expected"
                 f" {100 * (1.0 - MAX_DEVIATION):g} % or more beside gusts, which hide effects"
             )
-    return ""
+    return None
 
 
 def effect_sentence(part: Part) -> str:
