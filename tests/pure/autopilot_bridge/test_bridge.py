@@ -24,7 +24,7 @@ from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_bringup import fly as flying
 from flight_bringup.fly import _follow_real_time, _Span, last
 from flight_bringup.interrupt import DeferredInterrupt, handle_signals, interrupt
-from flight_core.outcome import Outcome, ended_early
+from flight_core.outcome import Outcome, Refusal, ended_early
 from flight_core.rates import nanoseconds
 from flight_core.vectors import ChannelError, FloatArray, StampedVector
 
@@ -74,7 +74,7 @@ def ready_bridge(
 
 
 def engage(bridge: Bridge, t: float = 0.0, *, blind: bool = False) -> None:
-    assert bridge.engage(at(t), blind=blind) == ""
+    assert bridge.engage(at(t), blind=blind) is None
 
 
 def engaged_bridge(channel_map: ChannelMap = CHANNEL_MAP) -> Bridge:
@@ -95,7 +95,7 @@ def test_only_service_engages_and_only_with_fresh_y_and_u() -> None:
         ("q, p, r not received yet", receive_outputs),
         ("u not received yet", receive_u),
     ):
-        assert reason in bridge.engage(at(0.0))
+        assert reason in str(bridge.engage(at(0.0)))
         assert bridge.step(at(0.0)) is Phase.DISENGAGED
         receive(bridge, 0.0)
     assert bridge.step(at(0.0)) is Phase.DISENGAGED
@@ -107,14 +107,14 @@ def test_engagement_with_stale_inputs_refused_with_reason() -> None:
     bridge = new_bridge()
     receive_outputs(bridge, 0.0)
     receive_u(bridge, 0.3)
-    assert bridge.engage(at(0.3)).startswith("q, p, r are 0.30 s old (/ap/twist/filtered)")
+    assert str(bridge.engage(at(0.3))).startswith("q, p, r are 0.30 s old (/ap/twist/filtered)")
     receive_outputs(bridge, 0.6)
-    assert bridge.engage(at(0.6)) == "u is 0.30 s old"
+    assert str(bridge.engage(at(0.6))) == "u is 0.30 s old"
 
 
 def test_dry_run_computes_but_never_sends_or_engages() -> None:
     bridge = ready_bridge(0.1, dry_run=True)
-    assert bridge.engage(at(0.0)).startswith("dry_run")
+    assert str(bridge.engage(at(0.0))).startswith("dry_run")
     assert not bridge.sends("joy", at(0.0))
     assert bridge.raw_u()[0] == approx(0.1 / 0.523599)
 
@@ -122,14 +122,17 @@ def test_dry_run_computes_but_never_sends_or_engages() -> None:
 def test_dry_run_says_what_else_would_refuse_engagement() -> None:
     bridge = new_bridge(dry_run=True)
     receive_outputs(bridge, 0.0)
-    assert bridge.refusal(at(0.0)) == "dry_run is true: nothing is sent; u not received yet"
+    assert (
+        str(bridge.reason_against_engagement(at(0.0)))
+        == "dry_run is true: nothing is sent; u not received yet"
+    )
     receive_u(bridge, 0.0)
-    assert bridge.refusal(at(0.0)) == "dry_run is true: nothing is sent"
+    assert str(bridge.reason_against_engagement(at(0.0))) == "dry_run is true: nothing is sent"
 
 
 def test_engagement_with_u_away_from_trim_refused() -> None:
     bridge = ready_bridge(0.05)  # above a tenth of 0.26 rad
-    assert bridge.engage(at(0.0)).startswith("u.elevator is 0.05 from trim")
+    assert str(bridge.engage(at(0.0))).startswith("u.elevator is 0.05 from trim")
 
 
 def test_u_stays_inside_its_limits_around_trim() -> None:
@@ -157,7 +160,7 @@ def test_timeout_of_u_sends_neutral_then_release_values_then_nothing() -> None:
             assert raw.tolist() == [0.0, 0.0, 0.0, 0.0]
         if phase is Phase.RELEASE:
             assert np.isnan(raw).all()
-    assert bridge.reason == "u is 0.20 s old"
+    assert str(bridge.reason) == "u is 0.20 s old"
 
 
 def test_bridge_does_not_re_engage_by_itself() -> None:
@@ -174,7 +177,7 @@ def test_a_timeout_of_y_releases_the_channels() -> None:
     bridge = engaged_bridge()
     receive_u(bridge, 0.25)
     assert bridge.step(at(0.25)) is Phase.RELEASE
-    assert bridge.reason.startswith("q, p, r are 0.25 s old")
+    assert str(bridge.reason).startswith("q, p, r are 0.25 s old")
     assert bridge.step(at(0.76)) is Phase.DISENGAGED
 
 
@@ -184,7 +187,7 @@ def test_pilot_override_disengages_at_once_and_blocks_engagement() -> None:
     assert bridge.step(at(0.01)) is Phase.ENGAGED
     bridge.take_override("gamepad", 1.0, at(0.02))
     assert bridge.phase is Phase.RELEASE
-    assert bridge.engage(at(0.03)) == "pilot override active: gamepad"
+    assert str(bridge.engage(at(0.03))) == "pilot override active: gamepad"
     bridge.take_override("gamepad", 0.0, at(0.04))
     engage(bridge, 0.05)
 
@@ -214,30 +217,30 @@ def test_while_engaged_no_other_publisher_of_u_takes_over_and_timeout_releases()
         with pytest.raises(ChannelError, match="conflicting publisher"):
             receive_u(bridge, 0.21, 0.2, sender=sender)
     assert bridge.step(at(0.21)) is Phase.RELEASE
-    assert bridge.reason == "u is 0.21 s old"
+    assert str(bridge.reason) == "u is 0.21 s old"
     receive_u(bridge, 0.22, sender="standby")
 
 
 def test_second_publisher_of_topic_of_autopilot_ends_engagement_and_blocks_another() -> None:
     bridge = engaged_bridge()
-    bridge.conflict = "/ap/twist/filtered has 2 publishers"
+    bridge.conflict = Refusal("/ap/twist/filtered has 2 publishers")
     assert bridge.step(at(0.01)) is Phase.RELEASE
-    assert bridge.reason == bridge.engage(at(0.02)) == "/ap/twist/filtered has 2 publishers"
-    bridge.conflict = ""
+    assert bridge.reason == bridge.engage(at(0.02)) == bridge.conflict
+    bridge.conflict = None
     engage(bridge, 0.03)
 
 
 def test_engagement_says_which_pilot_override_has_no_effect() -> None:
     bridge = engaged_bridge()
     silent = "a pilot override has no effect: no message on /joy for 1 s; "
-    assert bridge.reason.startswith(silent)
+    assert str(bridge.reason).startswith(silent)
     for t, received in ((0.1, True), (1.2, False)):
         if received:
             bridge.take_override("gamepad", 0.0, at(t))
         receive_outputs(bridge, t)
         receive_u(bridge, t)
         assert bridge.step(at(t)) is Phase.ENGAGED
-        assert bridge.reason.startswith(silent) is not received
+        assert str(bridge.reason).startswith(silent) is not received
 
 
 def test_y_returned_once_per_rate_sample_and_only_while_all_channels_are_fresh() -> None:
@@ -350,11 +353,11 @@ def test_neutral_values_end_with_lost_condition_or_conflicting_publisher(lost: s
     assert bridge.step(at(0.25)) is Phase.NEUTRAL
     assert bridge.step(at(0.5)) is Phase.NEUTRAL
     if lost == "two autopilots":
-        bridge.conflict = lost
+        bridge.conflict = Refusal(lost)
     else:
         bridge.take_condition("offboard", 4.0, at(0.5))
     assert bridge.step(at(0.51)) is Phase.RELEASE
-    assert lost in bridge.reason
+    assert lost in str(bridge.reason)
 
 
 def test_engagement_requests_mode_sends_setpoints_in_it_and_requests_hold_after_it() -> None:
@@ -363,12 +366,12 @@ def test_engagement_requests_mode_sends_setpoints_in_it_and_requests_hold_after_
     assert sent(bridge, 0.0) == set()
     engage(bridge)
     assert bridge.phase is Phase.ENGAGING
-    assert bridge.reason == "the mode is not offboard (nav_state is 4)"
+    assert str(bridge.reason) == "the mode is not offboard (nav_state is 4)"
     assert sent(bridge, 0.0) == {"offboard", "enter"}  # no setpoint beside those of PX4's own law
     refresh(bridge, 0.1, offboard=14.0)
     assert bridge.step(at(0.1)) is Phase.ENGAGED
     assert sent(bridge, 0.1) == {"offboard", "torque", "thrust"}
-    bridge.disengage("disengaged by request", at(0.2))
+    bridge.disengage(Refusal("disengaged by request"), at(0.2))
     assert sent(bridge, 0.2) == {"leave"}  # heartbeats and setpoints end at once
     bridge.take_condition("offboard", 4.0, at(0.3))
     assert sent(bridge, 0.3) == set()  # the mode that the pilot chose stays
@@ -382,7 +385,7 @@ def test_engagement_without_awaited_mode_ends_after_time_with_reason() -> None:
     assert bridge.step(at(4.9)) is Phase.ENGAGING
     refresh(bridge, 5.1)
     assert bridge.step(at(5.1)) is Phase.RELEASE
-    assert bridge.reason == "the mode is not offboard (nav_state is 4), after 5 s"
+    assert str(bridge.reason) == "the mode is not offboard (nav_state is 4), after 5 s"
     assert sent(bridge, 5.1) == set()
 
 
@@ -392,7 +395,7 @@ def test_engagement_refused_with_sentence_of_condition() -> None:
         "armed: arming_state not received yet (/fmu/out/vehicle_status_v1); transmitter: "
         "valid not received yet"
     )
-    assert bridge.engage(at(0.0)).startswith(refused)
+    assert str(bridge.engage(at(0.0))).startswith(refused)
     assert bridge.phase is Phase.DISENGAGED
 
 
@@ -411,7 +414,7 @@ def test_lost_condition_ends_engagement_with_sentence(
     assert bridge.phase is Phase.ENGAGED
     refresh(bridge, 0.1, **({"offboard": 14.0} | status))
     assert bridge.step(at(0.1)) is Phase.RELEASE
-    assert bridge.reason == reason
+    assert str(bridge.reason) == reason
 
 
 def test_condition_that_is_not_reported_any_more_ends_engagement() -> None:
@@ -422,7 +425,7 @@ def test_condition_that_is_not_reported_any_more_ends_engagement() -> None:
         receive_u(bridge, t)
         bridge.take_condition("transmitter", 1.0, at(t))
         assert (bridge.step(at(t)) is Phase.ENGAGED) == (t < 1.55), t
-    assert bridge.reason.startswith("armed: arming_state is 1.60 s old")
+    assert str(bridge.reason).startswith("armed: arming_state is 1.60 s old")
 
 
 def fly(bridge: Bridge, begin: float, end: float, **status: float) -> Phase:
@@ -451,23 +454,23 @@ def test_lost_transmitter_releases_within_a_second(valid: float, reason: str) ->
     bridge = px4_bridge(offboard=14.0)
     engage(bridge)
     assert fly(bridge, 0.05, 3.0) is Phase.ENGAGED
-    assert "the loss of the transmitter" not in bridge.reason
+    assert "the loss of the transmitter" not in str(bridge.reason)
     assert fly(bridge, 3.05, 3.96, transmitter=valid) in {Phase.RELEASE, Phase.DISENGAGED}
-    assert bridge.reason == reason
+    assert str(bridge.reason) == reason
 
 
 def test_blind_engagement_ignores_the_transmitter() -> None:
     bridge = px4_bridge(offboard=14.0, transmitter=0.0)
-    assert bridge.engage(at(0.0)) == "the transmitter is lost (valid is 0)"
+    assert str(bridge.engage(at(0.0))) == "the transmitter is lost (valid is 0)"
     engage(bridge, blind=True)
     assert fly(bridge, 0.05, 3.0, transmitter=0.0) is Phase.ENGAGED
-    assert bridge.reason.endswith(
+    assert str(bridge.reason).endswith(
         "the loss of the transmitter is not watched (--blind), and the override by pilot has no "
         "effect then; released by a lost condition (armed, offboard), rise-di engage --off"
     )
-    bridge.disengage("disengaged by request", at(3.0))
+    bridge.disengage(Refusal("disengaged by request"), at(3.0))
     # The bridge is blind for one engagement.
-    assert bridge.engage(at(3.0)) == "the transmitter is lost (valid is 0)"
+    assert str(bridge.engage(at(3.0))) == "the transmitter is lost (valid is 0)"
 
 
 def test_unwatched_transmitter_needs_a_bound() -> None:
@@ -476,7 +479,7 @@ def test_unwatched_transmitter_needs_a_bound() -> None:
         "the loss of the transmitter cannot be seen over this link: set max_engaged in "
         "the map, or engage with --blind"
     )
-    assert bridge.engage(at(0.0)) == refusal
+    assert str(bridge.engage(at(0.0))) == refusal
     engage(bridge, blind=True)
     assert bridge.phase is Phase.ENGAGED
 
@@ -487,16 +490,16 @@ def test_max_engaged_releases_after_a_warning() -> None:
         "the loss of the transmitter cannot be seen over this link; "
         "released by the override by gamepad, rise-di engage --off, max_engaged after 30 s"
     )
-    assert bridge.reason.endswith(blind)
+    assert str(bridge.reason).endswith(blind)
     assert fly(bridge, 0.05, 19.96) is Phase.ENGAGED
-    assert "max_engaged releases" not in bridge.reason
+    assert "max_engaged releases" not in str(bridge.reason)
     assert fly(bridge, 20.05, 29.96) is Phase.ENGAGED
-    assert bridge.reason.startswith("max_engaged releases in 10 s, unless engaged again; ")
+    assert str(bridge.reason).startswith("max_engaged releases in 10 s, unless engaged again; ")
     engage(bridge, 30.0)
     assert fly(bridge, 30.05, 49.96) is Phase.ENGAGED
-    assert bridge.reason.endswith(blind)
+    assert str(bridge.reason).endswith(blind)
     assert fly(bridge, 50.05, 60.06) is Phase.RELEASE
-    assert bridge.reason == "engaged for 30 s, max_engaged of the map"
+    assert str(bridge.reason) == "engaged for 30 s, max_engaged of the map"
 
 
 def test_blind_engagement_has_no_bound() -> None:
@@ -504,7 +507,7 @@ def test_blind_engagement_has_no_bound() -> None:
     engage(bridge)
     engage(bridge, blind=True)
     assert fly(bridge, 0.05, 20.0) is Phase.ENGAGED
-    assert "max_engaged" not in bridge.reason
+    assert "max_engaged" not in str(bridge.reason)
 
 
 def test_captured_output_is_zero_until_engagement_and_then_change() -> None:
@@ -558,13 +561,13 @@ def test_ardupilot_engaged_in_manual_armed_and_flying_alone(
 ) -> None:
     bridge = ardupilot_bridge()
     bridge.take_condition(condition, raw, at(0.0))
-    assert bridge.engage(at(0.0)) == sentence
+    assert str(bridge.engage(at(0.0))) == sentence
 
 
 def test_ardupilot_is_not_engaged_while_pilots_switch_is_on() -> None:
     bridge = ardupilot_bridge()
     bridge.take_override("switch", 1800.0, at(0.0))
-    assert bridge.engage(at(0.0)) == "pilot override active: switch"
+    assert str(bridge.engage(at(0.0))) == "pilot override active: switch"
 
 
 def mavlink_bridge(override_time: float = 0.5, max_engaged: float = 120.0) -> Bridge:
@@ -612,12 +615,12 @@ def stop(bridge: Bridge, how: str) -> None:
             receive_u(bridge, t)
             bridge.step(at(t))
     elif how == "another publisher":
-        bridge.conflict = how
+        bridge.conflict = Refusal(how)
     elif how == "max_engaged":
         receive_mavlink(bridge, 1.0)
         bridge.step(at(1.0))
     else:
-        bridge.disengage(how, at(0.2))
+        bridge.disengage(Refusal(how), at(0.2))
     bridge.step(at(0.25))
 
 
@@ -642,7 +645,7 @@ def test_release_by_the_pilot_leaves_the_mode(how: str) -> None:
     if how == "override":
         bridge.take_override("switch", 1900.0, at(0.1))
     elif how == "request":
-        bridge.disengage("disengaged by request", at(0.1), by_pilot=True)
+        bridge.disengage(Refusal("disengaged by request"), at(0.1), by_pilot=True)
     else:
         name, raw = {
             "mode": ("manual", 2.0),
@@ -656,7 +659,7 @@ def test_release_by_the_pilot_leaves_the_mode(how: str) -> None:
 
 def test_pilot_who_takes_over_during_a_release_keeps_the_mode() -> None:
     bridge = engaged_mavlink_bridge()
-    bridge.disengage("bridge shut down", at(0.1))
+    bridge.disengage(Refusal("bridge shut down"), at(0.1))
     assert "mode_after" in sent(bridge, 0.1)
     bridge.take_override("switch", 1900.0, at(0.2))
     assert sent(bridge, 0.2) == {"override"}
@@ -673,15 +676,15 @@ def test_mode_is_asked_for_after_each_engagement_and_not_after_one_that_did_not_
     bridge = with_failsafe()
     refresh(bridge, 0.0)
     engage(bridge)
-    bridge.disengage("the controller ended", at(0.1))
+    bridge.disengage(Refusal("the controller ended"), at(0.1))
     assert bridge.phase is Phase.RELEASE
     bridge.take_condition("offboard", 14.0, at(0.1))
     assert sent(bridge, 0.1) == set()  # it waited for offboard
     for begin, by_pilot in ((1.0, False), (2.0, True), (3.0, False)):
         refresh(bridge, begin, offboard=14.0)
         bridge.step(at(begin))
-        assert bridge.engage(at(begin)) == ""
-        bridge.disengage("the flight ended", at(begin + 0.1), by_pilot=by_pilot)
+        assert bridge.engage(at(begin)) is None
+        bridge.disengage(Refusal("the flight ended"), at(begin + 0.1), by_pilot=by_pilot)
         assert sent(bridge, begin + 0.1) == (set() if by_pilot else {"leave"})
 
 
@@ -709,7 +712,7 @@ OVERRIDE_TIME = (
 def test_engagement_needs_a_short_timeout_of_overrides(seconds: float) -> None:
     bridge = mavlink_bridge(seconds)
     assert (
-        bridge.engage(at(0.0))
+        str(bridge.engage(at(0.0)))
         == f"RC_OVERRIDE_TIME is {seconds:g}, expected 0.2 to 1: {OVERRIDE_TIME}"
     )
     bridge.take_parameter("RC_OVERRIDE_TIME", 0.5)
@@ -724,28 +727,28 @@ def test_engagement_without_an_answer_about_a_parameter_is_refused() -> None:
     unknown = (
         "RC_OVERRIDE_TIME not received yet: the autopilot does not answer, or has no such parameter"
     )
-    assert bridge.engage(at(0.0)) == unknown
+    assert str(bridge.engage(at(0.0))) == unknown
 
 
 def test_problem_of_the_link_refuses_an_engagement_and_stands_beside_what_ends_it() -> None:
     bridge = mavlink_bridge()
-    bridge.problem = "ATTITUDE comes at 4 Hz"
-    assert bridge.engage(at(0.0)) == "ATTITUDE comes at 4 Hz"
-    bridge.problem = ""
+    bridge.problem = Refusal("ATTITUDE comes at 4 Hz")
+    assert str(bridge.engage(at(0.0))) == "ATTITUDE comes at 4 Hz"
+    bridge.problem = None
     engage(bridge)
-    bridge.problem = "ATTITUDE comes at 4 Hz"
+    bridge.problem = Refusal("ATTITUDE comes at 4 Hz")
     assert bridge.step(at(0.1)) is Phase.ENGAGED
-    assert bridge.reason.startswith("ATTITUDE comes at 4 Hz; ")
+    assert str(bridge.reason).startswith("ATTITUDE comes at 4 Hz; ")
     receive_u(bridge, 0.25)
     assert bridge.step(at(0.25)) is Phase.RELEASE
-    assert bridge.reason.endswith("s old (mavlink/VFR_HUD); ATTITUDE comes at 4 Hz")
+    assert str(bridge.reason).endswith("s old (mavlink/VFR_HUD); ATTITUDE comes at 4 Hz")
 
 
 def test_engagement_needs_sources_of_trims() -> None:
     bridge = ardupilot_bridge(sticks=STICKS | {"thrust": 1450.0})
     receive_outputs(bridge, 0.6, tuple(bridge.outputs))
     receive_u(bridge, 0.6)
-    assert bridge.engage(at(0.6)).startswith(
+    assert str(bridge.engage(at(0.6))).startswith(
         "trim of elevator, trim of thrust, trim of aileron, trim of rudder are 0.60 s"
     )
 
@@ -754,7 +757,7 @@ def test_engagement_whose_limits_leave_range_around_trim_refused() -> None:
     # 90 % of throttle, upper limit 30 % above
     bridge = ardupilot_bridge(sticks=STICKS | {"thrust": 1900.0})
     assert (
-        bridge.engage(at(0.0))
+        str(bridge.engage(at(0.0)))
         == "thrust: its trim is 0.9 now, and the limits [-0.2, 0.3] around it leave its range"
     )
 
@@ -782,7 +785,7 @@ def test_override_by_stick_counts_way_since_engagement(earlier: float) -> None:
     assert bridge.step(at(0.01)) is Phase.ENGAGED
     bridge.take_override("gamepad", 0.45, at(0.02))
     assert bridge.step(at(0.02)) is Phase.RELEASE
-    assert bridge.reason == "pilot override by gamepad"
+    assert str(bridge.reason) == "pilot override by gamepad"
 
 
 def test_override_by_switch_in_bit_field_counts_own_bit_since_engagement() -> None:
@@ -801,7 +804,7 @@ def test_override_whose_topic_has_ended_does_not_block_engagement() -> None:
     bridge.take_override("gamepad", 1.0, at(0.0))
     receive_outputs(bridge, 0.9)
     receive_u(bridge, 0.9)
-    assert bridge.engage(at(0.9)) == "pilot override active: gamepad"
+    assert str(bridge.engage(at(0.9))) == "pilot override active: gamepad"
     engage(bridge, 1.05)
 
 
@@ -815,9 +818,9 @@ def enveloped_bridge() -> Bridge:
     )
     receive_u(bridge, 0.0)
     receive_outputs(bridge, 0.0)
-    assert bridge.engage(at(0.0)) == "phi, theta not received yet (/ap/pose/filtered)"
+    assert str(bridge.engage(at(0.0))) == "phi, theta not received yet (/ap/pose/filtered)"
     receive_outputs(bridge, 0.0, ("phi", "theta"))
-    assert bridge.engage(at(0.0)) == "V is -25, outside the envelope [-5, 8]"
+    assert str(bridge.engage(at(0.0))) == "V is -25, outside the envelope [-5, 8]"
     receive_outputs(bridge, 0.01, ("V",), raw=25.0)
     engage(bridge, 0.01)
     return bridge
@@ -836,7 +839,9 @@ def test_leaving_envelope_releases_channels_with_sentence(
     receive_outputs(bridge, 0.03, (name,), raw)
     assert bridge.step(at(0.03)) is Phase.RELEASE
     lower, upper = ENVELOPE[name]
-    assert bridge.reason == f"{name} is {channel:g}, outside the envelope [{lower:g}, {upper:g}]"
+    assert (
+        str(bridge.reason) == f"{name} is {channel:g}, outside the envelope [{lower:g}, {upper:g}]"
+    )
 
 
 def test_climb_refuses_an_engagement_and_does_not_end_one() -> None:
@@ -847,7 +852,7 @@ def test_climb_refuses_an_engagement_and_does_not_end_one() -> None:
     bridge = new_bridge(ChannelMap.validate_mapping(content, "map"))
     receive_u(bridge, 0.0)
     receive_outputs(bridge, 0.0, (*OUTPUTS, "climb"), raw=2.1)
-    assert bridge.engage(at(0.0)) == "climb is 2.1, outside engage_if [-2, 2]"
+    assert str(bridge.engage(at(0.0))) == "climb is 2.1, outside engage_if [-2, 2]"
     receive_outputs(bridge, 0.01, ("climb",), raw=1.9)
     engage(bridge, 0.01)
     receive_outputs(bridge, 0.02, ("climb",), raw=7.9)
@@ -855,7 +860,7 @@ def test_climb_refuses_an_engagement_and_does_not_end_one() -> None:
     # The sink of ArduPlane with a jammed elevator.
     receive_outputs(bridge, 0.03, ("climb",), raw=-8.4)
     assert bridge.step(at(0.03)) is Phase.RELEASE
-    assert bridge.reason == "climb is -8.4, outside the envelope [-8, 8]"
+    assert str(bridge.reason) == "climb is -8.4, outside the envelope [-8, 8]"
 
 
 def test_surface_that_stays_at_its_limit_ends_the_engagement_and_thrust_does_not() -> None:
@@ -881,7 +886,7 @@ def test_surface_that_stays_at_its_limit_ends_the_engagement_and_thrust_does_not
     assert fly(0.11, lower * [0.0, 1.0, 1.2, 0.0]) is Phase.ENGAGED
     assert fly(0.20, lower * [0.0, 1.0, 1.2, 0.0]) is Phase.ENGAGED
     assert fly(0.21, lower * [0.0, 1.0, 1.2, 0.0]) is Phase.RELEASE
-    assert bridge.reason == "aileron is at its limit for 0.1 s, p does not answer"
+    assert str(bridge.reason) == "aileron is at its limit for 0.1 s, p does not answer"
 
 
 def test_large_u_that_rests_is_at_a_limit_of_the_law_narrower_than_that_of_the_map() -> None:
@@ -902,7 +907,7 @@ def test_large_u_that_rests_is_at_a_limit_of_the_law_narrower_than_that_of_the_m
     assert {fly(t, 0.4) for t in steps} == {Phase.ENGAGED}  # as the doublets of an experiment
     assert {fly(0.2 + t, 0.6 + t) for t in steps} == {Phase.ENGAGED}  # it moves
     assert [fly(0.4 + t, 0.9) for t in steps][-1] is Phase.RELEASE
-    assert bridge.reason == "rudder is at its limit for 0.1 s, r does not answer"
+    assert str(bridge.reason) == "rudder is at its limit for 0.1 s, r does not answer"
 
 
 def test_envelope_whose_channel_is_stale_releases_channels() -> None:
@@ -911,7 +916,7 @@ def test_envelope_whose_channel_is_stale_releases_channels() -> None:
     receive_outputs(bridge, 0.16, ("V",), raw=25.0)
     receive_u(bridge, 0.15)
     assert bridge.step(at(0.25)) is Phase.RELEASE
-    assert bridge.reason.startswith("phi, theta are 0.25 s old (/ap/pose/filtered)")
+    assert str(bridge.reason).startswith("phi, theta are 0.25 s old (/ap/pose/filtered)")
 
 
 def test_pose_has_fresh_channels_and_stamp_of_first_row() -> None:
@@ -1099,4 +1104,6 @@ def test_input_without_effect_by_the_probe_ends_an_engagement_with_its_name() ->
     )
     assert bridge.step(at(0.0)) is Phase.RELEASE
     name = bridge.inputs[1]
-    assert bridge.reason == f"{name} does not answer the probe: it has at most 12 % of its effect"
+    assert (
+        str(bridge.reason) == f"{name} does not answer the probe: it has at most 12 % of its effect"
+    )

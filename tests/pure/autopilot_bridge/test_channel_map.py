@@ -40,6 +40,7 @@ from autopilot_bridge.map_check import check_map, definitions_below
 from autopilot_bridge.map_rows import MeasuredRow, OverrideRow
 from autopilot_bridge.params import BridgeConfig, ChannelMap, load_map
 from flight_core import installation
+from flight_core.outcome import Refusal
 from flight_core.vectors import ChannelError
 
 MAPS = sorted(MAP_FILES)
@@ -291,8 +292,8 @@ def test_request_of_a_service_is_checked_against_the_sources_of_a_package(tmp_pa
     service = tmp_path / "srv" / "ModeSwitch.srv"
     channel_map = named_map("ardupilot")
     for text, fault in (
-        ("uint8 mode\n---\nbool status", ""),
-        ("uint8 number\n---\nuint8 mode", "no mode"),
+        ("uint8 mode\n---\nbool status", None),
+        ("uint8 number\n---\nuint8 mode", Refusal("no mode")),
     ):
         service.write_text(text)
         kinds = [kind for _, _, kind in channel_map.used_topics()]

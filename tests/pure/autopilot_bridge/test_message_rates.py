@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from autopilot_bridge.message_rates import MessageRates
+from flight_core.outcome import Refusal
 
 # The highest and the lowest rate of the map ardupilot_mavlink.
 REQUESTED = {"ATTITUDE": 40.0, "EXTENDED_SYS_STATE": 2.0}
@@ -44,7 +45,7 @@ def test_rates_are_unknown_for_two_seconds_and_then_as_requested() -> None:
     assert stream.rates.unknown(1.9) == list(REQUESTED)
     stream.run(60.0)
     assert stream.rates.unknown(60.0) == []
-    assert (stream.again, stream.rates.slow(60.0), stream.rates.lasting(60.0)) == ([], {}, "")
+    assert (stream.again, stream.rates.slow(60.0), stream.rates.lasting(60.0)) == ([], {}, None)
 
 
 def test_rate_that_a_ground_station_takes_is_requested_again_and_ends_no_engagement() -> None:
@@ -58,11 +59,13 @@ def test_rate_that_a_ground_station_takes_is_requested_again_and_ends_no_engagem
     # A message of the 4 Hz is 0.25 s, a judgement 0.1 s.
     assert instant == pytest.approx(10.67, abs=0.15)
     assert requested == {"ATTITUDE": 40.0}
-    assert stream.rates.slow(10.8) == {"ATTITUDE": "ATTITUDE comes at 4 Hz, requested are 40 Hz"}
+    assert stream.rates.slow(10.8) == {
+        "ATTITUDE": Refusal("ATTITUDE comes at 4 Hz, requested are 40 Hz")
+    }
     for end in np.arange(10.9, 20.0, 0.1).tolist():
-        assert stream.run(end).rates.lasting(end) == ""
+        assert stream.run(end).rates.lasting(end) is None
     assert len(stream.again) <= 2
-    came = {"ATTITUDE": "ATTITUDE came at 4 Hz, requested are 40 Hz, less than 20 s ago"}
+    came = {"ATTITUDE": Refusal("ATTITUDE came at 4 Hz, requested are 40 Hz, less than 20 s ago")}
     assert stream.rates.slow(20.0) == came
     # Longer than the 15 s after which MAVProxy takes it again.
     assert stream.run(30.0).rates.slow(30.0) == came
@@ -77,7 +80,9 @@ def test_rate_that_stays_low_is_requested_each_second_and_ends_the_engagement() 
         if stream.run(end, ATTITUDE=4.0).rates.lasting(end)
     )
     assert first == pytest.approx(10.67 + 2.0, abs=0.2)
-    assert stream.rates.lasting(first) == "ATTITUDE comes at 4 Hz, requested are 40 Hz; for 2 s"
+    assert (
+        str(stream.rates.lasting(first)) == "ATTITUDE comes at 4 Hz, requested are 40 Hz; for 2 s"
+    )
     assert np.diff([instant for instant, _ in stream.again]) == pytest.approx(1.0, abs=0.11)
 
 
@@ -90,7 +95,9 @@ def test_bound_of_slow_rate(part: float, is_slow: bool) -> None:
 
 def test_rate_that_was_never_granted_is_slow_until_it_comes_and_not_remembered() -> None:
     stream = Stream().run(10.0, ATTITUDE=10.0)
-    assert stream.rates.slow(10.0) == {"ATTITUDE": "ATTITUDE comes at 10 Hz, requested are 40 Hz"}
+    assert stream.rates.slow(10.0) == {
+        "ATTITUDE": Refusal("ATTITUDE comes at 10 Hz, requested are 40 Hz")
+    }
     assert stream.run(13.0).rates.slow(13.0) == {}
 
 

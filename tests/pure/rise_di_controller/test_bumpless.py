@@ -22,6 +22,7 @@ from autopilot_bridge.channel_map import to_channel
 from autopilot_bridge.params import ChannelMap
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.modes import Mode
+from flight_core.outcome import Refusal
 from flight_core.rates import nanoseconds, seconds
 from flight_core.vectors import ChannelError, FloatArray, StampedVector
 from rise_di_controller.controller import Controller
@@ -448,7 +449,7 @@ def switch(key: str) -> Callable[[Engagement], None]:
 
 REQUESTS: Mapping[str, Callable[[Engagement], object]] = {
     "engage": lambda loop: loop.bridge.engage(loop.now_ns()),
-    "disengage": lambda loop: loop.bridge.disengage("by request", loop.now_ns()),
+    "disengage": lambda loop: loop.bridge.disengage(Refusal("by request"), loop.now_ns()),
     **{key: switch(key) for key in ("y", "u", "conflicting u")},
 }
 
@@ -469,7 +470,7 @@ def test_no_sequence_of_events_makes_sent_u_jump(events: list[tuple[str, int]]) 
 def test_engagement_of_sequences_sends_u() -> None:
     loop = Engagement()
     loop.ticks(1)
-    assert loop.bridge.engage(loop.now_ns()) == ""
+    assert loop.bridge.engage(loop.now_ns()) is None
     loop.ticks(20)
     assert loop.bridge.phase is Phase.ENGAGED
     assert loop.bridge.raw().any()

@@ -14,16 +14,16 @@ from enum import IntEnum
 import numpy as np
 
 from autopilot_bridge.channel_map import to_channel, to_raw
-from autopilot_bridge.conditions import Conditions, Reading, joined_faults, staleness
+from autopilot_bridge.conditions import Conditions, Reading, Stale, joined_faults, staleness
 from autopilot_bridge.map_rows import InputRow, MeasuredRow, OutputRow
 from autopilot_bridge.params import ROUNDING, ChannelMap
 from flight_core.channels import reason_against_inputs
+from flight_core.outcome import Refusal, joined
 from flight_core.publisher_lock import PublisherLock
 from flight_core.rates import NANOSECONDS, nanoseconds, seconds
-from flight_core.text import sentences
 from flight_core.vectors import ChannelError, FloatArray, StampedVector, require_newer
 
-UNBOUNDED = (
+UNBOUNDED = Refusal(
     "the loss of the transmitter cannot be seen over this link: set max_engaged in the "
     "map, or engage with --blind"
 )
@@ -61,13 +61,12 @@ class Bridge:
         self.inputs = tuple(channel_map.inputs)
         self.phase = Phase.DISENGAGED
         # Why the bridge is not engaged, or what an engagement waits for or lacks.
-        self.reason = "not engaged yet"
-        # What refuses and ends an engagement, such as another publisher, as a sentence. The node
-        # sets it.
-        self.conflict = ""
+        self.reason: Refusal | None = Refusal("not engaged yet")
+        # What refuses and ends an engagement, such as another publisher. The node sets it.
+        self.conflict: Refusal | None = None
         # What refuses an engagement but does not end one yet, such as a rate of the link. The node
         # sets it.
-        self.problem = ""
+        self.problem: Refusal | None = None
         sources = {trim_key(name): row for name, row in channel_map.trims.items()}
         self._rows: dict[str, MeasuredRow] = {
             **channel_map.pose,
@@ -155,7 +154,7 @@ class Bridge:
         """
         stuck = reason_against_inputs(self.inputs, sample.value.tolist())
         if stuck and self.phase is Phase.ENGAGED:
-            self.disengage(str(stuck), now_ns)
+            self.disengage(stuck, now_ns)
 
     def take_condition(self, name: str, raw: float, now_ns: int) -> None:
         """Take the field of a condition.
@@ -175,11 +174,11 @@ class Bridge:
         """
         self.conditions.take_override(name, raw, now_ns)
         if self._is_active(name, now_ns):
-            self.disengage(f"pilot override by {name}", now_ns, by_pilot=True)
+            self.disengage(Refusal(f"pilot override by {name}"), now_ns, by_pilot=True)
 
     # State
 
-    def stale(self, now_ns: int) -> dict[str, str]:
+    def stale(self, now_ns: int) -> dict[str, Stale]:
         """Return the stale channels of y and of the envelope, each with what is wrong.
 
         An example is "0.30 s old (/topic)".
@@ -187,17 +186,14 @@ class Bridge:
         watched = dict.fromkeys((*self.outputs, *self.channel_map.envelope))
         return {name: reason for name in watched if (reason := self._staleness(name, now_ns))}
 
-    def _staleness(self, name: str, now_ns: int) -> str:
-        """Say what is wrong with a channel.
-
-        Returns "" if the channel is fresh, or if its last value is held.
-        """
+    def _staleness(self, name: str, now_ns: int) -> Stale | None:
+        """Say what is wrong with a channel, unless it is fresh or its last value is held."""
         row = self._rows[name]
         if isinstance(row, OutputRow) and row.held and name in self._readings:
-            return ""
+            return None
         return staleness(row.topic, self._readings.get(name), row.max_age, now_ns)
 
-    def _outside(self, section: str = "envelope") -> str:
+    def _reason_against_values(self, section: str = "envelope") -> Refusal | None:
         """Say which channels are outside the limits of a section of the map.
 
         Every channel must have been received.
@@ -207,19 +203,19 @@ class Bridge:
             (name, self._value(name), limits)
             for name, limits in getattr(self.channel_map, section).items()
         )
-        return "; ".join(
-            f"{name} is {value:.3g}, outside {what} [{lower:g}, {upper:g}]"
+        return joined(
+            Refusal(f"{name} is {value:.3g}, outside {what} [{lower:g}, {upper:g}]")
             for name, value, (lower, upper) in values
             if not lower <= value <= upper
         )
 
-    def _does_not_answer(self, now_ns: int) -> str:
+    def _reason_against_inputs(self, now_ns: int) -> Refusal | None:
         """Say which inputs stay at a limit for longer than their rows allow.
 
         The aircraft does not follow such an input. The limits of the law may be narrower than those
         of the map, so a large u that does not change counts as being at one.
         """
-        sentences = []
+        reasons = []
         inside, small = (
             (factor * self._lower < self._u) & (self._u < factor * self._upper)
             for factor in (1.0, LARGE)
@@ -229,153 +225,150 @@ class Bridge:
             if row.at_limit is None or answers:
                 self._limit_ns.pop(name, None)
             elif now_ns - self._limit_ns.setdefault(name, now_ns) >= nanoseconds(row.at_limit):
-                sentences.append(
-                    f"{name} is at its limit for {row.at_limit:g} s, {row.motion[0]} does not "
-                    "answer"
+                reasons.append(
+                    Refusal(
+                        f"{name} is at its limit for {row.at_limit:g} s, {row.motion[0]} does not "
+                        "answer"
+                    )
                 )
-        return "; ".join(sentences)
+        return joined(reasons)
 
-    def _lost(self, now_ns: int) -> str:
-        """Why the autopilot is not to be commanded any more, whatever y and u are, as a sentence.
-
-        Empty where it is.
-        """
-        unmet = (self.conditions.unmet(now_ns, awaited=awaited) for awaited in (False, True))
-        return sentences(self.conflict, *unmet)
+    def _reason_against_commands(self, now_ns: int) -> Refusal | None:
+        """Say why the autopilot must not be commanded any more, whatever y and u are."""
+        violations = (
+            self.conditions.violation(now_ns, awaited=awaited) for awaited in (False, True)
+        )
+        return joined((self.conflict, *violations))
 
     def _is_active(self, name: str, now_ns: int) -> bool:
         is_engaged = self.phase in {Phase.ENGAGED, Phase.NEUTRAL}
         return self.conditions.is_active(name, now_ns, engaged=is_engaged)
 
-    def _lacks(self, now_ns: int) -> str:
+    def _lack(self, now_ns: int) -> Refusal | None:
         """Say what an engagement lacks."""
-        ends = self._end_ns is not None and now_ns >= self._end_ns - END_WARNING_NS
-        if ends:
-            warning = f"max_engaged releases in {seconds(END_WARNING_NS):g} s, unless engaged again"
-        else:
-            warning = ""
-        return sentences(
-            warning,
-            self.problem,
-            self.conditions.silent_overrides(now_ns),
-            self.conditions.blindness(bounded=self._end_ns is not None),
-        )
+        warning = None
+        if self._end_ns is not None and now_ns >= self._end_ns - END_WARNING_NS:
+            warning = Refusal(
+                f"max_engaged releases in {seconds(END_WARNING_NS):g} s, unless engaged again"
+            )
+        silent = self.conditions.silent_overrides(now_ns)
+        blindness = self.conditions.blindness(bounded=self._end_ns is not None)
+        return joined((warning, self.problem, silent, blindness))
 
     def u_timed_out(self, now_ns: int) -> bool:
         """Return whether no u was received yet, or none for longer than its age limit."""
         return self.u_lock.timed_out(now_ns, self._max_age_ns)
 
-    def _u_timeout(self, now_ns: int) -> str:
-        """Say why u has timed out; "" if u is fresh."""
+    def _u_timeout(self, now_ns: int) -> Refusal | None:
+        """Say why u has timed out, if it is not fresh."""
         if self.u_lock.publisher is None:
-            return "u not received yet"
+            return Refusal("u not received yet")
         if self.u_timed_out(now_ns):
-            return f"u is {seconds(self.u_lock.age_ns(now_ns)):.2f} s old"
-        return ""
+            return Refusal(f"u is {seconds(self.u_lock.age_ns(now_ns)):.2f} s old")
+        return None
 
-    def refusal(self, now_ns: int) -> str:
-        """Why `engage` would be refused now; empty where it would not.
+    def reason_against_engagement(self, now_ns: int) -> Refusal | None:
+        """Say why `engage` would be refused now.
 
         Awaited conditions do not count. A dry run states the reason that there would be with
         `dry_run: false` too.
         """
-        checks: tuple[Callable[[int], str], ...] = (
-            lambda _: self.conflict,
-            self._active_overrides,
-            lambda now_ns: self.conditions.unmet(now_ns, awaited=False),
-            lambda _: self.problem,
-            lambda _: self._unfit_parameters(),
-            lambda _: (
-                ""
-                if self.conditions.blind
-                or self.conditions.watches_transmitter
-                or self.channel_map.max_engaged
-                else UNBOUNDED
-            ),
-            self._missing,
-            lambda _: self._outside(),
-            lambda _: self._outside("engage_if"),
-            lambda _: self._away_from_trim(),
-            lambda _: sentences(*map(self._beyond_range, self.channel_map.trims)),
+        checks: tuple[Callable[[], Refusal | None], ...] = (
+            lambda: self.conflict,
+            lambda: self._active_overrides(now_ns),
+            lambda: self.conditions.violation(now_ns, awaited=False),
+            lambda: self.problem,
+            self._reason_against_parameters,
+            self._reason_against_endless_engagement,
+            lambda: self._stale_inputs(now_ns),
+            self._reason_against_values,
+            lambda: self._reason_against_values("engage_if"),
+            self._reason_against_u,
+            lambda: joined(map(self._reason_against_trim, self.channel_map.trims)),
         )
-        dry_run = "dry_run is true: nothing is sent" if self.dry_run else ""
-        return sentences(dry_run, next(filter(None, (check(now_ns) for check in checks)), ""))
+        dry_run = Refusal("dry_run is true: nothing is sent") if self.dry_run else None
+        return joined((dry_run, next(filter(None, (check() for check in checks)), None)))
 
-    def _unfit_parameters(self) -> str:
+    def _reason_against_endless_engagement(self) -> Refusal | None:
+        is_bounded = bool(self.channel_map.max_engaged)
+        if is_bounded or self.conditions.blind or self.conditions.watches_transmitter:
+            return None
+        return UNBOUNDED
+
+    def _reason_against_parameters(self) -> Refusal | None:
         """Say which parameters of the autopilot keep the bridge from engaging."""
-        sentences = []
+        reasons = []
         for name, row in self.channel_map.parameters.items():
             value = self._parameters.get(name)
             lower, upper = row.within
             if value is None:
-                sentences.append(
-                    f"{name} not received yet: the autopilot does not answer, or has no such "
-                    "parameter"
+                reasons.append(
+                    Refusal(
+                        f"{name} not received yet: the autopilot does not answer, or has no such "
+                        "parameter"
+                    )
                 )
             elif not lower <= value <= upper:
-                sentences.append(
-                    f"{name} is {value:g}, expected {lower:g} to {upper:g}: {row.sentence}"
+                reasons.append(
+                    Refusal(f"{name} is {value:g}, expected {lower:g} to {upper:g}: {row.sentence}")
                 )
-        return "; ".join(sentences)
+        return joined(reasons)
 
-    def _active_overrides(self, now_ns: int) -> str:
+    def _active_overrides(self, now_ns: int) -> Refusal | None:
         active = [name for name in self.channel_map.overrides if self._is_active(name, now_ns)]
-        return f"pilot override active: {', '.join(active)}" if active else ""
+        return Refusal(f"pilot override active: {', '.join(active)}") if active else None
 
-    def _missing(self, now_ns: int) -> str:
+    def _stale_inputs(self, now_ns: int) -> Refusal | None:
         """Say which inputs of the bridge are stale.
 
         These are y, envelope and engage_if, the trims' sources and u.
         """
         keys = (*map(trim_key, self.channel_map.trims), *self.channel_map.engage_if)
         sources = {key: stale for key in keys if (stale := self._staleness(key, now_ns))}
-        return sentences(joined_faults(self.stale(now_ns) | sources), self._u_timeout(now_ns))
+        return joined((joined_faults(self.stale(now_ns) | sources), self._u_timeout(now_ns)))
 
-    def _away_from_trim(self) -> str:
+    def _reason_against_u(self) -> Refusal | None:
+        """Say which input is too far from trim."""
         limits = self.channel_map.engage_within * np.where(self._u > 0.0, self._upper, -self._lower)
         for name, u, limit in zip(self.inputs, self._u, limits, strict=True):
             if abs(u) > limit:
-                return (
+                return Refusal(
                     f"u.{name} is {u:.3g} from trim, more than {limit:.3g}: deactivate the "
                     "controller until u is at trim"
                 )
-        return ""
+        return None
 
-    def _beyond_range(self, name: str) -> str:
-        """Why the limits around the trim of a captured input leave the range of its field.
-
-        Empty where they do not.
-        """
+    def _reason_against_trim(self, name: str) -> Refusal | None:
+        """Refuse the trim of a captured input if the limits around it leave its field's range."""
         row = self.channel_map.inputs[name]
         trim = self.trim(name)
         (low, high), ends = row.range, (trim + row.lower, trim + row.upper)
         if all(low - ROUNDING <= to_raw(end, row.line) <= high + ROUNDING for end in ends):
-            return ""
-        return (
+            return None
+        return Refusal(
             f"{name}: its trim is {trim:.3g} now, and the limits [{row.lower:g}, "
             f"{row.upper:g}] around it leave its range"
         )
 
-    def engage(self, now_ns: int, *, blind: bool = False) -> str:
-        """Engage, or begin to: the phase tells.
+    def engage(self, now_ns: int, *, blind: bool = False) -> Refusal | None:
+        """Engage, or begin to: the phase tells. Or refuse to.
 
-        Returns the reason of a refusal as a sentence, empty where there is none. `blind`: without
-        regard to the loss of the transmitter, and without end. A request while engaged starts the
-        time of `max_engaged` again.
+        `blind`: without regard to the loss of the transmitter, and without end. A request while
+        engaged starts the time of `max_engaged` again.
         """
         if self.phase is Phase.ENGAGED:
             self.conditions.blind |= blind
             self._begin_time(now_ns)
         if self.phase in {Phase.ENGAGED, Phase.ENGAGING}:
-            return ""
+            return None
         before = self.conditions.blind
         self.conditions.blind = blind
-        if refusal := self.refusal(now_ns):
+        if refusal := self.reason_against_engagement(now_ns):
             self.conditions.blind = before
-        else:
-            self._enter(Phase.ENGAGING, now_ns)
-            self._continue_engagement(now_ns)
-        return refusal
+            return refusal
+        self._enter(Phase.ENGAGING, now_ns)
+        self._continue_engagement(now_ns)
+        return None
 
     def _begin_time(self, now_ns: int) -> None:
         bound = None if self.conditions.blind else self.channel_map.max_engaged
@@ -386,13 +379,14 @@ class Bridge:
 
         Give up after their time, or if something else would refuse.
         """
-        self.reason = self.conditions.unmet(now_ns, awaited=True)
+        self.reason = self.conditions.violation(now_ns, awaited=True)
         timed_out = now_ns - self._phase_ns > nanoseconds(self.channel_map.engage_timeout)
-        if refusal := self.refusal(now_ns):
+        if refusal := self.reason_against_engagement(now_ns):
             self.disengage(refusal, now_ns)
-        elif self.reason and timed_out:
-            self.disengage(f"{self.reason}, after {self.channel_map.engage_timeout:g} s", now_ns)
-        elif not self.reason:
+        elif self.reason is not None and timed_out:
+            timeout = f"{self.channel_map.engage_timeout:g} s"
+            self.disengage(Refusal(f"{self.reason}, after {timeout}"), now_ns)
+        elif self.reason is None:
             self._trim = {name: self.trim(name) for name in self.channel_map.trims}
             self._zero = {
                 name: self._readings[name].value
@@ -402,7 +396,7 @@ class Bridge:
             self.conditions.engage(now_ns)
             self._enter(Phase.ENGAGED, now_ns)
 
-    def disengage(self, reason: str, now_ns: int, *, by_pilot: bool = False) -> None:
+    def disengage(self, reason: Refusal, now_ns: int, *, by_pilot: bool = False) -> None:
         """Disengage from any phase, which returns the channels to the autopilot.
 
         If it is `by_pilot`, the pilot requested it and the mode stays as it is.
@@ -422,24 +416,23 @@ class Bridge:
         """
         if self.phase is Phase.ENGAGING:
             self._continue_engagement(now_ns)
-        elif self.phase is Phase.NEUTRAL and (reason := self._lost(now_ns)):
+        elif self.phase is Phase.NEUTRAL and (reason := self._reason_against_commands(now_ns)):
             self.disengage(reason, now_ns)
         elif self.phase is Phase.ENGAGED:
             faults = joined_faults(self.stale(now_ns))
-            cause = self.problem if faults else ""
-            reasons = sentences(self._lost(now_ns), faults, cause) or self._outside()
-            if end_reason := reasons or self._does_not_answer(now_ns):
+            cause = self.problem if faults else None
+            lost = joined((self._reason_against_commands(now_ns), faults, cause))
+            outside = lost or self._reason_against_values()
+            if end_reason := outside or self._reason_against_inputs(now_ns):
                 self.disengage(end_reason, now_ns)
             elif timeout := self._u_timeout(now_ns):
                 self.reason = timeout
                 self._enter(Phase.NEUTRAL, now_ns)
             elif self._end_ns is not None and now_ns >= self._end_ns:
-                self.disengage(
-                    f"engaged for {self.channel_map.max_engaged:g} s, max_engaged of the map",
-                    now_ns,
-                )
+                length = f"{self.channel_map.max_engaged:g} s"
+                self.disengage(Refusal(f"engaged for {length}, max_engaged of the map"), now_ns)
             else:
-                self.reason = self._lacks(now_ns)
+                self.reason = self._lack(now_ns)
         times = self.channel_map.silence
         if self.phase is Phase.NEUTRAL and now_ns - self._phase_ns >= nanoseconds(times.neutral):
             self._enter(Phase.RELEASE, now_ns)
@@ -550,7 +543,7 @@ class Bridge:
         if when == "engaging":
             return phase is Phase.ENGAGING
         if when == "release":
-            return phase is Phase.RELEASE and not self.conditions.unmet(now_ns, awaited=True)
+            return phase is Phase.RELEASE and not self.conditions.violation(now_ns, awaited=True)
         if when == "failsafe":
             return phase is Phase.RELEASE and not (
                 self._keeps_mode or self.conditions.is_contradicted()
@@ -568,6 +561,6 @@ class Bridge:
         if phase is Phase.ENGAGED:
             self._limit_ns = {}
             self._begin_time(now_ns)
-            self.reason = self._lacks(now_ns)
+            self.reason = self._lack(now_ns)
         elif phase in {Phase.RELEASE, Phase.DISENGAGED}:
             self.conditions.blind = False

@@ -18,6 +18,7 @@ import numpy as np
 
 from flight_core.environment import PROFILE_VARIABLE
 from flight_core.installation import missing
+from flight_core.outcome import Refusal
 from flight_core.parameters import ParameterError
 from flight_core.vectors import ChannelError
 
@@ -232,23 +233,23 @@ def versioned_topic(topic: str, version: int) -> str:
     return topic
 
 
-def version_fault(topic: str, message_class: Any) -> str:
-    """Say what is wrong with the version in a topic of PX4; "" if nothing is."""
+def version_fault(topic: str, message_class: Any) -> Refusal | None:
+    """Say what is wrong with the version in a topic of PX4."""
     version = getattr(message_class, "MESSAGE_VERSION", None)
     if version is None:
-        return ""
+        return None
     expected = versioned_topic(topic, version)
     definition = f"the installed {message_class.__name__} has version {version}"
     if topic == expected:
-        return ""
-    return (
+        return None
+    return Refusal(
         f"{topic}: {definition}, whose topic is {expected}: change the map, or install the release"
     )
 
 
 def version_faults(
     topics: Iterable[tuple[str, str]], load: Callable[[str], Any] = importlib.import_module
-) -> list[str]:
+) -> list[Refusal]:
     """Return `version_fault` of topics and types whose message packages are installed.
 
     Nothing is known about the rest.
@@ -257,7 +258,7 @@ def version_faults(
     for topic, kind in dict.fromkeys(topics):
         with suppress(ParameterError):
             faults.append(version_fault(topic, message_type(kind, load)))
-    return [fault for fault in faults if fault]
+    return [fault for fault in faults if fault is not None]
 
 
 def no_publisher(environment: Mapping[str, str]) -> str:

@@ -3,10 +3,12 @@
 """The client of a bridge, for `rise-di engage` and the live page."""
 
 from collections.abc import Callable
+from typing import Any
 
 import rclpy
 from std_srvs.srv import SetBool, Trigger
 
+from flight_core.outcome import Refusal
 from flight_core.text import bounded
 from flight_ros.client import SERVICE_TIMEOUT, Client
 from flight_ros.messages import NamedDecoder
@@ -33,11 +35,11 @@ class EngagementClient(Client):
         self._engagement_subscription = PolledSubscription(self._node, ENGAGEMENT, PUBLISH)
         self._u_subscription = PolledSubscription(self._node, U, NEWEST_SAMPLES, raw=True)
 
-    def engage(self, progress: Callable[[str], None], *, blind: bool = False) -> str:
+    def engage(self, progress: Callable[[str], None], *, blind: bool = False) -> Refusal | None:
         """Wait for u at trim and engage the bridge, which activates the controller.
 
-        Returns the reason of a refusal, or "". An engaged bridge takes the request at once: the
-        time of `max_engaged` starts again. `blind`: without regard to the loss of the transmitter.
+        Returns the reason of a refusal. An engaged bridge takes the request at once: the time of
+        `max_engaged` starts again. `blind`: without regard to the loss of the transmitter.
         `progress` is called with what the bridge waits for, and with what it lacks once it is
         engaged. An engagement that is not waited for any more, as after Ctrl-C, is withdrawn: the
         autopilot must not change its mode later.
@@ -67,26 +69,22 @@ class EngagementClient(Client):
             raise
         phase, reason = self._phases[-1]
         if phase != "ENGAGED":
-            return reason
+            return Refusal(reason)
         if reason:
             progress(f"warning: {reason}")
-        return ""
+        return None
 
-    def _engage_blind(self) -> str:
-        return bounded(
-            self._call(Trigger, ENGAGE_BLIND, Trigger.Request(), "a flight with a bridge").message
-        )
+    def _engage_blind(self) -> Refusal | None:
+        request = Trigger.Request()
+        return _refusal_in(self._call(Trigger, ENGAGE_BLIND, request, "a flight with a bridge"))
 
-    def disengage(self) -> str:
-        """Disengage the bridge. Returns its reason to refuse, or ""."""
+    def disengage(self) -> Refusal | None:
+        """Disengage the bridge. Returns its reason to refuse."""
         return self._set_engaged(engaged=False)
 
-    def _set_engaged(self, *, engaged: bool) -> str:
-        return bounded(
-            self._call(
-                SetBool, ENGAGE, SetBool.Request(data=engaged), "a flight with a bridge"
-            ).message
-        )
+    def _set_engaged(self, *, engaged: bool) -> Refusal | None:
+        request = SetBool.Request(data=engaged)
+        return _refusal_in(self._call(SetBool, ENGAGE, request, "a flight with a bridge"))
 
     def _withdraw(self) -> None:
         """Ask the bridge to disengage, and wait for an answer at most WITHDRAW_TIMEOUT.
@@ -128,3 +126,8 @@ class EngagementClient(Client):
     def _at_rest(self) -> bool:
         self._received_u()
         return len(self._u) >= TRIM_SAMPLES and len(set(self._u[-TRIM_SAMPLES:])) == 1
+
+
+def _refusal_in(response: Any) -> Refusal | None:
+    """Read the refusal in the answer of the bridge, whose message is empty if there is none."""
+    return Refusal(bounded(response.message)) if response.message else None

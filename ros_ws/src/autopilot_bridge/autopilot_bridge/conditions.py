@@ -3,12 +3,13 @@
 """The conditions and pilot overrides of a channel map: what autopilot and pilot allow now."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import NamedTuple
 
 from autopilot_bridge.map_rows import ConditionRow
 from autopilot_bridge.params import ChannelMap
+from flight_core.outcome import Refusal, joined
 from flight_core.rates import nanoseconds, seconds
-from flight_core.text import sentences
 
 
 class Reading(NamedTuple):
@@ -16,6 +17,13 @@ class Reading(NamedTuple):
 
     stamp_ns: int
     value: float
+
+
+@dataclass(frozen=True)
+class Stale(Refusal):
+    """A field that is too old, or was not received yet."""
+
+    is_received: bool
 
 
 class Conditions:
@@ -48,7 +56,7 @@ class Conditions:
             if not self._is_silent(name, now_ns)
         }
 
-    def unmet(self, now_ns: int, *, awaited: bool) -> str:
+    def violation(self, now_ns: int, *, awaited: bool) -> Refusal | None:
         """Say which conditions do not hold.
 
         `awaited` selects those of an engagement; otherwise, it is the rest.
@@ -58,15 +66,15 @@ class Conditions:
             for name, row in self._map.conditions.items()
             if row.awaited is awaited and not (row.transmitter and self.blind)
         )
-        return sentences(*(self._violation(name, row, now_ns) for name, row in rows))
+        return joined(self._violation_of(name, row, now_ns) for name, row in rows)
 
-    def _violation(self, name: str, row: ConditionRow, now_ns: int) -> str:
+    def _violation_of(self, name: str, row: ConditionRow, now_ns: int) -> Refusal | None:
         reading = self._conditions.get(name)
         if stale := staleness(row.topic, reading, row.max_age, now_ns):
             return joined_faults({f"{name}: {row.field}": stale})
         if reading is None or row.holds(reading.value):
-            return ""
-        return f"{row.sentence} ({row.field} is {reading.value:g})"
+            return None
+        return Refusal(f"{row.sentence} ({row.field} is {reading.value:g})")
 
     def is_contradicted(self) -> bool:
         """Return whether the last value of a condition contradicts it.
@@ -96,25 +104,25 @@ class Conditions:
     def _is_silent(self, name: str, now_ns: int) -> bool:
         """Return whether an override cannot act now, because its topic has ended or never came."""
         row = self._map.overrides[name]
-        return bool(staleness(row.topic, self._overrides.get(name), row.max_age, now_ns))
+        return staleness(row.topic, self._overrides.get(name), row.max_age, now_ns) is not None
 
-    def silent_overrides(self, now_ns: int) -> str:
+    def silent_overrides(self, now_ns: int) -> Refusal | None:
         """Say which overrides have no effect."""
         silent = [
             f"no message on {row.topic} for {row.max_age:g} s"
             for name, row in self._map.overrides.items()
             if self._is_silent(name, now_ns)
         ]
-        return f"a pilot override has no effect: {'; '.join(silent)}" if silent else ""
+        return Refusal(f"a pilot override has no effect: {'; '.join(silent)}") if silent else None
 
-    def blindness(self, *, bounded: bool) -> str:
+    def blindness(self, *, bounded: bool) -> Refusal | None:
         """Say what an engagement lacks that does not see the loss of the transmitter.
 
         The sentence also names what still releases. `bounded` says whether `max_engaged` ends the
         engagement.
         """
         if self.watches_transmitter and not self.blind:
-            return ""
+            return None
         rows = self._map.overrides.items()
         dead = ", ".join(name for name, row in rows if row.transmitter)
         working = ", ".join(name for name, row in rows if not row.transmitter)
@@ -122,41 +130,43 @@ class Conditions:
             name for name, row in self._map.conditions.items() if not row.transmitter
         )
         releases = (
-            f"the override by {working}" if working else "",
-            f"a lost condition ({conditions})" if conditions else "",
+            f"the override by {working}" if working else None,
+            f"a lost condition ({conditions})" if conditions else None,
             "rise-di engage --off",
-            f"max_engaged after {self._map.max_engaged:g} s" if bounded else "",
+            f"max_engaged after {self._map.max_engaged:g} s" if bounded else None,
         )
         if self.watches_transmitter:
             where = "is not watched (--blind)"
         else:
             where = "cannot be seen over this link"
         blind_override = f", and the override by {dead} has no effect then" if dead else ""
-        return (
+        return Refusal(
             f"the loss of the transmitter {where}{blind_override}; released by "
             f"{', '.join(filter(None, releases))}"
         )
 
 
-def staleness(topic: str, reading: Reading | None, max_age: float, now_ns: int) -> str:
-    """Say what is wrong with the age of a field; "" if it is fresh."""
+def staleness(topic: str, reading: Reading | None, max_age: float, now_ns: int) -> Stale | None:
+    """Say what is wrong with the age of a field, if it is not fresh."""
     if reading is None:
-        return f"not received yet ({topic})"
+        return Stale(f"not received yet ({topic})", is_received=False)
     age_ns = now_ns - reading.stamp_ns
-    return f"{seconds(age_ns):.2f} s old ({topic})" if age_ns > nanoseconds(max_age) else ""
+    if age_ns <= nanoseconds(max_age):
+        return None
+    return Stale(f"{seconds(age_ns):.2f} s old ({topic})", is_received=True)
 
 
-def joined_faults(faults: Mapping[str, str]) -> str:
+def joined_faults(faults: Mapping[str, Stale]) -> Refusal | None:
     """Join what is wrong with some channels, by name, to a sentence.
 
     Channels with the same fault stand together.
     """
-    names: dict[str, list[str]] = {}
+    names: dict[Stale, list[str]] = {}
     for name, fault in faults.items():
         names.setdefault(fault, []).append(name)
-    sentences_of_faults = []
+    reasons = []
     for fault, channels in names.items():
         verb = "is" if len(channels) == 1 else "are"
-        predicate = fault if fault.startswith("not") else f"{verb} {fault}"
-        sentences_of_faults.append(f"{', '.join(channels)} {predicate}")
-    return "; ".join(sentences_of_faults)
+        predicate = f"{verb} {fault}" if fault.is_received else str(fault)
+        reasons.append(Refusal(f"{', '.join(channels)} {predicate}"))
+    return joined(reasons)

@@ -21,6 +21,7 @@ from autopilot_bridge.map_rows import MAVLINK
 from autopilot_bridge.params import ChannelMap
 from flight_core.files import read_file
 from flight_core.installation import require_package
+from flight_core.outcome import Refusal
 from flight_core.parameters import ParameterError, require
 from flight_log.message_definitions import definition, read_definition
 from flight_log.named_vectors import typestore
@@ -37,15 +38,12 @@ VERSION = "MESSAGE_VERSION"  # the constant in definitions of PX4
 
 
 class CheckedRow(NamedTuple):
-    """A field that a row of a map reads or sets, and its faults by release.
-
-    A fault says why the row does not hold; it is empty if the row holds.
-    """
+    """A field that a row of a map reads or sets, and by release why the row does not hold."""
 
     key: str
     topic: str
     field: str
-    faults: tuple[str, ...]
+    faults: tuple[Refusal | None, ...]
 
 
 def definitions_below(folder: Path, kinds: Iterable[str]) -> Types:
@@ -144,29 +142,31 @@ def _element(field: Any) -> tuple[Nodetype, Any]:
     return content[0] if node in {Nodetype.ARRAY, Nodetype.SEQUENCE} else (node, content)
 
 
-def _fault(types: Types, topic: str, kind: str, path: str, components: str | None) -> str:
+def _fault(
+    types: Types, topic: str, kind: str, path: str, components: str | None
+) -> Refusal | None:
     definitions = {**typestore().fielddefs, **types}
     if not is_known(types, kind):
-        return f"no {kind}"
+        return Refusal(f"no {kind}")
     version = next((value for name, _, value in definitions[kind][0] if name == VERSION), 0)
     if (expected := versioned_topic(topic, version)) != topic:
-        return f"{topic}: version {version}, whose topic is {expected}"
+        return Refusal(f"{topic}: version {version}, whose topic is {expected}")
     member_kind = kind
     field = (Nodetype.NAME, kind)
     for step in path.split("."):
         match = STEP.fullmatch(step)
         fields = dict(definitions[member_kind][1]) if member_kind in definitions else {}
         if match is None or match[1] not in fields:
-            return f"no {step}"
+            return Refusal(f"no {step}")
         node, content = fields[match[1]]
         if match[2] is not None and node is Nodetype.ARRAY and int(match[2]) >= content[1]:
-            return f"{match[1]} of {content[1]}"
+            return Refusal(f"{match[1]} of {content[1]}")
         element = _element((node, content))
         field = (node, content) if match[2] is None else element
         member_kind = element[1] if element[0] is Nodetype.NAME else ""
     if components is None or _has(definitions, field, components):
-        return ""
-    return f"{path}: no {', '.join(components) or 'number'}"
+        return None
+    return Refusal(f"{path}: no {', '.join(components) or 'number'}")
 
 
 def _has(definitions: Types, field: Any, components: str) -> bool:
@@ -188,11 +188,11 @@ def _has(definitions: Types, field: Any, components: str) -> bool:
     )
 
 
-def _constant_fault(types: Types, channel_map: ChannelMap, key: str, kind: str) -> str:
+def _constant_fault(types: Types, channel_map: ChannelMap, key: str, kind: str) -> Refusal | None:
     section, _, name = key.partition(".")
     row = channel_map.conditions.get(name) if section == "conditions" else None
     if row is None or not row.one_of or kind not in types:
-        return ""
+        return None
     values = {constant: value for constant, _, value in types[kind][0]}
     constants = [constant for constant in CONSTANT.findall(row.source) if constant in values]
     wrong = [
@@ -200,4 +200,4 @@ def _constant_fault(types: Types, channel_map: ChannelMap, key: str, kind: str) 
         for constant in constants
         if values[constant] not in row.one_of
     ]
-    return ", ".join(wrong)
+    return Refusal(", ".join(wrong)) if wrong else None

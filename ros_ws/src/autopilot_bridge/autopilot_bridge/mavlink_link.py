@@ -27,9 +27,9 @@ from autopilot_bridge.map_rows import MAVLINK, LinkConfig
 from autopilot_bridge.message_rates import MessageRates
 from flight_core.files import read_file
 from flight_core.installation import require_package
+from flight_core.outcome import Refusal, joined
 from flight_core.parameters import ParameterError
 from flight_core.rates import nanoseconds
-from flight_core.text import sentences
 from flight_core.vectors import ChannelError
 
 DIALECT = "ardupilotmega"
@@ -57,7 +57,7 @@ ANSWER = 1.0  # s, for an answer to a request, which is then repeated
 SILENCE = 3.0
 READ_AGAIN = 5.0  # s, then a parameter is read again, since a ground station may have set it
 QUEUE = 256  # messages between two ticks
-TAKEN = (
+TAKEN = Refusal(
     "requested again; a ground station on this link requests rates of its own (MAVProxy: set "
     "streamrate -1), or the link is too slow: give the bridge a port of its own"
 )
@@ -146,12 +146,11 @@ def _connection(config: LinkConfig) -> Any:
 class Link:
     """A connection, which receives from `start` on.
 
-    `problem` and `conflict` are sentences, empty if there is none. Only messages of the sender in
-    `AutopilotLock` are taken, and over UDP no other address gets messages. `parameters` are the
-    names of parameters of the autopilot that are read; `further` are others, which some releases
-    lack. If there is a passphrase, each message is signed, and messages without a valid signature
-    are refused. Source: MAVLink guide, message signing; the key of a passphrase is that of MAVProxy
-    and Mission Planner.
+    Only messages of the sender in `AutopilotLock` are taken, and over UDP no other address gets
+    messages. `parameters` are the names of parameters of the autopilot that are read; `further` are
+    others, which some releases lack. If there is a passphrase, each message is signed, and messages
+    without a valid signature are refused. Source: MAVLink guide, message signing; the key of a
+    passphrase is that of MAVProxy and Mission Planner.
     """
 
     def __init__(
@@ -162,11 +161,13 @@ class Link:
         self._connection = _connection(config)
         self._parser = self._new_parser(self._connection.mav.signing)
         self._lock = AutopilotLock(nanoseconds(SILENCE))
-        self._clash = ""  # a conflict that only another configuration can end
-        self._second = ""  # the sentence on a second sender
+        # a conflict that only another configuration can end
+        self._clash: Refusal | None = None
+        self._second: Refusal | None = None  # about a second sender
         self._second_at = 0.0  # and when it sent last
         self.stations: set[int] = set()  # systems of other ground stations
-        self._refused = ""  # why the last message was refused, for its signature
+        # why the last message was refused, for its signature
+        self._refused: Refusal | None = None
         self._queues: dict[str, deque[MavlinkMessage]] = {}
         self.parameters: dict[str, float] = {}  # of the autopilot, as it told them last
         self._to_read = tuple(parameters)
@@ -175,7 +176,7 @@ class Link:
         self._to_request = dict(config.rates)
         # The message whose interval was requested, and when.
         self._requested: tuple[str, float] | None = None
-        self._denied: dict[str, str] = {}
+        self._denied: dict[str, Refusal] = {}
         self._beat = 0.0
         self._alive = 0.0
         self._began = time.monotonic()
@@ -188,13 +189,13 @@ class Link:
         self._thread = Thread(target=self._receive, name="mavlink", daemon=True)
 
     @property
-    def conflict(self) -> str:
+    def conflict(self) -> Refusal | None:
         """Who else sends as the autopilot or as the bridge, or a setting that prevents engagement.
 
         Without that setting of the autopilot no engagement works.
         """
-        second = self._second if time.monotonic() - self._second_at <= SILENCE else ""
-        return sentences(self._clash, second)
+        second = self._second if time.monotonic() - self._second_at <= SILENCE else None
+        return joined((self._clash, second))
 
     def listen(self, name: str) -> deque[MavlinkMessage]:
         """Return the queue in which messages of a name arrive."""
@@ -221,34 +222,30 @@ class Link:
             self._thread.join(2.0)
         self._connection.close()
 
-    def problem(self, name: str = "") -> str:
-        """Say what is wrong with the link, or with one of its messages."""
+    def problem(self, name: str | None = None) -> Refusal | None:
+        """Say what is wrong with the link, or with the message of a name."""
         now = time.monotonic()
         silent = now - max(self._alive, self._began) > SILENCE
         if silent or (self._refused and not self._alive):
             silence = f"no message of system {self._config.system} over {self._config.url}"
             silence += f" for {SILENCE:g} s" if silent else " is taken"
             systems = ", ".join(map(str, sorted(self._systems)))
-            other_systems = (
-                f"an autopilot is system {systems} there: set link.system" if systems else ""
-            )
-            return sentences(silence, other_systems, self._refused, self.conflict)
-        names = [name] if name else list(self._config.rates)
-        slow = [sentence for message, sentence in self._rates.slow(now).items() if message in names]
-        refusals = {
-            message: sentence for message, sentence in self._denied.items() if message in names
-        }
+            other_systems = None
+            if systems:
+                other_systems = Refusal(f"an autopilot is system {systems} there: set link.system")
+            return joined((Refusal(silence), other_systems, self._refused, self.conflict))
+        names = list(self._config.rates) if name is None else [name]
+        slow = [reason for message, reason in self._rates.slow(now).items() if message in names]
+        refusals = {message: reason for message, reason in self._denied.items() if message in names}
         denied = [
-            sentence
-            for message, sentence in refusals.items()
-            if not self._rates.comes(message, now)
+            reason for message, reason in refusals.items() if not self._rates.comes(message, now)
         ]
-        return sentences(self.conflict, *slow, *denied, *([TAKEN] if slow else []))
+        return joined((self.conflict, *slow, *denied, TAKEN if slow else None))
 
-    def refusal(self) -> str:
-        """Why an engagement would not have the rates of the map, or no effect, as a sentence."""
+    def reason_against_engagement(self) -> Refusal | None:
+        """Say why an engagement would not have the rates of the map, or no effect."""
         unknown = self._rates.unknown(time.monotonic())
-        rates = f"the rate of {', '.join(unknown)} is not known yet" if unknown else ""
+        rates = Refusal(f"the rate of {', '.join(unknown)} is not known yet") if unknown else None
         return self.problem() or self._dropped_overrides() or rates
 
     def _station_numbers(self) -> range:
@@ -259,36 +256,35 @@ class Link:
         last = max(first, self.parameters.get(LAST_STATION, 0.0))
         return range(int(first), int(last) + 1)
 
-    def _dropped_overrides(self) -> str:
-        """Why the autopilot drops the RC overrides, as a sentence; empty where it does not."""
+    def _dropped_overrides(self) -> Refusal | None:
+        """Say why the autopilot drops the RC overrides."""
         numbers = self._station_numbers()
         system = self._config.source_system
         if system in numbers:
-            return ""
+            return None
         name = STATION if STATION in self.parameters else OLD_STATION
         mend = f"{name} and {LAST_STATION} to a range with it"
         mend = mend if LAST_STATION in self.parameters else f"{name} to {system}"
-        return (
+        return Refusal(
             f"the autopilot drops RC overrides of system {system}: set link.source_system to "
             f"{self._stations_text()}, or {mend}"
         )
 
-    def lost(self) -> str:
+    def end_reason(self) -> Refusal | None:
         """Say what ends an engagement.
 
         Either a rate stays slow, or the ground station is silent.
         """
         now = time.monotonic()
         limit = self._config.station_silence
-        is_silent = (
+        silence = None
+        if (
             limit is not None
             and self._station_heard is not None
             and now - self._station_heard > limit
-        )
-        station = (
-            f"ground station {self._stations_text()} is silent for {limit:g} s" if is_silent else ""
-        )
-        return sentences(self._rates.lasting(now), station)
+        ):
+            silence = Refusal(f"ground station {self._stations_text()} is silent for {limit:g} s")
+        return joined((self._rates.lasting(now), silence))
 
     def station(self) -> str:
         """Say what the autopilot's failsafe FS_GCS_ENABL watches.
@@ -374,14 +370,14 @@ class Link:
         parser.signing = signing
         return parser
 
-    def _signature_fault(self, packet: bytes) -> str:
+    def _signature_fault(self, packet: bytes) -> Refusal:
         """Why the signature of a packet was refused.
 
         A signature has 6 bytes of a time, 10 us each, and 6 of a hash (MAVLink guide).
         """
         signing = self._connection.mav.signing
         if hashlib.sha256(signing.secret_key + packet[:-6]).digest()[:6] != packet[-6:]:
-            return (
+            return Refusal(
                 "messages without a valid signature come: the passphrase differs, or the "
                 "autopilot does not sign"
             )
@@ -390,7 +386,7 @@ class Link:
         restart = (
             "the autopilot has started without the time, which a GPS or a ground station gives"
         )
-        return (
+        return Refusal(
             f"messages with the right passphrase come, signed {behind:.0f} s before {before}: "
             f"{restart}"
         )
@@ -404,13 +400,13 @@ class Link:
         namesake = name == "HEARTBEAT" and system == self._config.source_system
         # There may be other senders: a joystick, another bridge, a ground station, an autopilot.
         if joystick or (namesake and not is_station):
-            self._clash = (
+            self._clash = Refusal(
                 f"another sender on {self._config.url} has system {system} too, and the "
                 "autopilot takes its RC overrides:"
                 " give it another number, or switch the joystick of a ground station off"
             )
         elif (system, message.get_srcComponent()) == (self._config.system, COMPANION):
-            self._clash = f"another bridge is on {self._config.url}: end it"
+            self._clash = Refusal(f"another bridge is on {self._config.url}: end it")
         elif is_station:
             self.stations.add(system)
             if system in self._station_numbers():
@@ -428,7 +424,7 @@ class Link:
         if not self._admits(message, address, now):
             return
         if message.get_header().incompat_flags & SIGNED and self._config.passphrase_file is None:
-            self._clash = (
+            self._clash = Refusal(
                 "the autopilot signs its messages and drops others: set "
                 "link.passphrase_file in the map"
             )
@@ -456,14 +452,14 @@ class Link:
         try:
             self._lock.check(sender, since_boot_ns, now_ns)
         except ChannelError as error:
-            self._second = str(error)
+            self._second = Refusal(str(error))
             self._second_at = now
             return False
         is_new_sender = self._lock.refresh(sender, since_boot_ns, now_ns)
         if is_new_sender:
             self._parser = self._new_parser(self._connection.mav.signing)
             if before is not None:
-                self._second = (
+                self._second = Refusal(
                     f"the autopilot at {sender} is new, or has started again; before: {before}"
                 )
                 self._second_at = now
@@ -529,7 +525,7 @@ class Link:
         self._requested = None
         rate = self._to_request.pop(name, 0.0)
         if result != ACCEPTED:
-            self._denied[name] = (
+            self._denied[name] = Refusal(
                 f"the autopilot denied {rate:g} Hz of {name} (MAV_RESULT {result}): ArduPilot "
                 "grants 0.8 SCHED_LOOP_RATE"
             )

@@ -8,6 +8,8 @@ No clock is read: every instant is an argument, in s.
 from collections import deque
 from collections.abc import Mapping
 
+from flight_core.outcome import Refusal, joined
+
 # s over which messages are counted. If the host pauses for half a second, no rate becomes slow.
 COUNTED = 2.0
 MESSAGES = 4  # least number of messages to count, if COUNTED has fewer
@@ -54,25 +56,26 @@ class MessageRates:
             return {}
         return {name: rate.requested for name, rate in self._rates.items() if rate.step(now)}
 
-    def slow(self, now: float) -> dict[str, str]:
-        """Return sentences on slow messages, by name.
+    def slow(self, now: float) -> dict[str, Refusal]:
+        """Return what is wrong with slow messages, by name.
 
         A message is slow if it is slow now, or if it was less than REMEMBERED ago after it had its
         rate.
         """
-        sentences = {name: rate.sentence(name, now) for name, rate in self._rates.items()}
-        return {name: sentence for name, sentence in sentences.items() if sentence}
+        reasons = {name: rate.slowness(name, now) for name, rate in self._rates.items()}
+        return {name: reason for name, reason in reasons.items() if reason is not None}
 
-    def lasting(self, now: float) -> str:
+    def lasting(self, now: float) -> Refusal | None:
         """Say which messages have been slow for SLOW_ENDS or longer."""
-        lasting = [
-            rate.sentence(name, now) for name, rate in self._rates.items() if rate.lasts(now)
-        ]
-        return "; ".join([*lasting, f"for {SLOW_ENDS:g} s"]) if lasting else ""
+        reasons = joined(
+            rate.slowness(name, now) for name, rate in self._rates.items() if rate.lasts(now)
+        )
+        return None if reasons is None else Refusal(f"{reasons}; for {SLOW_ENDS:g} s")
 
     def comes(self, name: str, now: float) -> bool:
         """Return whether a message comes at the requested rate."""
-        return self._rates[name].is_known(now) and not self._rates[name].sentence(name, now)
+        rate = self._rates[name]
+        return rate.is_known(now) and rate.slowness(name, now) is None
 
     def unknown(self, now: float) -> list[str]:
         """Name the messages that have not been counted for the full length yet."""
@@ -124,13 +127,14 @@ class _Rate:
         self._repeated = now
         return True
 
-    def sentence(self, name: str, now: float) -> str:
+    def slowness(self, name: str, now: float) -> Refusal | None:
+        """Say how slow the message of a name is, or was."""
         rate = f"at {self._lowest:.2g} Hz, requested are {self.requested:g} Hz"
         if self._slow_since is not None:
-            return f"{name} comes {rate}"
+            return Refusal(f"{name} comes {rate}")
         if self._last_slow is not None and now - self._last_slow < REMEMBERED:
-            return f"{name} came {rate}, less than {REMEMBERED:g} s ago"
-        return ""
+            return Refusal(f"{name} came {rate}, less than {REMEMBERED:g} s ago")
+        return None
 
     def _drop_old(self, now: float) -> None:
         while self._instants and now - self._instants[0] > self._window:

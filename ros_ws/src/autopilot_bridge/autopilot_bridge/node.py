@@ -45,11 +45,11 @@ from autopilot_bridge.outgoing import (
     require_field,
 )
 from autopilot_bridge.params import BridgeConfig, load_map
-from flight_core.outcome import FlightEnded
+from flight_core.outcome import FlightEnded, Refusal, joined
 from flight_core.parameters import require
 from flight_core.publisher_lock import require_sender
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns, seconds
-from flight_core.text import bounded, sentences
+from flight_core.text import bounded
 from flight_core.vectors import ChannelError, StampedVector
 from flight_ros.flight_node import FlightNode
 from flight_ros.messages import Decoder, Encoder
@@ -65,6 +65,9 @@ LEFT = (
 RC_OVERRIDE = f"{MAVLINK}/RC_CHANNELS_OVERRIDE"  # topic of the overrides
 # Number of messages with release values when the node ends, since a single one may be lost.
 RELEASES_AT_SHUTDOWN = 5
+
+NOT_ACTIVATED = Refusal("the controller refused to activate, or was active already: see its log")
+ACTIVATION_TIMED_OUT = Refusal("timed out waiting for the controller to activate")
 
 # ns to wait until the controller is active at an engagement. It answers within some ticks.
 ACTIVATION_TIMEOUT_NS = NANOSECONDS
@@ -93,7 +96,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         self._link = self._open_link()
         # Systems of ground stations that were already reported.
         self._known_stations: set[int] = set()
-        self._conflict = ""  # which topics have two publishers, as a sentence
+        self._conflict: Refusal | None = None  # which topics have two publishers
         # Publishers and encoders of what comes over MAVLink, as named vectors.
         self._recorded: dict[str, tuple[Callable[[bytes], None], Encoder]] = {}
         self._readers = self._read_topics()
@@ -173,7 +176,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
             for name, row in rows:
                 require_field(kind(), name, row)
             if fault := version_fault(topic, kind):
-                self.get_logger().warning(fault)
+                self.get_logger().warning(str(fault))
             readers.append((self._reader(Topic(topic, kind, EXTERNAL)), rows))
         return readers
 
@@ -284,7 +287,8 @@ class BridgeNode(FlightNode[BridgeConfig]):
         pause_ns = self._pause_ns()
         self._began_ns += pause_ns
         if pause_ns > self._longest_pause_ns:
-            self._bridge.disengage(f"the bridge did not run for {seconds(pause_ns):.2f} s", now_ns)
+            pause = Refusal(f"the bridge did not run for {seconds(pause_ns):.2f} s")
+            self._bridge.disengage(pause, now_ns)
 
     def _read(
         self,
@@ -347,7 +351,8 @@ class BridgeNode(FlightNode[BridgeConfig]):
     def _engage(self, request: Any, response: Any) -> Any:
         if request.data:
             return self._request_engagement(response, blind=False)
-        self._bridge.disengage("disengaged by request", self.now_ns(), by_pilot=True)
+        request_reason = Refusal("disengaged by request")
+        self._bridge.disengage(request_reason, self.now_ns(), by_pilot=True)
         response.success = True
         self._log_phase()
         return response
@@ -357,10 +362,11 @@ class BridgeNode(FlightNode[BridgeConfig]):
 
     def _request_engagement(self, response: Any, *, blind: bool) -> Any:
         self._find_conflicts()
-        response.message = self._bridge.engage(self.now_ns(), blind=blind)
-        response.success = not response.message
-        if response.message:
-            self.get_logger().warning(f"not engaged: {response.message}")
+        refusal = self._bridge.engage(self.now_ns(), blind=blind)
+        response.success = refusal is None
+        if refusal is not None:
+            response.message = str(refusal)
+            self.get_logger().warning(f"not engaged: {refusal}")
         self._log_phase()
         return response
 
@@ -387,20 +393,21 @@ class BridgeNode(FlightNode[BridgeConfig]):
             success = self._activation.result().success
             self._activation = None
             if not success:
-                self._bridge.disengage(
-                    "the controller refused to activate, or was active already: see its log", now_ns
-                )
+                self._bridge.disengage(NOT_ACTIVATED, now_ns)
         elif now_ns - self._activation_ns > ACTIVATION_TIMEOUT_NS:
             self._activation = None
-            self._bridge.disengage("timed out waiting for the controller to activate", now_ns)
+            self._bridge.disengage(ACTIVATION_TIMED_OUT, now_ns)
 
     def _report(self, now_ns: int) -> None:
         """Publish the phase and its reason; once a second also what would refuse an engagement."""
         bridge = self._bridge
         self._report_ns = now_ns
-        refusal = "" if bridge.phase in {Phase.ENGAGED, Phase.ENGAGING} else bridge.refusal(now_ns)
-        sentence = "; would refuse: ".join(filter(None, (bridge.reason, refusal)))
-        self._engagement.publish(KeyValue(key=bridge.phase.name, value=sentence))
+        refusal = None
+        if bridge.phase not in {Phase.ENGAGED, Phase.ENGAGING}:
+            refusal = bridge.reason_against_engagement(now_ns)
+        parts = [str(part) for part in (bridge.reason, refusal) if part is not None]
+        value = "; would refuse: ".join(parts)
+        self._engagement.publish(KeyValue(key=bridge.phase.name, value=value))
         ready = self._controller.service_is_ready() and self._controller_state.service_is_ready()
         before = self._u_sender
         self._u_sender = bridge.u_lock.publisher
@@ -434,16 +441,16 @@ class BridgeNode(FlightNode[BridgeConfig]):
         if phase is before and (phase is not Phase.ENGAGED or reason == lacked):
             return
         sentence = phase.name if phase is before else f"{before.name} -> {phase.name}"
-        if reason:
-            self.get_logger().warning(bounded(f"{sentence}: {reason}"))
-        else:
+        if reason is None:
             self.get_logger().info(sentence)
+        else:
+            self.get_logger().warning(bounded(f"{sentence}: {reason}"))
         begins = phase is Phase.ENGAGED and before is not Phase.ENGAGED
         if begins and self._link is not None and self._overrides_sticks:
             self.get_logger().info(self._link.station())
         if phase is not before and Phase.ENGAGED in (phase, before):
             self._activate(active=phase is Phase.ENGAGED)
-        self._engagement.publish(KeyValue(key=phase.name, value=reason))
+        self._engagement.publish(KeyValue(key=phase.name, value=str(reason or "")))
 
     def _warn_stale_inputs(self, now_ns: int) -> None:
         stale = self._bridge.stale(now_ns)
@@ -480,15 +487,14 @@ class BridgeNode(FlightNode[BridgeConfig]):
     def _cause(self, subscription: PolledSubscription | MavlinkReader) -> str:
         """Why no sample of a topic was accepted, as a sentence."""
         if isinstance(subscription, MavlinkReader):
+            if problem := subscription.link.problem(subscription.message_name):
+                return str(problem)
             refusal = (
                 what
                 for what in self.refusals.counts
                 if what.startswith(f"{subscription.topic.name}: ")
             )
-            return next(
-                filter(None, (subscription.link.problem(subscription.message_name), *refusal)),
-                "no such message comes",
-            )
+            return next(refusal, "no such message comes")
         publishers = self.get_publishers_info_by_topic(subscription.name)
         if not publishers and (fault := version_fault(subscription.name, subscription.topic.type)):
             return f"no publisher. {fault}"
@@ -498,7 +504,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         refusal = (
             what for what in self.refusals.counts if what.startswith(f"{subscription.topic.name}: ")
         )
-        return next(iter((*faults, *refusal)), "no sample of its publisher arrives")
+        return str(next(iter((*faults, *refusal)), "no sample of its publisher arrives"))
 
     def graph_checks(self) -> list[Callable[[], None]]:
         """Return the checks of the graph, with one for topics that the autopilot cannot take.
@@ -544,7 +550,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
             for topic, count in counts.items()
             if count > (topic not in setpoints)
         ]
-        self._conflict = "; ".join(conflicts)
+        self._conflict = Refusal("; ".join(conflicts)) if conflicts else None
         self._watch_link()
 
     def _watch_link(self) -> None:
@@ -554,33 +560,31 @@ class BridgeNode(FlightNode[BridgeConfig]):
         bridge.conflict = self._conflict
         if link is None:
             return
-        bridge.conflict = sentences(self._conflict, link.conflict, link.lost())
-        bridge.problem = link.refusal()
+        bridge.conflict = joined((self._conflict, link.conflict, link.end_reason()))
+        bridge.problem = link.reason_against_engagement()
         for name, value in tuple(link.parameters.items()):
             bridge.take_parameter(name, value)
 
     def status(self) -> tuple[bytes, str, dict[str, object]]:
         bridge = self._bridge
         now_ns = self.now_ns()
-        refusal = "" if bridge.phase is Phase.ENGAGED else bridge.refusal(now_ns)
-        if bridge.phase is Phase.ENGAGED and not bridge.reason:
-            level = DiagnosticStatus.OK
-        else:
-            level = DiagnosticStatus.WARN
-        sentence = ": ".join(filter(None, (bridge.phase.name, bridge.reason)))
+        is_engaged = bridge.phase is Phase.ENGAGED
+        refusal = None if is_engaged else bridge.reason_against_engagement(now_ns)
+        is_ok = is_engaged and bridge.reason is None
+        phase = bridge.phase.name
         return (
-            level,
-            sentence,
+            DiagnosticStatus.OK if is_ok else DiagnosticStatus.WARN,
+            phase if bridge.reason is None else f"{phase}: {bridge.reason}",
             {
-                "phase": bridge.phase.name,
+                "phase": phase,
                 "map": self._map.name,
-                "would refuse": refusal or "nothing",
+                "would refuse": str(refusal or "nothing"),
             },
         )
 
     def close(self) -> None:
         if self._bridge.phase is not Phase.DISENGAGED and self._map.silence.release > 0.0:
-            self._bridge.disengage("bridge shut down", self.now_ns())
+            self._bridge.disengage(Refusal("bridge shut down"), self.now_ns())
             for _ in range(RELEASES_AT_SHUTDOWN):
                 self._send(self.now_ns(), NANOSECONDS)  # this slack makes every message due
                 time.sleep(0.01)

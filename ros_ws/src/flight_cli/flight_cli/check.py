@@ -190,7 +190,11 @@ def _check_rows(channel_map: ChannelMap, definitions: Sequence[Path], as_json: b
     rows = check_map(channel_map, releases)
     if as_json:
         print_json(
-            {"map": channel_map.name, "releases": names, "rows": [row._asdict() for row in rows]}
+            {
+                "map": channel_map.name,
+                "releases": names,
+                "rows": [_row_as_json(row) for row in rows],
+            }
         )
     else:
         _show_rows(channel_map.name, rows, names)
@@ -206,13 +210,18 @@ def _check_rows(channel_map: ChannelMap, definitions: Sequence[Path], as_json: b
         raise typer.Exit(CONTRADICTS)
 
 
+def _row_as_json(row: CheckedRow) -> dict[str, object]:
+    """Return a row with a sentence a release, which is empty if the row holds."""
+    return row._asdict() | {"faults": [str(fault or "") for fault in row.faults]}
+
+
 def _show_rows(name: str, rows: Sequence[CheckedRow], releases: Sequence[str]) -> None:
     """Print one line for each row of the map, and a sentence for each row that does not hold."""
     faults: dict[str, list[dict[str, None]]] = {}
     for row in rows:
         by_release = faults.setdefault(row.key, [{} for _ in releases])
         for sentences, fault in zip(by_release, row.faults, strict=True):
-            sentences.update({fault: None} if fault else {})
+            sentences.update({str(fault): None} if fault else {})
     table = new_table(
         f"Map {name}: which rows hold",
         ("row", *releases),

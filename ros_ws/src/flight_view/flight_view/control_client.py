@@ -110,11 +110,11 @@ class ControlClient(Client):
 
     def engage(self) -> str:
         """Engage the bridge, as `rise-di engage` does."""
-        return self._bridge().engage(lambda reason: None)
+        return str(self._bridge().engage(lambda reason: None) or "")
 
     def disengage(self) -> str:
         """Disengage the bridge."""
-        return self._bridge().disengage()
+        return str(self._bridge().disengage() or "")
 
     def _bridge(self) -> EngagementClient:
         self._engagement = self._engagement or EngagementClient(parent=self)
