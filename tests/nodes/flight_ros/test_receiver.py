@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from tests.joint_states import JOINT_STATE, STORE, vector
 
+from flight_core.outcome import Refusal
 from flight_core.publisher_lock import LockstepLock, PublisherLock
 from flight_core.vectors import ChannelError, StampedVector
 from flight_ros import messages
@@ -217,7 +218,8 @@ def test_conflicting_publisher_is_not_decoded(raw: bytes) -> None:
     sentence = "conflicting publisher /foreign ignored: already receiving from /aircraft#1"
     assert setup.topic.lines == [("error", f"/y: sample refused: {sentence}")]
     assert setup.refusals.last["/y"][1] == sentence
-    assert [setup.refusals.conflict(), setup.refusals.conflict()] == [f"/y: {sentence}", ""]
+    assert setup.refusals.pop_conflict() == Refusal(f"/y: {sentence}")
+    assert setup.refusals.pop_conflict() is None
     # the first one has timed out
     assert setup.poll(message("/foreign"), now_ns=TAKEOVER + 1) == [True]
 

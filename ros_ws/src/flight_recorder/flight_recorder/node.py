@@ -21,7 +21,7 @@ from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
 from rclpy.validate_topic_name import validate_topic_name
 
 from flight_core.files import dump_yaml, is_file, link_latest, read_file, writing
-from flight_core.outcome import UNKNOWN, Outcome, parsed_outcome
+from flight_core.outcome import UNKNOWN, Outcome, Refusal, joined, parsed_outcome
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns
 from flight_core.text import bounded
@@ -128,7 +128,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
         self.lost: Counter[str] = Counter()
         self._losses = Throttle(LOSS_PERIOD_NS)
         self.silent: Counter[str] = Counter()  # ns, by topic
-        self._end_reason = ""  # the reason why recording ended
+        self._end_reason: Refusal | None = None  # why recording ended
         self._flushed_ns = self._drained_ns = self._disk_checked_ns = time.monotonic_ns()
         self._warn_missing_ns = time.monotonic_ns() + NO_PUBLISHER_WARNING_NS
         self._heard = 0  # messages of LOOP
@@ -156,8 +156,8 @@ class RecorderNode(FlightNode[RecorderConfig]):
         directory = Path(parameters.directory or default).absolute()
         with writing("recorder.directory", directory, "a folder that can"):
             directory.mkdir(parents=True, exist_ok=True)
-            if sentence := self._space_shortage(directory):
-                raise ParameterError(f"recorder.min_free: {sentence}")
+            if shortage := self._space_shortage(directory):
+                raise ParameterError(f"recorder.min_free: {shortage}")
             bag = BagWriter(self._free_folder(directory))
             bag.add_attachments(attachments, time.time_ns())
             if self.simulated is not None:
@@ -176,13 +176,13 @@ class RecorderNode(FlightNode[RecorderConfig]):
         has_log = self.simulated is not None and any(directory.glob("*.mcap"))
         return next(folder for folder in folders if not folder.exists()) if has_log else directory
 
-    def _space_shortage(self, directory: Path) -> str:
-        """Write the sentence about too little free space; "" if there is enough."""
+    def _space_shortage(self, directory: Path) -> Refusal | None:
+        """Refuse a folder with too little free space."""
         free = free_bytes(directory) / MEGABYTE
         least = self.parameters.min_free
         if free >= least:
-            return ""
-        return f"found {free:.1f} MB free in {directory}, expected at least {least:g} MB"
+            return None
+        return Refusal(f"found {free:.1f} MB free in {directory}, expected at least {least:g} MB")
 
     def _among(self, topics: Sequence[Topic], *, heard: bool = False) -> list[_RecordedTopic]:
         """Return the recorded topics among `topics`; with `heard`, only those with messages."""
@@ -251,8 +251,8 @@ class RecorderNode(FlightNode[RecorderConfig]):
             self._write_or_end(self._check_disk)
 
     def _check_disk(self) -> None:
-        if sentence := self._space_shortage(self._bag.directory):
-            self._end(f"min_free: {sentence}")
+        if shortage := self._space_shortage(self._bag.directory):
+            self._end(f"min_free: {shortage}")
 
     def _drain_subscriptions(self) -> None:
         """Write the received messages.
@@ -336,12 +336,13 @@ class RecorderNode(FlightNode[RecorderConfig]):
                 self._end(f"no space left for {self._bag.path}")
 
     def _end(self, reason: str) -> None:
-        if not self._end_reason:
-            self._end_reason = f"recording ended: {reason}{self._close_bag()}"
-            self.get_logger().error(self._end_reason)
+        if self._end_reason is None:
+            end_reason = Refusal(f"recording ended: {reason}")
+            self._end_reason = joined((end_reason, self._close_bag()))
+            self.get_logger().error(str(self._end_reason))
 
-    def _close_bag(self) -> str:
-        """Finish the bag. Return the error text when the bag cannot be finished."""
+    def _close_bag(self) -> Refusal | None:
+        """Finish the bag, or return why it cannot be finished."""
         try:
             self._bag.add_metadata(
                 LOST_MESSAGES, {name: str(count) for name, count in self.lost.items()}
@@ -357,8 +358,9 @@ class RecorderNode(FlightNode[RecorderConfig]):
                 self._bag.add_metadata(OUTCOME, outcome.record())
             self._bag.close()
         except OSError as error:
-            return f"; {self._bag.path.name} is truncated: it cannot be written ({error.strerror})"
-        return ""
+            name = self._bag.path.name
+            return Refusal(f"{name} is truncated: it cannot be written ({error.strerror})")
+        return None
 
     def _add_silences(self) -> None:
         """Store the silences of topics, including those that still last."""
@@ -520,7 +522,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
         figures |= {f"lost {name}": count for name, count in self.lost.items()}
         figures |= {f"missing {name}": "no publisher" for name in self._missing}
         if self._end_reason:
-            return DiagnosticStatus.ERROR, self._end_reason, figures
+            return DiagnosticStatus.ERROR, str(self._end_reason), figures
         figures |= {
             f"silent {topic.name}": "no message" for topic in self._topics if topic.silent_ns
         }
@@ -552,10 +554,10 @@ class RecorderNode(FlightNode[RecorderConfig]):
 
     def close(self) -> None:
         self._drain()
-        if not self._end_reason:
-            self._end_reason = "recording ended"
-            if sentence := self._close_bag():
-                self.get_logger().error(f"{self._end_reason}{sentence}")
+        if self._end_reason is None:
+            self._end_reason = Refusal("recording ended")
+            if fault := self._close_bag():
+                self.get_logger().error(f"{self._end_reason}; {fault}")
         for name in self._missing:
             self.get_logger().warning(f"{name} is not in the log: it had no publisher")
         self.get_logger().info(

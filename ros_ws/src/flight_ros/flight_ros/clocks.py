@@ -159,17 +159,15 @@ class PeerClocks:
         """Return the clocks of the peers."""
         return self._peers.clocks()
 
-    def sentence_on(self, sender: str) -> str:
+    def sentence_on(self, sender: str) -> str | None:
         """End a sentence on the stamp of a node whose clock differs.
 
-        Returns "" if no difference is known.
+        Returns None if no difference is known.
         """
         clock = self.clocks().get(sender)
-        return (
-            bounded(f": the clock of {sender} is {clock}")
-            if clock is not None and abs(clock.offset) > DIFFERS
-            else ""
-        )
+        if clock is None or abs(clock.offset) <= DIFFERS:
+            return None
+        return bounded(f": the clock of {sender} is {clock}")
 
     def report(self) -> dict[str, object]:
         """Return the clocks for the diagnostics."""

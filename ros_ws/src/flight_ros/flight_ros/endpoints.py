@@ -14,6 +14,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
 from rclpy.topic_endpoint_info import TopicEndpointInfo, TopicEndpointTypeEnum
 
+from flight_core.outcome import Refusal
 from flight_core.parameters import require
 from flight_core.rates import NANOSECONDS
 from flight_core.text import bounded
@@ -51,22 +52,20 @@ def require_no_publishers(
         time.sleep(DISCOVERY_POLL_PERIOD)
 
 
-def mismatch(peer: TopicEndpointInfo, message_type: str, qos: QoSProfile) -> str:
-    """Say why a peer exchanges no messages with a local endpoint of this message type and QoS.
-
-    Returns "" if both match.
-    """
+def mismatch(peer: TopicEndpointInfo, message_type: str, qos: QoSProfile) -> Refusal | None:
+    """Say why a peer exchanges no messages with a local endpoint of this message type and QoS."""
     node = f"{peer.node_namespace.rstrip('/')}/{peer.node_name}"
     publishes = peer.endpoint_type == TopicEndpointTypeEnum.PUBLISHER
     verb = "publishes" if publishes else "subscribes"
     if peer.topic_type != message_type:
-        return (
+        return Refusal(
             f"{node} {verb}{'' if publishes else ' to'} {peer.topic_type}, expected {message_type}"
         )
     offered, requested = (peer.qos_profile, qos) if publishes else (qos, peer.qos_profile)
     compatibility, reason = qos_check_compatible(offered, requested)
-    is_refused = compatibility == QoSCompatibility.ERROR
-    return f"{node} {verb} with incompatible quality of service: {reason}" if is_refused else ""
+    if compatibility != QoSCompatibility.ERROR:
+        return None
+    return Refusal(f"{node} {verb} with incompatible quality of service: {reason}")
 
 
 class EndpointMonitor:
@@ -76,30 +75,32 @@ class EndpointMonitor:
         self._node = node
         self._throttle = Throttle(LOG_PERIOD_NS)
 
-    def mismatches(self, subscription: PolledSubscription) -> list[str]:
-        """Write a sentence for every publisher whose type or QoS does not fit a subscription."""
+    def mismatches(self, subscription: PolledSubscription) -> list[Refusal]:
+        """Refuse every publisher whose type or QoS does not fit a subscription."""
         kind = type_name(subscription.topic.type)
         peers = self._node.get_publishers_info_by_topic(subscription.name)
-        return [sentence for peer in peers if (sentence := mismatch(peer, kind, subscription.qos))]
+        return [refusal for peer in peers if (refusal := mismatch(peer, kind, subscription.qos))]
 
-    def unexpected(self, subscription: PolledSubscription) -> str:
-        """Write a sentence if nodes of several names publish a topic of a single node; else "".
+    def reason_against_publishers(self, subscription: PolledSubscription) -> Refusal | None:
+        """Refuse nodes of several names that publish a topic of a single node.
 
         A restarted node keeps the name.
         """
         if subscription.topic not in OF_ONE_NODE:
-            return ""
+            return None
         peers = self._node.get_publishers_info_by_topic(subscription.name)
         names = sorted({f"{peer.node_namespace.rstrip('/')}/{peer.node_name}" for peer in peers})
-        return f"published by {', '.join(names)}, expected one node" if len(names) > 1 else ""
+        if len(names) < 2:
+            return None
+        return Refusal(f"published by {', '.join(names)}, expected one node")
 
     def check_publishers(self, subscription: PolledSubscription) -> None:
         """Log an error for each publisher that does not match a subscription of the node.
 
         Unexpected nodes are logged too.
         """
-        sentences = [*self.mismatches(subscription), self.unexpected(subscription)]
-        self._log(subscription.name, sentences)
+        refusals = [*self.mismatches(subscription), self.reason_against_publishers(subscription)]
+        self._log(subscription.name, refusals)
 
     def check_subscribers(self, publisher: Publisher) -> None:
         """Log an error for each subscriber that does not match a publisher of the node."""
@@ -115,7 +116,7 @@ class EndpointMonitor:
                 )
                 return
 
-    def _log(self, topic: str, sentences: Sequence[str]) -> None:
-        for sentence in sentences:
-            if sentence and self._throttle.due(f"{topic}: {sentence}"):
-                self._node.get_logger().error(bounded(f"{topic}: {sentence}"))
+    def _log(self, topic: str, refusals: Sequence[Refusal | None]) -> None:
+        for refusal in refusals:
+            if refusal and self._throttle.due(f"{topic}: {refusal}"):
+                self._node.get_logger().error(bounded(f"{topic}: {refusal}"))

@@ -202,7 +202,7 @@ class _AwaitedInputs:
 
     def __init__(self, nodes: Sequence[FlightNode[Any]]) -> None:
         self._nodes = nodes
-        self._wait_sets: dict[tuple[str, ...], WaitSet] = {}
+        self._wait_sets: dict[tuple[str | None, ...], WaitSet] = {}
 
     def wait(self, duration: float) -> bool:
         """Wait for one of them, at most `duration` s. Return whether there is one."""
@@ -259,7 +259,9 @@ def require_input(nodes: Sequence[FlightNode[Any]], advance_ns: int, has_begun: 
     """
     for node in nodes:
         topic = node.awaited_topic()
-        refused_ns, sentence = node.refusals.last.get(topic, (0, ""))
+        if topic is None or topic not in node.refusals.last:
+            continue
+        refused_ns, sentence = node.refusals.last[topic]
         if refused_ns >= advance_ns:
             raise FlightEnded(f"timed out waiting for {topic}: a sample was refused: {sentence}")
     if not has_begun:

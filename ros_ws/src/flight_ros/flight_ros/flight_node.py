@@ -17,7 +17,7 @@ from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 
-from flight_core.outcome import LostContact
+from flight_core.outcome import LostContact, joined
 from flight_core.parameters import NodeConfig, ParameterError, flatten, require
 from flight_core.publisher_lock import LockstepLock, PublisherLock
 from flight_core.rates import NANOSECONDS, nanoseconds, seconds
@@ -149,9 +149,9 @@ class FlightNode(Node, Generic[P]):
         """Take every lockstep step whose messages have come, and return whether there was one."""
         raise NotImplementedError
 
-    def awaited_topic(self) -> str:
-        """Name the topic for whose next message this node waits in lockstep; "" for none."""
-        return ""
+    def awaited_topic(self) -> str | None:
+        """Name the topic for whose next message this node waits in lockstep; None for none."""
+        return None
 
     def status(self) -> tuple[bytes, str, dict[str, object]]:
         """Return level, sentence and more values for the 1 Hz diagnostics."""
@@ -276,9 +276,9 @@ class FlightNode(Node, Generic[P]):
         self._adopted = parameters
         self.set_parameters_atomically(changes)
 
-    def clock_of(self, sender: str) -> str:
-        """End a sentence on the stamp of a node whose clock differs; "" if it does not."""
-        return "" if self.clocks is None else self.clocks.sentence_on(sender)
+    def clock_of(self, sender: str) -> str | None:
+        """End a sentence on the stamp of a node whose clock differs; None if it does not."""
+        return None if self.clocks is None else self.clocks.sentence_on(sender)
 
     def warn_no_publisher(
         self, subscription: PolledSubscription, lack: str = "no publisher"
@@ -298,15 +298,11 @@ class FlightNode(Node, Generic[P]):
         )
         if now_ns < log_ns:
             return
-        cause = lack
-        if self.count_publishers(subscription.name):
-            cause = (
-                "; ".join(self.endpoints.mismatches(subscription))
-                or "no sample of its publisher arrives"
-            )
-        if refusal := self.refusals.since(subscription, now_ns - NO_PUBLISHER_WARNING_NS):
-            cause = refusal
-        self.get_logger().warning(f"waiting for {subscription.name}: {cause}")
+        cause = self.refusals.since(subscription, now_ns - NO_PUBLISHER_WARNING_NS)
+        if cause is None and self.count_publishers(subscription.name):
+            lack = "no sample of its publisher arrives"
+            cause = joined(self.endpoints.mismatches(subscription))
+        self.get_logger().warning(f"waiting for {subscription.name}: {cause or lack}")
 
     def _change_parameters(self, changes: list[Parameter]) -> SetParametersResult:
         """Accept a change of tunable parameters as a whole, or reject it with a sentence.
@@ -430,14 +426,14 @@ class FlightNode(Node, Generic[P]):
         """
         if self.simulated is not None:
             self.simulated.require_one_simulation()
-        if self.peers is not None and (role := self.peers.lost()):
+        if self.peers is not None and (role := self.peers.lost_role()) is not None:
             self.peers.report(role)
             raise LostContact(f"lost contact with {role}")
 
     def finish(self) -> None:
         """End the node. In lockstep, wait until its last messages have arrived."""
         self.close()
-        if self.parameters.lockstep and not (self.peers and self.peers.lost()):
+        if self.parameters.lockstep and not (self.peers and self.peers.lost_role()):
             for publisher in self.publishers:
                 publisher.wait_for_all_acked(ACKNOWLEDGE_TIMEOUT)
 
@@ -457,9 +453,9 @@ class FlightNode(Node, Generic[P]):
         It has loop period, compute time, missed ticks (overruns), rejected samples and more.
         """
         level, sentence, further = self.status()
-        if conflict := self.refusals.conflict():
+        if conflict := self.refusals.pop_conflict():
             level = DiagnosticStatus.ERROR
-            sentence = conflict
+            sentence = str(conflict)
         refused = {f"refused {reason}": count for reason, count in self.refusals.counts.items()}
         clocks = {} if self.clocks is None else self.clocks.report()
         report: dict[str, object] = {**self._tick_times.report(), **refused, **further, **clocks}

@@ -39,8 +39,9 @@ class LivelinessMonitor:
 
     def __init__(self, node: Node, role: str) -> None:
         self._role = role
-        self._dead = ""  # the first role whose heartbeats stopped, or that a peer reported
-        self._left = ""  # the first role that shut down cleanly
+        # the first role whose heartbeats stopped, or that a peer reported
+        self._dead: str | None = None
+        self._left: str | None = None  # the first role that shut down cleanly
         self._left_ns = 0
         self._publisher = node.create_publisher(String, f"alive/{role}", LIVELINESS)
         self._subscriptions = [
@@ -59,8 +60,8 @@ class LivelinessMonitor:
             if peer != role
         ]
 
-    def lost(self) -> str:
-        """Name the lost role; "" if there is none.
+    def lost_role(self) -> str | None:
+        """Name the lost role; None if there is none.
 
         After a clean shutdown a role counts as lost after SHUTDOWN_GRACE_NS, unless a report names
         the role that ended first.
@@ -69,7 +70,7 @@ class LivelinessMonitor:
         for subscription in self._subscriptions:
             for message, _ in take_messages(subscription, 1):
                 self._on_report(message)
-        if self._dead or not self._left or time.monotonic_ns() - self._left_ns < SHUTDOWN_GRACE_NS:
+        if self._dead is not None or time.monotonic_ns() - self._left_ns < SHUTDOWN_GRACE_NS:
             return self._dead
         return self._left
 
@@ -84,13 +85,13 @@ class LivelinessMonitor:
 
     def _on_liveliness(self, role: str, event: Any) -> None:
         if event.alive_count > 0:  # alive, possibly as the role of a new flight
-            self._dead = "" if self._dead == role else self._dead
+            self._dead = None if self._dead == role else self._dead
         elif event.not_alive_count_change > 0:
             self._dead = self._dead or role
 
     def _on_matched(self, role: str, event: Any) -> None:
         if event.current_count > 0:
-            self._left = "" if self._left == role else self._left
-        elif event.current_count_change < 0 and not self._left:
+            self._left = None if self._left == role else self._left
+        elif event.current_count_change < 0 and self._left is None:
             self._left = role
             self._left_ns = time.monotonic_ns()

@@ -13,6 +13,7 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 from rclpy.node import Node
 
+from flight_core.outcome import Refusal
 from flight_core.publisher_lock import SENDER, LockstepLock, PublisherLock
 from flight_core.rates import NANOSECONDS
 from flight_core.vectors import ChannelError, require_not_future, require_not_old
@@ -56,7 +57,9 @@ class Source(Protocol):
 class Refusals:
     """The refused samples of a node."""
 
-    def __init__(self, node: Node, clock_of: Callable[[str], str] = lambda sender: "") -> None:
+    def __init__(
+        self, node: Node, clock_of: Callable[[str], str | None] = lambda sender: None
+    ) -> None:
         # the end of a sentence on the stamp of a sender whose clock differs
         self.clock_of = clock_of
         self.counts: Counter[str] = Counter()  # by "topic: reason"
@@ -64,7 +67,7 @@ class Refusals:
         self.last: dict[str, tuple[int, str]] = {}
         self._node = node
         self._throttle = Throttle(LOG_PERIOD_NS)
-        self._conflict = ""
+        self._conflict: Refusal | None = None
 
     def add(self, subscription: Source, reason: str, sentence: str) -> None:
         """Count a refused sample, and log at most one in 2 s for each topic and reason.
@@ -75,7 +78,7 @@ class Refusals:
         self.counts[key] += 1
         self.last[subscription.name] = time.monotonic_ns(), sentence
         if reason == SENDER:
-            self._conflict = f"{subscription.name}: {sentence}"
+            self._conflict = Refusal(f"{subscription.name}: {sentence}")
         if not self._throttle.due(key):
             return
         if reason == SENDER:
@@ -123,28 +126,26 @@ class Refusals:
             stamps.append(stamp_ns)
         return stamps
 
-    def since(self, subscription: PolledSubscription, begin_ns: int) -> str:
+    def since(self, subscription: PolledSubscription, begin_ns: int) -> Refusal | None:
         """Return the last refusal of a topic since an instant of the monotonic clock.
 
-        It has age and count, and is "" if there was none.
+        It has age and count.
         """
-        refused_ns, sentence = self.last.get(subscription.name, (0, ""))
-        if not sentence or refused_ns < begin_ns:
-            return ""
+        if subscription.name not in self.last:
+            return None
+        refused_ns, sentence = self.last[subscription.name]
+        if refused_ns < begin_ns:
+            return None
         count = sum(
             n for key, n in self.counts.items() if key.startswith(f"{subscription.topic.name}: ")
         )
         age = (time.monotonic_ns() - refused_ns) / NANOSECONDS
-        return f"{count} samples refused, the last {age:.1f} s ago: {sentence}"
+        return Refusal(f"{count} samples refused, the last {age:.1f} s ago: {sentence}")
 
-    def conflict(self) -> str:
-        """Return the last sample of a conflicting publisher since the last call, as a sentence.
-
-        Returns "" if there was no conflict.
-        """
-        sentence = self._conflict
-        self._conflict = ""
-        return sentence
+    def pop_conflict(self) -> Refusal | None:
+        """Return the refusal of the last conflicting publisher since the last call."""
+        conflict, self._conflict = self._conflict, None
+        return conflict
 
 
 class Receiver(Generic[S]):
@@ -236,16 +237,13 @@ class Receiver(Generic[S]):
             require_size(raw, GROWTH * self._longest)
         return sender
 
-    def slowness(self, max_age_ns: int) -> str:
-        """Say why samples at their rate exceed an age limit at times, in a sentence.
-
-        Returns "" if FEWEST of them fit.
-        """
+    def slowness(self, max_age_ns: int) -> Refusal | None:
+        """Say why samples at their rate exceed an age limit at times, unless FEWEST of them fit."""
         if (
             len(self._stamps_ns) < RECENT
             or (period_ns := float(np.median(np.diff(self._stamps_ns)))) <= 0.0
         ):
-            return ""
+            return None
         fit = max_age_ns / period_ns
         max_age = max_age_ns / NANOSECONDS
         mend = (
@@ -256,7 +254,7 @@ class Receiver(Generic[S]):
             f"{NANOSECONDS / period_ns:.3g} samples a second, of which {fit:.1f} fit into "
             f"max_age = {max_age:g} s"
         )
-        return f"{slow}: {mend}" if fit < FEWEST else ""
+        return Refusal(f"{slow}: {mend}") if fit < FEWEST else None
 
     def receive(self) -> list[S | None]:
         """Decode the messages of the flight's publisher in lockstep, for `accept`.
@@ -323,4 +321,5 @@ class Receiver(Generic[S]):
             require_not_future(stamp_ns, now_ns, max_age_ns)
             require_not_old(stamp_ns, now_ns, max_age_ns)
         except ChannelError as error:
-            raise ChannelError(error.reason, f"{error}{self._refusals.clock_of(sender)}") from None
+            end = self._refusals.clock_of(sender) or ""
+            raise ChannelError(error.reason, f"{error}{end}") from None

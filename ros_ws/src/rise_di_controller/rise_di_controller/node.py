@@ -389,10 +389,9 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         for receiver in (self._y, self._y_m):
             if receiver.subscription.topic.name in stale:
                 self.warn_no_publisher(receiver.subscription)
-                if (sentence := receiver.slowness(self._max_age_ns())) and self._slow.due(
-                    receiver.name
-                ):
-                    self.get_logger().warning(f"{receiver.name}: {sentence}")
+                slowness = receiver.slowness(self._max_age_ns())
+                if slowness and self._slow.due(receiver.name):
+                    self.get_logger().warning(f"{receiver.name}: {slowness}")
         if not stale:
             publisher = None if self._y.lock is None else self._y.lock.publisher
             why = self.clock_of(publisher or "") or ": check for a delay and for different clocks"

@@ -91,8 +91,8 @@ class LearnerNode(FlightNode[LearnerConfig]):
     def advance(self) -> bool:
         return self._advance(0)
 
-    def awaited_topic(self) -> str:
-        return "" if self._search is not None else self._internals.name
+    def awaited_topic(self) -> str | None:
+        return None if self._search is not None else self._internals.name
 
     def _timeouts_ns(self) -> tuple[int, int]:
         max_age_ns = nanoseconds(self._start.max_age)
