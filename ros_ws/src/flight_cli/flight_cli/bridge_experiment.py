@@ -179,7 +179,7 @@ class BridgeExperiment:
         airframe = str((self.folder / "airframe.yaml").resolve())
         flyable = flying_scenario(channel_map, channels, self.speed, airframe, self.needed)
         expected = "the margins, or --accept beside --bridge"
-        require(self.accept or not flyable.lacking, "identify", flyable.lacking, expected)
+        require(self.accept or flyable.lack is None, "identify", flyable.lack, expected)
         return flyable
 
 

@@ -46,11 +46,12 @@ from flight_cli.words import (
     write_option,
 )
 from flight_core.files import display_path, writing
+from flight_core.outcome import Refusal, joined
 from flight_core.parameters import ParameterError, require
 from flight_design.gains import gain_yaml
 from flight_design.gains.gain_design import check_gains, select_gains
 from flight_design.gains.gain_selection import GainAssessment, Selection
-from flight_design.gains.relaxation import lacking
+from flight_design.gains.relaxation import reason_against_gains
 from flight_design.gains.requirement import PHASE_MARGIN
 from flight_log.px4_parameters import rate_loop
 
@@ -328,8 +329,9 @@ def _write_page(path: Path, answer: GainAssessment[Any]) -> None:
 def _require_margins(selection: Selection, *, theorem: bool) -> None:
     """Refuse gains whose margins fall short of the requirement."""
     assessment = selection.theorem if theorem else selection.engineering
-    short = "; ".join(row.sentence(assessment.controller.outputs) for row in assessment.unmet)
-    if short and not theorem and assessment.controller.observer is None:
-        short = lacking(selection, options=("lag", "delay", "rate"))
-    if short:
-        raise ParameterError(f"--write: {short}; --accept writes them all the same")
+    outputs = assessment.controller.outputs
+    lack = joined(Refusal(row.sentence(outputs)) for row in assessment.unmet)
+    if lack and not theorem and assessment.controller.observer is None:
+        lack = reason_against_gains(selection, options=("lag", "delay", "rate"))
+    if lack is not None:
+        raise ParameterError(f"--write: {lack}; --accept writes them all the same")

@@ -66,7 +66,7 @@ from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
 from flight_design.gains.gain_design import selected_observer
 from flight_design.gains.ideal_control import ChannelPairing
-from flight_design.gains.relaxation import lacking as what_lacks
+from flight_design.gains.relaxation import reason_against_gains
 from flight_design.gains.requirement import PHASE_MARGIN, Requirement, requirement
 from flight_design.identification.bridge_identification import AMPLITUDE
 from flight_design.identification.innovation_filters import Actuation, recording
@@ -251,12 +251,12 @@ class Identify:
         path = self._scenario_path(name)
         console = Console(quiet=self.as_json)
         identified_aircraft = self._identified_aircraft(name, self.speed, self.altitude, console)
-        lacking = ""
+        lack = None
         if not self.accept and not identified_aircraft.failure:
             # It takes as long as everything before. If it came after the tables, one would think
             # that the command has ended.
             with console.status("what would meet the margins"):
-                lacking = what_lacks(identified_aircraft.selection)
+                lack = reason_against_gains(identified_aircraft.selection)
         write_text("write", path, identified_aircraft.text)
         if self.as_json:
             print_json(identified_as_json(identified_aircraft, path))
@@ -267,9 +267,9 @@ class Identify:
             title = identified_aircraft.condition.title
             warn(f"error: {title} does not fly: {identified_aircraft.failure}")
             raise typer.Exit(CANNOT_FLY)
-        if lacking:
-            refusal = f"{display_path(path)}, which says so in its first line; --accept takes it"
-            raise ParameterError(f"identify: {lacking}; the gains are in {refusal}")
+        if lack is not None:
+            where = f"{display_path(path)}, which says so in its first line; --accept takes it"
+            raise ParameterError(f"identify: {lack}; the gains are in {where}")
 
     def _scenario_path(self, name: str) -> Path:
         """Return the path of the scenario, which may replace a file only if --write names it."""

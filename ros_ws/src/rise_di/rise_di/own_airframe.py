@@ -21,9 +21,10 @@ from flight_analysis.closed_loop.scenario import Scenario, parse_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_core.arguments import FilePath, as_path
 from flight_core.files import write_file, writing
-from flight_core.outcome import End
+from flight_core.outcome import End, Refusal
 from flight_core.parameters import require
 from flight_core.tape import Tape
+from flight_core.text import sentences
 from flight_design.gains import first_flight, gain_yaml
 from flight_design.gains.effectors import lags_by_input
 from flight_design.gains.first_scenario import LICENCE
@@ -44,7 +45,7 @@ class NewAirframe(NamedTuple):
         airframe: The airframe.
         note: Sentences on the source of the airframe, and on the pairing of inputs and outputs if
             it is not their order.
-        shortfall: What the first flight lacks, as the first line of the scenario file says; "" if
+        shortfall: What the first flight lacks, as the first line of the scenario file says; None if
             the flight ends as planned, clear of the end stops.
     """
 
@@ -52,7 +53,7 @@ class NewAirframe(NamedTuple):
     scenario_file: Path
     airframe: Airframe
     note: str
-    shortfall: str
+    shortfall: Refusal | None
 
 
 def new_airframe(
@@ -160,18 +161,15 @@ def new_airframe(
         if not source_is_target:
             write_file(files[0], text_of_airframe)
         write_file(files[1], scenario)
-    note = "; ".join(filter(None, (note, _pairing_sentence(airframe))))
+    note = sentences(note, _pairing_sentence(airframe))
     return NewAirframe(*files, airframe, note, shortfall)
 
 
-def _pairing_sentence(airframe: Airframe) -> str:
-    """Say how inputs and outputs pair, if an output does not have the input of its place.
-
-    Returns "" otherwise.
-    """
+def _pairing_sentence(airframe: Airframe) -> str | None:
+    """Say how inputs and outputs pair, if an output does not have the input of its place."""
     places = first_flight.pairing(airframe)
     if len(airframe.inputs) != len(airframe.outputs) or places == tuple(range(len(places))):
-        return ""
+        return None
     inputs = list(airframe.inputs)
     pairs = (f"{name} by {inputs[j]}" for name, j in zip(airframe.outputs, places, strict=True))
     return f"paired by C B: {', '.join(pairs)}"
@@ -179,19 +177,21 @@ def _pairing_sentence(airframe: Airframe) -> str:
 
 def _flying(
     airframe: Airframe, trial: Path, files: tuple[Path, Path], lag: Sequence[float]
-) -> tuple[str, str]:
-    """Write a scenario with selected gains whose flight ends as planned; return it and "".
+) -> tuple[str, Refusal | None]:
+    """Write a scenario with selected gains whose flight ends as planned.
 
     The flight keeps clear of the end stops. If there is no such flight, return the scenario with
     the smallest commands, and what its flight lacks. `trial` is the airframe's file for the trial
     flights. `files` are airframe and scenario as the text names them.
     """
-    shortfall = ""
+    shortfall = None
     scenario = ""
     controller = first_flight.placeholder(airframe, lag)
     for size in SIZES:
 
-        def text(path: Path, section: str, size: float = size, shortfall: str = "") -> str:
+        def text(
+            path: Path, section: str, size: float = size, shortfall: Refusal | None = None
+        ) -> str:
             return first_flight.first_flight(
                 airframe, str(path), str(files[1]), section, lag, size, shortfall
             )
@@ -203,7 +203,7 @@ def _flying(
         shares = _stop_shares(flight, tape)
         scenario = text(files[0], section)
         if tape.outcome.end is End.COMPLETED and max(shares.values()) <= CLEAR:
-            return scenario, ""
+            return scenario, None
         hardest = max(shares, key=lambda key: shares[key])
         if size == SIZES[-1]:
             shortfall = _shortfall(flight, tape, hardest)
@@ -217,7 +217,7 @@ def _stop_shares(flight: Scenario, tape: Tape) -> dict[str, float]:
     return {key: float(abs(tape["u"][key]).max()) / stop for key, stop in stops}
 
 
-def _shortfall(flight: Scenario, tape: Tape, hardest: str) -> str:
+def _shortfall(flight: Scenario, tape: Tape, hardest: str) -> Refusal:
     """Say what the flight of a scenario lacks.
 
     The sentence names the input that is at a stop, whether commands or gusts ask for the travel,
@@ -249,7 +249,7 @@ def _shortfall(flight: Scenario, tape: Tape, hardest: str) -> str:
         size = f"{np.degrees(largest[most]):.2g} degrees"
     end = "" if tape.outcome.end is End.COMPLETED else f", and ends: {tape.outcome}"
     percent = 100.0 * _stop_shares(flight, tape)[hardest]
-    return (
+    return Refusal(
         f"The first flight has {hardest} at {percent:.0f} % of its end "
         f"stop{end}: {cause} ask for it; {each}, and {most} reaches {size}."
     )

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from aircraft_sim.airframes.airframe import Airframe
+from flight_core.outcome import Refusal
 from flight_core.parameters import require
 from flight_core.units import ANGLE, ANGULAR_RATE, GRAVITY, SPEED, quantity
 from flight_design.gains import gain_yaml
@@ -55,7 +56,7 @@ def first_flight(
     controller: str,
     lag: Sequence[float],
     part: float = 1.0,
-    shortfall: str = "",
+    shortfall: Refusal | None = None,
 ) -> str:
     """Write a scenario file for the airframe in `path`, with the text of the section controller.
 
@@ -80,7 +81,7 @@ def first_flight(
     with_gusts = ", gusts" if gusts else ""
     assumed = "put those of your aircraft here, then select the gains again:"
     heading = [
-        shortfall,
+        str(shortfall or ""),
         f"The airframe {airframe.name} at {V0:.6g} m/s: every channel, servos, noise{with_gusts}.",
         f"Lags, end stops, rates and noise are assumed: {assumed}",
         f"rise-di gains select {path} --scenario {scenario} --write gains.yaml",

@@ -19,6 +19,7 @@ from control_laws.observer_design import ObserverDesign
 from flight_analysis.linear_loop.delay_margin import delay_margin
 from flight_analysis.linear_loop.input_margins import input_margins, phase_margins
 from flight_analysis.linear_loop.loop_margins import loop_of
+from flight_core.outcome import Refusal, joined
 from flight_core.parameters import ParameterError, require
 from flight_core.vectors import FloatArray
 from flight_design.gains.constrained_search import (
@@ -292,8 +293,8 @@ class ObserverSearch(NamedTuple):
 
     def _refusal(self, loops: _Loops) -> ParameterError:
         """Say what is missing at the end of the search."""
-        lacking = self._lacking(loops)
-        if self.others and not lacking:
+        lack = self._lack(loops)
+        if self.others and lack is None:
             return ParameterError(
                 "speeds: found less than the margins at another speed, expected speeds nearer to "
                 "that of the trim"
@@ -302,21 +303,22 @@ class ObserverSearch(NamedTuple):
             f"of {WORST_OF} uncertain aircraft: found a phase margin below "
             f"{np.degrees(self.needed.uncertain_phase):.0f} deg, expected at least this"
         )
-        return ParameterError(f"--margin: {lacking or uncertain}; {MEND}")
+        return ParameterError(f"--margin: {lack or uncertain}; {MEND}")
 
-    def _lacking(self, loops: _Loops) -> str:
-        """List the margins missing around the nominal aircraft, in sentences."""
+    def _lack(self, loops: _Loops) -> Refusal | None:
+        """List the margins missing around the nominal aircraft."""
         requirement = above_zeros(self.needed, self.nominal)
         longest = float(self.margin.max())
-        lacking = []
+        lacking = list[Refusal]()
         for law in _laws(loops.controller):
             margins = input_margins(self.nominal, law, loop_of(loops.controller), together=False)
             share = self.margin / longest if longest else 1.0
             delay = 1e3 * delay_margin(self.nominal, law, self.loop, share)
             late = GainCondition("delay margin (ms)", None, delay, 1e3 * (longest + RESOLUTION))
             failed = failing((late, *nominal_conditions(margins, requirement)))
-            lacking += [condition.sentence(loops.controller.outputs) for condition in failed]
-        return "; ".join(dict.fromkeys(lacking))
+            outputs = loops.controller.outputs
+            lacking += [Refusal(condition.sentence(outputs)) for condition in failed]
+        return joined(dict.fromkeys(lacking))
 
 
 def least_error(

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from flight_core.outcome import Refusal
 from flight_design.gains.gain_conditions import GainCondition
 from flight_design.gains.gain_selection import LoopSetting, Selection, gain_sets
 from flight_design.gains.requirement import ACCEPTED_PHASE_MARGIN, PHASE_MARGINS
@@ -17,8 +18,8 @@ def binding(selection: Selection) -> GainCondition:
     return min(selection.engineering.unmet, key=lambda condition: condition.margin)
 
 
-def lacking(selection: Selection, *, options: Sequence[str] = ()) -> str:
-    """Say in sentences what binds the best gains of the search; "" if every condition is met.
+def reason_against_gains(selection: Selection, *, options: Sequence[str] = ()) -> Refusal | None:
+    """Say what binds the best gains of the search, unless every condition is met.
 
     The sentences name the binding bound, every unmet condition, and every change of the loop that
     reaches the margins.
@@ -29,7 +30,7 @@ def lacking(selection: Selection, *, options: Sequence[str] = ()) -> str:
     """
     assessed = selection.engineering
     if not assessed.unmet:
-        return ""
+        return None
     outputs = assessed.controller.outputs
     rows = "; ".join(condition.sentence(outputs) for condition in assessed.unmet)
     relaxed = [
@@ -40,7 +41,7 @@ def lacking(selection: Selection, *, options: Sequence[str] = ()) -> str:
     mend = f"met with {' or with '.join(relaxed)}" if relaxed else "met with no single change"
     limit = binding(selection)
     where = "the loop" if limit.channel is None else outputs[limit.channel]
-    return f"{rows}: the best of the search, bound by {limit.name} of {where}; {mend}"
+    return Refusal(f"{rows}: the best of the search, bound by {limit.name} of {where}; {mend}")
 
 
 def _relaxed(selection: Selection, options: Sequence[str]) -> dict[str, LoopSetting]:

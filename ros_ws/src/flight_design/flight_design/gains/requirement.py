@@ -20,6 +20,7 @@ import numpy as np
 from flight_analysis.linear_loop.input_margins import Margins, input_margins
 from flight_analysis.linear_loop.loop_margins import LinearLoop, LoopMargins
 from flight_core.arguments import as_number
+from flight_core.outcome import Refusal, joined
 from flight_core.parameters import require
 from flight_core.vectors import FloatArray
 from flight_design.gains.airframe_properties import invariant_zeros
@@ -192,10 +193,12 @@ def nominal_conditions(nominal: Margins, requirement: Requirement) -> tuple[Gain
     return (*by_input, GainCondition(NAMES[3], None, float(nominal.damping), requirement.damping))
 
 
-def unmet(margins: LoopMargins, requirement: Requirement, outputs: Sequence[str]) -> str:
-    """Say what a loop lacks, in sentences; "" if nothing. `outputs` are those of the law."""
-    return "; ".join(
-        condition.sentence(outputs)
+def reason_against_margins(
+    margins: LoopMargins, requirement: Requirement, outputs: Sequence[str]
+) -> Refusal | None:
+    """Say what a loop lacks. `outputs` are those of the law."""
+    return joined(
+        Refusal(condition.sentence(outputs))
         for condition in failing(margin_conditions(margins, requirement))
     )
 

@@ -16,6 +16,7 @@ from flight_analysis.linear_loop.loop_margins import (
     linear_loop,
     loop_margins,
 )
+from flight_core.outcome import Refusal
 from flight_core.vectors import FloatArray
 from flight_design.gains import gain_selection, gain_yaml, ideal_control
 from flight_design.gains.first_scenario import (
@@ -32,7 +33,7 @@ from flight_design.gains.requirement import (
     REQUIREMENT,
     Candidate,
     Requirement,
-    unmet,
+    reason_against_margins,
     within_requirement,
 )
 from flight_design.identification.bridge_identification import (
@@ -68,7 +69,7 @@ class Flyable(NamedTuple):
     controller: RiseDiConfig
     # s, around the identified channels with lags and delay; None without a softened sign
     delay_margin: float | None
-    lacking: str  # required margins that the loop does not have; "" if it has all
+    lack: Refusal | None  # required margins that the loop does not have
     airframe: str  # text of the airframe file
     scenario: str  # text of the scenario file
 
@@ -111,12 +112,14 @@ def flying_scenario(
         gain_yaml.margins_sentence(controller, margins),
     ]
     text = scenario_text(heading, bridge_sections(airframe_file, commands, controller))
-    lacking = "" if margins is None else unmet(margins, requirement, controller.outputs)
-    delay = None if margins is None else margins.delay
+    lack = delay = None
+    if margins is not None:
+        lack = reason_against_margins(margins, requirement, controller.outputs)
+        delay = margins.delay
     return Flyable(
         controller=controller,
         delay_margin=delay,
-        lacking=lacking,
+        lack=lack,
         airframe=identified.airframe_text(source),
         scenario=text,
     )
