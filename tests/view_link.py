@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_core.outcome import Refusal
 from flight_core.parameters import ParameterError, flatten, nest
 from flight_view.flight import Flight
 
@@ -58,42 +59,44 @@ class NodesInMemory:
         """Those that are set."""
         return {name: self.values[node][name] for name in names if name in self.values[node]}
 
-    def set_parameters(self, node: str, values: Mapping[str, Any]) -> str:
+    def set_parameters(self, node: str, values: Mapping[str, Any]) -> Refusal | None:
         """As a node: the whole set is valid, or nothing changes."""
         try:
             self.schemas[node].validate_mapping(nest(self.values[node] | dict(values)), node)
         except ParameterError as error:
-            return str(error)
+            return Refusal(str(error))
         self.values[node] |= values
-        return ""
+        return None
 
-    def _keep(self, name: str, value: Any = None) -> str:
+    def _keep(self, name: str, value: Any = None) -> Refusal | None:
         self.done.append((name, value))
-        return ""
+        return None
 
-    def activate(self, *, active: bool) -> str:
+    def activate(self, *, active: bool) -> Refusal | None:
         """Kept."""
         return self._keep("activate", active)
 
-    def send_target(self, values: Mapping[str, float]) -> str:
+    def send_target(self, values: Mapping[str, float]) -> Refusal | None:
         """Kept."""
         return self._keep("target", values)
 
-    def send_route(self, points: Sequence[Sequence[float]]) -> str:
+    def send_route(self, points: Sequence[Sequence[float]]) -> Refusal | None:
         """Kept."""
         return self._keep("route", points)
 
-    def guide(self, service: str) -> str:
+    def guide(self, service: str) -> Refusal | None:
         """Kept; skip is refused."""
-        return "no route with a further leg is flown" if service == "skip" else self._keep(service)
+        if service == "skip":
+            return Refusal("no route with a further leg is flown")
+        return self._keep(service)
 
-    def engage(self) -> str:
+    def engage(self) -> Refusal | None:
         """Waits until it is cancelled."""
         self.blocked.set()
         self.cancelled.wait(20.0)
         raise ParameterError("cancelled by a later request")
 
-    def disengage(self) -> str:
+    def disengage(self) -> Refusal | None:
         """Kept."""
         return self._keep("disengage")
 

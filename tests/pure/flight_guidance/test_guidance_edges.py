@@ -319,7 +319,7 @@ def test_reason_of_failed_steps_is_said_where_no_u_m_comes(
     made = banked({})
     monkeypatch.setattr(module, "step", _Failing("raises", range(5000 * MS)))
     assert all(_feed(made, 20 * k * MS) is None for k in range(150))
-    assert made.waits(149 * 20 * MS) == f"no u_m: a step of guidance failed: {CAUSE}"
+    assert str(made.reason_to_wait(149 * 20 * MS)) == f"no u_m: a step of guidance failed: {CAUSE}"
 
 
 def test_command_of_a_step_that_failed_waits_for_the_next(

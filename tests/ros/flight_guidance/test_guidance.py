@@ -26,7 +26,7 @@ from flight_analysis.closed_loop.scenario import load_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_core.channels import POSE
 from flight_core.modes import Mode as ControllerMode
-from flight_core.outcome import STATUS_SHORTFALL
+from flight_core.outcome import STATUS_SHORTFALL, Refusal
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal
 from flight_guidance.guidance_state import Lateral
@@ -189,24 +189,24 @@ def test_command_and_page_say_what_guidance_took_and_refused(
 
     with ControlClient("") as client, ThreadPoolExecutor(max_workers=1) as worker:
 
-        def answer(method: Callable[..., str], *arguments: object) -> str:
+        def answer(method: Callable[..., Refusal | None], *arguments: object) -> Refusal | None:
             pending = worker.submit(method, *arguments)
             flight.until(pending.done, "an answer")
             return pending.result()
 
-        assert answer(client.send_target, {"phi": 0.2}) == ""
+        assert answer(client.send_target, {"phi": 0.2}) is None
         flight.until(lambda: flight.last("target.phi") == 0.2, "the target in force")
         # The log has these values already; guidance refuses two lateral commands at once.
         refusal = answer(client.send_target, {"theta": 0.0, "leg": 0.0, "phi": 0.2})
         assert (
-            refusal
+            str(refusal)
             == "target: found theta, leg, phi, expected one lateral and one vertical command at "
             "most"
         )
-        assert answer(client.guide, "skip") == "no route with a further leg is flown"
+        assert str(answer(client.guide, "skip")) == "no route with a further leg is flown"
         assert (
             answer(client.send_route, [[0.0, 0.0, 50.0], [900.0, 0.0, 55.0], [900.0, 900.0, 55.0]])
-            == ""
+            is None
         )
         flight.until(lambda: flight.last("mode.lateral") == Lateral.ROUTE, "a flown route")
         # a later guidance receives no route of before
@@ -214,9 +214,9 @@ def test_command_and_page_say_what_guidance_took_and_refused(
             lambda: peer_node.node.count_publishers("route") == 0, "a route that is withdrawn"
         )
         leg = flight.last("leg")
-        assert answer(client.guide, "skip") == ""
+        assert answer(client.guide, "skip") is None
         flight.until(lambda: flight.last("leg") > leg, "the next leg")
-        assert answer(client.guide, "hold") == ""
+        assert answer(client.guide, "hold") is None
         flight.until(lambda: flight.last("mode.lateral") == Lateral.HEADING, "the held heading")
 
         with flight.process.stopped():  # it takes nothing: a later request ends the wait

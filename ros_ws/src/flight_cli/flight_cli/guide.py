@@ -20,6 +20,7 @@ from flight_cli.words import (
     warn,
 )
 from flight_core.environment import require_ros_environment
+from flight_core.outcome import Refusal
 from flight_core.parameters import ParameterError, require
 from flight_guidance.guidance_state import TARGETS
 from flight_guidance.modes.targets import ANGLES
@@ -83,8 +84,8 @@ class Guide(RouteWords):
         command: str,
         values: dict[str, float],
         points: list[tuple[float, float, float]],
-    ) -> str:
-        """Send targets, a route or a service; why guidance refuses, else empty."""
+    ) -> Refusal | None:
+        """Send targets, a route or a service, and return why guidance refuses."""
         from flight_guidance.client import GuidanceClient, TargetClient  # noqa: PLC0415 - loads rclpy, which other commands do not need
 
         if values or command == LINK:
@@ -92,7 +93,7 @@ class Guide(RouteWords):
                 if command == LINK:
                     print("keeps the link until Ctrl-C", flush=True)
                     targets.hold_link()
-                return targets.send(values) if values else ""
+                return targets.send(values) if values else None
         with GuidanceClient(namespace=self.namespace) as client:
             return client.send_route(points) if points else client.call(command)
 

@@ -13,6 +13,7 @@ from rclpy.duration import Duration
 from rclpy.publisher import Publisher
 from std_srvs.srv import Trigger
 
+from flight_core.outcome import Refusal
 from flight_core.parameters import ParameterError
 from flight_guidance.guidance_state import TARGETS
 from flight_guidance.odometry import MAP
@@ -40,7 +41,7 @@ NAME = "guidance"
 
 
 class GuidanceClient(Client):
-    """Commands the guidance of a running flight. Methods return why something is refused, or ""."""
+    """Commands the guidance of a running flight. Methods return why something is refused."""
 
     def __init__(
         self, name: str = "operator", namespace: str = "", parent: Client | None = None
@@ -50,15 +51,14 @@ class GuidanceClient(Client):
         self._decoder = NamedDecoder()
         self._log = PolledSubscription(self._node, ROSOUT, RECORD_FOREIGN)
 
-    def call(self, service: str) -> str:
+    def call(self, service: str) -> Refusal | None:
         """Call a service of guidance without arguments: hold, skip, resume, home."""
-        return str(
-            self._call(
-                Trigger, f"{NAME}/{service}", Trigger.Request(), "a flight with guidance"
-            ).message
-        )
+        message = self._call(
+            Trigger, f"{NAME}/{service}", Trigger.Request(), "a flight with guidance"
+        ).message
+        return Refusal(str(message)) if message else None
 
-    def send_route(self, points: Sequence[Sequence[float]]) -> str:
+    def send_route(self, points: Sequence[Sequence[float]]) -> Refusal | None:
         """Publish a route of waypoints, each north, east and altitude in m."""
         places = [
             Point(x=float(east), y=float(north), z=float(altitude))
@@ -79,7 +79,7 @@ class GuidanceClient(Client):
             self._spin_until(
                 lambda: publisher.wait_for_all_acked(ROUTE_POLL_PERIOD), unconfirmed, ROUTE_TIMEOUT
             )
-            return self._reason(ROUTE, lambda: self._has_taken({"leg": 0.0}), "")
+            return self._reason_against(ROUTE, lambda: self._has_taken({"leg": 0.0}), None)
         finally:
             # Guidance that starts later must not receive the route and fly it.
             self._node.destroy_publisher(publisher)
@@ -95,12 +95,14 @@ class GuidanceClient(Client):
         ]
         return NAME in names and len(names) <= publisher.get_subscription_count()
 
-    def _reason(self, topic: Topic, is_taken: Callable[[], bool], unknown: str) -> str:
+    def _reason_against(
+        self, topic: Topic, is_taken: Callable[[], bool], unknown: Refusal | None
+    ) -> Refusal | None:
         """Wait until guidance has taken a message or refused it, and return the reason.
 
         The reason is `unknown` after TARGET_TIMEOUT.
         """
-        reasons: list[str] = []
+        reasons: list[Refusal] = []
 
         def answered() -> bool:
             if is_taken():
@@ -115,9 +117,9 @@ class GuidanceClient(Client):
             if self._cancelled.is_set():
                 raise
             return unknown
-        return reasons[-1] if reasons else ""
+        return reasons[-1] if reasons else None
 
-    def _refusals(self, topic: Topic) -> list[str]:
+    def _refusals(self, topic: Topic) -> list[Refusal]:
         """Return why guidance has refused messages of a topic since the last call.
 
         The reasons come from the log of the nodes.
@@ -130,7 +132,7 @@ class GuidanceClient(Client):
         parts = [text.partition(REFUSED) for text in texts]
         namespace = self._node.get_namespace().rstrip("/")
         return [
-            reason
+            Refusal(reason)
             for before, _, reason in parts
             if reason and before == f"{namespace}/{topic.name}: "
         ]
@@ -163,15 +165,15 @@ class TargetClient(GuidanceClient):
             f"{self._guidance.name}: not received, expected a flight with guidance in this domain"
         )
 
-    def send(self, values: Mapping[str, float]) -> str:
+    def send(self, values: Mapping[str, float]) -> Refusal | None:
         """Publish commands by channel until guidance has them in force.
 
-        Returns why they are not, or "".
+        Returns why they are not.
         """
         self._spin_until(lambda: bool(self._received()), self._silent)
         self._log.take()
-        unknown = f"guidance did not take them in {TARGET_TIMEOUT:g} s; its log says why"
-        return self._reason(TARGET, lambda: self._published(values), unknown)
+        unknown = Refusal(f"guidance did not take them in {TARGET_TIMEOUT:g} s; its log says why")
+        return self._reason_against(TARGET, lambda: self._published(values), unknown)
 
     def keep_link(self) -> None:
         """Publish a target without channels, which says that an operator is there."""

@@ -14,6 +14,7 @@ import numpy as np
 
 from flight_core.channels import POSE, UNKNOWN
 from flight_core.failures import Failures, sentence
+from flight_core.outcome import Refusal
 from flight_core.rates import nanoseconds, seconds
 from flight_core.vectors import (
     ChannelError,
@@ -100,7 +101,7 @@ class Guidance:
         # not fail.
         self._waits_from_ns: int | None = None
         self._failures = Failures()
-        self._failure = ""  # why there is no u_m, as a sentence; empty if it waits for a pose
+        self._failure: str | None = None  # of the last step; None if it waits for a pose
         # The instant of the operator's last message, or of the first step.
         self._operated_ns: int | None = None
         self._link_lost = False
@@ -315,8 +316,8 @@ class Guidance:
             if sample is not None
         }
 
-    def waits(self, now_ns: int) -> str:
-        """Say why there is no u_m; "" if there is one.
+    def reason_to_wait(self, now_ns: int) -> Refusal | None:
+        """Say why there is no u_m.
 
         There is a reason once guidance has waited STALE_TIME for a young pose, or for a step that
         does not fail.
@@ -324,12 +325,12 @@ class Guidance:
         since = self._waits_from_ns
         pose = self._pose
         if since is None or pose is None or now_ns - since < nanoseconds(STALE_TIME):
-            return ""
-        if self._failure:
-            return f"no u_m: a step of guidance failed: {self._failure}"
+            return None
+        if self._failure is not None:
+            return Refusal(f"no u_m: a step of guidance failed: {self._failure}")
         age = seconds(now_ns - pose.stamp_ns)
         limit = seconds(self._params.max_age_ns)
-        return f"no u_m: pose is {age:.2f} s old, guidance.max_age {limit:g} s"
+        return Refusal(f"no u_m: pose is {age:.2f} s old, guidance.max_age {limit:g} s")
 
     def _watch_link(self, now_ns: int) -> None:
         """Fly home, once, if the age of the operator's link exceeds the limit."""
@@ -438,7 +439,7 @@ class Guidance:
         is_stale = now_ns - pose.stamp_ns > self._params.max_age_ns
         if self._begin is not Begin.NO and is_stale:
             self._waits_from_ns = now_ns if self._waits_from_ns is None else self._waits_from_ns
-            self._failure = ""
+            self._failure = None
             return None
         self._watch_link(now_ns)
         self._land()

@@ -21,6 +21,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from flight_core import channels
 from flight_core.modes import Mode
+from flight_core.outcome import Refusal
 from flight_core.parameters import ParameterError, require
 from flight_core.publisher_lock import LockstepLock, require_sender
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns, seconds
@@ -115,7 +116,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         self._log_encoder = self.encoder(self._guidance.names)
         self._allowed = True
         self._mode = GuidanceMode.OFF
-        self._waits = ""
+        self._wait_reason: Refusal | None = None
         self._authority = self._receive_authority()
         self._authorities = deque[StampedVector]()
         self._authority_ns = -1  # stamp of the last one; -1 if there is none, or it is void
@@ -226,10 +227,10 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         self._target.poll(now_ns, MAX_TARGETS)
         self._take_routes()
         output = self._guidance.step(now_ns, t_ns)
-        waits = self._guidance.waits(now_ns)
-        if waits and not self._waits:
-            self.get_logger().warning(waits)
-        self._waits = waits
+        reason = self._guidance.reason_to_wait(now_ns)
+        if reason is not None and self._wait_reason is None:
+            self.get_logger().warning(str(reason))
+        self._wait_reason = reason
         for notice in () if output is None else output.notices:
             self.get_logger().warning(notice)
         if (mode := self._guidance.mode) is not self._mode:
@@ -483,7 +484,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
             }
         return (
             LEVELS.get(self._mode, DiagnosticStatus.WARN),
-            self._waits or SENTENCES[self._mode],
+            str(self._wait_reason or SENTENCES[self._mode]),
             further,
         )
 

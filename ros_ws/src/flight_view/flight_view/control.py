@@ -22,6 +22,7 @@ from typing import Any, Protocol
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_core.fields import short_repr
+from flight_core.outcome import Refusal
 from flight_core.parameters import ParameterError, flatten, nest
 from flight_core.rates import NANOSECONDS
 from flight_guidance.guidance_state import TARGETS
@@ -65,7 +66,7 @@ Assess = Callable[[Scenario, ControllerConfig], dict[str, Any]]
 class FlightLink(Protocol):
     """What reaches the nodes of a flight.
 
-    Methods return why something is refused, or "", and may raise ParameterError.
+    Methods return why something is refused, and may raise ParameterError.
     """
 
     def nodes(self) -> list[str]:
@@ -74,28 +75,28 @@ class FlightLink(Protocol):
     def parameters(self, node: str, names: Sequence[str]) -> dict[str, Any]:
         """Return the values of those parameters that are set."""
 
-    def set_parameters(self, node: str, values: Mapping[str, Any]) -> str:
+    def set_parameters(self, node: str, values: Mapping[str, Any]) -> Refusal | None:
         """Set all of these parameters, or none."""
 
-    def activate(self, *, active: bool) -> str:
+    def activate(self, *, active: bool) -> Refusal | None:
         """Activate or deactivate the controller."""
 
-    def send_target(self, values: Mapping[str, float]) -> str:
+    def send_target(self, values: Mapping[str, float]) -> Refusal | None:
         """Command guidance."""
 
-    def send_route(self, points: Sequence[Sequence[float]]) -> str:
+    def send_route(self, points: Sequence[Sequence[float]]) -> Refusal | None:
         """Publish a route."""
 
     def keep_link(self) -> None:
         """Tell guidance that an operator is there."""
 
-    def guide(self, service: str) -> str:
+    def guide(self, service: str) -> Refusal | None:
         """Call a service of guidance: one of GUIDED."""
 
-    def engage(self) -> str:
+    def engage(self) -> Refusal | None:
         """Engage the bridge."""
 
-    def disengage(self) -> str:
+    def disengage(self) -> Refusal | None:
         """Disengage the bridge."""
 
     def cancel(self) -> None:
@@ -154,7 +155,7 @@ class Control:
         self._digest = 0  # digest of the controller's parameters, as far as known
         self._values: dict[str, Any] = {}  # tunable parameters of the controller that are set
         self._faults: dict[str, Any] = {}  # parameters of the aircraft, without gusts
-        self._actions: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
+        self._actions: Mapping[str, Callable[[Mapping[str, Any]], Refusal | None]] = {
             "state": self._refresh,
             "gains": self._set_gains,
             "undo": self._undo_gains,
@@ -169,7 +170,7 @@ class Control:
             "disengage": lambda _: self._link.disengage(),
         }
 
-    def _guide(self, service: str, _: Mapping[str, Any]) -> str:
+    def _guide(self, service: str, _: Mapping[str, Any]) -> Refusal | None:
         return self._link.guide(service)
 
     async def answer(self, request: Any, key: str, lease: str) -> dict[str, Any]:
@@ -263,7 +264,7 @@ class Control:
                 if cancellations != self._cancellations:
                     raise ParameterError("cancelled by a later request")
                 if refusal := self._actions[action](request):
-                    raise ParameterError(refusal)
+                    raise ParameterError(str(refusal))
         except RefusedError as error:
             if action != "state":
                 self._link.note(f"control: {short_repr(what)} refused: {error.sentence}")
@@ -339,7 +340,7 @@ class Control:
             )
         return gains
 
-    def _refresh(self, request: Mapping[str, Any]) -> str:
+    def _refresh(self, request: Mapping[str, Any]) -> Refusal | None:
         """Read the faults.
 
         Also read the controller's parameters at first, and whenever the digest in the log differs.
@@ -352,7 +353,7 @@ class Control:
             self._read()
         if scenario is not None and "aircraft" in nodes:
             self._faults = self._link.parameters("aircraft", _faults_of(scenario))
-        return ""
+        return None
 
     def _read(self) -> None:
         base = self._controller()
@@ -365,7 +366,7 @@ class Control:
         content = {**dict(flatten(base.model_dump(exclude_none=True))), **values}
         return type(base).validate_mapping(nest(content), "controller")
 
-    def _set_gains(self, request: Mapping[str, Any]) -> str:
+    def _set_gains(self, request: Mapping[str, Any]) -> Refusal | None:
         values = values_by_name(request, "values")
         gains = gains_of(self._controller())
         changes = {}
@@ -375,15 +376,17 @@ class Control:
             require_range(name, changes[name], gains[name])
         return self._apply(request, changes, undo=True)
 
-    def _undo_gains(self, request: Mapping[str, Any]) -> str:
+    def _undo_gains(self, request: Mapping[str, Any]) -> Refusal | None:
         if not self._undo:
-            return "there is nothing to undo"
+            return Refusal("there is nothing to undo")
         refusal = self._apply(request, self._undo[-1], undo=False)
-        if not refusal:
+        if refusal is None:
             self._undo.pop()
         return refusal
 
-    def _apply(self, request: Mapping[str, Any], values: Mapping[str, Any], *, undo: bool) -> str:
+    def _apply(
+        self, request: Mapping[str, Any], values: Mapping[str, Any], *, undo: bool
+    ) -> Refusal | None:
         """Set values, unless the parameters differ from those on the page."""
         self._require_simulated()
         self._read()
@@ -400,7 +403,7 @@ class Control:
         self._digest = digest
         if undo:
             self._undo.append(before)
-        return ""
+        return None
 
     def _check(self, request: Mapping[str, Any]) -> dict[str, Any]:
         """Return the margins of the gains in flight, with some of them changed."""
@@ -431,18 +434,20 @@ class Control:
                 "the bridge sends to an autopilot: gains need rise-di watch --control --real",
             )
 
-    def _activate(self, *, active: bool) -> str:
+    def _activate(self, *, active: bool) -> Refusal | None:
         """Activate or deactivate the controller.
 
         With a bridge this is refused, because the bridge does it when it engages or disengages.
         """
         if "bridge" in self._link.nodes():
-            return "the bridge activates and deactivates the controller: engage or disengage it"
+            return Refusal(
+                "the bridge activates and deactivates the controller: engage or disengage it"
+            )
         return self._link.activate(active=active)
 
-    def _set_faults(self, request: Mapping[str, Any]) -> str:
+    def _set_faults(self, request: Mapping[str, Any]) -> Refusal | None:
         if self._flight.scenario is None:
-            return "the log has no scenario"
+            return Refusal("the log has no scenario")
         fault_names = _faults_of(self._flight.scenario)
         values = values_by_name(request, "values")
         for name in values:
@@ -451,11 +456,12 @@ class Control:
             name: value if is_sentences(value) else finite_numbers(name, value)
             for name, value in values.items()
         }
-        if not (refusal := self._link.set_parameters("aircraft", changes)):
+        refusal = self._link.set_parameters("aircraft", changes)
+        if refusal is None:
             self._faults |= changes
         return refusal
 
-    def _begin_gust(self, request: Mapping[str, Any]) -> str:
+    def _begin_gust(self, request: Mapping[str, Any]) -> Refusal | None:
         axis = request.get("axis")
         # Half a surrogate pair cannot be part of a name in ROS.
         require_form(
@@ -465,17 +471,17 @@ class Control:
         speed, length = (finite_number(key, request.get(key)) for key in ("speed", "length"))
         flight = self._flight
         real = flight.start_ns > SYSTEM_TIME_NS
-        refusal = ""
+        refusal = None
         for lead in GUST_LEADS:
             now = (time.time_ns() - flight.start_ns) / NANOSECONDS if real else flight.end
             gust = {"start": now + lead, "speed": speed, "length": length}
             values = {f"gusts.{axis}.{key}": value for key, value in gust.items()}
             refusal = self._link.set_parameters("aircraft", values)
-            if not refusal:
+            if refusal is None:
                 break
         return refusal
 
-    def _send_target(self, request: Mapping[str, Any]) -> str:
+    def _send_target(self, request: Mapping[str, Any]) -> Refusal | None:
         values = values_by_name(request, "values")
         for name in values:
             require_known(name, TARGETS, "target")
@@ -483,7 +489,7 @@ class Control:
             {name: finite_number(name, value) for name, value in values.items()}
         )
 
-    def _send_route(self, request: Mapping[str, Any]) -> str:
+    def _send_route(self, request: Mapping[str, Any]) -> Refusal | None:
         points = request.get("points")
         expected = f"points: expected 2 to {MAX_WAYPOINTS} of north, east, altitude"
         if not isinstance(points, list) or not 2 <= len(points) <= MAX_WAYPOINTS:
@@ -493,7 +499,7 @@ class Control:
         coordinate = partial(finite_number, "points")
         return self._link.send_route([[*map(coordinate, point)] for point in points])
 
-    def _engage(self, request: Mapping[str, Any]) -> str:
+    def _engage(self, request: Mapping[str, Any]) -> Refusal | None:
         name = self._map()
         require_form(
             request.get("map") == name,

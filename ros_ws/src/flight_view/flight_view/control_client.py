@@ -11,6 +11,7 @@ from rcl_interfaces.srv import GetParameters, ListParameters, SetParametersAtomi
 from rclpy.parameter import Parameter, parameter_value_to_python
 
 from autopilot_bridge.client import EngagementClient
+from flight_core.outcome import Refusal
 from flight_guidance.client import TargetClient
 from flight_ros.client import Client
 
@@ -62,7 +63,7 @@ class ControlClient(Client):
             if value is not None
         }
 
-    def set_parameters(self, node: str, values: Mapping[str, Any]) -> str:
+    def set_parameters(self, node: str, values: Mapping[str, Any]) -> Refusal | None:
         """Set parameters of a node together, or none of them."""
         request = SetParametersAtomically.Request()
         # rclpy takes an empty list for bytes. The only list that may be empty is that of faults.
@@ -73,22 +74,22 @@ class ControlClient(Client):
         result = self._call(
             SetParametersAtomically, f"{node}/set_parameters_atomically", request
         ).result
-        return "" if result.successful else str(result.reason)
+        return None if result.successful else Refusal(str(result.reason))
 
-    def activate(self, *, active: bool) -> str:
+    def activate(self, *, active: bool) -> Refusal | None:
         """Activate or deactivate the controller."""
         number = Transition.TRANSITION_ACTIVATE if active else Transition.TRANSITION_DEACTIVATE
         request = ChangeState.Request(transition=Transition(id=number))
         response = self._call(ChangeState, "controller/change_state", request)
         if response.success:
-            return ""
-        return f"the controller is {'active' if active else 'inactive'} already"
+            return None
+        return Refusal(f"the controller is {'active' if active else 'inactive'} already")
 
-    def send_target(self, values: Mapping[str, float]) -> str:
+    def send_target(self, values: Mapping[str, float]) -> Refusal | None:
         """Command guidance, as `rise-di guide` does."""
         return self._operator().send(values)
 
-    def send_route(self, points: Sequence[Sequence[float]]) -> str:
+    def send_route(self, points: Sequence[Sequence[float]]) -> Refusal | None:
         """Publish a route of waypoints, each north, east and altitude in m."""
         return self._operator().send_route(points)
 
@@ -100,7 +101,7 @@ class ControlClient(Client):
         if "guidance" in self.nodes():
             self._operator().keep_link()
 
-    def guide(self, service: str) -> str:
+    def guide(self, service: str) -> Refusal | None:
         """Call a service of guidance: hold, skip, resume, home."""
         return self._operator().call(service)
 
@@ -108,13 +109,13 @@ class ControlClient(Client):
         self._targets = self._targets or TargetClient(parent=self)
         return self._targets
 
-    def engage(self) -> str:
+    def engage(self) -> Refusal | None:
         """Engage the bridge, as `rise-di engage` does."""
-        return str(self._bridge().engage(lambda reason: None) or "")
+        return self._bridge().engage(lambda reason: None)
 
-    def disengage(self) -> str:
+    def disengage(self) -> Refusal | None:
         """Disengage the bridge."""
-        return str(self._bridge().disengage() or "")
+        return self._bridge().disengage()
 
     def _bridge(self) -> EngagementClient:
         self._engagement = self._engagement or EngagementClient(parent=self)

@@ -210,8 +210,8 @@ class GuidanceStation:
 
     def step(self, t_ns: int) -> None:
         """See Station."""
-        if waits := self._guidance.waits(t_ns):
-            raise FlightEnded(f"ended at t = {seconds(t_ns):.2f} s: {waits}")
+        if reason := self._guidance.reason_to_wait(t_ns):
+            raise FlightEnded(f"ended at t = {seconds(t_ns):.2f} s: {reason}")
         if (guided := self._guidance.step(t_ns, t_ns)) is not None:
             self._topics.publish("u_m", StampedVector(t_ns, guided.u_m), t_ns)
             self._topics.publish("guidance", StampedVector(t_ns, guided.log), t_ns)
