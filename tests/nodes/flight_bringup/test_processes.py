@@ -29,7 +29,7 @@ SILENT_MONITOR: Any = SimpleNamespace(
     ahead=lambda lead: lead,
     clock=time,
     by_clock=False,
-    clock_ended=lambda: "",
+    end_of_clock=lambda: None,
     require_free_domain=lambda: None,
 )
 

@@ -989,7 +989,7 @@ def test_flight_ends_once_log_holds_it(
         return None if until is None else 1000.0 + min(now[0], until)
 
     processes = SimpleNamespace(
-        learner_ended=str,
+        pop_end_of_learner=lambda: None,
         started=0.0,
         start_time=1000.0,
         ended=lambda: None,
@@ -1014,7 +1014,7 @@ def test_flight_announces_each_reason_once_without_those_in_which_number_alone_c
     waiting = [("DISENGAGED", reason) for reason in reasons] + [("ENGAGED", "")]
     announced = list[str]()
     processes = SimpleNamespace(
-        learner_ended=str,
+        pop_end_of_learner=lambda: None,
         start_time=1000.0,
         started=time.monotonic(),
         ended=lambda: None if waiting else ended_early("the end"),
@@ -1033,7 +1033,7 @@ def test_flight_announces_each_reason_once_without_those_in_which_number_alone_c
 def test_experiment_without_engagement_ends_when_too_little_time_left() -> None:
     # osprey_gust has 60 s, of which the experiment needs 59.8; it began 0.3 s ago.
     processes = SimpleNamespace(
-        learner_ended=str,
+        pop_end_of_learner=lambda: None,
         start_time=1000.0,
         started=time.monotonic() - 0.3,
         ended=lambda: None,
@@ -1048,7 +1048,7 @@ def test_experiment_without_engagement_ends_when_too_little_time_left() -> None:
 def test_step_of_system_clock_does_not_end_flight(monkeypatch: pytest.MonkeyPatch) -> None:
     calls = iter([None, None, ended_early("the end")])
     processes = SimpleNamespace(
-        learner_ended=str,
+        pop_end_of_learner=lambda: None,
         start_time=1000.0,
         started=time.monotonic(),
         ended=lambda: next(calls),

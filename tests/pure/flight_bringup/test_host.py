@@ -37,11 +37,11 @@ def test_two_idle_cores_are_enough_for_four_processes_and_half_a_core_is_not() -
     On a host that gave 0.44 to 0.52 of a core four flights of four lost samples.
     """
     scenario = find_scenario("osprey_servo")
-    assert shortage([scenario], lambda _: 1.9) == ""
-    assert shortage([scenario], lambda _: 0.52) == (
+    assert shortage([scenario], lambda _: 1.9) is None
+    assert str(shortage([scenario], lambda _: 0.52)) == (
         "gives 0.52 of the 1.4 cores that a flight in real time needs"
     )
-    assert "gives 1.39 of the 1.4 cores" in shortage([scenario], lambda _: 1.39)
+    assert "gives 1.39 of the 1.4 cores" in str(shortage([scenario], lambda _: 1.39))
 
 
 def test_host_gives_no_more_than_its_cores_and_no_more_than_is_asked_for() -> None:

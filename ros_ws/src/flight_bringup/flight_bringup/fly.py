@@ -205,7 +205,7 @@ class _Span:
         if self.engaged:
             return never_flew("u did not reach the aircraft")
         why = self._processes.last_words(CONTROLLER)
-        return never_flew(f"y did not reach the controller{f' ({why})' if why else ''}")
+        return never_flew(f"y did not reach the controller{'' if why is None else f' ({why})'}")
 
 
 def _follow_real_time(
@@ -264,8 +264,8 @@ def _announce_learned(
     """Announce what became of proposals since the last call, and if the learner has ended."""
     for instant, sentence in processes.monitor.learned():
         announce(f"t = {instant - start_time:.2f} s: {sentence}")
-    if outcome := processes.learner_ended():
-        announce(f"{outcome}: the law flies on with the model that it has")
+    if (outcome := processes.pop_end_of_learner()) is not None:
+        announce(f"{outcome.reason}: the law flies on with the model that it has")
 
 
 def _follow_lockstep(

@@ -15,6 +15,7 @@ from contextlib import ExitStack
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.report.display_units import unlike_numbers
 from flight_bringup.graph import FIRST_STAGE, LEARNER, second_stage
+from flight_core.outcome import Refusal
 from flight_core.parameters import require
 
 LOOK = 0.5  # s, that the processes spin: a hundred slices of the scheduler
@@ -56,19 +57,19 @@ def processes_of(scenario: Scenario, *, composed: bool) -> int:
 
 def shortage(
     scenarios: Sequence[Scenario], cores_given: CoresGiven, *, composed: bool = False
-) -> str:
-    """Return what the host lacks for these flights at once, in real time; empty if nothing.
+) -> Refusal | None:
+    """Say what the host lacks for these flights at once, in real time.
 
-    The text goes on behind "this host": "gives 0.5 of the 1.4 cores that a flight in real time
+    The sentence goes on behind "this host": "gives 0.5 of the 1.4 cores that a flight in real time
     needs".
     """
     processes = sum(processes_of(scenario, composed=composed) for scenario in scenarios)
     needed = processes * (CORES_A_PROCESS if composed else CORES_A_NODE)
     given = cores_given(processes)
     if given >= needed:
-        return ""
+        return None
     shown = unlike_numbers(given, needed)
-    return f"gives {shown[0]} of the {shown[1]} cores that a flight in real time needs"
+    return Refusal(f"gives {shown[0]} of the {shown[1]} cores that a flight in real time needs")
 
 
 def cores_given(processes: int) -> float:

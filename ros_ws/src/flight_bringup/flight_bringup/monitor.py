@@ -5,6 +5,7 @@
 import time
 
 from flight_core.modes import Mode
+from flight_core.outcome import Outcome, ended_early
 from flight_core.rates import nanoseconds, seconds
 from flight_core.text import bounded
 from flight_core.vectors import FloatArray
@@ -91,17 +92,18 @@ class FlightMonitor(Client):
         """Convert a time of the host, s, to one of the flight that is at least as long."""
         return lead if self._simulated is None else lead * max(self._simulated.speed(), 1.0)
 
-    def clock_ended(self) -> str:
-        """Return why the simulation behind /clock is over, or "" while it goes on."""
+    def end_of_clock(self) -> Outcome | None:
+        """Return the outcome if the simulation behind /clock is over; None while it goes on."""
         if self._simulated is None or not self._simulated.known():
-            return ""
+            return None
         try:
             self._simulated.require_one_simulation()
         except ClockRestarted as restart:
-            return f"ended early: {restart}"
+            return ended_early(f"ended early: {restart}")
         count = self._simulated.subscription.entity.get_publisher_count
-        gone = self._simulated.silent() and not count()
-        return "ended early: /clock has no publisher: its simulator ended" if gone else ""
+        if not self._simulated.silent() or count():
+            return None
+        return ended_early("ended early: /clock has no publisher: its simulator ended")
 
     def is_ready(self, node: str, pid: int) -> bool:
         """Return whether the loop of a node runs.

@@ -366,16 +366,15 @@ class FlightProcesses:
         ended_processes.sort(key=lambda process: causes.get(process.popen.returncode, 1))
         if ended_processes:
             return _outcome(ended_processes[0])
-        clock = self.monitor.clock_ended()
-        return ended_early(clock) if clock else None
+        return self.monitor.end_of_clock()
 
-    def learner_ended(self) -> str:
-        """Return how the learner has ended, once; "" at any other time."""
+    def pop_end_of_learner(self) -> Outcome | None:
+        """Return how the learner has ended, once; None at any other time."""
         for process in self.processes:
             if process.node is LEARNER and process.popen.poll() is not None:
                 self.processes.remove(process)
-                return _outcome(process).reason
-        return ""
+                return _outcome(process)
+        return None
 
     def waiting(self) -> list[str]:
         """Return the nodes that are not ready yet."""
@@ -397,16 +396,16 @@ class FlightProcesses:
             if name == AIRCRAFT.executable
         )
 
-    def last_words(self, node: NodeSpec) -> str:
-        """Return the last line in which a node waits for a topic or refuses a sample, or ""."""
+    def last_words(self, node: NodeSpec) -> str | None:
+        """Return the last line in which a node waits for a topic or refuses a sample, if any."""
         lines: list[str] = []
         for process in self.processes:
             if node.executable in self._names(process):
                 lines += process.lines
-        line = next(
-            (line for line in reversed(lines) if "waiting for" in line or "refused" in line), ""
-        )
-        return re.sub(r"^(\[[^]]*\] ?)*(: )?", "", line)
+        for line in reversed(lines):
+            if "waiting for" in line or "refused" in line:
+                return re.sub(r"^(\[[^]]*\] ?)*(: )?", "", line)
+        return None
 
     def stop(self) -> None:
         """Stop all processes, the recorder last.

@@ -60,7 +60,7 @@ from flight_cli.words import (
 from flight_core.environment import require_ros_environment
 from flight_core.files import display_path
 from flight_core.installation import require_package
-from flight_core.outcome import End, Outcome
+from flight_core.outcome import End, Outcome, Refusal
 from flight_core.parameters import ParameterError, require
 from flight_guidance.routes.route_file import ENDINGS, read_fence_file
 from flight_guidance.routes.route_formats import FENCES
@@ -327,16 +327,18 @@ class Fly(RouteWords):
         _warn_of_browser()
 
 
-def _falls_back(lack: str, *, can_step: bool = True) -> bool:
+def _falls_back(lack: Refusal | None, *, can_step: bool = True) -> bool:
     """Tell the user if the host lacks what real time needs, and return whether to fly in lockstep.
 
     If the flight cannot be in lockstep, it stays in real time and the sentence is a warning.
     """
-    if lack and can_step:
+    if lack is None:
+        return False
+    if can_step:
         warn(f"this host {lack}: flying in lockstep; --real-time flies in real time all the same")
-    elif lack:
+    else:
         warn(f"warning: this host {lack}, and aircraft with a delay do not fly in lockstep")
-    return bool(lack) and can_step
+    return can_step
 
 
 def _as_host_allows(fleet: Fleet) -> Fleet:

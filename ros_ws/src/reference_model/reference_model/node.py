@@ -74,8 +74,8 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
 
     def _sample(self, number: int) -> FloatArray:
         y_m = self._reference.sample(number)
-        if failure := self._reference.failure():
-            self.get_logger().error(failure)
+        if failure := self._reference.pop_failure():
+            self.get_logger().error(str(failure))
         return y_m
 
     def _max_age_ns(self) -> int:

@@ -8,6 +8,7 @@ The node and the simulation in a single process use it.
 import numpy as np
 
 from flight_core.failures import Failures, sentence
+from flight_core.outcome import Refusal
 from flight_core.rates import period_ns, seconds
 from flight_core.vectors import FloatArray, require_newer
 from reference_model import live, model
@@ -39,7 +40,7 @@ class Reference:
         self._live: Live | None = None
         self._applied = np.zeros_like(self._u_m[0])  # u_m at the end of the last step
         self._failures = Failures()
-        self._failure = ""
+        self._failure: Refusal | None = None
 
     def take(self, t_ns: int, u_m: FloatArray, attitude: FloatArray | None = None) -> None:
         """Take a live u_m, shape (m,), of flight time t, which acts from the next step on.
@@ -79,7 +80,7 @@ class Reference:
                 self._x_m, self._applied, self._live = self._stepped(tracked)
             except Exception as error:  # whatever it is, try the next step
                 if self._failures.add(seconds(self._number * self.period_ns)):
-                    self._failure = f"{LAST_GOES_ON}: {sentence(error)}"
+                    self._failure = Refusal(f"{LAST_GOES_ON}: {sentence(error)}")
             self._number += 1
         y_m: FloatArray = model.output(self._x_m, self._model)
         return y_m
@@ -89,10 +90,9 @@ class Reference:
         """Number of failed steps."""
         return self._failures.count
 
-    def failure(self) -> str:
-        """Say why steps have failed since the last call, in a sentence; "" if there is no news."""
-        failure = self._failure
-        self._failure = ""
+    def pop_failure(self) -> Refusal | None:
+        """Return why steps have failed since the last call; None if there is no news."""
+        failure, self._failure = self._failure, None
         return failure
 
     def _stepped(self, tracked: FloatArray) -> tuple[FloatArray, FloatArray, Live | None]:

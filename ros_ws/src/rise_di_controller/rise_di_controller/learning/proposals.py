@@ -12,6 +12,7 @@ from enum import StrEnum
 from typing import Any, NamedTuple
 
 from flight_core.modes import Mode
+from flight_core.outcome import Refusal
 from flight_core.parameters import SMALLEST, ParameterError, flatten, require
 from flight_core.rates import nanoseconds, seconds
 from flight_core.vectors import FloatArray
@@ -201,7 +202,7 @@ class Learning:
         """Take a proposal, or refuse it with an event."""
         if not (self._simulated or proposal.change or proposal.sentence):
             return  # a test without a change: nothing to certify or to say
-        if refusal := self._refusal(proposal, now_ns, controller):
+        if refusal := self._reason_against(proposal, now_ns, controller):
             self._refuse(refusal, proposal, now_ns)
         elif self._simulated:
             self._received[proposal.stamp_ns] = proposal
@@ -308,35 +309,39 @@ class Learning:
     def _acts_ns(self, end_ns: int) -> int:
         return end_ns + nanoseconds(self._settings.latency)
 
-    def _refusal(self, proposal: Proposal, now_ns: int, controller: Controller) -> str:
-        """Say why a proposal is not even worth certifying; return "" if it may be.
+    def _reason_against(
+        self, proposal: Proposal, now_ns: int, controller: Controller
+    ) -> Refusal | None:
+        """Refuse a proposal that is not even worth certifying.
 
         This costs microseconds, whatever the proposal.
         """
         window = f"a window that ends {seconds(now_ns - proposal.stamp_ns):.3g} s ago"
         if proposal.start != self._digest:
-            return (
+            return Refusal(
                 f"found a proposal for the parameters {proposal.start}, expected "
                 f"{self._digest}, those of the start"
             )
         if self._simulated:
             is_due = proposal.stamp_ns in self._due and proposal.stamp_ns not in self._received
             late = f"found {window}, expected that of an identification that is due, once"
-            return "" if is_due else late
+            return None if is_due else Refusal(late)
         longest = nanoseconds(self._settings.window)
         if self._since_ns is not None:
             longest = min(longest, now_ns - self._since_ns)
         if not 0 <= now_ns - proposal.stamp_ns <= longest:
-            return f"found {window}, expected 0 to {seconds(longest):.3g} s"
+            return Refusal(f"found {window}, expected 0 to {seconds(longest):.3g} s")
         if self._certificate is not None:
-            return f"found {window} while another proposal is certified, expected one at a time"
+            return Refusal(
+                f"found {window} while another proposal is certified, expected one at a time"
+            )
         if self._last_ns is not None and proposal.stamp_ns - self._last_ns < self._spacing_ns:
             later = (
                 f"one that ends at least {seconds(self._spacing_ns):g} s after that of the "
                 "last proposal"
             )
-            return f"found {window}, expected {later}"
-        return self._unfit(proposal, controller)
+            return Refusal(f"found {window}, expected {later}")
+        return self._reason_against_change(proposal, controller)
 
     def _begin(self, proposal: Proposal, controller: Controller, now_ns: int) -> None:
         if proposal.change:
@@ -361,47 +366,49 @@ class Learning:
                 next(certificate)
         except StopIteration as end:
             self._certificate = None
-            refusal = self._unfit(proposal, controller)
+            refusal = self._reason_against_change(proposal, controller)
             if end.value.digest in self._diverged:
-                refusal = "found parameters that diverged in this engagement, expected others"
-            if not refusal:
+                refusal = Refusal(
+                    "found parameters that diverged in this engagement, expected others"
+                )
+            if refusal is None:
                 bare_outputs = ", ".join(outputs_without(end.value.parameters))
                 exception = f", without {bare_outputs}" if bare_outputs else ""
                 what = f"flies {proposal.sentence}{exception}"
                 self._take(controller, now_ns, end.value, EventKind.FLIES, what)
                 return controller.parameters
         except ArithmeticError as error:
-            refusal = (
+            refusal = Refusal(
                 f"found numbers too large or too small ({error.args[-1]}), expected those "
                 "of a flight"
             )
         except (
             ValueError
         ) as error:  # ParameterError, or a matrix of which LAPACK finds no eigenvalues
-            refusal = str(error)
+            refusal = Refusal(str(error))
         else:
             return None
         self._certificate = None
         self._refuse(refusal, proposal, now_ns)
         return None
 
-    def _unfit(self, proposal: Proposal, controller: Controller) -> str:
-        """Say why the law cannot take a proposal; return "" if it can.
+    def _reason_against_change(self, proposal: Proposal, controller: Controller) -> Refusal | None:
+        """Refuse a proposal that the law cannot take.
 
         Either the law is not engaged, or another change overtook the proposal. A proposal that only
         holds an input without effect still counts after a fallback: the input has no effect then
         either, and its loss may have caused the fallback.
         """
         if controller.mode is not Mode.ENGAGED:
-            return (
+            return Refusal(
                 f"found the mode {controller.mode.name}, expected a model only while the law "
                 "is engaged"
             )
         if proposal.flown == controller.digest:
-            return ""
+            return None
         if self._fallback is not None and self._fallback.outlived_by(proposal, controller.digest):
-            return ""
-        return (
+            return None
+        return Refusal(
             f"found a proposal beside the parameters {proposal.flown}, expected "
             f"{controller.digest}: they changed meanwhile"
         )
@@ -413,7 +420,7 @@ class Learning:
         controller.retune(new)
         self._announce(Event(now_ns, kind, change, sentence))
 
-    def _refuse(self, refusal: str, proposal: Proposal, now_ns: int) -> None:
+    def _refuse(self, refusal: Refusal, proposal: Proposal, now_ns: int) -> None:
         # the sentence says which input has no effect, and that stays true
         proposed = f"; proposed: {proposal.sentence}" if proposal.sentence else ""
         self._announce(Event(now_ns, EventKind.REFUSED, {}, f"refused: {refusal}{proposed}"))
