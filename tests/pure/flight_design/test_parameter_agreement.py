@@ -36,7 +36,7 @@ PARAMETERS = {
 
 def agreement(
     channel_map: ChannelMap, values: Mapping[str, float], later: Mapping[str, float] | None = None
-) -> str:
+) -> str | None:
     """The sentence of `require_agreement` for parameters at the samples.
 
     `later`: others that the log has after them.
@@ -56,7 +56,7 @@ def changed(name: str, section: str, **values: Any) -> ChannelMap:
 
 @pytest.mark.parametrize("name", MAPS)
 def test_shipped_map_agrees_with_the_parameters_that_it_names(name: str) -> None:
-    assert agreement(named_map(name), PARAMETERS) == ""
+    assert agreement(named_map(name), PARAMETERS) is None
 
 
 @pytest.mark.parametrize(
@@ -106,7 +106,7 @@ def test_map_of_a_reversed_channel_agrees_with_the_reversal_alone(name: str) -> 
     So is the motion of the row for an increasing raw value.
     """
     reversed_map = changed(name, "inputs", positive="nose down")
-    assert agreement(reversed_map, PARAMETERS | {"RC2_REVERSED": 1.0}) == ""
+    assert agreement(reversed_map, PARAMETERS | {"RC2_REVERSED": 1.0}) is None
     with refusing("found RC2_REVERSED 0, expected RC2_REVERSED 1"):
         agreement(reversed_map, PARAMETERS)
 

@@ -121,10 +121,10 @@ def test_airspeed_flies_the_climb_where_the_elevator_has_no_effect() -> None:
 
 
 def test_limits_are_said_once_and_end_with_the_model() -> None:
-    def of(authority: Authority) -> str:
+    def of(authority: Authority) -> str | None:
         return reach_sentence(OWN, authority)
 
-    assert of(Authority(q=29.0, p=40.0, down=6.0, up=6.0)) == ""
+    assert of(Authority(q=29.0, p=40.0, down=6.0, up=6.0)) is None
     dead = "no roll rate: p has no input with an effect, bank at most 10 deg"
     assert of(Authority(p=0.0)) == dead
     assert (

@@ -126,7 +126,7 @@ class Notices:
         max_age: float,
         largest_wind: Callable[[float], float],
         link_timeout: float = math.inf,
-        reach: Callable[[Authority], str] = lambda authority: "",
+        reach: Callable[[Authority], str | None] = lambda authority: None,
         largest_tilt: float = math.inf,
         landing: Landing | None = None,
     ) -> None:
@@ -135,7 +135,7 @@ class Notices:
         self._tilted = _Lasting(0.0)
         self._reach = reach
         self._authority = Authority()
-        self._reach_text = ""
+        self._reach_text: str | None = None
         self._wind = wind
         self._max_age = max_age
         self._largest_wind = largest_wind

@@ -202,8 +202,8 @@ def _in_burst(stamp_ns: NDArray[np.int64], offset_ns: NDArray[np.int64]) -> bool
     return bool(rise_ns > max(STEP_NS, span_ns // 2))
 
 
-def recording_note(name: str, recording: Recording, start_ns: int) -> str:
-    """Write the sentence about the stamps of a topic; "" if they have neither steps nor damage."""
+def recording_note(name: str, recording: Recording, start_ns: int) -> str | None:
+    """Write the sentence about the stamps of a topic, if they have steps or damage."""
     parts = []
     if recording.unset:
         parts.append(
@@ -217,7 +217,7 @@ def recording_note(name: str, recording: Recording, start_ns: int) -> str:
             f"at t = {t:.3f} s"
         )
         parts.append(f"{step}: the {recording.left_out} samples after the step are left out")
-    return f"{name}: {'; '.join(parts)}" if parts else ""
+    return f"{name}: {'; '.join(parts)}" if parts else None
 
 
 class Leap(NamedTuple):

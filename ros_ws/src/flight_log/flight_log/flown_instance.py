@@ -12,6 +12,7 @@ from collections.abc import Mapping, Set
 
 import numpy as np
 
+from flight_core.outcome import Refusal, joined
 from flight_core.parameters import ParameterError, require
 from flight_log.log_samples import Instances
 from flight_log.vehicle_tables import PLANE, Choice, MessageTable, Parameters
@@ -50,11 +51,12 @@ def instances_of_flight(
                 number in sensors, f"--instance {name}", number, f"one of {_enumeration(sensors)}"
             )
         elif name == "ARSP":
-            if (unused := _unused(sensors, parameters)) and _has_estimate(instances):
+            unused = _reason_against_airspeed(sensors, parameters)
+            if unused and _has_estimate(instances):
                 choices.append((name, f"{unused}: V is the estimate in CTUN"))
                 continue
             ways_out = "its estimate in CTUN, or --instance ARSP=0"
-            require(not unused, "the log", f"no airspeed sensor in use ({unused})", ways_out)
+            require(unused is None, "the log", f"no airspeed sensor in use ({unused})", ways_out)
             tables[name], sentence = _airspeed(sensors)
             if len(sensors) > 1:
                 choices.append((name, sentence))
@@ -181,10 +183,12 @@ def _airspeed(sensors: Mapping[int, MessageTable]) -> tuple[MessageTable, str]:
     return tables[number], f"{number} of {_enumeration(tables)}: healthy and used"
 
 
-def _unused(sensors: Mapping[int, MessageTable], parameters: Parameters) -> str:
+def _reason_against_airspeed(
+    sensors: Mapping[int, MessageTable], parameters: Parameters
+) -> Refusal | None:
     """Say why the autopilot flew by none of its airspeed sensors, by U and H, else ARSPD_USE.
 
-    Returns "" if it flew by one, or if the log does not say.
+    Returns None if it flew by one, or if the log does not say.
     """
     reasons = []
     for number, table in sorted(sensors.items()):
@@ -195,10 +199,10 @@ def _unused(sensors: Mapping[int, MessageTable], parameters: Parameters) -> str:
         else:
             is_used = not records or records[0].value != 0.0
         if is_used and _share(table, "H") >= MOST:
-            return ""
+            return None
         value = f", {setting} {records[0].value:g}" if records else ""
-        reasons.append(f"{number} is not {'healthy' if is_used else 'used'}{value}")
-    return "; ".join(reasons)
+        reasons.append(Refusal(f"{number} is not {'healthy' if is_used else 'used'}{value}"))
+    return joined(reasons)
 
 
 def _has_estimate(instances: Instances) -> bool:

@@ -74,7 +74,9 @@ def read_playback(
     stored = sorted(
         (message for message in stored_messages(run) if message.topic != CLOCK), key=_sent_ns
     )
-    skipped = {message.topic: _unsendable(message) for message in stored if _unsendable(message)}
+    skipped = {
+        message.topic: kind for message in stored if (kind := _unsendable_kind(message)) is not None
+    }
     stored = [message for message in stored if message.topic not in skipped]
     if namespace is not None:
         stored = _within(stored, namespace, str(run))
@@ -180,11 +182,11 @@ def latched_depth(qos: str) -> int:
     return depth if depth <= MAX_LATCHED else 0
 
 
-def _unsendable(message: StoredMessage) -> str:
-    """Say why no ROS topic can have a message; "" for a message of a ROS topic."""
+def _unsendable_kind(message: StoredMessage) -> str | None:
+    """Name the kind of a message that no ROS topic can have; None for a message of a ROS topic."""
     if message.encoding != "cdr":
         return f"{message.type_name} in {message.encoding}".strip()
-    return "" if message.type_name else "no type"
+    return None if message.type_name else "no type"
 
 
 def _definition(message: StoredMessage) -> str:

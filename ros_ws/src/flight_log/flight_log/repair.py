@@ -39,7 +39,7 @@ class FileRepair(NamedTuple):
     messages: int  # messages in the file now
     last_ns: int  # log time of the last message
     known_end_ns: int  # the latest log time in any index or metadata, else 0
-    faults: str  # empty for an intact file
+    faults: str | None  # None for an intact file
     damaged: Path | None  # copy of the damaged file; None for an intact file
 
 
@@ -175,7 +175,7 @@ class _FileScan:
             messages=self.messages.total(),
             last_ns=self.last_ns,
             known_end_ns=self.known_end_ns,
-            faults="",
+            faults=None,
             damaged=None,
         )
 

@@ -163,11 +163,11 @@ class Scan:
         self._messages = 0  # that have been read
 
     @property
-    def faults(self) -> str:
-        """Faults of the file; "" for an intact file."""
+    def faults(self) -> str | None:
+        """Faults of the file; None for an intact file."""
         faults = [] if self.complete else ["a truncated end"]
         faults += [f"{self.damaged} damaged parts"] if self.damaged else []
-        return " and ".join(faults)
+        return " and ".join(faults) if faults else None
 
     def records(self) -> Iterator[McapRecord]:
         """Yield the schemas, channels, messages, attachments and metadata.

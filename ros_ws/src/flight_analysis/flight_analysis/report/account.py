@@ -163,8 +163,10 @@ def account(
     for name, topic in topics.items():
         last = late.get(name, 0.0)
         lack = _lack(name, topic, end, last, late_u=first is not None)
-        lacks += [lack] if lack else []
-        if lack and _is_of_host(tape, name, topic, starved, end - last):
+        if lack is None:
+            continue
+        lacks.append(lack)
+        if _is_of_host(tape, name, topic, starved, end - last):
             host_lacks.append(lack)
     busy = [
         f"{topic.unsent} of {topic.expected} {name} were never sent"
@@ -279,8 +281,8 @@ def _late_first_u(
     return first_u if first_u - scenario.aircraft.sensors.delay > SILENCE else None
 
 
-def _lack(name: str, topic: TopicAccount, end: float, late: float, *, late_u: bool) -> str:
-    """Return what a topic lacks, as a sentence without a verb; empty if it lacks nothing.
+def _lack(name: str, topic: TopicAccount, end: float, late: float, *, late_u: bool) -> str | None:
+    """Return what a topic lacks, as a sentence without a verb; None if it lacks nothing.
 
     `late` is how long before the end the last sample may be stamped, s; the first may be as late.
     `late_u` says that the first u of the flight was late.
@@ -311,7 +313,7 @@ def _lack(name: str, topic: TopicAccount, end: float, late: float, *, late_u: bo
                 f"no sample from t = {topic.gap_at:.3f} to {topic.gap_at + topic.gap:.3f} s"
             )
     if not (facts or missing):
-        return ""
+        return None
     if missing and topic.unsent:
         facts.append(f"{topic.unsent} were never sent")
     if topic.expected is None:

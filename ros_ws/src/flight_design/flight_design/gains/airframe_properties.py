@@ -218,12 +218,12 @@ def output_coordinates(C: FloatArray) -> tuple[FloatArray, FloatArray, FloatArra
     return inverse[:, :m], inverse[:, m:], H
 
 
-def marginal_sentence(facts: Sequence[AirframeFacts]) -> str:
-    """Say which zeros on the imaginary axis Assumption 3 does not cover; "" if there are none."""
+def marginal_sentence(facts: Sequence[AirframeFacts]) -> str | None:
+    """Say which zeros on the imaginary axis Assumption 3 does not cover, if there are any."""
     states = list(dict.fromkeys(chain.from_iterable(airframe.integrated for airframe in facts)))
     names = [airframe.name for airframe in facts if airframe.zero_dynamics is ZeroDynamics.MARGINAL]
     if not names:
-        return ""
+        return None
     integrals = ""
     if states:
         verb = "integrates" if len(states) == 1 else "integrate"

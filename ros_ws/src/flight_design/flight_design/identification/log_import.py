@@ -355,7 +355,7 @@ def _torque(log: VehicleLog, name: str, row: InputRow, servos: bool) -> _Reader:
 
 def _flight(
     log: VehicleLog, stamps: Stamps, speed: FloatArray | None, window: Window, *, needs_manual: bool
-) -> tuple[tuple[int, int], str]:
+) -> tuple[tuple[int, int], str | None]:
     """Return the first and the last instant that are taken, and a sentence on other flights.
 
     The window is taken, or else the longest stretch in the air; for sticks it must be in MANUAL.
@@ -436,15 +436,17 @@ def _length(run: tuple[int, int]) -> float:
     return seconds(run[1] - run[0])
 
 
-def _other_flights(runs: Sequence[tuple[int, int]], taken: tuple[int, int], start_ns: int) -> str:
-    """Return a sentence on the flights of a log that are not taken; "" if there is one flight."""
+def _other_flights(
+    runs: Sequence[tuple[int, int]], taken: tuple[int, int], start_ns: int
+) -> str | None:
+    """Return a sentence on the flights of a log that are not taken; None if there is one flight."""
     others = [
         f"{seconds(first - start_ns):.1f} to {seconds(last - start_ns):.1f} s"
         for first, last in runs
         if (first, last) != taken and _length((first, last)) >= LEAST
     ]
     if not others:
-        return ""
+        return None
     window = "take another by --from and --until"
     return f"the log has {len(others) + 1} flights, {window}: {', '.join(others)}"
 
@@ -466,13 +468,13 @@ def _complete(stamp_ns: Stamps, values: FloatArray, is_damaged: bool) -> tuple[S
     return stamp_ns[is_near], values[is_near]
 
 
-def gap_sentence(name: str, stamp_ns: Stamps, start_ns: int) -> str:
-    """Say how many samples a topic lacks, judged by its usual period; "" if it has all."""
+def gap_sentence(name: str, stamp_ns: Stamps, start_ns: int) -> str | None:
+    """Say how many samples a topic lacks, judged by its usual period; None if it has all."""
     gaps = np.diff(stamp_ns)
     period = float(np.median(gaps))
     expected = round(float(stamp_ns[-1] - stamp_ns[0]) / period) + 1
     if expected <= len(stamp_ns) or gaps.max() < 1.5 * period:
-        return ""
+        return None
     instant = seconds(int(stamp_ns[gaps.argmax()]) - start_ns)
     return (
         f"{name} lacks {expected - len(stamp_ns)} of {expected} samples: the longest gap, "

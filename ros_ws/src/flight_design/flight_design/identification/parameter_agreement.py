@@ -218,8 +218,8 @@ def compared(
     return rows
 
 
-def require_agreement(name_of_map: str, rows: Iterable[Agreement]) -> str:
-    """Return a sentence on the parameters without a value at the samples; "" if there is none.
+def require_agreement(name_of_map: str, rows: Iterable[Agreement]) -> str | None:
+    """Return a sentence on the parameters without a value at the samples, if there are any.
 
     Raises ParameterError if a parameter differs from the map's.
     """
@@ -237,9 +237,9 @@ def require_agreement(name_of_map: str, rows: Iterable[Agreement]) -> str:
             f"{'; '.join(mends)}"
         )
     absent = ", ".join(row.what for row in rows if not row.is_known)
-    if absent:
-        return f"the log has no {absent} before the samples: compare the map with them yourself"
-    return ""
+    if not absent:
+        return None
+    return f"the log has no {absent} before the samples: compare the map with them yourself"
 
 
 def change_sentences(recorded: Parameters, start_ns: int, first_ns: int, last_ns: int) -> list[str]:

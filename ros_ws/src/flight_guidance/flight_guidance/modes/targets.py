@@ -62,10 +62,10 @@ def within_reach(params: GuidanceParams, authority: Authority) -> GuidanceParams
     )
 
 
-def reach_sentence(params: GuidanceParams, authority: Authority) -> str:
+def reach_sentence(params: GuidanceParams, authority: Authority) -> str | None:
     """Write the limits that follow from what is learned in flight, in a sentence.
 
-    It is empty if the aircraft's own limits are lower.
+    Returns None if the aircraft's own limits are lower.
     """
     now = within_reach(params, authority)
     parts = [
@@ -90,7 +90,7 @@ def reach_sentence(params: GuidanceParams, authority: Authority) -> str:
     ):
         if 0.0 < limit < nominal:
             parts.append(f"{name} at most {limit:.2g} {unit}")
-    return ", ".join(parts)
+    return ", ".join(parts) if parts else None
 
 
 DEAD = {"p": "roll rate", "q": "pitch rate"}
