@@ -7,6 +7,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import cache
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ from aircraft_sim.airframes.airframe import load_airframe
 from aircraft_sim.uncertainty import as_yaml
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.linear_loop.certificate import certificate, keep
-from flight_analysis.linear_loop.guarantee import guarantee
+from flight_analysis.linear_loop.guarantee import Guarantee, guarantee
 from flight_analysis.linear_loop.loop_margins import LinearLoop, scenario_loop
 from flight_analysis.linear_loop.uncertain_loop import plants_at
 from rise_di_controller.law.linear_loop import closed_loop
@@ -47,10 +48,15 @@ def loop_of(name: str) -> LinearLoop:
     return scenario_loop(scenario, scenario.controller, 1, 0.3)
 
 
+@cache
+def promise_of(name: str) -> Guarantee:
+    return guarantee(loop_of(name))
+
+
 @pytest.fixture(scope="module")
 def servo() -> Content:
     linear = loop_of("osprey_servo")
-    content: Content = json.loads(certificate(linear, guarantee(linear), {}))
+    content: Content = json.loads(certificate(linear, promise_of("osprey_servo"), {}))
     return content
 
 
@@ -77,7 +83,7 @@ def test_checker_proves_a_guarantee(name: str, tmp_path: Path) -> None:
     checker refused it.
     """
     linear = loop_of(name)
-    promise = guarantee(linear)
+    promise = promise_of(name)
     done = run(json.loads(certificate(linear, promise, {})), tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("PROVED")
@@ -321,8 +327,7 @@ def test_export_puts_the_certificate_beside_the_code_of_its_constants(tmp_path: 
     code = tmp_path / "c"
     exported = rise_di.export("osprey_servo", code, proof=False)
     assert not any(path.name == "certificate.json" for path in exported.files)
-    linear = loop_of("osprey_servo")
-    keep(guarantee(linear))
+    keep(promise_of("osprey_servo"))
     exported = rise_di.export("osprey_servo", code, proof=False)
     assert code / "certificate.json" in exported.files
     content = json.loads((code / "certificate.json").read_text())

@@ -474,18 +474,15 @@ def test_refusal_names_the_option_as_it_is_typed(words: str, refusal: str) -> No
         ("guide altitude=1300 head", "heading="),
     ],
 )
-def test_shell_completes_after_each_option(words: str, expected: str, tmp_path: Path) -> None:
-    environment = {
-        **os.environ,
-        "_RISE_DI_COMPLETE": "complete_bash",
-        "COMP_WORDS": f"rise-di {words}",
-        "COMP_CWORD": str(len(words.split())),
-    }
-    command = [sys.executable, "-m", "flight_cli.cli"]
-    process = subprocess.run(
-        command, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False
-    )
-    assert expected in process.stdout.split(), process.stderr
+def test_shell_completes_after_each_option(
+    words: str, expected: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("_RISE_DI_COMPLETE", "complete_bash")
+    monkeypatch.setenv("COMP_WORDS", f"rise-di {words}")
+    monkeypatch.setenv("COMP_CWORD", str(len(words.split())))
+    shown = said()
+    assert expected in shown.stdout.split(), shown.stderr
 
 
 def test_failing_plugin_of_jax_is_one_sentence(tmp_path: Path) -> None:
