@@ -51,10 +51,10 @@ HEAD = """\
 # Evidence
 
 For you if you want to check a figure. Each link leads to the figures of a measurement, with goals, command, revision, host and date;
-`docs/evidence/tables/` has tables of other pages. `make evidence ARGS="--again NAME"` measures again and writes this page: NAME is that
-of the file. The programs of learning, guidance and real autopilots write their files themselves. Limits of all measurements: one host,
-the loopback interface, simulated aircraft. In turbulence a figure is the worst of the seeds. Flights of real autopilots before 2026-11-23
-take the times of their commands some seconds early: measure their rms again.
+`docs/evidence/tables/` has tables of other pages. `make evidence ARGS="--again NAME"` measures again and writes this page, where NAME is
+that of the file. The programs of learning, guidance and real autopilots write their files themselves. All measurements are limited to one
+host, the loopback interface and simulated aircraft. In turbulence a figure is the worst of the seeds. Flights of real autopilots before
+2026-11-23 have the times of their commands some seconds too early: measure their rms again.
 
 ## How to read a table
 
@@ -66,16 +66,16 @@ A table is a CSV file: your spreadsheet opens it, `pandas.read_csv` reads it. It
 | column | holds |
 |---|---|
 | name | "subject: figure" |
-| value, unit | the figure; a word where the result is one |
+| value, unit | the figure, or a word if the result is a word |
 | baseline | the name of the row that the value is compared with: the least program that does the same on this host |
-| goal | the limit: `<= 2`, `>= 0.05`, or `<= 2 x baseline` for a ratio; empty where the figure is told alone |
+| goal | the limit: `<= 2`, `>= 0.05`, or `<= 2 x baseline` for a ratio; empty if the figure has no goal |
 | command | what measures it again |
-| revision | the commit that was measured; `-dirty` with changes beside it |
-| host, date | where and when; `busy with other work`: times are longer than on an idle host |
+| revision | the commit that was measured; `-dirty` if the folder had changes that are not committed |
+| host, date | where and when; `busy with other work` means that times are longer than on an idle host |
 
-Most tables of other pages have a row a case instead, as [those laws](evidence/tables/laws-vanes.csv): each column names its
-quantity, and `conditions` says what was flown. "mean (worst)" is over the aircraft of the row, "+-30 %" draws
-each entry of A and B within 30 % of the airframe's, and a [score](glossary.md) sums the errors of the outputs.
+Most tables of other pages have a row for each case instead, such as [the laws with vanes](evidence/tables/laws-vanes.csv): each column names
+its quantity, and `conditions` says what was flown. "mean (worst)" is over the aircraft of the row, "+-30 %" means that each entry of A and B
+is drawn within 30 % of the airframe's, and a [score](glossary.md) sums the errors of the outputs.
 """  # noqa: E501 - a text as it is written
 
 
