@@ -217,7 +217,7 @@ def test_takes_over_from_the_torque_of_the_spare(shell: Shell) -> None:
 def test_falls_back_in_the_same_cycle(
     shell: Shell, changes: dict[str, object], refusal: int, latches: bool
 ) -> None:
-    """And fades the difference; a fault stays until it is switched off."""
+    """The difference then fades; a fault stays until RISE-DI is switched off."""
     shell.fly(100, enabled=False)
     assert set(shell.fly(50, setpoint=(0.3, 0.2, 0.1))) == {FLIES}
     before = shell.torque.copy()

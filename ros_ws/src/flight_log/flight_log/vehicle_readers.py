@@ -343,7 +343,10 @@ def _read_ulog(path: Path, kind: str, choice: Choice) -> VehicleLog:
 
 
 class UlogContent(BytesIO):
-    """The content of a ULog; pyulog may go back from a cut message to the same one for ever."""
+    """The content of a ULog, which ends after too many reads.
+
+    pyulog may otherwise go back from a cut message to the same message for ever.
+    """
 
     def __init__(self, content: bytes) -> None:
         """Permit more reads than messages and single steps over damaged bytes need."""

@@ -435,13 +435,13 @@ def _slope_of_wind(tape: Tape, controller: ControllerConfig, ticks: FloatArray) 
 def _gravity_along_path(
     tape: Tape, controller: ControllerConfig, ticks: FloatArray, y_m: FloatArray
 ) -> FloatArray:
-    """Return the disturbance of y_dot = Omega u + d by the weight along the path of y_m, (N, m).
+    """Return d of y_dot = Omega u + d as the weight causes it along the path of y_m, (N, m).
 
         theta_dot = q_m cos(phi) - r_m sin(phi),   V_dot = -g sin(theta)
 
     theta is the deviation from trim, and begins as in the log; phi is that of the log. An aircraft
-    without a rudder has no r_m, and turns by its own r. If the law has an integral of e, it keeps
-    the true theta within a hundredth of a radian of this one, whatever the gusts.
+    without a rudder has no r_m, and turns by its own r. If the law has an integral of e, the law
+    keeps the true theta within a hundredth of a radian of this one, whatever the gusts.
     """
     d = np.zeros((len(ticks), len(controller.outputs)))
     names = controller.outputs
