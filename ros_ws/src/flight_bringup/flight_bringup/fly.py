@@ -279,7 +279,7 @@ def _follow_lockstep(
     has taken the last u and the log is complete.
     """
     scenario = processes.scenario
-    # The last instant is the begin of the aircraft's last whole period.
+    # The last instant is the beginning of the aircraft's last whole period.
     end = scenario.flight.duration - 1.0 / scenario.aircraft.rate
     t = 0.0
     last_change = time.monotonic()

@@ -62,8 +62,8 @@ class Import:
     output: Path | None = option(
         "Folder to create; by default the name of the log in runs/.", "--output", "--write"
     )
-    start: float | None = option("Time to begin at, s since the begin of the log.", "--from")
-    stop: float | None = option("Time to end at, s since the begin of the log.", "--until")
+    start: float | None = option("Time to begin at, s since the beginning of the log.", "--from")
+    stop: float | None = option("Time to end at, s since the beginning of the log.", "--until")
     servos: bool = option(
         "Take u from the servos of ArduPilot, in any mode; by default from the sticks in MANUAL.",
         default=False,

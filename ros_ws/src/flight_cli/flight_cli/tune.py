@@ -153,8 +153,8 @@ class Tune:
         "Lags of the servos in s, in the order of the airframe, as in 0.02,0.1; by default those "
         "of the aircraft in the scenario."
     )
-    start: float | None = option("Time to begin at, s since the begin of the log.", "--from")
-    stop: float | None = option("Time to end at, s since the begin of the log.", "--until")
+    start: float | None = option("Time to begin at, s since the beginning of the log.", "--from")
+    stop: float | None = option("Time to end at, s since the beginning of the log.", "--until")
     calm: bool = option(
         "Do without an observer, which passes the noise of the gyro on to u in calm air.",
         default=False,

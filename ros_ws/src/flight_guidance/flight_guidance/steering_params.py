@@ -128,7 +128,7 @@ class SteeringConfig(NodeConfig):
         default=None, description="radius of fillets and of the last orbit, m"
     )
     profile: Literal["slope", "step"] = Field(
-        default="slope", description="altitude changes along a leg, or at its begin"
+        default="slope", description="altitude changes along a leg, or at its start"
     )
     max_age: Annotated[float, Field(gt=0, le=1e6)] = Field(
         default=0.2, description="age at which y and pose are stale, s"

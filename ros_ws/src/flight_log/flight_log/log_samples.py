@@ -31,7 +31,7 @@ SETTING = (PARAMETER, 0)
 def tables_of(
     samples: Iterable[Sample], fields: Mapping[str, set[str]]
 ) -> tuple[Instances, Parameters, str]:
-    """Make tables of messages, parameters, and a note.
+    """Return the messages as tables, the parameters, and a sentence on what was left out.
 
     A field that the first message lacks is absent.
 

@@ -35,7 +35,7 @@ LIKE_PART = 1.05  # of the rate of the law; a faster gyro is interpolated (rise_
 
 
 class RateLoop(NamedTuple):
-    """The loop of a law in PX4."""
+    """The timing of a law inside PX4."""
 
     rate: float  # of the law, Hz
     delay: float  # from the rates to the torque, s

@@ -54,8 +54,8 @@ OVER = (
     "ended",
     "interrupted",
 )  # states of a recording in which the flight can no longer be commanded
-# s, from the request to the begin of a gust. If a busy host sets the first too late, the second is
-# tried.
+# s, from the request to the beginning of a gust. If a busy host sets the first too late, the second
+# is tried.
 GUST_LEADS = (0.2, 1.0)
 # Larger stamps come from the system clock. Those of a flight in lockstep begin at 0.
 SYSTEM_TIME_NS = 10**17

@@ -224,9 +224,9 @@ class JsbsimModel:
         self._wind_model = self._wind_model._replace(gusts=parameters.gust_arrays(AXES))
 
     def _cut_engines(self, cut: bool) -> None:
-        """Stop the engines when they are lost, and start them when that ends.
+        """Stop the engines while they are lost, and start them again afterwards.
 
-        Whether they run is not an outcome of the flight then.
+        An engine that stops here does not end the flight.
         """
         if cut == self._are_engines_cut:
             return

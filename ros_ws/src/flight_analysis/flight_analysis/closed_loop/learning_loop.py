@@ -148,7 +148,10 @@ def proposed(
 
 
 class ProposalStation:
-    """Makes proposals that are due act, falls back if the law diverges, publishes `authority`."""
+    """Puts proposals in force when they are due, and publishes `authority`.
+
+    If the law diverges, the station falls back to the law of the start.
+    """
 
     def __init__(self, controller: Controller, learning: Learning, topics: Topics) -> None:
         self._controller = controller

@@ -461,7 +461,7 @@ def _gravity_along_path(
 
 
 def _has_path(tape: Tape, controller: ControllerConfig) -> bool:
-    """Return whether the log has the attitude and the wind of JSBSim, for an output V."""
+    """Return whether V is an output, and the log has the attitude and the wind of JSBSim."""
     truth = tape.signals.get("truth")
     if truth is None or AIRSPEED not in controller.outputs:
         return False

@@ -41,7 +41,9 @@ SHORT_RUN = 6  # samples: if a publisher leaves out 30 %, a tenth of such runs i
 class TopicAccount(NamedTuple):
     """The samples of a topic. Times are flight times, s, and None if there is no sample."""
 
-    expected: int | None  # None: unknown, as in a log without the rates or the begin of its flight
+    expected: (
+        int | None
+    )  # None if unknown, as in a log without the rates or the start of its flight
     found: int
     first: float | None
     last: float | None
@@ -65,7 +67,7 @@ class TopicAccount(NamedTuple):
         """Return whether `count` samples are the whole topic, or their expected number is unknown.
 
         One missing sample of a short topic does not count: the first or the last instant of a
-        flight may fall on either side of its begin or end.
+        flight may fall on either side of its beginning or end.
         """
         return self.expected is None or count >= min(
             WHOLE * self.expected, max(self.expected - 1, 1)

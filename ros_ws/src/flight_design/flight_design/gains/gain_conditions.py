@@ -368,15 +368,16 @@ def check_loop(
     largest: FloatArray,
     rate_limit: FloatArray,
 ) -> tuple[GainCondition, ...]:
-    """Return the conditions of the loop that its linear margins do not have, channel by channel.
+    """Return the conditions of the loop that its linear margins do not cover, channel by channel.
 
-        beta below rate:  beta_i <= 0.7 rate_limit_i         else a limit cycle; unit response
-        implicit: lag:    lag_i + delay <= period / 2        implicit sign: else it chatters
-        implicit: omega:  omega_i >= largest_i               the same
+        beta below rate:  beta_i <= 0.7 rate_limit_i
+        implicit: lag:    lag_i + delay <= period / 2
+        implicit: omega:  omega_i >= largest_i
 
-    Arguments: response_i = abs(Omega_ii) in the inputs of the law, nominal, and `largest` its upper
-    bound; rate_limit in those same inputs, units of y / s^2, infinite without a limit; all of shape
-    (m,).
+    Without the first, beta causes a limit cycle; it is stated for a response of 1. Without the
+    other two, the implicit sign chatters. response_i = abs(Omega_ii) is nominal, in the inputs of
+    the law, and `largest` is its upper bound. rate_limit is in those same inputs, in units of y /
+    s^2, and infinite without a limit. All have shape (m,).
     """
     fastest = MAX_BETA_TO_RATE_LIMIT * rate_limit * response
     conditions = _by_channel("beta below rate", params.beta * response, fastest, at_least=False)

@@ -398,7 +398,7 @@ def assess_scenario(
 
 
 def loop_setting(scenario: Scenario, gamma_2: float = 0.0) -> LoopSetting:
-    """Return the loop of a scenario: its controller, and rate limits of it and the actuators."""
+    """Return the loop of a scenario; the tighter rate limit of controller and actuator counts."""
     controller = scenario.controller
     rates = scenario.aircraft.actuators.rate
     slew = dict(zip(controller.inputs, controller.slew or (), strict=bool(controller.slew)))

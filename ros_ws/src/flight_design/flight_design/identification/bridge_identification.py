@@ -438,13 +438,11 @@ def airframe_yaml(
 ) -> str:
     """Write the airframe of identified channels as text, in the units of the map's channels.
 
-    With z_i of the dimension of y_i dt:
-
         y_i_dot = -(damping_i - zero_i) y_i + (damping_i zero_i - stiffness_i - zero_i^2) z_i
                   + sum_j Omega_ij u_j
         z_i_dot = y_i - zero_i z_i
 
-    z_i only exists if stiffness_i or zero_i is not 0.
+    z_i has the dimension of y_i dt, and only exists if stiffness_i or zero_i is not 0.
     """
     m = len(pairing.outputs)
     second = [i for i in range(m) if channels.stiffness[i] or channels.zero[i]]

@@ -27,7 +27,7 @@ from flight_core.vectors import FloatArray
 from flight_design.gains.nominal import airframe_model, unit_sizes
 from rise_di_controller.law.linear_loop import LoopTiming
 
-# s at the begin of a recording in which innovations do not count, because the filter starts from y
+# s at the start of a recording in which innovations do not count, because the filter starts from y
 # alone
 TRANSIENT = 0.5
 MOST_GAPS = 10.0  # largest length of a log, gaps included, as a multiple of its samples of u

@@ -105,7 +105,7 @@ class Models(NamedTuple):
 
     bank: FilterBank
     levels: NDArray[np.int64]  # (levels of the bank,) their places in LEVELS
-    begin: FloatArray  # (N, s) estimates at the begin of the flight
+    begin: FloatArray  # (N, s) estimates at the beginning of the flight
     u: FloatArray  # (T, m), or (N, T, m) if the delay is identified
 
 
@@ -117,7 +117,7 @@ class Unknown(NamedTuple):
     """
 
     delay: float = 0.0  # s, of u
-    angle: float = 0.0  # rad, of pitch and bank at the begin of the recording
+    angle: float = 0.0  # rad, of pitch and bank at the beginning of the recording
     effect: float = PRIOR  # 1, of an entry of B before the flight
     error: float = PRIOR  # 1, of an entry of A
     drift: float = DRIFT  # sizes/s per root s, of the disturbances
@@ -138,8 +138,8 @@ class Fit(NamedTuple):
 
     theta: FloatArray
     """(p,) relative errors of the uncertain entries of A, then of B; logarithms of the strengths of
-    the winds; then, if they are identified, the shear, the angles at the begin and the errors of
-    the delays, in units of their deviations."""
+    the winds; then, if they are identified, the shear, the angles at the beginning and the errors
+    of the delays, in units of their deviations."""
     deviation: FloatArray  # (p,) standard deviations after the flight
     before: Innovations  # those of the nominal model in these winds
     after: Innovations  # those of the identified model
@@ -346,8 +346,8 @@ class Likelihood:
     def levels(self, theta: FloatArray) -> NDArray[np.int64]:
         """Return the level of the wind in each span, (spans,), for theta, (p,).
 
-        Every level predicts the span from the estimates at its begin. The calmest level is taken
-        whose log-likelihood is within CHANGE of the best.
+        Every level predicts the span from the estimates at its beginning. The calmest level is
+        taken whose log-likelihood is within CHANGE of the best.
         """
         models = self.models(theta[None], self._usable)
         bank = models.bank.by_level()

@@ -54,7 +54,7 @@ Stamps = NDArray[np.int64]
 class Window(NamedTuple):
     """What is taken of a log, s since its first sample of the output `instant`.
 
-    None means the begin or the end of the flight that is found.
+    None means the beginning or the end of the flight that is found.
     """
 
     start: float | None

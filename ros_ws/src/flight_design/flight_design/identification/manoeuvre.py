@@ -41,7 +41,7 @@ def moderate_turbulence(altitude: float) -> dict[str, Any]:
 
 
 LEAST_SHARE = 0.01
-"""Share of the ticks: 0.6 s of a flight of a minute, more than the begin of a step takes."""
+"""Share of the ticks: 0.6 s of a flight of a minute, more than the start of a step takes."""
 
 
 class ManoeuvreResult(NamedTuple):

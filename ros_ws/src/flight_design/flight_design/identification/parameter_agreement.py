@@ -245,8 +245,8 @@ def require_agreement(name_of_map: str, rows: Iterable[Agreement]) -> str | None
 def change_sentences(recorded: Parameters, start_ns: int, first_ns: int, last_ns: int) -> list[str]:
     """Say which decisive parameters change before or after the samples.
 
-    `first_ns` and `last_ns` are the first and the last sample, and `start_ns` is the begin of the
-    log. Raises ParameterError if one changes between the samples.
+    `first_ns` and `last_ns` are the first and the last sample, and `start_ns` is the beginning of
+    the log. Raises ParameterError if one changes between the samples.
     """
     between = []
     outside = []

@@ -6,10 +6,11 @@ Omega, lags and delays have standard errors.
 
 A predictor of every sample of y from earlier samples and from u is fitted by least squares. It is
 long enough to include the disturbances. Its step response is the step response of the aircraft. A
-second-order response with a delay and a lag is fitted to the begin of the step response, and has
-Omega, the lag and the delay. Sources: L. Ljung, "System Identification", 1999, 7.3 and 13.4 (direct
-identification in closed loop); U. Forssell, L. Ljung, Automatica 35, 1999; Y. Zhu, "Multivariable
-System Identification for Process Control", 2001, 6 (a high-order ARX model, then a reduced one).
+second-order response with a delay and a lag is fitted to the beginning of the step response, and
+has Omega, the lag and the delay. Sources: L. Ljung, "System Identification", 1999, 7.3 and 13.4
+(direct identification in closed loop); U. Forssell, L. Ljung, Automatica 35, 1999; Y. Zhu,
+"Multivariable System Identification for Process Control", 2001, 6 (a high-order ARX model, then a
+reduced one).
 """
 
 import math

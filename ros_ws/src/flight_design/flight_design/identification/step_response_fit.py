@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fit a second-order response with a delay and a lag to the begin of a step response."""
+"""Fit a second-order response with a delay and a lag to the beginning of a step response."""
 
 import math
 from typing import Any, NamedTuple

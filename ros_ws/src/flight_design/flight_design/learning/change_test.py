@@ -39,7 +39,7 @@ LOSS = 2.0 * MAX_DEVIATION
 # every 3 s had gains up to 10.3, and once 17.4, because a gust is no normal process. Surfaces with
 # half their effect had gains of 18 and more.
 MAX_GAIN = 12.0
-# rad, standard deviation of pitch and bank at the begin of the record, which may be in a turn
+# rad, standard deviation of pitch and bank at the beginning of the record, which may be in a turn
 ANGLE = 0.3
 # rad, the same for alpha and beta. With 0.3, a gust before the record looked like a loss of effect.
 FLOW = 0.03
@@ -127,7 +127,7 @@ class Least(NamedTuple):
     """The least J of a hypothesis, and where it lies."""
 
     J: float
-    # (p,) kappa of the inputs, logarithms of the strengths of the winds, angles at the begin
+    # (p,) kappa of the inputs, logarithms of the strengths of the winds, angles at the beginning
     theta: FloatArray
     levels: NDArray[np.int64]  # (spans,) levels of the wind
 

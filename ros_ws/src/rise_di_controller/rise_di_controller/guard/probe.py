@@ -68,7 +68,7 @@ class ProbeConfig(Config):
 
 
 class Probe(NamedTuple):
-    """Sines of m inputs."""
+    """The sines that a controller adds to its m inputs."""
 
     amplitude: FloatArray  # (m,) units of u
     harmonic: FloatArray  # (m,) whole multiples of 1 / window, 0 without a sine
